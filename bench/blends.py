@@ -14,13 +14,13 @@ from functools import cached_property
 
 import numpy as np
 
-from mauvecl.answers.stares.stare import _log_energy
+from mauvecl.answers.inject import StarSurvey, survey_star
+from mauvecl.answers.stare import _log_energy
 from mauvecl.flares.events import Event, coefficients
 from mauvecl.search.alarms import Alarm, alarms
 from mauvecl.search.flare_fits import Factor
 from mauvecl.study.cases import Case
 from mauvecl.study.study import Study
-from mauvecl.study.surveys import StarSurvey, survey_star
 
 THRESHOLD = 4.92
 SQUARE = 0.72148

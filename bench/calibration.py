@@ -30,7 +30,7 @@ from tables import processor, versions, write
 from mauvecl import Study, calibrate
 from mauvecl.host.instrument.curves import Curve
 from mauvecl.host.stars.source import Source
-from mauvecl.observations.calibration.throughput import ERROR_KNOTS, ONE_STAR_ERROR
+from mauvecl.observations.throughput import ERROR_KNOTS, ONE_STAR_ERROR
 from tests.observations.test_calibrated_coverage import deviations, relative
 from tests.observations.test_calibration import NOMINAL, STARS, frames_of, truth
 

@@ -29,7 +29,7 @@ AXES = {
 CHILD = """
 import json, resource, sys, time
 from mauvecl.device.engine import Engine
-from mauvecl.device.toy_exposure import toy
+from mauvecl.device.selftest import toy
 axis, value, device = json.loads(sys.argv[1])
 realisations = value if axis == "realisations" else 20_000
 pixels = value if axis == "pixels" else 1_600

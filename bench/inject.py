@@ -16,8 +16,8 @@ from pathlib import Path
 
 from astropy.table import Table
 
-from mauvecl.answers.stares.inject import inject
-from mauvecl.device.stare_engine import Stares
+from mauvecl.answers.inject import inject
+from mauvecl.device.engine import Stares
 from mauvecl.study.study import Study
 
 STAR = {"star": [{"library": "G2V", "magnitude": 7.4}]}

@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from mauvecl import Study, analyse, stare
-from mauvecl.device.stare_engine import Stares
-from mauvecl.observations.reading import read_frames
+from mauvecl.device.engine import Stares
+from mauvecl.observations.frame_files import read_frames
 
 #: False alarms per star-day, enough to count them in a few star-days.
 FALSE_ALARMS = 10.0

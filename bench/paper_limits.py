@@ -14,7 +14,7 @@ from astropy.table import vstack
 from tables import write
 
 from mauvecl import Study, limit
-from mauvecl.answers.limits.assumptions import what_matters
+from mauvecl.answers.limit import what_matters
 from mauvecl.detection.requests import STATISTICS
 
 KEPT = ("amplitude", "exposure", "statistic", "magnitude", "low", "high", "closed_form", "check")

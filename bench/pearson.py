@@ -21,8 +21,7 @@ from scipy import special, stats
 from tables import write
 
 from mauvecl import Engine
-from mauvecl.device.selftest import pearson
-from mauvecl.device.toy_exposure import toy
+from mauvecl.device.selftest import pearson, toy
 from mauvecl.noise import layout, scene
 
 PIXELS = 1600

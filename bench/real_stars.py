@@ -499,7 +499,7 @@ def written(trial: Trial, folder: Path) -> tuple[Path, Path | None]:
 def by_command_line(trial: Trial, flags: list[str]) -> Answer:
     """Analyse a trial by the command line, in this process."""
     from mauvecl.cli.app import app
-    from mauvecl.cli.boundary import guarded
+    from mauvecl.cli.console import guarded
 
     with tempfile.TemporaryDirectory() as name:
         folder, said = Path(name), io.StringIO()

@@ -22,8 +22,8 @@ from rates import engine_lines
 from tables import write
 
 from mauvecl import Engine
-from mauvecl.device.device import VECTORS
-from mauvecl.device.kernel_cache import kernel_cache
+from mauvecl.device.build import VECTORS
+from mauvecl.device.drivers import kernel_cache
 
 PEAK = """
 typedef float float16_;

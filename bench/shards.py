@@ -26,10 +26,9 @@ from tables import write
 from mauvecl.detection.requests import DetectRequest, Shard
 from mauvecl.detection.snr import DetectionSums
 from mauvecl.device.engine import Engine
-from mauvecl.runs.checkpoint import Checkpoint
+from mauvecl.runs.checkpoint import Checkpoint, fingerprint, shards
 from mauvecl.runs.cluster import DaskWorkers
 from mauvecl.runs.pool import LocalWorkers, Pool
-from mauvecl.runs.shards import fingerprint, shards
 from mauvecl.study.cases import Case
 from mauvecl.study.sections import Run
 from mauvecl.study.study import Study

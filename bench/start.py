@@ -23,7 +23,7 @@ REPEATS = 5
 DETECT = """
 import time
 from mauvecl.device.engine import Engine
-from mauvecl.device.toy_exposure import toy
+from mauvecl.device.selftest import toy
 quiet, flare = toy(1600), toy(1600, flare=0.1)
 import mauvecl.detection.detection, pyopencl, scipy.special
 start = time.perf_counter()

@@ -25,13 +25,13 @@ from astropy.table import Table
 from tables import write
 
 from mauvecl.device.engine import Engine
-from mauvecl.store import bulk
+from mauvecl.runs import bulk
 from mauvecl.study.cases import Case
 from mauvecl.study.study import Study
 
 CHILD = """
 import resource, sys
-from mauvecl.store import bulk
+from mauvecl.runs import bulk
 from mauvecl.device.engine import Engine
 sys.path.insert(0, sys.argv[1])
 from store import study

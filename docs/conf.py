@@ -11,7 +11,7 @@ from typer.main import get_command
 from mauvecl.cli.app import app
 from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.host.version import VERSION
-from mauvecl.schema.reference import keys_of
+from mauvecl.schema.section import keys_of
 from mauvecl.study.study import Study
 
 project = "mauvecl"
@@ -27,9 +27,9 @@ extensions = [
 ]
 myst_heading_anchors = 3
 myst_enable_extensions = ["dollarmath", "amsmath"]
-# Notebooks and the gallery are executed at every build; an error in one is an error of the build.
+# Notebooks and the gallery are executed at every build. An error in one is a warning that holds its traceback, which -W
+# makes an error of the build.
 nb_execution_mode = "force"
-nb_execution_raise_on_error = True
 nb_execution_timeout = 900
 nb_execution_show_tb = True
 nb_merge_streams = True

@@ -11,7 +11,8 @@ import sys
 if sys.argv[:1] == ["-m"] or (sys.argv and os.path.basename(sys.argv[0]) == __name__):
 
     def _without_traceback(kind, error, trace, otherwise=sys.excepthook):  # type: ignore[no-untyped-def]
-        if issubclass(kind, KeyboardInterrupt):
+        # Python wraps what `__set_name__` raises while a class is made.
+        if issubclass(kind, KeyboardInterrupt) or isinstance(error.__cause__, KeyboardInterrupt):
             print(f"{__name__}: interrupted", file=sys.stderr)
         else:
             otherwise(kind, error, trace)
@@ -31,34 +32,29 @@ if sys.platform == "win32":
     raise ImportError(f"mauvecl does not run on Windows itself, expected {driver_sources('Windows')}")
 
 if TYPE_CHECKING:
-    from mauvecl.answers.campaigns.plan import plan
-    from mauvecl.answers.campaigns.visible import visible
-    from mauvecl.answers.detection.detect import detect
-    from mauvecl.answers.detection.gaussian import gaussian, gaussian_report
-    from mauvecl.answers.detection.maps import detection_map, map
-    from mauvecl.answers.limits.assumptions import what_matters
-    from mauvecl.answers.limits.limits import limit, limiting_magnitude, shortest_exposure, smallest_amplitude
-    from mauvecl.answers.measurements.measure import measure
-    from mauvecl.answers.observations.analyse import analyse
-    from mauvecl.answers.observations.calibrate import calibrate
-    from mauvecl.answers.observations.change import change
-    from mauvecl.answers.signal.exposures import exposure, exposure_for
-    from mauvecl.answers.signal.simulate import simulate
-    from mauvecl.answers.signal.snr import snr
-    from mauvecl.answers.stares.inject import inject
-    from mauvecl.answers.stares.stare import stare
+    from mauvecl.answers.analyse import analyse
+    from mauvecl.answers.calibrate import calibrate
+    from mauvecl.answers.change import change
+    from mauvecl.answers.detect import detect
+    from mauvecl.answers.gaussian import gaussian, gaussian_report
+    from mauvecl.answers.inject import inject
+    from mauvecl.answers.limit import limit, limiting_magnitude, shortest_exposure, smallest_amplitude, what_matters
+    from mauvecl.answers.map import detection_map, map
+    from mauvecl.answers.measure import measure
+    from mauvecl.answers.plan import plan
+    from mauvecl.answers.signal import exposure, exposure_for, simulate, snr
+    from mauvecl.answers.stare import stare
+    from mauvecl.answers.visible import visible
     from mauvecl.detection.detection import Detection, departures
     from mauvecl.detection.nuisances import Nuisances
     from mauvecl.detection.statistics import Linear
-    from mauvecl.device.engine import Engine
-    from mauvecl.device.stare_engine import Stares
+    from mauvecl.device.engine import Engine, Stares
     from mauvecl.fits.flare_model import FlareModel
     from mauvecl.fits.spectrum import fit, fit_two_temperatures, forecast
     from mauvecl.fits.time_course import fit_cooling, measure_along
-    from mauvecl.flares.cooling import Cooling
-    from mauvecl.flares.curves import Sinusoid
     from mauvecl.flares.energies import EnergyScale
     from mauvecl.flares.events import Event
+    from mauvecl.flares.settings import Cooling, Sinusoid
     from mauvecl.flares.shapes import SHAPES, TableShape
     from mauvecl.flares.stare import Stare
     from mauvecl.host.exposure.expectation import Expectation, expect
@@ -70,15 +66,15 @@ if TYPE_CHECKING:
     from mauvecl.noise.comparison import Comparison
     from mauvecl.noise.disturbances import Normal, Uniform
     from mauvecl.noise.processes import CosmicRays, Processes
+    from mauvecl.observations.frame_files import read_frames
     from mauvecl.observations.frames import Frames
-    from mauvecl.observations.reading import read_frames
+    from mauvecl.runs import bulk
     from mauvecl.runs.cluster import DaskWorkers
     from mauvecl.runs.pool import LocalWorkers, Pool
     from mauvecl.schema.errors import InputError
-    from mauvecl.store import bulk
     from mauvecl.study.study import PAPER_BUDGETS, Study
 
-drawable.connect(lambda: import_module("mauvecl.pictures.registry"))
+drawable.connect(lambda: import_module("mauvecl.charts.chart"))
 
 __version__ = VERSION
 __all__ = [
@@ -161,7 +157,7 @@ _HOMES = HOMES | {
     "fit": "fits.spectrum",
     "forecast": "fits.spectrum",
     "Comparison": "noise.comparison",
-    "Cooling": "flares.cooling",
+    "Cooling": "flares.settings",
     "CosmicRays": "noise.processes",
     "DaskWorkers": "runs.cluster",
     "Detection": "detection.detection",
@@ -170,7 +166,7 @@ _HOMES = HOMES | {
     "Event": "flares.events",
     "Expectation": "host.exposure.expectation",
     "Frames": "observations.frames",
-    "read_frames": "observations.reading",
+    "read_frames": "observations.frame_files",
     "InputError": "schema.errors",
     "Instrument": "host.instrument.instrument",
     "Linear": "detection.statistics",
@@ -182,24 +178,24 @@ _HOMES = HOMES | {
     "Pool": "runs.pool",
     "Processes": "noise.processes",
     "SHAPES": "flares.shapes",
-    "Sinusoid": "flares.curves",
+    "Sinusoid": "flares.settings",
     "Sky": "host.exposure.sky",
     "Source": "host.stars.source",
     "Stare": "flares.stare",
-    "Stares": "device.stare_engine",
+    "Stares": "device.engine",
     "Study": "study.study",
     "TableShape": "flares.shapes",
     "Uniform": "noise.disturbances",
-    "bulk": "store",
+    "bulk": "runs",
     "departures": "detection.detection",
     "expect": "host.exposure.expectation",
-    "exposure_for": "answers.signal.exposures",
+    "exposure_for": "answers.signal",
     "fit_cooling": "fits.time_course",
     "fit_two_temperatures": "fits.spectrum",
     "measure_along": "fits.time_course",
-    "shortest_exposure": "answers.limits.limits",
-    "smallest_amplitude": "answers.limits.limits",
-    "what_matters": "answers.limits.assumptions",
+    "shortest_exposure": "answers.limit",
+    "smallest_amplitude": "answers.limit",
+    "what_matters": "answers.limit",
 }
 
 

@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 from scenes import instrument, star
 
-from mauvecl import Engine, Expectation
-from mauvecl.runs import shards
+from mauvecl import Engine, Expectation, Instrument, Stares
+from mauvecl.runs import checkpoint as shards
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -35,6 +35,23 @@ def interruptible() -> None:
 def engine() -> Engine:
     """Return the default engine, shared because a build takes a second."""
     return Engine()
+
+
+@pytest.fixture(scope="session")
+def one_by_one() -> Engine:
+    """Return an engine with one realisation per work-item, as on a GPU."""
+    return Engine(width=1)
+
+
+@pytest.fixture(scope="session")
+def stares(engine: Engine) -> Stares:
+    """Return stares on the engine's device."""
+    return Stares(engine.open_device)
+
+
+@pytest.fixture(scope="session")
+def mauve() -> Instrument:
+    return Instrument.load("mauve")
 
 
 @pytest.fixture

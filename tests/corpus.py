@@ -19,9 +19,10 @@ from typing import Any
 
 import astropy.units as u
 import numpy as np
+from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.table import MaskedColumn, Table
-from astropy.time import Time
+from astropy.time import Time, TimeDelta
 
 Case = dict[str, Any]
 CORPUS = Path(__file__).parent / "data" / "corpus"
@@ -68,6 +69,15 @@ def dates(mjd: Any, form: str) -> Any:
     return Time(Time(mjd, format="mjd", scale="tdb"), format=form)
 
 
+def tiles(image: Any, how: str, **header: Any) -> bytes:
+    """Return a FITS file with an image that is compressed in tiles."""
+    packed = fits.CompImageHDU(np.float32(image), compression_type=how, quantize_level=-1e-18)
+    packed.header.update(header)
+    out = io.BytesIO()
+    fits.HDUList([fits.PrimaryHDU(), packed]).writeto(out, checksum=True)
+    return out.getvalue()
+
+
 NAMES: dict[str, Any] = {
     "np": np, "nm": NM, "wide": np.arange(170.0, 1100.0), "flux": FLUX, "k": K,
     "t": 20.0 * K + 100.0, "light": LIGHT, "error": 0 * K + 5.0, "per": per,
@@ -75,9 +85,11 @@ NAMES: dict[str, Any] = {
     "at": at, "air": in_air(NM), "shuffled": RNG.permutation(K.size), "dates": dates, "nan": np.nan,
     "hidden": lambda values, rows: MaskedColumn(values, mask=np.isin(np.arange(len(values)), rows)),
     "every": slice(None), "good": np.outer([1, 1], np.abs(np.arange(1024) - 506.5) < 487) > 0,
-    "curve": curve, "grid": GRID, "fibres": lambda low, high, ids: np.float32(
+    "curve": curve, "grid": GRID, "tiles": tiles, "fibres": lambda low, high, ids: np.float32(
         np.outer(np.arange(len(ids)) + 1, 1e17 * curve(np.arange(low, high + 0.1, 0.8)))
     ),
+    "sky": lambda ra, dec, frame: SkyCoord(ra, dec, unit="deg", frame=frame),
+    "lapse": lambda seconds, form: TimeDelta(TimeDelta(seconds, format="sec"), format=form),
     "arrays": lambda *rows: np.array([*rows, None], object)[:-1],
 }  # fmt: skip
 

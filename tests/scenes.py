@@ -2,18 +2,32 @@
 
 from __future__ import annotations
 
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from astropy.table import Table
 from numpy.typing import NDArray
+from scipy import stats
 
+import mauvecl
 from mauvecl import SHAPES, Expectation, Frames, Instrument, Sky, Source, Stare, Study, analyse, expect
+from mauvecl.flares import stare_scene
 from mauvecl.flares.frames import Components
-from mauvecl.flares.stare_scene import StaresRequest
 from mauvecl.host.exposure.star import Neighbour, Neighbours
-from mauvecl.host.stars.bands import band
 
 Float = NDArray[np.float64]
+
+#: Tables of the bands by name: wavelength in nm, and throughput.
+BANDS = {
+    table.meta["name"]: table
+    for path in (Path(mauvecl.__file__).parent / "host" / "stars" / "library" / "bands").iterdir()
+    for table in [Table.read(path, format="ascii.ecsv")]
+}
+
+#: False alarms per star-day, rarer than those of a day, whose simulation takes less time.
+PER_MONTH, PER_CENTURY = 12 / 365.25, 1 / 36_525
 
 #: Of `flaring_stares`: around the boundary of the counter's first word.
 N_STARES, FIRST_STARE = 200, 2**32 - 70
@@ -46,7 +60,24 @@ def star(
     return [expect(s, payload, exposure=exposure, sky=Sky.of_brightness(22.1), neighbours=neighbours) for s in sources]
 
 
-def flaring_stares(method: Any = "cumulants", **more: Any) -> StaresRequest:
+@cache
+def source(library: str = "M3V", magnitude: float = 9.0) -> Source:
+    return Source.from_library(library).at_magnitude(magnitude)
+
+
+@cache
+def quiescent(library: str = "M3V", magnitude: float = 9.0, exposure: float = 50.0) -> Expectation:
+    """Return the expectation of a star on the nominal payload."""
+    return expect(source(library, magnitude), "mauve", exposure=exposure)
+
+
+def assert_covered(inside: Any, n: int, least: float, most: float, false: float = 1e-6) -> None:
+    """Check counts of covered truths of n against coverages, which are left with this probability on each side."""
+    low, high = stats.binom.ppf(false, n, least), stats.binom.isf(false, n, most)
+    assert ((low <= np.asarray(inside)) & (np.asarray(inside) <= high)).all(), np.asarray(inside) / n
+
+
+def flaring_stares(method: Any = "cumulants", **more: Any) -> stare_scene.StaresRequest:
     """Return two hundred stares of half a minute, each with different flares in two scenarios."""
     quiet, flare = star(amplitudes=(1.0,), exposure=5.0, payload=instrument(part=True))
     slope = np.linspace(-1.0, 1.0, quiet.wavelength_nm.size)
@@ -54,7 +85,9 @@ def flaring_stares(method: Any = "cumulants", **more: Any) -> StaresRequest:
     stare = Stare.of(30.0, jitters={"light": 0.01}, offsets={"temperature": 0.1}, temperature_c=21.0)
     rng = np.random.default_rng(1)
     flares = {"flare": rng.random((N_STARES, 6, 1)), "amplitudes": rng.random((2, N_STARES))}
-    return StaresRequest(components, stare, N_STARES, 5, **({**flares, "start": FIRST_STARE, "method": method} | more))
+    return stare_scene.StaresRequest(
+        components, stare, N_STARES, 5, **({**flares, "start": FIRST_STARE, "method": method} | more)
+    )
 
 
 def flare(
@@ -67,12 +100,19 @@ def flare(
 
 def through(name: str, nm: Float, flux: Float) -> float:
     """Integrate a spectrum through a band, weighted with energy: erg s-1 cm-2."""
-    found = band(name)
-    fine = np.linspace(found.wavelength_nm[0], found.wavelength_nm[-1], 60_001)
-    response = np.interp(fine, found.wavelength_nm, found.throughput / found.throughput.max())
+    at, throughput = (np.asarray(BANDS[name][column], float) for column in ("wavelength", "throughput"))
+    fine = np.linspace(at[0], at[-1], 60_001)
+    response = np.interp(fine, at, throughput / throughput.max())
     return float(np.trapezoid(response * np.interp(fine, nm, flux, left=0, right=0), fine)) * 10
 
 
 def analysed(frames: Frames, **search: Any) -> Any:
     """Return the answer of `analyse` for one false alarm a day, or as the study's section says."""
     return analyse(Study.build({"search": {"per": "day"} | search}, "test"), frames=frames)
+
+
+def detected(analysis: Any, per_day: float | None = None) -> list[Any]:
+    """Return the flares above the threshold, or above that of a rarer false alarm, extrapolated from the rates."""
+    rates = () if per_day is None else (analysis.modelled, analysis.measured)
+    threshold = max([analysis.threshold, *(rate.threshold(per_day) for rate in rates)])
+    return [one for one in analysis.events if one.kind == "flare" and one.value >= threshold]

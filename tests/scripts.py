@@ -1,4 +1,4 @@
-"""Scripts of `tools/`, which are no package."""
+"""Scripts of the checkout that are no modules of the package."""
 
 from __future__ import annotations
 
@@ -10,12 +10,17 @@ from typing import Any
 ROOT = Path(__file__).parent.parent
 
 
-def tool(name: str) -> Any:
-    """Load a script of `tools/` by its name without extension."""
-    spec = importlib.util.spec_from_file_location(name, ROOT / "tools" / f"{name}.py")
+def loaded(path: Path) -> Any:
+    """Load a script as a module."""
+    spec = importlib.util.spec_from_file_location(path.stem, path)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)
     return module
+
+
+def tool(name: str) -> Any:
+    """Load a script of `tools/` by its name without extension."""
+    return loaded(ROOT / "tools" / f"{name}.py")

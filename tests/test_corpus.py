@@ -24,7 +24,7 @@ from mauvecl.host.exposure.star import read_neighbours
 from mauvecl.host.spectra.formats import read_spectrum
 from mauvecl.host.stars.flare import read_flares
 from mauvecl.observations.frames import Reason
-from mauvecl.study.orbits import PlanTarget, read_targets
+from mauvecl.study.plan import PlanTarget, read_targets
 
 # Astropy warns of the usual units when it writes a VOTable.
 pytestmark = pytest.mark.filterwarnings("ignore:The unit .* has been deprecated in the VOUnit standard")
@@ -163,8 +163,12 @@ def _neighbours(path: Path, case: Case) -> tuple[str, ...]:
 
 
 def _flares(path: Path, case: Case) -> tuple[str, ...]:
-    np.testing.assert_array_equal(read_flares(path)["amplitude"], case["amplitudes"])
-    return ()
+    table = read_flares(path)
+    np.testing.assert_array_equal(table["amplitude"], case["amplitudes"])
+    assert "start" not in case or table["start"].to_value("d").tolist() == case["start"]
+    remarks = tuple(table.meta["comments"])
+    assert len(remarks) == case.get("remarks", len(remarks))
+    return remarks
 
 
 READERS: dict[str, Callable[[Path, Case], tuple[str, ...]]] = {

@@ -1,17 +1,22 @@
-"""Names, imports and links in the documentation exist; `test_docs_run.py` runs its snippets."""
+"""Names, imports and links in the documentation exist, and examples in docstrings give what they show."""
 
 from __future__ import annotations
 
+import doctest
+import importlib
 import importlib.util
 import json
+import pkgutil
 import re
 import shlex
 import tomllib
 from pathlib import Path
 from typing import Any
 
+import pytest
 from typer.main import get_command
 
+import mauvecl
 from mauvecl import Instrument, Study
 from mauvecl.cli.app import app
 from mauvecl.observations.mapping import FrameMapping
@@ -20,10 +25,7 @@ ROOT = Path(__file__).parent.parent
 #: `mauvecl/detection/detection.py`, or with a name in it: `mauvecl/detection/detection.py: Roc`.
 NAMED = re.compile(r"`((?:host|kernels|mauvecl|tests|bench|tools|docs)/[\w./*-]+\.\w+)(?::\s*(\w+))?[^`]*`")
 #: What defines a name, by a file's ending.
-DEFINITIONS = {
-    ".py": r"^\s*(?:def|class) {0}\b|^{0}\b.* = |^    {0}: ",
-    ".mako": r"^(?:INLINE )?\w+ {0}\(",
-}
+DEFINITIONS = {".py": r"^\s*(?:def|class) {0}\b|^{0}\b.* = |^    {0}: ", ".mako": r"^(?:INLINE )?\w+ {0}\("}
 
 
 def all_pages() -> list[Path]:
@@ -58,6 +60,14 @@ def test_documented_names_exist() -> None:
     ]
     assert not undefined
     assert len([name for *_, name in named if name]) > 40
+
+
+def test_dotted_names_of_the_architecture_exist() -> None:
+    """Import every name in backticks that begins with the package's."""
+    names = re.findall(r"`(mauvecl(?:\.\w+)+)`", (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8"))
+    assert len(names) > 25
+    for name in names:
+        pkgutil.resolve_name(name)
 
 
 def test_imports_of_pages_and_scripts_exist() -> None:
@@ -120,3 +130,25 @@ def test_links_have_text() -> None:
     """Refuse links without text, which appear only in the built documentation."""
     empty = re.compile(r"\[\]\([^)]*\)")
     assert not [str(page) for page in all_pages() if empty.search(page.read_text(encoding="utf-8"))]
+
+
+FILES = [p for room in ("mauvecl", "host") for p in (ROOT / room).rglob("*.py") if ">>> " in p.read_text("utf-8")]
+
+
+def module(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts if parts[0] == "mauvecl" else ("mauvecl", *parts))
+
+
+@pytest.mark.parametrize("name", sorted({module(path) for path in FILES}))
+def test_examples_of_docstrings_run(name: str) -> None:
+    failed, attempted = doctest.testmod(importlib.import_module(name))
+    assert failed == 0 < attempted
+
+
+def test_main_names_have_examples() -> None:
+    """Check the main names of the package."""
+    finder = doctest.DocTestFinder(recurse=False)
+    for name in ("Source", "Sky", "Instrument", "expect", "Engine", "Study"):
+        thing = getattr(mauvecl, name)
+        assert any(test.examples for test in finder.find(thing, name)), name

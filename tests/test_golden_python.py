@@ -18,8 +18,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from commands import run
 from golden_inputs import DATA, write_inputs
-from scenes import instrument, star
+from scenes import NEAR, instrument, source, star
 from stores import CHUNK, flip
 from stores import study as stored_study
 
@@ -66,12 +67,8 @@ from mauvecl import (
     smallest_amplitude,
     what_matters,
 )
-from mauvecl.device.selftest import digests
 from mauvecl.flares.frames import Components
-from mauvecl.host.exposure.star import Neighbour, Neighbours
-from mauvecl.host.stars.library import library_names
-from mauvecl.observations.changes.periods import recover_periods
-from mauvecl.observations.line_index import MG_II_CONTINUUM_NM, MG_II_NM, line_index
+from mauvecl.observations.visits import MG_II_CONTINUUM_NM, MG_II_NM, line_index, recover_periods
 
 GOLDEN = Path(__file__).parent / "data" / "golden" / "python"
 # Of longer arrays evenly spaced values are kept.
@@ -146,29 +143,26 @@ NM, SEEN_NM = np.linspace(150.0, 1100.0, 39), np.linspace(200.0, 700.0, 26)
 QUICK = instrument(part=True)
 
 
-def m_dwarf() -> Source:
-    return Source.from_library("M3V").at_magnitude(9.0)
-
-
 @golden()
 def sources(folder: Path) -> Answer:
-    star, sun = m_dwarf(), Source.from_library("Sun")
+    star, sun = source(), Source.from_library("Sun")
     vb8 = Source.read(DATA / "spectra" / "vb8_stiswfcnic_004.fits")
     mine = Source.from_arrays(NM, 1e-13 * (NM / 500) ** -2, name="slope")
     both = {"added": star.flaring(0.5, 9000.0), "replaces": star.flaring(0.01, 9000.0, geometry="replaces")}
     found: Answer = {name: one.flux_flam for name, one in both.items()}
     found |= {"binned": star.binned(20.0).flux_flam, "reddened": star.reddened(0.3).flux_flam}
     bands = ("B", "V", "Kepler", "TESS", "Gaia G", "GALEX NUV")
-    for name, source in {"M3V": star, "Sun": sun, "VB8": vb8, "slope": mine}.items():
-        found[name] = {band: source.magnitude(band) for band in (bands if name != "VB8" else bands[:-1])}
+    for name, one in {"M3V": star, "Sun": sun, "VB8": vb8, "slope": mine}.items():
+        found[name] = {band: one.magnitude(band) for band in (bands if name != "VB8" else bands[:-1])}
     found["ab"] = [star.magnitude("V", system) for system in ("catalogue", "vega", "ab")]
     return found
 
 
 @golden()
 def library(folder: Path) -> Answer:
-    """Return mean fluxes of every fifth star of the library."""
-    return {name: Source.from_library(name).binned(50.0).flux_flam for name in library_names()[::5]}
+    """Return mean fluxes of every star of the library."""
+    names = [one["name"] for one in json.loads(run("library", "--json", folder=folder).stdout)]
+    return {name: Source.from_library(name).binned(50.0).flux_flam for name in names}
 
 
 @golden()
@@ -191,7 +185,7 @@ def flares_in_time(folder: Path) -> Answer:
     own = TableShape((-1.0, 0.0, 1.0, 4.0), (0.0, 1.0, 0.4, 0.0), "own")
     found: Answer = {name: one.mean_over(edges, 50.0, 30.0) for name, one in {**SHAPES, "own": own}.items()}
     scales = {
-        "star": EnergyScale.of_star(m_dwarf(), 5.0), "disc": EnergyScale.of_blackbody(0.4, 3300.0, band="TESS"),
+        "star": EnergyScale.of_star(source(), 5.0), "disc": EnergyScale.of_blackbody(0.4, 3300.0, band="TESS"),
         "shibayama": EnergyScale.shibayama2013(1.0, 5778.0),
     }  # fmt: skip
     for name, scale in scales.items():
@@ -236,11 +230,10 @@ def skies(folder: Path) -> Answer:
 @golden()
 def expectations(folder: Path) -> Answer:
     """Return means, variances and S/N in both orders, with neighbours, in electrons, and near saturation."""
-    near = Neighbours((Neighbour("B", 10.0, 8.0, "V", "F5V"),), 0.5)
     cases = {
-        "paper": star(), "physical": [expect(m_dwarf(), instrument(), exposure=300.0, order="physical")],
+        "paper": star(), "physical": [expect(source(), instrument(), exposure=300.0, order="physical")],
         "electrons": star("K5V", 8.0, amplitudes=(0.1,), payload=instrument("mauve-electrons")),
-        "neighbours": star(neighbours=near), "bright": star("A0V", 1.0, exposure=5.0),
+        "neighbours": star(neighbours=NEAR), "bright": star("A0V", 1.0, exposure=5.0),
     }  # fmt: skip
     found: Answer = {}
     for name, all_of in cases.items():
@@ -255,7 +248,10 @@ def expectations(folder: Path) -> Answer:
 
 @golden()
 def draws(folder: Path) -> Answer:
-    """Return digests of drawn exposures, and statistics realisation by realisation, of which all bits are promised."""
+    """Return digests of drawn exposures, and statistics realisation by realisation, of which all bits are promised.
+
+    `test_selftest.py` has those of the self-test.
+    """
     engine = Engine()
     quiet, flare = star(amplitudes=(0.1,), payload=QUICK)
     rays = Processes(cosmic_rays=CosmicRays(rate_per_cm2_s=300.0), jitter=Uniform(0.0, 0.05))
@@ -270,7 +266,6 @@ def draws(folder: Path) -> Answer:
         "pool": Pool().realise(quiet, count=20, seed=3, start=2**32 - 10),
         "snr": table(engine.snr(quiet, realisations=1000, seed=6).element), "values": values.view(np.uint32),
         "stare": frames.astype(np.int64),
-        "selftest": {name: digests(engine, name) for name in ("stack", "cosmic rays")},
     }  # fmt: skip
 
 
@@ -313,7 +308,7 @@ def priors(folder: Path) -> Answer:
 @golden(ITERATIVE)
 def fits(folder: Path) -> Answer:
     """Return fits of a flare of 9800 K and an amplitude of 0.5, and their errors in advance."""
-    dwarf, mauve = m_dwarf(), instrument()
+    dwarf, mauve = source(), instrument()
     quiet, flare = (expect(s, mauve, exposure=50.0) for s in (dwarf, dwarf.flaring(0.5, 9800.0)))
     unknown = Nuisances.of(quiet, {"dark": np.inf, "light": np.inf})
     model = FlareModel.of(dwarf, mauve, quiet, distance_pc=5.0, radius_rsun=0.4)
@@ -334,7 +329,7 @@ def fits(folder: Path) -> Answer:
 @golden(ITERATIVE)
 def fits_in_time(folder: Path) -> Answer:
     """Return fits along twelve frames, of which four hold a flare."""
-    dwarf, mauve = m_dwarf(), instrument()
+    dwarf, mauve = source(), instrument()
     quiet, flare = (expect(s, mauve, exposure=5.0) for s in (dwarf, dwarf.flaring(2.0, 9800.0)))
     frames = np.vstack([Engine().realise(x, count=4, seed=2) for x in (quiet, flare, quiet)])
     model = FlareModel.of(dwarf, mauve, quiet, distance_pc=5.0)

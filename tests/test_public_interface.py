@@ -52,12 +52,13 @@ def keys(section: Any, kind: str) -> Iterator[str]:
 
 
 def columns() -> Iterator[str]:
-    """Yield each column that a table of an answer or result can have, by the package that declares it."""
-    for package in ("answers", "detection", "flares", "fits", "search", "noise", "store"):
+    """Yield each column that a table can have, by the answer or the package that declares it."""
+    for package in ("answers", "detection", "flares", "fits", "search", "noise", "runs"):
         home = import_module(f"mauvecl.{package}")
         for found in pkgutil.walk_packages(home.__path__, f"{home.__name__}."):
             module = import_module(found.name)
-            where = found.name.removeprefix("mauvecl.").rpartition(".")[0]
+            where = found.name.removeprefix("mauvecl.")
+            where = where if package == "answers" else package
             for declared in vars(module).values():
                 if isinstance(declared, tuple) and declared and all(type(one).__name__ == "Column" for one in declared):
                     for one in declared:

@@ -20,7 +20,7 @@ from test_validation import FUNCTIONS, PARAMETERS, accepted, annotation, anythin
 
 import mauvecl
 from mauvecl import InputError
-from mauvecl.device.errors import DeviceError
+from mauvecl.device.drivers import DeviceError
 
 #: Values of required parameters that are text, by name of the parameter.
 WORDS = {

@@ -35,6 +35,7 @@ PURPOSES = {
     "platformdirs": "folders of caches and of the user's own spectra",
     "tomli-w": "study files that are written",
     "sgp4": "positions of the satellite from its orbital elements",
+    "celerite2": "Gaussian processes of the quiescent light of stars",
     "matplotlib": "pictures",
     "dust_extinction": "extinction laws",
     "specutils": "spectrum files of many archives",
@@ -53,7 +54,7 @@ PURPOSES = {
     "tornado": "the server of the page",
 }
 #: Extras for development; what users install is audited.
-DEVELOPMENT = ("all", "test", "lint", "bench", "docs")
+DEVELOPMENT = ("all", "test", "coverage", "dist", "lint", "bench", "docs")
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ import numpy as np
 from astropy.table import Table
 from typer.testing import CliRunner
 
-from mauvecl.answers.files import write_table
+from mauvecl.answers.answer import write_table
 from mauvecl.cli.app import app
 from mauvecl.detection.requests import STATISTICS
 from mauvecl.runs.pool import LocalWorkers, Pool
@@ -30,9 +30,9 @@ from mauvecl.schema.errors import InputError
 from mauvecl.web.closed_forms import ClosedForms
 from mauvecl.web.downloads import commands_and_programs
 from mauvecl.web.fields import FIELDS, UPLOADED_FILE, Choice, Number
+from mauvecl.web.page import State
 from mauvecl.web.question import Question
 from mauvecl.web.simulations import SIMULATIONS
-from mauvecl.web.state import State
 from mauvecl.web.tabs import TABS, reads_of
 from mauvecl.web.tabs.tab import Tab
 

@@ -171,8 +171,8 @@ def make(folder: Path) -> dict[str, Case]:
 def _stores(folder: Path) -> dict[str, Case]:
     """Write a store of raw spectra with an engine that draws nothing, and its exports."""
     from mauvecl.device.engine import Engine
-    from mauvecl.store import bulk
-    from mauvecl.store.export import Selection, export
+    from mauvecl.runs import bulk
+    from mauvecl.runs.bulk import Selection, export
     from mauvecl.study.study import Study
 
     class Painter(Engine):

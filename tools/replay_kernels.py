@@ -54,7 +54,8 @@ def record(folder: Path) -> None:
     import numpy as np
     import pyopencl as cl
 
-    from mauvecl.device import launches, program
+    from mauvecl.device import build as program
+    from mauvecl.device import launches
     from mauvecl.device.engine import Engine
     from mauvecl.device.selftest import CASES, digests
 

@@ -14,25 +14,24 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl.host.content_equality import ContentEquality
+from mauvecl.host.arrays import ContentEquality
 from mauvecl.host.exposure import DEFAULT_SKY
 from mauvecl.host.exposure.response import Order, electrons_per_second, negative_means_message
 from mauvecl.host.exposure.sky import Sky
+from mauvecl.host.exposure.star import Neighbours
 from mauvecl.host.instrument.instrument import Instrument, LineSpread
-from mauvecl.host.spectra.coverage import check_covers, continued
-from mauvecl.host.spectra.wavelength_range import SPAN_NM
+from mauvecl.host.spectra.units import SPAN_NM
+from mauvecl.host.stars.coverage import check_covers, continued
 from mauvecl.schema.calls import validated
+from mauvecl.schema.columns import Column, table_of
 from mauvecl.schema.drawable import Drawable
-from mauvecl.schema.errors import InputError
+from mauvecl.schema.errors import InputError, Message
 from mauvecl.schema.fields import Unit
-from mauvecl.schema.messages import Message
 from mauvecl.schema.physical import Duration, Exposure, SkyBrightness
-from mauvecl.schema.tables import Column, table_of
 
 if TYPE_CHECKING:
     from astropy.table import QTable
 
-    from mauvecl.host.exposure.star import Neighbours
     from mauvecl.host.stars.source import Source
 
 Float = NDArray[np.float64]
@@ -351,10 +350,7 @@ class Expectation(Drawable, ContentEquality):
         """Sum the values of pixels over resolution elements, from shape (n_pixel,) to (n_element,)."""
         if np.shape(values) != self.element.shape:
             raise InputError(
-                f"values of the shape {np.shape(values)}",
-                f"{self.element.shape}: one for each pixel",
-                key="values",
-                value=np.shape(values),
+                f"values of the shape {np.shape(values)}", f"{self.element.shape}: one for each pixel", key="values"
             )
         return np.asarray(np.bincount(self.element, values, minlength=self.element_wavelength_nm.size), np.float64)
 

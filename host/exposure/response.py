@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 
 from mauvecl.host.instrument.instrument import Instrument, LineSpread
-from mauvecl.host.spectra.point_noise import point_noise
+from mauvecl.host.stars.coverage import point_noise
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ def electrons_per_second(
     flux = np.asarray(flux_flam, np.float64)
     if flux.shape != nodes.shape:
         raise InputError(
-            f"flux has {flux.size} values for {nodes.size} wavelengths", "as many", key="flux", value=flux.size
+            f"flux needs one value per wavelength, but has {flux.size} values for {nodes.size} wavelengths", key="flux"
         )
     if nodes.size <= MATRIX_NODES:
         return cast(Float, response_matrix(instrument, nodes, order) @ flux)
@@ -223,10 +223,7 @@ def _nodes(wavelength_nm: ArrayLike) -> Float:
     nodes = np.ascontiguousarray(wavelength_nm, np.float64)
     if nodes.ndim != 1 or nodes.size < 2 or not np.isfinite(nodes).all() or not (np.diff(nodes) > 0).all():
         raise InputError(
-            "the wavelengths of a spectrum",
-            "at least two, finite and strictly increasing, in nm",
-            key="wavelength_nm",
-            value=wavelength_nm,
+            "the wavelengths of a spectrum", "at least two, finite and strictly increasing, in nm", key="wavelength_nm"
         )
     return nodes
 
@@ -278,7 +275,6 @@ def negative_means_message(
             f"{nm[worst]:.1f} nm, beyond {MAX_SIGMA_BELOW_ZERO:g} times its error of {error[worst]:.2g}",
             "non-negative light: bin the spectrum (`bin_nm`) or correct it",
             key="bin_nm",
-            value=source.name,
         )
     return (
         f"{source.name}: the means of {int(below.sum())} of {below.size} pixels, from {nm[below][0]:.1f} to "

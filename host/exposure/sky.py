@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mauvecl.host.stars.library import by_key, name_key, near_names
 from mauvecl.host.tables.coordinates import EXPECTED
 from mauvecl.host.tables.coordinates import position as coordinates
-from mauvecl.host.tables.times import offline
+from mauvecl.host.tables.units import offline
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import SkyBrightness, SolidAngle
@@ -60,10 +60,7 @@ def helioecliptic(target: SkyCoord | str, time: Time | str) -> HelioEcliptic:
             star = position.transform_to(frame)
         except Exception:  # frames that cannot be transformed (AltAz without a location) raise many kinds
             raise InputError(
-                f"target in the frame {position.frame.name!r} cannot be turned to the ecliptic",
-                "ICRS",
-                key="target",
-                value=position.frame.name,
+                f"target in the frame {position.frame.name!r} cannot be turned to the ecliptic", "ICRS", key="target"
             ) from None
         difference = float((star.lon - sun.lon).wrap_at("180d").deg)
         longitude, latitude = abs(difference), float(star.lat.deg)
@@ -89,7 +86,7 @@ def parse_time(time: Time | str) -> Time:
     else:
         raise InputError.of("time", time, expected)
     if not moment.isscalar:
-        raise InputError(f"time holds {moment.size} times", "one", key="time", value=time)
+        raise InputError(f"time must be a single time, but holds {moment.size} times", key="time")
     if np.ma.is_masked(moment.jd) or not np.isfinite(moment.jd):
         raise InputError.of("time", time, expected)
     year = float(moment.decimalyear)
@@ -121,7 +118,7 @@ def parse_position(target: SkyCoord | str) -> SkyCoord:
     else:
         raise InputError.of("target", target, expected)
     if not position.isscalar:
-        raise InputError(f"target holds {position.size} positions", "one", key="target", value=target)
+        raise InputError(f"target must be a single position, but holds {position.size} positions", key="target")
     angles = position.spherical
     if not np.isfinite([angles.lon.deg, angles.lat.deg]).all():
         raise InputError.of("target", target, expected)
@@ -267,7 +264,6 @@ def zodiacal_brightness(place: HelioEcliptic, lookup: Lookup = "bilinear") -> fl
             f"{place.longitude_deg:.1f} deg, latitude {place.latitude_deg:.1f} deg)",
             "it outside the zone of solar avoidance, some 50 deg",
             key="target",
-            value=place.separation_deg,
         )
     if lookup == "nearest":
         return nearest

@@ -17,11 +17,10 @@ from mauvecl.host.stars.library import embedded, library_table, nearest_spectrum
 from mauvecl.host.stars.source import Source
 from mauvecl.host.tables.names import DECLINATIONS, RIGHT_ASCENSIONS, SPECTRAL_TYPES, STARS, divided_unit, key_of
 from mauvecl.host.tables.opening import read_table
-from mauvecl.host.tables.rows import Rows
+from mauvecl.host.tables.table import Rows
 from mauvecl.schema.calls import validated
-from mauvecl.schema.errors import InputError
+from mauvecl.schema.errors import InputError, shortened, shown
 from mauvecl.schema.physical import Share
-from mauvecl.schema.text import shortened, shown
 
 if TYPE_CHECKING:
     from mauvecl.host.instrument.instrument import Instrument
@@ -74,7 +73,6 @@ class Neighbour:
             "temperature or colour",
             "one of them, since its light enters the fibre",
             key="neighbours",
-            value=self.name,
         )
 
     @cached_property
@@ -86,7 +84,6 @@ class Neighbour:
                 f"neighbour {self.name}, {self.separation_arcsec:.3g} arcsec away, has no magnitude",
                 "one, since its light enters the fibre",
                 key="neighbours",
-                value=self.name,
             )
         star = Source.from_library(name) if self.file is None else Source.read(self.file)
         if self.magnitude is not None:
@@ -96,7 +93,6 @@ class Neighbour:
                 f"the spectrum of neighbour {self.name} is not as bright as the star is seen: {star.unscaled}",
                 "a magnitude as well",
                 key="neighbours",
-                value=self.name,
             )
         return star
 
@@ -239,7 +235,7 @@ def read_neighbours(path: str | Path, target: str | None = None) -> tuple[tuple[
     named = f"table of neighbours {shortened(path.name)}"
     table = _Neighbours(read_table(path, "table of neighbours"), named, "neighbours")
     if not 1 <= table.n <= MOST_ROWS:
-        raise InputError(f"{named} holds {table.n} stars", f"1 to {MOST_ROWS}", key="neighbours", value=table.n)
+        raise InputError(f"{named} holds {table.n} stars", f"1 to {MOST_ROWS}", key="neighbours")
     name = table.first(STARS)
     names = [table.text(name, row) or f"row {row + 1}" for row in range(table.n)]
     own = None if target is None else next((k for k, name in enumerate(names) if name == target.strip()), None)
@@ -293,15 +289,13 @@ class _Neighbours(Rows):
                 + ("" if ra is None else " and no position of the star itself"),
                 "separation (arcsec)" + (", or ra and dec" if ra is None else "")
                 + ("" if ra is None else ", or star.neighbours_of: the star's own row by name, or its coordinates"),
-                key="neighbours" if ra is None else "neighbours_of",
-                value=target,
+                key="neighbours" if ra is None else "neighbours_of"
             )  # fmt: skip
         if target is not None and own is None:
             raise InputError(
                 f"{self.named} has no row named {shortened(target)}, and no positions",
                 "the name of a row, which is then left out",
                 key="neighbours_of",
-                value=target,
             )
         return self._stated(name)
 
@@ -318,7 +312,7 @@ class _Neighbours(Rows):
         if negative.any():
             row = int(np.argmax(negative))
             text = self.text(name, row)
-            raise self.error(f"row {row + 1} has {name} = {text}", "an angle of 0 and above", name, float(text))
+            raise self.error(f"row {row + 1} has {name} = {text}", "an angle of 0 and above", name)
         note = f"Separations are the column {name} of {self.named}, read as degrees since it states no unit."
         return values, (note,) if not stated and known == "dist" else ()
 
@@ -334,7 +328,7 @@ class _Neighbours(Rows):
 
     def _given(self, name: str, row: int, value: float | None) -> float:
         if value is None:
-            raise self.error(f"row {row + 1} has no {name}", "one", name, row + 1)
+            raise self.error(f"row {row + 1} has no {name}", "one", name)
         return value
 
 
@@ -349,6 +343,5 @@ def _coordinates(text: str, named: str) -> tuple[float, float]:
             f"{named} has no row named {shortened(text)}, and it is not a position",
             "the name of the star's own row, or coordinates such as '290.68 +11.12'",
             key="neighbours_of",
-            value=text,
         ) from error
     return float(place.ra.rad), float(place.dec.rad)

@@ -12,7 +12,7 @@ import astropy.units as u
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mauvecl.host.content_equality import ContentEquality
+from mauvecl.host.arrays import ContentEquality
 from mauvecl.host.tables.ecsv import read_numbers
 from mauvecl.host.tables.units import unit_of
 from mauvecl.schema.calls import validated
@@ -33,18 +33,12 @@ class Curve:
         value = np.asarray(self.value, dtype=np.float64)
         if wavelength.ndim != 1 or wavelength.size == 0 or wavelength.shape != value.shape:
             raise InputError(
-                f"a curve has {wavelength.size} wavelengths and {value.size} values",
-                "as many, one or more",
+                f"the curve needs one value per wavelength, but has {wavelength.size} wavelengths "
+                f"and {value.size} values",
                 key="value",
-                value=value.size,
             )
         if not (np.isfinite(wavelength).all() and (np.diff(wavelength) > 0).all()):
-            raise InputError(
-                "a curve's wavelengths are not finite and strictly increasing",
-                "nm in order",
-                key="wavelength_nm",
-                value=wavelength,
-            )
+            raise InputError("the wavelengths of the curve must be finite and strictly increasing", key="wavelength_nm")
         bad = ~(np.isfinite(value) & (value >= 0))
         if bad.any():
             knot = int(np.argmax(bad))
@@ -68,7 +62,6 @@ class Curve:
                 f"curve file {path} has the columns {', '.join(table.columns)}",
                 "'wavelength' and one value",
                 key="columns",
-                value=table.columns,
             )
         name = next(column for column in table.columns if column != "wavelength")
         meta = table.meta
@@ -100,7 +93,7 @@ def _converted(values: NDArray[np.float64], name: str, unit: u.UnitBase | None, 
     for wanted in units:
         if unit is not None and unit.is_equivalent(wanted):
             return (values * unit).to_value(wanted)
-    raise InputError(f"column {name!r} has the unit {str(unit or '') or 'none'!r}", str(units[0]), key=name, value=unit)
+    raise InputError(f"column {name!r} has the unit {str(unit or '') or 'none'!r}", str(units[0]), key=name)
 
 
 Float = NDArray[np.float64]
@@ -148,10 +141,7 @@ class PixelMap(ContentEquality):
             values = np.array(getattr(self, name), np.float64)
             if values.ndim != 1:
                 raise InputError(
-                    f"{name} of the pixel map has the shape {values.shape}",
-                    "one value per pixel",
-                    key=name,
-                    value=values.shape,
+                    f"{name} of the pixel map has the shape {values.shape}", "one value per pixel", key=name
                 )
             bad = ~(np.isfinite(values) & (values >= 0))
             if name == "gain":
@@ -165,10 +155,8 @@ class PixelMap(ContentEquality):
             sizes.add(values.size)
         if len(sizes) != 1:
             raise InputError(
-                f"the pixel map has columns of {sorted(sizes) or 'no'} pixels",
-                "one length",
+                f"the columns of the pixel map must have the same length, but have {sorted(sizes) or 'no'} pixels",
                 key="pixel_map",
-                value=sizes,
             )
 
     @property
@@ -208,9 +196,7 @@ class PixelMap(ContentEquality):
             unit = u.Unit(table.units[name], parse_strict="silent")
             if not unit.is_equivalent(COLUMNS[name]):
                 wanted = str(COLUMNS[name]) or "none"
-                raise InputError(
-                    f"pixel map {path}: {name} has the unit {str(unit) or 'none'!r}", wanted, key=name, value=unit
-                )
+                raise InputError(f"pixel map {path}: {name} has the unit {str(unit) or 'none'!r}", wanted, key=name)
             values[name] = table[name]
         source = f"{table.meta.get('tag', 'A')}: {table.meta.get('source', f'assumed, no source in {Path(path).name}')}"
         try:
@@ -387,7 +373,6 @@ class ThroughputErrors(ContentEquality):
                 f"throughput errors {path} have the columns {', '.join(table.columns)}",
                 f"wavelength, {MODE}1, {MODE}2 and so on",
                 key="columns",
-                value=table.columns,
             )
         if table.units["wavelength"] != "nm":
             raise InputError.of("unit", table.units["wavelength"], "nm", where=f"throughput errors {path}")

@@ -15,17 +15,14 @@ from pydantic import BeforeValidator, ConfigDict, Field, ValidationError, model_
 from pydantic_core import PydanticCustomError
 from scipy.special import erf, ndtr
 
-from mauvecl.host.files.parsing import read_text, toml
 from mauvecl.host.instrument.curves import MAX_PIXELS, Curve, PixelMap, ThroughputErrors
 from mauvecl.host.instrument.paths import instrument_path, shipped_names
+from mauvecl.host.tables.files import read_text, toml
 from mauvecl.schema.calls import validated
-from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Help, Range, Unit
+from mauvecl.schema.errors import InputError, shortened
+from mauvecl.schema.fields import Help, Range, Unit, count, is_quantity, numbers, word_of
 from mauvecl.schema.physical import DetectorTemperature, Exposure, NotNegative, Positive, Wavelength
-from mauvecl.schema.quantities import count, is_quantity, numbers, word_of
-from mauvecl.schema.records import input_error
-from mauvecl.schema.section import Section
-from mauvecl.schema.text import shortened
+from mauvecl.schema.section import Section, input_error
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -49,13 +46,11 @@ def read_values(
         Files that extend this one.
     """
     if path.resolve() in seen:
-        raise InputError(f"{path.name} extends itself", "a chain of files that ends", key="extends", value=path.name)
+        raise InputError(f"{path.name} extends itself; the chain of files must end", key="extends")
     if len(seen) == MAX_EXTENDED:
         raise InputError(
-            f"{path.name} ends a chain of {MAX_EXTENDED} files that extend another",
-            "fewer",
+            f"{path.name} ends a chain of {MAX_EXTENDED} files that extend another; the chain must be shorter",
             key="extends",
-            value=path.name,
         )
     content = toml(read_text(path, "instrument file"), f"instrument file {shortened(str(path))}")
     values: dict[str, Any] = {}
@@ -82,9 +77,7 @@ def _entry(
         unknown = [key for key in entry if key not in ("value", "tag", "source")]
         if unknown or "value" not in entry:
             what = f"the unknown key {unknown[0]!r}" if unknown else "no 'value'"
-            raise InputError(
-                f"{path.name}: the table {name} has {what}", "value, tag and source", key=name, value=entry
-            )
+            raise InputError(f"{path.name}: the table {name} has {what}", "value, tag and source", key=name)
         tag = entry.get("tag", "A")
         if tag not in TAGS:
             raise InputError.of("tag", tag, f"one of {', '.join(TAGS)}", where=f"{path.name}, {name}")
@@ -125,12 +118,6 @@ def _as_map(value: Any) -> Any:
 def _as_errors(value: Any) -> Any:
     """Convert a path to the uncertainty of a throughput."""
     return ThroughputErrors.read(value) if isinstance(value, str | Path) else value
-
-
-def _fraction(curve: Curve) -> Curve:
-    if max(curve.value) > 1:
-        raise InputError.of("value", max(curve.value), "a fraction between 0 and 1")
-    return curve
 
 
 Efficiency = Annotated[Curve, BeforeValidator(partial(_as_curve, unit=""))]
@@ -271,19 +258,15 @@ class Instrument(Section):
     @model_validator(mode="after")
     def _consistent(self) -> Instrument:
         for name in OPTICS:
-            try:
-                _fraction(getattr(self, name))
-            except InputError as error:
-                raise InputError.of(name, error.value, str(error.expected)) from None
+            largest = max(getattr(self, name).value)
+            if largest > 1:
+                raise InputError.of(name, largest, "a fraction between 0 and 1")
         low, high = self.output_min_nm, self.output_max_nm
         if not high > low:
             raise InputError.of("output_max_nm", high, f"more than output_min_nm = {low:g}")
         if self.wavelength_nm.size == 0:
             raise InputError(
-                f"no pixel lies in the output range {low:g}-{high:g} nm",
-                "at least one",
-                key="output_min_nm",
-                value=(low, high),
+                f"the output range {low:g}-{high:g} nm needs at least one pixel, but holds none", key="output_min_nm"
             )
         for name in CURVES:
             curve: Curve = getattr(self, name)
@@ -292,14 +275,11 @@ class Instrument(Section):
                     f"{name} covers {curve.wavelength_nm[0]:g}-{curve.wavelength_nm[-1]:g} nm",
                     f"at least the output range {low:g}-{high:g} nm",
                     key=name,
-                    value=(curve.wavelength_nm[0], curve.wavelength_nm[-1]),
                 )
         if self.top_hat_width_nm == self.gaussian_fwhm_nm == 0:
             raise InputError(
-                "top_hat_width_nm and gaussian_fwhm_nm are both 0",
-                "at least one above 0",
+                "top_hat_width_nm and gaussian_fwhm_nm are both 0, but at least one of them must be above 0",
                 key="top_hat_width_nm",
-                value=0.0,
             )
         for name in ("top_hat_width_nm", "gaussian_fwhm_nm"):
             # A width far below a pixel has no effect, but costs time and digits.
@@ -310,7 +290,6 @@ class Instrument(Section):
                 f"quantum_efficiency_a_per_w corresponds to {most:.3g} electrons per photon",
                 "at most 1",
                 key="quantum_efficiency_a_per_w",
-                value=most,
             )
         if self.resolution_element_nm < self.dispersion_nm_per_pixel:
             raise InputError.of(
@@ -322,10 +301,7 @@ class Instrument(Section):
             raise InputError.of("bias_dn", self.bias_dn, "below saturation")
         if self.pixel_map is not None and self.pixel_map.size != self.pixels:
             raise InputError(
-                f"pixel_map has {self.pixel_map.size} pixels",
-                f"the array's {self.pixels}",
-                key="pixel_map",
-                value=self.pixel_map.size,
+                f"pixel_map has {self.pixel_map.size} pixels", f"the array's {self.pixels}", key="pixel_map"
             )
         modes = 0 if self.throughput_errors is None else len(self.throughput_errors.modes)
         if len(self.throughput_amplitudes) > modes:
@@ -335,9 +311,7 @@ class Instrument(Section):
         if not (self.throughput(self.wavelength_nm) * self.per_pixel("response", 1.0) > 0).any():
             dark = [name for name in CURVES if not (getattr(self, name).at(self.wavelength_nm) > 0).any()]
             what = f"{' and '.join(dark) or 'the throughput'} = 0 from {low:g} to {high:g} nm"
-            raise InputError(
-                f"{what}", "a throughput above 0 in some pixel, where else all S/N are 0", key="throughput", value=0.0
-            )
+            raise InputError(what, "a throughput above 0 in some pixel, where else all S/N are 0", key="throughput")
         return self
 
     @cached_property

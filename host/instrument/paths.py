@@ -7,9 +7,8 @@ from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
 
-from mauvecl.host.files.parsing import is_file
-from mauvecl.schema.errors import InputError
-from mauvecl.schema.text import shortened
+from mauvecl.host.tables.files import is_file
+from mauvecl.schema.errors import InputError, shortened
 
 
 def shipped_names() -> tuple[str, ...]:
@@ -29,19 +28,14 @@ def instrument_path(name: str | Path, folder: Path) -> Path:
     if is_file(path):
         return path
     if path.is_dir():
-        raise InputError(
-            f"instrument {shortened(str(path))} is a folder", "a name or a TOML file", key="instrument", value=name
-        )
+        raise InputError(f"instrument {shortened(str(path))} is a folder", "a name or a TOML file", key="instrument")
     if path.suffix == ".toml":
-        raise InputError(
-            f"instrument file {shortened(str(path))} does not exist", "a TOML file", key="instrument", value=name
-        )
+        raise InputError(f"instrument file {shortened(str(path))} does not exist", "a TOML file", key="instrument")
     near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.0)[0]
     raise InputError(
         f"unknown instrument {shortened(str(name))}",
         f"{' or '.join(names)} (nearest: {near!r}) or the path of a TOML file",
         key="instrument",
-        value=name,
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.exposure.sky import parse_time
-from mauvecl.host.tables.times import offline
+from mauvecl.host.tables.units import offline
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range, Unit
@@ -192,7 +192,6 @@ class TimeGrid:
                 f"{self.days:g} days in steps of {self.step_s:g} s are {self.days * DAY_S / self.step_s:.3g} steps",
                 f"1 to {MAX_STEPS}",
                 key="step_s",
-                value=self.step_s,
             )
         _ = self.first  # raises InputError for an invalid start
 

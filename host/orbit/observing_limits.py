@@ -69,10 +69,7 @@ class Limits(Section):
             len(self.anomaly) < 3 or not all(math.isfinite(one) for corner in self.anomaly for one in corner)
         ):
             raise InputError(
-                f"anomaly is a polygon of {len(self.anomaly)} corners",
-                "at least 3, finite",
-                key="anomaly",
-                value=self.anomaly,
+                f"anomaly is a polygon of {len(self.anomaly)} corners", "at least 3, finite", key="anomaly"
             )
         return self
 

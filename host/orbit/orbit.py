@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.exposure.sky import parse_position
-from mauvecl.host.files.parsing import read_text
 from mauvecl.host.orbit.geometry import (
     GRAVITY,
     J2,
@@ -33,11 +32,11 @@ from mauvecl.host.orbit.geometry import (
 from mauvecl.host.stars.library import by_key, name_key, near_names, well_known_text
 from mauvecl.host.tables.coordinates import EXPECTED
 from mauvecl.host.tables.ecsv import parse_ecsv
-from mauvecl.host.tables.missing import is_missing_position
-from mauvecl.host.tables.times import offline
-from mauvecl.schema.errors import InputError
+from mauvecl.host.tables.files import read_text
+from mauvecl.host.tables.names import is_missing_position
+from mauvecl.host.tables.units import offline
+from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.physical import DAY_S
-from mauvecl.schema.text import shortened
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -56,17 +55,15 @@ class Elements:
             _check(line, number)
         if self.first[2:7] != self.second[2:7]:
             raise InputError(
-                f"orbital elements are of satellites {self.first[2:7]!r} and {self.second[2:7]!r}",
-                "one",
+                f"both lines of the orbital elements must be of one satellite, but are of "
+                f"{self.first[2:7]!r} and {self.second[2:7]!r}",
                 key="elements",
-                value=(self.first[2:7], self.second[2:7]),
             )
         if self.satellite.error:
             raise InputError(
                 f"orbital elements {shortened(self.second)} are refused by SGP4 (error {self.satellite.error})",
                 "those of an orbit around the Earth",
                 key="elements",
-                value=self.second,
             )
 
     @classmethod
@@ -91,10 +88,7 @@ class Elements:
             if one.startswith("1 ") and two.startswith("2 "):
                 return cls(one, two, source)
         raise InputError(
-            f"orbit file {named} holds no two lines of elements",
-            "a line '1 ...' before '2 ...'",
-            key="elements",
-            value=named,
+            f"orbit file {named} holds no two lines of elements", "a line '1 ...' before '2 ...'", key="elements"
         )
 
     @cached_property
@@ -162,7 +156,6 @@ def _check(line: str, number: int) -> None:
             f"orbital elements {shortened(line)} end in the checksum {line[68]!r}",
             f"{checksum}: one is wrong",
             key="elements",
-            value=line,
         )
 
 
@@ -280,10 +273,9 @@ class Orbit:
             first = int(np.argmax(error != 0))
             raise InputError(
                 f"orbital elements of epoch {self.elements.epoch} cannot be followed to "
-                f"{utc_text(float(midnight[first] + days[first]))} (SGP4 error {int(error[first])})",
-                "newer ones or the mean orbit",
+                f"{utc_text(float(midnight[first] + days[first]))} (SGP4 error {int(error[first])}): "
+                "give newer ones, or use the mean orbit",
                 key="elements",
-                value=self.elements.epoch,
             )
         return np.asarray(position), np.asarray(velocity)
 
@@ -405,9 +397,7 @@ class Target:
             Whether to query SIMBAD for a name that is not embedded (needs `mauvecl[names]` and a network).
         """
         if is_missing_position(text):
-            raise InputError(
-                f"target {shortened(text)} is a pair of missing values", EXPECTED, key="target", value=text
-            )
+            raise InputError(f"target {shortened(text)} is a pair of missing values", EXPECTED, key="target")
         star = by_key().get(name_key(text))
         if star is not None:
             return cls(name or star.name, star.ra_deg, star.dec_deg, f"embedded list ({star.source})",
@@ -420,7 +410,6 @@ class Target:
                 f"target {shortened(text)} is not in the embedded list",
                 f"a name such as {like}, coordinates such as '290.0 -11.2', or `simbad=True` to ask SIMBAD",
                 key="target",
-                value=text,
             )
         with offline():
             place = parse_position(text).icrs
@@ -464,7 +453,6 @@ def _from_simbad(text: str, name: str | None) -> Target:
             f"target {shortened(text)} is not in the embedded list and astroquery is missing",
             "coordinates, or `pip install 'mauvecl[names]'`",
             key="target",
-            value=text,
         ) from None
     query = SIMBAD_QUERY.format(text.strip().replace("'", "''"))
     try:
@@ -475,12 +463,9 @@ def _from_simbad(text: str, name: str | None) -> Target:
             f" s ({type(error).__name__})",
             "a network, or coordinates",
             key="target",
-            value=text,
         ) from error
     if table is None or len(table) == 0:
-        raise InputError(
-            f"target {shortened(text)} is unknown to SIMBAD", "another name, or coordinates", key="target", value=text
-        )
+        raise InputError(f"target {shortened(text)} is unknown to SIMBAD", "another name, or coordinates", key="target")
     row = table[0]
 
     def number(column: str) -> float | None:
@@ -489,9 +474,7 @@ def _from_simbad(text: str, name: str | None) -> Target:
 
     parallax, ra, dec = number("plx_value"), number("ra"), number("dec")
     if ra is None or dec is None:
-        raise InputError(
-            f"target {shortened(text)} has no coordinates in SIMBAD", "another name", key="target", value=text
-        )
+        raise InputError(f"target {shortened(text)} has no coordinates in SIMBAD", "another name", key="target")
     distance = None if parallax is None or parallax <= 0 else 1000 / parallax
     kind = None if np.ma.is_masked(row["sp_type"]) else str(row["sp_type"]).strip() or None
     return Target(name or text.strip(), ra, dec, "SIMBAD", distance, number("V"), kind)

@@ -1,1 +1,1 @@
-"""Readers of spectra of users and archives, checks of spectra, and continuation of their ends."""
+"""Readers of spectra of users and archives, on the tables of files."""

@@ -1,23 +1,294 @@
-"""Conversion of a spectrum from the units of its file to vacuum nm and erg s-1 cm-2 A-1, with messages."""
+"""Spectra of tables: selection of one, and conversion to wavelengths in vacuum and flux densities.
+
+A selection is of a table, of its columns, and of a row if cells contain whole spectra. Users select with
+``FILE[word, ...]``: a table's label, a column's name or a row's identifier.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.spectra.column_roles import Role
-from mauvecl.host.spectra.selection import RawSpectrum
-from mauvecl.host.spectra.wavelength_range import check_assumed_unit
-from mauvecl.host.tables.medium import Medium, unit_and_medium, vacuum_wavelengths
+from mauvecl.host.spectra.columns import Choice, Role, as_typed, choose, listed, numbered, plain, role_of
+from mauvecl.host.spectra.units import Medium, check_assumed_unit, unit_and_medium, vacuum_wavelengths
+from mauvecl.host.tables.names import divided_unit
+from mauvecl.host.tables.table import Values, marks_in, without_indefinite
 from mauvecl.host.tables.units import flux_kind, is_spectral, is_stated, linear, unit_of
 from mauvecl.schema.errors import InputError
 
+
+@dataclass(frozen=True)
+class SpectrumTable:
+    """Table of a file with its metadata."""
+
+    columns: Sequence[Values]
+    name: str
+    origin: str
+    #: Name by which users select it among the tables of a file.
+    label: str = ""
+    #: Units of wavelength and flux that the format implies if none is stated.
+    implied_units: tuple[str, str] | None = None
+    #: Text of the header that may mention air, the star's surface or its dust.
+    remarks: str = ""
+    #: Function that returns the medium of the wavelengths that keywords state.
+    medium: Callable[[], Medium | None] = lambda: None
+    notes: tuple[str, ...] = ()
+    messages: tuple[str, ...] = ()
+    #: Group; tables of the same group are parts of one spectrum.
+    group: str | None = None
+    #: Reason why fluxes need a magnitude; empty if they are those at the telescope.
+    unscaled: str = ""
+    #: Identifiers of its rows, if stored in another table.
+    row_names: Sequence[str] = ()
+    #: Format of a spectrum's name from the identifier of its row, as in ``Gaia DR3 {}``.
+    row_title: str = ""
+    #: Roles of the columns, if known from more than their names, units and descriptors.
+    known_roles: Sequence[Role] = ()
+
+    @property
+    def roles(self) -> Sequence[Role]:
+        """Roles of the columns."""
+        return self.known_roles or [role_of(one.name, one.unit, one.ucd) for one in self.columns]
+
+
 Float = NDArray[np.float64]
+
+#: Columns whose presence shows that rows are parts of one spectrum: detector segments and echelle orders.
+SEGMENTS = ("segment", "sporder", "order", "stripe")
+#: Names of columns that qualify arrays: their step, their length, and the validity of points.
+STEPS = ("deltaw", "delta_w", "delta_wavelength", "step", "dlam", "dlambda")
+LENGTHS = ("npoints", "n_points", "nelem", "npts")
+#: Zero for invalid points (COS Data Handbook 5.1, section 2.4.3).
+WEIGHTS = ("dq_wgt",)
+
+
+@dataclass(frozen=True, eq=False)
+class RawSpectrum:
+    """Spectrum in the units of its file."""
+
+    #: Wavelengths and fluxes of each segment, shape (n,) each.
+    segments: list[tuple[Float, Float]]
+    table: SpectrumTable
+    wavelength_name: str
+    flux_name: str
+    wavelength_role: Role
+    flux_role: Role
+    messages: tuple[str, ...] = ()
+
+
+def spectrum_in(tables: Sequence[SpectrumTable], asked: Sequence[str]) -> RawSpectrum:
+    """Return the spectrum of a file, or the selected one of several."""
+    if not tables:
+        raise InputError("has no table", "one with a wavelength and a flux", key="table")
+    labels = [table.label.strip().lower() for table in tables]
+    words = {word.lower() for word in asked}
+    named = [i for i, label in enumerate(labels) if label and label in words]
+    by_number = {word: place for word in asked if (place := numbered("table", word)) is not None}
+    if any(place >= len(tables) for place in by_number.values()):
+        raise InputError.of("table", max(by_number.values()) + 1, f"1 to {len(tables)}")
+    named += by_number.values()
+    rest = [word for word in asked if word.lower() not in {labels[i] for i in named} and word not in by_number]
+    found: list[RawSpectrum] = []
+    errors: list[InputError] = []
+    for table in [tables[i] for i in named] or tables:
+        try:
+            found.append(_spectrum_of(table, rest))
+        except InputError as error:
+            errors.append(error)
+    if errors and any(one.table.group for one in found):
+        # A missing part would go unnoticed.
+        raise errors[0]
+    if not found:
+        # The message that offers a choice is the most helpful.
+        raise next((error for error in errors if "FILE[" in str(error)), errors[0])
+    if len(found) > 1 and not named:
+        # SDSS: the sum of all exposures, next to each of them.
+        found = [one for one in found if one.table.label.strip().lower() == "coadd"] or found
+    if len(found) > 1 and found[0].table.group is not None and len({one.table.group for one in found}) == 1:
+        parts = listed([one.table.label for one in found])
+        segments = [segment for one in found for segment in one.segments]
+        return replace(found[0], segments=segments, messages=(*found[0].messages, f"its parts {parts} are joined"))
+    if len(found) > 1:
+        held = [one.table.label for one in found]
+        fault = f"{len(held)} tables hold a spectrum: {listed(held)}"
+        first = as_typed(held[0], "table", labels.index(held[0].strip().lower()), labels)
+        raise InputError(fault, f"one: name it as in {first}", key="table")
+    return found[0]
+
+
+def _spectrum_of(table: SpectrumTable, asked: Sequence[str]) -> RawSpectrum:
+    names = [column.name for column in table.columns]
+    roles = table.roles
+    known = {plain(name) for name in names} | {plain(f"column {place + 1}") for place in range(len(names))}
+    # Words that do not name a column may name a row.
+    rest = [word for word in asked if plain(word) not in known]
+    try:
+        choice = choose(names, roles, [word for word in asked if plain(word) in known])
+    except InputError as error:
+        raise (_no_such(rest[0], names) if rest else error) from error
+    messages = []
+    if len(choice.wavelength) == 2:
+        edges = " and ".join(names[i] for i in choice.wavelength)
+        if len({roles[i].unit for i in choice.wavelength}) > 1:
+            raise InputError.of("wavelength_unit", edges, "one unit")
+        messages.append(f"its wavelengths are the middles of bins, from {edges}")
+    chosen = [table.columns[i] for i in (*choice.wavelength, choice.flux)]
+    cells = [column.cells for column in chosen]
+    if _holds_arrays(cells[-1]):
+        rows, identifier, said = _selected_rows(table, choice, cells, rest)
+        messages += said
+        if table.row_title and identifier:
+            table = replace(table, name=table.row_title.format(identifier[:30]))
+    elif rest:
+        raise _no_such(rest[0], names)
+    else:
+        rows = [cells]
+    segments = []
+    for row in rows:
+        *axes, flux = (_numbers(cell, column.name.strip()) for cell, column in zip(row, chosen, strict=True))
+        segments.append((sum(axes[1:], axes[0]) / len(axes), flux))
+        for array, column in zip((axes[0], flux), (chosen[0], chosen[-1]), strict=True):
+            if array.ndim != 1:
+                fault = f"column {column.name.strip()} has the shape {array.shape}"
+                raise InputError(fault, "one spectrum", key=column.name.strip())
+        if axes[0].size != flux.size:
+            raise InputError(f"needs as many wavelengths as fluxes, but has {axes[0].size} for {flux.size}", key="flux")
+    if sum(flux.size for _, flux in segments) < 2:
+        raise InputError("has fewer than two points", "a spectrum", key="flux")
+    axis, flux_role = roles[choice.wavelength[0]], roles[choice.flux]
+    return RawSpectrum(
+        segments, table, chosen[0].name, chosen[-1].name, axis, flux_role, (*table.messages, *messages),
+    )  # fmt: skip
+
+
+def _numbers(cells: Any, name: str) -> Float:
+    """Return cells as numbers; NaN for missing measurements."""
+    if np.asanyarray(cells).dtype.kind == "b":
+        raise InputError(f"{name} holds true and false", "real numbers", key=name)
+    return without_indefinite(Values.of(name, cells, what="its table").numbers())
+
+
+def _holds_arrays(cells: Any) -> bool:
+    """Return whether each cell of a column contains an array."""
+    return np.ndim(cells) > 1 or (np.asarray(cells).dtype == object and len(cells) > 0 and np.ndim(cells[0]) > 0)
+
+
+def _no_such(word: str, names: Sequence[str]) -> InputError:
+    """Return the error for a word that does not name anything in the file."""
+    return InputError.of("columns", word, f"one of {listed(names)}")
+
+
+def _selected_rows(
+    table: SpectrumTable, choice: Choice, cells: list[Any], asked: Sequence[str]
+) -> tuple[list[list[Any]], str, tuple[str, ...]]:
+    """Return the selected row, or all rows if they are segments of one spectrum, the name of one, and messages.
+
+    Parameters
+    ----------
+    choice : Choice
+        Columns of wavelength and flux.
+    cells : list
+        Cells of these columns; wavelengths of shape (n,) apply to all rows of fluxes of shape (n_row, n).
+    asked : sequence of str
+        Words given by the user that may name a row.
+    """
+    n = len(cells[-1])
+    if np.ndim(cells[-1]) == 2:
+        shape = np.shape(cells[-1])
+        cells = [np.broadcast_to(cell, shape) if np.shape(cell) == shape[1:] else cell for cell in cells]
+    if len({len(cell) for cell in cells}) > 1:
+        raise InputError(f"needs as many rows of wavelengths as of fluxes, but has {len(cells[0])} for {n}", key="flux")
+    names = [plain(column.name) for column in table.columns]
+    is_only = n == 1 and not asked and not table.row_title
+    identifiers = [[""]] if is_only else _identifiers(table, {*choice.wavelength, choice.flux}, n)
+    identifier = ""
+    messages: tuple[str, ...] = ()
+    if n > 1 and not asked and set(names) & set(SEGMENTS):
+        rows = list(range(n))
+        labels = [identifiers[row][0] if identifiers[row] else str(row + 1) for row in rows]
+        messages = (f"its {n} segments ({listed(labels)}) are joined",)
+    else:
+        rows = [_row_asked(identifiers, asked, names)]
+        identifier = (identifiers[rows[0]] or [""])[0]
+    steps, lengths, weights = (
+        next((c.cells for c, name in zip(table.columns, names, strict=True) if name in wanted), None)
+        for wanted in (STEPS, LENGTHS, WEIGHTS)
+    )
+    found = []
+    for row in rows:
+        arrays = _arrays([cell[row] for cell in cells], None if steps is None else steps[row])
+        kept = np.ones(arrays[-1].size, bool)
+        if lengths is not None and 1 < (count := int(np.ravel(lengths[row])[0])) < kept.size:
+            kept[count:] = False
+        if weights is not None and np.shape(weights[row]) == kept.shape:
+            kept &= np.asarray(weights[row]) != 0
+        if kept.any():
+            found.append([array[kept] for array in arrays])
+    if not found:
+        raise InputError("its rows contain no valid point", "valid points", key="rows")
+    return found, identifier, messages
+
+
+def _arrays(cells: list[Any], step: Any) -> list[Any]:
+    """Return a row's cells as arrays of equal length; a start and a step are expanded."""
+    *axes, flux = (np.ma.asanyarray(cell).squeeze() for cell in cells)
+    if flux.ndim != 1:
+        raise InputError(f"its row: the flux has the shape {flux.shape}", "one spectrum", key="flux")
+    if axes[0].size == 1 < flux.size:
+        if step is None:
+            raise InputError(
+                f"its row needs as many wavelengths as fluxes, or a step, but has one for {flux.size}", key="flux"
+            )
+        axes = [float(axes[0]) + float(np.ravel(step)[0]) * np.arange(flux.size)]
+    if any(axis.shape != flux.shape for axis in axes):
+        raise InputError(
+            f"its row needs as many wavelengths as fluxes, but has {axes[0].size} for {flux.size}", key="flux"
+        )
+    return [*axes, flux]
+
+
+def _identifiers(table: SpectrumTable, without: set[int], n: int) -> list[list[str]]:
+    """Return the possible names of each row: its short texts and integers, the most specific first."""
+    columns = [list(table.row_names)] if len(table.row_names) == n else []
+    for place, column in enumerate(table.columns):
+        if place in without:
+            continue
+        values = column.cells
+        if np.shape(values) == (n,) and np.asarray(values).dtype.kind in "SUiuO" and np.ndim(values[0]) == 0:
+            texts = (one.decode(errors="replace") if isinstance(one, bytes) else str(one) for one in values)
+            columns.append([text.strip() for text in texts])
+    columns.sort(key=lambda texts: len(set(texts)) < n)
+    return [[texts[row] for texts in columns] for row in range(n)]
+
+
+def _row_asked(identifiers: Sequence[Sequence[str]], asked: Sequence[str], names: Sequence[str]) -> int:
+    """Return the selected row: the only one, the one with the requested identifier, or ``row 3``."""
+    fitting = list(range(len(identifiers)))
+    for word in asked:
+        if (place := numbered("row", word)) is not None:
+            if place >= len(identifiers):
+                raise InputError.of("row", place + 1, f"1 to {len(identifiers)}")
+            fits = [place]
+        else:
+            fits = [row for row in fitting if word.strip() in identifiers[row]]
+        if not fits:
+            raise _no_such(word, names)
+        fitting = [row for row in fitting if row in fits]
+    if len(fitting) == 1:
+        return fitting[0]
+    labels = [identifiers[row][0] if identifiers[row] and identifiers[row][0] else f"row {row + 1}" for row in fitting]
+    if len(set(labels)) < len(labels):
+        labels = [f"row {row + 1}" for row in fitting]
+    fault = f"{len(fitting)} spectra are in it, one in each row ({listed(labels)})"
+    first = as_typed((labels or ["row 1"])[0], "row", (fitting or [0])[0], labels)
+    raise InputError(fault, f"one: name it as in {first}", key="rows")
+
 
 #: Range of decimal logarithms of any wavelength in nm, Angstrom, um or Hz, and of any flux.
 LOG_WAVELENGTHS, LOG_FLUXES = (-2.0, 20.0), (-60.0, 60.0)
@@ -67,7 +338,7 @@ def converted(raw: RawSpectrum, wavelength_unit: Any = None, flux_unit: Any = No
     if axis.is_assumed:
         check_assumed_unit(axis.linear_values(np.concatenate([values for values, _ in raw.segments])), axis.name)
     segments = []
-    for values, fluxes in raw.segments:
+    for values, fluxes in _without_marks(raw.segments, messages):
         nm, kept = _in_nm(values, fluxes, axis)
         order = slice(None, None, -1 if nm.size > 1 and nm[0] > nm[-1] else 1)
         segments.append((nm[order], _in_flam(kept, nm, flux)[order]))
@@ -118,6 +389,8 @@ def _scale(what: str, column: str, role: Role, asked: Any, implied: str | None) 
         per_frequency = what == "flux" and role.per_frequency
         unit = unit_of("Angstrom" if what == "wavelength" and is_logarithm else "fnu" if per_frequency else implied)
         why = f", and {column} is one per frequency" if per_frequency else ""
+        named = divided_unit(column)[1]
+        why += f" ({named!r} in the name of its column is not one)" if named and not is_bare_logarithm else ""
         messages.append(f"ASSUMED: {what} in {unit}, because its file states no unit{why}; --{what}-unit names another")
     if what == "flux":
         _check_flux_unit(unit, role)
@@ -143,16 +416,10 @@ def _stated(what: str, column: str, stated: str | None, asked: Any) -> tuple[Any
         unit = unit_of(asked) if isinstance(asked, str) else asked
     except InputError as error:
         raise error.within(f"{what} ({column})") from error
-    if not is_stated(stated) or _is_same(stated, unit):
-        return unit, []
+    with contextlib.suppress(InputError):
+        if not is_stated(stated) or unit_of(str(stated)) == unit:
+            return unit, []
     return unit, [f"the unit of its {what} is {unit} as asked, not {stated!s:.40} as its file says"]
-
-
-def _is_same(stated: object, unit: Any) -> bool:
-    try:
-        return bool(unit_of(str(stated)) == unit)
-    except InputError:
-        return False
 
 
 def _power(values: Float, base: str, limits: tuple[float, float], column: str) -> Float:
@@ -162,7 +429,7 @@ def _power(values: Float, base: str, limits: tuple[float, float], column: str) -
     if finite.size and (finite.min() < limits[0] or finite.max() > limits[1] or np.abs(finite).max() < 1e-3):
         low, high = values[np.isfinite(values)].min(), values[np.isfinite(values)].max()
         fault = f"column {column} is named as a logarithm and holds {low:g} to {high:g}"
-        raise InputError(fault, f"logarithms from {limits[0]:g} to {limits[1]:g}", key=column, value=(low, high))
+        raise InputError(fault, f"logarithms from {limits[0]:g} to {limits[1]:g}", key=column)
     with np.errstate(over="ignore"):
         return np.asarray(10.0**logarithms)
 
@@ -183,7 +450,14 @@ def _check_flux_unit(unit: Any, role: Role) -> None:
         expected = "the flux of the whole star, such as erg / (s cm2 Angstrom)"
     else:
         return
-    raise InputError(fault, expected, key="flux_unit", value=unit)
+    raise InputError(fault, expected, key="flux_unit")
+
+
+def _without_marks(segments: list[tuple[Float, Float]], messages: list[str]) -> list[tuple[Float, Float]]:
+    """Return segments whose fluxes are undefined where they have the mark of a missing value."""
+    marks, said = marks_in(np.concatenate([one for _, one in segments]), "fluxes")
+    messages += said
+    return [(values, np.where(np.isin(one, marks), np.nan, one)) for values, one in segments] if marks else segments
 
 
 def _in_nm(values: Float, flux: Float, scale: _Scale) -> tuple[Float, Float]:
@@ -218,7 +492,7 @@ def _joined(segments: list[tuple[Float, Float]], messages: list[str]) -> tuple[F
         if more[-1] <= nm[-1]:
             fault = f"a segment of {more[0]:g}-{more[-1]:g} nm lies within another, which ends at {nm[-1]:g} nm"
             expected = "segments side by side: choose one by its name, as in FILE[name]"
-            raise InputError(fault, expected, key="table", value=(more[0], more[-1]))
+            raise InputError(fault, expected, key="table")
         if more[0] <= nm[-1]:
             middle = (more[0] + nm[-1]) / 2
             messages.append(f"two segments overlap at {more[0]:g}-{nm[-1]:g} nm and are cut at {middle:g} nm")
@@ -242,7 +516,7 @@ def _check_assumed_flux(flux: Float, raw: RawSpectrum) -> None:
         expected = "a star's flux"
     else:
         return
-    raise InputError(fault, f"{expected}: `flux_unit` names its unit", key="flux_unit", value=(low, high))
+    raise InputError(fault, f"{expected}: `flux_unit` names its unit", key="flux_unit")
 
 
 def _merged(nm: Float, flux: Float, messages: list[str]) -> tuple[Float, Float]:

@@ -1,39 +1,386 @@
-"""Reader of spectra in any supported file format, which is recognised by content instead of name."""
+"""Spectra in text, ECSV, VOTable and FITS, recognised by content instead of name.
+
+The headers of spectra in text mix names and units of columns with prose. A line names columns if it has as many cells
+as the data have columns, and names a wavelength and another known column; "vacuum wavelengths" over two columns is
+prose.
+"""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
-from mauvecl.host.files.parsing import parsing
-from mauvecl.host.files.size_limits import read_bytes, unpacked
-from mauvecl.schema.errors import InputError
-from mauvecl.schema.text import shortened
+import numpy as np
+
+from mauvecl.host.spectra.columns import AXES, Role, divided, is_unit, listed, role_of, words_of
+from mauvecl.host.spectra.conversion import SpectrumTable
+from mauvecl.host.spectra.units import medium_of, stated_units
+from mauvecl.host.tables.files import check_size, parsing, without_columns
+from mauvecl.host.tables.fits_tables import (
+    FLUX_UNITS,
+    WAVE_UNITS,
+    FitsTables,
+    axis_of,
+    is_spectrum_image,
+    is_survey_image,
+    multispec_axis,
+    open_fits,
+    paired_images,
+    reading,
+    rows_of,
+    text_at,
+    unit_at,
+)
+from mauvecl.host.tables.table import Values
+from mauvecl.host.tables.text_tables import PROSE, NumberLines, bracketed, divided_names, keywords_of
+from mauvecl.host.tables.units import is_stated, time_in_name
+from mauvecl.schema.errors import InputError, shortened
 
 if TYPE_CHECKING:
     import astropy.units as u
 
     from mauvecl.host.spectra.conversion import ReadSpectrum
-    from mauvecl.host.spectra.spectrum_table import SpectrumTable
+    from mauvecl.host.tables.opening import Content
     from mauvecl.host.tables.table import MemoryTable
+
+#: Units of a text file without stated units (the paper's rule).
+TEXT_UNITS = ("nm", "erg / (s cm2 Angstrom)")
+#: Gaia DR3's sampled mean spectra: 343 fluxes at 336 + 2 i nm (documentation of gaiadr3.xp_sampled_mean_spectrum).
+GAIA_NM, GAIA_FLUX = 336.0 + 2.0 * np.arange(343), "W m-2 nm-1"
+
+_NUMBERED = re.compile(r"(?:col(?:umn)?s?\.?\s*)?[(\[]?(\d{1,3})[)\]]?\s*[:=.)\-]?\s+(.+)", re.IGNORECASE)
+
+
+def table_of_text(
+    text: str, name: str, origin: str, asked: Sequence[str], wavelength: bool, flux: bool
+) -> SpectrumTable:
+    """Read the table of a text file.
+
+    Parameters
+    ----------
+    asked : sequence of str
+        Words given by the user; for columns without names, their numbers.
+    wavelength, flux : bool
+        Whether to search the header for the units of wavelength and flux.
+    """
+    lines = NumberLines(text, "wavelength and flux")
+    names, units = _names(lines)
+    if lines.holds_arrays:
+        return _table_of_arrays(lines, names, units, name, origin)
+    columns = [
+        lines.column(k, names[k] if names else str(k + 1), units[k] if units else "")
+        for k in range(lines.n if names else max(lines.n, 2))
+    ]
+    if names:
+        roles = [role_of(one.name, one.unit) for one in columns]
+    else:
+        roles = _roles_by_number(lines.n, asked, lines.messages)
+    if [one.name for one in columns[:2]] == ["wavelength", "flux"] and np.array_equal(columns[0].numbers(), GAIA_NM):
+        roles = [replace(roles[0], unit="nm"), replace(roles[1], unit=GAIA_FLUX), *roles[2:]]
+    roles = _with_units_of(lines.comments, roles, wavelength, flux, is_named=bool(names))
+    keywords = keywords_of([f"# {line}" for line, _ in lines.header])
+    return SpectrumTable(
+        columns, name, origin, implied_units=TEXT_UNITS, remarks=lines.comments, messages=tuple(lines.messages),
+        medium=partial(medium_of, keywords), known_roles=roles,
+    )  # fmt: skip
+
+
+def _roles_by_number(n: int, asked: Sequence[str], messages: list[str]) -> list[Role]:
+    """Return the roles of columns without names: the first two are the spectrum, or those selected by the user."""
+    indices = [int(one) - 1 for one in asked if one.isascii() and one.isdigit() and 1 <= int(one[:6]) <= n]
+    if len(indices) != len(asked) or len(indices) > 2:
+        raise InputError.of("columns", asked, f"their numbers, 1 to {n}")
+    if not asked and n > 2:
+        messages.append(f"the first two of its {n} columns are used, which have no names")
+    wave, value = (0, 1) if not indices else (0, indices[0]) if len(indices) == 1 else (indices[0], indices[1])
+    roles = {wave: Role("wavelength", 1), value: Role("flux", 1)}
+    return [roles.get(k, Role("unknown")) for k in range(max(n, 2))]
+
+
+def _with_units_of(remarks: str, roles: Sequence[Role], wavelength: bool, flux: bool, is_named: bool) -> list[Role]:
+    """Return roles with units from remarks if the names and headers of columns state none."""
+    # A column with an unknown name may be the flux if none is recognised.
+    fluxes = ("flux", "model") if any(role.kind in ("flux", "model") for role in roles) else ("unknown",)
+    has_axis = any(role.kind in AXES and role.unit for role in roles)
+    has_flux = any(role.kind in fluxes and role.unit for role in roles)
+    axis_unit, flux_unit = stated_units(
+        remarks, wavelength=wavelength and not has_axis, flux=flux and not has_flux, is_named=is_named
+    )
+    units = [axis_unit if role.kind in AXES else flux_unit if role.kind in fluxes else None for role in roles]
+    return [role if role.unit else replace(role, unit=unit) for role, unit in zip(roles, units, strict=True)]
+
+
+def _table_of_arrays(
+    lines: NumberLines, names: Sequence[str], units: Sequence[str], name: str, origin: str
+) -> SpectrumTable:
+    """Return a table whose cells contain arrays, with a spectrum per row, as in Gaia's files."""
+    if not names:
+        # Gaia's files have no column of wavelengths.
+        names = next((cells for line, _ in lines.header if len(cells := line.split(",")) == lines.n), [])
+    if not names:
+        raise InputError(
+            "contains arrays in its cells and no names of columns", "names in its first line", key="columns"
+        )
+    columns = [lines.column(k, names[k].strip(), units[k] if units else "") for k in range(lines.n)]
+    known = {column.name.lower(): column for column in columns}
+    if "source_id" not in known or "wavelength" in known or "flux" not in known:
+        return SpectrumTable(columns, name, origin, implied_units=TEXT_UNITS, remarks=lines.comments)
+    if np.shape(known["flux"].cells)[-1:] == GAIA_NM.shape:
+        flux = replace(known["flux"], unit=GAIA_FLUX)
+        columns = [known["source_id"], Values.of("wavelength", GAIA_NM, "nm"), flux]
+    return SpectrumTable(
+        columns, name, f"{origin}, Gaia DR3 sampled XP spectrum", row_title="Gaia DR3 {}",
+        notes=("wavelengths 336 + 2 i nm, W m-2 nm-1: Gaia DR3's documentation",),
+    )  # fmt: skip
+
+
+def _names(lines: NumberLines) -> tuple[list[str], list[str]]:
+    """Return the names of columns and the units below them; empty if there are none."""
+    if numbered := _numbered(lines):
+        return numbered, []
+    rows = {k: cells for k, (line, _) in enumerate(lines.header) if (cells := divided_names(line, lines.n))}
+    # The last of the lines that name most columns.
+    score, k = max(((_recognised(cells), k) for k, cells in rows.items()), default=(0, 0))
+    if score > 0:
+        return rows[k], _units(lines, k)
+    unmarked = [k for k, (line, is_comment) in enumerate(lines.header) if not is_comment and line]
+    if len(unmarked) == 1 and _may_name(lines.header[unmarked[0]][0], cells := rows.get(unmarked[0], [])):
+        return cells, _units(lines, unmarked[0])
+    return _of_another_length(lines), []
+
+
+def _may_name(line: str, cells: Sequence[str]) -> bool:
+    """Return whether the only line that is no comment names columns, some of them unknown."""
+    is_marked = bool(re.search(r"[,;|\t]", line.strip()))
+    kinds = {role_of(cell).kind for cell in cells}
+    if len(cells) == 2:
+        # A light curve has no wavelengths.
+        is_time = any(
+            cell.lower() == "phase" or time_in_name(f"time {cell}") or "time" in words_of(cell) for cell in cells
+        )
+        return is_marked and (bool(kinds & set(AXES)) or is_time)
+    return is_marked or (kinds > {"unknown"} and all(re.match(r"[^\W\d]", cell) for cell in cells))
+
+
+def _recognised(cells: Sequence[str]) -> int:
+    """Count the cells that name a spectrum's columns; 0 without a wavelength and another column."""
+    kinds = [role_of(cell).kind for cell in cells]
+    is_named = any(kind in AXES and not is_unit(cell) for cell, kind in zip(cells, kinds, strict=True))
+    # "resolution 5 nm" does not name columns; "nm error flux" does.
+    others = {*kinds} - {*AXES, "unknown"} if is_named else {*kinds} & {"flux", "model", "magnitude", "counts"}
+    if not others or not {*kinds} & {*AXES}:
+        return 0
+    # Names have precedence over the units below them.
+    return sum(1 if is_unit(cell) else 2 for cell, kind in zip(cells, kinds, strict=True) if kind != "unknown")
+
+
+def _units(lines: NumberLines, names_at: int) -> list[str]:
+    """Return the cells of the line of units below the names, if any; IPAC tables have types in between."""
+    for k, (line, _) in enumerate(lines.header[names_at + 1 : names_at + 3]):
+        cells = divided_names(line, lines.n)
+        is_all = any(is_unit(cell) for cell in cells) and all(is_unit(c) or not is_stated(c) for c in cells)
+        # "A star" is not a unit, and "nm banana" contains an unknown unit.
+        is_some = any(len(cell) > 1 and is_unit(cell) for cell in cells) and not any(c.endswith(":") for c in cells)
+        if is_all or (k == 0 and is_some):
+            return cells
+    return []
+
+
+def _numbered(lines: NumberLines) -> list[str]:
+    """Return names from lines such as "column 2: flux"; columns without such a line are named by number."""
+    found: dict[int, str] = {}
+    for line, _ in lines.header:
+        if (match := _NUMBERED.fullmatch(line.strip())) and 1 <= int(match[1]) <= lines.n:
+            found.setdefault(int(match[1]), re.split(r"[,;:]|\s-\s", match[2])[0].strip()[:60])
+    names = [found.get(k + 1, str(k + 1)) for k in range(lines.n)]
+    return names if len(found) > 1 and _recognised(names) else []
+
+
+def _of_another_length(lines: NumberLines) -> list[str]:
+    """Return the names of a line with fewer cells than the rows, for the columns from the left.
+
+    Raises InputError if a line that is no comment has another number of names than columns.
+    """
+    for line, is_comment in reversed(lines.header):
+        cells = [cell.strip("\"' ") for cell in re.split(r"[,;\t|]", line)]
+        cells = cells if len(cells) > 1 else bracketed(line)
+        if not all(cells) or PROSE.search(line) or not 1 < len(cells) <= lines.n + 8:
+            continue
+        kinds = [role_of(cell).kind if words_of(divided(cell)[0]) else "unknown" for cell in cells]
+        if "flux" not in kinds or not any(kind in AXES for kind in kinds):
+            continue
+        is_plain = set(kinds) <= {"wavelength", "flux", "unknown"} and not any(role_of(c).logarithm for c in cells)
+        in_order = is_plain and kinds.index("flux") > kinds.index("wavelength")
+        if is_comment and len(cells) < lines.n:
+            lines.messages.append(
+                f"its {len(cells)} names ({listed(cells)}) are those of the first of {lines.n} columns"
+            )
+            return [*cells, *(str(k + 1) for k in range(len(cells), lines.n))]
+        if not is_comment or not in_order:
+            fault = f"its line of names has {len(cells)} ({listed(cells)}) for {lines.n} columns"
+            raise InputError(fault, "one for each", key="columns")
+    return []
+
+
+#: Units implied by the archives' tables, those of CALSPEC.
+FITS_UNITS = ("Angstrom", "erg / (s cm2 Angstrom)")
+#: Keywords whose text may mention air, vacuum, the star's surface or its dust.
+_REMARKS = ("COMMENT", "HISTORY", "DESCRIP")
+
+
+def fits_tables(
+    file: IO[bytes], name: str, origin: str, asked: Sequence[str], check: bool = True
+) -> list[SpectrumTable]:
+    """Read the tables of a FITS file, including images of spectra.
+
+    Raises InputError if the content is not FITS, is truncated, contradicts its checksums, or has no tables or images.
+    """
+    hdus = open_fits(file, check=check)
+    with reading("it"):
+        return _Reader(hdus, name, origin, asked).tables()
+
+
+class _Reader:
+    """Reader of the extensions of an open file."""
+
+    def __init__(self, hdus: Any, name: str, origin: str, asked: Sequence[str]) -> None:
+        self.hdus, self.name, self.origin, self.asked = hdus, name, origin, asked
+        self.file = FitsTables(hdus, "it")
+        self.primary = hdus[0].header
+
+    def tables(self) -> list[SpectrumTable]:
+        from astropy.io import fits
+
+        pairs = paired_images(self.hdus)
+        if pairs:
+            rows = self._row_names()
+            return [self._of_pair(*pair, rows) for pair in pairs]
+        tables = [
+            self._of_table(number, hdu)
+            for number, hdu in enumerate(self.hdus)
+            if isinstance(hdu, fits.BinTableHDU | fits.TableHDU)
+        ]
+        if is_survey_image(self.hdus[0], text_at(self.primary, "TELESCOP")):
+            # SDSS keeps lines and redshifts of the spectrum in tables.
+            return [self._of_image(0, self.hdus[0])]
+        kinds = [{role.kind for role in table.roles} for table in tables]
+        images, errors = self._images()
+        labels = {image.label.strip().lower() for image in images}
+        named = labels & {word.lower() for word in self.asked}
+        if any("flux" in kind and kind & {"wavelength", "lower edge"} for kind in kinds) and not named:
+            return tables
+        if errors and not tables and not images:
+            raise errors[0]
+        if not tables and not images:
+            raise InputError("has no table and no image", "a FITS table with WAVELENGTH and FLUX", key="table")
+        return [*tables, *images]
+
+    def _label(self, number: int, hdu: Any) -> str:
+        """Return the name by which users select an extension: its number if requested, else its name."""
+        return str(number) if str(number) in self.asked else text_at(hdu.header, "EXTNAME") or str(number)
+
+    def _table(self, header: Any, columns: Sequence[Values], label: str, **more: Any) -> SpectrumTable:
+        is_relative = text_at(self.primary, "TELESCOP").upper().startswith("LAMOST")
+        return SpectrumTable(
+            columns,
+            next((t for key in ("TARGNAME", "TARGETID", "OBJECT") for one in (self.primary, header)
+                  if (t := text_at(one, key)[:80])), self.name),
+            self.origin,
+            label,
+            FITS_UNITS,
+            remarks=self._remarks(header) + more.pop("remarks", ""),
+            medium=partial(medium_of, self.primary, header),
+            notes=(*self._notes(header), *more.pop("notes", ())),
+            # LAMOST DR5, "Data production description", section 1: fluxes are calibrated relatively.
+            unscaled="LAMOST calibrates fluxes relative to each other" if is_relative else "",
+            **more,
+        )  # fmt: skip
+
+    def _remarks(self, header: Any) -> str:
+        headers = [self.primary] if self.primary is header else [self.primary, header]
+        texts = [text_at(one, key) for one in headers for key in _REMARKS]
+        # Comments beside the names and units of columns and axes, as in "TTYPE1 = 'WAVE' / in air".
+        cards = [key for key in header if re.fullmatch(r"T(?:TYPE|UNIT)\d+|C(?:TYPE|UNIT|RVAL)1", key)]
+        texts += [str(header.comments[key]) for key in cards] + [
+            text_at(header, key) for key in header if "TCOMM" in key
+        ]
+        return "\n".join(texts)[:100_000]
+
+    def _notes(self, header: Any) -> tuple[str, ...]:
+        notes = []
+        for key in ("DATAQUAL", "OFFSETPX"):
+            if value := text_at(self.primary, key) or text_at(header, key):
+                notes.append(f"{key} = {value[:60]}")
+        if "lowlib" in self.origin.lower():
+            notes.append("dereddened and at zero velocity: counts need it reddened again")
+        return tuple(notes)
+
+    def _of_table(self, number: int, hdu: Any) -> SpectrumTable:
+        header = hdu.header
+        # The units of the file apply to columns that state none (SDSS).
+        flux, wave = (unit_at(keys, self.primary, header) for keys in (FLUX_UNITS, WAVE_UNITS))
+        whole = dict.fromkeys(("flux", "model"), flux) | dict.fromkeys(AXES, wave)
+        columns = []
+        for title in map(str, hdu.columns.names):
+            column = self.file.column(number, title)
+            assert column is not None
+            role = role_of(title)
+            own = column.unit or role.unit
+            columns.append(column if own else replace(column, unit=whole.get(role.kind, "")))
+        ucds = " ".join(column.ucd for column in columns if column.ucd)
+        return self._table(header, columns, self._label(number, hdu), remarks=f"\n{ucds}")
+
+    def _images(self) -> tuple[list[SpectrumTable], list[InputError]]:
+        """Return the images with an axis of wavelengths, and the faults of others."""
+        images, errors = [], []
+        for number, hdu in enumerate(self.hdus):
+            if is_spectrum_image(hdu, text_at(hdu.header, "EXTNAME")):
+                try:
+                    images.append(self._of_image(number, hdu))
+                except InputError as error:
+                    errors.append(error)
+        flux = [one for one in images if one.label.strip().lower() in ("flux", "sci", "spectrum")]
+        return (flux if flux and not self.asked else images), errors
+
+    def _of_image(self, number: int, hdu: Any) -> SpectrumTable:
+        header = hdu.header
+        flux, names, note = rows_of(hdu, text_at(self.primary, "TELESCOP"), bool(self.asked))
+        system = text_at(header, "CTYPE1").upper()
+        if system.endswith("-TAB") or system.startswith("MULTISPE"):
+            axis = self.file.tabulated(header) if "-" in system else multispec_axis(header, flux.shape[-1])
+            columns = [axis, Values.of("flux", flux, text_at(header, "BUNIT"))]
+            return self._table(header, columns, self._label(number, hdu), notes=note, row_names=names)
+        axis, unit, kind, notes = axis_of(header, self.primary, flux.shape[-1])
+        # SDSS-I/II writes erg/cm/s/Ang for erg/cm2/s/Ang.
+        flux_unit = re.sub(r"erg/cm/s/", "erg/cm2/s/", unit_at(FLUX_UNITS, header, self.primary))
+        columns = [Values.of("wavelength", axis, unit), Values.of("flux", flux, flux_unit)]
+        remarks = "\nair wavelength" if kind == "AWAV" else "\nvacuum" if kind == "WAVE" else ""
+        return self._table(
+            header, columns, self._label(number, hdu), remarks=remarks, notes=(*notes, *note), row_names=names
+        )
+
+    def _of_pair(self, arm: str, axis: Any, flux: Any, rows: Sequence[str]) -> SpectrumTable:
+        """Return the table of an image of fluxes whose wavelengths are in another image (DESI, PFS, APOGEE)."""
+        name = text_at(axis.header, "EXTNAME").removeprefix(f"{arm}_")
+        columns = [replace(self.file.image(self.hdus.index(hdu)), name=title)
+                   for hdu, title in ((axis, name), (flux, "flux"))]  # fmt: skip
+        group = "arms" if arm else None
+        return self._table(flux.header, columns, arm or "flux", row_names=rows, group=group)
+
+    def _row_names(self) -> tuple[str, ...]:
+        """Return the targets of the rows of images, from a fibre map (DESI data model, coadd: FIBERMAP)."""
+        for hdu in self.hdus:
+            if text_at(hdu.header, "EXTNAME").upper() == "FIBERMAP" and "TARGETID" in getattr(hdu.columns, "names", ()):
+                return tuple(str(one) for one in hdu.data.field("TARGETID"))
+        return ()
+
 
 #: Largest number and length of messages in the table of a kept star, and length of the remarks on columns.
 MAX_NOTES, MAX_NOTE_LENGTH, MAX_REMARKS = 20, 400, 20_000
-
-
-def without_columns(path: str | Path) -> tuple[Path, tuple[str, ...]]:
-    """Divide ``grid.fits[g45]`` into the file and the words in brackets, which select a part of it.
-
-    If a file of this full name exists, it is returned.
-    """
-    text = str(path)
-    match = re.fullmatch(r"(?s)(.+?)\[([^\[\]]*)\]", text)
-    if match is None or Path(text).is_file():
-        return Path(text), ()
-    return Path(match[1]), tuple(one.strip() for one in match[2].split(",") if one.strip())
 
 
 def read_spectrum(
@@ -59,23 +406,25 @@ def read_spectrum(
     """
     import numpy as np
 
-    from mauvecl.host.spectra.conversion import converted
-    from mauvecl.host.spectra.selection import spectrum_in
+    from mauvecl.host.spectra.conversion import converted, spectrum_in
+    from mauvecl.host.tables.opening import open_content
 
     try:
         place, asked = without_columns(path)
     except (OSError, ValueError):
-        # `read_bytes` reports what is wrong with the name.
+        # `check_size` reports what is wrong with the name.
         place, asked = Path(path), ()
-    content = read_bytes(place, "spectrum file")
+    check_size(place, "spectrum file")
     shown = place.name if len(place.name) <= 80 else shortened(place.name)
+    units = (wavelength_unit is None, flux_unit is None)
     try:
-        units = (wavelength_unit is None, flux_unit is None)
-        with parsing("it", "a spectrum"):
-            content, origin = unpacked(content, "it"), f"file {shown}"
-            tables = _tables(content, _stem(place.name), origin, asked, units, not ignore_checksum)
         # Overflows become infinities, which the check of points rejects.
-        with parsing("it", "a spectrum"), np.errstate(all="ignore"):
+        with (
+            parsing("it", "a spectrum"),
+            open_content(place, "it", "spectrum file") as content,
+            np.errstate(all="ignore"),
+        ):
+            tables = _tables(content, _stem(place.name), f"file {shown}", asked, units, not ignore_checksum)
             return converted(spectrum_in(tables, asked), wavelength_unit, flux_unit)
     except InputError as error:
         raise error.within(shown) from error
@@ -87,25 +436,22 @@ def _stem(name: str) -> str:
 
 
 def _tables(
-    content: bytes, name: str, origin: str, asked: Sequence[str], units: tuple[bool, bool], check: bool
+    content: Content, name: str, origin: str, asked: Sequence[str], units: tuple[bool, bool], check: bool
 ) -> list[SpectrumTable]:
-    from mauvecl.host.spectra.fits_files import fits_tables
-    from mauvecl.host.spectra.text import table_of_text
     from mauvecl.host.tables.ecsv import parse_ecsv
-    from mauvecl.host.tables.opening import check_no_page, form_of, votables
+    from mauvecl.host.tables.opening import check_form, votables
     from mauvecl.host.tables.table import MemoryTable
-    from mauvecl.host.tables.text_table import text_of
+    from mauvecl.host.tables.text_tables import text_of
 
-    form = form_of(content[:4096])
-    if form == "FITS":
-        return fits_tables(content, name, origin, asked, check)
-    if form == "VOTable":
-        tables = enumerate(votables(content, "it", "a spectrum"), 1)
+    if content.form == "FITS":
+        return fits_tables(content.file, name, origin, asked, check)
+    if content.form == "VOTable":
+        tables = enumerate(votables(content.bytes, "it", "a spectrum"), 1)
         return [_in_memory(one, name, origin, str(one.header.get("name") or one.header.get("ID") or number))
                 for number, one in tables]  # fmt: skip
-    check_no_page(content, form, "it", "a spectrum")
-    text = text_of(content)
-    if form == "ECSV":
+    check_form(content, "it", "a spectrum in text, ECSV, FITS or VOTable")
+    text = text_of(content.bytes)
+    if content.form == "ECSV":
         table = MemoryTable(parse_ecsv(text, "it"), "it")
         own = table.header.get("name")
         return [_in_memory(table, own.strip()[:80] if isinstance(own, str) and own.strip() else name, origin)]
@@ -114,8 +460,8 @@ def _tables(
 
 def _in_memory(file: MemoryTable, name: str, origin: str, label: str = "") -> SpectrumTable:
     """Return the table of an ECSV file or a VOTable."""
-    from mauvecl.host.spectra.spectrum_table import SpectrumTable
-    from mauvecl.host.tables.medium import medium_of
+    from mauvecl.host.spectra.conversion import SpectrumTable
+    from mauvecl.host.spectra.units import medium_of
 
     columns = [file.find(one) for one in file.names]
     said = [f"{one.ucd} {one.description}" for one in columns]

@@ -16,16 +16,12 @@ from pathlib import Path
 from typing import IO
 from urllib.parse import urljoin, urlsplit
 
-from mauvecl.host.files.atomic import write_whole
-from mauvecl.host.files.parsing import parsing
-from mauvecl.host.files.size_limits import limit_bytes, read_bytes
-from mauvecl.host.spectra.coverage import check_covers
-from mauvecl.host.spectra.formats import without_columns
+from mauvecl.host.stars.coverage import check_covers
 from mauvecl.host.stars.library import OwnStar, embedded, find, folder, kept, spectrum_digest
 from mauvecl.host.stars.source import Source
+from mauvecl.host.tables.files import limit_bytes, parsing, read_bytes, without_columns, write_whole
 from mauvecl.host.version import VERSION
-from mauvecl.schema.errors import InputError
-from mauvecl.schema.text import shortened
+from mauvecl.schema.errors import InputError, shortened
 
 
 def add(
@@ -69,15 +65,10 @@ def add(
     if not re.fullmatch(r"[\w][\w .+\-*'()]{0,63}", name):
         raise InputError.of("name", name, "up to 64 letters, digits, spaces and . + - * ' ( )")
     if embedded(name) is not None:
-        raise InputError(
-            f"star name {name!r} is one of the embedded library's",
-            "another: give one with `name`",
-            key="name",
-            value=name,
-        )
+        raise InputError(f"star name {name!r} is one of the embedded library's: give another with `name`", key="name")
     there = find(name)
     if there is not None and not replace:
-        raise InputError(f"star {name!r} is kept already", "another name, or `replace=True`", key="name", value=name)
+        raise InputError(f"star {name!r} is kept already: give another name, or use `replace=True`", key="name")
     dereddened = any("dereddened" in note for note in source.notes)
     table = Table({"wavelength": source.wavelength_nm, "flux": source.flux_flam})
     table["wavelength"].unit, table["flux"].unit = "nm", "erg / (s cm2 Angstrom)"
@@ -97,9 +88,7 @@ def add(
     place = folder() / f"{re.sub(r'[^A-Za-z0-9.+-]', '_', name)}.ecsv" if there is None else there.path
     alike = re.sub(r"[\s_]+", "_", name.casefold())
     if there is None and any(re.sub(r"[\s_]+", "_", star.name.casefold()) == alike for star in kept()):
-        raise InputError(
-            f"star name {name!r} is too much like another kept star's", "another name", key="name", value=name
-        )
+        raise InputError(f"star name {name!r} is too much like another kept star's: give another", key="name")
     if there is None and place.exists():
         # Letters that file names cannot have, such as Greek ones, are equal in them: the digest of the name differs.
         place = place.with_stem(f"{place.stem}-{hashlib.sha256(name.casefold().encode()).hexdigest()[:8]}")
@@ -216,11 +205,11 @@ def fetch(
         raise InputError.of("collection", word, f"one of {known}")
     if base is not None and not colon:
         raise InputError(
-            f"another address is given for {name!r}", f"its collection too, such as ngsl:{name}", key="name", value=name
+            f"another address is given for {name!r}", f"its collection too, such as ngsl:{name}", key="name"
         )
     star = star if colon else word
     if not _file_name(star):
-        raise InputError(f"star {name!r} has an empty name", "a name such as ngsl:HD 37202", key="name", value=name)
+        raise InputError(f"star {name!r} has an empty name", "a name such as ngsl:HD 37202", key="name")
     for collection in chosen:
         address = base or collection.base
         try:
@@ -240,7 +229,6 @@ def fetch(
                 f"{url} was downloaded but is not a usable spectrum ({str(error).replace(local.name, file)})",
                 "a whole file",
                 key="base",
-                value=url,
             ) from error
         finally:
             local.unlink(missing_ok=True)
@@ -249,7 +237,6 @@ def fetch(
         f"no star {star!r} in {where}",
         "its name there, such as HD 37202; or bring the file: mauvecl library add",
         key="name",
-        value=name,
     )
 
 
@@ -286,9 +273,7 @@ def _download(url: str, show_progress: bool, max_bytes: int | None = None) -> Pa
             if error.code in (403, 404, 410):
                 # Object stores answer 403 for a missing file.
                 raise FileNotFoundError(url) from error
-            raise InputError(
-                f"{url} answers {error.code} {error.reason}", "the file: try again later", key="base", value=url
-            ) from error
+            raise InputError(f"{url} answers {error.code} {error.reason}: try again later", key="base") from error
         if not isinstance(error, OSError | ValueError | http.client.HTTPException):
             raise
         # Invalid host names raise ValueError (IDNA codec), malformed responses HTTPException.
@@ -297,7 +282,6 @@ def _download(url: str, show_progress: bool, max_bytes: int | None = None) -> Pa
             f"{url} cannot be reached ({reason})",
             f"a network; without one bring the file: mauvecl library add {url.rsplit('/', 1)[1] or 'FILE'}",
             key="base",
-            value=url,
         ) from error
 
 
@@ -322,25 +306,16 @@ def _receive(url: str, file: IO[bytes], max_bytes: int, show_progress: bool) -> 
                     size = got
                 if time.monotonic() > latest:
                     raise InputError(
-                        f"the download of {url} takes more than {MAX_DOWNLOAD_S:.0f} s",
-                        "less: try again later",
-                        key="base",
-                        value=url,
+                        f"the download of {url} takes more than {MAX_DOWNLOAD_S:.0f} s: try again later", key="base"
                     )
     if size is not None and size > max_bytes:
         raise InputError(
             f"{url} has more than {max_bytes >> 20} MiB",
             "less; MAUVECL_LARGEST_FILE_MIB sets the limit of files",
             key="MAUVECL_LARGEST_FILE_MIB",
-            value=max_bytes >> 20,
         )
     if size is not None and got < size:
-        raise InputError(
-            f"the download of {url} ended early ({got} of {size} bytes received)",
-            "the whole file: try again",
-            key="base",
-            value=url,
-        )
+        raise InputError(f"the download of {url} ended early ({got} of {size} bytes received): try again", key="base")
 
 
 def _listing(address: str, below: str) -> list[str]:

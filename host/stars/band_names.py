@@ -24,4 +24,4 @@ def known_band(name: str) -> str:
     for known, others in ALIASES.items():
         if wanted in (known.casefold(), *(other.casefold() for other in others)):
             return known
-    raise InputError(f"band {name!r} is unknown", f"one of {', '.join(ALIASES)}", key="band", value=name)
+    raise InputError(f"band {name!r} is unknown", f"one of {', '.join(ALIASES)}", key="band")

@@ -17,12 +17,11 @@ import numpy as np
 from astropy.constants import c, h
 from numpy.typing import NDArray
 
-from mauvecl.host.array_cache import array_cache
+from mauvecl.host.arrays import array_cache
 from mauvecl.host.stars.band_names import known_band
 from mauvecl.host.stars.blackbody import ANGSTROM
 from mauvecl.host.stars.library import band_table, embedded, spectrum_table
-from mauvecl.schema.errors import InputError
-from mauvecl.schema.text import shortened
+from mauvecl.schema.errors import InputError, shortened
 
 Float = NDArray[np.float64]
 
@@ -86,10 +85,7 @@ def scale(name: str, system: System = "catalogue") -> str:
 def _check_system(system: str) -> None:
     if system not in SYSTEMS:
         raise InputError(
-            f"magnitude system {shortened(str(system))} is unknown",
-            f"one of {', '.join(SYSTEMS)}",
-            key="system",
-            value=system,
+            f"magnitude system {shortened(str(system))} is unknown", f"one of {', '.join(SYSTEMS)}", key="system"
         )
 
 
@@ -114,9 +110,7 @@ def magnitude(wavelength_nm: Float, flux_flam: Float, name: str = "V", system: S
     grid = np.union1d(wavelength_nm, chosen.wavelength_nm) * 10.0
     star = _photon_rate(grid, *_photon_density(wavelength_nm, flux_flam, chosen), chosen)
     if not star > 0.0:
-        raise InputError(
-            f"the spectrum has no light in the band {chosen.name}", "a positive flux", key="band", value=chosen.name
-        )
+        raise InputError(f"the spectrum has no light in the band {chosen.name}", "a positive flux", key="band")
     if system == "ab" or (system == "catalogue" and chosen.system == "AB"):
         return _ab_magnitude(star, grid, chosen)
     vega = math.log10(photons(*_vega(), chosen.name))
@@ -153,7 +147,6 @@ def _covered(wavelength_nm: Float, name: str) -> Band:
             f"{COVERAGE:.0%} of the band {chosen.name} ({chosen.wavelength_nm[0]:.0f}-"
             f"{chosen.wavelength_nm[-1]:.0f} nm), not {share:.0%}",
             key="band",
-            value=chosen.name,
         )
     return chosen
 

@@ -7,7 +7,7 @@ import numpy as np
 from astropy.constants import c, h, k_B
 from numpy.typing import NDArray
 
-from mauvecl.host.array_cache import array_cache
+from mauvecl.host.arrays import array_cache
 
 #: Angstrom per nanometre, with astropy's rounding.
 ANGSTROM = float(u.nm.to(u.AA))

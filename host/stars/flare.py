@@ -9,15 +9,14 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.files.parsing import LARGEST, SMALLEST
 from mauvecl.host.stars.bands import photons
 from mauvecl.host.stars.blackbody import blackbody
+from mauvecl.host.tables.files import LARGEST, SMALLEST
 from mauvecl.host.tables.opening import read_table
-from mauvecl.host.tables.rows import Rows
-from mauvecl.schema.errors import InputError
+from mauvecl.host.tables.table import Rows
+from mauvecl.schema.errors import InputError, shortened, shown
 from mauvecl.schema.fields import checked
 from mauvecl.schema.physical import Amplitude, Temperature
-from mauvecl.schema.text import shortened, shown
 
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
@@ -69,7 +68,6 @@ def with_flare(
                 f"flare amplitude = {amplitude:g} is less than the rise of {rise:g} by its lines in {band}",
                 "more",
                 key="flare_amplitude",
-                value=amplitude,
             )
         return grid, quiescent + lines + (amplitude - rise) * light.star / light.hot * body
     if light.ratio is None:
@@ -80,7 +78,6 @@ def with_flare(
             f"flare amplitude = {amplitude:g} needs {filling:.2f} of the star's disc at {spectrum.describe()}",
             f"at most {light.ratio - 1.0:.3g}",
             key="flare_amplitude",
-            value=amplitude,
         )
     return grid, quiescent * (1.0 - filling) + filling * light.ratio * light.star / light.hot * body
 
@@ -126,7 +123,6 @@ def check_scales(spectrum: FlareSpectrum) -> None:
             f"a flare of {spectrum.describe()} has lines that do not scale with its amplitude",
             "lines as a fraction of its continuum",
             key="lines",
-            value=spectrum.describe(),
         )
 
 
@@ -150,16 +146,11 @@ def _photons_in_band(
     grid, quiescent = _on_grid(wavelength_nm, flux_flam, spectrum)
     star = photons(grid, quiescent, band)
     if not star > 0.0:
-        raise InputError(
-            f"the star has no light in the band {band}", "a star with light in the band", key="band", value=band
-        )
+        raise InputError(f"the star has no light in the band {band}", "a star with light in the band", key="band")
     hot = photons(grid, spectrum.flux(grid), band)
     if not hot > 0.0:
         raise InputError(
-            f"the flare, {spectrum.describe()}, has no light in the band {band}",
-            "some to scale",
-            key="band",
-            value=band,
+            f"the flare, {spectrum.describe()}, has no light in the band {band}", "some to scale", key="band"
         )
     if geometry == "added":
         return _Photons(star, hot, None)
@@ -167,14 +158,12 @@ def _photons_in_band(
         raise InputError.of("flare geometry", geometry, "'added' or 'replaces'")
     if photosphere_temperature_k is None:
         raise InputError(
-            "flare geometry 'replaces' needs a photosphere temperature", "one in K", key="photosphere_temperature"
+            "flare geometry 'replaces' needs a photosphere temperature, in K", key="photosphere_temperature"
         )
     if not spectrum.surface or spectrum.fixed_lines:
         raise InputError(
-            f"flare geometry 'replaces' with {spectrum.describe()}",
-            "'added': its surface flux is unknown",
+            f"flare geometry must be 'added' with {spectrum.describe()}, since its surface flux is unknown",
             key="flare_geometry",
-            value=geometry,
         )
     checked(Temperature, "photosphere temperature", photosphere_temperature_k)
     ratio = hot / photons(wavelength_nm, blackbody(wavelength_nm, photosphere_temperature_k), band)
@@ -183,7 +172,6 @@ def _photons_in_band(
             f"flare temperature = {spectrum.describe()} is no hotter than the photosphere it replaces",
             f"more than {photosphere_temperature_k:g} K",
             key="flare_temperature",
-            value=spectrum.describe(),
         )
     return _Photons(star, hot, ratio)
 
@@ -238,12 +226,15 @@ def flares_of(table: Table | Any, name: str = "flare table") -> QTable:
     # AltaiPony's tables have an empty row for a star without flares.
     kept = [row for row, values in enumerate(cells) if any(value is not None for value in values)]
     if not 0 < len(kept) <= MAX_FLARES:
-        raise rows.error(f"holds {len(kept)} flares", f"1 to {MAX_FLARES}", "amplitude", len(kept))
+        raise rows.error(f"holds {len(kept)} flares", f"1 to {MAX_FLARES}", "amplitude")
     for row in kept:
         value = cells[row][0]
         if value is None or not SMALLEST <= value <= LARGEST:
             shown_value = "no amplitude" if value is None else f"an amplitude of {value:g}"
-            raise rows.error(f"row {row + 1} has {shown_value}", "a relative rise above 0", "amplitude", value)
+            raise rows.error(f"row {row + 1} has {shown_value}", "a relative rise above 0", "amplitude")
+        begin, end = cells[row][1:]
+        if begin is not None and end is not None and end < begin:
+            raise rows.error(f"row {row + 1} begins at {begin:.10g} d and ends at {end:.10g} d", "a later end", "stop")
     flares = QTable({"amplitude": [cells[row][0] for row in kept]})
     for place, (title, (held, unit)) in enumerate(columns.items()):
         if place and held is not None:

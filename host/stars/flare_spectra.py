@@ -15,16 +15,15 @@ from typing import Annotated, Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mauvecl.host.content_equality import ContentEquality
-from mauvecl.host.spectra.coverage import check_points
+from mauvecl.host.arrays import ContentEquality
 from mauvecl.host.spectra.formats import read_spectrum
-from mauvecl.host.spectra.wavelength_range import NEEDED_NM
+from mauvecl.host.spectra.units import NEEDED_NM
 from mauvecl.host.stars.blackbody import blackbody
+from mauvecl.host.stars.coverage import check_points
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Range, Unit
+from mauvecl.schema.fields import Range, Unit, number
 from mauvecl.schema.physical import AreaRatio, BalmerJump, LineFraction, Temperature
-from mauvecl.schema.quantities import number
 
 Float = NDArray[np.float64]
 Wavelengths = Annotated[Float, Unit("nm")]
@@ -269,9 +268,7 @@ class FlareWithLines(FlareSpectrum):
             EmissionLine.named(name)
         both = set(self.fractions) & set(self.fluxes_cgs)
         if both:
-            raise InputError(
-                f"the line {min(both)!r} has a fraction and a flux", "one of them", key="lines", value=min(both)
-            )
+            raise InputError(f"the line {min(both)!r} needs either a fraction or a flux, but has both", key="lines")
 
     @property
     def temperature_k(self) -> float | None:  # type: ignore[override]
@@ -365,16 +362,12 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
                 f"the flare spectrum {self.name} covers {ends[0]:g}-{ends[1]:g} nm",
                 f"{NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm, or the temperature of a blackbody that continues it",
                 key="continue_at_k",
-                value=ends,
             )
         if self.measured_nm == (0.0, 0.0):
             object.__setattr__(self, "measured_nm", ends)
         if not self.bolometric_flux() > 0.0:
             raise InputError(
-                f"the flare spectrum {self.name} has a total flux of {self.bolometric_flux():g}",
-                "> 0",
-                key="flux",
-                value=self.bolometric_flux(),
+                f"the flare spectrum {self.name} has a total flux of {self.bolometric_flux():g}", "> 0", key="flux"
             )
 
     @classmethod
@@ -400,7 +393,7 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
         nm, flux = np.asarray(wavelength_nm, np.float64), np.asarray(flux_flam, np.float64)
         check_points(name, nm, flux)
         if not np.isfinite(flux).all():
-            raise InputError(f"the flare spectrum {name} has undefined fluxes", "finite ones", key="flux", value=name)
+            raise InputError(f"the flare spectrum {name} has undefined fluxes", "finite ones", key="flux")
         measured = float(nm[0]), float(nm[-1])
         gaps = [f"{nm[i]:.1f}-{nm[i + 1]:.1f}" for i in np.flatnonzero(np.diff(nm) > GAP_NM)]
         if gaps:
@@ -449,10 +442,8 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
             inside = (nm >= star.wavelength_nm[0]) & (nm <= star.wavelength_nm[-1])
             if inside.sum() < 2:
                 raise InputError(
-                    f"the spectra {read.name} and {star.name} do not overlap",
-                    "the same star",
+                    f"the spectra {read.name} and {star.name} must be of the same star, but do not overlap",
                     key="quiescent",
-                    value=star.name,
                 )
             nm, messages = nm[inside], (*messages, *star.messages)
             quiet = np.interp(nm, star.wavelength_nm, star.flux_flam)
@@ -463,7 +454,6 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
                     f"the spectrum {read.name} is no brighter than {star.name}, which is subtracted from it",
                     "the star with its flare, and the same star without it",
                     key="quiescent",
-                    value=star.name,
                 )
         return cls.from_arrays(
             nm, flux, name=read.name, continue_at_k=continue_at_k,
@@ -510,7 +500,6 @@ def _continued(name: str, nm: Float, flux: Float, kelvin: float) -> tuple[Float,
                 f"the flare spectrum {name} has no light near {end:g} nm",
                 "some to scale a blackbody to",
                 key="continue_at_k",
-                value=kelvin,
             )
         if first:
             added = np.exp(np.arange(np.log(low), np.log(end), steps))

@@ -20,11 +20,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mauvecl.host.tables.ecsv import Numbers, parse_numbers, read_ecsv
-from mauvecl.schema.errors import InputError
+from mauvecl.schema.columns import Column
+from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.fields import Range, checked, checked_number
 from mauvecl.schema.physical import Temperature
-from mauvecl.schema.tables import Column
-from mauvecl.schema.text import shortened
 
 if TYPE_CHECKING:
     import numpy as np
@@ -151,7 +150,6 @@ def spectrum(star: OwnStar) -> tuple[np.ndarray, np.ndarray]:
             f"kept star {star.name!r} was changed after it was kept (its digest differs)",
             "the unchanged file: add or fetch it again",
             key="name",
-            value=star.name,
         )
     return wavelength, flux
 
@@ -362,10 +360,7 @@ def subtype(spectral_type: str) -> float:
     matched = _TYPE.match(spectral_type)
     if not matched:
         raise InputError(
-            f"spectral type {shortened(spectral_type)} is unknown",
-            "one from O to M, such as M3V",
-            key="spectral_type",
-            value=spectral_type,
+            f"spectral type {shortened(spectral_type)} is unknown", "one from O to M, such as M3V", key="spectral_type"
         )
     return 10.0 * CLASSES.index(matched[1]) + (5.0 if matched[2] is None else float(matched[2]))
 
@@ -442,9 +437,7 @@ def spectrum_name(text: str, key: str = "star", *, own: bool = True) -> str:
     """
     star = resolve(text, own=own)
     if star is None:
-        raise InputError(
-            f"star {text.strip()!r} is unknown", f"a name such as {', '.join(near_names(text))}", key=key, value=text
-        )
+        raise InputError(f"star {text.strip()!r} is unknown", f"a name such as {', '.join(near_names(text))}", key=key)
     if star.spectrum is not None:
         return star.spectrum
     proposed = f"`{key}={star.nearest!r}`"
@@ -453,14 +446,12 @@ def spectrum_name(text: str, key: str = "star", *, own: bool = True) -> str:
             f"spectral type {text.strip()!r} has no spectrum in the library",
             f"the nearest, {proposed}, or a name such as {', '.join(near_names(text))}",
             key=key,
-            value=text,
         )
     raise InputError(
         f"star {text.strip()!r} has no spectrum in the library",
         f"that of the nearest type and its V: {proposed} with `magnitude={star.known.magnitude:g}` "
         f"({star.name}: {star.known.about})",
         key=key,
-        value=text,
     )
 
 

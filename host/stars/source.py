@@ -12,8 +12,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mauvecl.host.content_equality import ContentEquality
-from mauvecl.host.spectra.coverage import (
+from mauvecl.host.arrays import ContentEquality
+from mauvecl.host.spectra.formats import read_spectrum
+from mauvecl.host.spectra.units import SPAN_NM
+from mauvecl.host.stars import bands
+from mauvecl.host.stars.coverage import (
     check_flux,
     check_measured,
     check_points,
@@ -24,9 +27,6 @@ from mauvecl.host.spectra.coverage import (
     remarks,
     without_undefined_ends,
 )
-from mauvecl.host.spectra.formats import read_spectrum
-from mauvecl.host.spectra.wavelength_range import SPAN_NM
-from mauvecl.host.stars import bands
 from mauvecl.host.stars.flare import Geometry, with_flare
 from mauvecl.host.stars.flare_spectra import Blackbody, FlareSpectrum
 from mauvecl.host.stars.library import ModelStar, embedded, find, spectrum, spectrum_table
@@ -300,7 +300,7 @@ class Source(Drawable, ContentEquality):
             raise InputError.of("spectrum", spectrum, "a SourceSpectrum of synphot")
         own = spectrum.waveset
         if own is None:
-            raise InputError(f"{name} defines no wavelengths", "a spectrum with a waveset", key="spectrum", value=name)
+            raise InputError(f"{name} defines no wavelengths", "a spectrum with a waveset", key="spectrum")
         grid = np.arange(160.0, 1150.0, 0.5)
         nm = np.unique(own.to_value(u.nm))
         inside = grid[(grid > nm[0]) & (grid < nm[-1])]
@@ -318,7 +318,7 @@ class Source(Drawable, ContentEquality):
             raise InputError.of("spectrum", spectrum, "a Spectrum of specutils")
         axis, flux = spectrum.spectral_axis, spectrum.flux
         if flux.ndim != 1:
-            raise InputError(f"{name} has shape {flux.shape}", "one spectrum", key="spectrum", value=flux.shape)
+            raise InputError(f"{name} has shape {flux.shape}", "one spectrum", key="spectrum")
         import astropy.units as u
 
         order = np.argsort(axis.to_value(u.nm, u.spectral()))
@@ -481,12 +481,12 @@ class Source(Drawable, ContentEquality):
         try:
             model = getattr(parameter_averages, law)(Rv=rv)
         except ValueError as error:
-            raise InputError(f"R_V = {rv!r}: {error}", f"what the law {law} allows", key="rv", value=rv) from error
+            raise InputError(f"R_V = {rv!r}: {error}", f"what the law {law} allows", key="rv") from error
         # Laws end in the far ultraviolet, whose light does not reach the detector.
         low, high = 1000.0 / np.asarray(model.x_range)[::-1]
         inside = (self.wavelength_nm >= low) & (self.wavelength_nm <= high)
         if low > SPAN_NM[0] or high < SPAN_NM[1]:
-            raise InputError(f"extinction law {law} covers {low:.0f}-{high:.0f} nm", "180-750 nm", key="law", value=law)
+            raise InputError(f"extinction law {law} covers {low:.0f}-{high:.0f} nm", "180-750 nm", key="law")
         flux = self.flux_flam[inside] * model.extinguish(self.wavelength_nm[inside] * u.nm, Ebv=ebv)
         history = (*self.history, f"reddened by E(B-V) = {ebv:g}, {law}, R_V = {rv:g}")
         return replace(self, wavelength_nm=self.wavelength_nm[inside], flux_flam=flux, history=history)

@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 
 from mauvecl.host.tables.names import divided_unit
-from mauvecl.schema.errors import InputError
-from mauvecl.schema.text import shortened
+from mauvecl.schema.errors import InputError, shortened
 
 #: Signs, quotes and blanks of typeset text, which are read as those of a keyboard.
-_TYPESET = str.maketrans("−–—‐‑‒﹣－＋º˚′’ʹ″”ʺ，；：", "--------+°°'''\"\"\",;:", "\u200b\u200e\u200f\ufeff")
+_TYPESET = str.maketrans("−–—‐‑‒﹣－＋º˚′’ʹ″”ʺ，；：ʰᵐˢᵈ", "--------+°°'''\"\"\",;:hmsd", "\u200b\u200e\u200f\ufeff")
 _NUMBER = r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?"
 _PLAIN = re.compile(_NUMBER)
 _LABEL = re.compile(r"\b(?:ra|dec|de|icrs|j2000(?:\.0)?)\b\s*[=:]?", re.IGNORECASE)
@@ -36,6 +35,8 @@ def angle_unit(text: str) -> str | None:
     """Return the unit of an angle as astropy names it, or None for another unit."""
     import astropy.units as u
 
+    # Of old files of the Gaia archive.
+    text = re.sub(r"^Angle\[(.*)\]$", r"\1", text)
     found = ANGLES.get(text.strip().strip("\"'" if len(text.strip()) > 1 else "").lower())
     if found is not None:
         return found
@@ -47,7 +48,7 @@ def angle_unit(text: str) -> str | None:
     return "hourangle" if unit == u.hourangle else str(unit) if unit.is_equivalent(u.deg) else None
 
 
-def unit_in_name(name: str) -> str:
+def angle_unit_in_name(name: str) -> str:
     """Return the unit in the name of a column, as in ``ra_hours`` or ``dec [rad]``; empty if there is none."""
     base, unit = divided_unit(name)
     tail = re.split(r"[\s_.]+", base)[1:]
@@ -75,7 +76,7 @@ def position(text: str) -> tuple[float, float]:
     try:
         ra, dec = (angle(part, right_ascension=k == 0, pair=len(parts[1 - k].split())) for k, part in enumerate(parts))
     except InputError as error:
-        raise InputError(f"target = {shortened(text)}: {error}", EXPECTED, key="target", value=text) from error
+        raise InputError(f"target = {shortened(text)}: {error}", EXPECTED, key="target") from error
     except ValueError:
         raise unknown from None
     return ra, dec
@@ -118,7 +119,7 @@ def angle(text: str, unit: str = "", *, right_ascension: bool, pair: int = 3) ->
     name, low, high = ("right ascension", 0.0, 360.0) if right_ascension else ("declination", -90.0, 90.0)
     if not (np.isfinite(value) and low <= value <= high):
         expected = f"{low:g} to {high:g} degrees"
-        raise InputError(f"{shortened(text)} is a {name} of {value:g}", expected, key="target", value=text)
+        raise InputError(f"{shortened(text)} is a {name} of {value:g}", expected, key="target")
     return value
 
 

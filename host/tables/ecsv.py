@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mauvecl.host.files.parsing import as_text, parsing
-from mauvecl.host.files.size_limits import LONGEST_LINE, limit_bytes, read_bytes, unpacked
-from mauvecl.schema.errors import InputError
-from mauvecl.schema.text import shortened
+from mauvecl.host.tables.files import LONGEST_LINE, as_text, limit_bytes, parsing, read_bytes, unpacked
+from mauvecl.schema.errors import InputError, shortened
 
 if TYPE_CHECKING:
     import numpy as np
@@ -21,6 +20,8 @@ if TYPE_CHECKING:
 MOST_VALUES = 100_000
 #: Largest number of characters of a header; YAML in pure Python takes half a minute for a megabyte.
 MOST_HEADER = 256 * 2**10
+#: A cell in quotes, and a quote that begins one; others are units, as in ``-3°00'00"``.
+_QUOTED, _OPEN = re.compile(r'(?:^|(?<=[,;|\t ]))"(?:[^"]|"")*"(?=[,;|\t ]|$)'), re.compile(r'(?:^|[,;|\t ])"')
 
 
 def read_ecsv(path: str | Path, what: str, expected: str = "an ECSV table") -> Table:
@@ -44,7 +45,7 @@ def parse_ecsv(text: str, what: str, expected: str = "an ECSV table") -> Table:
     # These imports are slow and only needed here.
     from astropy.table import Table
 
-    from mauvecl.host.tables.times import with_mission_formats
+    from mauvecl.host.tables.units import with_mission_formats
 
     lines = text.splitlines()
     check_header(lines, what)
@@ -126,7 +127,7 @@ def check_header(lines: list[str], what: str) -> None:
     header = [line[2:] for line in lines if line.startswith("# ")]
     size = sum(map(len, header))
     if size > MOST_HEADER:
-        raise InputError(f"{what} has a header of {size} characters", f"at most {MOST_HEADER}", key="file", value=size)
+        raise InputError(f"{what} has a header of {size} characters", f"at most {MOST_HEADER}", key="file")
     if not any("*" in line for line in header):
         return
     sizes: dict[int, int] = {}
@@ -162,10 +163,10 @@ def check_cells(lines: list[str], what: str) -> None:
         fault = f"{what} has a line of {widest} characters among {len(lines)}"
         limit = "MAUVECL_LARGEST_CONTENT_MIB"
         expected = f"less than {most >> 20} MiB together if each were as long; {limit} sets the limit"
-        raise InputError(fault, expected, key=limit, value=widest)
+        raise InputError(fault, expected, key=limit)
     if widest > LONGEST_LINE:
         fault = f"{what} has a line of {widest} characters"
-        raise InputError(fault, f"at most {LONGEST_LINE}", key="file", value=widest)
-    odd = next((number for number, line in enumerate(lines, 1) if line.count('"') % 2), None)
+        raise InputError(fault, f"at most {LONGEST_LINE}", key="file")
+    odd = next((n for n, line in enumerate(lines, 1) if '"' in line and _OPEN.search(_QUOTED.sub("", line))), None)
     if odd is not None:
-        raise InputError(f"{what} has a cell that extends beyond row {odd}", "one line per row", key="file", value=odd)
+        raise InputError(f"{what} has a cell that extends beyond row {odd}", "one line per row", key="file")

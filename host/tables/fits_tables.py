@@ -1,19 +1,445 @@
-"""Frames in FITS files: tables with a row for each frame, and images with their axes."""
+"""FITS files: their headers, tables and images."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import io
+import math
+import re
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mauvecl.host.tables.fits import BLOCK, column_values, reading, text_at
-from mauvecl.host.tables.fits_images import axis_of
+from mauvecl.host.tables.files import limit_bytes, parsing
 from mauvecl.host.tables.names import matched
 from mauvecl.host.tables.table import PIECE_BYTES, TableFile, Values
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from astropy.io import fits
+
+#: Bytes of a block (FITS standard 4.0, section 3.1), and largest numbers of cards of a header and of extensions.
+BLOCK, MAX_CARDS, MAX_EXTENSIONS = 2880, 100_000, 1000
+#: Largest number of columns (section 7.2.1).
+MAX_FIELDS = 999
+#: Largest number of bytes after the last extension.
+MAX_AFTER = 2**20
+WHOLE = "a whole FITS file"
+#: astropy's classes of extensions whose headers it cannot interpret.
+DAMAGED = ("_ValidHDU", "_NonstandardHDU", "_CorruptedHDU")
+#: Bytes that are summed at a time.
+PIECE = 2**12 * BLOCK
+
+
+def check_sizes(content: FileContent) -> None:
+    """Raise InputError for headers whose sizes are impossible or larger than the file.
+
+    astropy's reader would never end for a negative size.
+    """
+    place = 0
+    for number in range(MAX_EXTENSIONS + 1):
+        if content[place : place + 8] not in (b"SIMPLE  ", b"XTENSION"):
+            if len(content) - place > MAX_AFTER:
+                # astropy would search all of it for the end of a header.
+                fault = f"has {len(content) - place} bytes after its extension {number - 1}"
+                raise InputError(fault, f"at most {MAX_AFTER}", key="file")
+            return
+        if number == MAX_EXTENSIONS:
+            break
+        cards: dict[bytes, bytes] = {}
+        at = place
+        while content[at : at + 8] != b"END     ":
+            card = content[at : at + 80]
+            if len(card) < 80 or at - place > 80 * MAX_CARDS:
+                raise InputError(f"has a header {number} without an end", WHOLE, key="file")
+            cards.setdefault(card[:8].strip(), card[10:].split(b"/")[0].strip())
+            at += 80
+        start = place + -(-(at + 80 - place) // BLOCK) * BLOCK
+        try:
+            axes = [int(cards[b"NAXIS%d" % (k + 1)]) for k in range(min(int(cards[b"NAXIS"]), 999))]
+            bits, extra, groups, fields = (
+                int(cards.get(k, d))
+                for k, d in ((b"BITPIX", b""), (b"PCOUNT", b"0"), (b"GCOUNT", b"1"), (b"TFIELDS", b"0"))
+            )
+        except (KeyError, ValueError) as error:
+            raise InputError(f"has a header {number} whose sizes are not numbers", WHOLE, key="file") from error
+        if axes[:1] == [0] and len(axes) > 1:
+            # Random groups.
+            axes = axes[1:]
+        if min([extra, groups, *axes]) < 0 or abs(bits) > 64 or not 0 <= fields <= MAX_FIELDS:
+            raise InputError(f"has a header {number} with impossible sizes", WHOLE, key="file")
+        size = abs(bits) // 8 * groups * (extra + math.prod(axes) if axes else 0)
+        if start + size > len(content):
+            fault = (
+                f"is truncated: its extension {number} should have {size} bytes, of which "
+                f"{max(0, len(content) - start)} are present"
+            )
+            raise InputError(fault, "a whole file", key="file")
+        place = start + -(-size // BLOCK) * BLOCK
+    raise InputError(f"has more than {MAX_EXTENSIONS} extensions", "fewer", key="file")
+
+
+@contextmanager
+def reading(what: str) -> Iterator[None]:
+    """Convert any fault of astropy's reader to InputError, and keep its warnings quiet.
+
+    astropy warns of the headers of old archive files that it can read.
+    """
+    with parsing(what, WHOLE), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+def open_fits(file: IO[bytes], what: str = "", *, check: bool = True) -> fits.HDUList:
+    """Open a FITS file after a check of its sizes and checksums; its data are read on access.
+
+    Parameters
+    ----------
+    what : str
+        The file, for messages.
+    check : bool
+        Whether to verify checksums, for which the whole file is read.
+    """
+    from astropy.io import fits
+
+    content = FileContent(file)
+    try:
+        check_sizes(content)
+        file.seek(0)
+        with reading("it"):
+            hdus = fits.open(file, mode="readonly", memmap=False, lazy_load_hdus=False, disable_image_compression=True)
+        with reading("it"):
+            check_extensions(hdus)
+        if check:
+            check_sums(hdus, content)
+        packed = [hdu for hdu in hdus if text_at(hdu.header, "ZIMAGE") == "True"]
+        if packed:
+            check_images(packed)
+            file.seek(0)
+            with reading("it"):
+                hdus = fits.open(file, mode="readonly", memmap=False, lazy_load_hdus=False)
+    except InputError as error:
+        raise (error.within(what) if what else error) from error
+    return hdus
+
+
+def check_extensions(hdus: Any) -> None:
+    """Raise InputError for an extension whose header is damaged, such as a second primary header.
+
+    astropy reads rows by the formats of their columns, also where they do not take NAXIS1 bytes.
+    """
+    from astropy.io import fits
+
+    for number, hdu in enumerate(hdus):
+        if type(hdu).__name__ in DAMAGED or (number > 0 and "SIMPLE" in hdu.header):
+            raise InputError(f"has a damaged header in extension {number}", WHOLE, key="file")
+        if not isinstance(hdu, fits.BinTableHDU):
+            continue
+        if text_at(hdu.header, "ZTABLE") == "True":
+            fault = f"has a table compressed by `fpack` in extension {number}"
+            raise InputError(fault, "the file after `funpack`", key="file")
+        names = hdu.columns.names
+        if odd := next((name for name in names if name is not None and names.count(name) > 1), None):
+            fault = f"has several columns named {odd!r} in extension {number}"
+            raise InputError(fault, "another name for each", key="columns")
+        if None in names:
+            fault = f"has a column whose TTYPE{names.index(None) + 1} is empty in extension {number}"
+            raise InputError(fault, "a name for each column", key="columns")
+        size = sum(np.dtype(column.format.recformat).itemsize for column in hdu.columns)
+        if size != hdu.header["NAXIS1"]:
+            fault = f"has rows of {hdu.header['NAXIS1']} bytes in extension {number}, whose columns take {size}"
+            raise InputError(fault, WHOLE, key="file")
+
+
+def check_images(packed: Sequence[Any]) -> None:
+    """Raise InputError for images in compressed tiles (standard 4.0, section 10.1) that are large or damaged."""
+    most = limit_bytes("MAUVECL_LARGEST_CONTENT_MIB")
+    for hdu in packed:
+        with reading("it"):
+            header = hdu.header
+            axes = [int(header[f"ZNAXIS{k + 1}"]) for k in range(int(header["ZNAXIS"]))]
+            tiles = [int(header.get(f"ZTILE{k + 1}", axes[0] if k == 0 else 1)) for k in range(len(axes))]
+            size = abs(int(header["ZBITPIX"])) // 8 * max(math.prod(axes), math.prod(tiles))
+        if min(*axes, *tiles) < 1:
+            raise InputError(f"has a compressed image of {axes} pixels in tiles of {tiles}", WHOLE, key="file")
+        if size > most:
+            raise InputError(f"has a compressed image that unpacks to more than {most >> 20} MiB",
+                             "less; MAUVECL_LARGEST_CONTENT_MIB sets the limit", key="file")  # fmt: skip
+
+
+class FileContent:
+    """Bytes of a file that are read on access."""
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self.file = file
+        self.size = file.seek(0, io.SEEK_END)
+
+    def __len__(self) -> int:
+        return self.size
+
+    def __getitem__(self, part: slice) -> bytes:
+        self.file.seek(part.start)
+        return self.file.read(part.stop - part.start)
+
+
+def check_sums(hdus: Any, content: FileContent) -> None:
+    """Raise InputError if DATASUM or CHECKSUM (FITS standard 4.0, section 4.4.2.7) contradict the bytes.
+
+    The sum of all words of a header and its data is zero, as is the complement of zero, with or without DATASUM.
+    astropy's check leaves the data out where there is no DATASUM.
+    """
+    for number, hdu in enumerate(hdus):
+        stated = {key: text_at(hdu.header, key) for key in ("DATASUM", "CHECKSUM")}
+        if not any(stated.values()):
+            continue
+        place = hdu.fileinfo()
+        header, data = place["hdrLoc"], place["datLoc"]
+        data_sum = _sum(content, data, data + place["datSpan"])
+        if stated["DATASUM"].isdigit() and int(stated["DATASUM"]) % 0xFFFFFFFF != data_sum % 0xFFFFFFFF:
+            raise _damaged("DATASUM", "data are", number)
+        # A blank value is that of a sum which is not defined; one of zeros is that before the sum was computed.
+        if len(stated["CHECKSUM"]) == 16 and set(stated["CHECKSUM"]) != {"0"}:
+            total = data_sum + _sum(content, header, data)
+            if total % 0xFFFFFFFF:
+                raise _damaged("CHECKSUM", "header or data are", number)
+
+
+def _damaged(key: str, part: str, number: int) -> InputError:
+    return InputError(
+        f"differs from its {key} in extension {number}: its {part} damaged or were edited",
+        "the file as it was written, or `ignore_checksum=True` after an intended change", key=key
+    )  # fmt: skip
+
+
+def _sum(content: FileContent, start: int, stop: int) -> int:
+    """Return the sum of the 32-bit words of a part of a file, with carries; see appendix J of the standard."""
+    total = 0
+    for place in range(start, stop, PIECE):
+        part = content[place : min(place + PIECE, stop)]
+        words = np.frombuffer(part + b"\0" * (-len(part) % 4), ">u4")
+        total += int(words.sum(dtype=np.uint64))
+    while total > 0xFFFFFFFF:
+        total = (total & 0xFFFFFFFF) + (total >> 32)
+    return total
+
+
+def text_at(header: Any, key: str) -> str:
+    """Return a keyword's value as text; empty if it is missing or cannot be parsed."""
+    try:
+        value = header.get(key, "")
+    except Exception:  # unparsable cards
+        return ""
+    return "" if value is None else str(value).strip()
+
+
+#: Keywords of the units of wavelengths and of fluxes: of the standard, of Spextool, and of others.
+WAVE_UNITS, FLUX_UNITS = ("CUNIT1", "XUNITS", "WAVEUNIT"), ("BUNIT", "YUNITS", "FLUXUNIT")
+
+
+def unit_at(keys: Sequence[str], *headers: Any) -> str:
+    """Return the unit that the first of some keywords states; empty if none does."""
+    return next((text for key in keys for header in headers if (text := text_at(header, key))), "")
+
+
+def column_values(data: Any, column: Any) -> Any:
+    """Return a column of a table, masked where it is undefined; bits are numbers.
+
+    TNULL is compared with the stored numbers, before TSCAL and TZERO (standard 4.0, section 7.3.2); astropy compares
+    it with the result, and reads zero for it in ASCII tables. Bits (``16X``) are the number that they are in an
+    integer, the first being the most significant.
+    """
+    stored: NDArray[Any] = np.asarray(data.view(np.ndarray)[column.name])
+    scale, zero = (
+        float(value) if value not in (None, "") else plain for value, plain in ((column.bscale, 1), (column.bzero, 0))
+    )
+    if (scale, zero) != (1.0, 0.0) and stored.dtype.kind in "iuf":
+        # astropy cannot scale integers of 64 bits by fractions.
+        values: Any = stored * scale + zero
+    else:
+        values = data.field(column.name)
+    if str(column.format).strip().upper().rstrip("0123456789").endswith("X") and np.ndim(values) == 2:
+        weights = 1 << np.arange(values.shape[1] - 1, -1, -1, dtype=np.int64)
+        return values.astype(np.int64) @ weights
+    if column.null is None or (isinstance(column.null, str) and not column.null.strip()):
+        return values
+    if stored.dtype.kind in "SU":
+        text = np.char.strip(stored.astype(str))
+        return (
+            np.ma.masked_array(values, text == str(column.null).strip()) if np.shape(values) == text.shape else values
+        )
+    if stored.dtype.kind not in "iuf" or stored.shape != np.shape(values):
+        return values
+    try:
+        null = float(column.null)
+    except (TypeError, ValueError):
+        return values
+    # Single precision rounds the values but not the mark in the header.
+    same = stored == null if stored.dtype.kind in "iu" else np.isclose(stored, null, rtol=1e-6, atol=0.0)
+    return np.ma.masked_array(values, same)
+
+
+#: Names of extensions with images that are not fluxes.
+_NO_FLUX = re.compile(r"err|unc|std|wgt|weight|sig|var|qual|mask|dq|snr|cont|sky|back|wave|lambda|lam$", re.IGNORECASE)
+_AXIS_NAME = re.compile(r"(?:(.+)_)?(?:WAVELENGTH|WAVE|WAVELEN|LAMBDA|LOGLAM)", re.IGNORECASE)
+_FLUX_NAMES = ("FLUX", "SCI", "SPECTRUM", "SPEC")
+#: Names of axes by their type, which say the medium.
+_AXIS_NAMES = {"AWAV": "air wavelength", "WAVE": "vacuum wavelength"}
+#: Largest number of rows of a single spectrum with its errors and masks, as in SDSS (spSpec) and LAMOST.
+MAX_PLANES = 6
+
+
+def is_spectrum_image(hdu: Any, label: str) -> bool:
+    """Return whether an extension is an image that may contain fluxes."""
+    return bool(getattr(hdu, "is_image", False) and hdu.header.get("NAXIS", 0) and not _NO_FLUX.search(label))
+
+
+def paired_images(hdus: Any) -> list[tuple[str, Any, Any]]:
+    """Return pairs of images of wavelengths and fluxes, and the common prefix of their names.
+
+    DESI's B_WAVELENGTH and B_FLUX (https://desidatamodel.readthedocs.io, coadd-SURVEY-PROGRAM-PIXNUM.fits).
+    """
+    named = {text_at(hdu.header, "EXTNAME").upper(): hdu for hdu in hdus if getattr(hdu, "is_image", False)}
+    pairs = []
+    for name, hdu in named.items():
+        if (match := _AXIS_NAME.fullmatch(name)) is None:
+            continue
+        arm = match[1] or ""
+        fluxes = [named[one] for kind in _FLUX_NAMES if (one := f"{arm}_{kind}".lstrip("_")) in named]
+        if not arm and not fluxes and name != "LAMBDA":
+            # An image of as many pixels without wavelengths of its own, such as the first of the file.
+            alike = [
+                one
+                for one in hdus
+                if is_spectrum_image(one, text_at(one.header, "EXTNAME")) and "CRVAL1" not in one.header
+            ]
+            fluxes = [one for one in alike if one.header.get("NAXIS1") == hdu.header.get("NAXIS1")]
+        if len(fluxes) == 1:
+            pairs.append((arm, hdu, fluxes[0]))
+    return pairs
+
+
+def is_survey_image(hdu: Any, telescope: str) -> bool:
+    """Return whether an image holds one spectrum with its errors and masks, as files of LAMOST and SDSS-I/II do.
+
+    https://dr5.lamost.org/v3/doc/data-production-description and https://classic.sdss.org/dr7/dm/flatFiles/spSpec.html:
+    the first row is the flux; the others are its inverse variance or error, wavelengths and masks.
+    """
+    header = hdu.header
+    known = re.match(r"LAMOST|SDSS", telescope, re.IGNORECASE) and "COEFF0" in header
+    return bool(known and header.get("NAXIS", 0) == 2 and header.get("NAXIS2", 0) <= MAX_PLANES)
+
+
+def rows_of(hdu: Any, telescope: str, asked: bool) -> tuple[Any, tuple[str, ...], tuple[str, ...]]:
+    """Return the fluxes of an image, the names of its rows if it has several, and a note.
+
+    Of IRAF's bands (`apall`: spectrum, raw, background, sigma) the first is the flux, unless the user asks for a part.
+    Raises InputError for an image of more dimensions than rows and wavelengths.
+    """
+    header = hdu.header
+    shape = [int(header.get(f"NAXIS{k + 1}", 0)) for k in range(int(header["NAXIS"]))]
+    if sum(n > 1 for n in shape) > 2 or shape[0] < 2:
+        fault = f"holds an image of {' x '.join(map(str, shape))} pixels"
+        raise InputError(fault, "a spectrum of one dimension, rows of spectra, or a table", key="table")
+    flux = np.asanyarray(hdu.data).reshape(-1, shape[0])
+    if len(flux) == 1:
+        return flux[0], (), ()
+    if is_survey_image(hdu, telescope):
+        return flux[0], (), (f"the first of {len(flux)} rows is its flux",)
+    bands = shape[2] if len(shape) > 2 else shape[1]
+    if not asked and text_at(header, "BANDID1").lower().startswith("spectrum") and len(flux) == bands:
+        return flux[0], (), (f"the first of {bands} bands (BANDID1) is its flux",)
+    return flux, tuple(text_at(header, f"BANDID{k + 1}") for k in range(len(flux))), ()
+
+
+def axis_of(header: Any, primary: Any, n: int) -> tuple[Any, str | None, str, tuple[str, ...]]:
+    """Return the values of an image's first axis, their unit, their kind (WAVE, AWAV, ...) and notes."""
+
+    def number(*keys: str) -> float | None:
+        for key in keys:
+            for one in (header, primary):
+                value = one.get(key)
+                if isinstance(value, int | float) and not isinstance(value, bool):
+                    return float(value)
+        return None
+
+    first, slope = number("COEFF0"), number("COEFF1")
+    if first is not None and slope is not None and 1.0 < first < 6.0:
+        return 10.0 ** (first + slope * np.arange(n)), "Angstrom", "", ("wavelengths from COEFF0 and COEFF1",)
+    start, step = number("CRVAL1"), number("CD1_1", "CDELT1")
+    if start is None or step is None or step == 0:
+        raise InputError(
+            "has an image without CRVAL1 and CDELT1 or CD1_1", "the wavelengths of its pixels", key="CRVAL1"
+        )
+    if number("CDELT1") is not None and number("CD1_1") is None and (scale := number("PC1_1")) is not None:
+        step *= scale
+    # A missing CRPIX1 is 0 by the FITS standard, but archives' spectra without it start at their first pixel.
+    reference = number("CRPIX1")
+    pixel = np.arange(1, n + 1) - (1.0 if reference is None else reference)
+    kind = (text_at(header, "CTYPE1") or text_at(primary, "CTYPE1")).upper()
+    unit = unit_at(WAVE_UNITS, header, primary) or _iraf_unit(header) or None
+    value = start + step * pixel
+    name, _, algorithm = kind.partition("-")
+    if algorithm.strip("-") not in ("", "LOG", "LAMBDA", "LINEAR", "WAV") or (
+        name not in ("", "WAVE", "AWAV", "FREQ", "ENER", "LINEAR", "LAMBDA", "WAVELENGTH", "LOGLAM", "LOG", "LOG10")
+        and not name.startswith(("WAVELEN", "LAM", "ANGSTROM", "ALOG"))
+    ):
+        raise InputError.of("CTYPE1", kind, "linear or logarithmic wavelengths")
+    flag = number("DC-FLAG")
+    if unit is not None and re.match(r"\s*log|\s*dex", unit, re.IGNORECASE):
+        flag, unit = 1, re.sub(r"^\s*(log|dex)\w*[\s(\[]*|[)\]\s]+$", "", unit, flags=re.IGNORECASE) or None
+    if flag != 1 and "LOG" not in kind:
+        if unit is None and start < 10.0 and abs(step) < 0.01:
+            fault = f"has an axis from {start:g} in steps of {step:g} without a unit or type"
+            raise InputError(fault, "CTYPE1 and CUNIT1", key="CUNIT1")
+        return value, unit, name, ()
+    if algorithm == "LOG" and name in ("WAVE", "AWAV", "FREQ", "ENER") and flag != 1 and start > 20.0:
+        # Greisen et al. 2006 (A&A 446, 747), equation 5: the value at the reference pixel times an exponential.
+        with np.errstate(over="ignore"):
+            return start * np.exp(step * pixel / start), unit, name, (f"logarithmic axis {kind}",)
+    if algorithm == "LOG" and flag != 1 and 6.0 <= start < 12.0:
+        # PHOENIX's library at medium resolution (Husser et al. 2013) has natural logarithms of Angstrom.
+        return np.exp(value), unit, name, ("wavelengths from natural logarithms",)
+    if not 1.0 < start < 6.0:
+        fault = f"has a logarithmic axis from {start:g}"
+        raise InputError(fault, f"logarithms to base ten or the form {name}-LOG", key="CTYPE1")
+    with np.errstate(over="ignore"):
+        return 10.0**value, unit, name, ("wavelengths from logarithms to base ten",)
+
+
+def multispec_axis(header: Any, n: int) -> Values:
+    """Return the wavelengths of each row of an image of IRAF's multispec system; raise InputError if they are curved.
+
+    An attribute has aperture, beam, type (0 linear, 1 logarithmic), first wavelength, step, number of pixels and
+    redshift (https://iraf.net/irafdocs/specwcs.php).
+    """
+    rows = []
+    for text in re.findall(r"spec\d+\s*=\s*\"([^\"]*)\"", _attributes(header, 2)):
+        with parsing("it", "attributes of IRAF's multispec system"):
+            _, _, kind, first, step, _, redshift = map(float, text.split()[:7])
+        if kind not in (0.0, 1.0):
+            fault = f"has wavelengths of the type {kind:g} in IRAF's multispec system"
+            raise InputError(fault, "linear or logarithmic ones, as IRAF's `dispcor` makes", key="CTYPE1")
+        values = first + step * np.arange(n)
+        rows.append((10.0**values if kind else values) / (1.0 + redshift))
+    if len(rows) != int(header.get("NAXIS2", 1)):
+        raise InputError(f"has {len(rows)} rows in its attributes WAT2", "one for each row", key="CTYPE1")
+    return Values.of("wavelength", np.array(rows) if len(rows) > 1 else rows[0], _iraf_unit(header))
+
+
+def _attributes(header: Any, axis: int) -> str:
+    """Return IRAF's attributes of an axis, whose cards have 68 characters each with blanks at their ends."""
+    keys = [key for key in sorted(header) if re.fullmatch(rf"WAT{axis}_\d{{3}}", key)]
+    return "".join(str(header[key]).ljust(68) for key in keys)
+
+
+def _iraf_unit(header: Any) -> str:
+    """Return the unit of the first axis in IRAF's attributes, as in ``wtype=linear units=Angstroms``."""
+    match = re.search(r"\bunits=(?:\"([^\"]*)\"|(\S+))", _attributes(header, 1))
+    return "" if match is None else match[1] or match[2]
+
 
 #: Scales that astropy writes for a column of times (TCTYPn), which then holds two parts of a Julian date.
 SCALES = ("UTC", "TAI", "TT", "TDB", "TCG", "TCB", "UT1")
@@ -74,15 +500,15 @@ class FitsTables(TableFile):
 
     def named(self, name: str) -> Values | None:
         """Return a column of the chosen table, an image, ``EXTENSION/COLUMN``, or a column of one other table."""
-        if self.chosen is not None and (found := self._column(self.chosen, name)) is not None:
+        if self.chosen is not None and (found := self.column(self.chosen, name)) is not None:
             return found
         at = self._number(name)
         if at in self.images:
-            return self._image(at)
+            return self.image(at)
         extension, _, column = name.partition("/")
         if column and (table := self._number(extension)) in self.tables:
-            return self._column(table, column)
-        others = [found for k in self.tables if (found := self._column(k, name)) is not None]
+            return self.column(table, column)
+        others = [found for k in self.tables if (found := self.column(k, name)) is not None]
         if len(others) > 1:
             raise InputError(f"{self.what} has {len(others)} columns called {name!r}", "EXTENSION/COLUMN", key=name)
         return others[0] if others else None
@@ -101,23 +527,22 @@ class FitsTables(TableFile):
                 raise InputError(f"{self.what}: the image {name!r} has no CRVAL2, CDELT2 and CRPIX2",
                                  "the times of its rows", key="time") from error  # fmt: skip
             return Values.of(name, first + step * (np.arange(1, n + 1) - reference), header.get("CUNIT2"), self.what)
-        if text_at(header, "CTYPE1").upper() == "WAVE-TAB":
-            return self._tabulated(header)
+        if text_at(header, "CTYPE1").upper().endswith("-TAB"):
+            return self.tabulated(header)
         try:
             values, unit, kind, _ = axis_of(header, self.hdus[0].header, n)
         except InputError as error:
             raise error.within(self.what) from error
-        # The name says the medium.
-        name = {"AWAV": "air wavelength", "WAVE": "vacuum wavelength"}.get(kind, "wavelength")
-        return Values.of(name, values, unit, self.what)
+        return Values.of(_AXIS_NAMES.get(kind, "wavelength"), values, unit, self.what)
 
-    def _tabulated(self, header: Any) -> Values:
+    def tabulated(self, header: Any) -> Values:
         """Return an axis that refers to the column of a table (-TAB, FITS standard 4.0, section 8.3)."""
         found = self.named(f"{text_at(header, 'PS1_0')}/{text_at(header, 'PS1_1')}")
         if found is None:
             raise InputError(f"{self.what} lacks the table of its wavelengths", "the column that PS1_0 and PS1_1 name",
                              key="wavelength")  # fmt: skip
-        return Values.of(found.name, found.numbers().ravel(), found.unit or header.get("CUNIT1"), self.what)
+        kind, unit = text_at(header, "CTYPE1").upper()[:4], found.unit or header.get("CUNIT1")
+        return Values.of(_AXIS_NAMES.get(kind, "wavelength"), found.numbers().ravel(), unit, self.what)
 
     def _label(self, number: int) -> str:
         return str(self.hdus[number].name) or str(number)
@@ -129,7 +554,8 @@ class FitsTables(TableFile):
             return labels.index(name.upper())
         return int(name) if name.isascii() and name.isdigit() and int(name[:6]) < len(self.hdus) else None
 
-    def _image(self, number: int) -> Values:
+    def image(self, number: int) -> Values:
+        """Return the image of an extension."""
         hdu = self.hdus[number]
         shape = tuple(hdu.shape)
 
@@ -139,17 +565,22 @@ class FitsTables(TableFile):
 
         return Values(self._label(number), shape, read, text_at(hdu.header, "BUNIT"), self.what)
 
-    def _column(self, number: int, name: str) -> Values | None:
+    def column(self, number: int, name: str) -> Values | None:
+        """Return a column of the table in an extension, or None."""
         hdu = self.hdus[number]
         title = matched(name, map(str, hdu.columns.names), self.what)
         if title is None:
             return None
         found = hdu.columns[title]
         n_rows = int(hdu.header["NAXIS2"])
-        small = int(hdu.header["NAXIS1"]) * n_rows + int(hdu.header.get("PCOUNT", 0)) <= PIECE_BYTES
-        if not small and int(hdu.header.get("PCOUNT", 0)):
-            raise InputError(f"{self.what}: the table {self._label(number)} has columns of variable length and more "
-                             f"than {PIECE_BYTES >> 20} MiB", "columns of fixed length", key="hdu")  # fmt: skip
+        heap = int(hdu.header.get("PCOUNT", 0))
+        size = int(hdu.header["NAXIS1"]) * n_rows + heap
+        # Tables of text, and columns of variable length, cannot be read in pieces.
+        is_whole = heap > 0 or hdu.header.get("XTENSION") == "TABLE"
+        small = size <= PIECE_BYTES or is_whole
+        if is_whole and size > limit_bytes("MAUVECL_LARGEST_FILE_MIB"):
+            raise InputError(f"{self.what}: the table {self._label(number)} has text or columns of variable length and "
+                             f"{size >> 20} MiB", "columns of fixed length", key="hdu")  # fmt: skip
         pair = str(self.header.get(f"TCTYP{hdu.columns.names.index(found.name) + 1}", "")).upper() in SCALES
 
         def read(start: int, stop: int) -> Any:
@@ -161,7 +592,8 @@ class FitsTables(TableFile):
 
         one = np.shape(read(0, min(1, n_rows)))
         width = 0 if small else 2 * int(hdu.header["NAXIS1"])
-        return Values(found.name, (n_rows, *one[1:]), read, str(found.unit or "").strip(), self.what, width)
+        ucd = text_at(hdu.header, f"TUCD{hdu.columns.names.index(found.name) + 1}")
+        return Values(found.name, (n_rows, *one[1:]), read, str(found.unit or "").strip(), self.what, width, ucd)
 
 
 def _piece(hdu: Any, start: int, stop: int) -> Any:

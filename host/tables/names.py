@@ -1,21 +1,44 @@
-"""Names of columns: an exact match wins, otherwise case, blanks and underscores do not matter."""
+"""Names of columns, and words for missing values, in a module that is fast to import."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
 
-from mauvecl.schema.errors import InputError
-from mauvecl.schema.text import shortened
+from mauvecl.schema.errors import InputError, shortened
+
+#: As archives and programs write them, in lower case; an empty cell has no value in any case.
+MISSING_WORDS = ("", "null", "none", "n/a", "na", "--", "---", "-", "...", "masked", "indef", "<na>")
+_NO_VALUE = {*MISSING_WORDS, "nan", "nat"}
+#: Errors of spreadsheets (``#N/A``, ``#DIV/0!``), of C (``1.#QNAN``), and numbers too long for Fortran (``*****``).
+_ERROR = re.compile(r"#[a-z/0]+[!?]?|[-+]?1\.#[a-z]+\d*|[-+]?nan(?:\(\w*\))?|\*+")
+
+
+def is_missing(cell: str) -> bool:
+    """Return whether a cell has no value: it is empty, one of the words for that, or an error of a program."""
+    word = cell.strip().lower()
+    return word in _NO_VALUE or _ERROR.fullmatch(word) is not None
+
+
+def is_missing_position(text: str) -> bool:
+    """Return whether a text is a pair of missing values, such as "nan nan" or "--, --"."""
+    words = re.split(r"\s*[,;]\s*|\s+", text.strip().strip("()[]").strip())
+    return len(words) == 2 and all(map(is_missing, words))
+
 
 #: Names of columns of stars: of the Gaia archive, SIMBAD, astroquery, VizieR, MAST and CDS X-Match, and plain ones.
 STARS = ("name", "designation", "source_id", "source", "main_id", "id", "dr3name", "target", "target_name", "targname",
-         "object", "star", "tic", "tic_id", "kic", "kepid", "epic", "hip")  # fmt: skip
+         "object", "star", "tic", "tic_id", "kic", "kepid", "epic", "hip", "star_name", "object_name", "identifier",
+         "star_id", "epic_number", "sourceid", "kelt_sourceid", "tid")  # fmt: skip
 RIGHT_ASCENSIONS = ("ra", "ra_deg", "ra_icrs", "_raj2000", "raj2000", "ra_j2000", "_ra_icrs", "_ra", "s_ra", "ra_hours",
-                    "ra_h", "ra_rad", "right_ascension", "alpha_j2000")  # fmt: skip
+                    "ra_h", "ra_rad", "right_ascension", "alpha_j2000", "radeg", "raj2000_deg", "raicrs",
+                    "r.a.", "ra.", "alpha")  # fmt: skip
 DECLINATIONS = ("dec", "dec_deg", "de_icrs", "_dej2000", "dej2000", "dec_j2000", "_de_icrs", "dec_icrs", "_de", "s_dec",
-                "de", "dec_rad", "declination", "delta_j2000")  # fmt: skip
-SPECTRAL_TYPES = ("spectral_type", "sptype", "sp_type", "spt", "spectype", "st_spectype")
+                "de", "dec_rad", "declination", "delta_j2000", "dedeg", "decdeg", "dej2000_deg", "deicrs",
+                "decl.", "decl", "dec.", "delta")  # fmt: skip
+#: Sexagesimal right ascensions in tables that have them in numbers as well.
+SEXAGESIMAL = ("ra_string", "rastr", "ra_str", "ra_hms", "ra_sexa")
+SPECTRAL_TYPES = ("spectral_type", "sptype", "sp_type", "spt", "spectype", "st_spectype", "spec._type")
 _UNIT = re.compile(r"(?s)(.*\S)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))\s*")
 #: Columns of magnitudes: ``mag``, ``Vmag``, ``mag_err``, ``INST_MAG1``, ``delta magnitude``.
 _MAGNITUDE = re.compile(r"(?:^|[^a-z])[a-z]{0,5}(?:mag|mags|magnitude|magnitudes)(?:$|[^a-z])")
@@ -25,6 +48,12 @@ def divided_unit(name: str) -> tuple[str, str]:
     """Divide ``flux (ct/s)`` or ``time [d]`` into name and unit, which is empty if there is none."""
     match = _UNIT.fullmatch(name.strip())
     return (name.strip(), "") if match is None else (match[1], (match[2] or match[3] or "").strip())
+
+
+def in_brackets(text: str) -> str:
+    """Return the text without brackets around all of it, as in ``[s]`` or ``(ct/s)``."""
+    match = re.fullmatch(r"\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))\s*", text)
+    return text.strip() if match is None else (match[1] or match[2] or "").strip()
 
 
 def key_of(name: str) -> str:
@@ -47,7 +76,7 @@ def matched(name: str, names: Iterable[str], what: str = "") -> str | None:
         place = f"{what}: " if what else ""
         raise InputError(
             f"{place}{len(fitting)} columns are called {shortened(name)} but for case ({', '.join(fitting)})",
-            "the exact name of one", key="column", value=name,
+            "the exact name of one", key="column"
         )  # fmt: skip
     return fitting[0] if fitting else None
 
@@ -69,7 +98,7 @@ def first_of(wanted: Sequence[str], names: Iterable[str], what: str = "") -> str
             place = f"{what}: " if what else ""
             raise InputError(
                 f"{place}several columns may be {one}: {', '.join(map(shortened, fitting))}",
-                "one of them, or a mapping that names it", key=one, value=fitting,
+                "one of them, or a mapping that names it", key=one
             )  # fmt: skip
         if fitting:
             return fitting[0]

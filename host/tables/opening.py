@@ -1,29 +1,180 @@
-"""The one way to open a table of a user: its form by its first bytes, within limits of size."""
+"""Tables of any format, recognised by content instead of name, and those larger than memory."""
 
 from __future__ import annotations
 
 import io
+import itertools
 import re
+import tempfile
 import warnings
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Literal
 
-from mauvecl.host.files.parsing import parsing
-from mauvecl.host.files.size_limits import check_size, limit_bytes, open_regular, packed, read_bytes, unpacked
-from mauvecl.host.tables.fits import open_fits, reading
-from mauvecl.host.tables.fits_tables import FitsTables
-from mauvecl.host.tables.large_tables import LARGE, open_large
-from mauvecl.host.tables.names import STARS
-from mauvecl.host.tables.table import MemoryTable, TableFile
-from mauvecl.host.tables.text_table import is_csv, keywords_of, text_of, text_table
-from mauvecl.schema.errors import InputError
-from mauvecl.schema.text import shortened
+import numpy as np
+
+from mauvecl.host.tables.ecsv import MOST_HEADER
+from mauvecl.host.tables.files import (
+    check_size,
+    limit_bytes,
+    lines_in,
+    open_regular,
+    packed,
+    parsing,
+    read_bytes,
+    unpacked,
+)
+from mauvecl.host.tables.fits_tables import FitsTables, open_fits, reading
+from mauvecl.host.tables.names import matched
+from mauvecl.host.tables.table import REMARKS, MemoryTable, TableFile, Values
+from mauvecl.host.tables.text_tables import Layout, TextRows, text_of, text_table
+from mauvecl.schema.errors import InputError, shortened
 
 if TYPE_CHECKING:
     from astropy.io.votable.tree import VOTableFile
     from astropy.table import Table
+
+#: Size of a text from which it is read in pieces, and of a piece, bytes.
+LARGE, PIECE = 16 * 2**20, 2**20
+#: Longest text of a cell, such as a date.
+CELL = 40
+
+
+class LargeTable(TableFile):
+    """Rows of a text table in a temporary file, which disappears with this object."""
+
+    def __init__(self, pieces: Iterator[Any], what: str) -> None:
+        first = MemoryTable(next(pieces), what)
+        # One row has the names and units.
+        self.table, self.n_rows = MemoryTable(first.table[:1], what), 0
+        super().__init__(what, first.header, first.remarks)
+        self.row = np.dtype([(name, "f8" if _numbers(first.find(name)) else f"U{CELL}") for name in first.names])
+        self.file = tempfile.TemporaryFile()  # noqa: SIM115
+        self._keep(first)
+        del first
+        for piece in pieces:
+            self._keep(MemoryTable(piece, what))
+
+    def _keep(self, piece: MemoryTable) -> None:
+        n, first = len(piece.table), self.n_rows
+        rows = np.zeros(n, self.row)
+        for name in self.names:
+            column = piece.find(name)
+            # Messages count rows from the start of the file.
+            read = lambda start, stop, column=column: column.read(start - first, stop - first)  # noqa: E731
+            values = Values(name, (n,), read, what=self.what)
+            if self.row[name].kind == "f":
+                rows[name] = values.rows(first, first + n)
+                continue
+            texts = column.texts() or [str(one) for one in column.numbers().tolist()]
+            if any(len(text) > CELL for text in texts):
+                fault = f"{self.what}: a cell of {name!r} is longer than {CELL} characters"
+                raise InputError(fault, "numbers or dates", key=name)
+            rows[name] = texts
+        rows.tofile(self.file)
+        self.n_rows += n
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the columns."""
+        return self.table.names
+
+    def _rows(self, start: int, stop: int) -> Any:
+        self.file.seek(start * self.row.itemsize)
+        return np.fromfile(self.file, self.row, max(0, stop - start))
+
+    def named(self, name: str) -> Values | None:
+        """Return a column."""
+        found = matched(name, self.names, self.what)
+        if found is None:
+            return None
+        return Values(name, (self.n_rows,), lambda start, stop: self._rows(start, stop)[found],
+                      self.table.find(name).unit, self.what, self.row.itemsize)  # fmt: skip
+
+    def _side_by_side(self, pattern: str) -> Values | None:
+        names = self.matching(pattern)
+        if not names or any(self.row[name].kind != "f" for name in names):
+            return super()._side_by_side(pattern)
+        units = {self.table.find(name).unit for name in names}
+        if len(units) > 1:
+            return super()._side_by_side(pattern)
+
+        def read(start: int, stop: int) -> Any:
+            rows = self._rows(start, stop)
+            return np.column_stack([rows[name] for name in names])
+
+        return Values(pattern, (self.n_rows, len(names)), read, units.pop(), self.what, self.row.itemsize)
+
+
+def _numbers(values: Values) -> bool:
+    """Return whether values are numbers, also as texts."""
+    try:
+        values.numbers()
+    except InputError:
+        return False
+    return True
+
+
+@contextmanager
+def open_large(file: IO[bytes], what: str, commas: bool, expected: str) -> Iterator[LargeTable]:
+    """Open a text table of any size; its text is UTF-8."""
+    text = io.TextIOWrapper(file, encoding="utf-8-sig")
+    try:
+        pieces = _pieces(text, what, commas, expected)
+        table = LargeTable(pieces, what)
+    except UnicodeDecodeError as error:
+        raise InputError(f"{what} is not text in UTF-8", expected, key="file") from error
+    with table.file:
+        yield table
+    text.detach()
+
+
+def _pieces(text: IO[str], what: str, commas: bool, expected: str) -> Iterator[Any]:
+    """Yield tables of consecutive rows, of which the first has the keywords of comments above them."""
+    lines = lines_in(text, what)
+    line = next(lines, "")
+    head: list[str] = []
+    size = 0
+    if line.startswith("# %ECSV"):
+        while line.startswith("#") or (line and not line.strip()):
+            head.append(line)
+            size += len(line)
+            _check_head(size, what)
+            line = next(lines, "")
+    layout: Layout | None = None
+    first, size, kept = 0, 0, [line]
+    for line in itertools.chain(lines, [""]):
+        kept.append(line)
+        size += len(line)
+        if line and size < PIECE:
+            continue
+        if head:
+            piece = text_table("".join([*head, *kept]), what, commas, expected)
+            # Its first line has the names.
+            kept, head = [], head if first else [*head, kept[0]]
+        else:
+            rows = TextRows("".join(kept), what, commas, layout, first)
+            piece = rows.table()
+            if not len(piece) and not first:
+                _check_head(size, what)
+                continue
+            kept, layout = [], rows.layout
+        size = 0
+        if len(piece):
+            first += len(piece)
+            yield piece
+    if not first:
+        raise InputError(f"{what} has no rows", "a row for each frame", key="frames")
+
+
+def _check_head(size: int, what: str) -> None:
+    """Raise InputError for more than `MOST_HEADER` characters above the rows."""
+    if size > MOST_HEADER:
+        fault = f"{what} has more than {MOST_HEADER} characters of comments and empty lines before its rows"
+        raise InputError(fault, "fewer", key="file")
+
 
 FORMATS = "CSV, ECSV, FITS or VOTable"
 Form = Literal["FITS", "HDF5", "VOTable", "XML", "ECSV", "text"]
@@ -42,6 +193,41 @@ def form_of(start: bytes) -> Form:
     return "ECSV" if re.match(rb"#\s*%ECSV", text) else "text"
 
 
+@dataclass(frozen=True, eq=False)
+class Content:
+    """An open file, unpacked."""
+
+    form: Form
+    file: IO[bytes]
+
+    @property
+    def size(self) -> int:
+        """Size in bytes."""
+        return self.file.seek(0, io.SEEK_END)
+
+    @property
+    def bytes(self) -> bytes:
+        """All of the content."""
+        self.file.seek(0)
+        return self.file.read()
+
+
+@contextmanager
+def open_content(path: Path, what: str, kind: str, *, large: bool = False) -> Iterator[Content]:
+    """Open a file within limits of size, and recognise its form by its first bytes; see `open_table`."""
+    if not large:
+        check_size(path, kind)
+    with open_regular(path, kind) as raw:
+        start = raw.read(4096)
+        raw.seek(0)
+        form = form_of(start)
+        if form in ("FITS", "HDF5") or (large and form in ("text", "ECSV") and not packed(start)):
+            yield Content(form, raw)
+            return
+        content = unpacked(read_bytes(path, kind), what)
+        yield Content(form_of(content[:4096]), io.BytesIO(content))
+
+
 @contextmanager
 def open_table(
     path: Path,
@@ -51,7 +237,6 @@ def open_table(
     expected: str = FORMATS,
     check: bool = True,
     large: bool = False,
-    texts: Collection[str] = (),
     of_fits: Callable[[Any], TableFile] | None = None,
     of_hdf5: Callable[[IO[bytes]], AbstractContextManager[TableFile]] | None = None,
 ) -> Iterator[TableFile]:
@@ -65,79 +250,93 @@ def open_table(
         Whether to verify the checksums of a FITS file that can be read whole.
     large : bool
         Whether the file may exceed MAUVECL_LARGEST_FILE_MIB, if it can be read in pieces.
-    texts : collection of str
-        Names of columns whose cells stay text, such as "0012".
     of_fits, of_hdf5 : callable, optional
         Functions that make tables of an open FITS file, by default of its first table, and of an HDF5 file.
     """
-    if not large:
-        check_size(path, kind)
-    with open_regular(path, kind) as raw:
-        start = raw.read(4096)
-        commas = bool({".csv", ".tsv"} & {suffix.lower() for suffix in path.suffixes[-2:]})
-        size = raw.seek(0, io.SEEK_END)
-        raw.seek(0)
-        if (commas or form_of(start) == "ECSV") and not packed(start) and size > LARGE:
-            with open_large(raw, what, commas, expected) as table:
-                yield table
-            return
-        file: IO[bytes] = raw
-        content = b""
-        if form_of(start) not in ("FITS", "HDF5"):
-            content = unpacked(read_bytes(path, kind), what)
-            start, file = content[:4096], io.BytesIO(content)
-        form = form_of(start)
-        if form == "FITS":
-            check &= file.seek(0, io.SEEK_END) <= limit_bytes("MAUVECL_LARGEST_FILE_MIB")
-            with open_fits(file, what, check=check) as hdus:
+    commas = bool({".csv", ".tsv"} & {suffix.lower() for suffix in path.suffixes[-2:]})
+    with open_content(path, what, kind, large=large) as content:
+        if content.form == "FITS":
+            check &= content.size <= limit_bytes("MAUVECL_LARGEST_FILE_MIB")
+            with open_fits(content.file, what, check=check) as hdus:
                 with reading(what):
                     found = FitsTables(hdus, what) if of_fits is None else of_fits(hdus)
                 yield _filled(found)
-        elif form == "HDF5" and of_hdf5 is not None:
-            with of_hdf5(file) as stored:
+        elif content.form == "HDF5" and of_hdf5 is not None:
+            with of_hdf5(content.file) as stored:
                 yield stored
+        elif content.form in ("text", "ECSV") and content.size > LARGE:
+            content.file.seek(0)
+            with open_large(content.file, what, commas, expected) as table:
+                yield table
         else:
-            yield _filled(_in_memory(content, form, what, commas, expected, texts))
+            yield _filled(_in_memory(content, what, commas, expected))
 
 
-def _in_memory(
-    content: bytes, form: Form, what: str, commas: bool, expected: str, texts: Collection[str]
-) -> MemoryTable:
-    if form == "VOTable":
-        found = next(votables(content, what, expected), None)
+def _in_memory(content: Content, what: str, commas: bool, expected: str) -> MemoryTable:
+    if content.form == "VOTable":
+        found = next(votables(content.bytes, what, expected), None)
         if found is None:
             raise InputError(f"{what} has no table", expected, key="file")
         return found
-    check_no_page(content, form, what, expected)
+    check_form(content, what, expected)
     try:
-        text = text_of(content)
+        text = text_of(content.bytes)
     except InputError as error:
         raise error.within(what) from error
     if not text.strip():
         raise InputError(f"{what} is empty", expected, key="file")
-    found = MemoryTable(text_table(text, what, commas or is_csv(text), expected, texts=texts), what)
-    found.header |= keywords_of([line for line in text.splitlines() if line[:1] in "#%!;"])
-    return found
+    return MemoryTable(text_table(text, what, commas, expected), what)
 
 
-def check_no_page(content: bytes, form: Form, what: str, expected: str) -> None:
-    """Raise InputError for XML other than VOTable, such as a page of an archive that says that a file is missing."""
-    if form == "XML":
-        start = content[:4096].lstrip(b"\xef\xbb\xbf \t\r\n")[:20]
+#: Forms of files that are not read, by their first bytes.
+FOREIGN = {
+    b"PK\x03\x04": "a ZIP archive or a workbook", b"\xd0\xcf\x11\xe0": "a workbook", b"%PDF": "a PDF document",
+    b"{\\rtf": "a document", b"%!PS": "a document", b"#ASDF": "ASDF", b"{": "JSON", b"[{": "JSON", b"[[": "JSON",
+    b"\x93NUMPY": "an array of NumPy", b"\x80\x04\x95": "a pickle of Python", b"SR\x00\x04": "a session of IDL",
+    b"PAR1": "Parquet", b"ARROW1": "Feather", b"SQLiteformat": "a database", b"MATLAB5": "of MATLAB",
+    b"\x89HDF": "HDF5 or NetCDF", b"CDF\x01": "NetCDF", b"CDF\x02": "NetCDF", b"CDF\x05": "NetCDF",
+    b"READSERR": "QDP", b"READTERR": "QDP", b"#Regionfileformat": "a list of regions",
+    b"versionhttps://git-lfs": "a pointer of Git LFS to another file", b"\x1f\x9d": "compressed by `compress`",
+    b"\x28\xb5\x2f\xfd": "compressed by zstd", b"7z\xbc\xaf": "a 7-Zip archive",
+}  # fmt: skip
+
+
+def check_form(content: Content, what: str, expected: str) -> None:
+    """Raise InputError for forms that are not read, such as JSON, or a page that says that a file is missing."""
+    start = content.bytes[:512]
+    tar = "a TAR archive" if start[257:262] == b"ustar" else ""
+    marks = b"".join(start.split())
+    if foreign := tar or next((form for mark, form in FOREIGN.items() if marks.startswith(mark)), ""):
+        raise InputError(f"{what} is {foreign}", expected, key="file")
+    if content.form == "XML":
+        start = content.bytes[:4096].lstrip(b"\xef\xbb\xbf \t\r\n")[:20]
         fault = f"{what} is a page or XML that begins with {shortened(start.decode('ascii', 'replace'))}"
-        raise InputError(fault, expected, key="file", value=start)
+        raise InputError(fault, expected, key="file")
 
 
 def votables(content: bytes, what: str, expected: str) -> Iterator[MemoryTable]:
     """Yield the tables of a VOTable, whose parameters and systems of times and coordinates are keywords."""
-    file = votable_in(content, what)
+    from astropy.io import votable
+
+    if b"<!ENTITY" in content or b"<!DOCTYPE" in content:
+        raise InputError(f"{what} defines entities", "a VOTable without entities", key="file")
+    with parsing(what, "a complete VOTable"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        file = votable.parse(io.BytesIO(content), verify="ignore")
+    status = {info.value: info.content for part in file.resources for info in part.infos if info.name == "QUERY_STATUS"}
+    if "ERROR" in status:
+        said = shortened(str(status["ERROR"] or "without a reason"))
+        raise InputError(f"{what} is the answer to a query that failed: {said}", expected, key="file")
     shared = {str(one.name or one.ID): one.value for resource in file.resources for one in resource.params}
     shared |= _systems(file)
     for table in file.iter_tables():
         with parsing(what, expected):
             for field in table.fields:
                 field.name = field.name or field.ID
-            found = MemoryTable(table.to_table(use_names_over_ids=True), what)
+            read = table.to_table(use_names_over_ids=True)
+            if "OVERFLOW" in status:
+                read.meta[REMARKS] = ("the query had more rows than the archive returns: the table is incomplete",)
+            found = MemoryTable(read, what)
         found.header |= shared | {str(one.name or one.ID): one.value for one in table.params}
         found.table.meta |= found.header
         yield found
@@ -164,19 +363,8 @@ def _filled(file: TableFile) -> TableFile:
     return file
 
 
-def read_table(path: str | Path, what: str, expected: str = FORMATS, *, texts: Collection[str] = STARS) -> Table:
+def read_table(path: str | Path, what: str, expected: str = FORMATS) -> Table:
     """Read a small table into memory; see `open_table`."""
     path = Path(path)
-    with open_table(path, f"{what} {shortened(str(path))}", what, expected=expected, texts=texts) as file:
+    with open_table(path, f"{what} {shortened(str(path))}", what, expected=expected) as file:
         return file.table if isinstance(file, MemoryTable) else file.loaded()
-
-
-def votable_in(content: bytes, what: str) -> VOTableFile:
-    """Parse a VOTable; raise InputError if it is damaged or defines entities."""
-    from astropy.io import votable
-
-    if b"<!ENTITY" in content or b"<!DOCTYPE" in content:
-        raise InputError(f"{what} defines entities", "a VOTable without entities", key="file")
-    with parsing(what, "a complete VOTable"), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return votable.parse(io.BytesIO(content), verify="ignore")

@@ -1,28 +1,96 @@
-"""Values of files with a row for each frame: numbers, texts and units, read whole or in pieces."""
+"""Tables of files, whole or in pieces, and their rows as quantities, positions and dates."""
 
 from __future__ import annotations
 
+import contextlib
 import fnmatch
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.tables.names import divided_unit, matched
-from mauvecl.host.tables.text_table import number_in
-from mauvecl.host.tables.times import time_unit
-from mauvecl.host.tables.units import unit_of
-from mauvecl.schema.errors import InputError
-from mauvecl.schema.text import shortened
+from mauvecl.host.tables.coordinates import ANGLES, angle, angle_unit, angle_unit_in_name
+from mauvecl.host.tables.names import divided_unit, first_of, is_missing, key_of, matched
+from mauvecl.host.tables.units import time_unit, unit_of
+from mauvecl.schema.errors import InputError, printable, shortened
+
+if TYPE_CHECKING:
+    from astropy.table import Table
 
 Float = NDArray[np.float64]
 
+#: Key of the statements on how a file is read, in the metadata of its table.
+REMARKS = "mauvecl remarks"
 #: Size of the pieces in which files are read, bytes of double precision.
 PIECE_BYTES = 4 * 2**20
+
+
+def unquoted(cell: str) -> str:
+    """Return a cell without quotes around it, of two kinds at most; one at its end alone is a unit, as in ``3.5'``."""
+    for mark in ('"', "'", '"'):
+        if len(cell := cell.strip()) > 1 and cell[0] == cell[-1] == mark:
+            cell = cell[1:-1]
+    return cell.strip()
+
+
+def number_in(cell: str) -> float:
+    """Return the number in a cell, NaN for words such as "null"; raise ValueError for anything else."""
+    cell = unquoted(cell).replace("−", "-")
+    if "_" in cell:
+        raise ValueError(cell)
+    try:
+        return float(cell)
+    except ValueError:
+        if is_missing(cell):
+            return float("nan")
+        # Exponents of Fortran's double precision, and of three digits, which it writes without a letter.
+        return float(re.sub(r"([\d.])[dD](?=[+-]?\d)|^([+-]?\d*\.\d*)(?=[+-]\d{3}$)", r"\1\2e", cell))
+
+
+#: Values of at least the first, or equal to the second, mark missing measurements: IRAF's INDEF, NetCDF's 9.97e36.
+INDEFINITE, MISSING = 9e36, 1e30
+
+
+def without_indefinite(values: Float) -> Float:
+    """Return values of which infinite ones, and those that mark missing ones by their size, are NaN."""
+    size = np.abs(values)
+    bad = ~(size < INDEFINITE) | (size == MISSING)
+    return np.where(bad, np.nan, values) if bad.any() else values
+
+
+def marks_in(values: Float, noun: str) -> tuple[list[float], list[str]]:
+    """Return values that mark missing ones, such as -99 and 9999, and remarks on them.
+
+    A mark has the digit nine only. It occurs once and is a thousand times larger than all other values, or it occurs
+    more often and is three times larger, or three times as far below zero.
+    """
+    marks: list[float] = []
+    remarks: list[str] = []
+    finite = np.isfinite(values)
+    for mark in {float(end(values, initial=0.0, where=finite)) for end in (np.min, np.max)}:
+        if not re.fullmatch(r"-?9{2,}(?:\.9+)?", f"{mark:.7g}"):
+            continue
+        others = values[finite & (np.abs(values) != abs(mark))]
+        n = np.count_nonzero(values == mark)
+        beyond = np.max(-others if mark < 0 and n > 1 else np.abs(others), initial=0.0)
+        if others.size and abs(mark) > (3 if n > 1 else 1000) * beyond:
+            marks += [mark, -mark]
+            remarks.append(f"{n} {noun} of {mark:.7g} mark missing values and are left undefined")
+    return marks, remarks
+
+
+def plain_numbers(texts: list[str]) -> Float | None:
+    """Return texts as numbers, or None if one of them has another form than Python's, as `number_in` allows."""
+    # Python takes 1_000 for a number.
+    if "_" not in "".join(texts):
+        with contextlib.suppress(ValueError):
+            return np.array(list(map(float, texts)))
+    return None
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,8 +111,8 @@ class Values:
         cls, name: str, values: Any, unit: object = None, what: str = "", ucd: str = "", description: str = ""
     ) -> Values:
         """Return values that are in memory."""
-        unit = text_of_unit(unit)
-        return cls(name, np.shape(values), lambda start, stop: values[start:stop], unit, what, 0, ucd, description)
+        text = "" if unit is None else str(unit).strip()
+        return cls(name, np.shape(values), lambda start, stop: values[start:stop], text, what, 0, ucd, description)
 
     @property
     def cells(self) -> Any:
@@ -116,7 +184,11 @@ class Values:
 
     def _parsed(self, values: Any, start: int, expected: str) -> Float:
         """Return texts as numbers; raises InputError that names the first text that is not a number."""
-        texts = [_plain(one) for one in np.ma.filled(values, "").ravel().tolist()]
+        texts = np.ma.filled(values, "").ravel().tolist()
+        if values.dtype.kind == "S":
+            texts = list(map(_plain, texts))
+        if (found := plain_numbers(texts)) is not None:
+            return found.reshape(values.shape)
         parsed = np.empty(len(texts))
         for place, text in enumerate(texts):
             try:
@@ -124,19 +196,13 @@ class Values:
             except ValueError as error:
                 row = start + place // max(1, int(np.prod(values.shape[1:]))) + 1
                 raise InputError(
-                    f"{self.what}: {self.name!r} = {shortened(text, 40)} in row {row}", expected, key=self.name,
-                    value=text
+                    f"{self.what}: {self.name!r} = {shortened(text, 40)} in row {row}", expected, key=self.name
                 ) from error  # fmt: skip
         return parsed.reshape(values.shape)
 
 
 def _plain(text: Any) -> str:
     return (text.decode("ascii", "replace") if isinstance(text, bytes) else str(text)).strip()
-
-
-def text_of_unit(unit: object) -> str:
-    """Return a unit as text; empty for none."""
-    return "" if unit is None else str(unit).strip()
 
 
 def converted(values: Values, given: str | None, unit: str, key: str) -> Values:
@@ -175,9 +241,8 @@ def unit_in(text: str) -> Any:
     said = time_unit(text)
     if said is not None and said.epoch_mjd is None:
         return u.Unit(said.unit)
-    spelt = {"degc": "deg_C", "c": "deg_C", "celsius": "deg_C", "deg c": "deg_C", "°c": "deg_C"}
     try:
-        return u.Unit(spelt.get(text.strip().lower(), text))
+        return u.Unit(_SPELT.get(text.strip().lower(), text))
     except ValueError:
         return unit_of(text)
 
@@ -185,17 +250,24 @@ def unit_in(text: str) -> Any:
 def unit_in_name(name: str) -> str:
     """Return the unit in brackets at the end of a column's name; empty if there is none."""
     text = divided_unit(name)[1]
+    return text if text and is_known(text) else ""
+
+
+def is_known(text: str) -> bool:
+    """Return whether a text is a unit."""
     try:
-        return text if text and unit_in(text) is not None else ""
+        return unit_in(text) is not None
     except (ValueError, TypeError):
-        return ""
+        return False
 
 
 class TableFile(ABC):
     """A file with frames: its named values, and the keywords of its header."""
 
-    def __init__(self, what: str, header: dict[str, Any]) -> None:
+    def __init__(self, what: str, header: dict[str, Any], remarks: tuple[str, ...] = ()) -> None:
         self.what, self.header = what, header
+        #: Statements on how the file is read, for answers.
+        self.remarks = remarks
 
     @property
     @abstractmethod
@@ -254,12 +326,12 @@ class TableFile(ABC):
         odd = next((name for name, numbers in zip(names, found, strict=True) if len(numbers) != 1), None)
         if odd is not None or not names:
             raise InputError(f"{self.what}: the column {odd or pattern!r} has no single number in its name",
-                             "names such as flux_350.5", key="wavelength", value=odd)  # fmt: skip
+                             "names such as flux_350.5", key="wavelength")  # fmt: skip
         return Values.of("the names of columns", np.array([float(one[0]) for one in found]), "", self.what)
 
     def axis(self, name: str, dimension: int) -> Values:
         """Return the coordinates of an image along an axis, by the keywords of its header (FITS WCS)."""
-        raise InputError(f"{self.what} has no coordinates of images", "a FITS image", key="wavelength", value="wcs")
+        raise InputError(f"{self.what} has no coordinates of images", "a FITS image", key="wavelength")
 
 
 class MemoryTable(TableFile):
@@ -269,7 +341,8 @@ class MemoryTable(TableFile):
         from astropy.time import Time
 
         meta = table.meta if isinstance(table.meta, dict) else {}
-        super().__init__(what, {str(key): value for key, value in meta.items()})
+        header = {str(key): value for key, value in meta.items() if key != REMARKS}
+        super().__init__(what, header, meta.get(REMARKS, ()))
         self.table = table
         for name in table.colnames:
             if isinstance(table[name], Time):
@@ -283,14 +356,225 @@ class MemoryTable(TableFile):
 
     def named(self, name: str) -> Values | None:
         """Return a column."""
-        from astropy.time import Time
+        from astropy.time import Time, TimeDelta
 
         title = matched(name, self.names, self.what)
         if title is None:
             return None
         column = self.table[title]
+        if isinstance(column, TimeDelta):
+            return Values.of(name, np.asarray(np.ma.filled(column.to_value("d"), np.nan)), "d", self.what)
         if isinstance(column, Time):
             return Values.of(name, np.asarray(np.ma.filled(column.mjd, np.nan)), "d", self.what)
         ucd, description = str((column.info.meta or {}).get("ucd", "")), column.info.description or ""
         unit = getattr(column, "unit", None)
         return Values.of(name, getattr(column, "value", column), unit, self.what, ucd, description)
+
+
+class Rows:
+    """Cells of a small table by the names of its columns, in any case.
+
+    Parameters
+    ----------
+    table : Table
+    named : str
+        The table, for messages.
+    key : str
+        Key of errors; by default that of the column.
+    """
+
+    def __init__(self, table: Table, named: str, key: str | None = None) -> None:
+        self.table, self.named, self.key, self.n = _with_coordinates(table), named, key, len(table)
+        self._texts: dict[str, list[str]] = {}
+        self._values: dict[str, list[float] | None] = {}
+        self._units: dict[str, str] = {}
+        self._factors: dict[tuple[str, str], float] = {}
+        self._ignored: list[str] = []
+
+    @cached_property
+    def names(self) -> list[str]:
+        """Names of the columns."""
+        return [str(name) for name in self.table.colnames]
+
+    def first(self, wanted: Sequence[str]) -> str | None:
+        """Return the column that has the first of some names."""
+        return first_of(wanted, self.names, self.named)
+
+    def text(self, name: str | None, row: int) -> str:
+        """Return the text of a cell; empty for a missing one."""
+        return "" if name is None else self.texts(name)[row]
+
+    def texts(self, name: str) -> list[str]:
+        """Return the texts of a column."""
+        if name not in self._texts:
+            values = np.ma.asarray(getattr(self.table[name], "value", self.table[name]))
+            cells = [
+                "" if cell is None or cell is np.ma.masked else
+                (cell.decode("utf-8", "replace") if isinstance(cell, bytes) else str(cell)).strip()
+                for cell in (values.tolist() if values.dtype.kind in "SUO" else values)
+            ]  # fmt: skip
+            self._texts[name] = ["" if is_missing(text) else text for text in cells]
+        return self._texts[name]
+
+    def _numbers(self, name: str) -> list[float] | None:
+        """Return the numbers of a column as the table holds them, or None if it holds texts."""
+        if name not in self._values:
+            values = np.ma.asarray(getattr(self.table[name], "value", self.table[name]))
+            numeric = values.dtype.kind in "iuf" and values.ndim == 1
+            self._values[name] = np.ma.filled(values.astype(np.float64), np.nan).tolist() if numeric else None
+        return self._values[name]
+
+    def unit(self, name: str) -> str:
+        """Return the unit of a column as the table states it, or in its name, as in ``distance (pc)``; or nothing."""
+        stated = getattr(self.table[name], "unit", None)
+        return divided_unit(name)[1] if stated is None else str(stated).strip()
+
+    def number(self, name: str | None, row: int, unit: str = "", *, above: float = -np.inf) -> float | None:
+        """Return the number of a cell in a unit, None for a missing one; raise InputError for anything else.
+
+        Parameters
+        ----------
+        unit : str
+            Unit of the result, which the column is in if it states none.
+        above : float
+            Exclusive lower bound.
+        """
+        text = self.text(name, row)
+        if name is None or not text:
+            return None
+        numbers = self._numbers(name)
+        try:
+            # Numbers of single precision are those that the file holds, not their shortest text.
+            value = (number_in(text) if numbers is None else numbers[row]) * self._factor(name, unit)
+        except InputError:
+            raise
+        except ValueError:
+            value = np.nan
+        if not (np.isfinite(value) and above < value):
+            expected = "a number" if np.isinf(above) else f"a number above {above:g}"
+            raise self.error(f"row {row + 1} has {name} = {shortened(text)}", expected, name)
+        return value
+
+    def degrees(self, name: str, row: int, *, right_ascension: bool) -> float | None:
+        """Return an angle in degrees, None for a missing one: numbers, or sexagesimal text."""
+        text = self.text(name, row)
+        if not text:
+            return None
+        unit = self._angles(name)
+        try:
+            return angle(text, unit, right_ascension=right_ascension)
+        except ValueError as error:
+            expected = getattr(error, "expected", None) or "degrees, or sexagesimal text such as 10h30m00s or 10:30:00"
+            raise self.error(f"row {row + 1} has {name} = {shortened(text)}", expected, name) from error
+
+    def _angles(self, name: str) -> str:
+        """Return the unit of a column of angles; raise InputError for another, or for coordinates in FK4."""
+        if name not in self._units:
+            if old := next(filter(_OLD_SYSTEM.search, self._system(name)), None):
+                expected = "right ascension and declination in ICRS or FK5 of J2000"
+                raise self.error(f"its coordinates are in {old}", expected, name)
+            stated = getattr(self.table[name], "unit", None)
+            unit = angle_unit_in_name(name) if stated is None else angle_unit(str(stated))
+            if unit is None:
+                raise self.error(f"{name} has the unit {shortened(str(stated))}", "an angle", name)
+            self._units[name] = unit
+        return self._units[name]
+
+    def _system(self, name: str) -> list[str]:
+        """Return what keywords, columns, comments and a name say of the system of the coordinates."""
+        meta = self.table.meta
+        told = [str(value) for key, value in meta.items() if key_of(str(key)) in SYSTEMS]
+        told += [text for one in self.names if key_of(one) in SYSTEMS for text in {*self.texts(one)}]
+        comments = f"{meta.get('comments', '')} {meta.get('COMMENT', '')}"
+        if not re.search(r"J2000|ICRS|FK5", f"{name} {comments}", re.IGNORECASE):
+            told += re.findall(r"FK4|B1950", comments, re.IGNORECASE)
+        return [*told, divided_unit(name)[1]]
+
+    def unused(self, names: Sequence[str]) -> tuple[str, ...]:
+        """Return the remarks on how the table is read, and on columns that are not used."""
+        said = (*(f"{self.named}: {text}" for text in self.table.meta.get(REMARKS, ())), *self._ignored)
+        words = f"column of {self.named} is" if len(names) == 1 else f"columns of {self.named} are"
+        return (*said, f"{len(names)} {words} not used: {printable(', '.join(names), 200)}.") if names else said
+
+    def error(self, fault: str, expected: str, name: str) -> InputError:
+        """Return the error of a column or cell."""
+        return InputError(f"{self.named}: {fault}", expected, key=self.key or name)
+
+    def _factor(self, name: str, unit: str) -> float:
+        """Return the factor from the unit of a column to another."""
+        if (name, unit) not in self._factors:
+            self._factors[name, unit] = self._ratio(name, unit)
+        return self._factors[name, unit]
+
+    def _ratio(self, name: str, unit: str) -> float:
+        import astropy.units as u
+
+        stated = self.unit(name)
+        if not stated or stated == unit or not unit:
+            return 1.0
+        try:
+            days = time_unit(stated)
+            spelt = days.unit if days else _SPELT.get(stated.lower(), stated)
+            return float(u.Unit((unit in ANGLES.values() and angle_unit(stated)) or spelt).to(unit))
+        except (ValueError, TypeError, u.UnitsError) as error:
+            like = re.search(r"\d|[/^%]|mag", stated, re.IGNORECASE) or is_known(stated)
+            if getattr(self.table[name], "unit", None) is None and not like:
+                # As in ``mass (this work)``.
+                self._ignored.append(
+                    f"{stated!r} in the name of the column {name!r} of {self.named} is read as no unit."
+                )
+                return 1.0
+            raise self.error(
+                f"{name} has the unit {shortened(stated)}",
+                f"a unit such as {'%' if unit == '1' else unit}",
+                name,
+            ) from error
+
+
+#: Keywords and columns of the system of coordinates, and words for those that are not right ascensions of J2000.
+SYSTEMS = ("radesys", "radecsys", "equinox", "epoch", "coosys", "frame", "coord_system", "coordinate_system")
+_OLD_SYSTEM = re.compile(r"FK4|(?<![\d.])B?1950(?:\.0*)?(?![\d.])|\bgal(?:actic)?\b|\becl(?:iptic)?\b", re.IGNORECASE)
+#: Columns of sexagesimal coordinates in tables of CDS and of the journals: hours or degrees, minutes, seconds.
+_PARTS = {"ra": ("RAh", "RAm", "RAs"), "dec": ("DEd", "DEm", "DEs")}
+
+
+def _with_coordinates(table: Table) -> Table:
+    """Return a table with ``ra`` and ``dec`` instead of columns of their parts, as in ``RAh`` and ``DE-``.
+
+    A column of astropy's coordinates is that of both; in FITS it is two, as in ``coord.ra`` and ``coord.dec``.
+    """
+    names = table.colnames
+    place = next((one for one in names if hasattr(table[one], "icrs")), None)
+    pair = next(([one, dec] for one in names if one.endswith(".ra") and (dec := f"{one[:-2]}dec") in names), [])
+    if (place or pair) and not {*_PARTS} & {*names}:
+        table = table.copy()
+        if pair:
+            table.rename_columns(pair, [*_PARTS])
+        else:
+            table["ra"], table["dec"] = table[place].icrs.ra.deg, table[place].icrs.dec.deg
+            table.remove_column(place)
+    parts = [name for names in _PARTS.values() for name in names]
+    if not {*parts} <= {*table.colnames} or {*_PARTS} & {*table.colnames}:
+        return table
+    table = table.copy()
+    signs = table["DE-"] if "DE-" in table.colnames else [""] * len(table)
+    for title, names in _PARTS.items():
+        rows = zip(*(table[name] for name in names), strict=True)
+        texts = ["" if np.ma.masked in row else " ".join(map(str, row)) for row in rows]
+        if title == "dec":
+            texts = [
+                f"{'-' if '-' in str(sign) else ''}{text}" if text else ""
+                for sign, text in zip(signs, texts, strict=True)
+            ]
+        table[title] = texts
+    table.remove_columns([name for name in (*parts, "DE-") if name in table.colnames])
+    return table
+
+
+#: Units of stars, of flares and of temperatures as catalogues spell them.
+_SPELT = {"degc": "deg_C", "c": "deg_C", "celsius": "deg_C", "deg c": "deg_C", "°c": "deg_C",
+          "percent": "%", "ppt": "1e-3", "ppm": "1e-6", "ppb": "1e-9", "solar mass": "solMass", "solar": "solMass",
+          "solar masses": "solMass", "msun": "solMass", "m_sun": "solMass", "solmass": "solMass",
+          "rsun": "solRad", "k": "K", "years": "yr",
+          "ly": "lyr", "lyr": "lyr", "lightyears": "lyr", "light-years": "lyr", "light years": "lyr", "kpc": "kpc",
+          "gyr": "Gyr", "myr": "Myr", "/d": "1/d", "1/day": "1/d", "d-1": "1/d", "per day": "1/d"}  # fmt: skip

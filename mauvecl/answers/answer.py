@@ -1,27 +1,39 @@
-"""Base class of answers: study, messages, inputs, tables, pictures and files."""
+"""Answers: tables, views and files, with everything that is needed to check and reproduce them."""
 
 from __future__ import annotations
 
+import csv
+import datetime
+import hashlib
+import io
+import json
+import platform
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from dataclasses import KW_ONLY, asdict, dataclass
 from functools import cached_property
+from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, overload
 
-from mauvecl.host.content_equality import ContentEquality
+from mauvecl.host.arrays import ContentEquality
+from mauvecl.host.exposure.star import Neighbour, rate_of
+from mauvecl.host.tables.files import check_size, json_text, open_regular, read_text, write_whole, writing
+from mauvecl.host.version import VERSION
+from mauvecl.schema.calls import validated
+from mauvecl.schema.columns import Column, View, percent, records, stacked, table_of
 from mauvecl.schema.drawable import Drawable, documents_of
-from mauvecl.schema.tables import View, records
-from mauvecl.study.labels import full_label
+from mauvecl.schema.errors import InputError
+from mauvecl.study.cases import assumption_line, cases, full_label, place_columns
+from mauvecl.study.study import read_embedded_study
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
     from astropy.table import QTable, Table
 
+    from mauvecl.device.build import Device
     from mauvecl.host.exposure.expectation import Expectation
-    from mauvecl.study.assumptions import Use
-    from mauvecl.study.cases import Case
+    from mauvecl.runs.pool import Pool
+    from mauvecl.study.cases import Case, Use
     from mauvecl.study.study import Study
 
 
@@ -38,16 +50,79 @@ class InCell:
         return full_label(self.label, self.at)
 
 
+@dataclass(eq=False)
+class TableOf:
+    """A table that an answer declares once: its file, its printed view and its part of the JSON.
+
+    It is an attribute of the answer, and made when it is read. What depends on the answer is given as a function of it.
+    """
+
+    file: str  # name of the file without its ending; empty for a table that is only printed or part of the JSON
+    columns: Sequence[Column] | Callable[[Any], Sequence[Column]]
+    rows: str | Callable[[Any], object]  # attribute with the rows, the rows, a single one, or the whole table
+    _: KW_ONLY
+    # Table for the answer and a row, with those of the columns that are not the row's own.
+    of: Callable[[Any, Any], Table] | None = None
+    place: bool = False  # whether columns of the star and of swept quantities precede those that are given
+    title: str | Callable[[Any], str] = ""  # of the printed view; without one there is none
+    key: str = ""  # in JSON
+    when: Callable[[Any], object] = lambda answer: True  # whether the answer has the table
+    about: Callable[[Any], Mapping[str, object]] = lambda answer: {}  # metadata, which precede the study
+    study: bool = True  # whether the metadata include the study
+    cached: bool = True  # whether the answer keeps the table, which may be large
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+
+    @overload
+    def __get__(self, answer: None, owner: type) -> TableOf: ...
+
+    @overload
+    def __get__(self, answer: Answer, owner: type) -> QTable: ...
+
+    def __get__(self, answer: Answer | None, owner: type) -> TableOf | QTable:
+        if answer is None:
+            return self
+        table: QTable = self._made(answer)
+        if self.cached:
+            # The instance's dictionary, which also frozen dataclasses have, hides this attribute from then on.
+            vars(answer)[self.name] = table
+        return table
+
+    def _made(self, answer: Answer) -> Any:
+        rows: Any = self.rows(answer) if callable(self.rows) else attrgetter(self.rows)(answer)
+        if hasattr(rows, "colnames"):
+            return rows
+        if isinstance(rows, Mapping) or not isinstance(rows, Iterable):
+            rows = [rows]
+        about = {**self.about(answer), **({"study": answer.study.text()} if self.study else {})}
+        if self.of is None:
+            return table_of(self.columns_of(answer), rows, **about)
+        parts = [(row, self.of(answer, row)) for row in rows]
+        names = {name for _, table in parts for name in table.colnames}
+        return stacked([column for column in self.columns_of(answer) if column.name not in names], parts, **about)
+
+    def columns_of(self, answer: Answer) -> tuple[Column, ...]:
+        """Return the columns for an answer."""
+        columns = self.columns(answer) if callable(self.columns) else self.columns
+        return answer.placed(columns) if self.place else tuple(columns)
+
+    def view(self, answer: Answer, title: str = "", table: Table | None = None) -> View:
+        """Return the printed view for an answer, under another title or of other rows if they are given."""
+        title = title or (self.title(answer) if callable(self.title) else self.title)
+        return View(title, self.columns_of(answer), getattr(answer, self.name) if table is None else table)
+
+
 class Answer(Drawable, ContentEquality, ABC):
-    """Answer of a verb to a study: tables, printed views, messages, pictures and files."""
+    """Answer of a verb to a study: tables, printed views, messages, pictures and files.
+
+    Subclasses declare tables with `TableOf`, in the order of the files; the first is the answer itself.
+    """
 
     #: File extensions of each table; in some answers only of the first table.
     ENDINGS: ClassVar[tuple[str, ...]] = ("ecsv",)
     #: Parts of the study that the answer uses.
     USES: ClassVar[tuple[Use, ...]]
-
-    #: Properties with the tables in JSON, by key; by default "rows" with the first table.
-    JSON: ClassVar[Mapping[str, str]] = {}
 
     if TYPE_CHECKING:
 
@@ -61,19 +136,36 @@ class Answer(Drawable, ContentEquality, ABC):
 
     @property
     @abstractmethod
-    def tables(self) -> dict[str, Table]:
-        """All tables by file name; the first is the answer itself."""
-
-    @property
-    @abstractmethod
     def inputs(self) -> list[Expectation]:
         """Expectations on which the answer is based, for the run record."""
+
+    def _declared(self) -> list[TableOf]:
+        """Return the declarations of the tables that the answer has."""
+        return [one for one in vars(type(self)).values() if isinstance(one, TableOf) and one.when(self)]
+
+    @property
+    def tables(self) -> dict[str, Table]:
+        """All tables by file name."""
+        return {table.file: getattr(self, table.name) for table in self._declared() if table.file}
+
+    @property
+    def views(self) -> list[View]:
+        """Printed tables, for the terminal and the page."""
+        return [table.view(self) for table in self._declared() if table.title]
+
+    @property
+    def json_tables(self) -> dict[str, Table]:
+        """Tables in JSON by key; "rows" is the first table unless others are declared."""
+        keyed = {table.key: getattr(self, table.name) for table in self._declared() if table.key}
+        return keyed or {"rows": next(iter(self.tables.values()))}
+
+    def placed(self, columns: Sequence[Column]) -> tuple[Column, ...]:
+        """Return columns after those of the star and of swept quantities that are not among them."""
+        return (*place_columns(self.study.sweep, *(column.name for column in columns)), *columns)
 
     @property
     def assumed(self) -> str:
         """Line with the study's assumptions about the parts that the answer uses."""
-        from mauvecl.study.assumptions import assumption_line
-
         return assumption_line(self.study, self.uses)
 
     @property
@@ -81,27 +173,23 @@ class Answer(Drawable, ContentEquality, ABC):
         """Parts of the study that this answer uses."""
         return self.USES
 
-    @property
-    def views(self) -> list[View]:
-        """Printed tables, for the terminal and the page."""
-        return []
-
     @cached_property
     def neighbours(self) -> QTable | None:
         """Neighbours of the stars that the answer observes, or None."""
-        from mauvecl.answers.neighbour_list import neighbour_table
-
-        return (
-            neighbour_table(self.observed, study=self.study.text())
-            if self.study.has_neighbours and "instrument" in self.uses
-            else None
-        )
+        if not self.study.has_neighbours or "instrument" not in self.uses:
+            return None
+        rows = [
+            NeighbourRow(case, neighbour)
+            for case in self.observed
+            for neighbour in (() if case.neighbours is None else case.neighbours.stars)
+        ]
+        shares = sorted({row.case.star.neighbour_share for row in rows})
+        about = {"assumed_share": shares[0] if len(shares) == 1 else shares, "study": self.study.text()}
+        return table_of(NEIGHBOUR_COLUMNS, rows, **about) if rows else None
 
     @property
     def observed(self) -> Sequence[Case]:
         """Cases of the stars that the answer observes, at the study's own values; those of its study by default."""
-        from mauvecl.study.cases import cases
-
         return cases(self.study, swept=False)
 
     @property
@@ -109,9 +197,7 @@ class Answer(Drawable, ContentEquality, ABC):
         """The views and, if there are any, the neighbours."""
         if self.neighbours is None:
             return self.views
-        from mauvecl.answers.neighbour_list import COLUMNS
-
-        return [*self.views, View("Neighbours; what enters is an assumption", COLUMNS, self.neighbours)]
+        return [*self.views, View("Neighbours; what enters is an assumption", NEIGHBOUR_COLUMNS, self.neighbours)]
 
     @property
     def remarks(self) -> list[str]:
@@ -126,18 +212,14 @@ class Answer(Drawable, ContentEquality, ABC):
 
     def as_json(self) -> dict[str, Any]:
         """Return the content that `--json` prints."""
-        tables = {key: getattr(self, name) for key, name in self.JSON.items()}
-        found = tables or {"rows": next(iter(self.tables.values()))}
-        near = {} if self.neighbours is None else {"neighbours": self.neighbours}
-        return {"messages": list(self.messages)} | {key: records(table) for key, table in (found | near).items()}
+        tables = self.json_tables | ({} if self.neighbours is None else {"neighbours": self.neighbours})
+        return {"messages": list(self.messages)} | {key: records(table) for key, table in tables.items()}
 
     def write(self, folder: str | Path) -> list[Path]:
         """Write every table and the study, and return their paths.
 
         Raises InputError if a file cannot be written; an earlier file of that name is then unchanged.
         """
-        from mauvecl.answers.files import make_folder, write_document, write_study, write_table
-
         place = make_folder(Path(folder))
         return [
             *(write_table(table, place / name) for name, table in self.files.items()),
@@ -153,5 +235,327 @@ class Answer(Drawable, ContentEquality, ABC):
     @property
     def files(self) -> dict[str, Table]:
         """Tables by full file name."""
-        near = {} if self.neighbours is None else {"neighbours": self.neighbours}
-        return {f"{name}.{ending}": table for name, table in (self.tables | near).items() for ending in self.ENDINGS}
+        tables = self.tables | ({} if self.neighbours is None else {"neighbours": self.neighbours})
+        return {f"{name}.{ending}": table for name, table in tables.items() for ending in self.ENDINGS}
+
+
+#: File name of the run record, and its key with the digest of all other keys.
+RECORD, OWN_DIGEST = "run.json", "record_digest"
+
+
+@dataclass(frozen=True)
+class FileFault:
+    """File that differs from what the run wrote."""
+
+    file: str
+    state: str  # "changed", "missing" or another fault
+
+
+#: Largest size of a file of an answer, bytes.
+LARGEST = 2**30
+
+#: Columns of the table of faults.
+FAULT_COLUMNS = (Column("file", heading="file"), Column("state", heading="what"))
+
+
+def digest_of(path: Path) -> str:
+    """Return the SHA-256 of a file, in hexadecimal; raise InputError if it is no regular file."""
+    with open_regular(path, "file") as opened:
+        return hashlib.file_digest(opened, "sha256").hexdigest()
+
+
+def record_digest(record: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of a run record as canonical JSON: sorted keys, no spaces, without its own digest."""
+    rest = {key: value for key, value in record.items() if key != OWN_DIGEST}
+    text = json.dumps(rest, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def is_answer(folder: Path) -> bool:
+    """Return whether a folder holds a run record, or the study and a table of an answer whose record is missing."""
+    if (folder / RECORD).is_file():
+        return True
+    return (folder / "study.toml").is_file() and any(map(_is_table_of_answer, folder.glob("*.ecsv")))
+
+
+def _is_table_of_answer(path: Path) -> bool:
+    """Return whether a table has a study in its metadata, which a user's own tables do not."""
+    try:
+        return bool(read_embedded_study(path))
+    except InputError:
+        return False
+
+
+@validated
+def verify_answer(folder: str | Path) -> list[FileFault]:
+    """Compare an answer's folder with the digests in its run record.
+
+    Any change of a file of the run, and of the record itself, is detected, unless digests are also recomputed: the
+    digest is not a signature. Other files in the folder are ignored.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Value of a verb's ``--output``.
+
+    Returns
+    -------
+    list of FileFault
+        Empty if all files are unchanged.
+    """
+    folder = Path(folder)
+    if not is_answer(folder):
+        raise InputError(f"{str(folder)!r} holds no {RECORD}", "the output folder of a verb", key="folder")
+    if not (folder / RECORD).is_file():
+        return [FileFault(RECORD, "missing")]
+    text = read_text(folder / RECORD, "run record")
+    try:
+        record = json.loads(text)
+        named = record.get("files", {})
+        files = {Path(name).name: digest for name, digest in named.items()}
+    except (ValueError, AttributeError, RecursionError):
+        return [FileFault(RECORD, "cannot be read")]
+    faults = []
+    if OWN_DIGEST not in record:
+        faults.append(FileFault(RECORD, "holds no digest of itself: changed, or of an earlier version"))
+    elif record[OWN_DIGEST] != record_digest(record) or text != json_text(record) + "\n":
+        faults.append(FileFault(RECORD, "changed"))
+    for name, digest in files.items():
+        path = folder / name
+        try:
+            same = path.exists() and check_size(path, "file", LARGEST) and digest_of(path) == digest
+        except (InputError, OSError):
+            faults.append(FileFault(name, f"no regular file of at most {LARGEST >> 30} GiB"))
+            continue
+        if not same:
+            faults.append(FileFault(name, "changed" if path.exists() else "missing"))
+    return faults
+
+
+FITS_KEYWORDS = {"name": "OBJECT", "exposure_s": "EXPTIME", "frames": "NFRAMES", "seed": "SEED"}
+
+
+def make_folder(path: Path) -> Path:
+    """Make a folder; raises InputError if it cannot be made or written to."""
+    if path.exists() and not path.is_dir():
+        raise InputError(f"output folder {str(path)!r} is a file: give the name of a folder", key="output")
+    with writing(f"output folder {str(path)!r}", path, "a writable one", key="output"):
+        path.mkdir(parents=True, exist_ok=True)
+        probe = path / ".mauvecl-probe"
+        probe.write_text("")
+        probe.unlink(missing_ok=True)
+    return path
+
+
+def write_table(table: Table, path: Path) -> Path:
+    """Write a table as ECSV, or as FITS by the file's ending, atomically.
+
+    Raises InputError if it cannot be written; an existing file is then kept.
+    """
+    if path.suffix == ".fits":
+        plain, packed = table.copy(), io.BytesIO()
+        # FITS keywords are limited to eight letters and short values, so the study has its own file.
+        plain.meta = {FITS_KEYWORDS[k]: v for k, v in plain.meta.items() if k in FITS_KEYWORDS}
+        plain.write(packed, format="fits")
+        write_whole(path, packed.getbuffer())
+    else:
+        write_whole(path, ecsv_text(table).encode())
+    return path
+
+
+def ecsv_text(table: Table) -> str:
+    """Return a table as ECSV text with the bytes of astropy's writer, but faster for many rows."""
+    text = io.StringIO()
+    cells = [_words(column) for column in table.itercols()]
+    if None in cells:
+        table.write(text, format="ascii.ecsv")
+    else:
+        table[:0].write(text, format="ascii.ecsv")
+        text.writelines(f"{' '.join(row)}\n" for row in zip(*cells, strict=True))
+    return text.getvalue()
+
+
+def _words(column: Any) -> list[str] | None:
+    """Return the cells of a column as text, or None if it is masked or contains anything but numbers and text."""
+    import numpy as np
+
+    values = np.asarray(column)
+    if values.ndim > 1 or values.dtype.kind not in "iufbU" or np.any(getattr(column, "mask", False)):
+        return None
+    if values.dtype.kind == "U":
+        names, place = np.unique(values, return_inverse=True)
+        return np.array([_quoted(str(name)) for name in names], object)[place].tolist()  # type: ignore[no-any-return]
+    # A shorter float's digits are its own.
+    return list(map(str, values.tolist() if values.dtype.kind != "f" or values.dtype == np.float64 else values))
+
+
+def _quoted(word: str) -> str:
+    """Quote a word if necessary, by the rules of `csv`."""
+    line = io.StringIO()
+    csv.writer(line, delimiter=" ", lineterminator="").writerow([word, "end"])
+    return line.getvalue().removesuffix(" end") or '""'
+
+
+def write_document(content: bytes, path: Path) -> Path:
+    """Write a file from its bytes; errors as for `write_table`."""
+    write_whole(path, content)
+    return path
+
+
+def write_study(text: str, folder: Path) -> Path:
+    """Write the text of a study; errors as for `write_table`."""
+    return write_document(text.encode(), folder / "study.toml")
+
+
+def write_record(
+    verb: str,
+    study: Mapping[str, Any],
+    expectations: Sequence[Expectation],
+    folder: Path,
+    *,
+    pool: Pool | None,
+    opened: Device | None = None,
+    seconds: float,
+    messages: Sequence[str],
+    files: Sequence[Path] | None = None,
+    whole: bool = True,
+) -> Path:
+    """Write the run record, which says how an answer was computed.
+
+    The study is as JSON can hold it. `opened` is the device if something was drawn without a pool. The record contains
+    the digests of the written `files` and its own; see `verify_answer`. If these are the `whole` answer, unchanged
+    files of an earlier run in the folder that this run did not write are removed.
+    """
+    record: dict[str, Any] = {
+        "mauvecl": VERSION,
+        "verb": verb,
+        "date_utc": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "wall_time_s": round(seconds, 3),
+        "seed": study["run"]["seed"],
+        "study": study,
+        "inputs": [{"name": x.name} | dict(x.provenance) for x in expectations],
+        "messages": list(messages),
+        "python": platform.python_version(),
+        "packages": _versions("numpy", "scipy", "astropy", "synphot", "pyopencl"),
+    }
+    if pool is not None or opened is not None:
+        devices = pool.devices if pool is not None else [opened.record] if opened is not None else []
+        record["devices"] = [asdict(device) for device in devices]
+        record["kernels"] = (pool or opened).kernel_digest  # type: ignore[union-attr]
+        if pool is not None:
+            record["shards"] = asdict(pool.standing)
+        # Outcome of the self-test on these devices, if it was run.
+        from mauvecl.device.selftest import read_outcome
+
+        missing = "not run on this device and version: mauvecl selftest"
+        record["selftest"] = [read_outcome(device) or missing for device in devices]
+    stale: list[Path] = []
+    if files is not None:
+        record["files"] = {path.name: digest_of(path) for path in files}
+        if whole:
+            stale = [path for path in _left_by_another(folder) if path.name not in record["files"]]
+    # Converted to JSON and back, so that the digest of a record that is read again is the same.
+    record = json.loads(json_text(record))
+    record[OWN_DIGEST] = record_digest(record)
+    written = write_json(record, folder / RECORD)
+    for path in stale:
+        path.unlink(missing_ok=True)
+    return written
+
+
+def _left_by_another(folder: Path) -> list[Path]:
+    """Return the files of the record in a folder that are unchanged."""
+    try:
+        named = json.loads(read_text(folder / RECORD, "run record")).get("files", {})
+        files = [(folder / name, digest) for name, digest in named.items() if Path(name).name == name]
+        return [path for path, digest in files if path.is_file() and digest_of(path) == digest]
+    except (InputError, OSError, ValueError, AttributeError, RecursionError):
+        # No record, or not one of mauvecl's.
+        return []
+
+
+def write_json(content: Any, path: Path) -> Path:
+    """Write plain data as JSON; errors as for `write_table`."""
+    write_whole(path, (json_text(content) + "\n").encode())
+    return path
+
+
+def _versions(*names: str) -> dict[str, str]:
+    from importlib.metadata import version
+
+    return {name: version(name) for name in names}
+
+
+@dataclass(frozen=True, eq=False)
+class NeighbourRow:
+    """A neighbour of a case's star."""
+
+    case: Case
+    neighbour: Neighbour
+
+    @property
+    def enters(self) -> bool:
+        """True if the neighbour is within the fibre's radius."""
+        return self.neighbour.separation_arcsec <= self.case.instrument.field_of_view_radius_arcsec
+
+    @property
+    def spectrum(self) -> str:
+        """Spectrum that represents the neighbour; empty beyond the fibre, where none is needed."""
+        return self.neighbour.spectrum[0] if self.enters else ""
+
+    @property
+    def share(self) -> float:
+        """Share of the electrons of all stars in the fibre."""
+        if not self.enters:
+            return 0.0
+        x, near = self.case.quiet, self.case.neighbours
+        assert near is not None
+        rate = rate_of(self.neighbour, self.case.instrument, self.case.study.observation.order)
+        own = near.share * float(rate.sum()) * x.frame_s
+        return own / float((x.source_electrons + x.neighbour_electrons).sum())
+
+
+#: Columns of the table of neighbours.
+NEIGHBOUR_COLUMNS = (
+    Column("star", "case.label", description="star that is observed", heading="star", kind=str),
+    Column("name", "neighbour.name", description="neighbour", heading="neighbour", kind=str),
+    Column("separation", "neighbour.separation_arcsec", "arcsec", "from the star", "arcsec", ".4g"),
+    Column("magnitude", lambda row: float("nan") if row.neighbour.magnitude is None else row.neighbour.magnitude,
+           "mag", "in the band", "magnitude", ".2f"),
+    Column("band", "neighbour.band", heading="band", kind=str),
+    Column("spectrum", description="spectrum that represents it; empty if its light does not enter",
+           heading="spectrum", kind=str),
+    Column("enters", description="whether it is within the fibre's radius, so that the assumed share of its light "
+           "enters", heading="enters", format=lambda value: "yes" if value else "no", kind=bool),
+    Column("share", description="share of the electrons of all stars in the fibre, without a flare",
+           heading="of all stars", format=percent(".3g")),
+)  # fmt: skip
+
+
+def share_columns(study: Study, get: str) -> tuple[Column, ...]:
+    """Return the column of the dilution, or nothing for studies without neighbours; `get` names it in a row."""
+    text = "share of the star in the electrons of all stars in the fibre, without a flare (dilution)"
+    return (Column("target_share", get, "", text, "star's share", percent(".3g")),) if study.has_neighbours else ()
+
+
+def realisations_of(answer: Answer) -> dict[str, object]:
+    """Return the number of a study's realisations, for the metadata of tables."""
+    return {"realisations": answer.study.run.realisations}
+
+
+Item = TypeVar("Item")
+
+
+def reported(items: Iterable[Item], total: int, progress: Callable[[int, int], None] | None) -> Iterator[Item]:
+    """Yield items, and call ``progress(done, total)`` after the work on each.
+
+    If that raises, a generator of items is closed at once, while the workers that it uses are still open.
+    """
+    try:
+        for done, item in enumerate(items, 1):
+            yield item
+            if progress is not None:
+                progress(done, total)
+    finally:
+        if isinstance(items, Generator):
+            items.close()

@@ -70,7 +70,6 @@ class Verb:
     """A question, answered by the function of the same name: ``verb(study, engine=None, progress=None) -> Answer``."""
 
     name: str
-    home: str  # module of `mauvecl.answers` that holds the function; it is imported when the verb is first used
     help: str  # help text of the command, with examples
     # Keys and sections of the study whose flags the command takes, in addition to those of `observation`.
     takes: tuple[str, ...]
@@ -84,6 +83,13 @@ class Verb:
     default: DefaultStudy | None = None
     # Whether the page has a tab with this answer; one without a class in `web.tabs` shows its first view.
     tab: bool = False
+    # Module of `mauvecl.answers` that holds the function, if it is not named after it; it is imported at the first use.
+    home: str = ""
+
+    @property
+    def module(self) -> str:
+        """Name of the module that holds the function."""
+        return f"answers.{self.home or self.name}"
 
     def accepts(self, key: str) -> bool:
         """Return whether the command has the flags of a key or section of the study."""
@@ -93,7 +99,7 @@ class Verb:
     @property
     def ask(self) -> Callable[..., Any]:
         """The function that answers."""
-        function: Callable[..., Any] = getattr(import_module(f"mauvecl.answers.{self.home}"), self.name)
+        function: Callable[..., Any] = getattr(import_module(f"mauvecl.{self.module}"), self.name)
         return function
 
 
@@ -122,7 +128,6 @@ VERBS: dict[str, Verb] = {
     for one in (
         Verb(
             "simulate",
-            "signal.simulate",
             """Simulate one observation, and show what it consists of.
 
     Star, sky, photon noise, dark, bias, read noise, and the closed-form S/N.
@@ -130,10 +135,10 @@ VERBS: dict[str, Verb] = {
     Example: mauvecl simulate --star G2V --magnitude 7.4 --exposure 50 --amplitude 0.24
     """,
             ("flare", *SIGNAL, "run.seed"),
+            home="signal",
         ),
         Verb(
             "snr",
-            "signal.snr",
             """Compute signal-to-noise ratios and noise budgets.
 
     Of each pixel and of each resolution element (10.5 nm).
@@ -150,10 +155,10 @@ VERBS: dict[str, Verb] = {
             counts="realisations",
             defaults=FEWER,
             default=_budgets_or_star,
+            home="signal",
         ),
         Verb(
             "exposure",
-            "signal.exposures",
             """Find the shortest exposure with a wanted S/N at a wavelength.
 
     By the closed form, in whole frames; `mauvecl snr` goes the other way.
@@ -162,10 +167,10 @@ VERBS: dict[str, Verb] = {
     """,
             ("signal", *SIGNAL),
             without="observation.exposure_s",
+            home="signal",
         ),
         Verb(
             "detect",
-            "detection.detect",
             """Tell whether flares would be seen: thresholds, probabilities.
 
     Without arguments: the paper's K3V star of V = 3.7 and G2V star of V = 7.4 with flares of 0.76, 2, 8.1 and 24 %,
@@ -178,7 +183,6 @@ VERBS: dict[str, Verb] = {
         ),
         Verb(
             "limit",
-            "limits.limits",
             """Find the limiting magnitude, smallest amplitude or exposure.
 
     Of a star or flare that is seen with a wanted probability.
@@ -194,7 +198,6 @@ VERBS: dict[str, Verb] = {
         ),
         Verb(
             "map",
-            "detection.maps",
             """Map the detection probability over two quantities, for one star.
 
     Quantities: magnitude, amplitude, flare_temperature, exposure, detector_temperature, sky, star. All cells are drawn
@@ -209,7 +212,6 @@ VERBS: dict[str, Verb] = {
         ),
         Verb(
             "gaussian",
-            "detection.gaussian",
             """Find where the usual root-of-N formula is wrong.
 
     Its S/N, intervals and false alarms are compared with those of realisations.
@@ -227,7 +229,6 @@ VERBS: dict[str, Verb] = {
         ),
         Verb(
             "measure",
-            "measurements.measure",
             """Measure simulated spectra of flares, and how well that works.
 
     Temperature, area, energy, Balmer jump and lines: errors in advance, simulated fits with the coverage of their
@@ -245,7 +246,6 @@ VERBS: dict[str, Verb] = {
         ),
         Verb(
             "stare",
-            "stares.stare",
             """Simulate a stare: light curves, spectra, flares, a search.
 
     Without arguments: the paper's two stars over one orbit, four flares each. The FITS files are read by lightkurve.
@@ -260,7 +260,6 @@ VERBS: dict[str, Verb] = {
         ),
         Verb(
             "inject",
-            "stares.inject",
             """Find which flares a search detects: completeness, false alarms.
 
     Over energy (or amplitude) and half-width, with the errors of recovered flares.
@@ -295,7 +294,6 @@ VERBS: dict[str, Verb] = {
         ),
         Verb(
             "analyse",
-            "observations.analyse",
             """Flares in observed frames, with their false alarms.
 
     Reads light curves of mauvecl, TESS and Kepler as they are, and other tables through a mapping (TOML). Spectra of
@@ -322,7 +320,6 @@ VERBS: dict[str, Verb] = {
         ),
         Verb(
             "change",
-            "observations.change",
             """Find the smallest change between visits that can be seen.
 
     Of lines, bands, Balmer jump, colour, or of a spectrum from a file; with `--periods`, which periods are recovered
@@ -337,7 +334,6 @@ VERBS: dict[str, Verb] = {
         ),
         Verb(
             "calibrate",
-            "observations.calibrate",
             """Fit an instrument to frames of standard stars and dark frames.
 
     Throughput with its covariance, dark current, gain, read noise, line width and wavelength zero point. The study
@@ -351,7 +347,6 @@ VERBS: dict[str, Verb] = {
         ),
         Verb(
             "visible",
-            "campaigns.visible",
             """Find when targets can be seen from the orbit.
 
     Windows, hours by day and month, the Sun's distance, zodiacal light, a calendar.
@@ -363,7 +358,6 @@ VERBS: dict[str, Verb] = {
         ),
         Verb(
             "plan",
-            "campaigns.plan",
             """Plan a campaign: hours, expected flares, false alarms; a report.
 
     The table has a column name, and what is known of each star: ra and dec, V, spectral_type, distance_pc, mass_msun
@@ -388,4 +382,4 @@ VERBS: dict[str, Verb] = {
     )
 }
 #: Module of every public name of a verb, including older names.
-HOMES = {name: f"answers.{verb.home}" for verb in VERBS.values() for name in (verb.name, *verb.older)}
+HOMES = {name: verb.module for verb in VERBS.values() for name in (verb.name, *verb.older)}

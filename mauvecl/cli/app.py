@@ -1,34 +1,274 @@
-"""The command line: one verb each, from a study file or flags."""
+"""The command line: its commands, and those about mauvecl itself, its library of stars and its page."""
 
 from __future__ import annotations
 
 import atexit
 import gc
 import inspect
+import json
 import os
 import re
 import sys
+import time
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache
-from importlib import import_module
-from pkgutil import iter_modules
-from typing import Annotated, Any
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
 from mauvecl.answers.verbs import VERBS
-from mauvecl.cli import verbs
-from mauvecl.cli.boundary import EXIT_CODES, guarded
-from mauvecl.cli.naming import name_flags_of
-from mauvecl.cli.verb import COMMANDS, add_plain_commands
-from mauvecl.cli.verbs.about import devices, schema, selftest
-from mauvecl.cli.verbs.bulk import export, verify
-from mauvecl.cli.verbs.library import app as library
-from mauvecl.cli.verbs.library import library as show_library
-from mauvecl.cli.verbs.serve import serve
+from mauvecl.cli.commands import COMMANDS, add_plain_commands, export, verify
+from mauvecl.cli.console import EXIT_CODES, guarded, name_flags_of
+from mauvecl.cli.flags import DeviceFlag, JsonFlag, QuietFlag, option_of, within
 from mauvecl.host.version import VERSION
+from mauvecl.schema.parsing import count
+
+if TYPE_CHECKING:
+    from mauvecl.host.stars.library import OwnStar
+
+WhereFlag = Annotated[
+    Path | None,
+    typer.Option("--output", "-o", metavar="PATH", help="Where to write [nowhere].", show_default=False),
+]
+
+
+def devices(
+    rate: Annotated[bool, typer.Option("--rate/--no-rate", help="Measure each device for a second.")] = True,
+    forget: Annotated[bool, typer.Option("--forget", help="Retry drivers that failed to build kernels.")] = False,
+    as_json: JsonFlag = False,
+) -> None:
+    """List the OpenCL devices that can run the kernels, and rates.
+
+    Promise: which numbers are the same as on every other device.
+    Rate: pixel-realisations per second of the chi2 statistic, two scenarios.
+
+    Example: mauvecl devices
+    """
+    from mauvecl.device.drivers import forget_outcomes
+    from mauvecl.device.selftest import DEVICE_COLUMNS, list_devices
+    from mauvecl.schema.columns import View
+
+    if forget:
+        forget_outcomes()
+    records = list_devices() if rate else list_devices(measure=False)
+    if as_json:
+        print(json.dumps(records, indent=2))
+        return
+    from mauvecl.cli.console import show_view
+
+    numbered = [{"number": number} | record for number, record in enumerate(records)]
+    show_view(View("OpenCL devices; choose with --device NUMBER or part of a name", DEVICE_COLUMNS, numbered))
+
+
+def selftest(
+    device: DeviceFlag = None, output: WhereFlag = None, as_json: JsonFlag = False, quiet: QuietFlag = False
+) -> None:
+    """Check that your device computes what it should.
+
+    Known answers, the NumPy reference, tests of chance and closed forms; takes about ten seconds.
+
+    Exit code 1 if a check fails. Later run records on the same device carry the outcome.
+
+    Example: mauvecl selftest
+    """
+    from dataclasses import asdict
+
+    from mauvecl.answers.answer import make_folder, write_json
+    from mauvecl.cli.console import Meter, show, show_view
+    from mauvecl.device import selftest
+    from mauvecl.device.engine import Engine
+    from mauvecl.schema.columns import View
+
+    started = time.perf_counter()
+    folder = None if output is None else make_folder(output)
+    with Meter(quiet=quiet or as_json) as meter:
+        engine = Engine(device, progress=meter)
+        checks = selftest.run(engine)
+    seconds = time.perf_counter() - started
+    selftest.write_outcome(engine.device, checks, seconds)
+    failed = sum(not check.passed for check in checks)
+    if as_json:
+        print(json.dumps(selftest.read_outcome(engine.device) or [asdict(check) for check in checks], indent=2))
+    else:
+        title = f"Self-test of {engine.device_name}, driver {engine.driver}"
+        show_view(View(title, selftest.CHECK_COLUMNS, [asdict(check) for check in checks]))
+        outcome = f"{failed} of {len(checks)} checks FAILED" if failed else f"All {len(checks)} checks passed"
+        show([f"{outcome} in {seconds:.0f} s. Promise: {engine.device.promise}."])
+    if folder is not None:
+        write_json(selftest.read_outcome(engine.device), folder / "selftest.json")
+    if failed:
+        raise typer.Exit(1)
+
+
+def schema() -> None:
+    """Print the JSON schema of study files, for editors of TOML.
+
+    A study names it in its first line, as in #:schema study.schema.json.
+
+    Example: mauvecl schema > study.schema.json
+    """
+    from mauvecl.study.study import Study
+
+    print(json.dumps(Study.model_json_schema(), indent=2))
+
+
+library_app = typer.Typer(invoke_without_command=True, rich_markup_mode=None, add_completion=False)
+ReplaceFlag = Annotated[bool, typer.Option("--replace", help="Replace an existing entry of that name.")]
+
+
+@library_app.callback()
+def library(context: typer.Context, as_json: JsonFlag = False) -> None:
+    """List the embedded spectra and your own.
+
+    `add`, `fetch` and `remove` change yours.
+
+    Those of the library are kept at V = 0 and need --magnitude, but for the Sun and Vega.
+
+    Examples: mauvecl library
+
+    mauvecl library add my-star.txt
+
+    mauvecl library fetch "ngsl:HD 37202"
+    """
+    if context.invoked_subcommand is not None:
+        return
+    from mauvecl.host.stars.library import COLUMNS, OWN_COLUMNS, library_table
+    from mauvecl.schema.columns import View, records
+
+    table = library_table()
+    if as_json:
+        print(json.dumps(records(table), indent=2))
+        return
+    from mauvecl.cli.console import show_view
+
+    title = "Embedded spectra (UV: mean flux over that at 540-560 nm); origin, citation: --json"
+    show_view(View(title, COLUMNS, table[table["kept"] == "embedded"]))
+    yours = table[table["kept"] == "yours"]
+    if len(yours):
+        show_view(View("Your own", OWN_COLUMNS, yours))
+
+
+@library_app.command()
+def add(
+    files: Annotated[list[Path], typer.Argument(help="Text, ECSV, VOTable or FITS; FILE[COLUMN] names a column.")],
+    name: Annotated[
+        str | None, typer.Option(metavar="TEXT", help="Name of the star, for a single file.", show_default=False)
+    ] = None,
+    replace: ReplaceFlag = False,
+    wavelength_unit: Annotated[str | None, option_of("star.wavelength_unit")] = None,
+    flux_unit: Annotated[str | None, option_of("star.flux_unit")] = None,
+    extend: Annotated[str | None, option_of("star.extend")] = None,
+    quiet: QuietFlag = False,
+) -> None:
+    """Keep spectra of your own under a name, for --star.
+
+    Example: mauvecl library add my-star.txt --name "HD 1234"
+    """
+    from mauvecl.host.stars.additions import add
+    from mauvecl.schema.errors import InputError
+
+    if name is not None and len(files) > 1:
+        raise InputError(f"--name {name!r} needs a single file, but {len(files)} are given", key="name")
+    for file in files:
+        star = add(file, name, replace=replace, wavelength_unit=wavelength_unit, flux_unit=flux_unit, extend=extend)
+        _tell(star, quiet)
+
+
+@library_app.command()
+def fetch(
+    names: Annotated[
+        list[str], typer.Argument(help="Stars, such as ngsl:HD 37202; in calspec, ngsl or lowlib, or in any of them.")
+    ],
+    base: Annotated[
+        str | None,
+        typer.Option("--from", metavar="TEXT", help="Address of a mirror of the collection.", show_default=False),
+    ] = None,
+    replace: ReplaceFlag = False,
+    extend: Annotated[str | None, option_of("star.extend")] = None,
+    quiet: QuietFlag = False,
+) -> None:
+    """Fetch stars of public collections of HST spectra and keep them.
+
+    Example: mauvecl library fetch "calspec:18sco"
+    """
+    import sys
+
+    from mauvecl.host.stars.additions import fetch
+
+    for name in names:
+        shown = not quiet and sys.stderr.isatty()
+        _tell(fetch(name, base=base, replace=replace, show_progress=shown, extend=extend), quiet)
+
+
+@library_app.command()
+def remove(names: Annotated[list[str], typer.Argument(help="Names of kept stars.")], quiet: QuietFlag = False) -> None:
+    """Remove spectra of your own.
+
+    Example: mauvecl library remove "HD 1234"
+    """
+    from mauvecl.cli.console import show
+    from mauvecl.host.stars.library import remove
+
+    for name in names:
+        remove(name)
+        if not quiet:
+            show([f"Removed {name}."])
+
+
+def _tell(star: OwnStar, quiet: bool) -> None:
+    from mauvecl.cli.console import show
+
+    if quiet:
+        return
+    lines = [
+        f"Kept {star.name}: --star {json.dumps(star.name) if ' ' in star.name else star.name}",
+        *star.notes,
+        *star.messages,
+    ]
+    if star.unscaled:
+        lines.append(f"It needs --magnitude: {star.unscaled}.")
+    if star.dereddened:
+        lines.append("Without its dust it is too bright in the ultraviolet: --ebv reddens it again.")
+    show(lines)
+
+
+def serve(
+    address: Annotated[
+        str, typer.Option(metavar="TEXT", help="Address to listen on; 127.0.0.1 accepts this machine only.")
+    ] = "127.0.0.1",
+    port: Annotated[str, typer.Option(metavar="INTEGER", help="Port to listen on.")] = "5006",
+    allow_origin: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="TEXT",
+            help="Public address of the page, such as https://mauve.example.org; required if --address "
+            "accepts other machines. May be repeated.",
+            show_default=False,
+        ),
+    ] = None,
+    show: Annotated[bool, typer.Option("--show", help="Open a browser.")] = False,
+) -> None:
+    """Serve a page in your browser: questions, answers, downloads.
+
+    Example: mauvecl serve --show
+    """
+    from mauvecl.schema.errors import InputError, shortened
+
+    number = within(port, "--port", read=count, low=1, high=65535)
+    if find_spec("bokeh") is None or find_spec("tornado") is None:
+        raise InputError("Bokeh, which the page needs, is missing: pip install 'mauvecl[web]'", key="bokeh")
+    from mauvecl.web.server import serve
+
+    try:
+        serve(address, number, show=show, allow_origin=allow_origin or ())
+    except OSError as error:
+        raise InputError(
+            f"port {port} of {shortened(address)} cannot be used ({error.strerror})", "another: --port", key="port"
+        ) from error
 
 
 def _help(text: str | None) -> str:
@@ -48,8 +288,6 @@ def _broken(command: str, most: int = 72) -> str:
     return "\n".join(lines)
 
 
-for module in iter_modules(verbs.__path__, f"{verbs.__name__}."):
-    import_module(module.name)
 add_plain_commands()
 #: Functions of the commands without a study.
 OTHERS: dict[str, Callable[..., None]] = {
@@ -59,7 +297,7 @@ OTHERS: dict[str, Callable[..., None]] = {
 HELP = {
     **{name: _help(COMMANDS[name].help) for name in (*VERBS, "realise")},
     **{name: _help(function.__doc__) for name, function in OTHERS.items()},
-    "library": _help(show_library.__doc__),
+    "library": _help(library.__doc__),
 }
 
 
@@ -67,7 +305,7 @@ HELP = {
 def _command(name: str) -> Any:
     """Build a command, with its flags."""
     if name == "library":
-        one = library
+        one = library_app
         for inner in one.registered_commands:
             inner.help = _help(inner.callback and inner.callback.__doc__)
     else:

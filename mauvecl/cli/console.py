@@ -1,19 +1,236 @@
-"""Output to the terminal: tables, messages, progress."""
+"""Text on the terminal: tables, errors with flags in place of keys, and exit codes."""
 
 from __future__ import annotations
 
+import ast
+import contextlib
+import datetime
+import errno
+import os
+import platform
+import re
+import shlex
 import sys
+import tempfile
 import time
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, Self
+import traceback
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Self
 
-from mauvecl.schema.tables import INTERVAL, View, without_empty
+from mauvecl.schema.columns import INTERVAL, View, without_empty
 
 if TYPE_CHECKING:
+    import typer
     from rich.progress import Progress, TaskID
     from rich.table import Table
 
     from mauvecl.runs.pool import PoolProgress
+    from mauvecl.schema.errors import InputError
+
+#: Exit codes other than 0; 70 and 74 as sysexits.h has them, those above 128 as shells count signals.
+FAULTY: Final = 1
+BAD_INPUT: Final = 2
+UNFORESEEN: Final = 70
+OUTPUT_FULL: Final = 74
+INTERRUPTED: Final = 130
+READER_GONE: Final = 141
+#: Their description in `--help`.
+EXIT_CODES = (
+    f"Exit codes: 0 done, {FAULTY} a check found a fault, {BAD_INPUT} bad input, {UNFORESEEN} an unforeseen failure "
+    f"(a fault of mauvecl; a file with its traceback is named), {OUTPUT_FULL} standard output cannot be written, "
+    f"{INTERRUPTED} interrupted, {READER_GONE} the reader of standard output went away, 143 terminated."
+)
+#: Largest number of characters of a message.
+LONGEST = 1000
+#: Error numbers of full disks and quotas, which name no file.
+DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EMFILE, errno.ENFILE)
+
+#: Libraries that write to standard output for mauvecl.
+PRINTERS = ("click", "typer", "rich", "mauvecl.cli")
+#: Output folder of the verb, once known, to which tracebacks are written.
+_folder: Path | None = None
+
+
+def writes_to(folder: Path) -> None:
+    """Set the folder into which an unforeseen failure writes its traceback."""
+    global _folder
+    _folder = folder
+
+
+def guarded(app: typer.Typer) -> int:
+    """Run the command line.
+
+    Returns
+    -------
+    int
+        The exit code.
+    """
+    global _folder
+    _folder = None
+    _print_anything()
+    out = sys.stdout
+    with warnings.catch_warnings():
+        warnings.showwarning = _warn
+        try:
+            code = _run(app)
+        except SystemExit as end:
+            code = end.code if isinstance(end.code, int) else BAD_INPUT if end.code else 0
+            if isinstance(end.__context__, BrokenPipeError):
+                # Click and rich end in different ways if the reader of standard output is gone.
+                sys.stdout, code = out, READER_GONE
+    return _flushed(code)
+
+
+def _run(app: typer.Typer) -> int:
+    # Click's own classes are private to newer versions of typer.
+    from mauvecl.schema.errors import InputError
+
+    try:
+        code = app(standalone_mode=False)
+    except InputError as error:
+        return _say(name_flag(error), BAD_INPUT)
+    except MemoryError:
+        return _say("the memory does not suffice for this question, expected a smaller one or more of it", BAD_INPUT)
+    except OSError as error:
+        return _failed_call(error)
+    except Exception as error:
+        return _failed(error)
+    if code == INTERRUPTED:
+        return _say("interrupted", INTERRUPTED)
+    return code if isinstance(code, int) else 0
+
+
+def _failed(error: Exception) -> int:
+    """Report a wrong use of flags, a device that fails, or an unforeseen failure."""
+    if hasattr(error, "format_message") and isinstance(getattr(error, "exit_code", None), int):
+        # A usage error of Click, or the help text of an empty command line, which Click prints itself.
+        text = str(error.format_message())
+        return _say(text.splitlines()[0] if text else "", BAD_INPUT) if text.strip() else BAD_INPUT
+    if type(error).__name__ == "Abort" or isinstance(error.__cause__, KeyboardInterrupt):
+        return _say("interrupted", INTERRUPTED)
+    # Imported here, because verbs that draw nothing do not need it.
+    program = sys.modules.get("mauvecl.device.build")
+    if program is not None and isinstance(error, program.DeviceError):
+        return _say(str(error), BAD_INPUT, whole=isinstance(error, program.BuildError))
+    where = _write_traceback(error)
+    what = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+    return _say(
+        f"something unforeseen happened, a fault of mauvecl ({what[:200]}); its traceback is in {str(where)!r}, and "
+        "what was written before is kept",
+        UNFORESEEN,
+    )
+
+
+def _failed_call(error: OSError) -> int:
+    """Report an error of the operating system: standard output, or a file that the user named."""
+    code = _flushed(0)
+    if code:
+        return code
+    if error.filename is None and _raised_by(error).startswith(PRINTERS):
+        # Click writes through its own stream.
+        _discard()
+        return _not_written(error)
+    if error.filename is None and error.errno not in DISK:
+        return _failed(error)
+    name = (
+        "a file"
+        if error.filename is None
+        else repr(os.fsdecode(error.filename) if not isinstance(error.filename, int) else error.filename)
+    )
+    return _say(
+        f"{name if len(name) < 200 else name[:100] + '...' + name[-60:]} cannot be used ({error.strerror or error}), "
+        "expected a place that can; what was written before is kept",
+        BAD_INPUT,
+    )
+
+
+def _say(text: str, code: int, *, whole: bool = False) -> int:
+    """Print one sentence on standard error; `whole` keeps the lines of a compiler's log."""
+    if not whole:
+        if len(text) > LONGEST:
+            text = f"{text[: LONGEST - 203]}...{text[-200:]}"
+        text = "".join(c if c.isprintable() else " " if c in "\n\t" else repr(c)[1:-1] for c in text)
+    with contextlib.suppress(OSError, ValueError):
+        print(f"mauvecl: {text}", file=sys.stderr, flush=True)
+    return code
+
+
+def _warn(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+    """Print a warning of a library on one line."""
+    _say(f"note: {message} ({category.__name__})", 0)
+
+
+def _print_anything() -> None:
+    """Write characters that the terminal's encoding lacks as escapes, since names may contain any character."""
+    for stream in (sys.stdout, sys.stderr):
+        change: Callable[..., None] | None = getattr(stream, "reconfigure", None)
+        if change is not None:
+            change(errors="backslashreplace")
+
+
+def _flushed(code: int) -> int:
+    """Flush standard output; return the exit code, or that of a failure to write."""
+    try:
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except OSError as error:
+        _discard()
+        if isinstance(error, BrokenPipeError):
+            return READER_GONE
+        return _not_written(error)
+    except ValueError:
+        # Already closed.
+        pass
+    return code
+
+
+def _not_written(error: OSError) -> int:
+    return _say(
+        f"standard output cannot be written ({error.strerror}), expected one with room; files are kept", OUTPUT_FULL
+    )
+
+
+def _raised_by(error: BaseException) -> str:
+    """Return the name of the module that raised an exception."""
+    step = error.__traceback__
+    while step is not None and step.tb_next is not None:
+        step = step.tb_next
+    return "" if step is None else str(step.tb_frame.f_globals.get("__name__", ""))
+
+
+def _discard() -> None:
+    """Discard the buffer of standard output, on which Python would fail again at exit."""
+    with contextlib.suppress(OSError, ValueError, AttributeError):
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)
+
+
+def _write_traceback(error: Exception) -> Path | str:
+    """Write the traceback to a file in the output folder, or else in the folder of temporary files."""
+    from mauvecl.host.version import VERSION
+
+    now = datetime.datetime.now(datetime.UTC).strftime("%Y%m%dT%H%M%S")
+    text = "\n".join(
+        [
+            f"mauvecl {VERSION}, Python {platform.python_version()}, {platform.platform()}",
+            f"command: {sys.argv!r}"[:20_000],
+            "".join(traceback.format_exception(error, limit=-60)),
+        ]
+    )
+    for folder in (_folder, Path(tempfile.gettempdir())):
+        if folder is None:
+            continue
+        with contextlib.suppress(OSError):
+            # A random name, which nobody can have created before.
+            handle, name = tempfile.mkstemp(prefix=f"mauvecl-fault-{now}-", suffix=".txt", dir=folder)
+            with os.fdopen(handle, "w", encoding="utf-8", errors="backslashreplace") as file:
+                file.write(text)
+            return Path(name)
+    return "no file, since none can be written"
+
 
 #: Work shorter than this shows no progress, s.
 PATIENCE_S = 2.0
@@ -190,3 +407,86 @@ def _parts(columns: Sequence[str], cells: Sequence[Sequence[Any]], filled: list[
             parts.append(list(first))
         parts[-1] += some
     return parts
+
+
+#: A remedy in a message: `extend`, `resume=True`, `wavelength_unit='Angstrom'`, `fap=0.001`.
+_REMEDY = re.compile(r"`(?P<name>[a-z][a-z0-9_.]*)(?:=(?P<value>[^`]+))?`")
+#: Parameters with flags of other names that are not keys of the study.
+_OTHERWISE = {"setting": "--set"}
+
+#: The command line whose flags messages name, alone in a list.
+_app: list[typer.Typer] = []
+
+
+def name_flags_of(app: typer.Typer) -> None:
+    """Set the command line whose flags messages name."""
+    _app[:] = [app]
+
+
+def _commands() -> Iterator[Any]:
+    """Yield the called command, then all others."""
+    from typer.main import get_command
+
+    called: Any = get_command(_app[0])
+    others = [called]
+    for word in sys.argv[1:]:
+        called = getattr(called, "commands", {}).get(word, called)
+    yield called
+    while others:
+        one = others.pop()
+        yield one
+        others += getattr(one, "commands", {}).values()
+
+
+def _flags(name: str, command: Any) -> list[str]:
+    """Return the flags that set a parameter or a key of the study, the long one first."""
+    from mauvecl.study.study import keys_with_flags
+
+    # If a key has several flags, the last takes its value unchanged.
+    parameters = {key: flag.parameter for key, _, flag in keys_with_flags()}
+    wanted = {name} | {parameter for key, parameter in parameters.items() if f".{key}".endswith(f".{name}")}
+    for parameter in command.params:
+        if parameter.name in wanted:
+            return sorted((one for one in parameter.opts if one.startswith("-")), key=len, reverse=True)
+    return []
+
+
+def with_flags(text: str) -> str:
+    """Return a message with flags instead of the remedies in backticks."""
+    return _REMEDY.sub(_as_flag, text) if "`" in text else text
+
+
+def _as_flag(found: re.Match[str]) -> str:
+    name = found["name"]
+    flag = _OTHERWISE.get(name) or next((flags[0] for one in _commands() if (flags := _flags(name, one))), None)
+    if flag is None:
+        return found[0]
+    if found["value"] is None:
+        return flag
+    try:
+        value = ast.literal_eval(found["value"])
+    except (ValueError, SyntaxError):
+        value = found["value"]
+    return flag if value is True else f"{flag} {shlex.quote(str(value))}"
+
+
+def name_flag(error: InputError) -> str:
+    """Return the error's message with a flag instead of its key, if that flag gave the value."""
+    text, key = with_flags(str(error)), error.key
+    if key is None:
+        return text
+    name = re.sub(r"\.\d+(?=\.|$)", "", key)
+    flags = [_OTHERWISE[name]] if name in _OTHERWISE else _flags(name, command := next(_commands()))
+    if not flags:
+        # "flare amplitude" is the amplitude of a flare.
+        flags = _flags(name.removeprefix("flare_"), command)
+    if not any(_gives(word, flags) for word in sys.argv[1:]):
+        return text
+    # The key as written, which may contain blanks, after its location.
+    section, _, own = re.escape(key).replace("_", "[_ ]").rpartition(r"\.")
+    shown = rf"(?:{section}\.)?{own}" if section else own
+    return re.sub(rf"^(?:[^:=]*: )?{shown} = ", lambda _: f"{flags[0]} ", text)
+
+
+def _gives(word: str, flags: list[str]) -> bool:
+    return any(word.partition("=")[0] == one if one.startswith("--") else word.startswith(one) for one in flags)

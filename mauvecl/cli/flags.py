@@ -1,8 +1,10 @@
-"""Flags of the command line: flags of a study, from the metadata of its fields, and those of no key."""
+"""Flags of studies: how they are read, and the study that they make."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from copy import copy
+from functools import partial
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
@@ -10,9 +12,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Union, ge
 import typer
 
 from mauvecl.schema.fields import Flag, Help, Unit, first
+from mauvecl.schema.parsing import count, number, refusal, several
 
 if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
+
+    from mauvecl.study.study import Study
 
 StudyFile = Annotated[
     Path | None,
@@ -60,7 +65,7 @@ def study_flags(*keys: str, defaults: Mapping[str, Any]) -> dict[str, StudyFlag]
         Defaults of a verb that differ from the study's, by key.
     """
     # `mauvecl --help` shows no flags, and starts twice as fast without importing the study.
-    from mauvecl.study.keys import keys_with_flags
+    from mauvecl.study.study import keys_with_flags
 
     flags: dict[str, StudyFlag] = {}
     for wanted in keys:
@@ -186,21 +191,226 @@ WORKERS = {
         ),
         None,
     ),
-    "resume": (_worker(bool, "--resume", "Go on with the unfinished run in the output folder."), False),
-    "restart": (_worker(bool, "--restart", "Forget the unfinished run in the output folder."), False),
+    "resume": (_worker(bool, "--resume", "Continue the unfinished run in the output folder."), False),
+    "restart": (_worker(bool, "--restart", "Discard the unfinished run in the output folder."), False),
     "keep_after": (
         _worker(
             float | None,
             "--keep-after",
-            "Seconds after which finished parts of the work are kept on the disk [20].",
+            "Seconds after which finished parts of a run are saved to disk [20].",
             min=0.0,
         ),
         None,
     ),
     "insist": (
-        _worker(bool, "--insist", "Begin even what would take more than a year, or more than the disk has room for."),
+        _worker(
+            bool,
+            "--insist",
+            "Run even if the estimated time exceeds a year, or the files the free disk space.",
+        ),
         False,
     ),
 }
 #: Options of verbs that can be resumed and draw no realisations.
 RESUMING = {name: WORKERS[name] for name in ("resume", "restart", "keep_after")}
+
+
+def study_of(
+    file: Path | None,
+    given: dict[str, Any],
+    flags: Mapping[str, StudyFlag],
+    default: Callable[[dict[str, Any]], Study] | None,
+) -> Study:
+    """Return a study file, or the default, changed by flags and then by ``--set``."""
+    from mauvecl.schema.errors import InputError
+    from mauvecl.study.study import Study
+
+    study = Study.read(file) if file is not None else default(given) if default else Study()
+    changes: dict[str, dict[str, Any]] = {"sky": sky_of(given)}
+    setting: dict[tuple[str, str], str] = {}
+    for name, one in flags.items():
+        if one.section not in ("star", "sky") and name != "nuisance":
+            value = given[name]
+            if value is not None:
+                other = setting.setdefault((one.section, one.key), name)
+                if other != name:
+                    raise InputError(
+                        f"--{other} and --{name} are both given",
+                        f"one of them: both set {one.section}.{one.key}",
+                        key=other,
+                    )
+                changes.setdefault(one.section, {})[one.key] = one.value(value)
+    if given.get("nuisance"):
+        changes.setdefault("nuisances", {}).update(nuisances_of(study, given["nuisance"]))
+    changed = study.with_changes(changes, stars_of(study, given, flags), "command line")
+    return changed.with_settings(given["set"], "--set") if given["set"] else changed
+
+
+def is_star(given: Path) -> bool:
+    """Return whether the argument of the study is a star: a name of the library or a spectrum file."""
+    from mauvecl.host.stars.library import resolve
+
+    text = str(given)
+    if given.suffix.lower() == ".toml" or given.is_dir():
+        return False
+    if not _is_there(text):
+        # The first name decides; a wrong name among others has its own message.
+        first = text.split(",")[0].strip()
+        star = resolve(first) if first else None
+        return star is not None and not (star.spectrum is None and star.known is None)
+    if given.suffix.lower() == ".ecsv":
+        return not holds_study(given)
+    return not given.is_file() or not _is_toml(given)
+
+
+def _is_toml(file: Path) -> bool:
+    """Return whether a file contains TOML, that is a study, regardless of its name."""
+    import tomllib
+
+    from mauvecl.host.tables.files import read_bytes
+
+    try:
+        tomllib.loads(read_bytes(file, "file")[:1_000_000].decode())
+    except (ValueError, RecursionError):
+        return False
+    return True
+
+
+def holds_study(file: Path) -> bool:
+    """Return whether a file is not a plain table, such as CSV, or ECSV that no answer wrote."""
+    suffix = file.suffix.lower()
+    if suffix != ".ecsv" or not file.is_file():
+        return suffix not in (".csv", ".vot", ".votable", ".xml", ".fits", ".fit")
+    from mauvecl.host.tables.ecsv import read_ecsv
+
+    return "study" in read_ecsv(file, "table", "a table of targets, or of an answer").meta
+
+
+def sky_of(given: dict[str, Any]) -> dict[str, Any]:
+    from mauvecl.schema.errors import InputError
+
+    if "time" not in given:
+        return {}
+    sky: dict[str, Any] = {"target": given["target"], "time": given["time"]}
+    text = given["sky"]
+    if text is not None and text.strip().lower() == "none":
+        sky["none"] = True
+    elif text is not None:
+        try:
+            sky["surface_brightness"] = float(text)
+        except ValueError as error:
+            raise InputError(f"--sky {text!r}", "V mag/arcsec^2 or none", key="sky") from error
+    return sky
+
+
+def nuisances_of(study: Study, texts: list[str]) -> dict[str, Any]:
+    """Read nuisance parameters such as dark=0.1, or with the name of a file, stray.txt=free."""
+    from mauvecl.noise.unknowns import NUISANCES
+    from mauvecl.schema.errors import InputError, shortened
+
+    nuisances: dict[str, Any] = {}
+    own = {name: one.model_dump(exclude_none=True) for name, one in study.nuisances.own.items()}
+    for text in texts:
+        name, _, sd = (part.strip() for part in text.rpartition("="))
+        if not (name and sd):
+            raise InputError(
+                f"--nuisance {shortened(text)}",
+                f"NAME=SD, with a name of {', '.join(NUISANCES)} or a file's, and a standard deviation or free",
+                key="nuisance",
+            )
+        if name in NUISANCES:
+            nuisances[name] = sd
+        else:
+            own[Path(name).stem] = {"file": Path(name), "sd": sd}
+    return nuisances | ({"own": own} if own else {})
+
+
+def stars_of(study: Study, given: dict[str, Any], flags: Mapping[str, StudyFlag]) -> list[dict[str, Any]] | None:
+    """Return the data of the stars that flags name or change, or None."""
+    from mauvecl.schema.errors import InputError
+    from mauvecl.study.sections import FILE_KEYS
+
+    if "star" not in given:
+        return None
+    names, magnitudes = given["star"], given["magnitude"]
+    of_stars = {one.key: given[name] for name, one in flags.items() if one.section == "star"}
+    changed = {
+        key: value for key, value in of_stars.items() if value is not None and key not in ("library", "magnitude")
+    }
+    of_files = {key: value for key, value in changed.items() if key in FILE_KEYS}
+    same = {key: value for key, value in changed.items() if key not in FILE_KEYS}
+    if not (names or magnitudes or same or of_files):
+        return None
+    if names:
+        # A name of an existing file is a file; other names are searched for in the library.
+        each = [one for name in names for one in ([name] if _is_there(name) else map(str.strip, name.split(",")))]
+        stars: list[dict[str, Any]] = [{"file": name} if _is_file(name) else {"library": name} for name in each]
+    else:
+        stars = [entry.model_dump(exclude_none=True) for entry in study.star]
+    if magnitudes:
+        if len(magnitudes) not in (1, len(stars)):
+            of = "one star" if len(stars) == 1 else f"{len(stars)} stars"
+            raise InputError(f"{len(magnitudes)} magnitudes for {of}", "one for all or one each", key="magnitude")
+        for entry, value in zip(stars, magnitudes * (len(stars) if len(magnitudes) == 1 else 1), strict=True):
+            entry["magnitude"] = value
+    if of_files and not any("file" in entry for entry in stars):
+        named = " and ".join("--" + key.replace("_", "-") for key in of_files)
+        raise InputError(f"{named} needs a spectrum file among the stars: --star FILE", key=next(iter(of_files)))
+    return [entry | same | (of_files if "file" in entry else {}) for entry in stars]
+
+
+def _is_there(name: str) -> bool:
+    """Return whether a file has that name, which may contain commas."""
+    from mauvecl.host.tables.files import without_columns
+
+    try:
+        return bool(name) and without_columns(name)[0].exists()
+    except (OSError, ValueError):
+        # Impossible file names raise an error.
+        return True
+
+
+def _is_file(name: str) -> bool:
+    if _is_there(name):
+        return True
+    from mauvecl.host.stars.library import ModelStar
+
+    # "K2.5V" and "power law -1.5" look like file names but are stars.
+    if ModelStar.named(name) is not None:
+        return False
+    suffix = Path(name).suffix
+    return bool(suffix) and not suffix[1:].isupper()
+
+
+def as_text(kind: Any) -> tuple[Any, str, Callable[[str, str], Any] | None]:
+    """Return the type of a flag as text, the flag's name, and a reader of its value if it is a number.
+
+    Parameters
+    ----------
+    kind : Annotated
+        A type and a `typer.Option`, whose limits the reader applies.
+    """
+    if get_origin(kind) is not Annotated:
+        return kind, "", None
+    wanted, option, *_ = get_args(kind)
+    (inner, *_) = [one for one in (get_args(wanted) or (wanted,)) if one is not NoneType]
+    many = get_origin(inner) is list or get_origin(wanted) is list
+    each = get_args(inner)[0] if get_origin(inner) is list else inner
+    if each not in (float, int):
+        return kind, "", None
+    option, low, high = copy(option), option.min, option.max
+    option.min = option.max = None
+    option.metavar = ("NUMBER" if each is float else "INTEGER") + (",..." if many else "")
+    flag = next((one for one in option.param_decls or () if one.startswith("--")), "")
+    read = partial(within, read=number if each is float else count, low=low, high=high)
+    texts: Any = list[str] if many else str
+    return Annotated[texts | None, option], flag, partial(several, read=read) if many else read
+
+
+def within(text: str, flag: str, *, read: Callable[[str, str], Any], low: float | None, high: float | None) -> Any:
+    """Read a number between two ends, either of which may be missing."""
+    value = read(text, flag)
+    if (low is not None and not value >= low) or (high is not None and not value <= high):
+        reach = f"at least {low:g}" if high is None else f"{low:g} to {high:g}"
+        raise refusal(flag, text, reach)
+    return value

@@ -325,7 +325,6 @@ class Distribution:
                 f"{what} is infinite or no number in {self.far.undefined} of {self.n} realisations",
                 "finite values of float32",
                 key="statistic",
-                value=self.far.undefined,
             )
 
     @property

@@ -22,18 +22,18 @@ from mauvecl.detection.distributions import (
     clopper_pearson_ends,
     detection_interval,
 )
-from mauvecl.detection.fap_checks import NoThresholdError, Tails, check_atom, check_fap, countable
+from mauvecl.detection.names import NoThresholdError, Tails, check_atom, check_fap, countable
 from mauvecl.detection.requests import ChannelPlan, Hypotheses, Key
 from mauvecl.detection.statistics import Differences, LinearStatistic, QuadraticStatistic
 from mauvecl.detection.tails import Tail, tail
-from mauvecl.host.content_equality import ContentEquality
+from mauvecl.host.arrays import ContentEquality
 from mauvecl.noise.drawing import Cumulants
 from mauvecl.noise.unknowns import ADDITIVE
 from mauvecl.schema.calls import validated
+from mauvecl.schema.columns import INTERVAL, Column, interval, number, percent, table_of
 from mauvecl.schema.drawable import Drawable
+from mauvecl.schema.errors import Message
 from mauvecl.schema.fields import Range
-from mauvecl.schema.messages import Message
-from mauvecl.schema.tables import INTERVAL, Column, interval, number, percent, table_of
 
 if TYPE_CHECKING:
     from astropy.table import QTable

@@ -1,6 +1,9 @@
-"""Names of statistics; `requests`, which defines them, takes longer to import."""
+"""Names of statistics, and checks of false-alarm probabilities, in a module that is fast to import."""
 
 from __future__ import annotations
+
+import math
+from typing import Literal
 
 from mauvecl.schema.errors import InputError
 
@@ -14,3 +17,57 @@ def check_statistic(name: str) -> None:
     """Raise InputError for an unknown statistic."""
     if name not in STATISTIC_NAMES:
         raise InputError.of("statistic", name, f"one of {', '.join(STATISTIC_NAMES)}")
+
+
+#: Smallest number of realisations beyond a threshold; rarer tails raise InputError and are never extrapolated.
+MIN_IN_TAIL = 100
+
+#: Treatment of thresholds with fewer than `MIN_IN_TAIL` realisations beyond: InputError, or importance sampling.
+Tails = Literal["counted", "sampled"]
+
+
+class NoThresholdError(InputError):
+    """A false-alarm probability that no threshold of a statistic has."""
+
+
+def check_atom(what: str, fap: float, beyond: float, at: float) -> None:
+    """Raise NoThresholdError if a single value of a statistic is more probable than a false-alarm probability.
+
+    This happens if saturation gives many exposures the same counts. `what` names the statistic and the star; `beyond`
+    is the probability of values above the threshold, and `at` that of the threshold itself.
+    """
+    if at > fap:
+        fewer = f"at most {rounded(beyond, up=False):g} or " if beyond > 0 else ""
+        more = beyond + at
+        exist = f"{fewer}{rounded(more, up=True):g} and more" if more < 1.0 else (fewer.removesuffix(" or ") or "none")
+        raise NoThresholdError(
+            f"no threshold of {what} has a false-alarm probability of {fap:g}: {100 * at:.3g} % of exposures without a "
+            "flare give one and the same value, as saturated pixels do, and either all of them or none are alarms",
+            f"a false-alarm probability that a threshold has: {exist}",
+            key="fap",
+        )
+
+
+def rounded(value: float, *, up: bool) -> float:
+    """Return a positive number with four digits, rounded up or down."""
+    unit = 10.0 ** (math.floor(math.log10(value)) - 3)
+    return (math.ceil if up else math.floor)(value / unit * (1 + (-1e-12 if up else 1e-12))) * unit
+
+
+def countable(fap: float, realisations: int) -> bool:
+    """Return whether at least `MIN_IN_TAIL` realisations lie beyond the threshold."""
+    return fap * realisations >= MIN_IN_TAIL * (1 - 1e-9)
+
+
+def check_fap(fap: float, realisations: int, tails: Tails = "counted") -> None:
+    """Raise InputError if `fap` is not a probability, or is too small for counted tails."""
+    if not 0.0 < fap < 1.0:
+        raise InputError.of("fap", fap, "a probability between 0 and 1")
+    if tails not in ("counted", "sampled"):
+        raise InputError.of("tails", tails, "'counted' or 'sampled'")
+    if tails == "counted" and not countable(fap, realisations):
+        raise InputError(
+            f"fap = {fap:g} leaves {fap * realisations:.3g} of {realisations} realisations beyond the threshold",
+            f"at least {MIN_IN_TAIL}: ask for {math.ceil(MIN_IN_TAIL / fap)} realisations, or for `tails='sampled'`",
+            key="fap",
+        )

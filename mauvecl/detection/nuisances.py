@@ -14,13 +14,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.content_equality import ContentEquality
-from mauvecl.host.files.parsing import LARGEST, SMALLEST, read_text
-from mauvecl.host.tables.text_lines import columns
+from mauvecl.host.arrays import ContentEquality
+from mauvecl.host.tables.files import LARGEST, SMALLEST, read_text
+from mauvecl.host.tables.text_tables import columns
 from mauvecl.noise.unknowns import NUISANCES
 from mauvecl.schema.calls import validated
-from mauvecl.schema.errors import InputError
-from mauvecl.schema.text import shortened
+from mauvecl.schema.errors import InputError, shortened
 
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
@@ -65,29 +64,22 @@ class Nuisances(ContentEquality):
                 f"the shape {shapes[1]}",
                 "one spectrum and one standard deviation for each name",
                 key="names",
-                value=self.names,
             )
         for name, spectrum, sd in zip(self.names, self.spectra, self.sd, strict=True):
             if not np.isfinite(spectrum).all():
                 raise InputError(
-                    f"the spectrum of the unknown {name!r} is not finite everywhere",
-                    "numbers",
-                    key="spectra",
-                    value=name,
+                    f"the spectrum of the unknown {name!r} is not finite everywhere", "numbers", key="spectra"
                 )
             if not sd > 0:
                 raise InputError(
-                    f"the unknown {name!r} has a standard deviation of {sd:g}",
-                    "one above 0 or 'free'",
-                    key="sd",
-                    value=sd,
+                    f"the unknown {name!r} has a standard deviation of {sd:g}", "one above 0 or 'free'", key="sd"
                 )
         for name, expected in (("of_flare", np.shape(self.spectra)), ("mean", np.shape(self.sd))):
             given = getattr(self, name)
             values = np.asarray(given, np.float64) if np.size(given) else np.zeros(expected)
             if values.shape != expected or not np.isfinite(values).all():
                 raise InputError(f"{name} of the unknowns has the shape {values.shape}", f"finite numbers, {expected}",
-                                 key=name, value=values.shape)  # fmt: skip
+                                 key=name)  # fmt: skip
             object.__setattr__(self, name, values)
 
     @classmethod
@@ -122,7 +114,6 @@ class Nuisances(ContentEquality):
                         f"the spectrum of the unknown {name!r} has the shape {spectrum.shape}",
                         f"one value for each of the {quiet.wavelength_nm.size} pixels",
                         key="own",
-                        value=spectrum.shape,
                     )
             else:
                 spectrum = spectrum_of(name, quiet)
@@ -131,7 +122,6 @@ class Nuisances(ContentEquality):
                     f"the unknown {name!r} changes no pixel of {quiet.name}",
                     "a spectrum that changes pixels",
                     key="own",
-                    value=name,
                 )
             spectra.append(spectrum)
         shape = len(spectra), quiet.wavelength_nm.size
@@ -252,7 +242,6 @@ class Nuisances(ContentEquality):
                 f"the unknowns {', '.join(self.names)} cannot be distinguished in these pixels",
                 "fewer of them or standard deviations instead of 'free'",
                 key="nuisances",
-                value=self.names,
             )
         return np.asarray(np.linalg.solve(np.linalg.cholesky(information), spectra * inverse))
 
@@ -261,10 +250,7 @@ def spectrum_of(name: str, quiet: Expectation) -> Float:
     """Return the spectrum of one of `NUISANCES`, DN of the exposure for unit amplitude, shape (n_pixel,)."""
     if name not in NUISANCES:
         raise InputError(
-            f"the unknown {name!r} has no spectrum",
-            f"one of {', '.join(NUISANCES)} or a file",
-            key="nuisances",
-            value=name,
+            f"the unknown {name!r} has no spectrum", f"one of {', '.join(NUISANCES)} or a file", key="nuisances"
         )
     return np.asarray(NUISANCES[name].spectrum(quiet))
 
@@ -314,12 +300,7 @@ def at_pixels(
     sizes = np.abs(rows)
     bad = ~((rows == 0) | ((sizes >= SMALLEST) & (sizes <= LARGEST)))
     if bad.any():
-        raise InputError(
-            f"{what} hold {rows[bad][0]!r}",
-            f"0 or a size from {SMALLEST:g} to {LARGEST:g}",
-            key=what,
-            value=rows[bad][0].tolist(),
-        )
+        raise InputError(f"{what} hold {rows[bad][0]!r}", f"0 or a size from {SMALLEST:g} to {LARGEST:g}", key=what)
     values = np.interp(wavelength_nm, rows[:, 0], rows[:, 1], left=0.0, right=0.0)
     if not values.any():
         raise InputError(

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from mauvecl.detection.chi2 import Chi2, Chi2Element, Chi2Pair, Paper
 from mauvecl.detection.counts import Grid, TailSamples
 from mauvecl.detection.distributions import Form
-from mauvecl.detection.fap_checks import Tails
-from mauvecl.detection.names import DEFAULT_STATISTICS, check_statistic
+from mauvecl.detection.names import DEFAULT_STATISTICS, Tails, check_statistic
 from mauvecl.detection.nuisances import Nuisances, as_nuisances
 from mauvecl.detection.statistics import (
     Linear,
@@ -36,9 +35,8 @@ from mauvecl.noise.drawing import AUTOMATIC, Drawing, DrawingOptions
 from mauvecl.noise.layout import FIXED_STATISTICS
 from mauvecl.noise.scene import BATCH, FactorDistributions, Scene, prepare
 from mauvecl.schema.calls import validated
-from mauvecl.schema.errors import InputError
+from mauvecl.schema.errors import InputError, Message
 from mauvecl.schema.fields import OneOrMore
-from mauvecl.schema.messages import Message
 from mauvecl.schema.physical import FirstRealisation, Realisations, Seed
 
 #: All statistics in the order of tables and plots; add a new one here.
@@ -61,9 +59,7 @@ def statistics_by_name(asked: Sequence[str | Linear]) -> dict[str, Statistic]:
             named.setdefault(one, STATISTICS[one])
             continue
         if one.name in STATISTICS:
-            raise InputError(
-                f"statistic {one.name!r} is one of mauvecl's own", "another name", key="statistics", value=one.name
-            )
+            raise InputError(f"statistic {one.name!r} is one of mauvecl's own", "another name", key="statistics")
         if one.name in own:
             raise InputError.of("statistics", one.name, "different names")
         own.add(one.name)
@@ -105,11 +101,9 @@ class Hypotheses:
         self.setting = Setting(self.quiet, self.scene.used, self.scene.comparison, self.flares, self.nuisances, drawn)
         shaped = next((name for name, one in self._chosen.items() if one.shaped), None)
         if shaped is not None and not self.flares:
-            raise InputError("no flare given", f"at least one for the statistic {shaped!r}", key="flares", value=shaped)
+            raise InputError("no flare given", f"at least one for the statistic {shaped!r}", key="flares")
         if not self.scene.used.any():
-            raise InputError(
-                f"every pixel of {self.quiet.name} is saturated", "a fainter star", key="quiet", value=self.quiet.name
-            )
+            raise InputError(f"every pixel of {self.quiet.name} is saturated", "a fainter star", key="quiet")
         for one in self._chosen.values():
             one.check(self.setting)
         if "matched" in self._chosen:
@@ -229,7 +223,6 @@ def check_shape(quiet: Expectation, flare: Expectation, used: NDArray[np.bool_],
             f"flare {number + 1} of {quiet.name} changes no pixel that counts",
             "an amplitude above 0 for the statistic 'matched', which looks for its shape",
             key="amplitude",
-            value=number + 1,
         )
 
 
@@ -289,12 +282,8 @@ class _Rows:
         self.ends.append(len(self.rows))
 
 
-def plan_channels(hypotheses: Hypotheses, batch: Sequence[int], *, first: bool) -> ChannelPlan:
-    """Plan the channels of a batch of flares; scenario 0 is always the quiescent one.
-
-    If `first`, the batch also counts the null distributions that all batches share.
-    """
-    asked = [hypotheses.statistic(name) for name in hypotheses.statistics]
+def _rows(hypotheses: Hypotheses, asked: Sequence[Statistic], batch: Sequence[int]) -> tuple[_Rows, _Rows]:
+    """Return the weights of sums over pixels, and the scales of the paper's statistic, in the kernel's order."""
     weighted, smoothed = _Rows(), _Rows()
     for scenario in range(1 + len(batch)):
         # Quiescent draws are compared with every flare's template, draws of a flare only with its own.
@@ -314,6 +303,16 @@ def plan_channels(hypotheses: Hypotheses, batch: Sequence[int], *, first: bool) 
                     smoothed.add(one.name, scenario, flare, one.scale(hypotheses.setting, looked_for))
         weighted.end()
         smoothed.end()
+    return weighted, smoothed
+
+
+def plan_channels(hypotheses: Hypotheses, batch: Sequence[int], *, first: bool) -> ChannelPlan:
+    """Plan the channels of a batch of flares; scenario 0 is always the quiescent one.
+
+    If `first`, the batch also counts the null distributions that all batches share.
+    """
+    asked = [hypotheses.statistic(name) for name in hypotheses.statistics]
+    weighted, smoothed = _rows(hypotheses, asked, batch)
     n_scenario, fixed = 1 + len(batch), len(FIXED_STATISTICS)
 
     def row(one: Statistic, scenario: int, flare: int) -> int:

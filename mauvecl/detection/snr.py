@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from mauvecl.detection.counts import FarCounts, SparseCounts, TailSamples, Tally
 from mauvecl.detection.detection import Detection
 from mauvecl.detection.requests import DetectRequest, SnrRequest
-from mauvecl.host.content_equality import ContentEquality
+from mauvecl.host.arrays import ContentEquality
 from mauvecl.noise import layout
 from mauvecl.noise.random_numbers import Floats, fma
 from mauvecl.noise.scene import Scene
+from mauvecl.schema.columns import Column, table_of
 from mauvecl.schema.drawable import Drawable
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.tables import Column, table_of
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -140,7 +140,6 @@ class Counts:
                     f"the S/N of resolution element {e} is {ratio[np.abs(steps).argmax()]:g} in a realisation",
                     f"something nearer to its closed form of {element['centre']:g}",
                     key="expectation",
-                    value=float(ratio[np.abs(steps).argmax()]),
                 )
             self._count_far("element", e, steps.astype(np.int64))
 

@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 
 from mauvecl.detection.distributions import Form, Gaussian, Mixture, QuadraticForm
 from mauvecl.detection.nuisances import Nuisances, join_names, read_values
-from mauvecl.host.content_equality import ContentEquality
+from mauvecl.host.arrays import ContentEquality
 from mauvecl.noise.comparison import NOISE_FREE, Comparison
 from mauvecl.noise.scene import FactorDistributions, changes_of
 from mauvecl.schema.calls import validated
-from mauvecl.schema.errors import InputError
-from mauvecl.schema.text import shortened
+from mauvecl.schema.errors import InputError, shortened
 
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
@@ -132,7 +131,6 @@ class Statistic(ABC):
                 f"statistic {self.name!r} {why} cannot be marginalised over {join_names(setting.nuisances.names)}",
                 "no unknowns, or another statistic by the model's variances",
                 key="statistic",
-                value=self.name,
             )
 
     def closed_form(self, setting: Setting, observed: Expectation, flare: Expectation | None = None) -> Form:
@@ -262,7 +260,6 @@ class LinearStatistic(Statistic):
                 f"statistic {self.name!r} cannot be distinguished from {join_names(setting.nuisances.names)}",
                 "fewer unknowns or smaller standard deviations",
                 key="statistic",
-                value=self.name,
             )
         return np.asarray(left / np.sqrt(power) if self.normalised else left)
 
@@ -361,7 +358,6 @@ class UvExcess(LinearStatistic):
                 f"{setting.quiet.name} has no used pixel at {UV_NM[0]:g}-{UV_NM[1]:g} nm",
                 "used pixels there for the statistic 'uv_excess'",
                 key="statistic",
-                value="uv_excess",
             )
 
     def plain_weights(self, setting: Setting, flare: Expectation | None = None) -> Float:
@@ -401,7 +397,6 @@ class Linear(ContentEquality, LinearStatistic):
                 f"statistic {self.name!r} has weights of the shape {weights.shape}, {bad} of them not finite",
                 "one finite value per pixel, not all zero",
                 key="weights",
-                value=weights.shape,
             )
 
     def check(self, setting: Setting) -> None:
@@ -411,7 +406,6 @@ class Linear(ContentEquality, LinearStatistic):
                 f"statistic {self.name!r} has {self.weights.size} weights",
                 f"one for each of the {setting.used.size} pixels",
                 key="weights",
-                value=self.weights.size,
             )
         if not (self.weights * setting.used).any():
             raise InputError(

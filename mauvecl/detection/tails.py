@@ -26,7 +26,7 @@ from mauvecl.detection.distributions import (
     central_counts,
     clopper_pearson,
 )
-from mauvecl.detection.fap_checks import check_atom
+from mauvecl.detection.names import check_atom
 from mauvecl.detection.statistics import Differences
 from mauvecl.noise import layout
 from mauvecl.noise.scene import quantile_at_score
@@ -154,7 +154,6 @@ def count_tests(frames: int, stack: int, step: int) -> int:
             f"a campaign of {frames} frames in stacks of {stack}, {step} apart",
             "1 <= step <= stack <= frames",
             key="step",
-            value=(frames, stack, step),
         )
     return (frames - stack) // step + 1
 
@@ -252,7 +251,6 @@ def tail(hypotheses: Hypotheses, fap: float, statistic: str, *, template: int = 
                 " tilted draws",
                 f"{WANTED_ERROR:g}",
                 key="fap",
-                value=fap,
             )
         goal *= 2
 
@@ -272,7 +270,6 @@ def _check(hypotheses: Hypotheses) -> None:
                 f"importance sampling with {reason}",
                 f"stacks of joint draws and at most {MAX_AVERAGED} averaged exposures: draw enough realisations",
                 key="tails",
-                value=reason,
             )
 
 

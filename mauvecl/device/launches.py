@@ -1,25 +1,132 @@
-"""Buffers and kernel launches of a scene."""
+"""Launches of kernels: variants, buffers, and tiles of realisations."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, Self
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.detection.chi2 import Paper
 from mauvecl.detection.counts import Grid, Tally
+from mauvecl.detection.requests import ChannelPlan, Hypotheses
 from mauvecl.detection.snr import Counts
-from mauvecl.device.device import Device
-from mauvecl.device.errors import DeviceError
-from mauvecl.device.program import out_of_memory
-from mauvecl.device.tiles import Tile
+from mauvecl.device.build import VECTORS, Device, Variant, out_of_memory
+from mauvecl.device.drivers import DeviceError
+from mauvecl.flares.stare_scene import Flares, Method, StareScene, SumTable
 from mauvecl.noise import layout
-from mauvecl.noise.scene import PIXEL_BLOCK, Scene
+from mauvecl.noise.scene import BATCH, PIXEL_BLOCK, Scene
 
-if TYPE_CHECKING:
-    from mauvecl.device.program import Variant
+Progress = Callable[[int, int], None]
+
+#: Device memory for the output of a tile. The size of tiles does not affect results.
+TILE_BYTES = 64 * 2**20
+LARGEST_TILE = 2**16
+
+
+@dataclass(frozen=True)
+class Tile:
+    """Range of realisations computed in one launch."""
+
+    first: int  # a multiple of the vector width
+    size: int
+    start: int  # the requested realisations are [start, stop), relative to first
+    stop: int
+
+    @property
+    def wanted(self) -> int:
+        """Number of requested realisations."""
+        return self.stop - self.start
+
+    def address(self) -> tuple[np.uint32, np.uint32]:
+        """Return both words of the first index."""
+        return np.uint32(self.first & 0xFFFFFFFF), np.uint32(self.first >> 32)
+
+    def rows(self) -> tuple[np.uint32, np.uint32]:
+        """Return the requested range, relative to the first realisation."""
+        return np.uint32(self.start), np.uint32(self.stop)
+
+    def narrow(self, width: int) -> Tile:
+        """Return the tile of the same requested realisations with the fewest vectors of this width."""
+        skip = self.start - self.start % width
+        return Tile(self.first + skip, -(-self.stop // width) * width - skip, self.start - skip, self.stop - skip)
+
+    def pieces(self, size: int) -> Iterator[Tile]:
+        """Yield tiles of at most `size` realisations, a multiple of those per work-item."""
+        for begin in range(0, self.size, size):
+            length = min(size, self.size - begin)
+            start, stop = max(self.start - begin, 0), min(self.stop - begin, length)
+            if start < stop:
+                yield Tile(self.first + begin, length, start, stop)
+
+
+class Tiles:
+    """Division of a device's work into tiles.
+
+    Parameters
+    ----------
+    progress : callable, optional
+        Called as ``progress(done, total)`` before and between tiles, in realisations. It may raise to stop the work.
+    largest : int, optional
+        Largest number of realisations per tile.
+    """
+
+    def __init__(self, device: Device, *, progress: Progress | None = None, largest: int | None = None) -> None:
+        self._device, self._progress, self._largest, self._step = device, progress, largest, device.step
+
+    def for_each(
+        self,
+        start: int,
+        count: int,
+        bytes_each: int,
+        work: Callable[[Tile, int], None],
+        *,
+        before: int = 0,
+        total: int | None = None,
+    ) -> None:
+        """Call `work(tile, done)` for each tile, with smaller tiles if the device's memory does not suffice."""
+        size = self.size(bytes_each)
+        done = 0
+        if self._progress is not None and not before:
+            self._progress(0, count if total is None else total)
+        while done < count:
+            tile = self.at(start + done, count - done, size)
+            try:
+                work(tile, done)
+            except self._device.cl.Error as error:
+                if not out_of_memory(error):
+                    raise
+                if size <= self._step:
+                    raise DeviceError(
+                        f"{self._device.name} has too little memory for {self._step} realisations of it: {error}",
+                        "memory",
+                    ) from error
+                size //= 2
+                continue
+            done += tile.wanted
+            if self._progress is not None:
+                self._progress(before + done, count if total is None else total)
+
+    def size(self, bytes_each: int) -> int:
+        """Return the number of realisations per tile, a power of two, from the memory of the device."""
+        memory = min(TILE_BYTES, self._device.record.global_memory // 8)
+        fit = memory // bytes_each if bytes_each else LARGEST_TILE
+        size = min(self._largest or LARGEST_TILE, LARGEST_TILE, max(fit, 1))
+        return int(max(1 << (size.bit_length() - 1), self._step))
+
+    def at(self, index: int, left: int, size: int) -> Tile:
+        """Return the tile from `index` to a multiple of `size`, so that no tile crosses a multiple of 2**32."""
+        first = index - index % size
+        start, stop = index - first, min(index - first + left, size)
+        # A short tile computes only the vectors that it needs.
+        skip = start - start % self._step
+        need = -(-stop // self._step) * self._step
+        return Tile(first + skip, need - skip, start - skip, stop - skip)
+
 
 #: Realisations times frames counted on the device before its 32-bit bins and 64-bit sums are moved to the host.
 MAX_COUNTED = 2**25
@@ -326,3 +433,229 @@ class Launches:
 def padded(array: NDArray[np.void]) -> NDArray[np.void]:
     """Flatten per-pixel structs and append a block, since kernels may read, but not use, pixels past the last one."""
     return np.concatenate([array.ravel(), np.zeros(PIXEL_BLOCK, array.dtype)])
+
+
+Floats = NDArray[np.float32]
+
+#: Frames per work-item of the kernels whose lanes are frames.
+FRAMES_EACH = 1024
+#: Cached because callers draw a few stares at a time with the same weights.
+table_of = lru_cache(maxsize=4)(SumTable.of)
+
+
+class StareLaunches(Launches):
+    """Buffers and launches of a stare; the buffers are released at the end of the `with` block."""
+
+    def __init__(self, device: Device, stare: StareScene, seed: int, method: Method) -> None:
+        self._by_sums = method == "cumulants"
+        table = table_of(stare.components) if self._by_sums else None
+        scene = stare.scene
+        variant = replace(
+            device.variant,
+            clip=scene.clip,
+            additive=scene.additive,
+            sums=stare.components.n_statistics,
+            spectra=stare.components.n_flares,
+            unknown_groups=-(-len(stare.kinds) // 4),
+            counts=stare.counts,
+            neighbours=bool(stare.components.quiet.neighbour_electrons.any()),
+            pointing=stare.stare.pointing is not None,
+            fourths=table is not None and table.fourths,
+            jittered=any(stare.stare.jitters.values()),
+            in_time=self._by_sums,
+        )
+        super().__init__(device, scene, variant, seed)
+        self._seed = seed
+        self._held: Any = None
+        self._stare, self._local = stare, (1, 1) if variant.width > 1 else None
+        self._known = [*map(self.upload, (stare.numbers, stare.known, stare.curves, stare.kinds))]
+        if table is None:
+            more = (padded(stare.mixtures), stare.spectra, stare.weights, stare.constants)
+            self._own = [*map(self.upload, more)]
+        else:
+            self._own = [self.upload(table.packed)]
+
+    def __exit__(self, *_: object) -> None:
+        super().__exit__()
+        if self._held is not None:
+            self._held.release()
+
+    def upload_flares(self, flares: Flares, first: int, count: int) -> None:
+        """Upload the flares and the pointing losses of the next `count` stares."""
+        self._scenarios = len(flares.amplitudes)
+        self._flares = [
+            self._fill("stare_job", self._stare.stare_struct(flares)),
+            *self._known,
+            self._shared(flares.rows) if self._device.record.kind == "cpu" else self._fill("flares", flares.rows),
+            self._fill("amplitudes", flares.amplitudes),
+            self._fill("losses", self._losses(first, count)),
+        ]
+
+    def _losses(self, first: int, count: int) -> Floats:
+        if not self.variant.pointing:
+            return np.zeros(0, np.float32)
+        return self._stare.losses(np.arange(count, dtype=np.uint64) + np.uint64(first), self._seed)
+
+    def _shared(self, array: NDArray[Any]) -> Any:
+        """Return a buffer that shares the host's memory, valid until the next flares are uploaded."""
+        if self._held is not None:
+            self._held.release()
+        flags = self._cl.mem_flags
+        self._given = np.ascontiguousarray(array if array.size else np.zeros(1, array.dtype))
+        self._held = self._cl.Buffer(self._device.context, flags.READ_ONLY | flags.USE_HOST_PTR, hostbuf=self._given)
+        return self._held
+
+    def _fill(self, name: str, array: NDArray[Any]) -> Any:
+        """Copy an array to a reused buffer."""
+        data = np.ascontiguousarray(array if array.size else np.zeros(1, array.dtype))
+        buffer = self._scratch(name, data.nbytes)
+        self._cl.enqueue_copy(self._queue, buffer, data)
+        return buffer
+
+    def draw(self, tile: Tile, out: Floats, row: int) -> None:
+        """Draw the statistics of a tile's frames into `out`.
+
+        Parameters
+        ----------
+        out : ndarray of float32, shape (n_scenario, n_stare, n_statistic, n_padded_frame)
+        row : int
+            Index in `out` of the tile's first stare.
+        """
+        if self._by_sums:
+            self._in_frames("stare_sums", self.variant, self._own, tile, out, row)
+        else:
+            self._by_pixels(tile, out[:, row : row + tile.wanted])
+
+    def _by_pixels(self, tile: Tile, out: Floats) -> None:
+        """Draw pixels, a few frames of all stares at a time."""
+        tile = tile.narrow(self.variant.width)
+        n_frames, each = self._stare.stare.n_frames, self._scenarios * self.variant.sums * tile.size
+        block = max(1, TILE_BYTES // (4 * each))
+        # The number of scenarios is rounded up to a power of two, so that few programs are built.
+        variant = replace(self.variant, scenarios=1 << (self._scenarios - 1).bit_length())
+        kernel = self._device.kernel(("stare", "stare_pixels"), variant, "stare_pixels")
+        for begin in range(0, n_frames, block):
+            size = min(block, n_frames - begin)
+            values = self._scratch("values", 4 * each * size)
+            kernel(
+                self._queue,
+                (tile.size // self.variant.width, size),
+                self._local,
+                *self._arguments,
+                *self._flares,
+                *tile.address(),
+                *tile.rows(),
+                np.uint32(begin),
+                *self._own,
+                np.uint32(tile.size),
+                values,
+            )
+            host = np.empty((size, self._scenarios, self.variant.sums, tile.size), np.float32)
+            self._cl.enqueue_copy(self._queue, host, values)
+            out[..., begin : begin + size] = host[..., tile.start : tile.stop].transpose(1, 3, 2, 0)
+
+    def glow(self, tile: Tile, out: Floats, row: int) -> None:
+        """Compute the values with which `Injections` add flares to a tile's frames.
+
+        `out` has the shape (1, n_stare, n_statistic + 1, n_padded_frame).
+        """
+        self._in_frames("stare_glow", replace(self.variant, in_time=True), [], tile, out, row)
+
+    def _in_frames(self, name: str, variant: Variant, own: list[Any], tile: Tile, out: Floats, row: int) -> None:
+        """Launch a kernel whose lanes are frames."""
+        first, each = tile.first + tile.start, FRAMES_EACH if variant.width > 1 else 1
+        kernel = self._device.kernel(("stare", name), variant, name)
+        # A CPU writes to `out`; a buffer of another device contains only this tile.
+        shares_memory = self._device.record.kind == "cpu"
+        place = (out.shape[1], row) if shares_memory else (tile.wanted, 0)
+        host = out if shares_memory else np.empty((len(out), tile.wanted, *out.shape[2:]), np.float32)
+        with self._output("values", host) as values:
+            kernel(
+                self._queue,
+                (tile.wanted, -(-out.shape[3] // each)),
+                self._local,
+                self._arguments[0],
+                *self._flares,
+                np.uint32(first & 0xFFFFFFFF),
+                np.uint32(first >> 32),
+                np.uint32(each),
+                *own,
+                *map(np.uint32, place),
+                values,
+            )
+        if not shares_memory:
+            out[:, row : row + tile.wanted] = host
+
+
+#: Vectors of realisations per work-item with sums other than chi-squared, limited by the number of registers.
+FEW_VECTORS = 2
+#: Pixels drawn at once for resolution elements, which have about 35 pixels and start at any pixel.
+ELEMENT_CHUNK = 8
+
+
+def scene_launches(
+    device: Device,
+    scene: Scene,
+    seed: int,
+    *,
+    pair: bool = False,
+    elements: bool = True,
+    linears: int = 0,
+    smooths: int = 0,
+    slots: int = 0,
+    row_type: str = "int",
+    chunk: int | None = None,
+) -> Launches:
+    """Return the launches of a scene, with the smallest kernel variant that suits it."""
+    variant = replace(
+        device.variant,
+        scenarios=BATCH[scene.frames],
+        linears=_capacity(linears),
+        frames=scene.frames,
+        clip=scene.clip,
+        pair=pair,
+        noisy=scene.comparison.exposures > 0,
+        estimated=scene.comparison.estimated,
+        smooths=_capacity(smooths),
+        slots=slots,
+        elements=elements,
+        joint=scene.joint,
+        quartic=scene.quartic,
+        photons=scene.photons,
+        additive=scene.additive,
+        modulations=scene.modulations,
+        row_type=row_type,
+        chunk=min(chunk or device.variant.chunk, device.variant.chunk),
+    )
+    single = device.width == 1 or scene.frames or variant.compared
+    many = VECTORS if not (variant.elements or variant.linears) else FEW_VECTORS
+    return Launches(device, scene, replace(variant, vectors=1 if single else many), seed)
+
+
+def detection_launches(device: Device, scene: Scene, seed: int, plan: ChannelPlan, hypotheses: Hypotheses) -> Launches:
+    """Return the launches of a scene, with the weights and scales of all statistics of a detection."""
+    bands, finished = np.zeros((1, 0, 1), np.float32), np.zeros(1, np.uint32)
+    if len(plan.scales):
+        bands, finished = Paper().smoothing(hypotheses.setting).bands(len(scene.pixels), device.variant.chunk)
+    sums = {hypotheses.statistic(name).kernel_sum for name in hypotheses.statistics}
+    launches = scene_launches(
+        device,
+        scene,
+        seed,
+        pair="chi2_pair" in sums,
+        elements="chi2_element" in sums,
+        linears=len(plan.weights),
+        smooths=len(plan.scales),
+        slots=bands.shape[1],
+    )
+    launches.weigh(plan.weights, plan.linear_end, plan.pixels_end)
+    if plan.subtractions.size:
+        launches.marginalise(plan.subtractions)
+    if launches.variant.compared:
+        launches.compare(bands, finished, plan.scales, plan.scale_end)
+    return launches
+
+
+def _capacity(count: int) -> int:
+    """Round a number of statistics up to a power of two, so that few programs are built."""
+    return max(32, 1 << (count - 1).bit_length()) if count else 0

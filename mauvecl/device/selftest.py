@@ -1,34 +1,387 @@
-"""Self-test of a device against known answers, the NumPy reference, probabilities and closed forms."""
+"""Self-test of a device against known answers of the NumPy reference and closed forms, and its speed."""
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
-from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+import json
+import resource
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from functools import cache
+from importlib import resources
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl.detection import reference as numpy_kernels
-from mauvecl.detection.counts import Tally
-from mauvecl.detection.nuisances import as_nuisances
-from mauvecl.detection.requests import STATISTICS, ChannelPlan, Hypotheses, plan_channels
-from mauvecl.detection.snr import Counts, elements, observers
-from mauvecl.device.engine import Engine
-from mauvecl.device.probes import Probes
-from mauvecl.device.program import SAME_BITS
-from mauvecl.device.selftest_outcome import Check
-from mauvecl.device.selftest_stares import stares
-from mauvecl.device.toy_exposure import toy
+from mauvecl.detection.counts import Distribution
+from mauvecl.detection.requests import STATISTICS
+from mauvecl.detection.snr import Counts
+from mauvecl.device import build as program
+from mauvecl.device import drivers as first_build
+from mauvecl.device import drivers as processor
+from mauvecl.device.build import SAME_BITS, DeviceRecord, Variant, choose_device, load_opencl, out_of_memory
+from mauvecl.device.drivers import BuildError, DeviceError, kernel_cache
+from mauvecl.device.engine import Engine, Stares, devices
+from mauvecl.flares.frames import Components
+from mauvecl.flares.stare import Stare
+from mauvecl.flares.stare_scene import Arrays, StaresRequest
 from mauvecl.host.exposure.expectation import Expectation
+from mauvecl.host.version import VERSION
 from mauvecl.noise import layout, reference
 from mauvecl.noise.comparison import Comparison
-from mauvecl.noise.processes import CosmicRays, Processes, Uniform
-from mauvecl.noise.scene import Scene, prepare
+from mauvecl.noise.processes import NONE, CosmicRays, Processes, Uniform
+from mauvecl.noise.scene import prepare
+from mauvecl.schema.columns import Column
 
 if TYPE_CHECKING:
-    pass
+    from mauvecl.device.build import Device
+
+
+class Probes:
+    """Probe kernels of a device.
+
+    Parameters
+    ----------
+    width : int, optional
+        Realisations per vector; by default the device's.
+    vector_forms : bool, optional
+        Whether to use the fast forms for PoCL instead of built-in functions; by default the device's choice.
+    """
+
+    def __init__(self, *, width: int | None = None, vector_forms: bool | None = None, device: Device) -> None:
+        self.cl, self.context, self.queue = device.cl, device.context, device.queue
+        plain = device.variant
+        self.width = width or plain.width
+        forms = plain.vector_forms if vector_forms is None else vector_forms
+        variant = Variant(width=self.width, vector_forms=forms and self.width > 1, chunk=32 if self.width > 1 else 4)
+        self.program = program.build(self.context, program.render(("probes",), variant))
+
+    def run(
+        self,
+        name: str,
+        items: int,
+        out: NDArray[Any],
+        *inputs: Any,
+        out_first: NDArray[Any] | None = None,
+        start: NDArray[Any] | None = None,
+    ) -> NDArray[Any]:
+        """Launch a probe kernel and return `out`, its last argument.
+
+        Input arrays are uploaded. `out_first` is an output before `out`, and `start` the initial contents of `out`.
+        """
+        flags = self.cl.mem_flags
+        arguments = [
+            self.cl.Buffer(self.context, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=np.ascontiguousarray(x))
+            if isinstance(x, np.ndarray)
+            else x
+            for x in inputs
+        ]
+        outs = [x for x in (out_first, out) if x is not None]
+        buffers = [self.cl.Buffer(self.context, flags.READ_WRITE, x.nbytes) for x in outs]
+        if start is not None:
+            self.cl.enqueue_copy(self.queue, buffers[-1], start)
+        local = (1,) if self.width > 1 and name != "probe_layout" else None
+        self.cl.Kernel(self.program, name)(self.queue, (items,), local, *arguments, *buffers)
+        for array, buffer in zip(outs, buffers, strict=True):
+            self.cl.enqueue_copy(self.queue, array, buffer)
+        return out
+
+    def philox(self, counters: NDArray[np.uint32], keys: NDArray[np.uint32]) -> NDArray[np.uint32]:
+        """Return eight words per counter: four of the plain generator, four of its loop-invariant form."""
+        out = np.empty((len(counters), 8), np.uint32)
+        return self.run("probe_philox", len(counters), out, np.uint32(len(counters)), counters, keys)
+
+    def normal(self, radius: NDArray[np.uint32], angle: NDArray[np.uint32]) -> NDArray[np.float32]:
+        """Return two rows of normal deviates from two words each; sizes are multiples of the width."""
+        words = np.stack([radius, angle])
+        return self.run("probe_normal", radius.size // self.width, np.empty(words.shape, np.float32), words)
+
+    def alias(self, words: NDArray[np.uint32], table: NDArray[np.uint32], bits: int) -> NDArray[np.uint32]:
+        """Return the column that each word selects."""
+        items = words.size // self.width
+        return self.run("probe_alias", items, np.empty(words.size, np.uint32), words, table, np.uint32(bits))
+
+    def prior(
+        self, word: NDArray[np.uint32], finer: NDArray[np.uint32], table: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Return a prior's factors minus one at the probabilities given by two words each."""
+        words = np.stack([word, finer])
+        return self.run("probe_prior", word.size // self.width, np.empty(word.size, np.float32), words, table)
+
+    def expansion(self, radius: NDArray[np.uint32], angle: NDArray[np.uint32], mean: float) -> NDArray[np.int64]:
+        """Return two rows of counts relative to the mean rounded to an integer."""
+        words, root = np.stack([radius, angle]), np.sqrt(mean)
+        offset, slope, cubic = mean - np.rint(mean) - 1 / 6, root - 1 / (36 * root), -1 / (72 * root)
+        coefficients = [np.float32(c) for c in (offset, slope, cubic)]
+        out = np.empty(words.shape, np.float32)
+        return self.run("probe_expansion", radius.size // self.width, out, words, *coefficients).astype(np.int64)
+
+
+@dataclass(frozen=True)
+class Check:
+    """Outcome of one check, a line of the table."""
+
+    name: str
+    passed: bool
+    result: str
+
+
+#: Columns of the table of checks.
+CHECK_COLUMNS = (
+    Column("passed", heading="result", format=lambda passed: "PASS" if passed else "FAIL"),
+    Column("name", heading="check"),
+    Column("result", heading="found"),
+)
+
+
+def write_outcome(device: DeviceRecord, checks: Sequence[Check], seconds: float) -> None:
+    """Write the outcome to the kernel cache, for run records of the same device, driver and version."""
+    record = {
+        "mauvecl": VERSION,
+        "device": asdict(device),
+        "date_utc": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "seconds": round(seconds, 1),
+        "passed": all(check.passed for check in checks),
+        "checks": [asdict(check) for check in checks],
+    }
+    kernel_cache().write_text(_key(device), json.dumps(record))
+
+
+def read_outcome(device: DeviceRecord) -> dict[str, Any] | None:
+    """Return the latest outcome for a device, or None."""
+    text = kernel_cache().read_text(_key(device))
+    return None if text is None else dict(json.loads(text))
+
+
+def _key(device: DeviceRecord) -> str:
+    said = f"selftest {VERSION} {device.label} {device.driver}"
+    return hashlib.sha256(said.encode()).hexdigest()[:32]
+
+
+def toy(
+    pixels: int = 64,
+    frames: int = 10,
+    *,
+    flare: float = 0.0,
+    dark: float = 2225.0,
+    read: float = 12.0,
+    light: float = 40.0,
+    unit: Any = "DN",
+    photon_noise: Any = "gaussian",
+) -> Expectation:
+    """Return a small exposure of a smooth spectrum on a uniform detector; dark in DN, light in electrons per frame."""
+    shape = light * (1.0 + 0.5 * np.sin(np.arange(pixels) / 9.0))
+    ones = np.ones(pixels)
+    element = np.arange(pixels, dtype=np.int32) // 10
+    return Expectation(
+        wavelength_nm=np.arange(200.0, 200.0 + pixels),
+        source_electrons=shape * (1.0 + flare * np.linspace(1.0, 0.2, pixels)),
+        sky_electrons=0.4 * ones,
+        dark_dn=dark * ones,
+        dark_unit=unit,
+        bias_dn=600.0 * ones,
+        read_noise_dn=read * ones,
+        gain_dn_per_electron=0.6 * ones,
+        n_frames=frames,
+        frame_s=5.0,
+        element=element,
+        element_wavelength_nm=205.0 + 10.0 * np.arange(element[-1] + 1),
+        adc_max_dn=65_535,
+        saturation_dn=59_578.0,
+        name="toy",
+        instrument="toy",
+        provenance={},
+        photon_noise=photon_noise,
+        conditions={"temperature_c": 21.0, "dark_slope_per_c": 0.0684, "light_loss": 0.34, "pointing_loss": 0.0},
+    )
+
+
+PIXELS = 1600
+
+
+def chi2_rate(engine: Engine, seconds: float = 0.5) -> float:
+    """Measure chi2's pixel-realisations per second, for a quiescent and a flaring scenario on common draws."""
+    quiet, flare = toy(PIXELS), toy(PIXELS, flare=0.1)
+
+    def work(count: int) -> float:
+        start = time.perf_counter()
+        engine.detect(quiet, [flare], realisations=count, seed=1, statistics=("chi2",))
+        return time.perf_counter() - start
+
+    # The first call builds the kernels.
+    work(64)
+    count = 256
+    while (spent := work(count)) < seconds / 4:
+        count *= 4
+    return count * PIXELS / min(spent, work(count))
+
+
+#: Columns of the table of devices.
+DEVICE_COLUMNS = (
+    Column("number", heading="number"),
+    Column("platform", heading="device", format=lambda platform, name: f"{platform}: {name}", others=("name",)),
+    Column("driver", heading="driver"),
+    Column("kind", heading="kind"),
+    Column("compute_units", heading="units"),
+    Column("global_memory", unit="byte", heading="GiB", format=lambda size: f"{size / 2**30:.1f}"),
+    Column("promise", heading="promise"),
+    Column("rate", unit="1 / s", heading="rate", format=lambda rate, error: error or _rate(rate), others=("error",)),
+    Column("default", heading="chosen", format=lambda chosen: "default" if chosen else ""),
+)
+
+
+def _rate(rate: float | None) -> str:
+    return "" if rate is None else f"{rate:.2g} /s"
+
+
+def list_devices(*, measure: bool = True) -> list[dict[str, Any]]:
+    """List all devices with their promise and, if `measure` is true, their speed.
+
+    Returns
+    -------
+    list of dict
+        Fields of `DeviceRecord`, ``rate`` (None if not measured) and ``error`` (the reason of a failure, or "").
+    """
+    rates = []
+    for number, record in enumerate(devices()):
+        rate, error = None, ""
+        if measure:
+            try:
+                rate = chi2_rate(Engine(str(number)))
+            except DeviceError as failure:
+                error = str(failure).splitlines()[0]
+        rates.append(asdict(record) | {"rate": rate, "error": error})
+    return rates
+
+
+def child(request: dict[str, Any]) -> None:
+    """Build and run kernels within the limits; print the reason of a failure, and exit with a code that says whose."""
+    limit(request)
+    code = first_build.DRIVER_FAILED
+    try:
+        why = _build(request)
+    except Exception as error:
+        why = str(error).splitlines()[0] if str(error) else type(error).__name__
+        if not _is_drivers(error):
+            code = first_build.OTHER_FAILED
+    if why:
+        print(why)
+    sys.exit(code if why else 0)
+
+
+def _is_drivers(error: Exception) -> bool:
+    """Return whether the driver is at fault for an exception, and not memory, disk or another device."""
+    if isinstance(error, DeviceError):
+        return isinstance(error, BuildError) or error.kind == "processor"
+    return isinstance(error, load_opencl().Error) and not out_of_memory(error)
+
+
+def limit(request: dict[str, Any]) -> None:
+    """Set the limits of this process."""
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    seconds = max(1, round(request["limit_s"]))
+    # The hard limit ends the process even if the compiler handles the signal of the soft one.
+    _lower(resource.RLIMIT_CPU, seconds, seconds + 5)
+    # The alarm ends this process if the parent is killed.
+    signal.alarm(max(1, round(first_build.CLOCK * request["limit_s"])))
+    if request["memory"] is not None:
+        _lower(resource.RLIMIT_DATA, request["memory"], request["memory"])
+
+
+def _lower(what: int, soft: int, hard: int) -> None:
+    """Lower a resource limit, unless it is lower already."""
+    now = resource.getrlimit(what)[1]
+    most = hard if now == resource.RLIM_INFINITY else min(hard, now)
+    # macOS defines some limits without enforcing them.
+    with contextlib.suppress(OSError, ValueError):
+        resource.setrlimit(what, (min(soft, most), most))
+
+
+def _build(request: dict[str, Any]) -> str:
+    """Draw a small scene and return a message if its counts are wrong, or an empty string."""
+    handle, record = choose_device(str(request["number"]))
+    if record.label != request["label"]:
+        raise DeviceError(f"device {request['number']} is {record.label} in a new process, not {request['label']}")
+    name = request["name"]
+    if name is not None and not processor.set_processor_name(handle, name):
+        return "PoCL's record of the device is not understood"
+    first_build.settled[int(handle.int_ptr)] = name
+    engine, quiet, flare = Engine(str(request["number"])), toy(), toy(flare=0.3)
+    raw = engine.realise(quiet, count=64, seed=1)
+    engine.detect(quiet, [flare], realisations=64, seed=1)
+    same = np.array_equal(raw, reference.realise(prepare([quiet]), np.arange(64, dtype=np.uint64), 1))
+    return "" if same or record.promise != SAME_BITS else "draws other counts than NumPy"
+
+
+#: Small stares that run every branch: options of `toy`, unknowns of the stare, number of sums.
+STARE_CASES: dict[str, tuple[dict[str, Any], dict[str, Any], int]] = {
+    "stares that wobble": (
+        {"pixels": 8, "unit": "electrons"},
+        {"jitters": {"light": 0.02, "sky": 0.02, "temperature": 0.1}, "offsets": {"star": 0.02, "temperature": 0.2}},
+        3,
+    ),
+    "skewed stares": ({"pixels": 4, "dark": 120.0, "photon_noise": "poisson"}, {}, 1),
+}
+#: Processes of each method of drawing stares: sums by cumulants have none.
+METHODS: dict[Any, Processes] = {
+    "pixels": Processes(cosmic_rays=CosmicRays(rate_per_cm2_s=300.0)),
+    "cumulants": NONE,
+}
+
+
+def stare_results(engine: Engine, name: str, count: int) -> dict[str, NDArray[np.float32]]:
+    """Return the sums of every frame of some stares with flares by each method, and the noise factors of the flares."""
+    components, stare, given = stare_case(name, count)
+    ours = {
+        method: Stares(engine.open_device).frames(
+            components, stare, given, first=START, count=count, seed=SEED, method=method, processes=processes
+        )
+        for method, processes in METHODS.items()
+    }
+    request = StaresRequest(components, stare, count, SEED, start=START, reduction=Glow(), glow=True)
+    return ours | {"noise of flares": Stares(engine.open_device).reduced(request)["glow"]}
+
+
+def stare_case(name: str, count: int) -> tuple[Components, Stare, NDArray[np.float64]]:
+    """Return the components of the light of a case, its stare, and the light curves of its flares."""
+    payload, wobble, n_sums = STARE_CASES[name]
+    quiet, flare = toy(frames=1, **payload), toy(frames=1, flare=1.0, **payload)
+    components = Components.of(quiet, [flare], np.vander(np.linspace(0.1, 1.0, payload["pixels"]), n_sums).T)
+    stare = Stare.of(100.0, gaps=[(10.0, 40.0)], **wobble)
+    return components, stare, np.linspace(0.0, 2.0, count * stare.n_frames).reshape(count, stare.n_frames, 1)
+
+
+def check_stares(engine: Engine) -> Iterator[Check]:
+    """Compare every frame of some stares with the known answers."""
+    known = known_arrays()
+    for name in STARE_CASES:
+        for part, ours in stare_results(engine, name, COUNT).items():
+            theirs = known[f"{name}: {part}"]
+            scale = 1.0 if part == "noise of flares" else theirs.std(axis=(0, 1))
+            apart = float(np.max(np.abs(ours - theirs).max(axis=(0, 1)) / scale))
+            if engine.device.promise == SAME_BITS:
+                passed, text = bool((ours == theirs).all()), f"{ours.size} sums, {apart:.2g} sigma apart"
+            else:
+                passed, text = apart < 0.2, f"weaker promise: {apart:.2g} sigma apart"
+            yield Check(f"same bits as the NumPy reference: {name}, {part}", passed, text)
+
+
+@dataclass(frozen=True)
+class Glow:
+    """Reduction that keeps the noise factors of flares."""
+
+    adds: ClassVar[bool] = False
+
+    def __call__(self, values: NDArray[np.float32], first: int, glow: NDArray[np.float32]) -> Arrays:
+        """Return the factors as ``glow``."""
+        return {"glow": glow.copy()}
+
 
 #: Probability that a statistical check fails on a correct device.
 FALSE_FAILURE_PROBABILITY = 1e-6
@@ -91,64 +444,49 @@ FAST = tuple(name for name, one in STATISTICS.items() if not one.paired)
 START, COUNT, SEED = 2**40 - 13, 40, 2**63 + 20_261_121
 
 
-def digests(engine: Engine, name: str) -> dict[str, str]:
-    """Return short digests of a device's raw counts, statistics and histograms for a case."""
+def results(engine: Engine, name: str, count: int) -> dict[str, NDArray[Any]]:
+    """Return a device's raw counts, statistics, histograms and tallies of a case."""
     options, how = CASES[name]
     quiet, flare = toy(**options), toy(flare=0.3, **options)
     place: dict[str, Any] = {"start": START, "seed": SEED}
-    raw, clipped = engine.realise_and_count(quiet, count=COUNT, **place, **_drawing(how))
-    seen = engine.snr(quiet, realisations=COUNT, **place, **_drawing(how))
+    raw, clipped = engine.realise_and_count(quiet, count=count, **place, **_drawing(how))
+    seen = engine.snr(quiet, realisations=count, **place, **_drawing(how))
     values, fast = (
-        engine.statistic_values(quiet, [flare], count=COUNT, statistics=names, **place, **how)
-        for names in (_statistics_of(how), _statistics_of(how, FAST))
+        engine.statistic_values(quiet, [flare], count=count, statistics=names, **place, **how)
+        for names in (statistics_of(how), statistics_of(how, FAST))
     )
-    detection = engine.detect(quiet, [flare], realisations=COUNT, statistics=_statistics_of(how, FAST), **place, **how)
-    null = detection.distribution("chi2")
+    detection = engine.detect(quiet, [flare], realisations=count, statistics=statistics_of(how, FAST), **place, **how)
     return {
-        "raw": _digest(raw.astype(np.int64), clipped),
-        "statistics": _digest(values.view(np.uint32)),
-        "fast statistics": _digest(fast.view(np.uint32)),
-        "histograms": _histograms(seen.counts),
-        "tally": _digest(null.counts, np.array([null.first, null.second]), null.far.keys, null.far.counts),
+        "raw": raw.astype(np.int32),
+        "clipped": clipped.astype(np.uint32),
+        "statistics": values,
+        "fast statistics": fast,
+        "histograms": histograms_of(seen.counts),
+        "tally": tally_of(detection.distribution("chi2")),
     }
 
 
-def reference_digests(name: str) -> dict[str, str]:
-    """Return the digests that the NumPy reference gives for a case."""
-    options, how = CASES[name]
-    quiet, flare = toy(**options), toy(flare=0.3, **options)
-    scene, index = prepare([quiet], **_scene_options(how)), np.arange(START, START + COUNT, dtype=np.uint64)
-    both = prepare([quiet, flare], **_scene_options(how))
-    raw = reference.realise(scene, index, SEED)
-    clipped = reference.clipped(scene, index, SEED)
-    seen = numpy_kernels.histograms(scene, observers(quiet, scene), elements(quiet), index, SEED)
-    values, plan = _statistics(name, both)
-    tally = Tally(plan.grids[plan.keys.index(("chi2", "null", 0)) :][:1])
-    counts, sums, _ = numpy_kernels.tally(values, tally.packed)
-    tally.add(counts, sums, COUNT)
-    tally.add_far(0, values[tally.grids[0].channel])
-    null = tally.distribution(0)
-    return {
-        "raw": _digest(raw.astype(np.int64), clipped.sum(axis=(1, 2)).astype(np.uint32)),
-        "statistics": _digest(values.view(np.uint32)),
-        "fast statistics": _digest(_fast(values, plan).view(np.uint32)),
-        "histograms": _histograms(seen),
-        "tally": _digest(null.counts, np.array([null.first, null.second]), null.far.keys, null.far.counts),
-    }
+def histograms_of(counts: Counts) -> NDArray[np.int64]:
+    """Return all counts of histograms as one array."""
+    far = (array for each in counts.far.values() for array in (each.keys, each.counts))
+    arrays = (counts.pixel, counts.element, counts.clipped, *far)
+    return np.concatenate([np.ravel(array).astype(np.int64) for array in arrays])
 
 
-def _statistics(name: str, scene: Scene) -> tuple[NDArray[np.float32], ChannelPlan]:
-    """Compute every statistic of a case with the NumPy reference; return values and the plan of their channels."""
-    options, how = CASES[name]
-    quiet, flare = toy(**options), toy(flare=0.3, **options)
-    unknown = as_nuisances(how.get("nuisances"), quiet)
-    hypotheses = Hypotheses(quiet, (flare,), _statistics_of(how), scene, nuisances=unknown)
-    plan = plan_channels(hypotheses, range(1), first=True)
-    index = np.arange(START, START + COUNT, dtype=np.uint64)
-    smoothed = numpy_kernels.Smoothed.of(hypotheses, plan) if len(plan.scales) else None
-    paired = "chi2_pair" in _statistics_of(how)
-    sums = numpy_kernels.statistics(scene, index, SEED, plan, pair=paired, smoothed=smoothed)
-    return numpy_kernels.marginalise(sums, plan.subtractions), plan
+def tally_of(distribution: Distribution) -> NDArray[np.int64]:
+    """Return all counts and sums of a tally as one array."""
+    moments, far = np.array([distribution.first, distribution.second]), distribution.far
+    return np.concatenate([each.astype(np.int64) for each in (distribution.counts, moments, far.keys, far.counts)])
+
+
+@cache
+def known_arrays() -> dict[str, NDArray[Any]]:
+    """Return the results of the NumPy reference for every case, by the names of case and part.
+
+    `python tests/reference/known_answers.py` computes them.
+    """
+    with resources.files(__package__).joinpath("known_answers.npz").open("rb") as file, np.load(file) as arrays:
+        return dict(arrays)
 
 
 def _drawing(how: dict[str, Any]) -> dict[str, Any]:
@@ -156,33 +494,14 @@ def _drawing(how: dict[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in how.items() if key not in ("comparison", "nuisances")}
 
 
-def _scene_options(how: dict[str, Any]) -> dict[str, Any]:
-    """Return the options that `prepare` accepts."""
-    return {key: value for key, value in how.items() if key != "nuisances"}
-
-
-def _statistics_of(how: dict[str, Any], names: tuple[str, ...] = tuple(STATISTICS)) -> tuple[str, ...]:
+def statistics_of(how: dict[str, Any], names: tuple[str, ...] = tuple(STATISTICS)) -> tuple[str, ...]:
     """Return the statistics of a case; if it marginalises, only those that support this."""
     return tuple(n for n in names if STATISTICS[n].marginal) if "nuisances" in how else names
 
 
-def _fast(values: NDArray[np.float32], plan: ChannelPlan) -> NDArray[np.float32]:
-    """Select the channels of the fast kernel, with zeros for statistics that it does not compute."""
-    known = values[: plan.n_rows - len(plan.scales)].copy()
-    known[[2, 5]] = 0.0
-    return known
-
-
-def _histograms(counts: Counts) -> str:
-    far = (array for each in counts.far.values() for array in (each.keys, each.counts))
-    return _digest(counts.pixel, counts.element, counts.clipped, *far)
-
-
-def _digest(*arrays: NDArray[Any]) -> str:
-    digest = hashlib.sha256()
-    for array in arrays:
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()[:12]
+def digest(array: NDArray[Any]) -> str:
+    """Return a short digest of the bytes of an array."""
+    return hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()[:12]
 
 
 def known_answers(engine: Engine) -> Check:
@@ -193,37 +512,32 @@ def known_answers(engine: Engine) -> Check:
     return Check("Philox4x32-10, known answers", right, f"{len(PHILOX_VECTORS)} vectors of Random123")
 
 
-def check_against_reference(engine: Engine) -> Iterator[Check]:
-    """Compare every branch of every kernel with the NumPy reference."""
+def check_results(engine: Engine) -> Iterator[Check]:
+    """Compare every branch of every kernel with the known answers."""
+    known = known_arrays()
     for name in CASES:
-        ours, slow = digests(engine, name), reference_digests(name)
-        differ = [part for part in ours if ours[part] != slow[part]]
+        ours = results(engine, name, COUNT)
+        theirs = {part: known[f"{name}: {part}"] for part in ours}
+        differ = [part for part in ours if ours[part].tobytes() != theirs[part].tobytes()]
         if not differ:
-            passed, text = True, "digests " + " ".join(ours.values())
+            passed, text = True, "digests " + " ".join(digest(array) for array in ours.values())
         elif engine.device.promise == SAME_BITS:
             passed, text = False, f"{', '.join(differ)} differ from the reference's"
         else:
-            passed, text = _check_weaker_promise(engine, name)
+            passed, text = _check_weaker_promise(ours, theirs)
         yield Check(f"same bits as the NumPy reference: {name}", passed, text)
 
 
-def _check_weaker_promise(engine: Engine, name: str) -> tuple[bool, str]:
+def _check_weaker_promise(ours: dict[str, NDArray[Any]], theirs: dict[str, NDArray[Any]]) -> tuple[bool, str]:
     """Check the weaker promise of devices without strict arithmetic.
 
     Fewer than 1 % of the counts differ from the reference's, by 1 DN, and statistics by less than 0.2 of their standard
     deviation.
     """
-    options, how = CASES[name]
-    quiet, flare = toy(**options), toy(flare=0.3, **options)
-    index = np.arange(START, START + COUNT, dtype=np.uint64)
-    raw = engine.realise(quiet, start=START, count=COUNT, seed=SEED, **_drawing(how)).astype(np.int64)
-    off = np.abs(raw - reference.realise(prepare([quiet], **_scene_options(how)), index, SEED))
+    off = np.abs(ours["raw"] - theirs["raw"])
     share = float(np.mean(off > 0))
-    ours = engine.statistic_values(
-        quiet, [flare], start=START, count=COUNT, seed=SEED, statistics=_statistics_of(how), **how
-    )
-    slow = _statistics(name, prepare([quiet, flare], **_scene_options(how)))[0]
-    apart = float(np.max(np.abs(ours - slow).max(axis=1) / np.maximum(slow.std(axis=1), 1e-3)))
+    values, slow = ours["statistics"], theirs["statistics"]
+    apart = float(np.max(np.abs(values - slow).max(axis=1) / np.maximum(slow.std(axis=1), 1e-3)))
     return (
         bool(off.max() <= 1 and share < 1e-2 and apart < 0.2),
         f"weaker promise: {share:.2g} of counts off, by {off.max()} DN at most; statistics by {apart:.2g} sigma",
@@ -317,8 +631,8 @@ def run(engine: Engine, report: Callable[[Check], None] = lambda check: None) ->
 
     note(known_answers(engine))
     for group in (
-        check_against_reference(engine),
-        stares(engine, START, COUNT, SEED),
+        check_results(engine),
+        check_stares(engine),
         chance(engine),
         closed_forms(engine),
     ):

@@ -167,9 +167,7 @@ class FlareModel:
         nm = star.wavelength_nm
         light = photons(nm, star.flux_flam, band)
         if not light > 0.0:
-            raise InputError(
-                f"the star has no light in the band {band}", "a star with light in the band", key="band", value=band
-            )
+            raise InputError(f"the star has no light in the band {band}", "a star with light in the band", key="band")
         # Ratio of the flux at the telescope to that at the flare's surface, for an amplitude of one.
         scale = np.array([light / photons(nm, blackbody(nm, float(k)), band) for k in kelvin])
         extra = ([balmer_continuum(grid, electron_temperature_k)] if jump else []) + [
@@ -279,7 +277,7 @@ class FlareModel:
             (spline for spline, one in zip(self.splines, self.derived, strict=True) if one.ratio is not None), None
         )
         if ratio is None and jump != 1.0:
-            raise InputError(f"jump = {jump:g} of a model without a Balmer continuum", "1", key="jump", value=jump)
+            raise InputError(f"jump = {jump:g} of a model without a Balmer continuum", "1", key="jump")
         own = [] if ratio is None else [(jump - 1.0) * amplitude / float(ratio(np.log(temperature_k)))]
         given = np.array([amplitude, *own, *lines], np.float64)
         return self._checked(temperature_k, given)
@@ -291,10 +289,7 @@ class FlareModel:
         linear = np.asarray(amplitudes, np.float64)
         if linear.shape != (len(self.linear),) or not np.isfinite(linear).all():
             raise InputError(
-                f"amplitudes of the shape {linear.shape}",
-                f"finite ones of {', '.join(self.linear)}",
-                key="amplitudes",
-                value=linear.shape,
+                f"amplitudes of the shape {linear.shape}", f"finite ones of {', '.join(self.linear)}", key="amplitudes"
             )
         return linear
 
@@ -744,7 +739,7 @@ def check_enough(quiet: Expectation, used: NDArray[np.bool_], parameters: int) -
         expected = f"more than the {parameters} parameters of the fit"
         if not count:
             fault, expected = f"every pixel of {quiet.name} saturates or is left out", "some that count"
-        raise InputError(fault, expected, key="skipped_nm", value=count)
+        raise InputError(fault, expected, key="skipped_nm")
 
 
 def skipped_pixels(quiet: Expectation, skipped_nm: Ranges) -> NDArray[np.bool_]:
@@ -767,8 +762,5 @@ def check_distinct(kept: Float, whole: Float, nuisances: Nuisances | None) -> No
     if not (kept > LEAST_KEPT * whole).all():
         unknown = join_names(nuisances.names) if nuisances else "nothing"
         raise InputError(
-            f"the light of a flare cannot be distinguished from {unknown}",
-            "fewer unknowns",
-            key="nuisances",
-            value=unknown,
+            f"the light of a flare cannot be distinguished from {unknown}", "fewer unknowns", key="nuisances"
         )

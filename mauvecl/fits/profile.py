@@ -754,7 +754,7 @@ class BoundedProfile(Profile):
         return self.solution(self._climbed(x, np.flatnonzero(moving)))
 
     def _climbed(self, x: Float, moving: NDArray[np.intp]) -> Float:
-        """Return temperatures, moved to the highest gain nearby if it is higher beside them."""
+        """Return the temperatures; those from which the gain still rises are moved to its maximum nearby."""
         if not moving.size:
             return x
         low, high = self.nodes[0], self.nodes[-1]

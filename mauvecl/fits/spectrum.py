@@ -41,9 +41,9 @@ from mauvecl.fits.profile import (
     with_bounds,
 )
 from mauvecl.schema.calls import validated
+from mauvecl.schema.columns import Column, table_of
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import Probability, Temperature, Wavelength
-from mauvecl.schema.tables import Column, table_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -275,12 +275,7 @@ def checked_exposures(
     """Return exposures less their mean without a flare; raises InputError as `fit` does."""
     raw = np.atleast_2d(np.asarray(frames))
     if raw.ndim != 2 or not len(raw) or raw.shape[1] != expectation.wavelength_nm.size:
-        raise InputError(
-            f"frames of the shape {raw.shape}",
-            f"(n, {expectation.wavelength_nm.size})",
-            key="frames",
-            value=raw.shape,
-        )
+        raise InputError(f"frames of the shape {raw.shape}", f"(n, {expectation.wavelength_nm.size})", key="frames")
     if raw.dtype.kind not in "iuf" or not np.isfinite(raw).all():
         raise InputError("frames hold undefined values", "finite numbers", key="frames")
     if not levels:

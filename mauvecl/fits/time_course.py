@@ -9,6 +9,7 @@ over. Those of all light change that of the flare as well.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache
 from typing import TYPE_CHECKING, Annotated, NamedTuple
@@ -20,21 +21,19 @@ from numpy.typing import ArrayLike, NDArray
 from mauvecl.detection.nuisances import Nuisances, spectrum_of
 from mauvecl.fits.flare_model import EVERY, Exposures, Ranges, Reduction
 from mauvecl.fits.spectrum import LEVELS, Measurement, clipped_pixels, fit
-from mauvecl.flares.cooling import Cooling
 from mauvecl.flares.events import Event
 from mauvecl.flares.frames import Components
+from mauvecl.flares.settings import Cooling
 from mauvecl.flares.shapes import Shape, shape_of
 from mauvecl.flares.stare import Stare
 from mauvecl.noise.unknowns import CHANGING, Changing
 from mauvecl.schema.calls import validated
+from mauvecl.schema.columns import Column, table_of
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range
 from mauvecl.schema.physical import Duration, Moment, Probability, Wavelength
-from mauvecl.schema.tables import Column, table_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
     from astropy.table import QTable
 
     from mauvecl.fits.flare_model import FlareModel
@@ -178,17 +177,13 @@ def checked_frames(frames: ArrayLike, quiet: Expectation, stare: Stare | None) -
     """Return raw frames of a stare and the stare; raises InputError unless they and the expectation agree."""
     raw = np.asarray(frames, np.float64)
     if raw.ndim != 2:
-        raise InputError(
-            f"frames of the shape {raw.shape}", "two dimensions: frames and pixels", key="frames", value=raw.shape
-        )
+        raise InputError(f"frames of the shape {raw.shape}", "two dimensions: frames and pixels", key="frames")
     if stare is None:
         here = quiet.conditions["temperature_c"]
         stare = Stare.of(max(len(raw), 1) * quiet.frame_s, frame_s=quiet.frame_s, temperature_c=here)
     n_pixel = quiet.wavelength_nm.size
     if raw.shape != (stare.n_frames, n_pixel):
-        raise InputError(
-            f"frames of the shape {raw.shape}", f"{(stare.n_frames, n_pixel)}", key="frames", value=raw.shape
-        )
+        raise InputError(f"frames of the shape {raw.shape}", f"{(stare.n_frames, n_pixel)}", key="frames")
     if not np.isfinite(raw).all():
         raise InputError("frames hold undefined values", "finite numbers", key="frames")
     if quiet.n_frames != 1:
@@ -559,7 +554,7 @@ def fit_cooling(
         every pixel is near saturation in a frame.
     """
     if len(model.linear) > 1:
-        raise InputError(f"a model of {', '.join(model.linear)}", "a blackbody alone", key="model", value=model.linear)
+        raise InputError(f"a model of {', '.join(model.linear)}", "a blackbody alone", key="model")
     raw, stare = checked_frames(frames, quiet, stare)
     data = _data(raw, quiet, model, nuisances, stare, shape_of(shape), skipped_nm)
     free = np.arange(len(PARAMETERS) if cooling else 4)
@@ -572,6 +567,7 @@ def fit_cooling(
     theta = _solve(data, whitening, theta, free, low, high)
 
     best = float(np.sum(data.residuals(theta, whitening) ** 2))
+    fit = _BestFit(data, whitening, theta, free, (low, high), best)
     jacobian = data.jacobian(theta, whitening)[:, free]
     covariance = np.linalg.pinv(jacobian.T @ jacobian, hermitian=True)
     quantities = _quantities(data, stare, cooling)
@@ -586,15 +582,8 @@ def fit_cooling(
         if one.name.startswith("energy"):
             fluence = names.index(one.name.replace("energy", "fluence"))
             ends[:, :, q] = estimates[q] / estimates[fluence] * ends[:, :, fluence]
-            continue
-        for side, sign in enumerate((-1.0, 1.0)):
-            for k, rise in enumerate(rises):
-                limit = best + rise
-                end = _newton_end(data, whitening, theta, free, (low, high), one, sign, best, limit)
-                if end is None:
-                    step = sign * float(np.sqrt(spread[q, q])) / max(abs(scale[q]), 1e-300)
-                    end = _end(data, whitening, theta, free, (low, high), one, step, limit)
-                ends[side, k, q] = end
+        else:
+            ends[:, :, q] = fit.ends(one, float(np.sqrt(spread[q, q])) / max(abs(scale[q]), 1e-300), rises)
     dof = data.sums.size - free.size - sum(np.isinf(one.sd) for one in data.unknown)
     empty = np.full(theta.shape, -np.inf)
     without = data.whitening(theta, none=True)
@@ -771,105 +760,118 @@ def _quantities(data: _Data, stare: Stare, cooling: bool) -> list[_Quantity]:
     return found
 
 
-def _newton_end(
-    data: _Data,
-    whitening: _Whitening,
-    theta: Float,
-    free: NDArray[np.intp],
-    limits: tuple[Float, Float],
-    quantity: _Quantity,
-    sign: float,
-    best: float,
-    allowed: float,
-) -> float | None:
-    """Return the end of a profile interval on one side, or None if Newton's steps do not find it within the limits.
+@dataclass(frozen=True, eq=False)
+class _BestFit:
+    """Best fit of a flare to all frames, and the ends of intervals from profiles of chi-squared about it."""
 
-    Each step goes to where the quantity is extreme on the surface of equal chi-squared, of linearised residuals.
-    """
-    there = theta.copy()
-    for _ in range(NEWTON_STEPS):
-        residuals, jacobian = data.residuals(there, whitening), data.jacobian(there, whitening)[:, free]
-        information, slope = jacobian.T @ jacobian, quantity.slope(there, data)[free]
-        scale = np.sqrt(np.diag(information))
-        # A flare that does not cool leaves the cooling time without any effect.
-        if not ((scale > 0.0) & (scale < np.inf)).all():
-            return None
-        if not np.linalg.cond(information / np.outer(scale, scale)) < WORST_CONDITION:
-            return None
-        back, along = np.linalg.solve(information, np.column_stack([-(residuals @ jacobian), slope])).T
-        room = allowed - float(residuals @ residuals + residuals @ jacobian @ back)
-        step = back + sign * np.sqrt(max(room, 0.0) / (slope @ along)) * along
-        moved = float(np.sum((jacobian @ step) ** 2)) / (allowed - best)
-        there[free] += step * min(1.0, LONGEST / np.sqrt(moved))
-        if not ((limits[0] <= there) & (there <= limits[1]))[free].all():
-            return None
-        if moved < CONVERGED:
-            return quantity.value(there, data)
-    return None
+    data: _Data
+    whitening: _Whitening
+    theta: Float  # shape (n_parameter,)
+    free: NDArray[np.intp]  # places of fitted parameters
+    limits: tuple[Float, Float]
+    chi2: float
 
+    def ends(self, quantity: _Quantity, sd: float, rises: Sequence[float]) -> Float:
+        """Return the ends of a quantity's intervals, shape (2, n_rise), for rises of chi-squared.
 
-def _end(
-    data: _Data,
-    whitening: _Whitening,
-    theta: Float,
-    free: NDArray[np.intp],
-    limits: tuple[Float, Float],
-    quantity: _Quantity,
-    step: float,
-    allowed: float,
-) -> float:
-    """Return the end of a profile interval on one side; infinite if chi-squared does not rise that far."""
-    place = quantity.place
-    rest = free[free != place]
-    centre, there = quantity.value(theta, data), theta
+        `sd` is the standard deviation of the peak, or of the logarithm of another quantity.
+        """
+        found = np.empty((2, len(rises)))
+        for side, sign in enumerate((-1.0, 1.0)):
+            for k, rise in enumerate(rises):
+                end = self._newton_end(quantity, sign, self.chi2 + rise)
+                found[side, k] = self._root_end(quantity, sign * sd, self.chi2 + rise) if end is None else end
+        return found
 
-    def held(log_factor: float, theta: Float) -> Float:
+    def _newton_end(self, quantity: _Quantity, sign: float, allowed: float) -> float | None:
+        """Return the end of an interval on one side, or None if Newton's steps do not find it within the limits.
+
+        Each step goes to where the quantity is extreme on the surface of equal chi-squared, of linearised residuals.
+        """
+        data, free, (low, high), there = self.data, self.free, self.limits, self.theta.copy()
+        for _ in range(NEWTON_STEPS):
+            residuals = data.residuals(there, self.whitening)
+            jacobian = data.jacobian(there, self.whitening)[:, free]
+            information, slope = jacobian.T @ jacobian, quantity.slope(there, data)[free]
+            scale = np.sqrt(np.diag(information))
+            # A flare that does not cool leaves the cooling time without any effect.
+            if not ((scale > 0.0) & (scale < np.inf)).all():
+                return None
+            if not np.linalg.cond(information / np.outer(scale, scale)) < WORST_CONDITION:
+                return None
+            back, along = np.linalg.solve(information, np.column_stack([-(residuals @ jacobian), slope])).T
+            room = allowed - float(residuals @ residuals + residuals @ jacobian @ back)
+            step = back + sign * np.sqrt(max(room, 0.0) / (slope @ along)) * along
+            moved = float(np.sum((jacobian @ step) ** 2)) / (allowed - self.chi2)
+            there[free] += step * min(1.0, LONGEST / np.sqrt(moved))
+            if not ((low <= there) & (there <= high))[free].all():
+                return None
+            if moved < CONVERGED:
+                return quantity.value(there, data)
+        return None
+
+    def _root_end(self, quantity: _Quantity, step: float, allowed: float) -> float:
+        """Return the end of an interval on the side of a step; infinite if chi-squared does not rise that far."""
+        theta, place, (low, high) = self.theta, quantity.place, self.limits
+        rest = self.free[self.free != place]
+        centre, there = quantity.value(theta, self.data), theta
+
+        @cache  # a root is between values that have different signs, though refits start elsewhere
+        def rise(log_factor: float) -> float:
+            nonlocal there
+            there, chi2 = self._refitted(quantity, log_factor, there, rest)
+            return chi2 - allowed
+
+        inner, outer = 0.0, step
+        if abs(step) < NO_STEP:
+            return float(np.copysign(np.inf, step))
+        while rise(outer) < 0.0:
+            inner, outer = outer, 1.7 * outer
+            if (
+                abs(outer) > REACH * abs(step)
+                or not low[place] <= self._held(quantity, outer, theta)[place] <= high[place]
+            ):
+                return float(np.copysign(np.inf, step))
+        there = theta
+        found = scipy.optimize.brentq(rise, inner, outer, xtol=1e-3 * abs(step), rtol=1e-6)
+        return float(centre + found if place == 0 else centre * np.exp(found))
+
+    def _held(self, quantity: _Quantity, log_factor: float, theta: Float) -> Float:
         """Return parameters with a changed quantity: by a difference for the peak, otherwise by a factor."""
-        moved = theta.copy()
+        moved, place, centre = theta.copy(), quantity.place, quantity.value(self.theta, self.data)
         if place == 0:
             moved[0] = centre + log_factor
         elif place == 4:
             moved[4] = np.log(centre) + log_factor - moved[3]
         else:
-            moved[place] += np.log(centre / quantity.value(moved, data)) + log_factor
+            moved[place] += np.log(centre / quantity.value(moved, self.data)) + log_factor
         return moved
 
-    @cache  # a root is between values that have different signs, though refits start elsewhere
-    def rise(log_factor: float) -> float:
-        nonlocal there
+    def _refitted(
+        self, quantity: _Quantity, log_factor: float, there: Float, rest: NDArray[np.intp]
+    ) -> tuple[Float, float]:
+        """Fit the other parameters from a starting point with a changed quantity; return them and chi-squared."""
 
         def with_rest(values: Float) -> Float:
             trial = there.copy()
             trial[rest] = values
-            trial = held(log_factor, trial)
+            trial = self._held(quantity, log_factor, trial)
             trial[4] = min(trial[4], 0.0)
             return trial
 
         def residuals(values: Float) -> Float:
-            return data.residuals(with_rest(values), whitening)
+            return self.data.residuals(with_rest(values), self.whitening)
 
         def jacobian(values: Float) -> Float:
             trial = with_rest(values)
-            each, slope = data.jacobian(trial, whitening), quantity.slope(trial, data)
-            return np.asarray(each[:, rest] - np.outer(each[:, place], slope[rest] / slope[place]))
+            each, slope = self.data.jacobian(trial, self.whitening), quantity.slope(trial, self.data)
+            return np.asarray(each[:, rest] - np.outer(each[:, quantity.place], slope[rest] / slope[quantity.place]))
 
-        low, high = limits[0][rest], limits[1][rest]
-        start = np.clip(there[rest], low + 1e-9, high - 1e-9)
-        scale = np.where(rest == 0, np.exp(theta[1]), 1.0)
+        low, high = (end[rest] for end in self.limits)
         found = scipy.optimize.least_squares(
-            residuals, start, jacobian, bounds=(low, high), x_scale=scale, xtol=1e-6, ftol=1e-8
-        )
-        there = there.copy()
-        there[rest] = found.x
-        return float(2 * found.cost - allowed)
-
-    inner, outer = 0.0, step
-    if abs(step) < NO_STEP:
-        return float(np.copysign(np.inf, step))
-    while rise(outer) < 0.0:
-        inner, outer = outer, 1.7 * outer
-        if abs(outer) > REACH * abs(step) or not limits[0][place] <= held(outer, theta)[place] <= limits[1][place]:
-            return float(np.copysign(np.inf, step))
-    there = theta
-    found = scipy.optimize.brentq(rise, inner, outer, xtol=1e-3 * abs(step), rtol=1e-6)
-    return float(centre + found if place == 0 else centre * np.exp(found))
+            residuals, np.clip(there[rest], low + 1e-9, high - 1e-9), jacobian, bounds=(low, high),
+            x_scale=np.where(rest == 0, np.exp(self.theta[1]), 1.0), xtol=1e-6, ftol=1e-8,
+        )  # fmt: skip
+        fitted = there.copy()
+        fitted[rest] = found.x
+        return fitted, 2 * float(found.cost)

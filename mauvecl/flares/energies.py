@@ -35,12 +35,11 @@ from mauvecl.host.stars.blackbody import blackbody
 from mauvecl.host.stars.flare import Geometry, added_light
 from mauvecl.host.stars.flare_spectra import PARSEC_CM, STEFAN_BOLTZMANN, SUN_CM, Blackbody, FlareSpectrum
 from mauvecl.host.tables.opening import read_table
-from mauvecl.host.tables.rows import Rows
+from mauvecl.host.tables.table import Rows
 from mauvecl.schema.calls import validated
-from mauvecl.schema.errors import InputError
+from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.fields import Range, Unit, checked
 from mauvecl.schema.physical import Distance, Energy, Positive, Radius, RateExponent, Temperature
-from mauvecl.schema.text import shortened
 
 if TYPE_CHECKING:
     from mauvecl.host.stars.source import Source
@@ -100,10 +99,7 @@ class EnergyScale:
         """
         if source.unscaled:
             raise InputError(
-                f"the flux of {source.name} has no absolute scale: {source.unscaled}",
-                "a magnitude",
-                key="source",
-                value=source.name,
+                f"the flux of {source.name} has no absolute scale: {source.unscaled}", "a magnitude", key="source"
             )
         source.magnitude(band)  # raises InputError if the spectrum does not cover the band
         return cls._of_light(
@@ -461,7 +457,7 @@ class RateTable(Rates):
             held = rows.first((name,))
             if held is None:
                 fault = f"{rows.named} has no column {name!r}"
-                raise InputError(fault, "energy and rate", key="columns", value=name)
+                raise InputError(fault, "energy and rate", key="columns")
             values = [rows.number(held, row, unit) for row in range(rows.n)]
             columns.append(np.array([np.nan if value is None else value for value in values]))
         energy, rate = columns
@@ -513,7 +509,6 @@ def davenport2019(*, mass_msun: float, age_myr: float) -> PowerLaw:
             f"age_myr = {age_myr:g}",
             "less mass or another distribution",
             key="mass_msun",
-            value=mass_msun,
         )
     return PowerLaw(
         alpha=1 - slope,

@@ -9,8 +9,8 @@ from typing import Annotated, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.flares.cooling import SAME_K, Cooling
 from mauvecl.flares.energies import EnergyScale, amplitude_of, amplitude_of_peak, equivalent_duration
+from mauvecl.flares.settings import SAME_K, Cooling
 from mauvecl.flares.shapes import SHAPES, Shape, shape_of
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
@@ -175,7 +175,6 @@ def check_contributions(events: Sequence[Event], start_s: Float, frame_s: float)
                 f"flare {number}, which peaks at {event.peak_s:g} s, adds no light to the frames of the stare",
                 f"light between {start_s[0]:g} and {start_s[-1] + frame_s:g} s and outside gaps",
                 key="peak_s",
-                value=event.peak_s,
             )
         peak_s = event.peak_s + event.half_width_s * event.form.peak_at
         last = int(np.searchsorted(start_s, peak_s, side="right")) - 1
@@ -206,7 +205,6 @@ def temperatures_of(events: Sequence[Event]) -> Float:
             f"flares of {len(constant)} constant temperatures{' and some that cool' if cooling else ''}",
             f"at most {MOST_TEMPERATURES - (LEAST_STEPS if cooling else 0)}",
             key="events",
-            value=len(constant),
         )
     if cooling:
         low, high = min(c.end_k for c in cooling), max(c.peak_k for c in cooling)
@@ -265,7 +263,6 @@ def _node_weights(temperature: Float, nodes: Float) -> list[tuple[int, Float]]:
             f"a flare of {temperature.min():g} to {temperature.max():g} K",
             f"temperatures within {nodes[0]:g} to {nodes[-1]:g} K",
             key="temperature",
-            value=float(temperature.max()),
         )
     inverse = -1.0 / nodes
     place = np.interp(-1.0 / temperature, inverse, np.arange(nodes.size, dtype=np.float64))

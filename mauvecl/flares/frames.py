@@ -60,7 +60,7 @@ class Components:
         for name, what, least in (("flare_electrons", "flare spectra", 0), ("weights", "spectral weights", 1)):
             kept = np.array(getattr(self, name), np.float64)
             if kept.ndim != 2 or kept.shape[1] != n_pixel or len(kept) < least:
-                raise InputError(f"{what} have the shape {kept.shape}", f"(n, {n_pixel})", key=name, value=kept.shape)
+                raise InputError(f"{what} have the shape {kept.shape}", f"(n, {n_pixel})", key=name)
             if not np.isfinite(kept).all():
                 raise InputError(
                     f"{what} of pixel {int(np.argmin(np.isfinite(kept).all(axis=0)))} are not finite",
@@ -72,21 +72,13 @@ class Components:
         if (self.flare_electrons < 0).any():
             pixel = int(np.argmax((self.flare_electrons < 0).any(axis=0)))
             raise InputError(
-                f"a flare takes light from pixel {pixel}",
-                "flare spectra of 0 and above",
-                key="flare_electrons",
-                value=pixel,
+                f"a flare takes light from pixel {pixel}", "flare spectra of 0 and above", key="flare_electrons"
             )
         if len(self.flare_electrons) > MOST_FLARES:
             raise InputError.of("flare_electrons", len(self.flare_electrons), f"at most {MOST_FLARES} spectra")
         unusable = self.quiet.saturated & (self.weights != 0).any(axis=0)
         if unusable.any():
-            raise InputError(
-                f"pixel {int(np.argmax(unusable))} saturates and has a weight",
-                "0 there",
-                key="weights",
-                value=int(np.argmax(unusable)),
-            )
+            raise InputError(f"pixel {int(np.argmax(unusable))} saturates and has a weight", "0 there", key="weights")
 
     @classmethod
     def of(cls, quiet: Expectation, flares: Sequence[Expectation], weights: Float) -> Self:
@@ -180,7 +172,6 @@ class Components:
                     f"flare coefficients have the shape {np.shape(flare)}",
                     f"{(stare.n_frames, self.n_flares)}",
                     key="flare",
-                    value=np.shape(flare),
                 )
             factors[:, len(STEADY) :] = stare.light[:, None] * flare
         return factors

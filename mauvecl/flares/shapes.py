@@ -15,11 +15,10 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from mauvecl.flares.defaults import check_shape
+from mauvecl.flares.settings import check_shape
 from mauvecl.schema.calls import validated
-from mauvecl.schema.errors import InputError
+from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.physical import Duration
-from mauvecl.schema.text import shortened
 
 Float = NDArray[np.float64]
 
@@ -342,15 +341,12 @@ class TableShape(Shape):
         if tau.ndim != 1 or tau.shape != values.shape or tau.size < 2:
             raise InputError.of("values", values.size, f"one for each of {tau.size} times, at least 2", where=name)
         if not (np.isfinite(tau).all() and (np.diff(tau) > 0).all()):
-            raise InputError(
-                f"the times of {name} do not ascend", "finite times in ascending order", key="tau", value=tau
-            )
+            raise InputError(f"the times of {name} do not ascend", "finite times in ascending order", key="tau")
         if not (np.isfinite(values).all() and values.min() >= 0 and values.max() > 0):
             raise InputError(
                 f"the values of {name} range from {values.min():g} to {values.max():g}",
                 "finite values of at least 0, some above 0",
                 key="values",
-                value=values,
             )
         values = values / values.max()
         for name, array in (("tau", tau), ("values", values)):

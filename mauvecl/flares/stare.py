@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.flares.curves import Curve, Sinusoid
-from mauvecl.flares.defaults import ORBIT_S
+from mauvecl.flares.settings import ORBIT_S, Curve, Sinusoid
 from mauvecl.host.orbit.geometry import TimeGrid, sunlight
 from mauvecl.host.orbit.observing_limits import Limits
 from mauvecl.host.orbit.orbit import Orbit, Target, Track
@@ -109,9 +108,7 @@ class Stare:
             raise InputError.of("n_frames", n, f"1 to {MOST_FRAMES}")
         for name, values in self._per_frame():
             if values.shape != (n,):
-                raise InputError(
-                    f"{name} of the stare has the shape {values.shape}", f"({n},)", key=name, value=values.shape
-                )
+                raise InputError(f"{name} of the stare has the shape {values.shape}", f"({n},)", key=name)
             if not np.isfinite(values).all():
                 raise InputError(
                     f"{name} of frame {int(np.argmin(np.isfinite(values)))} is not finite", "finite numbers", key=name
@@ -122,17 +119,11 @@ class Stare:
                 f"the frames of a stare start at {self.start_s[0]:g} ... {self.start_s[-1]:g} s",
                 f"ascending multiples of {self.frame_s:g} s from 0",
                 key="start_s",
-                value=self.start_s,
             )
         for name, values in (("star", self.star), ("light", self.light), ("sky", self.sky)):
             if not (values >= 0).all():
                 k = int(np.argmin(values >= 0))
-                raise InputError(
-                    f"the factor on the {name} of frame {k} = {values[k]:g}",
-                    "at least 0",
-                    key=name,
-                    value=float(values[k]),
-                )
+                raise InputError(f"the factor on the {name} of frame {k} = {values[k]:g}", "at least 0", key=name)
         for of, sd in self.jitters.items():
             _check_spread(f"{of} jitter", of, sd, least=0.0)
         for unknown in self.unknowns:
@@ -405,7 +396,6 @@ def stare_along(
             f"target {place.name!r} is never seen in {duration_s / 3600:g} h from {times.iso(0.0)}",
             "another time or other limits",
             key="target",
-            value=place.name,
         )
     # All but the temperature follow from a stare without gaps.
     whole = Stare.of(count * frame_s, frame_s=frame_s, **unknowns)

@@ -68,7 +68,6 @@ class Flares:
                 f"flare coefficients have the shape {given.shape}",
                 f"({count}, {n_frames}, {n_flares}), or one row for all stares",
                 key="flare",
-                value=given.shape,
             )
         factors = np.ones((1, 1)) if amplitudes is None else np.asarray(amplitudes)
         if factors.ndim != 2 or factors.shape[1] not in (1, count) or not 1 <= len(factors) <= MOST_SCENARIOS:
@@ -76,7 +75,6 @@ class Flares:
                 f"amplitudes have the shape {factors.shape}",
                 f"(n, {count}) or (n, 1) with n of 1 to {MOST_SCENARIOS} scenarios",
                 key="amplitudes",
-                value=factors.shape,
             )
         # The minimum of values that include NaN is NaN.
         ends = [("flare coefficients", given.min(initial=0.0)), ("amplitudes", factors.min(initial=0.0))]
@@ -246,7 +244,6 @@ class StareScene:
                     f"the {of} of a frame scatters by {float(spread[of].max()):.3g}",
                     f"less than {1 / REACH_SIGMA:.3g}, so that it is never drawn below zero",
                     key=of,
-                    value=float(spread[of].max()),
                 )
         x, mean = self.components.quiet, self.components.mean_dn
         _, high = self._ends
@@ -258,7 +255,6 @@ class StareScene:
                 f"the stare carries pixel {pixel} of {x.name} to {reach[pixel]:.3g} DN in a frame",
                 f"less than {REACH_DN:g}",
                 key="flare",
-                value=float(reach[pixel]),
             )
         if not _joint_throughout(x, self.conditions(flares)):
             raise _not_joint_error(x.name)
@@ -329,7 +325,6 @@ def _not_joint_error(name: str) -> InputError:
         f"the noise of a frame of {name} cannot be drawn jointly under all conditions of the stare",
         "Gaussian noise with the variance of at least 1.5 Poisson counts in each pixel, and more where counts are few",
         key="recipe",
-        value="joint",
     )
 
 
@@ -485,9 +480,7 @@ class SumTable:
         covariance = constant + each[: len(STEADY)].sum(axis=0)
         sd = np.sqrt(np.diag(covariance))
         if (sd == 0).any() or np.linalg.eigvalsh(covariance / np.outer(sd, sd))[0] < 1e-9:
-            raise InputError(
-                f"{n} spectral weights of which one is a sum of others", "independent ones", key="weights", value=n
-            )
+            raise InputError(f"{n} spectral weights of which one is a sum of others", "independent ones", key="weights")
         lower = np.linalg.cholesky(covariance)
         white = Components(
             components.quiet,
@@ -515,9 +508,7 @@ class SumTable:
 def check_sums(scene: StareScene, flares: Flares) -> None:
     """Raise InputError if cumulants do not describe frames: clipping, pixels without noise, or rare large hits."""
     for name in scene.scene.additive:
-        raise InputError(
-            f"{ADDITIVE[name].label} with method 'cumulants'", "method 'pixels'", key="method", value="cumulants"
-        )
+        raise InputError(f"{ADDITIVE[name].label} with method 'cumulants'", "method 'pixels'", key="method")
     x = scene.components.quiet
     used = (scene.components.weights != 0).any(axis=0)
     for light, dark in scene.conditions(flares):
@@ -531,7 +522,6 @@ def check_sums(scene: StareScene, flares: Flares) -> None:
                 f"pixel {pixel} of {x.name} comes within {RAIL_SIGMA:g} sigma of zero or saturation and has a weight",
                 "method 'pixels', which clips, or weight 0 there",
                 key="method",
-                value="cumulants",
             )
         if (used & (variance < LEAST_VARIANCE)).any():
             pixel = int(np.argmax(used & (variance < LEAST_VARIANCE)))
@@ -539,7 +529,6 @@ def check_sums(scene: StareScene, flares: Flares) -> None:
                 f"pixel {pixel} of {x.name} scatters by {sd[pixel]:.2g} DN, too little for its rounding to be noise",
                 "method 'pixels'",
                 key="method",
-                value="cumulants",
             )
 
 
@@ -583,7 +572,6 @@ def _fourths_are_needed(components: Components) -> bool:
             f"of {components.quiet.name}, too much for method 'cumulants'",
             "method 'pixels'",
             key="method",
-            value="cumulants",
         )
     g3, g4 = shapes[0], shapes[1]
     cubic, linear = g4 / 24 - g3**2 / 18, g3**2 * (5 / 36 - 6 / 36)

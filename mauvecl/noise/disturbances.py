@@ -15,9 +15,8 @@ from pydantic import PlainSerializer, PlainValidator, WithJsonSchema, model_vali
 
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Help, Range, Unit, Widget
+from mauvecl.schema.fields import Help, Range, Unit, Widget, is_quantity, without_unit
 from mauvecl.schema.physical import Duration
-from mauvecl.schema.quantities import is_quantity, without_unit
 from mauvecl.schema.section import Section
 
 if TYPE_CHECKING:
@@ -136,7 +135,6 @@ class CosmicRays(AdditiveProcess):
                 f"cosmic rays free up to {most} electrons in a pixel and draw",
                 f"at most {2**23}: lower the rate, the charge or the exposure",
                 key="rate_per_cm2_s",
-                value=most,
             )
         one = np.zeros(size)
         one[low : high + 1] = 1.0 if self.weights is None else self.weights
@@ -269,7 +267,7 @@ class PointingDrifts(Section):
         start, lasts, depth = (np.concatenate(several, axis=1) for several in zip(*parts, strict=True))
         return start, lasts, depth
 
-    def losses(self, numbers: NDArray[np.uint64], start_s: Float, frame_s: float, seed: int) -> Float:
+    def losses(self, numbers: NDArray[np.uint64], start_s: NDArray[np.float64], frame_s: float, seed: int) -> Float:
         """Draw the mean share of the light that each frame loses, shape (n_stare, n_frame).
 
         Parameters
@@ -331,7 +329,7 @@ class Uniform:
         if not self.low <= self.high:
             raise InputError.of("low", self.low, "low <= high")
 
-    def quantile(self, below: Float, above: Float | None = None) -> Float:
+    def quantile(self, below: NDArray[np.float64], above: NDArray[np.float64] | None = None) -> Float:
         """Return the quantiles at probabilities `below`; see `Normal.quantile`."""
         import numpy as np
 
@@ -357,7 +355,6 @@ class Normal:
                 f"a normal prior of mean {self.mean:g}, sd {self.sd:g}, cut at {self.low:g} and {self.high:g}",
                 "sd > 0 and low < high",
                 key="sd",
-                value=self.sd,
             )
         away = max(self.low - self.mean, self.mean - self.high) / self.sd
         if away > MAX_CUT_SD:
@@ -366,14 +363,13 @@ class Normal:
                 f"{self.high:g}, {away:g} sd from its mean",
                 f"at most {MAX_CUT_SD:g}",
                 key="low",
-                value=(self.low, self.high),
             )
 
     def is_wide(self, least_sd: float) -> bool:
         """Return whether both cuts are at least this many standard deviations from the mean."""
         return min(self.mean - self.low, self.high - self.mean) >= least_sd * self.sd * (1.0 - 1e-12)
 
-    def quantile(self, below: Float, above: Float | None = None) -> Float:
+    def quantile(self, below: NDArray[np.float64], above: NDArray[np.float64] | None = None) -> Float:
         """Return the quantiles at probabilities `below`.
 
         Parameters
@@ -411,14 +407,11 @@ def _from_study(given: Any) -> Prior:
             return kind(*(value for key, n in form.items() for value in _values(key, given[key], n)))
     known = [key for form in _FORMS.values() for key in form]
     if isinstance(given, Mapping) and (other := next((key for key in given if key not in known), None)):
-        raise InputError(
-            f"unknown key {other!r} of a prior", f"some of {', '.join(known)}", key=other, value=given[other]
-        )
+        raise InputError(f"unknown key {other!r} of a prior", f"some of {', '.join(known)}", key=other)
     raise InputError(
         "a prior is neither { uniform = [low, high] } nor { normal = [mean, sd], between = [low, high] }",
         "one of them",
         key="uniform",
-        value=given.get("uniform") if isinstance(given, Mapping) else given,
     )
 
 

@@ -409,9 +409,7 @@ def choose_method(scenarios: Sequence[Expectation], drawing: Drawing, factors: F
     quiet, processes = scenarios[0], drawing.processes
     modulations = processes.modulations
     if quiet.wavelength_nm.size > MAX_PIXELS:
-        raise InputError(
-            f"{quiet.wavelength_nm.size} pixels", f"at most {MAX_PIXELS}", key="pixels", value=quiet.wavelength_nm.size
-        )
+        raise InputError(f"{quiet.wavelength_nm.size} pixels", f"at most {MAX_PIXELS}", key="pixels")
     for other in scenarios[1:]:
         _check_same_detector(quiet, other)
     corners = _corners(factors)
@@ -481,7 +479,6 @@ def _joint(scenarios: Sequence[Expectation], varied: Sequence[Sequence[Cumulants
                     "Gaussian noise next to Poisson counts",
                     "recipe 'apart' or 'auto'",
                     key="recipe",
-                    value="joint",
                 )
             return False
     return True
@@ -512,7 +509,6 @@ def _draw_frames(
                         f"mode = 'stacked' {why} in the pixel at {where:.1f} nm of {x.name}",
                         "mode 'frames' or 'auto'",
                         key="mode",
-                        value="stacked",
                     )
                 return True
     return False
@@ -533,7 +529,6 @@ def check_reach(x: Expectation, c: Cumulants, factors: Factors) -> None:
             f"the priors move pixel {pixel} of {x.name} {reach[pixel]:.3g} DN away from its mean",
             f"less than {REACH_DN:g}: shorten the exposure or draw frame by frame",
             key="priors",
-            value=float(reach[pixel]),
         )
 
 
@@ -557,7 +552,6 @@ def _check_same_detector(quiet: Expectation, other: Expectation) -> None:
                 f"{name} of {other.name} differs from that of {quiet.name}",
                 "scenarios of one study to share instrument and exposure",
                 key=name,
-                value=other.name,
             )
 
 

@@ -19,7 +19,7 @@ from mauvecl.noise.drawing import DrawingOptions
 from mauvecl.noise.random_numbers import Floats, Words, fma, four_normals, words
 from mauvecl.noise.scene import Scene, prepare
 from mauvecl.noise.unknowns import ADDITIVE
-from mauvecl.schema.tables import Column, table_of
+from mauvecl.schema.columns import Column, table_of
 
 if TYPE_CHECKING:
     from astropy.table import QTable

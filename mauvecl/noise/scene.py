@@ -247,7 +247,6 @@ def fill_poisson_counts(out: NDArray[np.void], mean: Float, gain: Float, tables:
             f"{SMALLEST_EXPANDED:g}",
             f"at most {LARGEST_MEAN:g} there: draw frame by frame",
             key="mode",
-            value=float(mean[pixel]),
         )
     alias, starts = table_set(mean[~expanded].tolist(), tables)
     out["table"][~expanded] = starts

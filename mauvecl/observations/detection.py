@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 
 from mauvecl.observations.event_fits import flares_of
 from mauvecl.observations.event_windows import REACH
-from mauvecl.observations.process import Binned, Process, fit_process, level_fit
+from mauvecl.observations.process import Binned, Process, Steps, fit_process, level_fit
 from mauvecl.observations.process_search import FilterRow, ProcessSearch
 from mauvecl.observations.search import Detection, SeriesSurvey
-from mauvecl.observations.steps import Steps
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,8 +18,7 @@ import scipy
 from numpy.typing import NDArray
 
 from mauvecl.flares.shapes import Shape
-from mauvecl.observations.event_windows import FittedFlare, Likelihood, Profile, Window
-from mauvecl.observations.families import Family, families
+from mauvecl.observations.event_windows import Family, FittedFlare, Likelihood, Profile, Window, families
 
 if TYPE_CHECKING:
     from mauvecl.observations.search import Detection, SeriesSurvey
@@ -28,6 +28,10 @@ Bool = NDArray[np.bool_]
 
 #: Logarithm of the weight of a part of a mixture that is neglected.
 LEAST_LOG_WEIGHT = -18.5
+#: Size of the cells in which parts of a mixture are joined, in standard deviations and in the logarithm of these.
+CELL = 0.05
+#: Least standard deviation of a part, as a share of the largest mean.
+LEAST_ERROR = 1e-9
 #: Nodes of the grid along peak and half-width for a shape and for many, and the fall of the log posterior beyond
 #: which nodes are neglected.
 NODES, NODES_OF_MANY, NEGLIGIBLE = 25, 17, 14.0
@@ -60,18 +64,39 @@ class Mixture:
         """Logarithm of the sum of the weights."""
         return float(scipy.special.logsumexp(self.log_weight))
 
-    def quantile(self, probability: float) -> float:
-        """Return a quantile of the part above zero."""
+    @cached_property
+    def _cells(self) -> tuple[Float, Float, Float]:
+        """Logarithm of the weight, mean and standard deviation of cells of parts that hardly differ, shape (n_cell,).
+
+        A cell has the weight, mean and variance of its parts.
+        """
         log = self.log_weight - self.log_total
         kept = log > LEAST_LOG_WEIGHT
-        log, mean, sd = log[kept], self.mean[kept], np.maximum(self.sd[kept], 1e-300)
+        weight, mean = np.exp(log[kept]), self.mean[kept]
+        sd = np.maximum(self.sd[kept], max(LEAST_ERROR * float(np.abs(mean).max()), 1e-300))
+        row = np.rint(np.log(sd) / CELL)
+        place = np.rint(mean / (CELL * np.exp(CELL * row)))
+        _, first, cell = np.unique(row * (2 * np.abs(place).max() + 1) + place, return_index=True, return_inverse=True)
+        total = np.bincount(cell, weight)
+        # About a mean of the cell, so that no digits are lost.
+        middle = mean[first]
+        apart = mean - middle[cell]
+        shift = np.bincount(cell, weight * apart) / total
+        variance = np.bincount(cell, weight * (sd**2 + apart**2)) / total - shift**2
+        return np.log(total), middle + shift, np.sqrt(variance)
 
+    def quantile(self, probability: float) -> float:
+        """Return a quantile of the part above zero."""
+        log, mean, sd = self._cells
         # Logarithms only where all is far below zero: they take longer.
         above = _log_above if (mean / sd).max() < -FAR_BELOW else _above
         held = (log if above is _log_above else np.exp(log), mean, sd)
         goal = above(0.0, *held, 0.0)
         goal = goal + float(np.log1p(-probability)) if above is _log_above else goal * (1 - probability)
         high = max(float((mean + 10 * sd).max()), float(sd.max()))
+        if np.isinf(high):
+            # Frames without weight do not limit it.
+            return high
         # `brentq` keeps its function until the next collection of garbage, but not the arrays.
         return float(scipy.optimize.brentq(above, 0.0, high, args=(*held, goal), xtol=1e-9 * high))
 
@@ -195,7 +220,7 @@ class Grid:
             step = (box[:, 1] - box[:, 0]) / (n_node - 1)
             # The integral over the logarithm of the amplitude divides by the S/N.
             snr = np.maximum(slope / np.sqrt(information), 1.0)
-            log = 0.5 * slope**2 / information - np.log(snr) + float(np.log(step).sum() - np.log(len(family.weights)))
+            log = 0.5 * slope**2 / information - np.log(snr) + float(np.log(step).sum()) + family.log_prior[:, None]
             log[(slope <= 0) | (amplitude > max(brightest, 1e-12))] = -1e300
             which, node = np.nonzero(log >= log.max() - NEGLIGIBLE)
             found = cls(
@@ -371,13 +396,22 @@ def _single(
     box = np.column_stack([np.maximum(box[:, 0], outer[:, 0]), np.minimum(box[:, 1], outer[:, 1])])
     fits = []
     for epsilon in family.epsilon:
-        for _ in range(ROUNDS if epsilon else 1):
-            likelihood = Likelihood.of(window, [flare], shape, epsilon)
-            last = grid = Grid.of(likelihood, family, box, outer, last)
-            before, box = flare.equivalent_duration_s, grid.box
-            shape, flare = grid.best
-            if abs(np.log(flare.equivalent_duration_s / before)) < SETTLED:
+        likelihood = Likelihood.of(window, [flare], shape, epsilon)
+        last = grid = Grid.of(likelihood, family, box, outer, last)
+        for _ in range(ROUNDS - 1 if epsilon else 0):
+            # The departures are those of a flare, and the likelihood may fall as they follow the fit.
+            found, member = grid.best, shape.name == family.name
+            own = Likelihood.of(window, [found[1]], found[0], epsilon)
+            before = likelihood.log_of(light_of(window, shape, [flare]))
+            if member and own.log_of(light_of(window, found[0], [found[1]])) <= before:
                 break
+            change = abs(np.log(found[1].equivalent_duration_s / flare.equivalent_duration_s))
+            (shape, flare), likelihood = found, own
+            last = grid = Grid.of(own, family, grid.box, outer, grid)
+            if member and change < SETTLED:
+                break
+        box = grid.box
+        shape, flare = grid.best
         toward = likelihood.inverse @ likelihood.departure
         per_amplitude = grid.half_widths_s * family.durations[grid.shape] - grid.along(toward)
         in_level = grid.along(likelihood.level)

@@ -1,4 +1,8 @@
-"""Frames around an event, and their likelihood for flares that depart from their shape.
+"""Frames around an event, families of flare shapes, and the likelihood of flares that depart from their shape.
+
+Energies are averaged over families of shapes. A shape is a weighted sum of a few parts, so that the fits of all shapes
+of a family follow from those of its parts. The general family has flares with other rises and decays than the published
+shapes.
 
 The light near an event is the level, flares of a known shape, and noise:
 
@@ -12,23 +16,197 @@ shape where it is not observed.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
+from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from mauvecl.flares.shapes import Integrable, Shape, consecutive_integrals
-from mauvecl.observations.families import WeightedSum
+from mauvecl.flares.shapes import SHAPES, Davenport2014, Integrable, Shape, consecutive_integrals
 
 if TYPE_CHECKING:
     from mauvecl.observations.search import Detection, SeriesSurvey
 
-Profile = Shape | WeightedSum
 Float = NDArray[np.float64]
+
+#: Published shapes that are averaged, besides that of the search.
+AVERAGED = ("davenport2014", "tovarmendoza2022")
+#: Departures of flares from their shape that are averaged with equal weights (assumed). A flare of the general family
+#: is never exactly one of its shapes.
+EPSILON, GENERAL_EPSILON = (0.0, 0.02, 0.06, 0.2), (0.04, 0.1, 0.2)
+#: Widths of the Gaussian rises and decays of the general family from half maximum to maximum, in half-widths (assumed).
+GAUSSIAN_RISES, GAUSSIAN_DECAY = (0.15, 0.5, 1.5), 0.5
+#: Shares of slow exponentials in the decay, and their rates, per half-width (assumed; Davenport's are 0.30 and 0.28).
+SLOW_SHARES, SLOW_RATES = (0.08, 0.16, 0.3, 0.45), np.geomspace(0.1, 0.9, 24)
+#: Number of exponentials from which those of all rates are interpolated, to 1e-5 of their peak.
+EXPONENTIALS = 10
+#: Name of the general family.
+GENERAL = "general"
+#: Prior weight of the general family (assumed); published shapes share the rest.
+GENERAL_WEIGHT = 0.5
+
+
+class Rise(ABC):
+    """Rise of a flare that ends at the peak."""
+
+    @abstractmethod
+    def before(self, tau: ArrayLike) -> Float:
+        """Return the integral up to tau."""
+
+    def after(self, tau: ArrayLike) -> Float:
+        """Return the integral from tau to the peak."""
+        t = np.asarray(tau, np.float64)
+        return self.before(0.0) - self.before(t) if (t < 0).any() else np.zeros(t.shape)
+
+
+class Decay(ABC):
+    """Decay of a flare that begins at the peak."""
+
+    def before(self, tau: ArrayLike) -> Float:
+        """Return the integral from the peak to tau."""
+        t = np.asarray(tau, np.float64)
+        return self.after(0.0) - self.after(t) if (t > 0).any() else np.zeros(t.shape)
+
+    @abstractmethod
+    def after(self, tau: ArrayLike) -> Float:
+        """Return the integral from tau to the end."""
+
+
+@dataclass(frozen=True)
+class PublishedRise(Rise):
+    """The rise of Davenport et al. (2014)."""
+
+    def before(self, tau: ArrayLike) -> Float:
+        return SHAPES["davenport2014"].before(np.minimum(tau, 0.0))
+
+
+@dataclass(frozen=True)
+class GaussianRise(Rise):
+    """First half of a Gaussian; `width` is from half maximum to maximum, in half-widths."""
+
+    width: float
+
+    def before(self, tau: ArrayLike) -> Float:
+        return _gaussian_tail(-np.minimum(tau, 0.0), self.width)
+
+
+@dataclass(frozen=True)
+class GaussianDecay(Decay):
+    """Second half of a Gaussian; `width` is from maximum to half maximum, in half-widths."""
+
+    width: float
+
+    def after(self, tau: ArrayLike) -> Float:
+        return _gaussian_tail(np.maximum(tau, 0.0), self.width)
+
+
+@dataclass(frozen=True)
+class Exponential(Decay):
+    """Exponential decay; `rate` per half-width."""
+
+    rate: float
+
+    def after(self, tau: ArrayLike) -> Float:
+        return np.asarray(np.exp(-self.rate * np.maximum(tau, 0.0)) / self.rate)
+
+
+def _exponentials(rates: Float) -> tuple[list[Exponential], Float]:
+    """Return exponentials of few rates, and their weights in those of many, shape (n_rate, n_few).
+
+    An exponential is a smooth function of the logarithm of its rate: it is interpolated between Chebyshev points.
+    """
+    middle, half = np.log(rates[[0, -1]].prod()) / 2, np.log(rates[-1] / rates[0]) / 2
+    points = middle + half * np.cos(np.pi * np.arange(EXPONENTIALS) / (EXPONENTIALS - 1))
+    weights = scipy.interpolate.BarycentricInterpolator(points, np.eye(EXPONENTIALS))(np.log(rates))
+    return [Exponential(float(rate)) for rate in np.exp(points)], np.asarray(weights)
+
+
+def _gaussian_tail(tau: ArrayLike, width: float) -> Float:
+    """Return the integral of a Gaussian from tau to the end, for a half-width at half maximum of `width`."""
+    root = float(np.sqrt(np.log(2)))
+    return np.asarray(np.sqrt(np.pi) / 2 * width / root * scipy.special.erfc(np.asarray(tau) * root / width))
+
+
+@dataclass(frozen=True)
+class WeightedSum:
+    """Shape of a family: a weighted sum of its parts."""
+
+    name: str
+    parts: tuple[tuple[float, Integrable], ...]
+
+    def before(self, tau: ArrayLike) -> Float:
+        """Return the integral up to tau."""
+        return np.asarray(sum(weight * part.before(tau) for weight, part in self.parts))
+
+    def after(self, tau: ArrayLike) -> Float:
+        """Return the integral from tau to the end."""
+        return np.asarray(sum(weight * part.after(tau) for weight, part in self.parts))
+
+    @property
+    def equivalent_duration(self) -> float:
+        """Total integral, in half-widths."""
+        return float(self.before(0.0) + self.after(0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Family:
+    """Shapes that are weighted sums of the same parts."""
+
+    name: str
+    parts: tuple[Integrable, ...]
+    weights: Float  # shape (n_shape, n_part)
+    log_prior: Float  # shape (n_shape,); logarithm of the prior weight of each shape in the family
+    epsilon: tuple[float, ...]  # departures from the shapes that are averaged
+    prior: float  # weight of the family
+
+    @classmethod
+    def of(cls, shape: Shape, prior: float) -> Family:
+        """Return the family of a single shape."""
+        return cls(shape.name, (shape,), np.ones((1, 1)), np.zeros(1), EPSILON, prior)
+
+    @classmethod
+    @cache
+    def general(cls) -> Family:
+        """Return the general family, the same object in all calls: rises and decays in all combinations."""
+        rises: list[Integrable] = [PublishedRise(), *(GaussianRise(width) for width in GAUSSIAN_RISES)]
+        fast: list[Integrable] = [Exponential(Davenport2014.DECAY[0][1]), GaussianDecay(GAUSSIAN_DECAY)]
+        slow, interpolated = _exponentials(SLOW_RATES)
+        choices = [(0.0, 0), *((share, rate) for share in SLOW_SHARES for rate in range(SLOW_RATES.size))]
+        # Each share has the same weight: without a slow decay, its rate does not matter.
+        rates = np.array([1.0 if share == 0 else 1 / SLOW_RATES.size for share, _ in choices])
+        prior = np.tile(rates / rates.sum(), len(rises) * len(fast)) / (len(rises) * len(fast))
+        rows = []
+        for rise, start, (share, rate) in product(range(len(rises)), range(len(fast)), choices):
+            row = np.zeros(len(rises) + len(fast) + len(slow))
+            row[rise], row[len(rises) + start] = 1.0, 1.0 - share
+            row[len(rises) + len(fast) :] = share * interpolated[rate]
+            rows.append(row)
+        return cls(GENERAL, (*rises, *fast, *slow), np.array(rows), np.log(prior), GENERAL_EPSILON, GENERAL_WEIGHT)
+
+    @property
+    def durations(self) -> Float:
+        """Equivalent duration of each shape for unit amplitude and half-width."""
+        return np.asarray(self.weights @ [float(part.before(0.0) + part.after(0.0)) for part in self.parts])
+
+    def shape(self, k: int) -> WeightedSum:
+        """Return one of the shapes."""
+        return WeightedSum(self.name, tuple((float(w), part) for w, part in zip(self.weights[k], self.parts,
+                                                                                 strict=True) if w))  # fmt: skip
+
+
+def families(searched: Shape) -> Sequence[Family]:
+    """Return the families that are averaged for a search with some shape, that of many shapes last."""
+    published = {shape.name: shape for shape in (searched, *(SHAPES[name] for name in AVERAGED))}
+    prior = (1 - GENERAL_WEIGHT) / len(published)
+    return [*(Family.of(shape, prior) for shape in published.values()), Family.general()]
+
+
+Profile = Shape | WeightedSum
 Bool = NDArray[np.bool_]
 
 #: Correlation of departures in the logarithm of 1 + time from the peak in half-widths (assumed).
@@ -198,8 +376,8 @@ class Likelihood:
             if epsilon:
                 light = light + _floor(window.middle, one) * window.scale
                 cells, cell_light = _unobserved(window, one, shape)
-                place = _log_time(window.middle, one)
-                elsewhere = _log_time(cells, one)
+                place = log_time(window.middle, one)
+                elsewhere = log_time(cells, one)
                 near = np.exp(-np.abs(place[:, None] - place) / LOG_TIME)
                 covariance += epsilon**2 * light[:, None] * light * near
                 lengths = window.edges[:, 1] - window.edges[:, 0]
@@ -229,16 +407,13 @@ class Likelihood:
         Models are sums of parts, shape (n_part, n_node, n), with weights, shape (n_shape, n_part). The first product is
         zero for models that are constant but for rounding errors, as bright in all bins as the level.
         """
-
-        # A shape has few of the parts.
-        pairs = scipy.sparse.csr_array((weights[:, :, None] * weights[:, None]).reshape(len(weights), -1))
-
-        def norms(weighted: Float) -> Float:
-            gram = weighted.transpose(1, 0, 2) @ parts.transpose(1, 2, 0)
-            return np.asarray(pairs @ gram.reshape(len(gram), -1).T)
-
-        information = norms((parts.reshape(-1, values.size) @ self.inverse).reshape(parts.shape))
-        least = np.maximum(1e-9 * norms(parts * np.diag(self.inverse)), 1e-300)
+        pairs = (weights[:, :, None] * weights[:, None]).reshape(len(weights), -1)
+        weighted = (parts.reshape(-1, values.size) @ self.inverse).reshape(parts.shape)
+        gram = weighted.transpose(1, 0, 2) @ parts.transpose(1, 2, 0)
+        information = pairs @ gram.reshape(len(gram), -1).T
+        # At least the sum without the level, by the triangle inequality.
+        whole = (np.abs(weights) @ np.sqrt(parts**2 @ np.diag(self.inverse))) ** 2
+        least = np.maximum(1e-9 * whole, 1e-300)
         slope = np.where(information > least, weights @ (parts @ (self.inverse @ values)), 0.0)
         return slope, np.maximum(information, least)
 
@@ -251,13 +426,18 @@ class Likelihood:
         fitted = (self.window.values - light) @ self.level
         return np.where(fitted > 0, fitted, self.window.quiet_level)
 
+    def log_of(self, model: Float) -> float:
+        """Return the logarithm of the likelihood of a model of shape (n,), without the constant."""
+        return self.log_factor - 0.5 * float(self.chi2(model))
+
     def chi2(self, model: Float) -> Float:
         """Return chi-squared of the values with models, of shape (n,) or (k, n), added to the level."""
         left = self.window.values - model
         return np.asarray(np.einsum("...i,...i->...", left @ self.inverse, left))
 
 
-def _log_time(time_s: Float, one: FittedFlare) -> Float:
+def log_time(time_s: Float, one: FittedFlare) -> Float:
+    """Return the logarithm of the time from the peak, in which departures of a flare are correlated."""
     tau = (time_s - one.peak_s) / one.half_width_s
     return np.asarray(np.sign(tau) * np.log1p(np.abs(tau)))
 

@@ -1,21 +1,272 @@
-"""Events in observed frames: what they are, and their measurements."""
+"""Events: flares, or other changes, with their times, causes and energies."""
 
 from __future__ import annotations
 
 import gc
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Literal
+from functools import partial
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
-from mauvecl.observations.energies import Energy, measure_energy
-from mauvecl.observations.search import Detection, SeriesSurvey
-from mauvecl.observations.steps import Steps
+from mauvecl.flares.shapes import between, sides
+from mauvecl.observations.event_fits import Fit, Mixture, fit_event, joined, light_of
+from mauvecl.observations.event_windows import GENERAL, LOG_TIME, FittedFlare, Likelihood, Window, log_time
+from mauvecl.observations.process import Steps
+from mauvecl.observations.search import MIN_BASELINE, Detection, SeriesSurvey
+
+if TYPE_CHECKING:
+    from mauvecl.observations.process import Process
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
+
+#: Fall of chi-squared by which a step must fit better than a flare.
+STEP_GAIN = 9.0
+#: Light of the fitted flares that the frames of an event may lack, in standard errors and as a share.
+LACKING_ERRORS, LACKING_SHARE = 5.0, 0.5
+#: Probability of a larger chi-squared below which no shape fits an event without departures.
+POOR = 1e-3
+#: Levels of the intervals.
+LEVELS = (0.6826894921370859, 0.95)
+#: Number of frames on each side of an event from which the error of its level follows.
+NEARBY = 10_000
+#: Errors of the sum of an event's frames by which they are fainter than the level, from which they show no flare.
+FAINTER_ERRORS = 2.0
+#: Largest number of events that are measured at the same time. Most of the time passes in functions of NumPy and SciPy,
+#: beside which other threads run; each takes some 100 MB.
+MOST_THREADS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Energy:
+    """Equivalent duration of an event."""
+
+    summed_s: float  # sum of the light above the level over the frames of the event
+    summed_error_s: float
+    fitted_s: float  # of the whole flares; median of the posterior
+    low_s: tuple[float, float]  # lower ends of the intervals of `LEVELS`
+    high_s: tuple[float, float]
+    flares: tuple[FittedFlare, ...]  # of the shape of the largest weight, the largest first
+    shape: str
+    chi2: float  # of these without departures from the shape
+    dof: int
+    departure: float  # mean of epsilon
+    # Whether the frames lack the light of the best flares of the published shapes, since the level falls in them as by
+    # an eclipse, and whether a step of the level fits better than these: the general family can resemble both.
+    dips: bool
+    step: bool
+    peak_observed: bool  # the peak lies in or next to an observed frame
+    level: float  # of the star at the peak, in units of the survey's level
+
+    @property
+    def unclear(self) -> bool:
+        """True if the frames are together fainter than the level by more than its error: they show no light of a flare.
+
+        Where the level is uncertain, as in a gap of hours of a star that rotates, the sum says nothing.
+        """
+        return self.summed_s < -FAINTER_ERRORS * self.summed_error_s
+
+    @property
+    def p_value(self) -> float:
+        """Probability of a chi-squared at least as large."""
+        return _p_value(self.chi2, self.dof)
+
+    @property
+    def poor(self) -> bool:
+        """True if no shape fits without departures: the interval also includes the disagreement of the shapes."""
+        return self.p_value < POOR
+
+
+def _p_value(chi2: float, dof: int) -> float:
+    return float(scipy.stats.chi2.sf(chi2, dof)) if dof > 0 else float("nan")
+
+
+def measure_energy(survey: SeriesSurvey, taken: Bool, flux_level: Float, one: Detection) -> Energy:
+    """Measure the equivalent duration of an event.
+
+    Parameters
+    ----------
+    survey, taken, flux_level, one
+        As for `measure_event`.
+    """
+    peak = int(np.clip(np.searchsorted(survey.stare.middle_s, one.peak_s), 0, survey.stare.n_frames - 1))
+    level = float(flux_level[peak]) * survey.scale / survey.level
+    window = replace(Window.of(survey, taken, one), quiet_level=level if level > 0 else 1.0)
+    directions = _directions(survey, taken, one)
+    fits = fit_event(window, survey.bank.shape)
+    totals = np.array([fit.mixture.log_total for fit in fits])
+    best = fits[int(np.argmax(totals))]
+    plain, model = _without_departures(window, best)
+    chi2, dof = float(plain.chi2(model)), window.values.size - 1 - 3 * len(best.flares)
+    mixtures = [fit.mixture for fit in fits]
+    if _p_value(chi2, dof) < POOR:
+        mixtures = _tempered(window, best, mixtures)
+    mixture = joined(mixtures)
+    share = np.exp(np.array([one.log_total for one in mixtures]) - mixture.log_total)
+    published = [fit for fit in fits if fit.shape.name != GENERAL]
+    if len(directions) > 1:
+        # Flares of other temperatures have another light for the same sum.
+        mixture = joined([Mixture(mixture.log_weight + weight, factor * mixture.mean, factor * mixture.sd)
+                           for weight, factor in directions])  # fmt: skip
+    level = float(plain.level_without(model))
+    summed, error = _summed(survey, taken, flux_level, one)
+    ends = [[mixture.quantile(0.5 + sign * width / 2) for width in LEVELS] for sign in (-1, 1)]
+    apart_s = np.abs(survey.stare.middle_s[one.first : one.last + 1] - best.flares[0].peak_s)
+    observed = bool((apart_s <= 1.5 * survey.stare.frame_s).any())
+    return Energy(
+        summed / level, error / level, mixture.quantile(0.5), (ends[0][0], ends[0][1]), (ends[1][0], ends[1][1]),
+        tuple(replace(f, amplitude=f.amplitude / level, equivalent_duration_s=f.equivalent_duration_s / level)
+              for f in best.flares), best.shape.name, chi2, dof,
+        float(share @ np.array([fit.epsilon for fit in fits])),
+        _dips(window, published, summed, error), _is_step(window, published), observed, level,
+    )  # fmt: skip
+
+
+def _without_departures(window: Window, fit: Fit) -> tuple[Likelihood, Float]:
+    """Return the likelihood of flares without departures from their shape, and their light in the bins, shape (n,)."""
+    return Likelihood.of(window, fit.flares, fit.shape, 0.0), light_of(window, fit.shape, fit.flares)
+
+
+def _tempered(window: Window, best: Fit, mixtures: Sequence[Mixture]) -> list[Mixture]:
+    """Weaken the preference among fits of an event that no shape fits without departures.
+
+    The likelihoods of departures count every bin, but what a wrong shape leaves varies slowly: the bins of the event
+    count as many times as there are independent values of the departures in it (a power likelihood as of Miller &
+    Dunson 2019, doi 10.1080/01621459.2018.1469995), so that the interval includes the disagreement of the shapes.
+    """
+    place = log_time(window.middle[window.inside], best.flares[0])
+    power = min(1.0, (1.0 + float(np.ptp(place)) / LOG_TIME) / place.size)
+    top = max(one.log_total for one in mixtures)
+    return [replace(one, log_weight=one.log_weight + (power - 1) * (one.log_total - top)) for one in mixtures]
+
+
+def _dips(window: Window, fits: Sequence[Fit], summed: float, error: float) -> bool:
+    """Return whether the frames of an event lack the light of the best fit.
+
+    Parameters
+    ----------
+    fits : sequence of Fit
+    summed, error : float
+        Light of the frames above the level, amplitude x s.
+    """
+    best = max(fits, key=lambda fit: fit.mixture.log_total)
+    plain, model = _without_departures(window, best)
+    level = float(plain.level_without(model))
+    survey, one = window.survey, window.one
+    start = survey.stare.start_s[one.first : one.last + 1]
+    within = 0.0
+    for flare in best.flares:
+        edges = [(time - flare.peak_s) / flare.half_width_s for time in (start, start + survey.stare.frame_s)]
+        light = between(*(sides(best.shape, tau) for tau in edges))
+        within += flare.amplitude * flare.half_width_s * float(light.sum())
+    mixture = joined([fit.mixture for fit in fits])
+    low, high = (mixture.quantile(0.5 + sign * LEVELS[0] / 2) for sign in (-1, 1))
+    lacking, uncertain = (within - summed) / level, float(np.hypot(error / level, (high - low) / 2))
+    return lacking > LACKING_ERRORS * uncertain and lacking > LACKING_SHARE * within / level
+
+
+def _directions(survey: SeriesSurvey, taken: Bool, one: Detection) -> list[tuple[float, float]]:
+    """Return the log weight of each direction of the bank, and its light relative to that of the event's direction."""
+    if len(survey.bank.directions) == 1:
+        return [(0.0, 1.0)]
+    scores = []
+    for direction in range(len(survey.bank.directions)):
+        window = Window.of(survey, taken, one, direction)
+        noise = np.diag(window.process) + window.noise
+        model = window.model(survey.bank.shape, np.array([one.peak_s]), np.array([one.half_width_s]))[0]
+        weight = model / noise
+        level = window.values[~window.inside]
+        level_mean = (
+            float(level @ (1 / noise)[~window.inside] / (1 / noise)[~window.inside].sum()) if level.size else 0.0
+        )
+        value = float(weight @ (window.values - level_mean)) / np.sqrt(float(weight @ model))
+        scores.append((value, window.scale))
+    mine = scores[one.direction]
+    return [(0.5 * np.sign(value) * value**2 - 0.5 * mine[0] ** 2, mine[1] / scale * value / mine[0])
+            for value, scale in scores if value > 0]  # fmt: skip
+
+
+def _summed(survey: SeriesSurvey, taken: Bool, level: Float, one: Detection) -> tuple[float, float]:
+    """Return the sum of the light above the level over the frames of an event, amplitude x s, and its error.
+
+    Missing frames are interpolated. The error includes that of the level given the quiescent frames.
+    """
+    rows = slice(one.first, one.last + 1)
+    flux, numbers = survey.flux[rows] - level[rows], survey.stare.numbers[rows]
+    every = np.arange(numbers[0], numbers[-1] + 1)
+    factor = survey.stare.frame_s * survey.scale / survey.level
+    total = float(np.interp(every, numbers, flux).sum()) * factor
+    # Each frame counts for itself and for the missing frames next to it.
+    counts = np.bincount(np.rint(np.interp(every, numbers, np.arange(numbers.size))).astype(np.int64),
+                         minlength=numbers.size)  # fmt: skip
+    process = survey.flux_process
+    begin = max(0, one.first - NEARBY)
+    part = slice(begin, one.last + 1 + NEARBY)
+    time, noise = survey.stare.start_s[part], survey.flux_variance[part] * process.excess**2
+    event = slice(one.first - begin, one.last + 1 - begin)
+    photon = survey.photon / survey.scale * np.maximum(flux, 0.0)
+    variance = float(counts**2 @ (noise[event] + photon))
+    quiet = ~taken[part]
+    if quiet.sum() >= MIN_BASELINE:
+        # Variance of the sum of the level given quiescent frames: w^T K w less what they say of it.
+        near = np.zeros(quiet.size)
+        near[event] = counts
+        # Durations are relative to the level at the peak.
+        middle = time[event] + survey.stare.frame_s / 2
+        peak = event.start + min(int(np.searchsorted(middle, one.peak_s)), numbers.size - 1)
+        near[peak] += total / factor / max(float(level[begin + peak]), 1e-12)
+        variance += _level_variance(process, time, noise, quiet, near)
+    return total, float(np.sqrt(max(variance, 0.0))) * factor
+
+
+def _level_variance(process: Process, time: Float, noise: Float, quiet: Bool, weights: Float) -> float:
+    """Return the variance of a weighted sum of the level given quiescent frames."""
+    one = process.covariance(time[quiet], noise[quiet])
+    level = one.solve(np.ones(int(quiet.sum())))
+    constant = 1.0 / float(level.sum())
+    if not process.terms:
+        return float(weights.sum()) ** 2 * constant
+    # K w at all times.
+    shared = process.times(time, weights)
+    towards = shared[quiet]
+    solved = one.solve(towards)
+    # The constant level is known to 1 / (1^T C^-1 1).
+    rest = float(weights.sum() - level @ towards)
+    return float(weights @ shared - towards @ solved) + rest**2 * constant
+
+
+def _is_step(window: Window, fits: Sequence[Fit]) -> bool:
+    """Return whether a step of the level fits an event better than the flares of every fit do."""
+    inside = window.middle[window.inside]
+    if inside.size < 3:
+        return False
+    starts = window.edges[(window.middle > inside[0] - np.ptp(inside)) & (window.middle < inside[-1]), 0]
+    if not starts.size:
+        return False
+    least, plain = np.inf, None
+    for fit in fits:
+        one, model = _without_departures(window, fit)
+        # Each further flare has three parameters more (Schwarz 1978).
+        chi2 = float(one.chi2(model)) + 3 * (len(fit.flares) - 1) * float(np.log(window.values.size))
+        if chi2 < least:
+            least, plain = chi2, one
+    if plain is None:
+        return False
+    models = (window.middle >= starts[:, None]).astype(np.float64)
+    slope = models @ (plain.inverse @ window.values)
+    information = np.einsum("ki,ki->k", models @ plain.inverse, models)
+    fine = information > 1e-12
+    gain = np.where(fine & (slope > 0), slope**2 / np.where(fine, information, 1.0), 0.0)
+    whole = float(plain.chi2(np.zeros(window.values.size)))
+    return whole - float(gain.max()) < least - STEP_GAIN
+
+
 Kind = Literal["flare", "step", "dip", "throughput", "dark current", "sky", "cosmic ray"]
 
 #: Number of missing frames next to an event from which it may have begun before or gone on after them.
@@ -62,13 +313,13 @@ def measure_events(
     Weaker events next to a step or a dip belong to it. `steps` reports each event.
     """
     steps = steps or Steps()
-    known: Sequence[Kind] = causes or ["flare"] * len(found)
     level = survey.flux_level(~taken)
-    events = []
-    for one in steps.each(zip(found, known, strict=True), len(found)):
-        events.append(measure_event(survey, taken, level, *one))
-        # Fits of scipy leave circular references to arrays of some 20 MB, which are few objects and would be kept long.
-        gc.collect()
+    threads = ThreadPoolExecutor(min(os.cpu_count() or 1, MOST_THREADS))
+    try:
+        measured = threads.map(partial(measure_event, survey, taken, level), found, causes or ["flare"] * len(found))
+        events = list(steps.each(measured, len(found)))
+    finally:
+        threads.shutdown(cancel_futures=True)
     for k, event in enumerate(events):
         ends = (event.first - 1, event.last + 1)
         sides = [each for each in events[max(0, k - 1) : k + 2] if each.last == ends[0] or each.first == ends[1]]
@@ -103,6 +354,8 @@ def measure_event(
     if cause == "flare":
         # The sum over wavelength of spectra may fall during a flare, by a loss of light that their weights leave out.
         kind = "dip" if energy.dips and not survey.weighted else "step" if energy.step else cause
+    # Fits of scipy leave circular references to arrays of some 20 MB, which are few objects and would be kept long.
+    gc.collect(1)
     return ObservedEvent(
         found.value, first, last, first + int(np.argmax(flux)), found.half_width_s,
         float(flux.max()) / survey.level / energy.level, int(numbers[last] - numbers[first] + 1 - flux.size), cut, kind,

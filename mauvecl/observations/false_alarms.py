@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.observations.level import process_level
-from mauvecl.observations.steps import Steps
+from mauvecl.observations.process import Steps
 from mauvecl.schema.physical import DAY_S
 
 if TYPE_CHECKING:
@@ -143,15 +143,20 @@ def simulated_rates(
     return SimulatedRate(modelled, days, bool(survey.counts)), SimulatedRate(measured, days, True)
 
 
-def largest_dip(survey: SeriesSurvey, quiet: Bool) -> float:
+def largest_dip(survey: SeriesSurvey, quiet: Bool, least: float) -> float:
     """Return the largest statistic of events that no flare can be: sudden dips, and slow ones that end suddenly.
+
+    Smaller ones than `least` may be missed.
 
     Quiescent frames are searched upside down, in both directions of time. Noise that is as likely to rise as to fall
     has dips as large as its false alarms; losses of light have larger ones, and end as suddenly as flares begin.
     """
     down = survey.frames(quiet).inverted()
-    largest = [one.search.largest(one.sums[None]).maximum[0] for one in (down, down.backwards())]
-    return float(max(largest))
+    return max(
+        float(rho.max(initial=-np.inf))
+        for one in (down, down.backwards())
+        for _, rho in one.search.values(one.sums[None], least)
+    )
 
 
 def _mean_counts(survey: SeriesSurvey, quiet: Bool) -> Float:

@@ -1,7 +1,9 @@
-"""Frames of one star as they were observed: a light curve, or a sequence of spectra."""
+"""Observed frames: times, fluxes, errors and quality flags."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import IntFlag
 from functools import cached_property
@@ -10,11 +12,113 @@ from typing import Annotated, Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mauvecl.observations.quality import ALL_BITS, QualityBits
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Unit
 from mauvecl.schema.physical import DAY_S, Moment
+
+#: Bits of SAP_QUALITY by number: Kepler Archive Manual (KDMC-10008-006, table 2-3), K2 Archive Manual.
+KEPLER = {
+    1: "AttitudeTweak", 2: "SafeMode", 4: "CoarsePoint", 8: "EarthPoint", 16: "ZeroCrossing", 32: "Desat",
+    64: "Argabrightening", 128: "ApertureCosmic", 256: "ManualExclude", 1024: "SensitivityDropout",
+    2048: "ImpulsiveOutlier", 4096: "ArgabrighteningOnCCD", 8192: "CollateralCosmic", 16384: "DetectorAnomaly",
+    32768: "NoFinePoint", 65536: "NoData", 131072: "RollingBandInAperture", 262144: "RollingBandInMask",
+    524288: "PossibleThrusterFiring", 1048576: "ThrusterFiring",
+}  # fmt: skip
+#: Bits of QUALITY by number: TESS Science Data Products Description (EXP-TESS-ARC-ICD-0014 Rev F, table 32).
+TESS = {
+    1: "AttitudeTweak", 2: "SafeMode", 4: "CoarsePoint", 8: "EarthPoint", 16: "Argabrightening", 32: "Desat",
+    64: "ApertureCosmic", 128: "ManualExclude", 256: "Discontinuity", 512: "ImpulsiveOutlier",
+    1024: "CollateralCosmic", 2048: "Straylight", 4096: "Straylight2", 8192: "PlanetSearchExclude",
+    16384: "BadCalibrationExclude", 32768: "InsufficientTargets",
+}  # fmt: skip
+NAMES: Mapping[str, Mapping[int, str]] = {"Kepler": KEPLER, "TESS": TESS}
+#: Bits that exclude a frame by default: the default masks of lightkurve 2.6; of that for TESS without ImpulsiveOutlier,
+#: which can mark flares and is noted.
+DEFAULTS = {"Kepler": 1_130_799, "TESS": 17_087 & ~512}
+NOTED = {"TESS": 512}
+ALL_BITS = 2**62 - 1
+
+
+@dataclass(frozen=True)
+class QualityBits:
+    """Bits of a quality flag that exclude a frame."""
+
+    mask: int = ALL_BITS
+    mission: str = ""  # whose names the bits have; empty if they have none
+    noted: int = 0  # bits that are reported, though they do not exclude a frame
+
+    @classmethod
+    def of(cls, header: Mapping[str, Any], chosen: str | int | None, what: str) -> QualityBits:
+        """Return the bits that are chosen for a file, or the defaults of its mission.
+
+        Parameters
+        ----------
+        chosen : str or int, optional
+            A sum of bits; "all" or "none"; or names and numbers, such as "Desat, 128". By default lightkurve's default
+            for Kepler and K2, the same without ImpulsiveOutlier for TESS, and all bits for other files.
+        """
+        said = {str(header.get(key, "") or "").strip().upper() for key in ("TELESCOP", "MISSION")}
+        mission = "Kepler" if said & {"KEPLER", "K2"} else "TESS" if "TESS" in said else ""
+        if chosen is None or str(chosen).strip().lower() == "default":
+            return cls(DEFAULTS.get(mission, ALL_BITS), mission, NOTED.get(mission, 0))
+        return cls(_mask(chosen, NAMES.get(mission, {}), what), mission)
+
+    def excluded(self, quality: NDArray[Any]) -> NDArray[np.bool_]:
+        """Return which frames a chosen bit excludes."""
+        return np.asarray((np.asarray(quality, np.int64) & self.mask) != 0)
+
+    def words(self, value: int) -> str:
+        """Return the bits of a flag that exclude the frame, as in "Desat (32), NoData (65536)"."""
+        value = int(value) & self.mask
+        names = NAMES.get(self.mission, {})
+        bits = [1 << k for k in range(value.bit_length()) if value >> k & 1]
+        return ", ".join(f"{names[bit]} ({bit})" if bit in names else str(bit) for bit in bits)
+
+    def remarks(self, quality: NDArray[Any], name: str) -> tuple[str, ...]:
+        """Return the remark on frames that have a noted bit and are kept."""
+        flags = np.asarray(quality, np.int64)
+        n = int(np.count_nonzero((flags & self.noted != 0) & ~self.excluded(flags)))
+        if not n:
+            return ()
+        bits = QualityBits(self.noted, self.mission).words(self.noted)
+        frames = "1 frame of" if n == 1 else f"{n} frames of"
+        verb = "is" if n == 1 else "are"
+        return (f"{frames} {name} with the quality flag {bits} {verb} kept, because it can mark flares",)
+
+
+def decimal_flags(flags: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return flags as numbers; those that lightkurve 2 writes into CSV are the digits of binary numbers."""
+    finite = flags[np.isfinite(flags)]
+    if not (finite.size and finite.max() >= 2**32):
+        return flags
+    texts = {value: f"{value:.0f}" for value in np.unique(finite).tolist()}
+    if any(set(text) - {"0", "1"} for text in texts.values()):
+        return flags
+    return np.array([float(int(texts[value], 2)) if value in texts else value for value in flags.tolist()])
+
+
+def _mask(chosen: str | int, names: Mapping[int, str], what: str) -> int:
+    """Return the sum of the bits that a text or number chooses."""
+    by_name = {name.lower(): bit for bit, name in names.items()}
+    words = [word for word in re.split(r"[\s,;|+]+", str(chosen).strip()) if word]
+    known = ", ".join(names.values())
+    expected = "all, none, default, or numbers" + (f" and names among {known}" if known else
+                                                   "; names are known for Kepler, K2 and TESS")  # fmt: skip
+    if len(words) == 1 and words[0].lower() in ("all", "none"):
+        return ALL_BITS if words[0].lower() == "all" else 0
+    mask = 0
+    for word in words:
+        if word.isascii() and word.isdigit() and len(word) < 19:
+            mask |= int(word)
+        elif word.lower() in by_name:
+            mask |= by_name[word.lower()]
+        else:
+            raise InputError.of("quality_bits", word, expected, where=what)
+    if not words:
+        raise InputError.of("quality_bits", chosen, expected, where=what)
+    return mask
+
 
 Float = NDArray[np.float64]
 
@@ -46,6 +150,47 @@ class Reason(IntFlag):
     def words(cls, value: int) -> str:
         """Return the reasons in words."""
         return ", ".join(str(one.name).lower().replace("_", " ") for one in cls if value & one)
+
+
+def _check_light(name: str, time: Float, light: Float) -> None:
+    """Raise InputError for times or fluxes of a wrong shape, number or size."""
+    n = time.size
+    if time.ndim != 1 or light.ndim not in (1, 2) or len(light) != n:
+        raise _bad(name, "shape", (time.shape, light.shape), "times of shape (n,), flux of (n,) or (n, n_pixel)")
+    if not MIN_FRAMES <= n <= MAX_FRAMES:
+        raise _bad(name, "frames", n, f"{MIN_FRAMES} to {MAX_FRAMES} frames")
+    if (beyond := light[np.isfinite(light) & (np.abs(light) > MAX_FLUX)]).size:
+        raise _bad(name, "flux", f"{beyond[0]:g}", f"values between -{MAX_FLUX:g} and {MAX_FLUX:g}")
+    if not np.isfinite(time).all():
+        raise _bad(name, "time", f"{time[~np.isfinite(time)][0]} in row {int(np.argmin(np.isfinite(time)))}",
+                   "finite times")  # fmt: skip
+
+
+def _whole_flags(name: str, quality: ArrayLike | None, n: int) -> NDArray[np.int64]:
+    """Return the quality flags of frames, zero without any; raise InputError if they are no whole numbers."""
+    if quality is not None and not np.isfinite(np.asarray(quality, np.float64)).all():
+        raise _bad(name, "quality", "a value that is not finite", "whole numbers")
+    flags = np.zeros(n, np.int64) if quality is None else np.asarray(quality, np.int64)
+    if flags.shape != (n,):
+        raise _bad(name, "quality", flags.shape, f"({n},)")
+    return flags
+
+
+def _cadence_of(name: str, time: Float) -> float:
+    """Return the median step of ascending times; raise InputError for frames that overlap or are too far apart."""
+    step = np.diff(time)
+    cadence = float(np.median(step))
+    if not cadence > 0 or (step < MIN_STEP * cadence).any():
+        row = int(np.argmin(step))
+        least = f"frames that are at least {MIN_STEP:g} of the median step of {cadence:g} s apart"
+        if not cadence > 0:
+            least = "a different time for each frame"
+        raise _bad(name, "time", f"{step[row]:g} s from one frame to the next", least)
+    span = float(time[-1] - time[0])
+    if not span <= MAX_SPAN * cadence:
+        most = f"at most {MAX_SPAN} of the median step of {cadence:g} s"
+        raise _bad(name, "time", f"{span:g} s from the first frame to the last", most)
+    return cadence
 
 
 @validated
@@ -140,23 +285,11 @@ class Frames:
         time = np.asarray(time_s, np.float64)
         light = np.asarray(flux, np.float64)
         n = time.size
-        if time.ndim != 1 or light.ndim not in (1, 2) or len(light) != n:
-            raise _bad(name, "shape", (time.shape, light.shape), "times of shape (n,), flux of (n,) or (n, n_pixel)")
-        if not MIN_FRAMES <= n <= MAX_FRAMES:
-            raise _bad(name, "frames", n, f"{MIN_FRAMES} to {MAX_FRAMES} frames")
-        if (beyond := light[np.isfinite(light) & (np.abs(light) > MAX_FLUX)]).size:
-            raise _bad(name, "flux", f"{beyond[0]:g}", f"values between -{MAX_FLUX:g} and {MAX_FLUX:g}")
-        if not np.isfinite(time).all():
-            raise _bad(name, "time", f"{time[~np.isfinite(time)][0]} in row {int(np.argmin(np.isfinite(time)))}",
-                       "finite times")  # fmt: skip
+        _check_light(name, time, light)
         sd = None if error is None else np.asarray(error, np.float64)
         if sd is not None and sd.shape != light.shape:
             raise _bad(name, "error", sd.shape, f"the shape of the flux, {light.shape}")
-        if quality is not None and not np.isfinite(np.asarray(quality, np.float64)).all():
-            raise _bad(name, "quality", "a value that is not finite", "whole numbers")
-        flags = np.zeros(n, np.int64) if quality is None else np.asarray(quality, np.int64)
-        if flags.shape != (n,):
-            raise _bad(name, "quality", flags.shape, f"({n},)")
+        flags = _whole_flags(name, quality, n)
         if exposure_s is not None and np.shape(exposure_s) not in ((), (1,), (n,)):
             raise _bad(name, "exposure", np.shape(exposure_s), f"one exposure time, or one for each of {n} frames")
         exposure = None if exposure_s is None else np.array(np.broadcast_to(np.asarray(exposure_s, np.float64), (n,)))
@@ -164,18 +297,7 @@ class Frames:
         remarks: tuple[str, ...] = ()
         if (np.diff(time) < 0).any():
             remarks = (f"the times of {name} are not ascending; its frames were sorted by time",)
-        step = np.diff(time[order])
-        cadence = float(np.median(step))
-        if not cadence > 0 or (step < MIN_STEP * cadence).any():
-            row = int(np.argmin(step))
-            least = f"frames that are at least {MIN_STEP:g} of the median step of {cadence:g} s apart"
-            if not cadence > 0:
-                least = "a different time for each frame"
-            raise _bad(name, "time", f"{step[row]:g} s from one frame to the next", least)
-        span = float(time[order[-1]] - time[order[0]])
-        if not span <= MAX_SPAN * cadence:
-            most = f"at most {MAX_SPAN} of the median step of {cadence:g} s"
-            raise _bad(name, "time", f"{span:g} s from the first frame to the last", most)
+        cadence = _cadence_of(name, time[order])
         if exposure is None:
             exposure = np.full(n, cadence)
         if not (np.isfinite(exposure) & (exposure > 0)).all():
@@ -251,7 +373,8 @@ class Frames:
         finite = np.isfinite(values).all(axis=1)
         if self.error is not None:
             errors = self.error.reshape(self.n_frames, -1)
-            finite &= (np.isfinite(errors) & (errors > 0)).all(axis=1)
+            # An error below the rounding of the number is none.
+            finite &= (np.isfinite(errors) & (errors > 1e-16 * np.abs(values))).all(axis=1)
         flagged = np.zeros(self.n_frames, np.bool_)
         if self.quality is not None:
             flagged = QualityBits(self.quality_mask).excluded(self.quality)

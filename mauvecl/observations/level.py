@@ -1,4 +1,4 @@
-"""Quiescent light of observed frames: level, noise, and frames that cannot be part of a flare."""
+"""Quiescent level of a light curve, in alternation with the mask of flares, and the noise about it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import scipy
 from numpy.typing import NDArray
 
 from mauvecl.observations.frames import Frames, Reason
-from mauvecl.observations.steps import Steps
+from mauvecl.observations.process import Steps
 
 if TYPE_CHECKING:
     from mauvecl.observations.process import Process
@@ -88,13 +88,15 @@ def counts_per_unit(frames: Frames) -> float | None:
     exposure = float(np.median(frames.exposure_s))
     for factor in (1.0, exposure):
         counts = flux[finite] * factor
-        whole = np.abs(counts - np.rint(counts)) < 1e-6 * np.maximum(counts, 1.0)
-        if whole.all() and np.ptp(counts) > 0 and float(np.median(counts)) < MAX_COUNTS:
+        # Fluxes such as 1e-15 are near zero, but are no counts.
+        whole = np.abs(counts - np.rint(counts)) <= 1e-6 * counts
+        # Half of the frames may have no count at all.
+        if whole.all() and np.ptp(counts) > 0 and float(np.quantile(counts, 0.75)) < MAX_COUNTS:
             return factor
     return None
 
 
-def guess_flares(numbers: NDArray[np.int64], flux: Float) -> Bool:
+def guess_flares(numbers: NDArray[np.int64], flux: Float, least: float = 0.0) -> Bool:
     """Return a first guess of the frames in flares, which rise faster than the star otherwise does, shape (n_frame,).
 
     Parameters
@@ -102,16 +104,18 @@ def guess_flares(numbers: NDArray[np.int64], flux: Float) -> Bool:
     numbers : ndarray, shape (n_frame,)
         Numbers of the frames on their regular grid.
     flux : ndarray, shape (n_frame,)
+    least : float
+        Least standard deviation of a frame; most of few counts are equal.
     """
     inside = np.zeros(flux.size, np.bool_)
     rises: list[tuple[float, int, int]] = []
     steps = np.diff(flux)[np.diff(numbers) == 1]
-    noise = PER_MAD * float(np.median(np.abs(steps))) / np.sqrt(2.0) if steps.size else 0.0
+    noise = max(PER_MAD * float(np.median(np.abs(steps))) / np.sqrt(2.0) if steps.size else 0.0, least)
     for lag in JUMP_FRAMES:
         if flux.size <= lag:
             continue
         rise = np.where(numbers[lag:] - numbers[:-lag] <= 2 * lag, flux[lag:] - flux[:-lag], 0.0)
-        limit = JUMP * PER_MAD * float(np.median(np.abs(rise)))
+        limit = JUMP * max(PER_MAD * float(np.median(np.abs(rise))), np.sqrt(2.0) * least)
         rises += [(float(rise[k]), int(k), lag) for k in np.flatnonzero(rise > max(limit, 1e-300))]
     n_inside = 0
     for rise_of, start, _ in sorted(rises, reverse=True):
@@ -272,4 +276,106 @@ def spikes(numbers: NDArray[np.int64], flux: Float, error: Float | None, fine: B
     sd = np.full(at.size, scatter) if error is None else np.maximum(error[at], scatter)
     sigmas = np.divide(flux[at] - around, sd, out=np.zeros(at.size), where=sd > 0)
     found[at] = single_frames(numbers[at], sigmas, np.ones(at.size, np.bool_))
+    return found
+
+
+#: Numbers of frames per bin at which the scatter is measured.
+BINS = (1, 2, 4, 8, 16, 32, 64, 128)
+#: Smallest number of bins.
+MIN_BINS = 8
+#: Largest lag of correlations in frames.
+MAX_LAG = 40
+#: Correlation of the residuals from which the process does not describe them, if it is also as many standard errors.
+CORRELATED, SIGNIFICANT = 0.12, 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class Likeness:
+    """Comparison of the residuals of the fitted process with independent noise."""
+
+    correlations: (
+        Float  # shape (n_lag,); autocorrelation at lags of 1, 2 ... frames, of the sum that is most correlated
+    )
+    error: float  # its standard error for independent residuals
+
+    @property
+    def lag(self) -> int:
+        """Lag of the largest correlation in frames."""
+        return int(np.argmax(np.abs(self.correlations))) + 1
+
+    @property
+    def correlation(self) -> float:
+        """Largest correlation."""
+        return float(self.correlations[self.lag - 1])
+
+    @property
+    def alike(self) -> bool:
+        """True unless the residuals are significantly and clearly correlated."""
+        return abs(self.correlation) < max(CORRELATED, SIGNIFICANT * self.error)
+
+
+def likeness(numbers: NDArray[np.int64], residual: Float) -> Likeness:
+    """Return the autocorrelation of residuals.
+
+    Parameters
+    ----------
+    numbers : ndarray, shape (n_frame,)
+        Numbers of the frames on their regular grid.
+    residual : ndarray, shape (n_frame, n_sum)
+    """
+    # Single extreme values would hide correlations, or feign them.
+    scaled = np.clip(residual, -4.0, 4.0)
+    scaled = (scaled - scaled.mean(axis=0)) / np.maximum(scaled.std(axis=0), 1e-300)
+    lags = np.arange(1, max(2, min(MAX_LAG, len(numbers) // 4) + 1))
+    found = np.zeros((residual.shape[1], lags.size))
+    for k, lag in enumerate(lags):
+        pairs = numbers[lag:] - numbers[:-lag] == lag
+        if pairs.sum() > 10:
+            found[:, k] = (scaled[lag:][pairs] * scaled[:-lag][pairs]).mean(axis=0)
+    worst = int(np.argmax(np.abs(found).max(axis=1)))
+    return Likeness(found[worst], float(len(numbers) ** -0.5))
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """Scatter of means of several consecutive quiescent frames."""
+
+    frames: int  # number of frames in a mean
+    count: int  # number of means
+    measured: float  # their standard deviation, in units of the noise of one frame
+    white: float  # the same for independent frames: one over the root of `frames`
+    # low, high: range of `measured` in 95 % of light curves of independent, normal frames.
+    low: float
+    high: float
+
+    @property
+    def red(self) -> bool:
+        """True if the frames are correlated on this time scale."""
+        return self.measured > self.high
+
+
+def binned_scatter(numbers: NDArray[np.int64], residual: Float) -> list[Scatter]:
+    """Measure the scatter of means of consecutive frames without gaps.
+
+    Parameters
+    ----------
+    numbers : ndarray, shape (n_frame,)
+        Numbers of the frames on their regular grid.
+    residual : ndarray, shape (n_frame,)
+        Flux of quiescent frames less their level, in units of the noise of one frame.
+    """
+    found = []
+    # Place of each frame among consecutive ones, and their number.
+    first = np.flatnonzero(np.diff(numbers, prepend=numbers[:1] - 2) != 1)
+    lengths = np.diff(np.append(first, numbers.size))
+    place, length = np.arange(numbers.size) - np.repeat(first, lengths), np.repeat(lengths, lengths)
+    for size in BINS:
+        # Bins do not overlap, and begin with the first frame after a gap.
+        kept = np.flatnonzero((place % size == 0) & (place + size <= length))
+        if len(kept) < MIN_BINS:
+            break
+        means = residual[kept[:, None] + np.arange(size)].mean(axis=1)
+        dof = len(kept) - 1
+        low, high = (float(np.sqrt(scipy.stats.chi2.ppf(p, dof) / dof / size)) for p in (0.025, 0.975))
+        found.append(Scatter(size, len(kept), float(means.std(ddof=1)), size**-0.5, low, high))
     return found

@@ -1,14 +1,23 @@
-"""Search of light curves: quiescent level, noise, and the frames that are searched."""
+"""Light curves for a search, without sudden losses of light by drifts out of the fibre, eclipses and dips."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import median_filter, uniform_filter1d
 
-from mauvecl.observations.detection import fit_quiet_light
+from mauvecl.flares.shapes import Shape
+from mauvecl.observations.detection import (
+    END_FRAMES,
+    PROVISIONAL,
+    alternate,
+    criterion,
+    detect_events,
+    fit_quiet_light,
+    light_of_events,
+)
 from mauvecl.observations.frames import Frames, Reason
 from mauvecl.observations.level import (
     FAR,
@@ -22,17 +31,216 @@ from mauvecl.observations.level import (
     single_frames,
     spikes,
 )
-from mauvecl.observations.losses import sudden_losses
-from mauvecl.observations.search import SeriesSurvey
-from mauvecl.observations.steps import Steps
+from mauvecl.observations.process import Binned, Steps, fit_process, level_fit
+from mauvecl.observations.search import SeriesSurvey, bank_of
 from mauvecl.schema.errors import InputError
-
-if TYPE_CHECKING:
-    from mauvecl.flares.shapes import Shape
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
+#: Share of the frames in events of a star whose light is constant, and of one that rotates, and noise relative to the
+#: stated one, above which losses are tried (assumed).
+MOST_FLARING, MOST_ACTIVE, MOST_EXCESS = 0.1, 0.3, 1.5
+#: Time scale from which a process is slow, however long the light curve (assumed: 2 d, twelve times the longest loss
+#: that is searched).
+SLOW_S = 172_800.0
+#: Smallest standard deviation of a process that losses of light may have caused, relative to the noise of a mean over
+#: its time scale (assumed: losses with an S/N of 5 in 1 % of the frames give 0.5).
+LEAST_LOSS = 0.5
+#: Largest share of the frames in losses; more of them are the level of the star, before or after a step (assumed).
+MOST_LOST = 0.4
+#: Standard deviations of a frame above the median of a constant light from which frames belong to flares; their number
+#: before and, relative to the length, after the bright frames; the largest share of such frames (assumed).
+BRIGHT, BEFORE, DECAY, MOST_BRIGHT = 4.0, 2, 3, 0.3
+#: Shortest period of eclipses, their durations as shares of the period, and the factor by which the guessed ones are
+#: widened, because they begin and end gradually (assumed).
+SHORTEST_PERIOD_S, ECLIPSES, WIDENED = 17_280.0, np.array([0.03, 0.06, 0.12]), 1.6
+#: Largest number of values in which eclipses are guessed, and the shift of a box in its durations between two periods.
+MOST_BINNED, MOVED = 3000, 0.5
+#: Smallest number of eclipses, and smallest share of them that are at least half as deep as their median (assumed; a
+#: flare may fill some).
+LEAST_ECLIPSES, ALIKE = 3, 0.8
+#: Share of the period whose median is the light around an eclipse, and parameters of the times of eclipses.
+AROUND, EPHEMERIS = 0.3, 5
+#: Mean of consecutive frames, in standard deviations of a frame below the star, that belong to an eclipse.
+FAINT = 1.5
+
+
+class Loss(Shape):
+    """A constant loss that begins and ends suddenly, for two half-widths."""
+
+    name = "loss"
+    source = "assumed"
+    peak_at = 0.0
+    square_integral = 2.0
+
+    def at(self, tau: ArrayLike) -> Float:
+        return (np.abs(tau) <= 1.0).astype(np.float64)
+
+    def before(self, tau: ArrayLike) -> Float:
+        return np.clip(np.asarray(tau, np.float64) + 1.0, 0.0, 2.0)
+
+    def after(self, tau: ArrayLike) -> Float:
+        return np.clip(1.0 - np.asarray(tau, np.float64), 0.0, 2.0)
+
+
+def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, taken: Bool, steps: Steps | None = None) -> Bool:
+    """Return the frames in which light is lost, if losses explain a light curve better than flares do.
+
+    Without losses, a star does not flare in many of its frames, keeps its noise, and varies slowly. Where that does not
+    hold, the light curve is searched upside down for losses, and the smaller Bayesian information criterion decides.
+
+    Parameters
+    ----------
+    survey : SeriesSurvey
+        Without processes.
+    fitted : SeriesSurvey
+    taken : ndarray of bool, shape (n_frame,)
+        Process and events of `fit_quiet_light`.
+    steps : Steps, optional
+        Reports each fit and each search.
+
+    Returns
+    -------
+    ndarray of bool, shape (n_frame,)
+    """
+    none, process = np.zeros_like(taken), fitted.flux_process
+    rotates = any(term.kind == "rotation" for term in process.terms)
+    slow_s = min(survey.stare.duration_s / 3, SLOW_S)
+    noise = process.excess * float(np.sqrt(np.median(fitted.flux_variance)))
+    fast = any(
+        term.kind != "rotation"
+        and term.scale_s < slow_s
+        and term.sd * np.sqrt(term.scale_s / survey.stare.frame_s) > LEAST_LOSS * noise
+        for term in process.terms
+    )
+    active = taken.mean() > MOST_ACTIVE
+    many = active or (taken.mean() > MOST_FLARING and not rotates)
+    if survey.weighted or not (many or process.excess > MOST_EXCESS or fast):
+        return none
+    dark = ~_bright(survey)
+    survey, fitted, taken = survey.frames(dark), fitted.frames(dark), taken[dark]
+    down = replace(survey.inverted(), bank=bank_of(survey.stare, survey.bank.directions, Loss()))
+    # Losses in independent noise are the first guess: a process that is fitted to losses would hide them.
+    guessed = detect_events(down, PROVISIONAL, steps)[1]
+    # Those of a star that varies are most of its frames; eclipses repeat.
+    if active and guessed.mean() >= MOST_LOST:
+        lost = _eclipses(survey, criterion(fitted, light_of_events(fitted, taken), taken))
+        if lost.any():
+            none[dark] = lost
+            return none
+    other, losses = alternate(down, guessed, None, steps)
+    if 0 < losses.mean() < MOST_LOST:
+        light = light_of_events(other, losses)
+        if criterion(other, light, losses, shapeless=True) < criterion(fitted, light_of_events(fitted, taken), taken):
+            none[dark] = losses
+    return none
+
+
+def _eclipses(survey: SeriesSurvey, usual: float) -> Bool:
+    """Return the frames in periodic losses, if these lower the criterion, shape (n_frame,).
+
+    Parameters
+    ----------
+    survey : SeriesSurvey
+        Without processes.
+    usual : float
+        Criterion without losses.
+    """
+    guessed = guess_eclipses(survey)
+    none = np.zeros_like(guessed)
+    if not 0 < guessed.mean() < MOST_LOST:
+        return none
+    part = survey.frames(~guessed)
+    fitted, taken = fit_quiet_light(part, guess_flares(part.stare.numbers, part.flux))
+    # The light in eclipses may have any smooth shape.
+    dim = survey.frames(guessed)
+    data = Binned(dim.stare.start_s, dim.sums[:, 0], dim.variance, dim.stare.frame_s)
+    process = fit_process(data)
+    light = level_fit(process.covariance(data.time_s, data.variance * process.excess**2), data.values)
+    cost = (EPHEMERIS + process.n_parameters) * float(np.log(guessed.size)) - 2 * light.log_likelihood
+    if criterion(fitted, light_of_events(fitted, taken), taken) + cost >= usual:
+        return none
+    quiet = ~guessed
+    quiet[quiet] = ~taken
+    whole = replace(survey, processes=fitted.processes, flux_process=fitted.flux_process)
+    sigma = uniform_filter1d(whole.along(0, quiet), END_FRAMES)
+    # Frames at the ends of the guess that are as bright as the star are searched.
+    for first, last in _runs(guessed):
+        faint = np.flatnonzero(sigma[first : last + 1] < -FAINT)
+        if faint.size:
+            none[max(first, first + faint[0] - END_FRAMES) : min(last, first + faint[-1] + END_FRAMES) + 1] = True
+    return none
+
+
+def _runs(inside: Bool) -> list[tuple[int, int]]:
+    """Return the first and last frame of each run of frames."""
+    edges = np.diff(inside.astype(np.int8), prepend=0, append=0)
+    return list(zip(np.flatnonzero(edges > 0).tolist(), (np.flatnonzero(edges < 0) - 1).tolist(), strict=True))
+
+
+def guess_eclipses(survey: SeriesSurvey) -> Bool:
+    """Return a first guess of the frames in periodic losses, by box least squares, shape (n_frame,).
+
+    They are the box that fits best and, as of a binary star, the best one at the same period in the other frames
+    (Kovacs, Zucker & Mazeh 2002, doi 10.1051/0004-6361:20020802).
+    """
+    from astropy.timeseries import BoxLeastSquares
+
+    time = survey.stare.start_s
+    inside = np.zeros(time.size, np.bool_)
+    data = Binned.of(time, survey.flux, survey.flux_variance, survey.stare.frame_s, MOST_BINNED)
+    period = max(SHORTEST_PERIOD_S, 2 * data.step_s / ECLIPSES[0])
+    grids = []
+    while period < data.span_s / 3:
+        # Between neighbouring periods the last box moves by a part of the shortest duration.
+        number = max(2, int(data.span_s / (2 * period) / (MOVED * ECLIPSES[0])))
+        grids.append(1 / np.linspace(1 / (2 * period), 1 / period, number))
+        period *= 2
+    if not grids:
+        return inside
+    values = data.values
+    for _ in range(2):
+        kept = ~inside[np.searchsorted(time, data.time_s)]
+        search = BoxLeastSquares(data.time_s[kept], values[kept])
+        found = [search.power(grid, ECLIPSES * grid.min()) for grid in grids]
+        best = max(found, key=lambda one: float(one.power.max()))
+        k = int(np.argmax(best.power))
+        period, middle, length = (float(one[k]) for one in (best.period, best.transit_time, best.duration))
+        size = max(3, round(AROUND * period / data.step_s))
+        turn, apart = _turns(data.time_s, period, middle)
+        dim = (apart < length / 2) & kept
+        around = data.values - median_filter(data.values, size, mode="nearest")
+        depths = np.array([np.median(around[dim & (turn == one)]) for one in np.unique(turn[dim])])
+        # Losses that are seen once or twice, or that differ in depth, are no eclipses.
+        if depths.size < LEAST_ECLIPSES or np.mean(depths < 0.5 * np.median(depths)) < ALIKE or np.median(depths) >= 0:
+            break
+        inside |= _turns(time, period, middle)[1] < WIDENED * length / 2
+        grids = [np.array([period])]
+        # The star may vary by more than the shallower eclipse.
+        kept = ~inside[np.searchsorted(time, data.time_s)]
+        values = data.values.copy()
+        values[kept] -= median_filter(values[kept], size, mode="nearest")
+    return inside
+
+
+def _turns(time: Float, period: float, middle: float) -> tuple[Float, Float]:
+    """Return the number of the nearest eclipse, and the time from its middle."""
+    turn = np.rint((time - middle) / period)
+    return turn, np.abs(time - middle - turn * period)
+
+
+def _bright(survey: SeriesSurvey) -> Bool:
+    """Return frames far above the level that most frames have, and those after them, as long as flares decay."""
+    sigmas = (survey.flux - np.median(survey.flux)) / np.sqrt(survey.flux_variance)
+    bright = np.zeros(sigmas.size, np.bool_)
+    for first, last in _runs(sigmas > BRIGHT):
+        bright[max(0, first - BEFORE) : last + 1 + DECAY * (last + 1 - first)] = True
+    return bright if bright.mean() < MOST_BRIGHT else np.zeros_like(bright)
+
+
+#: Smallest step from frame to frame as a share of the light; numbers of single precision are rounded by 1e-7.
+LEAST_NOISE = 1e-10
 #: Smallest number of frames without a fault.
 MIN_USABLE = 10
 #: Largest number of times that single frames are left out and the rest is fitted again.
@@ -70,13 +278,17 @@ def survey_light_curve(
     if counts is None:
         reasons[spikes(frames.numbers, flux, error, reasons == 0)] |= Reason.SPIKE
     used = reasons == 0
+    # A frame of no count at the least has the Poisson noise of one.
+    least = 0.0 if counts is None else float(np.sqrt(max(np.median(flux[used]) * counts, 1.0))) / counts
     guessed = np.zeros(flux.size, np.bool_)
     survey: SeriesSurvey | None = None
     for number in range(ROUNDS):
         used = reasons == 0
         if survey is None:
-            guessed[used] = guess_flares(frames.numbers[used], flux[used])
-            level = np.full(flux.size, _mean(flux[used & ~guessed]))
+            guessed[used] = guess_flares(frames.numbers[used], flux[used], least)
+            level = np.full(flux.size, _mean(flux[used & ~guessed], least))
+            if not level.any():
+                raise InputError(f"{frames.name}: the level of its light is zero", "the light of a star", key="flux")
         quiet = used & ~guessed
         variance, photon = _noise(frames, flux, error, level, quiet, counts)
         typical = float(np.median(level[quiet]))
@@ -115,25 +327,17 @@ def check_usable(frames: Frames, reasons: NDArray[np.int64]) -> None:
     usable = reasons == 0
     if usable.sum() < MIN_USABLE:
         raise InputError(
-            f"{frames.name} has {usable.sum()} frames without a fault",
-            f"at least {MIN_USABLE}",
-            key="frames",
-            value=int(usable.sum()),
+            f"{frames.name} has {usable.sum()} frames without a fault", f"at least {MIN_USABLE}", key="frames"
         )
     flux = frames.white_light[0][usable]
-    if (np.diff(flux) == 0).mean() > 0.5 and counts_per_unit(frames) is None:
-        raise InputError(
-            f"{frames.name}: the flux of most frames is the same",
-            "a light curve with noise",
-            key="flux",
-            value=float(np.median(flux)),
-        )
+    if np.median(np.abs(np.diff(flux))) <= LEAST_NOISE * np.abs(np.median(flux)) and counts_per_unit(frames) is None:
+        raise InputError(f"{frames.name}: the flux of most frames is the same", "a light curve with noise", key="flux")
 
 
-def _mean(flux: Float) -> float:
+def _mean(flux: Float, least: float) -> float:
     """Return the mean without outliers; a median of whole numbers would be one of them."""
     middle = float(np.median(flux))
-    spread = PER_MAD * float(np.median(np.abs(flux - middle)))
+    spread = max(PER_MAD * float(np.median(np.abs(flux - middle))), least)
     near = np.abs(flux - middle) <= max(FAR * spread, 1e-12 * abs(middle))
     return float(flux[near].mean())
 

@@ -7,12 +7,11 @@ from typing import Literal, Self
 
 from pydantic import model_validator
 
-from mauvecl.host.files.parsing import read_text, toml
-from mauvecl.host.tables.times import EPOCHS_MJD, SCALES, offline, scale_of
-from mauvecl.schema.errors import InputError
+from mauvecl.host.tables.files import read_text, toml
+from mauvecl.host.tables.units import EPOCHS_MJD, SCALES, offline, scale_of
+from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.physical import Exposure
-from mauvecl.schema.records import Record
-from mauvecl.schema.text import shortened
+from mauvecl.schema.section import Record
 
 
 class FrameMapping(Record):

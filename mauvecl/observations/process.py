@@ -1,4 +1,4 @@
-"""Gaussian processes of the quiescent light: rotation, granulation and red noise.
+"""Gaussian process of the quiescent light: rotation, granulation and red noise; and the progress of an analysis.
 
 The light without flares is a constant plus a Gaussian process whose covariance is a sum of celerite terms, so that all
 computations take a time proportional to the number of frames (Foreman-Mackey et al. 2017, doi
@@ -8,18 +8,59 @@ information criterion (Schwarz 1978, doi 10.1214/aos/1176344136).
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.observations.steps import Steps
 from mauvecl.schema.errors import InputError
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
+Item = TypeVar("Item")
+
+#: Share of what is left that a step of an unknown number of steps counts as.
+EACH = 0.07
+
+
+class Steps:
+    """Part of an analysis, which reports the share of the whole that is done.
+
+    Parameters
+    ----------
+    report : callable, optional
+        Called with shares of the whole, which rise; may raise to stop the work.
+    first, last : float
+        Shares of the whole at the begin and the end of the part.
+    """
+
+    def __init__(self, report: Callable[[float], None] | None = None, first: float = 0.0, last: float = 1.0) -> None:
+        self._report, self._first, self._last = report, first, last
+        self._done = 0.0
+
+    def part(self, first: float, last: float) -> Steps:
+        """Return the part between two shares of this one."""
+        length = self._last - self._first
+        return Steps(self._report, self._first + first * length, self._first + last * length)
+
+    def reached(self, share: float) -> None:
+        """Report that a share of this part is done."""
+        self._done = max(self._done, min(share, 1.0))
+        if self._report is not None:
+            self._report(self._first + self._done * (self._last - self._first))
+
+    def step(self) -> None:
+        """Report that a step of an unknown number is done: each counts as the same share of what is left."""
+        self.reached(self._done + EACH * (1.0 - self._done))
+
+    def each(self, items: Iterable[Item], total: int) -> Iterator[Item]:
+        """Yield items, and report after the work on each."""
+        for done, item in enumerate(items, 1):
+            yield item
+            self.reached(done / total)
+        self.reached(1.0)
+
 
 Float = NDArray[np.float64]
 Kind = Literal["correlated", "smooth", "rotation"]
@@ -199,6 +240,7 @@ class Covariance:
         )
         if not (self._d > 0).all():
             raise np.linalg.LinAlgError("the covariance is not positive definite")
+        self._forms: dict[tuple[int, int], Float] = {}
 
     @property
     def log_determinant(self) -> float:
@@ -242,19 +284,26 @@ class Covariance:
             Number of times after the values from which innovations are neglected.
         """
         last = first + len(columns)
-        rows, rest = slice(first, last), slice(last, last + after)
+        rows = slice(first, last)
         time, rates, solve = self._time, self._rates, self._driver.solve_lower
         innovations = solve(time[rows], rates, self._u[rows], self._w[rows], columns, columns)
         total = 0.0
-        if time[rest].size:
+        if last < time.size:
             decay = np.exp((time[rows, None] - time[last]) * rates)
             state = (decay * self._w[rows]).T @ innovations
-            # Innovations of each unit state.
-            units = -self._u[rest] * np.exp((time[last] - time[rest, None]) * rates)
-            units = solve(time[rest], rates, self._u[rest], self._w[rest], units, units)
-            form = (units / self._d[rest, None]).T @ units
-            total = np.einsum("jo,jo->o", state, form @ state)
+            total = np.einsum("jo,jo->o", state, self._norms_after(last, after) @ state)
         return np.asarray((1.0 / self._d[rows]) @ np.square(innovations, out=innovations) + total)
+
+    def _norms_after(self, first: int, number: int) -> Float:
+        """Return the quadratic form of the state before a time that gives the sum of squared innovations from it on."""
+        if (first, number) not in self._forms:
+            rest = slice(first, first + number)
+            time, rates = self._time[rest], self._rates
+            # Innovations of each unit state.
+            units = -self._u[rest] * np.exp((time[0] - time[:, None]) * rates)
+            units = self._driver.solve_lower(time, rates, self._u[rest], self._w[rest], units, units)
+            self._forms[first, number] = (units / self._d[rest, None]).T @ units
+        return self._forms[first, number]
 
     def coloured(self, white: Float) -> Float:
         """Return values of this covariance from innovations, shape (n,) or (n, k)."""

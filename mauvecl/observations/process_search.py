@@ -14,6 +14,7 @@ threshold solves only those that can exceed it.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -45,6 +46,8 @@ CHANGED = 1e-2
 OTHER_NOISE = 0.5
 #: Number of frames, unless a template is longer, and largest number of templates in one solution.
 CHUNK_FRAMES, CHUNK_TEMPLATES = 256, 512
+#: Largest number of frames whose correlations are products with a matrix, which are faster than transforms then.
+MOST_DENSE = 128
 #: Approximate number of values in an array of a batch of light curves.
 BATCH = 2**21
 
@@ -376,6 +379,8 @@ class ProcessSearch:
         begin, end = np.searchsorted(self.at, [starts[0], starts[-1] + shape.size])
         if end <= begin:
             return np.zeros(starts.size)
+        # Many shapes end before the same frame, so that what follows it is solved once.
+        end = min(-(-end // CHUNK_FRAMES) * CHUNK_FRAMES, self.at.size)
         padded = np.pad(shape, 1)
         place = self.at[begin:end, None] - starts + 1
         columns = padded[np.clip(place, 0, shape.size + 1, out=place)]
@@ -384,12 +389,18 @@ class ProcessSearch:
 
 def _correlated(values: Float, kernel: Float, first: int) -> Float:
     """Return sum_k values[o + first + k] kernel[k] for every frame o of the last axis; values outside are zero."""
+    from scipy.fft import set_workers
     from scipy.signal import oaconvolve
 
     n = values.shape[-1]
+    if n <= MOST_DENSE:
+        place = np.arange(n)[:, None] - np.arange(n) - first
+        inside = (place >= 0) & (place < kernel.size)
+        return np.asarray(values @ np.where(inside, kernel[np.clip(place, 0, kernel.size - 1)], 0.0))
     last = first + kernel.size - 1
     before, after = max(0, -first), max(0, last)
     padded = np.pad(values, [(0, 0)] * (values.ndim - 1) + [(before, after)])
     reverse = kernel[::-1].reshape((1,) * (values.ndim - 1) + (-1,))
-    found = oaconvolve(padded, reverse, mode="valid", axes=-1)
+    with set_workers(os.cpu_count() or 1):
+        found = oaconvolve(padded, reverse, mode="valid", axes=-1)
     return np.asarray(found[..., max(0, first) : max(0, first) + n])

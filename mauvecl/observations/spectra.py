@@ -16,13 +16,12 @@ from numpy.typing import NDArray
 
 from mauvecl.detection.nuisances import Nuisances
 from mauvecl.observations.detection import fit_quiet_light
-from mauvecl.observations.frame_model import FrameModel
+from mauvecl.observations.frame_model import FrameModel, LightChange, light_changes
 from mauvecl.observations.frames import Reason
 from mauvecl.observations.level import PER_MAD, QuiescentLevel, guess_flares, single_frames
-from mauvecl.observations.light_changes import LightChange, light_changes
 from mauvecl.observations.light_curve import check_usable, quiescent_light, searched_among
+from mauvecl.observations.process import Steps
 from mauvecl.observations.search import WHITE, SeriesSurvey, bank_of, stare_of
-from mauvecl.observations.steps import Steps
 from mauvecl.schema.errors import InputError
 from mauvecl.search.templates import TEMPERATURES_K, Templates
 

@@ -1,23 +1,123 @@
-"""Raw spectra that `mauvecl realise` wrote, as frames: Zarr stores, FITS and HDF5 files."""
+"""Frames in folders of spectra and in stores, read piece by piece."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.files.parsing import parsing
-from mauvecl.host.files.size_limits import check_folder
+from mauvecl.host.tables.files import check_folder, parsing
 from mauvecl.host.tables.fits_tables import FitsTables
-from mauvecl.host.tables.table import TableFile, Values
+from mauvecl.host.tables.names import matched
+from mauvecl.host.tables.opening import read_table
+from mauvecl.host.tables.table import MemoryTable, TableFile, Values
 from mauvecl.observations.frames import MAX_FRAMES
 from mauvecl.observations.mapping import FrameMapping
 from mauvecl.schema.errors import InputError
+
+#: Largest number of files in a folder.
+MAX_FILES = 2**20
+#: Column of a table with the names of files, by default.
+FILES = "file"
+
+Open = Callable[[Path], AbstractContextManager[TableFile]]
+
+
+class FolderFile(TableFile):
+    """Spectra in the files of a folder; quantities of frames are keywords of their headers or columns of a table."""
+
+    def __init__(self, folder: Path, mapping: FrameMapping, what: str, open_file: Open) -> None:
+        super().__init__(what, {})
+        self.open_file = open_file
+        self.table: MemoryTable | None = None
+        if mapping.table is not None:
+            place = folder / mapping.table
+            self.table = MemoryTable(read_table(place, "table of files"), f"table {mapping.table!r}")
+            listed = self.table.find(mapping.files or FILES)
+            self.paths = [folder / str(name) for name in listed.texts() or listed.read(0, listed.n_rows)]
+        else:
+            self.paths = sorted(
+                path for path in folder.glob(mapping.files or "*")
+                if not path.is_dir() and not path.name.startswith(".") and path.suffix != ".toml"
+            )  # fmt: skip
+        if not 1 <= len(self.paths) <= MAX_FILES:
+            raise InputError(f"{what}: {mapping.files or '*'!r} names {len(self.paths)} files", f"1 to {MAX_FILES}",
+                             key="files")  # fmt: skip
+        with open_file(self.paths[0]) as first:
+            self.header = first.header
+            self.names_of_first = first.names
+        self.headers = lru_cache(maxsize=1)(self._headers)
+        self.values = lru_cache(maxsize=64)(self._values)
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the columns of the table, of keywords, and of the columns of the first file."""
+        return [*(self.table.names if self.table else []), *map(str, self.header), *self.names_of_first]
+
+    def named(self, name: str) -> Values | None:
+        """Return a column of the table, a keyword of each header, or a column of each file."""
+        if self.table is not None and (found := self.table.named(name)) is not None:
+            return found
+        keyword = matched(name, self.header)
+        if keyword is not None:
+            return Values.of(name, np.array(self._keywords(keyword)), None, self.what)
+        with self.open_file(self.paths[0]) as first:
+            one = first.named(name) or (first.find(name) if "*" in name else None)
+        return None if one is None else self._of_files(name, one)
+
+    def axis(self, name: str, dimension: int) -> Values:
+        """Return the wavelengths of the first file's image; raise InputError if another file has others."""
+        if dimension != 1:
+            return super().axis(name, dimension)
+        first: Values | None = None
+        for path in self.paths:
+            with self.open_file(path) as file:
+                axis = file.axis(name, 1)
+            first = first or axis
+            if axis.shape != first.shape or not np.allclose(axis.numbers(), first.numbers(), rtol=1e-9, atol=0.0):
+                raise InputError(f"{self.what}: {path.name} has other wavelengths than {self.paths[0].name}",
+                                 "the same in every file", key="wavelength")  # fmt: skip
+        assert first is not None
+        return first
+
+    def _of_files(self, name: str, one: Values) -> Values:
+        """Return a column of every file, with one row per file."""
+        n = int(np.prod(one.shape))
+
+        def read(start: int, stop: int) -> Any:
+            return np.stack([self.values(name, k, n) for k in range(start, stop)])
+
+        return Values(name, (len(self.paths), n), read, one.unit, self.what)
+
+    def _values(self, name: str, number: int, n: int) -> Any:
+        path = self.paths[number]
+        with self.open_file(path) as file:
+            found = file.find(name).numbers().ravel()
+        if found.size != n:
+            raise InputError(f"{self.what}: {path.name} has {found.size} values of {name!r}",
+                             f"{n} as in {self.paths[0].name}", key=name)  # fmt: skip
+        return found
+
+    def _headers(self) -> Sequence[dict[str, Any]]:
+        headers = []
+        for path in self.paths:
+            with self.open_file(path) as file:
+                headers.append(file.header)
+        return headers
+
+    def _keywords(self, keyword: str) -> list[Any]:
+        found = [header.get(keyword) for header in self.headers()]
+        if None in found:
+            raise InputError(f"{self.what}: {self.paths[found.index(None)].name} has no {keyword}",
+                             "the keyword in every file", key=keyword)  # fmt: skip
+        return found
+
 
 Float = NDArray[np.float64]
 
@@ -52,7 +152,7 @@ class StoredFile(TableFile):
         missing = [key for key in REQUIRED if key not in of]
         if missing:
             raise InputError(f"{what} does not state {missing[0]} of {scene.path}", "a file of this version of mauvecl",
-                             key="file", value=missing[0])  # fmt: skip
+                             key="file")  # fmt: skip
         super().__init__(what, {"OBJECT": of.get("star", ""), "INSTRUME": of["instrument"]})
         self.scene = scene
         numbers = scene.frames
@@ -61,7 +161,7 @@ class StoredFile(TableFile):
         exposure, frame = float(of["exposure_s"]), float(of["exposure_s"]) / int(of["frames"])
         n = int(scene.rows.shape[0]) * self.per_row
         if n > MAX_FRAMES:
-            raise InputError(f"{what} holds {n} frames of {scene.path}", f"at most {MAX_FRAMES}", key="frames", value=n)
+            raise InputError(f"{what} holds {n} frames of {scene.path}", f"at most {MAX_FRAMES}", key="frames")
         within = np.array([exposure / 2]) if numbers is None else (numbers + 0.5) * frame
         at = np.arange(n)
         each = np.ones(n)
@@ -99,7 +199,7 @@ class StoredFile(TableFile):
         """Paths of the quantities, with counts that have bias and dark current; only those of single frames."""
         if self.stacked > 1:
             raise InputError(f"{self.what} holds sums of {self.stacked} frames", "single frames: `mauvecl realise "
-                             "--frames all`", key="frames", value=self.stacked)  # fmt: skip
+                             "--frames all`", key="frames")  # fmt: skip
         return self.mapping.model_copy(update={"flux": "raw", "error": None})
 
     def _raw(self, start: int, stop: int) -> Float:
@@ -186,7 +286,7 @@ def _in_groups(root: Any, name: str | None, what: str) -> StoredFile:
         largest = max(int(group[key].size) for key in names)
         if largest > MAX_PIXELS:
             # A header may claim any number.
-            raise InputError(f"{what} holds {largest} pixels", f"at most {MAX_PIXELS}", key="file", value=largest)
+            raise InputError(f"{what} holds {largest} pixels", f"at most {MAX_PIXELS}", key="file")
         of = {key: np.asarray(group[key][:], np.float64) for key in names}
         frames = np.asarray(group["frame"][:], np.int64) if "frame" in group else None
         return StoredFile(StoredScene(path, array, of, dict(group.attrs), frames), what)
@@ -198,7 +298,7 @@ def _chosen(found: list[str], name: str | None, what: str) -> str:
         raise InputError(f"{what} holds no spectra", EXPECTED, key="file")
     if name is None and len(found) > 1:
         raise InputError(f"{what} holds {len(found)} arrays ({', '.join(found[:8])})",
-                         f"one: name it as in FILE[{found[-1]}]", key="hdu", value=found)  # fmt: skip
+                         f"one: name it as in FILE[{found[-1]}]", key="hdu")  # fmt: skip
     wanted = name or found[0]
     if wanted not in found:
         raise InputError.of("hdu", wanted, f"one of {', '.join(found[:8])}", where=what)

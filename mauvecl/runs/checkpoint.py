@@ -8,8 +8,10 @@ started again makes the same requests and finds the files.
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import hashlib
 import io
+import itertools
 import json
 import os
 import re
@@ -19,21 +21,160 @@ import tomllib
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
+from dataclasses import dataclass, fields, is_dataclass
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, Self
+from typing import TYPE_CHECKING, Any, Protocol, Self
 
 import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel
 
-from mauvecl.host.files.atomic import UNFINISHED, write_whole
-from mauvecl.host.files.parsing import json_data, read_text
-from mauvecl.host.files.size_limits import read_bytes
+from mauvecl.detection.requests import Countable, Divisible, Shard
+from mauvecl.host.tables.files import UNFINISHED, json_data, read_bytes, read_text, write_whole
 from mauvecl.host.version import VERSION
-from mauvecl.runs.locks import differing_keys, locked
-from mauvecl.runs.shards import FORM, fingerprint
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from mauvecl.detection.snr import Arrays
+
+
+@contextlib.contextmanager
+def locked(folder: Path, what: str) -> Iterator[None]:
+    """Lock a folder for this process; the operating system releases the lock however the process ends.
+
+    Raises InputError if another process holds the lock, or the file system has no locks.
+    """
+    try:
+        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    except OSError as error:
+        raise InputError(
+            f"{what} {str(folder)!r} cannot be opened ({error.strerror})", "a folder", key="lock"
+        ) from error
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise InputError(
+                f"{what} {str(folder)!r} is being written by another process: wait until it ends", key="lock"
+            ) from error
+        except OSError as error:
+            raise InputError(
+                f"{what} {str(folder)!r} cannot be locked ({error.strerror}): use a file system with locks", key="lock"
+            ) from error
+        yield
+    finally:
+        os.close(handle)
+
+
+def differing_keys(ours: Any, theirs: Any) -> list[str]:
+    """Return the dotted keys at which two nested structures differ."""
+    mine, other = dict(_flat(ours)), dict(_flat(theirs))
+    missing = object()
+    return sorted(key for key in mine.keys() | other.keys() if mine.get(key, missing) != other.get(key, missing))
+
+
+def _flat(data: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    items = data.items() if isinstance(data, dict) else enumerate(data) if isinstance(data, list | tuple) else None
+    if items is None:
+        yield path, data
+        return
+    for key, value in items:
+        yield from _flat(value, f"{path}.{key}" if path else str(key))
+
+
+#: Version of the content of a shard, raised with every change, so that shards of older versions are never added.
+FORM = 2
+#: Approximate work of a shard, realisations times pixels times scenarios: some seconds on a processor.
+SHARD_WORK = 2**34
+#: Approximate largest number of shards per part. Larger requests have larger shards, so that one process can add up
+#: the counts of a thousand.
+MAX_SHARDS = 2**13
+
+
+def shards(request: Divisible) -> list[Shard]:
+    """Divide a request into shards at multiples of a power of two, independently of the workers."""
+    wanted = max(SHARD_WORK // request.work, request.realisations // MAX_SHARDS)
+    size = 1 << (max(wanted, request.least).bit_length() - 1)
+    first, end = request.start, request.start + request.realisations
+    cuts = [first, *range(first - first % size + size, end, size), end]
+    return [Shard(part, a, b - a) for part in range(request.parts) for a, b in itertools.pairwise(cuts)]
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """A shard to count."""
+
+    request: Countable
+    key: str  # fingerprint of the request
+    shard: Shard
+    tick: Callable[[int], None] = lambda done: None  # called with the number of counted realisations, if possible
+    out: NDArray[Any] | None = None  # array for raw spectra, if a worker of this process draws them
+
+    @property
+    def name(self) -> str:
+        """Name in a checkpoint."""
+        return f"{self.key}-{self.shard.name}"
+
+
+#: Packages whose code affects the counts of a shard.
+DRAWING_PACKAGES = ("detection", "device", "fits", "flares", "kernels", "noise", "search")
+
+
+@cache
+def code_identity() -> tuple[str, str]:
+    """Return mauvecl's version, and a digest of the kernels and other code on which the counts of a shard depend."""
+    package, digest = Path(__file__).parents[1], hashlib.sha256()
+    for name in DRAWING_PACKAGES:
+        for path in sorted((package / name).rglob("*")):
+            if path.suffix in (".py", ".mako"):
+                digest.update(path.relative_to(package).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    return VERSION, digest.hexdigest()[:16]
+
+
+#: Fields that do not affect a draw.
+_DESCRIPTIVE = ("provenance", "messages")
+
+
+def fingerprint(request: object) -> str:
+    """Return the SHA-256 of everything in a request, or in a tuple, that affects its answer.
+
+    The number of realisations is excluded, since runs of different length share shards.
+    """
+    digest = hashlib.sha256(f"form {FORM}".encode())
+    _feed(digest, request, leave=("realisations", "start", "tails"))
+    return digest.hexdigest()[:32]
+
+
+def _feed(digest: Any, value: Any, leave: tuple[str, ...] = ()) -> None:
+    if is_dataclass(value) and not isinstance(value, type):
+        digest.update(f"<{type(value).__name__}".encode())
+        for each in fields(value):
+            if each.name not in (*leave, *_DESCRIPTIVE):
+                digest.update(each.name.encode())
+                _feed(digest, getattr(value, each.name))
+    elif isinstance(value, BaseModel):
+        digest.update(f"<{type(value).__name__}".encode())
+        for name in type(value).model_fields:
+            digest.update(name.encode())
+            _feed(digest, getattr(value, name))
+    elif isinstance(value, np.ndarray):
+        digest.update(f"<{value.dtype.str}{value.shape}".encode())
+        digest.update(np.ascontiguousarray(value).tobytes())
+    elif isinstance(value, Mapping):
+        for key in sorted(value):
+            digest.update(str(key).encode())
+            _feed(digest, value[key])
+    elif isinstance(value, list | tuple):
+        digest.update(f"<{len(value)}".encode())
+        for one in value:
+            _feed(digest, one)
+    elif isinstance(value, float):
+        digest.update(value.hex().encode())
+    else:
+        # None, integers, text.
+        digest.update(repr(value).encode())
+
 
 FOLDER, MANIFEST = "checkpoint", "manifest.json"
 #: Names of shards: fingerprint, part, start, count.
@@ -132,7 +273,6 @@ class Checkpoint:
                 f"{str(self.folder)!r} holds an unfinished run",
                 "`resume=True` to continue it or `restart=True` to discard it",
                 key="resume",
-                value=str(self.folder),
             )
         try:
             manifest = json_data(read_text(self.folder / MANIFEST, "manifest"), "manifest")
@@ -153,7 +293,6 @@ class Checkpoint:
                 f"the unfinished run in {str(self.folder)!r} has counts in the format {form}",
                 f"format {FORM} of this version: `restart=True` to discard it",
                 key="restart",
-                value=form,
             )
         ours = {"mauvecl": VERSION, "verb": self.verb, **self._plain_study()}
         differing = differing_keys(ours, theirs)
@@ -162,7 +301,6 @@ class Checkpoint:
                 f"the unfinished run in {str(self.folder)!r} differs in {', '.join(differing)}",
                 "the same study, or `restart=True` to discard it",
                 key="restart",
-                value=differing,
             )
 
     def get(self, name: str) -> Arrays | None:
@@ -224,10 +362,7 @@ class Checkpoint:
         shards = [name for name in names if SHARD_NAME.fullmatch(name)]
         if MANIFEST in names and not shards and not _is_ours(self.folder / MANIFEST):
             raise InputError(
-                f"{str(self.folder / MANIFEST)!r} is not mauvecl's",
-                "another output folder",
-                key="folder",
-                value=str(self.folder / MANIFEST),
+                f"{str(self.folder / MANIFEST)!r} is not mauvecl's: use another output folder", key="folder"
             )
         yield from (self.folder / name for name in names if name in shards or name == MANIFEST)
 

@@ -19,16 +19,14 @@ from urllib.parse import urlsplit
 
 from mauvecl.detection.requests import Countable, Shard
 from mauvecl.detection.snr import Arrays
-from mauvecl.device.errors import DeviceError
-from mauvecl.device.first_build import THREADS
-from mauvecl.device.program import DeviceRecord
-from mauvecl.host.files.parsing import is_file, json_data, read_text
+from mauvecl.device.build import DeviceRecord
+from mauvecl.device.drivers import THREADS, DeviceError
+from mauvecl.host.tables.files import is_file, json_data, read_text
 from mauvecl.host.version import VERSION
+from mauvecl.runs.checkpoint import Task, code_identity
 from mauvecl.runs.pool import Stopped
-from mauvecl.runs.shards import Task, code_identity
 from mauvecl.schema.calls import validated
-from mauvecl.schema.errors import InputError
-from mauvecl.schema.text import shortened
+from mauvecl.schema.errors import InputError, shortened
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -354,10 +352,7 @@ def _client(where: str, distributed: Any) -> Iterator[Client]:
             address = scheduler.get("address") if isinstance(scheduler, dict) else None
             if not (isinstance(address, str) and _is_address(address)):
                 raise InputError(
-                    f"scheduler file {shortened(where)} names no address",
-                    "one that Dask wrote",
-                    key="cluster",
-                    value=where,
+                    f"scheduler file {shortened(where)} names no address", "one that Dask wrote", key="cluster"
                 )
             how = {"scheduler_file": where}
         else:

@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 
 from mauvecl.detection.requests import DetectRequest, RealiseRequest, Shard, SnrRequest
 from mauvecl.detection.snr import Arrays, DetectionSums, SnrSums
-from mauvecl.device.engine import DeviceError, DeviceRecord, Engine
-from mauvecl.device.stare_engine import Stares
-from mauvecl.device.tiles import Progress
+from mauvecl.device.engine import DeviceError, DeviceRecord, Engine, Stares
+from mauvecl.device.launches import Progress
 from mauvecl.flares.stare_scene import StaresRequest, StareSums
-from mauvecl.runs.shards import Task, fingerprint, shards
+from mauvecl.runs.checkpoint import Checkpoint, Task, fingerprint, shards
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range
@@ -29,7 +28,6 @@ if TYPE_CHECKING:
     from mauvecl.detection.detection import Detection
     from mauvecl.detection.snr import SnrResult
     from mauvecl.host.exposure.expectation import Expectation
-    from mauvecl.runs.checkpoint import Checkpoint
 
 #: Number of attempts at a shard before the run fails.
 MAX_TRIES = 3

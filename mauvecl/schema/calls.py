@@ -1,24 +1,213 @@
-"""Validation of the arguments of public functions against their annotations."""
+"""Validation of the arguments of public functions by their annotations.
+
+Checks are stricter than pydantic's own: text, True and NaN are no numbers. They know what astronomers pass: NumPy's
+scalars and arrays, Quantities, and whole numbers such as 1e5. Objects are checked by `isinstance`, never copied.
+"""
 
 from __future__ import annotations
 
-import ast
+import builtins
 import inspect
-import re
+import operator
+import os
 import sys
-from collections.abc import Callable
-from contextlib import suppress
-from functools import cache, wraps
+from collections import ChainMap
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from functools import cache, partial, wraps
 from itertools import chain, repeat
-from textwrap import dedent
-from types import CodeType
-from typing import Any, TypeVar, cast
+from pathlib import Path
+from pkgutil import resolve_name
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_origin
 
-from pydantic_core import ValidationError
+from pydantic_core import CoreSchema, PydanticCustomError, SchemaValidator, ValidationError, core_schema
 
-from mauvecl.schema.core_schemas import ALTERNATIVE, validator
-from mauvecl.schema.errors import InputError
-from mauvecl.schema.text import shown
+from mauvecl.schema.errors import InputError, shown
+from mauvecl.schema.fields import is_quantity, without_unit
+
+#: Place of an error inside an alternative of a union.
+ALTERNATIVE = "|"
+#: Annotations of containers whose items are validated one by one; functions receive a tuple.
+SEQUENCES = (tuple, Sequence, Collection, Iterable)
+
+
+@cache
+def validator(hint: Any) -> SchemaValidator:
+    """Return the validator of an annotation."""
+    return SchemaValidator(schema_of(hint))
+
+
+def schema_of(hint: Any) -> CoreSchema:
+    """Return the core schema of an annotation; raises TypeError if it has none, so that no argument goes unchecked."""
+    origin, args = _origin(hint), get_args(hint)
+    if origin is Annotated:
+        schema = schema_of(args[0])
+        for metadata in args[1:]:
+            schema = metadata.__get_pydantic_core_schema__(args[0], lambda _, inner=schema: inner)
+        return schema
+    if origin in (Union, UnionType) and NoneType in args:
+        others = tuple(one for one in args if one is not NoneType)
+        return core_schema.nullable_schema(schema_of(Union[others]))  # noqa: UP007
+    if numpy := sys.modules.get("numpy"):
+        if hint == numpy.typing.ArrayLike:
+            return _leaf(_array, "numbers")
+        if origin is numpy.ndarray:
+            return _leaf(_real_array, "an array of numbers")
+    if origin in (Union, UnionType):
+        choices: Any = [(schema_of(one), ALTERNATIVE) for one in args]
+        return core_schema.union_schema(choices, mode="left_to_right")
+    if origin is Literal:
+        return core_schema.literal_schema(list(args))
+    if origin in LEAVES:
+        return _leaf(*LEAVES[origin])
+    if origin in SEQUENCES or origin is list:
+        return _sequence(origin, args)
+    if origin in (dict, Mapping):
+        keys, values = map(schema_of, args)
+        return core_schema.no_info_before_validator_function(_mapping, core_schema.dict_schema(keys, values))
+    if origin in (Any, object):
+        return core_schema.any_schema()
+    if inspect.isclass(origin):
+        return _instance(origin)
+    raise TypeError(f"arguments of the type {hint} cannot be validated")
+
+
+def _leaf(take: Callable[[Any], Any], words: str) -> CoreSchema:
+    """Return the schema of a function's argument, whose errors state the accepted values."""
+    schema = core_schema.no_info_plain_validator_function(take)
+    return core_schema.custom_error_schema(schema, "expected", custom_error_message=f"Input should be {words}")
+
+
+def _number(value: Any) -> float:
+    if type(value) not in (float, int):
+        value = without_unit(value, "") if is_quantity(value) else value
+        _require(not getattr(value, "ndim", 0) and _kind(value) in tuple("iuf"))
+    try:
+        plain = float(value)
+    except OverflowError as error:
+        raise ValueError from error
+    # NaN differs from itself.
+    _require(plain == plain)
+    return plain
+
+
+def _whole(value: Any) -> int:
+    if is_quantity(value):
+        value = without_unit(value, "")
+    _require(not _is_truth(value) and not getattr(value, "ndim", 0))
+    try:
+        return operator.index(value)
+    except TypeError:
+        _require(isinstance(value, float) or _kind(value) == "f")
+        _require(float(value).is_integer())
+        return int(value)
+
+
+def _truth(value: Any) -> bool:
+    _require(_is_truth(value))
+    return bool(value)
+
+
+def _text(value: Any) -> Any:
+    _require(isinstance(value, str))
+    return value
+
+
+def _path(value: Any) -> Any:
+    _require(isinstance(value, str | os.PathLike))
+    return value
+
+
+def _function(value: Any) -> Any:
+    _require(callable(value))
+    return value
+
+
+def _array(value: Any) -> Any:
+    if is_quantity(value):
+        return without_unit(value, "")
+    _require(_kind(value) in tuple("iufb"))
+    return value
+
+
+def _real_array(value: Any) -> Any:
+    _require(bool(getattr(value, "ndim", isinstance(value, list | tuple))))
+    return _array(value)
+
+
+def _items(value: Any, size: int | None = None) -> Any:
+    one = isinstance(value, str | bytes | Mapping) or not isinstance(value, Iterable) or getattr(value, "ndim", 1) == 0
+    items = () if one else tuple(value)
+    if one or size not in (None, len(items)):
+        raise PydanticCustomError("expected", f"Input should be a sequence{'' if size is None else f' of {size}'}")
+    return items
+
+
+def _mapping(value: Any) -> Any:
+    if not isinstance(value, Mapping):
+        raise PydanticCustomError("expected", "Input should be a dictionary")
+    return value
+
+
+#: Annotations of single values: what takes one, and what an error calls it.
+LEAVES: dict[Any, tuple[Callable[[Any], Any], str]] = {
+    float: (_number, "a number"),
+    int: (_whole, "a whole number"),
+    bool: (_truth, "true or false"),
+    str: (_text, "text"),
+    Path: (_path, "a path"),
+    Callable: (_function, "a function"),
+}
+
+
+def _sequence(origin: Any, args: tuple[Any, ...]) -> CoreSchema:
+    items = [schema_of(one) for one in args if one is not ...]
+    if origin is list:
+        return core_schema.no_info_before_validator_function(_items, core_schema.list_schema(items[0]))
+    if origin is tuple and ... not in args:
+        schema = core_schema.tuple_positional_schema(items)
+        return core_schema.no_info_before_validator_function(partial(_items, size=len(items)), schema)
+    return core_schema.no_info_before_validator_function(_items, core_schema.tuple_variable_schema(items[0]))
+
+
+def _instance(kind: type) -> CoreSchema:
+    if getattr(kind, "_is_protocol", False):
+        # Methods of a protocol are checked when they are called.
+        return core_schema.any_schema()
+    article = "an" if kind.__name__[0] in "AEIOU" else "a"
+    return core_schema.custom_error_schema(
+        core_schema.is_instance_schema(kind),
+        "expected",
+        custom_error_message=f"Input should be {article} {kind.__name__}",
+    )
+
+
+def _origin(hint: Any) -> Any:
+    """Return the class of an annotation without its arguments; NumPy 2.5 defines its own by `type` statements."""
+    origin = get_origin(hint) or hint
+    return _origin(origin.__value__) if hasattr(origin, "__value__") else origin
+
+
+def _kind(value: Any) -> str:
+    """Return NumPy's letter for the type of a number or array, without reading arrays on a disk."""
+    if type(value) is int:
+        return "i"
+    if not hasattr(value, "dtype"):
+        import numpy as np
+
+        value = np.asarray(value)
+    return str(getattr(value.dtype, "kind", ""))
+
+
+def _is_truth(value: Any) -> bool:
+    # NumPy's own type has this name as well, and need not be loaded.
+    return type(value).__name__ in ("bool", "bool_")
+
+
+def _require(condition: bool) -> None:
+    if not condition:
+        raise ValueError
+
 
 Public = TypeVar("Public", bound=Callable[..., Any])
 
@@ -26,7 +215,7 @@ Public = TypeVar("Public", bound=Callable[..., Any])
 def validated(thing: Public) -> Public:
     """Validate the arguments of a function, or of a class's constructor and public methods, when they are called.
 
-    Arguments are checked against the annotations; `core_schemas` and `fields.Unit` state what is converted. Defaults
+    Arguments are checked against the annotations; `schema_of` and `fields.Unit` state what is converted. Defaults
     are not checked. A wrong argument raises InputError.
     """
     if not inspect.isclass(thing):
@@ -83,13 +272,8 @@ class _Parameter:
             raise _input_error(self.name, error) from None
 
     def annotation(self) -> Any:
-        """Return the resolved annotation; names that modules import for type checkers only are imported now."""
-        if not isinstance(self.text, str):
-            return self.text
-        for module in self.modules:
-            with suppress(NameError):
-                return eval(self.text, module, _TypeCheckingNames(module))
-        raise TypeError(f"the annotation {self.text} of {self.name} names nothing known")
+        """Return the resolved annotation."""
+        return eval(self.text, {}, _Names(*self.modules)) if isinstance(self.text, str) else self.text
 
 
 def _input_error(name: str, error: ValidationError) -> InputError:
@@ -101,33 +285,24 @@ def _input_error(name: str, error: ValidationError) -> InputError:
     place, first = max(faults, key=lambda one: len(one[0]))
     expected = dict.fromkeys(fault["msg"].removeprefix("Input should be ") for at, fault in faults if at == place)
     where = name + "".join(f"[{part!r}]" for part in place if part != "[key]")
-    return InputError(f"{where} = {shown(first['input'])}", " or ".join(expected), key=name, value=first["input"])
+    return InputError(f"{where} = {shown(first['input'])}", " or ".join(expected), key=name)
 
 
-class _TypeCheckingNames(dict[str, Any]):
-    """Names that a module defines in its block `if TYPE_CHECKING`; each is defined when it is looked up."""
+#: Types of other packages that modules import for type checkers only.
+FOREIGN = {
+    "ArrayLike": "numpy.typing:ArrayLike",
+    "NDArray": "numpy.typing:NDArray",
+    "SkyCoord": "astropy.coordinates:SkyCoord",
+    "Time": "astropy.time:Time",
+    "np": "numpy",
+    "u": "astropy.units",
+}
 
-    def __init__(self, module: dict[str, Any]) -> None:
-        super().__init__()
-        self.module = module
+
+class _Names(ChainMap[str, Any]):
+    """Names of modules; further types are those of `FOREIGN` and the public ones of mauvecl."""
 
     def __missing__(self, name: str) -> Any:
-        if name in self.module:
+        if hasattr(builtins, name):
             raise KeyError(name)
-        exec(_type_checking_statements(self.module["__name__"])[name], self.module, self)
-        return self[name]
-
-
-@cache
-def _type_checking_statements(module: str) -> dict[str, CodeType]:
-    """Return the statement that defines each name of a module's block `if TYPE_CHECKING`."""
-    source = inspect.getsource(sys.modules[module])
-    block = re.search(r"^if TYPE_CHECKING:\n((?: .*\n|\n)+)", source, re.MULTILINE)
-    statements: dict[str, CodeType] = {}
-    for statement in ast.parse(dedent(block[1])).body if block else ():
-        code = compile(ast.Module([statement], []), module, "exec")
-        if isinstance(statement, ast.Import | ast.ImportFrom):
-            statements |= {one.asname or one.name: code for one in statement.names}
-        elif isinstance(statement, ast.Assign):
-            statements |= {one.id: code for one in statement.targets if isinstance(one, ast.Name)}
-    return statements
+        return resolve_name(FOREIGN.get(name, f"mauvecl:{name}"))

@@ -1,10 +1,61 @@
-"""Exception for bad input."""
+"""Errors for invalid input, messages of answers, and text in them."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
-from mauvecl.schema.text import shown
+
+class Message(str):
+    """A sentence with its kind."""
+
+    __slots__ = ("kind",)
+    kind: str  # what the sentence is about, such as "saturated" or "wrong sign"; programs compare it, not the sentence
+
+    def __new__(cls, text: str, kind: str = "") -> Message:
+        """Make a message from its sentence and its kind."""
+        self = super().__new__(cls, text)
+        self.kind = kind
+        return self
+
+    def __getnewargs__(self) -> tuple[str, str]:  # type: ignore[override]
+        """Return the arguments of the constructor, for pickle."""
+        return str(self), self.kind
+
+    def about(self, what: str) -> Message:
+        """Return the message with its subject in parentheses at its end."""
+        return Message(f"{self[:-1]} ({what}).", self.kind)
+
+
+def of_kind(messages: Iterable[str], kind: str) -> list[str]:
+    """Return the messages of a kind."""
+    return [one for one in messages if isinstance(one, Message) and one.kind == kind]
+
+
+def shortened(text: str, most: int = 80) -> str:
+    """Return foreign text for a message: quoted, on one line, of bounded length."""
+    return repr(text if len(text) <= most else f"{text[: most - 23]}...{text[-20:]}")
+
+
+def shown(value: Any, most: int = 80) -> str:
+    """Return any value for a message, however large or deep."""
+    if hasattr(value, "unit"):
+        return printable(str(value), most)
+    if hasattr(value, "dtype") and getattr(value, "ndim", 1) == 0:
+        # NumPy's numbers print their type as well.
+        value = value.item()
+    try:
+        return printable(" ".join(repr(value).split()) if hasattr(value, "dtype") else repr(value), most)
+    except (ValueError, RecursionError):
+        # Python does not print integers of more than some thousand digits.
+        return f"a value of the type {type(value).__name__}"
+
+
+def printable(text: str, most: int) -> str:
+    """Return text on one line, of bounded length, in printable characters."""
+    if len(text) > most:
+        text = f"{text[: most - 23]}...{text[-20:]}"
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 class InputError(ValueError):
@@ -22,24 +73,18 @@ class InputError(ValueError):
         What is accepted; ends the sentence.
     key : str, optional
         The parameter, or the key of a study such as ``run.fap``.
-    value : object, optional
-        The value of the key.
 
     Attributes
     ----------
     key : str or None
         The parameter, or the key of a study such as ``run.fap``; None for a fault that is not in one value.
-    value : object
-        As it was given, or as the message shows it.
     expected : str or None
         What is accepted.
     """
 
-    def __init__(
-        self, fault: str = "", expected: str | None = None, *, key: str | None = None, value: Any = None
-    ) -> None:
+    def __init__(self, fault: str = "", expected: str | None = None, *, key: str | None = None) -> None:
         super().__init__(f"{fault}, expected {expected}" if expected else fault)
-        self.key, self.value, self.expected = key, value, expected
+        self.key, self.expected = key, expected
 
     def within(self, place: str) -> InputError:
         """Return the same error with a place before its sentence, such as the name of a file."""
@@ -63,11 +108,11 @@ class InputError(ValueError):
             File or section that holds the value.
         """
         place, after = f"{where}: " if where else "", f" {unit}" if unit else ""
-        return cls(f"{place}{key} = {shown(value)}{after}", expected, key=key.replace(" ", "_"), value=value)
+        return cls(f"{place}{key} = {shown(value)}{after}", expected, key=key.replace(" ", "_"))
 
 
-def reworded(error: InputError, sentence: str) -> InputError:
-    """Return the same error with another sentence."""
-    found = InputError(sentence, key=error.key, value=error.value)
+def reworded(error: InputError, sentence: str, key: str | None = None) -> InputError:
+    """Return the same error with another sentence and, if given, another key."""
+    found = InputError(sentence, key=key or error.key)
     found.expected = error.expected
     return found

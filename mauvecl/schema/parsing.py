@@ -6,14 +6,13 @@ from collections.abc import Callable, Sequence
 from decimal import Decimal, InvalidOperation
 from typing import Any
 
-from mauvecl.schema.errors import InputError
-from mauvecl.schema.text import shortened
+from mauvecl.schema.errors import InputError, shortened
 
 
 def refusal(name: str, text: str, expected: str, more: str = "") -> InputError:
     """Return the error of a value's text; its key is the parameter that a flag sets, or else the value's name."""
     parameter = name.split()[0].strip("-").replace("-", "_")
-    return InputError(f"{name} {shortened(text)}{more}", expected, key=parameter, value=text)
+    return InputError(f"{name} {shortened(text)}{more}", expected, key=parameter)
 
 
 def number(text: str, name: str) -> float:

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import optimize, stats
 
 from mauvecl.detection.distributions import Interval, central_counts, clopper_pearson, smallest_integer
-from mauvecl.flares.defaults import HALF_WIDTHS_S as BANK_S
 from mauvecl.flares.energies import EnergyScale, PowerLaw, Rates
+from mauvecl.flares.settings import HALF_WIDTHS_S as BANK_S
 from mauvecl.flares.shapes import Shape, consecutive_integrals, shape_of
 from mauvecl.host.exposure.expectation import Expectation
 from mauvecl.schema.calls import validated
@@ -85,7 +85,7 @@ class Completeness:
         if energy.ndim != 1 or energy.shape != p.shape or energy.size < 2:
             raise InputError.of("probability", p.size, f"one for each of {energy.size} energies, at least 2")
         if not ((energy > 0).all() and (np.diff(energy) > 0).all() and np.isfinite(energy).all()):
-            raise InputError("energies of a completeness do not ascend", "ascending ones above 0", key="energy_erg")
+            raise InputError("the energies of a completeness must be above 0 and ascend", key="energy_erg")
         if not ((p >= 0) & (p <= 1)).all():
             raise InputError.of("probability", (float(p.min()), float(p.max())), "0 to 1")
 
@@ -428,9 +428,7 @@ def fit_power_law(
     """
     logs = np.log10(np.asarray(energy_erg, np.float64))
     if logs.size < 3 or not np.isfinite(logs).all():
-        raise InputError(
-            f"energy_erg has {logs.size} flares", "at least 3 with energies above 0", key="energy_erg", value=logs.size
-        )
+        raise InputError(f"energy_erg has {logs.size} flares", "at least 3 with energies above 0", key="energy_erg")
     pivot = float(np.median(logs))
     x = np.linspace(*completeness.decades, GRID)
     step = float(x[1] - x[0])

@@ -90,7 +90,6 @@ class CountedRate:
                 f"{rate:g} false alarms per star-day occur in {alarmed * n:.3g} of {n} simulated stares",
                 f"at least {MIN_ALARMS} with an alarm and as many without",
                 key="false_alarms",
-                value=rate,
             )
         low, high = central_counts(n, 1 - alarmed)
         ranks = np.clip([round(n * (1 - alarmed)), low, high], 0, n - 1)
@@ -363,7 +362,6 @@ class SampledRate:
                 f"at least {least:.2g}: what is unknown of the stare moves the level in ways that the "
                 "search does not marginalise over (see search.cycle, slope, offset and window_s)",
                 key="false_alarms",
-                value=rate,
             )
         low, high = self._ends
         goal = np.log(rate)
@@ -373,7 +371,6 @@ class SampledRate:
                 f"{rate:g} false alarms per star-day",
                 f"{ends[0]:.2g} to {ends[1]:.2g} for importance sampling of stares of {self.days:.3g} star-days",
                 key="false_alarms",
-                value=rate,
             )
         value = float(brentq(lambda u: self.log_rate(u)[0] - goal, low, high, xtol=1e-6))
         # The rate falls by about a factor exp(-u) per unit of u.

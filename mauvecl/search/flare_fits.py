@@ -564,6 +564,13 @@ class SingleFlareFit:
             weighted = three * weight[:, :, None]
             return np.einsum("nti,ntj->nij", weighted, three), np.einsum("nti,ntk->nik", weighted, y)
 
+        return self._climbed(inner_products, peak, log_width)
+
+    def _climbed(
+        self, inner_products: Callable[[Float, Float], tuple[Float, Float]], peak: Float, log_width: Float
+    ) -> FittedFlares:
+        """Climb to the largest gains from starting points, by damped Newton steps (Marquardt 1963)."""
+        n = peak.size
         products = inner_products(peak, log_width)
         log_kelvin, amplitude, gain = self._brightest(products)
         damping = np.full(n, DAMPING)

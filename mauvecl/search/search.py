@@ -93,7 +93,9 @@ class Search:
         if abs(stare.frame_s - bank.frame_s) > 1e-9 * bank.frame_s:
             raise InputError.of("frame_s", stare.frame_s, f"{bank.frame_s:g} s, as in the bank", unit="s")
         if bank.baseline.cycle != (curves is not None and len(curves) > 0):
-            raise InputError("only one of curves and level.cycle is given", "both or neither", key="curves")
+            raise InputError(
+                "curves and level.cycle must be given both or not at all, but only one is given", key="curves"
+            )
         self.bank, self.stare = bank, stare
         self._first = int(stare.numbers[0])
         self._at = stare.numbers - self._first
@@ -104,7 +106,7 @@ class Search:
         for curve in np.zeros((0, stare.n_frames)) if curves is None else curves:
             scale = float(np.std(curve))
             if not scale > 0:
-                raise InputError("a baseline curve is constant over the stare", "one that varies", key="curves")
+                raise InputError("a baseline curve must vary over the stare, but is constant", key="curves")
             series.append((curve - np.mean(curve)) / scale)
         # Terms of the baseline: a power of time in the window, and the index of a series in the stare.
         self._terms = [(power, 0) for power in bank.baseline.powers] + [(0, 1 + k) for k in range(len(series) - 1)]
@@ -206,10 +208,7 @@ class Search:
         expected = (self.stare.n_frames, self.bank.directions.shape[1])
         if sums.ndim != 3 or sums.shape[1:] != expected:
             raise InputError(
-                f"sums have the shape {sums.shape}",
-                f"(n_stare, {expected[0]}, {expected[1]})",
-                key="sums",
-                value=sums.shape,
+                f"sums have the shape {sums.shape}", f"(n_stare, {expected[0]}, {expected[1]})", key="sums"
             )
         return sums
 

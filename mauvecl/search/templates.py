@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from mauvecl.detection.nuisances import Nuisances, join_names
 from mauvecl.fits.flare_model import MeanSums
-from mauvecl.flares.defaults import RANK, WINDOW_S
+from mauvecl.flares.settings import RANK, WINDOW_S
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
@@ -263,7 +263,6 @@ class Templates:
                 f"a flare cannot be distinguished from {names} in one frame",
                 "fewer nuisance parameters",
                 key="nuisances",
-                value=names,
             )
         length = np.sqrt(power)
         values, vectors = np.linalg.eigh(gram / np.outer(length, length))

@@ -1,18 +1,23 @@
-"""Cases of a study: what answers need of each star at each combination of sweep values, computed on first use."""
+"""Cases of a study: each star at each combination of swept values, with its labels, messages and assumptions."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
-from mauvecl.study.labels import label
-from mauvecl.study.questions import Sweep
+import numpy as np
+
+from mauvecl.noise.drawing import Cumulants, stack_is_exact
+from mauvecl.noise.unknowns import COURSES, PROCESSES, STARE_PROCESSES
+from mauvecl.schema.columns import Column, percent, short
+from mauvecl.schema.errors import Message, of_kind
+from mauvecl.study.questions import QUANTITIES, Sweep
+from mauvecl.study.sections import Star
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
     from mauvecl.detection.nuisances import Nuisances
@@ -26,8 +31,168 @@ if TYPE_CHECKING:
     from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.host.stars.source import Source
     from mauvecl.noise.processes import Processes
-    from mauvecl.study.sections import Observation, SkyLight, Star
+    from mauvecl.study.sections import Observation, SkyLight
     from mauvecl.study.study import Study
+
+#: Parts of a study that answers use.
+Use = Literal["instrument", "sky", "flare", "orbit", "processes", "nuisances", "stare", "values", "templates", "seed"]
+#: Parts that hold unknowns: processes of draws, nuisance parameters of statistics, changes during a stare, and
+#: instrument values that are averaged over.
+UNKNOWN_USES: tuple[Use, ...] = ("processes", "nuisances", "stare", "values")
+#: Known changes during a stare.
+KNOWN_CHANGES = ("thermal", "variability", "throughput", "sky")
+
+
+def assumption_line(study: Study, uses: Collection[Use], varied: Collection[str] = ()) -> str:
+    """Return one line with the assumptions of a study about the parts that an answer uses.
+
+    Parameters
+    ----------
+    uses : collection of str
+        Parts of the study; see `Use`.
+    varied : collection of str
+        Quantities that the answer varies in addition to those that the study sweeps.
+    """
+    swept = {axis.quantity for axis in study.sweep.axes} | set(varied)
+    words: dict[str, Callable[[], str]] = {
+        "instrument": lambda: _instrument(study, swept),
+        "sky": lambda: _sky(study, swept),
+        "flare": lambda: _flare(study, swept),
+        "orbit": lambda: _orbit(study),
+        "unknowns": lambda: _unknowns(study, uses),
+        "templates": lambda: f"flares of the shape {study.search.shape}; noise as measured",
+        "seed": lambda: f"seed {study.run.seed}",
+    }
+    stated = {*uses, *(("unknowns",) if {*UNKNOWN_USES} & {*uses} else ())}
+    unused = unused_unknowns(study, uses)
+    ignored = [f"not used: {', '.join(unused)}"] if unused else []
+    return f"Assumed: {'; '.join([*(words[use]() for use in words if use in stated), *ignored])}."
+
+
+def _instrument(study: Study, swept: set[str]) -> str:
+    o = study.observation
+    text = f"instrument {o.instrument}"
+    if o.changes:
+        text += f" with another {', '.join(o.changes)}"
+    if "detector_temperature" in swept:
+        return f"{text}, detector temperature as swept"
+    return f"{text}, detector at {study.observation.load_instrument().temperature_c:g} deg C"
+
+
+def _sky(study: Study, swept: set[str]) -> str:
+    sky = study.sky
+    if "sky" in swept:
+        return "sky as swept"
+    if sky.none:
+        return "no sky"
+    if sky.target is not None:
+        return f"sky at {sky.target}, {sky.time} UTC"
+    return f"sky of V = {sky.surface_brightness:g} mag/arcsec2"
+
+
+def _flare(study: Study, swept: set[str]) -> str:
+    f, replaces = study.flare, "replacing photosphere"
+    temperature = "of swept temperature" if "flare_temperature" in swept else f"of {f.light().describe()}"
+    if f.geometry == "replaces" and f.photosphere_temperature_k is not None:
+        replaces += f" of {f.photosphere_temperature_k:g} K"
+    geometry = "added to the star" if f.geometry == "added" else replaces
+    size = "as bright as observed" if f.spectrum.as_observed else f"amplitudes in the {f.band} band"
+    return f"flares {temperature}, {geometry}, {size}"
+
+
+def _orbit(study: Study) -> str:
+    limits = study.orbit.limits
+    kept = [
+        f"{name} {value:g} deg"
+        for name, value in (
+            ("Earth's limb", limits.earth_limb_deg),
+            ("Sun", limits.sun_deg),
+            ("Moon", limits.moon_deg),
+        )
+        if value is not None
+    ]
+    source = "embedded elements" if study.orbit.tle is None else study.orbit.tle.name
+    return f"orbit of {source}; least angles: {', '.join(kept) or 'none'}"
+
+
+def _unknowns(study: Study, uses: Collection[Use]) -> str:
+    """List the unknowns that an answer draws, marginalises over or averages over."""
+    n, s = study.nuisances, study.stare
+    drawn = [name.replace("_", " ") for name, value in study.processes if value is not None and "processes" in uses]
+    if "stare" in uses:
+        drawn += [name for name in KNOWN_CHANGES if getattr(s, name) is not None]
+        drawn += [f"{course} of {', '.join(of)}" for course in COURSES if (of := getattr(s, course))]
+        drawn += [f"{process.label} (assumed)" for name, process in STARE_PROCESSES.items() if getattr(s, name)]
+    usual = "drawn and marginalised" if {"nuisances", "stare"} & {*uses} else "drawn"
+    parts = [f"the usual unknowns {usual}"] if n.usual else []
+    parts += [f"drawn: {', '.join(drawn)}"] if drawn else []
+    named = [*n.spreads(), *n.own] if "nuisances" in uses else []
+    parts += [f"marginalised: {', '.join(named)}"] if named else []
+    if study.unknowns.draws and "values" in uses:
+        parts.append(f"{study.unknowns.draws} draws of the instrument's unknowns")
+    return "; ".join(parts) or "everything known but the noise"
+
+
+def unused_unknowns(study: Study, uses: Collection[Use]) -> list[str]:
+    """Return the keys of the study's unknowns that an answer ignores."""
+    n, s = study.nuisances, study.stare
+    given: dict[Use, list[str]] = {
+        "processes": [f"processes.{name}" for name, value in study.processes if value is not None],
+        "nuisances": [f"nuisances.{name}" for name in n.spreads()] + [f"nuisances.own.{name}" for name in n.own],
+        "stare": [f"stare.{name}" for name in KNOWN_CHANGES if getattr(s, name) is not None]
+        + [f"stare.{name}" for name in (*COURSES, *STARE_PROCESSES) if getattr(s, name)],
+        "values": ["unknowns.draws"] if study.unknowns.draws else [],
+    }
+    # Verbs of an orbit look at targets, not at the study's star.
+    observes = "instrument" in uses and "orbit" not in uses
+    near = [] if observes or all(star.neighbours is None for star in study.star) else ["star.neighbours"]
+    usual = ["nuisances.usual"] if n.usual and not {"processes", "stare"} & {*uses} else []
+    return [key for use, keys in given.items() if use not in uses for key in keys] + usual + near
+
+
+def label(star: Star, x: Expectation) -> str:
+    """Return a star's name and magnitude, for tables and plots."""
+    name = star.library or x.name
+    system = {"catalogue": "", "vega": " (Vega = 0)", "ab": " (AB)"}[star.magnitude_system]
+    return name if star.magnitude is None else f"{name} {star.band} = {star.magnitude:g}{system}"
+
+
+def place_columns(sweep: Sweep, *own: str, star: str = "label") -> tuple[Column, ...]:
+    """Return the columns of the star and of the swept quantities, for rows with the values `at` a cell of the sweep.
+
+    `own` names quantities for which a table has separate columns, and `star` the attribute with the star's label.
+    """
+    return (
+        star_column(star),
+        *(quantity_column(axis.quantity) for axis in sweep.axes if axis.quantity not in own),
+    )
+
+
+def star_column(get: str = "star") -> Column:
+    """Return the column of a star's label."""
+    return Column("star", get, description=QUANTITIES["star"].description, heading="star", kind=str)
+
+
+def quantity_column(name: str, get: str | Callable[[Any], Any] = "", description: str = "") -> Column:
+    """Return the column of a quantity, by default of its value `at` a cell of the sweep."""
+    quantity, cell = QUANTITIES[name], Column("at")
+    get = get or (lambda row: cell.value(row)[name])
+    return Column(name, get, quantity.unit, description or quantity.description, name, short)
+
+
+def amplitude_column(get: str | Callable[[Any], Any] = "amplitude", description: str = "") -> Column:
+    """Return the column of a flare's amplitude, which people read in per cent."""
+    return replace(quantity_column("amplitude", get, description), heading="flare", format=percent("g"))
+
+
+def full_label(name: str, at: Mapping[str, float | str]) -> str:
+    """Return a star's label with the swept values that the label does not contain, for plots."""
+    parts = [
+        f"{quantity.replace('_', ' ')} {value:g}{QUANTITIES[quantity].suffix}"
+        for quantity, value in at.items()
+        if quantity not in ("magnitude", "star") and not isinstance(value, str)
+    ]
+    return ", ".join([name, *parts])
 
 
 #: Sections of a study on which no expectation depends.
@@ -267,14 +432,14 @@ class Case:
     @cached_property
     def stare(self) -> Stare:
         """The study's stare."""
-        from mauvecl.study.stare_expectation import stare_of
+        from mauvecl.study.stares import stare_of
 
         return stare_of(self.study, self.instrument)
 
     @cached_property
     def stare_expectation(self) -> StareExpectation:
         """Expectation of the stare at the star, with its flares."""
-        from mauvecl.study.stare_expectation import expect_stare
+        from mauvecl.study.stares import expect_stare
 
         frame = self.one_frame
         return expect_stare(self.stare, self.events, frame.quiet, frame.flare_electrons)
@@ -282,7 +447,7 @@ class Case:
     @cached_property
     def events(self) -> list[Event]:
         """Flares in the stare."""
-        from mauvecl.study.stare_expectation import events_of
+        from mauvecl.study.stares import events_of
 
         return events_of(self.study, self.source)
 
@@ -298,3 +463,82 @@ def cases(study: Study, *, swept: bool = True) -> list[Case]:
         stars = [Case(cell.model_copy(update={"star": (star,)}), values, loader) for star in cell.star]
         found += [case.at_observed_brightness() for case in stars] if cell.flare.spectrum.as_observed else stars
     return found
+
+
+#: Read noise, DN, above which rounding acts like independent noise at any signal: it damps the first harmonic of the
+#: rounding error to exp(-2 pi^2) = 3e-9.
+NOISY_DN = 1.0
+#: Tolerance for the rounding of a prior's limits.
+TINY = 1e-9
+#: Kind of messages on saturation, and their largest number in an answer.
+SATURATED = "saturated"
+MAX_SATURATED = 12
+
+
+def collect_messages(expectations: list[Expectation], processes: Processes | None = None) -> list[str]:
+    """Return the messages of expectations and on the validity of closed forms, in the order of `worst_first`.
+
+    All answers report the saturation of stars and flares through this function.
+    """
+    texts = [message for x in expectations for message in (*_without_light(x), *x.messages, *_coarse(x))]
+    outside = off_centre(expectations, processes) if processes else []
+    return worst_first([*(Message(f"OUTSIDE THE PRIOR: {text}.", "outside the prior") for text in outside), *texts])
+
+
+def off_centre(expectations: list[Expectation], processes: Processes) -> list[str]:
+    """Return a clause for each prior that excludes the value of an expectation."""
+    sentences = []
+    for name, _ in processes.modulations:
+        first, last = getattr(processes, name).quantile(np.array([0.0, 1.0]))
+        values = {PROCESSES[name].expected_in(x.conditions) for x in expectations}
+        outside = sorted(value for value in values if not first - TINY <= value <= last + TINY)
+        if outside:
+            sentences.append(
+                f"{name} is drawn from {first:g} to {last:g}, and the expectation, which is "
+                f"subtracted, has {', '.join(f'{value:g}' for value in outside)}: every exposure differs from it, and "
+                "thresholds hold that difference"
+            )
+    return sentences
+
+
+def _without_light(x: Expectation) -> tuple[str, ...]:
+    """Return the message on an exposure without light of the star, if it has none."""
+    electrons = float(np.sum(x.source_electrons)) * x.n_frames
+    if electrons >= 1.0:
+        return ()
+    return (
+        Message(
+            f"NO LIGHT: {x.name} gives {electrons:.2g} electrons in all {x.wavelength_nm.size} pixels of an exposure "
+            f"of {x.exposure_s:g} s: there is nothing to see of it, and its S/N is 0.",
+            "no light",
+        ),
+    )
+
+
+def worst_first(messages: Iterable[str]) -> list[str]:
+    """Remove duplicates, put messages on saturation first, and summarise these beyond `MAX_SATURATED`."""
+    once = list(dict.fromkeys(messages))
+    saturated = of_kind(once, SATURATED)
+    others = [text for text in once if text not in set(saturated)]
+    rest = len(saturated) - MAX_SATURATED
+    if rest > 0:
+        more = f"SATURATED: pixels of {rest} more stars, flares or exposures of this answer saturate."
+        return [*saturated[:MAX_SATURATED], Message(more, SATURATED), *others]
+    return [*saturated, *others]
+
+
+def _coarse(x: Expectation) -> tuple[str, ...]:
+    """Return the message on pixels for which rounding dominates, if any."""
+    if float(np.min(x.read_noise_dn)) >= NOISY_DN:
+        return ()
+    pixels = int(np.count_nonzero(~stack_is_exact(Cumulants.of(x, 1), x)))
+    if not pixels:
+        return ()
+    return (
+        Message(
+            f"In {pixels} of {x.wavelength_nm.size} pixels of {x.name} a frame has too little noise for its rounding "
+            "to whole DN to be like noise: closed forms treat it as noise and are wrong there; simulations round each "
+            "frame.",
+            "rounding",
+        ),
+    )

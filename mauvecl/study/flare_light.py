@@ -163,28 +163,18 @@ class FlareLight(Section):
     def _one_model(self) -> Self:
         given = [key for key in BLACKBODY_KEYS if getattr(self, key) is not None]
         if self.file is not None and given:
-            raise InputError(f"a flare's spectrum has file and {given[0]}", "one of them", key="file", value=self.file)
+            raise InputError(f"the spectrum of a flare needs either file or {given[0]}, but has both", key="file")
         own = [key for key in FILE_KEYS if getattr(self, key)]
         if self.file is None and own:
-            raise InputError(
-                f"a flare's spectrum has {own[0]} without a file",
-                "both or neither",
-                key=own[0],
-                value=getattr(self, own[0]),
-            )
+            raise InputError(f"the spectrum of a flare has {own[0]}, which needs a file as well", key=own[0])
         if (self.second_temperature_k is None) != (self.second_area is None):
             raise InputError(
-                "a flare's spectrum has only one of second_temperature_k and second_area",
-                "both or neither",
+                "the spectrum of a flare needs both second_temperature_k and second_area, or neither, but has only one",
                 key="second_area",
-                value=self.second_area,
             )
         if self.balmer_jump is not None and self.second_area is not None:
             raise InputError(
-                "a flare's spectrum has balmer_jump and second_area",
-                "one of them",
-                key="balmer_jump",
-                value=self.balmer_jump,
+                "the spectrum of a flare needs either balmer_jump or second_area, but has both", key="balmer_jump"
             )
         if self.file is None and self != FlareLight.model_construct():
             self.at_temperature(10_000.0)
@@ -226,7 +216,6 @@ class FlareLight(Section):
                 f"line_scale = {value} has no effect on a flare without lines",
                 "lines in flare.spectrum.lines",
                 key="line_scale",
-                value=value,
             )
         return type(self)(**(self.model_dump() | {key: value}))
 

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 from pydantic import BeforeValidator, Field, create_model, model_validator
 
 from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, NUISANCES, Amplitude, default_processes
-from mauvecl.schema.errors import InputError
+from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.fields import Flag, Help
 from mauvecl.schema.section import Section
-from mauvecl.schema.text import shortened
 
 if TYPE_CHECKING:
     import numpy as np
@@ -32,9 +31,7 @@ def _spread(given: Any) -> Any:
         value = float("nan")
     if not 0 < value < float("inf"):
         raise InputError(
-            f"the standard deviation of an unknown is {shortened(str(given))}",
-            "a number above 0, or 'free'",
-            value=given,
+            f"the standard deviation of an unknown is {shortened(str(given))}", "a number above 0, or 'free'"
         )
     return value
 
@@ -52,12 +49,7 @@ class OwnNuisance(Section):
     @model_validator(mode="after")
     def _one_spectrum(self) -> Self:
         if (self.file is None) == (self.points is None):
-            raise InputError(
-                "a nuisance spectrum has neither or both of file and points",
-                "one of them",
-                key="points",
-                value=self.points,
-            )
+            raise InputError("a nuisance spectrum needs either file or points, but has neither or both", key="points")
         return self
 
     def spectrum(self, name: str, wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,28 +1,69 @@
-"""Study sections for campaigns, S/N, raw frames, limits, maps and sweeps."""
+"""Study sections of questions: runs, sweeps, maps and limits, and the quantities that they vary."""
 
 from __future__ import annotations
 
 import itertools
 import math
-from typing import TYPE_CHECKING, Annotated, Literal, Self
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
 from mauvecl.schema import parsing
-from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Flag, Help, Range, Slider, Widget
+from mauvecl.schema.errors import InputError, shown
+from mauvecl.schema.fields import Flag, Help, Quantity, Range, Slider, Unit, Widget, checked_number, first
 from mauvecl.schema.physical import Positive, Probability, Wavelength
-from mauvecl.schema.section import Section
-from mauvecl.study.quantities import QUANTITIES
-
-#: Magnitudes and exposures of the default sweep of `gaussian`.
-MAGNITUDES, EXPOSURES_S = (4.0, 6.0, 8.0, 10.0, 12.0), (5.0, 50.0, 600.0)
+from mauvecl.schema.section import Section, fields_of
+from mauvecl.study.sections import Flare, Observation, SkyLight, Star
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from mauvecl.study.stare_section import EventChoice, StareQuestion
+    from mauvecl.study.stare import EventChoice, StareQuestion
 
+
+@dataclass(frozen=True)
+class StudyQuantity(Quantity):
+    """Quantity of a study, with the unit and range of its field."""
+
+    path: tuple[str, ...]  # sections and key
+    unit: str  # in astropy's notation; empty if dimensionless
+    range: Range
+    is_name: bool  # names instead of numbers
+
+    def checked(self, value: Any) -> float | str:
+        """Return a value in the unit of the quantity; raises InputError if it is outside of the range."""
+        return value if self.is_name else checked_number(self.name.replace("_", " "), value, self.unit, self.range)
+
+    @property
+    def suffix(self) -> str:
+        """Unit that follows a value in a title."""
+        return f" {Unit(self.unit).written}" if self.unit else ""
+
+
+QUANTITIES = {
+    one.name: StudyQuantity(
+        one.name,
+        one.description,
+        one.label,
+        path,
+        unit=(first(field, Unit) or Unit("")).name,
+        range=first(field, Range) or Range(),
+        is_name=first(field, Range) is None,
+    )
+    for name, section in (("star", Star), ("flare", Flare), ("observation", Observation), ("sky", SkyLight))
+    for path, field in fields_of(section, (name,))
+    if (one := first(field, Quantity)) is not None
+}
+#: Units of the quantities that have one.
+UNITS = {name: quantity.unit for name, quantity in QUANTITIES.items() if quantity.unit}
+
+
+#: Magnitudes and exposures of the default sweep of `gaussian`.
+MAGNITUDES, EXPOSURES_S = (4.0, 6.0, 8.0, 10.0, 12.0), (5.0, 50.0, 600.0)
+
+
+if TYPE_CHECKING:
     QuantityName = str
 else:
     QuantityName = Literal[tuple(QUANTITIES)]
@@ -46,12 +87,12 @@ class CampaignQuestion(Section):
     ] = None
     fap: Annotated[
         Probability | None,
-        Help("Wanted probability of any false alarm in the search", "shows what a test may have"),
+        Help("Wanted probability of any false alarm in the search", "shows what each test may have"),
         Flag("--campaign-fap"),
     ] = None
     alarms: Annotated[
         Positive | None,
-        Help("Wanted number of false alarms in the search", "shows what a test may have"),
+        Help("Wanted number of false alarms in the search", "shows what each test may have"),
         Flag("--campaign-alarms"),
     ] = None
 
@@ -60,10 +101,7 @@ class CampaignQuestion(Section):
         given = next((name for name in ("step", "fap", "alarms") if getattr(self, name) is not None), None)
         if given is not None and self.frames is None:
             raise InputError(
-                f"campaign.{given} is given without campaign.frames",
-                "the number of frames that are searched",
-                key=given,
-                value=getattr(self, given),
+                f"campaign.{given} needs campaign.frames, the number of frames that are searched, as well", key=given
             )
         return self
 
@@ -150,26 +188,21 @@ class Axis(Section):
         spaced = (self.start, self.stop, self.steps)
         if (self.values is None) == (None in spaced) or (self.values is not None and spaced != (None, None, None)):
             raise InputError(
-                f"the axis {self.quantity!r} has neither or both of values and start, stop, steps",
-                "one of them",
+                f"the axis {self.quantity!r} needs either values or start, stop and steps, but has neither or both",
                 key="values",
-                value=self.values,
             )
         if self.values is not None and len(self.values) == 0:
-            raise InputError(f"the axis {self.quantity!r} has no values", "some", key="values", value=self.values)
+            raise InputError(f"the axis {self.quantity!r} needs at least one value, but has none", key="values")
         quantity = QUANTITIES[self.quantity]
         for value in self.points():
             if quantity.is_name != isinstance(value, str):
                 expected = "names of the library" if quantity.is_name else "numbers"
-                raise InputError(
-                    f"the axis {self.quantity!r} has the value {value!r}", expected, key="values", value=value
-                )
+                raise InputError(f"the axis {self.quantity!r} has the value {value!r}", expected, key="values")
             if not isinstance(value, str) and value not in quantity.range:
                 raise InputError(
-                    f"the axis {self.quantity!r} reaches {value:g}",
+                    f"the axis {self.quantity!r} reaches {shown(value)}",
                     quantity.range.words(quantity.unit),
                     key="values",
-                    value=value,
                 )
         return self
 
@@ -182,10 +215,9 @@ class Axis(Section):
         assert self.steps is not None
         if self.log and min(self.start, self.stop) <= 0:
             raise InputError(
-                f"the logarithmic axis {self.quantity!r} runs from {self.start:g} to {self.stop:g}",
-                "values above 0",
+                f"the logarithmic axis {self.quantity!r} needs values above 0, but runs from "
+                f"{self.start:g} to {self.stop:g}",
                 key="start",
-                value=(self.start, self.stop),
             )
         share = [i / (self.steps - 1) for i in range(self.steps)]
         if self.log:
@@ -212,7 +244,7 @@ class MapQuestion(Section):
     def _different_axes(self) -> Self:
         if self.x.quantity == self.y.quantity:
             raise InputError(
-                f"both axes of the map are {self.x.quantity!r}", "two quantities", key="y", value=self.y.quantity
+                f"the axes of the map must be two different quantities, but both are {self.x.quantity!r}", key="y"
             )
         return self
 
@@ -244,15 +276,15 @@ class Sweep(Section):
         names = [axis.quantity for axis in self.axes]
         twice = next((name for name in names if names.count(name) > 1), None)
         if twice is not None:
-            raise InputError(f"the sweep has the quantity {twice!r} twice", "different ones", key="axes", value=twice)
+            raise InputError(f"the sweep has the quantity {twice!r} twice, but its quantities must differ", key="axes")
         lengths = {axis.quantity: len(axis.points()) for axis in self.axes}
         if self.how == "list" and len(set(lengths.values())) > 1:
             counts = ", ".join(f"{n} of {name}" for name, n in lengths.items())
-            raise InputError(f"the sweep is a list of {counts}", "equal numbers of values", key="axes", value=counts)
-        if self.size > MAX_CELLS:
             raise InputError(
-                f"the sweep has {self.size} combinations", f"at most {MAX_CELLS}", key="axes", value=self.size
+                f"the sweep is a list, whose axes must have equally many values, but it has {counts}", key="axes"
             )
+        if self.size > MAX_CELLS:
+            raise InputError(f"the sweep has {self.size} combinations", f"at most {MAX_CELLS}", key="axes")
         return self
 
     @property
@@ -291,5 +323,4 @@ def check_sweep(sweep: Sweep, stare: StareQuestion, events: Sequence[EventChoice
                 f"a sweep over {axis.quantity.replace('_', ' ')} changes no flare of this stare",
                 "a quantity that [stare] and [[events]] do not fix",
                 key="sweep",
-                value=axis.quantity,
             )

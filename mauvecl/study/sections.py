@@ -207,23 +207,15 @@ class Star(Section):
     @model_validator(mode="after")
     def _one_spectrum(self) -> Self:
         if (self.library is None) == (self.file is None):
-            raise InputError(
-                "a star has neither or both of library and file", "one of them", key="library", value=self.library
-            )
+            raise InputError("a star needs either library or file, but has neither or both", key="library")
         given = [key for key in FILE_KEYS if getattr(self, key) is not None]
         if self.file is None and given:
             raise InputError(
-                f"a star of the library has {' and '.join(given)}",
-                "a star from a file",
-                key=given[0],
-                value=getattr(self, given[0]),
+                f"a star of the library has {' and '.join(given)}, which only a star from a file may have", key=given[0]
             )
         if self.neighbours is None and self.neighbours_of is not None:
             raise InputError(
-                "a star has neighbours_of without neighbours",
-                "the table of its neighbours as well",
-                key="neighbours_of",
-                value=self.neighbours_of,
+                "a star has neighbours_of, which needs the table of its neighbours as well", key="neighbours_of"
             )
         return self
 
@@ -327,10 +319,9 @@ class Flare(Section):
         """Return a copy with another value; raises InputError for an amplitude of a flare as it was observed."""
         if path[0] == "amplitudes" and self.spectrum.as_observed:
             raise InputError(
-                f"amplitude = {value} has no effect on a flare that is as bright as observed",
-                "flare.spectrum.as_observed = false",
+                f"amplitude = {value} has no effect on a flare that is as bright as observed; it "
+                f"needs flare.spectrum.as_observed = false",
                 key="amplitude",
-                value=value,
             )
         return super().with_value(path, value)
 
@@ -464,13 +455,12 @@ class SkyLight(Section):
     @model_validator(mode="after")
     def _one_sky(self) -> Self:
         if (self.target is None) != (self.time is None):
-            raise InputError("the sky has only one of target and time", "both or neither", key="time", value=self.time)
+            raise InputError("the sky needs both target and time, or neither, but has only one", key="time")
         if (self.surface_brightness is not None) + (self.target is not None) + self.none > 1:
             raise InputError(
                 "the sky is given twice",
                 "one of surface_brightness, target with time, and none",
                 key="surface_brightness",
-                value=self.surface_brightness,
             )
         return self
 
@@ -593,9 +583,7 @@ class Unknowns(create_model("_InstrumentValues", __base__=Section, **_unknown_ke
             raise InputError.of("unknowns.draws", self.draws, "0 or at least 2")
         other = next((name for name in self.known if name not in INSTRUMENT_VALUES), None)
         if other is not None:
-            raise InputError(
-                f"unknowns.known names {other!r}", f"some of {', '.join(INSTRUMENT_VALUES)}", key="known", value=other
-            )
+            raise InputError(f"unknowns.known names {other!r}", f"some of {', '.join(INSTRUMENT_VALUES)}", key="known")
         return self
 
     def priors(self, instrument: Instrument) -> dict[str, Prior]:

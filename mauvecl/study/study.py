@@ -1,32 +1,33 @@
-"""The study: a question as data, read from TOML, changed by flags and converted to expectations."""
+"""Studies: the sections of a TOML file, its text, and the keys of all fields."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import contextlib
+import hashlib
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Self
+from types import UnionType
+from typing import TYPE_CHECKING, Annotated, Any, Self, Union, get_args, get_origin
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, model_validator
 
-from mauvecl.host.files.parsing import possible, read_text, toml
 from mauvecl.host.orbit.observing_limits import Limits
+from mauvecl.host.tables.ecsv import read_ecsv
+from mauvecl.host.tables.files import parsing, possible, read_bytes, read_text, toml, without_columns
 from mauvecl.noise.processes import NONE, Processes
 from mauvecl.noise.unknowns import COURSES
 from mauvecl.schema.calls import validated
-from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import AnyUnit
-from mauvecl.schema.records import input_error
-from mauvecl.schema.section import Section
-from mauvecl.schema.text import shortened
-from mauvecl.study.calibrations import CalibrateQuestion
-from mauvecl.study.changes import ChangeQuestion
-from mauvecl.study.data import DataChoice
+from mauvecl.schema.errors import InputError, shortened
+from mauvecl.schema.fields import AnyUnit, Flag, found
+from mauvecl.schema.section import Section, fields_of, input_error
+from mauvecl.study.analyses import PATHS, CalibrateQuestion, ChangeQuestion, DataChoice, MeasureQuestion
 from mauvecl.study.flare_light import drop_default_spectrum
-from mauvecl.study.measurements import MeasureQuestion
 from mauvecl.study.nuisances import NuisanceChoice
-from mauvecl.study.orbits import OrbitQuestion, PlanQuestion
-from mauvecl.study.quantities import QUANTITIES
+from mauvecl.study.plan import OrbitQuestion, PlanQuestion
 from mauvecl.study.questions import (
+    QUANTITIES,
     Axis,
     BulkQuestion,
     CampaignQuestion,
@@ -35,17 +36,140 @@ from mauvecl.study.questions import (
     SignalQuestion,
     Sweep,
 )
-from mauvecl.study.searches import InjectionQuestion, SearchChoice
 from mauvecl.study.sections import Flare, Observation, Run, SkyLight, Star, Unknowns
-from mauvecl.study.stare_section import EventChoice, StareQuestion
-from mauvecl.study.study_text import (
-    locate_files,
-    parse_toml_value,
-    read_embedded_study,
-    set_key,
-    with_file_digests,
-    with_paths,
-)
+from mauvecl.study.stare import EventChoice, InjectionQuestion, SearchChoice, StareQuestion
+
+if TYPE_CHECKING:
+    from pydantic.fields import FieldInfo
+
+
+def read_embedded_study(path: Path) -> str:
+    """Return the text of the study in an answer's metadata."""
+    study = read_ecsv(path, "study", "an answer's ECSV table").meta.get("study")
+    if not isinstance(study, str):
+        raise InputError(f"{path.name} contains no study", "an answer's ECSV table", key="study")
+    return study
+
+
+def with_paths(data: Any, kind: Any, change: Callable[[Path], Path]) -> Any:
+    """Return data of an annotated type, such as a section, with other paths; invalid data are left unchanged."""
+    parts = get_args(kind)
+    if kind is Path:
+        return str(change(Path(data))) if isinstance(data, str) else data
+    if isinstance(kind, type) and issubclass(kind, BaseModel) and isinstance(data, dict):
+        kinds = {key: field.annotation for key, field in kind.model_fields.items()}
+        return {key: with_paths(value, kinds.get(key), change) for key, value in data.items()}
+    if get_origin(kind) is tuple and isinstance(data, list):
+        return [with_paths(value, parts[0], change) for value in data]
+    if get_origin(kind) is dict and isinstance(data, dict):
+        return {key: with_paths(value, parts[1], change) for key, value in data.items()}
+    if get_origin(kind) in (Union, UnionType):
+        # At most one of the alternatives holds paths.
+        return next((new for part in parts if (new := with_paths(data, part, change)) != data), data)
+    return data
+
+
+def with_file_digests(text: str) -> str:
+    """Replace the paths of files in a study's text by names and digests, not by paths."""
+    import tomli_w
+
+    data = tomllib.loads(text)
+    named = _named_files(data)
+    if not named:
+        return text
+    for section, key in named:
+        place, _ = without_columns(Path(section[key]))
+        section[key] = Path(section[key]).name
+        # Keep the answer even if the file no longer exists.
+        with contextlib.suppress(InputError):
+            section[f"{key}_sha256"] = _digest(place)
+    return tomli_w.dumps(data)
+
+
+def _named_files(data: dict[str, Any]) -> list[tuple[dict[str, Any], str]]:
+    """List the sections of stars, flare, observations and changes that name a file, with the key."""
+    stars, flare = data.get("star"), data.get("flare")
+    sections = [(star, key) for star in (stars if isinstance(stars, list) else []) for key in ("file", "neighbours")]
+    light = flare.get("spectrum") if isinstance(flare, dict) else None
+    sections += [(light, "file"), (light, "quiescent"), (data.get("data"), "file"), (data.get("data"), "mapping")]
+    asked = data.get("calibrate")
+    rows = asked.get("observations") if isinstance(asked, dict) else None
+    sections += [(row, key) for row in (rows if isinstance(rows, list) else []) for key in PATHS]
+    sections += [(data.get("change"), "file")]
+    return [(one, key) for one, key in sections if isinstance(one, dict) and isinstance(one.get(key), str)]
+
+
+def locate_files(data: dict[str, Any], table: Path) -> None:
+    """Locate the files that the study of an answer's table gives by name and digest, in place.
+
+    Searches the table's folder, its parent, the current folder, and the paths in a ``study.toml`` next to the table.
+    Raises InputError if no file with the name and digest is found.
+    """
+    for section, key in _named_files(data):
+        if f"{key}_sha256" not in section:
+            continue
+        name, digest = Path(section[key]).name, section.pop(f"{key}_sha256")
+        places = [table.parent / name, table.parent.parent / name, Path(name), *_beside(table, name)]
+        for place in places:
+            if without_columns(place)[0].is_file() and _digest(without_columns(place)[0]) == digest:
+                section[key] = str(place.resolve())
+                break
+        else:
+            raise InputError(
+                f"{shortened(table.name)}: its file {shortened(name)} with sha256 "
+                f"{shortened(str(digest))} is missing or has changed",
+                "it next to the table",
+                key=key,
+            )
+
+
+def _beside(table: Path, name: str) -> list[Path]:
+    """Return the files of this name in the ``study.toml`` next to a table."""
+    study = table.parent / "study.toml"
+    if not study.is_file():
+        return []
+    data = toml(read_text(study, "study file"), "study file 'study.toml'")
+    files = [section[key] for section, key in _named_files(data)]
+    return [table.parent / file for file in files if Path(file).name == name]
+
+
+def _digest(file: Path) -> str:
+    return hashlib.sha256(read_bytes(file, "spectrum file")).hexdigest()
+
+
+def parse_toml_value(text: str) -> Any:
+    """Parse a TOML value; a bare word is text."""
+    with parsing(f"value {shortened(text)}", "a TOML value"):
+        try:
+            parsed = tomllib.loads(f"value = {text}")
+        except tomllib.TOMLDecodeError:
+            return text
+    # Text of several lines would define several keys.
+    return parsed["value"] if len(parsed) == 1 else text
+
+
+def set_key(data: Any, path: list[str], value: Any, text: str) -> None:
+    """Set a nested key in place; `text` is the setting, for messages."""
+    *parents, last = path
+    for part in parents:
+        if isinstance(data, list | tuple):
+            if part not in (numbers := [str(i) for i in range(len(data))]):
+                raise InputError(
+                    f"setting = {shortened(text)}: no entry {shortened(part)}",
+                    f"0 to {len(numbers) - 1}",
+                    key="setting",
+                )
+            data = data[int(part)]
+        elif isinstance(data, dict):
+            data = data.setdefault(part, {})
+    if not isinstance(data, dict):
+        raise InputError(
+            f"setting = {shortened(text)}: {shortened('.'.join(parents))} is a value",
+            "a section with keys",
+            key="setting",
+        )
+    data[last] = value
+
 
 #: Sections that a study's text leaves out if they have their default values.
 OMITTED = (
@@ -101,10 +225,8 @@ class Study(Section):
         own = [number for number, star in enumerate(self.star) if star.effective_temperature_k is not None]
         if own and self.flare.geometry == "replaces" and self.flare.photosphere_temperature_k is not None:
             raise InputError(
-                f"flare.photosphere_temperature_k and star.{own[0]}.effective_temperature_k are both given",
-                "one of them",
+                f"only one of flare.photosphere_temperature_k and star.{own[0]}.effective_temperature_k may be given",
                 key="flare.photosphere_temperature_k",
-                value=self.flare.photosphere_temperature_k,
             )
         return self
 
@@ -120,7 +242,6 @@ class Study(Section):
                 "at least one key, such as magnitude in [[star]]; a verb without a study file answers "
                 "the paper's question",
                 key="study_file",
-                value=path.name,
             )
         if path.suffix == ".ecsv":
             locate_files(data, path)
@@ -161,7 +282,7 @@ class Study(Section):
         for text in settings:
             path, equals, value = (part.strip() for part in text.partition("="))
             if not (path and equals):
-                raise InputError(f"setting = {text!r}", "key=value, such as run.fap=0.01", key="setting", value=text)
+                raise InputError(f"setting = {text!r}", "key=value, such as run.fap=0.01", key="setting")
             set_key(data, path.split("."), parse_toml_value(value), text)
         return self.build(data, where)
 
@@ -238,10 +359,7 @@ class Study(Section):
         """
         if quantity not in QUANTITIES:
             raise InputError(
-                f"quantity {shortened(str(quantity))!r} is unknown",
-                f"one of {', '.join(QUANTITIES)}",
-                key="quantity",
-                value=quantity,
+                f"quantity {shortened(str(quantity))!r} is unknown", f"one of {', '.join(QUANTITIES)}", key="quantity"
             )
         one = QUANTITIES[quantity]
         return self.with_value(one.path, one.checked(value))
@@ -264,3 +382,15 @@ PAPER_BUDGETS = Study(
     run=Run(realisations=100_000),
     sweep=Sweep(axes=(Axis(quantity="exposure", values=(50.0, 600.0)),)),
 )
+
+
+@cache
+def study_keys() -> Mapping[str, FieldInfo]:
+    """Return the field of every key of a study, by its path, as in ``run.fap``."""
+    return {".".join(path): field for path, field in fields_of(Study)}
+
+
+@cache
+def keys_with_flags() -> tuple[tuple[str, FieldInfo, Flag], ...]:
+    """Return key, field and metadata of every flag of a study."""
+    return tuple((key, field, flag) for key, field in study_keys().items() for flag in found(field, Flag))

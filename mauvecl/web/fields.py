@@ -1,24 +1,27 @@
-"""Fields of the page: labels, defaults and parsers."""
+"""Fields of the page, and messages in their words."""
 
 from __future__ import annotations
 
 import datetime
 import itertools
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple, get_args, get_origin
+from functools import cache
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args, get_origin
 
 from pydantic.fields import FieldInfo
 
 from mauvecl.detection.requests import STATISTICS
 from mauvecl.host.stars.library import ModelStar, embedded, near_names, spectrum_name
-from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Flag, Range, Slider, Unit, Widget, first, found, range_of, unit_of
+from mauvecl.schema.errors import InputError, shortened
+from mauvecl.schema.fields import Flag, Range, Unit, Widget, first, found, range_of, unit_of
 from mauvecl.schema.physical import LineFraction
-from mauvecl.schema.text import shortened
-from mauvecl.study.keys import study_keys
-from mauvecl.web.simulations import SIMULATIONS
+from mauvecl.study.study import keys_with_flags, study_keys
+
+if TYPE_CHECKING:
+    pass
 
 #: Texts of fields with an uploaded file: those that also accept a name or numbers, and all others.
 UPLOADED, UPLOADED_UNKNOWN, UPLOADED_FILE = "uploaded star", "uploaded spectrum", "uploaded file"
@@ -50,13 +53,13 @@ class Number:
         accepted = self.range.words(self.unit, whole=self.whole)
         form = r"[+-]?\d+" if self.whole else r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,3})?"
         if not text.strip():
-            raise InputError("nothing is entered", accepted, key="number", value=text)
+            raise InputError("nothing is entered", accepted, key="number")
         if re.fullmatch(form, text.strip(), flags=re.ASCII) is None:
             point = ", with a point for decimals" if "," in text else ""
-            raise InputError(f"{shortened(text)} is not {kind}", f"{accepted}{point}", key="number", value=text)
+            raise InputError(f"{shortened(text)} is not {kind}", f"{accepted}{point}", key="number")
         value = int(text) if self.whole else float(text)
         if value not in self.range:
-            raise InputError(f"{shortened(text.strip())} is out of range", accepted, key="number", value=value)
+            raise InputError(f"{shortened(text.strip())} is out of range", accepted, key="number")
         return value
 
 
@@ -75,20 +78,8 @@ class Choice:
     def __call__(self, text: str) -> Any:
         """Parse the value; an error states what is accepted."""
         if text not in self.options:
-            raise InputError(
-                f"{shortened(text)} is not a choice", f"one of {', '.join(self.options)}", key="choice", value=text
-            )
+            raise InputError(f"{shortened(text)} is not a choice", f"one of {', '.join(self.options)}", key="choice")
         return self.made(text)
-
-
-def several(text: str) -> tuple[str, ...]:
-    """Parse names of simulations, without repetitions."""
-    names = [name for name in text.split(",") if name]
-    if len(names) > len(SIMULATIONS) or not set(names) <= SIMULATIONS.keys():
-        raise InputError(
-            f"{shortened(text)} is not a simulation", f"some of {', '.join(SIMULATIONS)}", key="simulated", value=text
-        )
-    return tuple(dict.fromkeys(names))
 
 
 def points(text: str) -> tuple[tuple[float, float], ...] | None:
@@ -99,18 +90,12 @@ def points(text: str) -> tuple[tuple[float, float], ...] | None:
     pairs = [pair.split() for pair in text.split(",") if text.strip()]
     if any(len(pair) != 2 for pair in pairs):
         raise InputError(
-            f"{shortened(text)} is not a spectrum",
-            "pairs of nm and DN with commas between them",
-            key="own_unknown",
-            value=text,
+            f"{shortened(text)} is not a spectrum", "pairs of nm and DN with commas between them", key="own_unknown"
         )
     spectrum = tuple((float(number(nm)), float(number(dn))) for nm, dn in pairs)
     if any(low >= high for (low, _), (high, _) in itertools.pairwise(spectrum)):
         raise InputError(
-            f"{shortened(text)} does not ascend in nm",
-            "pairs of nm and DN in ascending order",
-            key="own_unknown",
-            value=text,
+            f"{shortened(text)} does not ascend in nm", "pairs of nm and DN in ascending order", key="own_unknown"
         )
     return spectrum
 
@@ -129,7 +114,7 @@ def line_fluxes(text: str) -> tuple[tuple[str, float], ...]:
         (EmissionLine.named(name).name, float(number_of(LineFraction)(value))) for name, _, value in pairs
     )
     if len(dict(fractions)) < len(fractions):
-        raise InputError(f"{shortened(text)} contains a line twice", "each line once", key="lines", value=text)
+        raise InputError(f"{shortened(text)} contains a line twice, but each must be given once", key="lines")
     return fractions
 
 
@@ -151,7 +136,7 @@ def star_name(text: str) -> str:
     if text == UPLOADED:
         return UPLOADED
     if not text.strip():
-        raise InputError("no star is chosen", "a name of the library, or an upload", key="star", value=text)
+        raise InputError("no star is chosen: give a name of the library, or upload a spectrum", key="star")
     return spectrum_name(text, own=False)
 
 
@@ -163,23 +148,19 @@ def day(text: str) -> str:
     try:
         found = datetime.date.fromisoformat(text.strip())
     except ValueError:
-        raise InputError(f"{shortened(text)} is not a day", expected, key="start", value=text) from None
+        raise InputError(f"{shortened(text)} is not a day", expected, key="start") from None
     if not YEARS[0] <= found.year < YEARS[1]:
-        raise InputError(f"{found} is out of range", expected, key="start", value=text)
+        raise InputError(f"{found} is out of range", expected, key="start")
     return found.isoformat()
 
 
 def targets(text: str, *, check: bool = True) -> tuple[dict[str, Any], ...]:
     """Parse targets: a name or coordinates in each line, or a CSV table with a header of keys of `PlanTarget`.
 
-    Parameters
-    ----------
-    text : str
-    check : bool
-        Whether their positions must be known, and all must differ.
+    With a check their positions must be known, and all must differ.
     """
-    from mauvecl.host.tables.text_table import text_table
-    from mauvecl.study.orbits import PlanTarget, targets_in
+    from mauvecl.host.tables.text_tables import text_table
+    from mauvecl.study.plan import PlanTarget, targets_in
 
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     if not lines:
@@ -189,7 +170,8 @@ def targets(text: str, *, check: bool = True) -> tuple[dict[str, Any], ...]:
         lines = ["name", *(f'"{line}"' for line in quoted)]
     if len(lines) - 1 > MOST_TARGETS:
         raise InputError(
-            f"{len(lines) - 1} targets are too many", f"at most {MOST_TARGETS}, or the command line", key="targets"
+            f"{len(lines) - 1} targets are too many: give at most {MOST_TARGETS}, or use the command line",
+            key="targets",
         )
     rows = targets_in(text_table("\n".join(lines), "the table", commas=True), "the table")
     if not check:
@@ -203,24 +185,26 @@ def targets(text: str, *, check: bool = True) -> tuple[dict[str, Any], ...]:
                 f"the position of {shortened(row['name'])} (target {number}) is unknown",
                 f"a name such as {like}, or coordinates such as 53.23 -9.46",
                 key="targets",
-                value=row["name"],
             ) from error
     names = [row["name"] for row in rows]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
-        raise InputError(f"{shortened(twice)} is named twice", "different targets", key="targets", value=twice)
+        raise InputError(f"{shortened(twice)} is named twice, but targets must differ", key="targets")
     return tuple(rows)
 
 
 def neighbours(text: str) -> str | None:
     """Check that a text is a CSV table of neighbours without names of files, and return it; None for nothing."""
     from mauvecl.host.exposure.star import FILES
-    from mauvecl.host.tables.text_table import text_table
+    from mauvecl.host.tables.text_tables import text_table
 
     if not text.strip():
         return None
     if text.startswith("# %ECSV"):
-        raise InputError("the table of neighbours is ECSV", "CSV, or the command line", key="neighbours")
+        raise InputError(
+            "the table of neighbours is ECSV, but must be CSV on this page; the command line reads both",
+            key="neighbours",
+        )
     names = {name.strip().lower() for name in text_table(text, "the table of neighbours", commas=True).colnames}
     if files := names & {*FILES}:
         raise InputError(
@@ -243,25 +227,16 @@ def star_words(name: str) -> str:
     return f"{article} {name} star" + ("" if star.startswith("Pickles ") else f" (spectrum of {star})")
 
 
-@dataclass(frozen=True)
-class Field:
-    """Field of the page."""
+@dataclass(frozen=True, kw_only=True)
+class Field(Widget):
+    """Field of the page: a widget of a key, or of keys that `Question` sets."""
 
-    label: str
     first: str  # text of a new page
-    read: Callable[[str], Any]  # converts text to the value; raises InputError with what is accepted
-    hint: str = ""  # explanation for visitors
     unit: str = ""
-    slider: Slider | None = None
-    group: str = ""  # heading; empty for fields that are always shown
-    place: int = 0  # order within the group
+    read: Callable[[str], Any]  # converts text to the value; raises InputError with what is accepted
     path: tuple[str, ...] = ()  # key of the study that takes the value; empty if `Question` converts it
-    scale: float = 1.0  # factor from the value of the key to that of the page
-    most: int = MOST_CHARACTERS  # largest number of characters
-    #: Kind of the widget if the parser does not imply it: "day", "file", "library", "targets", "table" or "upload".
-    kind: str = ""
-    suggestions: tuple[str, ...] = ()  # texts that the page offers
     own_keys: tuple[str, ...] = ()  # keys and sections of the study that it sets without a path
+    characters: int = MOST_CHARACTERS  # largest number
 
     @property
     def keys(self) -> tuple[str, ...]:
@@ -280,24 +255,16 @@ def _text(value: Any) -> str:
 
 def _field(path: tuple[str, ...], field: FieldInfo, widget: Widget) -> Field:
     """Return the field of a key from its metadata."""
-    default = field.get_default()
+    default, unit = field.get_default(), first(field, Unit) or Unit("")
     text = _text(default * widget.scale if isinstance(default, float) else default)
-    unit = first(field, Unit) or Unit("")
-    return Field(
-        widget.label,
-        text if widget.first is None else widget.first,
-        _reader(field, widget, unit.name, optional=text == "" if widget.first is None else not widget.first),
-        widget.hint,
-        unit.written if widget.unit is None else widget.unit,
-        widget.slider,
-        widget.group,
-        widget.place,
-        path,
-        widget.scale,
-        most=MOST_TABLE if widget.kind == "table" else MOST_CHARACTERS,
-        kind=widget.kind,
-        suggestions=widget.suggestions,
-    )
+    optional = text == "" if widget.first is None else not widget.first
+    own = {
+        "first": text if widget.first is None else widget.first,
+        "unit": unit.written if widget.unit is None else widget.unit,
+        "read": _reader(field, widget, unit.name, optional=optional),
+        "characters": MOST_TABLE if widget.kind == "table" else MOST_CHARACTERS,
+    }
+    return Field(**(vars(widget) | own), path=path)
 
 
 def _reader(field: FieldInfo, widget: Widget, unit: str, *, optional: bool) -> Callable[[str], Any]:
@@ -330,49 +297,50 @@ def _reader(field: FieldInfo, widget: Widget, unit: str, *, optional: bool) -> C
 
 
 #: Fields that do not stand for one key of the study.
-_OWN = {
+_OWN_FIELDS = {
     "star": Field(
-        "Star", "G2V", star_name,
-        "Whose spectrum: a spectral type of the library, one of its stars by any name (GJ 581, HD 40307), a blackbody "
-        "(blackbody 9000 K), a power law of the wavelength (power law -2), or your own file.",
+        label="Star", first="G2V", read=star_name,
+        hint="Whose spectrum: a spectral type of the library, one of its stars by any name (GJ 581, HD 40307), a "
+        "blackbody (blackbody 9000 K), a power law of the wavelength (power law -2), or your own file.",
         group="", place=-1, own_keys=("star.library",),
     ),
     "lines": Field(
-        "Emission lines", "", line_fluxes,
-        "Flux of lines as a fraction of the continuum's in 200-700 nm, such as Mg II=0.03, Ca II=0.02, Balmer=0.1, or "
-        "280=0.03 for one at 280 nm.", group="Flare's spectrum", place=1, own_keys=("flare.spectrum",),
+        label="Emission lines", first="", read=line_fluxes,
+        hint="Flux of lines as a fraction of the continuum's in 200-700 nm, such as Mg II=0.03, Ca II=0.02, "
+        "Balmer=0.1, or 280=0.03 for one at 280 nm.", group="Flare's spectrum", place=1, own_keys=("flare.spectrum",),
     ),
-    "sky": Field("Sky", "brightness", Choice(SKIES), "Zodiacal light behind the star.", group="Sky", place=0,
+    "sky": Field(
+        label="Sky", first="brightness", read=Choice(SKIES), hint="Zodiacal light behind the star.", group="Sky",
         own_keys=("sky",),
     ),
     "statistic": Field(
-        "Detection statistic", "matched", Choice(tuple(STATISTICS)),
-        "; ".join(f"{name}: {one.definition}" for name, one in STATISTICS.items()) + ".", group="Detection", place=1,
-        own_keys=("run.statistics",),
+        label="Detection statistic", first="matched", read=Choice(tuple(STATISTICS)),
+        hint="; ".join(f"{name}: {one.definition}" for name, one in STATISTICS.items()) + ".",
+        group="Detection", place=1, own_keys=("run.statistics",),
     ),
     "unknown": Field(
-        "Unknown", UNKNOWN[0], Choice(UNKNOWN),
-        "What differs from exposure to exposure and is not known: the usual are detector temperature, light lost and "
-        "sky. They are drawn, and the statistic is made blind to them. The card shows both chances; this is for the "
-        "pictures, tables and simulations.", group="", place=3,
+        label="Unknown", first=UNKNOWN[0], read=Choice(UNKNOWN),
+        hint="What differs from exposure to exposure and is not known: the usual are detector temperature, light lost "
+        "and sky. They are drawn, and the statistic is made blind to them. The card shows both chances; this is for "
+        "the pictures, tables and simulations.", group="", place=3,
         own_keys=("nuisances.usual",),
     ),
     "own_unknown": Field(
-        "Own unknown spectrum", "", points,
-        "Something else of known shape and unknown strength, such as stray light: pairs of nm and DN, as in "
+        label="Own unknown spectrum", first="", read=points,
+        hint="Something else of known shape and unknown strength, such as stray light: pairs of nm and DN, as in "
         "200 1, 450 3, 700 1, or a file of two columns.", group="Unknown", place=1, own_keys=("nuisances.own",),
     ),
     "targets": Field(
-        "Targets", "", targets,
-        "Stars by name, such as eps Eri or AU Mic, or coordinates such as 53.23 -9.46. What is known of a star need "
-        "not be entered; paste a list of names, or a CSV table with columns such as name, ra, dec, V, spectral_type, "
-        "distance_pc, mass_msun and age_myr.", group="Campaign", place=0, most=MOST_TARGETS * 100, kind="targets",
-        own_keys=("plan.targets",),
+        label="Targets", first="", read=targets,
+        hint="Stars by name, such as eps Eri or AU Mic, or coordinates such as 53.23 -9.46. What is known of a star "
+        "need not be entered; paste a list of names, or a CSV table with columns such as name, ra, dec, V, "
+        "spectral_type, distance_pc, mass_msun and age_myr.", group="Campaign", characters=MOST_TARGETS * 100,
+        kind="targets", own_keys=("plan.targets",),
     ),
     "realisations": Field(
-        "Realisations", "100000",
-        Choice((*map(str, REALISATIONS), *(f"{count} sampled" for count in SAMPLED)), draws),
-        "How many noisy exposures a simulation draws. At least 100 must lie beyond the threshold; a sampled tail "
+        label="Realisations", first="100000",
+        read=Choice((*map(str, REALISATIONS), *(f"{count} sampled" for count in SAMPLED)), draws),
+        hint="How many noisy exposures a simulation draws. At least 100 must lie beyond the threshold; a sampled tail "
         "(importance sampling) needs fewer.", group="Detection", place=2, own_keys=("run.realisations", "run.tails"),
     ),
 }  # fmt: skip
@@ -382,7 +350,7 @@ _KEYS = {
     for widget in found(field, Widget)
 }
 #: Fields by name, as in links and in `Question`; the default is a flare at the edge of detection.
-FIELDS = dict(sorted((_OWN | _KEYS).items(), key=lambda item: item[1].place))
+FIELDS = dict(sorted((_OWN_FIELDS | _KEYS).items(), key=lambda item: item[1].place))
 
 
 def _group(name: str) -> tuple[str, ...]:
@@ -432,3 +400,69 @@ PRESETS: dict[str, dict[str, str]] = {
     "M dwarf": {"star": "GJ 581", "magnitude": "10.6", "amplitude_percent": "10"},
     "Active G star": {"star": "G8V", "magnitude": "6.5", "amplitude_percent": "0.5", "exposure_s": "100"},
 }
+
+
+NO_KEYS: Mapping[str, str] = MappingProxyType({})
+#: A remedy in a message, such as `magnitude=7.4`.
+_REMEDY = re.compile(r"`(?P<key>[a-z][\w.]*)(?:=(?P<quote>'?)(?P<value>[^`]*?)(?P=quote))?`")
+#: A value at the beginning of a message, such as fap = 0.001.
+_VALUE = re.compile(r"^(?:page: )?(?P<key>[a-z][\w.]*) = (?P<empty>''(?=,|$))?")
+#: A flag of the command line.
+_FLAG = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
+#: A key within a message: words of prose hold no underscore.
+_KEY = re.compile(r"(?<![\w.'])(?:[a-z]+\.)*[a-z0-9]+(?:_[a-z0-9]+)+(?![\w.]*')")
+
+
+@cache
+def _fields() -> dict[str, str]:
+    """Return the field of each key of the study, whole and without its section, and of each own name."""
+    names = {
+        part: name for name, field in FIELDS.items() if field.path for part in (".".join(field.path), field.path[-1])
+    }
+    return names | {name: name for name in FIELDS} | {"tails": "realisations", "plan.targets": "targets"}
+
+
+@cache
+def _flags() -> dict[str, str]:
+    """Return the field of each flag whose key has one."""
+    names = {".".join(field.path): name for name, field in FIELDS.items() if field.path}
+    return {flag: names[key] for key, _, one in keys_with_flags() if key in names for flag in one.names}
+
+
+def field_of(key: str | None) -> str | None:
+    """Return the name of the field that sets a key of the study, or None."""
+    return _fields().get(key or "")
+
+
+def sentence(error: InputError, keys: Mapping[str, str] = NO_KEYS) -> str:
+    """Return the message of an error as the page shows it; `keys` maps other names of its keys to fields."""
+    text = _VALUE.sub(
+        lambda found: f"{_label(found['key'], keys)} {'is empty' if found['empty'] else '= '}", str(error)
+    )
+    return note(text.removeprefix("page: "), keys)
+
+
+def note(text: str, keys: Mapping[str, str] = NO_KEYS) -> str:
+    """Return a message with the labels of fields in place of keys and flags."""
+    text = _FLAG.sub(lambda found: f"“{FIELDS[_flags()[found[0]]].label}”" if found[0] in _flags() else found[0], text)
+    text = _REMEDY.sub(lambda found: _remedy(found, keys), text)
+    return _KEY.sub(lambda found: _label(found[0], keys), text)
+
+
+def _remedy(found: re.Match[str], keys: Mapping[str, str]) -> str:
+    label = _label(found["key"], keys)
+    if label == found["key"]:
+        return label
+    return f"{label} {found['value']}" if found["value"] else f"“{label}”"
+
+
+def remedies(error: InputError, keys: Mapping[str, str] = NO_KEYS) -> list[tuple[str, str]]:
+    """Return the values that a message proposes for fields, as pairs of field and text."""
+    each = _REMEDY.finditer(str(error))
+    named = ((field_of(keys.get(found["key"], found["key"])), found["value"]) for found in each)
+    return [(name, value) for name, value in named if name is not None and value]
+
+
+def _label(key: str, keys: Mapping[str, str]) -> str:
+    name = field_of(keys.get(key, key))
+    return key if name is None else FIELDS[name].label

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mauvecl.schema.errors import InputError
+from mauvecl.study.analyses import SPECTRUM
 from mauvecl.study.cases import Case, Loader
-from mauvecl.study.changes import SPECTRUM
 from mauvecl.study.study import Study
 from mauvecl.web.fields import FIELDS, WITH_FILE, Draws, Field
-from mauvecl.web.folders import content_folder
+from mauvecl.web.uploads import content_folder
 
 if TYPE_CHECKING:
     from mauvecl.host.spectra.conversion import ReadSpectrum
@@ -26,7 +26,6 @@ CONDITIONAL = (
     "sky_brightness", "target", "time", "second_area", "hours", "pointing_rate", "pointing_duration",
     "pointing_depth", *itertools.chain(*WITH_FILE.values()),
 )  # fmt: skip
-Points = tuple[tuple[float, float], ...]
 #: Names of uploaded spectra by field, and of a table of neighbours, in the folder of their study.
 SPECTRA = {
     "star": "star.ecsv",
@@ -67,15 +66,7 @@ class Question:
     def case(self, folder: Path | None = None) -> Case:
         """Return the question as a case; a flare that is as bright as observed has the amplitude of its brightness.
 
-        Parameters
-        ----------
-        folder : Path, optional
-            Where uploaded spectra and a table of neighbours are written for the study to find.
-
-        Raises
-        ------
-        InputError
-            If values are incompatible.
+        The visitor's files are written to the folder for the study to find. Raises InputError for incompatible values.
         """
         if folder is None and (self.uploads.keys() - {"own_unknown"} or self.neighbours is not None):
             raise InputError("no folder for the visitor's files", "a folder", key="folder")
@@ -92,14 +83,7 @@ class Question:
         for name, one in FIELDS.items():
             if one.path and name not in CONDITIONAL:
                 self._set_valid(data, name, folder)
-        star = data["star"]
-        if folder is not None and self.neighbours is not None:
-            star["neighbours"] = str(write_table(self.neighbours, folder))
-        if folder is not None and self.uploaded is not None:
-            star["file"] = str(write_spectrum(self.uploaded, folder, SPECTRA["star"]))
-        else:
-            star["library"] = values["star"]
-        data["star"] = [star]
+        data["star"] = [self._star(data["star"], folder)]
         data["sky"] = {
             "brightness": {"surface_brightness": values["sky_brightness"]},
             "target and time": {"target": values["target"], "time": values["time"]},
@@ -129,6 +113,14 @@ class Question:
         if values["targets"]:
             data["plan"] = {"targets": list(values["targets"]), "hours": values["hours"]}
         return data
+
+    def _star(self, star: dict[str, Any], folder: Path | None) -> dict[str, Any]:
+        """Return the data of a star with its spectrum and neighbours."""
+        if folder is not None and self.neighbours is not None:
+            star["neighbours"] = str(write_table(self.neighbours, folder))
+        if folder is not None and self.uploaded is not None:
+            return star | {"file": str(write_spectrum(self.uploaded, folder, SPECTRA["star"]))}
+        return star | {"library": self.values["star"]}
 
     def _set_valid(self, data: dict[str, Any], name: str, folder: Path | None) -> None:
         """Set the key of a field in the data of a study, in place, unless it is empty; its file goes to a folder."""

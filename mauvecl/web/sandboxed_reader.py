@@ -39,7 +39,7 @@ READERS = {
     "spectrum": ("mauvecl.host.stars.source", "Source.read"),
     "flare": ("mauvecl.host.stars.flare_spectra", "ObservedFlare.read"),
     "plain": ("mauvecl.host.spectra.formats", "read_spectrum"),
-    "frames": ("mauvecl.observations.reading", "read_frames"),
+    "frames": ("mauvecl.observations.frame_files", "read_frames"),
 }
 #: Expected content of an upload, by the function that reads it.
 EXPECTED = {
@@ -60,15 +60,6 @@ def read_limited(content: bytes, kind: type[Spectrum], options: Mapping[str, Any
 
     Blocks for about a second, most of it for the start of Python: call it from a thread. Raises InputError if it holds
     no usable spectrum, or reading it takes more memory or time than allowed.
-
-    Parameters
-    ----------
-    content : bytes
-        Its format is recognised from the content, not from a name.
-    kind : type
-        `Source`, `ObservedFlare` or `ReadSpectrum`.
-    options : mapping, optional
-        Further arguments of its `read`.
     """
     return kind(**_read(KINDS[kind], {"upload": content}, options or {}))
 
@@ -78,14 +69,7 @@ def read_frames_limited(
 ) -> Frames:
     """Read frames like `read_frames`, in a process with limited memory and time.
 
-    Parameters
-    ----------
-    files : mapping
-        Contents by name: the file of frames first, and files that the mapping or the frames need.
-    mapping : str, optional
-        Name of the file that is the mapping.
-    quality_bits : str, optional
-        Bits of the quality that exclude a frame.
+    `files` holds contents by name: the file of frames first, then the mapping and files that they need.
     """
     return Frames(**_read("frames", files, {"mapping": mapping, "quality_bits": quality_bits}))
 
@@ -93,7 +77,7 @@ def read_frames_limited(
 def _read(reader: str, files: Mapping[str, bytes], options: Mapping[str, Any]) -> dict[str, Any]:
     """Run a reading process, and return the attributes of the object that it reads."""
     if not _turns.acquire(timeout=SECONDS):
-        raise InputError("too many uploads are read at the same time", "yours again in a minute", key="upload")
+        raise InputError("too many uploads are read at the same time: try again in a minute", key="upload")
     try:
         answer = _read_apart(reader, files, options)
     finally:
@@ -129,10 +113,7 @@ def _read_apart(reader: str, files: Mapping[str, bytes], options: Mapping[str, A
             raise InputError(f"the upload takes more than {SECONDS} s to read", smaller, key="upload") from error
         except OSError as error:
             raise InputError(
-                f"the upload cannot be read now ({error.strerror})",
-                "it again later",
-                key="upload",
-                value=error.strerror,
+                f"the upload cannot be read now ({error.strerror}): try again later", key="upload"
             ) from error
     if done.returncode == 0:
         return done.stdout

@@ -1,12 +1,222 @@
-"""Server of the page."""
+"""Server of the page: access, connections, static files, and its log."""
 
 from __future__ import annotations
 
+import asyncio
+import gc
+import gzip
+import hashlib
+import ipaddress
+import json
+import logging
+import re
 import signal
+import socket
 import sys
+import tempfile
 import time
-from collections.abc import Sequence
-from typing import Any
+import traceback
+import webbrowser
+from collections.abc import Iterable, Sequence
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import bokeh
+from bokeh.embed import json_item
+from mako.lookup import TemplateLookup
+from tornado.httpserver import HTTPServer
+from tornado.ioloop import PeriodicCallback
+from tornado.iostream import IOStream
+from tornado.routing import Matcher, Rule
+from tornado.web import Application, RequestHandler
+
+from mauvecl.host.exposure.star import KNOWN
+from mauvecl.host.stars.library import all_names, library_names, well_known_stars
+from mauvecl.host.version import VERSION
+from mauvecl.schema.errors import InputError, shortened
+from mauvecl.web import fields
+from mauvecl.web.closed_forms import TITLES, ClosedForms
+from mauvecl.web.figures import INKS, PINS, Canvas
+from mauvecl.web.page import SEEN, State
+from mauvecl.web.simulations import SIMULATIONS
+from mauvecl.web.tabs import TABS, reads_of
+from mauvecl.web.uploads import UPLOADS, remove_abandoned
+from mauvecl.web.visitor import UNUSED, Job, Visitor, limit_arenas, reading, release_memory, shown
+
+if TYPE_CHECKING:
+    from tornado.httputil import HTTPServerRequest
+
+#: Largest number of simultaneous visitors, with some megabytes each (assumed to suffice for a team).
+MAX_VISITORS = 100
+#: A host as browsers write it: name, IPv4 address or IPv6 address in brackets; and a port.
+HOST = r"(?:[a-z0-9](?:[a-z0-9.-]*[a-z0-9])?|\[[0-9a-f:.]+\])(?::\d{1,5})?"
+
+
+def local(address: str) -> bool:
+    """Return whether an address is reachable from this machine only.
+
+    Raises InputError if it is empty, or this machine cannot resolve it.
+    """
+    if not address.strip():
+        raise InputError("address = '' is empty", "an address such as 127.0.0.1, ::1 or 0.0.0.0", key="address")
+    try:
+        known = {str(info[4][0]).split("%")[0] for info in socket.getaddrinfo(address, None, type=socket.SOCK_STREAM)}
+    except (OSError, UnicodeError) as error:
+        raise InputError.of("address", address, "one such as 127.0.0.1") from error
+    return all(ipaddress.ip_address(one).is_loopback for one in known)
+
+
+def netloc(address: str, port: int) -> str:
+    """Format host and port, with IPv6 addresses in brackets."""
+    return f"[{address}]:{port}" if ":" in address else f"{address}:{port}"
+
+
+def plain(host: str) -> str:
+    """Return a host in lower case without default ports."""
+    return re.sub(r":(80|443)$", "", host.strip().lower())
+
+
+def origin(text: str) -> str:
+    """Parse a value of `--allow-origin`, ``https://name`` or ``name:port``, to a host with its port.
+
+    Raises InputError if it does not name a single host.
+    """
+    host = re.sub(r"^https?://", "", text.strip().lower()).removesuffix("/")
+    if re.fullmatch(HOST, host) is None:
+        raise InputError.of("allow_origin", text, "one host such as https://mauve.example.org")
+    return plain(host)
+
+
+def hosts(address: str, port: int, allowed: Iterable[str]) -> frozenset[str]:
+    """Return the hosts under which the page is served.
+
+    Raises InputError if other machines may connect and no origin is given, or an origin or the address is invalid.
+    """
+    named = {origin(text) for text in allowed}
+    if not local(address) and not named:
+        raise InputError(
+            f"address = {shortened(address)} accepts other machines",
+            "`allow_origin` with the address that visitors' browsers will show, such as https://mauve.example.org",
+            key="address",
+        )
+    own = {"127.0.0.1", "localhost", "::1"} | ({address} if local(address) else set())
+    return frozenset(plain(netloc(one, port)) for one in own) | named
+
+
+class RefusalHandler(RequestHandler):
+    """Handler that returns an error message instead of the page."""
+
+    def initialize(self, status: int, why: str) -> None:
+        """Set status and message."""
+        self._status, self._why = status, why
+
+    async def prepare(self) -> None:
+        """Answer any request."""
+        self.set_status(self._status)
+        self.set_header("Content-Type", "text/plain; charset=utf-8")
+        if self._status == 503:
+            self.set_header("Retry-After", "60")
+        await self.finish(f"{self._why}\n")
+
+
+class AccessMatcher(Matcher):
+    """Matcher of requests that are rejected, as they do not come from pages of the allowed `hosts`."""
+
+    def __init__(self, allowed: frozenset[str]) -> None:
+        self._allowed = allowed
+
+    @classmethod
+    def rule(cls, allowed: frozenset[str]) -> Rule:
+        """Return the routing rule, which must precede all others."""
+        return Rule(cls(allowed), RefusalHandler)
+
+    def match(self, request: HTTPServerRequest) -> dict[str, Any] | None:
+        """Return the reason for which a request is rejected, or None."""
+        refused = self._foreign(request) or self._too_many(request)
+        return None if refused is None else {"target_kwargs": dict(zip(("status", "why"), refused, strict=True))}
+
+    def _foreign(self, request: HTTPServerRequest) -> tuple[int, str] | None:
+        """Return the error for an unknown host name (DNS rebinding) or another server's page, or None."""
+        if [plain(host) for host in request.headers.get_list("Host")] not in [[host] for host in self._allowed]:
+            return 403, "The page is not served under this host name; see `mauvecl serve --allow-origin`."
+        for given in request.headers.get_list("Origin"):
+            if plain(re.sub(r"^https?://", "", given.lower())) not in self._allowed:
+                return 403, "Pages of other servers cannot use this page; see `mauvecl serve --allow-origin`."
+        if request.path == "/live" and not request.headers.get_list("Origin"):
+            return 403, "Expected a connection from the page."
+        return None
+
+    def _too_many(self, request: HTTPServerRequest) -> tuple[int, str] | None:
+        """Return the error if there are too many visitors, or None."""
+        if request.path in ("/", "/live") and len(Visitor.here) >= MAX_VISITORS:
+            return 503, "Too many visitors are here at the moment; please come again in some minutes."
+        return None
+
+
+class BoundedServer(HTTPServer):
+    """HTTP server that closes the oldest connection without a visitor's page if there are too many."""
+
+    max_connections: int
+
+    def initialize(self, *args: Any, **options: Any) -> None:
+        """Create a server without connections."""
+        super().initialize(*args, **options)
+        self._streams: list[IOStream] = []
+
+    def handle_stream(self, stream: IOStream, address: tuple[Any, ...]) -> None:
+        """Serve a new connection."""
+        self._streams = [one for one in self._streams if not one.closed()]
+        if len(self._streams) >= self.max_connections:
+            pages = {id(page.ws_connection.stream) for page in Visitor.here if page.ws_connection is not None}
+            oldest = next((one for one in self._streams if id(one) not in pages), stream)
+            oldest.close()
+            if oldest is stream:
+                return
+        self._streams.append(stream)
+        super().handle_stream(stream, address)
+
+
+#: Characters of a line.
+MOST = 400
+
+
+class Plain(logging.Formatter):
+    """Formatter of one line: time, logger, message and, for exceptions, the location."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line."""
+        parts = [self.formatTime(record), record.levelname, record.name, _line(record.getMessage())]
+        if record.exc_info and record.exc_info[1] is not None:
+            error = record.exc_info[1]
+            parts.append(f"({type(error).__name__}: {_line(str(error))}; {_where(error)})")
+        return " ".join(parts)
+
+
+def _line(text: str) -> str:
+    """Shorten text to one bounded line."""
+    shown = " ".join(text.split())
+    return "".join(c if c.isprintable() else "?" for c in shown[:MOST])
+
+
+def _where(error: BaseException) -> str:
+    """Return modules and lines of a traceback: those of mauvecl, or the last one."""
+    frames = [(frame.f_globals.get("__name__", "?"), line) for frame, line in traceback.walk_tb(error.__traceback__)]
+    ours = [one for one in frames if one[0].startswith("mauvecl.")] or frames[-1:]
+    return ", ".join(f"{name} line {line}" for name, line in ours)
+
+
+def install() -> None:
+    """Apply the format to warnings and errors of all libraries."""
+    handler = logging.StreamHandler()
+    handler.setFormatter(Plain())
+    logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
+    # They write their own otherwise.
+    for name in ("bokeh", "tornado"):
+        logger = logging.getLogger(name)
+        logger.handlers, logger.propagate = [], True
+        logger.setLevel(logging.WARNING)
+
 
 #: Largest size in bytes of a message, an upload with a margin, and of a request's body, of which the page has none.
 MESSAGE, BODY = 17 * 2**20, 2**16
@@ -21,35 +231,12 @@ PING_S = 20
 
 
 def make(address: str, port: int, allowed: Sequence[str]) -> Any:
-    """Create a listening server.
+    """Return a listening server.
 
-    Parameters
-    ----------
-    address : str
-        Address; 127.0.0.1 accepts only this machine.
-    allowed : sequence of str
-        Origins of the page in addition to this machine's own.
-
-    Returns
-    -------
-    tornado.httpserver.HTTPServer
-
-    Raises
-    ------
-    InputError
-        If the address is invalid, or accepts other machines without an origin.
-    OSError
-        If the port is taken.
+    Raises InputError if the address is invalid or accepts other machines without an origin, and OSError if the port is
+    taken.
     """
-    from mauvecl.web.access import AccessMatcher, RefusalHandler, hosts
-
     let_in = hosts(address, port, allowed)
-    from tornado.web import Application
-
-    from mauvecl.web.connections import BoundedServer
-    from mauvecl.web.static_pages import AssetHandler, FigureHandler, FrontHandler
-    from mauvecl.web.visitor import Visitor
-
     application = Application(
         [
             (r"/", FrontHandler),
@@ -80,9 +267,6 @@ def make(address: str, port: int, allowed: Sequence[str]) -> Any:
 
 def close_unused() -> None:
     """Close the connections of unused pages, and release the memory of visitors who have left."""
-    from mauvecl.web.visitor import UNUSED, Visitor
-    from mauvecl.web.work import reading, release_memory
-
     if Visitor.has_left:
         Visitor.has_left = False
         reading(release_memory)
@@ -95,17 +279,6 @@ def close_unused() -> None:
 
 def warm() -> None:
     """Prepare imports, response matrix, kernels and page before the first visitor."""
-    import gc
-    import tempfile
-    from pathlib import Path
-
-    from mauvecl.web.closed_forms import ClosedForms
-    from mauvecl.web.state import State
-    from mauvecl.web.static_pages import prepare
-    from mauvecl.web.tabs import TABS
-    from mauvecl.web.visitor import shown
-    from mauvecl.web.work import Job
-
     with tempfile.TemporaryDirectory() as folder:
         closed = ClosedForms.of(State().question(), Path(folder))
     for tab in TABS:
@@ -118,33 +291,9 @@ def warm() -> None:
 
 
 def serve(address: str, port: int, *, show: bool = False, allow_origin: Sequence[str] = ()) -> None:
-    """Serve the page until interrupted.
-
-    Parameters
-    ----------
-    address : str
-        Address; 127.0.0.1 accepts only this machine.
-    show : bool
-        Whether to open a browser.
-    allow_origin : sequence of str
-        Origins of the page; required if the address accepts other machines.
-
-    Raises
-    ------
-    InputError, OSError
-        As for `make`.
-    """
-    import asyncio
-
-    from mauvecl.web.access import local, netloc
-    from mauvecl.web.folders import remove_abandoned
-    from mauvecl.web.plain_log import install
-    from mauvecl.web.visitor import Visitor
-    from mauvecl.web.work import limit_arenas
+    """Serve the page until interrupted; parameters and errors as for `make`."""
 
     async def run() -> None:
-        from tornado.ioloop import PeriodicCallback
-
         # Exit normally on SIGTERM, so that the folders of visitors are removed.
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
         remove_abandoned()
@@ -159,8 +308,6 @@ def serve(address: str, port: int, *, show: bool = False, allow_origin: Sequence
         print(f"mauvecl serves at {url}; Ctrl-C ends it.", flush=True)
         PeriodicCallback(close_unused, 1000 * SWEEP_S).start()
         if show:
-            import webbrowser
-
             webbrowser.open(url)
         try:
             await asyncio.Event().wait()
@@ -172,3 +319,204 @@ def serve(address: str, port: int, *, show: bool = False, allow_origin: Sequence
     install()
     limit_arenas()
     asyncio.run(run())
+
+
+#: The page connects to its own server only, and runs only its own code.
+HEADERS = {
+    "Content-Security-Policy": (
+        "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; object-src 'none'; "
+        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+}
+KINDS = {
+    "js": "text/javascript; charset=utf-8",
+    "css": "text/css; charset=utf-8",
+    "svg": "image/svg+xml",
+    "json": "application/json",
+    "html": "text/html; charset=utf-8",
+}
+#: Citation, as in the project's file CITATION.cff, which has neither the paper's volume and pages nor an address of
+#: the project.
+BIBTEX = """@software{{mauvecl,
+  author = {{{{The mauvecl developers}}}},
+  title = {{mauvecl: would the Mauve satellite see this stellar flare?}},
+  version = {{{version}}},
+  year = {{2026}}
+}}
+
+@article{{mauvesim,
+  author = {{Saba, A. and Favata, F. and Savini, G. and Tinetti, G. and Bradley, L. and Stotesbury, I. and
+            Tessenyi, M.}},
+  title = {{MauveSim: the instrument simulator software for the Blue Skies Space Mauve satellite}},
+  journal = {{RAS Techniques and Instruments}},
+  year = {{2025}},
+  eprint = {{2502.01389}},
+  archivePrefix = {{arXiv}},
+  url = {{https://arxiv.org/abs/2502.01389}}
+}}
+"""
+_FOLDER = Path(__file__).parent / "assets"
+
+
+@cache
+def packed(content: bytes) -> tuple[bytes, str]:
+    """Compress content with gzip, and return it with its digest."""
+    return gzip.compress(content, 6, mtime=0), hashlib.sha256(content).hexdigest()[:16]
+
+
+@cache
+def asset(name: str) -> bytes | None:
+    """Return an asset of the page; BokehJS comes from its own package."""
+    if name == "bokeh.min.js":
+        return (Path(bokeh.__file__).parent / "server" / "static" / "js" / name).read_bytes()
+    path = _FOLDER / name
+    return path.read_bytes() if path.suffix[1:] in KINDS and path.is_file() else None
+
+
+@cache
+def front() -> bytes:
+    """Return the page."""
+    lookup = TemplateLookup([str(_FOLDER)], default_filters=["h"], strict_undefined=True)
+    template = lookup.get_template("page.html.mako")
+    text = template.render(
+        fields=fields, uploads=UPLOADS, names=[star.name for star in well_known_stars()],
+        library=library_names(), tabs=TABS, version=VERSION,
+        bibtex=BIBTEX.format(version=VERSION), titles=TITLES, digest=_digest(),
+        words=json.dumps(_words()).replace("<", "\\u003c"),
+    )  # fmt: skip
+    return str(text).encode()
+
+
+def _words() -> dict[str, Any]:
+    """Return the settings of the page's script."""
+    return {
+        "version": VERSION,
+        "fields": {name: field.first for name, field in fields.FIELDS.items()},
+        "sliders": {
+            name: {"low": s.low, "high": s.high, "step": s.step, "log": s.log}
+            for name, field in fields.FIELDS.items()
+            if (s := field.slider) is not None
+        },
+        "stars": all_names(),
+        "example": "AU Mic\nYZ CMi\neps Eri",
+        "asks": {name: sorted(reads_of(name)) for name in SIMULATIONS},
+        "uploads": {
+            name: {"entered": one.entered, "options": list(one.options.values()), "most": one.most}
+            for name, one in UPLOADS.items()
+        },
+        "withFile": fields.WITH_FILE,
+        "columns": sorted({*KNOWN}),
+        "needs": {name: one.needs for name, one in SIMULATIONS.items() if one.needs},
+        "under": fields.ASKED_UNDER,
+        "presets": fields.PRESETS,
+        "seen": {name: field.first for name, field in SEEN.items()},
+        "tabs": {
+            tab.name: {
+                "pictures": [
+                    {"name": p.name, "sets": p.sets, "logs": list(p.logs), "pins": p.pins, "alike": p.alike}
+                    for p in tab.pictures
+                ],
+                "reads": sorted(tab.reads),
+                "headline": tab.headline,
+            }
+            for tab in TABS.values()
+        },
+        "pins": PINS,
+        "unused": UNUSED,
+    }
+
+
+def _digest() -> str:
+    """Return the digest of all assets, so that browsers do not use old ones."""
+    each = [packed(content)[1] for path in sorted(_FOLDER.iterdir()) if (content := asset(path.name)) is not None]
+    return hashlib.sha256("".join(each).encode()).hexdigest()[:12]
+
+
+@cache
+def figure(theme: str, name: str, logs: str) -> bytes | None:
+    """Return an empty figure with its legend."""
+    picture = next((p for tab in TABS.values() for p in tab.pictures if p.name == name), None)
+    if picture is None or theme not in INKS or not set(logs) <= {axis.lower() for axis in picture.logs}:
+        return None
+    canvas = Canvas(picture, theme, frozenset(logs))
+    return json.dumps({"item": json_item(canvas.plot), "legend": canvas.legend}).encode()
+
+
+def prepare() -> None:
+    """Render and compress the content that every visitor requests; pictures of other tabs follow on request."""
+    packed(front())
+    for path in _FOLDER.iterdir():
+        packed(asset(path.name) or b"")
+    packed(asset("bokeh.min.js") or b"")
+    for picture in next(iter(TABS.values())).pictures:
+        usual = "".join(axis.lower() for axis in picture.logs if axis.isupper())
+        for theme in ("light", "dark"):
+            packed(figure(theme, picture.name, usual) or b"")
+
+
+class CompressedHandler(RequestHandler):
+    """Handler of static content."""
+
+    def set_default_headers(self) -> None:
+        """Set the headers of every answer."""
+        self.clear_header("Server")
+        for name, value in HEADERS.items():
+            self.set_header(name, value)
+
+    def give(self, content: bytes | None, kind: str, *, keep: bool = False) -> None:
+        """Send content, or status 404 if it is None."""
+        if content is None:
+            self.set_status(404)
+            self.set_header("Content-Type", "text/plain; charset=utf-8")
+            self.finish("There is no such page.\n")
+            return
+        small, digest = packed(content)
+        self.set_header("Content-Type", KINDS[kind])
+        self.set_header("Vary", "Accept-Encoding")
+        # A file with its digest in its address never changes.
+        self.set_header("Cache-Control", "public, max-age=31536000, immutable" if keep else "no-cache")
+        self.set_header("Etag", f'"{digest}"')
+        if self.check_etag_header():
+            self.set_status(304)
+            self.finish()
+            return
+        if "gzip" in self.request.headers.get("Accept-Encoding", ""):
+            self.set_header("Content-Encoding", "gzip")
+            content = small
+        self.finish(content)
+
+    def compute_etag(self) -> str | None:
+        """Return None, since `give` sets the tag."""
+        return None
+
+    def write_error(self, status_code: int, **kwargs: Any) -> None:
+        """Send a message without internal details."""
+        self.set_header("Content-Type", "text/plain; charset=utf-8")
+        self.finish(f"The page cannot answer this ({status_code}).\n")
+
+
+class FrontHandler(CompressedHandler):
+    """Return the page."""
+
+    def get(self) -> None:
+        """Send the page, which reads the values of a link itself."""
+        self.give(front(), "html")
+
+
+class AssetHandler(CompressedHandler):
+    """Handler of assets."""
+
+    def get(self, name: str) -> None:
+        """Send an asset by name."""
+        self.give(asset(name), name.rpartition(".")[2], keep="v" in self.request.arguments)
+
+
+class FigureHandler(CompressedHandler):
+    """Handler of empty figures."""
+
+    def get(self, theme: str, name: str) -> None:
+        """Send a figure in a theme, with some logarithmic axes."""
+        logs = "".join(sorted(set(self.get_query_argument("log", ""))))[:2]
+        self.give(figure(theme, name, logs), "json", keep="v" in self.request.arguments)

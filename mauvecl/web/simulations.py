@@ -1,9 +1,10 @@
-"""Simulations that the page requests from a pool."""
+"""Simulations that buttons of the page start."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,8 +16,6 @@ if TYPE_CHECKING:
     from mauvecl.runs.pool import Pool
     from mauvecl.study.study import Study
 
-#: Answers of a question by name.
-Answers = dict[str, Any]
 #: Name of the detection with the other choice of unknowns; the card shows both.
 OTHER = "detection otherwise"
 #: Cells along each axis of the page's map, and realisations per cell.
@@ -27,7 +26,7 @@ INJECTED = {"of": "amplitude", "sizes": 12, "widths": 3, "count": 200, "position
 MOST_FITS, MOST_OF_TWO = 10_000, 1000
 
 
-def map_around(study: Study) -> Study:
+def _map_around(study: Study) -> Study:
     """Return the study of a coarse map around the question's star."""
     star, amplitude = study.star[0], study.flare.amplitudes[0]
     middle = 7.0 if star.magnitude is None else star.magnitude
@@ -39,33 +38,12 @@ def map_around(study: Study) -> Study:
     return _changed(study, map={"x": x, "y": y}, run={"realisations": n, "statistics": [study.run.statistics[-1]]})
 
 
-def completeness(study: Study) -> Study:
-    """Return the study of the completeness of a search of one orbit's stare on a coarse grid."""
-    return _changed(study, injections=INJECTED, search={"nulls": 0})
-
-
-def fits(study: Study) -> Study:
-    """Return the study of fits of the flare's spectrum."""
-    most = MOST_FITS if study.flare.spectrum.second_area is None else MOST_OF_TWO
-    return _changed(study, measure={"fits": min(study.run.realisations, most)})
-
-
-def campaign_plan(study: Study) -> Study:
-    """Return the study of a campaign without injections."""
-    return _changed(study, plan={"completeness": "closed form"})
-
-
-def periods(study: Study) -> Study:
-    """Return the study of periods in visits to the first target."""
-    return _changed(study, change={"periods": True})
-
-
 def _changed(study: Study, **sections: dict[str, Any]) -> Study:
     """Return a study with other values of keys, by section."""
     return study.with_changes(sections, None, "page")
 
 
-def _tabulated(answers: Answers) -> Answers:
+def _tabulated(answers: dict[str, Any]) -> dict[str, Any]:
     """Add the tables of a visibility, which are slow to make and read repeatedly."""
     answer = answers["visible"]
     return answers | {"seen": {name: getattr(answer, name) for name in ("table", "months", "by_day")}}
@@ -79,7 +57,7 @@ class Simulation:
     verbs: Mapping[str, str]
     asked: Callable[[Study], Study] = lambda study: study  # makes the study that is asked from that of the page
     # Adds to the answers what the page reads repeatedly.
-    completed: Callable[[Answers], Answers] = lambda answers: answers
+    completed: Callable[[dict[str, Any]], dict[str, Any]] = lambda answers: answers
     # Further answers of the main verb by name, with what makes their study; a refused one is left out.
     others: Mapping[str, Callable[[Study], Study]] = field(default_factory=dict)
     needs: str = ""  # field without which it cannot start
@@ -91,16 +69,8 @@ class Simulation:
         progress: Callable[[int, int], None] | None = None,
         *,
         given: Mapping[str, Any] | None = None,
-    ) -> Answers:
-        """Return the answers by name.
-
-        Parameters
-        ----------
-        progress : callable, optional
-            Called with the progress of the main verb.
-        given : mapping, optional
-            Contents of the visitor's files, as arguments of the main verb.
-        """
+    ) -> dict[str, Any]:
+        """Return the answers by name; the main verb reports its progress and takes the contents of files."""
         asked = self.asked(study)
         main = next(iter(self.verbs.values()))
         wanted = [(name, verb, asked) for name, verb in self.verbs.items()]
@@ -108,7 +78,7 @@ class Simulation:
         counted = sum(VERBS[verb].counts == "realisations" for _, verb, _ in wanted)
         if counted > 1:
             pool.expect(counted * asked.run.realisations)
-        answers: Answers = {}
+        answers: dict[str, Any] = {}
         for name, verb, one in wanted:
             try:
                 answers[name] = VERBS[verb].ask(one, pool, progress, **(given or {} if verb == main else {}))
@@ -118,25 +88,31 @@ class Simulation:
         return self.completed(answers)
 
 
+def _fits(study: Study) -> Study:
+    """Return the study of fits of the flare's spectrum."""
+    most = MOST_FITS if study.flare.spectrum.second_area is None else MOST_OF_TWO
+    return _changed(study, measure={"fits": min(study.run.realisations, most)})
+
+
 def _other_unknowns(study: Study) -> Study:
     """Return the study with the usual unknowns if it has none, or without."""
     return _changed(study, nuisances={"usual": not study.nuisances.usual})
 
 
 #: Simulations that change the study or have another name than their verb.
-_OWN = {
+_OWN_SIMULATIONS = {
     "detection": Simulation({"detection": "detect", "snr": "snr"}, others={OTHER: _other_unknowns}),
-    "map": Simulation({"map": "map"}, map_around),
-    "measure": Simulation({"measure": "measure"}, fits),
-    "completeness": Simulation({"completeness": "inject"}, completeness),
+    "map": Simulation({"map": "map"}, _map_around),
+    "measure": Simulation({"measure": "measure"}, _fits),
+    "completeness": Simulation({"completeness": "inject"}, partial(_changed, injections=INJECTED, search={"nulls": 0})),
     "visible": Simulation({"visible": "visible"}, completed=_tabulated, needs="targets"),
-    "plan": Simulation({"plan": "plan"}, campaign_plan, needs="targets"),
+    "plan": Simulation({"plan": "plan"}, partial(_changed, plan={"completeness": "closed form"}), needs="targets"),
     "analyse": Simulation({"analyse": "analyse"}, needs="frames"),
     "calibrate": Simulation({"calibrate": "calibrate"}, needs="observations"),
-    "periods": Simulation({"periods": "change"}, periods, needs="targets"),
+    "periods": Simulation({"periods": "change"}, partial(_changed, change={"periods": True}), needs="targets"),
 }
 #: All simulations by name: those above, and the verbs that have a tab.
-SIMULATIONS = {name: Simulation({name: name}) for name, verb in VERBS.items() if verb.tab} | _OWN
+SIMULATIONS = {name: Simulation({name: name}) for name, verb in VERBS.items() if verb.tab} | _OWN_SIMULATIONS
 
 
 def asked(name: str, study: Study) -> tuple[str, Study]:
@@ -153,4 +129,4 @@ def verbs_of(name: str) -> tuple[str, ...]:
 
 
 #: Simulations that use the pool's devices.
-DRAWING = {"detection", "map"} | {name for name in SIMULATIONS.keys() - _OWN.keys() if VERBS[name].counts}
+DRAWING = {"detection", "map"} | {name for name in SIMULATIONS.keys() - _OWN_SIMULATIONS.keys() if VERBS[name].counts}

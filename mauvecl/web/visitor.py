@@ -1,16 +1,21 @@
-"""A visitor's connection, on which the page sends requests; no state outlives it."""
+"""Visitors of the page: their connection, jobs and answers."""
 
 from __future__ import annotations
 
 import asyncio
 import base64
+import ctypes
+import gc
 import hashlib
 import json
 import logging
+import math
+import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Coroutine
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,27 +24,173 @@ import numpy as np
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from mauvecl.answers.verbs import VERBS
-from mauvecl.device.errors import DeviceError
+from mauvecl.device.drivers import DeviceError
+from mauvecl.device.engine import Engine
 from mauvecl.host.version import VERSION
-from mauvecl.schema.errors import InputError
-from mauvecl.schema.text import shortened
-from mauvecl.web.card import card, without_headline
-from mauvecl.web.closed_forms import ClosedForms
+from mauvecl.runs.pool import LocalWorkers, Pool, Stopped
+from mauvecl.schema.errors import InputError, shortened
+from mauvecl.web.closed_forms import ClosedForms, other_payloads, solved
 from mauvecl.web.downloads import as_file, asked_study, commands_and_programs
-from mauvecl.web.fields import FIELDS
-from mauvecl.web.folders import visitor_folder
-from mauvecl.web.headline import other_payloads, solved
-from mauvecl.web.known_stars import known
-from mauvecl.web.sentences import field_of, remedies, sentence
-from mauvecl.web.shelf import RESULTS, UPLOADED
+from mauvecl.web.fields import FIELDS, field_of, remedies, sentence
+from mauvecl.web.page import State, card, known, without_headline
 from mauvecl.web.simulations import DRAWING, SIMULATIONS, verbs_of
-from mauvecl.web.state import State
 from mauvecl.web.tabs import TABS, asking, reads_of
-from mauvecl.web.upload import UPLOADS
-from mauvecl.web.work import Cancelled, Job, reading
+from mauvecl.web.uploads import RESULTS, UPLOADS, visitor_folder
+from mauvecl.web.uploads import UPLOAD_SHELF as UPLOADED
 
 if TYPE_CHECKING:
-    from mauvecl.web.tabs.tab import Answers, Tab
+    from mauvecl.web.closed_forms import Answers
+    from mauvecl.web.tabs.tab import Tab
+
+#: Simulations that a server computes at the same time; others wait.
+TOGETHER = 2
+#: Simulations that take longer, s, leave memory to release; that of a short one would stop all visitors for longer.
+LONG_S = 1.0
+_threads = ThreadPoolExecutor(TOGETHER, thread_name_prefix="mauvecl-page")
+_per_thread = threading.local()
+#: Uploads are read one after the other, outside the event loop.
+_reader = ThreadPoolExecutor(1, thread_name_prefix="mauvecl-upload")
+
+
+def reading(read: Callable[[], Any]) -> Future[Any]:
+    """Read an upload in the background."""
+    return _reader.submit(read)
+
+
+class Cancelled(Exception):  # noqa: N818
+    """Cancellation by the visitor."""
+
+
+def _set_pending(thread: int, error: type[BaseException] | None) -> None:
+    """Set the exception that a thread raises at its next bytecode, or clear a pending one."""
+    given = None if error is None else ctypes.py_object(error)
+    ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread), given)
+
+
+def _engine(progress: Callable[[int, int], None]) -> Engine:
+    """Return this thread's engine, which reports the progress of this job from any thread."""
+    if not hasattr(_per_thread, "engine"):
+        listener = _per_thread.listener = [progress]
+        _per_thread.engine = Engine(progress=lambda done, total: listener[0](done, total))
+    _per_thread.listener[0] = progress
+    engine: Engine = _per_thread.engine
+    return engine
+
+
+def limit_arenas() -> None:
+    """Let the threads share two pools of glibc's malloc, since each pool keeps what its threads have freed."""
+    change = getattr(ctypes.CDLL(None), "mallopt", None)
+    if change is not None:
+        # M_ARENA_MAX of glibc's malloc.h.
+        change(-8, 2)
+
+
+def release_memory() -> None:
+    """Free what simulations leave: arrays in reference cycles, which Python finds late, and pages that malloc keeps."""
+    gc.collect()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
+
+
+@dataclass(eq=False)
+class Job:
+    """Simulation for a visitor."""
+
+    #: Computes the answer from a pool and, if there is a unit, a function that receives counts of it.
+    ask: Callable[..., Any]
+    #: Whether realisations are drawn. Such a job is cancelled between two tiles, others anywhere by an exception.
+    drawing: bool = True
+    unit: str = ""  # of the progress; realisations of the pool if empty
+    _cancelled: threading.Event = field(default_factory=threading.Event)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+    _thread: int | None = None
+    _pool: Pool | None = None
+    _started: float | None = None
+    _counted: tuple[int, int] = (0, 0)
+    _left_s: float = math.inf
+
+    def __post_init__(self) -> None:
+        self.future: Future[Any] = _threads.submit(self._run)
+
+    def _run(self) -> Any:
+        try:
+            return self._run_cancellable()
+        finally:
+            if time.monotonic() - (self._started or math.inf) > LONG_S:
+                release_memory()
+
+    def _run_cancellable(self) -> Any:
+        if not self.drawing:
+            with self._lock:
+                self._thread = threading.get_ident()
+        try:
+            return self._asked()
+        except Stopped as error:
+            raise Cancelled from error
+        finally:
+            # A pending interruption would otherwise reach the next work of this thread.
+            with self._lock:
+                if self._thread is not None:
+                    _set_pending(self._thread, None)
+                self._thread = None
+
+    def _asked(self) -> Any:
+        self._check()
+        self._started = time.monotonic()
+        workers = LocalWorkers([None], make=lambda device, progress: _engine(progress))
+        self._pool = Pool(workers, progress=lambda done, total: self._check())
+        return self.ask(self._pool, self._count) if self.unit else self.ask(self._pool)
+
+    def _count(self, done: int, total: int) -> None:
+        self._counted = done, total
+        if self.drawing:
+            self._check()
+
+    def _check(self) -> None:
+        if self._cancelled.is_set():
+            raise Cancelled
+
+    def cancel(self) -> None:
+        """Cancel between tiles, outside of draws, or before the start."""
+        with self._lock:
+            again = self._cancelled.is_set()
+            self._cancelled.set()
+            if self._thread is not None and not again:
+                _set_pending(self._thread, Cancelled)
+        # Work that waits for fits in other threads is not interrupted: fits end between two of their draws.
+        if self._pool is not None:
+            self._pool.stop()
+        self.future.cancel()
+
+    @property
+    def counts(self) -> tuple[int, int]:
+        """Return the finished part and the total, or 0 if nothing is counted yet."""
+        if self.unit:
+            return self._counted
+        standing = None if self._pool is None else self._pool.standing
+        return (0, 0) if standing is None else (standing.done, standing.total)
+
+    @property
+    def share(self) -> float:
+        """Return the share that is done."""
+        done, total = self.counts
+        return min(done / total, 1.0) if total else 0.0
+
+    @property
+    def words(self) -> str:
+        """Return the progress in words; the estimated time never rises."""
+        if self._started is None:
+            return "waiting for its turn"
+        (done, total), spent = self.counts, time.monotonic() - self._started
+        if not total:
+            return f"{spent:.0f} s"
+        words = f"{done:,} of {total:,} {self.unit or 'realisations'}"
+        if not 0 < done < total:
+            return f"{words}, {spent:.0f} s"
+        self._left_s = min(self._left_s, spent * (total - done) / done)
+        return f"{words}, about {self._left_s:.0f} s left"
+
 
 log = logging.getLogger(__name__)
 
@@ -52,7 +203,7 @@ MOST_KEPT, MOST_ANSWERS = 4, 12
 #: Things that are done for a visitor at a time.
 MOST_TASKS = 8
 #: Message if the page itself fails.
-OWN_FAULT = "the page has made a mistake of its own, and there is no answer: please report what was entered"
+OWN_FAULT = "the page failed, and there is no answer; this is a fault of mauvecl: please report what was entered"
 #: Why a connection was ended, for the page.
 UNUSED = 4000
 
@@ -280,7 +431,7 @@ class Visitor(WebSocketHandler):
         pictures = [picture for picture in tab.pictures if picture.pins]
         question = state.question(tab.reads)
         closed = await self._in_thread(partial(ClosedForms.of, question, Path(self._folder.name)))
-        drawn = await self._in_thread(lambda: {p.name: p.drawn(closed, {}).sources[p.pins] for p in pictures})
+        drawn = await self._in_thread(lambda: {p.name: p.drawn(closed, {})["sources"][p.pins] for p in pictures})
         self.send(n=n, pins={name: {c: packed(v) for c, v in columns.items()} for name, columns in drawn.items()})
 
     # Draws and simulations
@@ -308,7 +459,7 @@ class Visitor(WebSocketHandler):
         """Simulate, report progress, and send the answer."""
         n, kind, state = asked["n"], asked.get("kind"), self.state(asked["link"])
         if self.job is not None or kind not in SIMULATIONS or state.faults_of(reads_of(kind)):
-            self.send(n=n, ended="", refused="there is a simulation already, or nothing to simulate")
+            self.send(n=n, ended="", refused="a simulation is running already, or there is nothing to simulate")
             return
         self._begin(self._or_why(self._simulate(n, kind, state), n=n, ended=""))
 
@@ -319,7 +470,7 @@ class Visitor(WebSocketHandler):
         made = partial(ClosedForms.of, question, Path(self._folder.name), headline=tab.headline, given=given)
         closed = await self._in_thread(made)
         if self.job is not None:
-            raise InputError("there is a simulation already", "its end first", key="simulate", value=kind)
+            raise InputError("a simulation is running already: wait until it ends", key="simulate")
         # Several verbs count the realisations of all in the pool.
         verbs = verbs_of(kind)
         unit = VERBS[verbs[0]].counts if len(verbs) == 1 else ""
@@ -372,7 +523,8 @@ class Visitor(WebSocketHandler):
         upload = UPLOADS[field]
         self._uploads.pop(field, None)
         state = self.state(asked["link"])
-        options = tuple(state.entered[name] for name in upload.options)
+        names = tuple(upload.options.values())
+        options = tuple(state.entered[one] for one in names)
         self._digests[field] = hashlib.sha256(content + repr(options).encode()).hexdigest()
 
         def came(future: Future[Any]) -> None:
@@ -380,8 +532,8 @@ class Visitor(WebSocketHandler):
                 self._uploads[field] = future.result()
                 UPLOADED.keep(self, field, self._uploads[field], partial(self._uploads.pop, field, None))
             except InputError as error:
-                proposed = [one for one in remedies(error, upload.keys) if one[0] in upload.options]
-                self.send(n=n, field=field, lacks=sentence(error, upload.keys), remedies=proposed)
+                proposed = [one for one in remedies(error, upload.options) if one[0] in names]
+                self.send(n=n, field=field, lacks=sentence(error, upload.options), remedies=proposed)
             except Exception as error:
                 log.exception("an upload failed")
                 self.send(
@@ -391,7 +543,7 @@ class Visitor(WebSocketHandler):
             else:
                 self.send(n=n, field=field, entered=upload.entered)
 
-        self._when_done(reading(lambda: upload.read(name, content, **state.values_of(upload.options))), came)
+        self._when_done(reading(lambda: upload.read(name, content, state.values_of(names))), came)
 
     def _ask_file(self, asked: dict[str, Any]) -> None:
         n = asked["n"]
@@ -443,11 +595,9 @@ def shown(name: str, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
     pictures = {}
     for picture in tab.pictures:
         drawn = picture.drawn(closed, answers)
-        sources = {
-            source: {column: packed(values) for column, values in columns.items()}
-            for source, columns in drawn.sources.items()
-        }
-        pictures[picture.name] = {"text": drawn.text, "sources": sources, "props": drawn.props, "names": drawn.names}
+        for columns in drawn["sources"].values():
+            columns.update({name: packed(values) for name, values in columns.items()})
+        pictures[picture.name] = drawn
     return {"tab": tab.name, "pictures": pictures, "rows": tab.rows(closed, answers)}
 
 

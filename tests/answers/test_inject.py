@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import tomllib
 
 import numpy as np
 import pytest
 from answers import of_kind
-from commands import run
 from refusals import refused
 from scipy import stats
 
-from mauvecl import Stares, Study, inject
+from mauvecl import Study, inject
 
 SMALL = {
     "star": [{"library": "G2V", "magnitude": 7.4, "distance_pc": 14.0}],
@@ -26,11 +24,6 @@ def study(**changes):
     """Return a small question with some sections changed."""
     data = {**SMALL, **{k: {**SMALL.get(k, {}), **v} if isinstance(v, dict) else v for k, v in changes.items()}}
     return Study.build(data, "test")
-
-
-@pytest.fixture(scope="module")
-def stares():
-    return Stares()
 
 
 @pytest.fixture(scope="module")
@@ -65,13 +58,6 @@ def test_tables_are_consistent(found):
     )
     assert not of_kind(found.messages, "false alarms")
     assert Study.build(tomllib.loads(found.study.toml()), "text") == found.study
-
-
-def test_files_and_pictures_are_written(found, tmp_path):
-    names = {path.name for path in found.write(tmp_path)}
-    assert names == {"limits.ecsv", "completeness.ecsv", "search.ecsv", "study.toml"}
-    assert Study.read(tmp_path / "limits.ecsv") == found.study
-    assert found.plot(tmp_path / "map.png").stat().st_size > 10_000
 
 
 @pytest.mark.long
@@ -166,19 +152,3 @@ def clopper_pearson(share: float, n: int) -> float:
     low = 0.0 if k == 0 else stats.beta.ppf(0.025, k, n - k + 1)
     high = 1.0 if k == n else stats.beta.ppf(0.975, k + 1, n - k)
     return high - low
-
-
-@pytest.mark.long
-def test_inject_command_writes_its_files(tmp_path):
-    """Run the command with flags and check its JSON, files and record."""
-    words = (
-        "inject --star G2V --magnitude 7.4 --duration 4000 --injections 20 --alarms-per day --false-alarms 0.5 --json"
-    )
-    sets = ["injections.widths=2", "injections.sizes=3", "injections.positions=2", "injections.fitted=2"]
-    sets += ["search.half_widths_s=[20,60]", "search.nulls=10"]
-    done = run(*words.split(), *(x for s in sets for x in ("--set", s)), "--output", tmp_path, folder=tmp_path)
-    rows = json.loads(done.stdout)["rows"]
-    assert {"e50", "e90", "half_width"} <= set(rows[0])
-    assert {"limits.ecsv", "completeness.png", "curves.png", "energies.png", "run.json"} <= {
-        p.name for p in tmp_path.iterdir()
-    }

@@ -1,21 +1,22 @@
-"""Limits have the requested power by theory and by simulation, and are monotone."""
+"""Limits, maps and exposures have the requested power or S/N, by theory and by simulation, and are monotone."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from answers import of_kind
-from astropy.table import QTable
+from answers import expectations, of_kind
 from marks import long_but
 
 from mauvecl import (
     Engine,
+    Expectation,
     LocalWorkers,
     Pool,
     Study,
+    detection_map,
+    exposure_for,
     limiting_magnitude,
     shortest_exposure,
     smallest_amplitude,
@@ -107,25 +108,13 @@ def test_cooler_detector_gains_as_predicted(engine: Engine) -> None:
     assert 0.15 < gain < 1.25 * 0.0684 * 8 / np.log(10)
 
 
-def test_table_and_files_are_written(engine: Engine, tmp_path: Path) -> None:
-    result = limiting_magnitude(study(run=FEW), engine)
-    files = result.write(tmp_path)
-    table = QTable.read(tmp_path / "limit.ecsv")
-    assert table["magnitude"].unit == "mag"
-    assert table["magnitude"].value[0] == result.limits[0].value.value
-    assert {path.name for path in files} == {"limit.ecsv", "study.toml"}
-    again = limiting_magnitude(Study.read(tmp_path / "study.toml"), engine)
-    assert again.limits == result.limits
-    result.plot(tmp_path / "limit.png")
-    assert (tmp_path / "limit.png").stat().st_size > 10_000
-
-
-def test_failure_of_one_star_keeps_the_others(engine: Engine) -> None:
-    stars = [{"library": "G2V", "magnitude": m} for m in (25.0, 7.0)]
-    found = shortest_exposure(study(run=FEW, star=stars), engine)
-    assert [one.star for one in found.limits] == ["G2V V = 7"]
-    assert of_kind(found.messages, "no limit") == found.messages[:1]
-    assert "G2V V = 25" in found.messages[0]
+@pytest.mark.parametrize(("verb", "faint", "kind"), [("limit", 25.0, "no limit"), ("exposure", 28.0, "no answer")])
+def test_failure_of_one_star_keeps_the_others(engine: Engine, verb: str, faint: float, kind: str) -> None:
+    asked = study(run=FEW, star=[{"library": "G2V", "magnitude": m} for m in (faint, 7.0)])
+    found: Any = shortest_exposure(asked, engine) if verb == "limit" else exposure_for(asked, 10.0, 300.0)
+    assert [one.star for one in (found.limits if verb == "limit" else found.exposures)] == ["G2V V = 7"]
+    assert of_kind(found.messages, kind) == list(found.messages[:1])
+    assert f"G2V V = {faint:g}" in found.messages[0]
 
 
 @pytest.mark.long
@@ -136,12 +125,6 @@ def test_limit_above_one_day_is_found(engine: Engine) -> None:
     assert limit.value.value > 86_400.0
     assert limit.verdict != "DIFFERS"
     assert len(limit.points) < 100
-
-
-def test_limit_reports_saturation(engine: Engine) -> None:
-    bright = study(run=FEW, star=[{"library": "G2V", "magnitude": -1.0}])
-    found = smallest_amplitude(bright, engine)
-    assert of_kind(found.messages, "saturated")[:1] == found.messages[:1]
 
 
 def test_shortest_exposure_is_one_frame(engine: Engine) -> None:
@@ -183,3 +166,111 @@ def test_progress_has_one_total_and_moves_with_each_simulation() -> None:
     assert parts[-1] == seen[-1][1]
     # Each simulation and each end of a limit, its check among the simulations.
     assert len(parts) == sum(len(one.points) + 2 for one in found.limits)
+
+
+N = 20_000
+
+
+def mapped(x: dict, y: dict) -> Study:
+    return Study.build(
+        {
+            "star": [{"library": "G2V", "magnitude": 7.4}],
+            "flare": {"amplitudes": [0.1]},
+            "run": {"realisations": N, "fap": 1e-2, "statistics": ("chi2", "matched"), "seed": 9},
+            "map": {"x": x, "y": y},
+        },
+        "test",
+    )
+
+
+MAGNITUDE = {"quantity": "magnitude", "start": 6.0, "stop": 10.0, "steps": 5}
+AMPLITUDE = {"quantity": "amplitude", "start": 0.02, "stop": 0.5, "steps": 4, "log": True}
+
+
+def alone(asked: Study, engine: Engine, x: float | str, y: float | str) -> list[float]:
+    one = asked.at(asked.map.x.quantity, x).at(asked.map.y.quantity, y)
+    quiet, flare = expectations(one)
+    found = engine.detect(quiet, [flare], realisations=N, seed=9, statistics=("chi2", "matched"))
+    return [found.detection_probability(1e-2, s)[0].value for s in ("chi2", "matched")]
+
+
+@pytest.mark.parametrize(
+    ("x", "y"),
+    [
+        (MAGNITUDE, AMPLITUDE),
+        (AMPLITUDE, {"quantity": "flare_temperature", "values": [6000.0, 10_000.0, 20_000.0]}),
+        ({"quantity": "exposure", "values": [5.0, 50.0]}, {"quantity": "detector_temperature", "values": [13.0, 21.0]}),
+        ({"quantity": "star", "values": ["G2V", "K5V"]}, {"quantity": "sky", "values": [18.0, 22.0]}),
+    ],
+)
+def test_each_cell_equals_its_own_detection(engine: Engine, x: dict, y: dict) -> None:
+    """Compare all bits, which agree because all cells share their draws."""
+    asked = mapped(x, y)
+    found = detection_map(asked, engine)
+    assert found.probability.shape == (2, len(found.y), len(found.x))
+    for j, i in ((0, 0), (len(found.y) - 1, 0), (1, len(found.x) - 1)):
+        assert list(found.probability[:, j, i]) == alone(asked, engine, found.x[i], found.y[j])
+    assert (found.low <= found.probability).all()
+    assert (found.probability <= found.high).all()
+
+
+def test_probability_decreases_with_magnitude(engine: Engine) -> None:
+    """Check that brighter stars and larger flares are detected as often or more, but for the threshold's error."""
+    found = detection_map(mapped(MAGNITUDE, AMPLITUDE), engine)
+    slack = 5e-3
+    assert (np.diff(found.probability, axis=2) < slack).all()
+    assert (np.diff(found.probability, axis=1) > -slack).all()
+    assert (found.probability[1] > found.probability[0] - slack).all()
+    # Near the closed form: the threshold at 1e-2 of 20 000 is uncertain by 0.03 of a standard deviation.
+    error = np.sqrt(found.closed_form * (1 - found.closed_form) / N)
+    assert (np.abs(found.probability - found.closed_form) < 5 * (error + 0.4 * 0.03) + 1e-3).all()
+
+
+def sunlike(magnitude: float = 7.4, **observation: float) -> Study:
+    return Study.build({"star": [{"library": "G2V", "magnitude": magnitude}], "observation": observation}, "test")
+
+
+def snr_at(x: Expectation, wavelength_nm: float, per: str) -> float:
+    pixel = int(np.argmin(np.abs(x.wavelength_nm - wavelength_nm)))
+    return float(x.snr()[pixel] if per == "pixel" else x.snr_per_element()[x.element[pixel]])
+
+
+@pytest.mark.parametrize("per", ["pixel", "element"])
+@pytest.mark.parametrize("frames", [1, 2, 7, 120])
+@pytest.mark.parametrize("wavelength", [280.0, 450.0])
+def test_exposure_inverts_snr(per: str, frames: int, wavelength: float) -> None:
+    """Check that the S/N of an exposure asks for that exposure, and that one frame more is a little longer."""
+    asked = sunlike(exposure_s=5.0 * frames)
+    snr = snr_at(expectations(asked)[0], wavelength, per)
+    (same,) = exposure_for(asked, snr * (1 - 1e-9), wavelength, per=per).exposures
+    assert (same.frames, same.exposure_s) == (frames, 5.0 * frames)
+    assert same.snr_one_frame_less < snr <= same.snr * (1 + 1e-9)
+    (more,) = exposure_for(asked, snr * (1 + 1e-9), wavelength, per=per).exposures
+    assert more.frames == frames + 1
+
+
+def test_engine_finds_the_wanted_snr(engine: Engine) -> None:
+    """Compare the mean S/N of realisations at the answer within 5 standard errors and 1 % for the curved root."""
+    (found,) = exposure_for(sunlike(), 20.0, 300.0).exposures
+    quiet = expectations(sunlike(exposure_s=found.exposure_s))[0]
+    table = engine.snr(quiet, realisations=20_000, seed=4).element
+    row = table[int(np.argmin(np.abs(table["wavelength"].value - 300.0)))]
+    assert row["mean"] == pytest.approx(found.snr, abs=5 * row["std"] / np.sqrt(20_000) + 0.01 * found.snr)
+
+
+def test_fainter_stars_need_longer_exposures_and_saturation_is_reported() -> None:
+    bright, faint = (exposure_for(sunlike(m), 10.0, 400.0).exposures[0] for m in (6.0, 8.0))
+    assert faint.frames > bright.frames
+    blinding = exposure_for(sunlike(-2.0), 10.0, 450.0)
+    assert blinding.exposures[0].saturated
+    assert of_kind(blinding.messages, "saturated")
+    assert not bright.saturated
+
+
+def test_exposure_above_one_day_is_answered() -> None:
+    """Check that longer times are sums of several exposures, although `expect` allows only one day."""
+    found = exposure_for(sunlike(14.5), 10.0, 550.0)
+    (answer,) = found.exposures
+    assert answer.exposure_s > 86_400.0
+    assert answer.snr_one_frame_less < 10.0 <= answer.snr
+    assert of_kind(found.messages, "long exposure")

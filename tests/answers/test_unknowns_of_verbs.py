@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -16,58 +17,17 @@ from mauvecl import Engine, InputError, Stares, Study
 
 ADDITIVE, NUISANCES, LEVELS = ["cosmic_rays"], ["dark", "light", "sky", "tilt"], ["light", "sky", "temperature"]
 STARE_CHANGES = {"jitters": LEVELS} | {course: ["star", *LEVELS] for course in ("offsets", "drifts", "cycles")}
-#: Normal priors that stares accept, near the expectation's values.
-PRIORS: dict[str, dict[str, Any]] = {
-    "jitter": {"normal": [0.025, 0.005], "between": [0.0, 0.05]},
-    "detector_temperature": {"normal": [21.0, 0.2], "between": [20.0, 22.0]},
-    "light_loss": {"normal": [0.34, 0.01], "between": [0.29, 0.39]},
-    "pointing_loss": {"normal": [0.02, 0.004], "between": [0.0, 0.04]},
-    "qe_scale": {"normal": [1.0, 0.01], "between": [0.95, 1.05]},
-    "sky_level": {"normal": [1.0, 0.1], "between": [0.5, 1.5]},
-}
+DATA = Path(__file__).parents[1] / "data"
+TABLES: dict[str, dict[str, Any]] = tomllib.loads((DATA / "studies" / "unknowns.toml").read_text(encoding="utf-8"))
+FEW, PRIORS, NEEDS = (TABLES[name] for name in ("few", "priors", "needs"))
+NEEDS["analyse"]["data"] = {key: DATA / "flares" / name for key, name in NEEDS["analyse"]["data"].items()}
 #: One study section for each unknown.
-UNKNOWNS: dict[str, dict[str, Any]] = (
-    {f"processes.{name}": {"processes": {name: PRIORS[name]}} for name in PRIORS}
-    | {f"processes.{name}": {"processes": {name: {"rate_per_cm2_s": 300.0}}} for name in ADDITIVE}
-    | {f"nuisances.{name}": {"nuisances": {name: 0.1}} for name in NUISANCES}
-    | {
-        "nuisances.own.stray": {"nuisances": {"own": {"stray": {"points": [[200, 1], [450, 3], [700, 1]]}}}},
-        "nuisances.usual": {"nuisances": {"usual": True}},
-        "unknowns.draws": {"unknowns": {"draws": 2, "known": ["conversion_uv_per_electron", "read_noise_dn"]}},
-    }
-    | {
-        f"stare.{course}.{name}": {"stare": {course: {name: 0.01}}}
-        for course, rows in STARE_CHANGES.items()
-        for name in rows
-    }
-    | {f"stare.{name}": {"stare": {name: {"rate_per_h": 20.0}}} for name in ["pointing"]}
-)
-FLARES = Path(__file__).parents[1] / "data" / "flares"
-FEW = {"realisations": 2000, "fap": 0.1, "seed": 2, "statistics": ["matched"]}
-#: A bank of two half-widths, whose threshold is the closed form.
-SEARCH: dict[str, Any] = {"half_widths_s": [20.0, 60.0], "nulls": 0}
-#: Sections that each verb needs.
-NEEDS: dict[str, dict[str, Any]] = {
-    "snr": {"run": FEW | {"realisations": 200}},
-    "exposure": {"signal": {"snr": 10.0, "wavelength_nm": 330.0}},
-    "map": {
-        "map": {
-            "x": {"quantity": "amplitude", "values": [0.02, 0.05]},
-            "y": {"quantity": "exposure", "values": [50.0]},
-        }
-    },
-    "limit": {"limit": {"of": "magnitude", "power": 0.5}},
-    "measure": {"measure": {"fits": 50}},
-    "stare": {"stare": {"duration_s": 300.0, "bands_nm": [[305.0, 350.0]]}, "search": SEARCH},
-    "inject": {
-        "stare": {"duration_s": 600.0},
-        "injections": {"count": 20, "sizes": 2, "widths": 2, "fitted": 0},
-        "search": SEARCH,
-    },
-    "gaussian": {"sweep": {"axes": [{"quantity": "exposure", "values": [50.0]}]}},
-    "visible": {"orbit": {"targets": ["eps Eri"], "days": 2.0}},
-    "analyse": {"data": {"file": FLARES / "gj65_galex_nuv_5s.csv", "mapping": FLARES / "gj65.toml"}},
-    "plan": {"plan": {"targets": [{"name": "eps Eri"}], "completeness": "closed form"}, "orbit": {"days": 10.0}},
+UNKNOWNS: dict[str, dict[str, Any]] = {
+    **{f"processes.{name}": {"processes": {name: PRIORS[name]}} for name in PRIORS},
+    **{f"processes.{name}": {"processes": {name: {"rate_per_cm2_s": 300.0}}} for name in ADDITIVE},
+    **{f"nuisances.{name}": {"nuisances": {name: 0.1}} for name in NUISANCES},
+    **{f"stare.{at}.{name}": {"stare": {at: {name: 0.01}}} for at, rows in STARE_CHANGES.items() for name in rows},
+    **TABLES["unknowns"],
 }
 #: Verbs that take another engine, or none.
 ENGINES: dict[str, Any] = {"stare": Stares, "inject": Stares, "plan": Stares, "simulate": None, "visible": None}

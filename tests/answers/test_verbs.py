@@ -91,11 +91,10 @@ def test_files_json_and_terminal_agree(name: str, tmp_path: Path) -> None:
     (tmp_path / "study.toml").write_text(answer.study.toml())
     words = (name, "study.toml", "--no-pictures", "-o")
     found = json.loads(run(*words, "json", "--json", folder=tmp_path).stdout)
-    tables = [*answer.tables.values(), *(getattr(answer, attribute) for attribute in answer.JSON.values())]
-    assert answer.JSON.keys() <= found.keys()
-    for key in answer.JSON:
+    assert answer.json_tables.keys() <= found.keys()
+    for key, table in answer.json_tables.items():
         names = list(found[key][0])
-        (table, *_) = [one for one in tables if set(names) <= set(one.colnames) and len(one) == len(found[key])]
+        assert names == table.colnames
         assert [list(row.values()) for row in found[key]] == rows_of(table, names), key
     shown = run(*words, "shown", folder=tmp_path).stdout
     for view in answer.views:

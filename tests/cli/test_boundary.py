@@ -314,10 +314,7 @@ def test_uploads_are_read_in_a_limited_process(tmp_path: Path) -> None:
     with pytest.raises(InputError):
         sandboxed_reader.read_limited(b"200 a\n300 b\n", Source)
     # Limits hold in the other process, whatever is read there.
-    with (
-        mock.patch.object(sandboxed_reader, "MEMORY_MIB", 64),
-        refused_by_key("upload"),
-    ):
+    with mock.patch.object(sandboxed_reader, "MEMORY_MIB", 64), refused_by_key("upload"):
         sandboxed_reader.read_limited(b"".join(b"%f 1e-12\n" % nm for nm in np.linspace(170.0, 800.0, 150_000)), Source)
     started = time.monotonic()
     with mock.patch.object(sandboxed_reader, "SECONDS", 0.05), refused_by_key("upload", "0.05 s"):

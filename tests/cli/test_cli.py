@@ -16,7 +16,9 @@ from astropy.io import fits
 from astropy.table import QTable
 from commands import ended, run, started
 
-from mauvecl import CosmicRays, Engine, Normal, Processes, Source, Study, Uniform, __version__, detect, expect, simulate
+from mauvecl import CosmicRays, Engine, Normal, Processes, Source, Study, Uniform, detect, expect, simulate
+
+DATA = Path(__file__).parents[1] / "data"
 
 
 @pytest.fixture(scope="module")
@@ -121,31 +123,10 @@ def test_study_reddens_its_star() -> None:
     assert behind.magnitude("GALEX NUV") > plain.magnitude("GALEX NUV") + 1
 
 
-PROCESSES = """
-[[star]]
-library = "G2V"
-magnitude = 6
-[flare]
-amplitudes = [0.1]
-[observation]
-exposure_s = 10
-recipe = "joint"
-[processes]
-jitter = { uniform = [0.0, 0.05] }
-detector_temperature = { normal = [21, 2], between = [13, 25] }
-[processes.cosmic_rays]
-rate_per_cm2_s = 500
-[run]
-realisations = 2000
-fap = 0.1
-"""
-
-
 @pytest.mark.long
 def test_study_has_processes(tmp_path: Path, engine: Engine) -> None:
     """Compare with the engine's processes in Python, and with the study that is written back."""
-    (tmp_path / "study.toml").write_text(PROCESSES)
-    study = Study.read(tmp_path / "study.toml")
+    study = Study.read(DATA / "studies" / "processes.toml")
     (tmp_path / "again.toml").write_text(study.toml())
     assert Study.read(tmp_path / "again.toml") == study
     processes = Processes(
@@ -189,19 +170,6 @@ def test_simulation_equals_the_realisation_of_the_engine(magnitude: float, secon
             assert np.abs(table["digitisation"].value).max() <= 0.51 * max(1, np.sqrt(seconds / 10))
 
 
-@pytest.mark.long
-def test_components_of_a_simulation_have_their_variances() -> None:
-    """Compare photon and read noise separately: 197 pixels x 30 realisations, within 5 standard errors."""
-    found = [simulate(part_of(50.0, 4.0), realisation=i).observations[0] for i in range(30)]
-    x, tables = found[0][1], [table for _, _, table in found]
-    gain, n = x.gain_dn_per_electron, 30 * x.wavelength_nm.size
-    photon = np.array([t["photon_noise"].value for t in tables]) / np.sqrt(gain * x.recorded_light_dn)
-    read = np.array([t["read_noise"].value for t in tables]) / np.sqrt(x.n_frames * 144 + (x.n_frames - 1) / 12)
-    for z in (photon, read):
-        assert abs((z**2).sum() - n) < 5 * np.sqrt(2 * n)
-    assert abs((photon * read).sum()) < 5 * np.sqrt(n)
-
-
 def test_fits_of_a_simulation_equals_its_table(tmp_path: Path) -> None:
     words = ("--star", "G2V", "-m", "7.4", "-a", "0.24", "-t", "10", "--no-pictures", "-o", "out")
     run("simulate", *words, folder=tmp_path)
@@ -212,25 +180,6 @@ def test_fits_of_a_simulation_equals_its_table(tmp_path: Path) -> None:
         assert hdus[1].header["EXPTIME"] == 10.0
         assert hdus[1].columns["wavelength"].unit == "nm"
         np.testing.assert_array_equal(hdus[1].data["raw"], table["raw"].value)
-
-
-@pytest.mark.long
-def test_snr_answers_the_budgets_of_the_paper_and_sweeps(tmp_path: Path) -> None:
-    """Check the paper's three stars without arguments, and all combinations and lists of a sweep."""
-    shown = run("snr", "-n", "500", folder=tmp_path).stdout
-    for name in ("B2IV V = 3.03", "K3V V = 3.7", "G2V V = 7.4"):
-        assert len([line for line in shown.splitlines() if name in line and " 600 " in line]) == 8
-    assert {"noise-budget.png", "snr-sweep.png"} <= {p.name for p in (tmp_path / "mauvecl-snr").iterdir()}
-    words = ("snr", "--star", "G2V", "--sweep", "magnitude=5,7", "--sweep", "exposure=5,50", "--as-list", "-n", "5000")
-    run(*words, "--no-pictures", "-o", "swept", folder=tmp_path)
-    table = QTable.read(tmp_path / "swept" / "snr-element.ecsv")
-    assert {(m.value, t.value) for m, t in zip(table["magnitude"], table["exposure"], strict=True)} == {(5, 5), (7, 50)}
-    np.testing.assert_allclose(table["mean"], table["expected"], rtol=0.02, atol=0.05)
-    assert np.all(table["q2.5"] < table["q97.5"])
-    # Read back from a table, the study gives it again.
-    run("snr", tmp_path / "swept" / "snr-element.ecsv", "--no-pictures", "-o", "again", folder=tmp_path)
-    for name in ("snr-element.ecsv", "snr-pixel.ecsv"):
-        assert (tmp_path / "again" / name).read_text() == (tmp_path / "swept" / name).read_text()
 
 
 def test_wrong_template_loses_snr(engine: Engine) -> None:
@@ -248,16 +197,6 @@ def test_wrong_template_loses_snr(engine: Engine) -> None:
     assert p["matched 5000 K"] < p["matched"] == p["matched 10000 K"]
 
 
-def test_limit_is_confirmed_and_an_exposure_is_a_whole_number_of_frames(tmp_path: Path) -> None:
-    words = ("--star", "G2V", "-a", "0.24", "-n", "20000", "--fap", "0.01", "--statistic", "matched", "--no-pictures")
-    shown = run("limit", *words, folder=tmp_path).stdout
-    assert "Limit of magnitude" in shown
-    assert "confirms it" in shown
-    run("limit", *words, "--of", "exposure", "-m", "9", folder=tmp_path)
-    (row,) = QTable.read(tmp_path / "mauvecl-limit" / "limit.ecsv")
-    assert row["exposure"].value % 5 == 0
-
-
 def test_schema_describes_every_key(tmp_path: Path) -> None:
     schema = json.loads(run("schema", folder=tmp_path).stdout)
     assert set(schema["properties"]) == set(Study.model_fields)
@@ -271,13 +210,6 @@ def test_schema_describes_every_key(tmp_path: Path) -> None:
     missing = {f"{name}.{key}" for name, key, one in keys if "description" not in one and "$ref" not in str(one)}
     assert missing == set()
     assert len(keys) > 120
-
-
-def test_library_and_devices_are_listed(tmp_path: Path) -> None:
-    assert "HD 40307" in run("library", folder=tmp_path).stdout
-    assert len(json.loads(run("library", "--json", folder=tmp_path).stdout)) >= 25
-    assert json.loads(run("devices", "--no-rate", "--json", folder=tmp_path).stdout)[0]["default"]
-    assert run("--version", folder=tmp_path).stdout == f"mauvecl {__version__}\n"
 
 
 def test_saturation_is_the_first_message(tmp_path: Path) -> None:
@@ -307,12 +239,9 @@ def test_flags_of_a_flare_set_its_spectrum(tmp_path: Path) -> None:
     assert light.line_fluxes == {"H beta": 1e-13}
 
 
-SPECTRA = Path(__file__).parents[1] / "data" / "spectra"
-
-
 def test_assumptions_about_a_spectrum_come_first(tmp_path: Path) -> None:
     words = ("--wavelength-unit", "Angstrom", "-m", "8", "--exposure", "5", "--no-pictures", "-o", "out")
-    done = run("simulate", "--star", SPECTRA / "10lac_stis_001.txt", *words, folder=tmp_path).stdout
+    done = run("simulate", "--star", DATA / "spectra" / "10lac_stis_001.txt", *words, folder=tmp_path).stdout
     shown = " ".join(done.split())
     assert shown.index("ASSUMED: flux in erg") < shown.index("10lac_stis_001 V = 8")
     assert "ASSUMED: flux in erg" in (tmp_path / "out" / "run.json").read_text()
@@ -326,22 +255,12 @@ def test_assumptions_about_a_spectrum_come_first(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_star_is_extended_and_binned(tmp_path: Path) -> None:
     more = ("--exposure", "5", "--no-pictures")
-    flags = ("--star", SPECTRA / "vb8_stiswfcnic_004.fits", "--extend", "M3V", "--bin-nm", "2", "-m", "9")
+    flags = ("--star", DATA / "spectra" / "vb8_stiswfcnic_004.fits", "--extend", "M3V", "--bin-nm", "2", "-m", "9")
     shown = " ".join(run("simulate", *flags, *more, folder=tmp_path).stdout.split())
     assert "continued by M3V" in shown
     assert "113 of its 1349 points" in shown
-    column = f"{SPECTRA / 'ckp00_5750.fits'}[g45]"
+    column = f"{DATA / 'spectra' / 'ckp00_5750.fits'}[g45]"
     assert "ckp00_5750" in run("simulate", "--star", column, "-m", "8", *more, folder=tmp_path).stdout
-
-
-def test_limits_and_days_of_an_orbit_are_flags(tmp_path: Path) -> None:
-    words = ("visible", "--look-at", "eps Eri", "--look-at", "AU Mic", "--start", "2026-09-20", "--days", "3")
-    rows = json.loads(run(*words, "--sun", "60", "--moon", "none", "--json", folder=tmp_path).stdout)["rows"]
-    study = Study.read(tmp_path / "mauvecl-visible" / "study.toml").orbit
-    # What is not said stays as it is.
-    found = (study.limits.sun_deg, study.limits.moon_deg, study.limits.earth_limb_deg, study.days)
-    assert found == (60.0, None, 25.0, 3.0)
-    assert [row["target"] for row in rows] == ["eps Eri", "AU Mic"]
 
 
 def test_plan_is_read_back_from_its_table_and_targets_are_not_an_answer(tmp_path: Path) -> None:
@@ -362,7 +281,7 @@ def test_plan_is_read_back_from_its_table_and_targets_are_not_an_answer(tmp_path
 SMALL_SHARDS = [
     sys.executable,
     "-c",
-    "import mauvecl.runs.shards as s; s.SHARD_WORK = 2**27; from mauvecl.cli.app import main; main()",
+    "import mauvecl.runs.checkpoint as s; s.SHARD_WORK = 2**27; from mauvecl.cli.app import main; main()",
 ]
 LONG = ("detect", "--star", "G2V", "-m", "7.4", "--statistic", "chi2", "-n", "100000", "--no-pictures", "-o", "out")
 #: Files of somebody else in the folder of a checkpoint.

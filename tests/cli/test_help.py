@@ -220,7 +220,7 @@ def test_star_is_accepted_in_place_of_the_study(verb: str, tmp_path: Path) -> No
         code, _, reported = ended(verb, star, "-m", "99", folder=tmp_path)
         assert (code, reported) == (2, "mauvecl: --magnitude 99.0, expected -30 to 40 mag\n"), star
     code, _, reported = ended(verb, "G2V", "--star", "M3V", "-m", "7", folder=tmp_path)
-    assert (code, reported) == (2, "mauvecl: 'G2V' and --star are both stars, expected one of them\n")
+    assert (code, reported) == (2, "mauvecl: 'G2V' and --star are both stars, but only one may be given\n")
 
 
 def test_given_star_becomes_the_star_of_the_study(tmp_path: Path) -> None:
@@ -248,7 +248,7 @@ def test_every_listed_star_is_proposed() -> None:
     listed = Table.read(Path(mauvecl.__file__).parent / "host/stars/library/well_known.ecsv")["name"]
     # The library has these, of which GX And as GJ 15 A, its M1V.
     for name in {str(name) for name in listed} - {"Vega", "HD 40307", "GJ 581", "GX And"}:
-        with refused("star", value=name):
+        with refused("star", name):
             Study.build({"star": [{"library": name}]}, "test").star[0].source()
 
 

@@ -8,6 +8,7 @@ import os
 import shlex
 import shutil
 import sys
+import tomllib
 from functools import cache
 from pathlib import Path
 from tempfile import mkdtemp
@@ -20,70 +21,17 @@ from marks import long_but
 
 from mauvecl import Study, detect
 
-STAR = "--star G2V -m 7.4 --exposure 5"
-DRAWN = f"{STAR} -n 10000 --statistic chi2 --fap 0.01"
-#: Words after the verb.
-VERBS: dict[str, str] = {
-    "exposure": "--star G2V -m 7.4 --snr 300 --at 300",
-    "simulate": STAR,
-    "snr": f"{STAR} -n 2000",
-    "detect": DRAWN,
-    "limit": f"{DRAWN} --amplitude 0.5",
-    "map": f"{DRAWN} --x magnitude=6,7 --y amplitude=0.1,0.5",
-    "gaussian": f"{DRAWN} --sweep magnitude=6,9",
-    "stare": "--star G2V -m 7.4 --duration 60 --no-search",
-    "inject": "--star M3V -m 9 --distance 5 --duration 2000 -n 20 --set injections.sizes=2 --set injections.widths=2",
-    "measure": "--star M3V -m 9 -a 2 --fits 10",
-    "change": "--star M3V -m 9 --set change.trials=10 --set change.steps=2",
-    "calibrate": "standards.toml --knots 20",
-    "analyse": "flares.csv --mapping curve.toml --false-alarms 10 --alarms-per day",
-    "visible": "--look-at 'eps Eri' --start 2027-01-01 --days 2",
-    "plan": "targets.csv --hours 20 --start 2027-01-01 --days 20 --completeness 'closed form'",
-}
-#: Files besides study and record.
-FILES = {
-    "exposure": "exposure.ecsv exposure.png",
-    "simulate": "observation-1.ecsv observation-1.fits observation-1.png",
-    "snr": "noise-budget.ecsv noise-budget.png snr-element.ecsv snr-pixel.ecsv snr.png",
-    "detect": "departures.ecsv detection.ecsv detection.png roc.ecsv spectra.png tails.ecsv",
-    "limit": "limit.ecsv limit.png",
-    "map": "map.ecsv map.fits map.png",
-    "gaussian": "elements.ecsv gaussian.ecsv gaussian.png thresholds.ecsv",
-    "stare": "dynamic-spectrum-1.png events.ecsv light-curve-1.ecsv light-curve-1.fits light-curve-1.png stare.ecsv",
-    "inject": "completeness.ecsv completeness.png curves.png energies.png limits.ecsv search.ecsv",
-    "measure": "contours.png errors.png fit.png fits.ecsv measure.ecsv pulls.png",
-    "change": "change.ecsv change.png indices.ecsv indices.png magnitudes.ecsv",
-    "calibrate": "calibrate.ecsv dark.ecsv dark.png fits.ecsv instrument.toml instrument.zip photon-transfer.ecsv "
-    "photon-transfer.png pixel-map.ecsv residuals.png throughput-errors.ecsv throughput-factor.ecsv throughput.ecsv "
-    "throughput.png",
-    "analyse": "analyse.html completeness.ecsv events.ecsv frames.ecsv light-curve.png limits.ecsv noise.ecsv "
-    "noise.png process.ecsv residuals.png",
-    "visible": "assumptions.ecsv days.ecsv months.ecsv visible.ecsv visible.ics visible.png windows.ecsv",
-    "plan": "assumptions.ecsv days.ecsv energies.ecsv months.ecsv plan.ecsv plan.pdf plan.png stars.ecsv visible.png",
-}
-USUAL = "instrument mauve, detector at 21 deg C; sky of V = 22.1 mag/arcsec2; "
-FLARE = "flares of 10000 K, added to the star, amplitudes in the Kepler band; "
-ORBIT = "orbit of embedded elements; least angles: Earth's limb 25 deg, Sun 46 deg, Moon 25 deg"
-REST = "everything known but the noise; seed 1"
-#: What each verb states about the default study.
-STATED = {
-    "simulate": USUAL + REST,
-    "snr": USUAL + REST,
-    "exposure": USUAL[:-2],
-    "change": USUAL + "everything known but the noise",
-    "calibrate": USUAL[:-2],
-    "analyse": "flares of the shape davenport2014; noise as measured; seed 1",
-    "visible": ORBIT,
-    "plan": f"instrument mauve, detector at 21 deg C; {FLARE}{ORBIT}; {REST}",
-} | dict.fromkeys(("detect", "limit", "map", "gaussian", "stare", "inject", "measure"), USUAL + FLARE + REST)
+#: Words after each verb, its files besides study and record, and what it states; and statements of changed settings.
+TABLE = tomllib.loads((Path(__file__).parents[1] / "data" / "verbs.toml").read_text(encoding="utf-8"))
+SETTINGS, COMMANDS = TABLE.pop("settings"), TABLE.pop("commands")
 #: Verbs that draw. Every table of theirs describes its columns and holds its study; of the others one table does.
 DRAWING = {"snr", "detect", "limit", "map", "gaussian", "stare", "inject", "measure"}
 
-ALL = pytest.mark.parametrize("verb", long_but(VERBS, "exposure", "limit", "visible"))
+ALL = pytest.mark.parametrize("verb", long_but(TABLE, "exposure", "limit", "visible"))
 
 
 def words(verb: str) -> list[str]:
-    return [verb, *shlex.split(VERBS[verb])]
+    return [verb, *shlex.split(TABLE[verb]["words"])]
 
 
 @cache
@@ -104,12 +52,12 @@ def out(verb: str, tmp_path: Path) -> Path:
 @ALL
 def test_verb_writes_its_files_and_states_its_assumptions(verb: str) -> None:
     folder, done = answered(verb)
-    written = [folder / "out" / name for name in (*FILES[verb].split(), "study.toml", "run.json")]
+    written = [folder / "out" / name for name in (*TABLE[verb]["files"].split(), "study.toml", "run.json")]
     assert {*(folder / "out").iterdir()} == {*written}
     assert all(path.name in done.stdout.splitlines()[-1] for path in written)
     assert all(path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n" for path in written if path.suffix == ".png")
     (line,) = (text for text in done.stdout.splitlines() if text.startswith("Assumed: "))
-    assert line == f"Assumed: {STATED[verb]}."
+    assert line == f"Assumed: {TABLE[verb]['stated']}."
     assert "\x1b" not in done.stdout
     record = json.loads(written[-1].read_text())
     drawn = {"devices", "kernels"} if verb in DRAWING else set()
@@ -125,7 +73,7 @@ def test_written_study_gives_the_same_bits(verb: str) -> None:
     first, again = folder / "out", folder / "again"
     asked = [*words(verb)] if verb == "analyse" else [verb, first / "study.toml"]
     done = run(*asked, "--no-pictures", "--json", "-o", "again", folder=folder)
-    assert json.loads(done.stdout)["assumed"] == f"Assumed: {STATED[verb]}."
+    assert json.loads(done.stdout)["assumed"] == f"Assumed: {TABLE[verb]['stated']}."
     for path in again.glob("*.ecsv"):
         assert path.read_text() == (first / path.name).read_text(), path.name
         if path.stem == verb or (verb in DRAWING and path.stem != "events"):
@@ -309,28 +257,7 @@ def test_foreign_record_removes_nothing(record: str, tmp_path: Path) -> None:
     assert (out / "a").read_text() == (tmp_path / "mine").read_text() == "mine"
 
 
-@pytest.mark.parametrize(
-    ("setting", "stated"),
-    [
-        ("observation.instrument=mauve-electrons", "instrument mauve-electrons"),
-        ("observation.temperature_c=13", "detector at 13 deg C"),
-        ("observation.changes={light_loss=0.2}", "with another light_loss"),
-        ("sky={surface_brightness=20.5}", "sky of V = 20.5 mag/arcsec2"),
-        ("sky={none=true}", "no sky"),
-        ("sky={target='53.2 -9.5', time='2027-01-01'}", "sky at 53.2 -9.5, 2027-01-01 UTC"),
-        ("flare.temperature_k=9000", "flares of 9000 K"),
-        ("flare.band=TESS", "amplitudes in the TESS band"),
-        ("flare.geometry=replaces", "replacing photosphere"),
-        ("run.seed=7", "seed 7"),
-        ("nuisances.usual=true", "the usual unknowns drawn and marginalised"),
-        ("nuisances.dark=0.1", "marginalised: dark"),
-        ("processes.jitter.uniform=[0,0.05]", "drawn: jitter"),
-        ("stare.thermal.amplitude=0.5", "not used: stare.thermal"),
-        ("sweep.axes=[{quantity='sky', values=[20, 21]}]", "sky as swept"),
-        ("sweep.axes=[{quantity='detector_temperature', values=[13, 21]}]", "detector temperature as swept"),
-        ("sweep.axes=[{quantity='flare_temperature', values=[9000, 8000]}]", "flares of swept temperature"),
-    ],
-)
+@pytest.mark.parametrize(("setting", "stated"), SETTINGS.items())
 def test_assumptions_follow_the_study(setting: str, stated: str) -> None:
     few = ["run.realisations=500", "run.fap=0.5", "run.statistics=['matched']", "flare.amplitudes=[0.1]"]
     usual, changed = (detect(Study().with_settings([*few, *one])).assumed for one in ([], [setting]))
@@ -339,15 +266,7 @@ def test_assumptions_follow_the_study(setting: str, stated: str) -> None:
     assert "\n" not in changed
 
 
-@pytest.mark.parametrize(
-    ("words", "stated"),
-    [
-        ("stare --star G2V -m 7 --duration 60 --no-search --thermal 0.5", "drawn: thermal"),
-        ("stare --star G2V -m 7 --duration 60 --no-search --set stare.jitters={light=0.01}", "drawn: jitters of light"),
-        ("limit --amplitude 0.5 --set unknowns.draws=2", "2 draws of the instrument's unknowns"),
-        ("visible --look-at 'eps Eri' --days 1 --sun 50", "Sun 50 deg"),
-    ],
-)
+@pytest.mark.parametrize(("words", "stated"), COMMANDS.items())
 def test_assumptions_of_other_verbs_follow_the_study(words: str, stated: str, tmp_path: Path) -> None:
     few = ["-n", "2000", "--fap", "0.1", "--star", "G2V", "-m", "7"] if words.startswith("limit") else []
     shown = run(*shlex.split(words), *few, "--no-pictures", folder=tmp_path).stdout

@@ -12,15 +12,14 @@ import pytest
 from answers import same
 from marks import long_but
 from processes import python
+from reference import statistics as numpy_kernels
 from refusals import refused
 from scenes import instrument, star
 from scipy import stats
 
 from mauvecl import Comparison, CosmicRays, Engine, Linear, Normal, PixelMap, Processes, Uniform
-from mauvecl.detection import reference as numpy_kernels
-from mauvecl.detection.counts import Tally
-from mauvecl.detection.requests import STATISTICS, DetectRequest, plan_channels
-from mauvecl.device.toy_exposure import toy
+from mauvecl.detection import requests
+from mauvecl.device.selftest import toy
 from mauvecl.noise import reference
 from mauvecl.noise.scene import prepare
 
@@ -32,67 +31,41 @@ PRIORS = Processes(
     pointing_loss=Uniform(0.0, 0.05),
     qe_scale=Normal(1.0, 0.3, 0.4, 1.6),
 )
-#: Options of the noise model: paper and physical counts, one frame and stacks, a rail, every recipe (joint with and
-#: without the fourth power, apart by tables, expansion, or both), every process, uneven pixels.
+#: Options of the noise model beyond those of the self-test, which runs every branch on equal pixels: a payload at each
+#: end of its temperatures, a rail, quiet readouts, priors of every kind, uneven pixels.
 CASES = {
     "stack": {},
-    "one frame": {"exposure": 5.0},
-    "electrons": {"name": "mauve-electrons"},
     "cold": {"temperature_c": -30.0, "exposure": 5.0},
     "cold electrons": {"name": "mauve-electrons", "temperature_c": -20.0, "exposure": 10.0},
     "frames": {"exposure": 15.0, "mode": "frames"},
     "at the rail": {"exposure": 10.0, "magnitude": -0.7},
-    "apart": {"recipe": "apart"},
-    "apart, cold": {"recipe": "apart", "temperature_c": -30.0, "exposure": 5.0},
     "apart, quiet readout": {"read_noise_dn": 0.5, "name": "mauve-electrons", "exposure": 5.0, "magnitude": 14.0},
     "apart, electrons, frames": {"recipe": "apart", "name": "mauve-electrons", "exposure": 10.0, "mode": "frames"},
-    "apart, some of each": {"recipe": "apart", "name": "mauve-electrons", "exposure": 5.0, "magnitude": 3.0},
     "noiseless": {"read_noise_dn": 0.0, "dark_scale_dn_per_s": 0.0, "magnitude": 30.0, "exposure": 5.0},
     "uneven": {"pixel_map": PixelMap.made_up(2048, seed=5, hot_share=0.05)},
-    "uneven, apart": {
-        "pixel_map": PixelMap.made_up(2048, seed=5),
-        "recipe": "apart",
-        "temperature_c": -9.0,
-        "exposure": 5.0,
-    },
-    "uneven, pairs of two ways": {
-        "pixel_map": PixelMap.made_up(2048, seed=1),
-        "read_noise_dn": 1.0,
-        "temperature_c": 9.0,
-        "exposure": 5.0,
-    },
-    "cosmic rays": {"processes": Processes(cosmic_rays=RAYS)},
+    "uneven, apart": {"pixel_map": PixelMap.made_up(2048, seed=5), "recipe": "apart", "temperature_c": -9.0,
+                      "exposure": 5.0},
+    "uneven, pairs of two ways": {"pixel_map": PixelMap.made_up(2048, seed=1), "read_noise_dn": 1.0,
+                                  "temperature_c": 9.0, "exposure": 5.0},
     "cosmic rays, frames": {"processes": Processes(cosmic_rays=RAYS), "mode": "frames", "exposure": 10.0},
     "priors": {"processes": PRIORS},
     "priors, electrons, frames": {"processes": PRIORS, "name": "mauve-electrons", "mode": "frames", "exposure": 25.0},
-    "jitter, cold": {"processes": Processes(jitter=Uniform(0.0, 0.05)), "temperature_c": -30.0, "exposure": 5.0},
     "jitter, one frame, rays": {"processes": Processes(cosmic_rays=RAYS, jitter=Uniform(0.0, 0.05)), "exposure": 5.0},
-}
-
-
-FREE = float("inf")
-#: Further options of the statistics: comparisons with noisy exposures and estimated variances, and marginalised
-#: unknowns; the others are compared with the expectation, in every recipe, stacks and frames, with every process.
-COMPARED: list[tuple[str, dict[str, Any]]] = [
-    *((name, {}) for name in CASES if name not in ("electrons", "cold electrons", "frames", "apart", "noiseless")),
-    ("stack", {"comparison": Comparison(1)}),
-    ("stack", {"comparison": Comparison(0, True)}),
-    ("stack", {"comparison": Comparison(3)}),
-    *(
-        (name, {"comparison": Comparison(2, True)})
-        for name in ("at the rail", "apart, electrons, frames", "uneven", "priors")
-    ),
-    *((name, {"nuisances": {"dark": 0.1, "light": 0.02, "tilt": FREE}}) for name in ("stack", "one frame")),
-]
-#: Of these, tested with one realisation per work-item, too: joint and separate draws, stacks and frames, processes.
-ONE_BY_ONE = [
-    *((name, {}) for name in ("stack", "apart, electrons, frames", "priors, electrons, frames")),
-    ("jitter, one frame, rays", {}),
-    ("apart, electrons, frames", {"comparison": Comparison(2, True)}),
-    COMPARED[-2],
-]
+}  # fmt: skip
 #: Cases of raw spectra in `make test`: a joint draw, and separate draws frame by frame.
 SHORT = ("stack", "apart, electrons, frames")
+#: Cases and further options of the statistics: comparisons with noisy exposures and estimated variances, and
+#: marginalised unknowns, of which the last is in `make test`.
+COMPARED: list[tuple[str, dict[str, Any]]] = [
+    ("uneven", {}),
+    ("priors, electrons, frames", {}),
+    ("stack", {"comparison": Comparison(1)}),
+    ("stack", {"comparison": Comparison(0, True)}),
+    ("at the rail", {"comparison": Comparison(2, True)}),
+    ("apart, electrons, frames", {"comparison": Comparison(2, True)}),
+    ("cold", {"nuisances": {"dark": 0.1, "light": 0.02, "tilt": float("inf")}}),
+    ("stack", {"nuisances": {"dark": 0.1, "light": 0.02, "tilt": float("inf")}}),
+]
 
 
 def case(name: str) -> tuple[list, dict]:
@@ -102,12 +75,6 @@ def case(name: str) -> tuple[list, dict]:
     exposure, magnitude = options.pop("exposure", 50.0), options.pop("magnitude", 7.4)
     payload = instrument(options.pop("name", "mauve"), part=True, **options)
     return star(magnitude=magnitude, amplitudes=(0.081, 0.24), exposure=exposure, payload=payload), how
-
-
-@pytest.fixture(scope="module")
-def one_by_one() -> Engine:
-    """Return an engine with one realisation per work-item."""
-    return Engine(width=1)
 
 
 @pytest.fixture(scope="module", params=["vectors", pytest.param("scalar", marks=pytest.mark.long)])
@@ -149,60 +116,27 @@ def test_raw_sums_above_float32_integers_are_exact(engine: Engine) -> None:
     np.testing.assert_array_equal(raw, reference.realise(scene, np.arange(40, dtype=np.uint64), SEED))
 
 
-@pytest.mark.parametrize(("name", "more"), [
-    pytest.param(*row, marks=() if row == ("stack", COMPARED[-2][1]) else pytest.mark.long) for row in COMPARED
-])  # fmt: skip
-def test_statistics_equal_reference(engine: Engine, name: str, more: dict[str, Any]) -> None:
-    check_statistics(engine, name, **more)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(("name", "more"), ONE_BY_ONE)
-def test_statistics_equal_reference_at_width_one(one_by_one: Engine, name: str, more: dict[str, Any]) -> None:
-    check_statistics(one_by_one, name, **more)
-
-
-def check_statistics(engine: Engine, name: str, **more: Any) -> None:
-    """Compare all statistics with the NumPy reference, and without comparison and unknowns also their histograms."""
+@pytest.mark.parametrize(("name", "more"), long_but(COMPARED, COMPARED[-1]))
+def test_statistics_equal_reference(any_width: Engine, name: str, more: dict[str, Any]) -> None:
+    """Compare all statistics of two flares; the self-test compares their histograms and tallies as well."""
     (quiet, *flares), how = case(name)
-    names: tuple[Any, ...] = tuple(STATISTICS)
+    names: tuple[Any, ...] = tuple(requests.STATISTICS)
     if "nuisances" in more:
         # Of those that can be marginalised, `uv_excess` would be degenerate with a flat dark and the star's light.
         own = Linear("own", np.linspace(0.0, 1.0, quiet.wavelength_nm.size))
-        names = (*(one for one in names if STATISTICS[one].marginal and one != "uv_excess"), own)
+        names = (*(one for one in names if requests.STATISTICS[one].marginal and one != "uv_excess"), own)
     kind = {"statistics": names, "start": START, "seed": SEED, **how, **more}
-    asked = DetectRequest.of(quiet, tuple(flares), INDEX.size, **kind).hypotheses
-    plan = plan_channels(asked, range(len(flares)), first=True)
+    asked = requests.DetectRequest.of(quiet, tuple(flares), INDEX.size, **kind).hypotheses
+    plan = requests.plan_channels(asked, range(len(flares)), first=True)
     smoothed = numpy_kernels.Smoothed.of(asked, plan) if len(plan.scales) else None
-    paired = "chi2_pair" in names
-    sums = numpy_kernels.statistics(asked.scene, INDEX, SEED, plan, pair=paired, smoothed=smoothed)
-    expected = numpy_kernels.marginalise(sums, plan.subtractions)
-    values = engine.statistic_values(quiet, flares, count=INDEX.size, **kind)
-    np.testing.assert_array_equal(values, expected)
+    sums = numpy_kernels.statistics(asked.scene, INDEX, SEED, plan, pair="chi2_pair" in names, smoothed=smoothed)
+    values = any_width.statistic_values(quiet, flares, count=INDEX.size, **kind)
+    np.testing.assert_array_equal(values, numpy_kernels.marginalise(sums, plan.subtractions))
     if "nuisances" in more:
         assert (values[0] < sums[0]).all(), "the subtraction changes the statistics"
     if more == {"comparison": Comparison(1)}:
         # Against one exposure, chi2 and chi2_pair differ only in the order of summation.
         np.testing.assert_allclose(values[0], values[2], rtol=1e-5)
-    if more:
-        return
-    fast = ("chi2", "chi2_element", "matched", "uv_excess")
-    alone = engine.statistic_values(quiet, flares, count=INDEX.size, **kind | {"statistics": fast})
-    same = [row for row in range(len(alone)) if row % 3 != 2 or row >= 9]
-    np.testing.assert_array_equal(alone[same], values[: len(alone)][same])
-    found = engine.detect(quiet, flares, realisations=INDEX.size, **kind)
-    tally = Tally(plan.grids)
-    histogram, totals, outside = numpy_kernels.tally(values, tally.packed)
-    tally.add(histogram, totals, INDEX.size)
-    for i, (statistic, role, flare) in enumerate(plan.keys):
-        if role == "flare_on_null_grid":
-            continue
-        ours = found.distribution(statistic, None if role == "null" else flare, template=flare)
-        assert tally.add_far(i, values[plan.grids[i].channel]) == outside[i]
-        wanted = tally.distribution(i)
-        np.testing.assert_array_equal(ours.counts, wanted.counts)
-        assert (ours.first, ours.second) == (wanted.first, wanted.second)
-        assert ours.far.equals(wanted.far)
 
 
 def test_saturating_star_is_drawn_frame_by_frame(engine: Engine) -> None:
@@ -275,8 +209,10 @@ def test_realisation_depends_only_on_its_index(engine: Engine) -> None:
 @pytest.mark.parametrize("tile", [16, 64, 4096])
 def test_tile_size_does_not_affect_results(engine: Engine, tile: int) -> None:
     (quiet, *flares), _ = case("stack")
-    whole = engine.detect(quiet, flares, realisations=3001, start=77, seed=6, statistics=tuple(STATISTICS))
-    parts = Engine(tile=tile).detect(quiet, flares, realisations=3001, start=77, seed=6, statistics=tuple(STATISTICS))
+    whole = engine.detect(quiet, flares, realisations=3001, start=77, seed=6, statistics=tuple(requests.STATISTICS))
+    parts = Engine(tile=tile).detect(
+        quiet, flares, realisations=3001, start=77, seed=6, statistics=tuple(requests.STATISTICS)
+    )
     same(parts, whole)
 
 

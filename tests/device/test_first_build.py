@@ -20,23 +20,23 @@ pytestmark = pytest.mark.long
 #: Script that draws on the default device and prints the level and the counts' digest, or the error.
 RUN = """
 import hashlib, sys
-from mauvecl.device import first_build, kernel_cache, processor
+from mauvecl.device import drivers
 from mauvecl.device.engine import DeviceError, Engine
-from mauvecl.device.toy_exposure import toy
+from mauvecl.device.selftest import toy
 from mauvecl.schema.errors import InputError
 {before}
 try:
     engine = Engine()
     print("digest", hashlib.sha256(engine.realise(toy(), count=64, seed=1).tobytes()).hexdigest())
-    print("level", *first_build.settled.values())
+    print("level", *drivers.settled.values())
 except (DeviceError, InputError) as error:
     print("sentence", str(error).count(chr(10)), error)
 """
 #: Child that fails when it compiles for the first name, and does nothing otherwise.
 CHILD = """
 import json, sys, os, ctypes, time; asked = json.loads(sys.argv[1]); sys.path[:] = asked["path"]
-from mauvecl.device import first_build_child
-first_build_child.limit(asked)
+from mauvecl.device.selftest import limit
+limit(asked)
 if asked["name"] == "bad" or asked["name"] is None:
     {act}
 """
@@ -79,8 +79,8 @@ def chooses(plain: tuple[Path, dict[str, str]]) -> None:
 
 def misbehaving(act: str, names: str) -> str:
     # A wall-clock limit of two seconds per second of processor time ends sleeping children soon.
-    clock = "first_build.CLOCK = 2.0; " if "sleep" in act else ""
-    return f"{clock}first_build.CHILD = {CHILD.format(act=act)!r}; processor.names = lambda device: {names}"
+    clock = "drivers.CLOCK = 2.0; " if "sleep" in act else ""
+    return f"{clock}drivers.CHILD = {CHILD.format(act=act)!r}; drivers.names = lambda device: {names}"
 
 
 @pytest.mark.parametrize("act", ["ctypes.string_at(0)", "bytearray(6 * 2**30)", "os.kill(os.getpid(), 9)"])
@@ -92,8 +92,8 @@ def test_next_level_is_tried_after_compiler_failure(act: str, tmp_path: Path, pl
 
 #: Counts attempts without building, since some processors' own names crash the compiler.
 COUNT = (
-    "processor.names = lambda device: (None,); "
-    "first_build._try = lambda *a: print('tried', a[0]) or first_build.Failure('failed'); "
+    "drivers.names = lambda device: (None,); "
+    "drivers._try = lambda *a: print('tried', a[0]) or drivers.Failure('failed'); "
 )
 
 
@@ -162,9 +162,9 @@ def test_failing_linker_is_not_stored_as_failure_of_driver(failures: int, tmp_pa
 
 def test_outcome_is_reused_until_driver_or_version_change(plain: tuple[Path, dict[str, str]]) -> None:
     cache, first = plain
-    count = "first_build._try = lambda *a: print('tried', a[0]); "
+    count = "drivers._try = lambda *a: print('tried', a[0]); "
     assert run(cache, count) == first
-    changed = run(cache, count + "first_build.VERSION = 'another'")
+    changed = run(cache, count + "drivers.VERSION = 'another'")
     assert changed.keys() == first.keys() | {"tried"}
 
 
@@ -173,7 +173,7 @@ def test_read_only_store_suffices(plain: tuple[Path, dict[str, str]]) -> None:
     folders = [cache, *(path for path in cache.rglob("*") if path.is_dir())]
     modes = {path: stat.S_IMODE(path.stat().st_mode) for path in folders}
     # Root ignores permissions, so the store is made read-only in another way.
-    refuse = "kernel_cache._writable = lambda folder: False; " if os.getuid() == 0 else ""
+    refuse = "drivers._writable = lambda folder: False; " if os.getuid() == 0 else ""
     try:
         for path in folders:
             path.chmod(0o555)
@@ -195,7 +195,7 @@ def test_first_build_works_for_every_way_to_start_python(how: str, tmp_path: Pat
 
 def test_concurrent_processes_build_once(tmp_path: Path, plain: tuple[Path, dict[str, str]]) -> None:
     log = tmp_path / "log"
-    count = f"real = first_build._try; first_build._try = lambda *a: (open({str(log)!r}, 'a').write('.'), real(*a))[1]"
+    count = f"real = drivers._try; drivers._try = lambda *a: (open({str(log)!r}, 'a').write('.'), real(*a))[1]"
     command = [sys.executable, "-c", RUN.format(before=count)]
     environment = os.environ | {"MAUVECL_CACHE_DIR": str(tmp_path / "cache")}
     together = [subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(2)]
@@ -208,7 +208,7 @@ def test_first_build_stops_compiler_of_zen_4(tmp_path: Path, plain: tuple[Path, 
     """Stop the child of PoCL 3.0 with AVX-512, which crashes for the name znver3 after minutes and gigabytes."""
     if "avx512f" not in Path("/proc/cpuinfo").read_text().split():
         pytest.skip("this processor has no AVX-512")
-    names = f"processor.names = lambda device: ('znver3', {plain[1]['level']!r})"
+    names = f"drivers.names = lambda device: ('znver3', {plain[1]['level']!r})"
     start = time.monotonic()
     assert run(tmp_path, names, MAUVECL_BUILD_LIMIT_S="4") == plain[1]
     assert time.monotonic() - start < 100

@@ -15,27 +15,28 @@ from pathlib import Path
 
 import pytest
 from processes import printed, python
+from stores import flip
 
 from mauvecl import Engine
-from mauvecl.device import kernel_cache, program
+from mauvecl.device import build, drivers
 
 #: Script that runs two kernels on the toy scene and prints whether they came from the store.
 RUN = """
 import hashlib, sys
-from mauvecl.device import kernel_cache, program
-from mauvecl.device.toy_exposure import toy
+from mauvecl.device import build, drivers
+from mauvecl.device.selftest import toy
 def digest(engine):
     x = toy(frames=1)
     raw, seen = engine.realise(x, count=64, seed=1), engine.snr(x, realisations=64, seed=1)
     return hashlib.sha256(raw.tobytes() + seen.counts.pixel.tobytes()).hexdigest()
 {before}
 from mauvecl.device.engine import DeviceError, Engine
-restore, restored = kernel_cache.KernelCache.restore, []
-kernel_cache.KernelCache.restore = lambda cache, key: restored.append(restore(cache, key)) or restored[-1]
+restore, restored = drivers.KernelCache.restore, []
+drivers.KernelCache.restore = lambda cache, key: restored.append(restore(cache, key)) or restored[-1]
 try:
     print("digest", digest(Engine()))
     print("restored", sum(restored), "of", len(restored))
-    print("work", kernel_cache.kernel_cache().work)
+    print("work", drivers.kernel_cache().work)
 except DeviceError as error:
     print("sentence", error)
 """
@@ -72,14 +73,8 @@ def test_second_process_builds_nothing(filled: tuple[Path, str]) -> None:
     assert not Path(again["work"]).exists()
 
 
-def flip(path: Path) -> None:
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 0x10
-    path.write_bytes(bytes(content))
-
-
 DAMAGE = {
-    "a flipped bit": flip,
+    "a flipped bit": lambda path: flip(path, path.stat().st_size // 2),
     "cut short": lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
     "emptied": lambda path: path.write_bytes(b""),
     "garbage": lambda path: path.write_bytes(b"\xff\x00 nothing of the kind"),
@@ -98,7 +93,7 @@ def store_of(cache: Path) -> Path:
 def test_damaged_program_is_not_restored(filled: tuple[Path, str], tmp_path: Path, kind: str, ending: str) -> None:
     """Keep damaged files of every kind out of the folder that PoCL reads."""
     shutil.copytree(store_of(filled[0]), tmp_path / "store")
-    cache = kernel_cache.KernelCache(tmp_path, tmp_path / "work")
+    cache = drivers.KernelCache(tmp_path, tmp_path / "work")
     programs = [path for path in cache.store.iterdir() if path.is_dir()]
     assert len(programs) >= 2
     for stored in programs:
@@ -131,7 +126,7 @@ def test_damaged_store_is_rebuilt(filled: tuple[Path, str], tmp_path: Path, kind
 
 def test_concurrent_processes_share_programs(tmp_path: Path) -> None:
     """Store a program at the next build, not only at the end of the process."""
-    one = kernel_cache.KernelCache(tmp_path, tmp_path / "work-1")
+    one = drivers.KernelCache(tmp_path, tmp_path / "work-1")
     for number in range(2):
         with one.building(f"key{number}"):
             (one.work / "AA" / f"program{number}").mkdir(parents=True)
@@ -139,7 +134,7 @@ def test_concurrent_processes_share_programs(tmp_path: Path) -> None:
         if number == 0:
             # The first launch completes the program.
             (one.work / "AA" / "program0" / "kernel.so").write_bytes(bytes(100))
-    other = kernel_cache.KernelCache(tmp_path, tmp_path / "work-2")
+    other = drivers.KernelCache(tmp_path, tmp_path / "work-2")
     assert other.restore("key0")
     assert [path.name for path in files_of(other.work)] == ["kernel.so", "program.bc"]
 
@@ -149,7 +144,7 @@ MANIFESTS = ("", "[]", "3", '{"files": {}}', '{"files": 1}', '{"folder": "x"}', 
 
 @pytest.mark.parametrize("text", MANIFESTS)
 def test_invalid_manifest_is_rejected(tmp_path: Path, text: str) -> None:
-    cache = kernel_cache.KernelCache(tmp_path, tmp_path / "work")
+    cache = drivers.KernelCache(tmp_path, tmp_path / "work")
     entry = cache.store / "key"
     entry.mkdir(parents=True)
     (entry / "a").write_text("contents")
@@ -179,7 +174,7 @@ Path.write_bytes = Path.write_text = full
 
 @pytest.mark.long
 def test_error_without_free_space_names_remedy(tmp_path: Path) -> None:
-    said = run(tmp_path, "kernel_cache.MIN_FREE_BYTES = 2**60")["sentence"]
+    said = run(tmp_path, "drivers.MIN_FREE_BYTES = 2**60")["sentence"]
     assert "no folder for compiled kernels" in said
     assert "MAUVECL_CACHE_DIR" in said
     assert "\n" not in said
@@ -212,8 +207,8 @@ def test_folder_of_killed_process_is_removed(filled: tuple[Path, str], tmp_path:
     assert not left[0].exists()
 
 
-HOLDS = "from mauvecl.device import kernel_cache; print(kernel_cache.kernel_cache().work, flush=True); input()"
-SWEEPS = "import sys, pathlib; from mauvecl.device import kernel_cache; kernel_cache._sweep(pathlib.Path(sys.argv[1]))"
+HOLDS = "from mauvecl.device import drivers; print(drivers.kernel_cache().work, flush=True); input()"
+SWEEPS = "import sys, pathlib; from mauvecl.device import drivers; drivers._sweep(pathlib.Path(sys.argv[1]))"
 #: Commands that run another one with its own process numbers and host name, as on another machine.
 ELSEWHERE = {
     "another container": ["unshare", "--pid", "--fork", "--mount-proc"],
@@ -263,7 +258,7 @@ def test_folder_of_other_host_is_removed_by_age_and_lock(tmp_path: Path, days: i
         if locked:
             fcntl.flock(lock, fcntl.LOCK_EX)
         os.utime(folder / "lock", (then, then))
-        kernel_cache._sweep(tmp_path)
+        drivers._sweep(tmp_path)
     assert folder.exists() == (locked or days < 30)
 
 
@@ -282,9 +277,9 @@ assert first == digest(two) == digest(one)
 
 def test_store_is_limited_in_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Remove the least recently used programs."""
-    monkeypatch.setattr(kernel_cache, "MAX_STORED", 25_000)
+    monkeypatch.setattr(drivers, "MAX_STORED", 25_000)
     for number in range(4):
-        cache = kernel_cache.KernelCache(tmp_path, tmp_path / f"work{number}")
+        cache = drivers.KernelCache(tmp_path, tmp_path / f"work{number}")
         with cache.building(f"key{number}"):
             folder = cache.work / "AA" / f"program{number}"
             folder.mkdir(parents=True)
@@ -303,9 +298,9 @@ def test_store_is_limited_in_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 def test_installations_do_not_share_programs(monkeypatch: pytest.MonkeyPatch, engine: Engine) -> None:
     """Use different keys, since PoCL compiles a program of another installation again at every start."""
     keys: list[str] = []
-    restore = kernel_cache.KernelCache.restore
-    monkeypatch.setattr(kernel_cache.KernelCache, "restore", lambda cache, key: keys.append(key) or restore(cache, key))
+    restore = drivers.KernelCache.restore
+    monkeypatch.setattr(drivers.KernelCache, "restore", lambda cache, key: keys.append(key) or restore(cache, key))
     for place in ("one", "other", "one"):
         monkeypatch.setattr(sys, "prefix", place)
-        program.build(engine.open_device.context, "kernel void f(global int *a) { a[0] = 1; }")
+        build.build(engine.open_device.context, "kernel void f(global int *a) { a[0] = 1; }")
     assert keys[0] == keys[2] != keys[1]

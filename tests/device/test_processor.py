@@ -16,8 +16,8 @@ import pytest
 from processes import python
 
 from mauvecl import Engine
-from mauvecl.device import processor, program
-from mauvecl.device.errors import DeviceError
+from mauvecl.device import build, drivers
+from mauvecl.device.drivers import DeviceError
 
 V2 = {"cx16", "lahf_lm", "popcnt", "sse4_1", "sse4_2", "ssse3"}
 AVX = V2 | {"avx", "xsave"}
@@ -38,7 +38,7 @@ V4 = V3 | {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}
     ],
 )
 def test_highest_level_has_all_its_instructions(flags: set[str], level: str) -> None:
-    assert processor.levels(frozenset(flags))[0] == level
+    assert drivers.levels(frozenset(flags))[0] == level
 
 
 def library(flags: set[str]) -> str:
@@ -64,16 +64,16 @@ def test_compiled_vectors_are_as_wide_as_those_of_library() -> None:
     """Compare the register widths of the library and of the kernels, which must agree to pass vectors."""
     passed = {"sse2": 128, "ssse3": 128, "sse41": 128, "avx": 256, "avx_f16c": 256, "avx2": 256, "avx512": 512}
     for flags in STEPS:
-        offered = processor.levels(frozenset(flags))
+        offered = drivers.levels(frozenset(flags))
         assert offered
-        assert {processor.WIDTHS[level] for level in offered} == {passed[library(flags)]}, sorted(flags)
+        assert {drivers.WIDTHS[level] for level in offered} == {passed[library(flags)]}, sorted(flags)
 
 
 @pytest.fixture(scope="module")
 def with_library(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     """Return a function that makes a copy of PoCL load a library, and returns the folder of its .icd file."""
     spec = importlib.util.find_spec("pocl_binary_distribution")
-    if spec is None or spec.origin is None or not processor.flags():
+    if spec is None or spec.origin is None or not drivers.flags():
         pytest.skip("PoCL is not from a wheel")
     top, wheels = tmp_path_factory.mktemp("pocl"), Path(spec.origin).parents[1]
     (driver,) = (wheels / "pyopencl" / ".libs").glob("libpocl*.so")
@@ -82,7 +82,7 @@ def with_library(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Pa
     shutil.copy(driver, top / "pyopencl/.libs/libpocl.so")
     shutil.copytree(wheels / "pocl_binary_distribution", top / "pocl_binary_distribution")
     (top / "vendors/pocl.icd").write_text(f"{top}/pyopencl/.libs/libpocl.so\n")
-    (loaded,) = top.rglob(f"kernel-*-{library(set(processor.flags()))}.bc")
+    (loaded,) = top.rglob(f"kernel-*-{library(set(drivers.flags()))}.bc")
 
     def use(name: str) -> Path:
         (original,) = wheels.glob(f"pocl_binary_distribution/.libs/share/pocl/kernel-*-{name}.bc")
@@ -95,23 +95,22 @@ def with_library(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Pa
 #: Script that builds for a level in a first build's child, and prints the failure and the driver's path.
 BUILD = """
 import sys
-from mauvecl.device import first_build, program
-device, _ = program.choose_device(None)
-print(first_build._try(sys.argv[1], 0, device, 60.0))
+from mauvecl.device import build, drivers
+device, _ = build.choose_device(None)
+print(drivers._try(sys.argv[1], 0, device, 60.0))
 print({line.split()[-1] for line in open("/proc/self/maps") if "libpocl" in line})
 """
 
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("name", "level"),
-    [(library(flags), level) for flags in STEPS for level in processor.levels(frozenset(flags))],
+    ("name", "level"), [(library(flags), level) for flags in STEPS for level in drivers.levels(frozenset(flags))]
 )
 def test_every_offered_level_builds_and_draws(name: str, level: str, with_library, tmp_path: Path) -> None:
     """Build kernels for each level with the library for which it is offered, in place of this processor's library."""
-    levels = list(processor.LEVELS)
-    needed = [flag for lower in levels[: levels.index(level) + 1] for flag in processor.LEVELS[lower]]
-    if not processor.flags().issuperset(needed):
+    levels = list(drivers.LEVELS)
+    needed = [flag for lower in levels[: levels.index(level) + 1] for flag in drivers.LEVELS[lower]]
+    if not drivers.flags().issuperset(needed):
         pytest.skip("this processor lacks instructions of the level")
     vendors = with_library(name)
     done = python(BUILD, level, cache=tmp_path, OCL_ICD_VENDORS=str(vendors))
@@ -143,7 +142,7 @@ def test_processor_is_named_after_level(own: str) -> None:
     device = Record(own)
     before = device.words.copy()
     for name in ("x86-64-v4", "x86-64-v3", "x86-64-v3"):
-        assert processor.set_processor_name(device, name)
+        assert drivers.set_processor_name(device, name)
         assert device.cpu.decode() == name
     # The rest of the record is unchanged.
     assert np.flatnonzero(device.words != before).tolist() == [5]
@@ -161,25 +160,25 @@ def test_processor_is_named_after_level(own: str) -> None:
 )
 def test_other_devices_are_unchanged(device: Record) -> None:
     before = device.words.copy()
-    assert processor.names(device) == (None,)
-    assert not processor.set_processor_name(device, "x86-64-v3")
+    assert drivers.names(device) == (None,)
+    assert not drivers.set_processor_name(device, "x86-64-v3")
     assert (device.words == before).all()
 
 
 def test_record_at_invalid_address_is_ignored() -> None:
     device = Record("generic")
     device.int_ptr = 2**46
-    assert not processor.set_processor_name(device, "x86-64-v3")
+    assert not drivers.set_processor_name(device, "x86-64-v3")
 
 
 @pytest.mark.long
 def test_compiler_prints_nothing(tmp_path: Path) -> None:
     """Check file descriptor 2, to which PoCL's compiler writes the number of its warnings."""
     code = (
-        "from mauvecl.device import program\ncl = program.load_opencl()\n"
-        "handle, _ = program.choose_device(None)\n"
+        "from mauvecl.device import build\ncl = build.load_opencl()\n"
+        "handle, _ = build.choose_device(None)\n"
         "source = '#warning one\\nkernel void f(global int *a) { int unused; a[0] = 1; }'\n"
-        "program.build(cl.Context([handle]), source)"
+        "build.build(cl.Context([handle]), source)"
     )
     assert python(code, cache=tmp_path).stderr == ""
 
@@ -190,6 +189,6 @@ def test_error_names_processor_unknown_to_compiler(engine: Engine, monkeypatch: 
 
     monkeypatch.setattr(cl, "Program", refuse)
     with pytest.raises(DeviceError) as caught:
-        program.build(engine.open_device.context, "__kernel void nothing() {}")
+        build.build(engine.open_device.context, "__kernel void nothing() {}")
     assert caught.value.kind == "processor"
     assert "\n" not in str(caught.value)

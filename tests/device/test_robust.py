@@ -16,9 +16,9 @@ from processes import python
 from refusals import refused
 
 from mauvecl import Engine
-from mauvecl.device import kernel_cache, program
-from mauvecl.device.errors import DeviceError
-from mauvecl.device.toy_exposure import toy
+from mauvecl.device import build, drivers
+from mauvecl.device.drivers import DeviceError
+from mauvecl.device.selftest import toy
 
 
 def test_device_is_chosen_by_name_or_number() -> None:
@@ -45,7 +45,7 @@ def test_error_names_missing_linker(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_kernels_are_linked_without_a_compiler(tmp_path: Path) -> None:
     """Link with a linker that knows none of the folders where compilers install their libraries."""
-    imports = "from mauvecl import Engine; from mauvecl.device.toy_exposure import toy"
+    imports = "from mauvecl import Engine; from mauvecl.device.selftest import toy"
     code = f"{imports}; Engine().realise(toy(), count=64, seed=1)"
     (tmp_path / "bin").mkdir()
     linker = tmp_path / "bin" / "ld"
@@ -91,8 +91,8 @@ def test_engine_after_fork_raises(engine: Engine, new: bool) -> None:
 
 
 def test_forked_child_keeps_folder_of_parent(engine: Engine) -> None:
-    work = kernel_cache.kernel_cache().work
-    process = multiprocessing.get_context("fork").Process(target=lambda: kernel_cache.kernel_cache().close())
+    work = drivers.kernel_cache().work
+    process = multiprocessing.get_context("fork").Process(target=lambda: drivers.kernel_cache().close())
     process.start()
     process.join(timeout=20)
     assert process.exitcode == 0
@@ -101,7 +101,7 @@ def test_forked_child_keeps_folder_of_parent(engine: Engine) -> None:
 
 def test_build_error_contains_numbered_source(engine: Engine) -> None:
     with pytest.raises(DeviceError, match=r"   2  nonsense here"):
-        program.build(engine.open_device.context, "// a comment\nnonsense here\n")
+        build.build(engine.open_device.context, "// a comment\nnonsense here\n")
 
 
 def refuse_beyond(monkeypatch: pytest.MonkeyPatch, limit: int, *, scenes: bool = False) -> list[int]:
@@ -159,8 +159,7 @@ def test_other_device_errors_are_not_retried(monkeypatch: pytest.MonkeyPatch) ->
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, -1.0, 1e13])
 @pytest.mark.parametrize(
-    "name",
-    ["source_electrons", "sky_electrons", "dark_dn", "bias_dn", "read_noise_dn", "gain_dn_per_electron"],
+    "name", ["source_electrons", "sky_electrons", "dark_dn", "bias_dn", "read_noise_dn", "gain_dn_per_electron"]
 )
 def test_invalid_expectation_names_pixel(name: str, value: float) -> None:
     x = toy()

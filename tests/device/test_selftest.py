@@ -7,26 +7,28 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from commands import run
+from reference import known_answers
 
 from mauvecl import Engine
-from mauvecl.device import kernel_cache, program, selftest
+from mauvecl.device import build, drivers, selftest
 
 WEAKER = "same draws to float rounding: no fused multiply-add"
 
 
 def rendered_otherwise(monkeypatch: pytest.MonkeyPatch, change: Callable[[str], str]) -> None:
     """Change the source of kernels after rendering."""
-    render = program.render
+    render = build.render
 
-    def changed(rooms: tuple[str, ...], variant: program.Variant) -> str:
+    def changed(rooms: tuple[str, ...], variant: build.Variant) -> str:
         source = render(rooms, variant)
         other = change(source)
         assert other != source
         return other
 
-    monkeypatch.setattr(program, "render", changed)
+    monkeypatch.setattr(build, "render", changed)
 
 
 def unfused(source: str) -> str:
@@ -53,6 +55,14 @@ def test_self_test_passes(engine: Engine) -> None:
     assert [check.name for check in checks if not check.passed] == []
 
 
+def test_known_answers_are_those_of_the_numpy_reference() -> None:
+    stored, computed = selftest.known_arrays(), known_answers.every_result(selftest.COUNT)
+    assert stored.keys() == computed.keys()
+    for name, array in computed.items():
+        assert stored[name].dtype == array.dtype
+        np.testing.assert_array_equal(stored[name], array, name)
+
+
 def few_cases(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
     """Restrict the self-test to a few cases, since building their kernels is slow."""
     monkeypatch.setattr(selftest, "CASES", {name: selftest.CASES[name] for name in names})
@@ -62,10 +72,7 @@ def few_cases(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("weakness", "cases"),
-    [
-        (unfused, ("stack", "priors, frames")),
-        (rough_roots, ("apart, tables", "marginalised, the sky unknown")),
-    ],
+    [(unfused, ("stack", "priors, frames")), (rough_roots, ("apart, tables", "marginalised, the sky unknown"))],
 )
 def test_weaker_promise_is_checked_and_marked(
     monkeypatch: pytest.MonkeyPatch, weakness: Callable[[str], str], cases: tuple[str, ...]
@@ -73,10 +80,10 @@ def test_weaker_promise_is_checked_and_marked(
     few_cases(monkeypatch, *cases)
     rendered_otherwise(monkeypatch, weakness)
     weak = Engine()
-    strict = list(selftest.check_against_reference(weak))
+    strict = list(selftest.check_results(weak))
     assert not all(check.passed for check in strict), "a device that promises the same bits must give them"
     weak.open_device.record = replace(weak.device, promise=WEAKER)
-    checks = list(selftest.check_against_reference(weak))
+    checks = list(selftest.check_results(weak))
     assert [check.name for check in checks if not check.passed] == []
     marked = [check for check in checks if "weaker promise" in check.result]
     assert len(marked) == sum(not check.passed for check in strict) > 0
@@ -90,24 +97,23 @@ def test_wrong_kernel_fails_both_promises(monkeypatch: pytest.MonkeyPatch) -> No
     wrong = Engine()
     assert not selftest.known_answers(wrong).passed
     wrong.open_device.record = replace(wrong.device, promise=WEAKER)
-    assert not any(check.passed for check in selftest.check_against_reference(wrong))
+    assert not any(check.passed for check in selftest.check_results(wrong))
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", ["frames at the rail", "cosmic rays", "priors, frames"])
+@pytest.mark.parametrize(
+    "name", ["frames at the rail", "apart, pairs of two ways", "cosmic rays", "priors, fourth power", "priors, frames"]
+)
 def test_one_realisation_per_work_item_gives_the_same_bits(one_by_one: Engine, name: str) -> None:
     """Histograms and tallies, too, of joint and of separate draws; `test_engine.py` has raw counts of every case."""
-    assert selftest.digests(one_by_one, name) == selftest.reference_digests(name)
-
-
-@pytest.fixture(scope="module")
-def one_by_one() -> Engine:
-    return Engine(width=1)
+    theirs = known_answers.results(name, selftest.COUNT)
+    for part, ours in selftest.results(one_by_one, name, selftest.COUNT).items():
+        np.testing.assert_array_equal(ours, theirs[part], part)
 
 
 def test_device_without_strict_arithmetic_has_weaker_promise(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     assert "same bits" in run("devices", "--no-rate", folder=tmp_path).stdout.replace("\n", " ")
-    monkeypatch.setattr(program, "weaknesses", lambda device: ["fused multiply-add"])
+    monkeypatch.setattr(build, "weaknesses", lambda device: ["fused multiply-add"])
     (first, *_) = json.loads(run("devices", "--json", folder=tmp_path).stdout)
     assert first["promise"] == Engine().device.promise == WEAKER
     assert first["rate"] > 1e7
@@ -116,8 +122,8 @@ def test_device_without_strict_arithmetic_has_weaker_promise(monkeypatch: pytest
 def test_selftest_command_reports_and_records_outcome(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Check table, file, exit codes 0 and 1 (failed check), and the outcome in later run records."""
     # A separate store keeps these invented outcomes out of the user's.
-    store = kernel_cache.KernelCache(tmp_path, tmp_path)
-    monkeypatch.setattr("mauvecl.device.selftest_outcome.kernel_cache", lambda: store)
+    store = drivers.KernelCache(tmp_path, tmp_path)
+    monkeypatch.setattr("mauvecl.device.selftest.kernel_cache", lambda: store)
     checks = [selftest.Check("one thing", True, "as it should be")]
     monkeypatch.setattr(selftest, "run", lambda engine: checks)
     good = run("selftest", "--quiet", "--output", tmp_path, folder=tmp_path).stdout

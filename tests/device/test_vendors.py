@@ -14,7 +14,7 @@ import pytest
 from commands import run
 from packaging.requirements import Requirement
 
-from mauvecl.device import vendors
+from mauvecl.device import drivers
 
 CODE = """
 import os, sys
@@ -38,16 +38,16 @@ def wheel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "usual" / "nvidia.icd").write_text("libnvidia-opencl.so.1\n")
     monkeypatch.syspath_prepend(str(info.parent))
     monkeypatch.setattr(sys, "prefix", str(tmp_path))
-    for name in vendors.FOLDER_VARIABLES:
+    for name in drivers.FOLDER_VARIABLES:
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setenv(vendors.FOLDER_VARIABLES[1], str(tmp_path / "usual"))
-    vendors._folder.cache_clear()
+    monkeypatch.setenv(drivers.FOLDER_VARIABLES[1], str(tmp_path / "usual"))
+    drivers._folder.cache_clear()
     yield tmp_path
-    vendors._folder.cache_clear()
+    drivers._folder.cache_clear()
 
 
 def listed() -> dict[str, str]:
-    with vendors.show_intel_runtime():
+    with drivers.show_intel_runtime():
         folder = Path(os.environ["OCL_ICD_VENDORS"])
         return {path.name: path.read_text().strip() for path in folder.iterdir()}
 
@@ -62,26 +62,26 @@ def test_loader_finds_intels_driver_and_all_others(wheel: Path) -> None:
 
 def test_users_folder_is_not_replaced(wheel: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OCL_ICD_VENDORS", "/my/own")
-    with vendors.show_intel_runtime():
+    with drivers.show_intel_runtime():
         assert os.environ["OCL_ICD_VENDORS"] == "/my/own"
     assert os.environ["OCL_ICD_VENDORS"] == "/my/own"
 
 
 def test_driver_that_the_system_lists_is_not_listed_twice(wheel: Path) -> None:
     (wheel / "usual" / "intel.icd").write_text(f"{wheel}/lib/libintelocl.so\n")
-    with vendors.show_intel_runtime():
+    with drivers.show_intel_runtime():
         assert "OCL_ICD_VENDORS" not in os.environ
 
 
 def test_nothing_changes_without_the_wheel(wheel: Path) -> None:
     (wheel / "lib" / "libintelocl.so").unlink()
-    with vendors.show_intel_runtime():
+    with drivers.show_intel_runtime():
         assert "OCL_ICD_VENDORS" not in os.environ
 
 
 @pytest.mark.long
 def test_pocl_is_found_despite_broken_driver(wheel: Path) -> None:
-    environment = {name: text for name, text in os.environ.items() if name not in vendors.FOLDER_VARIABLES}
+    environment = {name: text for name, text in os.environ.items() if name not in drivers.FOLDER_VARIABLES}
     code = CODE.format(place=str(wheel / "site"))
     run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     assert "'Portable Computing Language'" in run.stdout

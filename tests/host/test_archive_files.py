@@ -145,10 +145,7 @@ def test_gaia_arrays_in_a_cell() -> None:
 
 def test_surface_or_relative_fluxes_need_a_magnitude() -> None:
     mauve = Instrument.load("mauve")
-    for name, options in (
-        ("ckp00_5750.fits[g45]", {}),
-        ("h_stis_ngsl_hd095735_v2.txtA", ANGSTROM),
-    ):
+    for name, options in (("ckp00_5750.fits[g45]", {}), ("h_stis_ngsl_hd095735_v2.txtA", ANGSTROM)):
         star = Source.read(HERE / name, **options)
         with refused("magnitude"):
             expect(star, mauve, exposure=5.0)
@@ -158,6 +155,7 @@ def test_surface_or_relative_fluxes_need_a_magnitude() -> None:
 def test_calspec_files_that_start_within_the_line_function_are_continued() -> None:
     """Cut a whole file where three of CALSPEC's begin (180.02-180.10 nm) and P330E does (199.95 nm)."""
     star = Source.read(HERE / "18sco_stis_004.fits")
+    assert star.name == "18SCO"
     mauve = Instrument.load("mauve")
     whole = expect(star, mauve, exposure=50.0)
     for start in (180.02, 180.10, 199.95):

@@ -11,14 +11,8 @@ from typing import Any
 import astropy.units as u
 import numpy as np
 import pytest
-from refusals import refused
 
 from mauvecl import Expectation, Instrument, Sky, Source, expect
-
-
-@pytest.fixture(scope="module")
-def mauve() -> Instrument:
-    return Instrument.load("mauve")
 
 
 @pytest.fixture(scope="module")
@@ -92,38 +86,6 @@ def test_sky_alone_has_no_net_signal(sunlike: Source, mauve: Instrument) -> None
     assert "paper signal" not in kinds(star[0])
 
 
-def test_elements_contain_their_pixels(quiet: Expectation) -> None:
-    snr, noise = quiet.snr_per_element(), quiet.noise_budget()["total"].value
-    assert snr.size == quiet.element_wavelength_nm.size == quiet.element[-1] + 1 == 48
-    for k, low in enumerate(200 + 10.5 * np.arange(48)):
-        inside = (quiet.wavelength_nm >= low) & (quiet.wavelength_nm < low + 10.5)
-        assert (quiet.element[inside] == k).all()
-        assert quiet.element_wavelength_nm[k] == pytest.approx(low + 5.25)
-        assert snr[k] == pytest.approx(quiet.signal_dn[inside].sum() / np.sqrt((noise[inside] ** 2).sum()))
-    assert set(np.diff(quiet.element).tolist()) == {0, 1}
-
-
-def test_noise_budget_adds_up_to_the_total(quiet: Expectation) -> None:
-    budget = quiet.noise_budget()
-    assert budget.colnames == ["wavelength", "source_photon", "zodiacal_photon", "dark", "read", "total"]
-    assert (budget["wavelength"].unit, budget["read"].unit) == (u.nm, u.DN)
-    parts = sum(budget[name] ** 2 for name in budget.colnames[1:5])
-    np.testing.assert_allclose((budget["total"] ** 2).value, parts.value, rtol=1e-12)
-    np.testing.assert_allclose(quiet.signal_dn / budget["total"].value, quiet.snr(), rtol=1e-12)
-    assert budget["read"][0].value == pytest.approx(12 * np.sqrt(10))
-    assert budget["dark"][0].value == pytest.approx(np.sqrt(445.5337 * 50), rel=1e-6)
-    photon = 0.5957818 * np.sqrt(10 * quiet.source_electrons[800])
-    assert budget["source_photon"][800].value == pytest.approx(photon, rel=1e-6)
-
-
-def test_dark_in_electrons_is_less_noisy(sunlike: Source, quiet: Expectation) -> None:
-    electrons = expect(sunlike, Instrument.load("mauve-electrons"), exposure=50)
-    np.testing.assert_array_equal(electrons.dark_dn, quiet.dark_dn)
-    ratio = quiet.noise_budget()["dark"] / electrons.noise_budget()["dark"]
-    # 1 / sqrt(gain); the conversion efficiencies that are quoted give 1.16 to 1.30.
-    np.testing.assert_allclose(ratio, 1.2956, rtol=1e-3)
-
-
 @pytest.mark.parametrize(("exposure", "frame_s", "frames", "rounded"), [
     (50, 5, 10, False), (47.0, 5, 10, True), (0.001, 5, 1, True), (5, 5, 1, False), (5.001, 5, 2, True),
     (2 * u.min, 5, 24, False), (1 * u.day, 5, 17280, False), (np.float32(10), 5, 2, False), (0.1 + 0.2, 0.1, 3, False),
@@ -182,36 +144,6 @@ def test_expectation_is_immutable_and_survives_pickling(quiet: Expectation) -> N
     again = pickle.loads(pickle.dumps(quiet))
     assert again == quiet
     assert again.messages == quiet.messages
-
-
-def test_negative_mean_raises(quiet: Expectation) -> None:
-    bad = quiet.source_electrons.copy()
-    bad[17] = -0.2
-    with refused("source_electrons", "17", "-0.2", "0"):
-        replace(quiet, source_electrons=bad)
-
-
-def test_short_spectrum_raises_for_a_wide_instrument(sunlike: Source, mauve: Instrument) -> None:
-    wide = mauve.with_(
-        output_max_nm=2000.0,
-        pixels=8000,
-        **dict.fromkeys(("grating_efficiency", "fibre_efficiency", "telescope_mirror_reflectivity"), 0.5),
-        spectrometer_mirror_reflectivity=0.9,
-        quantum_efficiency_a_per_w=0.1,
-    )
-    kept = sunlike.wavelength_nm < 800
-    short = replace(sunlike, wavelength_nm=sunlike.wavelength_nm[kept], flux_flam=sunlike.flux_flam[kept])
-    with refused("extend", "200-2000"):
-        expect(short, wide, exposure=5)
-
-
-def test_order_matters_only_in_the_ultraviolet(sunlike: Source, mauve: Instrument, quiet: Expectation) -> None:
-    physical = expect(sunlike, mauve, exposure=50, order="physical")
-    ratio = physical.net_source_dn / quiet.net_source_dn
-    assert np.abs(ratio[quiet.wavelength_nm > 250] - 1).max() < 0.04
-    # At 200 nm most light has come from longer wavelengths, where the efficiency is higher.
-    assert ratio[0] > 1.08
-    assert physical.provenance["order"] == "physical"
 
 
 def test_import_is_light() -> None:

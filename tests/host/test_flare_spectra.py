@@ -69,11 +69,6 @@ def test_balmer_flare_follows_its_formula() -> None:
     assert BalmerFlare(9500.0, 1.0).flux(nm) == pytest.approx(blackbody(nm, 9500.0), rel=1e-15)
 
 
-def test_two_blackbodies_of_one_temperature_equal_one() -> None:
-    nm = np.linspace(200.0, 700.0, 11)
-    np.testing.assert_allclose(TwoBlackbodies(9e3, 9e3, 0.25).flux(nm), 1.25 * blackbody(nm, 9e3), rtol=1e-14)
-
-
 def test_relative_lines_carry_their_fraction_and_absolute_ones_their_flux() -> None:
     plain, nm = Blackbody(10_000.0), np.linspace(200.0, 700.0, 50_001)
     lined = FlareWithLines(plain, {"Mg II": 0.05}, {"H beta": 2e-13})

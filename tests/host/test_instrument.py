@@ -1,4 +1,4 @@
-"""Values of the payload, and the content of users' instrument files."""
+"""Values of the payload, pixels that differ, and the content of users' instrument files."""
 
 from __future__ import annotations
 
@@ -8,29 +8,7 @@ import numpy as np
 import pytest
 from refusals import refused
 
-from mauvecl import Instrument
-
-# Computed independently of this code: wavelength nm, total efficiency, effective area cm^2.
-PUBLISHED = [
-    (200, 0.101, 5.6),
-    (250, 0.207, 11.6),
-    (300, 0.263, 16.2),
-    (400, 0.228, 14.7),
-    (500, 0.167, 12.3),
-    (600, 0.125, 9.7),
-    (700, 0.093, 6.9),
-]
-
-
-@pytest.fixture(scope="module")
-def mauve() -> Instrument:
-    return Instrument.load("mauve")
-
-
-@pytest.mark.parametrize(("nm", "efficiency", "area_cm2"), PUBLISHED)
-def test_efficiency_and_effective_area(mauve: Instrument, nm: float, efficiency: float, area_cm2: float) -> None:
-    assert mauve.efficiency(nm) == pytest.approx(efficiency, rel=0.02)
-    assert mauve.effective_area_cm2(nm) == pytest.approx(area_cm2, rel=0.02)
+from mauvecl import Expectation, Instrument, PixelMap, Source, expect
 
 
 def test_efficiency_is_the_product_of_the_paper(mauve: Instrument) -> None:
@@ -91,19 +69,7 @@ def test_with_returns_a_marked_copy(mauve: Instrument) -> None:
     assert {mauve: 1}[mauve.with_(temperature_c=21.0)] == 1
 
 
-CURVE = """# %ECSV 1.0
-# ---
-# datatype:
-# - {name: wavelength, unit: Angstrom, datatype: float64}
-# - {name: efficiency, unit: '', datatype: float64}
-# meta: !!omap
-# - {tag: D}
-# - {source: measured}
-# schema: astropy-2.0
-wavelength efficiency
-1900 0.2
-7100 0.4
-"""
+CURVE = (Path(__file__).parents[1] / "data" / "grating.ecsv").read_text(encoding="utf-8")
 
 
 def test_user_file_extends_an_embedded_instrument(tmp_path: Path, mauve: Instrument) -> None:
@@ -167,3 +133,41 @@ def test_instrument_without_throughput_raises(tmp_path: Path, mauve: Instrument,
     with refused("throughput", "0"):
         mauve.with_(**{name: tmp_path / "below.ecsv", "window_efficiency": tmp_path / "above.ecsv"})
     assert mauve.with_(**{name: tmp_path / "below.ecsv"}).throughput(300.0) > 0
+
+
+def seen(payload: Instrument) -> Expectation:
+    return expect(Source.from_library("G2V").at_magnitude(6.0), payload, exposure=5.0)
+
+
+def test_each_column_changes_its_own_quantity() -> None:
+    mauve = Instrument.load("mauve")
+    plain = seen(mauve)
+    n = np.arange(2048)
+    given = PixelMap(
+        response=1 + n / 4096, dark=1 + n / 1024, gain=1 - n / 8192, bias_dn=500.0 + n, read_noise_dn=10 + n / 500
+    )
+    uneven = seen(mauve.with_(pixel_map=given))
+    part = mauve.read_pixels
+    assert (part.start, part.stop - part.start) == (76, plain.wavelength_nm.size)
+    np.testing.assert_allclose(uneven.source_electrons, plain.source_electrons * given.response[part], rtol=1e-12)
+    np.testing.assert_allclose(uneven.dark_dn, plain.dark_dn * given.dark[part], rtol=1e-12)
+    np.testing.assert_allclose(uneven.gain_dn_per_electron, plain.gain_dn_per_electron * given.gain[part], rtol=1e-12)
+    np.testing.assert_array_equal(uneven.bias_dn, given.bias_dn[part])
+    np.testing.assert_array_equal(uneven.read_noise_dn, given.read_noise_dn[part])
+    only_dark = seen(mauve.with_(pixel_map=PixelMap(dark=given.dark)))
+    np.testing.assert_array_equal(only_dark.source_electrons, plain.source_electrons)
+    assert mauve.with_(pixel_map=given).digest != mauve.digest
+
+
+def test_written_maps_are_read_back(tmp_path: Path) -> None:
+    made = PixelMap.made_up(2048, seed=3, hot_share=0.01, hot_dark=50.0)
+    assert 5 < np.sum(made.dark > 10) < 50
+    made.write(tmp_path / "map.ecsv")
+    again = PixelMap.read(tmp_path / "map.ecsv")
+    assert again.digest == made.digest
+    assert again.source == "A: made up, seed 3"
+    (tmp_path / "own.toml").write_text('extends = "mauve"\nname = "own"\npixel_map = "map.ecsv"\n')
+    payload = Instrument.load(tmp_path / "own.toml")
+    assert payload.pixel_map is not None
+    assert payload.pixel_map.digest == made.digest
+    assert payload.sources["pixel_map"] == made.source

@@ -8,6 +8,7 @@ import io
 import json
 import re
 import threading
+import tomllib
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -30,7 +31,9 @@ def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "data" / "stars"
 
 
-WHOLE = Path(__file__).parents[1] / "data" / "spectra" / "18sco_stis_004.fits"
+DATA = Path(__file__).parents[1] / "data"
+WHOLE = DATA / "spectra" / "18sco_stis_004.fits"
+DOWNLOADS = tomllib.loads((DATA / "downloads.toml").read_text(encoding="utf-8"))["failed"]
 WAVELENGTH_NM = np.linspace(170.0, 1000.0, 500)
 FLUX = 1e-12 * np.exp(-(((WAVELENGTH_NM - 500) / 200) ** 2))
 
@@ -264,22 +267,9 @@ def test_any_collection_is_searched(archive: str, tmp_path: Path, monkeypatch: p
     assert "CALSPEC" in reported
 
 
-@pytest.mark.parametrize(("name", "below", "facts"), [
-    ("ngsl:HD 1", "ngsl", ("h_stis_ngsl_hd000001_v2.fits",)),
-    ("ngsl:HD 2", "ngsl", ("h_stis_ngsl_hd000002_v2.fits",)),
-    ("calspec:cut", "calspec", ("cut_stis_001.fits",)),
-    ("ngsl:HD 3", "ngsl", ("'HD 3'",)),
-    ("calspec:nobody", "calspec", ("'nobody'", "CALSPEC")),
-    ("ngsl:HD 3", "busy", ("503", "/busy/")),
-    ("ngsl:HD 4", "hang", ("/hang/",)),
-    ("ngsl:HD 1", "endless", ("MAUVECL_LARGEST_FILE_MIB", "_v2.fits", "1")),
-    ("calspec:x", "endless", ("MAUVECL_LARGEST_FILE_MIB", "1")),
-    ("ngsl:HD 1", "slow", ("_v2.fits", "0")),
-    ("mast:HD 37202", "", ("'mast'",)),
-    ("HD 37202", "", ("37202",)),
-])  # fmt: skip
+@pytest.mark.parametrize(("name", "below", "facts"), DOWNLOADS)
 def test_failed_downloads_raise(
-    archive: str, tmp_path: Path, name: str, below: str, facts: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+    archive: str, tmp_path: Path, name: str, below: str, facts: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("MAUVECL_LARGEST_FILE_MIB", "1")
     monkeypatch.setattr(additions, "MAX_LISTING_BYTES", 1 << 20)

@@ -1,4 +1,4 @@
-"""The response of the detector to light, compared with quadrature, and its conserved quantities."""
+"""The response of the detector to light, compared with quadrature."""
 
 from __future__ import annotations
 
@@ -18,11 +18,6 @@ Order = Literal["paper", "physical"]
 KERNELS = pytest.mark.parametrize(("top_hat", "fwhm"), [(10.8, 10.5), (10.8, 0.0), (0.0, 10.5), (2.0, 0.4)])
 ORDERS = pytest.mark.parametrize("order", ["paper", "physical"])
 CHARGE_C = 1.602176634e-19
-
-
-@pytest.fixture(scope="module")
-def mauve() -> Instrument:
-    return Instrument.load("mauve")
 
 
 def rate_of(instrument: Instrument, nm: ArrayLike, flux: ArrayLike, order: Order = "paper") -> Float:
@@ -94,7 +89,8 @@ def test_random_spectra_agree_with_quadrature(
     wavelength = np.sort(np.append(rng.uniform(150, 790, n), [150, 790]))
     flux = rng.random(wavelength.size) * np.where(rng.random(wavelength.size) < 0.03, 50, 1)
     rate = rate_of(instrument, wavelength, flux, order)
-    for pixel in (0, 811, 1642):
+    # Light of every wavelength reaches one of these.
+    for pixel in (0, 1, *range(53, 1642, 53), 1642):
         # Far below the requested 1e-6.
         assert rate[pixel] == pytest.approx(by_quadrature(instrument, wavelength, flux, pixel, order), rel=1e-9)
 
@@ -104,11 +100,6 @@ def per_efficiency(instrument: Instrument, rate: Float) -> Float:
     nm = instrument.wavelength_nm
     own = instrument.efficiency(nm) * instrument.quantum_efficiency_a_per_w.at(nm)
     return rate / (1e-6 * instrument.collecting_area_cm2 * own / CHARGE_C)
-
-
-def test_flat_spectrum_stays_flat(mauve: Instrument) -> None:
-    rate = rate_of(mauve, [100.0, 300.0, 800.0], [2.0, 2.0, 2.0])
-    np.testing.assert_allclose(per_efficiency(mauve, rate), 2.0 * 0.3043, rtol=1e-12)
 
 
 @KERNELS
@@ -123,39 +114,3 @@ def test_line_lands_as_the_line_function(mauve: Instrument, top_hat: float, fwhm
     if half_width < 1e-3:
         wanted = half_width * landing(instrument.wavelength_nm - 437.1, instrument)
         np.testing.assert_allclose(landed, wanted, rtol=1e-5, atol=1e-7 * wanted.max())
-
-
-@pytest.mark.parametrize("nm", [160.0, 185.0, 230.0, 437.0, 640.0, 715.0, 770.0])
-def test_light_is_conserved_and_stays_within_reach(mauve: Instrument, nm: float) -> None:
-    """A line in addition to flat light adds to no pixel out of reach, and keeps its flux unless it is near the ends."""
-    nodes = np.union1d(np.arange(100.0, 901.0, 50.0), [nm - 0.5, nm, nm + 0.5])
-    flat, line = (rate_of(mauve, nodes, 1 + added * (nodes == nm)) for added in (0, 1))
-    landed = per_efficiency(mauve, line - flat)
-    assert landed.min() >= -1e-9
-    assert landed.sum() == pytest.approx(0.5, rel=1e-6) if 230 <= nm <= 640 else landed.sum() < 0.499
-    assert np.abs(landed[np.abs(mauve.wavelength_nm - nm) > 45]).max() < 1e-9
-    assert bool(landed.max() > 1e-9) == (160.0 < nm < 770.0)
-
-
-@ORDERS
-@pytest.mark.parametrize("n", [5000, 150_001])
-def test_redundant_nodes_change_nothing(mauve: Instrument, order: Order, n: int) -> None:
-    wavelength, flux = np.array([150.0, 230.0, 390.0, 400.0, 800.0]), np.array([0.0, 1.0, 3.0, 1.0, 2.0])
-    more = np.union1d(wavelength, np.linspace(150, 800, n))
-    found = rate_of(mauve, more, np.interp(more, wavelength, flux), order)
-    np.testing.assert_allclose(found, rate_of(mauve, wavelength, flux, order), rtol=1e-10)
-
-
-def test_physical_order_applies_the_efficiency_of_the_light(mauve: Instrument) -> None:
-    nodes = np.array([150, 302.999, 303.0, 303.001, 790])
-    rate = rate_of(mauve, nodes, [0, 0, 1.0, 0, 0], "physical")
-    own = mauve.efficiency(303.0) * mauve.quantum_efficiency_a_per_w.at(303.0)
-    assert rate.sum() == pytest.approx(1e-6 * 0.001 * 122 * own / CHARGE_C, rel=1e-6)
-
-
-def test_order_matters_where_the_efficiency_is_steep(mauve: Instrument) -> None:
-    # For a flat flux it is the efficiency's curvature alone: some per cent at most, but at the ends of the range.
-    nodes, flat = np.array([100.0, 300.0, 900.0]), np.ones(3)
-    ratio = rate_of(mauve, nodes, flat, "physical") / rate_of(mauve, nodes, flat)
-    assert np.abs(ratio[100:-100] - 1).max() < 0.03
-    assert np.abs(ratio - 1).max() > 0.005

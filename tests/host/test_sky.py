@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import socket
 from datetime import datetime
+from pathlib import Path
 from typing import Any
 
 import astropy.units as u
@@ -17,25 +18,11 @@ from refusals import refused
 
 from mauvecl import InputError, Sky
 
-# The paper's table, longitude 180 to 0 downwards, latitude 0 to 90 across.
-PAPER = """
-22.1 22.4 22.7 23.0 23.2 23.4 23.3
-22.3 22.5 22.8 23.0 23.2 23.4 23.3
-22.4 22.6 22.9 23.1 23.3 23.4 23.3
-22.4 22.6 22.9 23.2 23.3 23.4 23.3
-22.4 22.6 22.9 23.2 23.3 23.3 23.3
-22.2 22.5 22.9 23.1 23.3 23.3 23.3
-22.0 22.3 22.7 23.0 23.2 23.3 23.3
-21.7 22.2 22.6 22.9 23.1 23.2 23.3
-21.3 21.9 22.4 22.7 23.0 23.2 23.3
-SA SA 22.1 22.5 22.9 23.1 23.3
-SA SA SA 22.3 22.7 23.1 23.3
-SA SA SA SA 22.6 23.0 23.3
-SA SA SA SA 22.6 23.0 23.3
-"""
+#: The paper's table, longitude 180 to 0 downwards, latitude 0 to 90 across.
+PAPER = Path(__file__).parents[1] / "data" / "zodiacal-light.txt"
 CELLS = {
     (180 - 15 * row, 15 * column): cell
-    for row, line in enumerate(PAPER.split("\n")[1:-1])
+    for row, line in enumerate(PAPER.read_text(encoding="utf-8").splitlines())
     for column, cell in enumerate(line.split())
 }
 

@@ -4,25 +4,16 @@ from __future__ import annotations
 
 import re
 import warnings
-from pathlib import Path
 from typing import Any
 
 import astropy.units as u
 import numpy as np
 import pytest
-from astropy.table import Table
 from refusals import refused
+from scenes import BANDS
 
-import mauvecl
 from mauvecl import Blackbody, Instrument, Source, expect
 
-DATA = Path(__file__).parents[1] / "data"
-FLAM = u.erg / (u.s * u.cm**2 * u.AA)
-BANDS = {
-    table.meta["name"]: table
-    for path in (Path(mauvecl.__file__).parent / "host" / "stars" / "library" / "bands").iterdir()
-    for table in [Table.read(path, format="ascii.ecsv")]
-}
 SYSTEMS = ("catalogue", "vega", "ab")
 
 
@@ -95,41 +86,6 @@ def test_scaling_to_a_magnitude_in_any_system(sun: Source, system: Any) -> None:
     )
 
 
-@pytest.mark.parametrize(
-    ("name", "band", "catalogued", "error"),
-    [
-        # The Sun: V = -26.76 +- .02 (Willmer 2018, ApJS 236, 47), G = -26.90 (Casagrande & VandenBerg 2018).
-        ("Sun", "V", -26.76, 0.02),
-        ("Sun", "Gaia G", -26.90, 0.01),
-        # Kepler's mission itself: Kp - V = .08 for A0V; -.08 for a B - V of .65 (keplergo, "Photometric zeropoint").
-        ("Sun", "Kepler", -26.76 - 0.077, 0.05),
-        ("A0V", "Kepler", 0.03 + 0.08, 0.05),
-    ],
-)
-def test_stars_have_their_catalogued_magnitudes(name: str, band: str, catalogued: float, error: float) -> None:
-    """Check V of the stars, all of which but the Sun's would be wrong with Vega at zero."""
-    assert Source.from_library(name).magnitude(band) == pytest.approx(catalogued, abs=error)
-
-
-@pytest.mark.parametrize("band", ["Kepler", "V", "TESS"])
-@pytest.mark.parametrize("amplitude", [0.0, 0.0076, 0.24, 3.0])
-def test_flares_rise_by_their_amplitude(sun: Source, band: str, amplitude: float) -> None:
-    for flare in (
-        sun.flaring(amplitude, 9_000 * u.K, band=band),
-        sun.flaring(amplitude / 4, 12_000, band=band, geometry="replaces", photosphere_temperature=5800),
-    ):
-        expected = amplitude if "added" in flare.history[-1] else amplitude / 4
-        assert ratio(flare, sun, band) - 1 == pytest.approx(expected, abs=1e-9)
-
-
-def test_added_flare_is_a_blackbody(sun: Source) -> None:
-    excess = sun.flaring(0.24).flux_flam - sun.flux_flam
-    shape = blackbody(sun.wavelength_nm, 10_000.0)
-    np.testing.assert_allclose(excess / shape, excess[100] / shape[100], rtol=1e-6)
-    # Wien's law places its peak at 290 nm.
-    assert sun.wavelength_nm[shape.argmax()] == pytest.approx(289.8, abs=1.0)
-
-
 def test_replacing_flare_hides_photosphere(sun: Source) -> None:
     """Compare with the exact area-weighted sum of two blackbodies, for a star that is a blackbody."""
     cool, hot, filling = (blackbody(grid(), t) for t in (5000.0, 10_000.0, 5000.0))
@@ -137,51 +93,6 @@ def test_replacing_flare_hides_photosphere(sun: Source) -> None:
     f = 0.1 / (ratio(Source.from_arrays(grid(), hot), star, "Kepler") - 1)
     flare = star.flaring(0.1, 10_000, geometry="replaces", photosphere_temperature=5000)
     np.testing.assert_allclose(flare.flux_flam, (1 - f) * filling + f * hot, rtol=1e-9)
-
-
-def test_replacing_flare_uses_the_photosphere_of_the_star(sun: Source) -> None:
-    """Use the library's temperature if none is given; the user's own spectrum has none."""
-    assert (sun.temperature_k, Source.from_library("K2.5V").temperature_k) == (5636.0, 4783.0)
-    own = sun.flaring(0.1, geometry="replaces")
-    np.testing.assert_array_equal(
-        own.flux_flam, sun.flaring(0.1, geometry="replaces", photosphere_temperature=5636).flux_flam
-    )
-    assert own.history[-1].endswith("replaces photosphere of 5636 K")
-    assert not np.array_equal(
-        own.flux_flam, sun.flaring(0.1, geometry="replaces", photosphere_temperature=4783).flux_flam
-    )
-
-
-def test_dust_dims_the_blue_most(sun: Source) -> None:
-    behind = sun.reddened(0.2)
-    assert behind.magnitude("V") - sun.magnitude("V") == pytest.approx(3.1 * 0.2, abs=0.03)
-    assert behind.magnitude("GALEX NUV") - sun.magnitude("GALEX NUV") > 1.0
-
-
-def test_calspec_file_is_read(sun: Source) -> None:
-    """Read the unmodified file of 18 Sco, the paper's G2V star, and compare it with the library's G2V."""
-    star = Source.read(DATA / "spectra" / "18sco_stis_004.fits")
-    assert star.name == "18SCO"
-    # V = 5.50 (SIMBAD); 5.456 with Vega at zero.
-    assert star.magnitude() == pytest.approx(5.50, abs=0.02)
-    assert star.messages == ("its own points cover 171.042-31891.2 nm",)
-    mauve = Instrument.load("mauve")
-    real, class_mean = (expect(s, mauve, exposure=50) for s in (star.at_magnitude(7.4), sun))
-    visible = real.wavelength_nm > 320
-    np.testing.assert_allclose(real.signal_dn[visible], class_mean.signal_dn[visible], rtol=0.08)
-
-
-def test_spectra_in_memory(sun: Source) -> None:
-    from specutils import Spectrum
-    from synphot import SourceSpectrum
-    from synphot.models import BlackBodyNorm1D
-
-    spectrum = Spectrum(spectral_axis=sun.wavelength_nm * u.nm, flux=sun.flux_flam * FLAM)
-    np.testing.assert_allclose(Source.from_specutils(spectrum).flux_flam, sun.flux_flam)
-    body = Source.from_synphot(SourceSpectrum(BlackBodyNorm1D, temperature=6000))
-    inside = (body.wavelength_nm > 200) & (body.wavelength_nm < 700)
-    shape = body.flux_flam[inside] / blackbody(body.wavelength_nm[inside], 6000.0)
-    np.testing.assert_allclose(shape, shape[0], rtol=1e-3)
 
 
 GOOD = grid() * 1e-15

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from mauvecl import Engine
-from mauvecl.device.probes import Probes
+from mauvecl.device.selftest import Probes
 
 
 @pytest.fixture(scope="session", params=["vector forms", "vectors of built-ins", "scalar"])

@@ -12,7 +12,7 @@ from scenes import instrument, star
 from scipy import optimize
 
 from mauvecl import Engine, Expectation, InputError, Processes, Uniform
-from mauvecl.device.toy_exposure import toy
+from mauvecl.device.selftest import toy
 from mauvecl.noise import layout, reference
 from mauvecl.noise.scene import prepare
 
@@ -184,10 +184,7 @@ def test_factors_follow_the_cumulants(quartic: bool, photon_noise: str) -> None:
     factors = reference.factors(scene, index, 0, 5)
     warm = np.exp(x.conditions["dark_slope_per_c"] * (12.0 - x.conditions["temperature_c"]))
     other = replace(
-        x,
-        source_electrons=1.4 * x.source_electrons,
-        sky_electrons=1.4 * x.sky_electrons,
-        dark_dn=warm * x.dark_dn,
+        x, source_electrons=1.4 * x.source_electrons, sky_electrons=1.4 * x.sky_electrons, dark_dn=warm * x.dark_dn
     )
     drawn = reference.draws(scene, index, 0, 1, 5)
     for i in range(4):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mauvecl.device.probes import Probes
+from mauvecl.device.selftest import Probes
 from mauvecl.noise import layout
 
 

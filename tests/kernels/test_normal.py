@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from mauvecl.device.probes import Probes
+from mauvecl.device.selftest import Probes
 from mauvecl.noise import random_numbers, reference
 
 #: Words at every end of every branch: zeros, ones, signs, quadrants, the split of the logarithm.

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import randomgen
 
-from mauvecl.device.probes import Probes
+from mauvecl.device.selftest import Probes
 from mauvecl.noise import random_numbers
 
 Words = tuple[int, ...]

@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mauvecl.device.probes import Probes
-from mauvecl.device.toy_exposure import toy
-from mauvecl.noise import random_numbers, reference
-from mauvecl.noise.layout import alias_table
+from mauvecl.device.selftest import Probes, toy
+from mauvecl.noise import layout, random_numbers, reference
 from mauvecl.noise.scene import prepare
 
 #: From this mean on, counts are drawn by an expansion.
@@ -23,7 +21,7 @@ MEANS = [0.0, 0.5, 5.0, 64.0, 2225.0, 22250.0, 222500.0]
 @pytest.mark.parametrize("mean", [*MEANS, 1e-9, 0.01, 1.0, 999.5, 1e6, 1e7])
 def test_alias_table_has_the_probabilities_of_scipy(mean: float) -> None:
     """Count the words of each outcome exactly and compare with scipy to one word in 2**32."""
-    table = alias_table(mean)
+    table = layout.alias_table(mean)
     words = table.words_per_column()
     assert words.sum() == 2**32
     counts = table.low + np.arange(words.size)
@@ -35,7 +33,7 @@ def test_alias_table_has_the_probabilities_of_scipy(mean: float) -> None:
 
 @pytest.mark.parametrize("mean", MEANS)
 def test_extreme_words_and_column_edges(probes: Probes, mean: float) -> None:
-    table = alias_table(mean)
+    table = layout.alias_table(mean)
     share = 2 ** (32 - table.bits)
     starts = np.arange(2**table.bits, dtype=np.int64) * share
     threshold = table.entries.astype(np.int64) & (share - 1)
@@ -62,7 +60,7 @@ EXPANDED = [SMALLEST_EXPANDED, 2225.0, 22250.0, 222500.0]
 @pytest.fixture(scope="module")
 def drawn(probes_fast: Probes) -> dict[tuple[str, float], np.ndarray]:
     """Count the draws of each value for each mean, by table and by expansion."""
-    tables = {mean: alias_table(mean) for mean in MEANS}
+    tables = {mean: layout.alias_table(mean) for mean in MEANS}
     half = {mean: int(10 * np.sqrt(mean)) for mean in EXPANDED}
     counts = {("table", mean): np.zeros(2**table.bits, np.int64) for mean, table in tables.items()}
     counts |= {("expansion", mean): np.zeros(2 * half[mean], np.int64) for mean in EXPANDED}
@@ -91,7 +89,7 @@ def test_pearson_of_the_table(drawn: dict[tuple[str, float], np.ndarray], mean: 
     if mean == 0.0:
         assert counts[0] == counts.sum()
     else:
-        assert pearson(counts, alias_table(mean).low, mean) > 1e-6
+        assert pearson(counts, layout.alias_table(mean).low, mean) > 1e-6
 
 
 @pytest.mark.long
@@ -136,6 +134,6 @@ def test_equal_means_share_a_table() -> None:
         prepare([replace(toy(4, 1, read=0.7, light=0.0), dark_dn=np.array(means))], recipe="apart")
         for means in ([5.0, 5.0, 5.0, 5.0], [5.0, 64.0, 5.0, 64.0])
     )
-    assert alike.tables.size == alias_table(5.0).entries.size
-    assert other.tables.size == alike.tables.size + alias_table(64.0).entries.size
+    assert alike.tables.size == layout.alias_table(5.0).entries.size
+    assert other.tables.size == alike.tables.size + layout.alias_table(64.0).entries.size
     assert other.dark_counts["table"][:4].tolist() == [0, alike.tables.size] * 2

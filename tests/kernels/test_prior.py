@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from mauvecl import Normal, Processes, Uniform
-from mauvecl.device.probes import Probes
-from mauvecl.device.toy_exposure import toy
+from mauvecl.device.selftest import Probes, toy
 from mauvecl.noise import layout, reference
 from mauvecl.noise.scene import prepare
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+import os
+import sys
 
 import numpy as np
 import pytest
 from processes import python
 
 from mauvecl import Engine, Processes
-from mauvecl.device.toy_exposure import toy
+from mauvecl.device.selftest import toy
 from mauvecl.noise import layout, reference, unknowns
 from mauvecl.noise.scene import prepare
 
@@ -72,10 +74,10 @@ class Bursts(additive.AdditiveProcess):
 from mauvecl.noise import unknowns
 unknowns.ADDITIVE["bursts"] = Bursts
 from mauvecl import Engine, Processes, Stare, Stares, Study, simulate
-from mauvecl.device.toy_exposure import toy
+from mauvecl.device.selftest import toy
 from mauvecl.flares.frames import Components
 from mauvecl.flares.stare_scene import Flares, StareScene
-from mauvecl.flares import reference as twin
+from reference import stares as twin
 from mauvecl.noise import reference
 from mauvecl.noise.scene import prepare
 sections = {"bursts": {"per_s": 0.02}, "cosmic_rays": {"rate_per_cm2_s": 300.0}}
@@ -113,7 +115,7 @@ print(json.dumps({
 @pytest.mark.long
 def test_another_process_needs_its_class_and_row_only() -> None:
     """Section, kernels, reference, stares and decomposition follow a row; the added charge is that of the class."""
-    done = python(TOY.replace("NUMBER", str(N)))
+    done = python(TOY.replace("NUMBER", str(N)), PYTHONPATH=os.pathsep.join(sys.path))
     found = json.loads(done.stdout.splitlines()[-1])
     assert found["keys"] == ["cosmic_rays", "bursts"]
     assert found["kept"]

@@ -9,8 +9,8 @@ import pytest
 from scenes import instrument, star
 
 from mauvecl import CosmicRays, Engine, Expectation, Normal, PixelMap, Processes
-from mauvecl.device.toy_exposure import toy
-from mauvecl.noise.layout import alias_table
+from mauvecl.device.selftest import toy
+from mauvecl.noise import layout
 from mauvecl.noise.scene import prepare
 
 #: Sixteen groups of four; pixel i of group g has a mean for the expansion where bit i of g is set, else for a table.
@@ -75,7 +75,7 @@ def test_pairs_of_pixels_use_one_method() -> None:
         np.testing.assert_array_equal(pairs[:, 0], (mean >= 1000.0).reshape(-1, 2).all(axis=1))
         # A table in place of the expansion is the same one that the mean has anywhere.
         p = int(np.flatnonzero((counts["bits"] > 0) & (mean >= 1000.0))[0])
-        table = alias_table(mean[p])
+        table = layout.alias_table(mean[p])
         start = int(counts["table"][p])
         np.testing.assert_array_equal(scene.tables[start : start + table.entries.size], table.entries)
     # The last of an odd number has no neighbour.

@@ -11,7 +11,7 @@ from refusals import refused
 from scenes import instrument, star
 
 from mauvecl import CosmicRays, Engine, Expectation, Processes
-from mauvecl.device.variants import scene_launches
+from mauvecl.device.launches import scene_launches
 from mauvecl.noise import layout, reference
 from mauvecl.noise.scene import prepare
 

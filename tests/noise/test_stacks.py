@@ -12,7 +12,7 @@ from scenes import instrument, star
 from scipy import optimize
 
 from mauvecl import Engine, Expectation, Processes, Uniform
-from mauvecl.device.toy_exposure import toy
+from mauvecl.device.selftest import toy
 from mauvecl.noise.scene import prepare
 
 #: Smallest number of draws of one pixel that distinguish an allowed stack from its frames, by exact convolution.

@@ -6,7 +6,7 @@ Draws are NumPy's, so that the simulation shares no code with the engine.
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ import pytest
 from astropy.table import Table
 from commands import run
 from refusals import refused
+from scenes import source as star
 
 from mauvecl import (
     Expectation,
@@ -54,11 +55,6 @@ def truth(**changes: Any) -> Instrument:
         "conversion_uv_per_electron": 22.0, "read_noise_dn": 13.0, "bias_dn": 612.0,
     }  # fmt: skip
     return NOMINAL.with_(**(true | changes))
-
-
-@cache
-def star(name: str, magnitude: float) -> Source:
-    return Source.from_library(name).at_magnitude(magnitude)
 
 
 @lru_cache(maxsize=32)
@@ -285,32 +281,6 @@ def test_plans_state_the_error_of_the_throughput(grey: str) -> None:
     assert 0.02 < table["E50_error"][0] < 0.06
     assert 0 < table["expected_error"][0] < 0.2
     assert "E50_error" not in plan(Study().with_settings(settings)).table.colnames
-
-
-@pytest.mark.long
-def test_light_through_the_fitted_instrument_covers_the_true_one() -> None:
-    """The light of a star through the true instrument lies in the 95 % of the fitted one: 6 seeds, 4 or more.
-
-    Fewer than 4 of 6 happen once in 450 times, if 95 % do.
-    """
-    true = truth(throughput_factor=curve([450.0], [1.0]))
-    study = Study().with_settings(["star=[{library='G2V', magnitude=7.4}]", "flare.amplitudes=[0.24]"])
-    held = 0
-    for seed in range(6):
-        answer = answer_of(STARS[:2], true, 50 + seed)
-        fitted, modes = answer.instrument, answer.instrument.throughput_errors
-        assert modes is not None
-
-        def signal(instrument: Instrument) -> float:
-            """Return the logarithm of the light of the star, electrons, on which limits rest."""
-            x = expect(study.star[0].source(), instrument, exposure=50.0, sky=SKY)
-            return float(np.log(x.source_electrons.sum()))
-
-        middle = signal(fitted)
-        several = range(len(modes.modes))
-        moved = [signal(fitted.with_(throughput_amplitudes=tuple(np.eye(len(several))[k]))) - middle for k in several]
-        held += abs(signal(true) - middle) < 1.96 * np.linalg.norm(moved)
-    assert held >= 4
 
 
 def test_dark_frames_of_two_exposure_times_determine_the_bias_of_pixels() -> None:

@@ -10,8 +10,7 @@ import pytest
 import scipy
 
 from mauvecl import Engine, Expectation, Instrument, Nuisances, Sky, Source, Study, change, expect
-from mauvecl.observations.changes.periods import recover_periods
-from mauvecl.observations.line_index import line_index
+from mauvecl.observations.visits import line_index, recover_periods
 
 AU_MIC = Path(__file__).parents[1] / "data" / "flares" / "aumic_iue"
 MAUVE = Instrument.load("mauve")
@@ -61,13 +60,6 @@ def test_smallest_changes_have_the_power() -> None:
     for values, expected in ((noise, fap), (one, power), (scattered, power)):
         share = np.mean(values.var(axis=1) * visits / row["error"] ** 2 > cut)
         assert abs(share - expected) < 4 * np.sqrt(expected * (1 - expected) / n)
-
-
-def test_errors_of_lines_are_those_computed_independently() -> None:
-    """S/N of 1e-12 erg s-1 cm-2 in 50 s at M3V, V = 9, everything known; numbers of two digits."""
-    snr = {"Mg II k": 0.050, "Ca II K": 0.071, "H beta": 0.075, "H alpha": 0.066}
-    for row in asked(f"change.of={list(snr)}").table:
-        assert 1e-12 / row["error_known"] == pytest.approx(snr[row["change"]], abs=0.001)
 
 
 def test_error_of_change_is_the_scatter_of_fits(quiet: Expectation) -> None:

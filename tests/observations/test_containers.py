@@ -9,8 +9,8 @@ from astropy.nddata import InverseVariance, StdDevUncertainty
 from astropy.time import Time
 from astropy.timeseries import BinnedTimeSeries, TimeSeries
 
+from mauvecl.observations.frame_files import frames_of
 from mauvecl.observations.mapping import FrameMapping
-from mauvecl.observations.reading import frames_of
 
 N = 30
 WHEN = Time(61_000.0, np.arange(N) * 20.0 / 86_400, format="mjd", scale="tdb")

@@ -6,7 +6,7 @@ import numpy as np
 from astropy.table import Table
 
 from mauvecl import Frames
-from mauvecl.observations.reading import frames_of
+from mauvecl.observations.frame_files import frames_of
 
 RNG = np.random.default_rng(29)
 TIME = np.arange(100) * 20.0

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from astropy.table import QTable
 from scenes import analysed
 
 from mauvecl import read_frames
@@ -25,14 +24,6 @@ def answer() -> Any:
 @pytest.fixture(scope="module")
 def analysis(answer: Any) -> Any:
     return answer.analysis
-
-
-def test_the_file_is_read_whole(analysis: Any) -> None:
-    frames = analysis.frames
-    assert frames.n_frames == 341
-    assert frames.unit == "1/s"
-    assert frames.date(frames.time_s[0]).startswith("2005-11-18T19:59:48.5")
-    np.testing.assert_allclose(frames.exposure_s, 5.0)
 
 
 def test_the_bad_bin_and_the_single_bin_are_flagged_with_reasons(answer: Any, analysis: Any) -> None:
@@ -65,28 +56,3 @@ def test_the_great_flare_is_found_at_its_time(analysis: Any) -> None:
     level = great.energy.level * survey.level
     assert great.amplitude * level == pytest.approx(838.6 - 5.5, rel=0.005)
     assert max(e.value for e in analysis.events) == great.value
-
-
-def test_the_rates_of_false_alarms_are_stated_for_each_event(analysis: Any) -> None:
-    for event in analysis.events:
-        modelled, measured = analysis.false_alarms(event)
-        # The threshold is that of the larger rate, with its standard error.
-        assert 0 <= modelled <= 1.05
-        assert 0 <= measured <= 1.05
-
-
-def test_the_answer_writes_its_tables_and_shows_them(answer: Any, analysis: Any, tmp_path: Path) -> None:
-    answer.write(tmp_path)
-    for name, table in answer.tables.items():
-        read = QTable.read(tmp_path / f"{name}.ecsv")
-        assert read.colnames == table.colnames
-        assert len(read) == len(table) > 0
-        assert [read[column].unit for column in read.colnames] == [table[column].unit for column in table.colnames]
-    events = answer.events
-    assert len(events) == len(analysis.events)
-    titles = [view.texts()[0] for view in answer.views]
-    assert all(titles)
-    assert set(answer.as_json()) == {"messages", "events", "limits", "noise", "measured"}
-    # The end of the great flare is not observed, one bin within it is bad, and no template has its shape.
-    assert sum(events["note"] != "") >= 1
-    assert "1 missing frame" in str(events["note"][-1])

@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from mauvecl.observations import light_changes as module
-from mauvecl.observations.light_changes import light_changes
+from mauvecl.observations import frame_model as module
+from mauvecl.observations.frame_model import light_changes
 
 Float = NDArray[np.float64]
 N, PIXELS = 720, 48

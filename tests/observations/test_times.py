@@ -15,7 +15,7 @@ from astropy.time import Time
 from mauvecl import Frames, Study, analyse, read_frames
 from mauvecl.host.orbit.geometry import TimeGrid
 from mauvecl.host.orbit.orbit import Orbit, Target
-from mauvecl.observations.barycentre import barycentric
+from mauvecl.observations.reduction import barycentric
 
 RNG = np.random.default_rng(29)
 TIME = np.arange(200) * 30.0 + 15.0

@@ -26,7 +26,7 @@ from commands import run
 from scenes import flaring_stares, instrument, star
 
 from mauvecl import DaskWorkers, Engine, Expectation, Pool, Stares, Study, bulk, measure
-from mauvecl.device.errors import DeviceError
+from mauvecl.device.drivers import DeviceError
 from mauvecl.runs.pool import Stopped, map_in_order
 
 pytestmark = [pytest.mark.long, pytest.mark.usefixtures("small_shards")]
@@ -194,7 +194,7 @@ def test_interrupted_cluster_ends_its_workers(stop: signal.Signals, tmp_path: Pa
 
     Ctrl-C in a terminal reaches the whole process group: workers are not of it, or what they build is cut off aloud.
     """
-    script = "import mauvecl.runs.shards as s; s.SHARD_WORK = 2**27; from mauvecl.cli.app import main; main()"
+    script = "import mauvecl.runs.checkpoint as s; s.SHARD_WORK = 2**27; from mauvecl.cli.app import main; main()"
     flags = "--statistic chi2 -n 80000 --no-pictures --fap 0.01"
     words = ["detect", "--star", "G2V", "--star", "K3V", "-m", "7.4,3.7", *flags.split()]
     command = [sys.executable, "-c", script, *words, "--output", "out"]
@@ -261,7 +261,7 @@ OTHER_CODE = {
 }
 #: Script that a worker reads when it starts; Dask runs it twice.
 PRELOAD = """
-from mauvecl.runs import cluster, shards
+from mauvecl.runs import checkpoint as shards, cluster
 if not hasattr(cluster, "changed"):
     cluster.changed, count, identity = True, cluster._count, shards.code_identity
     {change}

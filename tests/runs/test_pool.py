@@ -21,7 +21,7 @@ from answers import N, same, same_snr, small
 from commands import run
 from refusals import refused
 from scenes import instrument, star
-from stores import full_after
+from stores import flip, full_after
 
 from mauvecl import (
     Comparison,
@@ -40,9 +40,9 @@ from mauvecl import (
     limiting_magnitude,
     snr,
 )
-from mauvecl.detection.requests import DetectRequest
-from mauvecl.device.errors import DeviceError
-from mauvecl.runs import shards
+from mauvecl.detection import requests
+from mauvecl.device.drivers import DeviceError
+from mauvecl.runs import checkpoint as shards
 from mauvecl.runs.checkpoint import Checkpoint
 from mauvecl.runs.pool import Stopped, map_in_order
 
@@ -85,11 +85,10 @@ def test_order_of_shards_does_not_affect_the_answer(engine: Engine, scene: list[
     assert (
         pool.standing.shards
         == pool.standing.of
-        == len(shards.shards(DetectRequest(quiet, tuple(flares), N, 5, ("chi2",), start=start)))
+        == len(shards.shards(requests.DetectRequest(quiet, tuple(flares), N, 5, ("chi2",), start=start)))
     )
     same_snr(
-        pool.snr(quiet, realisations=N, seed=5, start=start),
-        engine.snr(quiet, realisations=N, seed=5, start=start),
+        pool.snr(quiet, realisations=N, seed=5, start=start), engine.snr(quiet, realisations=N, seed=5, start=start)
     )
 
 
@@ -233,8 +232,8 @@ def test_fingerprints_distinguish_requests(scene: list[Expectation]) -> None:
     own = [Linear("own", level * np.ones(quiet.wavelength_nm.size)) for level in (1.0, 2.0)]
     brighter = replace(flares[1], source_electrons=np.nextafter(flares[1].source_electrons, np.inf))
 
-    def asked(flares: Sequence[Expectation] = flares, seed: int = 5, **how: Any) -> DetectRequest:
-        return DetectRequest.of(quiet, tuple(flares), N, seed, **{"statistics": ("chi2", "matched")} | how)
+    def asked(flares: Sequence[Expectation] = flares, seed: int = 5, **how: Any) -> requests.DetectRequest:
+        return requests.DetectRequest.of(quiet, tuple(flares), N, seed, **{"statistics": ("chi2", "matched")} | how)
 
     base = asked()
     others = [
@@ -262,7 +261,7 @@ def test_fingerprints_distinguish_requests(scene: list[Expectation]) -> None:
 def test_shards_do_not_depend_on_the_number_of_realisations(scene: list[Expectation]) -> None:
     """Check all shards but the last, so that a longer run finds those of a shorter one."""
     quiet, *flares = scene
-    short, long = (shards.shards(DetectRequest(quiet, tuple(flares), n, 5, ("chi2",))) for n in (N, 10 * N))
+    short, long = (shards.shards(requests.DetectRequest(quiet, tuple(flares), n, 5, ("chi2",))) for n in (N, 10 * N))
     assert short[:-1] == long[: len(short) - 1]
     for request_shards, n in ((short, N), (long, 10 * N)):
         assert sum(shard.count for shard in request_shards) == n
@@ -272,7 +271,7 @@ def test_large_requests_have_larger_shards(scene: list[Expectation], monkeypatch
     """Limit the number of shards to what one process can add up."""
     monkeypatch.setattr(shards, "SHARD_WORK", 2**34)
     for n in (10**6, 10**9, 10**12, 10**15):
-        found = shards.shards(DetectRequest(scene[0], tuple(scene[1:]), n, 5, ("chi2",)))
+        found = shards.shards(requests.DetectRequest(scene[0], tuple(scene[1:]), n, 5, ("chi2",)))
         assert len(found) <= 2 * shards.MAX_SHARDS + 1
         assert sum(shard.count for shard in found) == n
         assert all(shard.count & (shard.count - 1) == 0 for shard in found[:-1])
@@ -314,12 +313,6 @@ def begun(tmp_path: Path, engine: Engine) -> Path:
 
 def shards_in(folder: Path) -> list[Path]:
     return sorted((folder / "checkpoint").glob("*.npz"))
-
-
-def flip(path: Path, place: int) -> None:
-    data = bytearray(path.read_bytes())
-    data[place] ^= 4
-    path.write_bytes(data)
 
 
 def change(folder: Path, text: str) -> None:

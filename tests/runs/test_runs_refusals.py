@@ -8,7 +8,7 @@ import pytest
 from refusals import refused
 
 from mauvecl import DaskWorkers
-from mauvecl.device.errors import DeviceError
+from mauvecl.device.drivers import DeviceError
 
 
 @pytest.mark.parametrize("package", ["distributed", "cryptography"])

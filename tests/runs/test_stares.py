@@ -15,7 +15,7 @@ from scenes import N_STARES as N
 from scenes import flaring_stares as request
 
 from mauvecl import Engine, LocalWorkers, Pool, Stare, Stares
-from mauvecl.runs import shards
+from mauvecl.runs import checkpoint as shards
 from mauvecl.runs.checkpoint import Checkpoint
 from mauvecl.runs.pool import Stopped
 

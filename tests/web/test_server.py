@@ -17,7 +17,7 @@ from tornado.httpclient import AsyncHTTPClient, HTTPClientError, HTTPRequest
 
 from tests.web.visits import Server, Talk, link
 
-#: Server with less patience, so that tests need not wait, which makes a mistake of its own at one magnitude.
+#: Server with less patience, so that tests need not wait, which fails at one magnitude.
 STRICT = """
 import sys
 from mauvecl import Study
@@ -198,9 +198,9 @@ def test_invalid_messages_give_no_traceback_and_no_path(strict: Server) -> None:
         wrong = await talk.answer("?magnitude=6.66")
         assert "answer" not in wrong
         assert (
-            "the page has made a mistake of its own" in wrong["refused"]
+            "this is a fault of mauvecl" in wrong["refused"]
             if "refused" in wrong
-            else ("mistake of its own" in (await talk.next())["refused"])
+            else ("fault of mauvecl" in (await talk.next())["refused"])
         )
         assert "answer" in await talk.answer("?magnitude=6.67")
 
@@ -271,7 +271,7 @@ def test_cancel_ends_every_computation(server: Server, kind: str) -> None:
         assert shares == sorted(shares)
         assert [int(one) for one in left] == sorted(map(int, left), reverse=True), "never more"
         refused = await talk.ask("simulate", "ended", kind=kind, link=many)
-        assert "there is a simulation already" in refused["refused"]
+        assert "a simulation is running already" in refused["refused"]
         used = server.spent()
         await talk.say("cancel")
         while (reported := await talk.next()).get("n") != n or "ended" not in reported:

@@ -3,22 +3,14 @@
 from __future__ import annotations
 
 from mauvecl.answers.verbs import VERBS
-from mauvecl.web.tabs.analyse import Analyse
-from mauvecl.web.tabs.calibrate import Calibrate
-from mauvecl.web.tabs.change import Change
-from mauvecl.web.tabs.compare import Compare
-from mauvecl.web.tabs.completeness import Completeness
-from mauvecl.web.tabs.detection import Detection
+from mauvecl.web.tabs.calibrations import Calibrate, Change, Periods
+from mauvecl.web.tabs.campaigns import Plan, Visibility
+from mauvecl.web.tabs.detection import Detection, Unknown
+from mauvecl.web.tabs.light_curves import Analyse, Completeness
 from mauvecl.web.tabs.limit import Limit
 from mauvecl.web.tabs.measurements import Measurement
-from mauvecl.web.tabs.noise import Noise
-from mauvecl.web.tabs.periods import Periods
-from mauvecl.web.tabs.plan import Plan
-from mauvecl.web.tabs.signal import Signal
-from mauvecl.web.tabs.spectrum import Spectrum
-from mauvecl.web.tabs.tab import Tab
-from mauvecl.web.tabs.unknowns import Unknown
-from mauvecl.web.tabs.visibility import Visibility
+from mauvecl.web.tabs.spectra import Noise, Signal, Spectrum
+from mauvecl.web.tabs.tab import Compare, Tab
 
 #: Tabs with pictures, in the order of the page.
 DRAWN: dict[str, Tab] = {

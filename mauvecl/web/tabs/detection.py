@@ -1,163 +1,150 @@
-"""Detection: the flare relative to the noise, distributions of the statistic, and the ROC."""
+"""Tabs of detection: the flare relative to the noise, the ROC, and unknowns of the instrument."""
 
 from __future__ import annotations
 
-from functools import partial
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mauvecl.answers.closed_forms import spoken, unknown_cost
+from mauvecl.answers.detect import UNKNOWN_COLUMNS as COLUMNS
+from mauvecl.answers.detect import power
+from mauvecl.charts.chart import (
+    SATURATED,
+    WAVELENGTH,
+    Axis,
+    Band,
+    Bars,
+    Chart,
+    ChartData,
+    Custom,
+    Dots,
+    Line,
+    Listed,
+    Own,
+    Rule,
+)
+from mauvecl.charts.detection import roc_columns
 from mauvecl.detection.requests import label
-from mauvecl.web.closed_forms import percent
-from mauvecl.web.figures import Canvas, strips
-from mauvecl.web.tabs.tab import Answers, Picture, PictureData, Tab
+from mauvecl.noise.unknowns import NUISANCES, Amplitude
+from mauvecl.schema.columns import View
+from mauvecl.study.nuisances import NuisanceChoice
+from mauvecl.web.closed_forms import Answers, percent
+from mauvecl.web.figures import strips
+from mauvecl.web.tabs.tab import Tab
 
 if TYPE_CHECKING:
+    from bokeh.models.sources import ColumnDataSource
+
     from mauvecl.web.closed_forms import ClosedForms
+    from mauvecl.web.figures import Canvas
 
 
-class Excess(Picture):
-    """Flare minus quiet in standard deviations of the noise."""
-
-    name, title = "excess", "Flare minus quiet, in sigma of the noise"
-    pins = "element"
-
-    def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
-        canvas = Canvas(ink, "wavelength (nm)", "sigma of the noise", logs, wavelength=True)
-        canvas.band("noise", "95 % of the noise", "drawn", alpha=0.16)
-        canvas.saturated()
-        canvas.dots("drawn", "drawn exposure", "drawn", size=5)
-        canvas.line("pixel", "expected per pixel", "sky", line_width=1.2)
-        curve = canvas.line("element", "expected per element of 10.5 nm", "flare", step=True, line_width=2.2)
-        canvas.pinned(partial(canvas.plot.step, mode="center"))
-        canvas.tooltips(curve, ("wavelength (nm)", "x"), ("sigma per element", "y"))
-        return canvas
-
-    def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
-        x = closed.quiet
-        pixel, element = closed.excess
-        sources: dict[str, Any] = {
-            "pixel": {"x": x.wavelength_nm, "y": pixel},
-            "element": {"x": x.element_wavelength_nm, "y": element},
-            "noise": {"x": [190.0, 710.0], "low": [-1.96] * 2, "high": [1.96] * 2},
-            "drawn": {"x": [], "y": []},
-            "saturated": strips(x.wavelength_nm, x.saturated | closed.flare.saturated),
-        }
-        if "draw" in answers:
-            raw = np.where(x.saturated, 0.0, answers["draw"] - x.recorded_dn)
-            noise = np.sqrt(x.per_element(np.where(x.saturated, 0.0, x.variance_dn2)))
-            shown = np.divide(x.per_element(raw), noise, out=np.full(noise.size, np.nan), where=noise > 0)
-            sources["drawn"] = {"x": x.element_wavelength_nm, "y": shown}
-        best = int(np.argmax(element))
-        saturated = int(np.count_nonzero(x.saturated | closed.flare.saturated))
-        text = (
-            f"The flare stands out most at {x.element_wavelength_nm[best]:.0f} nm, by {element[best]:.3g} sigma of an "
-            f"element's noise; {np.count_nonzero(element > 1.96)} of {element.size} elements rise above 95 % of the "
-            f"noise."
-        )
-        return PictureData(text + (f" {saturated} pixels saturate." if saturated else ""), sources)
+@Chart(
+    "excess", "Flare minus quiet, in sigma of the noise", WAVELENGTH, Axis("sigma of the noise"),
+    (
+        Band("95 % of the noise", name="noise", alpha=0.16),
+        SATURATED,
+        Dots("drawn exposure", name="drawn"),
+        Line("expected per pixel", "sky", "pixel", width=1.2),
+        Line("expected per element of 10.5 nm", "flare", "element", step=True, width=2.2,
+             tips=("wavelength (nm)", "sigma per element")),
+    ),
+    pins="element",
+).data()  # fmt: skip
+def excess(closed: ClosedForms, answers: Answers) -> ChartData:
+    """Return the flare minus quiet in standard deviations of the noise."""
+    x, saturated = closed.quiet, closed.quiet.saturated | closed.flare.saturated
+    pixel, element = closed.excess
+    series: dict[str, Any] = {
+        "pixel": (x.wavelength_nm, pixel),
+        "element": (x.element_wavelength_nm, element),
+        "noise": ([190.0, 710.0], [-1.96] * 2, [1.96] * 2),
+        "saturated": strips(x.wavelength_nm, saturated),
+    }
+    if "draw" in answers:
+        raw = np.where(x.saturated, 0.0, answers["draw"] - x.recorded_dn)
+        noise = np.sqrt(x.per_element(np.where(x.saturated, 0.0, x.variance_dn2)))
+        shown = np.divide(x.per_element(raw), noise, out=np.full(noise.size, np.nan), where=noise > 0)
+        series["drawn"] = x.element_wavelength_nm, shown
+    best, lost = int(np.argmax(element)), int(np.count_nonzero(saturated))
+    text = (
+        f"The flare stands out most at {x.element_wavelength_nm[best]:.0f} nm, by {element[best]:.3g} sigma of an "
+        f"element's noise; {np.count_nonzero(element > 1.96)} of {element.size} elements rise above 95 % of the noise."
+    )
+    return ChartData(text + (f" {lost} pixels saturate." if lost else ""), series)
 
 
-class Distributions(Picture):
-    """Distributions of the statistic without and with the flare, and the threshold."""
-
-    name, title = "distributions", "The statistic without and with the flare"
-    logs = ("y",)
-    pins, alike = "flare", ("statistic",)
-
-    def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
-        how = {"y_range": (1e-4, 1.5)} if "y" in logs else {"y_range": (0, 1.06)}
-        canvas = Canvas(ink, "statistic", "density, each peak = 1", logs, **how)
-        plot = canvas.plot
-        for name, colour in (("null bars", "star"), ("flare bars", "flare")):
-            bars = plot.quad(
-                "left", "right", "top", 1e-9 if "y" in logs else 0, source=canvas.source(name, "left", "right", "top"),
-                fill_color=ink[colour], fill_alpha=0.45, line_color=None,
-            )  # fmt: skip
-            bars.name = "simulated"
-        canvas.legend.append(("simulated", ink.drawn, "bars", "if any"))
-        for name, called, colour in (("null", "no flare", "star"), ("flare", "flare", "flare")):
-            canvas.band(f"{name} area", called, colour, alpha=0.18)
-            canvas.legend.pop()
-            curve = canvas.line(name, called, colour, line_width=2)
-            canvas.tooltips(curve, ("statistic", "x"), ("density", "y"))
-        canvas.pinned()
-        canvas.rule("threshold", "threshold", "x")
-        return canvas
-
-    def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
-        q, cut, chance = closed.question, closed.odds.threshold, closed.chance
-        sources: dict[str, Any] = {}
-        for name, form in (("null", closed.null), ("flare", closed.seen)):
-            edges = np.linspace(form.mean - 5 * form.std, form.mean + 5 * form.std, 161)
-            beyond = form.sf(edges)
-            density = np.maximum(beyond[:-1] - beyond[1:], 0.0)
-            density = density / density.max()
-            middle = (edges[1:] + edges[:-1]) / 2
-            sources[name] = {"x": middle, "y": density}
-            sources[f"{name} area"] = {"x": middle, "low": np.full(middle.size, 1e-9), "high": density}
-        empty: dict[str, Any] = {"left": [], "right": [], "top": []}
-        sources |= {"null bars": empty, "flare bars": empty}
-        if "detection" in answers:
-            (star,) = answers["detection"].stars
-            for name, flare in (("null bars", None), ("flare bars", 0)):
-                edges, counts = star.detection.histogram(q.statistic, flare, bins=80)
-                sources[name] = {"left": edges[:-1], "right": edges[1:], "top": counts / max(counts.max(), 1)}
-            (row,) = (row for row in answers["detection"].table if row["statistic"] == q.statistic)
-            cut, chance = float(row["threshold"]), float(row["probability"])
-        share = f"{percent(chance)} of flares lie above the threshold of {cut:.4g}"
-        text = (
-            f"Without a flare {q.statistic} lies at {closed.null.mean:.4g} ± {closed.null.std:.3g}, with it at "
-            f"{closed.seen.mean:.4g} ± {closed.seen.std:.3g}; "
-            f"{share if cut == cut else 'no threshold has this false-alarm probability'}."
-        )
-        return PictureData(
-            text,
-            sources,
-            {"threshold": {"location": cut if cut == cut else None}, "x axis": {"axis_label": label(q.statistic)}},
-        )
+@Chart(
+    "distributions", "The statistic without and with the flare", Axis("statistic"),
+    Axis("density, each peak = 1", limits=(0, 1.06), log_limits=(1e-4, 1.5)),
+    (
+        Bars("simulated", "star", "null bars", listed=False),
+        Bars("simulated", "flare", "flare bars", listed=False),
+        Listed("simulated", form="bars", show="if any"),
+        Band("no flare", "star", "null area", alpha=0.18, listed=False),
+        Line("no flare", "star", "null", width=2, tips=("statistic", "density")),
+        Band("flare", "flare", "flare area", alpha=0.18, listed=False),
+        Line("flare", "flare", width=2, tips=("statistic", "density")),
+        Rule("threshold", "threshold"),
+    ),
+    logs=("y",), pins="flare", alike=("statistic",),
+).data()  # fmt: skip
+def distributions(closed: ClosedForms, answers: Answers) -> ChartData:
+    """Return the distributions of the statistic without and with the flare, and the threshold."""
+    q, cut, chance = closed.question, closed.odds.threshold, closed.chance
+    series: dict[str, Any] = {}
+    for name, form in (("null", closed.null), ("flare", closed.seen)):
+        edges = np.linspace(form.mean - 5 * form.std, form.mean + 5 * form.std, 161)
+        beyond = form.sf(edges)
+        density = np.maximum(beyond[:-1] - beyond[1:], 0.0)
+        density = density / density.max()
+        middle = (edges[1:] + edges[:-1]) / 2
+        series |= {name: (middle, density), f"{name} area": (middle, np.full(middle.size, 1e-9), density)}
+    if "detection" in answers:
+        (star,) = answers["detection"].stars
+        for name, flare in (("null bars", None), ("flare bars", 0)):
+            edges, counts = star.detection.histogram(q.statistic, flare, bins=80)
+            series[name] = edges[:-1], edges[1:], counts / max(counts.max(), 1)
+        (row,) = (row for row in answers["detection"].table if row["statistic"] == q.statistic)
+        cut, chance = float(row["threshold"]), float(row["probability"])
+    series["threshold"] = cut if cut == cut else None
+    share = f"{percent(chance)} of flares lie above the threshold of {cut:.4g}"
+    text = (
+        f"Without a flare {q.statistic} lies at {closed.null.mean:.4g} ± {closed.null.std:.3g}, with it at "
+        f"{closed.seen.mean:.4g} ± {closed.seen.std:.3g}; "
+        f"{share if cut == cut else 'no threshold has this false-alarm probability'}."
+    )
+    return ChartData(text, series, {"x axis": {"axis_label": label(q.statistic)}})
 
 
-class Trade(Picture):
-    """Detection probability against false-alarm probability."""
-
-    name, title = "roc", "Receiver operating characteristic"
-    sets = "fap=x"
-    pins = "closed form"
-
-    def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
-        canvas = Canvas(
-            ink, "false-alarm probability per test", "detection probability", logs | {"x"}, x_range=(1e-6, 1),
-            y_range=(-0.02, 1.03),
-        )  # fmt: skip
-        canvas.band("simulated", "simulated, 95 %", "drawn", alpha=0.4)
-        curve = canvas.line("closed form", "closed form", "flare", line_width=2)
-        canvas.pinned()
-        canvas.own_point()
-        canvas.tooltips(curve, ("false-alarm probability", "x"), ("detection probability", "y"))
-        return canvas
-
-    def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
-        q = closed.question
-        faps = np.logspace(-6, 0, 121)[:-1]
-        chances = closed.seen.sf(closed.null.isf(faps))
-        sources: dict[str, Any] = {
-            "closed form": {"x": faps, "y": chances},
-            "own": {"x": [q.fap], "y": [closed.chance]},
-            "simulated": {"x": [], "low": [], "high": []},
-        }
-        if "detection" in answers:
-            curve = answers["detection"].stars[0].detection.roc(q.statistic).table()
-            seen = np.asarray(curve["fap"], float) > 0
-            columns = {"x": "fap", "low": "probability_low", "high": "probability_high"}
-            sources["simulated"] = {to: np.asarray(curve[name], float)[seen] for to, name in columns.items()}
-        half = int(np.searchsorted(chances, 0.5))
-        where = "half of them at " if half else "half of them still below "
-        text = (
-            f"At a false-alarm probability of {q.fap:g} {percent(closed.chance)} are detected; {where}"
-            f"{faps[min(half, faps.size - 1)]:.2g}."
-        )
-        return PictureData(text, sources)
+@Chart(
+    "roc", "Receiver operating characteristic", Axis("false-alarm probability per test", log=True, limits=(1e-6, 1)),
+    Axis("detection probability", limits=(-0.02, 1.03)),
+    (
+        Band("simulated, 95 %", name="simulated", alpha=0.4),
+        Line("closed form", "flare", width=2, tips=("false-alarm probability", "detection probability")),
+        Own(),
+    ),
+    sets="fap=x", pins="closed form",
+).data()  # fmt: skip
+def trade(closed: ClosedForms, answers: Answers) -> ChartData:
+    """Return the detection probability against the false-alarm probability."""
+    q = closed.question
+    faps = np.logspace(-6, 0, 121)[:-1]
+    chances = closed.seen.sf(closed.null.isf(faps))
+    series: dict[str, Any] = {"closed form": (faps, chances), "own": ([q.fap], [closed.chance])}
+    if "detection" in answers:
+        fap, _, *ends = roc_columns(answers["detection"].stars[0].detection.roc(q.statistic))
+        series["simulated"] = fap, *ends
+    half = int(np.searchsorted(chances, 0.5))
+    where = "half of them at " if half else "half of them still below "
+    text = (
+        f"At a false-alarm probability of {q.fap:g} {percent(closed.chance)} are detected; {where}"
+        f"{faps[min(half, faps.size - 1)]:.2g}."
+    )
+    return ChartData(text, series)
 
 
 class Detection(Tab):
@@ -165,7 +152,84 @@ class Detection(Tab):
 
     name, title = "detection", "Detection"
     about = "The flare relative to the noise, and the statistic with and without the flare."
-    pictures = (Excess(), Distributions(), Trade())
+    pictures = (excess, distributions, trade)
     simulations = {"detection": "Simulate"}  # noqa: RUF012
     answer = "detection"
     files = {"detection": "detection", "roc": "detection"}  # noqa: RUF012
+
+
+#: Name of an unknown, and the matched S/N plain and marginalised.
+Row = tuple[str, float, float]
+
+
+@lru_cache(maxsize=4)
+def costs(closed: ClosedForms) -> tuple[float, list[Row]]:
+    """Return the flare's matched S/N with everything known, and with unknowns alone and together."""
+    # Without a sky its brightness is no unknown. Those without a default prior are projected out.
+    there = {name: row for name, row in NUISANCES.items() if np.any(row.spectrum(closed.quiet))}
+    alone = [NuisanceChoice.model_validate({name: _spread(row.prior)}) for name, row in there.items()]
+    chosen = {spoken(choice).removeprefix("the "): choice for choice in alone}
+    chosen["all the usual together"] = NuisanceChoice(usual=True)
+    if closed.study.nuisances.own:
+        chosen["your own spectrum"] = NuisanceChoice(own=closed.study.nuisances.own)
+    rows, known = list[Row](), 0.0
+    for name, choice in chosen.items():
+        cost = unknown_cost(name, closed.quiet, closed.flare, choice, closed.study.run.comparison())
+        known = cost.known or known
+        rows.append((name, cost.plain, cost.marginal))
+    return known, rows
+
+
+def _spread(prior: object) -> float | str:
+    return prior.sd if isinstance(prior, Amplitude) and np.isfinite(prior.sd) else "free"
+
+
+def _bars(canvas: Canvas, source: ColumnDataSource) -> None:
+    for column, called, colour, width, alpha, form in (
+        ("known", "everything known", "flare", 0.85, 0.35, "band"),
+        ("marginal", "marginalised over it", "flare", 0.55, 1.0, "bar"),
+        ("plain", "unknown, and not looked for", "text", 0.2, 1.0, "bar"),
+    ):
+        look: dict[str, Any] = {"color": canvas.ink[colour], "alpha": alpha, "name": called}
+        made = canvas.plot.hbar("name", right=column, height=width, source=source, **look)
+        canvas.legend.append((called, canvas.ink[colour], form, ""))
+        canvas.tooltips(made, (called, column), along="hline")
+    canvas.plot.x_range.start = 0
+
+
+@Chart(
+    "cost", "What each unknown costs: the flare's S/N by the matched statistic", Axis("S/N of the flare"),
+    Axis(kind="names"), (Custom("bars", columns=("name", "plain", "marginal", "known"), draw=_bars),),
+).data()  # fmt: skip
+def unknown_costs(closed: ClosedForms, answers: Answers) -> ChartData:
+    """Return the matched S/N with each unknown, plain and marginalised."""
+    known, rows = costs(closed)
+    names, plain, marginal = zip(*rows[::-1], strict=True)
+    worst = min(rows, key=lambda row: row[2])
+    text = (
+        f"With everything known the flare has a matched S/N of {known:.3g}; {worst[0]} leaves {worst[2]:.3g} "
+        "of it, the least of these."
+    )
+    bars = names, np.array(plain), np.array(marginal), np.full(len(rows), known)
+    return ChartData(text, {"bars": bars}, {"y range": {"factors": names}})
+
+
+class Unknown(Tab):
+    """Cost of unknown properties of the instrument."""
+
+    name, title = "unknowns", "Unknowns"
+    about = (
+        "What it costs not to know the detector's temperature, the light lost, or the sky: a statistic that is blind "
+        "to them sees less of the flare; one that ignores them is fooled by them."
+    )
+    pictures = (unknown_costs,)
+
+    def shown(self, closed: ClosedForms, answers: Answers) -> View:
+        known, rows = costs(closed)
+        given: list[Row] = [("nothing: everything is known", known, known), *rows]
+        fap = closed.question.fap
+        table = [
+            {"unknown": name, "plain": plain, "marginalised": marginal, "detected": float(power(marginal, fap))}
+            for name, plain, marginal in given
+        ]
+        return View(self.title, [one for one in COLUMNS if one.name in table[0]], table)

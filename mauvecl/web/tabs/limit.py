@@ -6,17 +6,22 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from bokeh.models import FixedTicker, HoverTool, LinearColorMapper
+from bokeh.models.annotations import ColorBar
 from numpy.typing import NDArray
 from scipy import special
 from scipy.interpolate import PchipInterpolator
 
-from mauvecl.web.figures import Canvas
-from mauvecl.web.headline import LIMITS
-from mauvecl.web.tabs.tab import Answers, Picture, PictureData, Tab
+from mauvecl.charts.chart import Axis, Chart, ChartData, Contours, Custom, Dots, Line, Listed, Own, Rule
+from mauvecl.web.closed_forms import LIMITS, Answers
+from mauvecl.web.tabs.tab import Tab
 
 if TYPE_CHECKING:
+    from bokeh.models.sources import ColumnDataSource
+
     from mauvecl.detection.statistics import DetectionForms
     from mauvecl.web.closed_forms import ClosedForms
+    from mauvecl.web.figures import Canvas
 
 Float = NDArray[np.float64]
 
@@ -64,11 +69,6 @@ class _Kept:
 
     def __hash__(self) -> int:
         return hash(self.key)
-
-
-def probits(p: Float) -> Float:
-    """Convert probabilities to probits, which are smooth; limit those that round to 0 or 1."""
-    return np.asarray(special.ndtri(np.clip(p, 1e-15, 1 - 1e-15)))
 
 
 @lru_cache(maxsize=32)
@@ -124,161 +124,148 @@ def _pearson(part: Float, spread: Float, cut: Float, skewness: Float) -> Float:
     return np.asarray(np.where(skewness > 1e-4, gamma, special.ndtr(-off)))
 
 
-class Curve(Picture):
-    """Detection probability against the star's magnitude."""
-
-    name, title = "limit", "How faint a star: this flare is detected"
-    sets = "magnitude=x"
-    pins, alike = "closed form", ("band",)
-
-    def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
-        canvas = Canvas(ink, "magnitude", "detection probability", logs, x_range=MAGNITUDES, y_range=(-0.03, 1.05))
-        curve = canvas.line("closed form", "closed form", "flare", line_width=2)
-        canvas.rule("power", "wanted: 90 %", "y")
-        canvas.dots("simulated", "simulated", "drawn", size=8)
-        canvas.pinned()
-        canvas.own_point()
-        canvas.tooltips(curve, ("magnitude", "x"), ("detected", "y"))
-        return canvas
-
-    def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
-        q, power = closed.question, closed.study.limit.power
-        empty: dict[str, Any] = {"x": [], "y": []}
-        sources: dict[str, Any] = {"closed form": empty, "simulated": empty}
-        sources["own"] = {"x": [q.magnitude], "y": [closed.chance]}
-        text = f"The closed form of {q.statistic} takes too long for a curve: simulate it."
-        if not closed.slow:
-            x, y = _curve(_Kept(closed, q.amplitude_percent))
-            sources["closed form"] = {"x": x, "y": y}
-            seen = np.nonzero(y >= power)[0]
-            last = int(seen[-1]) if seen.size else -1
-            text = f"{100 * power:g} % of such flares are detected "
-            if last < 0:
-                text += f"at no magnitude from {MAGNITUDES[0]:g} to {MAGNITUDES[1]:g}."
-            elif last == x.size - 1:
-                text += f"at least to {q.band} = {MAGNITUDES[1]:g}."
-            else:
-                part = (y[last] - power) / (y[last] - y[last + 1])
-                text += f"to {q.band} = {x[last] + part * (x[last + 1] - x[last]):.2f}, in closed form."
-        if "limit" in answers:
-            limits = [one for one in answers["limit"].limits if one.statistic == q.statistic]
-            words = LIMITS[closed.study.limit.of]
-            for one in limits:
-                # Points of another quantity than the axis's are reported in words only.
+@Chart(
+    "limit", "How faint a star: this flare is detected", Axis("magnitude", limits=MAGNITUDES),
+    Axis("detection probability", limits=(-0.03, 1.05)),
+    (
+        Line("closed form", "flare", width=2, tips=("magnitude", "detected")),
+        Rule("wanted: 90 %", "threshold", "power", along="y"),
+        Dots("simulated", size=8),
+        Own(),
+    ),
+    sets="magnitude=x", pins="closed form", alike=("band",),
+).data()  # fmt: skip
+def curve(closed: ClosedForms, answers: Answers) -> ChartData:
+    """Return the detection probability against the star's magnitude."""
+    q, power = closed.question, closed.study.limit.power
+    series: dict[str, Any] = {"own": ([q.magnitude], [closed.chance]), "power": power}
+    text = f"The closed form of {q.statistic} takes too long for a curve: simulate it."
+    if not closed.slow:
+        x, y = series["closed form"] = _curve(_Kept(closed, q.amplitude_percent))
+        text = f"{100 * power:g} % of such flares are detected {_reach(x, y, power, q.band)}"
+    if "limit" in answers:
+        limits = [one for one in answers["limit"].limits if one.statistic == q.statistic]
+        words = LIMITS[closed.study.limit.of]
+        for one in limits:
+            # Points of another quantity than the axis's are reported in words only.
+            if one.of == "magnitude":
                 points = [(p.value, p.probability.value) for p in (*one.points, one.check)]
-                if one.of == "magnitude":
-                    sources["simulated"] = dict(zip(("x", "y"), np.array(points).T, strict=True))
-                value, low, high = map(words.value, (one.value.value, one.value.low, one.value.high))
-                limit = f"{words.before.format(band=q.band)} {value} [{low} to {high}]"
-                text += f" Simulated: {100 * power:g} % are detected {limit}."
-        return PictureData(text, sources, {"power": {"location": power}})
+                series["simulated"] = np.array(points).T
+            value, low, high = map(words.value, (one.value.value, one.value.low, one.value.high))
+            limit = f"{words.before.format(band=q.band)} {value} [{low} to {high}]"
+            text += f" Simulated: {100 * power:g} % are detected {limit}."
+    return ChartData(text, series)
 
 
-class Map(Picture):
-    """Detection probability over magnitude and amplitude."""
+def _reach(x: Float, y: Float, power: float, band: str) -> str:
+    """Return the words for the faintest magnitude at which a probability is reached."""
+    seen = np.nonzero(y >= power)[0]
+    if not seen.size:
+        return f"at no magnitude from {MAGNITUDES[0]:g} to {MAGNITUDES[1]:g}."
+    last = int(seen[-1])
+    if last == x.size - 1:
+        return f"at least to {band} = {MAGNITUDES[1]:g}."
+    part = (y[last] - power) / (y[last] - y[last + 1])
+    return f"to {band} = {x[last] + part * (x[last + 1] - x[last]):.2f}, in closed form."
 
-    name, title = "map", "How faint a star, how small a flare"
-    sets = "magnitude=x,amplitude_percent=10^y"
-    pins, alike = "half", ("band",)
 
-    def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
-        from bokeh.models import FixedTicker, HoverTool, LinearColorMapper
-        from bokeh.models.annotations import ColorBar
+def _draw_map(canvas: Canvas, source: ColumnDataSource) -> None:
+    plot, mapper = canvas.plot, _mapper()
+    image = plot.image("image", "x", "y", "dw", "dh", source=source, color_mapper=mapper)
+    shown = [("detected", "@image{0.000}"), ("magnitude", "$x{0.00}"), ("amplitude", "@percent{0.[00]} %")]
+    plot.add_tools(HoverTool(renderers=[image], tooltips=shown))
+    plot.yaxis.ticker = FixedTicker(ticks=[-1, 0, 1, 2])
+    plot.yaxis.major_label_overrides = {-1: "0.1 %", 0: "1 %", 1: "10 %", 2: "100 %"}
+    plot.add_layout(ColorBar(color_mapper=mapper, width=10, title="detected", **canvas.bar_text), "right")
 
-        low, high = np.log10(PERCENTS)
-        canvas = Canvas(ink, "magnitude", "flare amplitude", logs, x_range=MAGNITUDES, y_range=(low, high))
-        plot: Any = canvas.plot
-        mapper = LinearColorMapper(palette="Cividis256", low=0, high=1)
-        source = canvas.source("map", "image", "percent", "x", "y", "dw", "dh")
-        image = plot.image("image", "x", "y", "dw", "dh", source=source, color_mapper=mapper)
-        shown = [("detected", "@image{0.000}"), ("magnitude", "$x{0.00}"), ("amplitude", "@percent{0.[00]} %")]
-        plot.add_tools(HoverTool(renderers=[image], tooltips=shown))
-        for name, width in (("contours", 1.2), ("half", 2.2)):
-            source = canvas.source(name, "xs", "ys")
-            plot.multi_line("xs", "ys", source=source, line_color="#ffffff", line_width=width).name = name
-        cells = plot.scatter(
-            "x", "y", source=canvas.source("simulated", "x", "y", "p"), size=10, marker="square",
-            fill_color={"field": "p", "transform": mapper}, line_color="#ffffff",
-        )  # fmt: skip
-        cells.name = "simulated"
-        canvas.pinned(plot.multi_line, "xs", "ys", halo="#ffffff")
-        plot.text(
-            "x", "y", "text", source=canvas.source("labels", "x", "y", "text"), text_align="center",
-            text_baseline="middle", text_font={"value": "system-ui"}, text_font_size="11px", text_color="#1b2733",
-            background_fill_color="#ffffff", background_fill_alpha=0.85, padding=2,
-        ).name = "labels"  # fmt: skip
-        canvas.own_point()
-        plot.yaxis.ticker = FixedTicker(ticks=[-1, 0, 1, 2])
-        plot.yaxis.major_label_overrides = {-1: "0.1 %", 0: "1 %", 1: "10 %", 2: "100 %"}
-        plot.add_layout(
-            ColorBar(color_mapper=mapper, width=10, title="detected", **canvas.bar_text),
-            "right",
-        )
-        canvas.legend += [("10, 50 (bold) and 90 % in closed form", "#b8c0c8", "line", ""),
-                          ("simulated", "#8a8678", "dot", "if any")]  # fmt: skip
-        return canvas
 
-    def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
-        q = closed.question
-        sources: dict[str, Any] = {
-            "own": {"x": [q.magnitude], "y": [np.log10(q.amplitude_percent)]},
-            "simulated": {"x": [], "y": [], "p": []},
-            "map": {"image": [], "percent": [], "x": [], "y": [], "dw": [], "dh": []},
-            "labels": {"x": [], "y": [], "text": []},
-            "contours": {"xs": [], "ys": []},
-            "half": {"xs": [], "ys": []},
+def _draw_cells(canvas: Canvas, source: ColumnDataSource) -> None:
+    colour = {"field": "p", "transform": _mapper()}
+    cells = canvas.plot.scatter("x", "y", source=source, size=10, marker="square", fill_color=colour,
+                                line_color="#ffffff")  # fmt: skip
+    cells.name = "simulated"
+
+
+def _draw_labels(canvas: Canvas, source: ColumnDataSource) -> None:
+    canvas.plot.text(
+        "x", "y", "text", source=source, text_align="center", text_baseline="middle",
+        text_font={"value": "system-ui"}, text_font_size="11px", text_color="#1b2733", level="annotation",
+        background_fill_color="#ffffff", background_fill_alpha=0.85, padding=2,
+    ).name = "labels"  # fmt: skip
+
+
+def _mapper() -> LinearColorMapper:
+    return LinearColorMapper(palette="Cividis256", low=0, high=1)
+
+
+@Chart(
+    "map", "How faint a star, how small a flare", Axis("magnitude", limits=MAGNITUDES),
+    Axis("flare amplitude", limits=tuple(np.log10(PERCENTS))),
+    (
+        Custom("map", columns=("image", "percent", "x", "y", "dw", "dh"), draw=_draw_map),
+        Contours("contours", "#ffffff", width=1.2, listed=False),
+        Contours("half", "#ffffff", width=2.2, listed=False),
+        Custom("simulated", columns=("x", "y", "p"), draw=_draw_cells),
+        Custom("labels", columns=("x", "y", "text"), draw=_draw_labels),
+        Listed("10, 50 (bold) and 90 % in closed form", "#b8c0c8"),
+        Listed("simulated", "#8a8678", show="if any", form="dot", name="entry"),
+        Own(),
+    ),
+    sets="magnitude=x,amplitude_percent=10^y", pins="half", alike=("band",),
+).data()  # fmt: skip
+def detection_map(closed: ClosedForms, answers: Answers) -> ChartData:
+    """Return the detection probability over magnitude and amplitude."""
+    q = closed.question
+    series: dict[str, Any] = {"own": ([q.magnitude], [np.log10(q.amplitude_percent)])}
+    text = f"The closed form of {q.statistic} takes too long for a map: simulate it."
+    if not closed.slow:
+        x, y, p = _map(_Kept(closed))
+        series |= {
+            "map": _image(x, y, p),
+            "contours": _contours(x, y, p, 0.1, 0.9),
+            "half": _contours(x, y, p, 0.5),
+            "labels": _labels(x, y, p),
         }
-        text = f"The closed form of {q.statistic} takes too long for a map: simulate it."
-        if not closed.slow:
-            x, y, p = _map(_Kept(closed))
-            sources |= {
-                "map": _image(x, y, p),
-                "contours": _contours(x, y, p, 0.1, 0.9),
-                "half": _contours(x, y, p, 0.5),
-                "labels": _labels(x, y, p),
-            }
-            share = 100 * float(np.mean(p >= 0.5))
-            text = (
-                f"At least half of the flares are detected in {share:.0f} % of the map, which spans {q.band} = "
-                f"{MAGNITUDES[0]:g} to {MAGNITUDES[1]:g} and amplitudes of {PERCENTS[0]:g} to {PERCENTS[1]:g} %."
-            )
-        if "map" in answers:
-            got = answers["map"]
-            at_x, at_y = np.meshgrid(np.array(got.x, float), np.log10(100 * np.array(got.y, float)))
-            sources["simulated"] = {"x": at_x.ravel(), "y": at_y.ravel(), "p": got.probability[0].ravel()}
-            text += f" {at_x.size} cells are simulated."
-        return PictureData(text, sources)
+        share = 100 * float(np.mean(p >= 0.5))
+        text = (
+            f"At least half of the flares are detected in {share:.0f} % of the map, which spans {q.band} = "
+            f"{MAGNITUDES[0]:g} to {MAGNITUDES[1]:g} and amplitudes of {PERCENTS[0]:g} to {PERCENTS[1]:g} %."
+        )
+    if "map" in answers:
+        got = answers["map"]
+        at_x, at_y = np.meshgrid(np.array(got.x, float), np.log10(100 * np.array(got.y, float)))
+        series["simulated"] = at_x.ravel(), at_y.ravel(), got.probability[0].ravel()
+        text += f" {at_x.size} cells are simulated."
+    return ChartData(text, series)
 
 
-def _image(x: Float, y: Float, p: Float) -> dict[str, Any]:
-    """Return the edges of cells around the points of a map."""
+def _image(x: Float, y: Float, p: Float) -> tuple[Any, ...]:
+    """Return the image of a map, and the edges of cells around its points."""
     half_x, half_y = 0.5 * (x[1] - x[0]), 0.5 * (y[1] - y[0])
-    return {
-        "image": [p], "percent": [np.repeat(10 ** y[:, None], x.size, axis=1)], "x": [x[0] - half_x],
-        "y": [y[0] - half_y], "dw": [x[-1] - x[0] + 2 * half_x], "dh": [y[-1] - y[0] + 2 * half_y],
-    }  # fmt: skip
+    wide, high = x[-1] - x[0] + 2 * half_x, y[-1] - y[0] + 2 * half_y
+    percent = np.repeat(10 ** y[:, None], x.size, axis=1)
+    return [p], [percent], [x[0] - half_x], [y[0] - half_y], [wide], [high]
 
 
-def _contours(x: Float, y: Float, p: Float, *levels: float) -> dict[str, Any]:
+def _contours(x: Float, y: Float, p: Float, *levels: float) -> tuple[Any, Any]:
     from contourpy import contour_generator
 
     lines: list[Any] = [line for level in levels for line in contour_generator(x, y, p).lines(level)]
-    return {"xs": [line[:, 0].tolist() for line in lines], "ys": [line[:, 1].tolist() for line in lines]}
+    return [line[:, 0].tolist() for line in lines], [line[:, 1].tolist() for line in lines]
 
 
-def _labels(x: Float, y: Float, p: Float) -> dict[str, Any]:
+def _labels(x: Float, y: Float, p: Float) -> tuple[Any, ...]:
     """Return the names of contours, each at another part of its line: the lines are close to each other."""
     from contourpy import contour_generator
 
-    columns: dict[str, Any] = {"x": [], "y": [], "text": []}
+    found = []
     for level, part in LABELLED.items():
         lines: list[Any] = list(contour_generator(x, y, p).lines(level))
         if lines:
             longest = max(lines, key=len)
             at = longest[np.argsort(longest[:, 0])][int(part * (len(longest) - 1))]
-            for name, value in zip(columns, (float(at[0]), float(at[1]), f"{100 * level:g} %"), strict=True):
-                columns[name].append(value)
-    return columns
+            found.append((float(at[0]), float(at[1]), f"{100 * level:g} %"))
+    return tuple(zip(*found, strict=True)) or ([], [], [])
 
 
 class Limit(Tab):
@@ -286,6 +273,6 @@ class Limit(Tab):
 
     verb, title = "limit", "Limit and map"
     about = "How faint a star and how small a flare one would still see."
-    pictures = (Curve(), Map())
+    pictures = (curve, detection_map)
     simulations = {"limit": "Simulate the limit", "map": "Simulate the map"}  # noqa: RUF012
     files = {"limit": "limit", "map": "map"}  # noqa: RUF012

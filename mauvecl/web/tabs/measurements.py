@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.answers.measurements.expected import expected_measurements, models_of
-from mauvecl.answers.measurements.measure import COLUMNS
+from mauvecl.answers.measure import COLUMNS
+from mauvecl.answers.measurements import expected_measurements, models_of
+from mauvecl.charts.chart import Axis, Band, Chart, ChartData, Dots, Line, Own
 from mauvecl.fits.flare_model import FlareModel
-from mauvecl.schema.tables import View, records
+from mauvecl.schema.columns import View, records
 from mauvecl.study.nuisances import NuisanceChoice
-from mauvecl.web.closed_forms import short
-from mauvecl.web.figures import Canvas
-from mauvecl.web.tabs.tab import Answers, Picture, PictureData, Tab
+from mauvecl.web.closed_forms import Answers, short
+from mauvecl.web.tabs.tab import Tab
 
 if TYPE_CHECKING:
-    from mauvecl.answers.measurements.expected import ExpectedMeasurement
-    from mauvecl.answers.measurements.measure import MeasuredFlare
+    from mauvecl.answers.measure import MeasuredFlare
+    from mauvecl.answers.measurements import ExpectedMeasurement
     from mauvecl.fits.spectrum import Forecast
     from mauvecl.web.closed_forms import ClosedForms
 
@@ -32,6 +32,8 @@ ASSUMED = {
     "usual unknowns": NuisanceChoice(usual=True),
     "dark and star free": NuisanceChoice.model_validate({"dark": "free", "light": "free"}),
 }
+#: Names of the curves.
+NAMES = ("known", "usual", "free")
 #: Increase of chi-squared that encloses 95 % in two dimensions.
 RISE_95 = 5.99
 #: Factors on the amplitude at which errors are computed.
@@ -59,85 +61,76 @@ def simulated(answers: Answers) -> MeasuredFlare | None:
     return answers["measure"].flares[-1] if "measure" in answers else None
 
 
-class Errors(Picture):
-    """Relative error of the temperature against the amplitude of the flare."""
-
-    name, title = "errors", "Error of the temperature for smaller and larger flares"
-    sets = "amplitude_percent=x"
-    pins = "known"
-
-    def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
-        canvas = Canvas(
-            ink, "flare amplitude (%)", "error of the temperature (%)", logs | {"x", "y"}, y_range=(0.1, 1000)
-        )
-        for name, colour in zip(("known", "usual", "free"), ("flare", "star", "sky"), strict=True):
-            called = list(ASSUMED)[("known", "usual", "free").index(name)]
-            # Errors with other unknowns may be the same: dashes show the curve below.
-            dash: dict[str, Any] = {"line_dash": "dashed"} if name == "free" else {}
-            curve = canvas.line(name, called, colour, line_width=2, **dash)
-            canvas.tooltips(curve, ("amplitude (%)", "x"), (f"{called} (%)", "y"))
-        canvas.pinned()
-        canvas.own_point()
-        return canvas
-
-    def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
-        own = 100 * closed.study.flare.amplitudes[0]
-        sources: dict[str, Any] = {}
-        for name, one in zip(("known", "usual", "free"), expected(closed).values(), strict=True):
-            ahead = one.forecasts(FACTORS, one.unknown)
-            sources[name] = {"x": own * FACTORS, "y": [100 * f.errors[0] / f.values[0] for f in ahead]}
-        known, *_, free = expected(closed).values()
-        which = "temperature" if isinstance(known.fitted, FlareModel) else "lower temperature"
-        sources["own"] = {"x": [own], "y": [100 * known.ahead.errors[0] / known.ahead.values[0]]}
-        text = (
-            f"With everything known the {which} has a standard error of {_error(known)}, with dark level and star "
-            f"unknown one of {_error(free)}."
-        )
-        return PictureData(text, sources)
+@Chart(
+    "errors", "Error of the temperature for smaller and larger flares", Axis("flare amplitude (%)", log=True),
+    Axis("error of the temperature (%)", log=True, limits=(0.1, 1000)),
+    (
+        # Errors with other unknowns may be the same: dashes show the curve below.
+        *(
+            Line(called, colour, name, width=2, dash="dashed" * (name == "free"),
+                 tips=("amplitude (%)", f"{called} (%)"))
+            for called, name, colour in zip(ASSUMED, NAMES, ("flare", "star", "sky"), strict=True)
+        ),
+        Own(),
+    ),
+    sets="amplitude_percent=x", pins="known",
+).data()  # fmt: skip
+def temperature_errors(closed: ClosedForms, answers: Answers) -> ChartData:
+    """Return the relative error of the temperature against the amplitude of the flare."""
+    own = 100 * closed.study.flare.amplitudes[0]
+    series: dict[str, Any] = {}
+    for name, one in zip(NAMES, expected(closed).values(), strict=True):
+        ahead = one.forecasts(FACTORS, one.unknown)
+        series[name] = own * FACTORS, [100 * f.errors[0] / f.values[0] for f in ahead]
+    known, *_, free = expected(closed).values()
+    which = "temperature" if isinstance(known.fitted, FlareModel) else "lower temperature"
+    series["own"] = [own], [100 * known.ahead.errors[0] / known.ahead.values[0]]
+    text = (
+        f"With everything known the {which} has a standard error of {_error(known)}, with dark level and star "
+        f"unknown one of {_error(free)}."
+    )
+    return ChartData(text, series)
 
 
 def _error(one: ExpectedMeasurement) -> str:
     return f"{short(one.ahead.errors[0])} K"
 
 
-class Region(Picture):
-    """Confidence region of temperature and amplitude."""
-
-    name, title = "region", "Temperature and amplitude: 95 % confidence region"
-    logs = ("x",)
-
-    def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
-        canvas = Canvas(ink, "temperature (K)", "amplitude of the blackbody (%)", logs)
-        canvas.band("free", "dark and star free", "sky", alpha=0.3)
-        canvas.band("known", "everything known", "flare", alpha=0.5)
-        canvas.dots("fits", "simulated fits", "drawn", size=3)
-        canvas.own_point("the flare")
-        return canvas
-
-    def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
-        all_known, *_, free = expected(closed).values()
-        sources: dict[str, Any] = {name: {"x": [], "y": []} for name in ("fits", "own")}
-        # A fit without noise stands for a flare without these quantities, such as one from a file.
-        true, without_noise = all_known.truth[:2], all_known.perfect.estimates[0, :2]
-        best = true if np.isfinite(true).all() else without_noise
-        sources["own"] = {"x": [best[0]], "y": [100 * best[1]]}
-        fits = simulated(answers)
-        if fits is not None:
-            some = fits.found.estimates[:MOST_DOTS]
-            sources["fits"] = {"x": some[:, 0], "y": 100 * some[:, 1]}
-        one_temperature = isinstance(all_known.fitted, FlareModel)
-        for name, one in (("known", all_known), ("free", free)):
-            kelvin, low, high = one.region(RISE_95) if one_temperature else _ellipse(best, one.ahead)
-            sources[name] = {"x": kelvin, "low": 100 * low, "high": 100 * high}
-        x = np.asarray(sources["free"]["x"])
-        text = (
-            f"With dark level and star unknown the 95 % region reaches from {short(x[0])} to {short(x[-1])} K: hotter "
-            "flares of smaller area look alike."
-            if one_temperature
-            else "The flare has two temperatures, of which this is the lower one. Regions follow from its standard "
-            "errors where these are below 100 %; simulated fits need no such limit."
-        )
-        return PictureData(text, sources)
+@Chart(
+    "region", "Temperature and amplitude: 95 % confidence region", Axis("temperature (K)"),
+    Axis("amplitude of the blackbody (%)"),
+    (
+        Band("dark and star free", "sky", "free", alpha=0.3),
+        Band("everything known", "flare", "known", alpha=0.5),
+        Dots("simulated fits", name="fits", size=3),
+        Own("the flare"),
+    ),
+    logs=("x",),
+).data()  # fmt: skip
+def region(closed: ClosedForms, answers: Answers) -> ChartData:
+    """Return the confidence region of temperature and amplitude."""
+    all_known, *_, free = expected(closed).values()
+    # A fit without noise stands for a flare without these quantities, such as one from a file.
+    true, without_noise = all_known.truth[:2], all_known.perfect.estimates[0, :2]
+    best = true if np.isfinite(true).all() else without_noise
+    series: dict[str, Any] = {"own": ([best[0]], [100 * best[1]])}
+    fits = simulated(answers)
+    if fits is not None:
+        some = fits.found.estimates[:MOST_DOTS]
+        series["fits"] = some[:, 0], 100 * some[:, 1]
+    one_temperature = isinstance(all_known.fitted, FlareModel)
+    for name, one in (("known", all_known), ("free", free)):
+        kelvin, low, high = one.region(RISE_95) if one_temperature else _ellipse(best, one.ahead)
+        series[name] = kelvin, 100 * low, 100 * high
+    x = np.asarray(series["free"][0])
+    text = (
+        f"With dark level and star unknown the 95 % region reaches from {short(x[0])} to {short(x[-1])} K: hotter "
+        "flares of smaller area look alike."
+        if one_temperature
+        else "The flare has two temperatures, of which this is the lower one. Regions follow from its standard "
+        "errors where these are below 100 %; simulated fits need no such limit."
+    )
+    return ChartData(text, series)
 
 
 def _ellipse(best: Float, ahead: Forecast, n: int = 161) -> tuple[Float, Float, Float]:
@@ -155,49 +148,43 @@ def _ellipse(best: Float, ahead: Forecast, n: int = 161) -> tuple[Float, Float, 
     return best[0] * np.exp(along), low, high
 
 
-class Course(Picture):
-    """Temperature along a simulated stare."""
-
-    name, title = "course", "Temperature of the flare along a stare"
-
-    def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
-        canvas = Canvas(ink, "time from the start of the stare (s)", "temperature (K)", logs | {"y"})
-        canvas.band("bins", "bins of frames: 95 % interval", "star", alpha=0.3)
-        canvas.dots("estimates", "bins of frames", "star")
-        canvas.line("true", "simulated flare", "total", line_dash="dashed")
-        canvas.line("joint", "joint fit", "flare", line_width=2)
-        return canvas
-
-    def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
-        sources: dict[str, Any] = {name: {"x": [], "y": []} for name in ("estimates", "true", "joint")}
-        sources["bins"] = {"x": [], "low": [], "high": []}
-        stares = answers["measure"].stares if "measure" in answers else []
-        if not stares:
-            text = "No stare is measured yet: choose a joint fit or the S/N of bins, and simulate fits."
-            return PictureData(text, sources)
-        (one,), words = stares, []
-        if one.joint is not None:
-            (event,), stare = one.events, one.staring.stare
-            since = (stare.middle_s - event.peak_s) / event.half_width_s
-            near = (since > -NEAR[0]) & (since < NEAR[1])
-            for name, course in (("true", one.joint.true), ("joint", one.joint.fitted)):
-                sources[name] = {"x": stare.middle_s[near], "y": course.kelvin[near]}
-            found = one.joint.found
-            each = zip(found.names[:4], found.units, found.estimates[0], found.errors[0], strict=False)
-            words += [f"{name} {short(best)} +- {short(error)} {unit}".strip() for name, unit, best, error in each]
-        if isinstance(one.drawn, str):
-            words.append(one.drawn)
-        elif one.drawn is not None:
-            bins = one.drawn
-            x, kelvin = (bins.start_s + bins.end_s) / 2, bins.found.estimates[:, 0]
-            ends = [
-                np.where(np.isfinite(end), end, kelvin) for end in (bins.found.low[-1, :, 0], bins.found.high[-1, :, 0])
-            ]
-            sources["estimates"] = {"x": x, "y": kelvin}
-            sources["bins"] = dict(zip(("x", "low", "high"), (x, *ends), strict=True))
-            two = not isinstance(next(iter(expected(closed).values())).fitted, FlareModel)
-            words.append(f"{x.size} bins of frames{', each fitted with one temperature' if two else ''}")
-        return PictureData(f"One simulated stare: {'; '.join(words)}.", sources)
+@Chart(
+    "course", "Temperature of the flare along a stare", Axis("time from the start of the stare (s)"),
+    Axis("temperature (K)", log=True),
+    (
+        Band("bins of frames: 95 % interval", "star", "bins", alpha=0.3),
+        Dots("bins of frames", "star", "estimates"),
+        Line("simulated flare", "total", "true", dash="dashed"),
+        Line("joint fit", "flare", "joint", width=2),
+    ),
+).data()  # fmt: skip
+def course(closed: ClosedForms, answers: Answers) -> ChartData:
+    """Return the temperature along a simulated stare."""
+    stares = answers["measure"].stares if "measure" in answers else []
+    if not stares:
+        return ChartData("No stare is measured yet: choose a joint fit or the S/N of bins, and simulate fits.")
+    (one,), words, series = stares, list[str](), dict[str, Any]()
+    if one.joint is not None:
+        (event,), stare = one.events, one.staring.stare
+        since = (stare.middle_s - event.peak_s) / event.half_width_s
+        near = (since > -NEAR[0]) & (since < NEAR[1])
+        for name, fit in (("true", one.joint.true), ("joint", one.joint.fitted)):
+            series[name] = stare.middle_s[near], fit.kelvin[near]
+        found = one.joint.found
+        each = zip(found.names[:4], found.units, found.estimates[0], found.errors[0], strict=False)
+        words += [f"{name} {short(best)} +- {short(error)} {unit}".strip() for name, unit, best, error in each]
+    if isinstance(one.drawn, str):
+        words.append(one.drawn)
+    elif one.drawn is not None:
+        bins = one.drawn
+        x, kelvin = (bins.start_s + bins.end_s) / 2, bins.found.estimates[:, 0]
+        ends = (
+            np.where(np.isfinite(end), end, kelvin) for end in (bins.found.low[-1, :, 0], bins.found.high[-1, :, 0])
+        )
+        series |= {"estimates": (x, kelvin), "bins": (x, *ends)}
+        two = not isinstance(next(iter(expected(closed).values())).fitted, FlareModel)
+        words.append(f"{x.size} bins of frames{', each fitted with one temperature' if two else ''}")
+    return ChartData(f"One simulated stare: {'; '.join(words)}.", series)
 
 
 class Measurement(Tab):
@@ -210,7 +197,7 @@ class Measurement(Tab):
         "What is measured of the flare once it is detected: its temperature, size and light, with errors in closed "
         "form; simulated fits count how often their intervals hold the truth."
     )
-    pictures = (Errors(), Region(), Course())
+    pictures = (temperature_errors, region, course)
     simulations = {"measure": "Simulate fits"}  # noqa: RUF012
     files = dict.fromkeys(("measure", "fits", "temperatures", "joint"), "measure")
 

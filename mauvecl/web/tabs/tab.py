@@ -1,28 +1,26 @@
-"""Base classes of tabs: pictures, their simulations and downloadable tables."""
+"""Base class of tabs: charts, simulations and tables for download."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from abc import ABC
+from collections.abc import Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from mauvecl.answers.verbs import VERBS
-from mauvecl.schema.tables import View, without_empty
+from mauvecl.schema.columns import View, without_empty
+from mauvecl.web.closed_forms import Answers
 from mauvecl.web.fields import FIELDS, star_words
 from mauvecl.web.simulations import verbs_of
 
 if TYPE_CHECKING:
     from astropy.table import Table
-    from numpy.typing import ArrayLike
 
+    from mauvecl.charts.chart import Chart
     from mauvecl.study.study import Study
     from mauvecl.web.closed_forms import ClosedForms
     from mauvecl.web.question import Question
 
-#: Answers that are simulated, by name: of one question.
-Answers = Mapping[str, Any]
 #: Columns that the page does not show: its question has one star and one flare.
 FIXED = ("star", "amplitude")
 
@@ -33,43 +31,6 @@ def target_words(question: Question) -> str:
     return f"{names}; {question.days:g} days from {question.start}"
 
 
-@dataclass
-class PictureData:
-    """Data of a picture."""
-
-    text: str  # the picture in words, for visitors who do not see it
-    # Columns by the name of the figure's data source.
-    sources: dict[str, dict[str, ArrayLike | Sequence[str]]] = field(default_factory=dict)
-    # Properties by the name of the figure's model, such as an axis's label.
-    props: dict[str, dict[str, Any]] = field(default_factory=dict)
-    # Entries of the legend that have another name than in the figure.
-    names: dict[str, str] = field(default_factory=dict)
-
-
-class Picture(ABC):
-    """Picture: a static empty figure and data for it."""
-
-    name: ClassVar[str]  # within the page
-    title: ClassVar[str]
-    # Axes, of x and y, that the visitor can make logarithmic; in capitals those that are logarithmic at first.
-    logs: ClassVar[tuple[str, ...]] = ()
-    # Parts that are hidden by default, by tag of their models, with their names.
-    shows: ClassVar[Mapping[str, str]] = {}
-    # Fields that a click on the picture sets, with the axis that gives each, as in "magnitude=x".
-    sets: ClassVar[str] = ""
-    pins: ClassVar[str] = ""  # the source whose columns are also shown for pinned scenarios; empty if they are not
-    # Fields in which a pinned scenario must agree with the question to be shown with it.
-    alike: ClassVar[tuple[str, ...]] = ()
-
-    @abstractmethod
-    def figure(self, ink: Any, logs: frozenset[str]) -> Any:
-        """Return an empty Bokeh figure in a theme's colours, with these logarithmic axes."""
-
-    @abstractmethod
-    def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
-        """Return the data of the picture."""
-
-
 class Tab(ABC):
     """Tab of the page; a `verb` gives name, title, help, button, answer and file that the tab does not state itself."""
 
@@ -77,7 +38,7 @@ class Tab(ABC):
     name: ClassVar[str]
     title: ClassVar[str]
     about: ClassVar[str]  # what it shows, in a sentence
-    pictures: ClassVar[tuple[Picture, ...]] = ()
+    pictures: ClassVar[tuple[Chart, ...]] = ()
     simulations: ClassVar[Mapping[str, str]] = {}  # what can be simulated here, with the label of the button
     answer: ClassVar[str] = ""  # name of the simulated answer whose table is below the pictures
     view: ClassVar[int] = 0  # number of that table among the answer's `views`
@@ -164,3 +125,10 @@ class Tab(ABC):
         needed = self.files[name]
         study: Study = closed.study if needed is None else answers[needed].study
         return study
+
+
+class Compare(Tab):
+    """Pinned scenarios and the history of runs."""
+
+    name, title = "compare", "Compare"
+    about = "Scenarios that you have pinned, side by side, and what you have simulated; this browser tab keeps them."

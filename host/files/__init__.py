@@ -1,1 +1,0 @@
-"""Reading of user files within size limits, and atomic writing of files."""

@@ -1,0 +1,389 @@
+"""Columns of spectra: their roles by name, UCD and unit, and the choice among them.
+
+Names are divided into words (``FluxErr``, ``STATERROR``, ``wave_lo``) with known meanings. A word such as "error" or
+"sky" excludes a column from being the flux, regardless of the rest of its name. Other columns get a score for the match
+of name and unit, and the best is chosen.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
+
+from mauvecl.host.tables.units import SCALE, FluxKind, balanced, flux_kind, is_spectral, is_stated, unit_of
+from mauvecl.schema.errors import InputError, shortened
+
+Kind = Literal[
+    "wavelength", "lower edge", "upper edge", "flux", "model", "error", "quality", "continuum", "counts", "background",
+    "width", "magnitude", "throughput", "luminosity", "unknown",
+]  # fmt: skip
+
+_MEANINGS = {
+    "wave": "wavelength wavelengths wave waves wavel lambda lambdas lam wl wlen wav wvl wln awav λ w",
+    "other axis": "frequency freq nu ν energy wavenumber wavenum wn",
+    "flux": "flux fluxes flx flam fnu fλ fν sflux irradiance photlam photnu jy",
+    "weak flux": "intensity radiance brightness f value y sed spec spectrum spectra",
+    "total": "lamflam nufnu wfw vfv",
+    "logarithm": "log ln dex",
+    "error": "err errs error errors e sig sigma unc uncert uncertainty uncertainties std stdev stddev sd rms var"
+    " variance ivar invvar inverse weight weights noise stat sys syst snr sn eflux dflux ferr efl",
+    "quality": "qual quality dq flag flags mask andmask ormask good bad valid pixmask",
+    "continuum": "cont continuum baseline",
+    "counts": "count counts cts ct adu dn electron electrons",
+    "weak counts": "net gross gcounts rate photons",
+    "background": "sky bkg bkgd bg background back airglow",
+    "removed": "sub subtracted corrected removed",
+    "width": "width widths fwhm dw dlam dlambda dwave delta d step disp wdisp dispersion res wres resolution resolving"
+    " bandwidth binsize",
+    "throughput": "throughput transmission transmittance trans efficiency eff qe response sensitivity sens reflectivity"
+    " reflectance bandpass passband emissivity",
+    "luminosity": "luminosity lum llambda lnu llam",
+    "magnitude": "mag mags magnitude magnitudes abmag stmag ab st",
+    "model": "model models mod template templates fit synthetic synth bestfit bestmodel",
+    "low": "lo low lower min minimum left start begin",
+    "high": "hi high higher upper max maximum right end stop",
+    "bin": "bin edge edges",
+    "vacuum": "vac vacuum",
+    "air": "air",
+    "neutral": "density densities dens spectral total data cal calibrated of the in",
+    "label": "obs observed source dered dereddened corr rest norm normalized normalised bolo smooth smoothed raw star",
+}  # fmt: skip
+_WORDS = {word: meaning for meaning, words in _MEANINGS.items() for word in words.split()}
+# Words of a name that may be joined: FLUXERR, loglam, wavehi.
+_GLUED = sorted((w for w in _WORDS if len(w) > 2 or w in ("lo", "hi", "wl", "bg", "dq")), key=len, reverse=True)
+_LAMBDA, _NU = "(?:lambda|lam|λ)", "(?:nu|ν)"
+# Names of several words with a single meaning.
+_PHRASES = tuple(
+    (re.compile(rf"(?<![a-zλν])(?:{pattern})(?![a-zλν])"), word)
+    for pattern, word in (
+        (rf"{_LAMBDA}[\s_*.]*f(?:lux)?[\s_]*{_LAMBDA}|w[\s_*.]*f[\s_]*w", "lamflam"),
+        (rf"{_NU}[\s_*.]*f(?:lux)?[\s_]*{_NU}|v[\s_*.]*f[\s_]*v", "nufnu"),
+        (rf"(?:[sib]|f(?:lux)?(?:[\s_]*density)?)[\s_]*(?:{_LAMBDA}|wl|wave)", "flam"),
+        (rf"(?:[sib]|f(?:lux)?(?:[\s_]*density)?)[\s_]*{_NU}", "fnu"),
+        (rf"l[\s_]*(?:{_LAMBDA}|{_NU})", "luminosity"),
+        (r"log_?10|lg", "log"),
+        (r"spectral[\s_]*axis", "wavelength"),
+        (r"s[_/]n", "snr"),
+    )
+)
+# A word with one of these meanings determines the role, regardless of the rest of the name.
+_DECIDING: tuple[Kind, ...] = (
+    "error", "quality", "continuum", "background", "counts", "throughput", "luminosity",
+)  # fmt: skip
+#: Words in the name of a flux that say that it is one per frequency.
+_PER_FREQUENCY = {"fnu", "fν", "photnu", "nu", "ν", "freq", "frequency", "hz", "hertz", "jy"}
+_BRACKETS = re.compile(r"[\[(]((?:[^\[\]()]|\([^()]*\))*)[\])]\s*$")
+#: Words in brackets for units that are no flux density, or not a single one.
+_NO_DENSITY = re.compile(
+    r"\b(?:cgs|SI|arb|arbitrary|relative|normali[sz]ed|counts?|adu|electrons?|a\.?u\.?)(?:\b|$)", re.IGNORECASE
+)
+_LOGARITHM_OF = re.compile(r"(log_?10|log|lg|ln)\s*[(\[](.*?)[)\]]\s*([(\[].*)?", re.IGNORECASE)
+# Words of the IVOA's unified content descriptors (UCD1+ 1.5), by their first word.
+_UCD: dict[str, Kind] = {"em.wl": "wavelength", "em.freq": "wavelength", "em.energy": "wavelength",
+                         "phot.flux.density": "flux", "stat.error": "error", "meta.code": "quality",
+                         "spect.continuum": "continuum", "instr.bandwidth": "width"}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Role:
+    """Role of a column as inferred from its name, unit and UCD."""
+
+    kind: Kind
+    #: Score of the name for the kind, comparable among columns of one kind.
+    score: int = 0
+    #: Base of the logarithm, "10" or "e", if the column contains logarithms; otherwise empty.
+    logarithm: str = ""
+    #: Whether the flux is multiplied by its wavelength or frequency according to the name.
+    total: bool = False
+    #: Whether a flux is one per frequency according to its name.
+    per_frequency: bool = False
+    #: Stated unit, or the unit in the name, as in ``flux_W_m2_nm`` or ``wave [nm]``.
+    unit: str | None = None
+
+
+@lru_cache(maxsize=1024)
+def role_of(name: str, unit: str | None = None, ucd: str = "") -> Role:
+    """Infer the role of a column."""
+    base, unit_in_name = divided(name)
+    words = words_of(base)
+    kind, score = _kind_of(words)
+    if kind == "magnitude" and (system := set(words) & {"ab", "abmag", "st", "stmag"}):
+        # AB and ST magnitudes have zero points that are fluxes; others have not.
+        kind, score, unit_in_name = "flux", 0, "ABmag" if system & {"ab", "abmag"} else "STmag"
+    stated = unit if is_stated(unit) else None
+    if stated is None or (unit_in_name is not None and re.search("mag", stated, re.IGNORECASE)):
+        stated = unit_in_name
+    is_known, spectral, flux = _kinds_of_unit(stated)
+    if kind == "magnitude" and flux == "density":
+        kind = "flux"
+    if kind == "unknown" and ucd:
+        kind, score = next(((k, 3) for first, k in _UCD.items() if ucd.lower().startswith(first)), (kind, score))
+    if kind == "unknown" and not words:
+        # A name that is only a unit, as in a line "nm, flam".
+        kind, score = ("wavelength", 3) if spectral else ("flux", 3) if flux != "other" else (kind, 0)
+    if kind == "unknown" and is_stated(unit) and flux == "density":
+        kind, score = "flux", 1
+    # A unit of another kind contradicts the name; an unknown unit raises InputError at conversion.
+    if is_known and kind in ("flux", "model"):
+        score += 1 if flux in ("density", "total") else -6
+    if is_known and kind == "wavelength":
+        score += 1 if spectral else -6
+    logarithm = next(("e" if word == "ln" else "10" for word in words if _WORDS.get(word) == "logarithm"), "")
+    if logarithm:
+        score -= 1
+    total = any(_WORDS.get(word) == "total" for word in words)
+    per_frequency = kind in ("flux", "model") and not total and bool(_PER_FREQUENCY & set(words))
+    # VOTable says so by the second word of a UCD, as in phot.flux.density;em.freq.
+    per_frequency |= kind == "flux" and ucd.lower().startswith("phot.flux.density;em.freq")
+    return Role(kind, score, logarithm, total, per_frequency, stated)
+
+
+def _kind_of(words: Sequence[str]) -> tuple[Kind, int]:
+    """Return the kind of column that the words of a name indicate, and their score."""
+    has = {_WORDS.get(word, "label") for word in words if _WORDS.get(word) != "logarithm"}
+    if len(words) == 1 and len(words[0]) == 1:
+        # An "e" may be an energy, a "d" a distance.
+        has -= {"error", "width"}
+    if {"background", "removed"} <= has:
+        has -= {"background", "removed"}
+    is_axis, is_flux = bool(has & {"wave", "other axis"}), bool(has & {"flux", "total"})
+    for kind in _DECIDING:
+        if kind in has:
+            return kind, 0
+    if "weak counts" in has and not is_flux:
+        return "counts", 0
+    if "width" in has:
+        return "width", 0
+    if is_flux or ("weak flux" in has and not is_axis):
+        # Limits of a flux are those of its confidence interval.
+        return ("error", 0) if has & {"low", "high"} else ("flux", _flux_score(words, has))
+    if has & {"low", "high"} and (is_axis or "bin" in has):
+        return ("lower edge" if "low" in has else "upper edge"), 1
+    if is_axis:
+        return "wavelength", _axis_score(words, has)
+    if "magnitude" in has and words != ("st",):
+        return "magnitude", 0
+    return ("model", 1) if "model" in has else ("unknown", 0)
+
+
+def _flux_score(words: Sequence[str], has: set[str]) -> int:
+    if has - {"flux", "total", "weak flux", "vacuum", "air", "neutral"}:
+        score = 3
+    else:
+        score = 5 if words in (("flux",), ("fluxes",)) else 4
+    return score if has & {"flux", "total"} else score - 2
+
+
+def _axis_score(words: Sequence[str], has: set[str]) -> int:
+    # A "w" may be a weight.
+    if words == ("w",):
+        return 0
+    score = 4 if "wave" in has else 2
+    if has - {"wave", "other axis", "vacuum", "air", "neutral"}:
+        score -= 2
+    return score - 1 if "air" in has else score
+
+
+@lru_cache(maxsize=1024)
+def _kinds_of_unit(unit: str | None) -> tuple[bool, bool, FluxKind]:
+    """Return whether a unit is known, whether it is one of wavelength, and its kind of flux."""
+    try:
+        parsed = None if unit is None else unit_of(unit)
+    except InputError:
+        parsed = None
+    if parsed is None or str(parsed) == "dex":
+        return False, False, "other"
+    return True, is_spectral(parsed), flux_kind(parsed)
+
+
+def divided(name: str) -> tuple[str, str | None]:
+    """Divide a column's name into the quantity and its unit, if any."""
+    name = " ".join(name.strip().strip("\"'").split())
+    if is_unit(name, alone=True):
+        return "", name
+    if match := _LOGARITHM_OF.fullmatch(name):
+        # log10(wave/AA), log(F) [erg/s/cm2/A]
+        name = f"{match[1]} {match[2]} {match[3] or ''}".strip()
+    base, unit = name, None
+    if (match := _BRACKETS.search(name)) and match.start() > 0:
+        inner = match[1].strip()
+        if is_unit(inner) or re.search(r"\d|\^|/", inner) or _NO_DENSITY.search(inner):
+            base, unit = name[: match.start()], inner
+    elif (match := re.search(r"\s?/\s*(\S+)$|\sin\s+(\S+)$", name)) and is_unit(match[1] or match[2]):
+        base, unit = name[: match.start()], match[1] or match[2]
+    elif (match := SCALE.search(name)) and match.start() > 0:
+        # A factor without a unit, as in "flux/10^-15", is not a unit.
+        base, unit = re.sub(r"\s*[/*]\s*$|\s+x\s*$", "", name[: match.start()]), name[match.start() :]
+    else:
+        parts = name.split("_")
+        for k in range(1, len(parts)):
+            tail = parts[k:]
+            spelt = "/".join(tail) if len(tail) > 1 and not re.search(r"[/\-−]", "".join(tail)) else " ".join(tail)
+            if _fits(parts[:k], spelt):
+                base, unit = "_".join(parts[:k]), spelt
+                break
+    return base, unit if unit is None else balanced(unit)
+
+
+def _fits(base: Sequence[str], unit: str) -> bool:
+    """Return whether a unit at the end of a name matches the quantity: wavelength or flux."""
+    _, spectral, flux = _kinds_of_unit(unit)
+    if not spectral and flux == "other":
+        return False
+    kind, _ = _kind_of(words_of("_".join(base)))
+    is_axis = kind in ("wavelength", "lower edge", "upper edge", "width")
+    return spectral and len(unit) < 12 if is_axis else flux != "other" and unit.lower() not in ("ab", "st")
+
+
+def is_unit(text: str, alone: bool = False) -> bool:
+    """Return whether a text is a unit of wavelength or flux; if alone, one that is unlikely to be a word."""
+    if alone and text not in ("A", "Å") and (len(text) < 2 or text.lower() in ("ab", "st", "erg")):
+        return False
+    _, spectral, flux = _kinds_of_unit(text)
+    return spectral or flux != "other"
+
+
+@lru_cache(maxsize=1024)
+def words_of(name: str) -> tuple[str, ...]:
+    """Divide a name into lower-case words: at punctuation, capitals and digits, and between known words."""
+    name = re.sub(r"(?<=[a-zµλν])(?=[A-Z])", " ", name.strip())
+    lower = name.lower()
+    for pattern, word in _PHRASES:
+        lower = pattern.sub(word, lower)
+    words: list[str] = []
+    for chunk in re.findall(r"[^\W\d_]+|\d+", lower):
+        words += _unglued(chunk) or [chunk]
+    return tuple(words)
+
+
+def _unglued(chunk: str) -> list[str] | None:
+    """Divide letters into known words, or return None."""
+    if chunk in _WORDS or chunk.isdigit():
+        return [chunk]
+    for word in _GLUED:
+        if chunk.startswith(word):
+            rest = chunk[len(word) :]
+            if rest in _WORDS or (rest and len(rest) > 1 and _unglued(rest)):
+                return [word, *(_unglued(rest) or [])]
+    # wmin, efluxes
+    if chunk[:1] == "w" and _WORDS.get(chunk[1:]) in ("low", "high"):
+        return ["w", chunk[1:]]
+    return None
+
+
+#: Largest number of names in a message.
+MAX_LISTED = 12
+#: Names that can be typed between the brackets of ``FILE[name]``.
+TYPED = re.compile(r"[^\[\],\"'\s](?:[^\[\],\"'\n\r\t]{0,38}[^\[\],\"'\s])?")
+AXES = ("wavelength", "lower edge", "upper edge")
+
+
+def plain(name: str) -> str:
+    """Normalise a column's name for comparison: lower case, without quotes and repeated blanks."""
+    return " ".join(name.strip().strip("\"'").lower().split())
+
+
+def numbered(kind: str, word: str) -> int | None:
+    """Return the index in a word such as ``row 3``, or None."""
+    match = re.fullmatch(rf"{kind}\s+(\d{{1,9}})", word.strip(), re.IGNORECASE)
+    return int(match[1]) - 1 if match and int(match[1]) > 0 else None
+
+
+def listed(names: Sequence[str]) -> str:
+    """Join names for a message; a long list ends with the number of omitted names."""
+    shown = [name.strip()[:40] for name in names]
+    return ", ".join(shown[:MAX_LISTED]) + (f" and {len(shown) - MAX_LISTED} more" if len(shown) > MAX_LISTED else "")
+
+
+def as_typed(name: str, kind: str, place: int, names: Sequence[str] = ()) -> str:
+    """Return ``FILE[name]`` for a message, or ``FILE[row 3]`` where the name cannot be typed or is not the only one."""
+    word = name.strip()
+    typed = TYPED.fullmatch(word) is not None and word.isprintable()
+    alone = sum(plain(one) == plain(word) for one in names) < 2
+    return f"FILE[{word}]" if typed and alone else f"FILE[{kind} {place + 1}]"
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Indices of the columns of a spectrum: one wavelength or both edges of each bin, and the flux."""
+
+    wavelength: tuple[int, ...]
+    flux: int
+
+
+def choose(names: Sequence[str], roles: Sequence[Role], asked: Sequence[str] = ()) -> Choice:
+    """Choose the columns of wavelength and flux.
+
+    Parameters
+    ----------
+    roles : sequence of Role
+        Role of each column.
+    asked : sequence of str
+        Columns named by the user: a flux, a wavelength, or both.
+    """
+    wanted = [_named(name, names) for name in asked]
+    if len(wanted) > 2:
+        raise InputError.of("columns", asked, "one flux, and one wavelength at most")
+    axes = [i for i in wanted if roles[i].kind in AXES]
+    if len(wanted) == 2 and not axes:
+        axes = wanted[:1]
+    wavelength = (axes[0],) if axes else _wavelength(names, roles)
+    rest = [i for i in wanted if i not in wavelength]
+    if len(rest) > 1:
+        raise InputError.of("columns", asked, "one flux, and one wavelength at most")
+    return Choice(wavelength, rest[0] if rest else _flux(names, roles, wavelength))
+
+
+def _named(name: str, names: Sequence[str]) -> int:
+    indices = [i for i, one in enumerate(names) if one.strip() == name]
+    if not indices and (place := numbered("column", name)) is not None and place < len(names):
+        return place
+    indices = indices or [i for i, one in enumerate(names) if plain(one) == plain(name)]
+    if len(indices) != 1:
+        fault = f"{'several columns are' if indices else 'no column is'} named {shortened(name)}"
+        raise InputError(fault, f"one of {listed(names)}", key="columns")
+    return indices[0]
+
+
+def _wavelength(names: Sequence[str], roles: Sequence[Role]) -> tuple[int, ...]:
+    if best := _best([(role.score, i) for i, role in enumerate(roles) if role.kind == "wavelength"]):
+        return (_only("wavelength", names, best),)
+    low, high = ([i for i, role in enumerate(roles) if role.kind == f"{side} edge"] for side in ("lower", "upper"))
+    if low or high:
+        return _only("lower edge of the bins", names, low), _only("upper edge of the bins", names, high)
+    fault = f"no column is recognised as the wavelength among {listed(names) or 'none'}"
+    raise InputError(fault, "one named wavelength: name two columns as in FILE[wavelength,flux]", key="columns")
+
+
+def _flux(names: Sequence[str], roles: Sequence[Role], wavelength: tuple[int, ...]) -> int:
+    rest = [i for i in range(len(names)) if i not in wavelength]
+    for kind in ("flux", "model"):
+        if best := _best([(roles[i].score, i) for i in rest if roles[i].kind == kind]):
+            return _only("flux", names, best)
+    unknown = [i for i in rest if roles[i].kind == "unknown"]
+    if len(rest) == len(unknown) == 1:
+        return unknown[0]
+    shown = (unknown or rest or [0])[0]
+    held = [f"{names[i].strip()[:40]} ({roles[i].kind})" for i in rest]
+    fault = f"no column is recognised as a star's flux, only {listed(held) or 'the wavelength'}"
+    expected = f"one named flux: name the column as in {as_typed(names[shown], 'column', shown, names)}"
+    raise InputError(fault, expected, key="columns")
+
+
+def _best(scored: list[tuple[int, int]]) -> list[int]:
+    most = max((score for score, _ in scored), default=0)
+    return [i for score, i in scored if score == most]
+
+
+def _only(what: str, names: Sequence[str], indices: Sequence[int]) -> int:
+    if len(indices) == 1:
+        return indices[0]
+    if not indices:
+        fault = f"no column is the {what} among {listed(names) or 'none'}"
+        raise InputError(fault, "both edges or the wavelength itself", key="columns")
+    several = [names[i].strip() for i in indices]
+    fault = f"{len(several)} columns may be the {what}: {listed(several)}"
+    raise InputError(fault, f"one: name it as in {as_typed(several[-1], 'column', indices[-1], names)}", key="columns")

@@ -1,0 +1,345 @@
+"""Checks of a spectrum's points and range, its noise, and continuation of its ends by their level or a spectrum."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.host.spectra.units import MIN_MEASURED, NEEDED_NM, SPAN_NM, is_gap, likely_unit, measured_part
+from mauvecl.schema.errors import InputError
+
+if TYPE_CHECKING:
+    from mauvecl.host.instrument.instrument import LineSpread
+
+Float = NDArray[np.float64]
+
+#: Range of wavelengths, nm, from gamma rays to metre waves, whose products stay within double precision.
+NEAREST_NM, FARTHEST_NM = 1e-6, 1e9
+#: Smallest relative distance of two wavelengths; each conversion rounds by about 1e-16.
+CLOSEST = 1e-12
+#: Range of a spectrum's largest flux, erg s-1 cm-2 A-1, from 1e-21 for the faintest stars to 1e10 at a white dwarf's
+#: surface, with margins.
+FAINTEST, BRIGHTEST = 1e-40, 1e30
+#: Largest fraction of the brightest pixel's light that a continuation may add to the outermost pixel (a choice).
+MAX_CONTINUED = 0.01
+#: Number of neighbouring points from whose scatter the noise of a point is estimated.
+WINDOW = 51
+#: Widths over which a level at an end or join, and the brightest flux (a resolution element), are averaged, nm.
+END_NM, JOIN_NM, ELEMENT_NM = 5.0, 10.0, 10.5
+#: Smallest ratio of a level to its error for which another spectrum can be scaled to it.
+MIN_JOIN_SNR = 5.0
+
+
+def check_points(name: str, wavelength: Float, flux: Float) -> None:
+    """Raise InputError for points that are no spectrum.
+
+    Wavelengths and fluxes, nm and erg s-1 cm-2 A-1, must have equal length and be in range; wavelengths must be finite,
+    increasing and distinct.
+    """
+    if wavelength.ndim != 1 or wavelength.shape != flux.shape or wavelength.size < 2:
+        fault = f"spectrum {name} has {wavelength.shape} wavelengths and {flux.shape} fluxes"
+        raise InputError(fault, "two equal columns", key="flux")
+    bad = np.flatnonzero(~(np.isfinite(wavelength) & (wavelength > 0.0)))
+    if bad.size:
+        raise InputError.of(
+            "wavelength", wavelength[bad[0]], "a finite number above 0", where=f"spectrum {name}, point {bad[0] + 1}"
+        )
+    back = np.flatnonzero(np.diff(wavelength) <= 0)
+    if back.size:
+        i = int(back[0])
+        fault = f"spectrum {name}: wavelength {wavelength[i + 1]:g} nm at point {i + 2} follows {wavelength[i]:g} nm"
+        raise InputError(fault, "increasing wavelengths", key="wavelength")
+    outside = np.flatnonzero((wavelength < NEAREST_NM) | (wavelength > FARTHEST_NM))
+    if outside.size:
+        where = f"spectrum {name}, point {outside[0] + 1}"
+        raise InputError.of("wavelength", wavelength[outside[0]], f"{NEAREST_NM:g} to {FARTHEST_NM:g} nm", where=where)
+    close = np.flatnonzero(np.diff(wavelength) < CLOSEST * wavelength[1:])
+    if close.size:
+        i = int(close[0])
+        first, second = (float(one) for one in wavelength[i : i + 2])
+        same = f"{first!r} and {second!r} nm at points {i + 1} and {i + 2} are the same to within rounding"
+        expected = f"wavelengths that differ by {CLOSEST:g} of their value"
+        raise InputError(f"spectrum {name}: wavelengths {same}", expected, key="wavelength")
+    # Undefined ends are cut later.
+    largest = float(np.abs(flux[np.isfinite(flux)]).max(initial=0.0))
+    if largest and not FAINTEST <= largest <= BRIGHTEST:
+        raise InputError.of("flux", largest, f"{FAINTEST:g} to {BRIGHTEST:g}", where=f"spectrum {name}, largest value")
+
+
+def check_measured(name: str, wavelength: Float, unit: str = "nm") -> None:
+    """Raise InputError if a spectrum itself covers less than a third of 200-700 nm; `unit` is that of its file."""
+    part = measured_part(wavelength)
+    if part >= MIN_MEASURED - 1e-9:
+        return
+    low, high = float(wavelength[0]), float(wavelength[-1])
+    likely = likely_unit(low, high, "nm") if unit == "nm" else None
+    meant = f"; as numbers these look like {likely}: `wavelength_unit={likely!r}`" if likely else ""
+    fault = f"spectrum {name} covers {low:g}-{high:g} nm, {part:.0%} of {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm"
+    raise InputError(fault, f"at least a third, which `extend` can continue{meant}", key="extend")
+
+
+def check_covers(
+    name: str, span_nm: tuple[float, float], needed_nm: tuple[float, float] = NEEDED_NM, of: str = ""
+) -> None:
+    """Raise InputError if a spectrum's range does not cover that of the pixels."""
+    if span_nm[0] > needed_nm[0] or span_nm[1] < needed_nm[1]:
+        fault = f"spectrum {name} spans {span_nm[0]:g}-{span_nm[1]:g} nm"
+        expected = f"at least {of}{needed_nm[0]:g}-{needed_nm[1]:g} nm: `extend` continues it by a library spectrum"
+        raise InputError(fault, expected, key="extend")
+
+
+def coverage(wavelength: Float) -> str:
+    """Return the message on the wavelengths that a spectrum covers before it is continued."""
+    part = measured_part(wavelength)
+    share = "" if part > 1 - 1e-9 else f", {part:.0%} of {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm"
+    return f"its own points cover {wavelength[0]:g}-{wavelength[-1]:g} nm{share}"
+
+
+def without_undefined_ends(name: str, wavelength: Float, flux: Float) -> tuple[Float, Float, tuple[str, ...]]:
+    """Cut ends outside 200-700 nm at their innermost undefined point, and return a note."""
+    bad = ~np.isfinite(flux)
+    if not bad.any():
+        return wavelength, flux, ()
+    low, high = (np.flatnonzero(bad & side) for side in (wavelength < NEEDED_NM[0], wavelength > NEEDED_NM[1]))
+    start = int(low[-1]) + 1 if low.size else 0
+    stop = int(high[0]) if high.size else wavelength.size
+    kept = wavelength[start:stop]
+    if kept.size < 2:
+        fault = f"spectrum {name} has no defined flux in {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm"
+        raise InputError(fault, "some", key="flux")
+    note = f"cut to {kept[0]:.1f}-{kept[-1]:.1f} nm: undefined flux beyond"
+    return kept, flux[start:stop], (note,)
+
+
+def check_flux(name: str, wavelength: Float, flux: Float) -> None:
+    """Raise InputError for fluxes that are not finite, are all zero, or contain marks of missing values."""
+    bad = np.flatnonzero(~np.isfinite(flux))
+    if bad.size:
+        i = int(bad[0])
+        raise InputError.of(
+            "flux", flux[i], "a finite number", where=f"spectrum {name}, point {i + 1} at {wavelength[i]:g} nm"
+        )
+    inside = (wavelength >= NEEDED_NM[0]) & (wavelength <= NEEDED_NM[1])
+    most, least = (float(f(flux[inside])) if inside.any() else 0.0 for f in (np.max, np.min))
+    if max(abs(most), abs(least)) > BRIGHTEST or 0.0 < most < FAINTEST:
+        fault = f"spectrum {name}: the highest flux in 200-700 nm is {most:.3g} and the lowest {least:.3g} erg/s/cm2/A"
+        raise InputError(fault, f"{FAINTEST:g} to {BRIGHTEST:g}", key="flux")
+    if most <= 0.0:
+        what = "every flux is zero" if not flux.any() else f"no flux in 200-700 nm is above zero, the highest {most:g}"
+        raise InputError(f"spectrum {name}: {what}", "some light", key="flux")
+    if least < -most:
+        at = wavelength[inside][int(np.argmin(flux[inside]))]
+        fault = f"flux {least:g} at {at:g} nm lies farther below zero than any in 200-700 nm lies above"
+        expected = "at most measured noise: the value may mark a missing measurement"
+        raise InputError(f"spectrum {name}: {fault}", expected, key="flux")
+
+
+def remarks(wavelength: Float, flux: Float) -> tuple[str, ...]:
+    """Return messages about a spectrum's points in 180-750 nm: negative fluxes, zeros in a row, gaps."""
+    inside = (wavelength >= SPAN_NM[0]) & (wavelength <= SPAN_NM[1])
+    nm, values = wavelength[inside], flux[inside]
+    messages = []
+    negative = int(np.count_nonzero(values < 0.0))
+    if negative:
+        i = int(np.argmin(values))
+        messages.append(
+            f"{negative} of its {nm.size} points in {SPAN_NM[0]:g}-{SPAN_NM[1]:g} nm have a negative flux, the lowest "
+            f"{values[i]:.3g} at {nm[i]:.1f} nm: measured noise, kept; `bin_nm` bins it"
+        )
+    # Runs of at least three zeros are not measurements.
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], (values == 0.0).astype(np.int8), [0]])))
+    runs = [
+        (a, b) for a, b in edges.reshape(-1, 2) if b - a >= 3 and nm[b - 1] >= NEEDED_NM[0] and nm[a] <= NEEDED_NM[1]
+    ]
+    if runs:
+        where = ", ".join(f"{nm[a]:.1f}-{nm[b - 1]:.1f}" for a, b in runs[:3])
+        messages.append(f"its flux is exactly zero at {where} nm: no data, or no light")
+    steps = np.diff(nm)
+    if steps.size:
+        wide = np.flatnonzero(is_gap(steps))
+        if wide.size:
+            i = int(wide[np.argmax(steps[wide])])
+            messages.append(
+                f"it has no point between {nm[i]:.1f} and {nm[i + 1]:.1f} nm, where a straight line is taken"
+            )
+    return tuple(messages)
+
+
+@cache
+def _nominal_line() -> LineSpread:
+    from mauvecl.host.instrument.instrument import Instrument, LineSpread
+
+    return LineSpread.of(Instrument.load("mauve"))
+
+
+def continued(
+    name: str,
+    wavelength: Float,
+    flux: Float,
+    needed_nm: tuple[float, float] = NEEDED_NM,
+    line: LineSpread | None = None,
+    *,
+    dark_only: bool = False,
+) -> tuple[Float, Float, tuple[str, ...]]:
+    """Continue the ends of a spectrum at their level, within the reach of the line spread function.
+
+    Parameters
+    ----------
+    wavelength, flux : ndarray, shape (n,)
+    needed_nm : tuple of float
+        Range of the pixels; the line spread function reaches beyond it as `SPAN_NM` beyond `NEEDED_NM`.
+    line : LineSpread, optional
+        Line spread function; that of the nominal instrument by default.
+    dark_only : bool
+        Whether to leave ends unchanged that are too bright, or within the range of the pixels.
+
+    Returns
+    -------
+    wavelength, flux : ndarray
+    messages : tuple of str
+
+    Raises InputError if a continuation would be more than `MAX_CONTINUED` of the brightest pixel's light.
+    """
+    span = (needed_nm[0] - NEEDED_NM[0] + SPAN_NM[0], needed_nm[1] - NEEDED_NM[1] + SPAN_NM[1])
+    if wavelength[0] <= span[0] and wavelength[-1] >= span[1]:
+        return wavelength, flux, ()
+    messages = []
+    brightest = _brightest(wavelength, flux, needed_nm)
+    for is_blue in (True, False):
+        end, goal = (wavelength[0], span[0]) if is_blue else (wavelength[-1], span[1])
+        if (end <= goal) if is_blue else (end >= goal):
+            continue
+        near = np.abs(wavelength - end) <= END_NM
+        level = max(float(flux[near].mean()), 0.0)
+        # Light in the outermost pixel from beyond the end.
+        beyond = end - needed_nm[0] if is_blue else needed_nm[1] - end
+        share = float((line or _nominal_line()).below(np.array([beyond]))[0]) * level / brightest
+        if dark_only and (beyond > 0 or share > MAX_CONTINUED):
+            continue
+        word = "starts" if is_blue else "ends"
+        if share > MAX_CONTINUED:
+            invented = f"{share:.1%} of the brightest pixel's light would be invented"
+            fault = f"spectrum {name} {word} at {end:g} nm, where it is bright: {invented}"
+            expected = f"a spectrum to {goal:g} nm: `extend` continues it by a library spectrum"
+            raise InputError(fault, expected, key="extend")
+        messages.append(
+            f"it {word} at {end:g} nm and is continued to {goal:g} nm at its end's level, {level:.3g}: at most "
+            f"{100 * share:.2g} % of the brightest pixel's light"
+        )
+        wavelength, flux = (
+            (np.append(goal, wavelength), np.append(level, flux))
+            if is_blue
+            else (np.append(wavelength, goal), np.append(flux, level))
+        )
+    return wavelength, flux, tuple(messages)
+
+
+def _brightest(wavelength: Float, flux: Float, needed_nm: tuple[float, float]) -> float:
+    """Return the largest mean flux of a resolution element in a range."""
+    edges = np.arange(needed_nm[0], needed_nm[1] + 0.1, ELEMENT_NM)
+    return max(float(means(wavelength, flux, edges).max()), np.finfo(float).tiny)
+
+
+def means(wavelength: Float, flux: Float, edges: Float) -> Float:
+    """Return the mean fluxes between edges of a piecewise linear flux, shape (n_edge - 1,)."""
+    grid = np.union1d(wavelength, edges)
+    values = np.interp(grid, wavelength, flux)
+    area = np.concatenate([[0.0], np.cumsum(np.diff(grid) * (values[1:] + values[:-1]) / 2)])
+    mean: Float = np.diff(area[np.searchsorted(grid, edges)]) / np.diff(edges)
+    return mean
+
+
+def extended(
+    name: str,
+    wavelength: Float,
+    flux: Float,
+    extension: str,
+    beyond: Float,
+    shape: Float,
+    *,
+    ultraviolet: tuple[str, ...] = (),
+) -> tuple[Float, Float, tuple[str, ...]]:
+    """Continue a spectrum by a longer one, scaled at the join, and return messages.
+
+    Parameters
+    ----------
+    wavelength, flux : ndarray, shape (n,)
+    extension : str
+        Name of the other spectrum.
+    beyond, shape : ndarray, shape (m,)
+        Wavelengths, nm, and fluxes of the other spectrum.
+    ultraviolet : tuple of str
+        Messages on the other spectrum's ultraviolet, returned if it continues the spectrum to the blue.
+
+    Raises InputError if less than a third of 200-700 nm is measured, or a spectrum has no light at a join.
+    """
+    messages = []
+    # Consecutive zeros at an end are missing data.
+    light = np.flatnonzero(flux != 0.0)
+    if light.size > 1 and light[-1] - light[0] + 1 < flux.size:
+        wavelength, flux = (array[light[0] : light[-1] + 1] for array in (wavelength, flux))
+        messages.append(f"its ends of zeros are cut: {wavelength[0]:g}-{wavelength[-1]:g} nm remain")
+    check_measured(name, wavelength)
+    for blue in (True, False):
+        end = float(wavelength[0] if blue else wavelength[-1])
+        more = beyond < end if blue else beyond > end
+        if not more.any():
+            continue
+        join, own, other = _join(name, wavelength, flux, extension, beyond, shape, blue)
+        added = shape[more] * (own / other)
+        messages.append(
+            f"{'below' if blue else 'above'} {end:g} nm it is continued by {extension}, scaled by {own / other:.4g} to "
+            f"agree at {join[0]:g}-{join[1]:g} nm"
+        )
+        if blue:
+            messages += [f"in {extension}, {message}" for message in ultraviolet]
+        wavelength, flux = (
+            (np.append(beyond[more], wavelength), np.append(added, flux))
+            if blue
+            else (np.append(wavelength, beyond[more]), np.append(flux, added))
+        )
+    return wavelength, flux, tuple(messages) or (f"its extension {extension} reaches no farther and is not used",)
+
+
+def _join(
+    name: str, wavelength: Float, flux: Float, extension: str, beyond: Float, shape: Float, blue: bool
+) -> tuple[Float, float, float]:
+    """Return the range in which two spectra are compared, widened by the noise of the first, and their means."""
+    low, high = max(wavelength[0], beyond[0]), min(wavelength[-1], beyond[-1])
+    if not low < high:
+        fault = (
+            f"spectrum {name} spans {wavelength[0]:g}-{wavelength[-1]:g} nm and its extension {extension}"
+            f" {beyond[0]:g}-{beyond[-1]:g} nm"
+        )
+        raise InputError(fault, "them to overlap", key="extend")
+    noise = point_noise(flux)
+    for width in JOIN_NM * 2.0 ** np.arange(6):
+        join = np.clip([low, low + width] if blue else [high - width, high], low, high)
+        own, other = (float(means(x, y, join)[0]) for x, y in ((wavelength, flux), (beyond, shape)))
+        near = (wavelength >= join[0]) & (wavelength <= join[1])
+        error = float(np.sqrt(np.sum(noise[near] ** 2))) / max(int(near.sum()), 1)
+        if own > MIN_JOIN_SNR * error and other > 0.0 and np.isfinite(own / other):
+            return join, own, other
+    fault = (
+        f"spectrum {name} and its extension {extension} have mean fluxes of {own:g} and {other:g} "
+        f"at {join[0]:g}-{join[1]:g} nm"
+    )
+    raise InputError(fault, "light in both to scale by", key="extend")
+
+
+def point_noise(flux_flam: Float) -> Float:
+    """Return the standard deviation of each point from the scatter around it, shape (n,).
+
+    The median of |2 F_i - F_(i-2) - F_(i+2)| is 1.4826^-1 sqrt(6) of a point's error (Stoehr et al. 2008, ASP
+    Conf. Ser. 394, 505). Adjacent points are not used, since their errors are correlated.
+    """
+    from scipy.ndimage import median_filter
+
+    if flux_flam.size < 5:
+        return np.zeros_like(flux_flam)
+    second = np.abs(2 * flux_flam[2:-2] - flux_flam[:-4] - flux_flam[4:])
+    scatter = median_filter(np.pad(second, 2, mode="edge"), size=WINDOW, mode="nearest")
+    return np.asarray(1.482602 / np.sqrt(6.0) * scatter)

@@ -1,0 +1,406 @@
+"""Files: regular and of bounded size, read with errors in one style, and written whole."""
+
+from __future__ import annotations
+
+import bz2
+import contextlib
+import io
+import json
+import lzma
+import math
+import os
+import re
+import secrets
+import stat
+import tomllib
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import IO, Any
+
+from mauvecl.schema.errors import InputError, printable, shortened
+
+#: Prefix of files that are being written.
+UNFINISHED = ".unfinished-"
+
+
+@contextlib.contextmanager
+def writing(what: str, path: Path, expected: str, *, key: str) -> Iterator[None]:
+    """Convert failures of the operating system in the block to an InputError that `what` cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        fault = f"{what} cannot be written ({error.strerror or error})"
+        raise InputError(fault, expected, key=key) from error
+
+
+def write_whole(path: Path, *parts: bytes | memoryview, shared: bool = False) -> None:
+    """Write a file atomically: under a temporary name, flushed to the disk, then renamed.
+
+    Parameters
+    ----------
+    parts : bytes or memoryview
+        Content of the file.
+    shared : bool
+        Whether other processes may write the file at the same time; the last one wins.
+
+    Raises InputError if the file cannot be written; an existing file is then kept.
+    """
+    tail = f".{os.getpid()}-{secrets.token_hex(4)}" if shared else ""
+    unfinished = path.with_name(f"{UNFINISHED}{path.name}{tail}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with unfinished.open("wb", buffering=0) as file:
+            for part in parts:
+                left = memoryview(part).cast("B")
+                while left:
+                    left = left[file.write(left) :]
+            os.fsync(file.fileno())
+        unfinished.replace(path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            unfinished.unlink(missing_ok=True)
+        with writing(repr(str(path)), path, "a writable disk with room; what was written before is kept", key="file"):
+            raise
+
+
+def json_text(content: Any) -> str:
+    """Return plain data as JSON text, with null for NaN and infinity."""
+    return json.dumps(_finite(content), indent=2, default=str, allow_nan=False)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {key: _finite(one) for key, one in value.items()}
+    return [_finite(one) for one in value] if isinstance(value, list | tuple) else value
+
+
+#: Default limits of file size and unpacked size, MiB; environment variables of these names override them.
+LIMITS = {"MAUVECL_LARGEST_FILE_MIB": 256, "MAUVECL_LARGEST_CONTENT_MIB": 512}
+#: Bytes unpacked at a time.
+PIECE = 1 << 20
+#: Memory for unpacking xz, in addition to its output; the highest preset needs 65 MiB.
+XZ_MEMORY = 128 << 20
+
+
+def limit_bytes(variable: str) -> int:
+    """Return a limit in bytes, from the environment or `LIMITS`.
+
+    Raises InputError if the environment variable is not an integer number of MiB from 1 to 2**20.
+    """
+    text = os.environ.get(variable, str(LIMITS[variable]))
+    if not (text.isascii() and text.isdigit() and len(text) <= 7 and 1 <= int(text) <= 2**20):
+        raise InputError.of(variable, text[:40], "a whole number of MiB from 1 to 1048576")
+    return int(text) << 20
+
+
+#: Largest number of characters of a line of text.
+LONGEST_LINE = 2**17
+
+
+def open_regular(path: Path, what: str) -> io.BufferedReader:
+    """Open a regular file for reading.
+
+    Parameters
+    ----------
+    what : str
+        Expected kind of file, for messages: "spectrum file", "study".
+
+    Raises InputError if the file does not exist, is not a regular file, or cannot be opened.
+    """
+    shown = shortened(str(path))
+    try:
+        # Non-blocking, because a pipe without a writer would never open.
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except FileNotFoundError as error:
+        raise InputError(f"{what} {shown} does not exist", "a file", key="file") from error
+    except OSError as error:
+        raise InputError(
+            f"{what} {shown} cannot be opened ({error.strerror})", "a readable file", key="file"
+        ) from error
+    except ValueError as error:
+        # Null bytes, and characters that file names cannot contain.
+        raise InputError(f"{what} {shown} is not a path ({error})", "a file name", key="file") from error
+    mode = os.fstat(descriptor).st_mode
+    if not stat.S_ISREG(mode):
+        os.close(descriptor)
+        kind = "a folder" if stat.S_ISDIR(mode) else "no regular file"
+        raise InputError(f"{what} {shown} is {kind}", "a regular file", key="file")
+    return open(descriptor, "rb")
+
+
+def read_bytes(path: Path, what: str) -> bytes:
+    """Read a regular file of limited size, without unpacking it.
+
+    Raises InputError as `open_regular`, or if the file is too large or cannot be read.
+    """
+    check_size(path, what)
+    most = limit_bytes("MAUVECL_LARGEST_FILE_MIB")
+    with open_regular(path, what) as file:
+        try:
+            content = file.read(most + 1)
+        except OSError as error:
+            fault = f"{what} {shortened(str(path))} cannot be read ({error.strerror})"
+            raise InputError(fault, "a readable file", key="file") from error
+    if len(content) > most:
+        # It has grown since its size was read, or the system gives it none, as below /proc.
+        raise _too_large(path, what)
+    return content
+
+
+def check_size(path: Path, what: str, most: int | None = None) -> int:
+    """Return the size of a regular file in bytes, without reading it.
+
+    Parameters
+    ----------
+    most : int, optional
+        Largest size, bytes; by default MAUVECL_LARGEST_FILE_MIB.
+
+    Raises InputError if the file is larger, or as `open_regular`.
+    """
+    with open_regular(path, what) as file:
+        size = os.fstat(file.fileno()).st_size
+    if size > (limit_bytes("MAUVECL_LARGEST_FILE_MIB") if most is None else most):
+        raise _too_large(path, what, most)
+    return size
+
+
+def _too_large(path: Path, what: str, most: int | None = None) -> InputError:
+    """Return the error of a file with more bytes than `most`, by default MAUVECL_LARGEST_FILE_MIB."""
+    largest = limit_bytes("MAUVECL_LARGEST_FILE_MIB") if most is None else most
+    return InputError(
+        f"{what} {shortened(str(path))} has more than {largest >> 20} MiB",
+        "less; MAUVECL_LARGEST_FILE_MIB sets the limit" if most is None else "less",
+        key="MAUVECL_LARGEST_FILE_MIB" if most is None else "file",
+    )
+
+
+def check_folder(path: Path, what: str, most_json: int = 16 << 20) -> None:
+    """Check the files of a folder before another library reads them.
+
+    Raises InputError for anything but regular files and folders, a file above MAUVECL_LARGEST_FILE_MIB, or JSON of more
+    than `most_json` bytes.
+    """
+    for folder, _, names in os.walk(path):
+        for name in names:
+            file = Path(folder) / name
+            check_size(file, what, most_json if name.endswith(".json") else None)
+
+
+def lines_in(file: IO[str], what: str) -> Iterator[str]:
+    """Yield the lines of a text, with their ends.
+
+    Raises InputError for a line of more than `LONGEST_LINE` characters, of which no more is read.
+    """
+    number = 1
+    while line := file.readline(LONGEST_LINE + 2):
+        if len(line.rstrip("\r\n")) > LONGEST_LINE:
+            raise InputError(
+                f"{what} has more than {LONGEST_LINE} characters in line {number}",
+                f"at most {LONGEST_LINE}",
+                key="file",
+            )
+        yield line
+        number += 1
+
+
+def packed(start: bytes) -> bool:
+    """Return whether content is compressed by gzip, bzip2 or xz, by its first bytes."""
+    return start.startswith((b"\x1f\x8b", b"BZh", b"\xfd7zXZ\x00"))
+
+
+def unpacked(content: bytes, what: str) -> bytes:
+    """Unpack content that is compressed by gzip, bzip2 or xz; return other content unchanged.
+
+    Parameters
+    ----------
+    what : str
+        Description of the content for messages, including its name.
+
+    Raises InputError if it unpacks to more than the limit or is damaged.
+    """
+    if content[:2] == b"\x1f\x8b":
+        return _unpack(content, lambda: zlib.decompressobj(wbits=31), "gzip", what)
+    if content[:3] == b"BZh":
+        return _unpack(content, bz2.BZ2Decompressor, "bzip2", what)
+    if content[:6] == b"\xfd7zXZ\x00":
+        return _unpack(content, lambda: lzma.LZMADecompressor(memlimit=XZ_MEMORY), "xz", what)
+    return content
+
+
+def _unpack(content: bytes, start: Callable[[], Any], form: str, what: str) -> bytes:
+    """Unpack in pieces, to detect decompression bombs early; several streams may follow one another."""
+    most = limit_bytes("MAUVECL_LARGEST_CONTENT_MIB")
+    pieces: list[bytes] = []
+    size = 0
+    try:
+        while content:
+            stream = start()
+            waiting = content
+            while not stream.eof:
+                piece = stream.decompress(waiting, PIECE)
+                # zlib returns unused input; the other decompressors keep it.
+                waiting = getattr(stream, "unconsumed_tail", b"")
+                size += len(piece)
+                if size > most:
+                    raise InputError(
+                        f"{what} unpacks to more than {most >> 20} MiB",
+                        "less; MAUVECL_LARGEST_CONTENT_MIB sets the limit",
+                        key="MAUVECL_LARGEST_CONTENT_MIB",
+                    )
+                pieces.append(piece)
+                if not piece and not waiting and not stream.eof and getattr(stream, "needs_input", True):
+                    raise EOFError("it ends too early")
+            content = stream.unused_data.lstrip(b"\0")
+    except (OSError, EOFError, zlib.error, lzma.LZMAError, MemoryError) as error:
+        raise InputError(f"{what} is damaged {form}", "a whole file", key="file") from error
+    return b"".join(pieces)
+
+
+#: Range of absolute values of numbers from users, apart from 0; products of several stay within double precision.
+SMALLEST, LARGEST = 1e-30, 1e30
+#: Largest energy in erg, since flares reach 1e38, and the ending of keys of energies.
+ERG, LARGEST_ERG = "_erg", 1e45
+#: Other keys of energies.
+ENERGIES = ("injections.low", "injections.high")
+#: Range of integers of 64 bits, signed or unsigned.
+WHOLE = (-(2**63), 2**64 - 1)
+#: Longest text and deepest nesting of a study or an instrument.
+LONGEST, DEEPEST = 4096, 32
+#: Place in a file, in messages of parsers.
+PLACE = re.compile(r"\b(?:line|row|column) \d{1,9}(?:,? (?:line|row|column) \d{1,9})*")
+#: Largest number of parts of a dotted TOML key.
+MOST_PARTS = 512
+
+
+@contextlib.contextmanager
+def parsing(what: str, expected: str) -> Iterator[None]:
+    """Convert any exception of a parser of foreign content to InputError with a one-sentence message.
+
+    Parsers of TOML, YAML, FITS and tables raise many kinds of exceptions on damaged content: their own, those of Python
+    (RecursionError, OverflowError) and of NumPy (MemoryError for sizes that a header claims).
+
+    Parameters
+    ----------
+    what : str
+        Description of the content, including its name.
+    expected : str
+        Expected content.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except RecursionError as error:
+        raise InputError(f"{what} is nested too deeply", expected, key="file") from error
+    except MemoryError as error:
+        raise InputError(f"{what} needs more memory than is available", expected, key="file") from error
+    except Exception as error:
+        # Other libraries' messages are for their programmers, but may state the place.
+        place = PLACE.search(str(error))
+        fault = f"{what} cannot be read{f' ({place[0]})' if place else ''}"
+        raise InputError(fault, expected, key="file") from error
+
+
+def read_text(path: Path, what: str) -> str:
+    """Read a regular file of limited size as UTF-8 text, with or without a byte-order mark."""
+    return as_text(read_bytes(path, what), f"{what} {shortened(str(path))}")
+
+
+def as_text(content: bytes, what: str) -> str:
+    """Decode UTF-8; raise InputError whose message begins with `what` if the bytes are not UTF-8."""
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"{what} is not text (byte {error.start + 1} is not UTF-8)", "text in UTF-8", key="file"
+        ) from error
+
+
+def is_file(path: Path) -> bool:
+    """Return whether a path exists and is not a folder; False for impossible paths."""
+    try:
+        return path.exists() and not path.is_dir()
+    except (OSError, ValueError):
+        return False
+
+
+def toml(text: str, what: str) -> dict[str, Any]:
+    """Parse TOML; raise InputError if it is invalid, or as `possible`."""
+    parts = max(part.count(".") for part in re.split(r"[=,{}\[\]\n#]", text))
+    if parts > MOST_PARTS:
+        # The memory of Python's parser grows with the square of this number.
+        raise InputError(f"{what} has a key of {parts} parts", f"at most {MOST_PARTS}", key="file")
+    with parsing(what, "TOML"):
+        try:
+            tree = tomllib.loads(text)
+        except tomllib.TOMLDecodeError as error:
+            raise InputError(f"{what}: {printable(str(error), 160)}", "valid TOML", key="file") from error
+    possible(tree, what)
+    return tree
+
+
+def json_data(text: str, what: str) -> Any:
+    """Parse JSON; raise InputError if it is invalid or nested too deeply."""
+    with parsing(what, "JSON"):
+        return json.loads(text)
+
+
+def possible(data: Any, what: str) -> None:
+    """Check nested data for values that are impossible in any study or instrument.
+
+    Raises InputError for a number beyond `SMALLEST` to `LARGEST` (energies in erg: `LARGEST_ERG`),
+    an integer beyond 64 bits, text that is too long or contains impossible characters, or nesting that is too deep.
+    """
+    waiting: list[tuple[str, Any, int]] = [("", data, 0)]
+    while waiting:
+        key, value, depth = waiting.pop()
+        energy = key in ENERGIES or any(part.endswith(ERG) for part in key.split("."))
+        fault = _fault(value, LARGEST_ERG if energy else LARGEST)
+        if depth > DEEPEST:
+            fault = f"is nested more than {DEEPEST} deep", "less"
+            key = shortened(key, 40)
+        if fault:
+            named = printable(key, 80)
+            raise InputError(f"{what}: {named or 'the value'} {fault[0]}", fault[1], key=named or None)
+        if isinstance(value, Mapping):
+            for name, item in value.items():
+                if isinstance(name, str) and (bad := _fault(name)):
+                    raise InputError(f"{what}: a key {bad[0]}", bad[1], key=printable(name, 80))
+                waiting.append((f"{key}.{name}" if key else str(name), item, depth + 1))
+        elif isinstance(value, list | tuple):
+            waiting += [(f"{key}.{i}", item, depth + 1) for i, item in enumerate(value)]
+
+
+def _fault(value: Any, largest: float = LARGEST) -> tuple[str, str] | None:
+    """Return the fault of a value and the expected range, or None if the value is possible."""
+    if isinstance(value, bool):
+        return None
+    if isinstance(value, int):
+        if not WHOLE[0] <= value <= WHOLE[1]:
+            return f"is a whole number of {value.bit_length()} bits", "at most 64"
+    elif isinstance(value, float):
+        # NaN and infinity are checked where the meaning of the value is known.
+        if math.isfinite(value) and value and not SMALLEST <= abs(value) <= largest:
+            return f"= {value!r}", f"0 or a size from {SMALLEST:g} to {largest:g}"
+    elif isinstance(value, str | Path):
+        text = str(value)
+        if len(text) > LONGEST:
+            return f"is a text of {len(text)} characters", f"at most {LONGEST}"
+        if not text.isprintable() and (bad := next((c for c in text if c == "\0" or "\ud800" <= c <= "\udfff"), None)):
+            return f"= {shortened(text)} holds the character {bad!r}", "text"
+    return None
+
+
+def without_columns(path: str | Path) -> tuple[Path, tuple[str, ...]]:
+    """Divide ``grid.fits[g45]`` into the file and the words in brackets, which select a part of it.
+
+    If a file of this full name exists, it is returned.
+    """
+    text = str(path)
+    match = re.fullmatch(r"(?s)(.+?)\[([^\[\]]*)\]", text)
+    if match is None or Path(text).is_file():
+        return Path(text), ()
+    return Path(match[1]), tuple(one.strip() for one in match[2].split(",") if one.strip())

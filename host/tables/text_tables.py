@@ -1,0 +1,525 @@
+"""Texts as headers and rows of cells, whatever divides these: CSV, tables with blanks, columns of numbers."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import re
+import warnings
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.host.tables.ecsv import check_cells, parse_ecsv
+from mauvecl.host.tables.files import parsing, read_text
+from mauvecl.host.tables.names import in_brackets, is_missing
+from mauvecl.host.tables.table import REMARKS, Values, is_known, number_in, plain_numbers, unquoted
+from mauvecl.host.tables.units import is_dated, is_stated, time_unit
+from mauvecl.schema.errors import InputError, shortened
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+
+# IPAC's headings begin with |, as do rows of numbers of others, and its keywords with a backslash.
+_COMMENT = re.compile(r"\s*(#|%|!|;|//|\\|\|)")
+_BARRED = re.compile(r"\s*\|\s*[-+]?\.?\d")
+_NUMBER = re.compile(r"[+-]?(?:\d[\d_]*[.,]?\d*|[.,]\d+)(?:[eEdD][+-]?\d+)?(?![\w.])")
+_DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+(?:[eEdD][+-]?\d+)?")
+_DECIMAL_POINT = re.compile(r"[+-]?\d*\.\d+(?:[eEdD][+-]?\d+)?")
+_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(?:,\d{3})+")
+#: A line without cells, one of reStructuredText or of a frame, and Excel's statement of the mark.
+_RULE = re.compile(r"[\s,;|]*|\s*(?:={3,}(?:\s+|$))*|\s*(?=[-=:|]*\+)[-=+:|]+\s*|\"?sep=.\"?", re.IGNORECASE)
+#: Dates and times of day in cells of their own.
+_DAY, _CLOCK = re.compile(r"\d{4}-\d\d-\d\d"), re.compile(r"\d\d:\d\d(?::\d\d(?:\.\d*)?)?")
+#: Types of the columns of an RDB table, below their names.
+_RDB = re.compile(r"\d*[NSM]")
+_QUOTED = re.compile(r'"[^"]*"')
+#: Words that occur in prose but not in names of columns.
+PROSE = re.compile(
+    r"\b(?:and|at|is|are|the|for|with|vs|versus|from|by|on|was|were|this|that|has|have)\b", re.IGNORECASE
+)
+#: Marks between cells; the first of those that divide most lines alike counts.
+MARKS = ("\t", ";", "|", ",")
+#: Number of lines that show how a text is divided.
+SAMPLE = 50
+
+
+def read_columns(what: str, kind: str, path: Path) -> NDArray[np.float64]:
+    """Read times and values from a file, shape (n, 2); # starts a comment.
+
+    `what` names the content and `kind` the values in messages.
+    """
+    named = f"{what} {shortened(path.name)}"
+    pairs = columns(named, read_text(path, what))
+    if pairs.ndim != 2 or pairs.shape[1] != 2:
+        raise InputError(f"{named} has no two columns", f"times and {kind}", key=what)
+    return pairs
+
+
+def columns(what: str, text: str) -> NDArray[np.float64]:
+    """Parse rows of numbers, shape (n, 2) if each row has two."""
+    with parsing(what, "two columns"):
+        rows = [line.split("#", 1)[0].split() for line in text.splitlines()]
+        return np.array([[float(word) for word in row] for row in rows if row])
+
+
+def text_of(content: bytes) -> str:
+    """Decode text in UTF-8 or, with a byte-order mark, UTF-16."""
+    # Editors on Windows start a file with a byte-order mark.
+    code = "utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
+    try:
+        text = content.decode(code)
+    except UnicodeDecodeError as error:
+        if b"\0" in content[:4096]:
+            raise InputError("is not text (it holds null bytes)", "text", key="file") from error
+        line, odd = content[: error.start].count(b"\n") + 1, content[error.start]
+        fault = f"is not text in UTF-8 (byte 0x{odd:02x} in line {line})"
+        raise InputError(fault, "UTF-8: save it so", key="file") from error
+    if "\0" in text:
+        raise InputError("is not text (it holds null bytes)", "text", key="file")
+    return text
+
+
+class NumberLines:
+    """Header and rows of a text with numbers; the columns of the rows are parsed when they are read.
+
+    Parameters
+    ----------
+    expected : str
+        What a row should have, for messages.
+    """
+
+    def __init__(self, text: str, expected: str) -> None:
+        self.expected = expected
+        #: Lines above the rows without their marks, and all comments, and whether each is one.
+        self.header: list[tuple[str, bool]] = []
+        numbered = [(number, line) for number, line in enumerate(text.splitlines(), 1) if not _RULE.fullmatch(line)]
+        comments = {number for number, line in numbered if _COMMENT.match(line) and not _BARRED.match(line)}
+        start = _first_row([(number, line) for number, line in numbered if number not in comments])
+        found: list[tuple[int, str]] = []
+        for number, line in numbered:
+            if number in comments and not (line.lstrip()[0] == "|" and found):
+                self.header.append((_remark(line), True))
+            elif number < start:
+                self.header.append((line.split("#", 1)[0].rstrip(), False))
+            else:
+                found.append((number, line.split("#", 1)[0].strip()))
+        if not found:
+            raise InputError("does not contain numbers", f"two columns: {expected}", key="columns")
+        #: Number and text of the line of each row, and its cells.
+        self.lines = found
+        self.cells = self._divided([line for _, line in found])
+        #: Number of columns, and whether their cells contain arrays.
+        self.n = len(self.cells[0])
+        self.holds_arrays = any(map(_is_array, self.cells[0]))
+
+    @property
+    def comments(self) -> str:
+        """Text of the header."""
+        return "\n".join(line for line, _ in self.header)
+
+    def _divided(self, lines: list[str]) -> list[list[str]]:
+        """Return the cells of the rows; raise InputError if commas may be decimal or divide columns."""
+        mark = _mark(lines, commas=False)
+        cells = _split(lines, mark)
+        if decimal := _has_decimal_commas(cells, "it"):
+            cells = _with_points(cells)
+        #: Messages on how the rows are read.
+        self.messages = [DECIMAL_COMMAS] if decimal else []
+        sample = cells[:SAMPLE]
+        if (
+            mark == ","
+            and len(cells) > 1
+            and all(len(row) > 1 and re.fullmatch(r"\d+", row[1]) for row in sample)
+            and (not any("." in cell for row in sample for cell in row))
+        ):
+            fault = f"line {shortened(lines[0], 60)} may hold decimal commas or columns"
+            raise InputError(fault, "decimal points", key="columns")
+        return cells
+
+    def column(self, place: int, name: str, unit: str = "") -> Values:
+        """Return a column of numbers; of arrays or texts if there are arrays in the first row."""
+        read = self._texts_or_arrays if self.holds_arrays else self._numbers
+        return Values(name, (len(self.cells),), partial(read, place), unit)
+
+    def _numbers(self, place: int, start: int, stop: int) -> Any:
+        rows = self.cells[start:stop]
+        with contextlib.suppress(IndexError):
+            if (found := plain_numbers([cells[place] for cells in rows])) is not None:
+                return found
+        values = np.empty(len(rows))
+        for k, cells in enumerate(rows):
+            try:
+                values[k] = number_in(cells[place])
+            except (IndexError, ValueError) as error:
+                number, line = self.lines[start + k]
+                n = "one column" if len(cells) == 1 else f"{len(cells)} columns"
+                fault = f"line {number}: {shortened(line, 60)} {'is not numeric' if len(cells) > place else f'has {n}'}"
+                raise InputError(fault, self.expected, key="columns") from error
+        return values
+
+    def _texts_or_arrays(self, place: int, start: int, stop: int) -> Any:
+        cells = [cells[place] if place < len(cells) else "" for cells in self.cells[start:stop]]
+        if not any(map(_is_array, cells)):
+            return np.array(cells)
+        arrays = [_array(cell) for cell in cells]
+        if len({array.size for array in arrays}) == 1:
+            return np.array(arrays)
+        values = np.empty(len(arrays), object)
+        values[:] = arrays
+        return values
+
+
+def _remark(line: str) -> str:
+    """Return a comment without the mark at its start."""
+    return line.strip().lstrip("#%!;/\\| ")
+
+
+def _is_array(cell: str) -> bool:
+    return cell.strip()[:1] in ("(", "[")
+
+
+def _array(cell: str) -> NDArray[np.float64]:
+    try:
+        return np.array([number_in(one) for one in re.split(r"\s*,\s*|\s+", cell.strip("()[] \t"))])
+    except ValueError as error:
+        raise InputError.of("cell", cell, "an array of numbers") from error
+
+
+def _first_row(lines: Sequence[tuple[int, str]]) -> float:
+    """Return the number of the first line that starts with two numbers or, if there is none, with one."""
+    starting = []
+    for number, line in lines:
+        first = re.split(r"[\s;|]+|,\s|,(?=[^\d])", line.strip().strip("|").strip())[0]
+        if not _is_numeric(first.strip("\"'(")):
+            continue
+        starting.append(number)
+        cells = re.split(r"[\s;|]+", line.strip())
+        cells = line.split(",") if len(cells) == 1 else cells
+        # A line of a preamble, such as "2 columns" or "912 s", has no second number.
+        if sum(_is_numeric(cell) or is_missing(cell) for cell in cells) > 1:
+            return number
+    return starting[0] if starting else float("inf")
+
+
+def _is_numeric(cell: str) -> bool:
+    return _NUMBER.match(cell) is not None or cell.lower() in ("nan", "inf", "-inf")
+
+
+#: Message on numbers such as ``3,5``.
+DECIMAL_COMMAS = "its decimal commas are read as points"
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Division of a text into cells, and the names and units of its columns."""
+
+    mark: str  # between cells; empty for blanks
+    decimal: bool  # whether numbers have decimal commas
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    trailing: bool  # whether a mark ends the rows
+
+
+class TextRows:
+    """Names, units and rows of a text table, whose cells are texts.
+
+    The first line names the columns, unless it has numbers and dates only; then the last comment above it may do so,
+    and otherwise columns are called col1, col2 and so on. Lines above the names without a mark are a title. Units, and
+    dashes, may stand below the names.
+
+    Parameters
+    ----------
+    commas : bool
+        Whether cells are divided at commas if nothing else shows how.
+    like : Layout, optional
+        Layout of the rows of the same table above this text, which then has rows only.
+    first : int
+        Number of these rows, which messages count.
+    """
+
+    def __init__(self, text: str, what: str, commas: bool, like: Layout | None = None, first: int = 0) -> None:
+        self.what, self.first = what, first
+        lines = [line for line in text.splitlines() if not _RULE.fullmatch(line)]
+        check_cells([line for line in lines if line[0] != "#"], what)
+        mark = _mark([line for line in lines if line.lstrip()[0] != "#"], commas) if like is None else like.mark
+        # SIMBAD calls its first column #.
+        is_comment = [
+            _COMMENT.match(line) is not None
+            and line.lstrip()[0] != mark
+            and not (mark == "|" and line.startswith("#|"))
+            for line in lines
+        ]
+        data = [line for line, comment in zip(lines, is_comment, strict=True) if not comment]
+        self.comments = [line for line, comment in zip(lines, is_comment, strict=True) if comment]
+        cells = _with_dates(_split(data, mark))
+        if like is None:
+            n_above = next((k for k, comment in enumerate(is_comment) if not comment), len(lines))
+            self.layout, self.cells = self._divided(cells, data, [_remark(line) for line in lines[:n_above]], mark)
+        else:
+            self.layout, self.cells = like, [row[:-1] for row in cells] if like.trailing else cells
+        if self.layout.decimal:
+            self.cells = _with_points(self.cells)
+        self._check()
+
+    def table(self) -> Table:
+        """Return the cells as a table of texts, with the keywords of comments."""
+        from astropy.table import Table
+
+        names, units = self.layout.names, self.layout.units
+        held = zip(*self.cells, strict=True) if self.cells else ((),) * len(names)
+        table = Table({name: np.array(one, str) for name, one in zip(names, held, strict=True)})
+        table.meta |= {"comments": self.comments} | keywords_of(self.comments)
+        if self.layout.decimal:
+            table.meta[REMARKS] = (DECIMAL_COMMAS,)
+        for name, unit in zip(names, units, strict=False):
+            if unit:
+                table[name].unit = unit
+        return table
+
+    def _divided(
+        self, cells: list[list[str]], lines: list[str], above: list[str], mark: str
+    ) -> tuple[Layout, list[list[str]]]:
+        """Find names and units, and return them with the rows."""
+        if not cells:
+            return Layout(mark, False, (), (), False), []
+        at = self._first_of_width(cells, mark)
+        head, rows = cells[at], cells[at + 1 :]
+        # The last mark ends the lines, unless it is that of an empty column which has a name.
+        trailing = bool(mark and rows) and not any(row[-1] for row in rows)
+        trailing = trailing and (not head[-1] or len(rows[0]) > len(head))
+        if trailing:
+            cells = [*cells[:at], head if head[-1] else head[:-1], *(row[:-1] for row in rows)]
+        n = len(cells[at])
+        units: list[str] = []
+        is_row = all(_is_cell_of_row(cell) for cell in cells[at])
+        names: list[str] = []
+        if is_row or any(map(_is_finite, cells[at])) or _are_dashes(cells[at : at + 1]):
+            names, units = self._names_above(n, [*above, *lines[:at]], mark)
+        if names or is_row:
+            if not names and at:
+                fault = f"{self.what} has {n} cells in row 1"
+                raise InputError(fault, f"{len(cells[at - 1])} as in the line above", key="file")
+            names = names or [f"col{k + 1}" for k in range(n)]
+        else:
+            names, at = cells[at], at + 1
+        if _are_dashes(cells[at + 1 : at + 2]) and not any(map(_is_finite, cells[at])):
+            # VizieR writes units and dashes below the names.
+            units, at = cells[at], at + 2
+        elif _are_dashes(cells[at : at + 1]):
+            at += 1
+        elif len(cells) > at + 1 and _are_units(cells[at], cells[at + 1]):
+            units, at = cells[at], at + 1
+        names = [name or f"col{k + 1}" for k, name in enumerate(names)]
+        # Names that occur twice get numbers, so that none is taken for the only one.
+        while twice := [name for name, count in Counter(names).items() if count > 1]:
+            names = [f"{name}_{names[: k + 1].count(name)}" if name in twice else name for k, name in enumerate(names)]
+        rows = cells[at:]
+        decimal = _has_decimal_commas(rows, self.what)
+        if all(map(_RDB.fullmatch, units)):
+            units = []
+        plain = (in_brackets(unit.strip("\"'")) for unit in units)
+        return Layout(
+            mark, decimal, tuple(names), tuple(unit if is_stated(unit) else "" for unit in plain), trailing
+        ), rows
+
+    @staticmethod
+    def _first_of_width(cells: list[list[str]], mark: str) -> int:
+        """Return the place of the first line that has a cell for each column."""
+        if mark:
+            # A title has no mark.
+            return next((k for k, row in enumerate(cells) if len(row) > 1), 0)
+        (n, _), *_ = Counter(len(row) for row in cells).most_common(1)
+        return next(k for k, row in enumerate(cells) if len(row) == n)
+
+    def _names_above(self, n: int, above: list[str], mark: str) -> tuple[list[str], list[str]]:
+        """Return the names in the last line above the rows, and the units in it or below it; empty without names."""
+        if n < 2:
+            return [], []
+        found = [
+            cells for line in above[-2:] if (cells := divided_names(line, n, mark)) and not keywords_of([f"#{line}"])
+        ]
+        if len(found) == 2 and all(_is_unit(cell) for cell in found[1] if is_stated(cell)):
+            return found[0], found[1]
+        last = above[-1:] and divided_names(above[-1], n, mark)
+        return (found[-1], []) if last and found and found[-1] == last else ([], [])
+
+    def _check(self) -> None:
+        """Raise InputError for the first row with another number of cells than there are columns."""
+        n = len(self.layout.names)
+        for number, row in enumerate(self.cells, self.first + 1):
+            if len(row) != n:
+                # The file may be cut short.
+                fault = f"{self.what} has {len(row)} cells in row {number}"
+                raise InputError(fault, f"{n} as in the first line", key="file")
+
+
+def text_table(text: str, what: str, commas: bool, expected: str = "CSV or ECSV") -> Table:
+    """Parse a table from text: ECSV, those of IPAC and CDS, and rows that marks or blanks divide into texts."""
+    if text.startswith("# %ECSV"):
+        return parse_ecsv(text, what)
+    form = _known_form(text)
+    if form is None:
+        return TextRows(text, what, commas).table()
+    from astropy.table import Table
+
+    lines = text.splitlines()
+    check_cells(lines, what)
+    with parsing(what, expected), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        # Of an empty line astropy makes a row without values.
+        return Table.read([line for line in lines if line.strip()], format=form)
+
+
+def _known_form(text: str) -> str | None:
+    """Return the name in astropy of a form with units and types of its own, or None."""
+    if re.search(r"(?m)^\s*Byte-by-byte Description", text[:100_000]):
+        # Machine-readable tables of the journals, and tables of CDS with their description.
+        return "ascii.mrt" if re.match(r"\s*Title:", text) else "ascii.cds"
+    lines = [line for line in text[:100_000].splitlines() if line.strip() and line[0] not in "\\#"]
+    rows = [line for line in lines if not line.startswith("|")]
+    # The headings of IPAC's tables have marks, their rows blanks.
+    return "ascii.ipac" if lines and lines[0][0] == "|" and rows and not any("|" in line for line in rows) else None
+
+
+def _mark(lines: Sequence[str], commas: bool) -> str:
+    """Return the mark that divides lines into cells; empty for blanks."""
+    sample = [_QUOTED.sub('""', line) for line in lines[:SAMPLE]]
+    scores = {}
+    for mark in MARKS:
+        counts = Counter(n for line in sample if (n := line.count(mark)))
+        scores[mark] = counts.most_common(1)[0][1] if counts else 0
+    best = max(MARKS, key=scores.__getitem__)
+    words = [line.split() for line in sample[-5:]]
+    blanks = all(len(row) > 1 and all(map(_is_finite, row)) for row in words) and bool(words)
+    if commas and not (blanks and best == ","):
+        return best if scores[best] else "," if not blanks else ""
+    # Commas may stand in prose, and decimal commas between columns that blanks divide.
+    in_words = best == "," and any(
+        re.search(r"\d\s+[-+.\d]", cell)
+        for line in sample[1:]
+        for cell in map(str.strip, line.split(","))
+        if not is_dated(cell)
+    )
+    # Other marks are rare in prose, so that several lines of a title may stand above the first line with one.
+    is_usual = best != "," and 2 * scores[best] >= len(sample)
+    start = next((k for k, line in enumerate(sample) if best in line), 0) if is_usual else 1
+    return best if scores[best] and all(best in line for line in sample[start:]) and not in_words else ""
+
+
+def _split(lines: Sequence[str], mark: str) -> list[list[str]]:
+    """Divide lines into cells, whose quotes and blanks are removed."""
+    if mark == "|":
+        # Marks around a line enclose it; one at its end alone may follow an empty cell.
+        lines = [re.sub(r"^\s*\|(.*)\|\s*$", r"\1", line) for line in lines]
+    if any('"' in line for line in lines):
+        with parsing("it", "text"):
+            quoted = csv.reader((line.strip(" ") for line in lines), delimiter=mark or " ", skipinitialspace=True)
+            return [list(map(unquoted, row)) for row in quoted]
+    if not mark:
+        rows = ((re.sub(r"\s#.*", "", line) if "#" in line else line).split() for line in lines)
+    else:
+        rows = (line.split(mark) for line in lines)
+    if any("'" in line for line in lines):
+        return [list(map(unquoted, row)) for row in rows]
+    return [list(map(str.strip, row)) for row in rows]
+
+
+def _with_dates(cells: list[list[str]]) -> list[list[str]]:
+    """Return cells of which a date and the time of day next to it are one, under the name of the date."""
+    last = cells[-1] if cells else []
+    for at in range(len(last) - 1):
+        if _DAY.fullmatch(last[at]) and _CLOCK.fullmatch(last[at + 1]):
+            return [
+                [*row[:at], "T".join(row[at : at + 2]) if _DAY.fullmatch(row[at]) else row[at], *row[at + 2 :]]
+                if len(row) == len(last) else row for row in cells
+            ]  # fmt: skip
+    return cells
+
+
+def _has_decimal_commas(rows: list[list[str]], what: str) -> bool:
+    """Return whether numbers have decimal commas; raise InputError if these may divide thousands."""
+    sample = [cell for row in rows[:SAMPLE] for cell in row]
+    commas = [cell for cell in sample if _DECIMAL_COMMA.fullmatch(cell)]
+    if not commas or any(_DECIMAL_POINT.fullmatch(cell) for cell in sample):
+        return False
+    if all(_THOUSANDS.fullmatch(cell) for cell in commas):
+        fault = f"{what} has numbers such as {commas[0]}, whose comma may be decimal or divide thousands"
+        raise InputError(fault, "decimal points", key="file")
+    return True
+
+
+def _with_points(rows: list[list[str]]) -> list[list[str]]:
+    """Return cells with points for decimal commas."""
+    return [[cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell for cell in row] for row in rows]
+
+
+def divided_names(line: str, n: int, mark: str = "") -> list[str]:
+    """Divide a line of a header into a name for each of `n` columns; return an empty list if it has another number."""
+    if n < 2 or PROSE.search(line):
+        return []
+    line = re.sub(r"^\s*(?:units?(?:\s*[:=]|\s)|(?:columns?|names?)\s*[:=])\s*", "", line, flags=re.IGNORECASE)
+    divisions = [line.strip("|").split(one) for one in ((mark,) if mark else ",;|\t") if one in line]
+    if not mark:
+        divisions += [bracketed(line), line.split(), re.split(r"\s{2,}", line.strip())]
+    for division in divisions:
+        cells = [cell.strip().strip("\"'").strip() for cell in division]
+        if len(cells) == n and any(cells):
+            # The index of a data frame has no name.
+            return [cell or str(k + 1) for k, cell in enumerate(cells)]
+    return []
+
+
+def bracketed(line: str) -> list[str]:
+    """Divide at blanks and commas, but keep a unit in brackets with the preceding name."""
+    brackets = r"[\[(](?:[^\[\]()]|\([^()]*\))*[\])]"
+    return re.findall(rf"[^\s\[(,]+(?:\s+in\s+[^\s,]+|(?:\s*{brackets})+[^\s,]*)?|{brackets}", line)
+
+
+def _is_cell_of_row(cell: str) -> bool:
+    """Return whether a cell is a number, a date or missing, and no name."""
+    return is_dated(cell) or is_missing(cell) or _is_finite(cell) or _DECIMAL_COMMA.fullmatch(cell) is not None
+
+
+def _is_finite(cell: str) -> bool:
+    """Return whether a cell is a number that is not missing."""
+    try:
+        return not np.isnan(number_in(cell))
+    except ValueError:
+        return _DECIMAL_COMMA.fullmatch(cell) is not None
+
+
+def _are_dashes(rows: Iterable[list[str]]) -> bool:
+    """Return whether there is a row, and its cells are dashes."""
+    return any(any(row) and all(re.fullmatch(r":?[-=]*:?", cell) for cell in row) for row in rows)
+
+
+def _are_units(cells: list[str], below: list[str]) -> bool:
+    """Return whether the cells below the names of columns are units of the numbers below them."""
+    pairs = [(cell, number) for cell, number in zip(cells, below, strict=False) if _is_finite(number)]
+    return not any(_is_cell_of_row(cell) and not is_missing(cell) for cell in cells) and any(
+        _is_unit(in_brackets(cell)) for cell, _ in pairs
+    )
+
+
+def _is_unit(text: str) -> bool:
+    from mauvecl.host.tables.coordinates import angle_unit
+
+    plain = in_brackets(text)
+    return is_stated(text) and (time_unit(plain) is not None or angle_unit(plain) is not None or is_known(text))
+
+
+def keywords_of(lines: Sequence[str]) -> dict[str, str]:
+    """Return the keywords in the comments of a text file, as in ``# DATE-OBS = 2026-03-01T12:00:00``."""
+    found = {}
+    for line in lines:
+        match = re.match(r"\s*[#%!;]+\s*([A-Za-z][\w .-]{0,40}?)\s*[=:]\s*(.*?)\s*(?:\s/\s.*)?$", line)
+        if match:
+            found[match[1]] = match[2].strip("\"'")
+    return found

@@ -1,0 +1,640 @@
+"""Analysis of observed frames: flares, their energies, and those that a neighbour would explain."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from operator import itemgetter
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mauvecl.answers.answer import Answer, TableOf
+from mauvecl.fits.flare_model import FlareModel
+from mauvecl.fits.spectrum import Measurement
+from mauvecl.host.orbit.orbit import Orbit, Target
+from mauvecl.host.stars.flare import check_scales
+from mauvecl.host.stars.source import Source
+from mauvecl.observations.analysis import Analysis, analyse_frames
+from mauvecl.observations.event_spectra import EventSpectrum
+from mauvecl.observations.events import ObservedEvent
+from mauvecl.observations.frame_files import read_frames
+from mauvecl.observations.frame_model import FrameModel
+from mauvecl.observations.frames import Frames, Reason
+from mauvecl.observations.reduction import barycentric
+from mauvecl.observations.visits import flux_per_dn
+from mauvecl.schema.calls import validated
+from mauvecl.schema.columns import Column, View, interval, number, percent
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.physical import DAY_S
+from mauvecl.study.cases import cases
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+
+    from mauvecl.device.engine import Engine
+    from mauvecl.host.exposure.expectation import Expectation
+    from mauvecl.runs.pool import Pool
+    from mauvecl.study.cases import Case, Use
+    from mauvecl.study.study import Study
+
+
+@dataclass(frozen=True, eq=False)
+class BlendedStar:
+    """A star in the fibre: the target itself, or a neighbour within the fibre's radius."""
+
+    name: str
+    separation_arcsec: float
+    rise: float  # rise of all stars' light by a flare of unit amplitude on this star, relative to their light
+
+
+def blended_stars(cases: Sequence[Case]) -> list[BlendedStar]:
+    """Return the stars in the fibre of the observed star, itself first; raises InputError for several cases."""
+    if len(cases) != 1:
+        raise InputError(
+            f"neighbours of observed frames with {len(cases)} stars",
+            "the star that was observed, such as `star=G2V` with its magnitude",
+            key="star",
+        )
+    (case,) = cases
+    check_scales(case.study.flare.light())
+    near, quiet = case.neighbours, case.quiet
+    assert near is not None
+    total = float((quiet.source_electrons + quiet.neighbour_electrons).sum())
+    stars = [BlendedStar(case.label, 0.0, _electrons(case, case.source) / total)]
+    for neighbour in near.within(case.instrument):
+        rise = near.share * _electrons(case, neighbour.source) / total
+        stars.append(BlendedStar(neighbour.name, neighbour.separation_arcsec, rise))
+    return stars
+
+
+def _electrons(case: Case, source: Source) -> float:
+    """Return the electrons per frame that a flare of unit amplitude adds to a star if all of its light enters."""
+    f = case.study.flare
+    flaring = source.flaring(1.0, spectrum=f.light(), band=f.band)
+    with_it, without = case.expect(flaring, source)
+    return float((with_it.source_electrons - without.source_electrons).sum())
+
+
+@dataclass(frozen=True, eq=False)
+class NeighbourFlare:
+    """A flare on a star in the fibre that would look like an observed event."""
+
+    date: str  # of the brightest frame of the event
+    event: ObservedEvent
+    star: BlendedStar
+
+    @property
+    def amplitude(self) -> float:
+        """Rise of this star alone."""
+        return self.event.amplitude / self.star.rise if self.star.rise else float("inf")
+
+    @property
+    def equivalent_duration_s(self) -> float:
+        """Equivalent duration of the flare."""
+        return self.event.equivalent_duration_s / self.event.amplitude * self.amplitude
+
+
+#: Columns of the table.
+COLUMNS = (
+    Column("date", "date", "", "of the brightest frame of the event", "event at", lambda text: text[:22], kind=str),
+    Column("ampl_rec", "event.amplitude", "", "largest rise of the light of all stars", "rise of all light",
+           percent(".3g")),
+    Column("star", "star.name", "", "star on which the flare would be", "star", kind=str),
+    Column("separation", "star.separation_arcsec", "arcsec", "from the observed star", "arcsec", ".4g"),
+    Column("amplitude", "amplitude", "", "rise of this star alone, in the flare's band, at the brightest frame, for a "
+           "flare that looks like the event", "flare of the star", percent(".4g")),
+    Column("equivalent_duration", "equivalent_duration_s", "s", "of that flare, in the flare's band", "ED (s)",
+           number(".4g")),
+)  # fmt: skip
+
+
+#: Name of the bolometric energy among measured quantities.
+ENERGY = "energy bolometric"
+NO_SPECTRA = "no spectra of the instrument are given"
+NO_DISTANCE = (
+    "the distance of the star is not known: name the star that was observed, and its distance (star.distance_pc)"
+)
+#: V magnitude of the star that replaces one that is not named: far from saturation.
+ANY_MAGNITUDE = 12.0
+
+
+@dataclass(frozen=True, eq=False)
+class EventRow:
+    """An event, by its number, with the analysis that it belongs to."""
+
+    analysis: Analysis
+    number: int
+
+    @property
+    def event(self) -> ObservedEvent:
+        """The event."""
+        return self.analysis.events[self.number]
+
+    @property
+    def spectrum(self) -> EventSpectrum | None:
+        """Its spectrum, in spectra that are searched with weights for flares."""
+        return None if self.analysis.spectra is None else self.analysis.spectra.found[self.number]
+
+    @property
+    def measured(self) -> Measurement | str:
+        """The flare fitted to its spectrum, or the reason why none is."""
+        one = self.analysis.spectra
+        return NO_SPECTRA if one is None else one.measured[self.number]
+
+    @property
+    def unmeasured(self) -> str:
+        """Why temperature or energy are not measured; empty if they are."""
+        if isinstance(self.measured, str):
+            return self.measured
+        return "" if ENERGY in self.measured.names else NO_DISTANCE
+
+    def quantity(self, name: str) -> tuple[float, float, float]:
+        """Return estimate and 68 % interval of a measured quantity; NaN if it is not measured."""
+        one = self.measured
+        if isinstance(one, str) or name not in one.names:
+            return (float("nan"),) * 3
+        k = one.column(name)
+        return float(one.estimates[0, k]), float(one.low[0, 0, k]), float(one.high[0, 0, k])
+
+    def time_d(self, frame: int) -> float:
+        """Return the time of a searched frame, in days."""
+        return float(self.analysis.survey.time_s[frame]) / DAY_S
+
+    def cadence(self, frame: int) -> int:
+        """Return the number of a searched frame on the grid of the cadence."""
+        return int(self.analysis.frames.numbers[self.analysis.level.used][frame])
+
+    @property
+    def date(self) -> str:
+        """Date of the brightest frame."""
+        return self.analysis.frames.date(float(self.analysis.survey.time_s[self.event.brightest]))
+
+    @property
+    def duration_d(self) -> float:
+        """Time from the start of the first frame to the end of the last."""
+        first, last = (self.time_d(k) for k in (self.event.first, self.event.last))
+        return last - first + self.analysis.frames.cadence_s / DAY_S
+
+    @property
+    def significant(self) -> bool:
+        """True if noise reaches the statistic at most as often as the study allows."""
+        return self.event.value >= self.analysis.threshold
+
+    @property
+    def verdict(self) -> str:
+        """Judgement of the event: a detected flare, a candidate, rejected as an event of another kind, or undecided.
+
+        Where the throughput changes, only a spectrum that is clearly that of a flare makes an event a detection. Where
+        the fitted process does not describe the light, or most frames are in events, its false-alarm rate is not known.
+        """
+        if self.analysis.crowded:
+            return "undecided"
+        if self.event.kind != "flare":
+            return "rejected"
+        if not self.analysis.likeness.alike:
+            return "undecided"
+        doubtful = self.spectrum is not None and self.spectrum.ambiguous and self.analysis.light_misleads
+        return "detected" if self.significant and not doubtful and not self.unclear else "candidate"
+
+    @property
+    def unclear(self) -> bool:
+        """True if the frames of an event in a light curve are together fainter than the star."""
+        return self.event.energy.unclear and not self.analysis.survey.weighted
+
+    @property
+    def rates(self) -> tuple[float, float]:
+        """False alarms per star-day, in light curves of the fitted process and in those of measured residuals."""
+        return self.analysis.false_alarms(self.event)
+
+    @property
+    def probability(self) -> float:
+        """Probability of such an event from noise anywhere in the searched frames."""
+        return float(-np.expm1(-max(self.rates) * self.analysis.days))
+
+    @property
+    def fitted_s(self) -> tuple[float, float, float, float, float]:
+        """Equivalent duration of the whole flare and the ends of its 68 and 95 % intervals; NaN if it is no flare."""
+        energy = self.event.energy
+        if self.event.kind != "flare":
+            return (float("nan"),) * 5
+        return (energy.fitted_s, energy.low_s[0], energy.high_s[0], energy.low_s[1], energy.high_s[1])
+
+    @cached_property
+    def colour(self) -> tuple[float, float, float]:
+        """Blue over red rise with its error, and the p-value of an event without colour; NaN in a light curve."""
+        found = self.analysis.colour(self.event)
+        if found is None:
+            return (float("nan"),) * 3
+        return found.blue_over_red, found.blue_over_red_error, found.p_value
+
+    @property
+    def note(self) -> str:
+        """Statements about the event that a reader must know."""
+        event = self.event
+        reasons = {"step": "a step of the level fits better than a flare",
+                   "dip": "its frames lack the light of a flare: the star becomes fainter in them"}  # fmt: skip
+        notes = [reasons[event.kind]] if event.kind in reasons else []
+        notes += [self.spectrum.reason] if self.spectrum is not None and self.spectrum.reason else []
+        if event.is_limit:
+            notes.append("a gap or an end of the frames cuts it: the summed ED is a lower limit")
+        elif event.cut:
+            notes.append("it reaches a gap or an end of the frames")
+        frames = "1 missing frame is" if event.missing == 1 else f"{event.missing} missing frames are"
+        notes += [f"{frames} interpolated"] if event.missing else []
+        if event.kind == "flare" and event.energy.poor:
+            notes.append("no shape fits it within its noise: its interval includes other shapes but may be too narrow")
+        if event.kind == "flare" and self.unclear:
+            notes.append("its frames are together fainter than the level by more than its error")
+        if event.kind == "flare" and not event.energy.peak_observed:
+            notes.append("no frame shows its peak")
+        return "; ".join(notes)
+
+
+def _rate(value: float) -> str:
+    return f"{value:.1e}" if value < 0.01 else f"{value:.2g}"
+
+
+#: Columns of the table of events; names as in AltaiPony's flare tables where it has the quantity.
+EVENTS = (
+    Column("date", description="of the brightest frame, in the time scale of the file", heading="brightest at",
+           format=lambda text: text[:22], kind=str),
+    Column("tstart", lambda row: row.time_d(row.event.first), "d", "middle of the first frame, from time zero"),
+    Column("tpeak", lambda row: row.time_d(row.event.brightest), "d", "middle of the brightest frame"),
+    Column("tstop", lambda row: row.time_d(row.event.last), "d", "middle of the last frame"),
+    Column("istart", lambda row: row.event.first, "", "first frame, counted among the searched frames", kind=int),
+    Column("istop", lambda row: row.event.last, "", "last frame, inclusive", kind=int),
+    Column("cstart", lambda row: row.cadence(row.event.first), "", "first frame, counted on the grid of the cadence "
+           "with gaps", kind=int),
+    Column("cstop", lambda row: row.cadence(row.event.last), "", "last frame, likewise", kind=int),
+    Column("total_n_valid_data_points", lambda row: row.analysis.survey.stare.n_frames, "", "searched frames",
+           kind=int),
+    Column("dur", "duration_d", "d", "from the start of the first frame to the end of the last", "duration (min)",
+           lambda days: f"{1440 * days:.3g}"),
+    Column("ampl_rec", "event.amplitude", "", "largest flux above the level, relative to the level", "peak",
+           percent(".3g")),
+    Column("ed", lambda row: row.fitted_s[0], "s", "recommended equivalent duration, of the whole flare: the light "
+           "that is observed, and the shape where it is not; proportional to the energy; nan: no flare", "ED (s)",
+           number(".4g")),
+    Column("ed_low", lambda row: row.fitted_s[1], "s", "lower end of its 68 % interval, which includes the errors of "
+           "level and shape", "68 %", interval(".4g"), ("ed_high",)),
+    Column("ed_high", lambda row: row.fitted_s[2], "s", "upper end"),
+    Column("ed_low_95", lambda row: row.fitted_s[3], "s", "lower end of its 95 % interval"),
+    Column("ed_high_95", lambda row: row.fitted_s[4], "s", "upper end"),
+    Column("ed_rec", "event.energy.summed_s", "s", "equivalent duration in the frames of the event: sum of the flux "
+           "above the level, relative to the level at the peak", "ED in frames (s)", number(".4g")),
+    Column("ed_rec_err", "event.energy.summed_error_s", "s", "its standard error, with that of the level", "error (s)",
+           number(".2g")),
+    Column("ed_rec_limit", "event.is_limit", "", "whether it is a lower limit, because a gap or an end cuts the flare",
+           kind=bool),
+    Column("ed_fit", lambda row: row.fitted_s[0], "s", "the same as ed, by its older name"),
+    Column("ed_fit_low", lambda row: row.fitted_s[1], "s", "the same as ed_low"),
+    Column("ed_fit_high", lambda row: row.fitted_s[2], "s", "the same as ed_high"),
+    Column("shape", "event.energy.shape", "", "shape of the flares that fits best", kind=str),
+    Column("half_width", lambda row: row.event.energy.flares[0].half_width_s, "s",
+           "t_1/2 of the largest flare fitted to it; nan: none", "half-width (s)", number(".3g")),
+    Column("components", lambda row: len(row.event.energy.flares), "", "flares fitted together", kind=int),
+    Column("value", "event.value", "", "statistic of the search: S/N of the best template", "S/N", number(".4g")),
+    Column("rate_normal", lambda row: row.rates[0], "1 / d", "false alarms per star-day above this statistic in "
+           "light curves of the fitted process"),
+    Column("rate_measured", lambda row: row.rates[1], "1 / d", "the same with residuals resampled from quiescent "
+           "frames"),
+    Column("probability", "probability", "", "probability of such an event from noise anywhere in these frames, by "
+           "the larger rate", "from noise", _rate),
+    Column("significant", "significant", "", "whether the rate is at most the wanted one", kind=bool),
+    Column("verdict", "verdict", "", "detected: a flare with at most the wanted rate; candidate: a flare with a larger "
+           "one, one like the changes of throughput in these frames, or one whose frames are together not brighter "
+           "than the level; rejected: it resembles a flare, but its spectrum or shape is of another kind; undecided: "
+           "the false-alarm rate is not known", "verdict", kind=str),
+    Column("blue_over_red", lambda row: row.colour[0], "", "rise relative to the star in the blue half of the pixels "
+           "over that in the red half: 1 for a change of throughput; nan: no spectra", "blue/red", number(".3g")),
+    Column("blue_over_red_error", lambda row: row.colour[1], "", "its standard error"),
+    Column("p_no_colour", lambda row: row.colour[2], "", "probability of a spectrum at least as different from the "
+           "star's if the event has no colour, as a change of throughput"),
+    Column("temperature", lambda row: row.quantity("temperature")[0], "K", "temperature of a blackbody fitted to the "
+           "summed spectra of the event; nan: not measured", "temperature (K)", number(".4g")),
+    Column("temperature_low", lambda row: row.quantity("temperature")[1], "K", "lower end of its 68 % interval"),
+    Column("temperature_high", lambda row: row.quantity("temperature")[2], "K", "upper end"),
+    Column("energy", lambda row: row.quantity(ENERGY)[0], "erg", "bolometric energy in the frames of the event",
+           "energy (erg)", number(".3g")),
+    Column("energy_low", lambda row: row.quantity(ENERGY)[1], "erg", "lower end of its 68 % interval"),
+    Column("energy_high", lambda row: row.quantity(ENERGY)[2], "erg", "upper end"),
+    Column("unmeasured", "unmeasured", "", "why temperature or energy are not measured", kind=str),
+    Column("snr_flare", lambda row: float("nan") if row.spectrum is None else row.spectrum.snr, "", "S/N of a flare in "
+           "the event's spectrum if star, dark current and sky changed by any amount"),
+    Column("kind", "event.kind", "", "flare, or what resembles one: step of the level, edge of a dip, change of "
+           "throughput, dark current or sky, cosmic ray", "kind", kind=str),
+    Column("note", "note", "", "what is special", kind=str),
+)  # fmt: skip
+#: Columns of the table of frames, one row for all frames of an analysis.
+FRAMES = (
+    Column("time", lambda row: row.frames.time_s / DAY_S, "d", "middle of the frame, from time zero"),
+    Column("flux", "flux", "", "light in the unit of the file; for spectra, the sum over wavelength"),
+    Column("level", "level.level", "", "quiescent level"),
+    Column("level_error", "level.level_error", "", "standard error of the level"),
+    Column("error", "level.error", "", "standard deviation of a quiescent frame"),
+    Column("reason", lambda row: np.array([Reason.words(int(value)) for value in row.level.reasons]), "",
+           "why the frame is not searched; empty if it is"),
+    Column("quality", lambda row: np.zeros(row.frames.n_frames, np.int64) if row.frames.quality is None
+           else row.frames.quality, "", "quality flag of the file"),
+    Column("excluded_by", lambda row: np.array(row.frames.flags), "", "bits of the flag that exclude the frame"),
+    Column("rays", lambda row: np.zeros(row.frames.n_frames, np.int64) if row.spectra is None
+           else row.spectra.cleaned.rays, "", "single values that a fit to the other pixels replaces, such as those of "
+           "cosmic rays"),
+)  # fmt: skip
+#: Columns of the measured quantities of an event, one row for each.
+MEASURED = (
+    Column("date", description="brightest frame of the event", heading="event", format=lambda text: text[:22],
+           kind=str),
+    Column("quantity", "measured.names", "", "what is measured", "quantity", kind=str),
+    Column("unit", "measured.units", "", "of estimate and intervals", "unit", kind=str),
+    Column("estimate", lambda row: row.measured.estimates[0], "", "of maximum likelihood", "estimate", number(".4g")),
+    Column("low", lambda row: row.measured.low[0, 0], "", "lower end of the 68 % interval", "68 %", interval(".4g"),
+           ("high",)),
+    Column("high", lambda row: row.measured.high[0, 0], "", "upper end"),
+    Column("low_95", lambda row: row.measured.low[1, 0], "", "lower end of the 95 % interval"),
+    Column("high_95", lambda row: row.measured.high[1, 0], "", "upper end"),
+    Column("p_value", "measured.p_value", "", "probability of a worse fit of a blackbody"),
+)  # fmt: skip
+#: Columns of the noise per pixel, one row for all pixels.
+PIXELS = (
+    Column("wavelength", "wavelength_nm", "nm", "middle of the pixel"),
+    Column("stated", "stated", "", "standard deviation of a quiescent frame, as stated or by the instrument's model"),
+    Column("measured", "measured", "", "from differences of neighbouring quiescent frames, without changes of light "
+           "and dark current that all pixels share"),
+    Column("low", "low", "", "lower end of the range of 95 % of noise of the stated size"),
+    Column("high", "high", "", "upper end"),
+    Column("departs", "departs", "", "whether the search uses the measured noise"),
+)  # fmt: skip
+#: Columns of the changes of throughput, one row per change.
+THROUGHPUT = (
+    Column("date", lambda row: row[0].date(row[0].time_s[row[1].frame]), "", "first frame after the change", kind=str),
+    Column("time", lambda row: row[0].time_s[row[1].frame] / DAY_S, "d", "middle of this frame, from time zero"),
+    Column("frames", lambda row: row[1].width, "", "frames before and after the change whose means are compared",
+           kind=int),
+    Column("change", lambda row: row[1].change, "", "of the light that all pixels share, relative to the quiescent "
+           "star"),
+    Column("error", lambda row: row[1].error, "", "standard error of the change"),
+)  # fmt: skip
+#: Columns of the completeness, one row per half-width and equivalent duration.
+COMPLETENESS = (
+    Column("half_width", lambda row: row.completeness.half_widths_s[:, None], "s", "t_1/2 of the injected flares"),
+    Column("equivalent_duration", "completeness.equivalent_durations_s", "s", "of the injected flares"),
+    Column("injected", "completeness.injected", "", "number of injections"),
+    Column("detected", "completeness.detected", "", "number that the search detects"),
+)  # fmt: skip
+#: Columns of the limits, one row per half-width.
+LIMITS = (
+    Column("half_width", "completeness.half_widths_s", "s", "t_1/2 of the flares", "half-width (s)", number(".3g")),
+    Column("limit", lambda row: np.array([row.completeness.limit(k) for k in range(len(row.completeness.detected))]),
+           "s", "equivalent duration of flares that are detected with a probability of 90 %; nan: above the largest "
+           "injected", "ED detected at 90 % (s)", number(".4g", "not reached")),
+)  # fmt: skip
+#: Columns of the models of the quiescent light, one row per combination of terms.
+PROCESS = (
+    Column("terms", lambda row: row[0], "", "terms of the process, and independent noise",
+           "model of the quiescent light", kind=str),
+    Column("bic", lambda row: row[1], "", "Bayesian information criterion less the smallest; the smallest is used",
+           "BIC above the least", number(".3g")),
+)  # fmt: skip
+#: Columns of the noise, one row per number of frames.
+NOISE = (
+    Column("frames", "frames", "", "frames in a mean", "frames in a mean", kind=int),
+    Column("count", "count", "", "number of means", "means", kind=int),
+    Column("measured", "measured", "", "standard deviation of the means, in units of the noise of one frame",
+           "scatter", number(".3g")),
+    Column("white", "white", "", "the same for independent frames", "independent", number(".3g")),
+    Column("low", "low", "", "lower end of the range of 95 % of light curves of independent frames",
+           "95 % of independent", interval(".3g"), ("high",)),
+    Column("high", "high", "", "upper end"),
+)  # fmt: skip
+
+
+def _frames_of(answer: AnalyseAnswer) -> dict[str, object]:
+    frames = answer.analysis.frames
+    return {"star": frames.name, "unit": frames.unit, **frames.time_keywords}
+
+
+def _events_of(answer: AnalyseAnswer) -> dict[str, object]:
+    frames, threshold = answer.analysis.frames, answer.analysis.threshold
+    about = {"star": frames.name, "unit": frames.unit, "threshold": threshold}
+    return {"study": answer.study.text(), **frames.time_keywords, **about}
+
+
+def _has_spectra(answer: AnalyseAnswer) -> bool:
+    return answer.analysis.spectra is not None
+
+
+def _noise_of_pixels(answer: AnalyseAnswer) -> list[object]:
+    spectra = answer.analysis.spectra
+    return [] if spectra is None else [spectra.series.noise]
+
+
+def _changes_of_throughput(answer: AnalyseAnswer) -> list[object]:
+    spectra = answer.analysis.spectra
+    return [] if spectra is None else [(spectra.cleaned.frames, change) for change in spectra.series.changes]
+
+
+def _neighbour_flares(answer: AnalyseAnswer) -> list[NeighbourFlare]:
+    stars = blended_stars(cases(answer.study, swept=False))
+    return [NeighbourFlare(row.date, row.event, star) for row in answer.rows for star in stars]
+
+
+@dataclass(frozen=True, eq=False)
+class AnalyseAnswer(Answer):
+    """Answer of `analyse`."""
+
+    USES = ("templates", "seed")
+
+    study: Study
+    analysis: Analysis
+    white: str = ""  # why spectra are searched as their sum over wavelength; empty if they are not
+
+    #: One row per event, in order of time.
+    events = TableOf("events", EVENTS, "rows", key="events", about=_events_of, study=False)
+    #: One row per frame: flux, level, noise, and why it is not searched.
+    frames = TableOf("frames", FRAMES, "analysis", about=_frames_of, study=False, cached=False)
+    #: One row per half-width and size of injected flares.
+    completeness = TableOf("completeness", COMPLETENESS, "analysis", study=False,
+                           about=lambda answer: {"threshold": answer.analysis.threshold})  # fmt: skip
+    #: One row per half-width: the smallest flare that the search detects with a probability of 90 %.
+    limits = TableOf("limits", LIMITS, "analysis", key="limits", study=False,
+                     title="Smallest flares that would have been detected, by injecting into these frames")  # fmt: skip
+    #: One row per number of frames: scatter of their means.
+    noise = TableOf("noise", NOISE, "analysis.scatter", key="noise", study=False,
+                    title="Noise of quiescent frames, less the fitted process")  # fmt: skip
+    #: One row per combination of terms that was tried for the quiescent light, with its criterion.
+    process = TableOf(
+        "process", PROCESS, lambda answer: sorted(answer.analysis.level.process.bic, key=itemgetter(1)), study=False,
+        title="What was tried for the quiescent light",
+    )  # fmt: skip
+    #: One row per event and measured quantity, with intervals.
+    measured = TableOf(
+        "measured", MEASURED, lambda answer: [row for row in answer.rows if not isinstance(row.measured, str)],
+        when=_has_spectra, study=False,
+    )  # fmt: skip
+    #: One row per pixel of spectra: noise as stated and as measured.
+    pixels = TableOf("noise-per-pixel", PIXELS, _noise_of_pixels, when=_has_spectra, study=False,
+                     about=lambda answer: {"unit": answer.analysis.frames.unit})  # fmt: skip
+    #: One row per sudden change of the light that all pixels of spectra share.
+    throughput = TableOf("throughput", THROUGHPUT, _changes_of_throughput, when=_has_spectra, study=False)
+    #: One row per event and star in the fibre: the flare of that star which would look like the event.
+    neighbour_flares = TableOf("neighbour-flares", COLUMNS, _neighbour_flares,
+                               when=lambda answer: answer.study.has_neighbours)  # fmt: skip
+
+    @property
+    def messages(self) -> list[str]:
+        near = [
+            text
+            for case in (self.observed if self.study.has_neighbours else ())
+            if case.neighbours is not None
+            for text in case.neighbours.messages(case.label, case.instrument)
+        ]
+        return [*near, *([self.white] if self.white else []), *self.analysis.messages]
+
+    @property
+    def uses(self) -> tuple[Use, ...]:
+        """Parts of the study that this answer uses: the instrument only for spectra of its pixels."""
+        if self.study.has_neighbours:
+            return (*self.USES, "instrument", "sky", "flare")
+        return (*self.USES, "instrument", "sky") if self.analysis.spectra is not None else self.USES
+
+    @property
+    def rows(self) -> list[EventRow]:
+        """Events in order of time."""
+        return [EventRow(self.analysis, number) for number in range(len(self.analysis.events))]
+
+    @property
+    def json_tables(self) -> dict[str, Table]:
+        """Tables in JSON by key; light curves have no measured quantities."""
+        return super().json_tables | {"measured": self.measured}
+
+    @property
+    def views(self) -> list[View]:
+        return [*self._event_views, *super().views]
+
+    @property
+    def _event_views(self) -> list[View]:
+        one = self.analysis
+        wanted = f"{one.wanted:.3g} false alarms per star-day"
+        if not one.events:
+            title = f"Nothing above {one.candidates:.2f} in {one.days:.3g} star-days of {one.frames.name} ({wanted})."
+            return [View(title)]
+        title = (
+            f"Events in {one.days:.3g} star-days of {one.frames.name}; detected above {one.threshold:.2f} ({wanted}), "
+            f"candidates above {one.candidates:.2f}"
+        )
+        views = [AnalyseAnswer.events.view(self, title)]
+        if len(self.measured):
+            views.append(AnalyseAnswer.measured.view(self, "Measured in the summed spectra of each event"))
+        if self.study.has_neighbours:
+            flare = self.study.flare
+            title = (
+                f"Flares of each star in the fibre that would look like these events: {flare.light().describe()}, "
+                f"amplitudes in the {flare.band} band, for light that is that of all stars in the fibre"
+            )
+            views.append(AnalyseAnswer.neighbour_flares.view(self, title))
+        return views
+
+    @property
+    def remarks(self) -> list[str]:
+        return [f"{row.date[:19]}: {row.note}." for row in self.rows if row.note]
+
+    @property
+    def inputs(self) -> list[Expectation]:
+        """No expectations: the noise is measured."""
+        return []
+
+
+def _orbit(study: Study, frames: Frames) -> Orbit | None:
+    """Return the orbit of the satellite that took the frames, or None if it is not known."""
+    is_mauve = "mauve" in frames.instrument.lower()
+    return study.orbit.orbit() if is_mauve or study.orbit.tle is not None else None
+
+
+@validated
+def analyse(
+    study: Study,
+    engine: Engine | Pool | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    *,
+    frames: Frames | None = None,
+) -> AnalyseAnswer:
+    """Find the flares in observed frames, with false-alarm rates from the noise as measured.
+
+    Parameters
+    ----------
+    study : Study
+        Its sections `data` and `search`: `data.file` is read, `search.false_alarms` are allowed for a detection. With
+        `data.barycentric` times become those at the Solar System's barycentre, by the satellite's orbit.
+        Fainter events are candidates, down to one false alarm per star-day.
+    engine : optional
+        Not used: nothing is drawn on a device.
+    progress : callable, optional
+        Called as ``progress(done, total)`` in frames, as the share of the work that is done; may raise to stop it.
+    frames : Frames, optional
+        Frames in memory, in place of the file.
+    """
+    if frames is None:
+        if study.data.file is None:
+            raise InputError("no observed frames are given", "data.file, or frames", key="data.file")
+        frames = read_frames(study.data.file, study.data.mapping, quality_bits=study.data.quality_bits,
+                             ignore_checksum=study.data.ignore_checksum)  # fmt: skip
+    if study.data.barycentric is not None:
+        frames = barycentric(frames, Target.of(study.data.barycentric), _orbit(study, frames))
+    search = study.search
+    model = frame_model(study, frames)
+    jitters = search.spreads() or None
+    if study.has_neighbours:
+        # Errors of the star or its neighbours are reported before the search.
+        blended_stars(cases(study, swept=False))
+    analysis = analyse_frames(
+        frames, false_alarms=search.false_alarms, per=search.per, shape=search.shape, seed=study.run.seed,
+        model=model if isinstance(model, FrameModel) else None, rank=search.sums, jitters=jitters,
+        temperature_k=study.flare.temperature_k, report=_in_frames(progress, frames.n_frames),
+    )  # fmt: skip
+    return AnalyseAnswer(study, analysis, model if isinstance(model, str) else "")
+
+
+def _in_frames(progress: Callable[[int, int], None] | None, total: int) -> Callable[[float], None] | None:
+    """Return a function of the share that is done, which reports it in whole frames whenever their number rises."""
+    if progress is None:
+        return None
+    last = -1
+
+    def report(share: float) -> None:
+        nonlocal last
+        done = round(share * total)
+        if done > last:
+            last = done
+            progress(done, total)
+
+    report(0.0)
+    return report
+
+
+def frame_model(study: Study, frames: Frames) -> FrameModel | str:
+    """Return the model of frames' pixels, or the reason why it is not known, which is empty for a light curve.
+
+    The star is known if the study names exactly one. Otherwise a faint one replaces it: the fluxes of flares do not
+    depend on it, and the light of the star is measured.
+    """
+    if frames.flux.ndim == 1:
+        return ""
+    named = len(study.star) == 1
+    (case, *_) = cases(study, swept=False)
+    observation = study.observation.model_copy(update={"exposure_s": float(np.median(frames.exposure_s))})
+    case = case.with_sections(observation=observation)
+    star = case.star
+    source = case.source if named else Source.from_library("G2V").at_magnitude(ANY_MAGNITUDE)
+    try:
+        quiet = case.expect(source)[0]
+        flare = FlareModel.of(
+            source, case.instrument, quiet, band=study.flare.band, bands_nm=study.measure.bands_nm,
+            distance_pc=star.distance_pc if named else None, radius_rsun=star.radius_rsun if named else None,
+            order=study.observation.order,
+        )  # fmt: skip
+        return FrameModel.of(frames, quiet, flare, flux_per_dn(quiet, case.instrument))
+    except InputError as error:
+        return f"Spectra are searched as their sum over wavelength: {error}."

@@ -1,0 +1,538 @@
+"""An instrument fitted to frames of standard stars and to frames without light."""
+
+from __future__ import annotations
+
+import io
+import tempfile
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.answers.answer import Answer, TableOf, ecsv_text
+from mauvecl.host.exposure.expectation import expect
+from mauvecl.host.instrument.curves import CALIBRATED, MODE, ThroughputErrors
+from mauvecl.host.instrument.instrument import Instrument
+from mauvecl.host.instrument.paths import shipped_names
+from mauvecl.observations.detector import (
+    CalibrationFrames,
+    DarkFit,
+    MeasuredVariance,
+    NoiseModel,
+    PhotonTransfer,
+    assumed_dark,
+    fit_dark,
+    fit_photon_transfer,
+    measured_variance,
+)
+from mauvecl.observations.frame_files import read_frames
+from mauvecl.observations.frames import Frames
+from mauvecl.observations.throughput import ERROR_KNOTS, ThroughputFit, fit_throughput
+from mauvecl.schema.calls import validated
+from mauvecl.schema.columns import Column, View, number, percent, table_of
+from mauvecl.schema.errors import InputError
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+
+    from mauvecl.device.engine import Engine
+    from mauvecl.host.exposure.expectation import Expectation
+    from mauvecl.host.stars.source import Source
+    from mauvecl.runs.pool import Pool
+    from mauvecl.study.study import Study
+
+#: Change of temperature, deg C, within which consecutive dark frames are compared for their variance.
+SAME_TEMPERATURE_C = 0.05
+#: Knots of the written throughput factor, nm apart.
+KNOT_NM = 2.0
+#: Bands of equal width whose light the first modes of the throughput's errors determine.
+MODE_BANDS = 8
+#: Factor between fitted and nominal throughput above which it is reported.
+FAR_FROM_NOMINAL = 3.0
+#: Probability of chi-squared below which a fit is reported as bad.
+REJECTED = 0.01
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A value of the instrument: fitted, or assumed where the observations do not determine it."""
+
+    name: str
+    value: float
+    error: float  # NaN if it is assumed
+    nominal: float
+    unit: str
+    determined: bool
+
+    @property
+    def deviation(self) -> float:
+        """Difference from the nominal value in standard errors."""
+        return (self.value - self.nominal) / self.error if self.determined and self.error > 0 else float("nan")
+
+
+def _significant(value: float, error: float) -> str:
+    return f"{value:.6g} +- {error:.2g}" if error == error else f"{value:.6g}"
+
+
+#: Columns of the table of values.
+COLUMNS = (
+    Column("quantity", "name", "", "value of the instrument", "quantity", kind=str),
+    Column("value", "value", "", "fitted, or nominal where it is not determined", "value", _significant, ("error",)),
+    Column("error", "error", "", "standard error; nan: not determined by these observations"),
+    Column("nominal", "nominal", "", "value of the instrument that was given", "nominal", ".6g"),
+    Column("deviation", "deviation", "", "fitted less nominal value in standard errors", "sigma", number("+.1f")),
+    Column("unit", "unit", "", "of the value", "unit", kind=str),
+    Column("determined", "determined", "", "whether these observations determine it", "status",
+           lambda determined: "" if determined else "assumed", kind=bool),
+)  # fmt: skip
+#: Columns of the table of fits.
+FIT_COLUMNS = (
+    Column("fit", "name", "", "what is fitted", "fit", kind=str),
+    Column("chi2", "chi2", "", "chi-squared", "chi-squared / dof", lambda chi2, dof: f"{chi2:.1f} / {dof:.1f}",
+           ("dof",)),
+    Column("dof", "dof", "", "values less the effective number of parameters"),
+    Column("p_value", "p_value", "", "probability of a chi-squared at least as large", "p", number(".3g")),
+)  # fmt: skip
+#: Columns of the throughput, one row per pixel.
+THROUGHPUT_COLUMNS = (
+    Column("wavelength", "throughput.wavelength_nm", "nm", "middle of the pixel", "nm", ".1f"),
+    Column("throughput", "fitted_throughput", "", "electrons per photon", "throughput", ".4f"),
+    Column("error", lambda answer: answer.fitted_throughput * answer.throughput.error, "", "its standard error"),
+    Column("nominal", "nominal_throughput", "", "throughput of the instrument that was given"),
+    Column("ratio", lambda answer: np.exp(answer.throughput.log_factor), "", "fitted over nominal throughput",
+           "over nominal", ".4f"),
+    Column("relative_error", "throughput.error", "", "relative standard error, with that of the gain", "error",
+           percent(".2f")),
+    Column("relative_error_counts", "relative_error_counts", "",
+           "relative standard error of DN per photon, which the gain does not change"),
+)  # fmt: skip
+#: Columns of the dark current, one row per pixel.
+DARK_COLUMNS = (
+    Column("wavelength", "nominal.wavelength_nm", "nm", "middle of the pixel"),
+    Column("dark", "dark.level_dn_per_s", "DN / s", "dark current at the reference temperature"),
+    Column("dark_error", "dark.level_error", "DN / s", "its standard error"),
+    Column("slope", "dark.pixel_slope_per_c", "1 / deg_C",
+           "slope of the logarithm of this pixel alone; nan: not determined"),
+    Column("slope_error", "dark.pixel_slope_error", "1 / deg_C", "its standard error"),
+    Column("bias", "dark.bias_dn", "DN", "fitted or assumed"),
+    Column("bias_error", "dark.bias_error", "DN", "its standard error"),
+)  # fmt: skip
+#: Columns of the photon transfer, one row per observation and usable pixel.
+TRANSFER_COLUMNS = (
+    Column("light", "transfer.mean_dn", "DN", "mean light of a frame"),
+    Column("variance", "transfer.variance", "DN2", "variance of frames"),
+    Column("model", "transfer.model", "DN2", "fitted variance"),
+)
+
+
+def _reference(answer: CalibrateAnswer) -> dict[str, object]:
+    return {"reference_c": answer.dark.reference_c}
+
+
+def _title(answer: CalibrateAnswer) -> str:
+    stars = f"{len(answer.stars)} standard star{'s' if len(answer.stars) > 1 else ''}"
+    return f"{answer.nominal.name} fitted to {stars}; dark current at {answer.dark.reference_c:.1f} C"
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrateAnswer(Answer):
+    """Answer of `calibrate`."""
+
+    USES = ("instrument", "sky")
+
+    study: Study
+    # The instrument from which the fit starts, whose values remain where the observations determine none.
+    nominal: Instrument
+    observations: tuple[CalibrationFrames, ...]
+    dark: DarkFit
+    transfer: PhotonTransfer
+    throughput: ThroughputFit
+
+    #: One row per value of the instrument.
+    values_table = TableOf("calibrate", COLUMNS, "values", title=_title, key="rows", about=lambda answer: {
+        **_reference(answer), "dark_unit": answer.transfer.dark_unit})  # fmt: skip
+    #: One row per fit: its goodness.
+    fits = TableOf("fits", FIT_COLUMNS, "_fits", title="Goodness of fit", key="fits", study=False)
+    #: One row per pixel: fitted and nominal throughput.
+    throughput_table = TableOf("throughput", THROUGHPUT_COLUMNS, lambda answer: answer)
+    #: One row per pixel: dark current and bias.
+    dark_table = TableOf("dark", DARK_COLUMNS, lambda answer: answer, about=_reference, study=False)
+    #: One row per observation and usable pixel: the variance of frames.
+    transfer_table = TableOf("photon-transfer", TRANSFER_COLUMNS, lambda answer: answer, study=False)
+
+    @property
+    def stars(self) -> list[CalibrationFrames]:
+        """Observations of standard stars."""
+        return [observation for observation in self.observations if observation.star is not None]
+
+    @cached_property
+    def values(self) -> list[Fitted]:
+        """Values of the instrument, fitted or assumed."""
+        d, t, f, n = self.dark, self.transfer, self.throughput, self.nominal
+        level = float(np.mean(d.level_dn_per_s))
+        at = float(n.dark_scale_dn_per_s * np.exp(n.dark_slope_per_c * d.reference_c))
+        assumed = (*d.assumed, *t.assumed)
+        rows = [
+            ("dark current", level, float(np.sqrt(d.shared[1, 1])), at, "DN / s", "dark current" not in assumed),
+            ("dark slope", d.slope_per_c, d.slope_error, n.dark_slope_per_c, "1 / deg_C", "dark slope" not in assumed),
+            ("bias", float(d.bias_dn.mean()), float(d.bias_error.mean()), n.bias_dn, "DN", "bias" not in assumed),
+            ("gain", t.noise.gain, t.gain_error, n.gain_dn_per_electron, "DN / electron", "gain" not in assumed),
+            ("read noise", t.read_noise_dn, t.read_noise_error, n.read_noise_dn, "DN", "read noise" not in assumed),
+            *((name, found.value if found else usual, found.error if found else np.nan, usual, "nm", found is not None)
+              for name, found, usual in (
+                  ("wavelength shift", f.shift_nm, 0.0), ("wavelength stretch", f.stretch_nm, 0.0),
+                  ("line width", f.fwhm_nm, n.gaussian_fwhm_nm),
+                  ("line width, change to the red", f.fwhm_change_nm, 0.0))),
+        ]  # fmt: skip
+        return [Fitted(name, value, error if known else float("nan"), usual, unit, known)
+                for name, value, error, usual, unit, known in rows]  # fmt: skip
+
+    @property
+    def _fits(self) -> list[dict[str, Any]]:
+        fits: dict[str, ThroughputFit | DarkFit | PhotonTransfer] = {
+            "throughput": self.throughput, "dark current": self.dark, "photon transfer": self.transfer
+        }  # fmt: skip
+        return [{"name": name, "chi2": one.chi2, "dof": float(one.dof), "p_value": one.p_value}
+                for name, one in fits.items() if one.dof > 0]  # fmt: skip
+
+    @cached_property
+    def nominal_throughput(self) -> NDArray[np.float64]:
+        """Throughput of the instrument that was given, at each pixel."""
+        return self.nominal.throughput(self.throughput.wavelength_nm)
+
+    @cached_property
+    def fitted_throughput(self) -> NDArray[np.float64]:
+        """Throughput at each pixel."""
+        return np.asarray(np.exp(self.throughput.log_factor) * self.nominal_throughput)
+
+    @property
+    def relative_error_counts(self) -> NDArray[np.float64]:
+        """Relative standard error of DN per photon at each pixel."""
+        return np.sqrt(np.maximum(self.throughput.error**2 - self.transfer.relative_gain_error**2, 0.0))
+
+    @property
+    def tables(self) -> dict[str, Table]:
+        """Values, goodness of fit, throughput, dark current, photon transfer, and what the instrument file names."""
+        return super().tables | self.instrument_tables
+
+    @property
+    def views(self) -> list[View]:
+        """Values, the throughput of some pixels, and the goodness of the fits."""
+        values, fits = super().views
+        rows = self.throughput_table
+        some = rows[np.linspace(0, len(rows) - 1, 11).astype(int)]
+        return [values, CalibrateAnswer.throughput_table.view(self, "Throughput, electrons per photon", some), fits]
+
+    @property
+    def messages(self) -> list[str]:
+        lines = []
+        assumed = [*self.dark.assumed, *self.transfer.assumed, *self.throughput.assumed]
+        if assumed:
+            lines.append(f"NOT DETERMINED by these observations, taken as nominal: {', '.join(assumed)}.")
+        error, given = self.throughput.spectrum_error, self.study.calibrate.spectrum_error is not None
+        if "errors of the star's spectrum" in self.throughput.assumed and not given:
+            lines.append(
+                "One star cannot tell errors of its spectrum from the throughput: an error of "
+                f"{100 * error:.2g} % at each of {ERROR_KNOTS} wavelengths is assumed."
+            )
+        elif error > 0 and not given:
+            lines.append(
+                f"The stars disagree: their spectra are taken to be wrong by {100 * error:.2g} % at each of "
+                f"{ERROR_KNOTS} wavelengths."
+            )
+        if self.throughput.structure > 0:
+            lines.append(
+                "The throughput has structure finer than the spline follows, of "
+                f"{100 * self.throughput.structure:.2g} %: every pixel has its own factor."
+            )
+        far = float(np.exp(np.abs(self.throughput.log_factor).max()))
+        if far > FAR_FROM_NOMINAL:
+            lines.append(f"The throughput is up to {far:.2g} times above or below the nominal one: check the stars.")
+        if self.study.calibrate.light_error == 0:
+            lines.append("Losses by pointing are taken to be alike in all observations (calibrate.light_error).")
+        for row in self.fits:
+            if row["p_value"] < REJECTED:
+                lines.append(f"The fit of the {row['fit']} is rejected: p = {row['p_value']:.2g}.")
+        if self.dark.slopes_p_value < REJECTED:
+            lines.append(
+                "The dark current of single pixels rises differently with temperature: the instrument file has the "
+                f"common slope (p = {self.dark.slopes_p_value:.2g})."
+            )
+        change = self.throughput.fwhm_change_nm
+        if change is not None and abs(change.value) > 3 * change.error:
+            lines.append("The line width changes along the spectrum: the instrument file has its mean.")
+        saturated = [lit.name for lit in self.stars if not lit.usable(self.nominal).all()]
+        if saturated:
+            lines.append(f"Saturated pixels are not used: {', '.join(saturated)}.")
+        return lines
+
+    @property
+    def inputs(self) -> list[Expectation]:
+        exposure, sky = self.nominal.frame_s, self.study.sky.sky()
+        return [
+            expect(lit.star, self.nominal, exposure=exposure, sky=sky) for lit in self.stars if lit.star is not None
+        ]
+
+    @property
+    def source(self) -> str:
+        """Origin of the fitted values."""
+        return f"fitted to {', '.join(star.name for star in self.stars)}"
+
+    @cached_property
+    def instrument(self) -> Instrument:
+        """The fitted instrument, as its file has it."""
+        with tempfile.TemporaryDirectory() as folder:
+            zipfile.ZipFile(io.BytesIO(self.instrument_zip())).extractall(folder)
+            return Instrument.load(Path(folder) / "instrument.toml")
+
+    @property
+    def name(self) -> str:
+        """Name of the fitted instrument."""
+        return f"{self.nominal.name}-calibrated"
+
+    @property
+    def notice(self) -> str:
+        """Remark on the fitted values that every answer repeats."""
+        error = 100 * float(np.median(self.throughput.error))
+        return f"The throughput is {self.source}; median standard error {error:.2g} %."
+
+    @property
+    def changes(self) -> dict[str, Any]:
+        """Plain values of the fitted instrument by name."""
+        n, d, t, f = self.nominal, self.dark, self.transfer, self.throughput
+        found: dict[str, Any] = {}
+        if "dark current" not in d.assumed:
+            found["dark_slope_per_c"] = d.slope_per_c
+            found["dark_scale_dn_per_s"] = float(np.mean(d.level_dn_per_s) * np.exp(-d.slope_per_c * d.reference_c))
+            found["bias_dn"] = float(d.bias_dn.mean())
+        if "gain" not in t.assumed:
+            volts = n.adc_range_v / 2**n.adc_bits
+            found |= {"conversion_uv_per_electron": float(t.noise.gain * volts * 1e6), "read_noise_dn": t.read_noise_dn,
+                      "dark_unit": t.dark_unit}  # fmt: skip
+        if f.shift_nm is not None and f.stretch_nm is not None:
+            # A feature is found at a pixel whose nominal wavelength is too small by the shift.
+            half = np.ptp(f.wavelength_nm) / 2
+            found["dispersion_nm_per_pixel"] = n.dispersion_nm_per_pixel * (1 + f.stretch_nm.value / half)
+            first = n.pixel_zero_nm - f.wavelength_nm.mean()
+            found["pixel_zero_nm"] = n.pixel_zero_nm + f.shift_nm.value + f.stretch_nm.value * first / half
+            # The pixels that were observed stay those that are read.
+            step, read = found["dispersion_nm_per_pixel"], n.read_pixels
+            lowest, highest = (found["pixel_zero_nm"] + step * end for end in (read.start - 0.5, read.stop - 0.5))
+            found["output_min_nm"] = max(n.output_min_nm, float(lowest))
+            found["output_max_nm"] = min(n.output_max_nm, float(highest))
+        if f.fwhm_nm is not None:
+            found["gaussian_fwhm_nm"] = f.fwhm_nm.value
+        return found
+
+    @cached_property
+    def instrument_tables(self) -> dict[str, Table]:
+        """Tables that the instrument file names: factor and errors of the throughput, and the pixels."""
+        nm = self.throughput.wavelength_nm
+        knots = np.unique(np.concatenate([nm[:1], np.arange(np.ceil(nm[0]), nm[-1], KNOT_NM), nm[-1:]]))
+        at = np.searchsorted(nm, knots).clip(0, nm.size - 1)
+        errors = ThroughputErrors.of_covariance(
+            knots, self._covariance(at), f"C: {self.source}", names=tuple(CALIBRATED), sums=self._light(at)
+        )
+        factor = {"wavelength": knots, "factor": self._factor(knots)}
+        modes = {"wavelength": knots} | {f"{MODE}{k}": mode for k, mode in enumerate(errors.modes, 1)}
+        values = {name: list(steps) for name, steps in errors.values.items()}
+        origin = {"tag": "C", "source": self.source}
+
+        def columns(row: dict[str, Any]) -> list[Column]:
+            return [Column(name, unit="nm" if name == "wavelength" else "") for name in row]
+
+        return {
+            "throughput-factor": table_of(columns(factor), [factor], **origin),
+            "throughput-errors": table_of(columns(modes), [modes], **origin, values=values),
+            "pixel-map": table_of(self._pixel_columns, [self], **origin),
+        }
+
+    def _factor(self, knots_nm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return fitted over nominal throughput, interpolated in wavelengths of the fitted instrument."""
+        names = ("pixel_zero_nm", "dispersion_nm_per_pixel")
+        moved = self.nominal.with_(**{name: self.changes[name] for name in names if name in self.changes})
+        pixels = np.arange(moved.pixels)[self.nominal.read_pixels]
+        # The throughput of a pixel stays; its wavelength, and with it the nominal throughput, is another one.
+        centres = moved.pixel_zero_nm + moved.dispersion_nm_per_pixel * pixels
+        nominal = self.nominal.throughput(np.clip(centres, *self.nominal.curves_nm))
+        return np.interp(knots_nm, centres, self.fitted_throughput / nominal)
+
+    @property
+    def _pixel_columns(self) -> list[Column]:
+        """Columns of the pixel map, for the answer."""
+        nominal, dark, bias = self.nominal, self.dark.level_dn_per_s, self.dark.bias_dn
+
+        def of_all(values: NDArray[np.float64], others: float) -> NDArray[np.float64]:
+            """Return the values of all pixels from those of the read ones."""
+            every = np.full(nominal.pixels, others)
+            every[nominal.read_pixels] = values
+            return every
+
+        columns = [
+            Column("pixel", lambda _: np.arange(nominal.pixels)),
+            Column("dark", lambda _: of_all(dark / dark.mean(), 1.0), "", "factor on the dark current"),
+        ]
+        for name in ("response", "gain", "read_noise_dn"):
+            if nominal.pixel_map is not None and getattr(nominal.pixel_map, name) is not None:
+                unit = "DN" if name.endswith("_dn") else ""
+                columns.append(Column(name, f"nominal.pixel_map.{name}", unit))
+        if np.ptp(bias) > 0:
+            columns.append(Column("bias_dn", lambda _: of_all(bias, float(bias.mean())), "DN", "bias"))
+        return columns
+
+    def _light(self, at: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the light of some pixels in each of `MODE_BANDS` bands, shape (MODE_BANDS, n)."""
+        band = at * MODE_BANDS // self.throughput.wavelength_nm.size
+        return np.asarray(self.fitted_throughput[at] * (band == np.arange(MODE_BANDS)[:, None]))
+
+    def _covariance(self, at: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the covariance of log throughput at some pixels and of the logarithms of the values in `CALIBRATED`.
+
+        Counts determine the product of gain and throughput. Frames without light give the sum of dark counts and bias,
+        and of the variances of dark and read noise, so that an error of the bias changes dark current and read noise.
+        The throughput of a pixel is known better than its wavelength.
+        """
+        f, t, d, n, now = self.throughput, self.transfer, self.dark, self.nominal, self.changes
+        count, m = at.size, len(f.joint) - f.wavelength_nm.size
+        place = {name: count + k for k, name in enumerate(CALIBRATED)}
+        of_light = np.eye(count + len(CALIBRATED), count + m)
+        of_light[count:] = 0.0
+        if m >= 2:
+            half = np.ptp(f.wavelength_nm) / 2
+            slope = np.gradient(np.log(self.fitted_throughput), f.wavelength_nm)[at]
+            of_light[:count, count] = -slope
+            of_light[:count, count + 1] = -slope * (f.wavelength_nm[at] - f.wavelength_nm.mean()) / half
+            first = (n.pixel_zero_nm - f.wavelength_nm.mean()) / half
+            of_light[place["pixel_zero_nm"], count : count + 2] = np.array([1.0, first]) / now["pixel_zero_nm"]
+            of_light[place["dispersion_nm_per_pixel"], count + 1] = (
+                n.dispersion_nm_per_pixel / half / now["dispersion_nm_per_pixel"]
+            )
+        if m == 4:
+            of_light[place["gaussian_fwhm_nm"], count + 2] = n.gaussian_fwhm_nm / now["gaussian_fwhm_nm"]
+        chosen = np.concatenate([at, np.arange(f.wavelength_nm.size, len(f.joint))])
+        joint = f.joint[np.ix_(chosen, chosen)]
+        joint[:count, :count] -= t.relative_gain_error**2
+        covariance = of_light @ joint @ of_light.T
+        of_transfer = np.zeros((len(covariance), 2))
+        of_transfer[:count, 1] = -1 / t.noise.gain
+        of_transfer[place["conversion_uv_per_electron"], 1] = 1 / t.noise.gain
+        read = 0.0 if "read noise" in t.assumed else 0.5 / t.read_noise_dn**2
+        of_transfer[place["read_noise_dn"], 0] = read
+        covariance += of_transfer @ t.covariance @ of_transfer.T
+        if "dark current" not in d.assumed:
+            of_dark = np.zeros((len(covariance), 3))
+            of_dark[place["read_noise_dn"], 0] = read * t.noise.dark_factor
+            # From the logarithm of the level at the reference to that at 0 deg C.
+            of_dark[place["dark_scale_dn_per_s"], 1:] = 1 / d.level_dn_per_s.mean(), -d.reference_c
+            of_dark[place["dark_slope_per_c"], 2] = 1 / d.slope_per_c
+            covariance += of_dark @ d.shared @ of_dark.T
+        return np.asarray(covariance)
+
+    def instrument_toml(self) -> bytes:
+        """Return the content of the instrument file."""
+        import tomli_w
+
+        given = self.study.observation.instrument
+        extends = given if given in shipped_names() else str(Path(given).resolve())
+        values: dict[str, Any] = {"extends": extends, "name": self.name, "notice": self.notice}
+        values |= {key: {"value": value, "tag": "C", "source": self.source} for key, value in self.changes.items()}
+        values |= {"throughput_factor": "throughput-factor.ecsv", "throughput_errors": "throughput-errors.ecsv",
+                   "pixel_map": "pixel-map.ecsv"}  # fmt: skip
+        return tomli_w.dumps(values).encode()
+
+    @property
+    def documents(self) -> dict[str, Callable[[], bytes]]:
+        """The instrument file, alone and with the tables that it names, in addition to those of every answer."""
+        return super().documents | {"instrument.toml": self.instrument_toml, "instrument.zip": self.instrument_zip}
+
+    def instrument_zip(self) -> bytes:
+        """Return an archive of the instrument file and of the tables that it names."""
+        out = io.BytesIO()
+        with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("instrument.toml", self.instrument_toml())
+            for name, table in self.instrument_tables.items():
+                archive.writestr(f"{name}.ecsv", ecsv_text(table))
+        return out.getvalue()
+
+
+@validated
+def calibrate(
+    study: Study,
+    engine: Engine | Pool | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    *,
+    frames: tuple[Frames, ...] | None = None,
+    stars: tuple[Source | None, ...] | None = None,
+) -> CalibrateAnswer:
+    """Fit an instrument to raw frames of standard stars and to frames without light.
+
+    Parameters
+    ----------
+    study : Study
+        Its ``calibrate`` lists the observations, and its observation names the instrument from which the fit starts.
+    engine, progress : optional
+        Not used: nothing is drawn on a device.
+    frames : tuple of Frames, optional
+        Frames in memory, in place of the files of the observations, in their order.
+    stars : tuple of Source or None, optional
+        Spectra in memory, in place of those of the observations; None for frames without light.
+    """
+    asked = study.calibrate
+    if not any(observation.library or observation.spectrum for observation in asked.observations):
+        raise InputError("no observation of a standard star is given",
+                         "calibrate.observations with library or spectrum", key="calibrate.observations")  # fmt: skip
+    for name, given in (("frames", frames), ("stars", stars)):
+        if given is not None and len(given) != len(asked.observations):
+            raise InputError.of(name, len(given), f"{len(asked.observations)}, one for each observation")
+    nominal = study.observation.load_instrument()
+    read = frames or tuple(
+        read_frames(observation.frames, observation.mapping, raw=True) for observation in asked.observations
+    )
+    sources = stars or tuple(observation.source() for observation in asked.observations)
+    observations = tuple(
+        CalibrationFrames.of(given, nominal, star, one.temperature_c)
+        for given, star, one in zip(read, sources, asked.observations, strict=True)
+    )
+    for k, one in enumerate(observations):
+        if not one.usable(nominal).any():
+            raise InputError.of("observations", one.name, "frames with a pixel below saturation")
+        if any(np.array_equal(one.raw_dn, other.raw_dn) for other in observations[:k]):
+            raise InputError.of("observations", one.name, "frames that no other observation has")
+    lit = [observation for observation in observations if observation.star is not None]
+    without = [observation for observation in observations if observation.star is None]
+    dark = assumed_dark(nominal, nominal.wavelength_nm.size)
+    if without:
+        dark = fit_dark(without, nominal, NoiseModel.nominal(nominal))
+    transfer = fit_photon_transfer(_variances(observations, dark, nominal), nominal)
+    if without:
+        dark = fit_dark(without, nominal, transfer.noise)
+        error = float(np.sqrt(dark.shared[0, 0]))
+        transfer = fit_photon_transfer(_variances(observations, dark, nominal), nominal, error)
+    throughput = fit_throughput(
+        lit, nominal, dark, transfer, knots=asked.knots, sky=study.sky.sky(), order=study.observation.order,
+        light_error=asked.light_error, spectrum_error=asked.spectrum_error,
+    )  # fmt: skip
+    return CalibrateAnswer(study, nominal, observations, dark, transfer, throughput)
+
+
+def _variances(
+    observations: tuple[CalibrationFrames, ...], dark: DarkFit, nominal: Instrument
+) -> list[MeasuredVariance]:
+    """Measure the variances of all observations, of dark frames apart for each temperature."""
+    found = []
+    for observation in observations:
+        usable = observation.usable(nominal)
+        breaks = np.flatnonzero(np.abs(np.diff(observation.temperature_c)) > SAME_TEMPERATURE_C) + 1
+        for part in np.split(np.arange(observation.n_frames), breaks if observation.star is None else []):
+            if part.size < 3:
+                continue
+            same = replace(observation, raw_dn=observation.raw_dn[part], temperature_c=observation.temperature_c[part])
+            mean = dark.mean_dn(same)
+            light = np.zeros(mean.size) if observation.star is None else same.raw_dn.mean(axis=0) - mean
+            found.append(measured_variance(same.raw_dn, light, mean - dark.bias_dn, usable))
+    return found

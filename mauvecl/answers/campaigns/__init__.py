@@ -1,1 +1,0 @@
-"""Answers about campaigns: visibility of targets, and expected flares."""

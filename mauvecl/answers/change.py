@@ -1,0 +1,336 @@
+"""Smallest detectable changes of stars between visits, line indices, and periods that are recovered."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.answers.answer import Answer, InCell, TableOf, reported
+from mauvecl.host.orbit.visibility import Visibility
+from mauvecl.observations.visits import (
+    INDICES,
+    Change,
+    IndexValue,
+    Recovery,
+    Smallest,
+    covered_indices,
+    error_of_change,
+    error_of_index,
+    flux_per_dn,
+    pixels_of,
+    recover_periods,
+    smallest_change,
+    visit_times_d,
+)
+from mauvecl.schema.calls import validated
+from mauvecl.schema.columns import Column, View, number, percent
+from mauvecl.study.cases import Case, cases, collect_messages
+from mauvecl.study.plan import targets_of
+
+if TYPE_CHECKING:
+    from mauvecl.device.engine import Engine
+    from mauvecl.host.exposure.expectation import Expectation
+    from mauvecl.host.stars.source import Source
+    from mauvecl.runs.pool import Pool
+    from mauvecl.study.cases import Use
+    from mauvecl.study.study import Study
+
+#: Magnitudes around that of the star at which changes are computed.
+MAGNITUDES = np.arange(-4.0, 4.01, 0.5)
+#: Semi-amplitudes of the map of periods, in standard errors of a visit.
+AMPLITUDES = (0.4, 4.0)
+
+
+@dataclass(frozen=True, eq=False)
+class ChangeRow(InCell):
+    """One change of one star."""
+
+    change: Change
+    # error, error_known: standard error of one visit, with unknowns marginalised over and with everything known.
+    error: float
+    error_known: float
+    smallest: Smallest  # in the unit of the change
+    magnitude: float | None  # of the star
+    saturated: tuple[int, int]  # pixels near saturation, and all that the change concerns
+
+    @property
+    def hidden(self) -> bool:
+        """Whether what is unknown hides the change."""
+        return bool(np.isinf(self.error) and np.isfinite(self.error_known))
+
+    @property
+    def note(self) -> str:
+        """What limits the row, in a few words."""
+        lost, every = self.saturated
+        notes = [_lost_pixels(lost, every)] if lost else []
+        if not every:
+            notes.append("no light")
+        if self.hidden:
+            notes.append("hidden by what is unknown")
+        return "; ".join(notes)
+
+
+@dataclass(frozen=True, eq=False)
+class IndexRow(InCell):
+    """One line index of one star, with its errors in one exposure."""
+
+    value: IndexValue
+    error: float
+    error_known: float
+    wavelength_nm: NDArray[np.float64]  # of the pixels
+    flux: NDArray[np.float64]  # mean of the exposure, erg s-1 cm-2 nm-1
+    saturated: tuple[int, int]  # pixels near saturation, and all of the index
+
+    @property
+    def note(self) -> str:
+        """Why the index has no value; empty if it has one."""
+        lost, every = self.saturated
+        return _lost_pixels(lost, every) if lost else ""
+
+    @property
+    def snr(self) -> float:
+        """Index over its error; negative in absorption."""
+        return self.value.value / self.error_known
+
+
+@dataclass(frozen=True, eq=False)
+class PeriodRow(InCell):
+    """Recovered periods of one change of one star."""
+
+    change: Change
+    error: float
+    recovery: Recovery
+
+    def shares(self, end: str) -> NDArray[np.float64]:
+        """Return the recovered shares or the ends of their intervals, shape (n_amplitude, n_period)."""
+        return np.array([[getattr(share, end) for share in row] for row in self.recovery.recovered])
+
+
+def _lost_pixels(lost: int, every: int) -> str:
+    return "every pixel saturates" if lost == every else f"{lost} of {every} pixels saturate"
+
+
+def _amount(value: float, unit: str) -> str:
+    if np.isnan(value):
+        return ""
+    if np.isinf(value):
+        return "hidden"
+    return f"{100 * value:.3g} %" if not unit else f"{value:.3g} {unit}"
+
+
+#: Columns of the table of changes.
+COLUMNS = (
+    Column("change", "change.name", "", "what changes", "change", kind=str),
+    Column("unit", "change.unit", "", "unit of the change and its errors; empty if relative", kind=str),
+    Column("error", "error", "", "standard error of one visit, unknowns marginalised; inf: hidden by them; nan: none",
+           "error of a visit", _amount, ("unit",)),
+    Column("error_known", "error_known", "", "the same with everything known", "all known", _amount, ("unit",)),
+    Column("smallest", "smallest.one", "", "smallest detected difference of one visit from the others",
+           "smallest change", _amount, ("unit",)),
+    Column("smallest_scatter", "smallest.scatter", "", "smallest detected standard deviation between visits",
+           "smallest scatter", _amount, ("unit",)),
+    Column("meaning", "change.meaning", "", "what a change of one unit is", "of", kind=str),
+    Column("note", "note", "", "what limits the row: saturated pixels or unknowns", "note", kind=str),
+)  # fmt: skip
+#: Columns of the table of indices.
+INDEX_COLUMNS = (
+    Column("index", "value.index.name", "", "line or lines", "index", kind=str),
+    Column("flux", "value.value", "erg / (s cm2)", "flux in the band above the continuum; absorption is negative",
+           "flux", number(".3g")),
+    Column("error", "error", "erg / (s cm2)", "standard deviation in one exposure with unknowns of finite spread; inf: "
+           "a free unknown changes it", "error", lambda value: "free" if np.isinf(value) else number(".2g")(value)),
+    Column("error_known", "error_known", "erg / (s cm2)", "the same with everything known", "all known",
+           number(".2g")),
+    Column("snr", "snr", "", "index over its error with everything known", "S/N, all known", number(".3g")),
+    Column("equivalent_width", "value.equivalent_width_nm", "nm", "positive in emission", "EW (nm)", number(".3g")),
+    Column("captured", "value.captured", "", "share of a line's flux that the index holds at this resolution",
+           "captured", percent(".0f")),
+    Column("band_low", lambda row: row.value.index.band_nm[0], "nm", "lower end of the band"),
+    Column("band_high", lambda row: row.value.index.band_nm[1], "nm", "upper end"),
+    Column("published", "value.index.published", "", "usual definition at higher resolution, with its source",
+           kind=str),
+    Column("note", "note", "", "saturated pixels of the index, which has no value then", "note", kind=str),
+)  # fmt: skip
+#: Columns of the changes against magnitude.
+MAGNITUDE_COLUMNS = (Column("magnitude", "magnitude", "mag", "of the star in its band"), *COLUMNS[:2], COLUMNS[4])
+#: Columns of the recovered periods.
+PERIOD_COLUMNS = (
+    Column("change", "change.name", "", "what varies", "change", kind=str),
+    Column("unit", "change.unit", "", "of the amplitude; empty if relative", kind=str),
+    Column("period", "recovery.periods_d", "d", "of the sinusoid", "period (d)", number(".3g")),
+    Column("amplitude", lambda row: row.error * row.recovery.amplitudes[:, None], "", "semi-amplitude",
+           "semi-amplitude", _amount, ("unit",)),
+    Column("amplitude_errors", lambda row: row.recovery.amplitudes[:, None], "",
+           "the same in standard errors of a visit", "in errors", ".3g"),
+    Column("recovered", lambda row: row.shares("value"), "", "share of periods that are recovered", "recovered",
+           percent(".0f")),
+    Column("recovered_low", lambda row: row.shares("low"), "", "its 95 % interval, lower end"),
+    Column("recovered_high", lambda row: row.shares("high"), "", "upper end"),
+)  # fmt: skip
+
+
+def _title(answer: ChangeAnswer) -> str:
+    study, visits = answer.study, answer.study.change.visits
+    return (
+        f"Smallest changes between {'two' if visits == 2 else visits} visits of {study.observation.exposure_s:g} s, at "
+        f"a false-alarm probability of {study.run.fap:g} and a power of {study.limit.power:g}"
+    )
+
+
+def _probabilities(answer: ChangeAnswer) -> dict[str, object]:
+    study = answer.study
+    return {"visits": study.change.visits, "fap": study.run.fap, "power": study.limit.power}
+
+
+@dataclass(frozen=True, eq=False)
+class ChangeAnswer(Answer):
+    """Answer of `change`."""
+
+    USES = ("instrument", "sky", "nuisances")
+
+    study: Study
+    changes: list[ChangeRow]  # every change of every star in every cell of the sweep
+    indices: list[IndexRow]
+    along: list[ChangeRow]  # changes of stars at other magnitudes
+    periods: list[PeriodRow]  # empty unless the study asks for them
+    expectations: list[Expectation]
+
+    #: One row per star, cell and change.
+    table = TableOf("change", COLUMNS, "changes", place=True, title=_title, key="rows", about=_probabilities)
+    #: One row per star, cell and line index.
+    index_table = TableOf(
+        "indices", INDEX_COLUMNS, "indices", place=True, key="indices", study=False,
+        title=lambda answer: f"Line indices in {answer.study.observation.exposure_s:g} s",
+    )  # fmt: skip
+    #: One row per star, cell, change and magnitude.
+    magnitude_table = TableOf("magnitudes", MAGNITUDE_COLUMNS, "along", place=True, study=False,
+                              when=lambda answer: answer.along)  # fmt: skip
+    #: One row per star, cell, change, amplitude and period.
+    period_table = TableOf(
+        "periods", PERIOD_COLUMNS, "periods", place=True, study=False, when=lambda answer: answer.periods,
+        about=lambda answer: {"fap": answer.study.change.period_fap},
+    )  # fmt: skip
+
+    @property
+    def uses(self) -> tuple[Use, ...]:
+        """Parts of the study that this answer uses: orbit and seed only for periods."""
+        return (*self.USES, "orbit", "seed") if self.periods else self.USES
+
+    @property
+    def many(self) -> int:
+        """Number of stars at other magnitudes: all with a magnitude, in every cell of the sweep."""
+        return len(self.along) // (MAGNITUDES.size * len(self.study.change.of))
+
+    @property
+    def views(self) -> list[View]:
+        if not self.periods:
+            return super().views
+        name = self.periods[0].change.name
+        title = f"Periods of {name} that {self.study.change.visits} visits recover"
+        first = self.period_table[self.period_table["change"] == name]
+        return [*super().views, ChangeAnswer.period_table.view(self, title, first)]
+
+    @property
+    def messages(self) -> list[str]:
+        lines = collect_messages(self.expectations)
+        hidden = dict.fromkeys(f"{row.title}: {row.change.name}" for row in self.changes if row.hidden)
+        lines += [f"HIDDEN by what is unknown: {text}." for text in hidden]
+        left = [name for name in INDICES if name not in {row.value.index.name for row in self.indices}]
+        if left:
+            lines.append(f"The pixels do not cover the line indices {', '.join(left)}.")
+        lines.append(
+            "Bands of the line indices are wider than published ones, since Mauve resolves 13 nm: their widths are an "
+            "assumption; the table of indices names the published ones."
+        )
+        return lines
+
+    @property
+    def inputs(self) -> list[Expectation]:
+        return self.expectations
+
+
+@validated
+def change(
+    study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
+) -> ChangeAnswer:
+    """Compute the smallest changes of a study's stars between visits that are detected.
+
+    Parameters
+    ----------
+    study : Study
+        Its ``change`` gives the changes and the number of visits, ``run.fap`` and ``limit.power`` the probabilities,
+        and ``nuisances`` the unknowns of each visit.
+    engine : Engine or Pool, optional
+        Not used: errors are closed forms, and periodograms are simulated on the host.
+    progress : callable, optional
+        Called as ``progress(done, total)`` in stars and cells of the sweep.
+
+    Examples
+    --------
+    >>> from mauvecl import Study, change
+    >>> settings = ["star=[{library='M3V', magnitude=9}]", "observation.exposure_s=600", "change.of=['200-320']"]
+    >>> answer = change(Study().with_settings(settings))
+    >>> answer.table["change"].tolist()
+    ['200-320']
+    """
+    asked = study.change
+    file = asked.light()
+    prepared = cases(study)
+    times = _visits(study) if asked.periods else None
+    rows, indices, along, periods = [], [], list[ChangeRow](), []
+    for case in reported(prepared, len(prepared), progress):
+        own = _changes(case, file)
+        rows += own
+        indices += _indices(case)
+        magnitude = case.star.magnitude
+        if magnitude is not None:
+            for step in MAGNITUDES:
+                along += _changes(case.with_value("magnitude", float(magnitude + step)), file)
+        if times is not None:
+            recovery = recover_periods(
+                times, np.geomspace(asked.shortest_d, asked.longest_d, asked.steps),
+                np.geomspace(*AMPLITUDES, asked.steps), fap=asked.period_fap, trials=asked.trials, seed=study.run.seed,
+            )  # fmt: skip
+            # The recovery depends on the amplitude in errors alone, so that one map serves all changes.
+            periods += [PeriodRow(row.label, row.at, row.change, row.error, recovery)
+                        for row in own if not np.isnan(row.error)]  # fmt: skip
+    return ChangeAnswer(study, rows, indices, along, periods, [case.quiet for case in prepared])
+
+
+def _changes(case: Case, file: Source | None) -> list[ChangeRow]:
+    """Return the smallest detectable changes of a case's star."""
+    study, quiet, unknown = case.study, case.quiet, case.unknowns()
+    unit = smallest_change(1.0, study.change.visits, study.run.fap, study.limit.power)
+    rows = []
+    for name in study.change.of:
+        one = Change.named(name, case.source, quiet, case.instrument, study.observation.order, file, study.change.band)
+        error, known = error_of_change(one.counts_dn, quiet, unknown), error_of_change(one.counts_dn, quiet, None)
+        smallest = Smallest(one.size(error * unit.one), one.size(error * unit.scatter))
+        lost, own = pixels_of(one.counts_dn, quiet), (one.size(error), one.size(known))
+        rows.append(ChangeRow(case.label, case.at, one, *own, smallest, case.star.magnitude, lost))
+    return rows
+
+
+def _indices(case: Case) -> list[IndexRow]:
+    quiet, unknown = case.quiet, case.unknowns()
+    rows = []
+    for index in covered_indices(quiet):
+        value = IndexValue.of(index, quiet, case.instrument, case.study.observation.order)
+        error, known = (error_of_index(value.weights, quiet, one) for one in (unknown, None))
+        lost = pixels_of(value.weights, quiet)
+        if lost[0]:
+            value = replace(value, value=np.nan, equivalent_width_nm=np.nan)
+        flux = flux_per_dn(quiet, case.instrument) * quiet.signal_dn
+        rows.append(IndexRow(case.label, case.at, value, error, known, quiet.wavelength_nm, flux, lost))
+    return rows
+
+
+def _visits(study: Study) -> NDArray[np.float64]:
+    """Draw the times of visits to the first target of a study's orbit."""
+    o, target = study.orbit, targets_of(study.orbit, study.plan)[0]
+    seen = Visibility.of(o.orbit().track(o.times()), np.array([target.direction]), o.limits)
+    return visit_times_d(seen.windows(0), study.change.visits, study.observation.exposure_s, study.run.seed)

@@ -1,0 +1,357 @@
+"""Closed forms of detections with unknowns of the instrument, and what each unknown costs.
+
+The instrument will be calibrated before observers choose reference and threshold, but is unknown when a proposal is
+written. Each draw of the unknown values therefore has its own reference and threshold, and detection probabilities are
+averaged over draws.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+from scipy.interpolate import PchipInterpolator
+
+from mauvecl.detection.distributions import CONFIDENCE, Gaussian, Interval
+from mauvecl.detection.names import MIN_IN_TAIL
+from mauvecl.detection.nuisances import Nuisances, join_names
+from mauvecl.detection.statistics import Matched, Setting
+from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, NUISANCES, PROCESSES, Amplitude, ThroughputMode, values_of
+from mauvecl.schema.columns import Column, First
+from mauvecl.schema.errors import InputError, Message
+from mauvecl.study.cases import Case
+from mauvecl.study.nuisances import NuisanceChoice
+
+if TYPE_CHECKING:
+    from mauvecl.detection.distributions import Form
+    from mauvecl.host.exposure.expectation import Expectation
+    from mauvecl.host.instrument.instrument import Instrument
+    from mauvecl.noise.comparison import Comparison
+    from mauvecl.noise.disturbances import Prior
+    from mauvecl.study.study import Study
+
+
+@dataclass(frozen=True)
+class Cost:
+    """S/N of a flare by the matched statistic."""
+
+    of: str  # star and flare
+    known: float  # with everything known
+    plain: float  # with unknowns that scatter the statistic, which ignores them
+    marginal: float  # with a statistic that is marginalised over them
+
+
+def unknown_cost(
+    of: str, quiet: Expectation, flare: Expectation, nuisances: NuisanceChoice, comparison: Comparison
+) -> Cost:
+    """Return the S/N of a flare with and without unknowns, or with the documented ones if none are given.
+
+    `of` names star and flare.
+    """
+    chosen, used, matched = _or_documented(nuisances), ~quiet.saturated, Matched()
+    unknown = chosen.marginalised(quiet)
+    plain = Setting(quiet, used, comparison)
+    delta = np.where(used, flare.recorded_light_dn - quiet.recorded_light_dn, 0.0)
+    if unknown is None or not delta.any():
+        return Cost(of, 0.0, 0.0, 0.0)
+    weights = matched.plain_weights(plain, flare)
+    known = float(weights @ delta)
+    spread = scatter(unknown, usual=chosen.usual) * np.abs(unknown.spectra @ weights)
+    try:
+        marginal = matched.weights_per_dn(Setting(quiet, used, comparison, nuisances=unknown), flare)
+    except InputError:
+        # The flare has the spectrum of an unknown.
+        marginal = np.zeros_like(weights)
+    return Cost(of, known, float(known / np.sqrt(1.0 + np.sum(spread**2))), float(marginal @ delta))
+
+
+def scatter(unknown: Nuisances, *, usual: bool) -> NDArray[np.float64]:
+    """Return the standard deviations of nuisance amplitudes, shape (k,): as drawn by default, or else of the prior."""
+    drawn = {row.name: row.scatter for row in DOCUMENTED_NUISANCES if usual}
+    return np.array(
+        [drawn.get(name, sd) if np.isinf(sd) else sd for name, sd in zip(unknown.names, unknown.sd, strict=True)]
+    )
+
+
+def cost_lines(costs: Sequence[Cost], nuisances: NuisanceChoice) -> list[str]:
+    """Return a sentence on the faintest flare, or none if no flare has a signal."""
+    shown = [cost for cost in costs if cost.known > 0]
+    if not shown:
+        return []
+    faintest = min(shown, key=lambda cost: cost.known)
+    named = nuisances != NuisanceChoice()
+    which = spoken(nuisances) if named else f"the usual unknowns ({spoken(_or_documented(nuisances))})"
+    others = f", the faintest of {len(shown)}," if len(shown) > 1 else ""
+    text = (
+        f"What unknowns cost: {faintest.of}{others} has a matched S/N of {faintest.known:.3g} with everything known; "
+        f"with {which} it is {faintest.plain:.2g} by the plain statistic and {faintest.marginal:.3g} marginalised "
+        "(closed forms)."
+    )
+    return [Message(text, "cost of unknowns")]
+
+
+def marginal_lines(nuisances: NuisanceChoice) -> list[str]:
+    """Return a sentence on what statistics are marginalised over and which unknowns are drawn, or none."""
+    if nuisances == NuisanceChoice():
+        return []
+    texts = [PROCESSES[row.process].drawn for row in DOCUMENTED_NUISANCES]
+    drawn = f"; drawn: {'; '.join(texts)}" if nuisances.usual else ""
+    return [f"Statistics are marginalised over {spoken(nuisances)}{drawn}."]
+
+
+def spoken(choice: NuisanceChoice) -> str:
+    """Return the unknowns as text, such as "the dark level (+-0.5 deg C) and the light level (free)"."""
+    documented = DOCUMENTED_NUISANCES if choice.usual else ()
+    sd: dict[str, float | str] = {row.name: row.prior.sd for row in documented if isinstance(row.prior, Amplitude)}
+    sd |= choice.spreads()
+    sizes = [f"{NUISANCES[name].label} ({_size(value, NUISANCES[name].unit)})" for name, value in sd.items()]
+    return join_names(sizes + [f"{name!r} ({_size(one.sd, '')})" for name, one in choice.own.items()])
+
+
+def _size(sd: float | str, unit: str) -> str:
+    if sd in ("free", float("inf")):
+        return "free"
+    return f"+-{100 * float(sd) if unit == '%' else float(sd):g} {unit}".rstrip()
+
+
+def _or_documented(nuisances: NuisanceChoice) -> NuisanceChoice:
+    return nuisances if nuisances != NuisanceChoice() else NuisanceChoice(usual=True)
+
+
+#: Kind of the message.
+BOTH_CHANCES = "chance with unknowns"
+#: Largest number of flares of which the most uncertain is looked for.
+MAX_FLARES = 100
+
+
+def chance_with_unknowns(prepared: Sequence[Case]) -> list[str]:
+    """Return a sentence on the chance with and without the usual unknowns, or none if the study has unknowns.
+
+    The flare is the one whose chance is nearest to one half; others are detected, or missed, either way.
+    """
+    study = prepared[0].study
+    if study.nuisances != NuisanceChoice() or study.run.comparison().estimated:
+        return []
+    flares = [(case, flare) for case in prepared for flare in range(len(case.amplitudes))][:MAX_FLARES]
+    known = {item: chance for item in flares if (chance := _chance(*item)) is not None}
+    if not known:
+        return []
+    case, flare = min(known, key=lambda item: abs(known[item] - 0.5))
+    of = f"{case.label}, flare of {100 * case.amplitudes[flare]:g} %"
+    try:
+        unknown = _chance(case.with_sections(nuisances=NuisanceChoice(usual=True)), flare)
+    except InputError as error:
+        # Too few pixels are left.
+        return [Message(f"The usual unknowns cannot be taken into account for {of}: {error}.", BOTH_CHANCES)]
+    if unknown is None:
+        return []
+    text = (
+        f"Everything but the noise is taken as known: {of} is then detected by the matched statistic with a chance of "
+        f"{100 * known[case, flare]:.1f} %, with the usual unknowns of {100 * unknown:.1f} % (closed forms; "
+        f"`nuisances.usual` draws them). These are {spoken(NuisanceChoice(usual=True))}."
+    )
+    return [Message(text, BOTH_CHANCES)]
+
+
+def _chance(case: Case, flare: int) -> float | None:
+    """Return the closed-form chance of a flare by the matched statistic, or None if everything saturates."""
+    peak = case.flares[flare]
+    setting = case.setting(case.quiet, peak)
+    if not setting.used.any() or peak.saturated[setting.used].all():
+        return None
+    return Matched().detection_forms(setting, peak, case.study.run.fap).probability
+
+
+Float = NDArray[np.float64]
+
+#: Name of the variance that no unknown explains linearly.
+REST = "the rest"
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnStudies:
+    """Draws of unknown instrument values."""
+
+    names: tuple[str, ...]
+    labels: tuple[str, ...]
+    values: Float  # shape (n_draw, n_name)
+    studies: tuple[Study, ...]  # the study with each draw's instrument, without unknowns, and its share of realisations
+
+    @property
+    def by_name(self) -> dict[str, Float]:
+        """Drawn values of each unknown."""
+        return dict(zip(self.names, self.values.T, strict=True))
+
+
+def drawn(study: Study) -> DrawnStudies:
+    """Draw instrument values from a study's priors, as a Latin hypercube with the study's seed.
+
+    Raises InputError if a prior includes values that the instrument cannot have, or nothing is unknown.
+    """
+    from scipy.stats import qmc
+
+    asked = study.unknowns
+    nominal = study.observation.load_instrument()
+    rows, priors = values_of(nominal), _unknown_priors(study, nominal)
+    sequence = qmc.LatinHypercube(len(priors), rng=np.random.default_rng(study.run.seed))
+    even = sequence.random(asked.draws)
+    values = np.column_stack([prior.quantile(even[:, k]) for k, prior in enumerate(priors.values())])
+    run = study.run.model_copy(update={"realisations": realisations_each(study)})
+    certain = study.model_copy(update={"unknowns": type(asked)(), "run": run})
+    studies = []
+    for row in values:
+        changes: dict[str, Any] = {}
+        at = nominal
+        for name, value in zip(priors, row, strict=True):
+            one = rows[name].changes(at, float(value))
+            changes |= one
+            # The next mode is added to those before it.
+            at = at.model_copy(update=one) if isinstance(rows[name], ThroughputMode) else at
+        changed = certain.with_instrument(changes)
+        try:
+            nominal.with_(**changes)
+        except InputError as error:
+            raise error.within("the priors of unknown values include impossible ones") from error
+        studies.append(changed)
+    return DrawnStudies(tuple(priors), tuple(rows[name].label for name in priors), values, tuple(studies))
+
+
+def throughput_cases(case: Case) -> list[Case]:
+    """Return the case with each mode of its calibration at one standard deviation; empty if it has none.
+
+    The sign of a mode is arbitrary; it is chosen so that the same pixels lie in the output range. Raises InputError if
+    the wavelengths are not known well enough for that.
+    """
+    moved, pixels = [], case.instrument.read_pixels
+    for mode in values_of(case.instrument).values():
+        if isinstance(mode, ThroughputMode):
+            signs = (replace(case, study=case.study.with_instrument(mode.changes(case.instrument, x))) for x in (1, -1))
+            same = next((one for one in signs if one.instrument.read_pixels == pixels), None)
+            if same is None:
+                raise InputError(
+                    "an error of the calibrated wavelengths changes the pixels of the output range",
+                    "an output range that ends further from a pixel",
+                    key="observation.instrument",
+                )
+            moved.append(same)
+    return moved
+
+
+def _unknown_priors(study: Study, nominal: Instrument) -> dict[str, Prior]:
+    """Return the priors of unknown values of a study's instrument; values that the study sets are known."""
+    o = study.observation
+    known = {*o.changes, *(() if o.temperature_c is None else ("temperature_c",))}
+    priors = {name: prior for name, prior in study.unknowns.priors(nominal).items() if name not in known}
+    if study.unknowns.draws and not priors:
+        raise InputError("no instrument value is unknown", "a prior, or unknowns.draws = 0", key="unknowns.draws")
+    return priors
+
+
+def realisations_each(study: Study) -> int:
+    """Return the realisations per draw: an equal share, but enough to count the threshold of each draw."""
+    run, draws = study.run, int(study.unknowns.draws)
+    fewest = int(np.ceil(MIN_IN_TAIL / run.fap)) if run.tails == "counted" else 1000
+    return max(run.realisations // draws, fewest)
+
+
+def average(intervals: Sequence[Interval]) -> Interval:
+    """Return the mean of probabilities over draws, with a 95 % interval for their own errors and the number of draws.
+
+    The interval assumes independent draws and is therefore conservative for a Latin hypercube.
+    """
+    values = np.array([p.value for p in intervals])
+    own = np.array([p.high - p.low for p in intervals]) / 2
+    reach = float(special.ndtri(0.5 + CONFIDENCE / 2))
+    spread = values.std(ddof=1) / np.sqrt(values.size) if values.size > 1 else 0.0
+    half = float(np.hypot(reach * spread, np.sqrt(np.sum(own**2)) / values.size))
+    mean = float(values.mean())
+    return Interval(mean, max(mean - half, 0.0), min(mean + half, 1.0))
+
+
+def shares(draws: DrawnStudies, outcome: Float) -> dict[str, float]:
+    """Return the share of an outcome's variance that each unknown explains, largest first, and the unexplained rest.
+
+    A share is the mean increase of the explained variance when the unknown is added to a linear fit, over all orders of
+    adding them (Lindeman, Merenda & Gold 1980; Groemping 2007, doi 10.1198/000313007X188252). Shares from single slopes
+    would count variance twice, since a few draws are correlated by chance.
+
+    Parameters
+    ----------
+    draws : DrawnStudies
+    outcome : ndarray, shape (n_draw,)
+    """
+    names, kept = draws.names, np.isfinite(outcome)
+    x, y = draws.values[kept], outcome[kept]
+    if len(y) <= x.shape[1] + 1 or y.std() == 0.0:
+        return dict.fromkeys((*names, REST), float("nan"))
+    scaled = (x - x.mean(axis=0)) / x.std(axis=0)
+    explained = {(): 0.0} | {
+        some: _explained(scaled[:, some], y)
+        for size in range(1, len(names) + 1)
+        for some in itertools.combinations(range(len(names)), size)
+    }
+    share = np.zeros(len(names))
+    for some, value in explained.items():
+        for k in set(range(len(names))) - set(some):
+            # Fraction of orders in which exactly these precede unknown k.
+            weight = 1.0 / (len(names) * math.comb(len(names) - 1, len(some)))
+            share[k] += weight * (explained[tuple(sorted((*some, k)))] - value)
+    parts = {names[k]: float(share[k]) for k in np.argsort(-share)}
+    return parts | {REST: 1.0 - explained[tuple(range(len(names)))]}
+
+
+def _explained(x: Float, y: Float) -> float:
+    """Return the share of the variance that a linear fit explains."""
+    straight = np.column_stack([x, np.ones(len(y))])
+    left = y - straight @ np.linalg.lstsq(straight, y, rcond=None)[0]
+    return float(1.0 - left.var() / y.var())
+
+
+#: Unknowns whose shares of a scatter are named, at most.
+MAX_NAMED = 3
+
+
+def describe_shares(shares: Mapping[str, float]) -> str:
+    """Return the largest shares of a scatter in words, and how many there are."""
+    first = First(shares.items(), MAX_NAMED, "unknowns")
+    note = f" ({first.note})" if first.note else ""
+    return ", ".join(f"{name} {100 * share:.0f} %" for name, share in first) + note
+
+
+def draw_columns(draws: DrawnStudies) -> tuple[Column, ...]:
+    """Return the columns of the drawn values of unknowns, for rows with `draws`."""
+    return tuple(
+        Column(name, description=f"drawn {label}").of(lambda row: row.draws.by_name)
+        for name, label in zip(draws.names, draws.labels, strict=True)
+    )
+
+
+class InterpolatedForm:
+    """Closed form that is exact at some points and interpolated in the probit between them."""
+
+    def __init__(self, form: Form) -> None:
+        self.mean, self.std = form.mean, form.std
+        if isinstance(form, Gaussian):
+            self._probit: Any = lambda value: (form.mean - value) / form.std
+            self._inverse: Any = lambda probit: form.mean + form.std * probit
+            return
+        at = np.linspace(form.mean - 5 * form.std, form.mean + 6 * form.std, 14)
+        beyond = np.array([form.sf(value) for value in at])
+        # Probabilities that round to 0 or 1 have no finite probit.
+        kept = (beyond > 1e-12) & (beyond < 1 - 1e-12)
+        self._probit = PchipInterpolator(at[kept], special.ndtri(beyond[kept]), extrapolate=True)
+        self._inverse = PchipInterpolator(-special.ndtri(beyond[kept]), at[kept], extrapolate=True)
+
+    def sf(self, value: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the probabilities of exceeding values."""
+        return np.asarray(special.ndtr(self._probit(value)))
+
+    def isf(self, probability: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the values that are exceeded with given probabilities."""
+        return np.asarray(self._inverse(-special.ndtri(probability)))

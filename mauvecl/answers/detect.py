@@ -1,0 +1,446 @@
+"""Detection of flares: probabilities at a fixed rate of false alarms, with unknowns of the instrument."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from operator import itemgetter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from mauvecl.answers.answer import Answer, InCell, TableOf, realisations_of, reported, share_columns
+from mauvecl.answers.closed_forms import Cost, chance_with_unknowns, cost_lines, marginal_lines, spoken, unknown_cost
+from mauvecl.detection.detection import (
+    AREA_COLUMNS,
+    COLUMNS,
+    DEPARTURE_COLUMNS,
+    PAPER_G2V,
+    ROC_COLUMNS,
+    ROC_ROWS,
+    WHY,
+    Detection,
+    departure_table,
+    reconstruct,
+)
+from mauvecl.detection.distributions import QuadraticForm
+from mauvecl.detection.names import check_fap, countable
+from mauvecl.detection.statistics import Linear, Matched, Setting, read_weights
+from mauvecl.detection.tails import campaign, per_test
+from mauvecl.device.engine import Engine
+from mauvecl.runs.pool import Pool, map_in_order
+from mauvecl.schema.calls import validated
+from mauvecl.schema.columns import Column, View, percent
+from mauvecl.schema.errors import InputError
+from mauvecl.study.cases import Case, amplitude_column, cases, collect_messages, star_column
+from mauvecl.study.nuisances import NuisanceChoice
+from mauvecl.study.study import PAPER_STARS, Study
+
+if TYPE_CHECKING:
+    from mauvecl.host.exposure.expectation import Expectation
+    from mauvecl.study.questions import CampaignQuestion
+
+#: Largest number of rows of the tables of ROC curves and extremes, divided among flares.
+MOST_ROWS = 100_000
+
+
+@dataclass(frozen=True, eq=False)
+class StarDetection(InCell):
+    """A star in a cell of the sweep."""
+
+    amplitudes: tuple[float, ...]
+    detection: Detection
+
+    @property
+    def shown(self) -> tuple[str, Detection, list[str]]:
+        """Title, detection and names of the flares, for pictures."""
+        return self.title, self.detection, [f"flare {100 * amplitude:g} %" for amplitude in self.amplitudes]
+
+
+def _detection_columns(answer: DetectAnswer) -> tuple[Column, ...]:
+    amplitude = amplitude_column(
+        lambda star: np.repeat(star.amplitudes, len(star.detection.statistics)),
+        f"relative rise of the photons in the band {answer.study.flare.band}",
+    )
+    return (*share_columns(answer.study, "detection.quiet.target_share"), amplitude, *COLUMNS[1:])
+
+
+#: Columns of a statistic and of the flare that it looks at, before those of its curve or its extremes.
+FLARE_COLUMNS = (Column("statistic", description="detection statistic"), amplitude_column())
+TEMPLATE_COLUMN = Column("template", description="amplitude of the flare that the statistic looks for")
+
+
+@dataclass(eq=False)
+class DetectAnswer(Answer):
+    """Answer of `detect`."""
+
+    USES = ("instrument", "sky", "flare", "processes", "nuisances", "seed")
+
+    study: Study
+    stars: list[StarDetection]  # one per star and cell of the sweep
+    messages: list[str] = field(default_factory=list)  # messages for users, the most severe first
+    paper: list[str] = field(default_factory=list)  # comparison with the paper's values, if the study has its G2V star
+
+    #: One row per star, cell, flare and statistic.
+    table = TableOf(
+        "detection", _detection_columns, "stars", place=True, key="rows",
+        of=lambda answer, star: star.detection.table(answer.study.run.fap)[[column.name for column in COLUMNS[1:]]],
+    )  # fmt: skip
+    #: One row per star, cell and statistic, and per flare for shaped statistics; see `Departure`. The table is empty if
+    #: thresholds are not counted.
+    departures = TableOf(
+        "departures", DEPARTURE_COLUMNS, "stars", place=True, key="departures",
+        of=lambda answer, star: departure_table(star.detection, star.amplitudes, answer.study.run.fap),
+    )  # fmt: skip
+    #: All receiver operating characteristics with their areas; see `Roc`. Many flares share `MOST_ROWS` rows, so that
+    #: each curve has fewer than its 200.
+    roc = TableOf(
+        "roc", (*FLARE_COLUMNS, *ROC_COLUMNS, *(column.of(itemgetter("roc")) for column in AREA_COLUMNS)), "_curves",
+        place=True, about=realisations_of,
+    )  # fmt: skip
+    #: The extremes of every null (amplitude 0) and flare, with their realisations. Many flares share `MOST_ROWS` rows,
+    #: so that each distribution has fewer than its 1000.
+    tails = TableOf("tails", (*FLARE_COLUMNS, TEMPLATE_COLUMN), "_extremes", of=lambda _, row: row["tail"], place=True,
+                    about=lambda answer: {"seed": answer.study.run.seed})  # fmt: skip
+
+    @property
+    def views(self) -> list[View]:
+        run, quiet = self.study.run, [star.detection.quiet for star in self.stars]
+        exposures = " and ".join(dict.fromkeys(f"{x.exposure_s:g} s ({x.n_frames} frames)" for x in quiet))
+        title = (
+            f"Detection at a false-alarm probability of {run.fap:g} per test, {exposures}, {run.realisations:,} "
+            "realisations"
+        )
+        detected = DetectAnswer.table.view(self, title)
+        if not len(self.departures):
+            return [detected]
+        differing = self.departures[self.departures["differs"]]
+        if not len(differing):
+            line = (
+                f"At the thresholds for Gaussian noise the simulated false-alarm probability is {run.fap:g} within 4 "
+                "standard errors, for every statistic."
+            )
+            return [detected, View(line)]
+        title = (
+            "Where the simulation differs from the closed form: false-alarm probability at the threshold that should "
+            f"give {run.fap:g}"
+        )
+        return [detected, DetectAnswer.departures.view(self, title, differing)]
+
+    @property
+    def _curves(self) -> Iterator[dict[str, Any]]:
+        n_points = min(ROC_ROWS, self._row_limit(1))
+        for star in self.stars:
+            for statistic in star.detection.statistics:
+                for flare, amplitude in enumerate(star.amplitudes):
+                    roc = star.detection.roc(statistic, flare)
+                    place = {"statistic": statistic, "amplitude": amplitude, "roc": roc}
+                    yield vars(star) | place | roc.points(n_points)
+
+    @property
+    def _extremes(self) -> Iterator[dict[str, Any]]:
+        n_values = self._row_limit(2)
+        for star in self.stars:
+            detection = star.detection
+            for statistic in detection.statistics:
+                for flare, template in enumerate(star.amplitudes):
+                    samples = [(template, detection.tail_samples(statistic, flare))]
+                    if detection.statistic(statistic).shaped or flare == 0:
+                        samples.append((0.0, detection.tail_samples(statistic, template=flare)))
+                    for amplitude, tail in samples:
+                        place = {"statistic": statistic, "amplitude": amplitude, "template": template}
+                        yield vars(star) | place | {"tail": tail[:n_values]}
+
+    def _row_limit(self, n_tables: int) -> int:
+        """Return the number of rows of each curve or distribution, of which flares and statistics have `n_tables`."""
+        number = sum(len(star.detection.statistics) * len(star.amplitudes) for star in self.stars)
+        return max(MOST_ROWS // (n_tables * number), 2)
+
+    @property
+    def inputs(self) -> list[Expectation]:
+        return [x for star in self.stars for x in (star.detection.quiet, *star.detection.flares)]
+
+    @property
+    def remarks(self) -> list[str]:
+        """The comparison with the paper's values."""
+        return self.paper
+
+    def as_json(self) -> dict[str, Any]:
+        return {"paper": self.paper} | super().as_json()
+
+
+@validated
+def detect(
+    study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
+) -> DetectAnswer:
+    """Simulate the detection of every flare of a study, for every star and sweep value.
+
+    Parameters
+    ----------
+    progress : callable, optional
+        Called as ``progress(done, total)`` in stars.
+    """
+    # Invalid input raises an error before anything is drawn.
+    run = study.run
+    check_fap(run.fap, run.realisations, run.tails)
+    prepared = cases(study)
+    expectations = [x for case in prepared for x in case.expectations]
+    campaigns = [text for case in prepared for text in _campaign(case)]
+
+    engine = engine or Engine()
+
+    def detected(case: Case) -> StarDetection:
+        own = [read_weights(name, path, case.quiet.wavelength_nm) for name, path in run.weights.items()]
+        how = case.detect_options() | {"statistics": (*run.statistics, *own, *_other_templates(case))}
+        detection = engine.detect(case.quiet, case.flares, seed=run.seed, **how)
+        return StarDetection(case.label, case.at, case.amplitudes, detection)
+
+    if isinstance(engine, Pool):
+        engine.expect(len(prepared) * run.realisations)
+    stars: list[StarDetection] = []
+    paper: list[str] = []
+    for star in reported(map_in_order(engine, detected, prepared), len(prepared), progress):
+        if not stars:
+            # Meanwhile, the devices count the next star.
+            paper = _paper(prepared)
+        stars.append(star)
+    costs = [text for case, one in zip(prepared, stars, strict=True) for text in _template_costs(case, one)]
+    answer = DetectAnswer(study, stars)
+    blinding = [message.about(star.title) for star in stars for message in star.detection.messages]
+    blinding += [message.about(star.title) for star in stars for message in star.detection.without_threshold(run.fap)]
+    blinding += [message.about(star.title) for star in stars for message in star.detection.lowered]
+    messages: list[str] = [*blinding, *collect_messages(expectations, study.processes)]
+    errors = answer.table["fap_error"][np.isfinite(answer.table["fap_error"])]
+    if not countable(run.fap, run.realisations) and errors.size:
+        messages.append(
+            f"Thresholds at a false-alarm probability of {run.fap:g} come from importance sampling, right to "
+            f"{100 * errors.max():.1f} % of it: {run.realisations} realisations leave fewer than "
+            "100 beyond them."
+        )
+    last = [*_few_terms(stars), *marginal_lines(study.nuisances)]
+    # One sentence on unknowns: their effect on the chance, or on the S/N where they are taken into account.
+    last += chance_with_unknowns(prepared) or _cost_of_unknowns(prepared)
+    answer.messages = list(dict.fromkeys([*messages, *campaigns, *costs, *last]))
+    answer.paper = paper
+    return answer
+
+
+def _cost_of_unknowns(prepared: Sequence[Case]) -> list[str]:
+    """Return the sentence on the S/N that the faintest flare loses to unknowns."""
+    study = prepared[0].study
+    costs = [
+        unknown_cost(
+            f"{case.label}, flare of {100 * a:g} %", case.quiet, flare, study.nuisances, study.run.comparison()
+        )
+        for case in prepared
+        for a, flare in zip(case.amplitudes, case.flares, strict=True)
+    ]
+    return cost_lines(costs, study.nuisances)
+
+
+def _few_terms(stars: Sequence[StarDetection]) -> list[str]:
+    """Return a sentence on the number of independent squares of the paper's sum, if it is requested."""
+    forms = [
+        star.detection.closed_form("paper", template=flare)
+        for star in stars
+        if "paper" in star.detection.statistics
+        for flare in range(len(star.amplitudes))
+    ]
+    terms = [form.effective_terms for form in forms if isinstance(form, QuadraticForm)]
+    if not terms:
+        return []
+    few, many = (f"{end:.1f}" for end in (min(terms), max(terms)))
+    return [
+        f"The paper's sum over {stars[0].detection.dof('paper')} pixels scatters like one of "
+        f"{few if few == many else f'{few} to {many}'} independent squares: its faintest pixels make most of it."
+    ]
+
+
+def _other_templates(case: Case) -> list[Linear]:
+    """Return matched statistics that search for flares of other temperatures than the study's."""
+    filters, quiet = [], case.quiet
+    for temperature in case.study.run.template_temperatures_k:
+        (shape,) = case.expect(case.with_value("flare_temperature", temperature).flaring(case.amplitudes[0]))
+        setting = Setting(quiet, ~quiet.saturated, case.study.run.comparison())
+        filters.append(Linear(f"matched {temperature:g} K", Matched().weights_per_dn(setting, shape)))
+    return filters
+
+
+def _template_costs(case: Case, star: StarDetection) -> list[str]:
+    """Return sentences on the S/N lost to templates of another temperature, for Gaussian noise."""
+    detection, lines, light = star.detection, [], case.study.flare.light().describe()
+    for temperature in case.study.run.template_temperatures_k:
+        right = Matched().closed_form(detection.setting, detection.flares[0], detection.flares[0]).mean
+        name = f"matched {temperature:g} K"
+        kept = detection.closed_form(name, 0).mean / detection.closed_form(name).std / right if right else 0.0
+        lines.append(
+            f"{star.label}: looking for a flare of {temperature:g} K in one of {light} keeps "
+            f"{100 * kept:.1f} % of the matched statistic's S/N."
+        )
+    return lines
+
+
+def _campaign(case: Case) -> list[str]:
+    """Return sentences on the false alarms of the campaign that a study has, if any."""
+    asked, run, stack = case.study.campaign, case.study.run, case.quiet.n_frames
+    if asked.frames is None:
+        return []
+    many = campaign(run.fap, asked.frames, stack, step=asked.step, seed=run.seed)
+    text = (
+        f"A campaign of {asked.frames} frames makes {many.tests} tests: at {many.fap:g} per test "
+        f"{many.expected:.3g} false alarms are expected, and the chance of any is {many.independent:.3g} if tests "
+        f"are independent, at most {many.at_most:.3g}"
+    )
+    if many.overlapping is not None:
+        o = many.overlapping
+        text += f"; with the overlap of its stacks {o.value:.3g} [{o.low:.3g}, {o.high:.3g}] for a linear statistic"
+    return [text + ".", *_wanted(asked, many.tests, stack, run.seed)]
+
+
+def _wanted(asked: CampaignQuestion, tests: int, stack: int, seed: int) -> list[str]:
+    """Return sentences on the false-alarm probability per test for the campaign's wanted values."""
+    lines = []
+    if asked.fap is not None and asked.frames is not None:
+        one = per_test(asked.fap, asked.frames, stack, step=asked.step, seed=seed)
+        text = (
+            f"For a chance of {asked.fap:g} of any false alarm in the campaign each of its {tests} tests may have "
+            f"{one.independent:.4g} if they are independent, {one.at_least:.4g} in any case"
+        )
+        if one.overlapping is not None:
+            o = one.overlapping
+            text += f", and with the overlap of its stacks {o.value:.3g} [{o.low:.3g}, {o.high:.3g}]"
+        lines.append(f"{text}: `fap={one.at_least:.4g}`.")
+    if asked.alarms is not None:
+        if not asked.alarms < tests:
+            raise InputError(
+                f"campaign.alarms = {asked.alarms:g} of {tests} tests", "fewer alarms than tests", key="campaign.alarms"
+            )
+        alarms = "false alarm" if asked.alarms == 1 else "false alarms"
+        lines.append(
+            f"For {asked.alarms:g} {alarms} expected in the campaign each of its {tests} tests may have "
+            f"{asked.alarms / tests:.4g} for any dependence between them: `fap={asked.alarms / tests:.4g}`."
+        )
+    return lines
+
+
+def _paper(prepared: Sequence[Case]) -> list[str]:
+    """Return the paper's G2V values with their reconstruction, if its star is among the cases."""
+    case = next((case for case in prepared if case.star == PAPER_STARS[1] and not case.at), None)
+    if case is None or case.study.observation.exposure_s != 50.0:
+        return []
+    lines = []
+    for amplitude, flare in zip(case.amplitudes, case.flares, strict=True):
+        if amplitude not in PAPER_G2V:
+            continue
+        chi2, reduced = PAPER_G2V[amplitude]
+        ours = reconstruct(case.quiet, flare)
+        lines.append(
+            f"G2V, {100 * amplitude:g} % flare: the paper has chi2 = {chi2:g}, reduced {reduced:g}; "
+            f"reconstructed here {ours.value:.2f} ({ours.low:.2f}-{ours.high:.2f})"
+        )
+    return [*lines, WHY] if lines else []
+
+
+#: Default unknowns, which include those of the table in METHODS.
+SHOWN: dict[str, NuisanceChoice] = {
+    spoken(choice): choice
+    for choice in (
+        NuisanceChoice(dark=0.1),
+        NuisanceChoice(light=0.01),
+        NuisanceChoice(dark="free", light="free"),
+        NuisanceChoice(sky=0.1),
+        NuisanceChoice(tilt=0.01),
+    )
+}
+
+#: Columns of the table of unknowns.
+UNKNOWN_COLUMNS = (
+    star_column(),
+    amplitude_column(),
+    Column("unknown", description="what is unknown", heading="unknown"),
+    Column("known", description="S/N of the matched statistic with everything known", heading="S/N, all known",
+           format=".3g"),
+    Column("plain", description="the same where it is unknown and the statistic does not know of it",
+           heading="S/N, not looked for", format=".3g"),
+    Column("marginalised", "marginal", description="the same, marginalised", heading="S/N, marginalised",
+           format=".3g"),
+    Column("detected", description="detection probability of the marginalised statistic at the header's false alarms",
+           heading="then detected", format=percent(".3g")),
+    Column("smallest", description="flare amplitude that is detected, marginalised, at the header's power and false "
+           "alarms", heading="smallest flare", format=percent(".3g")),
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class UnknownAnswer(Answer):
+    """Answer of `unknown_table`."""
+
+    USES = ("instrument", "sky", "flare", "nuisances", "seed")
+
+    study: Study
+    costs: dict[tuple[str, float], dict[str, Cost]]  # by (star, amplitude), then by unknown
+    quiets: tuple[Expectation, ...] = ()  # the stars without a flare
+
+    #: One row per star, flare and unknown.
+    table = TableOf(
+        "unknowns", UNKNOWN_COLUMNS, "_rows", study=False,
+        title="What unknowns cost: S/N of the matched statistic, by closed forms",
+        about=lambda answer: {"fap": answer.study.run.fap, "power": answer.study.limit.power,
+                              "study": answer.study.toml()},
+    )  # fmt: skip
+
+    def smallest(self, star: str, unknown: str | None) -> float:
+        """Return the flare amplitude detected with the study's power at its false-alarm probability, marginalised.
+
+        Parameters
+        ----------
+        unknown : str or None
+            None for everything known.
+
+        Notes
+        -----
+        S/N grows with the amplitude; the flare's own photon noise is left out.
+        """
+        (amplitude, costs), *_ = ((a, c) for (name, a), c in self.costs.items() if name == star)
+        cost = next(iter(costs.values())) if unknown is None else costs[unknown]
+        snr = cost.known if unknown is None else cost.marginal
+        needed = special.ndtri(self.study.limit.power) - special.ndtri(self.study.run.fap)
+        return float(amplitude * needed / snr) if snr > 0 else float("inf")
+
+    @property
+    def _rows(self) -> Iterator[dict[str, Any]]:
+        for (star, amplitude), costs in self.costs.items():
+            for unknown, cost in costs.items():
+                flare = {"star": star, "amplitude": amplitude, "unknown": unknown}
+                detected = float(power(cost.marginal, self.study.run.fap))
+                yield vars(cost) | flare | {"detected": detected, "smallest": self.smallest(star, unknown)}
+
+    @property
+    def messages(self) -> list[str]:
+        return collect_messages(list(self.quiets))
+
+    @property
+    def inputs(self) -> list[Expectation]:
+        return list(self.quiets)
+
+
+def unknown_table(study: Study, unknowns: Mapping[str, NuisanceChoice] = SHOWN) -> UnknownAnswer:
+    """Compute the S/N of a study's flares under each of several unknowns, which are given by name."""
+    costs: dict[tuple[str, float], dict[str, Cost]] = {}
+    quiets = []
+    comparison = study.run.comparison()
+    for case in cases(study, swept=False):
+        quiets.append(case.quiet)
+        for amplitude, flare in zip(case.amplitudes, case.flares, strict=True):
+            costs[case.label, amplitude] = {
+                unknown: unknown_cost(case.label, case.quiet, flare, choice, comparison)
+                for unknown, choice in unknowns.items()
+            }
+    return UnknownAnswer(study, costs, tuple(quiets))
+
+
+def power(snr: float | NDArray[np.float64], fap: float) -> NDArray[np.float64]:
+    """Return the detection probability of a normal statistic with some S/N, shape of the S/N."""
+    return np.asarray(special.ndtr(snr + special.ndtri(fap)))

@@ -1,1 +1,0 @@
-"""Answers about detection: detect, map, gaussian, and the cost of unknowns."""

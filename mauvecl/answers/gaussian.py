@@ -1,0 +1,264 @@
+"""Errors of the usual root-of-N formula over magnitude and exposure.
+
+The formula promises three things: the S/N of a spectrum, that the true signal lies within one estimated standard
+deviation of the observed one in 68.27 % of all spectra, and the false-alarm probability of a threshold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from mauvecl.answers.answer import Answer, TableOf, realisations_of
+from mauvecl.answers.detect import DetectAnswer, detect
+from mauvecl.answers.signal import SnrAnswer, snr
+from mauvecl.detection.snr import steps_of
+from mauvecl.device.engine import Engine
+from mauvecl.noise.drawing import Cumulants
+from mauvecl.schema.calls import validated
+from mauvecl.schema.columns import Column, number, table_of
+from mauvecl.study.questions import formula_grid
+from mauvecl.study.sections import Observation
+from mauvecl.study.study import PAPER_STARS, Study
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
+
+    from mauvecl.detection.snr import SnrResult
+    from mauvecl.host.exposure.expectation import Expectation
+    from mauvecl.runs.pool import Pool
+
+#: Significance of reported differences, and width of a 95 % interval, in standard errors.
+SURE, ERRORS_IN_INTERVAL = 4, 3.92
+#: Smallest ratio of false-alarm probabilities that is distinguished.
+SMALLEST_RATIO = 1e-3
+#: Columns of the table of resolution elements.
+ELEMENT_COLUMNS = (
+    Column("wavelength", unit="nm", description="vacuum wavelength, the middle of the pixel or element"),
+    Column("expected", description="S/N by the formula"),
+    Column("mean", description="mean S/N of the realisations"),
+    Column("std", description="standard deviation of the S/N of the realisations"),
+    Column("error", description="standard error of the mean"),
+    Column("bias", description="mean over expected S/N, less one"),
+    Column("coverage", description="share of 1-sigma intervals of its pixels that hold the truth; 0.6827 promised"),
+)
+#: Columns of the largest error of each prediction.
+WORST_COLUMNS = (
+    Column("best_snr", description="largest S/N per element by the formula", heading="best S/N", format=".2f"),
+    Column("snr_off_by",
+           description="largest significant (4 standard errors) difference of the mean S/N from it; 0 if none",
+           heading="S/N off by", format="+.3f"),
+    Column("at_nm", description="where", heading="at nm", format=number(".0f")),
+    Column("coverage_low", description="smallest share of 1-sigma intervals that hold the truth, of all elements",
+           heading="1-sigma intervals", format=lambda low, high: f"{100 * low:.2f}-{100 * high:.2f} %",
+           others=("coverage_high",)),
+    Column("coverage_high", description="largest"),
+    Column("five_sigma_above", description="how often a pixel lies 5 sigma above its mean, over the normal 2.9e-7; "
+           "the most", heading="5 sigma above, below", format=lambda above, below: f"{above:.2f}, {below:.2f}",
+           others=("five_sigma_below",)),
+    Column("five_sigma_below",
+           description="how often a pixel lies 5 sigma below its mean, over the normal 2.9e-7; the least"),
+    Column("fap_ratio", description="most wrong false-alarm probability over the promised one; 1 if none differs",
+           heading="false alarms", format=".3f"),
+    Column("statistic", description="detection statistic", heading="statistic"),
+    Column("why", description="main cause of a difference from the closed form", heading="why"),
+    Column("probability_off_by",
+           description="largest significant difference of a detection probability from the closed form",
+           heading="detection off by", format="+.4f"),
+)  # fmt: skip
+
+
+def coverage(result: SnrResult) -> NDArray[np.float64]:
+    """Return the coverage of intervals of one estimated standard deviation about the observed signal.
+
+    Returns
+    -------
+    ndarray, shape (n_pixel,)
+        The standard deviation is estimated from the observed photons and the known dark and read noise. Values are
+        interpolated within the bins of the histogram of counts, 1/64 of a standard deviation or less.
+    """
+    seen = result.observers[: result.scene.n_pixel]
+    signal = result.expectation.light_dn
+    gain, known = seen["gain"].astype(float), seen["variance"].astype(float)
+    # Ends of the observed signals whose interval reaches the true one: net -+ sqrt(gain max(net, 0) + known) = signal.
+    root = np.sqrt(gain**2 / 4 + gain * signal + known)
+    high = signal + gain / 2 + root
+    low = signal + gain / 2 - root
+    low = np.where(low < 0, signal - np.sqrt(known), low)
+    width = 2.0 ** seen["bin_shift"].astype(float)
+    shares = np.empty(signal.size)
+    for p in range(signal.size):
+        filled, counts = result.counts.filled("pixel", p)
+        edges = width[p] * np.column_stack([filled, filled + 1]).ravel() - 0.5
+        ends = np.interp([low[p], high[p]], edges + float(seen["net_offset"][p]), steps_of(counts) / result.counts.n)
+        shares[p] = ends[1] - ends[0]
+    return shares
+
+
+def beyond(x: Expectation, sigmas: float) -> NDArray[np.float64]:
+    """Return the probability that a pixel deviates by more than N standard deviations, shape (n_pixel,).
+
+    Parameters
+    ----------
+    sigmas : float
+        Number of standard deviations; negative for deviations below the mean.
+
+    Notes
+    -----
+    By the saddle point (Lugannani & Rice 1980, doi 10.2307/1426607) of Gaussian and Poisson parts together; right to
+    3e-3 of the probability. For normal noise it would be the same in every pixel.
+    """
+    c = Cumulants.of(x, x.n_frames)
+    photons = np.where(c.photon_step > 0, c.photons, 0.0)
+    parts = ((c.photon_step, photons), (c.dark_step, c.dark_dn / c.dark_step))
+
+    def cumulants(u: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+        """Return the cumulant generating function of the deviation and its first two derivatives at u."""
+        value, first, second = c.gaussian * u**2 / 2, c.gaussian * u, c.gaussian.copy()
+        for step, mean in parts:
+            value = value + mean * (np.expm1(step * u) - step * u)
+            first = first + mean * step * np.expm1(step * u)
+            second = second + mean * step**2 * np.exp(step * u)
+        return value, first, second
+
+    sd = np.sqrt(c.variance)
+    goal, u = sigmas * sd, sigmas / sd
+    for _ in range(50):
+        _, first, second = cumulants(u)
+        u = u - (first - goal) / second
+    value, _, second = cumulants(u)
+    w, v = np.sqrt(2 * (u * goal - value)), np.abs(u) * np.sqrt(second)
+    return np.asarray(special.ndtr(-w) + np.exp(-(w**2) / 2) / np.sqrt(2 * np.pi) * (1 / v - 1 / w))
+
+
+def _promises(result: SnrResult) -> QTable:
+    """Return S/N and intervals of the formula and of the simulation, one row per resolution element."""
+    table, x = result.element, result.expectation
+    values = {name: np.asarray(table[name].value) for name in ("wavelength", "expected", "mean", "std")}
+    values["error"] = values["std"] / np.sqrt(result.counts.n)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        values["bias"] = values["mean"] / values["expected"] - 1.0
+    values["coverage"] = x.per_element(coverage(result)) / x.per_element(np.ones(x.wavelength_nm.size))
+    return table_of(ELEMENT_COLUMNS, [values], **table.meta)
+
+
+def _title(answer: GaussianAnswer) -> str:
+    run = answer.study.run
+    return (
+        f"The root-of-N formula and {run.realisations:,} realisations; promised: no difference in S/N, 68.3 % "
+        f"of 1-sigma intervals, as many 5-sigma pixels and false alarms ({run.fap:g}) as normal noise has"
+    )
+
+
+@dataclass(eq=False)
+class GaussianAnswer(Answer):
+    """Answer of `gaussian`."""
+
+    USES = ("instrument", "sky", "flare", "processes", "nuisances", "seed")
+
+    study: Study
+    signal: SnrAnswer
+    detection: DetectAnswer
+
+    #: Largest error of each prediction, one row per star and cell.
+    cells = TableOf("gaussian", WORST_COLUMNS, "_largest_errors", place=True, title=_title,
+                    about=lambda answer: {"fap": answer.study.run.fap})  # fmt: skip
+    #: Predictions and simulation, one row per star, cell and resolution element.
+    elements = TableOf("elements", (), "signal.stars", of=lambda _, star: _promises(star.result),
+                       place=True, about=realisations_of)  # fmt: skip
+    #: One row per star, cell and statistic: false-alarm probabilities at the formula's thresholds, with reasons.
+    thresholds = TableOf("thresholds", (), "detection.departures")
+
+    @property
+    def messages(self) -> list[str]:
+        return self.detection.messages
+
+    @property
+    def inputs(self) -> list[Expectation]:
+        return self.signal.inputs
+
+    @property
+    def _largest_errors(self) -> list[dict[str, Any]]:
+        tables = [_by_star(t, len(self.signal.stars)) for t in (self.elements, self.thresholds, self.detection.table)]
+        return [
+            vars(star) | _of_signal(star.result, elements) | _of_thresholds(tested, flares)
+            for star, elements, tested, flares in zip(self.signal.stars, *tables, strict=True)
+        ]
+
+
+def _by_star(table: QTable, stars: int) -> list[QTable]:
+    """Split a table into equal parts, in order."""
+    each = len(table) // stars
+    return [table[k * each : (k + 1) * each] for k in range(stars)]
+
+
+def _of_signal(result: SnrResult, elements: QTable) -> dict[str, float]:
+    """Return the largest errors of a star's S/N, and of the intervals that follow from it."""
+    sure = elements[np.abs(elements["mean"] - elements["expected"]) > SURE * elements["error"]]
+    worst = sure[np.argmax(np.abs(sure["mean"] - sure["expected"]))] if len(sure) else None
+    x, rare = result.expectation, special.ndtr(-5.0)
+    return {
+        "best_snr": float(elements["expected"].max()),
+        "snr_off_by": 0.0 if worst is None else float(worst["mean"] - worst["expected"]),
+        "at_nm": np.nan if worst is None else float(worst["wavelength"].value),
+        "coverage_low": float(elements["coverage"].min()),
+        "coverage_high": float(elements["coverage"].max()),
+        "five_sigma_above": float((beyond(x, 5.0) / rare).max()),
+        "five_sigma_below": float((beyond(x, -5.0) / rare).min()),
+    }
+
+
+def _of_thresholds(tested: QTable, flares: QTable) -> dict[str, float | str]:
+    """Return the largest errors of a star's false-alarm and detection probabilities."""
+    off = tested[tested["differs"]]
+    wrong = off[np.argmax(np.abs(np.log(np.maximum(off["ratio"], SMALLEST_RATIO))))] if len(off) else None
+    missed = flares["probability"] - flares["closed_form_probability"]
+    # The interval includes the error of the threshold.
+    sure = np.abs(missed) > (flares["high"] - flares["low"]) * SURE / ERRORS_IN_INTERVAL
+    missed = np.where(sure, missed, 0.0)
+    return {
+        "fap_ratio": 1.0 if wrong is None else float(wrong["ratio"]),
+        "statistic": "" if wrong is None else str(wrong["statistic"]),
+        "why": "" if wrong is None else str(wrong["why"]),
+        "probability_off_by": float(missed[np.argmax(np.abs(missed))]),
+    }
+
+
+@validated
+def gaussian(
+    study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
+) -> GaussianAnswer:
+    """Compare the usual formula with the simulation, over magnitude and exposure or the study's sweep.
+
+    Parameters
+    ----------
+    study : Study
+        Without a sweep: magnitudes from 4 to 12 and exposures of 5, 50 and 600 s, unless it states the magnitudes of
+        its stars, or another exposure than the default.
+    progress : callable, optional
+        Called as ``progress(done, total)`` in stars, each of which is drawn for its S/N and then for its flares.
+    """
+    engine = engine or Engine()
+    stated = study.star != PAPER_STARS and all(star.magnitude is not None for star in study.star)
+    if not study.sweep.axes and not stated:
+        own = study.observation.exposure_s
+        usual = own == Observation().exposure_s
+        study = study.model_copy(update={"sweep": formula_grid(exposure_s=None if usual else own)})
+
+    def progress_of(part: int) -> Callable[[int, int], None]:
+        def report(done: int, total: int) -> None:
+            if progress is not None:
+                progress(part * total + done, 2 * total)
+
+        return report
+
+    return GaussianAnswer(study, snr(study, engine, progress_of(0)), detect(study, engine, progress_of(1)))
+
+
+#: Former name.
+gaussian_report = gaussian

@@ -1,0 +1,458 @@
+"""Injection of flares into simulated stares: completeness and accuracy of a search."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from operator import attrgetter, itemgetter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from mauvecl.answers.answer import Answer, InCell, TableOf, share_columns
+from mauvecl.detection.distributions import Interval
+from mauvecl.device.engine import Stares
+from mauvecl.flares.frames import STEADY, Components
+from mauvecl.flares.shapes import shape_of
+from mauvecl.flares.stare_scene import Arrays
+from mauvecl.runs.pool import Pool, map_in_order
+from mauvecl.schema.calls import validated
+from mauvecl.schema.columns import INTERVAL, Column, View, interval, number, percent, table_of
+from mauvecl.schema.errors import InputError, Message
+from mauvecl.schema.physical import DAY_S
+from mauvecl.search.completeness import InjectedCompleteness
+from mauvecl.search.false_alarms import CountedRate, SampledRate, consecutive_alarm_rate, sampled_rate
+from mauvecl.search.flare_fits import SingleFlareFit
+from mauvecl.search.injections import FitAccuracy, Injections, Refit
+from mauvecl.search.search import Survey
+from mauvecl.search.templates import TEMPERATURES_K, Bank, Templates, frame_nuisances
+from mauvecl.study.cases import Case, cases, collect_messages
+from mauvecl.study.flare_light import FlareLight
+from mauvecl.study.stares import energy_scale, orbit_lines, threshold_line
+from mauvecl.study.study import Study
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
+
+    from mauvecl.flares.stare_scene import StaresRequest
+    from mauvecl.host.exposure.expectation import Expectation
+    from mauvecl.study.stare import Size
+
+#: Default range of injected sizes, in units of the size with a completeness of one half.
+DEFAULT_RANGE = (0.3, 3.0)
+
+
+@dataclass(frozen=True, eq=False)
+class StarSurvey:
+    """A star of a study with its search."""
+
+    quiet: Expectation  # of one frame
+    templates: Templates
+    survey: Survey  # its only flare component is the study's flare
+
+    @property
+    def fit(self) -> SingleFlareFit:
+        """Fit of detected flares."""
+        return SingleFlareFit(self.survey.bank, self.templates)
+
+    @property
+    def unit_snr(self) -> float:
+        """S/N of one frame for the study's flare at constant unit amplitude and known baseline."""
+        x = self.survey.components
+        unit = np.zeros(len(STEADY) + x.n_flares)
+        unit[: len(STEADY) + 1] = 1.0
+        return float(np.linalg.norm(x.means(unit)))
+
+
+def survey_star(case: Case) -> StarSurvey:
+    """Build the search of a case's stare."""
+    frame, stare, choice, flare = case.one_frame, case.stare, case.study.search, case.study.flare
+    own = frame.flare_electrons((flare.temperature_k,))
+    # Templates are blackbodies if the study's flare has no temperature to vary.
+    blackbody = flare.model_copy(update={"spectrum": FlareLight()})
+    hot = frame if flare.spectrum.file is None else frame.with_sections(flare=blackbody)
+    quiet, electrons = frame.quiet, hot.flare_electrons(TEMPERATURES_K)
+    nuisances = frame_nuisances(quiet, stare, choice.spreads())
+    templates = Templates.of(
+        quiet,
+        electrons * quiet.gain_dn_per_electron,
+        TEMPERATURES_K,
+        nuisances=nuisances,
+        rank=choice.sums,
+    )
+    level = choice.level(stare, case.study.stare.orbit_s)
+    bank = Bank(
+        choice.half_widths_s, templates.directions[list(templates.chosen)], shape_of(choice.shape), stare.frame_s, level
+    )
+    survey = Survey(Components(quiet, own, templates.weights), stare, bank)
+    if level.cycle and not len(survey.curves if survey.curves is not None else ()):
+        raise InputError("search.cycle needs an unknown cycle of the stare: stare.cycles", key="search.cycle")
+    return StarSurvey(quiet, templates, survey)
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Measure of flare size for a star: amplitude x half-width^power x per_unit."""
+
+    of: Size
+    power: int
+    per_unit: float  # size of a flare of unit amplitude and a half-width of 1 s
+
+    @classmethod
+    def chosen(cls, case: Case) -> Sizes:
+        """Return the measure that a case's study chooses; raises InputError for energies of a star of unknown size."""
+        asked, flare_k = case.study.injections.of, case.study.flare.temperature_k
+        bolometric = energy_scale(case.study, case.source, "bolometric", flare_k)
+        if asked is None:
+            asked = "amplitude" if bolometric is None else "energy"
+        if asked == "amplitude":
+            return cls("amplitude", 0, 1.0)
+        area = shape_of(case.study.search.shape).equivalent_duration
+        if asked == "duration":
+            return cls("duration", 1, area)
+        kind: Any = "bolometric" if asked == "energy" else "band"
+        scale = energy_scale(case.study, case.source, kind, flare_k)
+        if scale is None:
+            raise InputError(
+                f"injections.of = {asked!r}, but the size of {case.source.name} is unknown",
+                "the star's distance_pc, or radius_rsun and effective_temperature_k",
+                key="injections.of",
+            )
+        return cls(asked, 1, area * scale.erg_per_s)
+
+    def of_amplitude(self, amplitude: Any, half_width_s: Any) -> Any:
+        """Return the sizes of amplitudes and half-widths, broadcast together."""
+        return amplitude * half_width_s**self.power * self.per_unit
+
+    def amplitude(self, size: Any, half_width_s: Any) -> Any:
+        """Return the amplitudes of sizes and half-widths, broadcast together."""
+        return size / (half_width_s**self.power * self.per_unit)
+
+
+def injected_sizes(case: Case, sizes: Sizes, unit_snr: float, threshold: float) -> NDArray[np.float64]:
+    """Return the sizes of injected flares, ascending; by default around a completeness of one half.
+
+    `unit_snr` and `threshold` are those of the star's `StarSurvey` and its search.
+    """
+    asked = case.study.injections
+    widths = np.array([asked.half_width_low_s, asked.half_width_high_s])
+    frames = widths / case.instrument.frame_s
+    # S/N of a known flare on a known baseline: (A / sigma) sqrt(square integral x half-width in frames).
+    amplitude = threshold / unit_snr / np.sqrt(shape_of(case.study.search.shape).square_integral * frames)
+    half = sizes.of_amplitude(amplitude, widths)
+    low = DEFAULT_RANGE[0] * half.min() if asked.low is None else asked.low
+    high = DEFAULT_RANGE[1] * half.max() if asked.high is None else asked.high
+    if not low < high:
+        raise InputError(
+            f"injected sizes must rise from low to high, but run from {low:.3g} to {high:.3g}", key="injections.low"
+        )
+    return np.geomspace(low, high, asked.sizes)
+
+
+Float = NDArray[np.float64]
+
+#: Completeness at which limits are given, by the names of their columns.
+POWERS = {"e50": 0.5, "e90": 0.9}
+#: Units of sizes, in astropy's notation.
+SIZE_UNITS = {"amplitude": "", "duration": "s", "energy": "erg", "band_energy": "erg"}
+#: Difference between drawn and expected alarms that is reported, in standard errors.
+DIFFERS = 4.0
+#: Probability of the observed number of alarms below which it is reported as too large.
+LEAST_CHANCE = 1e-5
+
+
+def limit_columns(of: str) -> tuple[Column, ...]:
+    """Return the columns of the table of limits of a kind of size, for intervals by name."""
+    unit, columns = SIZE_UNITS[of], list[Column]()
+    size, ends = (percent(".4g"), interval(".4g", 100)) if of == "amplitude" else (".4g", interval(".4g"))
+    for name, power in POWERS.items():
+        limit = itemgetter(name)
+        columns += [
+            Column(name, "value", unit, f"{of} at which the completeness is {power:g}", name.upper(), size).of(limit),
+            Column(f"{name}_low", "low", unit, "its 95 % interval, lower end", INTERVAL, ends,
+                   (f"{name}_high",)).of(limit),
+            Column(f"{name}_high", "high", unit, "its 95 % interval, upper end").of(limit),
+        ]  # fmt: skip
+    return (
+        Column("half_width", "", "s", "half-width of the injected flares; NaN for all of them alike", "half-width (s)",
+               number(".4g", "all")),
+        *columns,
+        Column("never", "", "", "share of flares for which no template fits into what is observed", "no template fits",
+               percent(".3g")),
+    )  # fmt: skip
+
+
+def cell_columns(of: str) -> tuple[Column, ...]:
+    """Return the columns of the table of completeness over half-width and a kind of size."""
+    text = "their amplitude: relative rise of the photons in the flare's band"
+    return (
+        Column("half_width", lambda x: np.array(x.half_widths_s)[:, None], "s", "half-width of the injected flares"),
+        Column("size", "sizes", SIZE_UNITS[of], f"{of} of the injected flares"),
+        Column("amplitude", "amplitudes", "", text),
+        Column("completeness", "", "", "share of injected flares that the search finds"),
+        Column("completeness_low", "", "", "its 95 % interval, lower end"),
+        Column("completeness_high", "", "", "its 95 % interval, upper end"),
+        Column("injections", "count", "", "number of injected flares"),
+    )
+
+
+#: Columns of the table of searches.
+SEARCH_COLUMNS = (
+    Column("threshold", "threshold.value", "", "S/N from which on a template is an alarm", "threshold", ".3f"),
+    Column("threshold_low", "threshold.low", "", "its 95 % interval, lower end", INTERVAL, interval(".3f"),
+           ("threshold_high",)),
+    Column("threshold_high", "threshold.high", "", "its 95 % interval, upper end"),
+    Column("checked_at", "checked", "", "S/N at which drawn stares are held against normal noise",
+           "alarms a day above", ".2f"),
+    Column("alarms_sampled", "asked", "", "false alarms per star-day there, normal noise", "sampled", ".3g"),
+    Column("alarms_simulated", "simulated.value", "", "false alarms per star-day there, drawn stares", "drawn", ".3g"),
+    Column("alarms_low", "simulated.low", "", "lower end: 4 standard errors"),
+    Column("alarms_high", "simulated.high", "", "upper end: 4 standard errors"),
+    Column("alarmed", "", "", "drawn stares with a false alarm at the threshold"),
+    Column("alarmed_expected", "expected", "", "how many should have one"),
+    Column("in_a_row", "", "", "false alarms per star-day of the common rule, white noise"),
+    Column("templates", "surveyed.survey.search.n_filters", "", "templates of the bank", "templates"),
+    Column("sums", "surveyed.survey.components.n_statistics", "", "weighted sums of a frame", "sums of a frame"),
+    Column("spectral_loss", lambda row: float(row.surveyed.templates.loss.max()), "",
+           "largest share of S/N lost because only these sums are searched"),
+    Column("star_days", lambda row: row.surveyed.survey.stare.observed_s / DAY_S, "", "star-days of a stare"),
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class StarCompleteness(InCell):
+    """Completeness at one star in one cell of the sweep."""
+
+    surveyed: StarSurvey
+    sizes: Sizes
+    threshold: Interval
+    # False alarms per star-day of drawn stares at `checked`, with 4 standard errors; NaN if none are drawn.
+    simulated: Interval
+    asked: float  # the same by importance sampling
+    checked: float  # value that the maximum of a few stares in ten exceeds
+    alarmed: int  # drawn stares with an alarm at the threshold
+    expected: float  # their expected number; NaN if none are drawn
+    shifted: bool  # whether the threshold is raised for trends that the search does not remove
+    saturates: float  # amplitude at which flares saturate a used pixel, which injections ignore
+    in_a_row: float  # false alarms per star-day of the conventional rule in white noise
+    injected: InjectedCompleteness
+    fitted: FitAccuracy | None
+
+    @property
+    def limits(self) -> QTable:
+        """Sizes of which 50 % and 90 % are found, for all half-widths together and for each."""
+        rows = [
+            {"half_width": half_width, "never": self.injected.never(k)}
+            | {name: self.injected.limit(power, k) for name, power in POWERS.items()}
+            for k, half_width in ((None, np.nan), *enumerate(self.injected.half_widths_s))
+        ]
+        return table_of(limit_columns(self.sizes.of), rows)
+
+    @property
+    def cells(self) -> QTable:
+        """Completeness at each half-width and size, and how well the flares are recovered."""
+        columns = [column.of(attrgetter("injected")) for column in cell_columns(self.sizes.of)]
+        if self.fitted is not None:
+            columns += [column.of(attrgetter("fitted")) for column in FitAccuracy.COLUMNS]
+        return table_of(columns, [self])
+
+    @property
+    def messages(self) -> list[str]:
+        """Messages on stares whose false-alarm rate differs from that of normal noise, and on saturated flares."""
+        messages: list[str] = []
+        if not np.isnan(self.simulated.value) and not self.simulated.low <= self.asked <= self.simulated.high:
+            text = (
+                f"FALSE ALARMS of {self.title} are not those of normal noise: {self.simulated.value:.3g} per star-day "
+                f"at {self.checked:.2f} in drawn stares, {self.asked:.3g} by importance sampling: the search does not "
+                "marginalise over what changes in the stare (see [search] frame, cycle, window_s), or set "
+                'search.null = "counted".'
+            )
+            messages.append(Message(text, "false alarms"))
+        # The probability of at least this many alarms if the expected number is right.
+        if scipy.special.gammainc(max(self.alarmed, 1e-300), self.expected) < LEAST_CHANCE:
+            text = (
+                f"FALSE ALARMS of {self.title} exceed the requested rate: {self.alarmed} of the drawn stares have "
+                f"one at the threshold, {self.expected:.2g} should: set search.null = 'counted' with more search.nulls."
+            )
+            messages.append(Message(text, "false alarms"))
+        if self.shifted:
+            messages.append(threshold_line(self.title, self.threshold.value))
+        if self.injected.amplitudes.max() > self.saturates:
+            text = (
+                f"SATURATED: flares of {self.title} with an amplitude above {self.saturates:.3g} saturate a pixel, "
+                "which injections leave out."
+            )
+            messages.append(Message(text, "saturated"))
+        return messages
+
+
+def _share(answer: InjectAnswer) -> tuple[Column, ...]:
+    return share_columns(answer.study, "surveyed.quiet.target_share")
+
+
+def _search_of(answer: InjectAnswer) -> dict[str, object]:
+    choice, flare = answer.study.search, answer.study.flare
+    return {
+        "false_alarms": f"{choice.false_alarms:g} per star-{choice.per}",
+        "flare": f"{flare.light().describe()}, {choice.shape}, amplitudes in {flare.band}",
+    }
+
+
+@dataclass(eq=False)
+class InjectAnswer(Answer):
+    """Answer of `inject`."""
+
+    USES = ("instrument", "sky", "flare", "processes", "stare", "seed")
+
+    study: Study
+    stars: list[StarCompleteness]
+    messages: list[str] = field(default_factory=list)
+
+    #: Sizes E50 and E90: per star and cell of the sweep, one row for all half-widths and one for each.
+    table = TableOf("limits", _share, "stars", of=lambda _, star: star.limits, place=True, about=_search_of)
+    #: One row per star, cell of the sweep, half-width and size.
+    completeness = TableOf("completeness", _share, "stars", of=lambda _, star: star.cells, place=True, about=_search_of)
+    #: One row per star and cell of the sweep: thresholds, false alarms.
+    search = TableOf("search", lambda answer: (*_share(answer), *SEARCH_COLUMNS), "stars", place=True, about=_search_of)
+
+    @property
+    def views(self) -> list[View]:
+        choice = self.study.search
+        alarms = "false alarm" if choice.false_alarms == 1 else "false alarms"
+        title = f"The search: {choice.false_alarms:g} {alarms} per star-{choice.per} of frames"
+        views = [InjectAnswer.search.view(self, title)]
+        for star in self.stars:
+            unit = f" ({SIZE_UNITS[star.sizes.of]})" if SIZE_UNITS[star.sizes.of] else ""
+            title = f"{star.title}: {star.sizes.of}{unit} of which a half (E50) and nine tenths (E90) are found"
+            views.append(View(title, limit_columns(star.sizes.of), star.limits))
+        return views
+
+    @property
+    def inputs(self) -> list[Expectation]:
+        return [star.surveyed.quiet for star in self.stars]
+
+
+@validated
+def inject(
+    study: Study, engine: Stares | Pool | None = None, progress: Callable[[int, int], None] | None = None
+) -> InjectAnswer:
+    """Compute the completeness of a study's search for every star and sweep value.
+
+    Parameters
+    ----------
+    study : Study
+    engine : Stares or Pool, optional
+        Simulator; by default that of the default device.
+    progress : callable, optional
+        Called as ``progress(done, total)`` in injections; may raise to stop the work.
+    """
+    idle = next((axis.quantity for axis in study.sweep.axes if axis.quantity in ("amplitude", "exposure")), None)
+    if idle is not None:
+        raise InputError(f"the sweep needs quantities that injections have, but has {idle!r}", key="sweep")
+    engine = engine or Stares()
+    prepared = cases(study)
+    for case in prepared:
+        # Raise InputError for energies of stars of unknown size before the first search.
+        Sizes.chosen(case)
+    q = study.injections
+    each = q.count * q.sizes * q.widths
+    answer = InjectAnswer(study, [])
+    for done, case in enumerate(prepared):
+
+        def report(part: float, done: int = done) -> None:
+            if progress is not None:
+                progress(round((done + part) * each), len(prepared) * each)
+
+        report(0.0)
+        answer.stars.append(_completeness(case, engine, report))
+    report(1.0)
+    answer.messages = [
+        *(text for star in answer.stars for text in star.messages),
+        *collect_messages(answer.inputs),
+        *orbit_lines(study.stare, study.orbit, prepared[0].instrument.frame_s),
+    ]
+    return answer
+
+
+def _completeness(case: Case, engine: Stares | Pool, report: Callable[[float], None]) -> StarCompleteness:
+    """Inject flares into the stare of a case and search for them; `report` receives the share that is done."""
+    choice, asked, seed = case.study.search, case.study.injections, case.study.run.seed
+    processes = case.study.processes.additive_only
+    known = survey_star(case)
+    survey = known.survey
+    drawn, tail, threshold = _threshold(case, survey, engine)
+    sizes = Sizes.chosen(case)
+    values = injected_sizes(case, sizes, known.unit_snr, threshold.value)
+    positions = min(asked.positions, asked.count)
+    injections = Injections(
+        survey, 0, asked.half_widths_s, threshold.value, seed, positions, -(-asked.count // positions), processes
+    )
+    widths = np.array(injections.half_widths_s)
+    amplitudes = np.asarray(sizes.amplitude(values[None], widths[:, None]))
+    refit = Refit(known.fit, amplitudes, case.study.flare.temperature_k, -(-asked.fitted // positions))
+
+    def at_one_peak(position: int) -> Arrays:
+        return _reduced(engine, injections.request(position, refit if refit.count else None))
+
+    parts: list[Arrays] = []
+    for part in map_in_order(engine, at_one_peak, range(positions)):
+        parts.append(part)
+        report(len(parts) / positions)
+    critical = np.stack([part["critical"].T for part in parts], axis=1)
+    # The comparison with drawn stares has most power where a few in ten have an alarm.
+    checked, likely, error = tail.likely
+    simulated, expected = _checked(drawn, checked, likely, error, survey.stare.observed_s / DAY_S / tail.days)
+    alarmed = 0 if drawn is None else int(np.sum(drawn.maxima >= threshold.value))
+    should = float("nan") if drawn is None else drawn.maxima.size * -np.expm1(-choice.rate * drawn.days)
+    return StarCompleteness(
+        case.label,
+        case.at,
+        known,
+        sizes,
+        threshold,
+        simulated,
+        expected,
+        checked,
+        alarmed,
+        float(should),
+        tail.shifted and choice.null == "sampled",
+        injections.saturates,
+        consecutive_alarm_rate(choice.points, choice.sigma, survey.stare.frame_s),
+        InjectedCompleteness(
+            injections.half_widths_s, values, amplitudes, sizes.of_amplitude(critical, widths[:, None, None])
+        ),
+        FitAccuracy.of(parts) if refit.count else None,
+    )
+
+
+def _threshold(case: Case, survey: Survey, engine: Stares | Pool) -> tuple[CountedRate | None, SampledRate, Interval]:
+    """Return the false-alarm rates in drawn stares and by importance sampling, and the threshold of the study's."""
+    choice, seed, drawn = case.study.search, case.study.run.seed, None
+    if choice.nulls:
+        request = survey.largest_value_request(choice.nulls, seed, case.study.processes.additive_only)
+        drawn = CountedRate(np.sort(_reduced(engine, request)["maximum"]), survey.stare.observed_s / DAY_S)
+    tail = sampled_rate(survey, seed)
+    rate = tail if choice.null == "sampled" or drawn is None else drawn
+    return drawn, tail, rate.threshold(choice.rate)
+
+
+def _reduced(engine: Stares | Pool, request: StaresRequest) -> Arrays:
+    return engine.stares(request) if isinstance(engine, Pool) else engine.reduced(request)
+
+
+def _checked(
+    drawn: CountedRate | None, value: float, probability: float, error: float, longer: float
+) -> tuple[Interval, float]:
+    """Return false alarms per star-day of drawn stares at a value, within 4 standard errors, and the expected rate."""
+    if drawn is None:
+        return Interval(np.nan, np.nan, np.nan), float("nan")
+    n = drawn.maxima.size
+    # Drawn stares may be longer than those of importance sampling.
+    none = (1 - probability) ** longer
+    reach = DIFFERS * np.hypot(np.sqrt(none * (1 - none) / n), longer * none / (1 - probability) * error)
+    p = float(np.mean(drawn.maxima >= value))
+    with np.errstate(divide="ignore"):
+        ends = [-np.log1p(-np.clip(x, 0.0, 1.0)) / drawn.days for x in (p, p - reach, p + reach)]
+        return Interval(*(float(x) for x in ends)), float(-np.log(none) / drawn.days)

@@ -1,0 +1,433 @@
+"""Limits: smallest amplitudes, faintest stars and shortest exposures, and what moves them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from operator import attrgetter
+from threading import Lock
+from typing import TYPE_CHECKING, Any
+
+from mauvecl.answers.answer import Answer, TableOf, share_columns
+from mauvecl.answers.closed_forms import Cost, cost_lines, describe_shares, draw_columns, marginal_lines, unknown_cost
+from mauvecl.answers.limit_search import LimitSearch, MarginalLimitSearch, Point, Unknown, settle, single_flares
+from mauvecl.detection.distributions import Interval
+from mauvecl.detection.names import check_fap
+from mauvecl.device.engine import Engine
+from mauvecl.noise.disturbances import Uniform
+from mauvecl.noise.unknowns import values_of
+from mauvecl.runs.pool import Pool, map_in_order
+from mauvecl.schema.calls import validated
+from mauvecl.schema.columns import INTERVAL, Column, View, interval, table_of
+from mauvecl.schema.errors import InputError, Message, of_kind
+from mauvecl.study.cases import (
+    SATURATED,
+    Case,
+    amplitude_column,
+    cases,
+    collect_messages,
+    label,
+    place_columns,
+    star_column,
+    worst_first,
+)
+from mauvecl.study.questions import QUANTITIES, UNITS
+from mauvecl.study.sections import Unknowns
+from mauvecl.study.study import Study
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
+
+    from mauvecl.host.exposure.expectation import Expectation
+    from mauvecl.host.instrument.instrument import Instrument
+
+
+@dataclass(frozen=True)
+class Assumption:
+    """Uncertain value of the payload with both ends of its range (documentation: what is nominal)."""
+
+    name: str
+    ends: tuple[str, str]
+    changes: tuple[Mapping[str, Any], Mapping[str, Any]]
+
+
+def assumptions(nominal: Instrument) -> tuple[Assumption, ...]:
+    """Return the uncertain values of the payload and their ranges; normal priors extend to one standard deviation."""
+    rows = []
+    values = values_of(nominal)
+    for name, prior in Unknowns().priors(nominal).items():
+        ends = (prior.low, prior.high) if isinstance(prior, Uniform) else (prior.mean - prior.sd, prior.mean + prior.sd)
+        value = values[name]
+        low, high = (value.changes(nominal, float(f"{end:.12g}")) for end in ends)
+        rows.append(Assumption(value.label, (f"{ends[0]:g}", f"{ends[1]:g}"), (low, high)))
+    dark = Assumption(
+        "dark counts are Poisson in", ("DN", "electrons"), ({"dark_unit": "DN"}, {"dark_unit": "electrons"})
+    )
+    return (*rows, dark)
+
+
+@dataclass(frozen=True)
+class Moved:
+    """Limit with one assumption at both ends of its range."""
+
+    star: str
+    amplitude: float
+    statistic: str
+    assumption: Assumption
+    nominal: float
+    at_ends: tuple[float, float]
+
+    @property
+    def span(self) -> float:
+        """Difference between the ends."""
+        return abs(self.at_ends[1] - self.at_ends[0])
+
+
+@validated
+def what_matters(study: Study) -> QTable:
+    """Compute the closed-form limits of a study with each assumption at both ends of its range.
+
+    Returns
+    -------
+    QTable
+        One row per star, flare, statistic and assumption; for each limit, the assumption that changes it most first.
+    """
+    rows: list[Moved] = []
+    for case in cases(study, swept=False):
+        for single in single_flares(case):
+            for statistic in study.run.statistics:
+                rows += sorted(_moves(single, statistic), key=lambda m: -m.span)
+    columns = assumption_columns(study.limit.of)
+    table = table_of(columns, rows, power=study.limit.power, fap=study.run.fap, study=study.text())
+    for column in columns:
+        if column.format == LIMIT:
+            table[column.name].info.format = LIMIT
+    return table
+
+
+#: Format of limits.
+LIMIT = ".3f"
+
+
+def assumption_columns(of: str) -> tuple[Column, ...]:
+    """Return the columns of the table of assumptions, for limits of a quantity."""
+    return (
+        star_column(),
+        *(() if of == "amplitude" else (amplitude_column(),)),
+        STATISTIC_COLUMN,
+        Column("assumption", "assumption.name", "", "what is assumed of the instrument", "assumption"),
+        Column("low_end", lambda row: row.assumption.ends[0], "", "lower end of its sensible range", "from"),
+        Column("high_end", lambda row: row.assumption.ends[1], "", "upper end of its sensible range", "to"),
+        Column(of, "nominal", description=QUANTITIES[of].description, format=LIMIT),
+        Column("at_low_end", lambda row: row.at_ends[0], "", "closed-form limit with the assumption at its lower end",
+               "limit from", LIMIT),
+        Column("at_high_end", lambda row: row.at_ends[1], "", "closed-form limit with the assumption at its upper end",
+               "to", LIMIT),
+        Column("span", "", "", f"how far the closed-form limit of {of} moves from end to end", "moves by", LIMIT),
+    )  # fmt: skip
+
+
+def _moves(case: Case, statistic: str) -> list[Moved]:
+    """Return the change of a limit with each assumption."""
+    star, amplitude = case.star.library or str(case.star.file), case.amplitudes[0]
+    if case.study.limit.of == "amplitude":
+        amplitude = float("nan")
+    nominal, moves = LimitSearch(case, statistic).root(), []
+    for assumption in assumptions(case.instrument):
+        changed = (replace(case, study=case.study.with_instrument(change)) for change in assumption.changes)
+        low, high = (LimitSearch(each, statistic).root(near=nominal) for each in changed)
+        moves.append(Moved(star, amplitude, statistic, assumption, nominal, (low, high)))
+    return moves
+
+
+#: Steps in which the progress of a limit is reported, since its number of simulations is not known beforehand.
+STEPS = 100
+
+
+@dataclass(frozen=True)
+class Limit:
+    """Limit of a quantity."""
+
+    star: str
+    amplitude: float  # amplitude of the flare; NaN if the amplitude is the limit
+    of: str
+    statistic: str
+    fap: float
+    power: float
+    value: Interval  # limit with its 95 % interval, including that of the threshold
+    closed_form: float  # limit for Gaussian noise
+    check: Point  # detection probability at the value, simulated again with another seed
+    points: tuple[Point, ...]  # simulations of the search
+    curve: tuple[tuple[float, float], ...]  # the closed form around the limit
+    at: Mapping[str, float | str] = field(default_factory=dict)  # sweep values
+    unknown: Unknown | None = None  # for limits averaged over unknown instrument values
+    messages: tuple[str, ...] = ()  # saturation at the limit, without and with the flare
+    cost: Cost | None = None  # loss of S/N to unknowns at the limit
+    # The star at the limit, without the flare.
+    quiet: Expectation | None = field(default=None, compare=False, repr=False)
+
+    @property
+    def agrees(self) -> bool:
+        """True if the 95 % interval of the second simulation contains the power."""
+        p = self.check.probability
+        return p.low <= self.power <= p.high
+
+    @property
+    def verdict(self) -> str:
+        """Verdict of the second simulation on the limit.
+
+        It is "confirms it" if its interval contains the power, "exceeds it" if exposures of whole frames have more
+        power, and "DIFFERS" if the interval misses the power by more than its width. It is empty in between, which
+        happens by chance for one limit in six.
+        """
+        p = self.check.probability
+        if self.agrees:
+            return "confirms it"
+        if self.of == "exposure" and p.low > self.power:
+            return "exceeds it"
+        away = max(p.low - self.power, self.power - p.high)
+        return "DIFFERS" if away > p.high - p.low else ""
+
+
+#: Formats of limits by quantity.
+DIGITS = {"magnitude": ".3f", "amplitude": ".4g", "exposure": ".0f"}
+STATISTIC_COLUMN = Column("statistic", description="detection statistic", heading="statistic")
+CHECK = "detection probability there, with a fresh seed"
+
+
+def _limit_columns(answer: LimitAnswer) -> tuple[Column, ...]:
+    of, digits, unit = answer.study.limit.of, DIGITS[answer.study.limit.of], UNITS.get(answer.study.limit.of, "")
+    unknown = _unknown_columns(digits) if answer.study.unknowns.draws else ()
+    return (
+        *answer.flare_columns,
+        *share_columns(answer.study, "quiet.target_share"),
+        Column(of, "value.value", unit, "where the flare is detected with the wanted probability",
+               "exposure (s)" if of == "exposure" else of, digits),
+        Column("low", "value.low", unit, "its 95 % interval, lower end, with the threshold's own", INTERVAL,
+               interval(digits), ("high",)),
+        Column("high", "value.high", unit, "its 95 % interval, upper end, with the threshold's own"),
+        Column("closed_form", "", unit, "the same for Gaussian noise", "closed form", digits),
+        Column("check", "check.probability.value", "", CHECK, "detected there, simulated again", ".4f"),
+        Column("check_low", "check.probability.low", "", f"{CHECK}; 95 % interval, lower end", INTERVAL,
+               interval(".4f"), ("check_high",)),
+        Column("check_high", "check.probability.high", "", f"{CHECK}; 95 % interval, higher end"),
+        *unknown,
+    )  # fmt: skip
+
+
+def _unknown_columns(digits: str) -> tuple[Column, ...]:
+    """Return the columns of limits over draws of what is unknown of the instrument."""
+    return (
+        Column("unknown_low", lambda row: row.unknown.range[0],
+               description="central 95 % of the limits over what is unknown, lower end", heading="95 % of limits",
+               format=lambda low, high: f"{low:{digits}} to {high:{digits}}", others=("unknown_high",)),
+        Column("unknown_high", lambda row: row.unknown.range[1],
+               description="central 95 % of the limits over what is unknown, upper end"),
+        Column("matters_most", lambda row: next(iter(row.unknown.shares)),
+               description="unknown that explains most of the limits' variance"),
+        Column("its_share", lambda row: next(iter(row.unknown.shares.values())),
+               description="share of the limits' variance that this unknown explains"),
+    )  # fmt: skip
+
+
+def _draw_columns(answer: LimitAnswer) -> tuple[Column, ...]:
+    draws = next(one.unknown.draws for one in answer.limits if one.unknown is not None)
+    values = (column.of(attrgetter("unknown")) for column in draw_columns(draws))
+    limit = Column(answer.study.limit.of, "unknown.limits", description="closed-form limit")
+    return (*answer.flare_columns, *values, limit)
+
+
+def _run_of(answer: LimitAnswer) -> dict[str, object]:
+    study = answer.study
+    return {"power": study.limit.power, "fap": study.run.fap, "realisations": study.run.realisations}
+
+
+@dataclass(eq=False)
+class LimitAnswer(Answer):
+    """Answer of `limit`."""
+
+    USES = ("instrument", "sky", "flare", "processes", "nuisances", "values", "seed")
+
+    study: Study
+    limits: list[Limit] = field(default_factory=list)
+    assumptions: QTable | None = None  # change of the limits with assumptions about the instrument; see `what_matters`
+    failed: tuple[str, ...] = ()  # reasons for missing limits
+
+    #: One row per star, flare and statistic.
+    table = TableOf("limit", _limit_columns, "limits", place=True, key="rows", about=_run_of)
+    #: One row per limit and draw of the unknown: its values and the closed-form limit.
+    draws = TableOf("unknowns", _draw_columns, "limits", place=True, when=lambda answer: answer.study.unknowns.draws)
+    _assumptions = TableOf("assumptions", lambda answer: assumption_columns(answer.study.limit.of), "assumptions",
+                           key="assumptions", when=lambda answer: answer.assumptions is not None)  # fmt: skip
+
+    def placed(self, columns: Sequence[Column]) -> tuple[Column, ...]:
+        """Return columns after those of the star and of swept quantities other than the amplitude."""
+        return (*place_columns(self.study.sweep, "amplitude", star="star"), *columns)
+
+    @property
+    def flare_columns(self) -> tuple[Column, ...]:
+        """Columns of flare and statistic."""
+        return (*(() if self.study.limit.of == "amplitude" else (amplitude_column(),)), STATISTIC_COLUMN)
+
+    @property
+    def views(self) -> list[View]:
+        of, run, draws = self.study.limit.of, self.study.run, self.study.unknowns.draws
+        columns = LimitAnswer.table.columns_of(self)
+        shown = (*(column for column in columns if column.name != "unknown_low"), Column("verdict", heading="verdict"))
+        title = (
+            f"Limit of {of} at a detection probability of {self.study.limit.power:g}, false-alarm probability "
+            f"{run.fap:g} per test, {run.realisations:,} realisations"
+        )
+        views = [View(title, shown, table_of(shown, self.limits))]
+        if draws:
+            shares = Column("shares", lambda row: describe_shares(row.unknown.shares),
+                            heading="matters most, share of the variance")  # fmt: skip
+            title = (
+                f"Averaged over {draws} draws of what is unknown of the instrument: the limits of each, and what "
+                "explains their scatter"
+            )
+            shown = (*self.placed(self.flare_columns), *_unknown_columns(DIGITS[of])[:2], shares)
+            views.append(View(title, shown, table_of(shown, self.limits)))
+        if self.assumptions is not None:
+            title = f"What is assumed, and how far it moves the closed-form limit of {of}, the largest first"
+            views.append(LimitAnswer._assumptions.view(self, title))
+        return views
+
+    @cached_property
+    def inputs(self) -> list[Expectation]:
+        """Each star at its limits."""
+        return [limit.quiet for limit in self.limits if limit.quiet is not None]
+
+    @property
+    def messages(self) -> list[str]:
+        """Messages about failed limits, the stars, and unknowns."""
+        stars = worst_first(
+            [
+                *(text for limit in self.limits for text in limit.messages),
+                *collect_messages(self.inputs, self.study.processes),
+            ]
+        )
+        costs = [limit.cost for limit in self.limits if limit.cost is not None]
+        failed = [Message(f"NO LIMIT: {text}.", "no limit") for text in self.failed]
+        return [*failed, *stars, *marginal_lines(self.study.nuisances), *cost_lines(costs, self.study.nuisances)]
+
+
+def solve(case: Case, statistic: str, engine: Engine | Pool, report: Callable[[int], None] | None = None) -> Limit:
+    """Return the limit of a case's first flare, or of its amplitude, and simulate it again with another seed.
+
+    Averages over draws of unknown instrument values if the study has some. Raises InputError if the power is not
+    crossed in the searched range, or too few realisations lie beyond the threshold. Calls `report` with the number of
+    simulations after each of them.
+    """
+    study = case.study
+    check_fap(study.run.fap, study.run.realisations, study.run.tails)
+    kind = MarginalLimitSearch if study.unknowns.draws else LimitSearch
+    question = kind(case, statistic, engine, report)
+    # The root of the nominal instrument is near and found quickly.
+    theory = question.root(near=LimitSearch(case, statistic).root() if study.unknowns.draws else None)
+    value = settle(question, theory)
+    simulated = tuple(question.points)
+    # Users are unlikely to choose a seed with this distance from another.
+    fresh = (study.run.seed + 0x9E3779B97F4A7C15) % 2**64
+    check = Point(value.value, question.simulated(value.value, fresh), fresh)
+    quiet, flare = question.pair(value.value)
+    named = case.star.model_copy(update={"magnitude": None}) if question.of == "magnitude" else case.star
+    rise = value.value if question.of == "amplitude" else case.amplitudes[0]
+    there = f"exposure {value.value:.0f} s" if question.of == "exposure" else f"{question.of} {value.value:.4g}"
+    where = f"{label(named, quiet)} at {there}, flare of {100 * rise:.4g} %"
+    return Limit(
+        star=label(named, quiet),
+        amplitude=float("nan") if question.of == "amplitude" else case.amplitudes[0],
+        of=question.of,
+        statistic=statistic,
+        fap=question.fap,
+        power=question.power,
+        value=value,
+        closed_form=theory,
+        check=check,
+        points=simulated,
+        curve=question.curve(value.value),
+        at=case.at,
+        unknown=question.unknown(theory) if isinstance(question, MarginalLimitSearch) else None,
+        messages=tuple(of_kind(collect_messages([quiet, flare]), SATURATED)),
+        quiet=quiet,
+        cost=unknown_cost(where, quiet, flare, study.nuisances, study.run.comparison()),
+    )
+
+
+@validated
+def limit(
+    study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
+) -> LimitAnswer:
+    """Compute the limits of a study's stars and flares, by every statistic.
+
+    Raises InputError as for `solve` if all limits fail; otherwise see `LimitAnswer.failed`.
+
+    Parameters
+    ----------
+    study : Study
+        Its ``limit`` defines the quantity (magnitude, amplitude or exposure) and the power.
+    progress : callable, optional
+        Called as ``progress(done, total)`` in steps, `STEPS` for each limit.
+    """
+    engine = engine or Engine()
+    result = LimitAnswer(study)
+    if any(axis.quantity == study.limit.of for axis in study.sweep.axes):
+        raise InputError(
+            f"the sweep must run over other quantities than the {study.limit.of}, of which the limit is requested",
+            key="sweep",
+        )
+    asked = [
+        (single, statistic)
+        for case in cases(study)
+        for single in single_flares(case)
+        for statistic in study.run.statistics
+    ]
+
+    steps, lock = [0] * len(asked), Lock()
+
+    def report(number: int, done: int) -> None:
+        with lock:
+            steps[number] = done
+            if progress is not None:
+                progress(sum(steps), STEPS * len(asked))
+
+    def solved(number: int) -> Limit | InputError:
+        outcome: Limit | InputError
+        try:
+            # At least one more simulation follows each, until the limit is found.
+            outcome = solve(*asked[number], engine, lambda count: report(number, STEPS * count // (count + 1)))
+        except InputError as error:
+            # The limits of other stars are still computed.
+            outcome = error
+        report(number, STEPS)
+        return outcome
+
+    outcomes = list(map_in_order(engine, solved, range(len(asked))))
+    errors = [one for one in outcomes if isinstance(one, InputError)]
+    if len(errors) == len(outcomes):
+        raise errors[0]
+    result.limits.extend(one for one in outcomes if isinstance(one, Limit))
+    result.failed = tuple(dict.fromkeys(map(str, errors)))
+    return result
+
+
+#: Former name.
+limiting_magnitude = limit
+
+
+@validated
+def smallest_amplitude(study: Study, engine: Engine | Pool | None = None) -> LimitAnswer:
+    """Compute the smallest flare that is detected; see `limit`."""
+    return limit(_asking(study, "amplitude"), engine)
+
+
+@validated
+def shortest_exposure(study: Study, engine: Engine | Pool | None = None) -> LimitAnswer:
+    """Compute the shortest exposure in which the flares are detected; see `limit`."""
+    return limit(_asking(study, "exposure"), engine)
+
+
+def _asking(study: Study, of: str) -> Study:
+    return study.model_copy(update={"limit": study.limit.model_copy(update={"of": of})})

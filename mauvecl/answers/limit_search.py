@@ -1,0 +1,345 @@
+"""Search for the value at which a detection probability crosses a power: root of the closed form, then simulations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from mauvecl.answers.closed_forms import DrawnStudies, average, drawn, shares
+from mauvecl.detection.distributions import Interval, smallest_integer
+from mauvecl.detection.requests import STATISTICS, check_shape, fall_between
+from mauvecl.detection.statistics import LinearStatistic
+from mauvecl.schema.errors import InputError, reworded
+from mauvecl.schema.physical import DAY_S
+from mauvecl.study.cases import Case, off_centre
+
+if TYPE_CHECKING:
+    from mauvecl.device.engine import Engine
+    from mauvecl.host.exposure.expectation import Expectation
+    from mauvecl.runs.pool import Pool
+
+#: Steps of the search for the root of the closed form, from where a flare is hardest to see.
+STEPS = {"magnitude": -0.5, "amplitude": 2.0, "exposure": 2.0}
+#: Ends of that search, hardest and easiest.
+SEARCH = {"magnitude": (20.0, -2.0), "amplitude": (1e-5, 1e3), "exposure": (None, 1e6)}
+#: Largest number of simulations; two or three usually suffice, since each moves by the closed form's slope.
+MOST_EVALUATIONS = 8
+
+
+@dataclass(frozen=True)
+class Point:
+    """A simulated detection probability."""
+
+    value: float
+    probability: Interval
+    seed: int
+
+
+@dataclass(frozen=True, eq=False)
+class Unknown:
+    """Effect of unknown instrument values on a limit."""
+
+    draws: DrawnStudies
+    limits: NDArray[np.float64]  # closed-form limit of each draw, NaN if it has none, shape (n_draw,)
+    shares: dict[str, float]  # share of the limits' variance that each unknown explains, largest first
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """Central 95 % of the limits."""
+        low, high = np.nanquantile(self.limits, (0.025, 0.975))
+        return float(low), float(high)
+
+
+class LimitSearch:
+    """Detection probability of a case's first flare by one statistic, as a function of the limit's quantity."""
+
+    def __init__(
+        self,
+        case: Case,
+        statistic: str,
+        engine: Engine | Pool | None = None,
+        report: Callable[[int], None] | None = None,
+    ) -> None:
+        self.case, self.statistic, self.engine = case.with_value("amplitude", case.amplitudes[0]), statistic, engine
+        self.of, self.power, self.fap = case.study.limit.of, case.study.limit.power, case.study.run.fap
+        self.points: list[Point] = []
+        self._report = report
+        self._base: tuple[float, Expectation, Expectation] | None = None
+
+    def pair(self, value: float) -> tuple[Expectation, Expectation]:
+        """Return the expectations without and with the flare."""
+        if self.of == "exposure" and value > DAY_S:
+            # The sum of several exposures.
+            return self.scaled(value)
+        quiet, flare = self.case.with_value(self.of, value).expectations
+        return quiet, flare
+
+    def scaled(self, value: float) -> tuple[Expectation, Expectation]:
+        """Return `pair` by scaling one pair, since expectations are linear in light."""
+        if self._base is None:
+            at = {"magnitude": 10.0, "amplitude": 0.1, "exposure": self.frame_s}[self.of]
+            self._base = at, *self.pair(at)
+        at, quiet, flare = self._base
+        if self.of == "exposure":
+            frames = max(round(value / self.frame_s), 1)
+            return replace(quiet, n_frames=frames), replace(flare, n_frames=frames)
+        if self.of == "amplitude":
+            more = value / at * (flare.source_electrons - quiet.source_electrons)
+            return quiet, replace(flare, source_electrons=quiet.source_electrons + more)
+        fainter = 10 ** (-0.4 * (value - at))
+        dimmed = (replace(x, source_electrons=fainter * x.source_electrons) for x in (quiet, flare))
+        return next(dimmed), next(dimmed)
+
+    def theory(self, value: float) -> float:
+        """Return the detection probability for Gaussian noise; 0 if every pixel saturates."""
+        quiet, flare = self.scaled(value)
+        setting, one = self.case.setting(quiet, flare), STATISTICS[self.statistic]
+        if not setting.used.any():
+            return 0.0
+        one.check(setting)
+        if one.shaped and not flare.saturated[setting.used].all():
+            check_shape(quiet, flare, setting.used)
+        return one.detection_forms(setting, flare, self.fap).probability
+
+    def simulated(self, value: float, seed: int) -> Interval:
+        """Simulate the detection probability and return it with its interval."""
+        assert self.engine is not None
+        quiet, flare = self.pair(value)
+        detection = self.engine.detect(
+            quiet, [flare], seed=seed, **self.case.detect_options(quiet) | {"statistics": (self.statistic,)}
+        )
+        for message in detection.messages:
+            raise InputError(
+                f"at a {self.of} of {value:g}: {message.rstrip('.')}",
+                "a limit at which some pixel is not saturated",
+                key="limit.of",
+            )
+        # Raises InputError where no threshold has the false-alarm probability.
+        detection.threshold(self.fap, self.statistic)
+        (probability,) = detection.detection_probability(self.fap, self.statistic)
+        self._add(Point(value, probability, seed))
+        return probability
+
+    def _add(self, point: Point) -> None:
+        """Add a simulated point, and report the number of points."""
+        self.points.append(point)
+        if self._report is not None:
+            self._report(len(self.points))
+
+    def curve(self, value: float) -> tuple[tuple[float, float], ...]:
+        """Return the closed form around a value; exposures are whole frames."""
+        at = _coordinate(self.of, value)
+        values = [_value(self.of, at + step) for step in np.linspace(-0.75, 0.75, 25)]
+        if self.of == "exposure":
+            frame_s = self.frame_s
+            values = sorted({max(round(v / frame_s), 1) * frame_s for v in values})
+        return tuple((v, self.theory(v)) for v in values)
+
+    def root(self, near: float | None = None) -> float:
+        """Return the first value at which the closed form reaches the power, from the hardest or near one."""
+        from scipy.optimize import brentq
+
+        if near is not None and self.of != "exposure":
+            at = _coordinate(self.of, near)
+            ends = [_value(self.of, at + step) for step in (-1.0, 1.0)]
+            if self.theory(ends[0]) < self.power <= self.theory(ends[1]):
+                low, high = sorted(ends)
+                return float(brentq(lambda v: self.theory(v) - self.power, low, high, rtol=1e-5))
+        hardest, easiest = SEARCH[self.of]
+        value = self.frame_s if hardest is None else hardest
+        if self.theory(value) >= self.power:
+            if self.of == "exposure":
+                return value
+            raise self._beyond(value, "already exceeds")
+        step = STEPS[self.of]
+        while (easiest - value) * (_further(self.of, value, step) - value) > 0:
+            nearer = _further(self.of, value, step)
+            if self.theory(nearer) >= self.power:
+                if self.of == "exposure":
+                    # Whole frames: the closed form is a staircase.
+                    few, many = (round(end / self.frame_s) for end in (value, nearer))
+                    reached = smallest_integer(lambda n: self.theory(n * self.frame_s) >= self.power, few, many)
+                    return reached * self.frame_s
+                low, high = sorted((value, nearer))
+                return float(brentq(lambda v: self.theory(v) - self.power, low, high, xtol=1e-6 * abs(high - low)))
+            value = nearer
+        raise self._beyond(easiest, "does not reach")
+
+    @property
+    def frame_s(self) -> float:
+        """Seconds of one frame."""
+        return self.case.instrument.frame_s
+
+    def _beyond(self, value: float, verb: str) -> InputError:
+        star, (hardest, easiest) = self.case.star, SEARCH[self.of]
+        low, high = sorted((hardest or 0.0, easiest))
+        name = f"{star.library or star.file}" + (
+            f" {star.band} = {star.magnitude:g}" if self.of != "magnitude" and star.magnitude is not None else ""
+        )
+        flare = "" if self.of == "amplitude" else f" with a flare of {100 * self.case.amplitudes[0]:.3g} %"
+        return InputError(
+            f"the detection probability of {name}{flare} by {self.statistic} {verb} {self.power:g} at "
+            f"{self.of} = {value:g}",
+            f"a limit between {low:g} and {high:g}{self.saturation_clause(value)}{self.sign_clause(value)}",
+            key="limit.of",
+        )
+
+    def sign_clause(self, value: float) -> str:
+        """Return the clause of an error message on a weighted sum that the flare lowers at a value."""
+        quiet, flare = self.scaled(value)
+        setting, one = self.case.setting(quiet, flare), STATISTICS[self.statistic]
+        if not isinstance(one, LinearStatistic) or not setting.used.any() or flare.saturated[setting.used].all():
+            return ""
+        shape = flare if one.shaped else None
+        falls = fall_between(*(one.closed_form(setting, x, shape) for x in (quiet, flare)))
+        if not falls:
+            return ""
+        return (
+            f"; WRONG SIGN: there {self.statistic} falls by {falls:.3g} standard deviations with the flare, and only "
+            "higher values are alarms"
+        )
+
+    def saturation_clause(self, value: float) -> str:
+        """Return the clause of an error message on saturation at a value, of the star or else of the flare."""
+        quiet, flare = self.scaled(value)
+        return quiet.saturation_clause or flare.saturation_clause.replace(" saturate ", " saturate with the flare ")
+
+    def slope(self, value: float) -> float:
+        """Return the slope of the closed form's probit, per unit of `_coordinate`."""
+        at, width = _coordinate(self.of, value), 0.02
+        values = (_value(self.of, at - width), _value(self.of, at + width))
+        below, above = (special.ndtri(np.clip(self.theory(v), 1e-9, 1 - 1e-9)) for v in values)
+        return float((above - below) / (2 * width))
+
+
+class MarginalLimitSearch(LimitSearch):
+    """Detection probability averaged over draws of unknown instrument values."""
+
+    def __init__(
+        self,
+        case: Case,
+        statistic: str,
+        engine: Engine | Pool | None = None,
+        report: Callable[[int], None] | None = None,
+    ) -> None:
+        super().__init__(case, statistic, engine, report)
+        self.draws = drawn(case.study)
+        self.each = [LimitSearch(replace(case, study=study), statistic, engine) for study in self.draws.studies]
+
+    def theory(self, value: float) -> float:
+        """Return the mean over draws."""
+        return float(np.mean([draw.theory(value) for draw in self.each]))
+
+    def simulated(self, value: float, seed: int) -> Interval:
+        """Return the mean over draws, each with its own reference and threshold."""
+        probability = average([draw.simulated(value, seed) for draw in self.each])
+        self._add(Point(value, probability, seed))
+        return probability
+
+    def unknown(self, near: float) -> Unknown:
+        """Return the closed-form limit of each draw, and the share of its variance that each unknown explains."""
+        limits = []
+        for draw in self.each:
+            try:
+                limits.append(draw.root(near=near))
+            except InputError:
+                limits.append(float("nan"))
+        roots = np.array(limits)
+        return Unknown(self.draws, roots, shares(self.draws, roots))
+
+
+def single_flares(case: Case) -> list[Case]:
+    """Return a case for each flare of which a limit is computed: one if the limit is that of the amplitude."""
+    if case.study.limit.of == "amplitude":
+        return [case]
+    return [case.with_value("amplitude", amplitude) for amplitude in case.amplitudes]
+
+
+def _further(of: str, value: float, step: float) -> float:
+    return value + step if of == "magnitude" else value * step
+
+
+def _coordinate(of: str, value: float) -> float:
+    """Return a coordinate that increases towards easier detection: minus the magnitude, or 2.5 log10 of the value."""
+    return -value if of == "magnitude" else 2.5 * float(np.log10(value))
+
+
+def _value(of: str, coordinate: float) -> float:
+    return -coordinate if of == "magnitude" else float(10 ** (0.4 * coordinate))
+
+
+def settle(question: LimitSearch, start: float) -> Interval:
+    """Return the value at which the simulation reaches the power, with its interval, searched from a start near it.
+
+    Raises InputError if the probability does not rise there, or the search does not settle.
+    """
+    try:
+        return (_settle_frames if question.of == "exposure" else _settle)(question, start)
+    except InputError as error:
+        outside = off_centre([question.pair(start)[0]], question.case.processes)
+        if outside:
+            raise reworded(error, "; ".join([str(error), *outside])) from error
+        raise
+
+
+def _settle(question: LimitSearch, start: float) -> Interval:
+    """Find the limit by Newton's steps in the probit, and its interval, with the slope of the closed form."""
+    of, seed = question.of, question.case.study.run.seed
+    slope, goal = question.slope(start), float(special.ndtri(question.power))
+    if not slope > 0:
+        raise InputError(
+            f"the detection probability does not rise towards an easier {of} at {start:g}",
+            f"a slope there{question.saturation_clause(start)}{question.sign_clause(start)}",
+            key="limit.of",
+        )
+    at = _coordinate(of, start)
+    n = question.case.study.run.realisations
+    for _ in range(MOST_EVALUATIONS):
+        p = question.simulated(_value(of, at), seed)
+        clipped = (min(max(q, 0.5 / n), 1 - 0.5 / n) for q in (p.value, p.low, p.high))
+        here, low, high = (float(special.ndtri(q)) for q in clipped)
+        move = (goal - here) / slope
+        # Half the interval's width away the slope's own error no longer counts.
+        near = abs(goal - here) <= max(0.5 * (high - low), 0.02)
+        if near:
+            ends = [_value(of, at + (goal - q) / slope) for q in (low, high)]
+            return Interval(_value(of, at + move), min(ends), max(ends))
+        at += float(np.clip(move, -0.75, 0.75))
+    raise InputError(
+        f"the limit of {of} did not settle near {_value(of, at):g}",
+        f"it within {MOST_EVALUATIONS} simulations{question.saturation_clause(_value(of, at))}",
+        key="limit.of",
+    )
+
+
+def _settle_frames(question: LimitSearch, start: float) -> Interval:
+    """Find the fewest frames that reach the power, by the probability and by either end of its interval."""
+    seed, frame_s = question.case.study.run.seed, question.frame_s
+
+    @cache
+    def at(frames: int) -> Interval:
+        return question.simulated(frames * frame_s, seed)
+
+    def fewest(which: str) -> int:
+        """Return the fewest frames that reach the power, by doubling steps and then bisection."""
+
+        def reaches(frames: int) -> bool:
+            return frames > 0 and getattr(at(frames), which) >= question.power
+
+        many = max(round(start / frame_s), 1)
+        few, step = many - 1, 1
+        while not reaches(many):
+            few, many, step = many, many + step, 2 * step
+        step = 1
+        while reaches(few):
+            few, many, step = max(few - step, 0), few, 2 * step
+        return smallest_integer(reaches, few, many)
+
+    value, low, high = (fewest(which) * frame_s for which in ("value", "high", "low"))
+    return Interval(value, low, high)

@@ -1,0 +1,334 @@
+"""Detection probability over two quantities, all cells on common draws."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.answers.answer import Answer, TableOf
+from mauvecl.answers.closed_forms import (
+    average,
+    cost_lines,
+    describe_shares,
+    drawn,
+    marginal_lines,
+    shares,
+    unknown_cost,
+)
+from mauvecl.detection.distributions import Interval
+from mauvecl.detection.names import check_fap
+from mauvecl.device.engine import Engine
+from mauvecl.runs.pool import Pool, map_in_order
+from mauvecl.schema.calls import validated
+from mauvecl.schema.columns import Column, View, table_of
+from mauvecl.schema.errors import Message, of_kind
+from mauvecl.study.cases import (
+    SATURATED,
+    Case,
+    assumption_line,
+    cases,
+    collect_messages,
+    label,
+    quantity_column,
+    worst_first,
+)
+from mauvecl.study.nuisances import NuisanceChoice
+from mauvecl.study.questions import QUANTITIES
+from mauvecl.study.study import Study
+
+if TYPE_CHECKING:
+    from mauvecl.host.exposure.expectation import Expectation
+    from mauvecl.study.questions import MapQuestion
+    from mauvecl.study.sections import Run
+
+#: Quantities of the flare alone: cells that differ in them share their quiescent star, and one launch.
+OF_FLARE = tuple(name for name, one in QUANTITIES.items() if one.path[0] == "flare")
+
+
+#: Columns of the table of cells, after those of the two axes.
+COLUMNS = (
+    Column("statistic", lambda answer: np.array(answer.statistics)[:, None, None], description="detection statistic"),
+    Column("probability", description="detection probability"),
+    Column("low", description="its 95 % interval, lower end, with the threshold's own"),
+    Column("high", description="its 95 % interval, upper end, with the threshold's own"),
+    Column("closed_form", description="the same for Gaussian noise"),
+)
+
+
+def _cell_columns(answer: MapAnswer) -> tuple[Column, ...]:
+    x, y = (axis.quantity for axis in (answer.study.map.x, answer.study.map.y))
+    return (
+        quantity_column(x, lambda answer: np.array(answer.x)),
+        quantity_column(y, lambda answer: np.array(answer.y)[:, None]),
+        *COLUMNS,
+    )
+
+
+def _run_of(answer: MapAnswer) -> dict[str, object]:
+    run = answer.study.run
+    return {"star": answer.star, "fap": run.fap, "realisations": run.realisations}
+
+
+@dataclass(frozen=True, eq=False)
+class MapAnswer(Answer):
+    """Answer of `map`, for the study's first star.
+
+    Arrays have the shape (n_statistic, n_y, n_x) and are NaN where every pixel saturates.
+    """
+
+    USES = ("instrument", "sky", "flare", "processes", "nuisances", "values", "seed")
+    ENDINGS = ("ecsv", "fits")
+
+    study: Study
+    star: str
+    # x, y: values of both axes.
+    x: tuple[float | str, ...]
+    y: tuple[float | str, ...]
+    statistics: tuple[str, ...]
+    probability: NDArray[np.float64]  # detection probability
+    # low, high: its 95 % interval, with that of the threshold.
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    closed_form: NDArray[np.float64]  # probability for Gaussian noise
+    messages: list[str]
+    # For maps averaged over unknowns, by statistic: the share of the variance of the mean probability that each unknown
+    # explains, largest first.
+    shares: dict[str, dict[str, float]] = field(default_factory=dict)
+    quiet: Expectation | None = None  # the star of the first cell
+
+    #: One row per cell and statistic.
+    table = TableOf("map", _cell_columns, lambda answer: answer, about=_run_of)
+
+    @property
+    def views(self) -> list[View]:
+        """Map of each statistic, with a row per value of y and a column per value of x."""
+        draws = f"{self.study.unknowns.draws} draws of what is unknown"
+        lines = [
+            View(f"{statistic}, averaged over {draws}: its scatter is from {describe_shares(parts)}.")
+            for statistic, parts in self.shares.items()
+        ]
+        axes = f"{self.study.map.y.quantity}, {self.study.map.x.quantity}"
+        columns = [
+            Column("y", heading=axes, format=_shown),
+            *(Column(f"x{k}", heading=_shown(x), format=lambda p: f"{100 * p:.0f}") for k, x in enumerate(self.x)),
+        ]
+        maps = []
+        for statistic, probability in zip(self.statistics, self.probability, strict=True):
+            rows = [
+                {"y": y} | {f"x{k}": p for k, p in enumerate(row)} for y, row in zip(self.y, probability, strict=True)
+            ]
+            title = f"{self.star}: detection probability in percent, {statistic}, fap {self.study.run.fap:g} per test"
+            maps.append(View(title, columns, table_of(columns, rows)))
+        return [*lines, *maps]
+
+    @property
+    def assumed(self) -> str:
+        """One line with the study's assumptions apart from the two quantities of the map."""
+        return assumption_line(self.study, self.uses, (self.study.map.x.quantity, self.study.map.y.quantity))
+
+    @property
+    def inputs(self) -> list[Expectation]:
+        """The star without a flare in the first cell."""
+        return [] if self.quiet is None else [self.quiet]
+
+
+@validated
+def map(
+    study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
+) -> MapAnswer:
+    """Compute the detection probability of the study's first star and flare over two quantities.
+
+    Parameters
+    ----------
+    study : Study
+        Its ``map`` defines the axes; other quantities have the study's values.
+    progress : callable, optional
+        Called as ``progress(done, total)`` in cells.
+    """
+    check_fap(study.run.fap, study.run.realisations, study.run.tails)
+    study = study.model_copy(update={"star": study.star[:1]}).at("amplitude", study.flare.amplitudes[0])
+    (case,) = cases(study, swept=False)
+    unknown = drawn(case.study) if study.unknowns.draws else None
+    draws = [case] if unknown is None else [replace(case, study=draw) for draw in unknown.studies]
+    cells = Cells(study.map.x.points(), study.map.y.points(), engine or Engine(), len(draws), progress)
+    maps = [cells.map_of(draw) for draw in draws]
+    values, parts = maps[0], {}
+    if unknown is not None:
+        values = _averaged(maps)
+        for s, statistic in enumerate(study.run.statistics):
+            means = [float(np.nanmean(drawn_map["probability"][s])) for drawn_map in maps]
+            parts[statistic] = shares(unknown, np.array(means))
+    quiet, star, names = cells.quiet[0], study.star[0], {study.map.x.quantity, study.map.y.quantity}
+    if "magnitude" in names:
+        star = star.model_copy(update={"magnitude": None})
+    messages = [
+        *_blinded(values),
+        *_without_threshold(study.run, values),
+        *_wrong_sign(case, cells.lowered, len(cells.x) * len(cells.y)),
+        *worst_first([*collect_messages(cells.quiet, study.processes), *cells.saturated]),
+        *marginal_lines(study.nuisances),
+        *_cost(case, cells.x, cells.y),
+    ]
+    return MapAnswer(
+        study=study,
+        star="stars of the axis" if "star" in names else label(star, quiet),
+        x=cells.x,
+        y=cells.y,
+        statistics=study.run.statistics,
+        messages=messages,
+        shares=parts,
+        quiet=quiet,
+        **values,
+    )
+
+
+def _cost(case: Case, x: Values, y: Values) -> list[str]:
+    """Return the sentence on the cost of unknowns in the middle of the map."""
+    middle, study = (x[len(x) // 2], y[len(y) // 2]), case.study
+    there = _cell(case, *middle)
+    (flare,) = there.flares
+    names = (axis.quantity.replace("_", " ") for axis in (study.map.x, study.map.y))
+    at = " and ".join(f"{name} {_shown(value)}" for name, value in zip(names, middle, strict=True))
+    cost = unknown_cost(f"the cell of {at}", there.quiet, flare, study.nuisances, study.run.comparison())
+    return cost_lines([cost], study.nuisances)
+
+
+def _shown(value: float | str) -> str:
+    return value if isinstance(value, str) else f"{value:.3g}"
+
+
+#: Values of an axis.
+Values = tuple[float | str, ...]
+Arrays = dict[str, NDArray[np.float64]]
+#: A statistic, and the indices of a cell in which the flare lowers it.
+Lowered = tuple[str, int, int]
+
+
+def _blinded(values: Arrays) -> list[str]:
+    """Return the sentence on cells where every pixel saturates, if any."""
+    form = values["closed_form"][0]
+    cells = int(np.isnan(form).sum())
+    if not cells:
+        return []
+    text = f"SATURATED: every pixel that counts saturates in {cells} of {form.size} cells: no number there."
+    return [Message(text, SATURATED)]
+
+
+def _without_threshold(run: Run, values: Arrays) -> list[str]:
+    """Return a sentence for each statistic on cells where no threshold has the false-alarm probability, if any."""
+    missing = np.isnan(values["probability"]) & ~np.isnan(values["closed_form"])
+    return [
+        Message(
+            f"NO THRESHOLD: in {int(there.sum())} of {there.size} cells no threshold of {statistic} has a false-alarm "
+            f"probability of {run.fap:g}, because one value is more probable, as saturated pixels give it: no number "
+            "there; `mauvecl detect` names the probabilities that thresholds have.",
+            "no threshold",
+        )
+        for statistic, there in zip(run.statistics, missing, strict=True)
+        if there.any()
+    ]
+
+
+def _wrong_sign(case: Case, lowered: set[Lowered], cells: int) -> list[str]:
+    """Return a sentence for each weighted sum on the cells whose flare lowers it, if any."""
+    how = "marginalised over unknowns, " if case.study.nuisances != NuisanceChoice() else ""
+    return [
+        Message(
+            f"WRONG SIGN: {how}{statistic} falls with the flare in {number} of {cells} cells, and only higher values "
+            "are alarms: its detection probability says nothing of the flare there.",
+            "wrong sign",
+        )
+        for statistic in case.study.run.statistics
+        if (number := sum(name == statistic for name, *_ in lowered))
+    ]
+
+
+@dataclass(eq=False)
+class Cells:
+    """Cells of a map, and what their computation finds for messages."""
+
+    x: Values
+    y: Values
+    engine: Engine | Pool
+    n_maps: int
+    progress: Callable[[int, int], None] | None
+    done: int = 0  # cells of all maps
+    quiet: list[Expectation] = field(default_factory=list)
+    saturated: list[str] = field(default_factory=list)  # messages on flares that saturate
+    lowered: set[Lowered] = field(default_factory=set)  # weighted sums that flares lower
+
+    def map_of(self, case: Case) -> Arrays:
+        """Compute the map on the instrument of a case."""
+        shape = (len(case.study.run.statistics), len(self.y), len(self.x))
+        values = {name: np.full(shape, np.nan) for name in ("probability", "low", "high", "closed_form")}
+
+        def filled(cells: list[tuple[int, int]]) -> tuple[Expectation, int, list[str]]:
+            group = [_cell(case, self.x[i], self.y[j]) for i, j in cells]
+            quiet, flares = group[0].quiet, group[0].expect(*(cell.flaring(cell.amplitudes[0]) for cell in group))
+            if not quiet.saturated.all():
+                self.lowered.update(_fill(values, cells, group[0], flares, self.engine))
+            return quiet, len(cells), of_kind(collect_messages(flares), SATURATED)
+
+        for quiet, count, texts in map_in_order(self.engine, filled, _groups(case.study.map, self.x, self.y)):
+            self.quiet.append(quiet)
+            self.saturated.extend(texts)
+            self.done += count
+            if self.progress is not None:
+                self.progress(self.done, self.n_maps * len(self.x) * len(self.y))
+        return values
+
+
+def _averaged(maps: list[Arrays]) -> Arrays:
+    """Return the mean over draws of the unknown, with its interval; NaN if a draw has none."""
+    values = {name: np.mean([cells[name] for cells in maps], axis=0) for name in ("probability", "closed_form")}
+    values |= {name: np.full_like(values["probability"], np.nan) for name in ("low", "high")}
+    for at in zip(*np.nonzero(np.isfinite(values["probability"])), strict=True):
+        p = average([Interval(*(float(cells[name][at]) for name in ("probability", "low", "high"))) for cells in maps])
+        values["low"][at], values["high"][at] = p.low, p.high
+    return values
+
+
+def _groups(question: MapQuestion, x: Values, y: Values) -> list[list[tuple[int, int]]]:
+    """Return the cells (i, j) in groups that share a quiescent star."""
+    flare_x, flare_y = (axis.quantity in OF_FLARE for axis in (question.x, question.y))
+    every = [[(i, j) for i in range(len(x))] for j in range(len(y))]
+    if flare_x and flare_y:
+        return [[cell for row in every for cell in row]]
+    if flare_x:
+        return every
+    if flare_y:
+        return [list(column) for column in zip(*every, strict=True)]
+    return [[cell] for row in every for cell in row]
+
+
+def _cell(case: Case, x: float | str, y: float | str) -> Case:
+    """Return the case of a cell."""
+    question = case.study.map
+    return case.with_value(question.x.quantity, x).with_value(question.y.quantity, y)
+
+
+def _fill(
+    values: Arrays, cells: list[tuple[int, int]], case: Case, flares: list[Expectation], engine: Engine | Pool
+) -> list[Lowered]:
+    """Compute cells that share the quiescent star of a case, and return the weighted sums that their flares lower."""
+    run, lowered = case.study.run, []
+    result = engine.detect(case.quiet, flares, seed=run.seed, **case.detect_options())
+    for s, statistic in enumerate(run.statistics):
+        probabilities = result.detection_probability(run.fap, statistic)
+        for k, ((i, j), p) in enumerate(zip(cells, probabilities, strict=True)):
+            at = (s, j, i)
+            values["probability"][at], values["low"][at], values["high"][at] = p.value, p.low, p.high
+            limit = result.closed_form(statistic, template=k).isf(run.fap)
+            if k not in result.blinding:
+                values["closed_form"][at] = result.closed_form(statistic, k).sf(limit)
+            if result.fall(statistic, k):
+                lowered.append((statistic, i, j))
+    return lowered
+
+
+#: The older name, which does not hide Python's own `map`.
+detection_map = map

@@ -1,0 +1,378 @@
+"""Measurement of a study's flares: forecast errors, simulated fits, and the bias of models that are too simple."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from operator import attrgetter
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy
+from astropy.table import QTable
+from numpy.typing import NDArray
+
+from mauvecl.answers.answer import Answer, TableOf, reported
+from mauvecl.answers.measurements import (
+    JOINT_COLUMNS,
+    ExpectedMeasurement,
+    MeasuredStare,
+    expected_measurements,
+    fit_model,
+    matched_filter,
+    measured_stare,
+)
+from mauvecl.detection.distributions import Interval, clopper_pearson
+from mauvecl.detection.nuisances import join_names
+from mauvecl.device.engine import Engine
+from mauvecl.fits.flare_model import usable_variance
+from mauvecl.fits.spectrum import LEVELS, Measurement
+from mauvecl.fits.time_course import MeasuredBins
+from mauvecl.noise.scene import FactorDistributions
+from mauvecl.runs.checkpoint import kept
+from mauvecl.runs.pool import Pool, map_in_order
+from mauvecl.schema.calls import validated
+from mauvecl.schema.columns import Column, View, number, percent, table_of
+from mauvecl.schema.errors import InputError
+from mauvecl.study.cases import Case, amplitude_column, cases, collect_messages
+from mauvecl.study.questions import check_sweep
+from mauvecl.study.study import Study
+
+if TYPE_CHECKING:
+    from mauvecl.detection.snr import Arrays
+    from mauvecl.host.exposure.expectation import Expectation
+    from mauvecl.study.cases import Use
+
+Float = NDArray[np.float64]
+
+#: Number of exposures drawn and fitted at once, which limits the memory and the time until a fit can be cancelled.
+BATCH = 256
+#: S/N below which the coverage of intervals differs from the nominal one (bench/coverage.py).
+WILKS_SNR = 10.0
+#: p-value below which a fit is rejected.
+REJECTED = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredFlare(ExpectedMeasurement):
+    """Model fitted to simulated exposures of a flare."""
+
+    found: Measurement  # fits to simulated exposures
+    selected: NDArray[np.bool_]  # exposures that a matched filter detects at the study's false-alarm probability
+    frame: Float  # the first exposure, DN, less the quiescent mean; shape (n_pixel,)
+
+    def fitted_dn(self) -> tuple[Float, Float]:
+        """Return the mean of the fitted flare in the first exposure, and the best values of unknowns, DN."""
+        found = self.found
+        mean = self.fitted.counts(np.exp(found.log_k[0]), found.factor[0] * found.amplitudes[0])
+        if self.unknown is None:
+            return mean, np.zeros_like(mean)
+        unknown, expected = self.unknown.around(mean), self.unknown.mean_dn
+        variance, used = usable_variance(self.quiet, mean, self.skipped_nm, unknown)
+        spectra = unknown.spectra * used
+        weighted = np.divide(spectra, variance, out=np.zeros_like(spectra), where=used)
+        information = np.diag(unknown.sd**-2.0) + weighted @ spectra.T
+        left = self.frame - mean - expected
+        return mean, expected + np.linalg.solve(information, weighted @ left) @ unknown.spectra
+
+    def rows(self) -> QTable:
+        """Return one row per quantity."""
+        return table_of(COLUMNS, [self])
+
+    @cached_property
+    def coverages(self) -> dict[str, Float]:
+        """Shares of intervals that hold the truth, with 95 % intervals, by their columns; shape (3, n_derived) each."""
+        exposures = {"": np.ones(self.selected.size, np.bool_), "_selected": self.selected}
+        return {
+            f"coverage_{100 * level:.0f}{suffix}": _coverage(self.found, self.truth, k, which)
+            for suffix, which in exposures.items()
+            for k, level in enumerate(self.found.levels)
+        }
+
+    @property
+    def bias_selected(self) -> Float:
+        """Median of the estimates of detected flares less the truth, shape (n_derived,); NaN if none is detected."""
+        estimates = self.found.estimates[self.selected]
+        return (np.median(estimates, axis=0) if len(estimates) else np.nan) - self.truth
+
+    @cached_property
+    def rejected(self) -> Interval:
+        """Share of fits that are rejected, with its 95 % interval."""
+        return clopper_pearson(int((self.found.p_value < REJECTED).sum()), self.found.p_value.size)
+
+    @cached_property
+    def detected(self) -> Interval:
+        """Share of exposures in which the flare is detected, with its 95 % interval."""
+        return clopper_pearson(int(self.selected.sum()), self.selected.size)
+
+
+def _coverage_columns(level: float, suffix: str, whose: str, heading: str = "") -> list[Column]:
+    """Return the columns of the coverage of intervals of a level."""
+    name = f"coverage_{100 * level:.0f}{suffix}"
+    text = f"share of {100 * level:.0f} % intervals that hold the truth, {whose}"
+    return [
+        Column(name, lambda row: row.coverages[name][0], "", text, heading, percent(".1f")),
+        Column(f"{name}_low", lambda row: row.coverages[name][1], "", f"{text}: 95 % interval, lower end"),
+        Column(f"{name}_high", lambda row: row.coverages[name][2], "", f"{text}: 95 % interval, upper end"),
+    ]
+
+
+#: Columns of the measured quantities of a `MeasuredFlare`.
+COLUMNS = (
+    Column("quantity", "found.names", "", "what is measured", "quantity"),
+    Column("unit", "found.units", "", "of truth, estimates and errors", "unit"),
+    Column("truth", "", "", "true value; undefined where the flare has none", "truth", number(".4g")),
+    Column("error_known", "known.errors", "", "standard error in advance, everything known", "error, all known",
+           number(".4g")),
+    Column("error", "ahead.errors", "", "standard error in advance, unknowns marginalised over", "error",
+           number(".4g")),
+    Column("perfect", lambda row: row.perfect.estimates[0], "", "estimate from an exposure without noise",
+           "fit without noise", number(".4g")),
+    Column("low_68", lambda row: row.perfect.low[0, 0], "",
+           "lower end of the 68 % interval of that fit; infinite if there is none"),
+    Column("high_68", lambda row: row.perfect.high[0, 0], "", "its upper end"),
+    Column("low_95", lambda row: row.perfect.low[1, 0], "", "lower end of the 95 % interval of that fit", "95 % from",
+           number(".4g")),
+    Column("high_95", lambda row: row.perfect.high[1, 0], "", "its upper end", "to", number(".4g")),
+    Column("median", lambda row: np.median(row.found.estimates, axis=0), "", "median of the estimates"),
+    Column("bias", lambda row: np.median(row.found.estimates, axis=0) - row.truth, "",
+           "median of the estimates less the truth", "bias", number(".4g")),
+    Column("scatter", lambda row: _scatter(row.found.estimates), "", "half of the central 68.27 % of the estimates",
+           "scatter", number(".4g")),
+    *_coverage_columns(LEVELS[0], "", "of all"),
+    *_coverage_columns(LEVELS[1], "", "of all", "95 % covers"),
+    *_coverage_columns(LEVELS[0], "_selected", "of detected flares"),
+    *_coverage_columns(LEVELS[1], "_selected", "of detected flares", "if detected"),
+    Column("bias_selected", "", "", "median of the estimates of detected flares less the truth"),
+    Column("one_sided", lambda row: row.found.one_sided[-1].mean(axis=0), "", "share of 95 % intervals with one end",
+           "one-sided", percent(".0f")),
+)  # fmt: skip
+#: Column of errors that all exposures share, after the standard errors of one exposure.
+THROUGHPUT_COLUMN = Column("error_throughput", "of_throughput", "",
+                           "standard error by the calibration of the throughput, which all exposures share",
+                           "by throughput", number(".4g"))  # fmt: skip
+
+
+#: Columns of the table of fits.
+FIT_COLUMNS = (
+    Column("snr", lambda row: row.snr[0], "", "S/N of the flare in one exposure, everything known", "S/N, all known",
+           ".2f"),
+    Column("snr_marginal", lambda row: row.snr[1], "", "the same, unknowns marginalised over", "S/N", ".2f"),
+    Column("dof", "found.dof", "", "degrees of freedom of chi-squared"),
+    Column("chi2", lambda row: float(np.mean(row.found.chi2)), "", "mean chi-squared of the fits", "chi-squared / dof",
+           lambda chi2, dof: f"{chi2:.1f} / {dof}", ("dof",)),
+    Column("chi2_perfect", lambda row: float(row.perfect.chi2[0]), "",
+           "what the model cannot fit of an exposure without noise"),
+    Column("rejected", "rejected.value", "", f"share of fits with a p-value below {REJECTED:g}", "p < 0.01",
+           percent(".1f")),
+    Column("rejected_low", "rejected.low", "", "95 % interval, lower end"),
+    Column("rejected_high", "rejected.high", "", "95 % interval, upper end"),
+    Column("detected", "detected.value", "", "share that a matched filter for the true flare detects", "detected",
+           percent(".1f")),
+    Column("detected_low", "detected.low", "", "95 % interval, lower end"),
+    Column("detected_high", "detected.high", "", "95 % interval, upper end"),
+)  # fmt: skip
+MODEL_COLUMN = Column("model", description="model that is fitted", heading="model")
+
+
+def _quantity_columns(answer: MeasureAnswer) -> tuple[Column, ...]:
+    place = [column.name for column in COLUMNS].index("error") + 1
+    calibrated = any(flare.of_throughput is not None for flare in answer.flares)
+    by_throughput = (THROUGHPUT_COLUMN,) if calibrated else ()
+    return (amplitude_column(), MODEL_COLUMN, *COLUMNS[:place], *by_throughput, *COLUMNS[place:])
+
+
+def _bin_columns(stare: MeasuredStare) -> list[Column]:
+    """Return the columns of measurements along a stare."""
+    assert isinstance(stare.drawn, MeasuredBins)
+    columns = [column.of(attrgetter("drawn")) for column in stare.drawn.columns]
+    exact = Column("temperature_without_noise", lambda row: row.perfect.found.estimates[:, 0], "K",
+                   "temperature fitted to the means of these frames", "without noise", ".0f")  # fmt: skip
+    place = [column.name for column in columns].index("temperature") + 1
+    return [*columns[:place], exact, *columns[place:]]
+
+
+@dataclass(eq=False)
+class MeasureAnswer(Answer):
+    """Answer of `measure`."""
+
+    USES = ("instrument", "sky", "flare", "processes", "nuisances", "seed")
+
+    study: Study
+    flares: list[MeasuredFlare]  # all models of each flare of each star and cell of the sweep
+    messages: list[str]
+    # One stare per star and cell, if the study requests bins of a stare or a joint fit.
+    stares: list[MeasuredStare] = field(default_factory=list)
+
+    #: Errors, bias and coverage; one row per star, cell, flare, model and quantity.
+    table = TableOf("measure", _quantity_columns, "flares", place=True, key="rows")
+    #: Goodness of fit and detection; one row per star, cell, flare and model.
+    fits = TableOf("fits", (amplitude_column(), MODEL_COLUMN, *FIT_COLUMNS), "flares", place=True, key="fits")
+    #: Measurements against time; one row per star, cell and bin of its stare.
+    temperatures = TableOf(
+        "temperatures", (MODEL_COLUMN,), lambda answer: answer.binned or QTable(), place=True, key="temperatures",
+        of=lambda _, stare: table_of(_bin_columns(stare), [stare]),
+        when=lambda answer: answer.study.measure.snr_per_bin is not None,
+    )  # fmt: skip
+    #: Joint fits of shape and spectrum; one row per star, cell and quantity.
+    joint = TableOf("joint", JOINT_COLUMNS, "stares", place=True, key="joint",
+                    when=lambda answer: answer.study.measure.joint_fit)  # fmt: skip
+
+    @property
+    def uses(self) -> tuple[Use, ...]:
+        """Parts of the study that this answer uses: the stare only if it is measured."""
+        return (*self.USES, "stare") if self.stares else self.USES
+
+    @property
+    def binned(self) -> list[MeasuredStare]:
+        """Stares in which some bin has the requested S/N."""
+        return [stare for stare in self.stares if isinstance(stare.drawn, MeasuredBins)]
+
+    @property
+    def views(self) -> list[View]:
+        title = f"Measured in one exposure; {self.study.measure.fits} simulated fits of each flare"
+        views = [MeasureAnswer.table.view(self, title, self.table[self.table["unit"] != "erg / s"])]
+        if self.binned:
+            title = f"Measured along the stare, in bins of S/N {self.study.measure.snr_per_bin:g}"
+            views.append(View(title, self.placed(_bin_columns(self.binned[0])), self.temperatures))
+        if self.study.measure.joint_fit:
+            title = "One stare: shape and spectrum of the flare, fitted to all frames together"
+            shown = self.joint[self.joint["unit"] != "erg / cm2"]
+            views.append(MeasureAnswer.joint.view(self, title, shown))
+        return [*views, MeasureAnswer.fits.view(self, "Goodness of fit")]
+
+    @property
+    def inputs(self) -> list[Expectation]:
+        return list({id(flare.quiet): flare.quiet for flare in self.flares}.values())
+
+
+@validated
+def measure(
+    study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
+) -> MeasureAnswer:
+    """Forecast and simulate the measurement of a study's flares in one exposure.
+
+    Parameters
+    ----------
+    study : Study
+    engine : Engine or Pool, optional
+        Simulator of the exposures; by default that of the default device. The checkpoint of a pool keeps finished fits.
+    progress : callable, optional
+        Called as ``progress(done, total)`` in flares.
+    """
+    if study.flare.geometry != "added":
+        raise InputError.of("flare.geometry", "replaces", "'added': fits take light for added")
+    if study.measure.along_stare:
+        check_sweep(study.sweep, study.stare, study.events)
+    prepared = cases(study)
+    if any(not amplitude > 0.0 for case in prepared for amplitude in case.amplitudes):
+        raise InputError("flare amplitude = 0 in a measurement", "one above 0", key="flare.amplitudes")
+    expectations = [x for case in prepared for x in case.expectations]
+    engine = engine or Engine()
+    asked = [(case, *flare, engine) for case in prepared for flare in zip(case.amplitudes, case.flares, strict=True)]
+    flares: list[MeasuredFlare] = []
+    for some in reported(map_in_order(engine, lambda row: _measured(*row), asked), len(asked), progress):
+        flares += some
+    stares = [measured_stare(case, engine) for case in prepared if study.measure.along_stare]
+    messages = collect_messages(expectations)
+    messages += [one.drawn for one in stares if isinstance(one.drawn, str)]
+    messages += dict.fromkeys(line for case in prepared for line in _not_marginalised(case))
+    return MeasureAnswer(study, flares, [*messages, *_faint(flares), *_wrong(flares)], stares)
+
+
+def _measured(case: Case, amplitude: float, flare: Expectation, engine: Engine | Pool) -> list[MeasuredFlare]:
+    """Fit all models to simulated exposures of a flare."""
+    study, quiet = case.study, case.quiet
+    expected = expected_measurements(case, amplitude, flare)
+    models, unknown = [one.fitted for one in expected], expected[0].unknown
+    skipped = study.measure.skipped_nm
+    weights = matched_filter(quiet, flare, case.unknowns(), skipped_nm=skipped)[0]
+
+    def fitted(start: int, count: int) -> Arrays:
+        raw = engine.realise(flare, start=start, count=count, seed=study.run.seed, **case.draw_options)
+        excess = raw - quiet.recorded_dn
+        arrays: Arrays = {"first": excess[0], "detected": excess @ weights >= scipy.stats.norm.isf(study.run.fap)}
+        for k, model in enumerate(models):
+            found = fit_model(raw, quiet, model, unknown, skipped)
+            arrays |= {f"{k} {key}": value for key, value in found.arrays().items()}
+        return arrays
+
+    checkpoint = engine.checkpoint if isinstance(engine, Pool) else None
+    parts: list[Arrays] = []
+    for start in range(0, study.measure.fits, BATCH):
+        count = min(BATCH, study.measure.fits - start)
+        # The number changes with the arrays that a fit keeps.
+        depends_on = ("measure", 2, quiet, flare, unknown, models, study.text(), start, count)
+        parts.append(kept(checkpoint, depends_on, partial(fitted, start, count)))
+    selected = np.concatenate([arrays["detected"] for arrays in parts])
+    measured = []
+    for k, one in enumerate(expected):
+        own = [{key.removeprefix(f"{k} "): x for key, x in part.items() if key.startswith(f"{k} ")} for part in parts]
+        model = one.fitted
+        of_batch = partial(
+            Measurement.of_arrays, levels=LEVELS, names=model.names, units=model.units, bounds=model.bounds
+        )
+        found = Measurement.joined(list(map(of_batch, own)))
+        measured.append(MeasuredFlare(**vars(one), found=found, selected=selected, frame=parts[0]["first"]))
+    return measured
+
+
+def _coverage(found: Measurement, truth: Float, level: int, which: NDArray[np.bool_]) -> Float:
+    """Return coverage and its 95 % interval for each quantity, shape (3, n_derived); NaN without a truth."""
+    inside = (found.low[level] <= truth) & (truth <= found.high[level])
+    cover = np.full((3, truth.size), np.nan)
+    n = int(which.sum())
+    for q in np.flatnonzero(np.isfinite(truth)) if n else ():
+        interval = clopper_pearson(int(inside[which, q].sum()), n)
+        cover[:, q] = interval.value, interval.low, interval.high
+    return cover
+
+
+def _scatter(estimates: Float) -> Float:
+    """Return half of the central 68.27 % of the estimates, shape (n_derived,); undefined for a single one."""
+    if len(estimates) < 2:
+        return np.full(estimates.shape[1], np.nan)
+    low, high = np.quantile(estimates, [0.15865, 0.84135], axis=0)
+    return np.asarray((high - low) / 2)
+
+
+def _not_marginalised(case: Case) -> list[str]:
+    """Return a message on drawn factors over which fits do not marginalise."""
+    drawn = FactorDistributions.from_processes(case.processes, case.quiet)
+    unknown = case.unknowns_of_fits()
+    names = [name for name in (drawn.spreads if drawn else ()) if unknown is None or name not in unknown.names]
+    if not names:
+        return []
+    return [
+        f"NOT MARGINALISED: {join_names(names)}. Exposures are drawn with other levels than fits expect, so that "
+        f"intervals miss the truth; `nuisances.{names[0]}` marginalises over one."
+    ]
+
+
+def _faint(flares: Sequence[MeasuredFlare]) -> list[str]:
+    """Return a message for each flare whose intervals are approximate because it is faint."""
+    found = {f"{flare.title}, flare of {100 * flare.amplitude:g} %": flare.snr[1] for flare in flares}
+    return [
+        f"{title}: of an S/N of {snr:.2g} with unknowns marginalised over; below {WILKS_SNR:g} intervals of 95 % cover "
+        "93 to 99 %: the table counts how often they do."
+        for title, snr in found.items()
+        if snr < WILKS_SNR
+    ]
+
+
+def _wrong(flares: Sequence[MeasuredFlare]) -> list[str]:
+    """Return messages on models that do not fit, with the temperature that they give."""
+    lines = []
+    for flare in flares:
+        lost, truth = float(flare.perfect.chi2[0]), flare.truth[0]
+        if lost < 1.0:
+            continue
+        kelvin, error = flare.perfect.estimates[0, 0], flare.ahead.errors[0]
+        against = f" where the flare has {truth:.0f} K" if np.isfinite(truth) else ""
+        rejected = 100 * float((flare.found.p_value < REJECTED).mean())
+        lines.append(
+            f"{flare.title}, flare of {100 * flare.amplitude:g} %: the model {flare.model!r} gives {kelvin:.0f} +- "
+            f"{error:.0f} K{against}; its goodness of fit rejects it in {rejected:.0f} % of exposures."
+        )
+    return lines

@@ -1,0 +1,493 @@
+"""Measurements of flares that are expected or simulated, in single frames and along stares."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from mauvecl.answers.answer import InCell
+from mauvecl.answers.closed_forms import throughput_cases
+from mauvecl.fits.flare_model import FlareModel, Ranges, Ratio, Reduction, usable_variance, variance_of
+from mauvecl.fits.profile import Profile, ratio_at
+from mauvecl.fits.spectrum import (
+    Forecast,
+    Measurement,
+    TwoTemperatures,
+    fit,
+    fit_two_temperatures,
+    forecast,
+    forecast_two_temperatures,
+)
+from mauvecl.fits.time_course import (
+    CoolingCourse,
+    MeasuredBins,
+    cooling_course,
+    cooling_event,
+    fit_bins,
+    fit_cooling,
+    measure_along,
+)
+from mauvecl.flares.settings import Cooling
+from mauvecl.flares.stare_scene import Arrays, StaresRequest
+from mauvecl.host.stars.bands import photons
+from mauvecl.host.stars.flare_spectra import (
+    PARSEC_CM,
+    SUN_CM,
+    BalmerFlare,
+    Blackbody,
+    EmissionLine,
+    FlareWithLines,
+    TwoBlackbodies,
+)
+from mauvecl.runs.checkpoint import kept
+from mauvecl.runs.pool import Pool
+from mauvecl.schema.columns import Column, number
+from mauvecl.schema.errors import InputError
+from mauvecl.study.analyses import fitted_models
+
+if TYPE_CHECKING:
+    from mauvecl.detection.nuisances import Nuisances
+    from mauvecl.device.engine import Engine
+    from mauvecl.flares.events import Event
+    from mauvecl.flares.frames import Components, StareExpectation
+    from mauvecl.host.exposure.expectation import Expectation
+    from mauvecl.host.stars.flare_spectra import FlareSpectrum
+    from mauvecl.host.stars.source import Source
+    from mauvecl.study.cases import Case
+    from mauvecl.study.sections import Star
+
+Float = NDArray[np.float64]
+
+
+class Truth:
+    """True values of a flare that was added to a star."""
+
+    def __init__(self, star: Star, quiet: Source, lit: Source, light: FlareSpectrum, band: str, exposure_s: float):
+        self._light, self._star, self._exposure_s = light, star, exposure_s
+        nm = lit.wavelength_nm
+        added = lit.flux_flam - np.interp(nm, quiet.wavelength_nm, quiet.flux_flam)
+        added = added - light.flux_at_telescope(nm)
+        # Ratio of the flux at the telescope to that of the flare's spectrum.
+        self._scale = float(np.trapezoid(added, nm) / np.trapezoid(light.flux(nm), nm))
+        self._continuum = light.continuum if isinstance(light, FlareWithLines) else light
+        self._two = self._continuum if isinstance(self._continuum, TwoBlackbodies) else None
+        self._amplitude = np.nan
+        if self._continuum.temperature_k is not None:
+            at = quiet.wavelength_nm
+            # Flux of the blackbodies without recombination.
+            light = self._continuum if self._two else Blackbody(self._continuum.temperature_k)
+            body = photons(at, light.flux(at), band)
+            self._amplitude = self._scale * body / photons(at, quiet.flux_flam, band)
+
+    def value(self, name: str) -> float:
+        """Return the true value of a quantity by its name in fits; NaN if the flare has none."""
+        far = np.nan if self._star.distance_pc is None else self._star.distance_pc * PARSEC_CM
+        first, _, rest = name.partition(" ")
+        if first in ("flux", "luminosity", "energy"):
+            factor = {"flux": 1.0, "luminosity": 4 * np.pi * far**2, "energy": 4 * np.pi * far**2 * self._exposure_s}
+            return factor[first] * self._flux(rest)
+        if first == "line":
+            return self._line(rest)
+        if name in ("temperature", "second temperature", "second area"):
+            return self._temperatures().get(name, np.nan)
+        if name == "amplitude":
+            return self._amplitude
+        if name == "jump":
+            if not self._continuum.surface:
+                return np.nan
+            return self._continuum.jump if isinstance(self._continuum, BalmerFlare) else 1.0
+        area = np.pi * far**2 * self._scale if self._continuum.surface else np.nan
+        area *= 1.0 if self._two is None else 1.0 + self._two.second_area
+        if name == "area":
+            return area
+        radius = np.nan if self._star.radius_rsun is None else self._star.radius_rsun * SUN_CM
+        return float(area / (np.pi * radius**2))
+
+    def _temperatures(self) -> dict[str, float]:
+        """Return the temperatures, and the ratio of the hotter blackbody's area to that of the cooler one."""
+        kelvin, two = self._continuum.temperature_k, self._two
+        if kelvin is None:
+            return {}
+        if two is None:
+            return {"temperature": kelvin}
+        (low, area), (high, hot_area) = sorted([(kelvin, 1.0), (two.second_temperature_k, two.second_area)])
+        return {"temperature": low, "second temperature": high, "second area": hot_area / area}
+
+    def _flux(self, where: str) -> float:
+        if where == "bolometric":
+            lines = self._light.fluxes_cgs.values() if isinstance(self._light, FlareWithLines) else ()
+            return self._scale * self._light.bolometric_flux() + sum(lines)
+        low, high = (float(end) for end in where.removesuffix(" nm").split("-"))
+        nm = self._light.grid(np.linspace(low, high, 4001))
+        return 10.0 * float(np.trapezoid(self._scale * self._light.flux(nm) + self._light.flux_at_telescope(nm), nm))
+
+    def _line(self, name: str) -> float:
+        if not isinstance(self._light, FlareWithLines):
+            return 0.0 if self._light.surface else np.nan
+        for mapping, factor in (
+            (self._light.fractions, self._scale * self._light.continuum_flux),
+            (self._light.fluxes_cgs, 1.0),
+        ):
+            for one, value in mapping.items():
+                if EmissionLine.named(one).name == EmissionLine.named(name).name:
+                    return factor * value
+        return 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class ExpectedMeasurement(InCell):
+    """Model and flare with true values and expected errors of a fit."""
+
+    amplitude: float  # of the study's flare
+    model: str
+    snr: tuple[float, float]  # of the flare in one exposure: everything known, and unknowns marginalised
+    truth: Float  # shape (n_derived,); NaN where the flare has no such quantity
+    known: Forecast  # everything known
+    ahead: Forecast  # unknowns of the study marginalised
+    perfect: Measurement  # the fit to the mean exposure: estimates without noise
+    fitted: FlareModel | TwoTemperatures
+    quiet: Expectation
+    unknown: Nuisances | None  # of the fits
+    of_throughput: Float | None  # standard errors by the calibration of the throughput, which exposures share
+    skipped_nm: Ranges  # wavelength ranges that are not used
+
+    @property
+    def name(self) -> str:
+        """The star, the flare and the model, for pictures."""
+        return f"{self.title}, flare {100 * self.amplitude:g} %, {self.model}"
+
+    def forecasts(self, factors: Float, unknown: Nuisances | None) -> list[Forecast]:
+        """Return the expected errors for the flare times factors, with unknowns marginalised or all of them known.
+
+        Errors of a flare that leaves too few pixels below saturation are undefined.
+        """
+        log_k, linear = self.perfect.log_k[0], self.perfect.amplitudes[0]
+
+        def at(factor: float) -> Forecast:
+            try:
+                return forecast_model(self.quiet, self.fitted, log_k, factor * linear, unknown, self.skipped_nm)
+            except InputError:
+                return replace(self.ahead, errors=np.full_like(self.ahead.errors, np.nan))
+
+        return [at(float(factor)) for factor in factors]
+
+    def region(self, rise: float, n: int = 161) -> tuple[Float, Float, Float]:
+        """Return the expected confidence region of temperature and amplitude, with everything else profiled.
+
+        Only for models of one temperature.
+
+        Parameters
+        ----------
+        rise : float
+            Increase of chi-squared that bounds the region.
+
+        Returns
+        -------
+        kelvin, low, high : ndarray, shape (n,)
+            Smallest and largest amplitude at each temperature.
+        """
+        assert isinstance(self.fitted, FlareModel)
+        best, linear = self.perfect.log_k, self.perfect.factor[0] * self.perfect.amplitudes[0]
+        mean_dn = self.fitted.counts(float(np.exp(best[0])), linear)
+        reduction = Reduction.of(self.fitted, self.quiet, mean_dn, self.unknown, self.skipped_nm)
+        mean = linear[0] * reduction.spline(best) + linear[1:] @ reduction.fixed
+        light = reduction.light
+        of_light = None
+        if light is not None:
+            # The sum of the factor on light for the fitted flare.
+            flare = linear[0] * light.spline(best) + linear[1:] @ light.fixed
+            of_light = light.scale * (self.perfect.factor - light.expected) + flare
+        profile = Profile(reduction, mean, of_light)
+        gain = float(mean[0] @ mean[0])
+        amplitude = self.fitted.splines[self.fitted.names.index("amplitude")]
+        assert amplitude is not None
+
+        def at(log_k: Float) -> tuple[Float, Ratio]:
+            """Return what is left of the rise at temperatures, and the amplitude there."""
+            x = log_k[None]
+            value, variance, hot = profile.parts(x)
+            along = float(profile.along[0] @ profile.along[0])
+            left = rise - (gain - along - value**2 / variance)
+            return left, ratio_at(profile, amplitude, x, profile.linear(x, value, hot), variance, hot)
+
+        nodes = np.linspace(reduction.log_k[0], reduction.log_k[-1], 8 * reduction.log_k.size)
+        inside = np.flatnonzero(at(nodes)[0][0] >= 0.0)
+        # From the outermost node inside to the next one, where the region ends, or from the fit.
+        known = nodes[inside[[0, -1]]] if inside.size else np.array([best[0], best[0]])
+        beyond = np.searchsorted(nodes, known[0]) - 1, np.searchsorted(nodes, known[1], side="right")
+        ends = [
+            scipy.optimize.brentq(lambda x: float(at(np.array([x]))[0][0, 0]), inner, nodes[k])
+            if 0 <= k < nodes.size else inner
+            for inner, k in zip(known, beyond, strict=True)
+        ]  # fmt: skip
+        # Dense at the ends, where the two amplitudes converge like a root.
+        log_k = (ends[0] + ends[1]) / 2 + (ends[1] - ends[0]) / 2 * np.sin(np.linspace(-np.pi / 2, np.pi / 2, n))
+        left, found = at(log_k)
+        low, high = (found.end(left, sign)[0] for sign in (-1.0, 1.0))
+        return np.exp(log_k), np.maximum(low, 0.0), high
+
+
+def fit_model(
+    frames: Float,
+    quiet: Expectation,
+    model: FlareModel | TwoTemperatures,
+    unknown: Nuisances | None,
+    skipped_nm: Ranges = (),
+) -> Measurement:
+    """Fit a model of one or two temperatures to exposures."""
+    if isinstance(model, TwoTemperatures):
+        return fit_two_temperatures(frames, quiet, model.single, unknown, skipped_nm=skipped_nm)
+    return fit(frames, quiet, model, unknown, skipped_nm=skipped_nm)
+
+
+def forecast_model(
+    quiet: Expectation,
+    model: FlareModel | TwoTemperatures,
+    log_k: Float,
+    linear: Float,
+    unknown: Nuisances | None,
+    skipped_nm: Ranges = (),
+) -> Forecast:
+    """Return the errors of a model of one or two temperatures, for parameters of a `Measurement`."""
+    if isinstance(model, TwoTemperatures):
+        return forecast_two_temperatures(quiet, model.single, np.exp(log_k), linear, unknown, skipped_nm)
+    return forecast(quiet, model, float(np.exp(log_k)), linear, unknown, skipped_nm=skipped_nm)
+
+
+def model_of(case: Case, *, jump: bool = False, lines: tuple[str, ...] = ()) -> FlareModel:
+    """Return the model of a blackbody at the star of a case, with a Balmer continuum and lines if they are fitted."""
+    study = case.study
+    return FlareModel.of(
+        case.source,
+        case.instrument,
+        case.quiet,
+        jump=jump,
+        lines=lines,
+        band=study.flare.band,
+        electron_temperature_k=study.flare.spectrum.electron_temperature_k,
+        distance_pc=case.star.distance_pc,
+        radius_rsun=case.star.radius_rsun,
+        bands_nm=study.measure.bands_nm,
+        order=study.observation.order,
+    )
+
+
+def models_of(case: Case) -> dict[str, FlareModel | TwoTemperatures]:
+    """Return the models that are fitted to exposures of a case, the simplest first."""
+    asked = fitted_models(case.study.measure, case.study.flare)
+    models = {name: model_of(case, jump=jump, lines=lines) for name, jump, lines in asked}
+    return {name: TwoTemperatures(one) if name == "two-temperatures" else one for name, one in models.items()}
+
+
+def last_of_one_temperature(models: dict[str, FlareModel | TwoTemperatures]) -> tuple[str, FlareModel]:
+    """Return the name and the model of the last one with a single temperature, or that of a blackbody."""
+    found = [(name, one) for name, one in models.items() if isinstance(one, FlareModel)]
+    if found:
+        return found[-1]
+    (two,) = (model for model in models.values() if isinstance(model, TwoTemperatures))
+    return "blackbody", two.single
+
+
+def expected_measurements(
+    case: Case, amplitude: float, flare: Expectation, models: dict[str, FlareModel | TwoTemperatures] | None = None
+) -> list[ExpectedMeasurement]:
+    """Forecast the measurement of a flare with each model, by default those of `models_of`."""
+    quiet, light, unknown = case.quiet, case.study.flare.light(), case.unknowns_of_fits()
+    band, skipped = case.study.flare.band, case.study.measure.skipped_nm
+    truth = Truth(case.star, case.source, case.flaring(amplitude), light, band, quiet.exposure_s)
+    lit = flare.recorded_dn - quiet.recorded_dn
+    known_snr, snr = (matched_filter(quiet, flare, one, lit, skipped)[1] for one in (None, case.unknowns()))
+    calibrated = throughput_cases(case)
+    # A fit in few pixels may differ from the flare in those that saturate, which its errors must not use.
+    lost = (*skipped, *_saturated_nm(flare))
+    expected = []
+    for name, model in (models or models_of(case)).items():
+        perfect = fit_model(_mean_exposure(quiet, lit, unknown), quiet, model, unknown, skipped)
+        known, ahead = (
+            forecast_model(quiet, model, perfect.log_k[0], perfect.amplitudes[0], one, lost) for one in (None, unknown)
+        )
+        true = np.array([truth.value(quantity) for quantity in model.names])
+        of_throughput = None
+        if calibrated:
+            of_throughput = _errors_of_throughput(calibrated, amplitude, model, quiet, unknown, skipped, perfect)
+        expected.append(
+            ExpectedMeasurement(
+                case.label,
+                case.at,
+                amplitude,
+                name,
+                (known_snr, snr),
+                true,
+                known,
+                ahead,
+                perfect,
+                model,
+                quiet,
+                unknown,
+                of_throughput,
+                skipped,
+            )
+        )
+    return expected
+
+
+def _errors_of_throughput(
+    calibrated: list[Case],
+    amplitude: float,
+    model: FlareModel | TwoTemperatures,
+    quiet: Expectation,
+    unknown: Nuisances | None,
+    skipped_nm: Ranges,
+    perfect: Measurement,
+) -> Float:
+    """Return the standard errors that the throughput's own errors cause, to first order, shape (n_derived,).
+
+    The observer knows the quiescent exposure from other frames, and fits the flare with the calibrated throughput.
+    """
+    moved = []
+    for case in calibrated:
+        (flare,) = case.expect(case.flaring(amplitude))
+        exposure = _mean_exposure(quiet, flare.recorded_dn - case.quiet.recorded_dn, unknown)
+        moved.append(fit_model(exposure, quiet, model, unknown, skipped_nm).estimates[0] - perfect.estimates[0])
+    return np.asarray(np.sqrt(np.sum(np.square(moved), axis=0)))
+
+
+def _saturated_nm(flare: Expectation) -> list[tuple[float, float]]:
+    """Return the wavelengths of runs of pixels near saturation."""
+    near = ~variance_of(flare)[1]
+    steps = np.flatnonzero(np.diff(np.concatenate([[0], near.astype(np.int8), [0]])))
+    nm = flare.wavelength_nm
+    return [(float(nm[first]), float(nm[end - 1])) for first, end in steps.reshape(-1, 2)]
+
+
+def _mean_exposure(quiet: Expectation, added_dn: Float, unknown: Nuisances | None) -> Float:
+    """Return the mean of an exposure with a flare at the prior mean of the factor on all light, DN."""
+    factor = unknown.mean_factor if unknown else 1.0
+    return np.asarray(quiet.recorded_dn + (factor - 1.0) * quiet.recorded_light_dn + factor * added_dn)
+
+
+def matched_filter(
+    quiet: Expectation,
+    flare: Expectation,
+    unknown: Nuisances | None,
+    added_dn: Float | None = None,
+    skipped_nm: Ranges = (),
+) -> tuple[Float, float]:
+    """Return the weights of a matched filter of variance one, and its mean with the flare.
+
+    The variance is that of the quiescent star, or of one with some light added.
+    """
+    variance, used = usable_variance(quiet, added_dn, skipped_nm)
+    delta = (flare.recorded_dn - quiet.recorded_dn) * used
+    weights = np.divide(delta, variance, out=np.zeros_like(delta), where=used)
+    if unknown:
+        rows = unknown.rows(variance, unknown.spectra * used)
+        weights = weights - (rows @ delta) @ rows
+    power = float(weights @ delta)
+    return (weights / np.sqrt(power), float(np.sqrt(power))) if power > 0 else (weights, 0.0)
+
+
+#: Columns of the table of joint fits, for a `MeasuredStare`.
+JOINT_COLUMNS = (
+    Column("quantity", "joint.found.names", "", "what is measured", "quantity"),
+    Column("unit", "joint.found.units", "", "of truth, estimate and intervals", "unit"),
+    Column("truth", "joint.truth", "", "true value; undefined where the flare has none", "truth", number(".4g")),
+    Column("estimate", lambda row: row.joint.found.estimates[0], "", "of maximum likelihood", "estimate", ".4g"),
+    Column("error", lambda row: row.joint.found.errors[0], "", "its standard error", "error", ".2g"),
+    Column("low_68", lambda row: row.joint.found.low[0, 0], "",
+           "lower end of its 68 % interval; infinite if there is none"),
+    Column("high_68", lambda row: row.joint.found.high[0, 0], "", "higher end"),
+    Column("low_95", lambda row: row.joint.found.low[1, 0], "", "lower end of its 95 % interval", "95 % from", ".4g"),
+    Column("high_95", lambda row: row.joint.found.high[1, 0], "", "higher end", "to", ".4g"),
+    Column("p_value", "joint.found.p_value", "",
+           "probability of a chi-squared of the fit at least as large where the model is right"),
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class JointFit:
+    """Fit of shape and spectrum to all frames, with the drawn flare."""
+
+    found: Measurement
+    truth: Float  # shape (n_derived,)
+    true: CoolingCourse
+    fitted: CoolingCourse
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredStare(InCell):
+    """Flares of a simulated stare, measured in bins of frames with one model, and by a joint fit."""
+
+    model: str
+    staring: StareExpectation
+    events: tuple[Event, ...]
+    drawn: MeasuredBins | str | None  # a sentence if no bin reaches the S/N
+    perfect: MeasuredBins | None  # the same bins without noise
+    joint: JointFit | None
+
+
+def measured_stare(case: Case, engine: Engine | Pool) -> MeasuredStare:
+    """Draw the stare of a case, and measure its flares."""
+    study, asked = case.study, case.study.measure
+    staring, events = case.stare_expectation, case.events
+    if asked.joint_fit and len(events) != 1:
+        raise InputError(
+            f"a joint fit needs a stare with a single flare, but it has {len(events)}", key="measure.joint_fit"
+        )
+    quiet, stare, seed = staring.quiet, staring.stare, study.run.seed
+    name, model = last_of_one_temperature(models_of(case.one_frame))
+    unknown = case.unknowns_of_fits(quiet, stare)
+    processes = study.processes.additive_only
+
+    def draw(components: Components) -> Float:
+        request = StaresRequest(components, stare, 1, seed, staring.flare, start=study.stare.number, method="pixels",
+                                processes=processes)  # fmt: skip
+        if isinstance(engine, Pool):
+            return np.asarray(engine.stares(request)["values"][0], np.float64)
+        from mauvecl.device.engine import Stares
+
+        return np.asarray(Stares(engine.open_device).reduced(request)["values"][0], np.float64)
+
+    def drawn() -> Arrays:
+        return {"frames": staring.raw(draw)}
+
+    checkpoint = engine.checkpoint if isinstance(engine, Pool) else None
+    depends_on = ("pixels", quiet, staring.flare_electrons, stare, staring.flare, study.stare.number, seed, processes)
+    raw = kept(checkpoint, depends_on, drawn)["frames"]
+    where = case.label, case.at, name, staring, tuple(events)
+    joint = _joint_fit(case, raw, unknown) if asked.joint_fit else None
+    if asked.snr_per_bin is None:
+        return MeasuredStare(*where, None, None, joint)
+    try:
+        bins = measure_along(raw, quiet, model, unknown, snr_per_bin=asked.snr_per_bin, stare=stare,
+                             skipped_nm=asked.skipped_nm)  # fmt: skip
+    except InputError as error:
+        sentence = f"No flare of {case.label} is measured along the stare: {error}."
+        return MeasuredStare(*where, sentence, None, joint)
+    perfect = fit_bins(
+        staring.mean_raw, quiet, model, unknown, stare, bins.first, bins.count, skipped_nm=asked.skipped_nm
+    )
+    return MeasuredStare(*where, bins, perfect, joint)
+
+
+def _joint_fit(case: Case, raw: Float, unknown: Nuisances | None) -> JointFit:
+    """Fit a blackbody to the one flare of a stare; the search for the best fit starts from the true flare."""
+    staring, (event,), model = case.stare_expectation, case.events, model_of(case.one_frame)
+    quiet, stare, skipped = staring.quiet, staring.stare, case.study.measure.skipped_nm
+    found = fit_cooling(
+        raw, quiet, model, unknown, peak_s=event.peak_s, half_width_s=event.half_width_s, shape=event.form,
+        cooling=isinstance(event.temperature, Cooling), stare=stare, skipped_nm=skipped,
+    )  # fmt: skip
+    true, fitted = (
+        cooling_course(one, found, raw, quiet, model, stare, skipped)
+        for one in (event, cooling_event(found, event.form))
+    )
+    truth = true.values
+    if not case.study.flare.is_blackbody:
+        # Only the shape is that of the model.
+        truth = np.where(np.arange(truth.size) < 2, truth, np.nan)
+    return JointFit(found, truth, true, fitted)

@@ -1,1 +1,0 @@
-"""Forecasts and simulations of the measurement of flares."""

@@ -1,1 +1,0 @@
-"""Answers from observed frames: flares, calibrated instruments, and changes between visits."""

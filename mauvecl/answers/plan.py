@@ -1,0 +1,413 @@
+"""Plans of campaigns: yields of flares for each target, in tables and in words."""
+
+from __future__ import annotations
+
+import calendar
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mauvecl.answers.answer import Answer, TableOf, reported, share_columns
+from mauvecl.answers.plan_targets import (
+    NOTHING,
+    CompletenessOf,
+    OrbitConditions,
+    Planned,
+    TargetObservation,
+    closed_form,
+    errors_of_throughput,
+    inject_target,
+    observe,
+    rates_of,
+    star_of,
+)
+from mauvecl.answers.visible import VisibleAnswer, assumption_columns, visible
+from mauvecl.device.engine import Stares
+from mauvecl.host.orbit.visibility import PARTICLES_SOURCE, THERMAL_SOURCE
+from mauvecl.runs.pool import map_in_order
+from mauvecl.schema.calls import validated
+from mauvecl.schema.columns import Column, number, percent, records
+from mauvecl.schema.errors import InputError, Message, of_kind, printable
+from mauvecl.schema.physical import DAY_S
+from mauvecl.search.completeness import Yield, recovered_per_day
+from mauvecl.study.cases import SATURATED, Case, collect_messages
+from mauvecl.study.study import Study
+
+if TYPE_CHECKING:
+    from mauvecl.host.exposure.expectation import Expectation
+    from mauvecl.runs.pool import Pool
+
+
+def two_digits(value: float) -> str:
+    """Format a number with two significant digits, or without decimals if it is large."""
+    return f"{value:.0f}" if value == 0 or value >= 9.95 else f"{value:#.2g}"
+
+
+def energy(value: float, unit: str = "") -> str:
+    """Format an energy with two significant digits, or "none" if it is not finite."""
+    return f"{value:.1e}{unit}" if math.isfinite(value) else "none"
+
+
+def months(names: str) -> str:
+    """Return months such as 2027-01 by name, with their years."""
+    years: dict[str, list[str]] = {}
+    for name in names.split():
+        years.setdefault(name[:4], []).append(calendar.month_abbr[int(name[5:])])
+    return ", ".join(f"{' '.join(each)} {year}" for year, each in years.items())
+
+
+def _interval(low: int | None, high: int | None) -> str:
+    return "" if low is None else f"{low} to {high}"
+
+
+#: Columns of the table of targets, without false alarms, which precede the last.
+COLUMNS = (
+    Column("target", "name", "", "name of the target", "target"),
+    Column("seen", "seen_h", "h", "time in which the target is seen", "seen (h)", ".0f"),
+    Column("hours", "", "h", "of it observed", "observed (h)", ".0f"),
+    Column("E50", lambda row: row.energy_at(0.5), "erg",
+           "bolometric energy from which on half of the flares are recovered", "E50 (erg)", energy),
+    Column("E90", lambda row: row.energy_at(0.9), "erg",
+           "bolometric energy from which on 90 % of the flares are recovered", "E90 (erg)", energy),
+    Column("expected", lambda row: row.recovered.expected if row.recovered else np.nan, "",
+           "flares recovered, by the rates as they are", "flares",
+           lambda expected: two_digits(expected) if expected == expected else "not known"),
+    Column("low", lambda row: row.recovered.low if row.recovered else None, "",
+           "lower end of the 95 % interval: scatter of the rates and Poisson noise", "95 %", _interval,
+           ("high",), int),
+    Column("high", lambda row: row.recovered.high if row.recovered else None, "",
+           "upper end of the 95 % interval", kind=int),
+    Column("at_least_one", lambda row: row.recovered.at_least_one if row.recovered else np.nan, "",
+           "probability of recovering any", "P(>= 1)", number(".2f")),
+    Column("best_months", lambda row: " ".join(row.best_months), "", "those with most hours", "best months", months),
+)  # fmt: skip
+#: Columns of errors by a calibrated throughput.
+THROUGHPUT_COLUMNS = (
+    Column("E50_error", lambda row: row.of_throughput[0] if row.of_throughput else np.nan, "",
+           "relative standard error of E50 by the calibration of the throughput", "E50 by throughput", percent(".2g")),
+    Column("expected_error", lambda row: row.of_throughput[1] if row.of_throughput else np.nan, "",
+           "relative standard error of the recovered flares by the calibration of the throughput",
+           "flares by throughput", percent(".2g")),
+)  # fmt: skip
+#: Columns of the table of inputs.
+STAR_COLUMNS = (
+    Column("target", "name", "", "name of the target"),
+    Column("ra", "observation.target.ra_deg", "deg", "right ascension"),
+    Column("dec", "observation.target.dec_deg", "deg", "declination"),
+    Column("position", "observation.target.source", "", "who says so"),
+    Column("spectral_type", lambda row: row.observation.target.spectral_type or ""),
+    Column("spectrum", lambda row: row.observation.star.library or "", "",
+           "embedded spectrum that stands for the star"),
+    Column("V", lambda row: row.observation.star.magnitude or 0.0, "mag"),
+    Column("distance", lambda row: row.observation.star.distance_pc or 0.0, "pc"),
+    Column("sky", lambda row: np.nan if row.observation.sky is None else row.observation.sky, "mag / arcsec2",
+           "zodiacal light behind it, median over the days on which it is seen"),
+    Column("signal_per_frame", "observation.signal_per_frame", "", "S/N of one frame with a flare of amplitude 1"),
+    Column("energy_per_second", "observation.scale.erg_per_s", "erg / s",
+           "bolometric energy of a second of equivalent duration"),
+    Column("temperature", lambda row: row.observation.quiet.conditions["temperature_c"], "deg_C",
+           "of the detector, mean while it is seen"),
+    Column("hits", "observation.hits_per_cm2_s", "1 / (s cm2)",
+           "of cosmic rays and trapped protons, mean while it is seen"),
+    Column("window", lambda row: row.observation.window_s / 60, "min", "median stretch in which it is seen"),
+    Column("saturated", lambda row: int(row.observation.quiet.saturated.sum()), "",
+           "pixels left out since they saturate"),
+    Column("rates", lambda row: row.no_rates if row.rates is None else row.rates.source, "",
+           "where its flare rates are from, or why there are none"),
+    Column("recovered_per_day",
+           lambda row: np.nan if row.rates is None or row.completeness is None
+           else recovered_per_day(row.rates, row.completeness), "", "flares recovered in a day of exposure"),
+    Column("scatter", lambda row: np.nan if row.rates is None else row.rates.scatter_dex, "",
+           "standard deviation of the rate's logarithm, dex"),
+)  # fmt: skip
+#: Columns of the table of recovered fractions and rates by energy.
+ENERGY_COLUMNS = (
+    Column("target", description="name of the target", kind=str),
+    Column("energy", "", "erg", "bolometric"),
+    Column("recovered", "", "", "share of flares of this energy that is recovered"),
+    Column("rate_above", "", "1 / day", "flares of this energy or more, a day"),
+)
+
+
+def _target_columns(answer: PlanAnswer) -> tuple[Column, ...]:
+    alarms = Column("false_alarms", lambda row: answer.study.search.rate * row.hours / 24, "", "expected of noise",
+                    "false alarms", two_digits)  # fmt: skip
+    share = share_columns(answer.study, "observation.quiet.target_share")
+    calibrated = any(target.of_throughput is not None for target in answer.planned)
+    return (*COLUMNS[:-1], alarms, *share, *(THROUGHPUT_COLUMNS if calibrated else ()), COLUMNS[-1])
+
+
+def _time_of(answer: PlanAnswer) -> dict[str, object]:
+    times = answer.seen.times
+    return {"start": times.iso(0.0), "days": times.days, "false_alarms_per_day": answer.study.search.rate}
+
+
+@dataclass(frozen=True, eq=False)
+class PlanAnswer(Answer):
+    """Answer of `plan`."""
+
+    USES = ("instrument", "flare", "orbit", "processes", "stare", "seed")
+
+    study: Study
+    seen: VisibleAnswer
+    planned: tuple[Planned, ...]
+
+    #: One row per target.
+    table = TableOf("plan", _target_columns, "planned", title=lambda answer: answer.heading, about=_time_of)
+    #: Inputs, one row per target.
+    stars = TableOf("stars", STAR_COLUMNS, "planned")
+    #: Recovered fraction and rate by energy, one row per target and energy where either changes.
+    by_energy = TableOf("energies", ENERGY_COLUMNS, "_energy_rows")
+    months = TableOf("months", (), "seen.months")
+    days = TableOf("days", (), "seen.by_day")
+    #: All assumptions with their sources.
+    assumptions = TableOf("assumptions", assumption_columns("assumption"), "_assumptions", study=False)
+
+    @property
+    def heading(self) -> str:
+        """Number of targets and time of the plan."""
+        times = self.seen.times
+        targets = "1 target" if len(self.planned) == 1 else f"{len(self.planned)} targets"
+        return f"{targets}, {times.days:g} days from {times.iso(0.0)[:10]} (UTC)"
+
+    @property
+    def _energy_rows(self) -> Iterator[dict[str, Any]]:
+        for target in self.planned:
+            if target.completeness is not None:
+                energies, p = target.completeness.energy_erg, target.completeness.probability
+                first = max(int(np.argmax(p > 0)) - 1, 0)
+                part = slice(first, min(first + 161, energies.size))
+                rate = np.nan if target.rates is None else target.rates.per_day_above(energies[part])
+                yield {"target": target.name, "energy": energies[part], "recovered": p[part], "rate_above": rate}
+
+    @property
+    def _assumptions(self) -> list[tuple[str, str, str]]:
+        study, orbit, law = self.study, self.study.orbit.orbit(), self.study.plan.law()
+        elements = (
+            f"{orbit.elements.source}, epoch {orbit.elements.epoch}; mean is a Sun-synchronous orbit through them"
+        )
+        half_width = (
+            f"t_1/2 = {law.half_width_s:g} s (E / {law.at_erg:g} erg)^{law.exponent:g}, {law.scatter_dex:g} dex"
+        )
+        light = ("blackbody of " if study.flare.is_blackbody else "") + study.flare.light().describe()
+        alarms = f"{study.search.false_alarms:g} per {study.search.per} of exposure"
+        return [
+            *self.seen.visibility.limits.assumptions,
+            ("stray light", "none", "not modelled"),
+            ("orbit", orbit.resolved(self.seen.times), elements),
+            ("throughput", study.observation.instrument, study.observation.load_instrument().notice),
+            ("sky", "zodiacal light", "median over the days on which a target is seen; table of the MauveSim paper"),
+            ("duration of flares", half_width, "assumption; exponent of Maehara et al. 2015"),
+            ("shape of flares", study.search.shape, "every flare alike, no bursts"),
+            ("light of flares", light,
+             "assumption; energies are those of all its light, spread alike in all directions"),
+            ("noise of a stare", "white", "in addition to the study's unknowns of a stare; see completeness"),
+            *self._along_orbit,
+            ("false alarms", alarms, "sets the threshold; of noise, not of hits by particles that look like flares"),
+            ("stars known by name", "V, spectral type",
+             "V of the Hipparcos catalogue (variable stars to 0.2 mag), rounded types (to some two subtypes)"),
+            ("spectra", "library", "the embedded spectrum of the nearest type stands for the star, scaled to its V"),
+            *((f"flare rates of {one.name}", one.rates.source, _measured(one)) for one in self.planned if one.rates),
+            *(("where the satellite will be", "", text) for text in orbit.messages(self.seen.times)),
+            *((f"completeness of {one.name}", "", one.completeness.how) for one in self.planned if one.completeness),
+        ]  # fmt: skip
+
+    @property
+    def _along_orbit(self) -> list[tuple[str, str, str]]:
+        if not self.study.plan.along_orbit:
+            return [("temperature and particles", "the study's", "the same for all targets")]
+        hits = self.study.processes.with_particles(0.0).particle_processes
+        return [
+            ("temperature", "along the orbit", THERMAL_SOURCE),
+            ("hits by particles", "along the orbit", PARTICLES_SOURCE),
+            *(process.assumption for process in hits),
+        ]
+
+    @property
+    def observed(self) -> list[Case]:
+        """One frame of each target."""
+        return [target.observation.case for target in self.planned]
+
+    @cached_property
+    def inputs(self) -> list[Expectation]:
+        """One frame of each star."""
+        return [target.observation.quiet for target in self.planned]
+
+    @property
+    def messages(self) -> list[str]:
+        """Messages on saturation, targets without an answer, extrapolations and visibility."""
+        lines = of_kind(collect_messages(self.inputs), SATURATED)
+        if len(self.planned) > 1:
+            lines.append("Each target is planned by itself: the hours of different targets may coincide.")
+        for case in self.observed:
+            if case.neighbours is not None:
+                lines += case.neighbours.messages(case.label, case.instrument)
+        typical = [
+            target.name for target in self.planned if target.rates is not None and "typical" in target.rates.source
+        ]
+        if typical:
+            lines.append(
+                f"Flare rates of {', '.join(typical)} are those typical of their types at 1000 Myr: mass_msun and "
+                "age_myr, or their own rates, are more accurate."
+            )
+        for one in self.planned:
+            if one.no_rates:
+                lines.append(f"{one.no_rates[0].upper()}{one.no_rates[1:]}; its expected flares are not given.")
+            if one.rates is not None and one.completeness is not None and one.extrapolated:
+                low, high = one.rates.measured_erg
+                lines.append(
+                    f"E50 of {one.name}, {one.energy_at(0.5):.2g} erg, lies outside the {low:.2g} to {high:.2g} erg "
+                    "for which its flare rates are published: they are extrapolated."
+                )
+        study = self.study
+        if study.plan.completeness == "closed form" and (study.stare.has_unknowns or study.nuisances.usual):
+            text = (
+                "FALSE ALARMS may be more than stated: the closed form takes the stare for known, and it has unknowns; "
+                "plan.completeness = 'injections' allows for them."
+            )
+            lines.append(Message(text, "false alarms"))
+        if study.plan.along_orbit and study.processes.particle_processes:
+            lines.append("The rate of particles in [processes] is not used: it follows the orbit (plan.along_orbit).")
+        unused = dict.fromkeys(name for target in study.plan.targets for name in target.unused)
+        if unused:
+            lines.append(f"Columns of the table of targets that are not used: {printable(', '.join(unused), 300)}.")
+        lines += self.seen.messages
+        return list(dict.fromkeys(lines))
+
+
+def _measured(one: Planned) -> str:
+    assert one.rates is not None
+    low, high = one.rates.measured_erg
+    return f"published for {low:.2g} to {high:.2g} erg, bolometric; scatter {one.rates.scatter_dex:g} dex (assumption)"
+
+
+@validated
+def plan(
+    study: Study,
+    engine: Stares | Pool | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    *,
+    completeness: CompletenessOf | None = None,
+) -> PlanAnswer:
+    """Plan a campaign on a study's targets.
+
+    Parameters
+    ----------
+    study : Study
+        Its ``plan`` defines the targets, its ``orbit`` time and position.
+    engine : Stares or Pool, optional
+        Simulator of injections; by default that of the default device. The checkpoint of a pool keeps finished targets.
+    progress : callable, optional
+        Called as ``progress(done, total)`` in targets.
+    completeness : callable, optional
+        Recovered fraction of flares by bolometric energy. By default the study's ``plan.completeness`` decides between
+        injections into drawn noise and the closed form.
+
+    Examples
+    --------
+    >>> from mauvecl import Study, plan
+    >>> study = Study().with_settings(["plan.targets=[{name = 'eps Eri'}]", "orbit.days=31", "plan.hours=100"])
+    >>> answer = plan(study.with_settings(["plan.completeness='closed form'"]))
+    >>> answer.table["hours"].value.tolist()
+    [100.0]
+    """
+    if not study.plan.targets:
+        raise InputError("the plan has no targets", "some, such as `plan.targets='targets.csv'`", key="plan.targets")
+    if study.orbit.targets:
+        raise InputError("both orbit.targets and plan.targets are given", "plan.targets alone", key="orbit.targets")
+    closed = completeness is None and study.plan.completeness == "closed form"
+    if completeness is None:
+        completeness = closed_form if closed else partial(inject_target, engine=engine or Stares())
+    for name, _ in study.processes.modulations if closed else ():
+        raise InputError(
+            f"processes.{name} with plan.completeness = 'closed form', which takes the stare for known",
+            "'injections'",
+            key=f"processes.{name}",
+        )
+    stars = [star_of(text, study.orbit.simbad) for text in study.plan.targets]
+    if progress is not None:
+        progress(0, len(stars))
+    seen = visible(study)
+    names, hours = seen.visibility.by_month()
+    along = OrbitConditions.along(seen.visibility.track) if study.plan.along_orbit else None
+
+    base = Case(study)
+
+    def observations() -> Iterator[tuple[int, TargetObservation]]:
+        for k, (text, star) in enumerate(zip(study.plan.targets, stars, strict=True)):
+            yield k, observe(base, text, star, seen, k, along)
+
+    def planned_for(item: tuple[int, TargetObservation]) -> Planned:
+        k, one = item
+        exposed = float(seen.visibility.hours[k])
+        observed = exposed if study.plan.hours is None else min(exposed, study.plan.hours)
+        order = np.argsort(-hours[:, k], kind="stable")[: study.plan.best_months]
+        best = tuple(names[i] for i in sorted(order) if hours[i, k] > 0)
+        its = None
+        if one.window_s > 0:
+            its = completeness(one) if one.signal_per_frame > 0 else NOTHING
+        rates, why = rates_of(study.plan.targets[k], one)
+        recovered = None
+        if rates is not None:
+            days = observed * 3600 / DAY_S
+            recovered = Yield.of_expected(0.0, 0.0) if its is None else Yield.of(rates, its, days)
+        of_throughput = errors_of_throughput(one, rates)
+        return Planned(one, exposed, observed, its, rates, recovered, best, why, of_throughput)
+
+    # With a pool, the noise of a target is drawn while the threshold of the next one is sampled.
+    planned = tuple(reported(map_in_order(engine, planned_for, observations()), len(stars), progress))
+    return PlanAnswer(study, seen, planned)
+
+
+SUMMARY_TABLE = "plan.ecsv"
+#: Explanation of the columns.
+LEGEND = (
+    "E50 and E90: bolometric energies from which on half and 90 % of the flares are recovered. Flares: recovered "
+    "in the hours observed, expected by the rates as they are; 95 % of campaigns recover the numbers next to them, by "
+    "Poisson's scatter and that of a star's rate; P(>= 1): probability of recovering any. False alarms: expected of "
+    f"noise. Numbers are those of {SUMMARY_TABLE}."
+)
+
+
+def target_lines(answer: PlanAnswer, k: int) -> list[tuple[str, str, str]]:
+    """Return the lines on a target: quantity, value, and the file and column of the value."""
+    one, observation = answer.planned[k], answer.planned[k].observation
+    record = records(answer.table)[k]
+    columns = PlanAnswer.table.columns_of(answer)
+    said = {column.name: column.text(record) for column in columns if column.heading}
+    place, seen = observation.target, answer.seen
+    lines = [
+        ("right ascension, declination", f"{place.ra_deg:.4f}, {place.dec_deg:.4f} deg ({place.source})",
+         "stars: ra, dec, position"),
+        ("type; spectrum that stands for it", f"{place.spectral_type}; {observation.star.library}",
+         "stars: spectral_type, spectrum"),
+        ("V; distance", f"{observation.star.magnitude:g}; {observation.star.distance_pc:g} pc", "stars: V, distance"),
+        ("seen; observed", f"{said['seen']} h; {said['hours']} h", "plan: seen, hours"),
+    ]  # fmt: skip
+    if one.seen_h == 0:
+        return [*lines, ("never seen", seen.reason(place.name), "assumptions")]
+    away = seen.elongation_deg(k)
+    lines += [
+        ("median stretch", f"{observation.window_s / 60:.0f} min", "stars: window"),
+        ("best months", said["best_months"], "plan: best_months; months"),
+        ("angle from the Sun", f"{away.min():.0f} to {away.max():.0f} deg", "days: elongation"),
+        ("detector; hits by particles", f"{observation.quiet.conditions['temperature_c']:.1f} deg C; "
+         f"{observation.hits_per_cm2_s:.2f} per cm^2 and s", "stars: temperature, hits"),
+        ("S/N of a frame at amplitude 1", f"{observation.signal_per_frame:.4g}", "stars: signal_per_frame"),
+        ("half of flares recovered from", energy(one.energy_at(0.5), " erg"), "plan: E50; energies: recovered"),
+        ("90 % of flares recovered from", energy(one.energy_at(0.9), " erg"), "plan: E90; energies: recovered"),
+    ]  # fmt: skip
+    if one.recovered is not None:
+        lines += [
+            ("flares recovered, expected", said["expected"], "plan: expected; stars: recovered_per_day"),
+            ("95 % of campaigns", said["low"], "plan: low, high; stars: scatter"),
+            ("probability of at least one", said["at_least_one"], "plan: at_least_one"),
+        ]
+    lines.append(("false alarms expected", said["false_alarms"], "plan: false_alarms"))
+    rates = one.no_rates if one.rates is None else one.rates.source
+    lines.append(("flare rates", rates, "stars: rates; assumptions"))
+    return lines

@@ -1,0 +1,348 @@
+"""Targets of a plan: conditions along their orbits, completeness, and yields."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.answers.closed_forms import throughput_cases
+from mauvecl.answers.inject import inject
+from mauvecl.flares.energies import BOLOMETRIC, EnergyScale, Rates, quiescent_luminosity
+from mauvecl.flares.settings import Curve
+from mauvecl.host.orbit.geometry import sunlight
+from mauvecl.host.orbit.orbit import Target, Track
+from mauvecl.host.orbit.visibility import Particles, Thermal, Visibility
+from mauvecl.host.stars.library import nearest_spectrum
+from mauvecl.runs.checkpoint import kept
+from mauvecl.runs.pool import Pool
+from mauvecl.schema.errors import InputError
+from mauvecl.search.completeness import PER_DECADE, Completeness, DurationLaw, Yield, frame_signal, recovered_per_day
+from mauvecl.study.cases import Case
+from mauvecl.study.plan import PlanTarget
+from mauvecl.study.sections import SkyLight, Star
+from mauvecl.study.stare import InjectionQuestion
+from mauvecl.study.stares import energy_scale
+
+if TYPE_CHECKING:
+    from mauvecl.answers.visible import VisibleAnswer
+    from mauvecl.detection.snr import Arrays
+    from mauvecl.device.engine import Stares
+    from mauvecl.host.exposure.expectation import Expectation
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Conditions:
+    """Conditions of one target."""
+
+    temperature_c: float  # mean of the detector while the target is visible
+    # Time (s) and deviation from the mean (deg C), for one orbit from the start of a window of median length.
+    swing: tuple[tuple[float, float], ...]
+    hits_per_cm2_s: float  # mean of cosmic rays and trapped protons while the target is visible
+
+    def swings(self, orbits: int, orbit_s: float) -> tuple[tuple[float, float], ...]:
+        """Return the swing of N orbits."""
+        kept = [point for point in self.swing if point[0] < orbit_s]
+        return tuple((n * orbit_s + t, value) for n in range(orbits) for t, value in kept)
+
+
+@dataclass(frozen=True, eq=False)
+class OrbitConditions:
+    """Conditions at every time step of a plan."""
+
+    temperature_c: Float  # shape (n_time,)
+    hits_per_cm2_s: Float  # shape (n_time,)
+
+    @classmethod
+    def along(cls, track: Track) -> OrbitConditions:
+        """Compute the conditions along an orbit with the assumed models."""
+        light = sunlight(track.position_km, track.bodies.sun, track.bodies.sun_km)
+        temperature = Thermal().temperature_c(light, track.times.step_s)
+        return cls(temperature, Particles().rate_per_cm2_s(track))
+
+    def of(self, visibility: Visibility, k: int, orbit_s: float) -> Conditions | None:
+        """Return the conditions of target `k`, or None if it is never visible."""
+        seen, windows = visibility.seen[:, k], visibility.windows(k)
+        if not seen.any():
+            return None
+        mean = float(self.temperature_c[seen].mean())
+        step = visibility.track.times.step_s
+        # The first window if several have the median length.
+        typical = int(np.argmin(np.abs(windows.length_s - np.median(windows.length_s))))
+        first = round(float(windows.start_s[typical]) / step)
+        orbit = self.temperature_c[first : first + int(np.ceil(orbit_s / step))] - mean
+        swing = tuple((float((n + 0.5) * step), float(value)) for n, value in enumerate(orbit))
+        return Conditions(mean, swing, float(self.hits_per_cm2_s[seen].mean()))
+
+
+#: Amplitude of the flare from which the signal per amplitude follows; its own photon noise is neglected.
+SMALL = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class TargetObservation:
+    """Target as observed by the satellite."""
+
+    target: Target
+    case: Case  # of one frame, with the sky and the conditions below
+    window_s: float  # median length of its windows; 0 if it is never visible
+    sky: float | None = None  # zodiacal light, V mag arcsec^-2; None for the study's sky
+    conditions: Conditions | None = None  # along the orbit; None for the study's
+
+    @property
+    def star(self) -> Star:
+        """Library star that represents the target."""
+        return self.case.star
+
+    @property
+    def quiet(self) -> Expectation:
+        """Expectation of one frame."""
+        return self.case.quiet
+
+    @property
+    def hits_per_cm2_s(self) -> float:
+        """Rate of particle hits."""
+        return float(self.case.study.processes.particles_per_cm2_s)
+
+    @cached_property
+    def signal_per_frame(self) -> float:
+        """S/N of a frame with a flare of amplitude 1; 0 if every pixel saturates."""
+        (flare,) = self.case.expect(self.case.flaring(SMALL))
+        added = [process.variance_dn2(self.quiet) for process in self.case.study.processes.additive.values()]
+        hits = np.sum(added, axis=0) if added else None
+        return frame_signal(self.quiet, flare, SMALL, added_variance_dn2=hits)
+
+    @cached_property
+    def scale(self) -> EnergyScale:
+        """Bolometric energy of flares."""
+        scale = energy_scale(self.case.study, self.case.source, "bolometric", self.case.study.flare.temperature_k)
+        assert scale is not None
+        return scale
+
+
+#: Completeness for a star that saturates every pixel.
+NOTHING = Completeness(np.array([1e24, 1e40]), np.zeros(2), BOLOMETRIC, "every pixel saturates: no flare is recovered")
+#: Computes a target's completeness for bolometric energies.
+CompletenessOf = Callable[[TargetObservation], Completeness]
+
+
+@dataclass(frozen=True, eq=False)
+class Planned:
+    """Target of a plan with its expected flares."""
+
+    observation: TargetObservation
+    seen_h: float  # visible time
+    hours: float  # observed time
+    completeness: Completeness | None  # None if the target is never visible
+    rates: Rates | None  # of bolometric energies; None if unknown
+    recovered: Yield | None  # recovered flares; None if rates are unknown
+    best_months: tuple[str, ...]
+    no_rates: str = ""  # reason for unknown rates
+    of_throughput: tuple[float, float] | None = None  # relative errors of E50 and yield by a calibrated throughput
+
+    @property
+    def name(self) -> str:
+        """Name of the target."""
+        return self.observation.target.name
+
+    def energy_at(self, probability: float) -> float:
+        """Return the bolometric energy above which flares are recovered with a probability, erg; infinite if none."""
+        return float("inf") if self.completeness is None else self.completeness.energy_at(probability)
+
+    @property
+    def extrapolated(self) -> bool:
+        """Whether flares of E50 lie outside the energies at which the rates were measured."""
+        if self.rates is None:
+            return False
+        low, high = self.rates.measured_erg
+        return not low <= self.energy_at(0.5) <= high
+
+
+def closed_form(observation: TargetObservation) -> Completeness:
+    """Return the completeness of a bank of matched filters in white noise; see `Completeness.of_search`."""
+    study = observation.case.study
+    return Completeness.of_search(
+        observation.signal_per_frame,
+        observation.scale,
+        window_s=observation.window_s,
+        false_alarms_per_day=study.search.rate,
+        bank=study.search.white_bank(observation.quiet.frame_s),
+        law=study.plan.law(),
+    )
+
+
+def errors_of_throughput(observation: TargetObservation, rates: Rates | None) -> tuple[float, float] | None:
+    """Return the relative errors of E50 and of the recovered flares by a calibrated throughput, to first order.
+
+    They are those of the closed form; None if the throughput is not calibrated, or nothing is recovered.
+    """
+    calibrated = throughput_cases(observation.case)
+    if not calibrated or not observation.signal_per_frame > 0 or not observation.window_s > 0:
+        return None
+
+    def logarithms(case: Case) -> tuple[float, float]:
+        its = closed_form(replace(observation, case=case))
+        number = np.nan if rates is None else recovered_per_day(rates, its)
+        return float(np.log(its.energy_at(0.5))), float(np.log(number))
+
+    moved = np.array([logarithms(case) for case in calibrated]) - logarithms(observation.case)
+    energy, number = np.sqrt((moved**2).sum(axis=0))
+    return float(energy), float(number)
+
+
+def rates_of(text: PlanTarget, observation: TargetObservation) -> tuple[Rates | None, str]:
+    """Return a target's flare rates by bolometric energy, or None and the reason why they are unknown."""
+    case, flare = observation.case, observation.case.study.flare
+    try:
+        rates = text.distribution(observation.target.spectral_type or "")
+    except InputError as error:
+        if any(getattr(text, name) is not None for name in ("mass_msun", "alpha", "rates_file", "rates")):
+            raise
+        return None, str(error)
+    if rates.definition == "light":
+        return rates.in_band(BOLOMETRIC, flare=flare.light()), ""
+    band, distance_pc = rates.amplitude_band, case.star.distance_pc
+    measured = case.with_sections(flare=flare.model_copy(update={"band": band}))
+    scale = energy_scale(measured.study, measured.source, "bolometric", flare.temperature_k)
+    assert scale is not None
+    assert distance_pc is not None
+    return rates.of_light(scale.erg_per_s, quiescent_luminosity(case.source, distance_pc, band)), ""
+
+
+def star_of(text: PlanTarget, simbad: bool) -> Star:
+    """Return the library star that represents a target.
+
+    Raises InputError if its type, magnitude or distance is neither given nor known.
+    """
+    known = text.target(simbad)
+    given: dict[str, Any] = {
+        "spectral_type": text.spectral_type or known.spectral_type,
+        "magnitude": known.magnitude if text.magnitude is None else text.magnitude,
+        "distance_pc": known.distance_pc if text.distance_pc is None else text.distance_pc,
+    }
+    missing = [name for name, value in given.items() if value is None]
+    if missing:
+        raise InputError(
+            f"target {text.name!r} has no {' and no '.join(missing)}",
+            "them in the table of targets: it is not in the embedded list",
+            key="plan.targets",
+        )
+    library = nearest_spectrum(given.pop("spectral_type"))
+    given |= {name: getattr(text, name) for name in ("neighbours", "neighbours_of", "neighbour_share")}
+    return Star(library=library, **given)
+
+
+def observe(
+    case: Case, text: PlanTarget, star: Star, seen: VisibleAnswer, k: int, along: OrbitConditions | None = None
+) -> TargetObservation:
+    """Return the observation of target `k`, with the sky behind it and the conditions along the orbit."""
+    target, study = seen.targets[k], case.study
+    if text.spectral_type is not None:
+        target = replace(target, spectral_type=text.spectral_type)
+    conditions = None if along is None else along.of(seen.visibility, k, study.orbit.orbit().elements.period_s)
+    lengths = seen.windows[k].length_s
+    window, sky = float(np.median(lengths)) if lengths.size else 0.0, sky_behind(seen, k)
+    changes: dict[str, Any] = {"star": (star,)}
+    if sky is not None:
+        changes["sky"] = SkyLight(surface_brightness=sky)
+    if conditions is not None:
+        changes["processes"] = study.processes.with_particles(conditions.hits_per_cm2_s)
+        if study.observation.temperature_c is None:
+            at = {"temperature_c": conditions.temperature_c}
+            changes["observation"] = study.observation.model_copy(update=at)
+    return TargetObservation(target, case.with_sections(**changes).one_frame, window, sky, conditions)
+
+
+def sky_behind(seen: VisibleAnswer, k: int) -> float | None:
+    """Return the median sky brightness, V mag arcsec^-2, over the days on which a target is visible, or over all."""
+    light, hours = seen.zodiacal[k], seen.visibility.by_day(k)
+    used = np.isfinite(light) & (hours > 0)
+    used = used if used.any() else np.isfinite(light)
+    return float(np.median(light[used])) if used.any() else None
+
+
+#: Orbits of a stare; the baseline window of a search spans several of them.
+ORBITS = 3
+#: Number and range of injected half-widths, and number of their peak times.
+WIDTHS, WIDTH_RANGE_S, POSITIONS = 10, (5.0, 3000.0), 20
+
+
+def inject_target(observation: TargetObservation, engine: Stares | Pool | None = None) -> Completeness:
+    """Compute the share of injected flares that the study's search finds, by bolometric energy.
+
+    Each orbit of the stare has one window of the target's median length. The checkpoint of a pool keeps the result.
+    """
+    study, question = observation.case.study, injection_case(observation).study
+    energy = 10 ** np.arange(24.0, 40.0, 1 / PER_DECADE)
+
+    def computed() -> Arrays:
+        star = inject(question, engine).stars[0]
+        widths = np.array(star.injected.half_widths_s)
+        critical = star.injected.critical.reshape(widths.size, -1)
+        probability = found_by_energy(critical, widths, energy, study.plan.law())
+        return {
+            "probability": probability,
+            "threshold": np.array(star.threshold.value),
+            "shifted": np.array(star.shifted),
+        }
+
+    depends_on = ("completeness of a target", question.text(), observation.quiet, observation.scale)
+    found = kept(engine.checkpoint if isinstance(engine, Pool) else None, depends_on, computed)
+    how = (
+        f"{question.injections.count} injections of each of {WIDTHS} half-widths into stretches of "
+        f"{observation.window_s / 60:.0f} min, found above {float(found['threshold']):.2f} sigma, "
+        f"{study.search.false_alarms:g} false alarms per {study.search.per}"
+        + (", allowing for unknowns that the search leaves in" if found["shifted"] else "")
+    )
+    return Completeness(energy, found["probability"], BOLOMETRIC, how)
+
+
+def injection_case(observation: TargetObservation) -> Case:
+    """Return the case for `inject`, with the target's windows and conditions."""
+    study, conditions = observation.case.study, observation.conditions
+    orbit_s = study.orbit.orbit().elements.period_s
+    gap = max(orbit_s - observation.window_s, 0.0)
+    changes: dict[str, Any] = {
+        "duration_s": ORBITS * orbit_s, "orbit_s": orbit_s, "orbit_gap_s": gap, "gaps": (), "along_orbit": False,
+    }  # fmt: skip
+    if conditions is not None and study.stare.thermal is None:
+        changes["thermal"] = Curve(points=conditions.swings(ORBITS, orbit_s))
+    injections = InjectionQuestion(
+        of="energy", sizes=2, widths=WIDTHS, half_width_low_s=WIDTH_RANGE_S[0], half_width_high_s=WIDTH_RANGE_S[1],
+        count=study.plan.injections, positions=min(POSITIONS, study.plan.injections), fitted=0,
+    )  # fmt: skip
+    return observation.case.with_sections(
+        stare=study.stare.model_copy(update=changes),
+        search=study.search.model_copy(update={"nulls": 0}),
+        injections=injections,
+    )
+
+
+def found_by_energy(critical_erg: Float, half_widths_s: Float, energy_erg: Float, law: DurationLaw) -> Float:
+    """Return the completeness by energy, averaged over the half-widths of an energy, shape (n_energy,).
+
+    Parameters
+    ----------
+    critical_erg : ndarray, shape (n_half_width, n_draw)
+        Smallest detected energy of each injection. It is zero if there is an alarm without the flare; these injections
+        are ignored, since false alarms are counted separately.
+    half_widths_s : ndarray, shape (n_half_width,)
+    energy_erg : ndarray, shape (n_energy,)
+    """
+    of_width = np.empty((half_widths_s.size, energy_erg.size))
+    for row, one in zip(of_width, critical_erg, strict=True):
+        counted = np.sort(one[one > 0])
+        row[:] = np.searchsorted(counted, energy_erg, side="right") / max(counted.size, 1)
+    nodes, weights = np.polynomial.hermite_e.hermegauss(15)
+    half = np.log(law.half_width(energy_erg)[:, None] * 10 ** (law.scatter_dex * nodes))
+    place = np.interp(half, np.log(half_widths_s), np.arange(half_widths_s.size))
+    i = np.minimum(place.astype(int), half_widths_s.size - 2)
+    part, column = place - i, np.arange(energy_erg.size)[:, None]
+    p = (1 - part) * of_width[i, column] + part * of_width[i + 1, column]
+    return np.asarray(np.clip(p @ (weights / weights.sum()), 0.0, 1.0))

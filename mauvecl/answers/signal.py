@@ -1,0 +1,439 @@
+"""Signal and noise: a simulated spectrum, distributions of the S/N, and exposure times for an S/N."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+
+from mauvecl.answers.answer import Answer, InCell, TableOf, realisations_of, reported
+from mauvecl.detection.snr import COLUMNS
+from mauvecl.device.engine import Engine
+from mauvecl.host.exposure.expectation import BUDGET_COLUMNS
+from mauvecl.noise.reference import components
+from mauvecl.runs.pool import Pool, map_in_order
+from mauvecl.schema.calls import validated
+from mauvecl.schema.columns import Column, View, stacked
+from mauvecl.schema.errors import InputError, Message
+from mauvecl.schema.physical import DAY_S, FirstRealisation, Wavelength
+from mauvecl.study.cases import Case, cases, collect_messages, label, star_column
+from mauvecl.study.study import Study
+
+if TYPE_CHECKING:
+    from astropy.table import QTable, Table
+
+    from mauvecl.detection.snr import SnrResult
+    from mauvecl.host.exposure.expectation import Expectation
+    from mauvecl.study.cases import Use
+
+Per = Literal["pixel", "element"]
+#: Longest time that is considered, s: many exposures, added up.
+LONGEST_S = 1e7
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """Exposure time, in whole frames, that reaches an S/N."""
+
+    star: str
+    wavelength_nm: float
+    per: Per
+    wanted: float
+    exposure_s: float
+    frames: int
+    snr: float
+    snr_one_frame_less: float
+    saturated: bool
+
+
+def _floored(snr: float) -> str:
+    """Round an S/N down to three digits, so that an insufficient one does not appear sufficient."""
+    return f"{math.floor(1000 * snr) / 1000:.3f}"
+
+
+#: Columns of the table of exposures.
+EXPOSURE_COLUMNS = (
+    star_column(),
+    Column("wavelength", "wavelength_nm", "nm", "vacuum wavelength, the middle of the pixel or element"),
+    Column("per", description="pixel, or resolution element of 10.5 nm"),
+    Column("wanted", description="wanted S/N"),
+    Column("exposure", "exposure_s", "s", "the fewest frames whose closed-form S/N reaches the wanted one",
+           "exposure (s)", ".10g"),
+    Column("frames", description="frames of the exposure", heading="frames"),
+    Column("snr", description="closed-form S/N reached", heading="S/N", format=".3f"),
+    Column("snr_one_frame_less", description="closed-form S/N of one frame less", heading="a frame less",
+           format=_floored),
+    Column("saturated", description="whether the pixel, or one of the element, saturates in a single frame",
+           heading="saturation", format=lambda saturated: "SATURATED" if saturated else ""),
+)  # fmt: skip
+
+
+def _exposure_title(answer: ExposureAnswer) -> str:
+    wanted = answer.study.signal
+    return (
+        f"Exposure for an S/N of {wanted.snr:g} per {wanted.per} at {wanted.wavelength_nm:g} nm (closed form, whole "
+        "frames)"
+    )
+
+
+@dataclass(frozen=True)
+class ExposureAnswer(Answer):
+    """Answer of `exposure`."""
+
+    USES = ("instrument", "sky")
+
+    study: Study
+    exposures: tuple[Exposure, ...]
+    messages: tuple[str, ...]
+    expectations: tuple[Expectation, ...]  # each star at its exposure
+
+    #: One row per star.
+    table = TableOf("exposure", EXPOSURE_COLUMNS, "exposures", title=_exposure_title)
+
+    @property
+    def inputs(self) -> list[Expectation]:
+        return list(self.expectations)
+
+
+def snr_at(x: Expectation, wavelength_nm: float, per: Per = "element") -> float:
+    """Return the closed-form S/N of the pixel or 10.5 nm element at a wavelength; see `place_of`."""
+    return float((x.snr_per_element() if per == "element" else x.snr())[place_of(x, wavelength_nm, per)])
+
+
+def place_of(x: Expectation, wavelength_nm: float, per: Per) -> int:
+    """Return the index of the pixel or element at a wavelength; raises InputError outside the spectrum."""
+    if per not in ("pixel", "element"):
+        raise InputError(f"S/N per {per!r}", "pixel or element", key="per")
+    first, last = float(x.wavelength_nm[0]), float(x.wavelength_nm[-1])
+    if not first <= wavelength_nm <= last:
+        raise InputError.of("wavelength", wavelength_nm, f"{first:.1f} to {last:.1f} nm", unit="nm")
+    pixel = int(np.argmin(np.abs(x.wavelength_nm - wavelength_nm)))
+    return int(x.element[pixel]) if per == "element" else pixel
+
+
+@validated
+def exposure(
+    study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
+) -> ExposureAnswer:
+    """Compute the fewest frames whose closed-form S/N at a wavelength reaches a wanted one.
+
+    An S/N that no exposure up to 1e7 s reaches, or a wavelength outside the spectrum, raises InputError if it holds of
+    every star; of some it is reported by a message.
+
+    Parameters
+    ----------
+    study : Study
+        Its ``signal`` gives S/N and wavelength; its exposure is not used.
+    engine : Engine or Pool, optional
+        Not used: nothing is drawn.
+    progress : callable, optional
+        Called as ``progress(done, total)`` in stars.
+    """
+    snr, wavelength_nm, per = study.signal.snr, study.signal.wavelength_nm, study.signal.per
+    if snr is None or wavelength_nm is None:
+        missing = "S/N" if snr is None else "wavelength"
+        raise InputError(
+            f"no wanted {missing}",
+            "`signal.snr` and `signal.wavelength_nm`",
+            key="signal.snr" if snr is None else "signal.wavelength_nm",
+        )
+    answered, failed = [], []
+    prepared = cases(study, swept=False)
+    for case in reported(prepared, len(prepared), progress):
+        try:
+            answered.append(_one(case, snr, wavelength_nm, per))
+        except InputError as error:
+            # The exposures of other stars are still computed.
+            failed.append(error)
+    if not answered:
+        raise failed[0]
+    exposures, seen = zip(*answered, strict=True)
+    long = [
+        Message(
+            f"{e.star} needs more than a day: {np.ceil(e.exposure_s / DAY_S):.0f} exposures of a day at most, added "
+            "up.",
+            "long exposure",
+        )
+        for e in exposures
+        if e.exposure_s > DAY_S
+    ]
+    messages = [
+        *(Message(f"NO ANSWER: {error}.", "no answer") for error in failed),
+        *collect_messages(list(seen)),
+        *long,
+    ]
+    return ExposureAnswer(study, exposures, tuple(messages), seen)
+
+
+@validated
+def exposure_for(
+    study: Study, snr: float | None = None, wavelength_nm: Wavelength | None = None, *, per: Per | None = None
+) -> ExposureAnswer:
+    """Compute `exposure` for another S/N or wavelength than the study's.
+
+    Parameters
+    ----------
+    study : Study
+        Its exposure is not used.
+    snr : float, optional
+    wavelength_nm : Quantity, or float in nm, optional
+        In place of those of the study's ``signal``.
+    per : {"element", "pixel"}, optional
+        A resolution element of 10.5 nm, or one pixel.
+    """
+    study = study.with_changes({"signal": {"snr": snr, "wavelength_nm": wavelength_nm, "per": per}}, None, "exposure")
+    return exposure(study)
+
+
+def _one(case: Case, snr: float, wavelength_nm: float, per: Per) -> tuple[Exposure, Expectation]:
+    """Return the fewest frames for an S/N, and the expectation of as many."""
+    frame, frame_s = case.one_frame.quiet, case.instrument.frame_s
+
+    def after(frames: int) -> Expectation:
+        # The frames may exceed one exposure.
+        return replace(frame, n_frames=frames)
+
+    one = snr_at(after(1), wavelength_nm, per)
+    if not one > 0 or (snr / one) ** 2 * frame_s > LONGEST_S:
+        raise InputError(
+            f"{case.one_frame.label} has an S/N of {one:.3g} per {per} at {wavelength_nm:g} nm in one frame",
+            f"enough for {snr:g} within {LONGEST_S:g} s{frame.saturation_clause}",
+            key="signal.snr",
+        )
+    # S/N is proportional to the root of the number of frames, so only rounding has to be corrected.
+    frames = max(int(np.ceil((snr / one) ** 2)), 1)
+    while frames > 1 and snr_at(after(frames - 1), wavelength_nm, per) >= snr:
+        frames -= 1
+    while snr_at(after(frames), wavelength_nm, per) < snr:
+        frames += 1
+    x = after(frames)
+    place = place_of(x, wavelength_nm, per)
+    here = x.saturated[x.element == place] if per == "element" else x.saturated[[place]]
+    answer = Exposure(
+        star=case.one_frame.label,
+        wavelength_nm=wavelength_nm,
+        per=per,
+        wanted=snr,
+        exposure_s=x.exposure_s,
+        frames=x.n_frames,
+        snr=snr_at(x, wavelength_nm, per),
+        snr_one_frame_less=snr_at(after(frames - 1), wavelength_nm, per) if frames > 1 else 0.0,
+        saturated=bool(here.any()),
+    )
+    return answer, x
+
+
+class Observation(NamedTuple):
+    """A simulated observation."""
+
+    title: str
+    expectation: Expectation
+    table: QTable  # of its components
+
+    @property
+    def peak(self) -> int:
+        """Pixel with most signal."""
+        return int(self.expectation.signal_dn.argmax())
+
+
+#: Columns of the summary of observations.
+SUMMARY_COLUMNS = (
+    Column("observation", "title", description="star, and flare", heading="observation"),
+    Column("frames", "expectation.n_frames", description="frames of the exposure", heading="frames"),
+    Column("peak_nm", lambda row: row.expectation.wavelength_nm[row.peak], "nm",
+           "wavelength of the largest mean signal", "peak (nm)", ".1f"),
+    Column("peak_dn", lambda row: row.expectation.signal_dn[row.peak], "DN", "largest mean signal of a pixel",
+           "peak signal (DN)", ".0f"),
+    Column("snr_pixel", lambda row: row.expectation.snr().max(), "", "largest closed-form S/N of a pixel",
+           "best S/N pixel", ".2f"),
+    Column("snr_element", lambda row: row.expectation.snr_per_element().max(), "",
+           "largest closed-form S/N of an element", "best S/N element", ".1f"),
+    Column("saturated_pixels", lambda row: row.expectation.saturated.sum(), "", "pixels that saturate", "saturated"),
+)  # fmt: skip
+
+
+@dataclass(eq=False)
+class SimulateAnswer(Answer):
+    """Answer of `simulate`: one table of components per star and stage."""
+
+    USES = ("instrument", "sky", "processes", "seed")
+
+    ENDINGS = ("ecsv", "fits")
+
+    study: Study
+    observations: list[Observation]
+    messages: list[str]
+
+    #: Peak, best closed-form S/N and saturated pixels of each observation.
+    summary = TableOf("", SUMMARY_COLUMNS, "observations", title="One observation each (closed-form S/N)",
+                      key="observations", study=False)  # fmt: skip
+
+    @property
+    def uses(self) -> tuple[Use, ...]:
+        """Parts of the study that this answer uses: flares only if observations have any."""
+        return (*self.USES, "flare") if len(self.observations) > len(self.study.star) else self.USES
+
+    @property
+    def tables(self) -> dict[str, Table]:
+        """One per observation."""
+        return {f"observation-{n}": one.table for n, one in enumerate(self.observations, 1)}
+
+    @property
+    def inputs(self) -> list[Expectation]:
+        return [observation.expectation for observation in self.observations]
+
+    def plot(self, path: str | Path | None = None, *, number: int = 0, ax: Any = None) -> Any:
+        """Plot an observation and its components; requires matplotlib."""
+        return list(self.pictures.values())[number](path, ax=ax)
+
+
+@validated
+def simulate(
+    study: Study,
+    engine: Engine | Pool | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    *,
+    realisation: FirstRealisation = 0,
+    flaring: bool = False,
+) -> SimulateAnswer:
+    """Simulate one observation of every star of a study, by component.
+
+    Parameters
+    ----------
+    study : Study
+    engine : Engine or Pool, optional
+        Not used: the NumPy reference implementation draws.
+    progress : callable, optional
+        Called as ``progress(done, total)`` in stars.
+    realisation : int
+        Number of the realisation.
+    flaring : bool
+        Whether the flares of the study are observed, too.
+    """
+    observations, everything = [], []
+    prepared = cases(study, swept=False)
+    for case in reported(prepared, len(prepared), progress):
+        xs = case.expectations if flaring else [case.quiet]
+        for i, x in enumerate(xs):
+            title = label(case.star, x) + (f", flare {100 * case.amplitudes[i - 1]:g} %" if i else "")
+            table = components(x, realisation=realisation, seed=study.run.seed, **case.draw_options)
+            table.meta["study"] = study.text()
+            observations.append(Observation(title, x, table))
+        everything += xs
+    return SimulateAnswer(study, observations, collect_messages(everything, study.processes))
+
+
+#: Wavelengths of the elements that terminal and pictures show, nm; the tables hold all of them.
+SHOWN_NM = (250.0, 300.0, 400.0, 550.0)
+
+
+@dataclass(frozen=True, eq=False)
+class StarSnr(InCell):
+    """A star in a cell of the sweep."""
+
+    result: SnrResult
+    asked_nm: float | None = None
+
+    @property
+    def shown_nm(self) -> list[float]:
+        """The requested wavelength, or those of `SHOWN_NM` within the spectrum."""
+        if self.asked_nm is not None:
+            return [self.asked_nm]
+        first, last = self.result.expectation.wavelength_nm[[0, -1]]
+        return [wavelength for wavelength in SHOWN_NM if first <= wavelength <= last]
+
+
+@dataclass(eq=False)
+class SnrAnswer(Answer):
+    """Answer of `snr`."""
+
+    USES = ("instrument", "sky", "processes", "seed")
+
+    study: Study
+    stars: list[StarSnr]  # one per star and cell of the sweep
+    messages: list[str]
+
+    #: S/N per resolution element of 10.5 nm, one row per star, cell and element.
+    element = TableOf("snr-element", (), "stars", of=lambda _, star: star.result.element, place=True,
+                      key="snr-element", about=realisations_of)  # fmt: skip
+    #: S/N per pixel, one row per star, cell and pixel.
+    pixel = TableOf("snr-pixel", (), "stars", of=lambda _, star: star.result.pixel, place=True, about=realisations_of)
+    #: Noise by origin, DN rms per pixel, one row per star, cell and pixel.
+    noise_budget = TableOf("noise-budget", (), "stars", of=lambda _, star: star.result.expectation.noise_budget(),
+                           place=True, key="noise-budget", about=realisations_of)  # fmt: skip
+
+    @property
+    def inputs(self) -> list[Expectation]:
+        return [star.result.expectation for star in self.stars]
+
+    @property
+    def views(self) -> list[View]:
+        """S/N and noise at some wavelengths; all of them are in the files."""
+        place = self.placed(())
+
+        def at(star: StarSnr, per: Per) -> list[int]:
+            return [place_of(star.result.expectation, nm, per) for nm in star.shown_nm]
+
+        parts = [(star, star.result.element[at(star, "element")]) for star in self.stars]
+        budgets = [(star, star.result.expectation.noise_budget()[at(star, "pixel")]) for star in self.stars]
+        noise = stacked(place, budgets)
+        sources = [column for column in BUDGET_COLUMNS if column.name in noise.colnames]
+        return [
+            View("S/N per 10.5 nm element; all of them in the files", (*place, *COLUMNS), stacked(place, parts)),
+            View("Noise of a pixel by origin, DN rms", (*place, *sources), noise),
+        ]
+
+
+@validated
+def snr(
+    study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
+) -> SnrAnswer:
+    """Simulate the S/N of every star of a study without flares, for every sweep value.
+
+    Parameters
+    ----------
+    progress : callable, optional
+        Called as ``progress(done, total)`` in stars.
+    """
+    # Invalid input raises an error before anything is drawn.
+    prepared, run, asked = cases(study), study.run, study.signal.wavelength_nm
+    quiet = [case.quiet for case in prepared]
+    if asked is not None:
+        for x in quiet:
+            place_of(x, asked, "element")
+
+    engine = engine or Engine()
+
+    def answered(case: Case) -> StarSnr:
+        result = engine.snr(case.quiet, realisations=run.realisations, seed=run.seed, **case.draw_options)
+        return StarSnr(case.label, case.at, result, asked)
+
+    if isinstance(engine, Pool):
+        engine.expect(len(prepared) * run.realisations)
+    stars = list(reported(map_in_order(engine, answered, prepared), len(prepared), progress))
+    return SnrAnswer(
+        study,
+        stars,
+        [
+            *collect_messages(quiet, study.processes),
+            *filter(None, map(_cut_off, stars)),
+        ],
+    )
+
+
+def _cut_off(star: StarSnr) -> str:
+    """Return a message on pixels that saturated in the simulation, or an empty text."""
+    result = star.result
+    cut = result.counts.clipped[:, 1]
+    clipped = cut[cut > 0]
+    if not clipped.size:
+        return ""
+    share = 100 * clipped.mean() / (result.counts.n * result.expectation.n_frames)
+    return (
+        f"{star.title}: saturation cut off {clipped.size} of {cut.size} pixels in the simulation, each of them in "
+        f"{share:.3g} % of its frames on average."
+    )

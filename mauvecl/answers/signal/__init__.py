@@ -1,1 +1,0 @@
-"""One observation and its signal to noise: simulate, snr, exposure."""

@@ -1,0 +1,587 @@
+"""Stares: light curves of one star with flares, and their FITS files.
+
+A FITS file has a light curve, good time intervals and the dynamic spectrum. The names and units of its first
+table are those that lightkurve recognises (`lightkurve.read`), and with it AltaiPony: TIME in days, FLUX, FLUX_ERR,
+QUALITY, CADENCENO.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import chain
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from mauvecl.answers.answer import Answer, InCell, TableOf, reported
+from mauvecl.answers.inject import survey_star
+from mauvecl.device.engine import Stares
+from mauvecl.flares.energies import Kind
+from mauvecl.flares.events import Event, coefficients, temperatures_of
+from mauvecl.flares.frames import Draw, LightCurves, StareExpectation, draw_light_curves
+from mauvecl.host.exposure.sky import parse_position, parse_time
+from mauvecl.host.tables.units import offline
+from mauvecl.host.version import VERSION
+from mauvecl.runs.checkpoint import Checkpoint, kept
+from mauvecl.schema.calls import validated
+from mauvecl.schema.columns import Column, View, number, percent, table_of
+from mauvecl.schema.errors import InputError, Message
+from mauvecl.schema.physical import DAY_S
+from mauvecl.search.alarms import Alarm, alarms
+from mauvecl.search.false_alarms import sampled_rate
+from mauvecl.study.cases import Case, cases, collect_messages, place_columns
+from mauvecl.study.questions import check_sweep
+from mauvecl.study.stares import energy_of, orbit_lines, threshold_line, unused_lines
+from mauvecl.study.study import Study
+
+if TYPE_CHECKING:
+    from astropy.io import fits
+    from astropy.table import QTable, Table
+
+    from mauvecl.detection.snr import Arrays
+    from mauvecl.flares.stare import Stare
+    from mauvecl.host.exposure.expectation import Expectation
+    from mauvecl.search.flare_fits import Factor, FittedFlares
+    from mauvecl.study.sections import SkyLight
+
+#: Start of a stare whose study names no time: 2026-01-01, MJD. Any would do.
+NO_TIME_MJD = 61_041.0
+
+
+def light_curve_file(one: StarStare, sky: SkyLight, *, seed: int, number: int) -> bytes:
+    """Return the FITS file of the stare of some number at a star; `sky` has its position and time."""
+    from astropy.io import fits
+
+    primary, times = fits.PrimaryHDU(), _times(one.staring.stare, sky)
+    primary.header.update({
+        "OBJECT": (one.label, "star, simulated"),
+        "TELESCOP": ("Mauve", "simulated"),
+        "INSTRUME": (one.staring.quiet.instrument, ""),
+        "CCD-TEMP": (one.staring.quiet.conditions["temperature_c"], "[Celsius] detector, where nothing heats it"),
+        "CREATOR": (f"mauvecl {VERSION}", ""),
+        "SEED": (str(seed), "of the draws"),
+        "STARENO": (number, "number of the stare"),
+    })  # fmt: skip
+    if sky.target is not None:
+        with offline():
+            place = parse_position(sky.target).icrs
+        position = {"RA_OBJ": (place.ra.deg, "[deg]"), "DEC_OBJ": (place.dec.deg, "[deg]")}
+        primary.header.update({"RADESYS": "ICRS", **position})
+    tables = [_table(one), _intervals(one)]
+    for table in tables:
+        table.header.update(times)
+    content = io.BytesIO()
+    fits.HDUList([primary, *tables, *_spectra(one)]).writeto(content)
+    return content.getvalue()
+
+
+def _times(stare: Stare, sky: SkyLight) -> dict[str, tuple[str | float, str]]:
+    """Return the keywords that state the times of a stare."""
+    start, comment = NO_TIME_MJD, "arbitrary: no time was named"
+    if sky.time is not None:
+        start, comment = float(parse_time(sky.time).utc.mjd), "start of stare"
+    return {
+        "TIMESYS": ("UTC", ""),
+        "TREFPOS": ("TOPOCENTER", "at the satellite"),
+        "TIMEPIXR": (0.5, "times are middles of frames"),
+        "MJDREFI": (int(start), comment),
+        "MJDREFF": (float(start - int(start)), ""),
+        "TIMEUNIT": ("d", ""),
+        "TIMEDEL": (stare.frame_s / DAY_S, "one frame"),
+        "EXPOSURE": (stare.observed_s / DAY_S, "d in frames"),
+        "TSTART": (0.0, ""),
+        "TSTOP": (stare.duration_s / DAY_S, ""),
+    }
+
+
+def _table(one: StarStare) -> fits.BinTableHDU:
+    from astropy.io import fits
+
+    stare, light = one.staring.stare, one.light
+    columns: list[tuple[str, str, str | None, Any]] = [
+        ("TIME", "D", "d", stare.middle_s / DAY_S),
+        ("CADENCENO", "J", None, stare.numbers),
+        ("QUALITY", "J", None, one.staring.quality),
+    ]
+    for k, name in enumerate(light.bands):
+        for kind, (attribute, _) in LIGHT.items():
+            columns.append((kind.upper() + band_suffix(name, k), "E", "adu/s", getattr(light, attribute)[:, k]))
+    if one.pointing_loss is not None:
+        columns.append(("POINTING_LOSS", "E", None, one.pointing_loss))
+    made = [fits.Column(*about, array=values) for *about, values in columns]
+    hdu = fits.BinTableHDU.from_columns(made, name="LIGHTCURVE")
+    hdu.header["BANDS"] = ", ".join(light.bands)
+    hdu.header["COMMENT"] = "FLUX: star and sky, bias and known dark taken off. MEAN: the same without noise."
+    hdu.header["COMMENT"] = "TIME: middle of the frame, days after MJDREF. QUALITY 1: saturated pixels. 0: none."
+    if one.pointing_loss is not None:
+        lost = int(np.count_nonzero(one.pointing_loss))
+        hdu.header["LOSTFRMS"] = (lost, "frames that lost light, assumed drifts")
+        hdu.header["COMMENT"] = "POINTING_LOSS: share of all light lost in the frame, as drawn."
+    return hdu
+
+
+def _intervals(one: StarStare) -> fits.BinTableHDU:
+    from astropy.io import fits
+
+    start, stop = one.staring.stare.gtis.T / DAY_S
+    columns = [fits.Column(name="START", format="D", unit="d", array=start), fits.Column("STOP", "D", "d", array=stop)]
+    return fits.BinTableHDU.from_columns(columns, name="GTI")
+
+
+def _spectra(one: StarStare) -> list[Any]:
+    from astropy.io import fits
+
+    light = one.light
+    images = []
+    for name, values in (("SPECTRUM", light.spectrum), ("SPECTRUM_ERR", light.spectrum_sd)):
+        image = fits.ImageHDU(np.asarray(values, np.float32), name=name)
+        image.header["BUNIT"] = ("adu/s", "of a resolution element; rows are frames")
+        images.append(image)
+    column = fits.Column(name="WAVELENGTH", format="D", unit="nm", array=light.element_nm)
+    return [*images, fits.BinTableHDU.from_columns([column], name="WAVELENGTH")]
+
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class StareFlare(InCell):
+    """A flare of a stare, with its energies and S/N."""
+
+    event: Event
+    band_erg: float  # NaN if the star's size is unknown
+    bolometric_erg: float  # likewise
+    snr: float  # of the matched filter for this flare
+
+
+@dataclass(frozen=True, eq=False)
+class FoundFlare(InCell):
+    """A flare that the search of a stare found."""
+
+    alarm: Alarm
+    bolometric_erg: float  # of the fit; NaN if the star's size is unknown
+    # Number of the nearest flare of the stare within a half-width and two frames, from 1 on; 0 if there is none.
+    event: int
+
+
+@dataclass(frozen=True, eq=False)
+class SearchResult:
+    """Result of the search of a stare."""
+
+    threshold: float  # from importance sampling of normal noise
+    flares: list[FoundFlare]  # in descending order of the statistic
+    shifted: bool  # whether the threshold is raised for trends that the search does not remove
+
+
+@dataclass(frozen=True, eq=False)
+class StarStare(InCell):
+    """A stare at one star in one cell of the sweep; `search` is a message if no search is possible."""
+
+    staring: StareExpectation
+    flares: tuple[StareFlare, ...]
+    light: LightCurves
+    search: SearchResult | str | None = None
+    # Share of all light that each frame lost in pointing drifts, shape (n_frame,); None unless drifts are drawn.
+    pointing_loss: Float | None = None
+
+    @property
+    def found(self) -> list[FoundFlare]:
+        """Flares that the search found."""
+        return self.search.flares if isinstance(self.search, SearchResult) else []
+
+
+KINDS: tuple[Kind, ...] = ("band", "bolometric")
+#: Largest number of frames of light curves in text files; longer ones are in FITS files only.
+MOST_ROWS = 100_000
+#: Largest number of frames: 115 days, with spectra of 1.2 GB.
+MOST_SHOWN = 2_000_000
+
+
+def _with_error(value: float, error: float) -> str:
+    """Format a value to its error's two leading digits: 9979 ± 120, not 1e+02."""
+    if value != value:
+        return ""
+    if not (math.isfinite(error) and error > 0):
+        return f"{value:.3g}"
+    digits = max(1 - math.floor(math.log10(error)), 0)
+    return f"{value:.{digits}f} ± {error:.{digits}f}"
+
+
+def _percent_with_error(value: float, error: float) -> str:
+    text = _with_error(100 * value, 100 * error)
+    return f"{text} %" if text else ""
+
+
+#: Columns of the table of stares.
+COLUMNS = (
+    Column("frames", "staring.stare.n_frames", "", "frames of the stare", "frames"),
+    Column("observed", "staring.stare.observed_s", "s", "time in them", "recorded (s)", "g"),
+    Column("intervals", lambda row: len(row.staring.stare.gtis), "",
+           "good time intervals: runs of frames without a gap", "intervals"),
+    Column("flux", lambda row: float(np.median(row.light.mean[:, 0])), "DN / s",
+           "median net light of a frame, sky included, without bias and dark", "light (DN/s)", ".4g"),
+    Column("frame_noise", lambda row: float(np.median(row.light.sd[:, 0] / row.light.mean[:, 0])), "",
+           "standard deviation of a frame's own noise, relative to its light", "noise of a frame", percent(".3g")),
+    Column("flares", lambda row: len(row.flares), "", "flares put into it"),
+)  # fmt: skip
+#: Additional columns if stares are searched.
+SEARCHED_COLUMNS = (
+    Column("threshold", lambda row: row.search.threshold if isinstance(row.search, SearchResult) else np.nan, "",
+           "value of the search's statistic from which on it alarms"),
+    Column("found", lambda row: len(row.found) if isinstance(row.search, SearchResult) else -1, "",
+           "flares found; -1: not searched"),
+)  # fmt: skip
+SATURATED_COLUMN = Column(
+    "saturated_frames", lambda row: int(np.count_nonzero(row.staring.quality)), "",
+    "frames in which the mean of a used pixel reaches saturation", "saturated",
+)  # fmt: skip
+POINTING_COLUMN = Column(
+    "drifting_frames", lambda row: int(np.count_nonzero(row.pointing_loss)), "",
+    "frames that lost light in pointing drifts, which are assumptions", "drifting",
+)  # fmt: skip
+#: Columns of the table of flares, for `StareFlare`.
+EVENT_COLUMNS = (
+    Column("peak_time", "event.peak_s", "s", "from the start of the stare; tau = 0 of the shape", "peak at (s)", ".6g"),
+    Column("half_width", "event.half_width_s", "s", "t_1/2 of the shape's publication", "half-width (s)", "g"),
+    Column("amplitude", "event.amplitude", "", "the shape's own, in the flare's band"),
+    Column("peak", "event.peak", "", "highest relative rise of the photons in the flare's band", "peak",
+           percent(".3g")),
+    Column("temperature", "event.hottest_k", "K", "blackbody temperature, at the peak"),
+    Column("equivalent_duration", "event.equivalent_duration_s", "s", "in the flare's band", "ED (s)", ".4g"),
+    Column("energy_band", "band_erg", "erg", "in the flare's band; nan: star of unknown size"),
+    Column("energy_bolometric", "bolometric_erg", "erg", "of all of its light", "bolometric (erg)", number(".3g")),
+    Column("snr", "snr", "", "of one who knows all but whether the flare is there", "S/N", ".3g"),
+    Column("shape", "event.form.name", kind=str),
+)  # fmt: skip
+
+
+def _fitted(name: str, key: str, unit: str, text: str, heading: str = "", form: Any = "", *more: str) -> list[Column]:
+    """Return the columns of a fitted quantity: value, standard error, and ends of its 68 % interval."""
+    error = key.replace("_s", "_error_s").replace("_k", "_error_k") if key[-2:] in ("_s", "_k") else f"{key}_error"
+    return [
+        Column(name, lambda row: float(getattr(row.alarm.recovered, key)[0]), unit, text, heading, form, more),
+        Column(f"{name}_error", lambda row: float(getattr(row.alarm.recovered, error)[0]), unit,
+               f"{text}; standard error by curvature"),
+        *_interval(name, key, unit),
+    ]  # fmt: skip
+
+
+def _interval(name: str, key: str, unit: str) -> list[Column]:
+    return [
+        Column(f"{name}_low", lambda row: row.alarm.intervals[key][0], unit, "lower end of its 68 % interval"),
+        Column(f"{name}_high", lambda row: row.alarm.intervals[key][1], unit, "higher end of its 68 % interval"),
+    ]  # fmt: skip
+
+
+#: Columns of the table of flares that a search found, for `FoundFlare`.
+FOUND_COLUMNS = (
+    *_fitted("peak_time", "peak_s", "s", "from the start of the stare", "peak at (s)", number(".6g", "not measured")),
+    *_fitted("amplitude", "amplitude", "", "in the flare's band", "amplitude", _percent_with_error, "amplitude_error"),
+    *_fitted("half_width", "half_width_s", "s", "t_1/2 of the search's shape", "half-width (s)", _with_error,
+             "half_width_error"),
+    *_fitted("temperature", "temperature_k", "K", "blackbody temperature", "temperature (K)", _with_error,
+             "temperature_error"),
+    *_fitted("equivalent_duration", "equivalent_duration_s", "s", "in the flare's band"),
+    Column("energy_bolometric", "bolometric_erg", "erg", "", "bolometric (erg)", number(".3g")),
+    *_interval("energy_bolometric", "energy", "erg"),
+    Column("value", "alarm.rho", "", "the search's statistic when it was found: S/N of the template that fits best",
+           "value", ".2f"),
+    Column("event", "", "", "row of the star's flares that it is nearest to, from 1 on; 0: none near", "flare",
+           lambda event: str(event) if event else "none", kind=int),
+    Column("window", "alarm.block", "",
+           "number of the window that it was fitted in; flares of one number were fitted together", kind=int),
+    Column("chi2", "alarm.chi2", "", "of this fit"),
+    Column("dof", "alarm.dof", "", "degrees of freedom of this fit", kind=int),
+    Column("p_value", "alarm.p_value", "", "probability of a chi-squared at least as large where the model is right"),
+    Column("note", "alarm.note", "",
+           "what is special: a flare that is not measured, an interval that ends where the fit does", kind=str),
+)  # fmt: skip
+#: Columns of a light curve for every frame; those of the light follow for each band.
+FRAME_COLUMNS = (
+    Column("time", "staring.stare.middle_s", "s", "middle of the frame, from the start of the stare"),
+    Column("frame", "staring.stare.numbers", "", "number of the frame, gaps included"),
+    Column("quality", "staring.quality", "", "1 where the mean of a used pixel reaches saturation"),
+)
+LOSS_COLUMN = Column(
+    "pointing_loss", "", "",
+    "share of all light that the frame lost in pointing drifts, as drawn; an observer does not know it",
+)  # fmt: skip
+#: Attributes of light curves and descriptions of them, by the names of columns.
+LIGHT = {
+    "flux": ("flux", "net light, bias and known dark taken off"),
+    "flux_err": ("sd", "standard deviation of its photons, dark and reading"),
+    "mean": ("mean", "the same without any noise"),
+}
+
+
+def band_suffix(name: str, number: int) -> str:
+    """Return what the columns of a band are called after the kind of their values; nothing for the first band."""
+    return "" if number == 0 else "_" + name.removesuffix(" nm").replace("-", "_")
+
+
+def _light_column(kind: str, band: str, number: int) -> Column:
+    attribute, text = LIGHT[kind]
+    name = kind + band_suffix(band, number)
+    return Column(name, lambda star: getattr(star.light, attribute)[:, number], "DN / s", f"{band}: {text}")
+
+
+def _stare_columns(answer: StareAnswer) -> tuple[Column, ...]:
+    searched = SEARCHED_COLUMNS if answer.study.stare.search else ()
+    drifting = () if answer.study.stare.pointing is None else (POINTING_COLUMN,)
+    return (*COLUMNS, *searched, SATURATED_COLUMN, *drifting)
+
+
+def _seed(answer: StareAnswer) -> dict[str, object]:
+    return {"study": answer.study.text(), "seed": answer.study.run.seed}
+
+
+@dataclass(eq=False)
+class StareAnswer(Answer):
+    """Answer of `stare`."""
+
+    USES = ("instrument", "sky", "flare", "processes", "stare", "seed")
+
+    study: Study
+    stares: list[StarStare]  # one per star and cell of the sweep
+    messages: list[str] = field(default_factory=list)
+
+    #: One row per star and cell: frames, gaps, light and noise of a frame, flares.
+    table = TableOf("stare", _stare_columns, "stares", place=True, title="One stare each", key="stares", about=_seed,
+                    study=False)  # fmt: skip
+    #: One row per flare: peak, half-width, amplitude, temperature, energies, and the S/N of its matched filter.
+    events = TableOf(
+        "events", EVENT_COLUMNS, lambda answer: chain.from_iterable(stare.flares for stare in answer.stares),
+        place=True, title="Flares in them; S/N of one who knows all but whether the flare is there", key="events",
+        about=_seed, study=False,
+    )  # fmt: skip
+    #: One row per flare that the search found: fitted values with errors, and the number of the flare in the stare.
+    #: Values are NaN where the fit does not measure the flare: `note` says why.
+    found = TableOf(
+        "found", FOUND_COLUMNS, lambda answer: chain.from_iterable(stare.found for stare in answer.stares), place=True,
+        key="found", when=lambda answer: answer.study.stare.search, about=_seed, study=False,
+    )  # fmt: skip
+
+    def placed(self, columns: Sequence[Column]) -> tuple[Column, ...]:
+        """Return columns after those of the star and of all swept quantities; the amplitude is that of each flare."""
+        return (*place_columns(self.study.sweep), *columns)
+
+    @property
+    def views(self) -> list[View]:
+        choice = self.study.search
+        alarms = "false alarm" if choice.false_alarms == 1 else "false alarms"
+        views = super().views
+        for stare in self.stares:
+            if isinstance(stare.search, SearchResult):
+                above = f"{stare.search.threshold:.2f}, {choice.false_alarms:g} {alarms} per star-{choice.per}"
+                found = table_of(FOUND_COLUMNS, stare.found)
+                views.append(View(f"Found at {stare.title} above {above}", FOUND_COLUMNS, found))
+        return views
+
+    def light_curve(self, number: int = 0) -> QTable:
+        """Return the frames of a star in a cell: time, cadence number, quality, and light in every band."""
+        one = self.stares[number]
+        columns = [*FRAME_COLUMNS, *(() if one.pointing_loss is None else (LOSS_COLUMN,))]
+        columns += [_light_column(kind, band, k) for k, band in enumerate(one.light.bands) for kind in LIGHT]
+        return table_of(columns, [one], star=one.label, **_seed(self), **one.at)
+
+    @property
+    def tables(self) -> dict[str, Table]:
+        """The stares, their flares, and a light curve of each."""
+        curves = {
+            f"light-curve-{n}": self.light_curve(n - 1)
+            for n, one in enumerate(self.stares, 1)
+            if one.staring.stare.n_frames <= MOST_ROWS
+        }
+        return super().tables | curves
+
+    @property
+    def documents(self) -> dict[str, Callable[[], bytes]]:
+        """A FITS file of each star and cell: light curve, good time intervals, dynamic spectrum."""
+        study = self.study
+        of = partial(light_curve_file, sky=study.sky, seed=study.run.seed, number=study.stare.number)
+        return {f"light-curve-{n}.fits": partial(of, one) for n, one in enumerate(self.stares, 1)}
+
+    @property
+    def inputs(self) -> list[Expectation]:
+        return [stare.staring.quiet for stare in self.stares]
+
+    @property
+    def remarks(self) -> list[str]:
+        long = [stare.title for stare in self.stares if stare.staring.stare.n_frames > MOST_ROWS]
+        return (
+            [f"More than {MOST_ROWS} frames: light curves of {', '.join(long)} are in FITS files alone."]
+            if long
+            else []
+        )
+
+
+@validated
+def stare(
+    study: Study,
+    engine: Stares | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    *,
+    checkpoint: Checkpoint | None = None,
+) -> StareAnswer:
+    """Simulate one stare for every star and sweep value of a study.
+
+    Parameters
+    ----------
+    study : Study
+        Its section `stare`, `events`, star, flare, sky, observation; `run.seed` and `stare.number` select the stare.
+    engine : Stares, optional
+        Simulator; by default that of the default device.
+    progress : callable, optional
+        Called as ``progress(done, total)`` in stares.
+    checkpoint : Checkpoint, optional
+        Keeps the frames that are drawn and the thresholds of searches.
+    """
+    check_sweep(study.sweep, study.stare, study.events)
+    prepared = cases(study)
+    # Sweeps do not change the frames.
+    frames = prepared[0].stare.n_frames
+    if frames > MOST_SHOWN:
+        raise InputError(
+            f"a stare of {frames} frames, each with a spectrum", f"at most {MOST_SHOWN}", key="stare.duration_s"
+        )
+    # Bad input is refused before anything is drawn.
+    quiet = [case.stare_expectation.quiet for case in prepared]
+    engine = engine or Stares()
+    drawn = [_draw(case, engine, checkpoint) for case in reported(prepared, len(prepared), progress)]
+    messages = collect_messages(quiet) + orbit_lines(study.stare, study.orbit, prepared[0].instrument.frame_s)
+    messages += dict.fromkeys(
+        line for case in prepared for line in unused_lines(case.study.observation.exposure_s, case.stare, case.events)
+    )
+    messages += [star.search for star in drawn if isinstance(star.search, str)]
+    messages += [
+        threshold_line(star.title, star.search.threshold)
+        for star in drawn
+        if isinstance(star.search, SearchResult) and star.search.shifted
+    ]
+    messages += [line for star in drawn for line in _pointing_lines(star)]
+    for star in drawn:
+        saturated = int(np.count_nonzero(star.staring.quality))
+        if saturated:
+            text = f"SATURATED: {saturated} frames of the stare at {star.title}; their quality is 1."
+            messages.insert(0, Message(text, "saturated"))
+    return StareAnswer(study, drawn, messages)
+
+
+def _pointing_lines(star: StarStare) -> list[str]:
+    """Return the message about frames that lost light in pointing drifts, if drifts are drawn."""
+    lost, drifts = star.pointing_loss, star.staring.stare.pointing
+    if lost is None or drifts is None:
+        return []
+    n_lost = int(np.count_nonzero(lost))
+    return [
+        f"POINTING DRIFTS: {n_lost} of {lost.size} frames at {star.title} lose light, up to {100 * lost.max():.3g} %; "
+        f"assumed: {drifts.rate_per_h:g} per hour, {drifts.duration_s:g} s long on average, with up to "
+        f"{100 * drifts.depth:g} % of the light lost. The search marginalises over the level of each frame."
+    ]
+
+
+def _draw(case: Case, stares: Stares, checkpoint: Checkpoint | None) -> StarStare:
+    """Draw and search the stare of a case."""
+    q, seed, processes = case.study.stare, case.study.run.seed, case.study.processes.additive_only
+    staring = case.stare_expectation
+
+    def draw(components: Any) -> Any:
+        def computed() -> Arrays:
+            what = components, staring.stare, staring.flare
+            return {"frames": stares.frames(*what, first=q.number, count=1, seed=seed, processes=processes)[0]}
+
+        depends_on = ("frames", components, staring.stare, staring.flare, q.number, seed, processes)
+        return kept(checkpoint, depends_on, computed)["frames"]
+
+    light = draw_light_curves(staring, q.bands_nm, draw)
+    searched = _search(case, draw, checkpoint) if q.search else None
+    lost = None
+    if staring.stare.pointing is not None:
+        lost = staring.stare.pointing_losses(np.array([q.number], np.uint64), seed)[0]
+    return StarStare(case.label, case.at, staring, _flares(case), light, searched, lost)
+
+
+def _search(case: Case, draw: Draw, checkpoint: Checkpoint | None) -> SearchResult | str:
+    """Search the stare of a case for flares, or return a message if no search is possible."""
+    study, staring = case.study, case.stare_expectation
+    try:
+        known = survey_star(case)
+        survey = replace(known.survey, components=staring.components(known.templates.weights))
+
+        def computed() -> Arrays:
+            tail = sampled_rate(survey, study.run.seed)
+            return {"threshold": np.array(tail.threshold(study.search.rate).value), "shifted": np.array(tail.shifted)}
+
+        tail = kept(checkpoint, ("threshold", survey, study.text()), computed)
+        threshold = float(tail["threshold"])
+    except InputError as error:
+        return Message(f"{case.label} is not searched: {error}.", "not searched")
+    scale = _log_energy(case, known.templates.temperatures_k)
+    raised = alarms(survey, known.templates, draw(survey.components), threshold, scale)
+    return SearchResult(threshold, [_found_flare(case, alarm) for alarm in raised], bool(tail["shifted"]))
+
+
+def _found_flare(case: Case, alarm: Alarm) -> FoundFlare:
+    """Return an alarm with the energy of its flare and the number of the nearest flare of the stare."""
+    if not alarm.measured:
+        return FoundFlare(case.label, case.at, alarm, float("nan"), 0)
+    event = _event_of(case, alarm.recovered)
+    away = [abs(one.peak_s - event.peak_s) for one in case.events]
+    nearest = int(np.argmin(away)) if away else -1
+    reach = 2 * case.stare_expectation.stare.frame_s
+    near = nearest >= 0 and away[nearest] <= case.events[nearest].half_width_s + reach
+    return FoundFlare(case.label, case.at, alarm, _found_energy(case, event), nearest + 1 if near else 0)
+
+
+def _event_of(case: Case, fit: FittedFlares) -> Event:
+    """Return a fitted flare as an event."""
+    kelvin = float(np.nan_to_num(fit.temperature_k[0], nan=case.study.flare.temperature_k))
+    values = (float(fit.peak_s[0]), float(fit.half_width_s[0]), float(fit.amplitude[0]))
+    return Event(*values, kelvin, case.study.search.shape)
+
+
+def _log_energy(case: Case, kelvin: Sequence[float]) -> Factor | None:
+    """Return the logarithm of the energy per second of equivalent duration as a function of log temperature.
+
+    It is a spline through the energies at temperatures, K.
+
+    Returns None if the star's size is unknown, or a template's temperature gives no energy.
+    """
+    one = Event(0.0, 1.0, 1.0, kelvin[0], case.study.search.shape)
+    events = [replace(one, temperature=k) for k in kelvin]
+    energies = np.array([_found_energy(case, event) for event in events])
+    if len(kelvin) < 2 or not (np.isfinite(energies) & (energies > 0)).all():
+        return None
+    spline = CubicSpline(np.log(kelvin), np.log(energies / one.equivalent_duration_s))
+    return lambda x: (float(spline(x)), float(spline(x, 1)))
+
+
+def _found_energy(case: Case, event: Event) -> float:
+    """Return the bolometric energy of a detected flare, erg; NaN if the star's size is unknown.
+
+    Also NaN if flares replace photosphere and the fitted temperature is not above the photosphere's.
+    """
+    flare = case.study.flare
+    photosphere = flare.photosphere_temperature_k or case.source.temperature_k
+    if flare.geometry == "replaces" and photosphere is not None and event.hottest_k <= photosphere:
+        return float("nan")
+    energy = energy_of(case.study, case.source, event, "bolometric")
+    return float("nan") if energy is None else energy
+
+
+def _flares(case: Case) -> tuple[StareFlare, ...]:
+    """Return the flares of a case's stare with their energies and S/N."""
+    staring, kelvin, frames = case.stare_expectation, temperatures_of(case.events), case.stare
+    flares = []
+    for event in case.events:
+        energies = [energy_of(case.study, case.source, event, kind, kelvin) for kind in KINDS]
+        band, bolometric = (float("nan") if energy is None else energy for energy in energies)
+        own = coefficients([event], frames.start_s, frames.frame_s, kelvin)
+        flares.append(StareFlare(case.label, case.at, event, band, bolometric, staring.snr(own)))
+    return tuple(flares)

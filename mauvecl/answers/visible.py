@@ -1,0 +1,394 @@
+"""Visibility of targets from the orbit, and calendars of their windows."""
+
+from __future__ import annotations
+
+import datetime
+import hashlib
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from functools import cached_property, partial
+from operator import itemgetter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.answers.answer import Answer, TableOf
+from mauvecl.host.orbit.geometry import Bodies, TimeGrid
+from mauvecl.host.orbit.orbit import Target
+from mauvecl.host.orbit.visibility import Visibility, Windows, elongation_deg, zodiacal_light
+from mauvecl.host.version import VERSION
+from mauvecl.schema.calls import validated
+from mauvecl.schema.columns import Column, View, percent, table_of
+from mauvecl.schema.physical import DAY_S
+from mauvecl.study.plan import targets_of
+from mauvecl.study.study import Study
+
+if TYPE_CHECKING:
+    from mauvecl.device.engine import Engine
+    from mauvecl.host.exposure.expectation import Expectation
+    from mauvecl.runs.pool import Pool
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Appointment in a calendar."""
+
+    #: UTC, ISO 8601 to the second; dates without time make an entry of whole days, including the last.
+    start: str
+    stop: str
+    title: str
+    text: str = ""
+
+
+def calendar_bytes(entries: Iterable[Entry], name: str) -> bytes:
+    """Return a calendar as the bytes of an .ics file."""
+    lines = [
+        "BEGIN:VCALENDAR",
+        "VERSION:2.0",
+        f"PRODID:-//mauvecl//mauvecl {VERSION}//EN",
+        f"X-WR-CALNAME:{_text(name)}",
+    ]
+    for entry in entries:
+        unique = hashlib.sha256("\0".join((entry.start, entry.stop, entry.title)).encode()).hexdigest()[:24]
+        lines += [
+            "BEGIN:VEVENT",
+            f"UID:{unique}@mauvecl",
+            # A fixed time, so that equal plans give equal files.
+            f"DTSTAMP:{_moment(entry.start).removeprefix(':').removeprefix(';VALUE=DATE:')[:8]}T000000Z",
+            f"DTSTART{_moment(entry.start)}",
+            f"DTEND{_moment(_day_after(entry.stop) if _is_day(entry.stop) else entry.stop)}",
+            f"SUMMARY:{_text(entry.title)}",
+            *([f"DESCRIPTION:{_text(entry.text)}"] if entry.text else []),
+            "TRANSP:TRANSPARENT",
+            "END:VEVENT",
+        ]
+    lines.append("END:VCALENDAR")
+    return "".join(f"{_folded(line)}\r\n" for line in lines).encode()
+
+
+def _is_day(text: str) -> bool:
+    return len(text) == 10
+
+
+def _moment(text: str) -> str:
+    plain = text.replace("-", "").replace(":", "")
+    return f";VALUE=DATE:{plain}" if _is_day(text) else f":{plain}Z"
+
+
+def _day_after(text: str) -> str:
+    return (datetime.date.fromisoformat(text) + datetime.timedelta(days=1)).isoformat()
+
+
+def _text(value: str) -> str:
+    for special in ("\\", ";", ","):
+        value = value.replace(special, "\\" + special)
+    return value.replace("\n", "\\n")
+
+
+def _folded(line: str) -> str:
+    """Fold a line to at most 75 bytes; continuation lines begin with a space."""
+    parts: list[str] = []
+    part = ""
+    for character in line:
+        if len((part + character).encode()) > (75 if not parts else 74):
+            parts.append(part)
+            part = ""
+        part += character
+    return "\r\n ".join([*parts, part])
+
+
+Float = NDArray[np.float64]
+
+#: Largest number of rows for which the table of windows is written.
+MOST_WINDOWS = 100_000
+#: Smallest exposure per day, hours, for which a target counts as visible on a day if windows are not known.
+SEEN_H = 0.5
+
+
+#: Largest number of targets with printed hours per month.
+MOST_MONTHLY = 12
+TARGET_COLUMN = Column("target", description="name of the target", heading="target", kind=str)
+#: Columns of the table of targets; one for each limit in force follows `share`.
+COLUMNS = (
+    TARGET_COLUMN,
+    Column("ra", "", "deg", "right ascension", "RA", ".3f"),
+    Column("dec", "", "deg", "declination", "dec", ".3f"),
+    Column("hours", "", "h", "exposure in the whole time, with the duty cycle", "hours", ".0f"),
+    Column("share", "", "", "of the time in which the target is seen", "share", percent(".1f")),
+    Column("windows", "", "", "stretches in which it is seen", "windows"),
+    Column("median_window", "", "min", "length of a stretch", "median", lambda minutes: f"{minutes:.0f} min"),
+    Column("longest_gap", "", "day", "longest time without one", "longest gap", lambda days: f"{days:.1f} d"),
+    Column("per_orbit", "", "min", "exposure in a mean orbit"),
+    Column("in_shadow", "", "", "share of the windows in the Earth's shadow"),
+    Column("best_month", "", "", "that with most exposure", "best month"),
+    Column("least_elongation", "", "deg", "least angle from the Sun", "least elongation",
+           lambda degrees: f"{degrees:.0f} deg"),
+    Column("most_elongation", "", "deg", "largest angle from the Sun"),
+    Column("brightest_sky", "", "mag / arcsec2", "zodiacal light at its brightest, V, where the table has it"),
+    Column("faintest_sky", "", "mag / arcsec2", "zodiacal light at its faintest, V"),
+)  # fmt: skip
+DAY_COLUMNS = (
+    TARGET_COLUMN,
+    Column("day", description="UTC"),
+    Column("hours", "", "h", "exposure"),
+    Column("elongation", "", "deg", "angle from the Sun at noon"),
+    Column("zodiacal_light", "", "mag / arcsec2", "V at noon; none where the table has none, near the Sun"),
+)
+WINDOW_COLUMNS = (
+    TARGET_COLUMN,
+    Column("start", description="UTC", kind=str),
+    Column("stop", description="UTC", kind=str),
+    Column("length", "", "min"),
+    Column("in_shadow", "", "min", "of it, in the Earth's shadow"),
+    Column("orbit", description="ascending nodes since the start of the plan", kind=int),
+)
+
+
+def assumption_columns(first: str) -> tuple[Column, ...]:
+    """Return the columns of a table of assumptions, for rows of quantity, value and source."""
+    return tuple(Column(name, itemgetter(k)) for k, name in enumerate((first, "value", "source")))
+
+
+def _target_columns(answer: VisibleAnswer) -> tuple[Column, ...]:
+    limits = (
+        Column(f"leaves_{name}", itemgetter(f"leaves_{name}"), "",
+               f"share of the time that the limit of {name} alone leaves")
+        for name in answer.visibility.kept_by
+    )  # fmt: skip
+    place = [column.name for column in COLUMNS].index("share") + 1
+    return (*COLUMNS[:place], *limits, *COLUMNS[place:])
+
+
+def _month_columns(answer: VisibleAnswer) -> tuple[Column, ...]:
+    return (Column("month"), *(Column(target.name, unit="h") for target in answer.targets))
+
+
+@dataclass(frozen=True, eq=False)
+class VisibleAnswer(Answer):
+    """Answer of `visible`."""
+
+    USES = ("orbit",)
+
+    study: Study
+    targets: tuple[Target, ...]
+    visibility: Visibility  # of the targets in their order
+
+    #: One row per target.
+    table = TableOf(
+        "visible", _target_columns, lambda answer: [answer._row(k) for k in range(len(answer.targets))],
+        title=lambda answer: f"Seen in {answer.times.days:g} days from {answer.times.iso(0.0)} UTC",
+        about=lambda answer: {"start": answer.times.iso(0.0), "days": answer.times.days},
+    )  # fmt: skip
+    #: One row per month, one column of hours per target.
+    months = TableOf("months", _month_columns, "_hours_by_month")
+    #: One row per target and day.
+    by_day = TableOf("days", DAY_COLUMNS, "_day_rows")
+    #: One row per window.
+    window_table = TableOf("windows", WINDOW_COLUMNS, "_window_rows", when=lambda answer: answer.writes_windows,
+                           about=lambda answer: {"study": answer.study.text(), "step_s": answer.times.step_s},
+                           study=False)  # fmt: skip
+    #: Active limits with their values and the sources of their defaults.
+    assumptions = TableOf("assumptions", assumption_columns("limit"), "visibility.limits.assumptions",
+                          study=False)  # fmt: skip
+
+    @property
+    def times(self) -> TimeGrid:
+        """Time grid."""
+        return self.visibility.track.times
+
+    @cached_property
+    def days(self) -> list[str]:
+        """UTC days of the time grid, such as "2027-01-31"."""
+        first = np.datetime64(self.times.iso(0.0)[:10], "D")
+        count = int(np.floor(self.times.julian[1][-1])) + 1
+        return [str(first + n) for n in range(count)]
+
+    @cached_property
+    def noons(self) -> Bodies:
+        """Positions of Sun and Moon at noon of each day, UTC."""
+        return Bodies.at(TimeGrid(self.days[0], len(self.days), DAY_S))
+
+    def elongation_deg(self, k: int) -> Float:
+        """Return the angle of a target from the Sun at noon of each day, shape (n_day,)."""
+        return elongation_deg(self.noons.sun, self.targets[k].direction)
+
+    @cached_property
+    def zodiacal(self) -> Float:
+        """Sky behind each target at noon of each day, V mag arcsec^-2, (n_target, n_day); NaN near the Sun."""
+        return np.array([zodiacal_light(self.noons, target.direction) for target in self.targets])
+
+    @cached_property
+    def windows(self) -> tuple[Windows, ...]:
+        """Windows of each target."""
+        return tuple(self.visibility.windows(k) for k in range(len(self.targets)))
+
+    def _row(self, k: int) -> dict[str, Any]:
+        """Return the row of a target, by the names of columns."""
+        seen, windows, target = self.visibility, self.windows[k], self.targets[k]
+        names, by_month = seen.by_month()
+        hours, away = by_month[:, k], self.elongation_deg(k)
+        light = self.zodiacal[k][np.isfinite(self.zodiacal[k])]
+        length = windows.length_s
+        return {
+            "target": target.name,
+            "ra": target.ra_deg,
+            "dec": target.dec_deg,
+            "hours": seen.hours[k],
+            "share": seen.share[k],
+            **{f"leaves_{name}": kept[k] for name, kept in seen.kept_by.items()},
+            "windows": length.size,
+            "median_window": float(np.median(length / 60)) if length.size else 0.0,
+            "longest_gap": self._longest_gap_d(k),
+            "per_orbit": float(np.mean(seen.by_orbit(k))),
+            "in_shadow": float(windows.in_shadow_s.sum() / length.sum()) if length.size else 0.0,
+            "best_month": names[int(np.argmax(hours))] if hours.any() else "",
+            "least_elongation": float(away.min()),
+            "most_elongation": float(away.max()),
+            "brightest_sky": float(light.min()) if light.size else np.nan,
+            "faintest_sky": float(light.max()) if light.size else np.nan,
+        }
+
+    @property
+    def views(self) -> list[View]:
+        if len(self.targets) > MOST_MONTHLY:
+            return super().views
+        names, hours = self.visibility.by_month()
+        columns = (TARGET_COLUMN, *(Column(name, heading=name, format=".0f") for name in map(str, names)))
+        rows = [
+            {"target": target.name} | dict(zip(map(str, names), hours[:, k], strict=True))
+            for k, target in enumerate(self.targets)
+        ]
+        return [*super().views, View("Hours of exposure by month", columns, table_of(columns, rows))]
+
+    def _longest_gap_d(self, k: int) -> float:
+        """Return the longest time without a window, in days."""
+        one = self.windows[k]
+        ends = (
+            np.concatenate([[0.0], one.stop_s]),
+            np.concatenate([one.start_s, [self.times.n * self.times.step_s]]),
+        )
+        return float(np.max(ends[1] - ends[0])) / DAY_S
+
+    @property
+    def _hours_by_month(self) -> dict[str, Any]:
+        names, hours = self.visibility.by_month()
+        return {"month": names} | {target.name: hours[:, k] for k, target in enumerate(self.targets)}
+
+    @property
+    def _day_rows(self) -> Iterator[dict[str, Any]]:
+        for k, target in enumerate(self.targets):
+            yield {
+                "target": target.name,
+                "day": self.days,
+                "hours": self.visibility.by_day(k),
+                "elongation": self.elongation_deg(k),
+                "zodiacal_light": self.zodiacal[k],
+            }
+
+    @property
+    def _window_rows(self) -> Iterator[dict[str, Any]]:
+        times, z = self.times, self.visibility.track.of_date_km[:, 2]
+        nodes = times.seconds[1:][(z[:-1] < 0) & (z[1:] >= 0)]
+        for target, windows in zip(self.targets, self.windows, strict=True):
+            yield {
+                "target": target.name,
+                "start": np.array([times.iso(float(t)) for t in windows.start_s], str),
+                "stop": np.array([times.iso(float(t)) for t in windows.stop_s], str),
+                "length": windows.length_s / 60,
+                "in_shadow": windows.in_shadow_s / 60,
+                "orbit": np.searchsorted(nodes, windows.start_s),
+            }
+
+    @property
+    def writes_windows(self) -> bool:
+        """True if there are few enough windows for a table of them."""
+        return sum(windows.start_s.size for windows in self.windows) <= MOST_WINDOWS
+
+    @property
+    def documents(self) -> dict[str, Callable[[], bytes]]:
+        """Calendar of windows or, if these are not known, of the days on which a target is visible."""
+        return {"visible.ics": partial(calendar_bytes, self.entries(), "Mauve")}
+
+    def entries(self) -> list[Entry]:
+        """Return the appointments of the calendar."""
+        times, entries = self.times, list[Entry]()
+        single = self.study.orbit.orbit().resolved(times) == "tle" and self.writes_windows
+        for k, one in enumerate(self.targets):
+            if single:
+                windows = self.windows[k]
+                entries += [
+                    Entry(times.iso(float(a)), times.iso(float(b)), one.name, f"{(b - a) / 60:.0f} min of exposure")
+                    for a, b in zip(windows.start_s, windows.stop_s, strict=True)
+                ]
+                continue
+            hours = self.visibility.by_day(k)
+            edges = np.flatnonzero(np.diff(np.concatenate([[False], hours >= SEEN_H, [False]])))
+            for first, last in zip(edges[::2], edges[1::2], strict=True):
+                mean = f"{hours[first:last].mean():.1f} h of exposure a day"
+                entries.append(Entry(self.days[first], self.days[last - 1], one.name, mean))
+        return entries
+
+    @property
+    def inputs(self) -> list[Expectation]:
+        """No expectations, since nothing is exposed."""
+        return []
+
+    @property
+    def messages(self) -> list[str]:
+        """Messages on the orbit, assumptions, effects that are not modelled, and targets that are never visible."""
+        never = [one.name for one, part in zip(self.targets, self.visibility.share, strict=True) if part == 0]
+        lines = [f"{name} is never seen: {self.reason(name)}." for name in never]
+        lines += self.study.orbit.orbit().messages(self.times)
+        lines.append(
+            "Mauve's own limits are not public: those used are assumptions, named with their sources in the table of "
+            "assumptions. Stray light is not modelled."
+        )
+        if not self.writes_windows:
+            lines.append(
+                f"There are more than {MOST_WINDOWS} windows: their table is not written, and the calendar has days."
+            )
+        return lines
+
+    def reason(self, name: str) -> str:
+        """Return the reason why a target is never visible."""
+        k = [target.name for target in self.targets].index(name)
+        alone = [limit for limit, kept in self.visibility.kept_by.items() if kept[k] == 0]
+        if not alone:
+            return "its limits together leave nothing"
+        ends = np.atleast_1d(getattr(self.visibility.limits, f"{alone[0]}_deg", ()))
+        value = f" ({' to '.join(f'{end:g}' for end in ends)} deg)" if ends.size else ""
+        return f"the limit of {alone[0].replace('_', ' ')}{value} alone leaves nothing"
+
+
+@validated
+def visible(
+    study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
+) -> VisibleAnswer:
+    """Compute when a study's targets are visible.
+
+    Parameters
+    ----------
+    study : Study
+        Its ``orbit`` defines position, time and limits.
+    engine : Engine or Pool, optional
+        Not used: nothing is drawn.
+    progress : callable, optional
+        Called once, with the number of targets, at the end.
+
+    Examples
+    --------
+    >>> from mauvecl import Study, visible
+    >>> study = Study().with_settings(["orbit.targets=['eps Eri']", "orbit.start=2027-01-01", "orbit.days=31"])
+    >>> seen = visible(study)
+    >>> seen.months["month"].tolist()
+    ['2027-01']
+    """
+    targets = tuple(targets_of(study.orbit, study.plan))
+    o = study.orbit
+    track = o.orbit().track(o.times())
+    directions = np.array([target.direction for target in targets])
+    answer = VisibleAnswer(study, targets, Visibility.of(track, directions, o.limits))
+    if progress is not None:
+        progress(len(targets), len(targets))
+    return answer

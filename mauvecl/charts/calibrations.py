@@ -1,0 +1,206 @@
+"""Charts of calibrations and of changes between visits."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mauvecl.charts.chart import (
+    WAVELENGTH,
+    Axis,
+    Band,
+    Chart,
+    Dots,
+    Line,
+    Mesh,
+    Panel,
+    Picture,
+    Rule,
+    Strips,
+    Targets,
+    picture_of,
+)
+from mauvecl.charts.matplotlib import styled_picture
+from mauvecl.schema.columns import First
+
+if TYPE_CHECKING:
+    from mauvecl.answers.calibrate import CalibrateAnswer
+    from mauvecl.answers.change import ChangeAnswer
+
+#: Pixels that are averaged for a point of the residuals, and values for one of the photon transfer.
+BIN, GROUPS = 16, 60
+THROUGHPUT = Chart(
+    "throughput", "Throughput: fitted and nominal", WAVELENGTH, Axis("electrons per photon (%)"),
+    (
+        Band("95 %", "star", "band", alpha=0.35),
+        Line("fitted", "star", width=2, tips=("nm", "fitted (%)")),
+        Line("nominal", dash="dashed"),
+    ),
+)  # fmt: skip
+TRANSFER = Chart(
+    "transfer", "Photon transfer: variance of frames against their mean", Axis("fitted variance (DN²)", log=True),
+    Axis("measured variance (DN²)", log=True),
+    (Line("fitted"), Dots("measured", "star", size=6, tips=("fitted", "measured"))),
+)  # fmt: skip
+
+
+def throughput_series(answer: CalibrateAnswer, scale: str = "throughput") -> dict[str, Any]:
+    """Return the data of `THROUGHPUT`, or with the scale "ratio" those relative to the nominal throughput."""
+    table = answer.throughput_table
+    nm = table["wavelength"].value
+    wide = np.exp(1.96 * np.asarray(table["relative_error"]))
+    if scale == "ratio":
+        fitted, nominal = np.asarray(table["ratio"]), np.ones(nm.size)
+    else:
+        fitted, nominal = (100 * np.asarray(table[name]) for name in ("throughput", "nominal"))
+    return {"band": (nm, fitted / wide, fitted * wide), "fitted": (nm, fitted), "nominal": (nm, nominal)}
+
+
+@picture_of("CalibrateAnswer", "throughput")
+@styled_picture
+def fitted_throughput(answer: CalibrateAnswer) -> Picture:
+    """Plot the fitted throughput with its 95 % band next to the nominal one, and their ratio."""
+    above = THROUGHPUT.panel(throughput_series(answer), f"nominal: {answer.nominal.name}")
+    ratio = THROUGHPUT.panel(throughput_series(answer, "ratio"))
+    below = Panel(WAVELENGTH, Axis("fitted / nominal"), [replace(one, listed=False) for one in ratio.series])
+    return Picture([[above], [below]], (5.2, 4.6), f"Throughput {answer.source}", share_x=True)
+
+
+def residual_series(answer: CalibrateAnswer) -> list[tuple[str, Any, Any]]:
+    """Return name, wavelengths and averaged residuals of each star, without pixels that were not used."""
+    nm, each = answer.throughput.binned_residuals(BIN)
+    stars = zip(answer.stars, each, strict=True)
+    return [(one.name, nm[kept], row[kept]) for one, row in stars for kept in [np.isfinite(row)]]
+
+
+@picture_of("CalibrateAnswer", "residuals")
+@styled_picture
+def calibration_residuals(answer: CalibrateAnswer) -> Picture:
+    """Plot the residuals of each star, averaged over some pixels, in their standard deviations."""
+    y, two = Axis(f"residual of {BIN} pixels (sigma)"), Strips(along="y", alpha=0.2, at=([-2], [2]))
+    rows = [
+        [Panel(WAVELENGTH, y if k == len(answer.stars) // 2 else Axis(), [two, Dots("", "star", at=(nm, row))], name)]
+        for k, (name, nm, row) in enumerate(residual_series(answer))
+    ]
+    title = f"Observed less fitted spectra; grey: 2 sigma; p = {answer.throughput.p_value:.2g}"
+    return Picture(rows, (5.2, 1.0 + 1.1 * len(rows)), title, share_x=True, share_y=True)
+
+
+def transfer_series(answer: CalibrateAnswer) -> tuple[dict[str, Any], Any]:
+    """Return the data of `TRANSFER`, and the errors of the measured variances."""
+    t = answer.transfer
+    # Dark counts have their own variance, which the fit includes.
+    groups = np.array_split(np.argsort(t.model), GROUPS)
+    model, measured = (np.array([values[group].mean() for group in groups]) for values in (t.model, t.variance))
+    error = np.array([(t.variance - t.model)[group].std() / np.sqrt(group.size) for group in groups])
+    return {"fitted": (model, model), "measured": (model, measured)}, error
+
+
+@picture_of("CalibrateAnswer", "photon-transfer", when=lambda answer: "gain" not in answer.transfer.assumed)
+@styled_picture
+def photon_transfer(answer: CalibrateAnswer) -> Picture:
+    """Plot the variance of frames against their mean, binned, with the fit and its residuals."""
+    t, (series, error) = answer.transfer, transfer_series(answer)
+    model, measured = series["measured"]
+    off = Dots("", "star", size=6, at=(model, 100 * (measured / model - 1), 100 * error / model))
+    below = Panel(TRANSFER.x, Axis("difference (%)"), [Rule(along="y", dash="-", at=0), off])
+    title = (
+        f"Photon transfer: gain {t.noise.gain:.4g} +- {t.gain_error:.1g} DN per electron, read noise "
+        f"{t.read_noise_dn:.3g} +- {t.read_noise_error:.1g} DN; dark counts in {t.dark_unit}"
+    )
+    return Picture([[TRANSFER.panel(series)], [below]], (4.6, 4.6), title, share_x=True)
+
+
+@picture_of("CalibrateAnswer", "dark", when=lambda answer: answer.dark.dof > 0)
+@styled_picture
+def dark_current(answer: CalibrateAnswer) -> Picture:
+    """Plot the dark current of each pixel, and its mean against temperature with the fit."""
+    d, n = answer.dark, answer.nominal
+    pixels = Dots("", "star", size=2, at=(n.wavelength_nm, d.level_dn_per_s))
+    dark = [one for one in answer.observations if one.star is None]
+    celsius = np.concatenate([np.atleast_1d(one.temperature_c) for one in dark])
+    kelvin = np.linspace(celsius.min(), celsius.max(), 101)
+    usual = n.dark_scale_dn_per_s * np.exp(n.dark_slope_per_c * kelvin)
+    mean = [
+        *(
+            Dots("", "star", at=(one.temperature_c, (one.raw_dn - d.bias_dn).mean(axis=1) / one.exposure_s))
+            for one in dark
+        ),
+        Line("fitted", "flare", at=(kelvin, d.level_dn_per_s.mean() * d.growth(kelvin))),
+        Line("nominal", dash="dashed", at=(kelvin, usual)),
+    ]
+    left = Panel(WAVELENGTH, Axis("dark current (DN/s)"), [pixels], f"pixels at {d.reference_c:.1f} C")
+    right = Panel(Axis("detector temperature (C)"), Axis("mean dark current (DN/s)"), mean)
+    title = f"Dark current: slope {d.slope_per_c:.4g} +- {d.slope_error:.1g} per deg C"
+    return Picture([[left, right]], (7.2, 2.9), title)
+
+
+#: Changes whose periods are drawn, at most.
+MOST = 3
+#: Nanometres on both sides of an index that are drawn.
+AROUND_NM = 15.0
+
+
+def along_magnitude(answer: ChangeAnswer, names: Sequence[str], scale: float) -> list[tuple[str, Any, Any]]:
+    """Return name, magnitudes and smallest changes of the first star, times a factor, where they are known."""
+    found = []
+    for name in names:
+        own = [one for one in answer.along if one.change.name == name]
+        x, y = np.array([(one.magnitude, one.smallest.one) for one in own[: len(own) // answer.many]]).T
+        found.append((name, x[np.isfinite(y)], scale * y[np.isfinite(y)]))
+    return found
+
+
+@picture_of("ChangeAnswer", "change", when=lambda answer: bool(answer.along))
+@styled_picture
+def change_against_magnitude(answer: ChangeAnswer) -> Picture:
+    """Plot the smallest detectable changes against the magnitude of the star, one panel for each unit."""
+    titles = First(list(dict.fromkeys(row.title for row in answer.changes)), 1, "stars")
+    (title,), star, row = titles, answer.study.star[0], []
+    for unit in dict.fromkeys(row.change.unit for row in answer.along):
+        names = list(dict.fromkeys(row.change.name for row in answer.along if row.change.unit == unit))
+        found = [one for one in along_magnitude(answer, names, 1 if unit else 100) if one[1].size]
+        here = [] if star.magnitude is None else [Rule(dash="dotted", at=star.magnitude)]
+        # Without a pixel that does not saturate there is nothing to show.
+        y = Axis(f"smallest change ({unit or '%'})", log=bool(found))
+        row.append(Panel(Axis(f"magnitude ({star.band})"), y, [Targets(at=found), *here]))
+    visits, exposure = answer.study.change.visits, answer.study.observation.exposure_s
+    title = f"{title}: smallest change between {visits} visits of {exposure:g} s"
+    return Picture([row], (1.0 + 3.3 * len(row), 3.6), title, (titles.note,))
+
+
+@picture_of("ChangeAnswer", "periods", when=lambda answer: bool(answer.periods))
+@styled_picture
+def recovered_periods(answer: ChangeAnswer) -> Picture:
+    """Plot the share of recovered periods over period and semi-amplitude, for the first changes."""
+    first, row = First(answer.periods, MOST, "changes"), []
+    for one in first:
+        r, scale = one.recovery, one.error * (1 if one.change.unit else 100)
+        shares = 100 * one.shares("value")
+        mesh = Mesh("recovered (%)", high=100, at=(r.periods_d, scale * r.amplitudes, shares))
+        y = Axis(f"semi-amplitude ({one.change.unit or '%'})", log=True)
+        row.append(Panel(Axis("period (d)", log=True), y, [mesh], one.change.name))
+    time = first[0].recovery.time_d
+    title = f"{first[0].title}: periods that {time.size} visits within {np.ptp(time):.0f} days recover"
+    return Picture([row], (1.0 + 2.9 * len(row), 3.2), title, (first.note,))
+
+
+@picture_of("ChangeAnswer", "indices", when=lambda answer: bool(answer.indices))
+@styled_picture
+def line_indices(answer: ChangeAnswer) -> Picture:
+    """Plot the mean calibrated spectrum around each line index, with its band and continuum."""
+    title, row = answer.indices[0].title, []
+    for one in answer.indices:
+        if one.title != title:
+            continue
+        index, nm = one.value.index, one.wavelength_nm
+        near = (nm > index.continuum_nm[0][0] - AROUND_NM) & (nm < index.continuum_nm[-1][1] + AROUND_NM)
+        line = Line("", "star", at=(nm[near], one.flux[near]))
+        band, continua = np.array([index.band_nm]).T, np.array(index.continuum_nm).T
+        series = [line, Strips("", "read", at=band), Strips(alpha=0.2, at=continua)]
+        row.append(Panel(Axis("nm"), Axis("erg / (s cm² nm)"), series, index.name))
+    title = f"{title}: bands (orange) and continua (grey) of the line indices, mean spectrum"
+    return Picture([row], (1.0 + 2.3 * len(row), 2.8), title)

@@ -1,0 +1,436 @@
+"""Pictures and reports of campaigns, as HTML and PDF, and the report of an analysis."""
+
+from __future__ import annotations
+
+import base64
+import calendar as months_of_years
+import io
+import textwrap
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from functools import partial
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mauvecl.charts.chart import Axis, Dots, Line, Mesh, Panel, Picture, Series, picture_of, pictures_of
+from mauvecl.charts.matplotlib import COLOURS, NULL, available, draw_picture, new_figure, style, styled_picture
+from mauvecl.host.version import VERSION
+from mauvecl.schema.columns import without_empty
+
+if TYPE_CHECKING:
+    from mauvecl.answers.analyse import AnalyseAnswer
+    from mauvecl.answers.plan import PlanAnswer
+    from mauvecl.answers.visible import VisibleAnswer
+
+#: Largest number of targets with a calendar each; more targets are rows of one picture.
+MOST_CALENDARS = 6
+
+
+@picture_of("VisibleAnswer", "visible")
+@styled_picture
+def calendar(answer: VisibleAnswer) -> Picture:
+    """Plot daily hours of exposure: a calendar per target or, for many targets, a row."""
+    hours = np.array([answer.visibility.by_day(k) for k in range(len(answer.targets))])
+    picture = (_calendars if len(answer.targets) <= MOST_CALENDARS else _rows)(answer, hours)
+    kind = "mean orbit" if answer.study.orbit.orbit().resolved(answer.times) == "mean" else "SGP4"
+    return replace(picture, title=f"Hours of exposure a day ({kind}); limits are assumptions, no stray light")
+
+
+def _calendars(answer: VisibleAnswer, hours: Any) -> Picture:
+    """Return calendars with days of the month across and months down."""
+    months = sorted({day[:7] for day in answer.days})
+    across, step = min(len(answer.targets), 2), max(1, len(months) // 14)
+    x = Axis("day of the month (UTC)", ticks=([1, 8, 15, 22, 29],))
+    names = np.arange(0, len(months), step), [_month(name) for name in months[::step]]
+    y, panels = Axis(limits=(len(months) - 0.5, -0.5), ticks=names), list[Panel]()
+    for one, seen, total in zip(answer.targets, hours, answer.visibility.hours, strict=True):
+        grid = np.full((len(months), 31), np.nan)
+        for day, value in zip(answer.days, seen, strict=True):
+            grid[months.index(day[:7]), int(day[8:]) - 1] = value
+        at = np.arange(0.5, 32), np.arange(-0.5, len(months)), grid
+        mesh = Mesh("hours a day", high=max(float(hours.max()), 0.1), edges="white", at=at)
+        panels.append(Panel(x, y, [mesh], f"{one.name}: {total:.0f} h in {answer.times.days:g} d"))
+    rows = [panels[k : k + across] for k in range(0, len(panels), across)]
+    height = max(1.3, 0.17 * len(months) + 0.8)
+    return Picture(rows, (3.9 * across + 0.8, height * len(rows) + 0.4), share_x=True)
+
+
+def _rows(answer: VisibleAnswer, hours: Any) -> Picture:
+    """Return targets as rows and days as columns."""
+    n = len(answer.targets)
+    mesh = Mesh("hours a day", high=None, at=(np.arange(len(answer.days) + 1) - 0.5, np.arange(n + 1) - 0.5, hours))
+    step = max(1, n // 60)
+    names = np.arange(0, n, step), [one.name for one in answer.targets[::step]]
+    firsts = [i for i, day in enumerate(answer.days) if day.endswith("-01")]
+    firsts = firsts[:: max(1, len(firsts) // 13)]
+    x = Axis(ticks=(firsts, [_month(answer.days[i]) for i in firsts]))
+    panel = Panel(x, Axis(limits=(n - 0.5, -0.5), ticks=names), [mesh])
+    return Picture([[panel]], (7.4, min(0.16 * n + 1.4, 20.0)))
+
+
+def _month(day: str) -> str:
+    return f"{months_of_years.month_abbr[int(day[5:7])]} {day[2:4]}"
+
+
+#: A4, and its margin, inches.
+PAGE, MARGIN = (8.27, 11.69), 0.6
+#: Approximate width of a letter divided by its size, for line breaks; line spacing divided by the size.
+LETTER, LINE = 0.53, 1.4
+#: Starts of the columns of the summary and of the assumptions, as fractions of the text width.
+SUMMARY_AT = (0.0, 0.16, 0.235, 0.34, 0.425, 0.51, 0.605, 0.685, 0.755, 0.86)
+ASSUMED_AT = (0.0, 0.24, 0.5)
+#: Number of colours kept in the pictures of an HTML report.
+COLOURS_KEPT = 64
+#: Margins of a target's panels, as fractions of the figure; computing them takes longer than drawing the figure.
+PANELS = {"left": 0.085, "right": 0.905, "top": 0.955, "bottom": 0.09, "hspace": 0.5}
+
+
+@picture_of("PlanAnswer", "plan")
+@styled_picture
+def overview(answer: PlanAnswer) -> Picture:
+    """Plot each target's expected number of flares with the range of 95 % of campaigns, and E50 to E90."""
+    return _overview(answer)
+
+
+def _overview(answer: PlanAnswer) -> Picture:
+    """Return each target's expected number of flares with the range of 95 % of campaigns, and E50 to E90."""
+    planned, left, right = answer.planned, list[Series](), list[Series]()
+    ends = [(one.energy_at(0.5), one.energy_at(0.9)) for one in planned]
+    for k, one in enumerate(planned):
+        if one.recovered is not None and one.recovered.high > 0:
+            # A logarithmic axis cannot show zero.
+            low, high, expected = np.maximum([one.recovered.low, one.recovered.high, one.recovered.expected], 0.05)
+            left += [_bar("star", (low, high), k), Dots("", "star", size=7, at=([expected], [k]))]
+        if np.isfinite(ends[k][0]):
+            right += [_bar("flare", ends[k], k), Dots("", "flare", size=7, at=([ends[k][0]], [k]))]
+    # Limits at whole decades avoid labels that overlap.
+    known = np.log10([energy for pair in ends for energy in pair if np.isfinite(energy)])
+    decades = (10 ** np.floor(known.min()), 10 ** np.ceil(known.max())) if known.size else None
+    names = range(len(planned)), [f"{one.name} ({one.hours:.0f} h)" for one in planned]
+    y, above = Axis(limits=(len(planned) - 0.5, -0.5), ticks=names), "expected (dot); 95 % of campaigns"
+    row = [
+        Panel(Axis("flares recovered", log=True, limits=(0.05, None)), y, left, above),
+        Panel(Axis("bolometric energy (erg)", log=True, limits=decades), y, right, "E50 (dot) to E90"),
+    ]
+    return Picture([row], (7.4, 0.24 * len(planned) + 1.5), share_y=True)
+
+
+def _bar(colour: str, ends: tuple[float, float], k: int) -> Line:
+    return Line("", colour, width=3.3, alpha=0.5, at=(ends, [k, k]))
+
+
+@picture_of("PlanAnswer", "visible")
+def visible(answer: PlanAnswer, path: str | Path | None = None) -> Any:
+    """Plot the daily hours of exposure of all targets."""
+    return calendar(answer.seen, path=path)
+
+
+@picture_of("PlanAnswer", "plan.pdf", document=True, when=lambda answer: answer.study.plan.report == "pdf")
+def pdf_bytes(answer: PlanAnswer) -> bytes:
+    """Return the report as PDF: summary, a page per target, and all assumptions."""
+
+    def figures() -> list[Any]:
+        targets = [_target(answer, k) for k in range(len(answer.planned))]
+        return [*_summary(answer), *targets, *_assumptions(answer)]
+
+    return _pdf(f"Mauve: {answer.heading}", figures)
+
+
+def _pdf(title: str, figures: Callable[[], list[Any]]) -> bytes:
+    """Return a PDF with a page per figure; without a date, so that equal answers give equal files."""
+    from matplotlib.backends.backend_pdf import PdfPages
+
+    made, about = io.BytesIO(), {"Title": title, "Creator": f"mauvecl {VERSION}", "CreationDate": None}
+    with style(), PdfPages(made, metadata=about) as pages:
+        for figure in figures():
+            pages.savefig(figure)
+    return made.getvalue()
+
+
+def target_figure(answer: PlanAnswer, k: int) -> Any:
+    """Return the pictures of a target."""
+    figure = new_figure((7.4, 5.4), layout="none")
+    _panels(figure, answer, k)
+    return figure
+
+
+def html_image(draw: Callable[[], Any], text: str) -> str:
+    """Return a figure as an image of few colours; nothing if matplotlib is not installed."""
+    if not available():
+        return ""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from PIL import Image
+
+    made = io.BytesIO()
+    with style():
+        figure = draw()
+        # savefig draws each picture twice.
+        figure.set_dpi(110)
+        drawn = FigureCanvasAgg(figure)
+        drawn.draw()  # type: ignore[no-untyped-call]
+    # A palette holds the few colours of a figure in a fourth of the bytes: a report may hold hundreds.
+    colours = Image.fromarray(np.asarray(drawn.buffer_rgba())[:, :, :3])  # type: ignore[no-untyped-call]
+    colours.quantize(COLOURS_KEPT, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(made, "png")
+    content = base64.b64encode(made.getvalue()).decode()
+    return f"<img alt='{escape(text, quote=True)}' src='data:image/png;base64,{content}'>"
+
+
+class Sheets:
+    """Text that flows over as many pages as it needs."""
+
+    def __init__(self) -> None:
+        self.pages: list[Any] = []
+        self.left_in = 0.0
+
+    def line(self, cells: Sequence[tuple[float, str]], size: float, **how: Any) -> None:
+        """Write cells at fractions of the text width, each wrapped before the start of the next."""
+        edges = [*(place for place, _ in cells[1:]), 1.0]
+        width = PAGE[0] - 2 * MARGIN
+        wrapped = []
+        for (place, text), end in zip(cells, edges, strict=True):
+            letters = max(8, int((end - place) * width * 72 / (LETTER * size)) - 1)
+            wrapped.append((MARGIN + place * width, textwrap.wrap(text, letters) or [""]))
+        height = max(len(lines) for _, lines in wrapped) * size * LINE / 72
+        y = self.take(height)
+        for x, lines in wrapped:
+            self.pages[-1].text(x / PAGE[0], y / PAGE[1], "\n".join(lines), fontsize=size, va="top", linespacing=LINE,
+                                parse_math=False, **how)  # fmt: skip
+
+    def rows(self, rows: Iterable[Sequence[object]], places: Sequence[float], size: float, *, head: bool) -> None:
+        """Write the rows of a table with a line below each, the first in bold if it has the headings."""
+        from matplotlib.lines import Line2D
+
+        for number, row in enumerate(rows):
+            weight = "bold" if head and not number else "normal"
+            self.line([(place, str(cell)) for place, cell in zip(places, row, strict=True)], size, weight=weight)
+            y, ends = self.take(0.06) / PAGE[1], (MARGIN / PAGE[0], 1 - MARGIN / PAGE[0])
+            self.pages[-1].add_artist(Line2D(ends, (y, y), color=NULL, linewidth=0.5))
+
+    def take(self, height_in: float) -> float:
+        """Reserve a height, on a new page if necessary, and return its top in inches from the bottom."""
+        if not self.pages or self.left_in < height_in:
+            self.pages.append(new_figure(PAGE, layout="none"))
+            self.left_in = PAGE[1] - 2 * MARGIN
+        top = MARGIN + self.left_in
+        self.left_in -= height_in
+        return top
+
+
+def _summary(answer: PlanAnswer) -> list[Any]:
+    from mauvecl.answers.plan import LEGEND
+
+    sheets = Sheets()
+    sheets.line([(0.0, "Mauve: yields of a campaign")], 15)
+    sheets.line([(0.0, f"{answer.heading}; mauvecl {VERSION}")], 9)
+    sheets.take(0.1)
+    headings, cells = answer.views[0].texts()
+    sheets.rows([headings, *cells], SUMMARY_AT, 7, head=True)
+    sheets.take(0.05)
+    sheets.line([(0.0, LEGEND)], 7, color=NULL)
+    height = 0.2 * len(answer.planned) + 1.3
+    if height < PAGE[1] - 2 * MARGIN:
+        top, margin = sheets.take(height) / PAGE[1], MARGIN / PAGE[0]
+        around = {"width_ratios": [margin, 1 - 2 * margin, margin]}
+        heights = [1 - top, height / PAGE[1], top - height / PAGE[1]]
+        part = sheets.pages[-1].subfigures(3, 3, height_ratios=heights, **around)[1, 1]
+        draw_picture(_overview(answer), part)
+        part.subplots_adjust(left=0.2, right=0.98, bottom=0.6 / height, top=1 - 0.3 / height)
+    for message in answer.messages:
+        sheets.line([(0.0, message)], 8)
+        sheets.take(0.08)
+    return sheets.pages
+
+
+def _assumptions(answer: PlanAnswer) -> list[Any]:
+    sheets = Sheets()
+    sheets.line([(0.0, "What is assumed")], 14)
+    sheets.line([(0.0, "Rows of assumptions.ecsv.")], 8, color=NULL)
+    sheets.take(0.1)
+    sheets.rows(answer.assumptions, ASSUMED_AT, 7, head=False)
+    return sheets.pages
+
+
+def _target(answer: PlanAnswer, k: int) -> Any:
+    from mauvecl.answers.plan import target_lines
+
+    figure = new_figure(PAGE, layout="none")
+    # The text is above the pictures.
+    margin = MARGIN / PAGE[0]
+    pictures = figure.subfigures(2, 3, height_ratios=[0.43, 0.57], width_ratios=[margin, 1 - 2 * margin, margin])[1, 1]
+    figure.text(margin, 0.96, answer.planned[k].name, fontsize=14, va="top", parse_math=False)
+    figure.text(1 - margin, 0.96, answer.heading, fontsize=8, va="top", ha="right", color=NULL)
+    y = 0.925
+    for name, value, where in target_lines(answer, k):
+        lines = textwrap.wrap(value, 48) or [""]
+        figure.text(margin, y, name, fontsize=8, va="top")
+        figure.text(0.33, y, "\n".join(lines), fontsize=8, va="top", parse_math=False)
+        figure.text(1 - margin, y, where, fontsize=6.5, va="top", ha="right", color=NULL)
+        y -= 0.018 * len(lines)
+    if answer.planned[k].seen_h > 0:
+        _panels(pictures, answer, k)
+    return figure
+
+
+def _panels(figure: Any, answer: PlanAnswer, k: int) -> None:
+    """Plot daily hours with elongation, monthly hours, and recovered fraction with the rate by energy."""
+    one, seen = answer.planned[k], answer.seen
+    top, bottom = figure.subplots(2, 1)
+    figure.subplots_adjust(**PANELS)
+    days = np.arange(len(seen.days))
+    top.fill_between(days, seen.visibility.by_day(k), step="mid", color=COLOURS[1], linewidth=0)
+    top.set(ylabel="hours a day", xlim=(0, max(len(days) - 1, 1)), ylim=(0, None))
+    firsts = [i for i, day in enumerate(seen.days) if day.endswith("-01")]
+    step = max(1, len(firsts) // 12)
+    top.set_xticks(firsts[::step], [seen.days[i][:7] for i in firsts[::step]], fontsize=7, rotation=30)
+    sun = top.twinx()
+    sun.plot(days, seen.elongation_deg(k), color=COLOURS[4])
+    sun.set(ylabel="angle from the Sun (deg)", ylim=(0, 180))
+    sun.spines["right"].set_visible(True)
+    sun.yaxis.label.set_color(COLOURS[4])
+    top.set_title("when it is seen")
+    if one.completeness is None:
+        bottom.set_visible(False)
+        return
+    energy, p = one.completeness.energy_erg, one.completeness.probability
+    first = int(np.argmax(p > 0))
+    shown = slice(max(first - 4, 0), min(first + 100, energy.size))
+    bottom.plot(energy[shown], p[shown], color=COLOURS[0])
+    bottom.set(xscale="log", xlabel="bolometric energy (erg)", ylabel="share recovered", ylim=(0, 1.02))
+    bottom.yaxis.label.set_color(COLOURS[0])
+    _plain_decades(bottom.xaxis)
+    for share, dash in ((0.5, "--"), (0.9, ":")):
+        if np.isfinite(one.energy_at(share)):
+            bottom.axvline(one.energy_at(share), color=NULL, linestyle=dash, linewidth=0.8)
+    bottom.set_title("flares recovered (E50 dashed, E90 dotted), and how often they are")
+    if one.rates is not None:
+        often = bottom.twinx()
+        rate = one.rates.per_day_above(energy[shown]) * one.hours / 24
+        used = rate > 0
+        often.plot(energy[shown][used], rate[used], color=COLOURS[4])
+        often.set(yscale="log", ylabel=f"flares above this energy in {one.hours:.0f} h")
+        often.spines["right"].set_visible(True)
+        often.yaxis.label.set_color(COLOURS[4])
+        _plain_decades(often.yaxis)
+
+
+def _plain_decades(axis: Any) -> None:
+    """Label whole decades as 1e33, since minor ticks and formulas take most of the drawing time."""
+    from matplotlib.ticker import FuncFormatter, NullLocator
+
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}" if 1e-3 <= value < 1e4 else f"{value:.0e}"))
+
+
+PAGE_STYLE = (
+    "body{font-family:sans-serif;max-width:60em;margin:2em auto;font-size:14px;line-height:1.35}"
+    "table{border-collapse:collapse;margin:1em 0}img{max-width:100%;break-inside:avoid}"
+    "td,th{padding:.2em .7em;text-align:left;border-bottom:1px solid #ccc;vertical-align:top}.from{color:#666}"
+    ".numbers td:nth-child(n+2):not(:last-child),.numbers th:nth-child(n+2):not(:last-child){text-align:right}"
+    "section{break-before:page}h2{break-after:avoid}@media print{body{font-size:11px}}"
+)
+
+
+@picture_of("PlanAnswer", "plan.html", document=True, when=lambda answer: answer.study.plan.report == "html")
+def plan_html(answer: PlanAnswer) -> bytes:
+    """Return the report: summary, a section per target (with pictures if matplotlib is installed), assumptions."""
+    from mauvecl.answers.plan import LEGEND, target_lines
+
+    parts = [
+        *_top(f"Mauve: {answer.heading}", "Mauve: yields of a campaign"),
+        f"<p>{escape(answer.heading)}; mauvecl {VERSION}.</p>",
+        html_table(*answer.views[0].texts(), "numbers", link=True),
+        f"<p class=from>{escape(LEGEND)}</p>",
+        html_image(partial(overview, answer), "flares expected and energies of all targets"),
+        *(f"<p>{escape(message)}</p>" for message in answer.messages),
+    ]
+    for k, one in enumerate(answer.planned):
+        lines = html_table(("", "", "table: column"), target_lines(answer, k))
+        parts.append(f"<section id=target-{k}><h2>{escape(one.name)}</h2>{lines}")
+        if one.seen_h > 0:
+            parts.append(html_image(partial(target_figure, answer, k), f"hours and energies of {one.name}"))
+        parts.append("</section>")
+    table = answer.assumptions
+    rows = [tuple(str(cell) for cell in row) for row in table]
+    parts.append(
+        "<section><h2>What is assumed</h2><p class=from>Rows of assumptions.ecsv.</p>"
+        f"{html_table(table.colnames, rows)}"
+        "</section></html>"
+    )
+    return "\n".join(parts).encode()
+
+
+def _top(title: str, heading: str) -> tuple[str, str]:
+    """Return the beginning of a page of HTML."""
+    return (
+        f"<!doctype html><html lang=en><meta charset=utf-8><title>{escape(title)}</title>",
+        f"<style>{PAGE_STYLE}</style><h1>{escape(heading)}</h1>",
+    )
+
+
+def html_table(names: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "", *, link: bool = False) -> str:
+    """Return a table; `link` makes the first cell of row k lead to the section of target k."""
+    head = "".join(f"<th>{escape(name)}</th>" for name in names)
+    body = ""
+    for k, row in enumerate(rows):
+        cells = [escape(cell) for cell in row]
+        if link:
+            cells[0] = f"<a href='#target-{k}'>{cells[0]}</a>"
+        body += "<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
+    return f"<table class='{kind}'><tr>{head}</tr>{body}</table>"
+
+
+#: Sizes of text on a page of A4: of tables with many columns, and of others.
+SMALL, NORMAL = 5.5, 7.0
+#: Number of columns from which a table has small letters.
+MANY = 9
+
+
+def title(answer: AnalyseAnswer) -> str:
+    """Return the heading of the report."""
+    frames = answer.analysis.frames
+    return f"{frames.name}: {frames.n_frames} frames from {frames.date(float(frames.time_s[0]))[:19]}"
+
+
+def _sections(answer: AnalyseAnswer) -> list[tuple[str, list[str], list[list[str]]]]:
+    """Return title, headings and cells of each table, without empty columns."""
+    return [(view.title, *without_empty(*view.texts())) for view in answer.all_views]
+
+
+@picture_of("AnalyseAnswer", "analyse.html", document=True, when=lambda answer: answer.study.data.report == "html")
+def analysis_html(answer: AnalyseAnswer) -> bytes:
+    """Return the report: messages, tables, remarks, and pictures if matplotlib is installed."""
+    parts = [
+        *_top(title(answer), title(answer)),
+        f"<p>Analysed by mauvecl {VERSION}. {escape(answer.assumed)}</p>",
+        *(f"<p>{escape(text)}</p>" for text in answer.messages),
+    ]
+    for heading, names, cells in _sections(answer):
+        parts.append(f"<h2>{escape(heading)}</h2>{html_table(names, cells) if names else ''}")
+    parts += [f"<p>{escape(text)}</p>" for text in answer.remarks]
+    for name, draw in pictures_of(answer).items():
+        parts.append(html_image(draw, name))
+    return "\n".join([*parts, "</html>"]).encode()
+
+
+@picture_of("AnalyseAnswer", "analyse.pdf", document=True, when=lambda answer: answer.study.data.report == "pdf")
+def report_pdf(answer: AnalyseAnswer) -> bytes:
+    """Return the report as PDF: messages, tables, remarks, and a page for each picture."""
+
+    def figures() -> list[Any]:
+        sheets = Sheets()
+        sheets.line([(0.0, title(answer))], 14)
+        for text in (f"Analysed by mauvecl {VERSION}. {answer.assumed}", *answer.messages, *answer.remarks):
+            sheets.line([(0.0, text)], 8)
+            sheets.take(0.05)
+        for heading, names, cells in _sections(answer):
+            sheets.take(0.1)
+            sheets.line([(0.0, heading)], 10)
+            places = [k / len(names) for k in range(len(names))]
+            sheets.rows([names, *cells] if names else [], places, SMALL if len(names) >= MANY else NORMAL, head=True)
+        sheets.line([(0.0, "Every number is a row of the tables next to this report.")], SMALL, color=NULL)
+        return [*sheets.pages, *(draw() for draw in pictures_of(answer).values())]
+
+    return _pdf(title(answer), figures)

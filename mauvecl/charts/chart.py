@@ -1,0 +1,336 @@
+"""Descriptions of charts, which matplotlib and Bokeh draw, and the registry of pictures by class."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextvars import ContextVar
+from dataclasses import dataclass, field, replace
+from functools import cache, partial
+from importlib import import_module
+from pathlib import Path
+from pkgutil import iter_modules
+from typing import Any, TypeVar
+
+from mauvecl.schema.errors import InputError
+
+F = TypeVar("F", bound=Callable[..., Any])
+#: Caller's axes to draw in; None if the picture creates its own figure.
+AXES: ContextVar[Any] = ContextVar("axes", default=None)
+#: Largest number of curves of targets on the page; further targets are in the table alone.
+MOST_TARGETS = 8
+
+
+@dataclass(frozen=True)
+class Axis:
+    """Axis of a chart."""
+
+    label: str = ""
+    log: bool = False
+    limits: tuple[Any, Any] | None = None
+    log_limits: tuple[Any, Any] | None = None  # limits of an axis that the visitor has made logarithmic, if others
+    kind: str = ""  # "wavelength", "dates" or "names"; empty for other numbers
+    ticks: tuple[Any, ...] | None = None  # places, and labels if they are no numbers, in files
+
+
+WAVELENGTH = Axis("wavelength (nm)", kind="wavelength")
+
+
+@dataclass(frozen=True)
+class Series:
+    """Part of a chart, which one entry of the chart's data fills: an array for each of its columns."""
+
+    called: str = ""  # in the legend
+    colour: str = "drawn"  # name in a theme, or the colour itself
+    name: str = ""  # of its data; by default that of the legend
+    show: str = ""  # part of the page that shows or hides it; "if any" if only the legend depends on its data
+    listed: bool = True  # whether the legend lists it
+    width: float = 1.6
+    dash: str = ""
+    alpha: float = 1.0
+    tips: tuple[str, ...] = ()  # names of y, or of x and y, in its tooltip; without a name it has no tooltip
+    form: str = "line"  # in the legend: "line", "dash", "band", "dot", "bar" or "bars"
+    columns: tuple[str, ...] = ("x", "y")
+    at: Any = None  # its data, unless the chart's data hold it
+
+    @property
+    def key(self) -> str:
+        """Name of its data."""
+        return self.name or self.called
+
+
+@dataclass(frozen=True)
+class Line(Series):
+    """Line through points."""
+
+    step: bool = False
+    marker: str = ""  # of its points in files
+
+
+@dataclass(frozen=True)
+class Band(Series):
+    """Area between two lines."""
+
+    alpha: float = 0.22
+    step: bool = False
+    form: str = "band"
+    columns: tuple[str, ...] = ("x", "low", "high")
+
+
+@dataclass(frozen=True)
+class Dots(Series):
+    """Points; in files also with the lengths of error bars along y and x."""
+
+    size: float = 5
+    marker: str = "circle"
+    alone: bool = False  # whether the y axis has the range of these points alone
+    form: str = "dot"
+
+
+@dataclass(frozen=True)
+class Own(Series):
+    """Marker of the visitor's question."""
+
+    called: str = "your question"
+    colour: str = "own"
+    name: str = "own"
+    form: str = "dot"
+
+
+@dataclass(frozen=True)
+class Strips(Series):
+    """Ranges of x over the whole height, in files also of y over the whole width."""
+
+    alpha: float = 0.3
+    along: str = "x"
+    hatched: bool = False
+    form: str = "band"
+    columns: tuple[str, ...] = ("x0", "x1")
+
+
+@dataclass(frozen=True)
+class Bars(Series):
+    """Histogram."""
+
+    alpha: float = 0.45
+    form: str = "bars"
+    columns: tuple[str, ...] = ("left", "right", "top")
+
+
+@dataclass(frozen=True)
+class Contours(Series):
+    """Several lines, each a list of points."""
+
+    columns: tuple[str, ...] = ("xs", "ys")
+
+
+@dataclass(frozen=True)
+class Rule(Series):
+    """Straight line at a value of x or y, which is its data, in files also at several."""
+
+    along: str = "x"
+    dash: str = "dashed"
+
+
+@dataclass(frozen=True)
+class Targets(Series):
+    """Lines of several targets; its data is a list of name, x and y."""
+
+
+@dataclass(frozen=True)
+class Mesh(Series):
+    """Values over x and y as colours, for files; `called` is the label of the colour bar."""
+
+    low: float | None = 0.0
+    high: float | None = 1.0
+    palette: str = "cividis"
+    edges: str = "none"  # colour of the cells' edges
+    columns: tuple[str, ...] = ("x", "y", "values")
+
+
+@dataclass(frozen=True)
+class Listed(Series):
+    """Entry of the legend for parts that are not listed themselves."""
+
+
+@dataclass(frozen=True)
+class Custom(Series):
+    """Part that the page draws by a function of its own, which is given the page's figure and the data source."""
+
+    draw: Callable[[Any, Any], None] | None = None
+
+
+#: Pixels that saturate.
+SATURATED = Strips("saturated", "own", show="if any", alpha=0.18, hatched=True)
+
+
+@dataclass(frozen=True)
+class ChartData:
+    """Data of a chart."""
+
+    text: str  # the picture in words, for visitors who do not see it
+    #: By the name of the series: arrays for its columns, the place of a rule, or the curves of targets.
+    series: Mapping[str, Any] = field(default_factory=dict)
+    #: Properties by the name of the page's model, such as an axis's label.
+    props: Mapping[str, dict[str, Any]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Chart:
+    """Description of a picture: axes and series, without their data."""
+
+    name: str
+    title: str
+    x: Axis
+    y: Axis
+    series: tuple[Series, ...]
+    logs: tuple[str, ...] = ()  # axes that the visitor may make logarithmic; in capitals those that are so at first
+    shows: Mapping[str, str] = field(default_factory=dict)  # parts that are hidden at first, with what they are called
+    sets: str = ""  # fields that a click on the page sets, with the axis that gives each, as in "magnitude=x"
+    pins: str = ""  # series that pinned scenarios have, too; empty if they are not drawn
+    alike: tuple[str, ...] = ()  # fields in which a pinned scenario must agree with the question
+    fill: Callable[[Any, Any], ChartData] | None = None  # see `data`
+    of: str = ""
+    before: str = ""
+
+    def panel(self, series: Mapping[str, Any], title: str = "") -> Panel:
+        """Return the chart with the data of its series; those without data are left out."""
+        filled = [replace(one, at=series[one.key]) for one in self.series if one.key in series]
+        return Panel(self.x, self.y, filled, title)
+
+    def data(self, of: str = "", before: str = "") -> Callable[[Callable[[Any, Any], ChartData]], Chart]:
+        """Return a decorator for the function that gives the data, which makes the whole chart of it.
+
+        The function takes the closed forms of a question and its answers by name, or the answer `of` alone; without
+        that answer the chart is empty, and `before` is its text.
+        """
+        return lambda fill: replace(self, fill=fill, of=of, before=before)
+
+    def drawn(self, closed: Any, answers: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the text, the columns of the page's data sources, properties of models, and entries of the legend."""
+        data = ChartData(self.before)
+        if self.fill is not None and (not self.of or self.of in answers):
+            data = self.fill(closed, answers[self.of] if self.of else answers)
+        assert data.series.keys() <= {one.key for one in self.series}
+        sources, props, names = dict[str, Any](), dict(data.props), dict[str, str]()
+        for one in self.series:
+            given = data.series.get(one.key, one.at)
+            if isinstance(one, Rule):
+                props[one.key] = {"location": given}
+            elif isinstance(one, Targets):
+                for k, (name, x, y) in enumerate([*(given or ()), *[("", [], [])] * MOST_TARGETS][:MOST_TARGETS]):
+                    sources[f"{one.key} {k}"] = {"x": x, "y": y}
+                    names |= {f"target {k + 1}": name} if name else {}
+            elif not isinstance(one, Listed):
+                columns = [[]] * len(one.columns) if given is None else given
+                sources[one.key] = dict(zip(one.columns, columns, strict=True))
+        return {"text": data.text, "sources": sources, "props": props, "names": names}
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Axes and series with their data, as a part of a file."""
+
+    x: Axis
+    y: Axis
+    series: Sequence[Series]
+    title: str = ""
+    finish: Callable[[Any], None] | None = None  # changes the axes of matplotlib when all is drawn
+
+
+@dataclass(frozen=True)
+class Picture:
+    """Panels of a file, from top to bottom and from left to right; None for an empty place.
+
+    A label that the panel below or on the left has, too, is not repeated.
+    """
+
+    rows: Sequence[Sequence[Panel | None]]
+    size: tuple[float, float] = (3.6, 2.7)  # inches
+    title: str = ""
+    notes: tuple[str, ...] = ()
+    below: bool = False  # whether one legend stands below all panels
+    share_x: bool = False
+    share_y: bool | str = False
+    heights: tuple[float, ...] | None = None  # ratios of the rows' heights
+    widths: tuple[float, ...] | None = None
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Function that draws a picture or writes a document of a class."""
+
+    name: str  # name of the file
+    make: Callable[..., Any]
+    given: Callable[[Any], tuple[Any, ...]] = lambda thing: (thing,)  # arguments of `make` for a thing
+    #: Arguments of `make` for each of several numbered pictures of a thing.
+    each: Callable[[Any], Iterable[tuple[Any, ...]]] | None = None
+    when: Callable[[Any], bool] = lambda thing: True  # whether a thing has the picture
+    document: bool = False
+
+    def of(self, thing: Any) -> list[tuple[int, str, Callable[..., Any]]]:
+        """Return number, name and bound function of each picture of an object."""
+        if self.each is not None:
+            return [(n, f"{self.name}-{n}", partial(self.make, *given)) for n, given in enumerate(self.each(thing), 1)]
+        return [(0, self.name, partial(self.make, *self.given(thing)))]
+
+
+#: Entries by class name, since importing the classes would import every answer.
+ENTRIES: defaultdict[str, list[Entry]] = defaultdict(list)
+
+
+def picture_of(kind: str, name: str, **how: Any) -> Callable[[F], F]:
+    """Register a function as a picture of a class, or as the bytes of a document; `plot` draws the first picture.
+
+    Parameters
+    ----------
+    kind : str
+        Name of the class, as in ``"LimitAnswer"``.
+    name : str
+        Name of the picture's file without its ending, or of the document.
+    **how
+        `given`, `each`, `when` and `document`; see `Entry`.
+    """
+
+    def register(make: F) -> F:
+        ENTRIES[kind].append(Entry(name, make, **how))
+        return make
+
+    return register
+
+
+def pictures_of(thing: Any) -> dict[str, Callable[..., Any]]:
+    """Return every picture of an object by file name, as functions of `path` and `ax`."""
+    return {name: partial(_draw, draw) for name, draw in _made_of(thing, document=False)}
+
+
+def documents_of(thing: Any) -> dict[str, Callable[[], bytes]]:
+    """Return the function of each document of an object, by file name."""
+    return dict(_made_of(thing, document=True))
+
+
+def _made_of(thing: Any, *, document: bool) -> list[tuple[str, Callable[..., Any]]]:
+    """Return the functions of an object's class by name, numbered ones in the order of their numbers."""
+    load()
+    own = next((ENTRIES[kind.__name__] for kind in type(thing).__mro__ if kind.__name__ in ENTRIES), [])
+    made = [one for entry in own if entry.document is document and entry.when(thing) for one in entry.of(thing)]
+    return [(name, make) for _, name, make in sorted(made, key=lambda one: one[0])]
+
+
+@cache
+def load() -> None:
+    """Import all modules of pictures, so that they register their functions."""
+    for module in iter_modules([str(Path(__file__).parent)]):
+        import_module(f"{__package__}.{module.name}")
+
+
+def _draw(draw: Callable[..., Any], path: str | Path | None = None, *, ax: Any = None, **options: Any) -> Any:
+    """Draw a picture and return the figure, the path of the saved file, or `ax`."""
+    if ax is not None and not (hasattr(ax, "plot") and hasattr(ax, "figure")):
+        raise InputError.of("ax", ax, "axes, as returned by plt.subplots")
+    before = AXES.set(ax)
+    try:
+        drawn = draw(path=path, **options)
+    finally:
+        AXES.reset(before)
+    return drawn if ax is None else ax

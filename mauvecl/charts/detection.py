@@ -1,0 +1,271 @@
+"""Charts of detections and of the instrument's unknowns."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from itertools import cycle
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.charts.chart import WAVELENGTH, Axis, Band, Dots, Line, Panel, Picture, Rule, Series, picture_of
+from mauvecl.charts.matplotlib import COLOURS, COLUMN, MAX_COLUMNS, UNBROKEN, styled_picture
+from mauvecl.detection.names import NoThresholdError
+from mauvecl.detection.requests import label
+from mauvecl.detection.statistics import LinearStatistic
+from mauvecl.schema.columns import First, note_of, part_note
+from mauvecl.study.questions import QUANTITIES
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
+
+    from mauvecl.answers.detect import DetectAnswer, UnknownAnswer
+    from mauvecl.detection.detection import Detection, Roc
+    from mauvecl.detection.snr import SnrResult
+    from mauvecl.host.exposure.expectation import Expectation
+
+#: Flares of a star in one picture.
+MOST_FLARES = 16
+#: A star: title, findings, and its flares' names.
+Shown = tuple[str, "Detection", Sequence[str]]
+ELEMENT = "per 10.5 nm element"
+#: Largest number of stars in a picture.
+MOST_STARS = 6
+
+
+def _few(answer: DetectAnswer) -> First[Shown]:
+    """Limit the number of stars so that each panel stays readable."""
+    return First([star.shown for star in answer.stars], MOST_STARS, "stars")
+
+
+def _alone(found: Detection) -> list[Shown]:
+    return [(found.quiet.name, found, [f"flare {k + 1}" for k in range(len(found.flares))])]
+
+
+@picture_of("DetectAnswer", "detection", given=lambda answer: (_few(answer), answer.study.run.fap))
+@picture_of("Detection", "detection", given=lambda found: (_alone(found),))
+@styled_picture
+def detection(stars: Sequence[Shown], fap: float = 1e-3) -> Picture:
+    """Plot null and flare distributions, with a row per star and a column per statistic."""
+    first = stars[0][1]
+    columns = min(len(first.statistics), MAX_COLUMNS)
+    rows = list[list[Panel]]()
+    for title, outcome, flares in stars:
+        panels = [_distributions(title, outcome, flares, statistic, fap) for statistic in first.statistics]
+        rows += [panels[k : k + columns] for k in range(0, len(panels), columns)]
+    exposures = " and ".join(sorted({f"{outcome.quiet.exposure_s:g}{UNBROKEN}s" for _, outcome, _ in stars}))
+    title = (
+        f"Detection statistics without a flare and with one, {exposures}, {first.realisations:,} realisations each; "
+        "nominal throughput"
+    )
+    size, notes = (COLUMN * columns, 2.6 * len(rows) + 0.4), (note_of(stars), _flare_note(stars))
+    return Picture(rows, size, title, notes, below=True)
+
+
+def _drawn_flares(names: Sequence[str]) -> list[int]:
+    """Return the indices of the flares that a picture shows: all, or evenly spread from the first to the last."""
+    return [round(k) for k in np.linspace(0, len(names) - 1, min(len(names), MOST_FLARES))]
+
+
+def _flare_note(stars: Sequence[Shown]) -> str:
+    """Return the note on the number of drawn flares; empty if all are drawn."""
+    most = max(len(names) for *_, names in stars)
+    return part_note(min(MOST_FLARES, most), most, "flares")
+
+
+def _distributions(title: str, outcome: Detection, flares: Sequence[str], statistic: str, fap: float) -> Panel:
+    """Return the histograms of a statistic without and with each flare, and its thresholds."""
+    one = outcome.statistic(statistic)
+    linear, chosen = isinstance(one, LinearStatistic), _drawn_flares(flares)
+    shapes: list[tuple[int | None, str, str]] = [(None, "drawn", "no flare")]
+    shapes += [(k, colour, flares[k]) for k, colour in zip(chosen, cycle(COLOURS), strict=False)]
+    series: list[Series] = []
+    for flare, colour, name in shapes:
+        edges, counts = outcome.histogram(statistic, flare, bins=120)
+        middle, height = (edges[1:] + edges[:-1]) / 2, counts / counts.max()
+        series += [
+            Band("", colour, alpha=0.3, step=True, at=(middle, 0 * height, height)),
+            Line(name, colour, step=True, at=(middle, height)),
+        ]
+    # Statistics that are scaled by the flare have a threshold per flare.
+    own = chosen if one.shaped and not linear else [0]
+    for k, colour in zip(own, cycle(COLOURS if len(own) > 1 else ["text"]), strict=False):
+        try:
+            cut = outcome.threshold(fap, statistic, template=k).value
+        except NoThresholdError:
+            continue
+        series.append(Rule(f"threshold, fap {fap:g} per test", colour, listed=len(own) == 1, at=cut))
+    y = Axis(f"{title}\nrealisations, each peak = 1", limits=(0, None))
+    return Panel(Axis(label(statistic)), y, series, finish=partial(_scaled, linear=linear))
+
+
+def _scaled(axis: Any, linear: bool) -> None:
+    """Scale the axis of a statistic, whose means differ by decades."""
+    if linear:
+        axis.set_xscale("function", functions=(lambda x: np.arcsinh(x / 2), lambda y: 2 * np.sinh(y)))
+        low, high = axis.get_xlim()
+        ticks: list[float] = [t for t in (-4, 0, 4, 10, 30, 100, 1000, 10000) if low <= t <= high]
+        axis.set_xticks(ticks, [str(t) for t in ticks])
+        return
+    axis.set_xscale("log")
+    low, high = axis.get_xlim()
+    digits: tuple[float, ...] = (1,)
+    if high / low <= 100:
+        # Below two decades, powers of ten alone are too sparse.
+        digits = (1, 2, 5) if high / low > 3 else (1, 1.2, 1.4, 1.6, 1.8, 2, 2.5, 3, 4, 5, 6, 8)
+    ticks = [t for t in (d * 10.0**e for e in range(9) for d in digits) if low <= t <= high]
+    axis.set_xticks(ticks, [f"{t:g}" if t < 1e5 else f"$10^{{{np.log10(t):.0f}}}$" for t in ticks])
+    axis.tick_params(axis="x", which="minor", labelbottom=False)
+
+
+def roc_columns(curve: Roc) -> tuple[Any, ...]:
+    """Return false-alarm and detection probabilities with the ends of their intervals, where there are alarms."""
+    table = curve.table()
+    seen = np.asarray(table["fap"]) > 0
+    names = ("fap", "probability", "probability_low", "probability_high")
+    return tuple(np.asarray(table[name], float)[seen] for name in names)
+
+
+@picture_of("Roc", "roc")
+@styled_picture
+def roc(curves: Roc | Sequence[tuple[str, Roc]], *, name: str = "") -> Panel:
+    """Plot receiver operating characteristics with their areas: one with its name, or several with theirs."""
+    from mauvecl.detection.detection import Roc
+
+    series: list[Series] = []
+    named = [(name, curves)] if isinstance(curves, Roc) else curves
+    for colour, (one, curve) in zip(cycle(COLOURS), named, strict=False):
+        fap, probability, low, high = roc_columns(curve)
+        text = f"{one}: area {curve.area.value:.4f}".removeprefix(": ")
+        series += [Line(text, colour, at=(fap, probability)), Band("", colour, alpha=0.3, at=(fap, low, high))]
+    x, y = Axis("false-alarm probability per test", log=True), Axis("detection probability", limits=(0, 1.02))
+    return Panel(x, y, series)
+
+
+@picture_of("DetectAnswer", "spectra", given=lambda answer: (_few(answer),))
+@styled_picture
+def spectra(stars: Sequence[Shown]) -> Picture:
+    """Plot mean spectra per second with pixel noise and, below, the flares in sigma of an element's noise."""
+
+    def finish(axis: Any) -> None:
+        axis.set_ylim(bottom=max(axis.get_ylim()[0], 0.03))
+
+    above, below = list[Panel](), list[Panel]()
+    for title, outcome, names in stars:
+        quiet, whole, nm = outcome.quiet, _whole(outcome.quiet), outcome.quiet.wavelength_nm
+        sigma = np.sqrt(quiet.per_element(quiet.variance_dn2))
+        drawn = [(names[k], outcome.flares[k], COLOURS[i % len(COLOURS)]) for i, k in enumerate(_drawn_flares(names))]
+        mean, noise = quiet.signal_dn / quiet.exposure_s, np.sqrt(quiet.variance_dn2) / quiet.exposure_s
+        spectra = [Line(name, colour, at=(nm, x.signal_dn / x.exposure_s)) for name, x, colour in drawn[::-1]]
+        band = Band("1 sigma of a pixel", alpha=0.35, at=(nm, mean - noise, mean + noise))
+        series = [*spectra, band, Line("no flare", "text", dash="dashed", at=(nm, mean))]
+        y = Axis("net signal (DN s$^{-1}$ pixel$^{-1}$)")
+        above.append(Panel(WAVELENGTH, y, series, f"{title}, {quiet.exposure_s:g} s"))
+        risen = [(x.per_element(x.signal_dn - quiet.signal_dn) / sigma, colour) for _, x, colour in drawn[::-1]]
+        lines = [Line("", colour, at=(quiet.element_wavelength_nm[whole], rise[whole])) for rise, colour in risen]
+        y = Axis("flare less quiet\n(sigma per 10.5 nm)", log=True)
+        below.append(Panel(WAVELENGTH, y, [*lines, Rule(along="y", at=1.0)], finish=finish))
+    title = "Mean spectra as Mauve would see them; nominal throughput, not a flight calibration"
+    size, notes = (COLUMN * len(stars), 5.0), (note_of(stars), _flare_note(stars))
+    return Picture([above, below], size, title, notes, below=True, share_x=True, heights=(3, 2))
+
+
+def _whole(x: Expectation) -> NDArray[np.bool_]:
+    """Return the complete elements; the last one of the spectrum may have fewer pixels."""
+    pixels = np.bincount(x.element, minlength=x.element_wavelength_nm.size)
+    return np.asarray(pixels >= np.median(pixels) - 1)
+
+
+#: Components of a raw spectrum, as in the paper's figure.
+COMPONENTS = {
+    "raw": "raw spectrum",
+    "source": "star",
+    "sky": "zodiacal light",
+    "photon_noise": "photon noise",
+    "dark": "dark",
+    "bias": "bias",
+    "read_noise": "read noise",
+}
+
+
+@picture_of(
+    "SimulateAnswer", "observation", each=lambda answer: [(title, table) for title, _, table in answer.observations]
+)
+@styled_picture
+def observation(title: str, table: QTable) -> Picture:
+    """Plot a raw spectrum and its components, as the paper's figure of components."""
+    nm, rows = table["wavelength"].to_value("nm"), list[list[Panel]]()
+    for letter, (name, text), colour in zip("abcdefg", COMPONENTS.items(), COLOURS, strict=True):
+        line = Line("", colour, width=0.9, at=(nm, table[name].value))
+        rows.append([Panel(WAVELENGTH, Axis("DN"), [line], f"({letter}) {text}")])
+    title = f"{title}: one observation of {table.meta['exposure_s']:g} s; nominal throughput"
+    return Picture(rows, (7.2, 9.5), title, share_x=True)
+
+
+@picture_of(
+    "SnrAnswer",
+    "snr",
+    given=lambda answer: (First([(star.title, star.result) for star in answer.stars], MOST_STARS, "stars"),),
+)
+@picture_of("SnrResult", "snr", given=lambda result: ([(result.expectation.name, result)],))
+@styled_picture
+def signal_to_noise(stars: Sequence[tuple[str, SnrResult | Expectation]]) -> Picture:
+    """Plot the closed-form S/N per pixel and resolution element, and the spread of realisations if simulated."""
+    from mauvecl.detection.snr import SnrResult
+
+    rows = list[list[Panel]]()
+    for title, result in stars:
+        drawn = result if isinstance(result, SnrResult) else None
+        x = drawn.expectation if drawn else cast("Expectation", result)
+        title = title if f"{x.exposure_s:g} s" in title else f"{title}, {x.exposure_s:g} s"
+        whole = _whole(x)
+        element = drawn.element[whole] if drawn else None
+        rows.append([
+            _snr_panel(title, "per pixel", x.wavelength_nm, x.snr(), drawn.pixel if drawn else None),
+            _snr_panel(title, ELEMENT, x.element_wavelength_nm[whole], x.snr_per_element()[whole], element),
+        ])  # fmt: skip
+    title = "S/N of one exposure; nominal throughput, not a flight calibration"
+    size = 7.6, 2.6 * len(rows) + 0.4
+    return Picture(rows, size, title, (note_of(stars),), below=True, share_x=True)
+
+
+def _snr_panel(title: str, what: str, nm: Any, expected: Any, table: QTable | None) -> Panel:
+    """Return the S/N in closed form, over the ranges of realisations if there is a table of them."""
+    series: list[Series] = [Line("closed form", "text", width=1.2, at=(nm, expected))]
+    for low, high, alpha, text in (("q16", "q84", 0.45, "68 %"), ("q2.5", "q97.5", 0.25, "95 %")):
+        if table is not None:
+            series.insert(0, Band(f"{text} of realisations", "star", alpha=alpha, at=(nm, table[low], table[high])))
+    return Panel(WAVELENGTH, Axis(f"S/N {what}"), series, title)
+
+
+@picture_of("UnknownAnswer", "unknowns")
+@styled_picture
+def unknowns(answer: UnknownAnswer) -> Picture:
+    """Plot closed-form power per star (dashed plain, solid marginalised), and the smallest amplitudes."""
+    from mauvecl.answers.detect import power
+
+    stars = list(dict.fromkeys(star for star, _ in answer.costs))
+    fap, above, below = answer.study.run.fap, list[Panel](), list[Panel]()
+    for star in stars:
+        amplitude, costs = next((a, c) for (s, a), c in answer.costs.items() if s == star)
+        relative = np.geomspace(0.03, 300.0, 200) * answer.smallest(star, None)
+        known = next(iter(costs.values())).known
+        at = relative, power(known * relative / amplitude, fap)
+        series: list[Series] = [Line("everything known", "text", width=4, at=at)]
+        smallest = [Dots("", "text", size=12, at=([0], [answer.smallest(star, None)]))]
+        for k, (colour, (unknown, cost)) in enumerate(zip(cycle(COLOURS), costs.items(), strict=False), 1):
+            series += [
+                Line(unknown, colour, at=(relative, power(cost.marginal * relative / amplitude, fap))),
+                Line("", colour, dash="dashed", at=(relative, power(cost.plain * relative / amplitude, fap))),
+            ]
+            smallest.append(Dots("", colour, size=12, at=([k], [answer.smallest(star, unknown)])))
+        y = Axis("detection probability", limits=(-0.02, 1.02))
+        above.append(Panel(Axis(QUANTITIES["amplitude"].label, log=True), y, series, star))
+        below.append(Panel(Axis(ticks=((), ())), Axis("smallest flare amplitude", log=True), smallest))
+    title = (
+        f"Above: solid marginalised, dashed plain; below: detected with a probability of {answer.study.limit.power:g}, "
+        f"marginalised over each unknown; false-alarm probability {fap:g} per test"
+    )
+    return Picture([above, below], (2.6 * len(stars) + 1.6, 5.6), title, below=True)

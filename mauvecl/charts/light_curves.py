@@ -1,0 +1,412 @@
+"""Charts of light curves: stares, observed frames, and injected flares."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import cycle
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri
+
+from mauvecl.charts.chart import (
+    Axis,
+    Band,
+    Chart,
+    Dots,
+    Line,
+    Mesh,
+    Panel,
+    Picture,
+    Rule,
+    Series,
+    Strips,
+    picture_of,
+)
+from mauvecl.charts.matplotlib import COLOURS, INK, MAX_COLUMNS, styled_picture
+from mauvecl.schema.columns import First, part_note
+
+if TYPE_CHECKING:
+    from mauvecl.answers.analyse import AnalyseAnswer
+    from mauvecl.answers.inject import InjectAnswer
+    from mauvecl.answers.stare import StareAnswer, StarStare
+    from mauvecl.flares.stare import Stare
+    from mauvecl.observations.analysis import Analysis
+    from mauvecl.observations.events import ObservedEvent
+
+#: Labels of the size axes.
+SIZES = {
+    "amplitude": "flare amplitude",
+    "duration": "equivalent duration (s)",
+    "energy": "bolometric energy (erg)",
+    "band_energy": "energy in the band (erg)",
+}
+#: Largest number of half-widths with a curve each.
+MOST_CURVES = 6
+#: Largest number of maps in a picture.
+MOST_MAPS = 6
+CONTOURS = (0.1, 0.5, 0.9)
+HALF_WIDTH = Axis("half-width (s)", log=True)
+
+
+def _stars(answer: InjectAnswer, panel: Callable[[Any], Panel], *notes: str, below: bool = False) -> Picture:
+    """Return a picture with a panel per star, the first ones if there are many."""
+    stars, choice = First(answer.stars, MOST_MAPS, "stars"), answer.study.search
+    columns = min(len(stars), MAX_COLUMNS)
+    panels = [panel(star) for star in stars]
+    rows = [panels[k : k + columns] for k in range(0, len(panels), columns)]
+    alarms = "false alarm" if choice.false_alarms == 1 else "false alarms"
+    title = (
+        f"Flares of {answer.study.flare.light().describe()}, {choice.false_alarms:g} {alarms} per star-{choice.per}; "
+        "nominal throughput"
+    )
+    return Picture(rows, (3.6 * columns + 0.8, 3.2 * len(rows)), title, (stars.note, *notes), below)
+
+
+@picture_of("InjectAnswer", "completeness")
+@styled_picture
+def maps(answer: InjectAnswer) -> Picture:
+    """Plot completeness over half-width and size, one panel per star."""
+
+    def panel(star: Any) -> Panel:
+        f, size = star.injected, Axis(SIZES[star.sizes.of], log=True)
+        x, y, z = np.array(f.half_widths_s), f.sizes, f.completeness.T
+        if x.size < 2:
+            # A single half-width defines no cell width.
+            return Panel(Axis("completeness"), size, [Line("", "star", at=(f.completeness[0], y))], star.title)
+
+        def finish(axis: Any) -> None:
+            lines = axis.contour(x, y, z, levels=CONTOURS, colors="white", linewidths=1)
+            axis.clabel(lines, fmt=lambda level: f"{100 * level:g} %", fontsize=7)
+
+        return Panel(HALF_WIDTH, size, [Mesh("completeness", at=(_edges(x), _edges(y), z))], star.title, finish)
+
+    return _stars(answer, panel)
+
+
+@picture_of("InjectAnswer", "curves")
+@styled_picture
+def curves(answer: InjectAnswer) -> Picture:
+    """Plot completeness over size at some half-widths, with 95 % intervals."""
+
+    def panel(star: Any) -> Panel:
+        f, series = star.injected, list[Series]()
+        picked = np.unique(np.linspace(0, len(f.half_widths_s) - 1, MOST_CURVES).round().astype(int))
+        for k, colour in zip(picked, cycle(COLOURS), strict=False):
+            name = f"half-width {f.half_widths_s[k]:.0f} s"
+            series += [
+                Band("", colour, alpha=0.25, at=(f.sizes, f.completeness_low[k], f.completeness_high[k])),
+                Line(name, colour, at=(f.sizes, f.completeness[k])),
+            ]
+        series.append(Rule(colour="text", along="y", at=(0.5, 0.9)))
+        y = Axis("completeness", limits=(-0.02, 1.02))
+        return Panel(Axis(SIZES[star.sizes.of], log=True), y, series, star.title)
+
+    widths = len(answer.stars[0].injected.half_widths_s)
+    return _stars(answer, panel, part_note(min(MOST_CURVES, widths), widths, "half-widths"), below=True)
+
+
+@picture_of("InjectAnswer", "energies", when=lambda answer: all(star.fitted for star in answer.stars))
+@styled_picture
+def energies(answer: InjectAnswer) -> Picture:
+    """Plot recovered over injected energy of found flares."""
+
+    def panel(star: Any) -> Panel:
+        x, y, meshes = np.array(star.injected.half_widths_s), star.injected.sizes, list[Series]()
+        if x.size > 1:
+            at = _edges(x), _edges(y), np.log10(star.fitted.energy_ratio.T)
+            label = "recovered over injected energy, median (dex)"
+            meshes.append(Mesh(label, low=-0.3, high=0.3, palette="RdBu_r", at=at))
+        return Panel(HALF_WIDTH, Axis(SIZES[star.sizes.of], log=True), meshes, star.title)
+
+    return _stars(answer, panel)
+
+
+def _edges(middles: Any) -> Any:
+    """Return the edges of cells whose centres are about evenly spaced in the logarithm."""
+    steps = np.sqrt(middles[1:] / middles[:-1])
+    return np.concatenate([[middles[0] / steps[0]], middles[:-1] * steps, [middles[-1] * steps[-1]]])
+
+
+Float = NDArray[np.float64]
+#: Largest number of points of a light curve, and of rows of a dynamic spectrum; longer stares are averaged.
+MOST_POINTS, MOST_ROWS = 4000, 600
+#: Longest durations that are shown in seconds, and in minutes, s.
+IN_SECONDS_S, IN_MINUTES_S = 600.0, 4 * 3600.0
+
+
+@picture_of("StareAnswer", "light-curve", each=lambda answer: [(one,) for one in answer.stares])
+@styled_picture
+def light_curves(one: StarStare) -> Picture:
+    """Plot light curves in all bands, relative to the quiescent star.
+
+    Dotted lines are injected flares, triangles detections. Shaded frames lose light in pointing drifts.
+    """
+    stare, light, rows = one.staring.stare, one.light, list[list[Panel]]()
+    scale, unit = time_unit(stare.duration_s)
+    level, gaps = np.median(light.mean, axis=0), _runs(stare.numbers)
+    lost = stare.numbers[:0] if one.pointing_loss is None else stare.numbers[one.pointing_loss > 0]
+    ends = [(lost[part[0]] * stare.frame_s, (lost[part[-1]] + 1) * stare.frame_s) for part in _runs(lost) if part.size]
+    always = [
+        Strips(alpha=0.2, at=np.reshape(ends, (-1, 2)).T / scale),
+        Rule(dash="dotted", at=[flare.event.peak_s / scale for flare in one.flares]),
+    ]
+    peaks = [float(flare.alarm.recovered.peak_s[0]) / scale for flare in one.found if flare.alarm.measured]
+
+    def finish(axis: Any) -> None:
+        axis.plot(peaks, [1.0] * len(peaks), "v", color=COLOURS[4], markersize=4, transform=axis.get_xaxis_transform())
+
+    for k, band in enumerate(light.bands):
+        series = list[Series](always)
+        for part in gaps:
+            step = -(-part.size // max(1, MOST_POINTS * part.size // stare.n_frames))
+            columns = (stare.middle_s / scale, light.flux[:, k] / level[k], light.mean[:, k] / level[k])
+            time, flux, mean = (_binned(values[part], step) for values in columns)
+            colour = "text" if k == 0 else COLOURS[(k - 1) % len(COLOURS)]
+            series += [Dots("", colour, size=1.7, alpha=0.6, at=(time, flux)), Line("", width=1.1, at=(time, mean))]
+        x, y = Axis(f"time from the start of the stare ({unit})"), Axis("relative light")
+        rows.append([Panel(x, y, series, band, finish)])
+    title = f"{one.title}: one simulated stare; nominal throughput"
+    return Picture(rows, (7.2, 1.5 * len(rows) + 0.7), title, share_x=True)
+
+
+@styled_picture
+def compare_light_curves(answers: Sequence[tuple[str, StareAnswer]], band: int = 0) -> Picture:
+    """Plot a band's light curves of several answers, with a row per star and a column per answer.
+
+    Parameters
+    ----------
+    answers : sequence of (str, StareAnswer)
+        Title and answer of each column.
+    band : int
+        Number of the band, 0 the whole range.
+    """
+    rows: list[list[Panel]] = [[] for _ in answers[0][1].stares]
+    for title, answer in answers:
+        for row, one in zip(rows, answer.stares, strict=True):
+            light, stare = one.light, one.staring.stare
+            scale, unit = time_unit(stare.duration_s)
+            level, time = np.median(light.mean[:, band]), stare.middle_s / scale
+            series = [
+                Dots("", "star", size=1.3, at=(time, light.flux[:, band] / level)),
+                Line("", width=1.1, at=(time, light.mean[:, band] / level)),
+            ]
+            above = f"{title}\n" if row is rows[0] else ""
+            heading = f"{above}{one.title}, {light.bands[band]}"
+            row.append(Panel(Axis(f"time ({unit})"), Axis("relative light"), series, heading))
+    size = 3.7 * len(answers), 1.5 * len(rows) + 0.8
+    return Picture(rows, size, share_x=True, share_y="row")
+
+
+@picture_of("StareAnswer", "dynamic-spectrum", each=lambda answer: [(one,) for one in answer.stares])
+@styled_picture
+def dynamic_spectrum(one: StarStare) -> Picture:
+    """Plot each resolution element and frame, in standard deviations from the median over the stare."""
+    light = one.light
+    panel, column_s = spectra_panel(one.staring.stare, light.spectrum, light.spectrum_sd, light.element_nm)
+    return Picture([[panel]], (7.2, 3.6), f"{one.title}: dynamic spectrum, {column_s:g} s to a column")
+
+
+def spectra_panel(
+    stare: Stare, spectra: NDArray[Any], sd: NDArray[Any], wavelength_nm: Float, marks: Sequence[tuple[Any, str]] = ()
+) -> tuple[Panel, float]:
+    """Return spectra, of shape (n_frame, n_pixel), in standard deviations from their median, and the s of a column.
+
+    The ends of events in time are marked above the spectra in colours.
+    """
+    scale, unit = time_unit(stare.duration_s)
+    # The stare is shown on a regular grid with empty gaps.
+    numbers = stare.numbers - stare.numbers[0]
+    step = -(-(int(numbers[-1]) + 1) // MOST_ROWS)
+    rows = numbers // step
+    n_rows = int(rows[-1]) + 1
+
+    def summed(values: NDArray[Any]) -> Float:
+        return np.array([np.bincount(rows, column, minlength=n_rows) for column in values.T]).T
+
+    # Columns without frames are 0 / 0.
+    with np.errstate(invalid="ignore", divide="ignore"):
+        image = summed(spectra - np.median(spectra, axis=0)) / np.sqrt(summed(sd.astype(np.float64) ** 2))
+    reach = max(3.0, float(np.nanpercentile(np.abs(image), 99.5)))
+    half = (wavelength_nm[1] - wavelength_nm[0]) / 2 if wavelength_nm.size > 1 else 5.0
+    time = np.arange(n_rows + 1) * step * stare.frame_s / scale
+    nm = np.linspace(wavelength_nm[0] - half, wavelength_nm[-1] + half, wavelength_nm.size + 1)
+    label = "standard deviations from the median"
+    mesh = Mesh(label, low=-reach, high=reach, palette="RdBu_r", at=(time, nm, image.T))
+
+    def finish(axis: Any) -> None:
+        axis.set_facecolor("#dddddd")
+        for ends, colour in marks:
+            axis.plot(ends, [1.02, 1.02], transform=axis.get_xaxis_transform(), color=INK[colour], linewidth=3,
+                      clip_on=False, solid_capstyle="butt")  # fmt: skip
+
+    x = Axis(f"time from the start of the stare ({unit})", limits=(time[0], time[-1]))
+    panel = Panel(x, Axis("wavelength (nm)", limits=(nm[0], nm[-1])), [mesh], finish=finish)
+    return panel, step * stare.frame_s
+
+
+def time_unit(duration_s: float) -> tuple[float, str]:
+    if duration_s <= IN_SECONDS_S:
+        return 1.0, "s"
+    return (
+        (60.0, "min")
+        if duration_s <= IN_MINUTES_S
+        else (3600.0, "h")
+        if duration_s <= 3 * 86_400.0
+        else (86_400.0, "d")
+    )
+
+
+def _runs(numbers: NDArray[np.int64]) -> list[NDArray[np.intp]]:
+    """Return the runs of frames between gaps."""
+    return np.split(np.arange(numbers.size), np.flatnonzero(np.diff(numbers) > 1) + 1)
+
+
+def _binned(values: Float, step: int) -> Float:
+    """Average groups of `step` values; the last group may be smaller."""
+    edges = np.arange(0, values.size, max(1, step))
+    return np.asarray(np.add.reduceat(values, edges) / np.diff(np.append(edges, values.size)))
+
+
+#: Title of the light curve, which explains its colours.
+KINDS = "events above {:.2f} (blue), candidates (grey), look-alikes (red)"
+#: Flux in standard deviations above which the light curve has a second panel near the level.
+BRIGHT = 30.0
+
+
+def _minutes(one: Analysis, time_s: Any) -> Any:
+    """Return times in minutes from the first frame."""
+    return (time_s - one.frames.time_s[0]) / 60.0
+
+
+@picture_of("AnalyseAnswer", "light-curve")
+@styled_picture
+def observed_light_curve(answer: AnalyseAnswer) -> Picture:
+    """Plot the observed light curve with its level and the level's band of 95 %, events, and frames not searched.
+
+    If there are bright events, a second panel shows the part near the level.
+    """
+    one = answer.analysis
+    time, used, (level, error) = _minutes(one, one.frames.time_s), one.level.used, (one.level.level, one.level.error)
+    left_out, off = ~used & np.isfinite(one.flux), 2 * one.level.level_error
+    series: list[Series] = [
+        Strips(
+            "",
+            _colour(one, event),
+            alpha=0.2,
+            at=[[_minutes(one, one.survey.time_s[k])] for k in (event.first, event.last)],
+        )
+        for event in one.events
+    ]
+    series += [
+        Dots("", "text", size=2.5, alpha=0.7, at=(time[used], one.flux[used])),
+        Line("", "sky", width=1.1, at=(time, level)),
+        Band("", "sky", alpha=0.3, at=(time, level - off, level + off)),
+        Dots("", COLOURS[1], size=8, marker="x", at=(time[left_out], one.flux[left_out])),
+    ]
+    x = Axis(f"time (min) from {one.frames.date(float(one.frames.time_s[0]))[:19]}")
+    label = f"flux ({one.frames.unit})" if one.frames.unit else "flux"
+    around = float(np.min((one.flux - error)[used])), float(np.max((one.flux + error)[used]))
+    ranges: list[Any] = [around]
+    if (((one.flux - level) / error)[used] > BRIGHT).any():
+        ranges = [None, (float(np.min((level - 6 * error)[used])), float(np.max((level + BRIGHT / 2 * error)[used])))]
+    rows = [[Panel(x, Axis(label, limits=limits), series)] for limits in ranges]
+    title = f"{one.frames.name}: {KINDS.format(one.threshold)}"
+    return Picture(rows, (7.2, 1.1 + 1.8 * len(rows)), title, share_x=True)
+
+
+def _colour(one: Analysis, event: ObservedEvent) -> str:
+    """Return the colour of an event."""
+    if event.kind != "flare":
+        return "flare"
+    return "star" if event.value >= one.threshold else "drawn"
+
+
+@picture_of("AnalyseAnswer", "dynamic-spectrum", when=lambda answer: answer.analysis.spectra is not None)
+@styled_picture
+def observed_dynamic_spectrum(answer: AnalyseAnswer) -> Picture:
+    """Plot the searched spectra, in standard deviations from their median, and mark the events."""
+    one, spectra = answer.analysis, answer.analysis.spectra
+    assert spectra is not None
+    stare, noise = one.survey.stare, spectra.series.noise
+    sd = np.broadcast_to(noise.used, spectra.series.excess.shape)
+    marks = []
+    for event in one.events:
+        first, last = (stare.start_s[k] - stare.start_s[0] for k in (event.first, event.last))
+        marks.append((np.array([first, last + stare.frame_s]) / time_unit(stare.duration_s)[0], _colour(one, event)))
+    panel, _ = spectra_panel(stare, spectra.series.excess, sd, noise.wavelength_nm, marks)
+    return Picture([[panel]], (7.2, 3.6), f"{one.frames.name}: {KINDS.format(one.threshold)}")
+
+
+@picture_of("AnalyseAnswer", "noise-per-pixel", when=lambda answer: answer.analysis.spectra is not None)
+@styled_picture
+def observed_pixel_noise(answer: AnalyseAnswer) -> Picture:
+    """Plot the measured over the stated noise of each pixel, with the range of 95 % of normal noise."""
+    spectra = answer.analysis.spectra
+    assert spectra is not None
+    noise = spectra.series.noise
+    series: list[Series] = [
+        Band("", alpha=0.4, at=(noise.wavelength_nm, noise.low / noise.stated, noise.high / noise.stated))
+    ]
+    for which, colour in ((~noise.departs, "star"), (noise.departs, "flare")):
+        at = noise.wavelength_nm[which], (noise.measured / noise.stated)[which]
+        series.append(Dots("", colour, size=2.5, at=at))
+    panel = Panel(Axis("wavelength (nm)"), Axis("measured over stated noise"), series)
+    title = f"{answer.analysis.frames.name}: quiescent frames; grey: 95 % of normal noise; red: departs"
+    return Picture([[panel]], (4.6, 3.2), title)
+
+
+@picture_of("AnalyseAnswer", "residuals")
+@styled_picture
+def observed_residuals(answer: AnalyseAnswer) -> Picture:
+    """Plot the residuals of the fitted process against time, their autocorrelation, and their quantiles."""
+    one = answer.analysis
+    residual, likeness = one.residual[:, 0], one.likeness
+    time = _minutes(one, one.survey.time_s)[one.quiet]
+    lags = np.arange(1, likeness.correlations.size + 1)
+    normal = ndtri((np.arange(residual.size) + 0.5) / residual.size)
+    course = [Dots("", "text", size=1.7, alpha=0.7, at=(time, residual))]
+    correlation = [
+        Strips(along="y", alpha=0.4, at=([-2 * likeness.error], [2 * likeness.error])),
+        Line("", "star", marker="o", at=(lags, likeness.correlations)),
+    ]
+    quantiles = [
+        Line(at=(normal[[0, -1]], normal[[0, -1]])),
+        Dots("", "star", size=1.7, at=(normal, np.sort(residual))),
+    ]
+    row = [
+        Panel(Axis("time (min)"), Axis("residual (standard deviations)"), course),
+        Panel(Axis("lag (frames)"), Axis("autocorrelation"), correlation),
+        Panel(Axis("normal quantile"), Axis("quantile of the residuals"), quantiles),
+    ]
+    title = f"{one.frames.name}: residuals of {one.level.process.name}; grey: 95 % of independent, normal noise"
+    return Picture([row], (9.6, 2.9), title, widths=(2, 1, 1))
+
+
+SCATTER = Chart(
+    "scatter", "Noise of quiescent frames", Axis("frames in a mean", log=True),
+    Axis("scatter (noise of one frame)", log=True),
+    (
+        Band("95 % of independent frames", name="range", alpha=0.4),
+        Line("independent frames", name="white"),
+        Dots("as measured", "star", "measured", size=8, tips=("frames", "scatter")),
+    ),
+)  # fmt: skip
+
+
+def scatter_series(answer: AnalyseAnswer) -> dict[str, Any]:
+    """Return the data of `SCATTER`, or nothing if there are too few quiescent frames."""
+    rows = answer.analysis.scatter
+    if len(rows) < 2:
+        return {}
+    x, low, high, white, measured = np.array([(r.frames, r.low, r.high, r.white, r.measured) for r in rows]).T
+    return {"range": (x, low, high), "white": (x, white), "measured": (x, measured)}
+
+
+@picture_of("AnalyseAnswer", "noise", when=lambda answer: len(answer.analysis.scatter) > 1)
+@styled_picture
+def observed_noise(answer: AnalyseAnswer) -> Picture:
+    """Plot the scatter of means of quiescent frames against their number, and that of independent frames."""
+    panel, title = SCATTER.panel(scatter_series(answer)), f"{answer.analysis.frames.name}: quiescent frames"
+    return Picture([[panel]], (4.6, 3.2), title)

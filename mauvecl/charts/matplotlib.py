@@ -1,0 +1,289 @@
+"""Matplotlib figures: style, axes, and files."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from functools import cache, wraps
+from itertools import cycle
+from pathlib import Path
+from typing import Any, ParamSpec
+
+import numpy as np
+
+from mauvecl.charts.chart import AXES, Band, Dots, Line, Mesh, Panel, Picture, Rule, Series, Strips, Targets
+from mauvecl.host.tables.files import write_whole
+from mauvecl.schema.errors import InputError
+
+P = ParamSpec("P")
+#: Colours of Okabe & Ito, which colour-blind readers can distinguish (jfly.uni-koeln.de/color).
+COLOURS = ("#0072B2", "#56B4E9", "#009E73", "#E69F00", "#D55E00", "#CC79A7", "#000000")
+NULL = "#777777"
+#: Colours of files by their names in charts; `web.figures.INKS` has those of the page's themes.
+INK = {
+    "star": "#0072B2", "flare": "#D55E00", "sky": "#009E73", "drawn": NULL, "dark": "#CC79A7", "read": "#E69F00",
+    "own": "#D55E00", "total": "#000000", "text": "#000000", "threshold": "#000000",
+}  # fmt: skip
+#: Wavelengths that are shown, nm.
+RANGE_NM = (200.0, 700.0)
+#: Markers by their names in charts.
+MARKERS = {"circle": "o"}
+#: Cells of a mesh above which vector files hold it as pixels.
+MANY = 5000
+#: Panels side by side.
+MAX_COLUMNS = 3
+#: Width of one column of a journal, inches.
+COLUMN = 3.5
+#: No-break space.
+UNBROKEN = "\N{NO-BREAK SPACE}"
+#: Size of the labels of ticks that are names.
+SMALL = 8
+#: Largest fraction of a figure's width for titles and legends.
+INSIDE = 0.97
+
+STYLE = {
+    "font.size": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.titlesize": 9,
+    "axes.titlelocation": "left",
+    "legend.frameon": False,
+    "legend.fontsize": 8,
+    "figure.constrained_layout.use": True,
+    "savefig.dpi": 160,
+    "pdf.fonttype": 42,
+    "lines.linewidth": 1.2,
+}
+
+
+def available() -> bool:
+    """Return whether matplotlib is installed."""
+    from importlib.util import find_spec
+
+    return find_spec("matplotlib") is not None
+
+
+def style() -> Any:
+    """Return a context in which figures have the common style."""
+    import matplotlib as mpl
+
+    return mpl.rc_context(STYLE)  # type: ignore[arg-type]
+
+
+@cache
+def _figure_class() -> Any:
+    """Return the class of figures, which imports matplotlib."""
+    from matplotlib.figure import Figure
+
+    class Picture(Figure):
+        """Matplotlib figure that notebooks display."""
+
+        def _repr_png_(self) -> bytes:
+            content = io.BytesIO()
+            self.savefig(content, format="png")
+            return content.getvalue()
+
+    return Picture
+
+
+def new_figure(size: tuple[float, float], **how: Any) -> Any:
+    """Return an empty figure that Agg renders, without pyplot's windows, backend and list of open figures."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    figure = _figure_class()(figsize=size, **how)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _own_part(ax: Any) -> Any:
+    """Return the part of the caller's figure that axes occupy, for a picture of several panels.
+
+    Raises InputError if the axes are not part of a grid.
+    """
+    spec = ax.get_subplotspec()
+    if spec is None:
+        raise InputError(
+            "ax is not part of a grid", "axes from plt.subplots, for a picture of several panels", key="ax"
+        )
+    ax.set_axis_off()
+    return ax.figure.add_subfigure(spec)
+
+
+def _headline(figure: Any, text: str) -> None:
+    """Add a title above all panels, wrapped to the figure's width."""
+    title = figure.suptitle(text, fontsize=9.0)
+    words, lines = text.split(" "), [""]
+    for word in words:
+        title.set_text(f"{lines[-1]} {word}".strip())
+        if lines[-1] and title.get_window_extent(_renderer(figure)).width > INSIDE * figure.bbox.width:
+            lines.append("")
+        lines[-1] = f"{lines[-1]} {word}".strip()
+    title.set_text("\n".join(lines))
+
+
+def _legend_below(figure: Any, handles: dict[str, Any]) -> None:
+    """Add a legend below all panels, in as many columns as fit."""
+    for columns in range(len(handles), 0, -1):
+        legend = figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)
+        if columns == 1 or legend.get_window_extent(_renderer(figure)).width <= INSIDE * figure.bbox.width:
+            return
+        legend.remove()
+
+
+def _plain_numbers(axis: Any) -> None:
+    """Label logarithmic ticks as plain numbers (0.1, 20, 500), with intermediate ticks only over few decades."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    for one in (axis.xaxis, axis.yaxis):
+        if one.get_scale() != "log":
+            continue
+        low, high = sorted(one.get_view_interval())
+        decades = float(np.log10(high / low))
+        one.set_major_locator(LogLocator(subs=(1.0,) if decades > 2 else (1.0, 2.0, 5.0)))
+        if decades < 4 and high < 1e6:
+            one.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        one.set_minor_formatter(NullFormatter())
+
+
+def _renderer(figure: Any) -> Any:
+    """Return the renderer that measures text."""
+    from matplotlib.backends.backend_agg import RendererAgg
+
+    size = figure.bbox
+    return RendererAgg(size.width, size.height, figure.dpi)  # type: ignore[no-untyped-call]
+
+
+def styled_picture(draw: Callable[P, Any]) -> Callable[..., Any]:
+    """Decorate a function that returns a picture, a panel or a figure: draw it in the common style, and save it.
+
+    The decorated function takes the `path` of the file as well, and returns the figure without one.
+    """
+
+    @wraps(draw)
+    def picture(*what: Any, path: str | Path | None = None, **how: Any) -> Any:
+        with style():
+            made = draw(*what, **how)
+            made = Picture([[made]]) if isinstance(made, Panel) else made
+            return save_or_return(draw_picture(made) if isinstance(made, Picture) else made, path)
+
+    return picture
+
+
+def draw_picture(picture: Picture, figure: Any = None) -> Any:
+    """Draw a picture in a figure, by default one of its own or the caller's axes, and return the figure."""
+    rows, n, ax = picture.rows, max(len(row) for row in picture.rows), AXES.get()
+    alone = ax is not None and len(rows) == n == 1
+    if figure is None:
+        figure = new_figure(picture.size) if ax is None else ax.figure if alone else _own_part(ax)
+    axes = np.array([[ax]]) if alone else figure.subplots(
+        len(rows), n, squeeze=False, sharex=picture.share_x, sharey=picture.share_y, height_ratios=picture.heights,
+        width_ratios=picture.widths,
+    )  # fmt: skip
+    bars, drawn = dict[str, tuple[Any, list[Any]]](), list[tuple[Any, Panel]]()
+    for (i, k), axis in np.ndenumerate(axes):
+        panel, below = (rows[j][k] if j < len(rows) and k < len(rows[j]) else None for j in (i, i + 1))
+        if panel is None:
+            axis.set_visible(False)
+            continue
+        drawn.append((axis, panel))
+        for called, mesh in _draw_panel(axis, panel, legend=alone or not picture.below).items():
+            bars.setdefault(called, (mesh, []))[1].append(axis)
+        before = rows[i][k - 1] if k else None
+        if picture.share_x and below is not None:
+            axis.set_xlabel("")
+        if before is not None and before.y.label == panel.y.label:
+            axis.set_ylabel("")
+    for axis, panel in drawn:
+        _finish(axis, panel)
+    for called, (mesh, beside) in bars.items():
+        figure.colorbar(mesh, ax=beside, label=called)
+    title = "; ".join(filter(None, (picture.title, *picture.notes)))
+    if alone:
+        axes[0, 0].set_title(axes[0, 0].get_title(loc="left") or title)
+        return figure
+    if picture.below:
+        entries = [zip(*axis.get_legend_handles_labels(), strict=True) for axis, _ in drawn]
+        _legend_below(figure, {name: handle for each in entries for handle, name in each})
+    if title:
+        _headline(figure, title)
+    return figure
+
+
+def _finish(axis: Any, panel: Panel) -> None:
+    """Set the ranges of axes, which may be shared, when all panels are drawn."""
+    for name, of in (("x", panel.x), ("y", panel.y)):
+        limits = RANGE_NM if of.kind == "wavelength" and of.limits is None else of.limits
+        if limits is not None:
+            getattr(axis, f"set_{name}lim")(*limits)
+        if of.ticks is not None:
+            getattr(axis, f"set_{name}ticks")(*of.ticks, **({"fontsize": SMALL} if len(of.ticks) > 1 else {}))
+    _plain_numbers(axis)
+    if panel.finish is not None:
+        panel.finish(axis)
+
+
+def _draw_panel(axis: Any, panel: Panel, *, legend: bool) -> dict[str, Any]:
+    """Draw a panel on axes, and return what its colour bars are of, by their labels."""
+    for name, of in (("x", panel.x), ("y", panel.y)):
+        getattr(axis, f"set_{name}label")(of.label)
+        if of.log:
+            getattr(axis, f"set_{name}scale")("log")
+    bars = {one.called: mesh for one in panel.series if (mesh := _draw_series(axis, one)) is not None}
+    axis.set_title(panel.title)
+    if legend and axis.get_legend_handles_labels()[1]:
+        axis.legend()
+    return bars
+
+
+def _draw_series(axis: Any, one: Series) -> Any:
+    """Draw a series, and return what a colour bar is of, if any."""
+    look = {
+        "color": INK.get(one.colour, one.colour),
+        "alpha": one.alpha,
+        "label": (one.called if one.listed else "") or None,
+    }
+    width, at = {"linewidth": 0.75 * one.width}, one.at
+    match one:
+        case Mesh():
+            look = {"cmap": one.palette, "rasterized": at[2].size > MANY, "edgecolors": one.edges, "linewidth": 0.2}
+            return axis.pcolormesh(*at, vmin=one.low, vmax=one.high, **look)
+        case Rule():
+            for place in np.atleast_1d(at):
+                (axis.axvline if one.along == "x" else axis.axhline)(place, **look, linewidth=0.8, linestyle=one.dash)
+                look["label"] = None
+        case Strips():
+            for low, high in zip(*at, strict=True):
+                (axis.axvspan if one.along == "x" else axis.axhspan)(low, high, **look, linewidth=0)
+                look["label"] = None
+        case Targets():
+            for colour, (name, x, y) in zip(cycle(COLOURS), at, strict=False):
+                axis.plot(x, y, color=colour, label=name, **width)
+        case Band():
+            axis.fill_between(*at, step="mid" if one.step else None, **look, linewidth=0)
+        case Dots():
+            form = MARKERS.get(one.marker, one.marker) or "none"
+            axis.errorbar(*at, fmt=form, markersize=0.6 * one.size, elinewidth=0.6 * one.width, **look)
+        case Line():
+            step = "steps-mid" if one.step else "default"
+            axis.plot(*at, linestyle=one.dash or "-", marker=one.marker, markersize=3, drawstyle=step, **look, **width)
+    return None
+
+
+def save_or_return(figure: Any, path: str | Path | None) -> Any:
+    """Save a figure in the format of the path's extension (.png, .pdf, .svg), or return it if there is no path.
+
+    Raises InputError, without changing an existing file, if the figure cannot be written.
+    """
+    if path is None:
+        return figure
+    drawn, place, whole = io.BytesIO(), Path(path), figure.figure
+    if place.suffix == ".png":
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+        # savefig gives the same result, but draws each picture twice.
+        whole.set_dpi(STYLE["savefig.dpi"])
+        FigureCanvasAgg(whole).print_png(drawn)  # type: ignore[no-untyped-call]
+    else:
+        whole.savefig(drawn, format=place.suffix[1:] or None)
+    write_whole(place, drawn.getbuffer())
+    return place

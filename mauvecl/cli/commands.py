@@ -1,0 +1,492 @@
+"""Commands with a study file and flags: of verbs, and of stores of raw spectra."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_type_hints
+
+import typer
+
+from mauvecl.answers.verbs import DRAWS, FEWER, OBSERVATION, VERBS
+from mauvecl.cli.flags import (
+    PICTURES,
+    RESUMING,
+    TELLING,
+    WORKERS,
+    DeviceFlag,
+    JsonFlag,
+    QuietFlag,
+    SetFlag,
+    StudyFile,
+    as_text,
+    holds_study,
+    is_star,
+    output_flag,
+    study_flags,
+    study_of,
+)
+
+if TYPE_CHECKING:
+    from mauvecl.answers.verbs import DefaultStudy
+    from mauvecl.cli.invocation import Session
+    from mauvecl.runs.store import Store
+
+
+class StudyCommand(NamedTuple):
+    """Command with the flags of a study, which are built when it is called."""
+
+    help: str
+    build: Callable[[], Callable[..., None]]
+
+
+#: Commands of verbs with a study by name, filled by `takes_study`.
+COMMANDS: dict[str, StudyCommand] = {}
+
+
+def takes_study(
+    *keys: str,
+    name: str = "",
+    help: str = "",
+    without: str = "",
+    defaults: Mapping[str, Any] = MappingProxyType({}),
+    writes: str = "",
+    default: DefaultStudy | None = None,
+    draws: bool = True,
+    resumes: bool = False,
+    pictures: bool = True,
+    observation: Sequence[str] = OBSERVATION,
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Make a function a command with a study file and flags, called with the session of the resulting study.
+
+    Parameters
+    ----------
+    *keys : str
+        Keys and sections of the study whose flags the verb accepts, in addition to those of the observation.
+    name, help : str
+        Name and help text of the command; by default the function's name and docstring.
+    without : str
+        Key of the observation that the verb does not accept.
+    defaults : mapping
+        Defaults of keys that differ from the study's.
+    writes : str
+        Default output, if it is not a folder of tables.
+    default : callable, optional
+        Function of the flags that returns the study if no file is given; the paper's question by default.
+    draws, pictures : bool
+        Whether the verb draws realisations, and whether it draws pictures.
+    resumes : bool
+        Whether a verb that draws no realisations can be resumed.
+    observation : sequence of str
+        Keys instead of those of an observation. With a flag `targets`, a table may replace the study file.
+
+    Returns
+    -------
+    callable
+        Decorator of functions whose first parameter is the session. A parameter `given` receives the
+        flags; others are the verb's own options.
+    """
+
+    def decorate(verb: Callable[..., None]) -> Callable[..., None]:
+        called = name or verb.__name__
+        COMMANDS[called] = StudyCommand(help or inspect.getdoc(verb) or "", lambda: build(called, verb))
+        return verb
+
+    def build(called: str, verb: Callable[..., None]) -> Callable[..., None]:
+        flags = study_flags(*(key for key in (*observation, *keys) if key != without), defaults=defaults)
+        output = output_flag(writes or f"the folder mauvecl-{called}")
+        around = (
+            {"output": (output, None)}
+            | TELLING
+            | (PICTURES if pictures else {})
+            | (WORKERS if draws else RESUMING if resumes else {})
+        )
+        kinds = get_type_hints(verb, localns={"Session": Any}, include_extras=True)
+        _, *own = inspect.signature(verb).parameters.values()
+
+        def command(study_file: Path | None = None, **values: Any) -> None:
+            from mauvecl.cli.invocation import Session, question_time, question_values
+
+            for key, (shown, read) in readers.items():
+                if values.get(key) is not None and not isinstance(values[key], int | float):
+                    values[key] = read(values[key], shown)
+            given = {key: values.pop(key, None) for key in (*flags, "set")}
+            study_file = _placed(study_file, given)
+            if study_file is None:
+                for one in flags.values():
+                    if given[one.name] is None:
+                        given[one.name] = defaults.get(f"{one.section}.{one.key}")
+            how = {key: values.pop(key, usual) for key, (_, usual) in around.items()}
+            if "given" in kinds:
+                values["given"] = given
+            study = study_of(study_file, given, flags, default)
+            question_values(study, detects={"fap", "realisations"} <= flags.keys())
+            if draws:
+                question_time(study, **{key: how[key] for key in ("device", "cluster", "insist")})
+            with Session(called, study, **how) as session:
+                verb(session, **values)
+
+        named = inspect.Parameter.KEYWORD_ONLY
+        parameters = [
+            inspect.Parameter("study_file", named, default=None, annotation=StudyFile),
+            *(inspect.Parameter(key, named, default=None, annotation=one.kind) for key, one in flags.items()),
+            inspect.Parameter("set", named, default=None, annotation=SetFlag),
+            *(p.replace(kind=named, annotation=kinds[p.name]) for p in own if p.name != "given"),
+            *(inspect.Parameter(key, named, default=usual, annotation=kind) for key, (kind, usual) in around.items()),
+        ]
+        parameters, readers = _read_as_text(parameters)
+        command.__name__ = called
+        command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        command.__annotations__ = {p.name: p.annotation for p in parameters}
+        return command
+
+    return decorate
+
+
+def _placed(study_file: Path | None, given: dict[str, Any]) -> Path | None:
+    """Give a file that is no study to the flag that takes such files, and return None in its place."""
+    from mauvecl.schema.errors import InputError
+
+    others: dict[str, tuple[Callable[[Path], bool], str, Callable[[Path], Any]]] = {
+        "targets": (lambda path: not holds_study(path), "tables of targets", lambda path: path),
+        "data": (lambda path: path.suffix.lower() != ".toml", "observed frames", lambda path: path),
+        "star": (is_star, "stars", lambda path: [str(path)]),
+    }
+    for key, (applies, plural, value) in others.items():
+        if key in given and study_file is not None and applies(study_file):
+            if given[key]:
+                raise InputError(
+                    f"{str(study_file)!r} and --{key} are both {plural}, but only one may be given", key=key
+                )
+            given[key], study_file = value(study_file), None
+    return study_file
+
+
+def _read_as_text(
+    parameters: Sequence[inspect.Parameter],
+) -> tuple[list[inspect.Parameter], dict[str, tuple[str, Callable[[str, str], Any]]]]:
+    """Return parameters of which numbers are taken as text, so that messages have one style, and their readers."""
+    taken, readers = [], {}
+    for parameter in parameters:
+        kind, shown, read = as_text(parameter.annotation)
+        if read is not None:
+            readers[parameter.name] = shown or "--" + parameter.name.replace("_", "-"), read
+            default_text = None if parameter.default is None else f"{parameter.default:g}"
+            parameter = parameter.replace(annotation=kind, default=default_text)
+        taken.append(parameter)
+    return taken, readers
+
+
+def command_of(
+    name: str, *, draws: bool | None = None, resumes: bool = False
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Make a function of the session the command of a registered verb.
+
+    Parameters
+    ----------
+    draws : bool, optional
+        Whether a pool draws; by default if the verb counts something.
+    resumes : bool
+        As for `takes_study`.
+    """
+    verb = VERBS[name]
+    return takes_study(
+        *verb.takes,
+        name=name,
+        help=verb.help,
+        without=verb.without,
+        defaults=verb.defaults or {},
+        default=verb.default,
+        draws=bool(verb.counts) if draws is None else draws,
+        resumes=resumes,
+        observation=verb.observation,
+    )
+
+
+def add_plain_commands() -> None:
+    """Add the commands of verbs without their own function, which compute and print the answer."""
+
+    def ask(session: Session) -> None:
+        session.answer(session.ask())
+
+    for name in VERBS:
+        if name not in COMMANDS:
+            command_of(name)(ask)
+
+
+StoreArgument = Annotated[Path, typer.Argument(help="Store that `mauvecl realise` wrote.")]
+RowsFlag = Annotated[
+    str | None,
+    typer.Option(metavar="TEXT", help="Realisations, such as 1000:2000, without the last.", show_default=False),
+]
+
+
+@takes_study(
+    "flare",
+    *DRAWS,
+    "sweep",
+    "bulk",
+    defaults=FEWER,
+    pictures=False,
+    writes="mauvecl-frames.zarr; also NAME.fits, .h5, .hdf5",
+)
+def realise(session: Session) -> None:
+    """Draw raw spectra in bulk: a Zarr store, a FITS or HDF5 file.
+
+    One file holds fewer than 4 GiB. An array per star and flare, a row per realisation, with calibration, units and
+    the study. An interrupted run keeps its rows: --resume draws the rest.
+
+    Examples: mauvecl realise study.toml -n 10000 --output frames.zarr
+
+    mauvecl realise --star G2V --magnitude 7.4 --amplitude 0.24 --exposure 5 -n 1000 --output frames.fits
+    """
+    from mauvecl.cli.invocation import question_room, report_interrupts, working
+    from mauvecl.runs import bulk
+    from mauvecl.runs.export import ENDINGS
+    from mauvecl.runs.store import Store
+    from mauvecl.schema.errors import InputError
+
+    place = session.output or Path("mauvecl-frames.zarr")
+    one_file = place.suffix in ENDINGS
+    if not one_file and place.suffix not in ("", ".zarr"):
+        raise InputError(f"--output {str(place)!r}", f"a name ending in .zarr, {', '.join(ENDINGS)}", key="output")
+    folder = bulk.unfinished(place) if one_file else place
+    question_room(Store(folder, session.study), insist=session.insist)
+    with (
+        report_interrupts(lambda: f"what was written to {str(folder)!r} is kept, and --resume draws the rest"),
+        session.metered("spectra") as meter,
+        working(session.device, session.cluster) as workers,
+    ):
+        from mauvecl.runs.pool import Pool
+
+        pool = Pool(workers)
+        meter.standing = lambda: pool.standing
+        draw = bulk.realise_file if one_file else bulk.realise
+        store = draw(session.study, place, pool, resume=session.resume, restart=session.restart, progress=meter)
+    _tell(store, place, session)
+
+
+def _tell(store: Store, place: Path, session: Session) -> None:
+    from mauvecl.cli.console import show_view
+    from mauvecl.runs.store import ARRAY_COLUMNS
+    from mauvecl.schema.columns import View
+    from mauvecl.study.cases import assumption_line, collect_messages
+
+    messages = collect_messages([scene.expectation for scene in store.scenes], store.study.processes)
+    assumed = assumption_line(store.study, ("instrument", "sky", "flare", "processes", "seed"))
+    session.say([*messages, assumed])
+    rows = [
+        {
+            "array": scene.path,
+            "star": scene.star,
+            "amplitude": scene.amplitude,
+            "shape": [store.rows, *scene.row],
+            "type": scene.dtype.name,
+        }
+        for scene in store.scenes
+    ]
+    if session.as_json:
+        session.print_json(
+            {"assumed": assumed, "messages": messages, "store": str(place), "bytes": store.n_bytes, "arrays": rows}
+        )
+        return
+    title = (
+        f"Raw spectra, DN; seed {store.study.run.seed}. Rows of the same number share their random numbers, rows of "
+        "different number are independent."
+    )
+    show_view(View(title, ARRAY_COLUMNS, rows))
+    if not session.quiet:
+        seconds = time.perf_counter() - session.started
+        session.say([f"Wrote {store.n_bytes / 2**20:.0f} MiB to {place} in {seconds:.1f} s."])
+
+
+def verify(
+    store: Annotated[
+        Path, typer.Argument(help="Store that `mauvecl realise` wrote, or output folder of any other verb.")
+    ],
+    repair: Annotated[bool, typer.Option("--repair", help="Redraw damaged frames, bit for bit.")] = False,
+    redraw: Annotated[
+        bool, typer.Option("--redraw", help="Redraw and compare every spectrum, not only the digests.")
+    ] = False,
+    rows: RowsFlag = None,
+    device: DeviceFlag = None,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Check that a store or an answer's folder is as it was written.
+
+    In a store, finds flipped bytes, missing and foreign chunks, and can repair them. In the output folder of another
+    verb, finds files that were changed or removed, by the digests in its run.json.
+
+    Exit code 1 if anything is wrong and not repaired.
+
+    Example: mauvecl verify frames.zarr --repair
+    """
+    from mauvecl.answers.answer import is_answer
+    from mauvecl.cli.console import Meter, show, show_view
+    from mauvecl.schema.columns import View
+    from mauvecl.schema.errors import InputError
+
+    if is_answer(store):
+        if repair or redraw or rows is not None:
+            raise InputError(
+                f"{str(store)!r} is the folder of an answer",
+                "no --repair, --redraw or --rows, which are for stores: the same command with "
+                "--restart writes the answer again",
+                key="store",
+            )
+        _verify_answer(store, as_json=as_json)
+        return
+    from mauvecl.device.engine import Engine
+    from mauvecl.runs import bulk
+
+    engine = Engine(device) if repair or redraw else None
+    with Meter(quiet=quiet or as_json, unit="chunks") as meter:
+        faults = bulk.verify(store, engine, repair=repair, redraw=redraw, rows=_rows_of(rows), progress=meter)
+    left = sum(not fault.mended for fault in faults)
+    if as_json:
+        print(json.dumps([asdict(fault) for fault in faults], indent=2))
+    else:
+        if faults:
+            show_view(View(f"Not as it was written: {store}", bulk.FAULT_COLUMNS, [asdict(one) for one in faults]))
+        source = "with what was written" if not redraw else "with what the engine draws"
+        show([f"{len(faults) - left} repaired, {left} left as found." if faults else f"Everything agrees {source}."])
+    if left:
+        raise typer.Exit(1)
+
+
+def _verify_answer(folder: Path, *, as_json: bool) -> None:
+    """Print files that differ from the run record, with exit code 1 if there are any."""
+    from mauvecl.answers.answer import FAULT_COLUMNS, verify_answer
+    from mauvecl.cli.console import show, show_view
+    from mauvecl.schema.columns import View
+
+    faults = verify_answer(folder)
+    if as_json:
+        print(json.dumps([asdict(fault) for fault in faults], indent=2))
+    elif faults:
+        show_view(View(f"Not as it was written: {folder}", FAULT_COLUMNS, [asdict(one) for one in faults]))
+    else:
+        show(["Every file agrees with the run record, and the record with its own digest."])
+    if faults:
+        raise typer.Exit(1)
+
+
+def export(
+    store: StoreArgument,
+    file: Annotated[Path, typer.Argument(help="Ending in .fits, .h5 or .hdf5.")],
+    array: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--array", metavar="TEXT", help="Such as star-1/flare-2; may be repeated [all].", show_default=False
+        ),
+    ] = None,
+    rows: RowsFlag = None,
+    replace: Annotated[bool, typer.Option("--replace", help="Replace an existing entry of that name.")] = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Write a part of a store as one FITS or HDF5 file.
+
+    Example: mauvecl export frames.zarr some.fits --array star-1/quiescent --rows 0:1000
+    """
+    from mauvecl.cli.console import show
+    from mauvecl.runs.export import Selection
+    from mauvecl.runs.export import export as write
+    from mauvecl.runs.store import Store
+
+    write(Selection.of(Store.open(store), array, _rows_of(rows)), file, replace=replace)
+    if not quiet:
+        show([f"Wrote {file}, {file.stat().st_size / 2**20:.1f} MiB."])
+
+
+def _rows_of(text: str | None) -> tuple[int, int] | None:
+    from mauvecl.schema.errors import InputError
+
+    if text is None:
+        return None
+    first, _, stop = text.partition(":")
+    try:
+        return int(first), int(stop)
+    except ValueError as error:
+        raise InputError(f"--rows {text!r}", "a range such as 1000:2000", key="rows") from error
+
+
+@command_of("limit")
+def limit(
+    session: Session,
+    assumptions: Annotated[
+        bool, typer.Option("--assumptions", help="Also show how much each assumed instrument value changes the limit.")
+    ] = False,
+) -> None:
+    """Search for limits, and vary the assumptions about the instrument if `assumptions` is set."""
+    answer = session.ask()
+    if assumptions:
+        from mauvecl.answers.limit import what_matters
+
+        answer.assumptions = what_matters(session.study)
+    session.answer(answer)
+
+
+@command_of("simulate")
+def simulate(
+    session: Session,
+    given: dict[str, Any],
+    realisation: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Which realisation to show.")] = 0,
+) -> None:
+    """Draw a realisation, with flares if a flag names their amplitude."""
+    from mauvecl.answers.signal import simulate as compute
+
+    session.answer(compute(session.study, realisation=realisation, flaring=bool(given["amplitude"])))
+
+
+@command_of("plan")
+def plan(session: Session) -> None:
+    """Plan a campaign; a report needs matplotlib for PDF, and a closed form needs no pool."""
+    from mauvecl.answers.plan import plan as compute
+    from mauvecl.charts.matplotlib import available
+
+    if session.study.plan.report == "pdf" and not available():
+        session.study = session.study.with_settings(["plan.report=html"])
+        session.say(["The report is HTML: matplotlib is missing, `pip install 'mauvecl[plot]'` brings it."])
+    if session.study.plan.completeness == "closed form":
+        with session.metered("targets") as meter:
+            answer = compute(session.study, progress=meter)
+    else:
+        answer = session.ask()
+    session.answer(answer)
+
+
+@command_of("stare", draws=False, resumes=True)
+def stare(
+    session: Session,
+    given: dict[str, Any],
+    device: DeviceFlag = None,
+) -> None:
+    """Draw stares on one device, which keeps their frames for a resume."""
+    from mauvecl.answers.stare import stare as compute
+    from mauvecl.device.engine import Stares
+    from mauvecl.schema.errors import InputError
+
+    if given["energy"] and (given["amplitude"] or given["flares"]):
+        raise InputError("only one of --energy, --amplitude and --flares may be given", key="energy")
+
+    stares = Stares(device)
+    session.opened = stares.open_device
+    with session.checkpoint() as checkpoint:
+        answer = compute(session.study, stares, checkpoint=checkpoint)
+    session.answer(answer)
+
+
+@command_of("analyse", draws=False)
+def analyse(session: Session) -> None:
+    """Find the flares in observed frames, with progress in frames."""
+    from mauvecl.answers.analyse import analyse as compute
+
+    with session.metered("frames", "searching") as meter:
+        answer = compute(session.study, progress=meter)
+    session.answer(answer)

@@ -1,0 +1,425 @@
+"""One call of a command: questions before long runs, workers, progress, and files."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+from mauvecl.cli.console import writes_to
+from mauvecl.schema.errors import InputError
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+
+    from mauvecl.answers.answer import Answer
+    from mauvecl.cli.console import Meter
+    from mauvecl.device.build import Device
+    from mauvecl.host.exposure.expectation import Expectation
+    from mauvecl.runs.checkpoint import Checkpoint
+    from mauvecl.runs.pool import Pool, Workers
+    from mauvecl.runs.store import Store
+    from mauvecl.study.study import Study
+
+YEAR_S = 365.25 * 86_400.0
+#: Pixel-realisations a second of one core, counted per scenario: the best of `bench/results/rates.ecsv`, 1.2e10 on two
+#: cores with 16 scenarios, so that no feasible run raises an error.
+CORE_RATE = 6e9
+#: Assumed speed of a selected device, in cores: that of an accelerator.
+DEVICE_RATE = 100 * CORE_RATE
+#: Assumed number of cores of a cluster, as in the documentation's plan.
+CLUSTER_CORES = 1000
+#: The engine's index of realisations has 63 bits: `Engine._check`.
+MOST_REALISATIONS = 2**63 - 1
+
+
+def question_values(study: Study, *, detects: bool) -> None:
+    """Raise InputError for values that a later step would reject.
+
+    Parameters
+    ----------
+    detects : bool
+        Whether the verb needs flares and thresholds.
+    """
+    from mauvecl.detection.names import check_fap, check_statistic
+    from mauvecl.host.instrument.paths import instrument_path
+    from mauvecl.host.stars.band_names import known_band
+    from mauvecl.host.stars.library import spectrum_name
+
+    for star in study.star:
+        if star.library is not None:
+            spectrum_name(star.library)
+        elif star.file is not None:
+            _check_file(star.file)
+        known_band(star.band)
+    instrument_path(study.observation.instrument, Path())
+    if not detects:
+        return
+    run = study.run
+    known_band(study.flare.band)
+    for name in run.statistics:
+        check_statistic(name)
+    check_fap(run.fap, run.realisations, run.tails)
+
+
+def _check_file(file: Path) -> None:
+    from mauvecl.host.tables.files import read_bytes, without_columns
+
+    try:
+        place, _ = without_columns(file)
+        there = place.is_file()
+    except (OSError, ValueError):
+        # The reader reports impossible names.
+        return
+    if not there:
+        read_bytes(place, "spectrum file")
+
+
+def question_time(study: Study, *, device: str | None, cluster: str | None, insist: bool) -> None:
+    """Raise InputError for a study whose smallest number of draws takes more than a year; `insist` skips this check.
+
+    The message contains the estimate and names `--insist`. More realisations than the index can count always raise it.
+    """
+    count = study.run.realisations
+    if count > MOST_REALISATIONS:
+        raise InputError.of("realisations", count, f"at most {MOST_REALISATIONS}: the index has 63 bits")
+    if insist or count < 10**9:
+        # A billion ends within hours on any device, so the instrument need not be loaded.
+        return
+    scenarios = 1 + len(study.flare.amplitudes)
+    combinations = study.sweep.size
+    drawn = count * len(study.star) * combinations * scenarios * study.observation.load_instrument().pixels
+    rate, by = _rate(device, cluster)
+    years = drawn / rate / YEAR_S
+    if years > 1.0:
+        raise InputError(
+            f"realisations = {count:.3g} of {len(study.star) * combinations} stars draw {drawn:.2g} "
+            f"pixels and take some {years:.2g} years at {rate:.2g} a second ({by})",
+            "less than a year; --insist starts it anyway",
+            key="realisations",
+        )
+
+
+def question_room(store: Store, *, insist: bool) -> None:
+    """Raise InputError, with the required and the available space, for a store that does not fit on its disk."""
+    if insist:
+        return
+    there = next(folder for folder in (store.path, *store.path.absolute().parents) if folder.is_dir())
+    free = shutil.disk_usage(there).free + _held(store.path)
+    if store.n_bytes > free:
+        rows = free // (store.n_bytes // store.rows)
+        raise InputError(
+            f"realisations = {store.rows} take {_size(store.n_bytes)} and {str(store.path)!r} has room "
+            f"for {_size(free)}",
+            f"at most {rows} of them, or another place; --insist starts it anyway",
+            key="realisations",
+        )
+
+
+def _rate(device: str | None, cluster: str | None) -> tuple[float, str]:
+    """Return the highest pixel-realisations per second, and the source of this rate."""
+    cores = os.cpu_count() or 1
+    if cluster is not None and not cluster.startswith("local:"):
+        return CLUSTER_CORES * CORE_RATE, f"assumed of {CLUSTER_CORES} cores"
+    if device is not None:
+        devices = device.count(",") + 1
+        return max(devices * DEVICE_RATE, cores * CORE_RATE), f"assumed of {devices} accelerators"
+    return cores * CORE_RATE, f"the best measured on {cores} cores"
+
+
+def _held(folder: Path) -> int:
+    """Return the bytes that an unfinished store already has."""
+    return sum(path.stat().st_size for path in folder.glob("star-*/*/c/*/*")) if folder.is_dir() else 0
+
+
+def _size(size: float) -> str:
+    for unit in ("bytes", "KiB", "MiB", "GiB", "TiB"):
+        if size < 1024:
+            return f"{size:.3g} {unit}"
+        size /= 1024
+    return f"{size:.3g} PiB"
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM, sent at the time limit of a batch job or at shutdown."""
+
+
+@dataclass(eq=False)
+class Session:
+    """Session of one call of a verb; in its `with` block, only this process writes to the output folder."""
+
+    verb: str
+    study: Study
+    output: Path | None = None  # folder for everything written
+    as_json: bool = False
+    quiet: bool = False
+    pictures: bool = True
+    device: str | None = None  # device as for `Engine`; several are separated by commas
+    cluster: str | None = None  # as for `cluster.DaskWorkers`
+    # resume, restart: whether to continue or discard an unfinished run in the folder.
+    resume: bool = False
+    restart: bool = False
+    # Seconds after which finished parts are written to the disk; the default is that of `Checkpoint`.
+    keep_after: float | None = None
+    insist: bool = False  # whether to start runs that would take too long or too much space
+    files: list[Path] = field(default_factory=list)
+    started: float = field(default_factory=time.perf_counter)
+    opened: Device | None = None  # device on which something was drawn without a pool, for the run record
+    _pool: Pool | None = None
+    _checkpoint: Checkpoint | None = None
+    _lost: list[InputError] = field(default_factory=list)
+    _held: ExitStack = field(default_factory=ExitStack)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Release the output folder.
+
+        Raises InputError if a file of the answer could not be written; the answer is printed before.
+        """
+        from mauvecl.schema.errors import reworded
+
+        self._held.close()
+        if kind is None and self._lost:
+            others = f"; the same holds for {len(self._lost) - 1} more files of this answer" if self._lost[1:] else ""
+            raise reworded(self._lost[0], f"{self._lost[0]}{others}")
+
+    @cached_property
+    def folder(self) -> Path:
+        """Output folder, which is locked from the first use."""
+        from mauvecl.answers.answer import make_folder
+        from mauvecl.runs.checkpoint import locked
+
+        folder = make_folder(self.output or Path(f"mauvecl-{self.verb}"))
+        writes_to(folder)
+        self._held.enter_context(locked(folder, "output folder"))
+        return folder
+
+    @contextmanager
+    def pool(self, *, unit: str = "realisations") -> Iterator[Pool]:
+        """Yield the pool of workers, with progress and a checkpoint; interruptions are reported.
+
+        Parameters
+        ----------
+        unit : str
+            Unit of progress: realisations, which the pool reports, or items that the caller reports to `meter`.
+        """
+        from mauvecl.runs.pool import Pool
+
+        self.meter = self.metered(unit)
+        with self.checkpoint() as checkpoint, ExitStack() as stack:
+            stack.enter_context(self.meter)
+            workers = stack.enter_context(working(self.device, self.cluster))
+            progress = self.meter if unit == "realisations" else None
+            self._pool = Pool(workers, checkpoint=checkpoint, progress=progress, meanwhile=self._load)
+            self.meter.standing = lambda: self._pool.standing
+            yield self._pool
+
+    @contextmanager
+    def checkpoint(self) -> Iterator[Checkpoint]:
+        """Keep finished parts of the work in the output folder, and report interruptions."""
+        from mauvecl.runs.checkpoint import Checkpoint
+
+        how: dict[str, Any] = {"resume": self.resume, "restart": self.restart}
+        if self.keep_after is not None:
+            how["patience_s"] = self.keep_after
+        checkpoint = Checkpoint(self.folder, self.verb, self.study, held=True, **how)
+        with report_interrupts(lambda: self._kept(checkpoint)), checkpoint:
+            self.say(checkpoint.messages)
+            yield checkpoint
+            if checkpoint.damaged:
+                self.say(
+                    [f"{checkpoint.damaged} files of {str(checkpoint.folder)!r} were damaged and are drawn again."]
+                )
+        self._checkpoint = checkpoint
+
+    def _load(self) -> None:
+        """Import modules for tables and pictures in advance, which saves 0.75 s at the end."""
+        from importlib import import_module
+
+        from mauvecl.charts.chart import load
+        from mauvecl.charts.matplotlib import available, style
+
+        for name in ("astropy.table", "astropy.io.misc.yaml", "rich.table"):
+            import_module(name)
+        load()
+        if self.pictures and available():
+            style()
+
+    def metered(self, unit: str, work: str = "drawing") -> Meter:
+        """Return the progress in a unit, for a `with` block; a word names the work."""
+        from mauvecl.cli.console import Meter
+
+        return Meter(quiet=self.quiet or self.as_json, unit=unit, work=work)
+
+    def _kept(self, checkpoint: Checkpoint) -> str:
+        kept = checkpoint.kept
+        if not kept:
+            return "nothing was written, and nothing is half written"
+        parts = f"{kept} part{'s' if kept > 1 else ''} of the work"
+        return f"{parts} kept in {str(checkpoint.folder)!r}, and the same command with --resume continues from there"
+
+    def say(self, lines: Sequence[str]) -> None:
+        """Print messages, unless standard output is reserved for JSON."""
+        from mauvecl.cli.console import show, with_flags
+
+        if lines and not self.as_json:
+            show([with_flags(line) for line in lines])
+
+    @cached_property
+    def draws_pictures(self) -> bool:
+        """Return whether to draw pictures; print a message if matplotlib is missing."""
+        from mauvecl.charts.matplotlib import available
+
+        if self.pictures and not available():
+            if not self.quiet:
+                self.say(["No pictures: matplotlib is missing, `pip install 'mauvecl[plot]'` brings it."])
+            return False
+        return self.pictures
+
+    def write(self, table: Table, name: str) -> None:
+        """Write a table to the folder, in the format of its file extension."""
+        from mauvecl.answers.answer import write_table
+
+        self.leave(lambda: write_table(table, self.folder / name))
+
+    def _document(self, name: str, content: Callable[[], bytes]) -> Path:
+        from mauvecl.answers.answer import write_document
+
+        return write_document(content(), self.folder / name)
+
+    def leave(self, write: Callable[[], Path | Sequence[Path]]) -> None:
+        """Write files; failures are reported at the end, after the answer is printed."""
+        from mauvecl.schema.errors import InputError
+
+        try:
+            made = write()
+        except InputError as error:
+            self._lost.append(error)
+            return
+        self.files += [made] if isinstance(made, Path) else made
+
+    def record(self, study: Study, inputs: Sequence[Expectation], messages: Sequence[str]) -> None:
+        """Write the study and the run record to the folder, and remove the checkpoint."""
+        from mauvecl.answers.answer import write_record, write_study
+
+        if self.folder / "study.toml" not in self.files:
+            self.leave(lambda: write_study(study.toml(), self.folder))
+        seconds = time.perf_counter() - self.started
+        pool = self._pool
+        how: dict[str, Any] = {"pool": pool, "opened": self.opened, "seconds": seconds, "messages": messages}
+        # Only a complete answer replaces another's files.
+        how |= {"files": self.files, "whole": not self._lost}
+        data = study.model_dump(mode="json", exclude_none=True)
+        self.leave(lambda: write_record(self.verb, data, inputs, self.folder, **how))
+        if self._checkpoint is not None and not self._lost:
+            self._checkpoint.forget()
+
+    def ask(self) -> Any:
+        """Return the answer of the session's verb to its study; a pool draws if the verb counts something."""
+        from mauvecl.answers.verbs import VERBS
+
+        verb = VERBS[self.verb]
+        if not verb.counts:
+            return verb.ask(self.study)
+        with self.pool(unit=verb.counts) as engine:
+            return verb.ask(self.study, engine, None if verb.counts == "realisations" else self.meter)
+
+    def answer(self, answer: Answer) -> None:
+        """Print an answer and write its files."""
+        self.say([*answer.messages, answer.assumed])
+        with report_interrupts(self._written):
+            self._leave_all(answer)
+        if self.as_json:
+            from mauvecl.cli.console import with_flags
+
+            content = answer.as_json()
+            remarks = {"assumed": answer.assumed, "messages": [with_flags(line) for line in content["messages"]]}
+            self.print_json(remarks | {key: value for key, value in content.items() if key != "messages"})
+            return
+        from mauvecl.cli.console import show_view
+
+        for view in answer.all_views:
+            show_view(view)
+        self.say(answer.remarks)
+        self.finish()
+
+    def _leave_all(self, answer: Answer) -> None:
+        """Write tables, documents and pictures of an answer, then the run record."""
+        for name, table in answer.files.items():
+            self.write(table, name)
+        for name, content in answer.documents.items():
+            self.leave(partial(self._document, name, content))
+        if self.draws_pictures:
+            for name, draw in answer.pictures.items():
+                self.leave(partial(draw, self.folder / f"{name}.png"))
+        self.record(answer.study, answer.inputs, [*answer.messages, *answer.remarks])
+
+    def _written(self) -> str:
+        """Describe what an interruption leaves while files are written."""
+        whole = ", ".join(path.name for path in self.files) or "nothing"
+        kept = None if self._checkpoint is None else self._checkpoint.kept
+        again = "the same command with --resume" if kept else "the same command"
+        return f"{whole} written to {str(self.folder)!r}, each file whole, and {again} writes all of them"
+
+    def print_json(self, content: dict[str, Any]) -> None:
+        """Print the answer as JSON."""
+        from mauvecl.host.tables.files import json_text
+
+        print(json_text(content))
+
+    def finish(self) -> None:
+        """Print the names of the written files."""
+        if self.files and not self.quiet:
+            names = ", ".join(path.name for path in self.files)
+            self.say([f"Wrote {names} to {self.folder}/ in {time.perf_counter() - self.started:.1f} s."])
+
+
+@contextmanager
+def working(device: str | None, cluster: str | None) -> Iterator[Workers]:
+    """Open the requested workers; release them at the end, immediately if the work ended early."""
+    from mauvecl.runs.pool import LocalWorkers
+
+    if cluster is not None:
+        from mauvecl.runs.cluster import DaskWorkers
+
+        workers: Workers = DaskWorkers(cluster, device)
+    else:
+        workers = LocalWorkers([None] if device is None else [word.strip() for word in device.split(",")])
+    try:
+        yield workers
+    except BaseException:
+        workers.stop()
+        raise
+    finally:
+        workers.close()
+
+
+@contextmanager
+def report_interrupts(kept: Callable[[], str]) -> Iterator[None]:
+    """Stop the work in order at Ctrl-C and SIGTERM, with a message on kept results; exit codes 130 and 143."""
+
+    def terminate(*_: object) -> None:
+        raise Terminated
+
+    main = threading.current_thread() is threading.main_thread()
+    before = signal.signal(signal.SIGTERM, terminate) if main else None
+    try:
+        yield
+    except KeyboardInterrupt as stop:
+        terminated = isinstance(stop, Terminated)
+        print(f"mauvecl: {'terminated' if terminated else 'interrupted'}; {kept()}", file=sys.stderr)
+        sys.exit(143 if terminated else 130)
+    finally:
+        if main:
+            signal.signal(signal.SIGTERM, before)

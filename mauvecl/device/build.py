@@ -1,0 +1,377 @@
+"""Devices and their programs: choice of a device, rendering of kernels, and builds."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import shutil
+import sys
+import warnings
+from dataclasses import asdict, dataclass
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mauvecl.device import drivers as vendors
+from mauvecl.device.drivers import BuildError, DeviceError, choose_processor_level, driver_sources, kernel_cache
+from mauvecl.host.version import VERSION
+from mauvecl.noise import layout, random_numbers
+from mauvecl.noise.scene import PIXEL_BLOCK
+
+if TYPE_CHECKING:
+    import pyopencl
+
+SHARED_FILES = ("portable", "philox", "normal", "poisson", "prior", "detector")
+POCL = "Portable Computing Language"
+#: Promise of devices with strict arithmetic: draws, statistics and tables are equal on all of them.
+SAME_BITS = "same bits"
+
+
+@dataclass(frozen=True)
+class DeviceRecord:
+    """OpenCL device, as listed by `mauvecl devices`."""
+
+    platform: str
+    name: str
+    driver: str
+    kind: str
+    compute_units: int
+    global_memory: int
+    default: bool
+    promise: str = SAME_BITS
+
+    @property
+    def label(self) -> str:
+        return f"{self.platform}: {self.name}"
+
+
+@dataclass(frozen=True)
+class Variant:
+    """Options for which kernels are rendered; values of a study are not among them."""
+
+    width: int
+    vector_forms: bool
+    chunk: int
+    vectors: int = 1
+    scenarios: int = 16
+    linears: int = 0
+    frames: bool = False
+    clip: bool = False
+    pair: bool = False
+    noisy: bool = False
+    estimated: bool = False
+    slots: int = 0
+    smooths: int = 0
+    elements: bool = True
+    joint: bool = True
+    quartic: bool = True
+    photons: bool = False
+    additive: tuple[str, ...] = ()
+    modulations: tuple[tuple[str, str], ...] = ()
+    row_type: str = "int"
+    sums: int = 0
+    spectra: int = 0
+    unknown_groups: int = 0
+    jittered: bool = False
+    counts: bool = False
+    fourths: bool = False
+    neighbours: bool = False
+    pointing: bool = False
+    in_time: bool = False
+
+    @property
+    def compared(self) -> bool:
+        """Whether statistics use more than the expectation and the model's variances."""
+        return self.pair or self.noisy or self.estimated or self.slots > 0
+
+
+def load_opencl() -> Any:
+    """Import pyopencl with a private cache folder.
+
+    PoCL aborts the process if its cache is unusable or the linker is missing, so both are checked first. Raises
+    DeviceError if the linker ``ld`` is not on the path, or pyopencl cannot be loaded or was loaded before a fork.
+    """
+    linker = shutil.which("ld", path=os.environ.get("PATH") or os.defpath)
+    if linker is None:
+        raise DeviceError(
+            "no linker `ld` found on PATH, and PoCL needs it to link kernels: install binutils "
+            "(Debian, Ubuntu: `apt-get install binutils`; Fedora: `dnf install binutils`)"
+        )
+    if not os.environ.get("PATH"):
+        # Without PATH, Python searches the default folders, but PoCL finds no linker and aborts the process.
+        os.environ["PATH"] = os.path.dirname(linker)
+    try:
+        os.environ["POCL_CACHE_DIR"] = str(kernel_cache().work)
+    except OSError as error:
+        raise DeviceError(f"{error}: set MAUVECL_CACHE_DIR to a folder that can") from error
+    _provide_libraries(kernel_cache().work / "libraries")
+    if kernel_cache().pid != os.getpid():
+        # PoCL's threads do not survive a fork; its next call would wait forever.
+        raise DeviceError("OpenCL was loaded before a fork, expected a newly started process (use spawn)")
+    # pyopencl's own cache would duplicate PoCL's.
+    os.environ.setdefault("PYOPENCL_NO_CACHE", "1")
+    try:
+        import pyopencl
+    except ImportError as error:
+        raise DeviceError(f"pyopencl cannot be loaded ({error}): install {driver_sources()}") from error
+    return pyopencl
+
+
+def _provide_libraries(folder: Path) -> None:
+    """Let kernels be linked where no compiler is installed.
+
+    PoCL links each kernel as a compiler links a program: with libraries that come with compilers, although kernels call
+    none of their functions. Empty archives take their places, and are searched after those that are installed.
+    """
+    if folder.exists():
+        return
+    folder.mkdir()
+    for name in ("gcc", "gcc_s", "c"):
+        (folder / f"lib{name}.a").write_bytes(b"!<arch>\n")
+    os.environ["LIBRARY_PATH"] = os.pathsep.join(filter(None, (os.environ.get("LIBRARY_PATH"), str(folder))))
+
+
+def _devices() -> list[Any]:
+    cl = load_opencl()
+    try:
+        with vendors.show_intel_runtime():
+            platforms = cl.get_platforms()
+    except cl.Error:
+        platforms = []
+    handles = []
+    for platform in platforms:
+        try:
+            handles += platform.get_devices()
+        except cl.Error:
+            continue
+    if not handles:
+        # If a variable names a folder, loaders search only that.
+        folders = ", ".join(f"{name}={os.environ[name]}" for name in vendors.FOLDER_VARIABLES if os.environ.get(name))
+        searched = f" ({folders})" if folders else ""
+        raise DeviceError(f"no OpenCL device found{searched}: install {driver_sources()}", "no device")
+    # PoCL on the CPU comes first, because the first device is the default.
+    return sorted(handles, key=lambda d: (d.platform.name != POCL, "cpu" not in _kind(d)))
+
+
+def _kind(device: Any) -> str:
+    cl = load_opencl()
+    kinds = {"cpu": cl.device_type.CPU, "gpu": cl.device_type.GPU, "accelerator": cl.device_type.ACCELERATOR}
+    return next((name for name, bit in kinds.items() if device.type & bit), "other")
+
+
+def _promise(device: Any) -> str:
+    lacking = weaknesses(device)
+    return SAME_BITS if not lacking else f"same draws to float rounding: no {', no '.join(lacking)}"
+
+
+def weaknesses(device: Any) -> list[str]:
+    """Return the properties of strict arithmetic that a device lacks."""
+    cl = load_opencl()
+    bits = cl.device_fp_config
+    needed = {
+        "rounding to nearest": bits.ROUND_TO_NEAREST,
+        "fused multiply-add": bits.FMA,
+        "correctly rounded division and square root": bits.CORRECTLY_ROUNDED_DIVIDE_SQRT,
+    }
+    return [name for name, bit in needed.items() if not device.single_fp_config & bit]
+
+
+def devices() -> list[DeviceRecord]:
+    """List all OpenCL devices, the default one first. Raises DeviceError if there is none, or no linker."""
+    return [
+        DeviceRecord(
+            platform=device.platform.name.strip(),
+            name=device.name.strip(),
+            driver=device.driver_version.strip(),
+            kind=_kind(device),
+            compute_units=int(device.max_compute_units),
+            global_memory=int(device.global_mem_size),
+            default=index == 0,
+            promise=_promise(device),
+        )
+        for index, device in enumerate(_devices())
+    ]
+
+
+def choose_device(wanted: str | None) -> tuple[Any, DeviceRecord]:
+    """Return the pyopencl device whose number, platform or name matches `wanted`, or the default one for None.
+
+    Raises DeviceError, with a list of all devices, if none matches.
+    """
+    handles, records = _devices(), devices()
+    if wanted is None:
+        return handles[0], records[0]
+    for index, record in enumerate(records):
+        if wanted == str(index) or wanted.casefold() in record.label.casefold():
+            return handles[index], record
+    present = "; ".join(f"{index} = {record.label}" for index, record in enumerate(records))
+    raise DeviceError(f"device {wanted!r} is not here, expected one of: {present}", "unknown device")
+
+
+@cache
+def render(kernel_files: tuple[str, ...], variant: Variant) -> str:
+    """Render the OpenCL C source of the shared files and `kernel_files`, given without their extension."""
+    local = "" if variant.width == 1 else "__attribute__((reqd_work_group_size(1, 1, 1)))"
+    values = asdict(variant) | {
+        "attributes": local,
+        "streams": layout.STREAMS,
+        "polynomials": {k: [f"{c}f" for c in v] for k, v in random_numbers.POLYNOMIALS.items()},
+        "two_ln2": f"{random_numbers.TWO_LN2}f",
+        "magic": f"{layout.MAGIC}f",
+        "reference": layout.REFERENCE,
+        "fixed": len(layout.FIXED_STATISTICS),
+        "linear": variant.linears > 0,
+        "modulated": bool(variant.modulations),
+        "jitter": next((i for i, (name, _) in enumerate(variant.modulations) if name == "jitter"), None),
+        "prior_bits": layout.PRIOR_BITS,
+        "prior_finest": layout.PRIOR_FINEST,
+        "prior_nodes": layout.PRIOR_NODES,
+        "observer_bins": layout.OBSERVER_BINS,
+        "log2_e": f"{layout.LOG2_E}f",
+        "ln2_parts": layout.LN2_PARTS,
+        "exponential": [f"{c!r}f" for c in layout.EXPONENTIAL],
+        "bins": layout.BINS,
+        "fine_bits": layout.FINE_BITS,
+        "structs": {name: dtype.names for name, dtype in layout.STRUCTS.items()},
+    }
+    names = (*SHARED_FILES, *kernel_files)
+    folder = files("mauvecl.kernels")
+    texts = [folder.joinpath(f"{name}.cl.mako").read_text(encoding="utf-8") for name in names]
+    structs = layout.c_structs()
+
+    def make() -> str:
+        parts = (str(_parsed(text).render(**values)) for text in texts)
+        return "\n".join((f"/* mauvecl {VERSION} */", structs, *parts))
+
+    # Rendering takes longer than loading a compiled kernel.
+    return kernel_cache().get_or_write(hashlib.sha256(repr((structs, values, texts)).encode()).hexdigest()[:32], make)
+
+
+@cache
+def _parsed(text: str) -> Any:
+    # The import is slow.
+    from mako.template import Template
+
+    return Template(text, strict_undefined=True)
+
+
+def out_of_memory(error: Exception) -> bool:
+    """Return whether an OpenCL error means that the device's memory does not suffice."""
+    codes = ("MEM_OBJECT_ALLOCATION_FAILURE", "OUT_OF_RESOURCES", "OUT_OF_HOST_MEMORY", "INVALID_BUFFER_SIZE")
+    return any(code in str(error) for code in codes)
+
+
+def digest(source: str) -> str:
+    """Return the short sha256 of a rendered source, for run records."""
+    return hashlib.sha256(source.encode()).hexdigest()[:16]
+
+
+def build(context: pyopencl.Context, source: str) -> pyopencl.Program:
+    """Compile a rendered source with strict arithmetic, or load it from the cache."""
+    cl = load_opencl()
+    device = context.devices[0]
+    # Without -w, PoCL's compiler prints the number of suppressed warnings.
+    options = ["-cl-std=CL1.2", "-w"]
+    if not weaknesses(device):
+        options.append("-cl-fp32-correctly-rounded-divide-sqrt")
+    kept = kernel_cache()
+    # The key contains the processor level, since machines with the same device name, such as "AMD EPYC", may share the
+    # store, and the installation, since PoCL compiles a program of another installation again at every start.
+    target = (
+        device.name,
+        device.version,
+        device.driver_version,
+        str(choose_processor_level(device, _devices)),
+        sys.prefix,
+    )
+    key = hashlib.sha256("\0".join((source, *options, *target)).encode()).hexdigest()[:32]
+    restored = kept.restore(key)
+    try:
+        with warnings.catch_warnings(), contextlib.nullcontext() if restored else kept.building(key):
+            # Some compilers print a greeting.
+            warnings.simplefilter("ignore", cl.CompilerWarning)
+            program: pyopencl.Program = cl.Program(context, source).build(options, cache_dir=False)
+    except cl.Error as error:
+        if "unknown target CPU" in str(error):
+            raise DeviceError(
+                f"{device.platform.version.strip()} does not know the processor {device.name} and cannot build for it, "
+                "expected a newer PoCL or another OpenCL driver",
+                "processor",
+            ) from error
+        numbered = "\n".join(f"{i:4d}  {line}" for i, line in enumerate(source.splitlines(), 1))
+        raise BuildError(f"a kernel did not compile on {device.name}\n{numbered}\n{error}") from error
+    return program
+
+
+#: Largest number of vectors of realisations per work-item of the detection kernels on a CPU.
+VECTORS = 4
+
+
+class Device:
+    """Open OpenCL device with its context, queue and compiled kernels.
+
+    Parameters
+    ----------
+    wanted : str, optional
+        Number or part of the name, as for `Engine`.
+    width : int, optional
+        Realisations per work-item; by default 16 on CPUs, 1 elsewhere.
+
+    Attributes
+    ----------
+    record : DeviceRecord
+    cl : module
+        The imported pyopencl.
+    context, queue : pyopencl.Context, pyopencl.CommandQueue
+    width : int
+    step : int
+        Realisations per work-item of the widest kernel; launches are cut at its multiples.
+    """
+
+    def __init__(self, wanted: str | None = None, *, width: int | None = None) -> None:
+        self.cl = load_opencl()
+        handle, self.record = choose_device(wanted)
+        self.context = self.cl.Context([handle])
+        self.queue = self.cl.CommandQueue(self.context)
+        self.width = width or (16 if self.record.kind == "cpu" else 1)
+        self.step = VECTORS * self.width if self.width > 1 else 1
+        self._vector_forms = self.width == 16 and self.record.platform == POCL
+        self._programs: dict[str, Any] = {}
+        self._kernels: dict[tuple[str, str], Any] = {}
+        self._pid = os.getpid()
+
+    @property
+    def name(self) -> str:
+        """Platform and device name."""
+        return self.record.label
+
+    @property
+    def variant(self) -> Variant:
+        """Kernel variant of this device, before a scene sets its own options."""
+        return Variant(width=self.width, vector_forms=self._vector_forms, chunk=PIXEL_BLOCK if self.width > 1 else 4)
+
+    @property
+    def programs(self) -> list[str]:
+        """Sources built so far."""
+        return sorted(self._programs)
+
+    @property
+    def kernel_digest(self) -> str:
+        """Short sha256 of the kernels rendered so far, for run records."""
+        return digest("\n".join(self.programs))
+
+    def kernel(self, kernel_files: tuple[str, ...], variant: Variant, name: str) -> Any:
+        """Return a kernel of the program of these files; both are built once."""
+        source = render(kernel_files, variant)
+        if source not in self._programs:
+            self._programs[source] = build(self.context, source)
+        if (source, name) not in self._kernels:
+            self._kernels[source, name] = self.cl.Kernel(self._programs[source], name)
+        return self._kernels[source, name]
+
+    def check_process(self) -> None:
+        """Raise DeviceError after a fork, which PoCL's threads do not survive: its next call would wait forever."""
+        if os.getpid() != self._pid:
+            raise DeviceError("this Engine was made before a fork, expected an Engine made in this process (use spawn)")

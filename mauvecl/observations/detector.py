@@ -1,0 +1,457 @@
+"""Calibration of the detector: dark current, gain and read noise from exposures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, Self
+
+import numpy as np
+import scipy
+from numpy.typing import ArrayLike, NDArray
+
+from mauvecl.host.instrument.instrument import Instrument
+from mauvecl.observations.frames import Frames
+from mauvecl.schema.errors import InputError
+
+if TYPE_CHECKING:
+    from mauvecl.host.stars.source import Source
+
+Float = NDArray[np.float64]
+
+#: Share of saturation above which a mean raw level is not used, since clipping then changes mean and variance.
+MOST_OF_SATURATION = 0.98
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationFrames:
+    """Raw frames of one observation that have no fault."""
+
+    name: str
+    raw_dn: Float  # shape (n_frame, n_pixel); with bias and dark
+    exposure_s: float  # of each frame
+    temperature_c: Float  # shape (n_frame,); of the detector
+    star: Source | None = None  # the known spectrum at its brightness; None for frames without light
+
+    @classmethod
+    def of(cls, frames: Frames, nominal: Instrument, star: Source | None, temperature_c: float | None = None) -> Self:
+        """Select the good frames of spectra that a detector recorded.
+
+        Parameters
+        ----------
+        frames : Frames
+            Raw DN of each pixel that the instrument reads.
+        temperature_c : float, optional
+            Of the detector, where the frames do not state it.
+        """
+        nm = frames.wavelength_nm
+        if nm is None or nm.shape != nominal.wavelength_nm.shape:
+            raise InputError.of(
+                "frames", frames.flux.shape, f"spectra of the {nominal.wavelength_nm.size} pixels that "
+                f"{nominal.name} reads", where=frames.name,
+            )  # fmt: skip
+        off = float(np.abs(nm - nominal.wavelength_nm).max())
+        if off > nominal.resolution_element_nm:
+            raise InputError.of("wavelength", f"{off:.3g} nm from those of {nominal.name}",
+                                f"at most {nominal.resolution_element_nm:g} nm", where=frames.name)  # fmt: skip
+        unit = frames.unit.strip().casefold()
+        if unit not in ("dn", "adu", "ct", "count"):
+            raise InputError.of("unit", frames.unit or "none", "raw DN, with bias and dark", where=frames.name)
+        if frames.net:
+            raise InputError(
+                f"{frames.name}: dark current and bias are subtracted",
+                "raw DN: read_frames(..., raw=True)", key="frames",
+            )  # fmt: skip
+        temperatures = frames.temperature_c
+        if temperatures is None:
+            if temperature_c is None:
+                raise InputError(f"{frames.name}: the temperature of the detector is not stated",
+                                 "a column of temperatures, or temperature_c", key="temperature_c")  # fmt: skip
+            temperatures = np.full(frames.n_frames, temperature_c)
+        good = (frames.faults == 0) & np.isfinite(temperatures)
+        lengths = np.unique(frames.exposure_s[good].round(6))
+        if good.sum() < 3 or lengths.size != 1:
+            raise InputError.of("frames", f"{int(good.sum())} good ones of {lengths.size} exposure times",
+                                "at least 3 of one exposure time", where=frames.name)  # fmt: skip
+        if (frames.flux[good] == frames.flux[good][0]).all():
+            raise InputError.of("frames", "all the same", "frames that differ by their noise", where=frames.name)
+        return cls(frames.name, frames.flux[good], float(lengths[0]), temperatures[good], star)
+
+    @property
+    def n_frames(self) -> int:
+        """Number of frames."""
+        return len(self.raw_dn)
+
+    def usable(self, nominal: Instrument) -> NDArray[np.bool_]:
+        """Return the pixels that stay below saturation in every frame, shape (n_pixel,)."""
+        ceiling = min(nominal.saturation_dn, nominal.adc_max_dn)
+        return np.asarray(self.raw_dn.max(axis=0) < MOST_OF_SATURATION * ceiling)
+
+
+#: Variance of rounding to whole DN.
+ROUNDING = 1.0 / 12.0
+#: Iterations of the weights, which follow the fitted variances.
+ITERATIONS = 20
+#: Difference of chi-squared above which the unit of the dark counts is determined (5 %).
+TELLS = 3.84
+#: Smallest S/N of the gain with which it is reported.
+MIN_SNR = 5.0
+#: Relative error of a gain that is not measured: the root mean square deviation of 20 to 25 uV per electron, the values
+#: that are quoted of the detector, from the nominal 20.
+ASSUMED_GAIN_ERROR = 0.14
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """Variance of a pixel in a frame: read_variance + dark_factor * dark + gain * light, all in DN."""
+
+    read_variance: float  # DN^2, rounding included
+    dark_factor: float  # DN: 1 if dark counts are DN, the gain if they are electrons
+    gain: float  # DN per electron
+
+    @classmethod
+    def nominal(cls, instrument: Instrument) -> NoiseModel:
+        """Return the noise of an instrument."""
+        gain = instrument.gain_dn_per_electron
+        factor = gain if instrument.dark_unit == "electrons" else 1.0
+        return cls(instrument.read_noise_dn**2 + ROUNDING, factor, gain)
+
+    def variance(self, light_dn: ArrayLike, dark_dn: ArrayLike) -> Float:
+        """Return the variance of frames with this mean light and dark, DN^2."""
+        light, dark = np.maximum(light_dn, 0.0), np.maximum(dark_dn, 0.0)
+        return np.asarray(self.read_variance + self.dark_factor * dark + self.gain * light)
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredVariance:
+    """Variance of the frames of one observation, for each usable pixel."""
+
+    # variance, light_dn, dark_dn: shape (n_pixel,); of a frame.
+    variance: Float
+    light_dn: Float
+    dark_dn: Float
+    dof: float  # degrees of freedom of each variance
+
+
+@dataclass(frozen=True, eq=False)
+class PhotonTransfer:
+    """Fit of measured variances."""
+
+    noise: NoiseModel
+    # Shape (2, 2); of read variance and gain, for known dark counts; from `ASSUMED_ERROR` if the gain is assumed.
+    covariance: Float
+    read_noise_error: float  # standard error, DN, with that of the dark counts
+    dark_unit: Literal["DN", "electrons"]
+    dark_unit_chi2: float  # chi-squared with dark counts in DN, less that with electrons
+    chi2: float
+    dof: int
+    # mean_dn, variance, model: shape (n_value,); all means of light, measured and fitted variances.
+    mean_dn: Float
+    variance: Float
+    model: Float
+    assumed: tuple[str, ...] = ()  # quantities that these frames do not determine
+
+    @property
+    def read_noise_dn(self) -> float:
+        """Read noise without the rounding, DN."""
+        return float(np.sqrt(max(self.noise.read_variance - ROUNDING, 0.0)))
+
+    @property
+    def gain_error(self) -> float:
+        """Standard error of the gain, DN per electron."""
+        return float(np.sqrt(self.covariance[1, 1]))
+
+    @property
+    def relative_gain_error(self) -> float:
+        """Standard error of the gain over its value."""
+        return self.gain_error / self.noise.gain
+
+    @property
+    def p_value(self) -> float:
+        """Probability of a chi-squared at least as large."""
+        return float(scipy.stats.chi2.sf(self.chi2, self.dof))
+
+
+def measured_variance(raw_dn: Float, light_dn: Float, dark_dn: Float, usable: NDArray[np.bool_]) -> MeasuredVariance:
+    """Measure the variance of frames from differences of consecutive ones, without drifts.
+
+    From each difference the best multiples of light and dark are subtracted, since jitter of the pointing and of the
+    temperature change all pixels together.
+
+    Parameters
+    ----------
+    raw_dn : ndarray, shape (n_frame, n_pixel)
+    light_dn, dark_dn : ndarray, shape (n_pixel,)
+        Mean of a frame.
+    usable : ndarray of bool, shape (n_pixel,)
+    """
+    # A pixel that never changes is dead.
+    usable = usable & np.any(raw_dn != raw_dn[0], axis=0)
+    steps = np.diff(raw_dn[:, usable], axis=0)
+    light, dark = light_dn[usable], dark_dn[usable]
+    scale = np.sqrt(np.mean(steps**2, axis=0))
+    shared = np.column_stack([part for part in (light, dark) if part.any()]) / scale[:, None]
+    basis, _ = np.linalg.qr(shared)
+    white = steps / scale
+    white = white - (white @ basis) @ basis.T
+    kept = 1.0 - np.sum(basis**2, axis=1)
+    n = len(steps)
+    # The mean square of consecutive differences of normal values has this many degrees of freedom (von Neumann 1941).
+    return MeasuredVariance(np.mean(white**2, axis=0) / kept * scale**2 / 2, light, dark, 2 * n**2 / (3 * n - 1))
+
+
+def fit_photon_transfer(
+    measured: Sequence[MeasuredVariance], nominal: Instrument, dark_error_dn: float = 0.0
+) -> PhotonTransfer:
+    """Fit gain, read noise and the unit of dark counts to measured variances, by iterated weighted least squares.
+
+    Parameters
+    ----------
+    measured : sequence of MeasuredVariance
+        At least one.
+    nominal : Instrument
+        Instrument whose values are kept where the data determine none.
+    dark_error_dn : float
+        Standard error of the dark of a mean frame, which moves the read noise.
+    """
+    variance, light, dark = (
+        np.concatenate([getattr(one, key) for one in measured]) for key in ("variance", "light_dn", "dark_dn")
+    )
+    dof = np.concatenate([np.full(one.variance.size, one.dof) for one in measured])
+    fits = {}
+    for name, column in (("DN", light), ("electrons", light + dark)):
+        fixed = dark if name == "DN" else np.zeros_like(dark)
+        fits[name] = _fit(column, fixed, variance, dof)
+    better = fits["DN"][2] - fits["electrons"][2]
+    assumed: list[str] = []
+    unit: Literal["DN", "electrons"] = nominal.dark_unit
+    if abs(better) > TELLS:
+        unit = "electrons" if better > 0 else "DN"
+    else:
+        assumed.append("unit of the dark counts")
+    (read, gain), covariance, chi2, model = fits[unit]
+    errors = np.sqrt(np.diag(covariance))
+    if not gain > MIN_SNR * errors[1]:
+        before, unknown = NoiseModel.nominal(nominal), ("gain", "read noise", "unit of the dark counts")
+        model, assumed_error = before.variance(light, dark), np.diag([0.0, (ASSUMED_GAIN_ERROR * before.gain) ** 2])
+        return PhotonTransfer(before, assumed_error, 0.0, nominal.dark_unit, better, np.nan, 0, light, variance, model,
+                              unknown)  # fmt: skip
+    read = max(float(read), ROUNDING)
+    noise = NoiseModel(read, float(gain) if unit == "electrons" else 1.0, float(gain))
+    read_error = np.hypot(errors[0], noise.dark_factor * dark_error_dn) / (2 * np.sqrt(max(read - ROUNDING, errors[0])))
+    return PhotonTransfer(noise, covariance, float(read_error), unit, float(better), float(chi2),
+                          variance.size - 2, light, variance, model, tuple(assumed))  # fmt: skip
+
+
+def _fit(column: Float, fixed: Float, variance: Float, dof: Float) -> tuple[Float, Float, float, Float]:
+    """Fit variance = fixed + read + gain * column; return the values, covariance, chi-squared and the model."""
+    design = np.column_stack([np.ones_like(column), column])
+    model = np.maximum(variance, 1.0)
+    found, covariance = np.zeros(2), np.eye(2)
+    for _ in range(ITERATIONS):
+        weight = dof / (2 * model**2)
+        weighted = design * weight[:, None]
+        covariance = np.linalg.pinv(weighted.T @ design)
+        found = covariance @ (weighted.T @ (variance - fixed))
+        model = np.maximum(fixed + design @ found, ROUNDING)
+    # The cube roots of chi-squared variables are nearly normal (Wilson & Hilferty 1931).
+    spread = 2 / (9 * dof)
+    normal = (np.cbrt(variance / model) - (1 - spread)) / np.sqrt(spread)
+    return found, covariance, float(np.sum(normal**2)), model
+
+
+#: Smallest range of temperatures, deg C, from which the slope is fitted, and from which the bias is as well.
+SLOPE_RANGE_C, BIAS_RANGE_C = 0.5, 3.0
+#: Relative error of the dark current where it is not measured: an assumption, as that of the quantum efficiency.
+ASSUMED_DARK_ERROR = 0.3
+#: Smallest ratio of exposure times from which the bias is fitted.
+EXPOSURE_RATIO = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class DarkFit:
+    """Dark current as level_p exp(slope (T - reference)), and bias."""
+
+    reference_c: float  # temperature at which the levels hold
+    # level_dn_per_s, level_error: shape (n_pixel,).
+    level_dn_per_s: Float
+    level_error: Float
+    # bias_dn, bias_error: shape (n_pixel,); the error is 0 if the bias is assumed.
+    bias_dn: Float
+    bias_error: Float
+    covariance: Float  # shape (n_pixel, 2, 2); of bias and level of each pixel, independent between pixels
+    shared: Float  # shape (3, 3); covariance of bias, level and slope of the mean pixel, which all pixels share
+    # slope_per_c, slope_error: common to all pixels; the error is 0 if the slope is assumed.
+    slope_per_c: float
+    slope_error: float
+    # pixel_slope_per_c, pixel_slope_error: shape (n_pixel,); of each pixel alone; NaN if it is not determined.
+    pixel_slope_per_c: Float
+    pixel_slope_error: Float
+    chi2: float
+    dof: int
+    # Probability of pixel slopes at least as different if all are equal; NaN if they are not determined.
+    slopes_p_value: float
+    assumed: tuple[str, ...]  # quantities that these frames do not determine
+
+    @property
+    def p_value(self) -> float:
+        """Probability of a chi-squared at least as large."""
+        return float(scipy.stats.chi2.sf(self.chi2, self.dof))
+
+    def growth(self, temperature_c: Float) -> Float:
+        """Return the dark current at temperatures over that at the reference."""
+        return np.asarray(np.exp(self.slope_per_c * (temperature_c - self.reference_c)))
+
+    def terms(self, frames: CalibrationFrames) -> tuple[float, float]:
+        """Return the seconds of dark current at the reference in a mean frame, and their change with the slope."""
+        growth = self.growth(frames.temperature_c)
+        seconds = frames.exposure_s * growth
+        return float(seconds.mean()), float((seconds * (frames.temperature_c - self.reference_c)).mean())
+
+    def mean_dn(self, frames: CalibrationFrames) -> Float:
+        """Return bias and dark of a mean frame, DN, shape (n_pixel,)."""
+        return self.bias_dn + self.level_dn_per_s * self.terms(frames)[0]
+
+
+def assumed_dark(nominal: Instrument, n_pixel: int) -> DarkFit:
+    """Return the dark current and bias of an instrument, where there are no frames without light."""
+    zero, nothing = np.zeros(n_pixel), np.full(n_pixel, np.nan)
+    level = nominal.per_pixel("dark", nominal.dark_dn_per_s)
+    return DarkFit(
+        reference_c=nominal.temperature_c,
+        level_dn_per_s=level,
+        level_error=zero,
+        bias_dn=nominal.per_pixel("bias_dn", nominal.bias_dn),
+        bias_error=zero,
+        covariance=np.zeros((n_pixel, 2, 2)),
+        shared=np.diag([0.0, (ASSUMED_DARK_ERROR * level.mean()) ** 2, 0.0]),
+        slope_per_c=nominal.dark_slope_per_c,
+        slope_error=0.0,
+        pixel_slope_per_c=nothing,
+        pixel_slope_error=nothing,
+        chi2=np.nan,
+        dof=0,
+        slopes_p_value=np.nan,
+        assumed=("dark current", "dark slope", "bias"),
+    )
+
+
+def fit_dark(dark: Sequence[CalibrationFrames], nominal: Instrument, noise: NoiseModel) -> DarkFit:
+    """Fit bias, dark level of each pixel and a common slope to frames without light, by weighted least squares.
+
+    The slope is assumed if the temperatures span less than `SLOPE_RANGE_C`. Each pixel's bias is fitted if exposure
+    times differ by `EXPOSURE_RATIO`, and one for all pixels if the temperatures span `BIAS_RANGE_C`; otherwise it is
+    the instrument's.
+
+    Parameters
+    ----------
+    dark : sequence of CalibrationFrames
+        At least one.
+    noise : NoiseModel
+        Its variances are the weights.
+    """
+    raw = np.concatenate([one.raw_dn for one in dark])
+    temperature = np.concatenate([one.temperature_c for one in dark])
+    exposure = np.concatenate([np.full(one.n_frames, one.exposure_s) for one in dark])
+    n_pixel = raw.shape[1]
+    reference, spread = float(temperature.mean()), float(np.ptp(temperature))
+    offset = temperature - reference
+    fits_slope, by_pixel = spread >= SLOPE_RANGE_C, float(exposure.max() / exposure.min()) >= EXPOSURE_RATIO
+    fits_bias = by_pixel or spread >= BIAS_RANGE_C
+    bias = nominal.per_pixel("bias_dn", nominal.bias_dn)
+
+    # The mean pixel gives what all pixels share: bias, slope, and their errors.
+    series = raw.mean(axis=1)
+    start = np.array([bias.mean(), (series - bias.mean()).mean() / exposure.mean(), nominal.dark_slope_per_c])
+    typical = noise.variance(0.0, start[1] * exposure * np.exp(start[2] * offset))
+    free = np.array([fits_bias, True, fits_slope])
+    common, shared = _mean_dark(series, exposure, offset, typical / n_pixel, start, free)
+    slope = float(common[2])
+    if fits_bias and not by_pixel:
+        bias = np.full(n_pixel, common[0])
+
+    # With the slope known, each pixel is linear in its level and bias.
+    seconds = exposure * np.exp(slope * offset)
+    weight = 1.0 / typical
+    columns = np.column_stack([np.ones_like(seconds), seconds, seconds * offset])
+    own_bias = np.zeros_like(bias) if by_pixel else bias
+    used = np.array([0, 1] if by_pixel else [1])
+    hat, own = _solved(columns[:, used], weight, raw - own_bias)
+    level = own[-1]
+    bias = own[0] if by_pixel else bias
+    # Variances of the pixels differ from the typical ones of the weights.
+    covariance = np.zeros((n_pixel, 2, 2))
+    covariance[np.ix_(np.arange(n_pixel), used, used)] = noise.read_variance * hat @ hat.T + noise.dark_factor * level[
+        :, None, None
+    ] * ((hat * seconds) @ hat.T)
+    pixel_slope, pixel_error = np.full((2, n_pixel), np.nan)
+    if fits_slope:
+        hat, own = _solved(columns[:, [*used, 2]], weight, raw - own_bias)
+        pixel_slope = slope + own[-1] / level
+        variance = noise.read_variance * hat[-1] @ hat[-1] + noise.dark_factor * level * ((hat[-1] * seconds) @ hat[-1])
+        pixel_error = np.sqrt(variance) / np.abs(level)
+    scatter = float(np.sum(((pixel_slope - slope) / pixel_error) ** 2))
+    mean = seconds[:, None] * level
+    chi2 = float(np.sum((raw - bias - mean) ** 2 / noise.variance(0.0, mean)))
+    dof = raw.size - len(used) * n_pixel - int(fits_slope) - int(fits_bias and not by_pixel)
+    assumed = [*(() if fits_slope else ("dark slope",)), *(() if fits_bias else ("bias",))]
+    bias_error = np.sqrt(covariance[:, 0, 0]) if by_pixel else np.full(n_pixel, np.sqrt(shared[0, 0]))
+    return DarkFit(
+        reference_c=reference,
+        level_dn_per_s=level,
+        level_error=np.sqrt(covariance[:, 1, 1]),
+        bias_dn=bias,
+        bias_error=bias_error,
+        covariance=covariance,
+        shared=shared,
+        slope_per_c=slope,
+        slope_error=float(np.sqrt(shared[2, 2])),
+        pixel_slope_per_c=pixel_slope,
+        pixel_slope_error=pixel_error,
+        chi2=chi2,
+        dof=dof,
+        slopes_p_value=float(scipy.stats.chi2.sf(scatter, n_pixel - 1)),
+        assumed=tuple(assumed),
+    )
+
+
+def _mean_dark(
+    series: Float, exposure: Float, offset: Float, variance: Float, start: Float, free: NDArray[np.bool_]
+) -> tuple[Float, Float]:
+    """Fit bias, dark level and slope of the mean pixel.
+
+    Parameters
+    ----------
+    series, exposure, offset, variance : ndarray, shape (n_frame,)
+        Mean of the pixels, exposure time, temperature above the reference, and variance of the mean.
+    start, free : ndarray, shape (3,)
+        Bias, level and slope, and whether each is fitted.
+
+    Returns
+    -------
+    ndarray, shape (3,)
+        Fitted values, those of `start` where they are not free.
+    ndarray, shape (3, 3)
+        Covariance, zero where they are not free.
+    """
+
+    def whole(values: Float) -> Float:
+        every = start.copy()
+        every[free] = values
+        return every
+
+    def left(values: Float) -> Float:
+        bias, level, slope = whole(values)
+        return np.asarray((series - bias - level * exposure * np.exp(slope * offset)) / np.sqrt(variance))
+
+    found = scipy.optimize.least_squares(left, start[free], x_scale=np.maximum(np.abs(start[free]), 1e-3), xtol=1e-14)
+    covariance, jacobian = np.zeros((3, 3)), np.asarray(found.jac)
+    covariance[np.ix_(free, free)] = np.linalg.inv(jacobian.T @ jacobian)
+    return whole(found.x), covariance
+
+
+def _solved(columns: Float, weight: Float, values: Float) -> tuple[Float, Float]:
+    """Return the weights of a least-squares fit, shape (n_column, n_frame), and its solution for each pixel."""
+    weighted = columns * weight[:, None]
+    hat = np.linalg.solve(weighted.T @ columns, weighted.T)
+    return np.asarray(hat), np.asarray(hat @ values)

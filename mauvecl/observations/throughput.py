@@ -1,0 +1,516 @@
+"""Throughput, wavelength zero point and line width from the spectra of standard stars.
+
+The logarithm of the throughput over the nominal one is a cubic B-spline. Its second derivative has a normal prior whose
+width follows from the data by restricted maximum likelihood. The posterior covariance consists of noise and of the bias
+that this prior expects of the smoothing (Wahba 1983; Nychka 1988, doi 10.1080/01621459.1988.10478711). A throughput
+smoother than the prior has less of it, so that the expected bias is scaled to that of the fitted curve; intervals then
+hold the truth with their nominal probability on average over wavelength.
+
+If all stars deviate alike from the spline, the throughput has structure that it does not follow. Each pixel then has a
+factor of its own, whose spread follows from the data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline
+from scipy.optimize import minimize_scalar
+from scipy.sparse import csr_array
+
+from mauvecl.host.exposure.expectation import continued_to_reach, expect
+from mauvecl.host.exposure.response import Order, response_matrix
+from mauvecl.host.exposure.sky import Sky
+from mauvecl.host.instrument.instrument import Instrument
+from mauvecl.host.stars.source import Source
+from mauvecl.observations.detector import CalibrationFrames, DarkFit, PhotonTransfer
+from mauvecl.schema.errors import InputError
+
+Float = NDArray[np.float64]
+
+#: Knots of the errors of a star's spectrum, and their relative size if one star alone cannot tell: an assumption.
+ERROR_KNOTS, ONE_STAR_ERROR = 12, 0.10
+#: Probability of chi-squared below which errors of the stars' spectra are fitted.
+REJECTED = 0.01
+#: Widths of the line function, over the nominal, through which the light is computed; it is quadratic in between.
+WIDTHS = (1.0, 0.9, 1.1)
+#: Steps of wavelength, nm, and of the relative width for derivatives.
+STEP_NM, STEP_WIDTH = 0.2, 0.05
+#: Largest fitted shift and stretch, nm, and relative change of the line's width, beyond which nothing is linear.
+LIMITS = np.array([5.0, 5.0, 0.3, 0.3])
+#: Largest number of iterations, and the change of log throughput at which they end.
+ITERATIONS, SETTLED = 50, 1e-5
+#: Largest change of the logarithm of the throughput in an iteration, and of its difference from the nominal one.
+LARGEST_STEP, LARGEST_LOG = 1.0, 10.0
+#: Range of the logarithm of the smoothing parameter, relative to the information, and of that of spectra's errors.
+LOG_SMOOTHING, LOG_ERROR = (-25.0, 25.0), (-9.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Value:
+    """A fitted value with its standard error."""
+
+    value: float
+    error: float
+
+
+@dataclass(frozen=True, eq=False)
+class ThroughputFit:
+    """Fit of the throughput."""
+
+    wavelength_nm: Float  # shape (n_pixel,)
+    log_factor: Float  # shape (n_pixel,); logarithm of the throughput over the nominal one
+    # Shape (n_pixel + n_shape, n_pixel + n_shape); covariance of `log_factor` and, if they are fitted, of shift and
+    # stretch in nm and of the relative width and its change.
+    joint: Float
+    # shift_nm, stretch_nm: wavelength of a feature less the nominal one in the middle of the spectrum, and its change
+    # to either end.
+    shift_nm: Value | None
+    stretch_nm: Value | None
+    # fwhm_nm, fwhm_change_nm: width of the line function's Gaussian in the middle of the spectrum, and its change to
+    # the red end.
+    fwhm_nm: Value | None
+    fwhm_change_nm: Value | None
+    # Shape (n_star, n_pixel); observed less fitted counts in standard deviations; NaN for pixels that are not used.
+    residual: Float
+    chi2: float
+    dof: float  # pixels less the effective number of parameters
+    smoothing: float  # weight of the squared second derivative
+    spectrum_error: float  # relative error of the stars' spectra at each of `ERROR_KNOTS` knots
+    structure: float  # relative standard deviation of the pixels about the spline; 0 if it follows the throughput
+    assumed: tuple[str, ...]  # quantities that these stars do not determine
+
+    @property
+    def error(self) -> Float:
+        """Standard error of `log_factor`, shape (n_pixel,)."""
+        return np.asarray(np.sqrt(np.diag(self.joint)[: self.wavelength_nm.size]))
+
+    @property
+    def p_value(self) -> float:
+        """Probability of a chi-squared at least as large."""
+        return float(scipy.stats.chi2.sf(self.chi2, self.dof))
+
+    def binned_residuals(self, pixels: int) -> tuple[Float, Float]:
+        """Return middles of groups of pixels, nm, and the residuals of each star, in their standard deviations.
+
+        Residuals are NaN in groups of which no pixel is used.
+        """
+        n = self.wavelength_nm.size // pixels
+        nm = self.wavelength_nm[: n * pixels].reshape(n, pixels).mean(axis=1)
+        part = self.residual[:, : n * pixels].reshape(-1, n, pixels)
+        count = np.isfinite(part).sum(axis=2)
+        return nm, np.divide(np.nansum(part, axis=2), np.sqrt(count), out=np.full(count.shape, np.nan), where=count > 0)
+
+
+@dataclass(frozen=True, eq=False)
+class _Linearised:
+    """Observed counts as a linear function of the parameters, independent and of variance one."""
+
+    values: Float  # shape (n,)
+    design: Float  # shape (n, n_parameter); the spline's coefficients first
+    prior: Float  # shape (n_parameter,); standard deviations; infinite for free parameters
+    penalty: Float  # shape (n_coefficient, n_coefficient)
+
+    def solved(self, smoothing: float, prior: Float | None = None) -> tuple[Float, Float]:
+        """Return the parameters and their covariance."""
+        covariance = np.linalg.inv(self.normal + self._full(smoothing, self.prior if prior is None else prior))
+        return np.asarray(covariance @ self.projected), np.asarray(covariance)
+
+    def likelihood(self, smoothing: float, prior: Float | None = None) -> float:
+        """Return minus twice the logarithm of the restricted likelihood, up to a constant."""
+        prior = self.prior if prior is None else prior
+        full = self.normal + self._full(smoothing, prior)
+        found = np.linalg.solve(full, self.projected)
+        rank = len(self.penalty) - 2
+        known = np.isfinite(prior)
+        return float(
+            self.values @ self.values - self.projected @ found - rank * np.log(smoothing)
+            + 2 * np.log(prior[known]).sum() + np.linalg.slogdet(full)[1]
+        )  # fmt: skip
+
+    def smoothing(self) -> float:
+        """Return the smoothing of the largest restricted likelihood."""
+        n = len(self.penalty)
+        middle = np.log(np.trace(self.normal[:n, :n]) / np.trace(self.penalty))
+        found = minimize_scalar(
+            lambda log: self.likelihood(np.exp(log)), bounds=middle + np.array(LOG_SMOOTHING), method="bounded"
+        )
+        return float(np.exp(found.x))
+
+    def error_of(self, which: NDArray[np.bool_], smoothing: float) -> float:
+        """Return the prior standard deviation of some parameters that has the largest restricted likelihood."""
+        found = minimize_scalar(
+            lambda log: self.likelihood(smoothing, np.where(which, np.exp(log), self.prior)),
+            bounds=LOG_ERROR,
+            method="bounded",
+        )
+        return float(np.exp(found.x))
+
+    def goodness(self, found: Float, covariance: Float) -> tuple[float, float]:
+        """Return chi-squared, and the values less the effective number of parameters."""
+        left = self.values - self.design @ found
+        return float(left @ left), float(np.any(self.design != 0, axis=1).sum() - np.sum(covariance * self.normal))
+
+    def scaled(self, found: Float, covariance: Float, smoothing: float, basis: Float) -> Float:
+        """Return the covariance with the smoothing's bias as large as that of the fitted curve, on average over pixels.
+
+        Parameters
+        ----------
+        found, covariance : ndarray
+            From `solved`.
+        basis : ndarray, shape (n_pixel, n_coefficient)
+        """
+        n = len(self.penalty)
+        pull = np.zeros_like(covariance)
+        pull[:, :n] = smoothing * covariance[:, :n] @ self.penalty
+        noise = covariance - pull @ covariance
+        variance = _diagonal(basis, covariance[:n, :n])
+
+        def mean(values: Float) -> float:
+            return float(np.mean(_diagonal(basis, values[:n, :n]) / variance))
+
+        bias = basis @ (pull @ found)[:n]
+        of_noise, expected = mean(pull @ noise @ pull.T), mean(pull @ noise)
+        if not expected > of_noise:
+            return covariance
+        scale = (float(np.mean(bias**2 / variance)) - of_noise) / (expected - of_noise)
+        return np.asarray(noise + max(scale, 0.0) * pull @ covariance)
+
+    @cached_property
+    def normal(self) -> Float:
+        """Information of the values, shape (n_parameter, n_parameter)."""
+        return np.asarray(self.design.T @ self.design)
+
+    @cached_property
+    def projected(self) -> Float:
+        """Values times the design, shape (n_parameter,)."""
+        return np.asarray(self.design.T @ self.values)
+
+    def _full(self, smoothing: float, prior: Float) -> Float:
+        full = np.diag(prior**-2.0)
+        n = len(self.penalty)
+        full[:n, :n] += smoothing * self.penalty
+        return full
+
+
+@dataclass(frozen=True, eq=False)
+class ThroughputModel:
+    """Mean light of standard stars for a throughput, wavelength scale and line width."""
+
+    stars: tuple[CalibrationFrames, ...]
+    nominal: Instrument
+    dark: DarkFit
+    transfer: PhotonTransfer
+    sky: Sky
+    order: Order
+    # basis, penalty: B-spline at the pixels, shape (n_pixel, n_coefficient), and the matrix of its squared second
+    # derivative.
+    basis: Float
+    penalty: Float
+    light_error: float  # relative standard deviation of the light of an observation
+
+    @cached_property
+    def x(self) -> Float:
+        """Wavelengths of the pixels from -1 to 1."""
+        nm = self.nominal.wavelength_nm
+        return np.asarray(2 * (nm - nm[0]) / np.ptp(nm) - 1)
+
+    @property
+    def n_shape(self) -> int:
+        """Number of fitted values of wavelengths (shift, stretch) and width (mean, change): none for a single star."""
+        return 0 if self.n_stars < 2 else 4 if self.nominal.gaussian_fwhm_nm > 0 else 2
+
+    @property
+    def n_stars(self) -> int:
+        """Number of stars with different spectra; stars that differ in brightness alone count once."""
+        flux = [one.star.flux_flam / one.star.flux_flam.max() for one in self.stars if one.star is not None]
+        return sum(
+            all(one.shape != other.shape or not np.allclose(one, other) for other in flux[:k])
+            for k, one in enumerate(flux)
+        )
+
+    @cached_property
+    def observed_dn(self) -> Float:
+        """Mean light of a frame, shape (n_star, n_pixel)."""
+        return np.array([one.raw_dn.mean(axis=0) - self.dark.mean_dn(one) for one in self.stars])
+
+    @cached_property
+    def usable(self) -> NDArray[np.bool_]:
+        """Pixels that stay below saturation, shape (n_star, n_pixel)."""
+        return np.array([one.usable(self.nominal) for one in self.stars])
+
+    @cached_property
+    def dark_terms(self) -> Float:
+        """Seconds of dark current and their change with its slope, shape (n_star, 2)."""
+        return np.array([self.dark.terms(one) for one in self.stars])
+
+    @cached_property
+    def sky_electrons(self) -> Float:
+        """Zodiacal light of a second in each pixel, shape (n_pixel,)."""
+        star, nominal = self.stars[0].star, self.nominal
+        assert star is not None
+        return expect(star, nominal, exposure=nominal.frame_s, sky=self.sky, order=self.order).sky_electrons / (
+            nominal.frame_s
+        )
+
+    @cached_property
+    def responses(self) -> list[tuple[Source, list[csr_array]]]:
+        """Each star with the electrons per second for its flux, through line functions of `WIDTHS` on the nominal."""
+        fwhm, found = self.nominal.gaussian_fwhm_nm, []
+        lines = [self.nominal.with_(gaussian_fwhm_nm=fwhm * width) for width in WIDTHS[: 3 if fwhm else 1]]
+        for one in self.stars:
+            assert one.star is not None
+            star = continued_to_reach(one.star, lines[-1])
+            found.append((star, [response_matrix(line, star.wavelength_nm, self.order) for line in lines]))
+        return found
+
+    def light_dn(self, log_factor: Float, shape: Float) -> Float:
+        """Return the mean light of a frame of each star, DN, shape (n_star, n_pixel).
+
+        The light is quadratic in the local width of the line function.
+        """
+        shift, stretch, width, change = np.pad(shape, (0, 4 - shape.size))
+        nm, local, step = self.nominal.wavelength_nm, width + change * self.x, WIDTHS[-1] - 1.0
+        light = []
+        for one, (star, responses) in zip(self.stars, self.responses, strict=True):
+            at, flux = star.wavelength_nm, star.flux_flam
+            if shift or stretch:
+                flux = np.interp(at + shift + stretch * np.interp(at, nm, self.x), at, flux)
+            if self.order == "physical":
+                flux = flux * np.exp(np.interp(at, nm, log_factor))
+            electrons = responses[0] @ flux
+            if width or change:
+                narrow, wide = (response @ flux for response in responses[1:])
+                slope, bend = (wide - narrow) / (2 * step), (wide + narrow - 2 * electrons) / (2 * step**2)
+                electrons = electrons + local * (slope + local * bend)
+            electrons = np.maximum(electrons * self.nominal.per_pixel("response", 1.0), 0.0) + self.sky_electrons
+            light.append(self.transfer.noise.gain * electrons * one.exposure_s)
+        return np.array(light) if self.order == "physical" else np.array(light) * np.exp(log_factor)
+
+    def variance_dn2(self, light_dn: Float) -> Float:
+        """Return the variance of the mean frames of all stars, shape (n_star, n_pixel)."""
+        frames = np.array([one.n_frames for one in self.stars])
+        dark = self.dark_terms[:, :1] * self.dark.level_dn_per_s
+        return np.asarray(self.transfer.noise.variance(light_dn, dark) / frames[:, None])
+
+    @cached_property
+    def dark_covariance(self) -> Float:
+        """Covariance between stars of each pixel's subtracted dark, shape (n_pixel, n_star, n_star)."""
+        jacobian = np.column_stack([np.ones(len(self.stars)), self.dark_terms[:, 0]])
+        return np.asarray(jacobian @ self.dark.covariance @ jacobian.T)
+
+    @cached_property
+    def slopes_dn(self) -> list[Float]:
+        """Derivatives of the light with respect to the shape, for the nominal instrument, shape (n_star, n_pixel)."""
+        slopes = []
+        for step, place in [(STEP_NM, 0), (STEP_WIDTH, 2)][: self.n_shape // 2]:
+            moved = step * np.eye(self.n_shape)[place]
+            more, less = (self.light_dn(np.zeros(self.x.size), sign * moved) for sign in (1, -1))
+            slopes += [(more - less) / (2 * step), (more - less) / (2 * step) * self.x]
+        return slopes
+
+    def linearised(self, coefficients: Float, shape: Float, error: float) -> _Linearised:
+        """Return the linear problem around a spline and a shape, for a relative error of the stars' spectra."""
+        n_star, own = len(self.stars), self.basis @ coefficients
+        model = self.light_dn(own, shape)
+        columns = [model * column for column in self.basis.T]
+        columns += [slope * np.exp(own) for slope in self.slopes_dn]
+        around = np.concatenate([coefficients, shape])
+        prior = [np.inf] * around.size
+        for k in range(n_star):
+            alone = np.zeros((n_star, 1))
+            alone[k] = 1.0
+            if self.light_error > 0:
+                columns.append(alone * model)
+                prior.append(self.light_error)
+            if error > 0:
+                columns += [alone * model * column for column in _linear_basis(self.nominal.wavelength_nm).T]
+                prior += [error] * ERROR_KNOTS
+        level = self.dark.level_dn_per_s.mean()
+        jacobian = np.column_stack([np.ones(n_star), self.dark_terms[:, 0], level * self.dark_terms[:, 1]])
+        values, vectors = np.linalg.eigh(self.dark.shared)
+        for value, vector in zip(values, vectors.T, strict=True):
+            if value > 0:
+                columns.append(np.sqrt(value) * (jacobian @ vector)[:, None] * np.ones_like(model))
+                prior.append(1.0)
+        white = self._whitener(self.variance_dn2(model))
+        design = np.column_stack([white(column) for column in columns])
+        values = white(self.observed_dn - model) + design[:, : around.size] @ around
+        return _Linearised(values, design, np.array(prior), self.penalty)
+
+    def _whitener(self, variance: Float) -> Callable[[Float], Float]:
+        """Return a function that makes values of shape (n_star, n_pixel) independent and of variance one."""
+        used = self.usable.T
+        covariance = np.where(used[:, :, None] & used[:, None, :], self.dark_covariance, 0.0)
+        index = np.arange(len(self.stars))
+        covariance[:, index, index] += np.where(used, variance.T, 1.0)
+        inverse = np.linalg.inv(np.linalg.cholesky(covariance))
+        return lambda values: np.einsum("pij,jp->ip", inverse, np.where(used.T, values, 0.0)).ravel()
+
+
+def fit_throughput(
+    stars: Sequence[CalibrationFrames],
+    nominal: Instrument,
+    dark: DarkFit,
+    transfer: PhotonTransfer,
+    *,
+    knots: int,
+    sky: Sky,
+    order: Order,
+    light_error: float = 0.0,
+    spectrum_error: float | None = None,
+) -> ThroughputFit:
+    """Fit the throughput to the mean frames of standard stars.
+
+    With two or more stars the zero point of the wavelengths and the width of the line function are fitted as well.
+
+    Parameters
+    ----------
+    stars : sequence of CalibrationFrames
+        At least one, each with its spectrum.
+    knots : int
+        Number of intervals of the spline.
+    order : {"paper", "physical"}
+    light_error : float
+        Relative standard deviation of the light of an observation, by pointing.
+    spectrum_error : float, optional
+        Relative standard deviation of the stars' spectra at each of `ERROR_KNOTS` knots. By default it is assumed for
+        one star, and fitted for several if they disagree.
+    """
+    nm = nominal.wavelength_nm
+    model = ThroughputModel(tuple(stars), nominal, dark, transfer, sky, order, *_basis(nm, knots), light_error)
+    several = model.n_stars > 1
+    error = spectrum_error if spectrum_error is not None else 0.0
+    best = _iterated(model, error)
+    m, n = model.n_shape, model.basis.shape[1]
+    if several and spectrum_error is None and best.pixels(model).disagree:
+        trial = _iterated(model, ONE_STAR_ERROR)
+        error = trial.linear.error_of(trial.linear.prior == ONE_STAR_ERROR, trial.smoothing)
+        best = _iterated(model, error)
+    pixels = best.pixels(model)
+    if (np.abs(best.found[n : n + m]) > LIMITS[:m]).any():
+        raise InputError(
+            "the spectra of the stars do not match a wavelength scale and line width near the nominal ones",
+            f"shifts up to {LIMITS[0]:g} nm and widths within {100 * LIMITS[2]:g} %",
+            key="observations",
+        )
+    covariance = best.linear.scaled(best.found, best.covariance, best.smoothing, model.basis)
+    onto = scipy.linalg.block_diag(model.basis, np.eye(m))
+    joint = onto @ covariance[: n + m, : n + m] @ onto.T
+    curve = joint[: nm.size, : nm.size]
+    curve += np.diag(pixels.variance)
+    if not several and spectrum_error is None:
+        # One star cannot tell errors of its spectrum from the throughput.
+        error = ONE_STAR_ERROR
+        curve += error**2 * _linear_basis(nm) @ _linear_basis(nm).T
+    # Counts determine the product of gain and throughput.
+    curve += transfer.relative_gain_error**2
+    log_factor, shape = model.basis @ best.found[:n] + pixels.log_factor, best.found[n : n + m]
+    errors = np.sqrt(np.diag(covariance))[n : n + m]
+    scale = [1.0, 1.0, nominal.gaussian_fwhm_nm, nominal.gaussian_fwhm_nm]
+    values = [Value(scale[k] * float(shape[k] + (k == 2)), scale[k] * float(errors[k])) for k in range(m)]
+    light = model.light_dn(log_factor, shape)
+    sd = np.sqrt(model.variance_dn2(light) + np.diagonal(model.dark_covariance, axis1=1, axis2=2).T)
+    residual = np.where(model.usable, (model.observed_dn - light) / sd, np.nan)
+    assumed = [*(() if m else ("wavelength zero point",)), *(() if m == 4 else ("line width",)),
+               *(() if several else ("errors of the star's spectrum",))]  # fmt: skip
+    padded: list[Value | None] = [*values, *[None] * (4 - m)]
+    shift, stretch, width, change = padded
+    return ThroughputFit(nm, log_factor, joint, shift, stretch, width, change, residual, pixels.chi2, pixels.dof,
+                         best.smoothing, error, pixels.structure, tuple(assumed))  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Pixels:
+    """Factors of single pixels on the throughput that the spline leaves."""
+
+    # log_factor, variance: shape (n_pixel,); 0 if the spline follows the throughput.
+    log_factor: Float
+    variance: Float
+    structure: float  # relative standard deviation of the factors
+    disagree: bool  # true if the stars differ from each other
+    # chi2, dof: of the fit with these factors.
+    chi2: float
+    dof: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Solution:
+    linear: _Linearised
+    smoothing: float
+    found: Float
+    covariance: Float
+
+    def pixels(self, model: ThroughputModel) -> _Pixels:
+        """Divide the residuals into those that all stars share, and those by which they differ."""
+        n_star, n_pixel = model.observed_dn.shape
+        left = (self.linear.values - self.linear.design @ self.found).reshape(n_star, n_pixel)
+        # The columns of the spline sum to one.
+        whole = self.linear.design[:, : model.basis.shape[1]].sum(axis=1).reshape(n_star, n_pixel)
+        information = np.sum(whole**2, axis=0)
+        used = information > 0
+        shared = np.divide(np.sum(whole * left, axis=0), information, out=np.zeros(n_pixel), where=used)
+        chi2, dof = self.linear.goodness(self.found, self.covariance)
+        of_shared = float(np.sum(shared**2 * information))
+        dof_shared = dof - model.usable.sum() + used.sum()
+        disagree = n_star > 1 and scipy.stats.chi2.sf(chi2 - of_shared, dof - dof_shared) < REJECTED
+        if model.order != "paper" or scipy.stats.chi2.sf(of_shared, dof_shared) >= REJECTED:
+            nothing = np.zeros(n_pixel)
+            return _Pixels(nothing, nothing, 0.0, disagree, chi2, dof)
+        variance = (of_shared - dof_shared) / float(np.sum(information))
+        kept = variance * information / (1 + variance * information)
+        chi2 -= float(np.sum(shared**2 * information * kept * (2 - kept)))
+        return _Pixels(np.log1p(kept * shared), variance * (1 - kept), float(np.sqrt(variance)), disagree, chi2,
+                       dof - float(kept.sum()))  # fmt: skip
+
+
+def _iterated(model: ThroughputModel, error: float) -> _Solution:
+    """Return the solution of the problem that is linearised around it."""
+    n, m = model.basis.shape[1], model.n_shape
+    coefficients, shape = np.zeros(n), np.zeros(m)
+    for _ in range(ITERATIONS):
+        linear = model.linearised(coefficients, shape, error)
+        smoothing = linear.smoothing()
+        found, covariance = linear.solved(smoothing)
+        step = found[:n] - coefficients
+        moved = np.abs(model.basis @ step).max()
+        if moved < SETTLED:
+            return _Solution(linear, smoothing, found, covariance)
+        coefficients = coefficients + step * min(1.0, LARGEST_STEP / moved)
+        shape = np.clip(found[n : n + m], -LIMITS[:m], LIMITS[:m])
+        if not np.abs(model.basis @ coefficients).max() < LARGEST_LOG:
+            break
+    raise InputError(
+        "no throughput makes the spectra of the stars those of the frames",
+        "frames of the stated stars, with dark frames if the dark current is not nominal",
+        key="observations",
+    )
+
+
+def _basis(nm: Float, knots: int) -> tuple[Float, Float]:
+    """Return a cubic B-spline basis, shape (n_pixel, knots + 3), and the matrix of its squared second derivative."""
+    inner = np.linspace(nm[0], nm[-1], knots + 1)
+    full = np.concatenate([np.full(3, nm[0]), inner, np.full(3, nm[-1])])
+    design = BSpline.design_matrix(nm, full, 3).toarray()
+    # The second derivative is linear between knots, so that two Gauss nodes integrate its square exactly.
+    half = np.diff(inner)[:, None] / 2
+    nodes = inner[:-1, None] + half * (1 + np.array([-1.0, 1.0]) / np.sqrt(3.0))
+    second = BSpline(full, np.eye(knots + 3), 3).derivative(2)(nodes.ravel())
+    weight = np.repeat(half, 2, axis=1).ravel()
+    return design, np.asarray((second * weight[:, None]).T @ second)
+
+
+def _diagonal(basis: Float, covariance: Float) -> Float:
+    """Return the variance of a curve at the pixels from the covariance of its coefficients, shape (n_pixel,)."""
+    return np.asarray(np.einsum("pi,pi->p", basis @ covariance, basis))
+
+
+def _linear_basis(nm: Float) -> Float:
+    """Return the basis of piecewise linear curves with `ERROR_KNOTS` knots, shape (n_pixel, ERROR_KNOTS)."""
+    at = np.linspace(nm[0], nm[-1], ERROR_KNOTS)
+    return np.column_stack([np.interp(nm, at, row) for row in np.eye(ERROR_KNOTS)])

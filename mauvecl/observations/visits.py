@@ -1,0 +1,547 @@
+"""Changes between visits: indices of lines, their periods, and the smallest change that is detected.
+
+A visit gives an estimate with a normal error, by generalised least squares with its unknowns marginalised over. Visits
+are compared by chi-squared about their mean; for two visits this is the two-sided test of their difference.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Self
+
+import numpy as np
+import scipy
+from numpy.typing import ArrayLike, NDArray
+
+from mauvecl.detection.distributions import Interval, clopper_pearson
+from mauvecl.fits.flare_model import variance_of
+from mauvecl.host.exposure.response import W_PER_NM_IN_FLAM, Order, electrons_per_second
+from mauvecl.host.stars.bands import photons
+from mauvecl.host.stars.flare_spectra import BALMER_EDGE_NM, EmissionLine
+from mauvecl.schema.calls import validated
+from mauvecl.schema.errors import InputError, shortened
+from mauvecl.schema.fields import Range, Unit
+from mauvecl.schema.physical import Positive, Probability, Seed, Wavelength
+
+if TYPE_CHECKING:
+    from mauvecl.detection.nuisances import Nuisances
+    from mauvecl.host.exposure.expectation import Expectation
+    from mauvecl.host.instrument.instrument import Instrument
+    from mauvecl.host.orbit.visibility import Windows
+    from mauvecl.host.stars.source import Source
+
+Float = NDArray[np.float64]
+
+#: Frequencies per resolution of the time base.
+OVERSAMPLING = 5
+#: Smallest number of visits of which a sinusoid with a free mean leaves residuals.
+MIN_VISITS = 5
+#: Largest number of frequencies.
+MAX_FREQUENCIES = 200_000
+#: Simulated periodograms beyond the threshold.
+IN_TAIL = 20
+
+
+@dataclass(frozen=True, eq=False)
+class Recovery:
+    """Share of sinusoids whose period is recovered."""
+
+    time_d: Float  # shape (n_visit,)
+    # Normalised power that noise exceeds with the false-alarm probability, anywhere in the periodogram.
+    threshold: float
+    periods_d: Float  # shape (n_period,)
+    amplitudes: Float  # shape (n_amplitude,); semi-amplitudes in standard errors of a visit
+    recovered: list[list[Interval]]  # for each amplitude and period
+
+
+def visit_times_d(windows: Windows, visits: int, exposure_s: float, seed: int) -> Float:
+    """Draw the middles of visits in windows, evenly over the time in which an exposure fits, in days; ascending.
+
+    Raises InputError if no window is long enough.
+    """
+    room = np.maximum(windows.length_s - exposure_s, 0.0)
+    if not room.sum() > 0:
+        longest = windows.length_s.max(initial=0.0)
+        expected = f"at most the longest window, {longest:.0f} s"
+        raise InputError.of("observation.exposure_s", exposure_s, expected, unit="s")
+    ends = np.cumsum(room)
+    at = np.sort(np.random.default_rng(seed).uniform(0.0, ends[-1], visits))
+    which = np.searchsorted(ends, at, side="right")
+    start = windows.start_s[which] + at - (ends[which] - room[which])
+    return np.asarray((start + exposure_s / 2) / 86_400.0)
+
+
+@validated
+def recover_periods(
+    time_d: Annotated[Float, Unit("d")],
+    periods_d: Annotated[Float, Unit("d")],
+    amplitudes: Float,
+    *,
+    fap: Probability = 0.01,
+    trials: Annotated[int, Range(1)] = 100,
+    seed: Seed = 1,
+    shortest_d: Annotated[Positive | None, Unit("d")] = None,
+    longest_d: Annotated[Positive | None, Unit("d")] = None,
+) -> Recovery:
+    """Simulate how often the period of a sinusoid is found in visits with normal errors of one.
+
+    A period is recovered if the highest peak exceeds the threshold and lies within half of the frequency resolution,
+    1 / (2 time base), of the truth.
+
+    Parameters
+    ----------
+    time_d : ndarray, shape (n_visit,)
+    periods_d : ndarray, shape (n_period,)
+    amplitudes : ndarray, shape (n_amplitude,)
+        Semi-amplitudes in standard errors of a visit.
+    fap : float
+        Probability that noise exceeds the threshold anywhere in the periodogram, by simulation.
+    trials : int
+        Sinusoids of random phase for each period and amplitude.
+    seed : int
+    shortest_d, longest_d : float, optional
+        Range of the periodogram; by default that of the periods.
+    """
+    from astropy.timeseries import LombScargle
+
+    time = np.sort(np.asarray(time_d, np.float64))
+    if time.size < MIN_VISITS:
+        raise InputError.of("visits", time.size, f"at least {MIN_VISITS}")
+    base = float(np.ptp(time))
+    if not base > 0:
+        raise InputError.of("time_d", "visits at one time", "visits at different times")
+    low, high = 1 / (longest_d or max(periods_d)), 1 / (shortest_d or min(periods_d))
+    step = 1 / (OVERSAMPLING * base)
+    # Half a resolution beyond the ends, so that periods at the ends can be recovered.
+    count = int(np.ceil((high - low) / step)) + OVERSAMPLING + 1
+    if count > MAX_FREQUENCIES:
+        expected = f"at most {MAX_FREQUENCIES}: longer periods or a shorter campaign"
+        raise InputError.of("periods", f"{count} frequencies", expected)
+    frequency = max(low - 0.5 / base, step) + step * np.arange(count)
+    generator = np.random.default_rng(seed)
+
+    def peak(values: Float) -> tuple[float, float]:
+        power = LombScargle(time, values).power(frequency, method="fast", assume_regular_frequency=True)
+        best = int(np.argmax(power))
+        return float(power[best]), float(frequency[best])
+
+    noise = np.sort([peak(generator.standard_normal(time.size))[0] for _ in range(int(np.ceil(IN_TAIL / fap)))])
+    threshold = float(noise[-IN_TAIL])
+    recovered = []
+    for amplitude in amplitudes:
+        row = []
+        for period in periods_d:
+            found = 0
+            for phase in generator.uniform(0, 2 * np.pi, trials):
+                values = amplitude * np.sin(2 * np.pi * time / period + phase) + generator.standard_normal(time.size)
+                power, at = peak(values)
+                found += power > threshold and abs(at - 1 / period) < 0.5 / base
+            row.append(clopper_pearson(found, trials))
+        recovered.append(row)
+    return Recovery(time, threshold, np.asarray(periods_d), np.asarray(amplitudes), recovered)
+
+
+#: Share of the information on a change that must be left by what is unknown; less is rounding.
+LEAST_KEPT = 1e-10
+#: Share of the largest change of a pixel above which a change concerns a pixel.
+LEAST_LIGHT = 1e-3
+
+
+@dataclass(frozen=True)
+class Smallest:
+    """Smallest detectable changes, in the unit of the error of a visit."""
+
+    one: float  # difference of one visit from all others
+    scatter: float  # standard deviation of a star that differs normally in each visit
+
+
+@validated
+def smallest_change(
+    error: Positive, visits: Annotated[int, Range(2)], fap: Probability, power: Probability
+) -> Smallest:
+    """Compute the smallest detectable changes among visits with equal errors.
+
+    Parameters
+    ----------
+    error : float
+        Standard error of a visit.
+    visits : int
+    fap : float
+        False-alarm probability of the test of all visits.
+    power : float
+        Detection probability.
+
+    Examples
+    --------
+    >>> from mauvecl.observations.visits import smallest_change
+    >>> round(smallest_change(1.0, 2, 0.05, 0.9).one, 3)
+    4.584
+    """
+    dof = visits - 1
+    cut = float(scipy.stats.chi2.isf(fap, dof))
+    rest = float(scipy.stats.chi2.isf(power, dof))
+    if power <= fap:
+        return Smallest(0.0, 0.0)
+    # The non-centrality grows the probability from fap to 1.
+    high = 1.0
+    while scipy.stats.ncx2.sf(cut, dof, high) < power:
+        high *= 2.0
+    centre = scipy.optimize.brentq(lambda value: scipy.stats.ncx2.sf(cut, dof, value) - power, 1e-12, high, xtol=1e-10)
+    return Smallest(float(error * np.sqrt(centre * visits / dof)), float(error * np.sqrt(cut / rest - 1.0)))
+
+
+def pixels_of(counts_dn: Float, quiet: Expectation) -> tuple[int, int]:
+    """Return how many of the pixels that a change of the light concerns are near saturation, and how many these are."""
+    concerned = np.abs(counts_dn) > LEAST_LIGHT * np.abs(counts_dn).max(initial=0.0)
+    return int((concerned & ~variance_of(quiet)[1]).sum()), int(concerned.sum())
+
+
+def error_of_change(counts_dn: Float, quiet: Expectation, unknown: Nuisances | None) -> float:
+    """Return the standard error of the amplitude of a change in one exposure, from pixels that do not saturate.
+
+    It is infinite if the unknowns hide the change, and NaN if no pixel is left.
+
+    Parameters
+    ----------
+    counts_dn : ndarray, shape (n_pixel,)
+        DN of the exposure for an amplitude of one.
+    """
+    variance, used = variance_of(quiet)
+    lost, concerned = pixels_of(counts_dn, quiet)
+    if lost == concerned:
+        return float("nan")
+    delta = np.where(used, counts_dn, 0.0)
+    weights = np.divide(delta, variance, out=np.zeros_like(delta), where=used)
+    information = whole = float(weights @ delta)
+    if unknown:
+        information -= float(np.sum((unknown.rows(variance * used, unknown.spectra * used) @ delta) ** 2))
+    return information**-0.5 if information > LEAST_KEPT * whole > 0 else float("inf")
+
+
+def error_of_index(weights: Float, quiet: Expectation, unknown: Nuisances | None) -> float:
+    """Return the standard deviation of a weighted sum of an exposure.
+
+    It is infinite if a free unknown changes the sum, and NaN if a pixel with a weight is near saturation.
+
+    Parameters
+    ----------
+    weights : ndarray, shape (n_pixel,)
+    """
+    if (weights[~variance_of(quiet)[1]] != 0.0).any():
+        return float("nan")
+    variance = float(np.sum(weights**2 * quiet.variance_dn2))
+    if unknown:
+        moved = unknown.spectra @ weights
+        free = np.isinf(unknown.sd)
+        if np.any(np.abs(moved[free]) > 0):
+            return float("inf")
+        variance += float(np.sum((moved[~free] * unknown.sd[~free]) ** 2))
+    return float(np.sqrt(variance))
+
+
+#: Mg II h and k with the continuum on both sides, for spectra of low resolution such as IUE's (0.6 nm), nm: an
+#: assumption; definitions of Mg II indices differ between experiments, and none for stars at this resolution was found.
+MG_II_NM = (278.5, 281.5)
+MG_II_CONTINUUM_NM = ((275.5, 278.0), (282.0, 284.5))
+#: Smallest number of pixels of the continuum, for a straight line and a sign of its scatter.
+MIN_CONTINUUM = 3
+
+
+@dataclass(frozen=True, eq=False)
+class LineIndex:
+    """Lines of one or more spectra.
+
+    Attributes
+    ----------
+    flux, error : ndarray, shape (...)
+        Integral over the band above the continuum, in the unit of the flux times nm, and its standard error; the
+        error is NaN if the spectrum has none.
+    continuum : ndarray, shape (...)
+        Mean of the continuum over the band.
+    equivalent_width_nm : ndarray, shape (...)
+        Width of the continuum with the light of the line: positive in emission.
+    """
+
+    flux: Float
+    error: Float
+    continuum: Float
+    equivalent_width_nm: Float
+
+
+@validated
+def line_index(
+    wavelength_nm: Annotated[ArrayLike, Unit("nm")],
+    flux: ArrayLike,
+    error: ArrayLike | None = None,
+    *,
+    band_nm: tuple[Wavelength, Wavelength],
+    continuum_nm: Sequence[tuple[Wavelength, Wavelength]],
+) -> LineIndex:
+    """Integrate a line above the straight line through windows of the continuum.
+
+    The index is linear in the fluxes, so that its error follows exactly from those of the pixels, of the continuum's
+    as well as of the band's. Pixels across a limit of the band count in part.
+
+    Parameters
+    ----------
+    wavelength_nm : array_like, shape (n_pixel,)
+        Middle of each pixel, ascending.
+    flux, error : array_like, shape (..., n_pixel)
+        Flux density per nm and its standard error, by which the continuum is weighted. Pixels of the continuum that
+        are not finite, or whose error is not positive, are left out.
+    band_nm : tuple of float
+        Limits of the line.
+    continuum_nm : sequence of tuple
+        Limits of the windows of the continuum.
+
+    Raises
+    ------
+    InputError
+        If the spectrum does not cover the band, pixels of the band are not finite, or less than three pixels of the
+        continuum are left.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from mauvecl.observations.visits import line_index
+    >>> nm = np.linspace(270, 290, 201)
+    >>> flux = 2.0 + np.exp(-((nm - 280) ** 2) / 2 / 0.3**2) / 0.3 / np.sqrt(2 * np.pi)
+    >>> found = line_index(nm, flux, band_nm=(278.5, 281.5), continuum_nm=[(275.5, 278), (282, 284.5)])
+    >>> round(float(found.flux), 4)
+    1.0
+    """
+    nm = np.asarray(wavelength_nm, np.float64)
+    if nm.ndim != 1 or nm.size < 2 or not (np.diff(nm) > 0).all():
+        raise InputError.of("wavelength_nm", nm.shape, "ascending wavelengths of at least two pixels")
+    light = np.asarray(flux, np.float64)
+    if not light.ndim or light.shape[-1] != nm.size:
+        raise InputError.of("flux", light.shape, f"{nm.size} pixels in the last axis")
+    if error is not None and np.shape(error) != light.shape:
+        raise InputError.of("error", np.shape(error), f"the shape of the flux, {light.shape}")
+    sd = np.ones_like(light) if error is None else np.asarray(error, np.float64)
+    edges = np.concatenate([[1.5 * nm[0] - nm[1] / 2], (nm[1:] + nm[:-1]) / 2, [1.5 * nm[-1] - nm[-2] / 2]])
+    low, high = band_nm
+    if not edges[0] <= low < high <= edges[-1]:
+        raise InputError.of("band_nm", band_nm, f"ascending limits within {edges[0]:g}-{edges[-1]:g} nm")
+    share = np.clip(np.minimum(edges[1:], high) - np.maximum(edges[:-1], low), 0.0, None)
+    inside = share > 0
+    good = np.isfinite(light) & np.isfinite(sd) & (sd > 0)
+    if not good[..., inside].all():
+        raise InputError.of("flux", "pixels in the band without a finite flux and a positive error", "none of these")
+    windows = np.zeros(nm.size, np.bool_)
+    for start, end in continuum_nm:
+        windows |= (nm >= start) & (nm <= end)
+    left = good & windows
+    if (count := int(left.sum(axis=-1).min(initial=nm.size))) < MIN_CONTINUUM:
+        raise InputError.of("continuum_nm", f"{count} usable pixels", f"at least {MIN_CONTINUUM} in each spectrum")
+    # The integral of the continuum is a linear function of the pixels, by the weights of its least squares.
+    design = np.stack([np.ones_like(nm), nm - (low + high) / 2])
+    weight = np.where(left, 1.0 / np.where(left, sd, 1.0) ** 2, 0.0)
+    normal = np.einsum("ap,...p,bp->...ab", design, weight, design)
+    coefficients = np.linalg.solve(normal, (design @ share)[:, None])[..., 0]
+    continuum = np.einsum("...a,ap,...p->...p", coefficients, design, weight)
+    light, sd = (np.where(left | inside, each, 0.0) for each in (light, sd))
+    level = (continuum * light).sum(axis=-1)
+    index = (share * light).sum(axis=-1) - level
+    variance = ((share - continuum) ** 2 * sd**2).sum(axis=-1)
+    mean = level / (high - low)
+    return LineIndex(index, np.sqrt(variance) if error is not None else np.full_like(index, np.nan), mean, index / mean)
+
+
+#: Wavelength between the two halves of the colour, nm: the middle of the output range.
+COLOUR_NM = 450.0
+#: Change of the natural logarithm of a flux for a change of one magnitude.
+LOG_PER_MAG = 0.4 * np.log(10.0)
+#: Wavelengths at which spectra with edges are computed, nm: beyond the reach of the line function, in steps far below
+#: the resolution.
+GRID_NM = np.linspace(150.0, 760.0, 6101)
+
+
+@dataclass(frozen=True)
+class Index:
+    """Definition of a line index: light in a band above a straight continuum."""
+
+    name: str  # as in `EmissionLine.named`
+    band_nm: tuple[float, float]
+    continuum_nm: tuple[tuple[float, float], ...]
+    published: str  # the usual definition for spectra of higher resolution, with its source
+
+    @property
+    def lines(self) -> EmissionLine:
+        """The lines in the band."""
+        return EmissionLine.named(self.name)
+
+
+#: Indices by name. The bands are an assumption of this project: published ones, of 0.1 to 3 nm, lie within Mauve's line
+#: function of 13.3 nm, so that the band is 16 nm about the lines and each continuum 12 nm beyond.
+#: The published windows of Ca II and H alpha were compared with the table of ACTIN 2, that of H beta with lists of Lick
+#: indices, that of Mg II with the public code of the Mg II index of SUIT; the papers themselves were not read.
+INDICES = {
+    one.name: one
+    for one in (
+        Index("Mg II", (272.0, 288.0), ((258.0, 270.0), (290.0, 302.0)),
+              "solar index: 4/3 of the sum at 279.8, 280.0 and 280.2 nm over that at 276.6, 276.8, 283.2 and 283.4 nm "
+              "(Heath & Schlesinger 1986, J. Geophys. Res. 91, 8672)"),
+        Index("Ca II", (387.0, 403.0), ((373.0, 385.0), (405.0, 417.0)),
+              "Mount Wilson S: triangles of 0.109 nm (FWHM) at 393.366 and 396.847 nm over 2 nm at 390.107 and "
+              "400.107 nm (Duncan et al. 1991, ApJS 76, 383)"),
+        Index("H beta", (478.0, 494.0), ((464.0, 476.0), (496.0, 508.0)),
+              "Lick: 484.788-487.663 nm, continua 482.788-484.788 and 487.663-489.163 nm (Worthey et al. 1994; "
+              "Trager et al. 1998, ApJS 116, 1)"),
+        Index("H alpha", (648.0, 664.0), ((634.0, 646.0), (666.0, 678.0)),
+              "0.16 nm at 656.281 nm over 1.075 nm at 655.087 and 0.875 nm at 658.031 nm "
+              "(Gomes da Silva et al. 2011, arXiv:1109.0321)"),
+    )
+}  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """A change of a star's spectrum by one unit."""
+
+    name: str
+    unit: str  # unit of the change; empty if it is relative
+    meaning: str  # meaning of a change of one unit
+    counts_dn: Float  # shape (n_pixel,); DN of the exposure that it adds, for a small change
+
+    def size(self, linear: float) -> float:
+        """Return the size of a change that brightens, in its unit, from its light over `counts_dn`."""
+        return float(np.log1p(LOG_PER_MAG * linear) / LOG_PER_MAG) if self.unit == "mag" else linear
+
+    @classmethod
+    def named(
+        cls,
+        name: str,
+        star: Source,
+        quiet: Expectation,
+        instrument: Instrument,
+        order: Order,
+        file: Source | None,
+        band: str,
+    ) -> Self:
+        """Return a change by name.
+
+        Parameters
+        ----------
+        name : str
+            A line or group of lines, ``balmer jump``, ``colour``, a band as in ``200-320``, or ``spectrum``.
+        star : Source
+            At its brightness.
+        quiet : Expectation
+            One exposure.
+        order : {"paper", "physical"}
+        file : Source, optional
+            Light that the change ``spectrum`` adds.
+        band : str
+            In which the light of that spectrum is measured.
+        """
+        nm, unit = GRID_NM, ""
+        own = np.interp(nm, star.wavelength_nm, star.flux_flam, left=0.0, right=0.0)
+        words = name.strip().casefold()
+        if words == "balmer jump":
+            flux, meaning = own * _below(BALMER_EDGE_NM), "relative change of the light below the Balmer edge"
+        elif words == "colour":
+            flux, unit = LOG_PER_MAG * own * _below(COLOUR_NM), "mag"
+            meaning = f"brightening of the light below {COLOUR_NM:g} nm against that above"
+        elif words == "spectrum":
+            if file is None:
+                raise InputError("the change 'spectrum' has no file", "`change.file`", key="change.file")
+            scale = photons(star.wavelength_nm, star.flux_flam, band) / photons(
+                file.wavelength_nm, file.flux_flam, band
+            )
+            nm, flux = file.wavelength_nm, scale * file.flux_flam
+            meaning = f"light of {file.name} over that of the star in {band}"
+        elif (limits := _band(name)) is not None:
+            flux = own * (_below(limits[1]) - _below(limits[0]))
+            meaning = f"relative change of the light in {limits[0]:g}-{limits[1]:g} nm"
+        else:
+            line = _line(name)
+            nm = np.unique(np.concatenate([nm, line.nodes_nm]))
+            flux, unit, meaning = line.profile(nm), "erg / (s cm2)", f"flux of {line.name}"
+        rate = electrons_per_second(instrument, nm, flux, order)
+        return cls(name.strip(), unit, meaning, rate * exposure_dn_per_electron(quiet, instrument))
+
+
+def _below(edge_nm: float) -> Float:
+    """Return factors at `GRID_NM` of light that ends at a wavelength.
+
+    Flux is linear between the wavelengths, and the factor of each is the share of its triangle below the edge, so that
+    the light and its mean wavelength are those of a sharp edge.
+    """
+    distance = np.clip((edge_nm - GRID_NM) / (GRID_NM[1] - GRID_NM[0]), -1.0, 1.0)
+    return np.asarray(np.where(distance < 0.0, (1.0 + distance) ** 2, 2.0 - (1.0 - distance) ** 2) / 2.0)
+
+
+def _band(name: str) -> tuple[float, float] | None:
+    try:
+        low, high = (float(part) for part in name.split("-"))
+    except ValueError:
+        return None
+    if not 0 < low < high:
+        raise InputError.of("change.of", name, "a band of ascending wavelengths, such as 200-320", unit="nm")
+    return low, high
+
+
+def _line(name: str) -> EmissionLine:
+    try:
+        return EmissionLine.named(name)
+    except InputError:
+        raise InputError.of(
+            "change.of", shortened(name),
+            f"a line such as {', '.join(INDICES)}, a band such as 200-320, balmer jump, colour or spectrum",
+        ) from None  # fmt: skip
+
+
+def covered_indices(quiet: Expectation) -> list[Index]:
+    """Return the indices whose band and continua lie within the pixels."""
+    first, last = quiet.wavelength_nm[0], quiet.wavelength_nm[-1]
+    return [one for one in INDICES.values() if first <= one.continuum_nm[0][0] and one.continuum_nm[-1][1] <= last]
+
+
+def exposure_dn_per_electron(quiet: Expectation, instrument: Instrument) -> Float:
+    """Return the DN of an exposure for a rate of one electron per second, shape (n_pixel,)."""
+    return np.asarray(quiet.exposure_s * quiet.gain_dn_per_electron * instrument.per_pixel("response", 1.0))
+
+
+def flux_per_dn(quiet: Expectation, instrument: Instrument) -> Float:
+    """Return the flux density, erg s-1 cm-2 nm-1, for one DN of the exposure in each pixel, shape (n_pixel,).
+
+    This is the calibration of an observer: counts over the effective area at the wavelength of the pixel.
+    """
+    flam = W_PER_NM_IN_FLAM * instrument.electrons_per_joule_cm2(instrument.wavelength_nm)
+    per_flam = flam * instrument.dispersion_nm_per_pixel * exposure_dn_per_electron(quiet, instrument)
+    # Per nm in place of per Angstrom.
+    return np.divide(10.0, per_flam, out=np.zeros_like(per_flam), where=per_flam > 0)
+
+
+@dataclass(frozen=True, eq=False)
+class IndexValue:
+    """A line index of a star in one exposure."""
+
+    index: Index
+    weights: Float  # shape (n_pixel,); the index, erg s-1 cm-2, for one DN of the exposure in each pixel
+    value: float  # of the mean exposure
+    equivalent_width_nm: float  # positive in emission
+    captured: float  # share of a line's flux that the index holds at Mauve's resolution
+
+    @classmethod
+    def of(cls, index: Index, quiet: Expectation, instrument: Instrument, order: Order) -> Self:
+        """Compute an index; raises InputError if the instrument does not cover its bands."""
+        calibration = flux_per_dn(quiet, instrument)
+        nm = quiet.wavelength_nm
+        # The index is linear in the pixels near it.
+        windows = (index.band_nm, *index.continuum_nm)
+        near = (nm > min(low for low, _ in windows) - 1.0) & (nm < max(high for _, high in windows) + 1.0)
+        find = partial(line_index, nm[near], band_nm=index.band_nm, continuum_nm=index.continuum_nm)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            # Pixels of the band alone have no continuum, and no equivalent width.
+            part = find(np.eye(int(near.sum())))
+        weights = np.zeros(nm.size)
+        weights[near] = part.flux * calibration[near]
+        mean = find((calibration * quiet.signal_dn)[near])
+        lines = index.lines
+        rate = electrons_per_second(instrument, lines.nodes_nm, lines.profile(lines.nodes_nm), order)
+        captured = float(weights @ (rate * exposure_dn_per_electron(quiet, instrument)))
+        return cls(index, weights, float(mean.flux), float(mean.equivalent_width_nm), captured)

@@ -1,0 +1,439 @@
+"""Raw spectra in bulk: drawing, verification and reading."""
+
+from __future__ import annotations
+
+import json
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.host.tables.files import UNFINISHED, check_size, read_bytes, write_whole
+from mauvecl.runs.checkpoint import locked
+from mauvecl.runs.export import Selection, export
+from mauvecl.runs.pool import Pool, map_in_order
+from mauvecl.runs.store import (
+    CRC_BYTES,
+    Chunk,
+    Store,
+    StoredScene,
+    crc,
+    digest,
+    without_later_attributes,
+    without_version,
+)
+from mauvecl.schema.calls import validated
+from mauvecl.schema.columns import Column
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.physical import FirstRealisation, Realisations
+from mauvecl.study.cases import Case
+from mauvecl.study.study import Study
+
+if TYPE_CHECKING:
+    from mauvecl.device.engine import Engine
+
+
+Progress = Callable[[int, int], None]
+
+#: Chunks drawn at once, and threads that write them while the next are drawn.
+CHUNKS_AT_ONCE, WRITERS = 4, 2
+#: Largest number of missing chunks that `verify` lists, since a study can ask for any number.
+MAX_MISSING = 100_000
+
+
+@validated
+def draw(
+    study: Study,
+    scene: StoredScene,
+    engine: Engine | Pool,
+    start: FirstRealisation,
+    count: Realisations,
+    out: NDArray[Any] | None = None,
+) -> NDArray[Any]:
+    """Draw rows of an array without a store.
+
+    Parameters
+    ----------
+    study : Study
+        Study that gives seed, mode, recipe and processes.
+    start, count : int
+        Range of realisations, `start` to `start + count - 1`.
+    out : ndarray, shape (count, *scene.row), optional
+        Array to fill.
+
+    Returns
+    -------
+    ndarray of uint16 or int32, shape (count, n_pixel), or (count, n_frame, n_pixel) if single frames are stored
+        Raw DN.
+    """
+    how = Case(study).draw_options | {"start": start, "count": count, "seed": study.run.seed}
+    if scene.frames is None:
+        return engine.realise(scene.expectation, out=out, **how)
+    rows = np.empty((count, *scene.row), scene.dtype) if out is None else out
+    single = replace(scene.expectation, n_frames=1)
+    for place, frame in enumerate(scene.frames):
+        rows[:, place] = engine.realise(single, first_frame=frame, **how)
+    return rows
+
+
+@validated
+def realise(
+    study: Study,
+    path: str | Path,
+    engine: Engine | Pool,
+    *,
+    resume: bool = True,
+    restart: bool = False,
+    progress: Progress | None = None,
+) -> Store:
+    """Draw a study's spectra into a store, or complete a store.
+
+    Parameters
+    ----------
+    study : Study
+        Its ``run.realisations`` is the number of rows of each array, and its ``bulk`` selects the stored data.
+    path : str or Path
+        A new folder, or an unfinished store of the same study.
+    engine : Engine or Pool
+    resume : bool
+        Whether to complete an unfinished store; otherwise it raises InputError.
+    restart : bool
+        Whether to remove an existing store first, even one of another study.
+    progress : callable, optional
+        Called as ``progress(done, total)`` in spectra. It may raise to stop the work, which keeps written chunks.
+
+    Raises
+    ------
+    InputError
+        If the folder contains other files, is being written by another process, or cannot be written.
+    """
+    store = Store(Path(path), study)
+    store.make_folder()
+    with locked(store.path, "store"):
+        _complete(store, engine, resume, restart, progress)
+    return store
+
+
+@validated
+def realise_file(
+    study: Study,
+    file: str | Path,
+    engine: Engine | Pool,
+    *,
+    resume: bool = True,
+    restart: bool = False,
+    progress: Progress | None = None,
+) -> Store:
+    """Draw a study's spectra into a FITS or HDF5 file; parameters as for `realise`.
+
+    A temporary store next to the file exists until the file is complete. Raises InputError if the file exists, unless
+    `restart` is true.
+    """
+    file = Path(file)
+    if file.exists() and not restart:
+        raise InputError(
+            f"{str(file)!r} is there already", "another place, or `restart=True` to write it anew", key="restart"
+        )
+    store = Store(unfinished(file), study)
+    store.make_folder()
+    with locked(store.path, "store"):
+        _complete(store, engine, resume, restart, progress)
+        export(Selection.of(store), file, replace=restart)
+        store.clear()
+        store.path.rmdir()
+    return store
+
+
+@validated
+def unfinished(file: Path) -> Path:
+    """Return the path of the temporary store of a file."""
+    return file.with_name(f"{UNFINISHED}{file.name}.zarr")
+
+
+def _complete(store: Store, engine: Engine | Pool, resume: bool, restart: bool, progress: Progress | None) -> None:
+    """Draw the missing chunks of a store that this process has locked."""
+    if restart and any(store.path.iterdir()):
+        Store.open(store.path).clear()
+    begun = (store.path / "zarr.json").exists()
+    store.make()
+    todo = [chunk for chunk in store.chunks() if not store.has(chunk)]
+    if begun and not resume and todo:
+        raise InputError(
+            f"store {str(store.path)!r} holds {store.count() - len(todo)} of {store.count()} chunks",
+            "`resume=True` to draw the others, or another place",
+            key="resume",
+        )
+    _fill(store, todo, engine, progress)
+    store.sort_digests()
+
+
+@validated
+def forget(path: str | Path) -> None:
+    """Remove a store.
+
+    Raises InputError, without removing anything, if the folder contains other files or another process is writing it.
+    """
+    path = Path(path)
+    if path.exists():
+        Store.open(path)
+        with locked(path, "store"):
+            Store.open(path).clear()
+            path.rmdir()
+
+
+def _fill(store: Store, todo: list[Chunk], engine: Engine | Pool, progress: Progress | None) -> None:
+    total = store.rows * len(store.scenes)
+    done = total - sum(chunk.stop - chunk.start for chunk in todo)
+    if progress is not None:
+        progress(done, total)
+    waiting: deque[tuple[Chunk, Future[str]]] = deque()
+
+    def collect(left: int) -> None:
+        nonlocal done
+        while len(waiting) > left:
+            chunk, placed = waiting.popleft()
+            store.note(chunk, placed.result())
+            done += chunk.stop - chunk.start
+            if progress is not None:
+                progress(done, total)
+
+    with ThreadPoolExecutor(WRITERS) as writers:
+        try:
+            for block, rows in _drawn(store.study, todo, engine):
+                # The buffer of the previous block is free once all its chunks are written.
+                collect(0)
+                for chunk in block:
+                    part = rows[chunk.start - block[0].start : chunk.stop - block[0].start]
+                    waiting.append((chunk, writers.submit(store.place, chunk, part)))
+            collect(0)
+        except BaseException:
+            # Chunks that are being written are completed and listed; the rest is left for a resume.
+            for _, placed in waiting:
+                placed.cancel()
+            writers.shutdown()
+            for chunk, placed in waiting:
+                if not placed.cancelled() and placed.exception() is None:
+                    store.note(chunk, placed.result())
+            raise
+
+
+def _drawn(study: Study, todo: Sequence[Chunk], engine: Engine | Pool) -> Iterator[tuple[list[Chunk], NDArray[Any]]]:
+    """Yield blocks of neighbouring chunks and their rows, in order."""
+    if isinstance(engine, Pool) and engine.workers.count > 1:
+        # A single chunk per request limits the size of transfers.
+        def rows_of(block: list[Chunk]) -> NDArray[Any]:
+            return draw(study, block[0].scene, engine, block[0].start, block[0].stop - block[0].start)
+
+        blocks = list(_blocks(todo, 1))
+        yield from zip(blocks, map_in_order(engine, rows_of, blocks), strict=True)
+        return
+    # Two alternating buffers, one being drawn while the other is written, keep the memory constant.
+    buffers: list[NDArray[Any]] = [np.empty(0)] * 2
+    for number, block in enumerate(_blocks(todo, CHUNKS_AT_ONCE)):
+        scene, count = block[0].scene, block[-1].stop - block[0].start
+        there = buffers[number % 2]
+        if there.shape[1:] != scene.row or there.dtype != scene.dtype or len(there) < count:
+            there = buffers[number % 2] = np.empty((count, *scene.row), scene.dtype)
+        yield block, draw(study, scene, engine, block[0].start, count, there[:count])
+
+
+def _blocks(chunks: Sequence[Chunk], max_chunks: int) -> Iterator[list[Chunk]]:
+    """Yield blocks of at most `max_chunks` neighbouring chunks of one scene."""
+    block: list[Chunk] = []
+    for chunk in chunks:
+        if block and (len(block) == max_chunks or chunk.scene is not block[0].scene or chunk.start != block[-1].stop):
+            yield block
+            block = []
+        block.append(chunk)
+    if block:
+        yield block
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A faulty file of a store.
+
+    Attributes
+    ----------
+    key : str
+        Path in the store.
+    state : str
+        ``missing``; ``damaged``: wrong CRC or unreadable text; ``foreign``: intact, but not what was written;
+        ``unlisted``: intact, but not in the list of digests; ``differs``: not what the engine draws; or ``not of this
+        store``.
+    mended : bool
+        Whether the file was repaired.
+    """
+
+    key: str
+    state: str
+    mended: bool
+
+
+#: Columns of the table of faults.
+FAULT_COLUMNS = (
+    Column("key", heading="file"),
+    Column("state", heading="what"),
+    Column("mended", heading="repaired", format=lambda mended: "repaired" if mended else ""),
+)
+
+
+@validated
+def state(store: Store, chunk: Chunk) -> str:
+    """Return ``good``, or the fault of a chunk's file; see `Fault`."""
+    place, size = store.path / chunk.key, store.chunk_bytes(chunk)
+    if not place.exists():
+        return "missing"
+    try:
+        data = read_bytes(place, "chunk") if check_size(place, "chunk") == size else b""
+    except InputError:
+        # Too large, or no regular file.
+        return "damaged"
+    if len(data) != size or crc(data[:-CRC_BYTES]) != data[-CRC_BYTES:]:
+        return "damaged"
+    known = store.digests.get(chunk.key)
+    if known is None:
+        return "unlisted"
+    return "good" if digest(data) == known else "foreign"
+
+
+@validated
+def verify(
+    path: str | Path,
+    engine: Engine | Pool | None = None,
+    *,
+    repair: bool = False,
+    redraw: bool = False,
+    rows: tuple[int, int] | None = None,
+    progress: Progress | None = None,
+) -> list[Fault]:
+    """Check every file of a store, and optionally repair it.
+
+    Parameters
+    ----------
+    path : str or Path
+    engine : Engine or Pool, optional
+        Required to repair or redraw.
+    repair : bool
+        Whether to write faulty files again.
+    redraw : bool
+        Whether to compare every spectrum with what the engine draws, not only with its digest.
+    rows : (int, int), optional
+        Half-open range of realisations to which the check of chunks is restricted.
+    progress : callable, optional
+        Called as ``progress(done, total)`` in chunks.
+
+    Returns
+    -------
+    list of Fault
+        Empty for an intact store.
+
+    Raises
+    ------
+    InputError
+        If the folder is not a store, is being written, or cannot be written for a repair; if copies of its study
+        contradict each other, or the study does not draw what was written; or if more than `MAX_MISSING` chunks are
+        missing.
+    """
+    if engine is None and (repair or redraw):
+        raise InputError("repairing and redrawing need an engine, but none is given", key="engine")
+    Store.open(path)
+    with locked(Path(path), "store"):
+        store = Store.open(path)
+        first, last = rows or (0, store.rows)
+        if not 0 <= first < last <= store.rows:
+            raise InputError.of("rows", (first, last), f"a range within 0:{store.rows}")
+        files = list(store.files())
+        total, there = store.count(first, last), sum(store.owns(key) for key, _ in files)
+        if total - there > MAX_MISSING:
+            raise InputError(
+                f"store {str(store.path)!r} holds {there} chunks of the {total} of its study",
+                f"at most {MAX_MISSING} missing: choose `rows`, or `mauvecl realise --resume` draws them",
+                key="rows",
+            )
+        faults = list(_faults_of_description(store, repair))
+        for number, chunk in enumerate(store.chunks(first, last)):
+            fault = _fault(store, chunk, engine, repair, redraw)
+            if fault is not None:
+                faults.append(fault)
+            if progress is not None:
+                progress(number + 1, total)
+        if repair:
+            store.sort_digests()
+        faults += [Fault(key, "not of this store", False) for key, own in files if not own]
+    return faults
+
+
+def _fault(store: Store, chunk: Chunk, engine: Engine | Pool | None, repair: bool, redraw: bool) -> Fault | None:
+    seen = state(store, chunk)
+    if seen == "good" and not redraw:
+        return None
+    if seen != "good" and not repair:
+        return Fault(chunk.key, seen, False)
+    assert engine is not None
+    rows = draw(store.study, chunk.scene, engine, chunk.start, chunk.stop - chunk.start)
+    drawn = digest(*store.encode(chunk, rows))
+    if store.digests.get(chunk.key, drawn) != drawn and not redraw:
+        raise InputError(
+            f"{chunk.key} of {store.path.name} was written with the digest {store.digests[chunk.key]} and "
+            f"is now drawn with {drawn}",
+            "the same: its study or its list is wrong; `redraw=True` with `repair=True` trusts the study",
+            key="redraw",
+        )
+    if seen == "good":
+        if drawn == store.digests[chunk.key]:
+            return None
+        seen = "differs"
+    if repair:
+        if seen != "unlisted" or digest((store.path / chunk.key).read_bytes()) != drawn:
+            store.place(chunk, rows)
+        store.note(chunk, drawn)
+    return Fault(chunk.key, seen, repair)
+
+
+def _faults_of_description(store: Store, repair: bool) -> Iterator[Fault]:
+    """Compare groups, descriptions of arrays and calibration with those of the study."""
+    for name, content in sorted(store.description().items()):
+        there = store.path / name
+        try:
+            data = read_bytes(there, "description")
+            if name.endswith("zarr.json"):
+                found, made = (without_version(json.loads(one)) for one in (data, content))
+                same, seen = found in (made, without_later_attributes(made)), "foreign"
+            else:
+                same, seen = data == content, "damaged"
+        except (ValueError, TypeError, AttributeError, RecursionError):
+            same, seen = False, "damaged" if there.exists() else "missing"
+        if not same:
+            if repair:
+                write_whole(there, content)
+            yield Fault(name, seen, repair)
+
+
+@validated
+def read(path: str | Path, scene: str = "star-1/quiescent") -> Any:
+    """Open an array of spectra, which is read from disk on access.
+
+    Parameters
+    ----------
+    path : str or Path
+    scene : str
+        Path of the array, such as ``"star-1/flare-2"``.
+
+    Returns
+    -------
+    xarray.DataArray, dimensions (realisation, pixel) or (realisation, frame, pixel)
+        Raw DN, with the wavelengths, nm, as a coordinate. ``.values`` is a NumPy array, also of a slice.
+    """
+    import xarray
+
+    store = Store.open(path)
+    there = store.scene(scene)
+    group = xarray.open_zarr(store.path, group=there.group, chunks=None, consolidated=False)
+    data = group[there.name].assign_coords(wavelength=group["wavelength_nm"])
+    return data if there.frames is None else data.assign_coords(frame=group["frame"])

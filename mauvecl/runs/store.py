@@ -1,0 +1,510 @@
+"""Stores of raw spectra: Zarr v3 hierarchies, with their scenes, chunks and digests.
+
+A group per star holds an array per scene (``quiescent``, ``flare-1``, ...) with one row per realisation, and the
+calibration of its pixels. Each chunk ends with a CRC, which every Zarr reader checks. A list of digests next to each
+array distinguishes its chunks from foreign ones. Chunks are written atomically.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.host.tables.files import UNFINISHED, read_bytes, toml, write_whole, writing
+from mauvecl.host.version import VERSION
+from mauvecl.runs.checkpoint import differing_keys
+from mauvecl.schema.columns import Column, percent
+from mauvecl.schema.errors import InputError
+from mauvecl.study.cases import cases, full_label
+from mauvecl.study.cases import collect_messages as messages_of
+from mauvecl.study.study import Study
+
+if TYPE_CHECKING:
+    from mauvecl.host.exposure.expectation import Expectation
+    from mauvecl.study.cases import Case
+
+#: Units of the calibration per pixel and frame, which each star's group contains.
+CALIBRATION = {
+    "wavelength_nm": "nm",
+    "bias_dn": "DN",
+    "dark_dn": "DN",
+    "read_noise_dn": "DN",
+    "gain_dn_per_electron": "DN / electron",
+}
+COMMON_DRAWS = (
+    "row i of every array is drawn with the same random numbers, so that a flare is the only difference between two "
+    "arrays; rows of different number are independent"
+)
+NOMINAL = "the throughput is nominal, not a flight calibration"
+
+#: Attributes of a star that stores of earlier versions do not have.
+LATER_ATTRIBUTES = ("instrument", "saturation_dn", "dark_unit", "temperature_c")
+
+
+def without_later_attributes(described: dict[str, Any]) -> dict[str, Any]:
+    """Return the description of a group as earlier versions wrote it."""
+    attributes = described.get("attributes", {})
+    return described | {"attributes": {k: v for k, v in attributes.items() if k not in LATER_ATTRIBUTES}}
+
+
+def without_version(described: dict[str, Any]) -> dict[str, Any]:
+    """Return the description of a group without the version that wrote it, which may be any."""
+    attributes = described.get("attributes", {})
+    return described | {"attributes": {k: v for k, v in attributes.items() if k != "mauvecl"}}
+
+
+def describe(study: Study, scenes: Sequence[StoredScene], folder: Path) -> None:
+    """Write groups, descriptions of arrays and calibration of a store to a folder."""
+    import zarr
+    from zarr.codecs import Crc32cCodec
+
+    text, rows = study.toml(), study.run.realisations
+    with warnings.catch_warnings():
+        # Zarr warns of an empty folder.
+        warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)
+        root = zarr.open_group(folder, mode="w", zarr_format=3)
+        run: dict[str, Any] = signed(text) | {"seed": study.run.seed, "realisations": rows}
+        root.attrs.update(run | {"mauvecl": VERSION, "draws": COMMON_DRAWS, "throughput": NOMINAL})
+        for scene in scenes:
+            x, group = scene.expectation, root.require_group(scene.group)
+            if scene.name == "quiescent":
+                group.attrs.update({"star": scene.star, **scene.at})
+                group.attrs.update(exposure_attributes(x) | {"messages": messages_of([x])})
+                for name, unit in CALIBRATION.items():
+                    _values(group, name, np.asarray(getattr(x, name)), unit, ["pixel"])
+                if scene.frames is not None:
+                    _values(group, "frame", np.array(scene.frames), "", ["frame"])
+            if study.bulk.components:
+                n = x.n_frames if scene.frames is None else 1
+                gain = n * x.gain_dn_per_electron
+                for name, values in (
+                    ("source", gain * x.source_electrons),
+                    ("sky", gain * x.sky_electrons),
+                    *([("neighbours", gain * x.neighbour_electrons)] if x.neighbour_electrons.any() else []),
+                    ("noise", np.sqrt(x.variance_dn2 * n / x.n_frames)),
+                ):
+                    _values(group, f"{scene.name}-{name}", values, "DN", ["pixel"])
+            dimensions = ["realisation", *(["frame"] if scene.frames is not None else []), "pixel"]
+            array = group.create_array(
+                scene.name,
+                shape=(rows, *scene.row),
+                chunks=(scene.chunk_rows(rows), *scene.row),
+                dtype=scene.dtype,
+                compressors=[Crc32cCodec()],
+                fill_value=0,
+                dimension_names=dimensions,
+            )
+            origin: dict[str, Any] = {"star": scene.star, "provenance": dict(x.provenance)} | signed(text)
+            array.attrs.update(origin | {"units": "DN", "amplitude": scene.amplitude})
+
+
+def exposure_attributes(x: Expectation) -> dict[str, float | str]:
+    """Return the attributes that describe the exposure in every row of an array."""
+    known: dict[str, float | str] = {"exposure_s": x.exposure_s, "frames": x.n_frames, "instrument": x.instrument}
+    known |= {"saturation_dn": float(x.saturation_dn), "dark_unit": x.dark_unit}
+    return known | ({"temperature_c": x.conditions["temperature_c"]} if "temperature_c" in x.conditions else {})
+
+
+def _values(group: Any, name: str, values: NDArray[Any], unit: str, dimensions: list[str]) -> None:
+    from zarr.codecs import Crc32cCodec
+
+    array = group.create_array(
+        name, data=values, chunks=values.shape, compressors=[Crc32cCodec()], dimension_names=dimensions
+    )
+    array.attrs["units"] = unit
+
+
+def signed(study: str) -> dict[str, str]:
+    """Return a study's text and its digest, of which a store has several copies."""
+    return {"study": study, "study_sha256": hashlib.sha256(study.encode()).hexdigest()}
+
+
+def study_in(place: Path) -> str | None:
+    """Return the study's text in a description if its digest is correct, else None."""
+    try:
+        kept = json.loads(read_bytes(place, "description"))["attributes"]
+        text = kept["study"]
+        return text if signed(text).items() <= kept.items() else None
+    except (InputError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        return None
+
+
+#: Approximate size of a chunk, bytes.
+CHUNK_BYTES = 16 * 2**20
+
+
+@dataclass(frozen=True, eq=False)
+class StoredScene:
+    """An array of a store: a star with or without a flare."""
+
+    group: str
+    name: str
+    star: str
+    amplitude: float
+    expectation: Expectation
+    frames: tuple[int, ...] | None
+    at: Mapping[str, float | str]
+
+    @property
+    def path(self) -> str:
+        """Path in the store."""
+        return f"{self.group}/{self.name}"
+
+    @property
+    def row(self) -> tuple[int, ...]:
+        """Shape of one realisation: pixels, or frames and pixels."""
+        n_pixel = self.expectation.wavelength_nm.size
+        return (n_pixel,) if self.frames is None else (len(self.frames), n_pixel)
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of a value: 16 bits for single frames of a 16-bit ADC, 32 bits for sums."""
+        x = self.expectation
+        single = self.frames is not None or x.n_frames == 1
+        return np.dtype("<u2" if single and x.adc_max_dn < 2**16 else "<i4")
+
+    @property
+    def row_bytes(self) -> int:
+        """Size of a realisation, bytes."""
+        return int(np.prod(self.row)) * self.dtype.itemsize
+
+    def chunk_rows(self, realisations: int) -> int:
+        """Return the number of realisations per chunk."""
+        return max(min(CHUNK_BYTES // self.row_bytes, realisations), 1)
+
+
+#: Columns of the table of arrays.
+ARRAY_COLUMNS = (
+    Column("array", heading="array"),
+    Column("star", heading="star"),
+    Column("amplitude", heading="flare", format=percent("g")),
+    Column("shape", heading="shape", format=lambda shape: " x ".join(map(str, shape))),
+    Column("type", heading="type"),
+)
+
+
+def scenes(cases: Sequence[Case]) -> list[StoredScene]:
+    """Return the arrays of the cases of a store: every star and sweep value, without and with each flare."""
+    stored = []
+    for number, case in enumerate(cases, 1):
+        chosen = case.study.bulk.chosen(case.quiet.n_frames)
+        # The amplitude is an attribute of the flare's array.
+        swept = {name: value for name, value in case.at.items() if name != "amplitude"}
+        name = full_label(case.label, swept)
+        stored.append(StoredScene(f"star-{number}", "quiescent", name, 0.0, case.quiet, chosen, swept))
+        for k, (amplitude, x) in enumerate(zip(case.amplitudes, case.flares, strict=True), 1):
+            stored.append(StoredScene(f"star-{number}", f"flare-{k}", name, amplitude, x, chosen, swept))
+    return stored
+
+
+DIGESTS = "digests.txt"
+CRC_BYTES = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Chunk:
+    """A chunk of a scene: rows `start` to `stop - 1` of its array."""
+
+    scene: StoredScene
+    number: int
+    start: int
+    stop: int
+
+    @property
+    def name(self) -> str:
+        """Path of the file in the array's folder."""
+        return "/".join(["c", str(self.number), *["0"] * len(self.scene.row)])
+
+    @property
+    def key(self) -> str:
+        """Path of the file in the store."""
+        return f"{self.scene.path}/{self.name}"
+
+
+@dataclass(eq=False)
+class Store:
+    """A store and its study, whose ``run.realisations`` is the number of rows of each array."""
+
+    path: Path
+    study: Study
+    digests: dict[str, str] = field(default_factory=dict)  # of written chunks, by path
+
+    def __post_init__(self) -> None:
+        missing = [name for name in ("zarr", "xxhash", "google_crc32c") if find_spec(name) is None]
+        if missing:
+            raise InputError(
+                f"{missing[0]} is missing", "the packages for stores: pip install 'mauvecl[bulk]'", key=missing[0]
+            )
+
+    @classmethod
+    def open(cls, path: str | Path) -> Store:
+        """Open an existing store.
+
+        Raises InputError if the folder is not a store, no copy of its study is intact, or intact copies contradict each
+        other.
+        """
+        path = Path(path)
+        copies: dict[str, Path] = {}
+        for place in (path / "zarr.json", *sorted(path.glob("*/*/zarr.json"))):
+            text = study_in(place)
+            if text is not None:
+                copies.setdefault(text, place.relative_to(path))
+        if not copies:
+            raise InputError(
+                f"{str(path)!r} is not a store of spectra",
+                "a folder that `mauvecl realise` wrote, with an intact copy of its study",
+                key="store",
+            )
+        (text, first), *others = copies.items()
+        if others:
+            other, second = others[0]
+            keys = ", ".join(differing_keys(toml(text, path.name), toml(other, path.name)))
+            raise InputError(
+                f"store {str(path)!r} holds two studies, {str(first)!r} and {str(second)!r} differ in {keys}",
+                "one study: restore the file of the correct one",
+                key="store",
+            )
+        store = cls(path, Study.build(toml(text, path.name), path.name))
+        store.read_digests()
+        return store
+
+    @cached_property
+    def scenes(self) -> list[StoredScene]:
+        """Arrays of spectra."""
+        return scenes(cases(self.study))
+
+    def scene(self, path: str) -> StoredScene:
+        """Return an array by path, such as ``star-1/flare-2``."""
+        known = next((scene for scene in self.scenes if scene.path == path), None)
+        if known is None:
+            raise InputError.of("scenes", path, f"one of {', '.join(s.path for s in self.scenes)}")
+        return known
+
+    @property
+    def rows(self) -> int:
+        """Number of realisations of each array."""
+        return self.study.run.realisations
+
+    @property
+    def n_bytes(self) -> int:
+        """Size of all spectra, bytes."""
+        return sum(self.rows * scene.row_bytes for scene in self.scenes)
+
+    def chunks(self, first: int = 0, stop: int | None = None) -> Iterator[Chunk]:
+        """Yield the chunks of all scenes that contain rows `first` to `stop - 1`; all chunks by default."""
+        for scene in self.scenes:
+            rows = scene.chunk_rows(self.rows)
+            for number in self._numbers(scene, first, stop):
+                yield Chunk(scene, number, number * rows, min((number + 1) * rows, self.rows))
+
+    def count(self, first: int = 0, stop: int | None = None) -> int:
+        """Return the number of chunks that `chunks` yields, without iterating."""
+        return sum(len(self._numbers(scene, first, stop)) for scene in self.scenes)
+
+    def _numbers(self, scene: StoredScene, first: int = 0, stop: int | None = None) -> range:
+        rows = scene.chunk_rows(self.rows)
+        return range(first // rows, -(-(self.rows if stop is None else stop) // rows))
+
+    def make(self) -> None:
+        """Write the description of the arrays, or check that an existing one is the same.
+
+        Raises InputError if the store exists and is another study's (the message lists keys that differ), or cannot be
+        written.
+        """
+        root = self.path / "zarr.json"
+        if root.exists():
+            self._check_same()
+            self.read_digests()
+            return
+        self.make_folder()
+        ours = {scene.group for scene in self.scenes}
+        other = [p.name for p in self.path.iterdir() if p.name not in ours and not p.name.startswith(UNFINISHED)]
+        if other:
+            raise InputError(
+                f"{str(self.path)!r} holds {min(other)!r} and no store", "an empty or a new folder", key="store"
+            )
+        # The root comes last, so that its presence means that the description is complete.
+        made = self.description()
+        for name in sorted(made, key=lambda name: name == root.name):
+            write_whole(self.path / name, made[name])
+
+    def make_folder(self) -> None:
+        """Make the folder if needed; raises InputError if its file system is smaller than the spectra."""
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            room = shutil.disk_usage(self.path).total
+        except OSError as error:
+            raise InputError(
+                f"store {str(self.path)!r} cannot be made ({error.strerror})", "a writable folder", key="store"
+            ) from error
+        if self.n_bytes > room:
+            raise InputError(
+                f"spectra of {self.n_bytes / 2**30:.4g} GiB for {str(self.path)!r}",
+                f"less than its disk's {room / 2**30:.4g} GiB",
+                key="run.realisations",
+            )
+
+    def description(self) -> dict[str, bytes]:
+        """Return the content of every file except spectra, by path."""
+        with tempfile.TemporaryDirectory() as folder:
+            describe(self.study, self.scenes, Path(folder))
+            files = [p for p in Path(folder).rglob("*") if p.is_file()]
+            return {str(p.relative_to(folder)): p.read_bytes() for p in files}
+
+    def _check_same(self) -> None:
+        there = Store.open(self.path).study
+        differing = differing_keys(self.study.model_dump(mode="json"), there.model_dump(mode="json"))
+        if differing:
+            raise InputError(
+                f"store {str(self.path)!r} was started by another study, which differs in {', '.join(differing)}",
+                "the same study or another place",
+                key="store",
+            )
+
+    def read_digests(self) -> None:
+        """Read the digests of written chunks; incomplete lines are ignored."""
+        self.digests = {}
+        for scene in self.scenes:
+            try:
+                text = read_bytes(self.path / scene.path / DIGESTS, "list of digests").decode(errors="replace")
+            except InputError:
+                continue
+            for line in text.splitlines():
+                name, _, rest = line.partition(" ")
+                written, _, check = rest.partition(" ")
+                if check == _check(name, written):
+                    self.digests[f"{scene.path}/{name}"] = written
+
+    def note(self, chunk: Chunk, digest_text: str) -> None:
+        """Add a chunk's digest to its array's list."""
+        self.digests[chunk.key] = digest_text
+        line = _line(chunk.name, digest_text)
+        what = f"{chunk.scene.path}/{DIGESTS} of {self.path.name}"
+        # A single short write at the end. A line that a full disk cut short is terminated first.
+        with (
+            writing(what, self.path, "a writable disk with room; what was written before is kept", key="store"),
+            (self.path / chunk.scene.path / DIGESTS).open("a+b", buffering=0) as file,
+        ):
+            file.seek(0, 2)
+            if file.tell():
+                file.seek(-1, 2)
+                line = line if file.read(1) == b"\n" else "\n" + line
+            file.write(line.encode())
+
+    def sort_digests(self) -> None:
+        """Write the lists of digests in the order of their chunks, which may have been written in another."""
+        for scene in self.scenes:
+            place = self.path / scene.path / DIGESTS
+            keys = sorted(
+                (key for key in self.digests if key.startswith(f"{scene.path}/c/")),
+                key=lambda key: int(key.removeprefix(f"{scene.path}/c/").partition("/")[0]),
+            )
+            names = [(key.removeprefix(f"{scene.path}/"), self.digests[key]) for key in keys]
+            text = "".join(_line(name, digest_text) for name, digest_text in names).encode()
+            if names and place.read_bytes() != text:
+                write_whole(place, text)
+
+    def encode(self, chunk: Chunk, rows: NDArray[Any]) -> tuple[memoryview, bytes]:
+        """Encode a chunk by Zarr's codecs `bytes` and `crc32c`, padding the last chunk with zeros."""
+        full = chunk.scene.chunk_rows(self.rows)
+        if len(rows) < full:
+            rows = np.concatenate([rows, np.zeros((full - len(rows), *chunk.scene.row), rows.dtype)])
+        whole = np.ascontiguousarray(rows, chunk.scene.dtype)
+        return memoryview(whole.data).cast("B"), crc(whole)
+
+    def place(self, chunk: Chunk, rows: NDArray[Any]) -> str:
+        """Write a chunk atomically and return its digest."""
+        data, check = self.encode(chunk, rows)
+        write_whole(self.path / chunk.key, data, check)
+        return digest(data, check)
+
+    def has(self, chunk: Chunk) -> bool:
+        """Return whether a chunk was written, by digest list and file size; `bulk.state` checks its content."""
+        try:
+            size = (self.path / chunk.key).stat().st_size
+        except OSError:
+            return False
+        return chunk.key in self.digests and size == self.chunk_bytes(chunk)
+
+    def owns(self, key: str) -> bool:
+        """Return whether a path in the store is that of a chunk."""
+        scene = next((scene for scene in self.scenes if key.startswith(f"{scene.path}/c/")), None)
+        number = key.removeprefix(f"{scene.path}/c/").partition("/")[0] if scene else ""
+        # Twenty digits suffice for any chunk; int() of a very long name would be slow.
+        if scene is None or not (number.isascii() and number.isdigit() and len(number) <= 20):
+            return False
+        return int(number) in self._numbers(scene) and key == Chunk(scene, int(number), 0, 0).key
+
+    def files(self) -> Iterator[tuple[str, bool]]:
+        """Yield every file and link in the folder, and whether it belongs to this store."""
+        described = self.description()
+        lists = {f"{scene.path}/{DIGESTS}" for scene in self.scenes}
+        for folder, folders, names in os.walk(self.path):
+            here = Path(folder).relative_to(self.path)
+            linked = [name for name in folders if (Path(folder) / name).is_symlink()]
+            for name in sorted([*names, *linked]):
+                whole = str(here / name.removeprefix(UNFINISHED))
+                yield str(here / name), whole in described or whole in lists or self.owns(whole)
+
+    def clear(self) -> None:
+        """Remove all files but not the folder; the study is last, so that an interrupted removal leaves a store.
+
+        Raises InputError, without removing anything, if the folder contains other files.
+        """
+        files = list(self.files())
+        other = [key for key, own in files if not own]
+        if other:
+            raise InputError(
+                f"store {str(self.path)!r} holds {other[0]!r}, which does not belong to it",
+                "no other files in a store that is removed",
+                key="store",
+            )
+        for key, _ in sorted(files, key=lambda entry: entry[0] == "zarr.json"):
+            (self.path / key).unlink(missing_ok=True)
+        for folder, _, _ in os.walk(self.path, topdown=False):
+            if folder != str(self.path):
+                Path(folder).rmdir()
+        self.digests = {}
+
+    def chunk_bytes(self, chunk: Chunk) -> int:
+        """Return the size of a chunk's file, bytes: rows and CRC."""
+        return chunk.scene.chunk_rows(self.rows) * chunk.scene.row_bytes + CRC_BYTES
+
+
+def crc(data: bytes | NDArray[Any]) -> bytes:
+    """Return the CRC-32C in the format of Zarr's codec."""
+    import google_crc32c
+
+    return int(google_crc32c.value(data)).to_bytes(CRC_BYTES, "little")
+
+
+def digest(*parts: bytes | memoryview) -> str:
+    """Return the 128-bit XXH3 hash of concatenated parts."""
+    import xxhash
+
+    hashed = xxhash.xxh3_128()
+    for part in parts:
+        hashed.update(part)
+    return hashed.hexdigest()
+
+
+def _line(name: str, digest_text: str) -> str:
+    """Return the line of a chunk in a list of digests."""
+    return f"{name} {digest_text} {_check(name, digest_text)}\n"
+
+
+def _check(*words: str) -> str:
+    return digest(" ".join(words).encode())[:8]

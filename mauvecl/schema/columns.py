@@ -1,0 +1,190 @@
+"""Columns of tables, their views and JSON, and notes on tables that are shown in part."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import islice
+from operator import attrgetter, itemgetter
+from typing import TYPE_CHECKING, Any, TypeVar
+
+if TYPE_CHECKING:
+    from astropy.table import QTable, Table
+
+#: Heading of an interval, which stays next to the column before it.
+INTERVAL = "95 % interval"
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table."""
+
+    name: str  # name in files and JSON; empty for a column that only people read
+    # Attribute or key of a row that holds the value, or a function of the row; the column's name if empty. Arrays are
+    # broadcast together, and each of their elements then has a row of the table. None is a missing value.
+    get: str | Callable[[Any], Any] = ""
+    unit: str = ""
+    description: str = ""
+    heading: str = ""  # heading for people; without one, only files and JSON have the column
+    format: str | Callable[..., str] = ""  # format specification of a value, or a function that returns its text
+    others: tuple[str, ...] = ()  # further columns whose values `format` takes after the column's own
+    # Type of the values, where it does not follow from them: in a table without rows, or with missing values.
+    kind: type | None = None
+
+    def value(self, row: object) -> Any:
+        """Return the value or values of a row."""
+        if callable(self.get):
+            return self.get(row)
+        key = self.get or self.name
+        return row[key] if isinstance(row, Mapping) else attrgetter(key)(row)
+
+    def of(self, part: Callable[[Any], Any]) -> Column:
+        """Return the column for rows of which only a part has its value."""
+        return replace(self, get=lambda row: self.value(part(row)))
+
+    def text(self, record: Mapping[str, Any]) -> str:
+        """Return a cell as people read it, from the values of its row by column."""
+        values = [record[name] for name in (self.name, *self.others) if name]
+        return self.format(*values) if callable(self.format) else formatted(values[0], self.format)
+
+
+@dataclass(frozen=True)
+class View:
+    """A table as people read it: a title and some of its columns. Without a table, the title is a sentence.
+
+    The table may also be a list of records: values by the columns' names.
+    """
+
+    title: str
+    columns: Sequence[Column] = ()
+    table: Table | Sequence[Mapping[str, Any]] | None = None
+
+    def texts(self, hidden: Collection[str] = ()) -> tuple[list[str], list[list[str]]]:
+        """Return headings and cells, without `hidden` columns."""
+        shown = [one for one in self.columns if one.heading and one.name not in hidden]
+        table = [] if self.table is None else self.table
+        found = table if isinstance(table, Sequence) else records(table)
+        return [one.heading for one in shown], [[one.text(record) for one in shown] for record in found]
+
+
+def without_empty(headings: Sequence[str], cells: Sequence[Sequence[str]]) -> tuple[list[str], list[list[str]]]:
+    """Return headings and cells without columns whose cells are all empty."""
+    filled = [k for k in range(len(headings)) if not cells or any(row[k] for row in cells)]
+    return [headings[k] for k in filled], [[row[k] for k in filled] for row in cells]
+
+
+def table_of(columns: Iterable[Column], rows: Iterable[object], **meta: object) -> QTable:
+    """Return the table of rows for files and JSON, with units and descriptions."""
+    import astropy.units as u
+    import numpy as np
+    from astropy.table import QTable
+
+    table, unit_of = QTable(), cache(u.Unit)
+    named = [one for one in columns if one.name]
+    parts = [np.broadcast_arrays(*(np.atleast_1d(one.value(row)) for one in named)) for row in rows]
+    for k, column in enumerate(named):
+        values = np.concatenate([part[k].ravel() for part in parts] or [np.array([], column.kind or float)])
+        if values.dtype == object:
+            missing = np.array([value is None for value in values])
+            values = np.ma.MaskedArray(np.where(missing, 0, values).astype(column.kind or float), missing)
+        elif column.kind is not None:
+            values = values.astype(column.kind)
+        table[column.name] = values * unit_of(column.unit) if column.unit else values
+        table[column.name].info.description = column.description or None
+    table.meta |= meta
+    return table
+
+
+def stacked(first: Sequence[Column], parts: Iterable[tuple[object, Table]], **meta: object) -> QTable:
+    """Return tables as one, each after the `first` columns of its row; keep metadata that all share, and add `meta`.
+
+    Columns that a table lacks are masked.
+    """
+    every = list(parts)
+    tables = [table for _, table in every]
+    shared = {k: v for k, v in tables[0].meta.items() if all(k in t.meta and t.meta[k] == v for t in tables)}
+
+    def values(part: tuple[object, Table], name: str) -> Any:
+        return getattr(part[1][name], "value", part[1][name]) if name in part[1].colnames else None
+
+    def taken(name: str) -> Column:
+        having = [table[name] for table in tables if name in table.colnames]
+        (unit, *others) = dict.fromkeys(str(one.unit or "") for one in having)
+        if others:
+            raise ValueError(f"column {name} has several units")
+        kind = None if len(having) == len(tables) else having[0].dtype.type
+        text = having[0].info.description or ""
+        return Column(name, lambda part: values(part, name), unit, text, kind=kind)
+
+    names = dict.fromkeys(name for table in tables for name in table.colnames)
+    return table_of([*(one.of(itemgetter(0)) for one in first), *map(taken, names)], every, **shared | meta)
+
+
+def records(table: Table) -> list[dict[str, Any]]:
+    """Return the rows of a table as plain values by column, None where a value is missing."""
+    columns = [getattr(table[name], "value", table[name]).tolist() for name in table.colnames]
+    return [dict(zip(table.colnames, values, strict=True)) for values in zip(*columns, strict=True)]
+
+
+def formatted(value: Any, spec: str) -> str:
+    """Format a value; numbers below a million that `spec` writes with a power of ten, as 1e+04, are written out."""
+    text = format(value, spec)
+    return f"{float(text):.0f}" if spec.endswith("g") and re.search(r"e\+0[0-5]$", text) else text
+
+
+def number(spec: str, undefined: str = "") -> Callable[[float], str]:
+    """Return a function that formats a number, and returns `undefined` for NaN."""
+    return lambda value: formatted(value, spec) if value == value else undefined
+
+
+def percent(spec: str) -> Callable[[float], str]:
+    """Return a function that formats a fraction as a percentage; empty for NaN."""
+    return lambda value: f"{100 * value:{spec}} %" if value == value else ""
+
+
+def interval(spec: str, factor: float = 1.0) -> Callable[[float, float], str]:
+    """Return a function that formats the ends of an interval, times a factor; empty for NaN."""
+    return lambda low, high: (
+        f"[{formatted(factor * low, spec)}, {formatted(factor * high, spec)}]" if low == low else ""
+    )
+
+
+def short(value: float | str) -> str:
+    """Format a number or a name without its unit."""
+    return value if isinstance(value, str) else f"{value:g}"
+
+
+T = TypeVar("T")
+
+
+class First(list[T]):
+    """The first items of a list, and a note on their number.
+
+    Parameters
+    ----------
+    most : int
+        Largest number of items.
+    name : str
+        Plural noun for the items.
+
+    Attributes
+    ----------
+    note : str
+        As in "6 of 9 stars shown"; empty if all are kept.
+    """
+
+    def __init__(self, things: Collection[T], most: int, name: str) -> None:
+        super().__init__(islice(things, most))
+        self.note = part_note(len(self), len(things), name)
+
+
+def part_note(shown: int, total: int, name: str) -> str:
+    """Return the note on a part of a list, as in "6 of 9 stars shown", or nothing for all of it."""
+    return f"{shown} of {total} {name} shown" if shown < total else ""
+
+
+def note_of(things: Iterable[object]) -> str:
+    """Return the note of items that are a part of a list, or nothing."""
+    return things.note if isinstance(things, First) else ""

@@ -1,1 +1,0 @@
-"""Stores of raw spectra: layout, writing, verification and export."""

@@ -1,0 +1,422 @@
+"""Study sections for orbit, visibility limits, targets and their flare rates, and campaign plans."""
+
+from __future__ import annotations
+
+import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+
+from pydantic import ValidationError, field_validator, model_validator
+
+from mauvecl.host.orbit.observing_limits import Limits
+from mauvecl.host.tables.names import (
+    DECLINATIONS,
+    RIGHT_ASCENSIONS,
+    SEXAGESIMAL,
+    SPECTRAL_TYPES,
+    STARS,
+    is_missing_position,
+    key_of,
+)
+from mauvecl.schema.errors import InputError, shortened, shown
+from mauvecl.schema.fields import Flag, Help, Range, Slider, Unit, Widget, first
+from mauvecl.schema.physical import (
+    Distance,
+    Duration,
+    DurationExponent,
+    DurationScatter,
+    Energy,
+    Magnitude,
+    RateExponent,
+    Share,
+)
+from mauvecl.schema.section import Section, input_error
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+
+    from mauvecl.flares.energies import Rates
+    from mauvecl.host.orbit.geometry import TimeGrid
+    from mauvecl.host.orbit.orbit import Orbit, Target
+    from mauvecl.host.tables.table import Rows
+    from mauvecl.search.completeness import DurationLaw
+
+#: Largest number of rows of a table of targets; a plan has a page for each.
+MAX_TARGETS = 500
+
+
+class OrbitQuestion(Section):
+    """Orbit, time grid, targets and visibility limits."""
+
+    start: Annotated[
+        str,
+        Help("First day or time, UTC"),
+        Flag("--start"),
+        Widget(
+            label="First day",
+            hint="The first day of the time that is looked at, UTC.",
+            group="Campaign",
+            place=1,
+            kind="day",
+        ),
+    ] = "2027-01-01"
+    days: Annotated[
+        float,
+        Unit("d"),
+        Range(0, open_low=True),
+        Help("Length of time"),
+        Flag("--days"),
+        Widget(
+            label="Days",
+            hint="How many days from the first one on are looked at: 365 show every season.",
+            group="Campaign",
+            place=2,
+            unit="d",
+            most=1000,
+            slider=Slider(5, 730, 5),
+        ),
+    ] = 365.0
+    step_s: Annotated[Duration, Help("Time between the computed positions"), Flag("--step")] = 60.0
+    tle: Annotated[Path | None, Help("File of two-line elements, newer than the embedded ones"), Flag("--tle")] = None
+    kind: Annotated[
+        Literal["auto", "tle", "mean"],
+        Help("Model of the orbit", choices="tle, mean, or auto (mean far from the elements' epoch)"),
+        Flag("--orbit"),
+    ] = "auto"
+    targets: Annotated[
+        tuple[str, ...], Help("Name of a target, or coordinates such as '290.0 -11.2'"), Flag("--look-at")
+    ] = ()
+    simbad: Annotated[
+        bool, Help("Ask SIMBAD for names that are not embedded", "needs mauvecl[names]"), Flag("--simbad")
+    ] = False
+    limits: Limits = Limits()
+
+    @field_validator("start", mode="before")
+    @classmethod
+    def _as_text(cls, given: Any) -> Any:
+        """Convert TOML's date and time types to text."""
+        if isinstance(given, datetime.datetime) and given.tzinfo is not None:
+            given = given.astimezone(datetime.UTC).replace(tzinfo=None)
+        return given.isoformat() if isinstance(given, datetime.date) else given
+
+    def orbit(self) -> Orbit:
+        """Load the orbit."""
+        from mauvecl.host.orbit.orbit import Orbit
+
+        return Orbit.load(self.tle, self.kind)
+
+    def times(self) -> TimeGrid:
+        """Return the time grid."""
+        from mauvecl.host.orbit.geometry import TimeGrid
+
+        return TimeGrid(self.start, self.days, self.step_s)
+
+
+#: Keys of a target that hold paths, relative to its table or the study file.
+PATH_KEYS = ("rates_file", "neighbours")
+
+
+class PlanTarget(Section):
+    """Position, spectrum and flare rates of a star in a plan.
+
+    Missing values are looked up by name in the embedded list of stars, or follow from the spectral type.
+    """
+
+    name: Annotated[str, Help("Name of the target")]
+    coordinates: Annotated[str | None, Help("Coordinates, which replace those of the name")] = None
+    spectral_type: Annotated[
+        str | None, Help("Spectral type, such as M3V", "the nearest spectrum of the library is used")
+    ] = None
+    magnitude: Annotated[Magnitude | None, Help("V magnitude")] = None
+    distance_pc: Annotated[Distance | None, Help("Distance")] = None
+    rates: Annotated[
+        Literal["G", "K", "M", "sunlike"] | None, Help("Published flare rates", default="the spectral type's")
+    ] = None
+    mass_msun: Annotated[
+        Annotated[float, Unit("solMass"), Range(0, open_low=True)] | None,
+        Help("Mass, for the rates of Davenport et al. 2019", "needs the age"),
+    ] = None
+    age_myr: Annotated[Annotated[float, Unit("Myr"), Range(0, open_low=True)] | None, Help("Age")] = None
+    alpha: Annotated[RateExponent | None, Help("Exponent of a power law of bolometric energies")] = None
+    rate_per_day: Annotated[
+        Annotated[float, Unit("1 / d"), Range(0, open_low=True)] | None,
+        Help("Rate of flares above an energy, for the power law"),
+    ] = None
+    at_erg: Annotated[Energy | None, Help("That energy")] = None
+    rates_file: Annotated[Path | None, Help("File with a cumulative distribution of energies")] = None
+    rates_band: Annotated[str, Help("Band of the energies in that file")] = "bolometric"
+    neighbours: Annotated[Path | None, Help("Table of other stars near the target, as for a star")] = None
+    neighbours_of: Annotated[str | None, Help("The target's own row in that table, or its coordinates")] = None
+    neighbour_share: Annotated[
+        Share,
+        Help("Share of the light of neighbours within the fibre's radius that enters it", "an assumption"),
+    ] = 1.0
+
+    unused: Annotated[tuple[str, ...], Help("Columns of its table that are not read")] = ()
+
+    @model_validator(mode="after")
+    def _one_distribution(self) -> Self:
+        for names in (("mass_msun", "age_myr"), ("alpha", "rate_per_day", "at_erg")):
+            given = [name for name in names if getattr(self, name) is not None]
+            if given and len(given) < len(names):
+                raise InputError(
+                    f"{self.name} needs all of {', '.join(names)} or none, but has only {' and '.join(given)}",
+                    key=given[0],
+                )
+        ways = [
+            name
+            for name, key in (("rates", "rates"), ("mass and age", "mass_msun"), ("alpha", "alpha"),
+                              ("rates_file", "rates_file"))
+            if getattr(self, key) is not None
+        ]  # fmt: skip
+        if len(ways) > 1:
+            raise InputError(
+                f"{self.name} needs its flare rates in one way only, but has them by {' and by '.join(ways)}",
+                key="rates",
+            )
+        return self
+
+    def target(self, simbad: bool) -> Target:
+        """Look up the target; given coordinates replace those of its name."""
+        from dataclasses import replace
+
+        from mauvecl.host.orbit.orbit import Target
+
+        if self.coordinates is None:
+            return Target.of(self.name, name=self.name, simbad=simbad)
+        place = Target.of(self.coordinates, name=self.name)
+        try:
+            known = Target.of(self.name)
+        except InputError:
+            return place
+        return replace(known, name=self.name, ra_deg=place.ra_deg, dec_deg=place.dec_deg, source="given")
+
+    def distribution(self, spectral_type: str) -> Rates:
+        """Return the flare rates; raises InputError if none are given and the spectral type has no preset."""
+        from mauvecl.flares.energies import BOLOMETRIC, EXPONENTS, PowerLaw, RateTable, davenport2019, preset
+
+        if self.mass_msun is not None and self.age_myr is not None:
+            return davenport2019(mass_msun=self.mass_msun, age_myr=self.age_myr)
+        if self.alpha is not None and self.rate_per_day is not None and self.at_erg is not None:
+            return PowerLaw.through(self.alpha, self.at_erg, self.rate_per_day, band=BOLOMETRIC)
+        if self.rates_file is not None:
+            return RateTable.read(self.rates_file, self.rates_band)
+        kind = self.rates or spectral_type.strip()[:1].upper()
+        if kind not in ("G", "K", "M", "sunlike"):
+            alpha = EXPONENTS.get(kind)
+            known = "" if alpha is None else f" except for an exponent of {alpha} (Althukair & Tsiklauri 2023)"
+            raise InputError(
+                f"flare rates of {self.name}, of the type {shortened(spectral_type)}, are unknown{known}",
+                "alpha with rate_per_day and at_erg, rates, mass_msun and age_myr, or rates_file",
+                key="rates",
+            )
+        return preset(kind)
+
+
+class PlanQuestion(Section):
+    """Campaign: targets, exposure time per target, durations of flares, and how completeness is computed."""
+
+    targets: Annotated[
+        tuple[PlanTarget, ...],
+        Help("Targets of the campaign"),
+        Flag(
+            "--targets",
+            kind=Path,
+            read=lambda path, _: read_targets(path),
+            help=Help("Table of targets (CSV, ECSV, FITS, VOTable)", "name, and what is known of each"),
+        ),
+    ] = ()
+    hours: Annotated[
+        Annotated[float, Unit("h"), Range(0, open_low=True)] | None,
+        Help("Exposure of each target at most", default="all"),
+        Flag("--hours"),
+        Widget(
+            label="Hours on each target",
+            hint="How long each target is observed, at most: never longer than it is seen.",
+            group="Campaign",
+            place=3,
+            first="100",
+            slider=Slider(10, 1000, 10),
+        ),
+    ] = None
+    half_width_s: Annotated[Duration, Help("Half-width of flares of the energy at_erg")] = 100.0
+    at_erg: Annotated[Energy, Help("That energy")] = 1e33
+    exponent: Annotated[DurationExponent, Help("Exponent with which half-widths grow with energy")] = 0.39
+    scatter_dex: Annotated[DurationScatter, Help("Scatter of half-widths about that law, dex")] = 0.3
+    completeness: Annotated[
+        Literal["injections", "closed form"],
+        Help("Completeness", choices="injections (into simulated noise) or 'closed form' (at once)"),
+        Flag("--completeness"),
+    ] = "injections"
+    along_orbit: Annotated[
+        bool, Help("Whether frames have the detector temperature and particle flux along the orbit")
+    ] = True
+    injections: Annotated[int, Range(20, 1_000_000), Help("Injections of each half-width")] = 100
+    best_months: Annotated[int, Range(1, 12), Help("Number of best months in the report")] = 3
+    report: Annotated[Literal["pdf", "html"], Help("Form of the report"), Flag("--report")] = "pdf"
+
+    @model_validator(mode="after")
+    def _different_targets(self) -> Self:
+        names = [target.name for target in self.targets]
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise InputError(f"the plan has the target {twice!r} twice, but targets must differ", key="targets")
+        return self
+
+    def law(self) -> DurationLaw:
+        """Return the relation between energy and duration of flares."""
+        from mauvecl.search.completeness import DurationLaw
+
+        return DurationLaw(self.half_width_s, self.at_erg, self.exponent, self.scatter_dex)
+
+
+def targets_of(orbit: OrbitQuestion, plan: PlanQuestion) -> list[Target]:
+    """Look up the targets of `orbit`, or else those of `plan`."""
+    from mauvecl.host.orbit.orbit import Target
+
+    targets = [Target.of(text, simbad=orbit.simbad) for text in orbit.targets] or [
+        target.target(orbit.simbad) for target in plan.targets
+    ]
+    if not targets:
+        raise InputError("no targets", "names or coordinates, such as `orbit.targets='eps Eri'`", key="orbit.targets")
+    names = [one.name for one in targets]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise InputError(f"the target {twice!r} is named twice, but targets must differ", key="orbit.targets")
+    return targets
+
+
+def read_targets(path: Path) -> list[dict[str, Any]]:
+    """Read targets from a table of any format; see `targets_in`. Paths in it are relative to its folder."""
+    from mauvecl.host.tables.opening import read_table
+
+    named = f"table of targets {shortened(path.name)}"
+    return targets_in(read_table(path, "table of targets"), named, path.parent)
+
+
+#: Names of columns of targets, in any case, by the keys of `PlanTarget`; keys themselves are names as well.
+TARGET_COLUMNS = {
+    "name": (*STARS, "hostname"), "ra": RIGHT_ASCENSIONS, "dec": DECLINATIONS, "spectral_type": SPECTRAL_TYPES,
+    "magnitude": ("V", "vmag", "mag_v", "v_mag", "johnson_v", "flux_v", "sy_vmag", "mag"),
+    "distance_pc": ("distance", "dist", "d_pc", "dist_pc"), "parallax": ("parallax", "plx", "plx_value"),
+    "mass_msun": ("mass", "st_mass"), "age_myr": ("age",), "coordinates": ("coord", "coords", "position", "coord1"),
+}  # fmt: skip
+
+
+def targets_in(table: Table, named: str, folder: Path | None = None) -> list[dict[str, Any]]:
+    """Return the targets of a table with a column ``name`` and any other keys of `PlanTarget`, in any case.
+
+    ``ra`` and ``dec`` in degrees, or in the unit that they state, replace ``coordinates``; ``V`` replaces ``magnitude``
+    and ``parallax`` a distance. Empty cells are ignored, and other columns are left out.
+
+    Parameters
+    ----------
+    named : str
+        Description of the table, for messages.
+    folder : Path, optional
+        Folder of paths in the table; without it, columns of paths are refused.
+    """
+    from mauvecl.host.tables.table import Rows
+
+    rows = Rows(table, named)
+    keys = [key for key in PlanTarget.model_fields if key != "unused"]
+    columns = {key: rows.first((key, *TARGET_COLUMNS.get(key, ()))) for key in (*keys, "ra", "dec", "parallax")}
+    if columns["alpha"] is not None and columns["ra"] == columns["alpha"]:
+        # A right ascension next to a declination, otherwise the exponent of a distribution.
+        columns["alpha" if columns["dec"] is not None else "ra"] = None
+    if columns["name"] is None:
+        raise InputError(f"{named} has the columns {shown(', '.join(rows.names), 200)}", "one called name", key="name")
+    path = next((held for key in PATH_KEYS if (held := columns[key]) and folder is None), None)
+    if path is not None:
+        raise InputError(f"{named} has the column {shortened(path)}", "no names of files", key=path)
+    for key in ("distance_pc", "mass_msun", "age_myr"):
+        held = columns[key]
+        if held is not None and key_of(held) in ("distance", "dist", "mass", "age") and not rows.unit(held):
+            # A distance in an unknown unit is none.
+            columns[key] = None
+    if not 1 <= rows.n <= MAX_TARGETS:
+        raise InputError(f"{named} holds {rows.n} targets", f"1 to {MAX_TARGETS}", key="name")
+    unused = tuple(name for name in rows.names if name not in columns.values())
+    return [_target(rows, columns, row, folder, unused) for row in range(rows.n)]
+
+
+def _target(
+    rows: Rows, columns: dict[str, str | None], row: int, folder: Path | None, unused: tuple[str, ...]
+) -> dict[str, Any]:
+    """Return the data of a target from the cells of its row."""
+    named = f"{rows.named}: row {row + 1}"
+    one: dict[str, Any] = {}
+    for key, field in PlanTarget.model_fields.items():
+        column = columns.get(key)
+        text = rows.text(column, row)
+        if column is None or not text or (key == "coordinates" and is_missing_position(text)):
+            continue
+        unit = first(field, Unit)
+        if unit is None and first(field, Range) is None:
+            one[key] = text
+        else:
+            # A text that is no number is refused with the key's own sentence.
+            one[key] = rows.number(column, row, "" if unit is None else unit.name) if _is_number(text) else text
+    parallax = columns["parallax"]
+    if parallax is not None and "distance_pc" not in one:
+        value = rows.number(parallax, row, "mas")
+        one |= {"distance_pc": 1000.0 / value} if value is not None and value > 0 else {}
+    if (coordinates := _coordinates(rows, columns, row, one)) is not None:
+        one["coordinates"] = coordinates
+    for key in PATH_KEYS:
+        if folder is not None and isinstance(one.get(key), str):
+            one[key] = folder / one[key]
+    alone = [key for key in ("mass_msun", "age_myr") if key in one]
+    if len(alone) == 1 and (held := columns[alone[0]]) is not None and key_of(held) != alone[0]:
+        # Catalogues have the mass of most stars and the age of few.
+        del one[alone[0]]
+        unused += (held,)
+    if unused:
+        one["unused"] = unused
+    try:
+        PlanTarget.model_validate(one)
+    except ValidationError as error:
+        raise input_error(named, PlanTarget, error) from error
+    return one
+
+
+def _coordinates(rows: Rows, columns: dict[str, str | None], row: int, one: dict[str, Any]) -> str | None:
+    """Return the coordinates of a target in degrees from the columns ra and dec, or None if it has none there.
+
+    Raises InputError for one of the two, for sexagesimal ones that differ, and for a star without any that is not in
+    the embedded list.
+    """
+    from mauvecl.host.stars.library import by_key, name_key
+
+    ra, dec = columns["ra"], columns["dec"]
+    given = [name for name in (ra, dec) if rows.text(name, row)]
+    if len(given) == 1 or (given and "coordinates" in one):
+        raise InputError(f"{rows.named}: row {row + 1} needs either coordinates, or both ra and dec", key="coordinates")
+    if ra is not None and dec is not None and given:
+        east, north = (rows.degrees(name, row, right_ascension=name == ra) for name in (ra, dec))
+        again = rows.first(SEXAGESIMAL)
+        other = None if again in (None, ra) else rows.degrees(again, row, right_ascension=True)
+        if other is not None and east is not None and abs((other - east + 180) % 360 - 180) > 0.1:
+            fault = f"row {row + 1} has {ra} = {rows.text(ra, row)} and {again} = {rows.text(again, row)}, which differ"
+            raise rows.error(fault, "numbers in degrees, or only one of these columns", ra)
+        return f"{east!r} {north!r}"
+    if "coordinates" not in one and name_key(name := one.get("name", "")) not in by_key():
+        for column in (ra, columns["coordinates"]):
+            if column is not None and _is_marked_missing(text := str(rows.table[column][row])):
+                fault = f"row {row + 1} has no coordinates ({column} = {' '.join(text.split())}), and {shortened(name)}"
+                expected = "its coordinates, or a name of the list"
+                raise rows.error(f"{fault} is not in the embedded list", expected, column)
+    return None
+
+
+def _is_marked_missing(cell: str) -> bool:
+    """Return whether a cell says that a coordinate, or a pair of them, is not a number, instead of being empty."""
+    return cell.strip().lower() == "nan" or is_missing_position(cell)
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True

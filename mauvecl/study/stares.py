@@ -1,0 +1,274 @@
+"""Expectation of a study's stare at a star: frames, unknown changes, and flares with their sizes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.flares.energies import EnergyScale, Kind, amplitude_of, amplitude_of_peak
+from mauvecl.flares.events import Event, check_contributions, coefficients, temperatures_of
+from mauvecl.flares.frames import StareExpectation
+from mauvecl.flares.settings import Cooling
+from mauvecl.flares.stare import Stare
+from mauvecl.noise.disturbances import Normal, Prior
+from mauvecl.noise.unknowns import CHANGING, COURSES, PROCESSES, STARE_PROCESSES, Changing, Course, default_spreads
+from mauvecl.schema.errors import InputError, Message
+from mauvecl.study.stare import EventChoice, StareQuestion
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from mauvecl.host.exposure.expectation import Expectation
+    from mauvecl.host.instrument.instrument import Instrument
+    from mauvecl.host.stars.source import Source
+    from mauvecl.study.plan import OrbitQuestion
+    from mauvecl.study.study import Study
+
+Float = NDArray[np.float64]
+
+
+#: Smallest distance of a prior's cuts from its mean, in standard deviations, for a normal distribution to replace it:
+#: 6e-7 of the values lie beyond.
+NEGLIGIBLE_CUT_SD = 5.0
+
+
+@dataclass(frozen=True)
+class StarePrior:
+    """A process of exposures as an unknown of a stare.
+
+    The stare's quiescent level is measured in the stare itself, so the mean of the prior is a known factor or shift.
+    """
+
+    course: Course
+    changes: Changing
+    sd: float  # relative to the mean, or deg C
+    mean: float  # known factor on light or sky, or shift of the temperature in deg C
+
+    @classmethod
+    def of(cls, name: str, prior: Prior, instrument: Instrument) -> Self:
+        """Convert the prior of a process. Raises InputError unless it is normal and cut far from its mean."""
+        if not isinstance(prior, Normal) or not prior.is_wide(NEGLIGIBLE_CUT_SD):
+            raise InputError(
+                f"processes.{name} is drawn from a normal distribution in a stare",
+                f"a normal prior whose cuts are {NEGLIGIBLE_CUT_SD:g} sd or more from its mean, or jitters, offsets, "
+                "drifts or cycles in [stare]",
+                key=f"processes.{name}",
+            )
+        process = PROCESSES[name]
+        course: Course = "jitters" if process.when == "frame" else "offsets"
+        if process.of == "dark":
+            return cls(course, "temperature", prior.sd, prior.mean - instrument.temperature_c)
+        at = {"light_loss": instrument.light_loss, "pointing_loss": instrument.pointing_loss}
+        # The factors on light and sky are linear in their values.
+        mean, upper = (1.0 + float(process.change(at, np.array(x))) for x in (prior.mean, prior.mean + prior.sd))
+        return cls(course, process.of, abs(upper - mean) / mean, mean)
+
+    def applied(self, stare: Stare) -> Stare:
+        """Return the stare with the mean of the prior."""
+        if self.changes == "temperature":
+            return replace(stare, temperature_c=stare.temperature_c + self.mean)
+        return replace(stare, **{self.changes: getattr(stare, self.changes) * self.mean})
+
+
+def stare_of(study: Study, instrument: Instrument) -> Stare:
+    """Return the stare of a study. Raises InputError if the stare cannot draw one of the study's processes."""
+    q = study.stare
+    priors = [
+        StarePrior.of(name, getattr(study.processes, name), instrument) for name, _ in study.processes.modulations
+    ]
+    spreads: dict[Course, dict[Changing, float]] = {how: dict(getattr(q, how)) for how in COURSES}
+    for one in priors:
+        # Independent normal amplitudes of one change add up to one.
+        given = spreads[one.course]
+        given[one.changes] = math.hypot(given.get(one.changes, 0.0), one.sd)
+    spreads = {how: {of: given[of] for of in CHANGING if of in given} for how, given in spreads.items()}
+    if study.nuisances.usual:
+        spreads = {how: documented | spreads[how] for how, documented in default_spreads().items()}
+
+    changes: dict[str, Any] = {name: getattr(q, name) for name in ("variability", "throughput", "sky")} | spreads
+    changes |= {"orbit_s": q.orbit_s} | {name: getattr(q, name) for name in STARE_PROCESSES}
+    if q.along_orbit:
+        stare = _along_orbit(study, instrument.frame_s, changes)
+    else:
+        stare = Stare.of(
+            q.duration_s,
+            frame_s=instrument.frame_s,
+            gaps=q.all_gaps(),
+            temperature_c=instrument.temperature_c,
+            thermal=q.thermal,
+            **changes,
+        )
+    for one in priors:
+        stare = one.applied(stare)
+    return stare
+
+
+def _along_orbit(study: Study, frame_s: float, changes: dict[str, Any]) -> Stare:
+    """Return the stare at the target of the study's ``orbit``, with gaps and temperatures along the orbit."""
+    from mauvecl.flares.stare import stare_along
+    from mauvecl.study.plan import targets_of
+
+    q, o = study.stare, study.orbit
+    if q.gaps or q.orbit_gap_s or q.thermal is not None:
+        raise InputError(
+            "stare.along_orbit needs neither gaps nor a thermal curve, since both follow from the orbit",
+            key="stare.along_orbit",
+        )
+    targets = targets_of(study.orbit, study.plan)
+    if len(targets) != 1:
+        raise InputError(
+            f"stare.along_orbit needs a single target in orbit.targets, but has {len(targets)}", key="stare.along_orbit"
+        )
+    return stare_along(o.orbit(), targets[0], o.start, q.duration_s, frame_s=frame_s, limits=o.limits, **changes).stare
+
+
+def expect_stare(
+    stare: Stare, events: Sequence[Event], quiet: Expectation, flare_electrons: Callable[[Float], Float]
+) -> StareExpectation:
+    """Compute the expectation of a stare with its flares.
+
+    Parameters
+    ----------
+    quiet : Expectation
+        One frame without a flare.
+    flare_electrons : callable
+        Electrons that flares of unit amplitude and some temperatures, K, add to a frame, shape
+        (n_temperature, n_pixel).
+    """
+    check_contributions(events, stare.start_s, stare.frame_s)
+    kelvin = temperatures_of(events)
+    amplitudes = coefficients(events, stare.start_s, stare.frame_s, kelvin)
+    return StareExpectation(quiet, stare, flare_electrons(kelvin), amplitudes)
+
+
+def unused_lines(exposure_s: float, stare: Stare, events: Sequence[Event]) -> list[str]:
+    """Return messages about settings without effect on the stare: the exposure, and flares that peak outside it."""
+    lines = check_contributions(events, stare.start_s, stare.frame_s)
+    if exposure_s != stare.frame_s:
+        lines.insert(
+            0,
+            Message(
+                f"A stare consists of frames of {stare.frame_s:g} s: observation.exposure_s = {exposure_s:g} s is not "
+                "used.",
+                "not used",
+            ),
+        )
+    return lines
+
+
+def orbit_lines(stare: StareQuestion, orbit: OrbitQuestion, frame_s: float) -> list[str]:
+    """Return messages about the orbit of a stare with `along_orbit`."""
+    from mauvecl.host.orbit.geometry import TimeGrid
+    from mauvecl.schema.physical import DAY_S
+
+    if not stare.along_orbit:
+        return []
+    times = TimeGrid(orbit.start, stare.duration_s / DAY_S, frame_s)
+    assumed = (
+        "Limits, temperatures and windows of a stare along the orbit are assumptions; stray light is not modelled."
+    )
+    return [*orbit.orbit().messages(times), assumed]
+
+
+def threshold_line(title: str, threshold: float) -> str:
+    """Return the message for a threshold that is raised because of trends that the search does not remove."""
+    return Message(
+        f"FALSE ALARMS of {title} come from what is unknown of the stare, too: the search does not marginalise over "
+        "all of it (see search.cycle, slope, offset and window_s). The threshold of "
+        f"{threshold:.2f} allows for it, so that alarms are as often as asked for to a factor of 1.5.",
+        "false alarms",
+    )
+
+
+def energy_scale(study: Study, source: Source, kind: Kind, flare_k: float) -> EnergyScale | None:
+    """Return the energy of flares of a temperature on the study's star per second of equivalent duration.
+
+    It follows from the star's distance or else from its radius and temperature; None if neither is known.
+    """
+    flare, star = study.flare, study.star[0]
+    how: dict[str, Any] = {
+        "band": flare.band, "flare": flare.light(flare_k), "kind": kind, "geometry": flare.geometry,
+        "photosphere_k": flare.photosphere_temperature_k,
+    }  # fmt: skip
+    if star.distance_pc is not None:
+        return EnergyScale.of_star(source, star.distance_pc, **how)
+    if star.radius_rsun is not None and star.effective_temperature_k is not None:
+        return EnergyScale.of_blackbody(star.radius_rsun, star.effective_temperature_k, **how)
+    return None
+
+
+def energy_of(
+    study: Study, source: Source, event: Event, kind: Kind, temperatures_k: Float | None = None
+) -> float | None:
+    """Return the energy of a flare, erg, or None if the star's distance and radius are unknown.
+
+    `temperatures_k` are the temperatures between which flare spectra are interpolated; see `Event.total_energy`.
+    """
+    if energy_scale(study, source, kind, event.hottest_k) is None:
+        return None
+
+    def scale_of(kelvin: float) -> EnergyScale:
+        scale = energy_scale(study, source, kind, kelvin)
+        assert scale is not None
+        return scale
+
+    return event.total_energy(scale_of, temperatures_k)
+
+
+def events_of(study: Study, source: Source) -> list[Event]:
+    """Return the flares of a study's star: `events`, or one per energy or amplitude, evenly spaced over the stare.
+
+    Raises InputError if an energy is given for a star of unknown distance and radius.
+    """
+    choices = study.events or _evenly_spaced(study)
+    events = [_event(study, choice) for choice in choices]
+    # The spectrum of a cooling flare is interpolated between the temperatures of all flares.
+    kelvin = temperatures_of(events)
+    return [_of_energy(study, source, choice, event, kelvin) for choice, event in zip(choices, events, strict=True)]
+
+
+def _evenly_spaced(study: Study) -> Sequence[EventChoice]:
+    q = study.stare
+    sizes = [{"energy_erg": e} for e in q.energies_erg] or [{"amplitude": a} for a in study.flare.amplitudes]
+    # The time before the first flare equals the spacing.
+    step = q.duration_s / (len(sizes) + 1)
+    return [EventChoice(peak_s=step * (n + 1), **size) for n, size in enumerate(sizes)]
+
+
+def _event(study: Study, choice: EventChoice) -> Event:
+    """Return a flare, with amplitude 1 if its energy is given."""
+    shape, flare = choice.load_shape(study.stare.shape), study.flare
+    half = study.stare.half_width_s if choice.half_width_s is None else choice.half_width_s
+    kelvin = flare.temperature_k if choice.temperature_k is None else choice.temperature_k
+    if choice.cooling is not None and flare.spectrum.file is not None:
+        raise InputError(
+            "events.cooling needs a flare that has a temperature, but its spectrum is from a file", key="events.cooling"
+        )
+    temperature = kelvin if choice.cooling is None else Cooling(kelvin, choice.cooling.end_k, choice.cooling.fold_s)
+    amplitude = flare.amplitudes[0] if choice.amplitude is None else choice.amplitude
+    if choice.peak is not None:
+        amplitude = amplitude_of_peak(choice.peak, shape)
+    elif choice.equivalent_duration_s is not None:
+        amplitude = amplitude_of(choice.equivalent_duration_s, half, shape)
+    elif choice.energy_erg is not None:
+        amplitude = 1.0
+    return Event(choice.peak_s, half, amplitude, temperature, shape)
+
+
+def _of_energy(study: Study, source: Source, choice: EventChoice, event: Event, temperatures_k: Float) -> Event:
+    """Return the flare with the amplitude that follows from its energy, if one is given."""
+    if choice.energy_erg is None:
+        return event
+    # The energy is linear in the amplitude.
+    one = energy_of(study, source, event, choice.energy, temperatures_k)
+    if one is None:
+        raise InputError(
+            f"the amplitude of a flare of {choice.energy_erg:g} erg on {source.name} is unknown",
+            "the star's distance_pc, or radius_rsun and effective_temperature_k",
+            key="events.energy_erg",
+        )
+    return replace(event, amplitude=choice.energy_erg / one)

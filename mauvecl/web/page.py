@@ -1,0 +1,281 @@
+"""The page's state, its card, and the stars that it knows.
+
+The state is independent of the page's appearance: the page enters text, and shows `entered` and `faults`. It holds the
+text of all fields, their errors, and the question if all are valid.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from typing import Any
+from urllib.parse import parse_qsl, urlencode
+
+from mauvecl.answers.closed_forms import BOTH_CHANCES
+from mauvecl.detection.names import check_fap
+from mauvecl.host.exposure.sky import parse_position, parse_time
+from mauvecl.host.stars.library import resolve
+from mauvecl.host.tables.units import offline
+from mauvecl.schema.errors import InputError, of_kind, shortened
+from mauvecl.study.plan import PlanTarget
+from mauvecl.web.closed_forms import TITLES, Answers, ClosedForms, chances, percent, short
+from mauvecl.web.fields import FIELDS, UPLOADED, Choice, Field, note, sentence, targets
+from mauvecl.web.question import Question
+from mauvecl.web.simulations import OTHER, SIMULATIONS
+from mauvecl.web.tabs import TABS
+from mauvecl.web.tabs.tab import Tab
+from mauvecl.web.uploads import UPLOADS
+
+#: Part of the message about the throughput, which the page shows once.
+NOMINAL = "The throughput is nominal"
+#: Answers whose messages are shown, since they include those of the others.
+TOLD = ("detection", "measure")
+
+
+def card(closed: ClosedForms, answers: Answers) -> dict[str, Any]:
+    """Return the contents of the card.
+
+    It holds ``numbers``, one for each choice of what is unknown; ``chosen``, ``shown`` and ``interval`` of the
+    question's choice, and ``words``; ``facts``, pairs of names and values; ``notes``, pairs of sentences and kinds;
+    ``simulated``, names of what is simulated; ``files``, tabs and names of downloads.
+    """
+    q, x = closed.question, closed.quiet
+    cut, both = closed.odds.threshold, chances(closed, answers)
+    (chosen,) = (one for one in both if one.unknown == q.unknown)
+    facts = []
+    if "detection" in answers:
+        (row,) = (row for row in answers["detection"].table if row["statistic"] == q.statistic)
+        cut = float(row["threshold"])
+        facts.append(("In closed form", percent(closed.chance)))
+    facts += [
+        ("Threshold", f"{cut:.4g}" if cut == cut else "none"),
+        ("Expected with flare", f"{closed.odds.flaring.mean:.4g}"),
+        ("Best S/N per pixel", short(x.snr().max())),
+        ("Best S/N per element", short(x.snr_per_element().max())),
+    ]
+    words = (
+        f"chance to detect {closed.words}, by the statistic {q.statistic} at a false-alarm probability of {q.fap:g} "
+        f"per test, with the payload {q.instrument}"
+    )
+    return {
+        "headline": True,
+        "numbers": [one.shown for one in both],
+        "chosen": q.unknown,
+        "shown": percent(chosen.value),
+        "interval": f"{TITLES[q.unknown]}; {chosen.how}",
+        "words": words,
+        "facts": facts,
+        "notes": _with_kinds(_messages(closed, answers)),
+        "simulated": _simulated_sentences(answers),
+        "files": _files(answers),
+    }
+
+
+def without_headline(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
+    """Return the `card` of a tab that asks for no chance of detection."""
+    messages = list(answers[tab.answer].messages) if tab.answer in answers else []
+    return {
+        "headline": False,
+        "numbers": [],
+        "chosen": "",
+        "shown": tab.title,
+        "interval": "",
+        "words": tab.words(closed.question),
+        "facts": [],
+        "notes": _with_kinds([m for m in dict.fromkeys(messages) if not m.startswith(NOMINAL)]),
+        "simulated": _simulated_sentences(answers),
+        "files": _files(answers),
+    }
+
+
+def _simulated_sentences(answers: Answers) -> list[str]:
+    return sorted(name for name in answers if name not in ("snr", "draw", "seen", OTHER))
+
+
+def _files(answers: Answers) -> list[str]:
+    tables = [f"{tab.name} {name}" for tab in TABS.values() for name in tab.files if tab.offers(name, answers)]
+    return tables + [
+        f"{tab.name} {name}" for tab in TABS.values() for name, of in tab.documents.items() if of in answers
+    ]
+
+
+def _with_kinds(messages: list[str]) -> list[tuple[str, str]]:
+    """Return messages with their kinds: severe ones begin in capitals."""
+    return [(note(m), "danger" if m.partition(":")[0].isupper() else "info") for m in messages]
+
+
+def _messages(closed: ClosedForms, answers: Answers) -> list[str]:
+    of_answers = [m for name in TOLD if name in answers for m in answers[name].messages]
+    # The card shows both chances itself.
+    both = of_kind(of_answers, BOTH_CHANCES)
+    return [m for m in dict.fromkeys([*of_answers, *closed.messages]) if not m.startswith(NOMINAL) and m not in both]
+
+
+def _several(text: str) -> tuple[str, ...]:
+    """Parse names of simulations, without repetitions."""
+    names = [name for name in text.split(",") if name]
+    if len(names) > len(SIMULATIONS) or not set(names) <= SIMULATIONS.keys():
+        raise InputError(f"{shortened(text)} is not a simulation", f"some of {', '.join(SIMULATIONS)}", key="simulated")
+    return tuple(dict.fromkeys(names))
+
+
+#: Largest number of characters of a link that are parsed.
+MOST_LINKED = 8192
+#: Entries of a link in addition to the question.
+SEEN = {
+    "tab": Field(label="Tab", hint="", first=next(iter(TABS)), read=Choice(tuple(TABS))),
+    "simulated": Field(label="Simulated", hint="", first="", read=_several),
+}
+
+
+class State:
+    """State of a page: the text of each field in `entered`, valid or not, and the visitor's files in `uploads`.
+
+    `stray` is the message on entries of the last link that are no fields.
+    """
+
+    def __init__(self, uploads: Mapping[str, Any] | None = None) -> None:
+        self._fields = FIELDS | SEEN
+        self.entered = {name: field.first for name, field in self._fields.items()}
+        self._values = {name: field.read(field.first) for name, field in self._fields.items()}
+        self._invalid: dict[str, str] = {}
+        self.stray = ""
+        self.uploads = dict(uploads or {})
+
+    def enter(self, given: Mapping[str, str]) -> None:
+        """Enter text into fields."""
+        for name, text in given.items():
+            field = self._fields[name]
+            self.entered[name] = text[: field.characters]
+            self._invalid.pop(name, None)
+            try:
+                if len(text) > field.characters:
+                    raise InputError(
+                        f"{shortened(text)} is too long", f"at most {field.characters} characters", key=name
+                    )
+                value = field.read(text)
+                if self._holds_file(name) and name not in self.uploads:
+                    raise InputError(
+                        f"the {text} is not here: give its file again, since links do not hold it", key=name
+                    )
+                self._values[name] = value
+            except InputError as error:
+                self._invalid[name] = sentence(error)
+
+    def _holds_file(self, name: str) -> bool:
+        return name in UPLOADS and self.entered[name] == UPLOADS[name].entered
+
+    def faults_of(self, names: Collection[str]) -> dict[str, str]:
+        """Return the error messages of some fields, with those of values that cannot be together."""
+        faults = {name: why for name, why in self._invalid.items() if name in names}
+        for name in ("realisations", "target", "time"):
+            if name in names and name not in faults:
+                try:
+                    self._check(name)
+                except InputError as error:
+                    faults[name] = sentence(error)
+        return faults
+
+    def values_of(self, names: Collection[str]) -> dict[str, Any]:
+        """Return the values of fields by name; raises InputError if one is invalid."""
+        for name in names:
+            if name in self._invalid:
+                raise InputError(f"{self._fields[name].label}: {self._invalid[name]}", key=name)
+        return {name: self._values[name] for name in names}
+
+    def _check(self, name: str) -> None:
+        """Raise InputError for a value that cannot be together with those of other fields."""
+        if name == "realisations":
+            if "fap" not in self._invalid:
+                check_fap(self._values["fap"], *self._values["realisations"])
+        elif self.entered["sky"] == "target and time":
+            with offline():
+                (parse_position if name == "target" else parse_time)(self.entered[name])
+
+    def asked(self, names: Collection[str] = tuple(FIELDS)) -> tuple[str, ...]:
+        """Return the text of the named fields on which an answer depends, by default of all."""
+        return tuple(self.entered[name] for name in FIELDS if name in names)
+
+    def question(self, names: Collection[str] = tuple(FIELDS)) -> Question:
+        """Return the question, whose other fields have their first values.
+
+        Raises InputError with the accepted values if a requested field is invalid.
+        """
+        faults = self.faults_of(names)
+        if faults:
+            all_of_them = "; ".join(f"{self._fields[name].label}: {why}" for name, why in faults.items())
+            fault, _, expected = all_of_them.partition(", expected ")
+            raise InputError(fault, expected or None, key=next(iter(faults)))
+        first = State()
+        values = {name: (self if name in names else first)._values[name] for name in FIELDS}
+        return Question(
+            values, {name: self.uploads[name] for name in UPLOADS if name in names and self._holds_file(name)}
+        )
+
+    # Links
+
+    @property
+    def link(self) -> str:
+        """Return all entries as the query of a URL."""
+        return "?" + urlencode({name: text for name, text in self.entered.items() if text or self._fields[name].first})
+
+    def follow(self, link: str) -> None:
+        """Enter the values of a link, and defaults for all others."""
+        query = link.removeprefix("?")
+        self.stray = ""
+        if len(query) > MOST_LINKED:
+            query, self.stray = "", f"The link has more than {MOST_LINKED} characters and was left out."
+        pairs = parse_qsl(query, keep_blank_values=True, errors="replace")
+        strange = sorted({name for name, _ in pairs} - set(self._fields))
+        if strange:
+            self.stray = f"The link holds {shortened(', '.join(strange))}, which is no field here; it was left out."
+        first = {name: field.first for name, field in self._fields.items()}
+        self.enter(first | {name: text for name, text in pairs if name in self._fields})
+        for name in SEEN.keys() & self._invalid.keys():
+            # The page has no field to correct them.
+            self.stray += f" The link's {name}: {self._invalid[name]}; it was left out."
+            self.enter({name: SEEN[name].first})
+
+
+def known(state: State) -> dict[str, Any]:
+    """Return the known values of the star and of each target, and the values that can be entered for it.
+
+    The star has ``about`` in words, ``given``, texts of fields, and ``offer``, the words of a button that enters them;
+    ``targets`` has texts by the columns of the table for each row.
+    """
+    return {"star": _star(state.entered["star"]), "targets": [_target(row) for row in _rows(state.entered["targets"])]}
+
+
+def _star(text: str) -> dict[str, Any]:
+    star = None if text == UPLOADED else resolve(text, own=False)
+    if star is None:
+        return {"about": "", "given": {}, "offer": ""}
+    given: dict[str, str] = {}
+    about = "" if star.known is None else star.known.about
+    if star.known is not None:
+        given |= {"magnitude": f"{star.known.magnitude:g}", "band": "V", "target": star.name}
+    if star.spectrum is None:
+        given["star"] = star.nearest
+        at = "" if star.known is None else f" at V = {star.known.magnitude:g}"
+        return {"about": about, "given": given, "offer": f"Use {star.nearest}{at}"}
+    return {"about": about, "given": given, "offer": f"Use V = {star.known.magnitude:g}" if star.known else ""}
+
+
+def _rows(text: str) -> list[dict[str, Any]]:
+    """Return the rows of a table, without the check of their names."""
+    try:
+        return list(targets(text, check=False))
+    except InputError:
+        return []
+
+
+def _target(row: dict[str, Any]) -> dict[str, str]:
+    try:
+        star = PlanTarget.model_validate(row).target(simbad=False)
+    except InputError as error:
+        return {"fault": sentence(error)}
+    facts = {"spectral_type": star.spectral_type, "V": star.magnitude, "distance_pc": star.distance_pc}
+    found = {
+        key: "" if value is None else f"{value:g}" if isinstance(value, float) else value
+        for key, value in facts.items()
+    }
+    return found | {"coordinates": f"{star.ra_deg:.3f} {star.dec_deg:+.3f}", "about": star.source}

@@ -1,0 +1,443 @@
+"""Files of visitors: limits, readers of each kind, and the shelf that keeps them."""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import fcntl
+import gc
+import hashlib
+import io
+import re
+import shutil
+import sys
+import tempfile
+import threading
+import tomllib
+import zipfile
+import zlib
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import cache
+from pathlib import Path, PureWindowsPath
+from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
+from typing import IO, Any
+
+import numpy as np
+
+from mauvecl.host.spectra.conversion import ReadSpectrum
+from mauvecl.host.stars.flare_spectra import ObservedFlare
+from mauvecl.host.stars.source import Source
+from mauvecl.host.tables.text_tables import columns
+from mauvecl.observations.frames import Frames
+from mauvecl.schema.errors import InputError, printable, reworded, shortened
+from mauvecl.study.analyses import PATHS, CalibrateQuestion, CalibrationObservation
+from mauvecl.web.fields import FIELDS, UPLOADED, UPLOADED_FILE, UPLOADED_UNKNOWN
+from mauvecl.web.sandboxed_reader import Spectrum, read_frames_limited, read_limited
+
+PREFIX = "mauvecl-page-"
+#: File that a running server holds locked.
+LOCK = "in-use"
+
+
+@cache
+def _own() -> tuple[Path, IO[bytes]]:
+    """Make the folder of this server, with its lock, which the system releases however the server ends."""
+    folder = Path(tempfile.mkdtemp(prefix=PREFIX))
+    lock = (folder / LOCK).open("wb")
+    _locked(lock)
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder, lock
+
+
+def visitor_folder() -> tempfile.TemporaryDirectory[str]:
+    """Make a folder for a visitor in that of this server."""
+    return tempfile.TemporaryDirectory(dir=_own()[0])
+
+
+def content_folder(folder: Path, content: bytes, fill: Callable[[Path], object]) -> Path:
+    """Return the subfolder for some content, named after its digest; the first call fills it."""
+    home = folder / hashlib.sha256(content).hexdigest()
+    if not home.exists():
+        new = Path(tempfile.mkdtemp(dir=folder))
+        fill(new)
+        # Another thread may have been faster; the visitor's folder is removed as a whole.
+        with contextlib.suppress(OSError):
+            new.rename(home)
+    return home
+
+
+def remove_abandoned() -> None:
+    """Remove the folders of servers that were killed."""
+    for folder in Path(tempfile.gettempdir()).glob(f"{PREFIX}*"):
+        # Those of other users cannot be opened; one without a lock is being made, or of an older version.
+        with contextlib.suppress(OSError), (folder / LOCK).open("r+b") as lock:
+            if _locked(lock):
+                shutil.rmtree(folder, ignore_errors=True)
+
+
+def _locked(file: IO[bytes]) -> bool:
+    """Lock a file; return False if a running server holds it, or the file system has no locks."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
+
+
+#: Largest numbers of files and observations of an archive, and of bytes to which it unpacks.
+MOST_FILES, MOST_BYTES = 40, 64 * 2**20
+#: Bytes of a TOML file of it, and characters of a file's name, at most.
+MOST_TOML_BYTES, MOST_NAME = 2**18, 100
+#: Packings that are read to the stated size and no further; others, such as LZMA, unpack to any size.
+BOUNDED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+
+
+@dataclass(frozen=True)
+class Observations:
+    """A visitor's archive with frames of standard stars."""
+
+    name: str  # name on the visitor's computer
+    content: bytes  # the zip archive
+    rows: tuple[CalibrationObservation, ...]  # observations with the names of their files
+
+    @classmethod
+    def of(cls, name: str, content: bytes) -> Observations:
+        """Keep an archive of observations; raises InputError if it lacks a file."""
+        return cls(printable(name, MOST_NAME), content, observations_in(unpacked(content)))
+
+    @property
+    def files(self) -> dict[str, bytes]:
+        """Contents by name without folders, unpacked on each call since they are large."""
+        return unpacked(self.content)
+
+    def written(self, folder: Path) -> list[dict[str, Any]]:
+        """Write the files below a folder, once, and return the observations with their paths."""
+
+        def unpack(new: Path) -> None:
+            for name, content in self.files.items():
+                (new / name).write_bytes(content)
+
+        home = content_folder(folder, self.content, unpack)
+        return placed(self.rows, lambda name: str(home / name))
+
+
+def placed(rows: Iterable[CalibrationObservation], place: Callable[[Path], str]) -> list[dict[str, Any]]:
+    """Return observations as data of a study, with other paths."""
+    data = [row.model_dump(exclude_none=True) for row in rows]
+    return [row | {key: place(row[key]) for key in PATHS if key in row} for row in data]
+
+
+def unpacked(content: bytes) -> dict[str, bytes]:
+    """Return the files of a zip archive by their names without folders.
+
+    Hidden files, which some systems add, are left out. Raises InputError if the content is not a zip archive, is
+    damaged, encrypted or too large, or contains a name that is not a plain one in a folder of the archive.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            entries = {entry: _name(entry.filename) for entry in archive.infolist() if not entry.is_dir()}
+            entries = {entry: name for entry, name in entries.items() if not name.startswith(".")}
+            if len(entries) > MOST_FILES or sum(entry.file_size for entry in entries) > MOST_BYTES:
+                raise InputError(
+                    "the archive holds too much", f"at most {MOST_FILES} files of {MOST_BYTES // 2**20} MiB in all",
+                    key="observations",
+                )  # fmt: skip
+            if any(entry.compress_type not in BOUNDED for entry in entries):
+                raise InputError(
+                    "the archive is packed in an unusual way", "a zip archive with deflate", key="observations"
+                )
+            files = {}
+            for entry, name in entries.items():
+                # A stated size that is too small ends the reading, and the checksum then differs.
+                with archive.open(entry) as file:
+                    files[name] = file.read(entry.file_size)
+    except InputError:
+        raise
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, OSError, ValueError) as error:
+        raise InputError(
+            f"the observations are no sound zip archive ({error})",
+            "a TOML file and the files that it names in a zip archive without a password",
+            key="observations",
+        ) from error
+    if len(files) < len(entries):
+        raise InputError("two files of the archive have the same name, but names must differ", key="observations")
+    return files
+
+
+def _name(path: str) -> str:
+    """Return the name of a file of an archive without folders."""
+    parts = PureWindowsPath(path)
+    if parts.anchor or ".." in parts.parts or not parts.name.isprintable() or not 0 < len(parts.name) <= MOST_NAME:
+        raise InputError(
+            f"the archive holds a file named {shortened(path)}",
+            f"files in folders of the archive, with printable names of at most {MOST_NAME} characters",
+            key="observations",
+        )
+    return parts.name
+
+
+def observations_in(files: Mapping[str, bytes]) -> tuple[CalibrationObservation, ...]:
+    """Return the observations that a study among files lists, with the names of their files.
+
+    Raises InputError unless exactly one file is such a study, and the archive contains all files that it names.
+    """
+    studies = [rows for name, one in files.items() if name.endswith(".toml") and (rows := _observations(name, one))]
+    if len(studies) != 1:
+        raise InputError(
+            f"{len(studies)} files of the archive list observations", "one TOML file with [[calibrate.observations]]",
+            key="observations",
+        )  # fmt: skip
+    (rows,) = studies
+    if len(rows) > MOST_FILES:
+        raise InputError(f"{len(rows)} observations are too many", f"at most {MOST_FILES}", key="observations")
+    for row in rows:
+        for key in PATHS:
+            if isinstance(row.get(key), str):
+                name = PureWindowsPath(row[key]).name
+                if name not in files:
+                    expected = f"its file in the archive, which holds {', '.join(sorted(files))}"
+                    raise InputError(f"{shortened(name)} is missing", expected, key="observations")
+                row[key] = name
+    return CalibrateQuestion.model_validate({"observations": rows}).observations
+
+
+def _observations(name: str, content: bytes) -> list[dict[str, Any]]:
+    """Return the rows of a file's table of observations; empty if it has none."""
+    if len(content) > MOST_TOML_BYTES:
+        raise InputError(f"{shortened(name)} is too large", f"TOML of at most {MOST_TOML_BYTES // 2**10} KiB",
+                         key="observations")  # fmt: skip
+    try:
+        study = tomllib.loads(content.decode("utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(f"{shortened(name)} is not a TOML file ({error})", "valid TOML", key="observations") from error
+    section = study.get("calibrate")
+    if not isinstance(section, dict) or "observations" not in section:
+        return []
+    others = [*(study.keys() - {"calibrate"}), *(f"calibrate.{key}" for key in section.keys() - {"observations"})]
+    if others:
+        raise InputError(
+            f"{shortened(name)} sets {shortened(min(others))}",
+            "calibrate.observations alone; fields set the rest",
+            key="observations",
+        )
+    rows = section["observations"]
+    return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
+
+
+Points = tuple[tuple[float, float], ...]
+#: Largest size of an upload, bytes, and largest number of points of its spectrum.
+MOST_UPLOADED, MOST_POINTS = 4 * 2**20, 200_000
+#: Largest size of a file that is kept unread, such as frames; a day of resolution elements takes some 8 MiB.
+MOST_KEPT_BYTES = 16 * 2**20
+#: Largest number of values of frames that an answer reads: the spectra of a day.
+MOST_VALUES = 2**24
+
+#: Largest size and number of rows of an unknown spectrum, which the study in every table contains.
+MOST_PAIRS_BYTES, MOST_PAIRS = 2**18, 4000
+
+
+def _star(name: str, content: bytes, **options: Any) -> Source:
+    """Read an untrusted spectrum, packed or not; its format follows from the content, not the name.
+
+    Raises InputError if it holds no usable spectrum. Called on a thread of its own; any other exception is reported to
+    the visitor too.
+    """
+    return replace(_spectrum(content, Source, options), name=UPLOADED, origin="upload")
+
+
+def _added(name: str, content: bytes, **options: Any) -> Source:
+    """Read a spectrum of light that a change adds."""
+    return replace(_star(name, content, **options), name="added spectrum")
+
+
+def _flare(name: str, content: bytes, **options: Any) -> ReadSpectrum:
+    """Read the measured range of a flare's spectrum; the study that reads the file continues it."""
+    flare = _spectrum(content, ObservedFlare, options)
+    low, high = flare.measured_nm
+    inside = (flare.wavelength_nm >= low) & (flare.wavelength_nm <= high)
+    own = tuple(text for text in flare.messages if text.startswith(f"{flare.name}: "))
+    return ReadSpectrum(flare.wavelength_nm[inside], flare.flux_flam[inside], "uploaded flare", "upload", messages=own)
+
+
+def _quiescent(name: str, content: bytes, **options: Any) -> ReadSpectrum:
+    """Read a spectrum of a star without its flare, which may cover any range."""
+    return replace(_spectrum(content, ReadSpectrum, options), name="uploaded star without the flare", origin="upload")
+
+
+def _spectrum(content: bytes, kind: type[Spectrum], options: Mapping[str, Any]) -> Spectrum:
+    spectrum = read_limited(content, kind, options)
+    if spectrum.wavelength_nm.size > MOST_POINTS:
+        raise InputError.of("points", spectrum.wavelength_nm.size, f"at most {MOST_POINTS}")
+    return spectrum
+
+
+def read_pairs(name: str, content: bytes) -> Points:
+    """Read the spectrum of a nuisance parameter: text with two columns, nm and DN of the exposure."""
+    try:
+        text = content.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{shortened(name)} is not text", "two columns, nm and DN", key="upload") from error
+    pairs = columns(f"upload {shortened(name)}", text)
+    if pairs.ndim != 2 or pairs.shape[1] != 2 or not 2 <= len(pairs) <= MOST_PAIRS:
+        raise InputError(
+            f"{shortened(name)} does not have two columns",
+            f"2 to {MOST_PAIRS} rows of two numbers, nm and DN",
+            key="upload",
+        )
+    if not np.isfinite(pairs).all() or (np.diff(pairs[:, 0]) <= 0).any():
+        raise InputError(f"{shortened(name)} does not ascend in nm", "rows in ascending order", key="upload")
+    return tuple((float(nm), float(dn)) for nm, dn in pairs)
+
+
+@dataclass(frozen=True)
+class VisitorFile:
+    """A visitor's file, not read until an answer needs it."""
+
+    name: str  # name on the visitor's computer, without folders and odd characters
+    content: bytes
+
+    @classmethod
+    def of(cls, name: str, content: bytes) -> VisitorFile:
+        """Keep a file."""
+        plain = re.sub(r"[^A-Za-z0-9_.+-]", "_", re.split(r"[/\\]", name)[-1])[-80:].strip(".-")
+        return cls(plain or "file", content)
+
+    def written(self, folder: Path) -> Path:
+        """Write the file below a folder, once, and return its path."""
+        home = content_folder(
+            folder, self.name.encode() + self.content, lambda new: (new / self.name).write_bytes(self.content)
+        )
+        return home / self.name
+
+
+def _options(*names: str, prefix: str = "") -> dict[str, str]:
+    return {name: f"{prefix}{name}" for name in names}
+
+
+@dataclass(frozen=True)
+class Upload:
+    """Kind of file that a field takes."""
+
+    reader: Callable[..., Any]  # of its name and content, and of options by name
+    entered: str = UPLOADED_FILE  # text of the field that stands for the file
+    most: int = MOST_UPLOADED  # largest number of bytes
+    options: Mapping[str, str] = field(default_factory=dict)  # fields that say how it is read, by the reader's names
+
+    def read(self, name: str, content: bytes, values: Mapping[str, Any]) -> Any:
+        """Read an untrusted file with the values of fields; raises InputError if it is too large or unusable."""
+        if len(content) > self.most:
+            size = len(content) / 2**20
+            raise InputError(f"upload of {size:.1f} MiB", f"at most {self.most / 2**20:g} MiB", key="upload")
+        return self.reader(name, content, **{option: values[name] for option, name in self.options.items()})
+
+
+#: Files by the field that takes them.
+UPLOADS: Mapping[str, Upload] = {
+    "star": Upload(_star, UPLOADED, options=_options("wavelength_unit", "flux_unit", "extend")),
+    "flare_file": Upload(
+        _flare, options=_options("wavelength_unit", "flux_unit", prefix="flare_") | _options("continue_at_k")
+    ),
+    "flare_quiescent": Upload(_quiescent, options=_options("wavelength_unit", "flux_unit", prefix="flare_")),
+    "change_file": Upload(_added, options=_options("wavelength_unit", "flux_unit", "extend", prefix="change_")),
+    "own_unknown": Upload(read_pairs, UPLOADED_UNKNOWN, most=MOST_PAIRS_BYTES),
+    **{name: Upload(VisitorFile.of, most=MOST_KEPT_BYTES) for name, one in FIELDS.items() if one.kind == "upload"},
+    "observations": Upload(Observations.of, most=MOST_KEPT_BYTES),
+}
+
+
+def read_frames_of(
+    file: VisitorFile, mapping: VisitorFile | None, key: str, *, quality_bits: str | None = None
+) -> Frames:
+    """Read the frames of a visitor's file, through a mapping if there is one, without those of the quality bits.
+
+    Raises InputError with the name of the field if it holds no frames.
+    """
+    files = {file.name: file.content}
+    how = None
+    if mapping is not None:
+        how = mapping.name if mapping.name != file.name else f"mapping-{mapping.name}"
+        files[how] = mapping.content
+    with reported_for(key, file.name):
+        return read_frames_limited(files, how, quality_bits)
+
+
+@contextmanager
+def reported_for(key: str, name: str) -> Iterator[None]:
+    """Raise the errors of a reader as those of a field, with the name of the file."""
+    try:
+        yield
+    except InputError as error:
+        raise reworded(error, str(error), key) from error
+
+
+#: Bytes of closed forms, answers and files that the server keeps for all visitors together, and of their uploads.
+MOST_RESULTS, MOST_UPLOADS = 256 * 2**20, 256 * 2**20
+#: Objects that are counted of a value; arrays, which take most of the memory, are near its top.
+MOST_OBJECTS = 20_000
+#: Objects that belong to the program.
+PROGRAM = (type, ModuleType, FunctionType, BuiltinFunctionType, MethodType)
+
+
+class Shelf:
+    """Values of all visitors, of which the least recently used are dropped if they take more than `most` bytes."""
+
+    def __init__(self, most: int) -> None:
+        self.most, self.size = most, 0
+        self._held: OrderedDict[tuple[int, Hashable], tuple[int, Callable[[], object]]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def keep(self, owner: object, key: Hashable, value: object, drop: Callable[[], object]) -> None:
+        """Count a value that its owner keeps; `drop` is called if it must go."""
+        size = size_of(value)
+        with self._lock:
+            self._remove((id(owner), key))
+            self._held[id(owner), key] = size, drop
+            self.size += size
+            gone = []
+            while self.size > self.most and len(self._held) > 1:
+                oldest = next(iter(self._held))
+                gone.append(self._held[oldest][1])
+                self._remove(oldest)
+        for one in gone:
+            one()
+
+    def used(self, owner: object, key: Hashable) -> None:
+        """Note that a value was used."""
+        with self._lock:
+            if (id(owner), key) in self._held:
+                self._held.move_to_end((id(owner), key))
+
+    def leave(self, owner: object) -> None:
+        """Forget the values of an owner."""
+        with self._lock:
+            for entry in [entry for entry in self._held if entry[0] == id(owner)]:
+                self._remove(entry)
+
+    def _remove(self, entry: tuple[int, Hashable]) -> None:
+        self.size -= self._held.pop(entry, (0, None))[0]
+
+
+#: Results and uploads of all visitors.
+RESULTS, UPLOAD_SHELF = Shelf(MOST_RESULTS), Shelf(MOST_UPLOADS)
+
+
+def size_of(value: object) -> int:
+    """Return the approximate size of a value and of what it refers to, bytes."""
+    seen: set[int] = set()
+    waiting: list[Any] = [value]
+    size = 0
+    while waiting and len(seen) < MOST_OBJECTS:
+        # The oldest first, so that the top is counted before the details.
+        level, waiting = waiting, []
+        for one in level:
+            if id(one) in seen or isinstance(one, PROGRAM):
+                continue
+            seen.add(id(one))
+            size += sys.getsizeof(one, 0)
+            waiting += gc.get_referents(one)
+            if isinstance(one, np.ndarray) and one.base is not None:
+                waiting.append(one.base)
+    return size

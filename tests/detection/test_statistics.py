@@ -1,0 +1,229 @@
+"""Closed forms against scipy's exact distributions and plain simulation, and the paper's smoothing."""
+
+from __future__ import annotations
+
+import itertools
+import time
+
+import numpy as np
+import pytest
+from scenes import instrument, star
+from scipy import integrate, stats
+from scipy.ndimage import gaussian_filter1d
+
+from mauvecl import Comparison, Expectation, Instrument, Sky, Source, expect
+from mauvecl.detection import chi2
+from mauvecl.detection.distributions import Gaussian, Mixture, QuadraticForm
+
+
+@pytest.mark.parametrize("n", [10, 48, 1643])
+@pytest.mark.parametrize("scale", [1.0, 2.5])
+def test_equal_weights_are_a_scaled_non_central_chi_squared(n: int, scale: float) -> None:
+    """Compare with scipy's ncx2 (Boost); weights of 1 + 1e-12 keep ours from using it."""
+    shift = np.linspace(-0.5, 0.7, n)
+    form = QuadraticForm(np.full(n, scale * (1 + 1e-12)), shift)
+    exact = stats.ncx2(n, np.sum(shift**2), scale=scale)
+    assert form.mean == pytest.approx(exact.mean())
+    assert form.std == pytest.approx(exact.std())
+    for p in (0.999999, 0.99, 0.5, 1e-2, 1e-4, 1e-6, 1e-9):
+        assert form.sf(float(exact.isf(p))) == pytest.approx(p, rel=1e-4, abs=1e-13)
+
+
+def test_unit_weights_use_scipy() -> None:
+    assert QuadraticForm(np.ones(30), np.zeros(30)).isf(1e-3) == stats.chi2.isf(1e-3, 30)
+    form = QuadraticForm(np.ones(30), np.full(30, 0.3))
+    assert form.sf(40.0) == pytest.approx(stats.ncx2.sf(40.0, 30, 30 * 0.09), rel=1e-12)
+
+
+def of_two(form: QuadraticForm, x: float, *, upper: bool) -> float:
+    """Return the probability above or below x for two terms, integrated over the normal of the first."""
+    (a, b), (first, second) = form.weight, form.shift
+    most = np.sqrt(x / a)
+
+    def rest(z: float) -> float:
+        root = np.sqrt(max(x - a * (z + first) ** 2, 0.0) / b)
+        ends = stats.norm.cdf([root - second, -root - second])
+        return float(stats.norm.sf(root - second) + ends[1] if upper else ends[0] - ends[1])
+
+    edges = np.linspace(-most, most, 21) - first
+    inside = sum(
+        integrate.quad(lambda z: stats.norm.pdf(z) * rest(z), *pair, epsabs=0.0, epsrel=1e-10)[0]
+        for pair in itertools.pairwise(edges)
+    )
+    return float(inside + upper * (stats.norm.sf(edges[-1]) + stats.norm.cdf(edges[0])))
+
+
+@pytest.mark.long
+@pytest.mark.filterwarnings("ignore::scipy.integrate.IntegrationWarning")
+def test_two_terms_of_any_kind_against_quadrature() -> None:
+    """Compare weights up to 1e4 apart and shifts up to 8: every tail to 1e-10, quantiles in half a second."""
+    generator = np.random.default_rng(8)
+    for _ in range(3):
+        form = QuadraticForm(10 ** generator.uniform(-4, 0, 2), generator.normal(0, 1, 2) * generator.choice([0, 1, 4]))
+        for p in (1e-10, 1e-3, 0.3, 0.9, 1 - 1e-4):
+            began = time.process_time()
+            x = form.isf(p)
+            assert time.process_time() - began < 0.5
+            upper = p <= 0.5
+            assert of_two(form, x, upper=upper) == pytest.approx(p if upper else 1 - p, rel=1e-7)
+            assert form.sf(x) == pytest.approx(p, rel=1e-9)
+
+
+@pytest.mark.parametrize("n", [1, 2, 5, 29, 400])
+@pytest.mark.parametrize("push", [0.0, 0.5, 1e4])
+def test_few_terms_and_far_tails_agree_with_scipy(n: int, push: float) -> None:
+    """Compare equal weights down to 1e-100, with the accuracy that scipy has below 1e-10."""
+    form = QuadraticForm(np.full(n, 2.5), np.sqrt(np.append(push, np.zeros(n - 1))))
+    exact = stats.ncx2(n, push, scale=2.5) if push else stats.chi2(n, scale=2.5)
+    for p in (1e-10, 1e-5, 0.2):
+        assert exact.sf(form.isf(p)) == pytest.approx(p, rel=1e-6)
+        assert exact.cdf(form.isf(1 - p)) == pytest.approx(p, rel=1e-5)
+    if not push:
+        assert exact.sf(form.isf(1e-100)) == pytest.approx(1e-100, rel=1e-9)
+
+
+def test_several_weights_with_a_closed_form() -> None:
+    """Compare five pairs of equal weights from 1 to 1e-3 with sums of exponentials, also at 1e-12."""
+    weight = np.array([1.0, 0.4, 0.05, 0.01, 1e-3])
+    form = QuadraticForm(np.repeat(weight, 2), np.zeros(10))
+    share = np.array([np.prod(w / (w - np.delete(weight, k))) for k, w in enumerate(weight)])
+    for p in (0.9, 0.1, 1e-3, 1e-12):
+        x = form.isf(p)
+        assert share @ np.exp(-x / (2 * weight)) == pytest.approx(p, rel=1e-8)
+
+
+@pytest.mark.parametrize("spread", [0.01, 0.5, 3.0])
+def test_many_terms_of_two_kinds_have_the_tail_of_their_convolution(spread: float) -> None:
+    """Compare 300 terms of two weights with the convolution of two of scipy's non-central chi-squareds."""
+    a, b, n, push = 1.0, 10.0**-spread, 150, 0.09 * 150
+    form = QuadraticForm(np.repeat([a, b], n), np.full(2 * n, 0.3))
+    one, other = stats.ncx2(n, push, scale=a), stats.ncx2(n, push, scale=b)
+    nodes, weights = np.polynomial.legendre.leggauss(400)
+    low, high = other.isf(1 - 1e-13), other.isf(1e-13)
+    x, w = low + (high - low) * (nodes + 1) / 2, (high - low) / 2 * weights
+    for sigmas in (-3.0, -1.0, 0.5, 3.0, 5.0):
+        value = form.mean + sigmas * form.std
+        exact = w @ (other.pdf(x) * one.sf(value - x))
+        assert form.sf(value) == pytest.approx(exact, rel=1e-6, abs=1e-12)
+
+
+@pytest.mark.long
+def test_unequal_weights_against_simulation() -> None:
+    """Compare five values within 5 standard errors of 4e5 draws; one fails in 3e5 seeds."""
+    generator = np.random.default_rng(77)
+    weight, shift = generator.uniform(0.8, 1.4, 60), generator.normal(0, 0.5, 60)
+    form = QuadraticForm(weight, shift)
+    draws = ((generator.standard_normal((400_000, 60)) + shift) ** 2) @ weight
+    for p in (0.9, 0.5, 0.1, 1e-2, 1e-3):
+        x = form.isf(p)
+        assert abs(np.mean(draws > x) - p) < 5 * np.sqrt(p * (1 - p) / draws.size)
+
+
+def test_quantiles_invert_probabilities() -> None:
+    form = QuadraticForm(np.linspace(0.5, 2.0, 100), np.linspace(0.0, 1.0, 100))
+    for distribution in (form, Gaussian(2.0, 3.0)):
+        for p in (0.9, 0.1, 1e-3, 1e-6):
+            assert distribution.sf(distribution.isf(p)) == pytest.approx(p, rel=1e-5)
+
+
+def test_mixture_follows_simulation() -> None:
+    """Compare moments, tails and quantiles with draws from the components: 4.5 standard errors of 4e5 draws."""
+    rng, n = np.random.default_rng(20_261_122), 400_000
+    weight, shift = np.array([0.5, 2.0, 1.0]), np.array([0.3, 1.0, 0.0])
+    found = Mixture((Gaussian(-1.0, 0.5), QuadraticForm(weight, shift)), np.array([0.3, 0.7]))
+    squares = ((rng.normal(size=(n, 3)) + shift) ** 2) @ weight
+    x = np.where(rng.random(n) < 0.3, rng.normal(-1.0, 0.5, n), squares)
+    assert abs(x.mean() - found.mean) < 4.5 * found.std / np.sqrt(n)
+    away = x - found.mean
+    assert abs(np.mean(away**2) - found.std**2) < 4.5 * np.std(away**2) / np.sqrt(n)
+    assert abs(np.mean(away**3) - found.third) < 4.5 * np.std(away**3) / np.sqrt(n)
+    for p in (0.9, 0.5, 0.01, 1e-6):
+        cut = found.isf(p)
+        assert found.sf(cut) == pytest.approx(p, rel=1e-6)
+        assert abs(np.mean(x > cut) - p) < 4.5 * np.sqrt(p * (1 - p) / n) + 1e-5
+
+
+def whole(quiet: Expectation, flare: Expectation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the rows, factors of squares and variances of modes of the paper's sum over every pixel."""
+    n = quiet.wavelength_nm.size
+    sigma = 10.5 / np.sqrt(8 * np.log(2)) / np.median(np.diff(quiet.wavelength_nm))
+    rows = gaussian_filter1d(np.eye(n), sigma, axis=0, mode="nearest")
+    factor = 1.0 / gaussian_filter1d(flare.recorded_light_dn, sigma, mode="nearest") / flare.exposure_s
+    half = np.sqrt(factor)[:, None] * rows
+    modes = np.linalg.eigvalsh((half * (quiet.variance_dn2 + quiet.variance_dn2)) @ half.T)
+    return rows, factor, modes[modes > 1e-10 * modes.max()]
+
+
+@pytest.mark.long
+def test_few_centres_represent_all_pixels() -> None:
+    """Compare draws to 1e-3, thresholds to 1e-4, false alarms to 1e-3 at 1e-2 and to 5e-3 at 1e-10."""
+    quiet, flare = star(amplitudes=(0.081,))
+    rows, factor, modes = whole(quiet, flare)
+    smoothing = chi2.Smoothing.of(quiet, np.ones(len(rows), bool), (flare,))
+    assert np.diff(smoothing.centres).max() == 7
+    rng = np.random.default_rng(1)
+    noise = rng.normal(0.0, np.sqrt(2 * quiet.variance_dn2), (200, len(rows)))
+    for x in (noise, noise + flare.signal_dn - quiet.signal_dn):
+        ours = (x @ smoothing.rows.T) ** 2 @ smoothing.scale(flare)
+        np.testing.assert_allclose(ours, (x @ rows.T) ** 2 @ factor, rtol=1e-3)
+    full = QuadraticForm(modes, np.zeros(modes.size))
+    form = smoothing.form(smoothing.scale(flare), np.zeros(len(rows)), 2 * quiet.variance_dn2)
+    for fap, error in ((1e-2, 1e-3), (1e-10, 5e-3)):
+        assert form.isf(fap) == pytest.approx(full.isf(fap), rel=1e-4)
+        assert full.sf(form.isf(fap)) == pytest.approx(fap, rel=error)
+
+
+def test_every_pixel_is_a_centre_if_few_do_not_suffice() -> None:
+    """Use a star without light or sky below 400 nm, where the inverse of the smoothed flux jumps."""
+    nm = np.arange(170.0, 1150.0, 0.5)
+    dark = Source.from_arrays(nm, np.where(nm > 400.0, 1e-11, 0.0)).at_magnitude(7.4)
+    quiet = expect(dark, Instrument.load("mauve"), exposure=50.0, sky=Sky.none())
+    used = np.ones(quiet.wavelength_nm.size, bool)
+    smoothing = chi2.Smoothing.of(quiet, used)
+    assert len(smoothing.centres) == used.size
+    rows = gaussian_filter1d(np.eye(used.size), smoothing.sigma, axis=0, mode="nearest")
+    np.testing.assert_allclose(smoothing.rows, rows)
+
+
+@pytest.mark.parametrize("chunk", [4, 32])
+@pytest.mark.parametrize("changes", [{}, {"output_min_nm": 300.0, "output_max_nm": 330.0}])
+def test_bands_hold_the_rows(chunk: int, changes: dict) -> None:
+    """Follow the bands in chunks as the kernel does, with some pixels left out."""
+    (quiet,) = star(payload=instrument(**changes))
+    n = quiet.wavelength_nm.size
+    used = np.random.default_rng(2).random(n) > 0.1
+    used[20:90] = False
+    smoothing = chi2.Smoothing.of(quiet, used)
+    padded = -(-n // 32) * 32
+    weights, finished = smoothing.bands(padded, chunk)
+    x = np.zeros(padded)
+    x[:n] = np.random.default_rng(3).normal(size=n)
+    window, out = np.zeros(weights.shape[1]), []
+    for c, count in enumerate(finished):
+        window += weights[c] @ x[c * chunk : (c + 1) * chunk]
+        out += list(window[:count])
+        window = np.append(window[count:], np.zeros(count))
+    assert len(out) == len(smoothing.rows)
+    np.testing.assert_allclose(out, smoothing.rows @ x[:n], atol=1e-6)
+
+
+def test_sum_is_a_generalised_chi_squared() -> None:
+    """Compare with NumPy's normals: Kolmogorov-Smirnov p > 1e-6 with and without a flare."""
+    quiet, flare = star(amplitudes=(0.03,), payload=instrument(part=True))
+    smoothing = chi2.Smoothing.of(quiet, np.ones(quiet.wavelength_nm.size, bool))
+    scale = smoothing.scale(flare)
+    rng = np.random.default_rng(4)
+    for delta in (np.zeros_like(quiet.signal_dn), flare.signal_dn - quiet.signal_dn):
+        form = smoothing.form(scale, delta, 2 * quiet.variance_dn2)
+        x = delta + rng.normal(0.0, np.sqrt(2 * quiet.variance_dn2), (20_000, delta.size))
+        values = (x @ smoothing.rows.T) ** 2 @ scale
+        grid = np.quantile(values, np.linspace(0.01, 0.999, 60))
+        ours = np.searchsorted(np.sort(values), grid) / values.size
+        theirs = 1 - np.array([form.sf(v) for v in grid])
+        assert stats.kstwo.sf(np.abs(ours - theirs).max(), values.size) > 1e-6
+
+
+def test_comparison_is_read_from_words() -> None:
+    assert Comparison.of("stack:5", "estimated") == Comparison(5, True)
+    assert Comparison.of("exposure").added_variance == 1.0
+    assert Comparison.of().plain

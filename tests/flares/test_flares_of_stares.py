@@ -1,0 +1,191 @@
+"""Flares of a study's stare: the light of each frame, and the stated energies, are those of the flares' spectra."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import QTable
+from marks import long_but
+from refusals import refused
+from scenes import through
+from scipy.integrate import quad
+
+from mauvecl import SHAPES, Blackbody, Cooling, EnergyScale, Instrument, Sky, Source, Study, expect, stare
+
+MAUVE = Instrument.load("mauve")
+STARS = ("A0V", "A7V", "F5V", "G2V", "K1V", "K5V", "M0V", "M3V", "M5V", "Sun")
+BANDS = ("Kepler", "TESS", "V", "B", "Gaia G", "Gaia BP", "GALEX NUV")
+#: Ranges of wavelength of the columns of a light curve.
+COLUMNS = {"mean_200_300": (200, 300), "mean_300_400": (300, 400), "mean_550_700": (550, 700)}
+
+
+def drawn(events: list[dict[str, Any]], star: dict[str, Any] | None = None, **sections: Any) -> Any:
+    frames = {"duration_s": 2000.0, "search": False} | sections.pop("stare", {})
+    star = star or {"library": "M3V", "magnitude": 8.0, "distance_pc": 5.0}
+    return stare(Study.build({"star": [star], "events": events, "stare": frames, **sections}, "test"))
+
+
+def light_of(amplitude: float = 0.0, kelvin: float = 10_000.0) -> dict[str, float]:
+    """Return the mean DN/s of a frame in the columns' ranges."""
+    star = Source.from_library("M3V").at_magnitude(8.0)
+    x = expect(star.flaring(amplitude, kelvin), MAUVE, exposure=5.0, sky=Sky.of_brightness(22.1))
+    nm = x.wavelength_nm
+    return {name: float(x.light_dn[(low <= nm) & (nm < high)].sum()) / 5.0 for name, (low, high) in COLUMNS.items()}
+
+
+def excess(table: QTable, name: str) -> np.ndarray:
+    """Return the light of the flares in each frame, DN/s."""
+    return np.asarray(table[name].value - light_of()[name])
+
+
+def courses(table: QTable, events: list[dict[str, Any]]) -> np.ndarray:
+    """Return the flares' means over the frames, by their shapes."""
+    edges = np.asarray(table["time"].value)[:, None] + [-2.5, 2.5]
+    rows = [
+        SHAPES[one.get("shape", "davenport2014")].mean_over(edges, one["peak_s"], one["half_width_s"]) for one in events
+    ]
+    return np.array(rows)
+
+
+def test_light_of_the_frames_is_that_of_the_flares_and_gaps_have_none() -> None:
+    """Flares of two temperatures and shapes, of which one has the same temperature from first to last."""
+    events: list[dict[str, Any]] = [
+        {"peak_s": 300.0, "half_width_s": 20.0, "amplitude": 0.2},
+        {"peak_s": 420.0, "half_width_s": 60.0, "peak": 0.1, "temperature_k": 15_000.0, "shape": "tovarmendoza2022"},
+        {"peak_s": 500.0, "half_width_s": 10.0, "amplitude": 0.3, "temperature_k": 10_000.0,
+         "cooling": {"end_k": 10_000.0, "fold_s": 100.0}},
+    ]  # fmt: skip
+    answer = drawn(events, stare={"gaps": [[450.0, 650.0]]})
+    table = answer.light_curve()
+    assert len(table) == 400 - 40
+    assert not ((table["time"].value > 450) & (table["time"].value < 650)).any()
+    sizes = np.array([0.2, 0.1 / SHAPES["tovarmendoza2022"].peak, 0.3])
+    np.testing.assert_allclose(answer.events["amplitude"], sizes, rtol=1e-12)
+    one, two, three = sizes[:, None] * courses(table, events)
+    for name in COLUMNS:
+        cool, hot = (light_of(1.0, k)[name] - light_of()[name] for k in (10_000.0, 15_000.0))
+        np.testing.assert_allclose(excess(table, name), (one + three) * cool + two * hot, rtol=1e-6, atol=1e-6 * cool)
+
+
+def test_cooling_flare_has_the_light_of_its_temperatures() -> None:
+    """Mixed from few temperatures, whose light is 2 % too bright at most, and 6 % in the far ultraviolet."""
+    event = {"peak_s": 500.0, "half_width_s": 60.0, "amplitude": 0.5, "temperature_k": 14_000.0,
+             "cooling": {"end_k": 6000.0, "fold_s": 120.0}}  # fmt: skip
+    table = drawn([event]).light_curve()
+    (course,) = 0.5 * courses(table, [event])
+    cooling = Cooling(14_000.0, 6000.0, 120.0)
+    for k in (95, 101, 110, 130, 200):
+        found = light_of(float(course[k]), float(cooling.at(np.array(table["time"][k].value - 500.0))))
+        for name in COLUMNS:
+            within = 0.06 if name == "mean_200_300" else 0.02
+            assert excess(table, name)[k] == pytest.approx(found[name] - light_of()[name], rel=within)
+
+
+def share_within(low_nm: float, high_nm: float, kelvin: float) -> float:
+    """Return the fraction of a blackbody's light between two wavelengths."""
+    # 15 / pi^4 times the integral of x^3 / (e^x - 1) over x = h c / (wavelength k T), CODATA 2018.
+    ends = [1.438776877e7 / (nm * kelvin) for nm in (high_nm, low_nm)]
+    value = quad(lambda x: x**3 / np.expm1(x), ends[0], ends[1], epsabs=0.0, epsrel=1e-12, limit=200)[0]
+    return float(15 / np.pi**4 * value)
+
+
+def random_event(rng: np.random.Generator) -> dict[str, Any]:
+    """Return a flare of a given energy within a stare of a day, which cools in four cases of ten."""
+
+    def spread(low: float, high: float) -> float:
+        return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+    event: dict[str, Any] = {
+        "peak_s": float(rng.uniform(5000, 20_000)), "half_width_s": spread(2, 600), "energy_erg": spread(1e28, 1e31),
+        "energy": str(rng.choice(["bolometric", "band"])), "temperature_k": spread(7000, 30_000),
+        "shape": str(rng.choice(["davenport2014", "tovarmendoza2022"])),
+    }  # fmt: skip
+    if rng.random() < 0.4:
+        event["cooling"] = {"end_k": float(rng.uniform(5500, event["temperature_k"])), "fold_s": spread(2, 1000)}
+    return event
+
+
+@pytest.mark.parametrize("seed", long_but(range(12), 0, 1, 2))
+def test_stated_energies_are_those_of_the_light(seed: int) -> None:
+    """Draw stars, distances, bands, shapes, temperatures and cooling at random, and integrate over time and wavelength.
+
+    Light of a flare that cools is mixed from few temperatures, which changes its energy by 3 % at most.
+    """
+    rng = np.random.default_rng(seed)
+    events = [random_event(rng) for _ in range(rng.integers(1, 4))]
+    band, library = str(rng.choice(BANDS)), str(rng.choice(STARS))
+    star = {"library": library, "magnitude": float(rng.uniform(4, 10)), "distance_pc": float(rng.uniform(2, 100))}
+    frames = {"duration_s": 30_000.0}
+    answer = drawn(events, star, stare=frames, flare={"band": band}, sky={"none": True})
+    source = Source.from_library(library).at_magnitude(star["magnitude"])
+    nm, sphere = source.wavelength_nm, 4 * np.pi * (star["distance_pc"] * u.pc).to_value(u.cm) ** 2
+    for given, row in zip(events, answer.events, strict=True):
+        stated = {kind: row[f"energy_{kind}"].to_value("erg") for kind in ("band", "bolometric")}
+        assert stated[given["energy"]] == pytest.approx(given["energy_erg"], rel=1e-9)
+        # Steps of a fiftieth of a half-width, over which the temperature hardly changes.
+        law = given.get("cooling")
+        steps = np.linspace(-2, 60, 3101) if law else np.array([-2.0, 60.0, 1e4])
+        edges = given["peak_s"] + given["half_width_s"] * steps
+        course = SHAPES[given["shape"]].mean_over(edges, given["peak_s"], given["half_width_s"]) * np.diff(edges)
+        middle = (edges[1:] + edges[:-1]) / 2 - given["peak_s"]
+        hot = given["temperature_k"]
+        kelvin = np.full(middle.size, hot) if law is None else Cooling(hot, law["end_k"], law["fold_s"]).at(middle)
+        bins = np.linspace(kelvin.min(), kelvin.max(), 25) if law else kelvin[:1]
+        drawn_erg = {"band": 0.0, "bolometric": 0.0}
+        for number, one in enumerate(bins):
+            seconds = row["amplitude"] * course[np.abs(kelvin[:, None] - bins).argmin(axis=1) == number].sum()
+            light = source.flaring(1.0, float(one), band=band).flux_flam - source.flux_flam
+            drawn_erg["band"] += seconds * sphere * through(band, nm, light)
+            # A spectrum ends somewhere: beyond, the blackbody's light is known.
+            share = share_within(nm[0], nm[-1], float(one))
+            drawn_erg["bolometric"] += seconds * sphere * 10 * np.trapezoid(light, nm) / share
+        assert stated == pytest.approx(drawn_erg, rel=0.03 if law else 5e-4)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_replacing_flare_carries_the_energy_it_adds(seed: int) -> None:
+    """Integrate the light of the hot patch less that of the photosphere, for stars that are blackbodies."""
+    rng = np.random.default_rng(100 + seed)
+    name, star_k, flare_k = str(rng.choice(BANDS)), float(rng.uniform(3000, 9000)), float(rng.uniform(9500, 30_000))
+    nm = np.geomspace(20, 300_000, 60_001)
+    source = Source.from_arrays(nm, 1e-19 * Blackbody(star_k).flux(nm))
+    how: Any = {"band": name, "geometry": "replaces"}
+    small = 1e-4
+    light = source.flaring(small, flare_k, photosphere_temperature=star_k, **how).flux_flam - source.flux_flam
+    light /= small
+    sphere = 4 * np.pi * (10 * u.pc).to_value(u.cm) ** 2
+    for kind, given in (("band", through(name, nm, light)), ("bolometric", 10 * np.trapezoid(light, nm))):
+        scale = EnergyScale.of_star(source, 10.0, flare_k=flare_k, photosphere_k=star_k, kind=kind, **how)
+        assert scale.erg_per_s == pytest.approx(sphere * given, rel=5e-4)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_flares_outside_of_the_frames_are_refused_or_reported(shape: str) -> None:
+    rng = np.random.default_rng(81)
+    count = {"refused": 0, "named": 0, "inside": 0}
+    for _ in range(24):
+        peak, half_width = float(rng.uniform(-400, 2000)), float(10 ** rng.uniform(0, 2.8))
+        event = {"peak_s": peak, "half_width_s": half_width, "amplitude": 0.5, "shape": shape}
+        frames = {"duration_s": 1500.0, "gaps": [[600.0, 1000.0]]}
+        edges = np.column_stack([np.r_[0:120, 200:300], np.r_[1:121, 201:301]]) * 5.0
+        if SHAPES[shape].mean_over(edges, peak, half_width).max() < 1e-9 * SHAPES[shape].peak:
+            with refused("peak_s", f"{peak:g} s"):
+                drawn([event], stare=frames)
+            count["refused"] += 1
+            continue
+        answer = drawn([event], stare=frames)
+        table = answer.light_curve()
+        light = excess(table, "mean_300_400")
+        if any("peak" in line and f"{peak:.6g}"[:4] in line for line in answer.messages):
+            # The largest light is then at an edge of the frames.
+            assert light[[0, 119, 120, 219]].max() >= (1 - 1e-9) * light.max()
+            count["named"] += 1
+        else:
+            # What peaks in a frame is largest there or next to it, but for a boxcar, whose top is flat.
+            best = table["time"][np.argmax(light)].value
+            assert abs(best - peak) <= 7.5 + half_width * (shape == "fiducial")
+            count["inside"] += 1
+    assert min(count.values()) > 0, count

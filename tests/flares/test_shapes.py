@@ -1,0 +1,185 @@
+"""Shapes of flares in time and their energies: published values, integrals against quadrature, frames."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import numpy as np
+import pytest
+from scenes import BANDS
+from scipy.integrate import quad
+
+from mauvecl import SHAPES, Blackbody, EnergyScale, Event, Source, TableShape
+
+#: A shape whose height and length follow from its equivalent duration.
+FIDUCIAL: Any = SHAPES["fiducial"]
+#: Where each shape has a kink or a step.
+KINKS = {"davenport2014": [-1.0, 0.0], "tovarmendoza2022": [0.0], "fiducial": [0.0, FIDUCIAL.BOX], "table": [0.0, 1.0]}
+TABLE = TableShape(np.array([-1.0, 0.0, 1.0, 4.0]), np.array([0.0, 3.0, 1.0, 0.0]))
+ALL = [*SHAPES.values(), TABLE]
+NAMES = [shape.name for shape in ALL]
+
+
+def between(function, first: float, last: float, kinks: list[float]) -> float:
+    """Integrate a shape numerically, piece by piece."""
+    ends = [first, *(k for k in kinks if first < k < last), last]
+    return sum(quad(function, a, b, epsabs=1e-14, epsrel=1e-12, limit=400)[0] for a, b in itertools.pairwise(ends))
+
+
+def test_shape_equals_the_published_formula():
+    # Tovar Mendoza et al. 2022 as printed, with plain exp and erfc.
+    from scipy.special import erfc
+
+    shape, tau = SHAPES["tovarmendoza2022"], np.linspace(-1.2, 30, 500)
+    a, b, c = shape.A, shape.B, shape.C
+    printed = sum(
+        np.sqrt(np.pi) / 2 * a * c * f * np.exp(-d * tau + (b / c + d * c / 2) ** 2) * erfc((b - tau) / c + c * d / 2)
+        for f, d in shape.DECAY
+    )
+    np.testing.assert_allclose(shape.at(tau), printed, rtol=1e-10, atol=1e-15)
+    with np.errstate(all="raise", under="ignore"):
+        far = shape.at(np.array([-1e4, -50.0, 1e4]))
+    assert (far == 0).all()
+
+
+@pytest.mark.parametrize("shape", ALL, ids=NAMES)
+def test_integrals_agree_with_quadrature(shape):
+    kinks = KINKS[shape.name]
+    top = max(kinks) + 3.0
+    tail = quad(lambda t: float(shape.at(t)), top, np.inf, epsabs=1e-14)[0] if shape is not TABLE else 0.0
+    whole = between(lambda t: float(shape.at(t)), -3.0, top, kinks) + tail
+    assert shape.equivalent_duration == pytest.approx(whole, abs=1e-11)
+    squares = between(lambda t: float(shape.at(t)) ** 2, -3.0, top + 100, [*kinks, top, top + 10, top + 30])
+    assert shape.square_integral == pytest.approx(squares, abs=1e-11)
+    # Pieces anywhere, of any length.
+    edges = np.array([-2.5, -1.3, -1.0, -0.7, -0.2, 0.0, 0.1, 0.6, 0.9, 3.0, 3.5, 9.0])
+    exact = [between(lambda t: float(shape.at(t)), a, b, kinks) for a, b in itertools.pairwise(edges)]
+    np.testing.assert_allclose(shape.integral(edges[:-1], edges[1:]), exact, atol=1e-12)
+
+
+@pytest.mark.parametrize("shape", ALL, ids=NAMES)
+def test_frames_sum_to_the_fluence_outside_of_gaps(shape):
+    edges = np.arange(-100, 30_001) * 5.0
+    means = shape.mean_over(edges, 777.7, 33.0)
+    assert 5.0 * means.sum() == pytest.approx(33.0 * shape.equivalent_duration, rel=1e-12)
+    pairs = np.column_stack([edges[:-1], edges[1:]])[[3, 255, 256, 900]]
+    np.testing.assert_array_equal(shape.mean_over(pairs, 777.7, 33.0), means[[3, 255, 256, 900]])
+    several = shape.mean_over(edges, np.array([[777.7], [900.0]]), np.array([[33.0], [10.0]]))
+    np.testing.assert_array_equal(several[0], means)
+
+
+@pytest.mark.parametrize("shape", ALL, ids=NAMES)
+def test_frames_conserve_light_of_any_flare(shape):
+    # Whole stares about 400 random flares: scipy's erfc underflows to 0 before a product with an exponential does.
+    rng = np.random.Generator(np.random.Philox(26))
+    for _ in range(400):
+        peak, half = rng.uniform(-2000.0, 8000.0), 10 ** rng.uniform(-2.0, 6.0)
+        with np.errstate(all="raise", under="ignore"):
+            means = shape.mean_over(np.arange(1201) * 5.0, peak, half)
+        assert (means >= 0).all(), (peak, half, means.min())
+
+
+def test_tovar_mendoza_rise_keeps_its_digits():
+    # Against quadrature of the shape itself, down to where doubles end.
+    shape = SHAPES["tovarmendoza2022"]
+    for tau in (-0.2513, -0.4, -1.0, -2.0, -4.0, -6.0):
+        # In units of the shape's own value at the end, so that quadrature sees something.
+        scale = float(shape.at(tau))
+        exact = scale * quad(lambda t: float(shape.at(t)) / scale, tau - 1.0, tau, epsrel=1e-12, limit=400)[0]  # noqa: B023
+        assert float(shape.before(tau)) == pytest.approx(exact, rel=1e-8)
+
+
+def test_late_frame_keeps_its_digits():
+    # The difference of two integrals from the beginning would have none left here.
+    shape = SHAPES["davenport2014"]
+    (a, b), (c, d) = shape.DECAY
+    exact = a / b * (np.exp(-b * 100) - np.exp(-b * 101)) + c / d * (np.exp(-d * 100) - np.exp(-d * 101))
+    assert float(shape.integral(100, 101)) == pytest.approx(exact, rel=1e-10)
+
+
+@pytest.mark.parametrize("shape", ALL, ids=NAMES)
+def test_peak_and_width_agree_with_a_fine_scan(shape):
+    tau = np.linspace(-2, 5, 700_001)
+    values = shape.at(tau)
+    # Davenport's peak is a step's upper edge.
+    assert values.max() == pytest.approx(shape.peak, abs=1e-8)
+    assert (values > shape.peak / 2).sum() * 1e-5 == pytest.approx(shape.width, abs=3e-5)
+
+
+def test_fiducial_flare_has_its_equivalent_duration():
+    for delta in (100.0, 1000.0, 1e5):
+        amplitude, half_width = FIDUCIAL.of(delta)
+        shape = SHAPES["fiducial"]
+        assert amplitude == pytest.approx(0.3 * delta**0.6)
+        assert amplitude * half_width * shape.equivalent_duration == pytest.approx(delta, rel=1e-12)
+        box = amplitude * half_width * shape.BOX
+        assert box == pytest.approx(delta / 1.5, rel=1e-12)
+
+
+#: Planck's and Boltzmann's constants and the speed of light (CODATA 2018), and the radius of the Sun, cm.
+H, C, K, SUN_CM = 6.62607015e-27, 2.99792458e10, 1.380649e-16, 6.957e10
+#: erg/s of Shibayama et al. 2013's formula by other tables of the bands, for flares of 9000 and 10 000 K.
+ELSEWHERE = [
+    ("Kepler", 5778, 1.0, 1.1774e33, 1.3289e33),
+    ("Kepler", 4830, 0.755, 2.9825e32, 3.3663e32),
+    ("Kepler", 3200, 0.2, 1.9525e30, 2.2037e30),
+    ("TESS", 5778, 1.0, 1.5365e33, 1.8197e33),
+]
+
+
+def through(name: str, kelvin: float, *, of: str) -> float:
+    """Integrate Planck's law over a band by Gauss and Legendre: in units of response, photons or energy."""
+    at, throughput = (np.asarray(BANDS[name][column], float) for column in ("wavelength", "throughput"))
+    nodes, weights = np.polynomial.legendre.leggauss(4)
+    a, b = at[:-1, None], at[1:, None]
+    nm, step = (a + b) / 2 + (b - a) / 2 * nodes, (b - a) / 2 * weights * 1e-7
+    response = np.interp(nm, at, throughput)
+    cm = nm * 1e-7
+    light = 2 * np.pi * H * C**2 / cm**5 / np.expm1(H * C / (cm * K * kelvin))
+    return float(np.sum(step * response * light * {"response": 1.0, "photons": nm, "energy": 1 / throughput.max()}[of]))
+
+
+@pytest.mark.parametrize(("name", "star_k", "radius", "cool", "hot"), ELSEWHERE)
+def test_energies_agree_with_direct_integration_and_other_band_tables(
+    name: str, star_k: float, radius: float, cool: float, hot: float
+) -> None:
+    # The embedded bands are those of pyphot; with another table of Kepler's or TESS's energies differ by up to 1.4 %.
+    sphere = 4 * np.pi * (radius * SUN_CM) ** 2
+    for flare_k, elsewhere in ((9000.0, cool), (10_000.0, hot)):
+        bolometric = sphere * 5.670374419e-5 * flare_k**4
+        bodies, weighted = (
+            through(name, star_k, of=of) / through(name, flare_k, of=of) for of in ("photons", "response")
+        )
+        published = EnergyScale.shibayama2013(radius, star_k, band=name, flare_k=flare_k).erg_per_s
+        assert published == pytest.approx(bolometric / 4 * weighted, rel=2e-6)
+        assert published == pytest.approx(elsewhere, rel=0.015)
+        exact = {"bolometric": bolometric * bodies, "band": sphere * bodies * through(name, flare_k, of="energy")}
+        for kind, value in exact.items():
+            scale = EnergyScale.of_blackbody(radius, star_k, band=name, flare_k=flare_k, kind=kind)  # type: ignore[arg-type]
+            assert scale.erg_per_s == pytest.approx(value, rel=2e-6)
+
+
+def test_blackbody_star_agrees_with_the_blackbody_scale() -> None:
+    nm = np.linspace(160, 1200, 20_801)
+    # Of one solar radius seen from 10 pc.
+    shrunk = (SUN_CM / (10 * 3.0856775814913674e18)) ** 2
+    star = Source.from_arrays(nm, shrunk * Blackbody(5778.0).flux(nm))
+    for how in ({"kind": "band"}, {"flare_k": 9e3}, {"geometry": "replaces", "photosphere_k": 5778.0}):
+        seen, made = EnergyScale.of_star(star, 10.0, **how), EnergyScale.of_blackbody(1.0, 5778.0, **how)  # type: ignore[arg-type]
+        assert seen.kind == made.kind == how.get("kind", "bolometric")
+        assert seen.erg_per_s == pytest.approx(made.erg_per_s, rel=1e-5)
+
+
+@pytest.mark.parametrize("name", list(SHAPES))
+def test_duration_peak_and_energy_are_consistent(name: str) -> None:
+    scale = EnergyScale.of_blackbody(1.0, 5778.0, flare_k=10_000.0)
+    flare, where = Event(100.0, 33.0, 0.4, shape=name), {"peak_s": 100.0, "half_width_s": 33.0, "shape": name}
+    duration = flare.equivalent_duration_s
+    assert Event.of_energy(flare.energy(scale), scale, **where).amplitude == pytest.approx(0.4, rel=1e-14)
+    assert Event.of_equivalent_duration(duration, **where).amplitude == pytest.approx(0.4, rel=1e-14)
+    assert Event.of_peak(flare.peak, **where).amplitude == pytest.approx(0.4)
+    assert flare.peak == pytest.approx(0.4 * SHAPES[name].peak)
+    # And the duration is the integral of what frames are given.
+    edges = np.arange(-100, 30_000) * 5.0
+    assert 5.0 * 0.4 * SHAPES[name].mean_over(edges, 100.0, 33.0).sum() == pytest.approx(duration, rel=1e-12)

@@ -1,0 +1,265 @@
+"""Families of shapes and the process of a light curve: their matrices, and work that does not grow with its length."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scenes import flare
+from scipy import stats
+
+from mauvecl import SHAPES, Frames, Study, analyse
+from mauvecl.observations import event_windows, events
+from mauvecl.observations.detection import detect_events
+from mauvecl.observations.event_fits import Mixture
+from mauvecl.observations.event_windows import Family, Likelihood, families
+from mauvecl.observations.level import process_level
+from mauvecl.observations.process import Covariance, Process, ProcessTerm, Steps
+from mauvecl.observations.search import Detection, SeriesSurvey
+
+GENERAL = Family.general()
+
+
+def test_prior_weights_add_up_to_one() -> None:
+    for searched in SHAPES.values():
+        every = families(searched)
+        assert sum(one.prior for one in every) == pytest.approx(1.0)
+        assert searched.name in [one.name for one in every]
+
+
+def test_shares_of_the_slow_decay_have_equal_weights() -> None:
+    """No slow decay is one of five shares, though it has one rate where the others have 24."""
+    share, prior = GENERAL.weights[:, 6:].sum(axis=1).round(9), np.exp(GENERAL.log_prior)
+    weights = [prior[share == each].sum() for each in np.unique(share)]
+    assert weights == pytest.approx([0.2] * 5)
+
+
+def test_slow_decays_are_exponentials_of_all_rates() -> None:
+    tau = np.concatenate([[0.0], np.geomspace(1e-3, 150, 500)])
+    (fast,) = (each for each in GENERAL.parts[4:6] if isinstance(each, event_windows.Exponential))
+    pairs = [(share, rate) for share in event_windows.SLOW_SHARES for rate in event_windows.SLOW_RATES]
+    for k, (share, rate) in enumerate(pairs, 1):
+        slow = np.exp(-rate * tau) / rate
+        np.testing.assert_allclose(GENERAL.shape(k).after(tau), (1 - share) * fast.after(tau) + share * slow, atol=5e-5)
+
+
+@pytest.mark.parametrize("k", range(0, len(GENERAL.weights), 37))
+def test_shapes_have_a_peak_of_one_and_the_integral_of_their_values(k: int) -> None:
+    shape = GENERAL.shape(k)
+    # Values are differences of the integrals from both ends, which agree.
+    tau = np.concatenate([-np.geomspace(1e-6, 12, 4000)[::-1], np.geomspace(1e-6, 150, 8000)])
+    up, down = np.diff(shape.before(tau)), -np.diff(shape.after(tau))
+    np.testing.assert_allclose(up, down, rtol=1e-5, atol=1e-13)
+    at = up / np.diff(tau)
+    assert at.max() == pytest.approx(1.0, abs=2e-3)
+    assert np.argmax(at) == pytest.approx(np.searchsorted(tau, 0.0), abs=600)
+    # Slow decays are interpolated to 1e-5 of the peak.
+    assert (at >= -1e-5).all()
+    assert np.sum(np.diff(tau) * at) == pytest.approx(shape.equivalent_duration, rel=1e-4)
+    assert GENERAL.durations[k] == pytest.approx(shape.equivalent_duration, rel=1e-12)
+
+
+def test_fits_of_all_shapes_are_those_of_each() -> None:
+    rng = np.random.default_rng(3)
+    n, n_node = 12, 5
+    parts = rng.random((len(GENERAL.parts), n_node, n))
+    root = rng.standard_normal((n, n))
+    likelihood = Likelihood(SimpleNamespace(), root @ root.T, 0.0, np.zeros(n), 0.0, np.zeros(n), 0.0)  # type: ignore[arg-type]
+    values = 5 + rng.standard_normal(n)
+    slope, information = likelihood.matched(parts, GENERAL.weights, values)
+    for k in range(0, len(GENERAL.weights), 29):
+        for node in range(n_node):
+            model = GENERAL.weights[k] @ parts[:, node]
+            assert information[k, node] == pytest.approx(model @ likelihood.inverse @ model, rel=1e-10)
+            assert slope[k, node] == pytest.approx(model @ likelihood.inverse @ values, rel=1e-8, abs=1e-8)
+
+
+@pytest.mark.parametrize("mean", [-40.0, -5.0, 0.0, 3.0, 1e4])
+def test_quantiles_are_those_of_a_truncated_normal_distribution(mean: float) -> None:
+    mixture = Mixture(np.log([0.2, 0.8]), np.full(2, mean), np.full(2, 2.0))
+    expected = stats.truncnorm(-mean / 2, np.inf, mean, 2.0)
+    for probability in (0.025, 0.16, 0.5, 0.84, 0.975):
+        assert mixture.quantile(probability) == pytest.approx(float(expected.ppf(probability)), rel=1e-5)
+
+
+def test_quantiles_of_a_mixture_are_those_of_its_draws() -> None:
+    """The allowed errors are five standard errors of the draws."""
+    log_weight, mean, sd = np.log([1.0, 2.0, 3.0]), np.array([-1.0, 2.0, 6.0]), np.array([1.0, 3.0, 0.5])
+    rng = np.random.default_rng(5)
+    which = rng.choice(3, 400_000, p=np.exp(log_weight) / 6)
+    drawn = mean[which] + sd[which] * rng.standard_normal(which.size)
+    drawn = drawn[drawn > 0]
+    for probability in (0.025, 0.16, 0.5, 0.84, 0.975):
+        below = np.mean(drawn < Mixture(log_weight + 3.0, mean, sd).quantile(probability))
+        assert abs(below - probability) < 5 * np.sqrt(probability * (1 - probability) / drawn.size)
+
+
+@pytest.mark.parametrize("middle", [-3.0, 0.1, 5.0, 300.0])
+def test_quantiles_of_many_parts_are_those_of_their_sum(middle: float) -> None:
+    rng = np.random.default_rng(2)
+    log_weight, mean, log_sd = rng.normal([0.0, middle, 0.0], [1.0, 2.0, 0.4], (50_000, 3)).T
+    mixture, weight = Mixture(log_weight, mean, np.exp(log_sd)), np.exp(log_weight)
+    levels = (0.025, 0.16, 0.5, 0.84, 0.975)
+    none, *above = (weight @ stats.norm.sf(q, mean, np.exp(log_sd)) for q in (0.0, *map(mixture.quantile, levels)))
+    assert np.array(above) / none == pytest.approx(1 - np.array(levels), abs=2e-5)
+
+
+Float = NDArray[np.float64]
+SHAPE = SHAPES["davenport2014"]
+CADENCE_S, LEVEL, SD = 20.0, 10_000.0, 10.0
+SHORT, LONG = 80_000, 320_000
+SMOOTH = Process((ProcessTerm("smooth", (np.log(2.0), np.log(40_000.0))),), 1.0)
+WHITE = Process((), 1.0)
+
+
+def survey_of(n: int, model: Process) -> SeriesSurvey:
+    """Return frames with a flare in the middle, around which light curves of each length are the same."""
+    noise = np.random.default_rng(5).normal(0.0, SD, LONG)[(LONG - n) // 2 : (LONG + n) // 2]
+    time = np.arange(n) * CADENCE_S
+    flux = LEVEL * (1 + 0.05 * flare(time + CADENCE_S / 2, CADENCE_S, time[n // 2], 120.0)) + noise
+    frames = Frames.of(time, flux, np.full(n, SD))
+    survey = SeriesSurvey.of(frames, flux, np.full(n, SD**2), np.ones(n, np.bool_), LEVEL, 0.0, SHAPE)
+    return replace(survey, processes=(model,), flux_process=model)
+
+
+def event_of(survey: SeriesSurvey) -> Detection:
+    middle = survey.stare.n_frames // 2
+    return Detection(100.0, 120.0, float(survey.stare.start_s[middle]), 0, 20.0, middle - 8, middle + 120)
+
+
+class Sizes:
+    """Numbers of values that functions are called with."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.monkeypatch, self.found = monkeypatch, list[tuple[str, int]]()
+
+    def watch(self, owner: object, name: str, place: int) -> None:
+        """Record the size of an argument of a function."""
+        original = getattr(owner, name)
+
+        def recorded(*given, **others):  # type: ignore[no-untyped-def]
+            self.found.append((name, np.size(given[place])))
+            return original(*given, **others)
+
+        self.monkeypatch.setattr(owner, name, recorded)
+
+    def taken(self) -> list[tuple[str, int]]:
+        """Return the sizes and forget them."""
+        found, self.found = self.found, []
+        return found
+
+
+@pytest.mark.parametrize("model", [SMOOTH, WHITE], ids=["smooth", "white"])
+def test_work_of_an_event_does_not_grow_with_the_light_curve(model: Process, monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes = Sizes(monkeypatch)
+    sizes.watch(event_windows, "_bins", 0)
+    sizes.watch(Process, "covariance", 1)
+    sizes.watch(Process, "times", 1)
+    sizes.watch(Process, "at", 1)
+    measured, work = [], []
+    for n in (SHORT, LONG):
+        survey = survey_of(n, model)
+        one = event_of(survey)
+        taken = np.zeros(n, np.bool_)
+        taken[one.first : one.last + 1] = True
+        measured.append(events.measure_event(survey, taken, np.full(n, LEVEL / SD), one).energy)
+        work.append(sizes.taken())
+    assert work[0]
+    assert work[0] == work[1]
+    assert max(size for name, size in work[0] if name != "at") <= 2 * event_windows.WINDOW_FRAMES + 200
+    for name in ("summed_s", "summed_error_s", "fitted_s", "low_s", "high_s"):
+        assert getattr(measured[1], name) == pytest.approx(getattr(measured[0], name), rel=1e-4)
+
+
+def test_search_solves_as_many_templates_around_an_event_in_a_longer_light_curve(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    sizes = Sizes(monkeypatch)
+    sizes.watch(Covariance, "squared_norms", 1)
+    work = []
+    for n in (SHORT, LONG):
+        found, _ = detect_events(survey_of(n, SMOOTH), 7.0)
+        assert len(found) == 1
+        work.append(sum(size for _, size in sizes.taken()))
+    assert work[1] == pytest.approx(work[0], rel=0.02)
+
+
+@pytest.mark.parametrize(
+    "term",
+    [ProcessTerm("rotation", (1.0, 8.0, 1.0, 0.1, -0.5)), ProcessTerm("correlated", (0.5, 6.0)), *SMOOTH.terms],
+    ids=lambda term: term.kind,
+)
+def test_level_norms_and_covariances_are_those_of_the_matrices(term: ProcessTerm) -> None:
+    rng = np.random.default_rng(8)
+    time = np.sort(rng.choice(900, 500, replace=False)) * CADENCE_S
+    model = Process((ProcessTerm("smooth", (np.log(3.0), np.log(2000.0))), term), 1.1)
+    variance = rng.uniform(0.8, 1.3, time.size)
+    quiet = rng.random(time.size) < 0.8
+    values = rng.normal(1000.0, 2.0, (time.size, 2))
+    noise = variance * model.excess**2
+    between = model.at(time[:, None] - time)
+    inverse = np.linalg.inv(between[np.ix_(quiet, quiet)] + np.diag(noise[quiet]))
+    mean = inverse.sum(axis=0) @ values[quiet] / inverse.sum()
+    expected = mean + between[:, quiet] @ inverse @ (values[quiet] - mean)
+    found = process_level(model, time, values, variance, quiet)
+    np.testing.assert_allclose(found, expected, rtol=1e-8)
+    weights = np.where(np.arange(time.size) % 90 < 20, rng.random(time.size), 0.0)
+    np.testing.assert_allclose(model.times(time, weights), between @ weights, rtol=1e-9)
+    columns = rng.normal(size=(40, 3))
+    padded = np.pad(columns, [(30, time.size - 70), (0, 0)])
+    exact = np.einsum("ik,ik->k", padded, np.linalg.solve(between + np.diag(noise), padded))
+    np.testing.assert_allclose(model.covariance(time, noise).squared_norms(columns, 30, time.size), exact, rtol=1e-9)
+
+
+def few_frames() -> Frames:
+    rng = np.random.default_rng(6)
+    time = np.arange(500) * 60.0
+    flux = LEVEL * (1 + 0.05 * flare(time, 60.0, 12_000.0, 300.0)) + rng.normal(0.0, SD, time.size)
+    return Frames.of(time, flux, np.full(time.size, SD))
+
+
+def test_progress_rises_to_the_number_of_frames() -> None:
+    reported: list[tuple[int, int]] = []
+    answer = analyse(Study(), progress=lambda done, total: reported.append((done, total)), frames=few_frames())
+    assert max(row.event.value for row in answer.rows) > 20
+    done, totals = (list(each) for each in zip(*reported, strict=True))
+    assert set(totals) == {500}
+    assert done[0] == 0
+    assert done[-1] == 500
+    assert (np.diff(done) > 0).all()
+    assert len(done) > 20
+
+
+class StoppedError(Exception):
+    """Raised by a report to stop the work."""
+
+
+def test_a_report_may_stop_the_analysis() -> None:
+    def stop(done: int, total: int) -> None:
+        if done:
+            raise StoppedError
+
+    with pytest.raises(StoppedError):
+        analyse(Study(), progress=stop, frames=few_frames())
+
+
+def test_events_that_wait_are_not_measured_once_the_analysis_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+    begun: list[Any] = []
+
+    def slow(*given: Any) -> None:
+        begun.append(given)
+        time.sleep(0.02)
+
+    def stop(share: float) -> None:
+        raise StoppedError
+
+    monkeypatch.setattr(events, "measure_event", slow)
+    survey: Any = SimpleNamespace(flux_level=lambda quiet: None)
+    with pytest.raises(StoppedError):
+        events.measure_events(survey, np.zeros(3, np.bool_), [None] * 100, steps=Steps(stop))  # type: ignore[list-item]
+    assert 0 < len(begun) < 30

@@ -1,0 +1,88 @@
+"""Results of the NumPy reference for every case of the self-test.
+
+    python tests/reference/known_answers.py
+
+writes them into the package, where the self-test reads them.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+sys.path.insert(0, str(Path(__file__).parent.parent))
+
+from reference import stares, statistics
+
+from mauvecl.detection import counts, nuisances, requests, snr
+from mauvecl.device import selftest
+from mauvecl.flares import stare_scene
+from mauvecl.noise import reference
+from mauvecl.noise.scene import prepare
+
+FILE = Path(selftest.__file__).parent / "known_answers.npz"
+
+
+def results(name: str, count: int) -> dict[str, NDArray[Any]]:
+    """Return what `selftest.results` gives on a device."""
+    options, how = selftest.CASES[name]
+    quiet, flare = selftest.toy(**options), selftest.toy(flare=0.3, **options)
+    drawing = {key: value for key, value in how.items() if key != "nuisances"}
+    scene, both = prepare([quiet], **drawing), prepare([quiet, flare], **drawing)
+    index, seed = np.arange(selftest.START, selftest.START + count, dtype=np.uint64), selftest.SEED
+    names = selftest.statistics_of(how)
+    hypotheses = requests.Hypotheses(
+        quiet, (flare,), names, both, nuisances=nuisances.as_nuisances(how.get("nuisances"), quiet)
+    )
+    plan = requests.plan_channels(hypotheses, range(1), first=True)
+    smoothed = statistics.Smoothed.of(hypotheses, plan) if len(plan.scales) else None
+    sums = statistics.statistics(both, index, seed, plan, pair="chi2_pair" in names, smoothed=smoothed)
+    values = statistics.marginalise(sums, plan.subtractions)
+    tally = counts.Tally(plan.grids[plan.keys.index(("chi2", "null", 0)) :][:1])
+    counted, moments, _ = statistics.tally(values, tally.packed)
+    tally.add(counted, moments, count)
+    tally.add_far(0, values[tally.grids[0].channel])
+    seen = statistics.histograms(scene, snr.observers(quiet, scene), snr.elements(quiet), index, seed)
+    return {
+        "raw": reference.realise(scene, index, seed).astype(np.int32),
+        "clipped": reference.clipped(scene, index, seed).sum(axis=(1, 2)).astype(np.uint32),
+        "statistics": values,
+        "fast statistics": fast(values, plan),
+        "histograms": selftest.histograms_of(seen),
+        "tally": selftest.tally_of(tally.distribution(0)),
+    }
+
+
+def fast(values: NDArray[np.float32], plan: requests.ChannelPlan) -> NDArray[np.float32]:
+    """Select the channels of the fast kernel, with zeros for statistics that it does not compute."""
+    chosen = values[: plan.n_rows - len(plan.scales)].copy()
+    chosen[[2, 5]] = 0.0
+    return chosen
+
+
+def stare_results(name: str, count: int) -> dict[str, NDArray[np.float32]]:
+    """Return what `selftest.stare_results` gives on a device."""
+    components, stare, given = selftest.stare_case(name, count)
+    index, seed = np.arange(selftest.START, selftest.START + count, dtype=np.uint64), selftest.SEED
+    flares, frames = stare_scene.Flares.of(components, stare, given, None, count), range(stare.n_frames)
+    made = {"pixels": stares.pixels, "cumulants": stares.sums}
+    ours = {
+        method: made[method](stare_scene.StareScene.of(components, stare, processes), flares, index, frames, seed)[0]
+        for method, processes in selftest.METHODS.items()
+    }
+    return ours | {"noise of flares": stares.glow(stare_scene.StareScene.of(components, stare), index, frames, seed)}
+
+
+def every_result(count: int) -> dict[str, NDArray[Any]]:
+    """Return all results by the names of case and part."""
+    made = [(name, results(name, count)) for name in selftest.CASES]
+    made += [(name, stare_results(name, count)) for name in selftest.STARE_CASES]
+    return {f"{name}: {part}": array for name, parts in made for part, array in parts.items()}
+
+
+if __name__ == "__main__":
+    np.savez_compressed(FILE, **every_result(selftest.COUNT))

@@ -1,0 +1,253 @@
+"""NumPy reference implementation of the stare kernels, with the same counters, arithmetic and order of summation."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.flares import stare_scene
+from mauvecl.noise import layout, random_numbers, reference
+
+Floats = NDArray[np.float32]
+Numbers = NDArray[np.uint64]
+
+Flares, StareScene, SumTable = stare_scene.Flares, stare_scene.StareScene, stare_scene.SumTable
+fma = random_numbers.fma
+
+
+def exponential_less_one(x: Floats) -> Floats:
+    """Return exp(x) - 1 for |x| < 80."""
+    whole = x * np.float32(layout.LOG2_E) + reference.MAGIC
+    n = whole - reference.MAGIC
+    r = fma(n, np.float32(-layout.LN2_PARTS[1]), fma(n, np.float32(-layout.LN2_PARTS[0]), x))
+    *rest, last = (np.float32(c) for c in layout.EXPONENTIAL)
+    q = np.full_like(x, last)
+    for term in reversed(rest):
+        q = fma(q, r, term)
+    scale = ((whole.view(np.int32) - reference.MAGIC.view(np.int32) + np.int32(127)) << 23).view(np.float32)
+    return fma(scale, fma(r * r, q, r), scale - np.float32(1.0))
+
+
+def strengths(scene: StareScene, numbers: Numbers, frame: int, seed: int, lost: Floats) -> dict[str, Floats]:
+    """Draw the coefficients of the steady components and the factor on light in a frame, minus one.
+
+    Returns
+    -------
+    dict of str to ndarray of float32, shape (n_stare,)
+    """
+    moved = {str(name): np.zeros(len(numbers), np.float32) for name in layout.MOVED}
+    if scene.stare_job["jittered"]:
+        drawn = random_numbers.four_normals(
+            reference.words_at(numbers, int(scene.numbers[frame]), "stare_frame", 0, seed)
+        )
+        for name, z in zip(("light", "sky", "temperature"), drawn, strict=False):
+            moved[name] = z * scene.stare_job[f"{name}_jitter"]
+    for u, kind in enumerate(scene.kinds):
+        name = layout.MOVED[kind]
+        z = random_numbers.four_normals(reference.words_at(numbers, 0, "stare_unknown", u // 4, seed))[u % 4]
+        moved[name] = fma(z, scene.curves[u, frame], moved[name])
+    star, star_less_one, sky, sky_less_one, dark, dark_less_one, near, near_less_one, _ = scene.known[:, frame]
+    light = moved["light"]
+    if scene.stare.pointing is not None:
+        light = reference.combine_factors(light, -lost[:, frame])
+    return {
+        "star": fma(star, reference.combine_factors(light, moved["star"]), star_less_one),
+        "sky": fma(sky, reference.combine_factors(light, moved["sky"]), sky_less_one),
+        "dark": fma(dark, exponential_less_one(moved["temperature"] * scene.stare_job["dark_slope"]), dark_less_one),
+        "neighbours": fma(near, light, near_less_one),
+        "light": light,
+    }
+
+
+def glow(scene: StareScene, numbers: Numbers, frames: Iterable[int], seed: int) -> Floats:
+    """Draw a normal per statistic, for the photon noise of flares, and the factor on all light minus one.
+
+    Returns
+    -------
+    ndarray of float32, shape (n_stare, n_frame, n_statistic + 1)
+    """
+    out, lost = [], scene.losses(numbers, seed)
+    for frame in frames:
+        z: list[Floats] = []
+        for group in range(-(-len(scene.weights) // 4)):
+            z += random_numbers.four_normals(
+                reference.words_at(numbers, int(scene.numbers[frame]), "stare_glow", group, seed)
+            )
+        out.append([*z[: len(scene.weights)], strengths(scene, numbers, frame, seed, lost)["light"]])
+    return np.moveaxis(np.array(out), (0, 1, 2), (1, 2, 0))
+
+
+def _coefficients(scene: StareScene, flares: Flares, frame: int, scenario: int, light: Floats) -> list[Floats]:
+    """Return the coefficients of the flare spectra, shape (n_stare,) each."""
+    given = flares.rows[:, :, frame] * (scene.known[-1, frame] * flares.amplitudes[scenario][:, None])
+    return [fma(light, f, f) for f in np.broadcast_to(given, (len(light), given.shape[1])).T]
+
+
+def pixels(scene: StareScene, flares: Flares, numbers: Numbers, frames: Iterable[int], seed: int) -> Floats:
+    """Draw statistics by the method "pixels".
+
+    Returns
+    -------
+    ndarray of float32, shape (n_scenario, n_stare, n_frame, n_statistic)
+    """
+    out, lost = [], scene.losses(numbers, seed)
+    for frame in frames:
+        conditions = strengths(scene, numbers, frame, seed, lost)
+        sums = np.zeros((len(flares.amplitudes), 4, len(scene.weights), len(numbers)), np.float32)
+        for group in range(len(scene.mixtures) // 4):
+            drawn = reference.draws(scene.scene, numbers, int(scene.numbers[frame]), group, seed)
+            for i, p in enumerate(range(4 * group, 4 * group + 4)):
+                for k in range(len(flares.amplitudes)):
+                    flare = _coefficients(scene, flares, frame, k, conditions["light"])
+                    v = _count(scene, p, drawn.z[i], conditions, flare)
+                    for electrons in drawn.added.values():
+                        v = fma(electrons[i], scene.scene.pixels[p]["electron_gain"], v)
+                    x = reference.digitise(v, scene.scene.edges[0, p], clip=scene.scene.clip)
+                    for s, weight in enumerate(scene.weights[:, p]):
+                        sums[k, i, s] = fma(x, weight, sums[k, i, s])
+        a, b, c, d = np.moveaxis(sums, 1, 0)
+        out.append(((a + b) + (c + d)) + scene.constants[:, None])
+    return np.moveaxis(np.array(out), (0, 1, 2, 3), (2, 0, 3, 1))
+
+
+def _count(scene: StareScene, p: int, z: Floats, conditions: dict[str, Floats], flare: list[Floats]) -> Floats:
+    """Return the count of a pixel above its base, before the ADC."""
+    m, one = scene.mixtures[p], np.float32(1.0)
+    light, dark = fma(conditions["star"], m["star"], conditions["sky"] * m["sky"]), conditions["dark"]
+    light = fma(conditions["neighbours"], m["neighbours"], light)
+    for coefficient, spectrum in zip(flare, scene.spectra, strict=True):
+        light = fma(coefficient, spectrum[p], light)
+    variance = fma(light, m["photon_variance"], fma(dark, m["dark_variance"], m["variance"]))
+    third, fourth, fifth = (fma(dark, m[f"dark_{name}"], m[name]) for name in ("third", "fourth", "fifth"))
+    if scene.counts:
+        third = fma(light, m["photon_third"], third)
+        fourth = fma(light, m["photon_fourth"], fourth)
+        fifth = fma(light, m["photon_fifth"], fifth)
+    zz, sd, each = z * z, np.sqrt(variance), one / variance
+    skew = third * each
+    curve = fourth * fma(zz, np.float32(0.041666668), np.float32(-0.125))
+    curve = curve - third * skew * fma(zz, np.float32(0.055555556), np.float32(-0.1388889))
+    even = fifth * _quartic(zz, 0.008333334, -0.05, 0.025)
+    even = even - skew * fourth * _quartic(zz, 0.041666668, -0.20833333, 0.083333336)
+    even = even + skew * skew * third * _quartic(zz, 0.037037037, -0.16358025, 0.052469134)
+    straight = fma(curve * each, sd * each, sd)
+    v = fma(z, straight, fma(skew, fma(zz, np.float32(0.16666667), np.float32(-0.16666667)), m["rest"]))
+    return np.asarray(fma(even * each, each, v) + fma(dark, m["dark"], light))
+
+
+def _quartic(zz: Floats, second: float, first: float, constant: float) -> Floats:
+    return fma(zz, fma(zz, np.float32(second), np.float32(first)), np.float32(constant))
+
+
+def sums(scene: StareScene, flares: Flares, numbers: Numbers, frames: Iterable[int], seed: int) -> Floats:
+    """Draw statistics by the method "cumulants".
+
+    Returns
+    -------
+    ndarray of float32, shape (n_scenario, n_stare, n_frame, n_statistic)
+    """
+    table = SumTable.of(scene.components)
+    out, lost = [], scene.losses(numbers, seed)
+    for frame in frames:
+        conditions = strengths(scene, numbers, frame, seed, lost)
+        z: list[Floats] = []
+        for group in range(-(-len(scene.weights) // 4)):
+            z += random_numbers.four_normals(
+                reference.words_at(numbers, int(scene.numbers[frame]), "stare_sums", group, seed)
+            )
+        rows = []
+        for k in range(len(flares.amplitudes)):
+            flare = _coefficients(scene, flares, frame, k, conditions["light"])
+            rows.append(_sums(scene, table, z, conditions, flare))
+        out.append(rows)
+    return np.moveaxis(np.array(out), (0, 1, 2, 3), (2, 0, 3, 1))
+
+
+def _chain(terms: Iterable[tuple[Floats, Floats]]) -> Floats:
+    """Return the sum of products, added in order."""
+    (a, b), *rest = terms
+    total = np.asarray(a * b)
+    for a, b in rest:
+        total = fma(a, b, total)
+    return total
+
+
+def _sums(
+    scene: StareScene,
+    table: SumTable,
+    z: list[Floats],
+    conditions: dict[str, Floats],
+    flare: list[Floats],
+) -> list[Floats]:
+    n = len(scene.weights)
+    pairs = stare_scene.unique(n, 2)
+    place = {key: i for i, key in enumerate(key for order in (1, 2, 3, 4) for key in stare_scene.unique(n, order))}
+    lit = [
+        (conditions["star"], 1),
+        (conditions["sky"], 2),
+        (conditions["neighbours"], 4),
+        *((f, 5 + j) for j, f in enumerate(flare)),
+    ]
+
+    def cumulant(key: tuple[int, ...], light: bool = True) -> Floats:
+        total = np.full_like(z[0], table.rows[0, place[key]])
+        for strength, row in [(conditions["dark"], 3), *(lit if light else [])]:
+            total = fma(strength, table.rows[row, place[key]], total)
+        return total
+
+    def of(tensor: dict[tuple[int, ...], Floats], *key: int) -> Floats:
+        return tensor[tuple(sorted(key, reverse=True))]
+
+    c = {key: cumulant(key) for key in pairs}
+    low: dict[tuple[int, int], Floats] = {}
+    m: dict[tuple[int, int], Floats] = {}
+    for b in range(n):
+        for a in range(b, n):
+            left = c[a, b]
+            for i in range(b):
+                left = fma(-low[a, i], low[b, i], left)
+            if a == b:
+                low[b, b] = np.sqrt(left)
+                m[b, b] = np.float32(1.0) / low[b, b]
+            else:
+                low[a, b] = left * m[b, b]
+    for a in range(n):
+        for b in range(a):
+            m[a, b] = -_chain((low[a, i], m[i, b]) for i in range(b, a)) * m[a, a]
+    third = {key: cumulant(key, scene.counts) for key in stare_scene.unique(n, 3)}
+    first = {(a, *key): _chain((m[a, i], of(third, i, *key)) for i in range(a + 1)) for a in range(n) for key in pairs}
+    second = {
+        (a, b, c): _chain((m[b, i], first[a, *sorted((i, c), reverse=True)]) for i in range(b + 1))
+        for a, b in pairs
+        for c in range(n)
+    }
+    skew: dict[tuple[int, ...], Floats] = {
+        (a, b, c): _chain((m[c, i], second[a, b, i]) for i in range(c + 1)) for a, b, c in stare_scene.unique(n, 3)
+    }
+    x = []
+    for a in range(n):
+        total = z[a]
+        for b, d in pairs:
+            q = (
+                fma(z[b], z[b], np.float32(-1.0)) * np.float32(0.16666667)
+                if b == d
+                else z[b] * z[d] * np.float32(0.33333334)
+            )
+            total = fma(of(skew, a, b, d), q, total)
+        if table.fourths:
+            f = np.zeros_like(z[a])
+            for key in itertools.combinations_with_replacement(range(a, -1, -1), 4):
+                product = m[a, key[0]]
+                for i in key[1:]:
+                    product = product * m[a, i]
+                f = fma(product, cumulant(key, scene.counts), f)
+            zz, s = z[a] * z[a], skew[a, a, a]
+            total = fma(f * z[a], fma(zz, np.float32(0.041666668), np.float32(-0.125)), total)
+            total = fma(-s * s * z[a], fma(zz, np.float32(0.055555556), np.float32(-0.1388889)), total)
+        x.append(total)
+    u = [cumulant((a,)) + _chain((low[a, i], x[i]) for i in range(a + 1)) for a in range(n)]
+    whole = dict(zip(pairs, table.whole, strict=True))
+    return [_chain((whole[a, i], u[i]) for i in range(a + 1)) for a in range(n)]

@@ -1,0 +1,259 @@
+"""NumPy reference of the kernels for statistics, S/N histograms and tallies, in the device's order of summation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.detection import chi2, snr
+from mauvecl.noise import layout, random_numbers, reference
+
+if TYPE_CHECKING:
+    from mauvecl.detection import requests
+    from mauvecl.noise.scene import Scene
+
+Floats = NDArray[np.float32]
+
+fma = random_numbers.fma
+
+
+def statistics(
+    scene: Scene,
+    realisation: NDArray[np.uint64],
+    seed: int,
+    plan: requests.ChannelPlan,
+    *,
+    pair: bool = True,
+    smoothed: Smoothed | None = None,
+) -> NDArray[np.float32]:
+    """Compute all channels of the kernels `statistics` and `comparison`, in their order.
+
+    Parameters
+    ----------
+    realisation : ndarray of uint64, shape (n,)
+    pair : bool
+        Whether to compute `chi2_pair`; its rows are zero otherwise.
+    smoothed : Smoothed, optional
+        Input of the statistic `paper`, if it is computed.
+
+    Returns
+    -------
+    ndarray of float32, shape (3 n_scenario + n_linear + n_smoothed, n)
+    """
+    n_scenario, fixed = len(scene.levels), len(layout.FIXED_STATISTICS)
+    weights, linear_end, pixels_end = plan.weights, plan.linear_end, plan.pixels_end
+    constants = scene.constants(weights, linear_end, pixels_end)
+    estimated, exposures = scene.comparison.estimated, scene.comparison.exposures
+    added, scale = scene.job["reference_weight"], scene.job["pair_scale"]
+    out = np.zeros((fixed * n_scenario + len(weights), len(realisation)), np.float32)
+    x = _above_reference(scene, reference.observed(scene, realisation, seed))
+    drawn = max(exposures, 1) if exposures or pair or smoothed is not None else 0
+    others = [
+        _above_reference(scene, reference.observed(scene, realisation, seed, exposure=layout.REFERENCE, number=number))
+        for number in range(drawn)
+    ]
+    finished = []
+    begin = 0
+    for k in range(n_scenario):
+        t = int(scene.references[k])
+        raw, level = x[k], scene.levels[k]
+        y: Floats = raw
+        variance: Floats = np.zeros_like(raw)
+        if exposures:
+            total = np.sum([other[t] for other in others], axis=0, dtype=np.float32)
+            y = fma(total, -added, raw)
+        if estimated:
+            estimate = scene.estimates[k]
+            variance = _variance(raw, estimate)
+            if exposures:
+                variance = np.add(variance, added * _variance(total * added, estimate), dtype=np.float32)
+            y = np.add(y, estimate["fraction"][:, None], dtype=np.float32)
+        parts = [np.zeros(len(realisation), np.float32) for _ in range(4)]
+        for p, pixel in enumerate(scene.pixels):
+            if estimated:
+                parts[p % 4] = fma(y[p] * y[p], pixel["used"] / variance[p], parts[p % 4])
+            else:
+                slope = fma(y[p], level[p]["inverse_variance"], level[p]["twice"])
+                parts[p % 4] = fma(y[p], slope, parts[p % 4])
+        out[fixed * k] = ((parts[0] + parts[1]) + (parts[2] + parts[3])) + constants[k]
+        out[fixed * k + 1], of_elements = _element_sums(scene, k, y, variance, weights[pixels_end[k] : linear_end[k]])
+        out[fixed * n_scenario + int(pixels_end[k]) : fixed * n_scenario + int(linear_end[k])] = of_elements
+        for p, pixel in enumerate(scene.pixels) if pair else ():
+            d = raw[p] - others[0][t, p]
+            if estimated:
+                both = _variance(raw, estimate)[p] + _variance(others[0][t], estimate)[p]
+                weight = pixel["used"] / both
+            else:
+                weight = scale * level[p]["inverse_variance"]
+            out[fixed * k + 2] = fma(d * d, weight, out[fixed * k + 2])
+        for linear in range(begin, int(pixels_end[k])):
+            row = _summed(y, weights[linear])
+            if estimated:
+                row = np.divide(row, np.sqrt(_summed(variance, weights[linear] * weights[linear])), dtype=np.float32)
+            else:
+                row = row + constants[n_scenario + linear]
+            out[fixed * n_scenario + linear] = row
+        begin = int(linear_end[k])
+        if smoothed is not None:
+            finished += smoothed.sums(raw - others[0][t], k)
+    return np.concatenate([out, np.array(finished, np.float32).reshape(len(finished), len(realisation))])
+
+
+def _variance(x: Floats, estimate: NDArray[np.void]) -> Floats:
+    """Return the variances that an observer estimates from counts, shape (n_padded, n)."""
+    gain, known, offset = (estimate[name][:, None] for name in ("gain", "variance", "net_offset"))
+    return fma(np.maximum(x + offset, np.float32(0.0)), gain, known)
+
+
+def _element_sums(
+    scene: Scene, k: int, y: Floats, variance: Floats, weights: NDArray[np.float32]
+) -> tuple[Floats, Floats]:
+    """Return `chi2_element` of a scenario, shape (n,), and weighted sums of its elements, shape (m, n)."""
+    total: Floats = np.zeros_like(y[0])
+    weighted: Floats = np.zeros((len(weights), total.size), np.float32)
+    inside, noise = total, total
+    estimated = scene.comparison.estimated
+    for p, (pixel, edge) in enumerate(zip(scene.pixels, scene.edges[k], strict=True)):
+        if pixel["four_uneven"] or estimated:
+            inside = fma(y[p], pixel["used"], inside)
+            noise = fma(variance[p], pixel["used"], noise)
+        elif p % 4 == 0:
+            inside = inside + ((y[p] + y[p + 1]) + (y[p + 2] + y[p + 3]))
+        if pixel["element_end"]:
+            if estimated:
+                total = np.add(total, inside * inside / np.maximum(noise, np.float32(1e-12)), dtype=np.float32)
+            else:
+                inside = np.add(inside, edge["element_offset"], dtype=np.float32)
+                total = fma(inside * inside, edge["inverse_element_variance"], total)
+                weighted = fma(inside, weights[:, p, None], weighted)
+            inside, noise = np.zeros_like(total), np.zeros_like(total)
+    return total, weighted
+
+
+def marginalise(values: NDArray[np.float32], subtractions: NDArray[np.uint32]) -> NDArray[np.float32]:
+    """Subtract the squares of channels as the kernel `marginalise` does."""
+    out = values.copy()
+    for base, first, end in subtractions.T:
+        for row in out[first:end]:
+            out[base] = fma(-row, row, out[base])
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class Smoothed:
+    """Input of the statistic `paper`."""
+
+    rows: NDArray[np.float32]  # weights of each centre, shape (n_centre, n_padded)
+    scales: NDArray[np.float32]  # factors of squares, as in `ChannelPlan`
+    scale_end: NDArray[np.uint32]
+
+    @classmethod
+    def of(cls, hypotheses: requests.Hypotheses, plan: requests.ChannelPlan) -> Smoothed:
+        """Return the input for a detection's channels."""
+        smoothing = chi2.Paper().smoothing(hypotheses.setting)
+        rows = np.zeros((len(smoothing.rows), len(hypotheses.scene.pixels)), np.float32)
+        rows[:, : hypotheses.scene.n_pixel] = smoothing.rows
+        return cls(rows, plan.scales, plan.scale_end)
+
+    def sums(self, difference: Floats, k: int) -> list[Floats]:
+        """Return the smoothed statistics of a scenario, each of shape (n,)."""
+        begin = int(self.scale_end[k - 1]) if k else 0
+        out = [np.zeros(difference.shape[1], np.float32) for _ in range(begin, int(self.scale_end[k]))]
+        for centre, row in enumerate(self.rows):
+            value = np.zeros(difference.shape[1], np.float32)
+            for p in np.flatnonzero(row):
+                value = fma(difference[p], row[p], value)
+            square = value * value
+            out = [fma(square, self.scales[begin + i, centre], one) for i, one in enumerate(out)]
+        return out
+
+
+def _above_reference(scene: Scene, counts: NDArray[np.int64]) -> NDArray[np.float32]:
+    above = counts.astype(np.float32)
+    if scene.frames:
+        return np.asarray(above + scene.edges["whole"][:, :, None])
+    return np.asarray((above + reference.MAGIC) - scene.levels["shift"][:, :, None])
+
+
+def _summed(values: NDArray[np.float32], weights: NDArray[np.float32]) -> Floats:
+    """Return weighted sums over pixels, shape (n,), from four partial sums by pixel index modulo four."""
+    parts = [np.zeros(values.shape[1], np.float32) for _ in range(4)]
+    for p, weight in enumerate(weights):
+        parts[p % 4] = fma(values[p], weight, parts[p % 4])
+    total: Floats = (parts[0] + parts[1]) + (parts[2] + parts[3])
+    return total
+
+
+def histograms(
+    scene: Scene,
+    observers: NDArray[np.void],
+    elements: NDArray[np.void],
+    realisation: NDArray[np.uint64],
+    seed: int,
+) -> snr.Counts:
+    """Count pixels, S/N of elements and clipped frames as the kernel `histogram` does, including far values."""
+    counts, half = snr.Counts(scene.n_pixel, len(elements)), layout.OBSERVER_BINS // 2
+    n = reference.observed(scene, realisation, seed, scenarios=[0])[0]
+
+    def count(kind: str, which: int, numbers: NDArray[np.int64]) -> None:
+        inner = np.abs(numbers + 0.5) < half - 1
+        dense = counts.pixel if kind == "pixel" else counts.element
+        dense[which] = np.bincount(numbers[inner] + half, minlength=2 * half)
+        counts.far[kind].count(which * 2**32 + 2**31 + numbers[~inner])
+
+    for e, element in enumerate(elements):
+        signal, variance = (np.zeros(len(realisation), np.float32) for _ in range(2))
+        for p in range(int(element["first"]), int(element["end"])):
+            observer = observers[p]
+            net = n[p].astype(np.float32) + observer["net_offset"]
+            signal = signal + net
+            variance = variance + fma(np.maximum(net, np.float32(0.0)), observer["gain"], observer["variance"])
+            count("pixel", p, n[p] >> int(observer["bin_shift"]))
+        signal = signal - element["sky"]
+        ratio = np.divide(signal, np.sqrt(variance), out=np.zeros_like(signal), where=variance > 0)
+        steps = (ratio - element["centre"]) * element["bins_per_unit"]
+        count("element", e, np.rint(steps).astype(np.int64))
+    counts.clipped += reference.clipped(scene, realisation, seed).sum(axis=0)
+    counts.n = len(realisation)
+    return counts
+
+
+def tally(
+    values: NDArray[np.float32], grids: NDArray[np.void]
+) -> tuple[NDArray[np.uint32], NDArray[np.int64], NDArray[np.uint32]]:
+    """Count values on grids as the kernel `tally` does.
+
+    Parameters
+    ----------
+    values : ndarray of float32, shape (n_channel, n)
+    grids : ndarray of layout.GRID, shape (n_grid,)
+
+    Returns
+    -------
+    histogram : ndarray of uint32, shape (n_grid, BINS)
+        The first and last bins include all values outside.
+    sums : ndarray of int64, shape (n_grid, 2)
+        Sums of fine steps and of their squares, without values outside.
+    outside : ndarray of uint32, shape (n_grid,)
+        Number of values outside.
+    """
+    bins = layout.BINS
+    histogram = np.zeros((len(grids), bins), np.uint32)
+    sums = np.zeros((len(grids), 2), np.int64)
+    outside = np.zeros(len(grids), np.uint32)
+    end = np.float32(bins // 2 << layout.FINE_BITS)
+    for g, grid in enumerate(grids):
+        with np.errstate(over="ignore", invalid="ignore"):
+            steps = (values[int(grid["channel"])] - grid["centre"]) * grid["steps_per_unit"]
+        # NaN is counted at the lower end.
+        steps = np.where(steps > -end, np.minimum(steps, end - np.float32(1.0)), -end)
+        step = reference.nearest(steps).astype(np.int64)
+        bin_index = (step >> layout.FINE_BITS) + bins // 2
+        histogram[g] = np.bincount(bin_index, minlength=bins)
+        inner = step[(bin_index > 0) & (bin_index < bins - 1)]
+        sums[g] = inner.sum(), (inner * inner).sum()
+        outside[g] = step.size - inner.size
+    return histogram, sums, outside

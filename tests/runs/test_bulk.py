@@ -1,0 +1,394 @@
+"""Stores of raw spectra: content, verification, and recovery."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import time
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import zarr
+from astropy.io import fits
+from astropy.wcs import WCS
+from commands import run
+from marks import long_but
+from refusals import refused
+from stores import CHUNK, LAST, Painter, expectations, flip, forked, full_after, killed, locked, study, tree
+
+from mauvecl import Engine, Study, bulk
+from mauvecl.runs.store import Store
+
+
+@pytest.fixture(scope="module")
+def painted(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """Return the store of an uninterrupted run."""
+    path = tmp_path_factory.mktemp("painted") / "frames.zarr"
+    bulk.realise(study(1000), path, Painter())  # type: ignore[arg-type]
+    return tree(path)
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory, engine: Engine) -> Path:
+    """Return a store that the engine drew, which no test changes."""
+    path = tmp_path_factory.mktemp("drawn") / "frames.zarr"
+    bulk.realise(study(), path, engine)
+    return path
+
+
+@pytest.fixture
+def path(tmp_path: Path, original: Path) -> Path:
+    """Return a copy of the engine's store."""
+    return Path(shutil.copytree(original, tmp_path / "frames.zarr"))
+
+
+def test_rows_equal_those_of_the_engine(tmp_path: Path, engine: Engine) -> None:
+    asked = study()
+    made = bulk.realise(asked, tmp_path / "frames.zarr", engine)
+    assert len(list(made.chunks())) > 4
+    quiet, flare = expectations(asked)
+    for name, x in (("star-1/quiescent", quiet), ("star-1/flare-1", flare)):
+        found = bulk.read(tmp_path / "frames.zarr", name)
+        assert found.dims == ("realisation", "pixel")
+        assert found.dtype == np.uint16
+        assert found.attrs["units"] == "DN"
+        np.testing.assert_array_equal(found.values, engine.realise(x, count=300, seed=11))
+        np.testing.assert_array_equal(found[17:20].values, engine.realise(x, start=17, count=3, seed=11))
+        np.testing.assert_array_equal(found.wavelength, x.wavelength_nm)
+    root = zarr.open_group(tmp_path / "frames.zarr", mode="r")
+    np.testing.assert_array_equal(root["star-1/gain_dn_per_electron"][:], quiet.gain_dn_per_electron)
+    assert Study.build(tomllib.loads(root.attrs["study"]), "store") == asked
+    assert "not a flight calibration" in root.attrs["throughput"]
+
+
+def test_sums_have_32_bits_and_components_are_kept(tmp_path: Path, engine: Engine) -> None:
+    asked = study(40, observation={"exposure_s": 50.0}, bulk={"components": True})
+    bulk.realise(asked, tmp_path / "s.zarr", engine)
+    quiet, flare = expectations(asked)
+    found = bulk.read(tmp_path / "s.zarr", "star-1/flare-1")
+    assert found.dtype == np.int32
+    np.testing.assert_array_equal(found.values, engine.realise(flare, count=40, seed=11))
+    group = zarr.open_group(tmp_path / "s.zarr", mode="r")["star-1"]
+    mean = group["flare-1-source"][:] + group["flare-1-sky"][:] + 10 * (group["bias_dn"][:] + group["dark_dn"][:])
+    np.testing.assert_allclose(mean, 10 * flare.mean_raw_dn, rtol=1e-12)
+    np.testing.assert_allclose(group["quiescent-noise"][:], np.sqrt(quiet.variance_dn2), rtol=1e-12)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("processes", [{}, {"jitter": {"uniform": (0.0, 0.05)}}])
+def test_separate_frames_sum_to_the_exposure(tmp_path: Path, engine: Engine, processes: dict[str, Any]) -> None:
+    how = {"observation": {"exposure_s": 50.0, "mode": "frames"}, "processes": processes}
+    whole = bulk.realise(study(30, **how), tmp_path / "whole.zarr", engine)
+    bulk.realise(study(30, **how, bulk={"frames": "all"}), tmp_path / "all.zarr", engine)
+    bulk.realise(study(30, **how, bulk={"frames": [0, 7]}), tmp_path / "two.zarr", engine)
+    for scene in whole.scenes:
+        every = bulk.read(tmp_path / "all.zarr", scene.path)
+        assert every.dims == ("realisation", "frame", "pixel")
+        assert every.dtype == np.uint16
+        np.testing.assert_array_equal(every.values.sum(axis=1), bulk.read(tmp_path / "whole.zarr", scene.path).values)
+        two = bulk.read(tmp_path / "two.zarr", scene.path)
+        np.testing.assert_array_equal(two.frame, [0, 7])
+        np.testing.assert_array_equal(two.values, every.values[:, [0, 7]])
+
+
+def test_every_star_of_every_cell_is_stored(tmp_path: Path, engine: Engine) -> None:
+    asked = study(20, sweep={"axes": [{"quantity": "magnitude", "values": [6.0, 8.0]}]})
+    made = bulk.realise(asked, tmp_path / "sweep.zarr", engine)
+    assert [scene.path for scene in made.scenes] == [f"star-{k}/{n}" for k in (1, 2) for n in ("quiescent", "flare-1")]
+    second, _ = expectations(asked.at("magnitude", 8.0))
+    np.testing.assert_array_equal(
+        bulk.read(tmp_path / "sweep.zarr", "star-2/quiescent").values, engine.realise(second, count=20, seed=11)
+    )
+
+
+def swap(a: Path, b: Path) -> None:
+    a_bytes, b_bytes = a.read_bytes(), b.read_bytes()
+    a.write_bytes(b_bytes)
+    b.write_bytes(a_bytes)
+
+
+FAULTS: dict[str, tuple[Callable[[Path], object], dict[str, str]]] = {
+    "flipped byte": (lambda p: flip(p / CHUNK), {CHUNK: "damaged"}),
+    "flipped CRC": (lambda p: flip(p / LAST, -1), {LAST: "damaged"}),
+    "cut short": (lambda p: (p / CHUNK).write_bytes((p / CHUNK).read_bytes()[:-10]), {CHUNK: "damaged"}),
+    "missing": (lambda p: (p / CHUNK).unlink(), {CHUNK: "missing"}),
+    "swapped": (
+        lambda p: swap(p / CHUNK, p / "star-1/quiescent/c/2/0"),
+        {CHUNK: "foreign", "star-1/quiescent/c/2/0": "foreign"},
+    ),
+    "flipped byte in the list": (
+        lambda p: flip(p / "star-1/quiescent/digests.txt", 5),
+        {"star-1/quiescent/c/0/0": "unlisted"},
+    ),
+    "flipped byte in the study": (lambda p: flip(p / "zarr.json", 40), {"zarr.json": "?"}),
+    "a missing description": (
+        lambda p: (p / "star-1/flare-1/zarr.json").unlink(),
+        {"star-1/flare-1/zarr.json": "missing"},
+    ),
+    "flipped calibration": (lambda p: flip(p / "star-1/bias_dn/c/0"), {"star-1/bias_dn/c/0": "damaged"}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", long_but(FAULTS, "flipped byte", "flipped byte in the study", "missing"))
+def test_damage_is_found_and_repaired_to_the_bit(path: Path, engine: Engine, fault: str) -> None:
+    break_it, expected = FAULTS[fault]
+    assert bulk.verify(path) == []
+    before = tree(path)
+    break_it(path)
+    found = {one.key: one.state for one in bulk.verify(path)}
+    assert found.keys() == expected.keys()
+    assert all(state in (found[key], "?") for key, state in expected.items())
+    assert all(one.mended for one in bulk.verify(path, engine, repair=True))
+    # A list of digests keeps the line that could not be read.
+    after = tree(path)
+    assert {k: v for k, v in after.items() if "digests" not in k} == {
+        k: v for k, v in before.items() if "digests" not in k
+    }
+    assert bulk.verify(path, engine, redraw=True) == []
+
+
+@pytest.mark.long
+def test_redrawing_finds_damage_with_valid_digests(tmp_path: Path, path: Path, engine: Engine) -> None:
+    """Insert chunk and digest of another seed's store, which are consistent with each other."""
+    other = tmp_path / "other.zarr"
+    bulk.realise(study(run={"seed": 12}), other, engine)
+    for name in (CHUNK, "star-1/quiescent/digests.txt"):
+        shutil.copy(other / name, path / name)
+    states = {fault.state for fault in bulk.verify(path)}
+    assert states == {"foreign"}, "the other chunks do not have the copied digests"
+    (path / "star-1/quiescent/c").rename(tmp_path / "c")
+    shutil.copytree(other / "star-1/quiescent/c", path / "star-1/quiescent/c")
+    assert bulk.verify(path) == []
+    assert {f.state for f in bulk.verify(path, engine, redraw=True, rows=(60, 70))} == {"differs"}
+    bulk.verify(path, engine, redraw=True, repair=True)
+    assert bulk.verify(path, engine, redraw=True) == []
+
+
+def test_foreign_files_are_named_and_kept(path: Path, engine: Engine) -> None:
+    (path / "star-1/quiescent/c/99").mkdir()
+    (path / "star-1/quiescent/c/99/0").write_bytes(b"?")
+    (fault,) = bulk.verify(path, engine, repair=True)
+    assert (fault.key, fault.state, fault.mended) == ("star-1/quiescent/c/99/0", "not of this store", False)
+
+
+def test_another_study_raises_with_the_difference(path: Path, engine: Engine) -> None:
+    with refused("store", "run.seed", "star.0.magnitude"):
+        bulk.realise(study(run={"seed": 3}).at("magnitude", 7.0), path, engine)
+    assert bulk.verify(path) == []
+
+
+def test_second_writer_raises(path: Path, engine: Engine) -> None:
+    with locked(path):
+        with refused("lock", str(path)):
+            bulk.realise(study(), path, engine)
+        with refused("lock", str(path)):
+            bulk.verify(path)
+    assert bulk.verify(path) == []
+
+
+@pytest.fixture
+def described_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Study], None]:
+    """Return a function that describes a store once for all its runs, which then begin to write at once."""
+
+    def describe(asked: Study) -> None:
+        store = Store(tmp_path, asked)
+        described, scenes = store.description(), store.scenes
+        monkeypatch.setattr(Store, "description", lambda self: described)
+        monkeypatch.setattr(Store, "scenes", property(lambda self: scenes))
+
+    return describe
+
+
+@pytest.mark.long
+def test_random_kills_lose_nothing(
+    tmp_path: Path, painted: dict[str, bytes], described_once: Callable[[Study], None]
+) -> None:
+    """Kill a run at random moments, within about the time that it takes, and resume it; files have the same bits."""
+    described_once(study(1000))
+    path, kills, moments = tmp_path / "frames.zarr", 0, random.Random(5)
+    began = time.monotonic()
+    killed(forked(lambda: bulk.realise(study(1000), path, Painter())))  # type: ignore[arg-type]
+    takes = time.monotonic() - began
+    while kills < 30:
+        if path.exists() and tree(path) == painted:
+            # A store that is finished after many kills: the next one begins.
+            shutil.rmtree(path)
+        child = forked(lambda: bulk.realise(study(1000), path, Painter()))  # type: ignore[arg-type]
+        time.sleep(moments.uniform(0.0, takes))
+        os.kill(child, signal.SIGKILL)
+        kills += killed(child)
+    bulk.realise(study(1000), path, Painter())  # type: ignore[arg-type]
+    assert tree(path) == painted
+    assert bulk.verify(path) == []
+
+
+@pytest.mark.long
+def test_kill_at_every_step_of_writing_loses_nothing(tmp_path: Path, described_once: Callable[[Study], None]) -> None:
+    """Kill before each fsync, rename and line of digests."""
+    described_once(study(200))
+    step = 0
+    while True:
+        path, counted = tmp_path / f"{step}.zarr", iter(range(step + 1))
+
+        def mortal(work: Callable[..., Any], counted: Any = counted, last: int = step) -> Callable[..., Any]:
+            def wrapped(*given: Any) -> Any:
+                if next(counted, last) == last:
+                    os.kill(os.getpid(), signal.SIGKILL)
+                return work(*given)
+
+            return wrapped
+
+        def run(path: Path = path, mortal: Any = mortal) -> None:
+            os.fsync = mortal(os.fsync)
+            Path.replace = mortal(Path.replace)  # type: ignore[method-assign]
+            Store.note = mortal(Store.note)  # type: ignore[method-assign]
+            bulk.realise(study(200), path, Painter())  # type: ignore[arg-type]
+
+        ended = not killed(forked(run))
+        bulk.realise(study(200), path, Painter())  # type: ignore[arg-type]
+        if step == 0:
+            first = tree(path)
+        assert tree(path) == first
+        shutil.rmtree(path)
+        if ended:
+            break
+        step += 1
+    assert step > 30
+
+
+def test_full_disk_raises_and_is_resumed(
+    tmp_path: Path, painted: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "frames.zarr"
+    with monkeypatch.context() as patch:
+        full_after(300_000, patch)
+        with refused("file", "No space left on device"):
+            bulk.realise(study(1000), path, Painter())  # type: ignore[arg-type]
+    assert len(list(path.glob("star-1/*/c/*/0"))) > 5, "what was written before is kept"
+    bulk.realise(study(1000), path, Painter())  # type: ignore[arg-type]
+    assert tree(path) == painted
+
+
+def test_full_or_read_only_file_system_raises(small_disk: Path, painted: dict[str, bytes]) -> None:
+    path = small_disk / "frames.zarr"
+    filler = small_disk / "filler"
+    filler.write_bytes(bytes(1_400_000))
+    with refused("file", "No space left on device"):
+        bulk.realise(study(1000), path, Painter())  # type: ignore[arg-type]
+    filler.unlink()
+    subprocess.run(["mount", "-o", "remount,ro", small_disk], check=True)
+    with refused("file", "Read-only file system"):
+        bulk.realise(study(1000), path, Painter())  # type: ignore[arg-type]
+    with refused("store", "Read-only file system"):
+        bulk.realise(study(1000), small_disk / "other.zarr", Painter())  # type: ignore[arg-type]
+    subprocess.run(["mount", "-o", "remount,rw", small_disk], check=True)
+    bulk.realise(study(1000), path, Painter())  # type: ignore[arg-type]
+    assert tree(path) == painted
+
+
+def test_store_stopped_by_progress_is_resumed(tmp_path: Path, painted: dict[str, bytes]) -> None:
+    path = tmp_path / "frames.zarr"
+
+    def stop(done: int, total: int) -> None:
+        if done > total // 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        bulk.realise(study(1000), path, Painter(), progress=stop)  # type: ignore[arg-type]
+    seen: list[int] = []
+    bulk.realise(study(1000), path, Painter(), progress=lambda done, total: seen.append(done))  # type: ignore[arg-type]
+    assert seen[0] > 1000, "it went on from where it was"
+    assert seen[-1] == 2000
+    assert tree(path) == painted
+
+
+def test_fits_export_contains_the_rows(tmp_path: Path, engine: Engine) -> None:
+    made = bulk.realise(study(50), tmp_path / "s.zarr", engine)
+    run("export", "s.zarr", "s.fits", "--rows", "10:30", folder=tmp_path)
+    path = tmp_path / "s.fits"
+    with fits.open(path, checksum=True) as hdus:
+        for hdu, scene in zip(hdus[1:3], made.scenes, strict=True):
+            np.testing.assert_array_equal(hdu.data, engine.realise(scene.expectation, start=10, count=20, seed=11))
+            wcs = WCS(hdu.header, hdus)
+            pixels = np.arange(hdu.data.shape[1])
+            wavelength, row = wcs.pixel_to_world_values(pixels, 3 + 0 * pixels)
+            np.testing.assert_allclose(wavelength, scene.expectation.wavelength_nm, rtol=1e-12)
+            np.testing.assert_array_equal(row, 13)
+        np.testing.assert_array_equal(hdus[3].data["DARK_DN"][0], made.scenes[0].expectation.dark_dn)
+        assert "table STUDY" in str(hdus[0].header["HISTORY"])
+        assert Study.build(tomllib.loads("\n".join(hdus["STUDY"].data["LINE"])), "fits") == made.study
+    if shutil.which("fitsverify"):
+        reported = subprocess.run(["fitsverify", path], capture_output=True, text=True, check=True).stdout
+        assert "0 warning(s) and 0 error(s)" in reported, reported
+
+
+def test_fits_file_contains_any_study(tmp_path: Path) -> None:
+    name = f'{"long/" * 30}ein "Stern" \\ λ Vir 🌟.txt'
+    (tmp_path / name).parent.mkdir(parents=True)
+    (tmp_path / name).write_text("".join(f"{nm} 1e-12\n" for nm in range(150, 1200, 5)))
+    sections = tomllib.loads(study(2).toml()) | {"star": [{"file": str(tmp_path / name), "magnitude": 5.0}]}
+    asked = Study.build(sections, "test")
+    (tmp_path / "study.toml").write_text(asked.toml())
+    run("realise", "study.toml", "--output", "f.fits", folder=tmp_path)
+    with fits.open(tmp_path / "f.fits") as hdus:
+        lines = "\n".join(hdus["STUDY"].data["LINE"])
+    assert lines.isascii()
+    assert Study.build(tomllib.loads(lines), "fits") == asked
+
+
+def test_hdf5_export_contains_the_frames(tmp_path: Path, engine: Engine) -> None:
+    asked = study(50, observation={"exposure_s": 10.0}, bulk={"frames": "all"})
+    bulk.realise(asked, tmp_path / "s.zarr", engine)
+    words = ("--array", "star-1/flare-1", "--rows", "5:9")
+    run("export", "s.zarr", "s.h5", *words, folder=tmp_path)
+    with h5py.File(tmp_path / "s.h5") as file:
+        data = file["star-1/flare-1"]
+        assert [d.label for d in data.dims] == ["realisation", "frame", "pixel"]
+        np.testing.assert_array_equal(data[:], bulk.read(tmp_path / "s.zarr", "star-1/flare-1")[5:9].values)
+        assert file.attrs["first_row"] == 5
+        assert data.attrs["units"] == "DN"
+        assert "star-1/quiescent" not in file
+
+
+@pytest.mark.long
+def test_commands_of_stores_work(tmp_path: Path) -> None:
+    (tmp_path / "study.toml").write_text(study(100).toml())
+
+    def said(*words: str, code: int = 0) -> str:
+        done = run(*words, folder=tmp_path, code=code)
+        return done.stdout + done.stderr
+
+    made = said("realise", "study.toml", "--output", "f.zarr")
+    assert "100 x 197" in made
+    assert "not a flight calibration" in made
+    again = run("realise", "study.toml", "--output", "f.zarr", "--json", folder=tmp_path)
+    assert json.loads(again.stdout)["arrays"][1]["amplitude"] == 0.24
+    assert "Everything agrees" in said("verify", "f.zarr")
+    chunk, exported = tmp_path / "f.zarr/star-1/quiescent/c/0/0", tmp_path / "f.h5"
+    flip(chunk)
+    assert "damaged" in said("verify", "f.zarr", code=1)
+    said("verify", "f.zarr", "--repair")
+    said("verify", "f.zarr", "--redraw", "--rows", "0:10")
+    said("export", "f.zarr", "f.h5", "--rows", "0:10")
+    written = exported.read_bytes()
+    assert "--replace" in said("export", "f.zarr", "f.h5", "--rows", "0:5", code=2)
+    assert exported.read_bytes() == written
+    said("export", "f.zarr", "f.h5", "--rows", "0:5", "--replace")
+    assert exported.read_bytes() != written
+    said("realise", "study.toml", "--output", "f.fits", "--quiet")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["f.fits", "f.h5", "f.zarr", "study.toml"]
+    chunk.unlink()
+    refusal = said("realise", "study.toml", "--output", "f.zarr", code=2)
+    assert all(word in refusal for word in ("3", "4", "--resume"))
+    said("realise", "study.toml", "--output", "f.zarr", "--resume")
+    said("verify", "f.zarr")
+    assert ".zarr" in said("realise", "study.toml", "--output", "f.txt", code=2)

@@ -1,0 +1,121 @@
+"""Stores, FITS and HDF5 files are read back as frames with their metadata, and refuse what they cannot use."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from commands import run
+from refusals import refused
+from stores import Painter, expectations, study
+
+from mauvecl import Engine, Study, bulk, read_frames
+from mauvecl.observations.frame_files import reduce_frames
+
+#: Stacks of two frames, and single frames of which the second is stored.
+STACKED: dict[str, Any] = {"observation": {"exposure_s": 10.0}}
+SINGLE: dict[str, Any] = {"observation": {"exposure_s": 15.0}, "bulk": {"frames": [0, 2]}}
+
+
+@pytest.mark.parametrize("ending", ["zarr", "fits", "h5"])
+@pytest.mark.parametrize("which", ["stacked", "single"])
+def test_stores_are_read_back_with_their_metadata(tmp_path: Path, engine: Engine, ending: str, which: str) -> None:
+    asked = study(40, **(STACKED if which == "stacked" else SINGLE))
+    path = _written(tmp_path, asked, engine, ending)
+    frames = read_frames(f"{path}[star-1/flare-1]")
+    _, x = expectations(asked)
+    raw = bulk.read(tmp_path / "frames.zarr", "star-1/flare-1").values.reshape(-1, x.wavelength_nm.size)
+    n = 2 if which == "stacked" else 1
+    np.testing.assert_allclose(frames.flux, raw - n * (x.bias_dn + x.dark_dn), rtol=1e-12, atol=1e-9)
+    assert frames.wavelength_nm is not None
+    np.testing.assert_allclose(frames.wavelength_nm, x.wavelength_nm)
+    exposure, times = (10.0, [5.0, 15.0, 25.0, 35.0]) if which == "stacked" else (5.0, [2.5, 12.5, 17.5, 27.5])
+    np.testing.assert_allclose(frames.exposure_s, exposure)
+    np.testing.assert_allclose(frames.time_s[:4], times)
+    assert frames.temperature_c is not None
+    np.testing.assert_allclose(frames.temperature_c, 21.0)
+    assert (frames.instrument, frames.unit, frames.name) == ("mauve", "adu", "G2V V = 7.4")
+    # The mean of the squared errors is the variance of the model: 40 rows of 197 pixels know it to a percent.
+    assert frames.error is not None
+    np.testing.assert_allclose((frames.error**2).mean(), (x.variance_dn2 / x.n_frames * n).mean(), rtol=0.03)
+    assert frames.quality is not None
+    assert not frames.quality.any()
+
+
+@pytest.mark.parametrize("ending", ["zarr", "fits", "h5"])
+def test_stores_are_reduced_in_pieces(
+    tmp_path: Path, engine: Engine, ending: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = f"{_written(tmp_path, study(40, **SINGLE), engine, ending)}[star-1/flare-1]"
+    light, error = read_frames(path).white_light
+    # Seven frames at once, which divide realisations of two frames.
+    monkeypatch.setattr("mauvecl.host.tables.table.PIECE_BYTES", 7 * 8 * 197)
+    (curve,) = reduce_frames(path).light_curves
+    np.testing.assert_allclose(curve.flux, light, rtol=1e-12)
+    assert curve.error is not None
+    assert error is not None
+    np.testing.assert_allclose(curve.error, error, rtol=1e-12)
+
+
+def _written(folder: Path, asked: Study, engine: Engine, ending: str) -> Path:
+    bulk.realise(asked, folder / "frames.zarr", engine)
+    if ending == "zarr":
+        return folder / "frames.zarr"
+    run("export", "frames.zarr", f"frames.{ending}", folder=folder)
+    return folder / f"frames.{ending}"
+
+
+PAINTER = Painter()
+#: Rows of the store.
+ROWS = 20
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Return a folder with a store and a file of the user's."""
+    bulk.realise(study(ROWS), tmp_path / "s.zarr", PAINTER)
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "mine.txt").write_text("keep me")
+    return tmp_path
+
+
+def exported(folder: Path, *words: str) -> str:
+    """Return the refusal of an export."""
+    return run("export", "s.zarr", *words, folder=folder, code=2).stderr
+
+
+#: Calls with the folder, the key of the error, and what its sentence names.
+CALLS: dict[str, tuple[Callable[[Path], object], str, *tuple[str, ...]]] = {
+    "a folder of other files": (lambda at: bulk.realise(study(), at / "notes", PAINTER), "store", "'mine.txt'"),
+    "removal of other files": (lambda at: bulk.forget(at / "notes"), "store"),
+    "a store in a file": (lambda at: bulk.realise(study(), at / "notes" / "mine.txt" / "s", PAINTER), "store"),
+    "no store": (lambda at: bulk.read(at / "nowhere"), "store"),
+    "no such array": (lambda at: bulk.read(at / "s.zarr", "star-9/quiescent"), "scenes", "'star-9/quiescent'"),
+    "a frame beyond the exposure": (
+        lambda at: bulk.realise(study(ROWS, bulk={"frames": [7]}), at / "t.zarr", PAINTER), "bulk.frames"),
+    "frames of an unnamed array": (lambda at: read_frames(at / "s.zarr"), "hdu", "star-1/quiescent",
+                                   "FILE[star-1/flare-1]"),
+    "frames of an unknown array": (lambda at: read_frames(f"{at / 's.zarr'}[star-2]"), "hdu", "star-2"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_bad_input_raises(name: str, folder: Path) -> None:
+    call, key, *facts = CALLS[name]
+    with refused(key, *facts):
+        call(folder)
+    assert (folder / "notes" / "mine.txt").read_text() == "keep me"
+
+
+def test_bad_exports_are_refused(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert f"0:{ROWS}" in exported(folder, "s.fits", "--rows", "10:60")
+    assert "hdf5" in exported(folder, "s.txt")
+    with monkeypatch.context() as patch:
+        patch.setattr("mauvecl.runs.export.MAX_BYTES", 1000)
+        assert "rows" in exported(folder, "s.fits")
+    (folder / "s.zarr" / "star-1/quiescent/c/0/0").unlink()
+    assert "star-1/quiescent/c/0/0" in exported(folder, "s.fits")
+    assert not (folder / "s.fits").exists()

@@ -1,0 +1,222 @@
+"""Stores under attack: wrong studies, other people's files, two processes, absurd sizes."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from commands import run
+from numpy.typing import NDArray
+from refusals import refused
+from stores import CHUNK, Painter, flip, forked, killed, locked, study, tree
+
+from mauvecl import bulk
+from mauvecl.runs.store import Store
+
+
+class Seeded(Painter):
+    """Painter of rows that also contain their seed."""
+
+    def realise(
+        self, x: Any, *, start: int, count: int, seed: int, out: NDArray[Any] | None = None, **how: Any
+    ) -> NDArray[Any]:
+        rows = super().realise(x, start=start, count=count, seed=seed) ^ np.uint16(seed)
+        if out is None:
+            return rows
+        out[:] = rows
+        return out
+
+
+PAINTER: Any = Seeded()
+
+
+@pytest.fixture
+def made(tmp_path: Path) -> Path:
+    """Return a small intact store."""
+    path = tmp_path / "frames.zarr"
+    bulk.realise(study(), path, PAINTER)
+    return path
+
+
+@pytest.fixture
+def other(tmp_path: Path) -> Path:
+    """Return the store of the same study with another seed."""
+    path = tmp_path / "other.zarr"
+    bulk.realise(study(run={"seed": 31}), path, PAINTER)
+    return path
+
+
+def relabelled(place: Path, change: Callable[[str], str]) -> None:
+    """Change the study's text in a description."""
+    content = json.loads(place.read_text())
+    content["attributes"]["study"] = change(content["attributes"]["study"])
+    place.write_text(json.dumps(content, indent=2))
+
+
+COPIES = ["zarr.json", "star-1/quiescent/zarr.json", "star-1/flare-1/zarr.json"]
+
+
+@pytest.mark.parametrize("copy", COPIES)
+def test_changed_byte_of_a_study_is_found(made: Path, copy: str) -> None:
+    """Change any byte: the store keeps its study, and repair restores the file."""
+    before = tree(made)
+    text = study().toml()
+    # A sample of the bytes, and the seed's.
+    for place in [*range(3, len(text), len(text) // 6), text.index("seed = 11") + 7]:
+        other = "3" if text[place] != "3" else "4"
+        relabelled(made / copy, lambda text, place=place, other=other: text[:place] + other + text[place + 1 :])
+        assert [fault.key for fault in bulk.verify(made)] == [copy]
+        (made / copy).write_bytes(before[copy])
+    relabelled(made / copy, lambda text: text.replace("seed = 11", "seed = 31"))
+    assert [(f.key, f.mended) for f in bulk.verify(made, PAINTER, repair=True)] == [(copy, True)]
+    assert tree(made) == before
+
+
+@pytest.mark.parametrize("copy", COPIES)
+def test_contradicting_studies_raise(made: Path, other: Path, copy: str) -> None:
+    """Give two studies with valid digests; nothing is read or written, since either could be the drawn one."""
+    shutil.copy(other / copy, made / copy)
+    before = tree(made)
+    for ask in (
+        lambda: bulk.verify(made),
+        lambda: bulk.verify(made, PAINTER, repair=True, redraw=True),
+        lambda: bulk.read(made),
+        lambda: bulk.realise(study(), made, PAINTER),
+        lambda: bulk.realise(study(), made, PAINTER, restart=True),
+        lambda: bulk.forget(made),
+    ):
+        with refused("store", "'zarr.json'"):
+            ask()
+    assert tree(made) == before
+
+
+def test_store_without_intact_study_raises(made: Path) -> None:
+    for copy in COPIES:
+        relabelled(made / copy, lambda text: text.replace("seed = 11", "seed = 31"))
+    before = tree(made)
+    with refused("store"):
+        bulk.verify(made, PAINTER, repair=True)
+    assert tree(made) == before
+
+
+def test_repair_does_not_mix_two_studies(made: Path, other: Path) -> None:
+    """Replace every copy of the study; the digests of the written data still show it."""
+    for copy in COPIES:
+        shutil.copy(other / copy, made / copy)
+    flip(made / CHUNK)
+    before = tree(made)
+    with refused("redraw"):
+        bulk.verify(made, PAINTER, repair=True)
+    assert {k: v for k, v in tree(made).items() if not k.endswith("zarr.json")} == {
+        k: v for k, v in before.items() if not k.endswith("zarr.json")
+    }
+
+
+@pytest.mark.parametrize("how", ["python", "command", "forget"])
+def test_locked_store_is_not_removed(made: Path, how: str) -> None:
+    (made.parent / "study.toml").write_text(study().toml())
+    before = tree(made)
+    with locked(made):
+        if how == "command":
+            done = run("realise", "study.toml", "--restart", "--output", made, folder=made.parent, code=2)
+            assert f"{str(made)!r} is being written by another process" in done.stderr
+        else:
+            with refused("lock", str(made)):
+                bulk.forget(made) if how == "forget" else bulk.realise(study(), made, PAINTER, restart=True)
+    assert tree(made) == before
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("place", ["mine.txt", "star-1/mine.txt", "star-1/quiescent/c/mine", "star-1/quiescent/c/99/0"])
+@pytest.mark.parametrize("kind", ["file", "link"])
+def test_foreign_files_are_not_removed(made: Path, place: str, kind: str) -> None:
+    elsewhere = made.parent / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "keep").write_text("me")
+    (made / place).parent.mkdir(exist_ok=True)
+    (made / place).write_text("keep me") if kind == "file" else (made / place).symlink_to(elsewhere)
+    before = tree(made)
+    for remove in (lambda: bulk.realise(study(), made, PAINTER, restart=True), lambda: bulk.forget(made)):
+        with refused("store", str(place)):
+            remove()
+    assert tree(made) == before
+    assert (elsewhere / "keep").read_text() == "me"
+
+
+def test_restart_draws_the_new_study(made: Path, tmp_path: Path) -> None:
+    other = study(run={"seed": 3})
+    bulk.realise(other, made, PAINTER, restart=True)
+    bulk.realise(other, tmp_path / "fresh.zarr", PAINTER)
+    assert tree(made) == tree(tmp_path / "fresh.zarr")
+    bulk.forget(made)
+    assert not made.exists()
+
+
+@pytest.mark.long
+def test_kill_during_removal_is_recovered(made: Path, tmp_path: Path) -> None:
+    """Kill at any file; the rest is a store, and a second restart completes."""
+    other = study(run={"seed": 3})
+    bulk.realise(other, tmp_path / "fresh.zarr", PAINTER)
+    for step in (0, 3, 9, 14):
+        path, counted = tmp_path / f"{step}.zarr", iter(range(step))
+        shutil.copytree(made, path)
+
+        def run(path: Path = path, counted: Any = counted) -> None:
+            unlink = Path.unlink
+
+            def mortal(self: Path, missing_ok: bool = False) -> None:
+                if next(counted, None) is None:
+                    os.kill(os.getpid(), signal.SIGKILL)
+                unlink(self, missing_ok)
+
+            Path.unlink = mortal  # type: ignore[method-assign]
+            bulk.realise(other, path, PAINTER, restart=True)
+
+        assert killed(forked(run))
+        with refused("store", "run.seed"):
+            bulk.realise(other, path, PAINTER)
+        bulk.realise(other, path, PAINTER, restart=True)
+        assert tree(path) == tree(tmp_path / "fresh.zarr")
+
+
+def test_store_larger_than_any_disk_raises(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Claim 6e15 rows with one chunk; each question is answered in about a second."""
+    path, asked = tmp_path / "vast.zarr", study(6 * 10**15)
+    with refused("run.realisations"):
+        bulk.realise(asked, path, PAINTER)
+    # Written by hand, as an attacker would.
+    vast = Store(path, asked)
+    for name, content in vast.description().items():
+        (path / name).parent.mkdir(parents=True, exist_ok=True)
+        (path / name).write_bytes(content)
+    first = next(vast.chunks())
+    vast.note(first, vast.place(first, bulk.draw(asked, first.scene, PAINTER, 0, first.stop)))
+    for repair in (False, True):
+        with refused("rows", "1", "100000"):
+            bulk.verify(path, PAINTER, repair=repair)
+    assert [f.key for f in bulk.verify(path, rows=(0, first.stop))] == ["star-1/flare-1/c/0/0"]
+    run("export", path, "few.h5", "--array", "star-1/quiescent", "--rows", "3:5", folder=tmp_path)
+    with refused("run.realisations"):
+        bulk.realise(asked, path, PAINTER)
+    bulk.forget(path)
+    assert not path.exists()
+
+
+@pytest.mark.parametrize("name", ["f.fits", "f.h5"])
+def test_existing_file_is_not_overwritten(name: str, tmp_path: Path) -> None:
+    (tmp_path / "study.toml").write_text(study(20).toml())
+    (tmp_path / name).write_text("mine")
+    words = ("realise", "study.toml", "--output", name)
+    for more in ([], ["--resume"]):
+        assert "--restart" in run(*words, *more, folder=tmp_path, code=2).stderr
+    assert (tmp_path / name).read_text() == "mine"
+    run(*words, "--restart", folder=tmp_path)
+    assert (tmp_path / name).stat().st_size > 2 * 2 * 20 * 197
+    assert sorted(p.name for p in tmp_path.iterdir()) == [name, "study.toml"]

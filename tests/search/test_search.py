@@ -1,0 +1,225 @@
+"""Searches of sums of frames: values of filters, losses of a bank, and rates of false alarms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from refusals import refused
+from scipy import special
+
+from mauvecl import SHAPES, Stare, Study
+from mauvecl.search.completeness import search_threshold
+from mauvecl.search.false_alarms import sample_rate
+from mauvecl.search.search import Search
+from mauvecl.search.templates import Bank, Baseline
+
+DAVENPORT = SHAPES["davenport2014"]
+ONE = np.ones((1, 1))
+KNOWN = Baseline(offset=False, slope=False, window_s=0.0)
+HALF_WIDTHS_S = Study().search.half_widths_s
+
+
+def filtered(search, sums, curves):
+    """Compute all values of a search by least squares, template by template."""
+    stare, bank = search.stare, search.bank
+    weight = 1 / search.variance
+    for row, rho in search.values(sums):
+        t = row.template
+        for onset in range(0, row.peaks.size, 11):
+            if row.per_amplitude[onset] == 0:
+                continue
+            peak = stare.numbers[0] + row.peaks[onset]
+            place = stare.numbers - peak
+            inside = (place >= t.first) & (place < t.first + t.time.size)
+            at = place[inside]
+            edges = np.column_stack([at, at + 1]) * bank.frame_s
+            shape = DAVENPORT.mean_over(edges, t.phases[row.phase] * bank.frame_s, t.half_width_s)
+            root = np.sqrt(weight[inside])
+            terms = [at.astype(float) ** p for p in bank.baseline.powers] + [c[inside] for c in curves]
+            left = root * shape
+            if terms:
+                columns = root[:, None] * np.array(terms).T
+                columns /= np.linalg.norm(columns, axis=0)
+                left = left - columns @ np.linalg.lstsq(columns, left, rcond=1e-13)[0]
+            length = np.linalg.norm(left)
+            found = np.einsum("t,stk,dk->sd", left / length * root, sums[:, inside], bank.directions)
+            yield rho[:, :, onset], found
+
+
+@pytest.mark.parametrize("level", [KNOWN, Baseline(window_s=600.0), Baseline(cycle=True, window_s=600.0)])
+def test_filters_are_least_squares_over_gaps(level):
+    """Compare correlations by FFT with a fit for each template, with gaps, unequal variances and a varying level.
+
+    The last template is longer than the stare.
+    """
+    stare = Stare.of(6000.0, gaps=[(1000, 1500), (3000, 3050)])
+    rng = np.random.default_rng(1)
+    curves = np.array([np.sin(stare.start_s / 600), np.cos(stare.start_s / 600)]) if level.cycle else np.zeros((0, 1))
+    bank = Bank((11.0, 54.0, 266.0, 2000.0), np.array([[1.0, 0.0], [0.8, 0.6]]), DAVENPORT, 5.0, level)
+    assert bank.window(2000.0)[1] > stare.n_frames or level.offset
+    variance = rng.uniform(0.5, 2.0, stare.n_frames)
+    search = Search(bank, stare, curves if level.cycle else None, variance)
+    sums = rng.standard_normal((2, stare.n_frames, 2)) + (30 + 1e-2 * stare.start_s[:, None] if level.offset else 0)
+    if level.cycle:
+        sums += 20 * curves[0][:, None]
+    pairs = list(filtered(search, sums, curves))
+    assert len(pairs) > 200
+    assert max(np.abs(a - b).max() for a, b in pairs) < 5e-3
+
+
+@pytest.mark.parametrize("level", [KNOWN, Baseline()])
+def test_bank_loses_little_in_time(level):
+    """Check a loss of 1.3 % of S/N at most for half-widths of 10-1800 s at any phase (spectra: 0.7 %)."""
+    bank = Bank(HALF_WIDTHS_S, ONE, DAVENPORT, 5.0, level)
+    stare = Stare.of(60_000.0)
+    search = Search(bank, stare)
+    edges = np.arange(stare.n_frames + 1) * 5.0
+    flares, own = [], []
+    for half_width in np.geomspace(10, 1800, 24):
+        for phase, frame in ((0.1, 5000), (0.5, 5007), (0.8, 5020)):
+            flares.append(DAVENPORT.mean_over(edges, (frame + phase) * 5.0, half_width))
+            t = bank.template(half_width, (phase,))
+            left = t.shapes[0]
+            if level.offset:
+                left = left - np.polyval(np.polyfit(t.time, left, 1), t.time)
+            own.append(np.linalg.norm(left))
+    kept = search.largest(np.array(flares, np.float32)[:, :, None]).maximum / np.array(own)
+    assert (1 - kept).max() < 0.013
+
+
+@pytest.fixture(scope="module")
+def day():
+    """Return a day and the bank of the theory's table: eight filters from 30 s on, a factor of two apart."""
+    return Search(Bank(tuple(30.0 * 2**k for k in range(8)), ONE, DAVENPORT, 5.0, KNOWN), Stare.of(86_400.0))
+
+
+def test_largest_value_of_a_day(day):
+    """Compare quantiles with 3.73, 4.20, 4.67 and 0.41-0.48 independent tests a frame; fails once in 10^4 runs."""
+    rng = np.random.default_rng(18)
+    days = 400
+    parts = [day.largest(rng.standard_normal((50, 17280, 1), dtype=np.float32)) for _ in range(days // 50)]
+    largest = np.sort(np.concatenate([p.maximum for p in parts]))
+    for q, value in ((0.5, 3.73), (0.9, 4.20), (0.99, 4.67)):
+        # Of 400 days so many lie below the quantile, within four standard errors, and 0.01 for two decimals.
+        spread = 4 * np.sqrt(days * q * (1 - q))
+        assert np.sum(largest < value + 0.02) > days * q - spread
+        assert np.sum(largest < value - 0.02) < days * q + spread
+    # The share below a value is (1 - Q)^(17280 N).
+    tests = np.log(np.mean(largest < 3.9)) / np.log1p(-special.ndtr(-3.9)) / 17280
+    assert 0.38 < tests < 0.55
+
+
+@pytest.fixture(scope="module")
+def short():
+    """Return a search of two sums over a stare with a gap, and its null by importance sampling."""
+    stare = Stare.of(9000.0, gaps=[(4000, 5000)])
+    bank = Bank((20.0, 60.0, 180.0), np.array([[1.0, 0.0], [0.8, 0.6]]), DAVENPORT, 5.0, Baseline(window_s=900.0))
+    search = Search(bank, stare)
+    return search, sample_rate(search, seed=2, draws=400)
+
+
+@pytest.mark.long
+def test_rate_agrees_with_counting(short):
+    """Compare six thresholds within 4 standard errors; fails once in 10^3 runs."""
+    search, tail = short
+    rng = np.random.default_rng(5)
+    maxima = search.largest(rng.standard_normal((2000, search.stare.n_frames, 2), dtype=np.float32)).maximum
+    for u in (3.5, 3.75, 4.0, 4.25, 4.5, 4.75):
+        k = int(np.flatnonzero(tail.thresholds == u)[0])
+        p = np.mean(maxima > u)
+        spread = np.hypot(np.sqrt(p * (1 - p) / 2000), tail.error[k])
+        assert abs(p - tail.probability[k]) < 4 * spread
+
+
+@pytest.mark.long
+def test_repeated_estimates_scatter_by_their_errors():
+    """Compare the scatter of eight seeds of the default bank with their errors, and with drawn noise.
+
+    Chi-squared of 7 degrees at three thresholds, and the mean of the seeds within 4 standard errors at two where
+    alarms can be counted: fails by chance once in 10^3 runs. The stated error of the rate at one false alarm per
+    star-month is below 5 % for every seed.
+    """
+    stare = Stare.of(2500.0)
+    search = Search(Study().search.white_bank(5.0), stare)
+    repeats = [sample_rate(search, seed=seed) for seed in range(8)]
+    for u in (4.25, 5.0, 6.5):
+        k = list(repeats[0].thresholds).index(u)
+        p, error = (np.array([getattr(tail, name)[k] for tail in repeats]) for name in ("probability", "error"))
+        scatter = np.sum((p - p.mean()) ** 2) / np.mean(error**2)
+        assert special.chdtri(7, 1 - 1e-4) < scatter < special.chdtri(7, 1e-4)
+    month = 12 / 365.25
+    assert max(tail.log_rate(tail.threshold(month).value)[1] for tail in repeats) < 0.05
+    rng, n = np.random.default_rng(9), 5000
+    maxima = search.largest(rng.standard_normal((n, stare.n_frames, 1), dtype=np.float32)).maximum
+    for u in (3.5, 4.0):
+        p = np.array([tail.probability[list(tail.thresholds).index(u)] for tail in repeats])
+        q = np.mean(maxima > u)
+        assert abs(p.mean() - q) < 4 * np.hypot(p.std() / np.sqrt(8), np.sqrt(q * (1 - q) / n))
+
+
+def test_rate_of_one_filter_equals_the_closed_form():
+    """Compare independent frames with P = 1 - (1 - Q)^n."""
+    stare = Stare.of(500.0)
+    search = Search(Bank((0.02,), ONE, DAVENPORT, 5.0, KNOWN), stare)
+    tail = sample_rate(search, seed=1, draws=50)
+    # Both phases of a template see its one frame: they are the same filter.
+    exact = -np.expm1(100 * np.log1p(-special.ndtr(-tail.thresholds)))
+    kept = tail.thresholds >= 4.5
+    assert tail.probability[kept] == pytest.approx(exact[kept], rel=2e-3)
+
+
+def test_threshold_inverts_the_rate(short):
+    _, tail = short
+    for rate in (1.0, 1e-2, 1 / 365.25):
+        cut = tail.threshold(rate)
+        assert tail.rate(cut.value).value == pytest.approx(rate, rel=1e-4)
+        assert 0 < cut.high - cut.value < 0.1
+    with refused("false_alarms", "1e-30"):
+        tail.threshold(1e-30)
+
+
+@pytest.mark.parametrize("widths", [pytest.param(HALF_WIDTHS_S, marks=pytest.mark.long), (20.0, 40.0, 80.0, 160.0)])
+def test_closed_form_of_the_rate_agrees_with_importance_sampling(widths):
+    """Compare one alarm a day to one in 10^10 days, for one sum and for three temperatures.
+
+    An upper bound, up to a tenth above; four standard errors of the sampled rate, some 8 % each, which thresholds of
+    one bank share: fails by chance once in 10^4 runs.
+    """
+    directions = ONE if widths is HALF_WIDTHS_S else np.array([[1.0, 0.0], [0.95, 0.312], [0.8, 0.6]])
+    bank = Bank(widths, directions, DAVENPORT, 5.0, Baseline(window_s=900.0))
+    tail = sample_rate(Search(bank, Stare.of(12_000.0)), seed=2, draws=120)
+    for asked in (1.0, 1e-2, 1e-4, 1e-7, 1e-10):
+        log_rate, error = tail.log_rate(search_threshold(asked, bank))
+        assert -0.1 - 4 * error < log_rate - np.log(asked) < 4 * error
+
+
+def test_closed_form_of_the_rate_has_known_values():
+    """Eight filters a factor of two apart have a median of 3.73 a day (TIME.md), a filter of one frame 1 - (1 - Q)^n.
+
+    Both phases of a template shorter than a frame are the same filter.
+    """
+    eight = Bank(tuple(30.0 * 2**k for k in range(8)), ONE, DAVENPORT, 5.0, KNOWN)
+    assert search_threshold(np.log(2), eight) == pytest.approx(3.73, abs=0.05)
+    alone = Bank((0.02,), ONE, DAVENPORT, 5.0, KNOWN)
+    for sigma in (4.5, 5.0, 6.0):
+        assert search_threshold(17_280 * special.ndtr(-sigma), alone) == pytest.approx(sigma, abs=1e-3)
+
+
+def test_closed_form_of_the_rate_agrees_with_counts():
+    """Compare at a few alarms per day, where maxima are clustered and the rate is at most a fifth too large.
+
+    600 stares of six hours: 4 standard errors fail by chance once in 10^4 runs.
+    """
+    bank, stare, rng = (
+        Bank(HALF_WIDTHS_S, ONE, DAVENPORT, 5.0, Baseline()),
+        Stare.of(21_600.0),
+        np.random.default_rng(1),
+    )
+    maxima = Search(bank, stare).largest(rng.standard_normal((600, stare.n_frames, 1), dtype=np.float32)).maximum
+    for asked in (7.0, 3.0, 1.0):
+        share = -np.expm1(-asked / 4)
+        spread = 4 * np.sqrt(600 * share * (1 - share))
+        assert (
+            600 * -np.expm1(-asked / 4 / 1.2) - spread < np.sum(maxima > search_threshold(asked)) < 600 * share + spread
+        )
+        assert search_threshold(asked) == pytest.approx(search_threshold(asked, bank), abs=0.1)
