@@ -211,14 +211,16 @@ def _statistics(
             values[quality.rows(part.start, part.stop) != 0] = np.nan
         fine = np.isfinite(values)
         values[~fine] = np.nan
-        steps = np.diff(np.concatenate([before, values]), axis=0)
         count += fine.sum(axis=0)
-        pairs += np.isfinite(steps).sum(axis=0)
-        total += np.nansum(values, axis=0)
-        squares += np.nansum(steps**2, axis=0)
+        total += values.sum(axis=0, where=fine)
+        steps = np.diff(values, axis=0, prepend=before)
+        before = values[-1:].copy()
+        del values
+        known = np.isfinite(steps)
+        pairs += known.sum(axis=0)
+        squares += np.square(steps, out=steps).sum(axis=0, where=known)
         if error is not None:
             stated += np.where(fine, error.rows(part.start, part.stop) ** 2, 0.0).sum(axis=0)
-        before = values[-1:].copy()
     with np.errstate(invalid="ignore", divide="ignore"):
         mean, scatter = total / count, np.sqrt(squares / pairs / 2.0)
         return PixelStatistics(count, mean, scatter, None if error is None else np.sqrt(stated / count)), finite

@@ -169,7 +169,7 @@ def _csv(path: Path, n: int) -> None:
 @pytest.mark.long
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs the size of a process as Linux states it")
 def test_a_csv_table_larger_than_memory_is_read_in_pieces(tmp_path: Path) -> None:
-    n, margin = 36_000, 64
+    n, margin = 44_000, 80
     path, small, out = tmp_path / "large.csv", tmp_path / "small.csv", tmp_path / "out.npz"
     _csv(path, n)
     small.write_text("time,flux_200\n" + "\n".join(f"{k},1" for k in range(30)) + "\n")

@@ -537,7 +537,11 @@ def test_uploaded_frames_are_analysed_as_on_the_command_line(server: Server, tmp
             assert found[name].colnames == table.colnames
             assert len(found[name]) == len(table)
             for one in table.colnames:
-                assert list(map(str, found[name][one])) == list(map(str, table[one])), (name, one)
+                # Sums of linear algebra depend on where arrays lie in memory, in their last digit.
+                if table[one].dtype.kind == "f":
+                    same_numbers(found[name], table, one)
+                else:
+                    assert list(map(str, found[name][one])) == list(map(str, table[one])), (name, one)
 
 
 def test_quality_bits_are_chosen_as_on_the_command_line(server: Server) -> None:
