@@ -214,7 +214,7 @@ class Grid:
             if before is not None and np.array_equal(before.box, box):
                 parts = before.parts
             else:
-                parts = np.array([window.model(part, p, np.exp(w)) for part in family.parts])
+                parts = window.models(family.parts, p, np.exp(w))
             slope, information = likelihood.matched(parts, family.weights, window.values)
             amplitude = slope / information
             step = (box[:, 1] - box[:, 0]) / (n_node - 1)

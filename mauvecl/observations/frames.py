@@ -151,6 +151,12 @@ class Reason(IntFlag):
         """Return the reasons in words."""
         return ", ".join(str(one.name).lower().replace("_", " ") for one in cls if value & one)
 
+    @classmethod
+    def all_words(cls, values: NDArray[Any]) -> NDArray[np.str_]:
+        """Return the reasons of many frames in words."""
+        different, place = np.unique(values, return_inverse=True)
+        return np.array([cls.words(int(value)) for value in different], np.str_)[place]
+
 
 def _check_light(name: str, time: Float, light: Float) -> None:
     """Raise InputError for times or fluxes of a wrong shape, number or size."""
