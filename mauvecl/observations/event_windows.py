@@ -20,7 +20,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
-from itertools import product
+from itertools import pairwise, product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -283,8 +283,7 @@ class Window:
         ends = np.where(numbers[at] > peak, distance - (numbers[end] - peak), distance - (peak - numbers[begin]))
         outer = np.clip(np.maximum(ends, 0.0) / GROWTH, 1.0, max(1.0, SHORT * shortest / frame_s))
         size[~inside[at]] = np.maximum(np.floor(outer), size.min())[~inside[at]]
-        bins = _bins(numbers[at], size, inside[at])
-        first = np.flatnonzero(np.diff(bins, prepend=-1))
+        first = _bins(numbers[at], size, inside[at])
         count = np.diff(np.append(first, at.size))
         is_inside = inside[at][first]
         # As the start of the next frame, to the bit.
@@ -345,18 +344,25 @@ class Window:
 
 
 def _bins(numbers: NDArray[np.int64], size: Float, inside: Bool) -> NDArray[np.int64]:
-    """Return the bin of each frame: consecutive frames, at most as many as the smallest size that they allow."""
+    """Return the first frame of each bin: a consecutive frame is added to a bin of fewer frames than its own size.
+
+    Sizes are whole numbers that do not both fall and rise within consecutive frames.
+    """
     breaks = np.diff(numbers, prepend=numbers[:1] - 2) != 1
     breaks |= np.diff(inside, prepend=inside[:1])
-    bins = []
-    bin_number, held, limit = -1, 0, 0.0
-    for breaks_here, most in zip(breaks.tolist(), size.tolist(), strict=True):
-        limit = most if breaks_here or held >= limit else min(limit, most)
-        if breaks_here or held >= limit:
-            bin_number, held, limit = bin_number + 1, 0, most
-        held += 1
-        bins.append(bin_number)
-    return np.array(bins, np.int64)
+    sizes = size.astype(np.int64).tolist()
+    firsts = []
+    for begin, end in pairwise([*np.flatnonzero(breaks).tolist(), len(sizes)]):
+        first = begin
+        while first < end:
+            held = min(sizes[first], end - first)
+            while held > 1 and sizes[first + held - 1] < held:
+                held -= 1
+            while first + held < end and sizes[first + held] > held:
+                held += 1
+            firsts.append(first)
+            first += held
+    return np.array(firsts, np.int64)
 
 
 @dataclass(frozen=True, eq=False)

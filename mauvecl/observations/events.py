@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import gc
-import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -15,6 +12,7 @@ import scipy
 from numpy.typing import NDArray
 
 from mauvecl.flares.shapes import between, sides
+from mauvecl.host.threads import map_in_threads
 from mauvecl.observations.event_fits import Fit, Mixture, fit_event, joined, light_of
 from mauvecl.observations.event_windows import GENERAL, LOG_TIME, FittedFlare, Likelihood, Window, log_time
 from mauvecl.observations.process import Steps
@@ -38,9 +36,6 @@ LEVELS = (0.6826894921370859, 0.95)
 NEARBY = 10_000
 #: Errors of the sum of an event's frames by which they are fainter than the level, from which they show no flare.
 FAINTER_ERRORS = 2.0
-#: Largest number of events that are measured at the same time. Most of the time passes in functions of NumPy and SciPy,
-#: beside which other threads run; each takes some 100 MB.
-MOST_THREADS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -314,12 +309,9 @@ def measure_events(
     """
     steps = steps or Steps()
     level = survey.flux_level(~taken)
-    threads = ThreadPoolExecutor(min(os.cpu_count() or 1, MOST_THREADS))
-    try:
-        measured = threads.map(partial(measure_event, survey, taken, level), found, causes or ["flare"] * len(found))
-        events = list(steps.each(measured, len(found)))
-    finally:
-        threads.shutdown(cancel_futures=True)
+    kinds: Sequence[Kind] = causes or ["flare"] * len(found)
+    measured = map_in_threads(lambda k: measure_event(survey, taken, level, found[k], kinds[k]), range(len(found)))
+    events = list(steps.each(measured, len(found)))
     for k, event in enumerate(events):
         ends = (event.first - 1, event.last + 1)
         sides = [each for each in events[max(0, k - 1) : k + 2] if each.last == ends[0] or each.first == ends[1]]

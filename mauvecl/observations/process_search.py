@@ -14,15 +14,15 @@ threshold solves only those that can exceed it.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.threads import map_in_threads
 from mauvecl.search.search import LargestValue
 from mauvecl.search.templates import LEAST_SHARE, Bank, Template
 
@@ -50,6 +50,8 @@ CHUNK_FRAMES, CHUNK_TEMPLATES = 256, 512
 MOST_DENSE = 128
 #: Approximate number of values in an array of a batch of light curves.
 BATCH = 2**21
+#: Number of values of light curves below which templates are searched one after another.
+FEW_VALUES = 2**15
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,9 +194,9 @@ class ProcessSearch:
         """Templates with the denominators that were solved by now."""
         if self._before is not None:
             _ = self._before.filters
-        filters = [
-            self._filter(template, phase) for template in self.bank.templates for phase in range(len(template.phases))
-        ]
+        _ = self._levels
+        templates = [(template, phase) for template in self.bank.templates for phase in range(len(template.phases))]
+        filters = list(map_in_threads(lambda one: self._filter(*one), templates, small=self.n_grid < FEW_VALUES))
         self._before = None
         return filters
 
@@ -234,19 +236,28 @@ class ProcessSearch:
             Positive threshold. Onsets next to gaps, at which rho of the first light curve cannot exceed it, are not
             searched.
         """
+        rows = self.rows if above is None else [None] * len(self.filters)
         scores = self.scores(sums)
-        for k, one in enumerate(self.filters):
-            correlated = _correlated(scores, one.shape, one.first)[..., one.peaks]
-            rho = np.einsum("dk,sko->sdo", self.bank.directions, correlated)
-            if above is None:
-                row = self.rows[k]
-            else:
-                # A template of which a smaller share lies in frames is not searched.
-                least = np.sqrt(LEAST_SHARE * one.without_gaps)
-                self._solve(one, one.unsolved & (rho[0] > above * least).any(axis=0))
-                row = one.row()
-            tried = row.per_amplitude > 0
-            yield row, np.where(tried, rho / np.where(tried, row.per_amplitude, 1.0), -np.inf)
+        found = partial(self._values, scores, above)
+        pairs = list(zip(self.filters, rows, strict=True))
+        yield from map_in_threads(lambda pair: found(*pair), pairs, small=scores.size < FEW_VALUES)
+
+    def _values(
+        self, scores: Float, above: float | None, one: Filter, row: FilterRow | None
+    ) -> tuple[FilterRow, Float]:
+        """Return a row, if it is not given, with rho; see `values`."""
+        correlated = _correlated(scores, one.shape, one.first)[..., one.peaks]
+        rho = np.einsum("dk,sko->sdo", self.bank.directions, correlated)
+        if row is None:
+            assert above is not None
+            # A template of which a smaller share lies in frames is not searched.
+            least = np.sqrt(LEAST_SHARE * one.without_gaps)
+            self._solve(one, one.unsolved & (rho[0] > above * least).any(axis=0))
+            row = one.row()
+        tried = row.per_amplitude > 0
+        np.divide(rho, row.per_amplitude, out=rho, where=tried)
+        rho[:, ~tried] = -np.inf
+        return row, rho
 
     def largest(self, sums: NDArray[Any]) -> LargestValue:
         """Return the largest value of each light curve and its template.
@@ -389,7 +400,6 @@ class ProcessSearch:
 
 def _correlated(values: Float, kernel: Float, first: int) -> Float:
     """Return sum_k values[o + first + k] kernel[k] for every frame o of the last axis; values outside are zero."""
-    from scipy.fft import set_workers
     from scipy.signal import oaconvolve
 
     n = values.shape[-1]
@@ -401,6 +411,5 @@ def _correlated(values: Float, kernel: Float, first: int) -> Float:
     before, after = max(0, -first), max(0, last)
     padded = np.pad(values, [(0, 0)] * (values.ndim - 1) + [(before, after)])
     reverse = kernel[::-1].reshape((1,) * (values.ndim - 1) + (-1,))
-    with set_workers(os.cpu_count() or 1):
-        found = oaconvolve(padded, reverse, mode="valid", axes=-1)
+    found = oaconvolve(padded, reverse, mode="valid", axes=-1)
     return np.asarray(found[..., max(0, first) : max(0, first) + n])
