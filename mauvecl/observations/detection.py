@@ -45,6 +45,8 @@ UNCERTAIN = 0.5
 #: Flux of a template, in standard deviations of a frame, to which its tail belongs to the event; the longest tail and
 #: the beginning, in half-widths.
 FAINT, LONGEST_TAIL, BEGINNING = 0.05, 60.0, 1.2
+#: Statistic of an event, relative to that of an event next to it, below which it is that one's beginning or tail.
+BELONGING = 0.1
 #: Half-widths, and shortest time scales of the process, around a larger event in which smaller ones wait for the next
 #: search.
 NEAR_WIDTHS, NEAR_SCALES = 20.0, 2.0
@@ -327,13 +329,18 @@ def most_events(n_frames: int) -> int:
 
 
 def _merged(found: list[Detection]) -> list[Detection]:
-    """Return the events in order of time, without those that lie inside the frames of a larger one."""
+    """Return the events in order of time, without those that belong to a larger one.
+
+    These overlap with it, or are its beginning or tail: next to it, and much smaller.
+    """
     kept: list[Detection] = []
     for one in sorted(found, key=lambda each: each.first):
-        if kept and one.first <= kept[-1].last:
-            other = kept.pop()
-            larger = max(one, other, key=lambda each: each.value)
-            one = replace(larger, first=min(one.first, other.first), last=max(one.last, other.last))
+        if kept:
+            smaller, larger = sorted((one, kept[-1]), key=lambda each: each.value)
+            touching = one.first == kept[-1].last + 1 and smaller.value < BELONGING * larger.value
+            if one.first <= kept[-1].last or touching:
+                other = kept.pop()
+                one = replace(larger, first=min(one.first, other.first), last=max(one.last, other.last))
         kept.append(one)
     return kept
 

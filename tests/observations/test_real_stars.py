@@ -227,6 +227,20 @@ def test_probability_of_an_event_is_that_of_the_larger_rate() -> None:
     np.testing.assert_allclose(events["probability"], -np.expm1(-rates.max(axis=0) * analysis.days), rtol=1e-12)
 
 
+@pytest.mark.parametrize(("peak_s", "half_width_s", "snr"), [(699.0, 338.0, 3800.0), (617.0, 307.0, 8500.0)])
+def test_beginning_of_a_bright_flare_is_no_flare_of_its_own(peak_s: float, half_width_s: float, snr: float) -> None:
+    """The window ends within a half-width after the peak, so that the best template is shorter than the flare."""
+    time, noise = (np.arange(195) + 0.5) * 5.0, 5e-3
+    light = flare(time, 5.0, peak_s, half_width_s)
+    amplitude = snr * noise / np.sqrt((light**2).sum())
+    flux = 1 + amplitude * light + noise * np.random.default_rng(1).standard_normal(time.size)
+    analysis = analysed(Frames.of(time, flux, exposure_s=5.0), per="month").analysis
+    assert len(analysis.events) == 1
+    whole = amplitude * half_width_s * DAVENPORT.equivalent_duration
+    energy = analysis.events[0].energy
+    assert energy.low_s[1] < whole < energy.high_s[1]
+
+
 @pytest.mark.parametrize(
     ("after_s", "half_width_s", "seed"), long_but([(60.0, 40.0, 1), (40.0, 40.0, 2), (50.0, 30.0, 3)], (60.0, 40.0, 1))
 )
