@@ -64,8 +64,8 @@ if TYPE_CHECKING:
     from mauvecl.host.stars.flare_spectra import BalmerFlare, Blackbody, FlareWithLines, ObservedFlare, TwoBlackbodies
     from mauvecl.host.stars.source import Source
     from mauvecl.noise.comparison import Comparison
-    from mauvecl.noise.disturbances import Normal, Uniform
-    from mauvecl.noise.processes import CosmicRays, Processes
+    from mauvecl.noise.disturbances import CosmicRays, Normal, Uniform
+    from mauvecl.noise.unknowns import Processes
     from mauvecl.observations.frame_files import read_frames
     from mauvecl.observations.frames import Frames
     from mauvecl.runs import bulk
@@ -158,7 +158,7 @@ _HOMES = HOMES | {
     "forecast": "fits.spectrum",
     "Comparison": "noise.comparison",
     "Cooling": "flares.settings",
-    "CosmicRays": "noise.processes",
+    "CosmicRays": "noise.disturbances",
     "DaskWorkers": "runs.cluster",
     "Detection": "detection.detection",
     "EnergyScale": "flares.energies",
@@ -176,7 +176,7 @@ _HOMES = HOMES | {
     "PAPER_BUDGETS": "study.study",
     "PixelMap": "host.instrument.curves",
     "Pool": "runs.pool",
-    "Processes": "noise.processes",
+    "Processes": "noise.unknowns",
     "SHAPES": "flares.shapes",
     "Sinusoid": "flares.settings",
     "Sky": "host.exposure.sky",

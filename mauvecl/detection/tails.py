@@ -30,7 +30,7 @@ from mauvecl.detection.names import check_atom
 from mauvecl.detection.statistics import Differences
 from mauvecl.noise import layout
 from mauvecl.noise.scene import quantile_at_score
-from mauvecl.noise.unknowns import ADDITIVE
+from mauvecl.noise.unknowns import ADDITIVE, PROCESSES
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
@@ -447,8 +447,9 @@ def _factors(
     moved = np.arange(BLOCK)[:, None] % 2 == 1
     ratio = np.zeros(BLOCK)
     for row, ((name, factor), table) in enumerate(zip(scene.modulations, scene.priors, strict=True)):
-        score = _normals(scene.n_frames if name == "jitter" else 1, seed, block, row, purpose=1)
-        if name != "jitter" and kinds.count(factor) == 1 and factor in towards:
+        each_frame = PROCESSES[name].when == "frame"
+        score = _normals(scene.n_frames if each_frame else 1, seed, block, row, purpose=1)
+        if not each_frame and kinds.count(factor) == 1 and factor in towards:
             mean, sd = towards[factor]
             score = np.where(moved, mean + sd * score, score)
             # Ratio of the moved density to the prior's.

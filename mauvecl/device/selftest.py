@@ -35,8 +35,9 @@ from mauvecl.host.exposure.expectation import Expectation
 from mauvecl.host.version import VERSION
 from mauvecl.noise import layout, reference
 from mauvecl.noise.comparison import Comparison
-from mauvecl.noise.processes import NONE, CosmicRays, Processes, Uniform
+from mauvecl.noise.disturbances import CosmicRays, Uniform
 from mauvecl.noise.scene import prepare
+from mauvecl.noise.unknowns import NONE, Processes
 from mauvecl.schema.columns import Column
 
 if TYPE_CHECKING:

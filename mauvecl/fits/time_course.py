@@ -26,7 +26,7 @@ from mauvecl.flares.frames import Components
 from mauvecl.flares.settings import Cooling
 from mauvecl.flares.shapes import Shape, shape_of
 from mauvecl.flares.stare import Stare
-from mauvecl.noise.unknowns import CHANGING, Changing
+from mauvecl.noise.unknowns import CHANGED_PART, CHANGING, Changing
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, table_of
 from mauvecl.schema.errors import InputError
@@ -239,7 +239,7 @@ def spreads_of(stare: Stare, first: int, end: int) -> dict[Changing, float]:
 
 def _with_change(unknown: Nuisances, quiet: Expectation, of: Changing, sd: float) -> Nuisances:
     """Return nuisance parameters with an unknown change of a stare, unless they have one of the same kind."""
-    name = {"temperature": "dark"}.get(of, of)
+    name = CHANGED_PART[of]
     if not sd > 0.0 or name in unknown.names:
         return unknown
     if name == "star":

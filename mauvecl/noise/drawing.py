@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from mauvecl.noise import layout
 from mauvecl.noise.disturbances import Prior
-from mauvecl.noise.processes import NONE, Processes
-from mauvecl.noise.unknowns import PROCESSES, Conditions
+from mauvecl.noise.unknowns import NONE, PROCESSES, Conditions, Processes
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:

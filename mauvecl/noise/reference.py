@@ -18,7 +18,7 @@ from mauvecl.noise import layout, random_numbers
 from mauvecl.noise.drawing import DrawingOptions
 from mauvecl.noise.random_numbers import Floats, Words, fma, four_normals, words
 from mauvecl.noise.scene import Scene, prepare
-from mauvecl.noise.unknowns import ADDITIVE
+from mauvecl.noise.unknowns import ADDITIVE, PROCESSES
 from mauvecl.schema.columns import Column, table_of
 
 if TYPE_CHECKING:
@@ -137,7 +137,7 @@ def factors(
     kept = np.zeros(len(realisation), np.float32)
     first = int(scene.job["first_frame"]) + frame
     for (name, factor), table in zip(scene.modulations, scene.priors, strict=True):
-        if name != "jitter":
+        if PROCESSES[name].when != "frame":
             words = words_at(realisation, 0, name, 0, seed)
             factor_of[factor] = combine_factors(factor_of[factor], quantile(words[0], words[1], table))
             continue

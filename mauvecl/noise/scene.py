@@ -27,12 +27,12 @@ from mauvecl.noise.drawing import (
     sky_share,
 )
 from mauvecl.noise.layout import LARGEST_MEAN, SMALLEST_EXPANDED, AliasTable, table_of, table_set
-from mauvecl.noise.unknowns import ADDITIVE, SignalPart
+from mauvecl.noise.unknowns import ADDITIVE, PROCESSES, SignalPart
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
-    from mauvecl.noise.processes import Processes
+    from mauvecl.noise.unknowns import Processes
 
 Float = NDArray[np.float64]
 
@@ -139,7 +139,7 @@ class FactorDistributions:
         spreads: dict[str, list[FactorDistribution]] = {}
         for (name, factor), table in zip(modulations, tables, strict=True):
             one = _of_table(table)
-            if name == "jitter" and n_frames > 1:
+            if PROCESSES[name].when == "frame" and n_frames > 1:
                 one = _normal(one.mean, one.sd / np.sqrt(n_frames))
             spreads.setdefault(factor, []).append(one)
         median = dict(zip(("light", "dark", "sky"), medians, strict=True))
