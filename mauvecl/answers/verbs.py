@@ -45,12 +45,9 @@ DRAWS = ("run.realisations", "run.seed")
 DETECTION = ("run.statistics", "run.fap", "run.tails", "run.reference", "run.variances")
 NUISANCES = ("nuisances.own", "nuisances.usual")
 UNKNOWN = ("unknowns.draws", "unknowns.known")
+FRAMES = ("stare.duration_s", "stare.gaps", "stare.orbit_gap_s", "stare.thermal", "stare.pointing")
 STARE = (
-    "stare.duration_s",
-    "stare.gaps",
-    "stare.orbit_gap_s",
-    "stare.thermal",
-    "stare.pointing",
+    *FRAMES,
     "stare.half_width_s",
     "stare.shape",
     "stare.energies_erg",
@@ -272,11 +269,7 @@ VERBS: dict[str, Verb] = {
                 "flare.geometry",
                 "flare.photosphere_temperature_k",
                 "flare.spectrum",
-                "stare.duration_s",
-                "stare.gaps",
-                "stare.orbit_gap_s",
-                "stare.thermal",
-                "stare.pointing",
+                *FRAMES,
                 "nuisances.usual",
                 *SIZE,
                 "search",
