@@ -318,10 +318,6 @@ class Templates:
         """Return the covariance added by the photon noise of a flare of the nearest temperature, (n_sum, n_sum)."""
         return np.asarray(self.noise[int(np.argmin(np.abs(np.log(np.array(self.temperatures_k) / kelvin))))])
 
-    def of_flares(self, flares_dn: Float) -> Float:
-        """Return the mean sums, (n, n_sum), for flare spectra in DN, (n, n_pixel)."""
-        return np.asarray(flares_dn @ self.weights.T)
-
 
 def frame_nuisances(
     quiet: Expectation, stare: Stare, more: Mapping[str, float] | Nuisances | None = None
