@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 
 Conditions = Mapping[str, float]
 SignalPart = Literal["light", "dark", "sky"]
+SIGNAL_PARTS: tuple[SignalPart, ...] = get_args(SignalPart)
 #: Object of an unknown: a part of the signal, the wavelength dependence of the response, or an instrument value.
 Of = Literal["star", "light", "sky", "dark", "response", "instrument"]
 #: How often an unknown takes another value.
