@@ -483,6 +483,29 @@ def calibrate(
         Spectra in memory, in place of those of the observations; None for frames without light.
     """
     asked = study.calibrate
+    nominal, observations = _observations(study, frames, stars)
+    lit = [observation for observation in observations if observation.star is not None]
+    without = [observation for observation in observations if observation.star is None]
+    dark = assumed_dark(nominal, nominal.wavelength_nm.size)
+    if without:
+        dark = fit_dark(without, nominal, NoiseModel.nominal(nominal))
+    transfer = fit_photon_transfer(_variances(observations, dark, nominal), nominal)
+    if without:
+        dark = fit_dark(without, nominal, transfer.noise)
+        error = float(np.sqrt(dark.shared[0, 0]))
+        transfer = fit_photon_transfer(_variances(observations, dark, nominal), nominal, error)
+    throughput = fit_throughput(
+        lit, nominal, dark, transfer, knots=asked.knots, sky=study.sky.sky(), order=study.observation.order,
+        light_error=asked.light_error, spectrum_error=asked.spectrum_error,
+    )  # fmt: skip
+    return CalibrateAnswer(study, nominal, observations, dark, transfer, throughput)
+
+
+def _observations(
+    study: Study, frames: tuple[Frames, ...] | None, stars: tuple[Source | None, ...] | None
+) -> tuple[Instrument, tuple[CalibrationFrames, ...]]:
+    """Return the instrument from which the fit starts and the observations; parameters as for `calibrate`."""
+    asked = study.calibrate
     if not any(observation.library or observation.spectrum for observation in asked.observations):
         raise InputError("no observation of a standard star is given",
                          "calibrate.observations with library or spectrum", key="calibrate.observations")  # fmt: skip
@@ -503,21 +526,7 @@ def calibrate(
             raise InputError.of("observations", one.name, "frames with a pixel below saturation")
         if any(np.array_equal(one.raw_dn, other.raw_dn) for other in observations[:k]):
             raise InputError.of("observations", one.name, "frames that no other observation has")
-    lit = [observation for observation in observations if observation.star is not None]
-    without = [observation for observation in observations if observation.star is None]
-    dark = assumed_dark(nominal, nominal.wavelength_nm.size)
-    if without:
-        dark = fit_dark(without, nominal, NoiseModel.nominal(nominal))
-    transfer = fit_photon_transfer(_variances(observations, dark, nominal), nominal)
-    if without:
-        dark = fit_dark(without, nominal, transfer.noise)
-        error = float(np.sqrt(dark.shared[0, 0]))
-        transfer = fit_photon_transfer(_variances(observations, dark, nominal), nominal, error)
-    throughput = fit_throughput(
-        lit, nominal, dark, transfer, knots=asked.knots, sky=study.sky.sky(), order=study.observation.order,
-        light_error=asked.light_error, spectrum_error=asked.spectrum_error,
-    )  # fmt: skip
-    return CalibrateAnswer(study, nominal, observations, dark, transfer, throughput)
+    return nominal, observations
 
 
 def _variances(

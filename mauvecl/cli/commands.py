@@ -35,6 +35,7 @@ from mauvecl.cli.flags import (
 if TYPE_CHECKING:
     from mauvecl.cli.invocation import Session
     from mauvecl.runs.store import Store
+    from mauvecl.schema.columns import Column
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -286,8 +287,7 @@ def verify(
     Example: mauvecl verify frames.zarr --repair
     """
     from mauvecl.answers.answer import is_answer
-    from mauvecl.cli.console import Meter, show, show_view
-    from mauvecl.schema.columns import View
+    from mauvecl.cli.console import Meter
     from mauvecl.schema.errors import InputError
 
     if is_answer(store):
@@ -307,32 +307,35 @@ def verify(
     with Meter(quiet=quiet or as_json, unit="chunks") as meter:
         faults = bulk.verify(store, engine, repair=repair, redraw=redraw, rows=_rows_of(rows), progress=meter)
     left = sum(not fault.mended for fault in faults)
-    if as_json:
-        print(json.dumps([asdict(fault) for fault in faults], indent=2))
-    else:
-        if faults:
-            show_view(View(f"Not as it was written: {store}", bulk.FAULT_COLUMNS, [asdict(one) for one in faults]))
-        source = "with what was written" if not redraw else "with what the engine draws"
-        show([f"{len(faults) - left} repaired, {left} left as found." if faults else f"Everything agrees {source}."])
+    source = "with what was written" if not redraw else "with what the engine draws"
+    outcome = f"{len(faults) - left} repaired, {left} left as found." if faults else f"Everything agrees {source}."
+    _tell_faults(store, bulk.FAULT_COLUMNS, faults, outcome, as_json=as_json)
     if left:
         raise typer.Exit(1)
 
 
 def _verify_answer(folder: Path, *, as_json: bool) -> None:
-    """Print files that differ from the run record, with exit code 1 if there are any."""
     from mauvecl.answers.answer import FAULT_COLUMNS, verify_answer
+
+    faults = verify_answer(folder)
+    outcome = "" if faults else "Every file agrees with the run record, and the record with its own digest."
+    _tell_faults(folder, FAULT_COLUMNS, faults, outcome, as_json=as_json)
+    if faults:
+        raise typer.Exit(1)
+
+
+def _tell_faults(place: Path, columns: Sequence[Column], faults: Sequence[Any], outcome: str, *, as_json: bool) -> None:
+    """Print what is not as it was written, and the outcome unless it is empty."""
     from mauvecl.cli.console import show, show_view
     from mauvecl.schema.columns import View
 
-    faults = verify_answer(folder)
+    rows = [asdict(fault) for fault in faults]
     if as_json:
-        print(json.dumps([asdict(fault) for fault in faults], indent=2))
-    elif faults:
-        show_view(View(f"Not as it was written: {folder}", FAULT_COLUMNS, [asdict(one) for one in faults]))
-    else:
-        show(["Every file agrees with the run record, and the record with its own digest."])
-    if faults:
-        raise typer.Exit(1)
+        print(json.dumps(rows, indent=2))
+        return
+    if rows:
+        show_view(View(f"Not as it was written: {place}", columns, rows))
+    show([outcome] if outcome else [])
 
 
 def export(
