@@ -373,12 +373,10 @@ class StareAnswer(Answer):
 
     @property
     def views(self) -> list[View]:
-        choice = self.study.search
-        alarms = "false alarm" if choice.false_alarms == 1 else "false alarms"
         views = super().views
         for stare in self.stares:
             if isinstance(stare.search, SearchResult):
-                above = f"{stare.search.threshold:.2f}, {choice.false_alarms:g} {alarms} per star-{choice.per}"
+                above = f"{stare.search.threshold:.2f}, {self.study.search.rate_text}"
                 found = table_of(FOUND_COLUMNS, stare.found)
                 views.append(View(f"Found at {stare.title} above {above}", FOUND_COLUMNS, found))
         return views

@@ -242,6 +242,11 @@ class SearchChoice(Section):
         """False alarms per star-day."""
         return per_day(self.false_alarms, self.per)
 
+    @property
+    def rate_text(self) -> str:
+        """The false alarms as text, such as "1 false alarm per star-month"."""
+        return f"{self.false_alarms:g} false alarm{'' if self.false_alarms == 1 else 's'} per star-{self.per}"
+
     def white_bank(self, frame_s: float) -> Bank:
         """Return the template bank of the closed form: one sum per frame and no cycle."""
         from mauvecl.flares.shapes import shape_of
