@@ -230,6 +230,28 @@ class CalibrateAnswer(Answer):
 
     @property
     def messages(self) -> list[str]:
+        lines = [*self._throughput_messages]
+        if self.study.calibrate.light_error == 0:
+            lines.append("Losses by pointing are taken to be alike in all observations (calibrate.light_error).")
+        for row in self.fits:
+            if row["p_value"] < REJECTED:
+                lines.append(f"The fit of the {row['fit']} is rejected: p = {row['p_value']:.2g}.")
+        if self.dark.slopes_p_value < REJECTED:
+            lines.append(
+                "The dark current of single pixels rises differently with temperature: the instrument file has the "
+                f"common slope (p = {self.dark.slopes_p_value:.2g})."
+            )
+        change = self.throughput.fwhm_change_nm
+        if change is not None and abs(change.value) > 3 * change.error:
+            lines.append("The line width changes along the spectrum: the instrument file has its mean.")
+        saturated = [lit.name for lit in self.stars if not lit.usable(self.nominal).all()]
+        if saturated:
+            lines.append(f"Saturated pixels are not used: {', '.join(saturated)}.")
+        return lines
+
+    @property
+    def _throughput_messages(self) -> list[str]:
+        """Messages on what is not determined, and on the throughput."""
         lines = []
         assumed = [*self.dark.assumed, *self.transfer.assumed, *self.throughput.assumed]
         if assumed:
@@ -253,22 +275,6 @@ class CalibrateAnswer(Answer):
         far = float(np.exp(np.abs(self.throughput.log_factor).max()))
         if far > FAR_FROM_NOMINAL:
             lines.append(f"The throughput is up to {far:.2g} times above or below the nominal one: check the stars.")
-        if self.study.calibrate.light_error == 0:
-            lines.append("Losses by pointing are taken to be alike in all observations (calibrate.light_error).")
-        for row in self.fits:
-            if row["p_value"] < REJECTED:
-                lines.append(f"The fit of the {row['fit']} is rejected: p = {row['p_value']:.2g}.")
-        if self.dark.slopes_p_value < REJECTED:
-            lines.append(
-                "The dark current of single pixels rises differently with temperature: the instrument file has the "
-                f"common slope (p = {self.dark.slopes_p_value:.2g})."
-            )
-        change = self.throughput.fwhm_change_nm
-        if change is not None and abs(change.value) > 3 * change.error:
-            lines.append("The line width changes along the spectrum: the instrument file has its mean.")
-        saturated = [lit.name for lit in self.stars if not lit.usable(self.nominal).all()]
-        if saturated:
-            lines.append(f"Saturated pixels are not used: {', '.join(saturated)}.")
         return lines
 
     @property
