@@ -14,12 +14,11 @@ import typer
 
 from mauvecl.answers.verbs import DRAWS, FEWER, VERBS, Verb
 from mauvecl.cli.flags import (
-    PICTURES,
     RESUMING,
-    TELLING,
     WORKERS,
     DeviceFlag,
     JsonFlag,
+    Options,
     QuietFlag,
     SetFlag,
     StudyFile,
@@ -70,17 +69,18 @@ class Command:
             *(p.replace(kind=named, annotation=kinds[p.name]) for p in own if p.name != "given"),
             *(inspect.Parameter(key, named, default=usual, annotation=kind) for key, (kind, usual) in options),
         ]
-        parameters, readers = _read_as_text(parameters)
+        taken = [as_text(parameter) for parameter in parameters]
+        readers = {parameter.name: read for parameter, read in taken if read is not None}
 
         def command(study_file: Path | None = None, **values: Any) -> None:
-            for key, (shown, read) in readers.items():
+            for key, read in readers.items():
                 if values.get(key) is not None and not isinstance(values[key], int | float):
-                    values[key] = read(values[key], shown)
+                    values[key] = read(values[key])
             self._call(study_file, flags, values, tells_flags="given" in kinds)
 
         command.__name__ = verb.name
-        command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        command.__annotations__ = {p.name: p.annotation for p in parameters}
+        command.__signature__ = inspect.Signature([parameter for parameter, _ in taken])  # type: ignore[attr-defined]
+        command.__annotations__ = {parameter.name: parameter.annotation for parameter, _ in taken}
         return command
 
     def _call(
@@ -109,8 +109,10 @@ class Command:
     def _options(self) -> dict[str, tuple[Any, Any]]:
         """Return the options of the session, with their defaults."""
         output = output_flag(self.writes or f"the folder mauvecl-{self.verb.name}")
-        workers = WORKERS if self.draws else RESUMING if self.resumes else {}
-        return {"output": (output, None)} | TELLING | (PICTURES if self.pictures else {}) | workers
+        workers = WORKERS if self.draws else RESUMING if self.resumes else ()
+        names = ("as_json", "quiet", *(["pictures"] if self.pictures else []), *workers)
+        kinds = get_type_hints(Options, include_extras=True)
+        return {"output": (output, None)} | {name: (kinds[name], getattr(Options, name)) for name in names}
 
 
 #: Commands with a study by name, filled by `command_of`.
@@ -154,21 +156,6 @@ def _placed(study_file: Path | None, given: dict[str, Any]) -> Path | None:
                 )
             given[key], study_file = value(study_file), None
     return study_file
-
-
-def _read_as_text(
-    parameters: Sequence[inspect.Parameter],
-) -> tuple[list[inspect.Parameter], dict[str, tuple[str, Callable[[str, str], Any]]]]:
-    """Return parameters of which numbers are taken as text, so that messages have one style, and their readers."""
-    taken, readers = [], {}
-    for parameter in parameters:
-        kind, shown, read = as_text(parameter.annotation)
-        if read is not None:
-            readers[parameter.name] = shown or "--" + parameter.name.replace("_", "-"), read
-            default_text = None if parameter.default is None else f"{parameter.default:g}"
-            parameter = parameter.replace(annotation=kind, default=default_text)
-        taken.append(parameter)
-    return taken, readers
 
 
 def add_plain_commands() -> None:
