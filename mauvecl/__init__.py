@@ -23,7 +23,7 @@ from functools import cache
 from importlib import import_module
 from typing import Any
 
-from mauvecl.host.version import VERSION
+from mauvecl.host import VERSION
 from mauvecl.schema import drawable
 
 if sys.platform == "win32":

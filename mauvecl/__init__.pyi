@@ -66,3 +66,5 @@ from mauvecl.runs.pool import Pool as Pool
 from mauvecl.schema.errors import InputError as InputError
 from mauvecl.study.study import PAPER_BUDGETS as PAPER_BUDGETS
 from mauvecl.study.study import Study as Study
+
+__version__: str

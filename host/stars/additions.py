@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import IO
 from urllib.parse import urljoin, urlsplit
 
+from mauvecl.host import VERSION
 from mauvecl.host.stars.coverage import check_covers
 from mauvecl.host.stars.library import OwnStar, embedded, find, folder, kept, spectrum_digest
 from mauvecl.host.stars.source import Source
 from mauvecl.host.tables.files import limit_bytes, parsing, read_bytes, without_columns, write_whole
-from mauvecl.host.version import VERSION
 from mauvecl.schema.errors import InputError, shortened
 
 

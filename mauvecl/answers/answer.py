@@ -16,10 +16,10 @@ from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, overload
 
+from mauvecl.host import VERSION
 from mauvecl.host.arrays import ContentEquality
 from mauvecl.host.exposure.star import Neighbour, rate_of
 from mauvecl.host.tables.files import check_size, json_text, open_regular, read_text, write_whole, writing
-from mauvecl.host.version import VERSION
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, View, percent, records, stacked, table_of
 from mauvecl.schema.drawable import Drawable, documents_of

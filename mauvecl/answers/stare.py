@@ -25,9 +25,9 @@ from mauvecl.device.engine import Stares
 from mauvecl.flares.energies import Kind
 from mauvecl.flares.events import Event, coefficients, temperatures_of
 from mauvecl.flares.frames import Draw, LightCurves, StareExpectation, draw_light_curves
+from mauvecl.host import VERSION
 from mauvecl.host.exposure.sky import parse_position, parse_time
 from mauvecl.host.tables.units import offline
-from mauvecl.host.version import VERSION
 from mauvecl.runs.checkpoint import Checkpoint, kept
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, View, number, percent, table_of

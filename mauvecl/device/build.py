@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from mauvecl.device import drivers as vendors
 from mauvecl.device.drivers import BuildError, DeviceError, choose_processor_level, driver_sources, kernel_cache
-from mauvecl.host.version import VERSION
+from mauvecl.host import VERSION
 from mauvecl.noise import layout, random_numbers
 from mauvecl.noise.scene import PIXEL_BLOCK
 from mauvecl.noise.unknowns import PROCESSES

@@ -31,8 +31,8 @@ from mauvecl.device.engine import Engine, Stares, devices
 from mauvecl.flares.frames import Components
 from mauvecl.flares.stare import Stare
 from mauvecl.flares.stare_scene import Arrays, StaresRequest
+from mauvecl.host import VERSION
 from mauvecl.host.exposure.expectation import Expectation
-from mauvecl.host.version import VERSION
 from mauvecl.noise import layout, reference
 from mauvecl.noise.comparison import Comparison
 from mauvecl.noise.disturbances import CosmicRays, Uniform

@@ -21,8 +21,8 @@ from mauvecl.detection.requests import Countable, Shard
 from mauvecl.detection.snr import Arrays
 from mauvecl.device.build import DeviceRecord
 from mauvecl.device.drivers import THREADS, DeviceError
+from mauvecl.host import VERSION
 from mauvecl.host.tables.files import is_file, json_data, read_text
-from mauvecl.host.version import VERSION
 from mauvecl.runs.checkpoint import Task, code_identity
 from mauvecl.runs.pool import Stopped
 from mauvecl.schema.calls import validated
