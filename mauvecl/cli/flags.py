@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Union, ge
 
 import typer
 
-from mauvecl.schema.fields import Flag, Help, Unit, first
-from mauvecl.schema.parsing import count, number, refusal, several
+from mauvecl.schema.fields import Flag, Help, Unit, as_typed, first
+from mauvecl.schema.parsing import assignment, count, number, refusal, several
 
 if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
@@ -131,7 +131,7 @@ def _help(path: str, field: FieldInfo, flag: Flag, kind: Any, defaults: Mapping[
         )
     else:
         default = help.default or (
-            "" if flag.help or kind is bool else _text(field.get_default(call_default_factory=True))
+            "" if flag.help or kind is bool else as_typed(field.get_default(call_default_factory=True))
         )
     return text + (f" [{default}]" if default else "") + "."
 
@@ -143,15 +143,6 @@ def _words(annotation: Any) -> str:
         return f"{', '.join(others)} or {last}"
     inner = [part for part in get_args(annotation) if part not in (NoneType, ...)]
     return _words(inner[0]) if len(inner) == 1 else ""
-
-
-def _text(default: Any) -> str:
-    """Return a default as it is typed; empty without a default."""
-    if isinstance(default, tuple):
-        return ",".join(map(_text, default))
-    if isinstance(default, bool) or not isinstance(default, str | int | float):
-        return ""
-    return f"{default:g}" if isinstance(default, float) else str(default)
 
 
 def output_flag(usual: str) -> Any:
@@ -295,18 +286,12 @@ def sky_of(given: dict[str, Any]) -> dict[str, Any]:
 def nuisances_of(study: Study, texts: list[str]) -> dict[str, Any]:
     """Read nuisance parameters such as dark=0.1, or with the name of a file, stray.txt=free."""
     from mauvecl.noise.unknowns import NUISANCES
-    from mauvecl.schema.errors import InputError, shortened
 
     nuisances: dict[str, Any] = {}
     own = {name: one.model_dump(exclude_none=True) for name, one in study.nuisances.own.items()}
     for text in texts:
-        name, _, sd = (part.strip() for part in text.rpartition("="))
-        if not (name and sd):
-            raise InputError(
-                f"--nuisance {shortened(text)}",
-                f"NAME=SD, with a name of {', '.join(NUISANCES)} or a file's, and a standard deviation or free",
-                key="nuisance",
-            )
+        expected = f"NAME=SD, with a name of {', '.join(NUISANCES)} or a file's, and a standard deviation or free"
+        name, sd = assignment(text, "--nuisance", expected)
         if name in NUISANCES:
             nuisances[name] = sd
         else:
