@@ -9,8 +9,8 @@ from pydantic import BaseModel
 from typer.main import get_command
 
 from mauvecl.cli.app import app
+from mauvecl.host import VERSION
 from mauvecl.host.instrument.instrument import Instrument
-from mauvecl.host.version import VERSION
 from mauvecl.schema.section import keys_of
 from mauvecl.study.study import Study
 

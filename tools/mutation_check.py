@@ -41,7 +41,7 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "a sky that follows no level": (
         "test_sky_follows_its_level[level0]",
-        ("factors.light * factors.sky * share / light", "0.0 * share / light"),
+        ('factors.medians["light"] * factors.medians["sky"] * share / light', "0.0 * share / light"),
     ),
     "unknowns marginalised without their prior": (
         "test_subtracted_rows_give_the_inverse_covariance[chi2]",

@@ -477,22 +477,19 @@ def expect(
     n_frames = max(1, int(np.ceil(exposure / instrument.frame_s * (1 - 1e-12))))
     if n_frames > MAX_FRAMES:
         raise InputError.of("exposure", exposure, f"at most {MAX_FRAMES} frames of {instrument.frame_s:g} s", unit="s")
-    low, high = instrument.output_min_nm, instrument.output_max_nm
-    first, last = source.measured_nm or (float(source.wavelength_nm[0]), float(source.wavelength_nm[-1]))
-    check_covers(source.name, (first, last), (low, high), f"{instrument.name}'s output range ")
-    source = continued_to_reach(source, instrument)
-    if source.unscaled:
-        raise InputError(
-            f"the spectrum of {source.name} is not as bright as the star is seen: {source.unscaled}",
-            "a magnitude as well",
-            key="magnitude",
-        )
+    source = _usable(source, instrument)
 
     def per_frame(light: Source) -> Float:
         rate = electrons_per_second(instrument, light.wavelength_nm, light.flux_flam, order)
         return rate * instrument.frame_s * instrument.per_pixel("response", 1.0)
 
     zodiacal = sky.spectrum(instrument.field_of_view_arcsec2)
+    provenance = _provenance(source, instrument, sky, zodiacal) | {
+        "order": order,
+        "signal": signal,
+        "requested exposure": f"{exposure:g} s",
+        "exposure": f"{n_frames} x {instrument.frame_s:g} s",
+    }
     n_pixel = instrument.wavelength_nm.size
     element, element_wavelength = _elements(instrument)
     electrons = per_frame(source)
@@ -523,36 +520,42 @@ def expect(
         },
         name=source.name,
         instrument=instrument.name,
-        provenance={
-            "source": source.name,
-            "source origin": source.origin,
-            "source notes": "; ".join(source.notes),
-            "source history": "; ".join(source.history),
-            "source remarks": "; ".join(source.messages),
-            "source digest": source.digest,
-            "sky": sky.description,
-            "sky digest": "" if zodiacal is None else zodiacal.digest,
-            "instrument": instrument.name,
-            "instrument digest": instrument.digest,
-            "detector temperature": f"{instrument.temperature_c:g} C",
-            "order": order,
-            "signal": signal,
-            "requested exposure": f"{exposure:g} s",
-            "exposure": f"{n_frames} x {instrument.frame_s:g} s",
-        }
-        | ({} if neighbours is None else neighbours.provenance(instrument)),
+        provenance=provenance | ({} if neighbours is None else neighbours.provenance(instrument)),
     )
     messages = [*_saturation(plain), *(f"{source.name}: {text}." for text in source.messages)]
     if neighbours is not None:
         messages += neighbours.messages(source.name, instrument)
     drawn = np.sqrt(plain.variance_dn2) / (n_frames * plain.gain_dn_per_electron)
     messages += negative_means_message(source, instrument, electrons, drawn, order)
-    if signal == "paper" and plain.sky_electrons.any():
+    return replace(plain, messages=(*messages, *_remarks(plain, exposure, source, instrument)))
+
+
+def _provenance(source: Source, instrument: Instrument, sky: Sky, zodiacal: Source | None) -> dict[str, str]:
+    """Return names, origins and digests of what an expectation is computed from."""
+    return {
+        "source": source.name,
+        "source origin": source.origin,
+        "source notes": "; ".join(source.notes),
+        "source history": "; ".join(source.history),
+        "source remarks": "; ".join(source.messages),
+        "source digest": source.digest,
+        "sky": sky.description,
+        "sky digest": "" if zodiacal is None else zodiacal.digest,
+        "instrument": instrument.name,
+        "instrument digest": instrument.digest,
+        "detector temperature": f"{instrument.temperature_c:g} C",
+    }
+
+
+def _remarks(x: Expectation, exposure: float, source: Source, instrument: Instrument) -> list[str]:
+    """Return messages on signal and exposure, and on what source and instrument assume."""
+    messages: list[str] = []
+    if x.signal == "paper" and x.sky_electrons.any():
         messages.append(Message("S/N counts the zodiacal light as signal, as the MauveSim paper does.", "paper signal"))
-    if n_frames * instrument.frame_s > exposure * (1 + 1e-9):
+    if x.n_frames * x.frame_s > exposure * (1 + 1e-9):
         text = (
-            f"The exposure of {exposure:g} s is rounded up to {plain.exposure_s:g} s, "
-            f"{n_frames} frame{'s' if n_frames > 1 else ''} of {instrument.frame_s:g} s."
+            f"The exposure of {exposure:g} s is rounded up to {x.exposure_s:g} s, "
+            f"{x.n_frames} frame{'s' if x.n_frames > 1 else ''} of {x.frame_s:g} s."
         )
         messages.append(Message(text, "rounded up"))
     if any(note.startswith("dereddened") for note in source.notes) and not any("redden" in h for h in source.history):
@@ -564,7 +567,21 @@ def expect(
         messages.append(instrument.notice)
     if source.scale:
         messages.append(source.scale)
-    return replace(plain, messages=tuple(messages))
+    return messages
+
+
+def _usable(source: Source, instrument: Instrument) -> Source:
+    """Return a source with continued ends; raises InputError unless it covers the output range and has a scale."""
+    low, high = instrument.output_min_nm, instrument.output_max_nm
+    first, last = source.measured_nm or (float(source.wavelength_nm[0]), float(source.wavelength_nm[-1]))
+    check_covers(source.name, (first, last), (low, high), f"{instrument.name}'s output range ")
+    if source.unscaled:
+        raise InputError(
+            f"the spectrum of {source.name} is not as bright as the star is seen: {source.unscaled}",
+            "a magnitude as well",
+            key="magnitude",
+        )
+    return continued_to_reach(source, instrument)
 
 
 def continued_to_reach(source: Source, instrument: Instrument) -> Source:

@@ -257,10 +257,6 @@ class Instrument(Section):
 
     @model_validator(mode="after")
     def _consistent(self) -> Instrument:
-        for name in OPTICS:
-            largest = max(getattr(self, name).value)
-            if largest > 1:
-                raise InputError.of(name, largest, "a fraction between 0 and 1")
         low, high = self.output_min_nm, self.output_max_nm
         if not high > low:
             raise InputError.of("output_max_nm", high, f"more than output_min_nm = {low:g}")
@@ -268,14 +264,7 @@ class Instrument(Section):
             raise InputError(
                 f"the output range {low:g}-{high:g} nm needs at least one pixel, but holds none", key="output_min_nm"
             )
-        for name in CURVES:
-            curve: Curve = getattr(self, name)
-            if not curve.covers(low, high):
-                raise InputError(
-                    f"{name} covers {curve.wavelength_nm[0]:g}-{curve.wavelength_nm[-1]:g} nm",
-                    f"at least the output range {low:g}-{high:g} nm",
-                    key=name,
-                )
+        self._check_curves(low, high)
         if self.top_hat_width_nm == self.gaussian_fwhm_nm == 0:
             raise InputError(
                 "top_hat_width_nm and gaussian_fwhm_nm are both 0, but at least one of them must be above 0",
@@ -285,12 +274,6 @@ class Instrument(Section):
             # A width far below a pixel has no effect, but costs time and digits.
             if 0 < getattr(self, name) < 0.1:
                 raise InputError.of(name, getattr(self, name), "0 (none) or at least 0.1")
-        if (most := float(self.quantum_efficiency(self.wavelength_nm).max())) > 1:
-            raise InputError(
-                f"quantum_efficiency_a_per_w corresponds to {most:.3g} electrons per photon",
-                "at most 1",
-                key="quantum_efficiency_a_per_w",
-            )
         if self.resolution_element_nm < self.dispersion_nm_per_pixel:
             raise InputError.of(
                 "resolution_element_nm",
@@ -313,6 +296,27 @@ class Instrument(Section):
             what = f"{' and '.join(dark) or 'the throughput'} = 0 from {low:g} to {high:g} nm"
             raise InputError(what, "a throughput above 0 in some pixel, where else all S/N are 0", key="throughput")
         return self
+
+    def _check_curves(self, low: float, high: float) -> None:
+        """Raise InputError unless all curves cover the output range with possible values."""
+        for name in OPTICS:
+            largest = max(getattr(self, name).value)
+            if largest > 1:
+                raise InputError.of(name, largest, "a fraction between 0 and 1")
+        for name in CURVES:
+            curve: Curve = getattr(self, name)
+            if not curve.covers(low, high):
+                raise InputError(
+                    f"{name} covers {curve.wavelength_nm[0]:g}-{curve.wavelength_nm[-1]:g} nm",
+                    f"at least the output range {low:g}-{high:g} nm",
+                    key=name,
+                )
+        if (most := float(self.quantum_efficiency(self.wavelength_nm).max())) > 1:
+            raise InputError(
+                f"quantum_efficiency_a_per_w corresponds to {most:.3g} electrons per photon",
+                "at most 1",
+                key="quantum_efficiency_a_per_w",
+            )
 
     @cached_property
     def wavelength_nm(self) -> Float:

@@ -149,22 +149,24 @@ def _spectrum_of(table: SpectrumTable, asked: Sequence[str]) -> RawSpectrum:
         raise _no_such(rest[0], names)
     else:
         rows = [cells]
-    segments = []
-    for row in rows:
-        *axes, flux = (_numbers(cell, column.name.strip()) for cell, column in zip(row, chosen, strict=True))
-        segments.append((sum(axes[1:], axes[0]) / len(axes), flux))
-        for array, column in zip((axes[0], flux), (chosen[0], chosen[-1]), strict=True):
-            if array.ndim != 1:
-                fault = f"column {column.name.strip()} has the shape {array.shape}"
-                raise InputError(fault, "one spectrum", key=column.name.strip())
-        if axes[0].size != flux.size:
-            raise InputError(f"needs as many wavelengths as fluxes, but has {axes[0].size} for {flux.size}", key="flux")
+    segments = [_segment(row, [column.name.strip() for column in chosen]) for row in rows]
     if sum(flux.size for _, flux in segments) < 2:
         raise InputError("has fewer than two points", "a spectrum", key="flux")
     axis, flux_role = roles[choice.wavelength[0]], roles[choice.flux]
     return RawSpectrum(
         segments, table, chosen[0].name, chosen[-1].name, axis, flux_role, (*table.messages, *messages),
     )  # fmt: skip
+
+
+def _segment(cells: Sequence[Any], names: Sequence[str]) -> tuple[Float, Float]:
+    """Return the wavelengths, or the middles of bins, and the fluxes of one row or of whole columns."""
+    *axes, flux = (_numbers(cell, name) for cell, name in zip(cells, names, strict=True))
+    for array, name in ((axes[0], names[0]), (flux, names[-1])):
+        if array.ndim != 1:
+            raise InputError(f"column {name} has the shape {array.shape}", "one spectrum", key=name)
+    if axes[0].size != flux.size:
+        raise InputError(f"needs as many wavelengths as fluxes, but has {axes[0].size} for {flux.size}", key="flux")
+    return sum(axes[1:], axes[0]) / len(axes), flux
 
 
 def _numbers(cells: Any, name: str) -> Float:

@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import IO
 from urllib.parse import urljoin, urlsplit
 
+from mauvecl.host import VERSION
 from mauvecl.host.stars.coverage import check_covers
 from mauvecl.host.stars.library import OwnStar, embedded, find, folder, kept, spectrum_digest
 from mauvecl.host.stars.source import Source
 from mauvecl.host.tables.files import limit_bytes, parsing, read_bytes, without_columns, write_whole
-from mauvecl.host.version import VERSION
 from mauvecl.schema.errors import InputError, shortened
 
 
@@ -62,13 +62,7 @@ def add(
     source = Source.read(given, wavelength_unit=wavelength_unit, flux_unit=flux_unit, extend=extend)
     check_covers(source.name, source.measured_nm or (source.wavelength_nm[0], source.wavelength_nm[-1]))
     name = (name or source.name).strip()
-    if not re.fullmatch(r"[\w][\w .+\-*'()]{0,63}", name):
-        raise InputError.of("name", name, "up to 64 letters, digits, spaces and . + - * ' ( )")
-    if embedded(name) is not None:
-        raise InputError(f"star name {name!r} is one of the embedded library's: give another with `name`", key="name")
-    there = find(name)
-    if there is not None and not replace:
-        raise InputError(f"star {name!r} is kept already: give another name, or use `replace=True`", key="name")
+    place = _place_of(name, replace=replace)
     dereddened = any("dereddened" in note for note in source.notes)
     table = Table({"wavelength": source.wavelength_nm, "flux": source.flux_flam})
     table["wavelength"].unit, table["flux"].unit = "nm", "erg / (s cm2 Angstrom)"
@@ -85,13 +79,6 @@ def add(
     }
     if source.measured_nm is not None:
         table.meta["measured_nm"] = list(source.measured_nm)
-    place = folder() / f"{re.sub(r'[^A-Za-z0-9.+-]', '_', name)}.ecsv" if there is None else there.path
-    alike = re.sub(r"[\s_]+", "_", name.casefold())
-    if there is None and any(re.sub(r"[\s_]+", "_", star.name.casefold()) == alike for star in kept()):
-        raise InputError(f"star name {name!r} is too much like another kept star's: give another", key="name")
-    if there is None and place.exists():
-        # Letters that file names cannot have, such as Greek ones, are equal in them: the digest of the name differs.
-        place = place.with_stem(f"{place.stem}-{hashlib.sha256(name.casefold().encode()).hexdigest()[:8]}")
     text = io.StringIO()
     table.write(text, format="ascii.ecsv")
     try:
@@ -101,6 +88,27 @@ def add(
     known = find(name)
     assert known is not None
     return known
+
+
+def _place_of(name: str, *, replace: bool) -> Path:
+    """Return the file of a star to keep; raises InputError if the name is invalid or taken."""
+    if not re.fullmatch(r"[\w][\w .+\-*'()]{0,63}", name):
+        raise InputError.of("name", name, "up to 64 letters, digits, spaces and . + - * ' ( )")
+    if embedded(name) is not None:
+        raise InputError(f"star name {name!r} is one of the embedded library's: give another with `name`", key="name")
+    there = find(name)
+    if there is not None:
+        if not replace:
+            raise InputError(f"star {name!r} is kept already: give another name, or use `replace=True`", key="name")
+        return there.path
+    alike = re.sub(r"[\s_]+", "_", name.casefold())
+    if any(re.sub(r"[\s_]+", "_", star.name.casefold()) == alike for star in kept()):
+        raise InputError(f"star name {name!r} is too much like another kept star's: give another", key="name")
+    place = folder() / f"{re.sub(r'[^A-Za-z0-9.+-]', '_', name)}.ecsv"
+    if place.exists():
+        # Letters that file names cannot have, such as Greek ones, are equal in them: the digest of the name differs.
+        place = place.with_stem(f"{place.stem}-{hashlib.sha256(name.casefold().encode()).hexdigest()[:8]}")
+    return place
 
 
 #: Timeout of a connection, s.
@@ -198,18 +206,7 @@ def fetch(
     InputError
         If the network fails, the star is unknown, or its file holds no usable spectrum.
     """
-    word, colon, star = (part.strip() for part in name.partition(":"))
-    chosen = [c for c in COLLECTIONS if c.name == word.casefold()] if colon else list(COLLECTIONS)
-    known = ", ".join(c.name for c in COLLECTIONS)
-    if not chosen:
-        raise InputError.of("collection", word, f"one of {known}")
-    if base is not None and not colon:
-        raise InputError(
-            f"another address is given for {name!r}", f"its collection too, such as ngsl:{name}", key="name"
-        )
-    star = star if colon else word
-    if not _file_name(star):
-        raise InputError(f"star {name!r} has an empty name", "a name such as ngsl:HD 37202", key="name")
+    star, chosen = _star_and_collections(name, base)
     for collection in chosen:
         address = base or collection.base
         try:
@@ -238,6 +235,22 @@ def fetch(
         "its name there, such as HD 37202; or bring the file: mauvecl library add",
         key="name",
     )
+
+
+def _star_and_collections(name: str, base: str | None) -> tuple[str, list[Collection]]:
+    """Return a star's own name, and the collections in which it is searched for."""
+    word, colon, star = (part.strip() for part in name.partition(":"))
+    chosen = [c for c in COLLECTIONS if c.name == word.casefold()] if colon else list(COLLECTIONS)
+    if not chosen:
+        raise InputError.of("collection", word, f"one of {', '.join(c.name for c in COLLECTIONS)}")
+    if base is not None and not colon:
+        raise InputError(
+            f"another address is given for {name!r}", f"its collection too, such as ngsl:{name}", key="name"
+        )
+    star = star if colon else word
+    if not _file_name(star):
+        raise InputError(f"star {name!r} has an empty name", "a name such as ngsl:HD 37202", key="name")
+    return star, chosen
 
 
 def _folder(address: str) -> str:

@@ -363,8 +363,8 @@ def _filled(file: TableFile) -> TableFile:
     return file
 
 
-def read_table(path: str | Path, what: str, expected: str = FORMATS) -> Table:
+def read_table(path: str | Path, what: str) -> Table:
     """Read a small table into memory; see `open_table`."""
     path = Path(path)
-    with open_table(path, f"{what} {shortened(str(path))}", what, expected=expected) as file:
+    with open_table(path, f"{what} {shortened(str(path))}", what) as file:
         return file.table if isinstance(file, MemoryTable) else file.loaded()

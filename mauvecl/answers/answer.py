@@ -16,10 +16,10 @@ from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, overload
 
+from mauvecl.host import VERSION
 from mauvecl.host.arrays import ContentEquality
 from mauvecl.host.exposure.star import Neighbour, rate_of
 from mauvecl.host.tables.files import check_size, json_text, open_regular, read_text, write_whole, writing
-from mauvecl.host.version import VERSION
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, View, percent, records, stacked, table_of
 from mauvecl.schema.drawable import Drawable, documents_of
@@ -30,7 +30,7 @@ from mauvecl.study.study import read_embedded_study
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
-    from mauvecl.device.build import Device
+    from mauvecl.device.build import Device, DeviceRecord
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.runs.pool import Pool
     from mauvecl.study.cases import Case, Use
@@ -438,17 +438,10 @@ def write_record(
         "python": platform.python_version(),
         "packages": _versions("numpy", "scipy", "astropy", "synphot", "pyopencl"),
     }
-    if pool is not None or opened is not None:
-        devices = pool.devices if pool is not None else [opened.record] if opened is not None else []
-        record["devices"] = [asdict(device) for device in devices]
-        record["kernels"] = (pool or opened).kernel_digest  # type: ignore[union-attr]
-        if pool is not None:
-            record["shards"] = asdict(pool.standing)
-        # Outcome of the self-test on these devices, if it was run.
-        from mauvecl.device.selftest import read_outcome
-
-        missing = "not run on this device and version: mauvecl selftest"
-        record["selftest"] = [read_outcome(device) or missing for device in devices]
+    if pool is not None:
+        record |= _devices(pool.devices, pool.kernel_digest) | {"shards": asdict(pool.standing)}
+    elif opened is not None:
+        record |= _devices([opened.record], opened.kernel_digest)
     stale: list[Path] = []
     if files is not None:
         record["files"] = {path.name: digest_of(path) for path in files}
@@ -461,6 +454,15 @@ def write_record(
     for path in stale:
         path.unlink(missing_ok=True)
     return written
+
+
+def _devices(devices: Sequence[DeviceRecord], kernels: str) -> dict[str, Any]:
+    """Return what a run record says of the devices, with the outcome of the self-test on each if it was run."""
+    from mauvecl.device.selftest import read_outcome
+
+    missing = "not run on this device and version: mauvecl selftest"
+    outcomes = [read_outcome(device) or missing for device in devices]
+    return {"devices": [asdict(device) for device in devices], "kernels": kernels, "selftest": outcomes}
 
 
 def _left_by_another(folder: Path) -> list[Path]:

@@ -230,6 +230,28 @@ class CalibrateAnswer(Answer):
 
     @property
     def messages(self) -> list[str]:
+        lines = [*self._throughput_messages]
+        if self.study.calibrate.light_error == 0:
+            lines.append("Losses by pointing are taken to be alike in all observations (calibrate.light_error).")
+        for row in self.fits:
+            if row["p_value"] < REJECTED:
+                lines.append(f"The fit of the {row['fit']} is rejected: p = {row['p_value']:.2g}.")
+        if self.dark.slopes_p_value < REJECTED:
+            lines.append(
+                "The dark current of single pixels rises differently with temperature: the instrument file has the "
+                f"common slope (p = {self.dark.slopes_p_value:.2g})."
+            )
+        change = self.throughput.fwhm_change_nm
+        if change is not None and abs(change.value) > 3 * change.error:
+            lines.append("The line width changes along the spectrum: the instrument file has its mean.")
+        saturated = [lit.name for lit in self.stars if not lit.usable(self.nominal).all()]
+        if saturated:
+            lines.append(f"Saturated pixels are not used: {', '.join(saturated)}.")
+        return lines
+
+    @property
+    def _throughput_messages(self) -> list[str]:
+        """Messages on what is not determined, and on the throughput."""
         lines = []
         assumed = [*self.dark.assumed, *self.transfer.assumed, *self.throughput.assumed]
         if assumed:
@@ -253,22 +275,6 @@ class CalibrateAnswer(Answer):
         far = float(np.exp(np.abs(self.throughput.log_factor).max()))
         if far > FAR_FROM_NOMINAL:
             lines.append(f"The throughput is up to {far:.2g} times above or below the nominal one: check the stars.")
-        if self.study.calibrate.light_error == 0:
-            lines.append("Losses by pointing are taken to be alike in all observations (calibrate.light_error).")
-        for row in self.fits:
-            if row["p_value"] < REJECTED:
-                lines.append(f"The fit of the {row['fit']} is rejected: p = {row['p_value']:.2g}.")
-        if self.dark.slopes_p_value < REJECTED:
-            lines.append(
-                "The dark current of single pixels rises differently with temperature: the instrument file has the "
-                f"common slope (p = {self.dark.slopes_p_value:.2g})."
-            )
-        change = self.throughput.fwhm_change_nm
-        if change is not None and abs(change.value) > 3 * change.error:
-            lines.append("The line width changes along the spectrum: the instrument file has its mean.")
-        saturated = [lit.name for lit in self.stars if not lit.usable(self.nominal).all()]
-        if saturated:
-            lines.append(f"Saturated pixels are not used: {', '.join(saturated)}.")
         return lines
 
     @property
@@ -483,6 +489,29 @@ def calibrate(
         Spectra in memory, in place of those of the observations; None for frames without light.
     """
     asked = study.calibrate
+    nominal, observations = _observations(study, frames, stars)
+    lit = [observation for observation in observations if observation.star is not None]
+    without = [observation for observation in observations if observation.star is None]
+    dark = assumed_dark(nominal, nominal.wavelength_nm.size)
+    if without:
+        dark = fit_dark(without, nominal, NoiseModel.nominal(nominal))
+    transfer = fit_photon_transfer(_variances(observations, dark, nominal), nominal)
+    if without:
+        dark = fit_dark(without, nominal, transfer.noise)
+        error = float(np.sqrt(dark.shared[0, 0]))
+        transfer = fit_photon_transfer(_variances(observations, dark, nominal), nominal, error)
+    throughput = fit_throughput(
+        lit, nominal, dark, transfer, knots=asked.knots, sky=study.sky.sky(), order=study.observation.order,
+        light_error=asked.light_error, spectrum_error=asked.spectrum_error,
+    )  # fmt: skip
+    return CalibrateAnswer(study, nominal, observations, dark, transfer, throughput)
+
+
+def _observations(
+    study: Study, frames: tuple[Frames, ...] | None, stars: tuple[Source | None, ...] | None
+) -> tuple[Instrument, tuple[CalibrationFrames, ...]]:
+    """Return the instrument from which the fit starts and the observations; parameters as for `calibrate`."""
+    asked = study.calibrate
     if not any(observation.library or observation.spectrum for observation in asked.observations):
         raise InputError("no observation of a standard star is given",
                          "calibrate.observations with library or spectrum", key="calibrate.observations")  # fmt: skip
@@ -503,21 +532,7 @@ def calibrate(
             raise InputError.of("observations", one.name, "frames with a pixel below saturation")
         if any(np.array_equal(one.raw_dn, other.raw_dn) for other in observations[:k]):
             raise InputError.of("observations", one.name, "frames that no other observation has")
-    lit = [observation for observation in observations if observation.star is not None]
-    without = [observation for observation in observations if observation.star is None]
-    dark = assumed_dark(nominal, nominal.wavelength_nm.size)
-    if without:
-        dark = fit_dark(without, nominal, NoiseModel.nominal(nominal))
-    transfer = fit_photon_transfer(_variances(observations, dark, nominal), nominal)
-    if without:
-        dark = fit_dark(without, nominal, transfer.noise)
-        error = float(np.sqrt(dark.shared[0, 0]))
-        transfer = fit_photon_transfer(_variances(observations, dark, nominal), nominal, error)
-    throughput = fit_throughput(
-        lit, nominal, dark, transfer, knots=asked.knots, sky=study.sky.sky(), order=study.observation.order,
-        light_error=asked.light_error, spectrum_error=asked.spectrum_error,
-    )  # fmt: skip
-    return CalibrateAnswer(study, nominal, observations, dark, transfer, throughput)
+    return nominal, observations
 
 
 def _variances(

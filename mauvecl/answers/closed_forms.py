@@ -22,7 +22,7 @@ from mauvecl.detection.distributions import CONFIDENCE, Gaussian, Interval
 from mauvecl.detection.names import MIN_IN_TAIL
 from mauvecl.detection.nuisances import Nuisances, join_names
 from mauvecl.detection.statistics import Matched, Setting
-from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, NUISANCES, PROCESSES, Amplitude, ThroughputMode, values_of
+from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, NUISANCES, PROCESSES, ThroughputMode, values_of
 from mauvecl.schema.columns import Column, First
 from mauvecl.schema.errors import InputError, Message
 from mauvecl.study.cases import Case
@@ -108,7 +108,7 @@ def marginal_lines(nuisances: NuisanceChoice) -> list[str]:
 def spoken(choice: NuisanceChoice) -> str:
     """Return the unknowns as text, such as "the dark level (+-0.5 deg C) and the light level (free)"."""
     documented = DOCUMENTED_NUISANCES if choice.usual else ()
-    sd: dict[str, float | str] = {row.name: row.prior.sd for row in documented if isinstance(row.prior, Amplitude)}
+    sd: dict[str, float | str] = {row.name: row.prior.sd for row in documented if row.prior is not None}
     sd |= choice.spreads()
     sizes = [f"{NUISANCES[name].label} ({_size(value, NUISANCES[name].unit)})" for name, value in sd.items()]
     return join_names(sizes + [f"{name!r} ({_size(one.sd, '')})" for name, one in choice.own.items()])

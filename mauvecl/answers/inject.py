@@ -319,10 +319,7 @@ class InjectAnswer(Answer):
 
     @property
     def views(self) -> list[View]:
-        choice = self.study.search
-        alarms = "false alarm" if choice.false_alarms == 1 else "false alarms"
-        title = f"The search: {choice.false_alarms:g} {alarms} per star-{choice.per} of frames"
-        views = [InjectAnswer.search.view(self, title)]
+        views = [InjectAnswer.search.view(self, f"The search: {self.study.search.rate_text} of frames")]
         for star in self.stars:
             unit = f" ({SIZE_UNITS[star.sizes.of]})" if SIZE_UNITS[star.sizes.of] else ""
             title = f"{star.title}: {star.sizes.of}{unit} of which a half (E50) and nine tenths (E90) are found"

@@ -25,9 +25,9 @@ from mauvecl.device.engine import Stares
 from mauvecl.flares.energies import Kind
 from mauvecl.flares.events import Event, coefficients, temperatures_of
 from mauvecl.flares.frames import Draw, LightCurves, StareExpectation, draw_light_curves
+from mauvecl.host import VERSION
 from mauvecl.host.exposure.sky import parse_position, parse_time
 from mauvecl.host.tables.units import offline
-from mauvecl.host.version import VERSION
 from mauvecl.runs.checkpoint import Checkpoint, kept
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, View, number, percent, table_of
@@ -373,12 +373,10 @@ class StareAnswer(Answer):
 
     @property
     def views(self) -> list[View]:
-        choice = self.study.search
-        alarms = "false alarm" if choice.false_alarms == 1 else "false alarms"
         views = super().views
         for stare in self.stares:
             if isinstance(stare.search, SearchResult):
-                above = f"{stare.search.threshold:.2f}, {choice.false_alarms:g} {alarms} per star-{choice.per}"
+                above = f"{stare.search.threshold:.2f}, {self.study.search.rate_text}"
                 found = table_of(FOUND_COLUMNS, stare.found)
                 views.append(View(f"Found at {stare.title} above {above}", FOUND_COLUMNS, found))
         return views

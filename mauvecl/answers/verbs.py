@@ -45,12 +45,9 @@ DRAWS = ("run.realisations", "run.seed")
 DETECTION = ("run.statistics", "run.fap", "run.tails", "run.reference", "run.variances")
 NUISANCES = ("nuisances.own", "nuisances.usual")
 UNKNOWN = ("unknowns.draws", "unknowns.known")
+FRAMES = ("stare.duration_s", "stare.gaps", "stare.orbit_gap_s", "stare.thermal", "stare.pointing")
 STARE = (
-    "stare.duration_s",
-    "stare.gaps",
-    "stare.orbit_gap_s",
-    "stare.thermal",
-    "stare.pointing",
+    *FRAMES,
     "stare.half_width_s",
     "stare.shape",
     "stare.energies_erg",
@@ -74,7 +71,6 @@ class Verb:
     # Keys and sections of the study whose flags the command takes, in addition to those of `observation`.
     takes: tuple[str, ...]
     counts: str = ""  # what the command line's progress bar counts; empty if a closed form answers at once
-    older: tuple[str, ...] = ()  # names that the function had before; they still work
     observation: tuple[str, ...] = OBSERVATION  # keys of an observation, or their replacements
     without: str = ""  # key of the observation that the command does not take
     # Values of keys where neither a study file nor a flag is given, if they differ from the study's.
@@ -193,7 +189,6 @@ VERBS: dict[str, Verb] = {
     """,
             ("limit", "flare", *DRAWS, *DETECTION, *NUISANCES, *UNKNOWN, "sweep"),
             counts="steps",
-            older=("limiting_magnitude",),
             tab=True,
         ),
         Verb(
@@ -207,7 +202,6 @@ VERBS: dict[str, Verb] = {
     """,
             ("map", "flare", *DRAWS, *DETECTION, *NUISANCES, *UNKNOWN),
             counts="cells",
-            older=("detection_map",),
             defaults=FEWER,
         ),
         Verb(
@@ -223,7 +217,6 @@ VERBS: dict[str, Verb] = {
     """,
             (*DRAWS, *DETECTION, *SIGNAL, "sweep"),
             counts="realisations",
-            older=("gaussian_report",),
             defaults=FEWER,
             default=_formula_grid,
         ),
@@ -276,11 +269,7 @@ VERBS: dict[str, Verb] = {
                 "flare.geometry",
                 "flare.photosphere_temperature_k",
                 "flare.spectrum",
-                "stare.duration_s",
-                "stare.gaps",
-                "stare.orbit_gap_s",
-                "stare.thermal",
-                "stare.pointing",
+                *FRAMES,
                 "nuisances.usual",
                 *SIZE,
                 "search",
@@ -381,5 +370,3 @@ VERBS: dict[str, Verb] = {
         ),
     )
 }
-#: Module of every public name of a verb, including older names.
-HOMES = {name: verb.module for verb in VERBS.values() for name in (verb.name, *verb.older)}

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer, TableOf
+from mauvecl.host import VERSION
 from mauvecl.host.orbit.geometry import Bodies, TimeGrid
 from mauvecl.host.orbit.orbit import Target
 from mauvecl.host.orbit.visibility import Visibility, Windows, elongation_deg, zodiacal_light
-from mauvecl.host.version import VERSION
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, View, percent, table_of
 from mauvecl.schema.physical import DAY_S

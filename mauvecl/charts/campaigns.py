@@ -17,7 +17,7 @@ import numpy as np
 
 from mauvecl.charts.chart import Axis, Dots, Line, Mesh, Panel, Picture, Series, picture_of, pictures_of
 from mauvecl.charts.matplotlib import COLOURS, NULL, available, draw_picture, new_figure, style, styled_picture
-from mauvecl.host.version import VERSION
+from mauvecl.host import VERSION
 from mauvecl.schema.columns import without_empty
 
 if TYPE_CHECKING:

@@ -52,15 +52,11 @@ HALF_WIDTH = Axis("half-width (s)", log=True)
 
 def _stars(answer: InjectAnswer, panel: Callable[[Any], Panel], *notes: str, below: bool = False) -> Picture:
     """Return a picture with a panel per star, the first ones if there are many."""
-    stars, choice = First(answer.stars, MOST_MAPS, "stars"), answer.study.search
+    stars, study = First(answer.stars, MOST_MAPS, "stars"), answer.study
     columns = min(len(stars), MAX_COLUMNS)
     panels = [panel(star) for star in stars]
     rows = [panels[k : k + columns] for k in range(0, len(panels), columns)]
-    alarms = "false alarm" if choice.false_alarms == 1 else "false alarms"
-    title = (
-        f"Flares of {answer.study.flare.light().describe()}, {choice.false_alarms:g} {alarms} per star-{choice.per}; "
-        "nominal throughput"
-    )
+    title = f"Flares of {study.flare.light().describe()}, {study.search.rate_text}; nominal throughput"
     return Picture(rows, (3.6 * columns + 0.8, 3.2 * len(rows)), title, (stars.note, *notes), below)
 
 

@@ -24,7 +24,7 @@ from mauvecl.answers.verbs import VERBS
 from mauvecl.cli.commands import COMMANDS, add_plain_commands, export, verify
 from mauvecl.cli.console import EXIT_CODES, guarded, name_flags_of
 from mauvecl.cli.flags import DeviceFlag, JsonFlag, QuietFlag, option_of, within
-from mauvecl.host.version import VERSION
+from mauvecl.host import VERSION
 from mauvecl.schema.parsing import count
 
 if TYPE_CHECKING:

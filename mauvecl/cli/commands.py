@@ -5,25 +5,24 @@ from __future__ import annotations
 import inspect
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
-from mauvecl.answers.verbs import DRAWS, FEWER, OBSERVATION, VERBS
+from mauvecl.answers.verbs import DRAWS, FEWER, VERBS, Verb
 from mauvecl.cli.flags import (
-    PICTURES,
     RESUMING,
-    TELLING,
     WORKERS,
     DeviceFlag,
     JsonFlag,
+    Options,
     QuietFlag,
     SetFlag,
     StudyFile,
+    StudyFlag,
     as_text,
     holds_study,
     is_star,
@@ -33,117 +32,109 @@ from mauvecl.cli.flags import (
 )
 
 if TYPE_CHECKING:
-    from mauvecl.answers.verbs import DefaultStudy
     from mauvecl.cli.invocation import Session
     from mauvecl.runs.store import Store
+    from mauvecl.schema.columns import Column
 
 
-class StudyCommand(NamedTuple):
-    """Command with the flags of a study, which are built when it is called."""
+@dataclass(frozen=True, kw_only=True)
+class Command:
+    """Command with a study file and flags, which are built when it is called."""
 
-    help: str
-    build: Callable[[], Callable[..., None]]
+    verb: Verb
+    run: Callable[..., None]  # receives the session of the study; `given` are the flags, others are options of its own
+    draws: bool  # whether workers draw realisations
+    resumes: bool = False  # whether a verb that draws no realisations can be resumed
+    pictures: bool = True
+    writes: str = ""  # default output, if it is not a folder of tables
 
+    @property
+    def help(self) -> str:
+        """Help text, by default the docstring of the function."""
+        return self.verb.help or inspect.getdoc(self.run) or ""
 
-#: Commands of verbs with a study by name, filled by `takes_study`.
-COMMANDS: dict[str, StudyCommand] = {}
-
-
-def takes_study(
-    *keys: str,
-    name: str = "",
-    help: str = "",
-    without: str = "",
-    defaults: Mapping[str, Any] = MappingProxyType({}),
-    writes: str = "",
-    default: DefaultStudy | None = None,
-    draws: bool = True,
-    resumes: bool = False,
-    pictures: bool = True,
-    observation: Sequence[str] = OBSERVATION,
-) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Make a function a command with a study file and flags, called with the session of the resulting study.
-
-    Parameters
-    ----------
-    *keys : str
-        Keys and sections of the study whose flags the verb accepts, in addition to those of the observation.
-    name, help : str
-        Name and help text of the command; by default the function's name and docstring.
-    without : str
-        Key of the observation that the verb does not accept.
-    defaults : mapping
-        Defaults of keys that differ from the study's.
-    writes : str
-        Default output, if it is not a folder of tables.
-    default : callable, optional
-        Function of the flags that returns the study if no file is given; the paper's question by default.
-    draws, pictures : bool
-        Whether the verb draws realisations, and whether it draws pictures.
-    resumes : bool
-        Whether a verb that draws no realisations can be resumed.
-    observation : sequence of str
-        Keys instead of those of an observation. With a flag `targets`, a table may replace the study file.
-
-    Returns
-    -------
-    callable
-        Decorator of functions whose first parameter is the session. A parameter `given` receives the
-        flags; others are the verb's own options.
-    """
-
-    def decorate(verb: Callable[..., None]) -> Callable[..., None]:
-        called = name or verb.__name__
-        COMMANDS[called] = StudyCommand(help or inspect.getdoc(verb) or "", lambda: build(called, verb))
-        return verb
-
-    def build(called: str, verb: Callable[..., None]) -> Callable[..., None]:
-        flags = study_flags(*(key for key in (*observation, *keys) if key != without), defaults=defaults)
-        output = output_flag(writes or f"the folder mauvecl-{called}")
-        around = (
-            {"output": (output, None)}
-            | TELLING
-            | (PICTURES if pictures else {})
-            | (WORKERS if draws else RESUMING if resumes else {})
-        )
-        kinds = get_type_hints(verb, localns={"Session": Any}, include_extras=True)
-        _, *own = inspect.signature(verb).parameters.values()
-
-        def command(study_file: Path | None = None, **values: Any) -> None:
-            from mauvecl.cli.invocation import Session, question_time, question_values
-
-            for key, (shown, read) in readers.items():
-                if values.get(key) is not None and not isinstance(values[key], int | float):
-                    values[key] = read(values[key], shown)
-            given = {key: values.pop(key, None) for key in (*flags, "set")}
-            study_file = _placed(study_file, given)
-            if study_file is None:
-                for one in flags.values():
-                    if given[one.name] is None:
-                        given[one.name] = defaults.get(f"{one.section}.{one.key}")
-            how = {key: values.pop(key, usual) for key, (_, usual) in around.items()}
-            if "given" in kinds:
-                values["given"] = given
-            study = study_of(study_file, given, flags, default)
-            question_values(study, detects={"fap", "realisations"} <= flags.keys())
-            if draws:
-                question_time(study, **{key: how[key] for key in ("device", "cluster", "insist")})
-            with Session(called, study, **how) as session:
-                verb(session, **values)
-
+    def build(self) -> Callable[..., None]:
+        """Return the function that typer calls."""
+        verb = self.verb
+        keys = (key for key in (*verb.observation, *verb.takes) if key != verb.without)
+        flags = study_flags(*keys, defaults=verb.defaults or {})
+        kinds = get_type_hints(self.run, localns={"Session": Any}, include_extras=True)
+        _, *own = inspect.signature(self.run).parameters.values()
         named = inspect.Parameter.KEYWORD_ONLY
+        options = self._options().items()
         parameters = [
             inspect.Parameter("study_file", named, default=None, annotation=StudyFile),
             *(inspect.Parameter(key, named, default=None, annotation=one.kind) for key, one in flags.items()),
             inspect.Parameter("set", named, default=None, annotation=SetFlag),
             *(p.replace(kind=named, annotation=kinds[p.name]) for p in own if p.name != "given"),
-            *(inspect.Parameter(key, named, default=usual, annotation=kind) for key, (kind, usual) in around.items()),
+            *(inspect.Parameter(key, named, default=usual, annotation=kind) for key, (kind, usual) in options),
         ]
-        parameters, readers = _read_as_text(parameters)
-        command.__name__ = called
-        command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        command.__annotations__ = {p.name: p.annotation for p in parameters}
+        taken = [as_text(parameter) for parameter in parameters]
+        readers = {parameter.name: read for parameter, read in taken if read is not None}
+
+        def command(study_file: Path | None = None, **values: Any) -> None:
+            for key, read in readers.items():
+                if values.get(key) is not None and not isinstance(values[key], int | float):
+                    values[key] = read(values[key])
+            self._call(study_file, flags, values, tells_flags="given" in kinds)
+
+        command.__name__ = verb.name
+        command.__signature__ = inspect.Signature([parameter for parameter, _ in taken])  # type: ignore[attr-defined]
+        command.__annotations__ = {parameter.name: parameter.annotation for parameter, _ in taken}
         return command
+
+    def _call(
+        self, study_file: Path | None, flags: dict[str, StudyFlag], values: dict[str, Any], *, tells_flags: bool
+    ) -> None:
+        """Run the command with the values of all its options."""
+        from mauvecl.cli.invocation import Session, question_time, question_values
+
+        verb, defaults = self.verb, self.verb.defaults or {}
+        given = {key: values.pop(key, None) for key in (*flags, "set")}
+        study_file = _placed(study_file, given)
+        if study_file is None:
+            for one in flags.values():
+                if given[one.name] is None:
+                    given[one.name] = defaults.get(f"{one.section}.{one.key}")
+        how = {key: values.pop(key, usual) for key, (_, usual) in self._options().items()}
+        if tells_flags:
+            values["given"] = given
+        study = study_of(study_file, given, flags, verb.default)
+        question_values(study, detects={"fap", "realisations"} <= flags.keys())
+        if self.draws:
+            question_time(study, **{key: how[key] for key in ("device", "cluster", "insist")})
+        with Session(verb.name, study, **how) as session:
+            self.run(session, **values)
+
+    def _options(self) -> dict[str, tuple[Any, Any]]:
+        """Return the options of the session, with their defaults."""
+        output = output_flag(self.writes or f"the folder mauvecl-{self.verb.name}")
+        workers = WORKERS if self.draws else RESUMING if self.resumes else ()
+        names = ("as_json", "quiet", *(["pictures"] if self.pictures else []), *workers)
+        kinds = get_type_hints(Options, include_extras=True)
+        return {"output": (output, None)} | {name: (kinds[name], getattr(Options, name)) for name in names}
+
+
+#: Commands with a study by name, filled by `command_of`.
+COMMANDS: dict[str, Command] = {}
+
+
+def command_of(
+    verb: Verb, *, draws: bool | None = None, **how: Any
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Make a function of the session the command of a verb.
+
+    Parameters
+    ----------
+    draws : bool, optional
+        Whether workers draw; by default if the verb counts something.
+    **how
+        Other fields of `Command`.
+    """
+
+    def decorate(run: Callable[..., None]) -> Callable[..., None]:
+        COMMANDS[verb.name] = Command(verb=verb, run=run, draws=bool(verb.counts) if draws is None else draws, **how)
+        return run
 
     return decorate
 
@@ -167,56 +158,15 @@ def _placed(study_file: Path | None, given: dict[str, Any]) -> Path | None:
     return study_file
 
 
-def _read_as_text(
-    parameters: Sequence[inspect.Parameter],
-) -> tuple[list[inspect.Parameter], dict[str, tuple[str, Callable[[str, str], Any]]]]:
-    """Return parameters of which numbers are taken as text, so that messages have one style, and their readers."""
-    taken, readers = [], {}
-    for parameter in parameters:
-        kind, shown, read = as_text(parameter.annotation)
-        if read is not None:
-            readers[parameter.name] = shown or "--" + parameter.name.replace("_", "-"), read
-            default_text = None if parameter.default is None else f"{parameter.default:g}"
-            parameter = parameter.replace(annotation=kind, default=default_text)
-        taken.append(parameter)
-    return taken, readers
-
-
-def command_of(
-    name: str, *, draws: bool | None = None, resumes: bool = False
-) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Make a function of the session the command of a registered verb.
-
-    Parameters
-    ----------
-    draws : bool, optional
-        Whether a pool draws; by default if the verb counts something.
-    resumes : bool
-        As for `takes_study`.
-    """
-    verb = VERBS[name]
-    return takes_study(
-        *verb.takes,
-        name=name,
-        help=verb.help,
-        without=verb.without,
-        defaults=verb.defaults or {},
-        default=verb.default,
-        draws=bool(verb.counts) if draws is None else draws,
-        resumes=resumes,
-        observation=verb.observation,
-    )
-
-
 def add_plain_commands() -> None:
     """Add the commands of verbs without their own function, which compute and print the answer."""
 
     def ask(session: Session) -> None:
         session.answer(session.ask())
 
-    for name in VERBS:
+    for name, verb in VERBS.items():
         if name not in COMMANDS:
-            command_of(name)(ask)
+            command_of(verb)(ask)
 
 
 StoreArgument = Annotated[Path, typer.Argument(help="Store that `mauvecl realise` wrote.")]
@@ -226,12 +176,8 @@ RowsFlag = Annotated[
 ]
 
 
-@takes_study(
-    "flare",
-    *DRAWS,
-    "sweep",
-    "bulk",
-    defaults=FEWER,
+@command_of(
+    Verb("realise", "", ("flare", *DRAWS, "sweep", "bulk"), counts="spectra", defaults=FEWER),
     pictures=False,
     writes="mauvecl-frames.zarr; also NAME.fits, .h5, .hdf5",
 )
@@ -328,8 +274,7 @@ def verify(
     Example: mauvecl verify frames.zarr --repair
     """
     from mauvecl.answers.answer import is_answer
-    from mauvecl.cli.console import Meter, show, show_view
-    from mauvecl.schema.columns import View
+    from mauvecl.cli.console import Meter
     from mauvecl.schema.errors import InputError
 
     if is_answer(store):
@@ -349,32 +294,35 @@ def verify(
     with Meter(quiet=quiet or as_json, unit="chunks") as meter:
         faults = bulk.verify(store, engine, repair=repair, redraw=redraw, rows=_rows_of(rows), progress=meter)
     left = sum(not fault.mended for fault in faults)
-    if as_json:
-        print(json.dumps([asdict(fault) for fault in faults], indent=2))
-    else:
-        if faults:
-            show_view(View(f"Not as it was written: {store}", bulk.FAULT_COLUMNS, [asdict(one) for one in faults]))
-        source = "with what was written" if not redraw else "with what the engine draws"
-        show([f"{len(faults) - left} repaired, {left} left as found." if faults else f"Everything agrees {source}."])
+    source = "with what was written" if not redraw else "with what the engine draws"
+    outcome = f"{len(faults) - left} repaired, {left} left as found." if faults else f"Everything agrees {source}."
+    _tell_faults(store, bulk.FAULT_COLUMNS, faults, outcome, as_json=as_json)
     if left:
         raise typer.Exit(1)
 
 
 def _verify_answer(folder: Path, *, as_json: bool) -> None:
-    """Print files that differ from the run record, with exit code 1 if there are any."""
     from mauvecl.answers.answer import FAULT_COLUMNS, verify_answer
+
+    faults = verify_answer(folder)
+    outcome = "" if faults else "Every file agrees with the run record, and the record with its own digest."
+    _tell_faults(folder, FAULT_COLUMNS, faults, outcome, as_json=as_json)
+    if faults:
+        raise typer.Exit(1)
+
+
+def _tell_faults(place: Path, columns: Sequence[Column], faults: Sequence[Any], outcome: str, *, as_json: bool) -> None:
+    """Print what is not as it was written, and the outcome unless it is empty."""
     from mauvecl.cli.console import show, show_view
     from mauvecl.schema.columns import View
 
-    faults = verify_answer(folder)
+    rows = [asdict(fault) for fault in faults]
     if as_json:
-        print(json.dumps([asdict(fault) for fault in faults], indent=2))
-    elif faults:
-        show_view(View(f"Not as it was written: {folder}", FAULT_COLUMNS, [asdict(one) for one in faults]))
-    else:
-        show(["Every file agrees with the run record, and the record with its own digest."])
-    if faults:
-        raise typer.Exit(1)
+        print(json.dumps(rows, indent=2))
+        return
+    if rows:
+        show_view(View(f"Not as it was written: {place}", columns, rows))
+    show([outcome] if outcome else [])
 
 
 def export(
@@ -416,7 +364,7 @@ def _rows_of(text: str | None) -> tuple[int, int] | None:
         raise InputError(f"--rows {text!r}", "a range such as 1000:2000", key="rows") from error
 
 
-@command_of("limit")
+@command_of(VERBS["limit"])
 def limit(
     session: Session,
     assumptions: Annotated[
@@ -432,7 +380,7 @@ def limit(
     session.answer(answer)
 
 
-@command_of("simulate")
+@command_of(VERBS["simulate"])
 def simulate(
     session: Session,
     given: dict[str, Any],
@@ -444,7 +392,7 @@ def simulate(
     session.answer(compute(session.study, realisation=realisation, flaring=bool(given["amplitude"])))
 
 
-@command_of("plan")
+@command_of(VERBS["plan"])
 def plan(session: Session) -> None:
     """Plan a campaign; a report needs matplotlib for PDF, and a closed form needs no pool."""
     from mauvecl.answers.plan import plan as compute
@@ -461,7 +409,7 @@ def plan(session: Session) -> None:
     session.answer(answer)
 
 
-@command_of("stare", draws=False, resumes=True)
+@command_of(VERBS["stare"], draws=False, resumes=True)
 def stare(
     session: Session,
     given: dict[str, Any],
@@ -482,7 +430,7 @@ def stare(
     session.answer(answer)
 
 
-@command_of("analyse", draws=False)
+@command_of(VERBS["analyse"], draws=False)
 def analyse(session: Session) -> None:
     """Find the flares in observed frames, with progress in frames."""
     from mauvecl.answers.analyse import analyse as compute

@@ -210,7 +210,7 @@ def _discard() -> None:
 
 def _write_traceback(error: Exception) -> Path | str:
     """Write the traceback to a file in the output folder, or else in the folder of temporary files."""
-    from mauvecl.host.version import VERSION
+    from mauvecl.host import VERSION
 
     now = datetime.datetime.now(datetime.UTC).strftime("%Y%m%dT%H%M%S")
     text = "\n".join(

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Iterator, Mapping
 from copy import copy
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import NoneType, UnionType
@@ -11,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Union, ge
 
 import typer
 
-from mauvecl.schema.fields import Flag, Help, Unit, first
-from mauvecl.schema.parsing import count, number, refusal, several
+from mauvecl.schema.fields import Flag, Help, Unit, as_typed, first
+from mauvecl.schema.parsing import assignment, count, number, refusal, several
 
 if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
@@ -129,7 +131,7 @@ def _help(path: str, field: FieldInfo, flag: Flag, kind: Any, defaults: Mapping[
         )
     else:
         default = help.default or (
-            "" if flag.help or kind is bool else _text(field.get_default(call_default_factory=True))
+            "" if flag.help or kind is bool else as_typed(field.get_default(call_default_factory=True))
         )
     return text + (f" [{default}]" if default else "") + "."
 
@@ -143,15 +145,6 @@ def _words(annotation: Any) -> str:
     return _words(inner[0]) if len(inner) == 1 else ""
 
 
-def _text(default: Any) -> str:
-    """Return a default as it is typed; empty without a default."""
-    if isinstance(default, tuple):
-        return ",".join(map(_text, default))
-    if isinstance(default, bool) or not isinstance(default, str | int | float):
-        return ""
-    return f"{default:g}" if isinstance(default, float) else str(default)
-
-
 def output_flag(usual: str) -> Any:
     """Return the option of the output, with its default."""
     return Annotated[
@@ -160,59 +153,46 @@ def output_flag(usual: str) -> Any:
     ]
 
 
-#: Options of a verb's `Session`, with their defaults: output on the terminal.
-TELLING = {"as_json": (JsonFlag, False), "quiet": (QuietFlag, False)}
-PICTURES = {
-    "pictures": (
-        Annotated[bool, typer.Option("--pictures/--no-pictures", help="Draw pictures (needs mauvecl[plot]).")],
-        True,
+def _option(*names: str, text: str, **how: Any) -> Any:
+    return typer.Option(*names, help=text, show_default=False, **how)
+
+
+@dataclass(eq=False, kw_only=True)
+class Options:
+    """Values of a call that are no keys of a study, each with its flag."""
+
+    output: Path | None = None  # where everything is written; its flag states the default of the command
+    as_json: JsonFlag = False
+    quiet: QuietFlag = False
+    pictures: Annotated[bool, typer.Option("--pictures/--no-pictures", help="Draw pictures (needs mauvecl[plot]).")] = (
+        True
     )
-}
-
-
-def _worker(kind: Any, name: str, text: str, **how: Any) -> Any:
-    return Annotated[kind, typer.Option(name, help=text, show_default=False, **how)]
-
-
-WORKERS = {
-    "device": (
-        _worker(
-            str | None,
-            "--device",
-            "OpenCL device: number or part of its name [PoCL; 0,1 for several together].",
-        ),
-        None,
-    ),
-    "cluster": (
-        _worker(
-            str | None,
+    device: Annotated[
+        str | None,
+        _option("--device", text="OpenCL device: number or part of its name [PoCL; 0,1 for several together]."),
+    ] = None
+    cluster: Annotated[
+        str | None,
+        _option(
             "--cluster",
-            "Draw on Dask workers: local:N, tcp://host:8786, or a scheduler file (needs mauvecl[cluster]).",
+            text="Draw on Dask workers: local:N, tcp://host:8786, or a scheduler file (needs mauvecl[cluster]).",
         ),
-        None,
-    ),
-    "resume": (_worker(bool, "--resume", "Continue the unfinished run in the output folder."), False),
-    "restart": (_worker(bool, "--restart", "Discard the unfinished run in the output folder."), False),
-    "keep_after": (
-        _worker(
-            float | None,
-            "--keep-after",
-            "Seconds after which finished parts of a run are saved to disk [20].",
-            min=0.0,
-        ),
-        None,
-    ),
-    "insist": (
-        _worker(
-            bool,
-            "--insist",
-            "Run even if the estimated time exceeds a year, or the files the free disk space.",
-        ),
-        False,
-    ),
-}
-#: Options of verbs that can be resumed and draw no realisations.
-RESUMING = {name: WORKERS[name] for name in ("resume", "restart", "keep_after")}
+    ] = None
+    resume: Annotated[bool, _option("--resume", text="Continue the unfinished run in the output folder.")] = False
+    restart: Annotated[bool, _option("--restart", text="Discard the unfinished run in the output folder.")] = False
+    keep_after: Annotated[
+        float | None,
+        _option("--keep-after", text="Seconds after which finished parts of a run are saved to disk [20].", min=0.0),
+    ] = None
+    insist: Annotated[
+        bool,
+        _option("--insist", text="Run even if the estimated time exceeds a year, or the files the free disk space."),
+    ] = False
+
+
+#: Options of verbs that can be resumed and draw no realisations, and of those that draw.
+RESUMING = ("resume", "restart", "keep_after")
+WORKERS = ("device", "cluster", *RESUMING, "insist")
 
 
 def study_of(
@@ -306,18 +286,12 @@ def sky_of(given: dict[str, Any]) -> dict[str, Any]:
 def nuisances_of(study: Study, texts: list[str]) -> dict[str, Any]:
     """Read nuisance parameters such as dark=0.1, or with the name of a file, stray.txt=free."""
     from mauvecl.noise.unknowns import NUISANCES
-    from mauvecl.schema.errors import InputError, shortened
 
     nuisances: dict[str, Any] = {}
     own = {name: one.model_dump(exclude_none=True) for name, one in study.nuisances.own.items()}
     for text in texts:
-        name, _, sd = (part.strip() for part in text.rpartition("="))
-        if not (name and sd):
-            raise InputError(
-                f"--nuisance {shortened(text)}",
-                f"NAME=SD, with a name of {', '.join(NUISANCES)} or a file's, and a standard deviation or free",
-                key="nuisance",
-            )
+        expected = f"NAME=SD, with a name of {', '.join(NUISANCES)} or a file's, and a standard deviation or free"
+        name, sd = assignment(text, "--nuisance", expected)
         if name in NUISANCES:
             nuisances[name] = sd
         else:
@@ -382,29 +356,26 @@ def _is_file(name: str) -> bool:
     return bool(suffix) and not suffix[1:].isupper()
 
 
-def as_text(kind: Any) -> tuple[Any, str, Callable[[str, str], Any] | None]:
-    """Return the type of a flag as text, the flag's name, and a reader of its value if it is a number.
-
-    Parameters
-    ----------
-    kind : Annotated
-        A type and a `typer.Option`, whose limits the reader applies.
-    """
-    if get_origin(kind) is not Annotated:
-        return kind, "", None
-    wanted, option, *_ = get_args(kind)
+def as_text(parameter: inspect.Parameter) -> tuple[inspect.Parameter, Callable[[Any], Any] | None]:
+    """Return an option of which numbers are taken as text, so that messages have one style, and its reader if any."""
+    if get_origin(parameter.annotation) is not Annotated:
+        return parameter, None
+    wanted, option, *_ = get_args(parameter.annotation)
     (inner, *_) = [one for one in (get_args(wanted) or (wanted,)) if one is not NoneType]
     many = get_origin(inner) is list or get_origin(wanted) is list
     each = get_args(inner)[0] if get_origin(inner) is list else inner
     if each not in (float, int):
-        return kind, "", None
+        return parameter, None
     option, low, high = copy(option), option.min, option.max
     option.min = option.max = None
     option.metavar = ("NUMBER" if each is float else "INTEGER") + (",..." if many else "")
-    flag = next((one for one in option.param_decls or () if one.startswith("--")), "")
+    named = (one for one in option.param_decls or () if one.startswith("--"))
+    flag = next(named, "--" + parameter.name.replace("_", "-"))
     read = partial(within, read=number if each is float else count, low=low, high=high)
     texts: Any = list[str] if many else str
-    return Annotated[texts | None, option], flag, partial(several, read=read) if many else read
+    default = None if parameter.default is None else f"{parameter.default:g}"
+    taken = parameter.replace(annotation=Annotated[texts | None, option], default=default)
+    return taken, partial(several, name=flag, read=read) if many else partial(read, flag=flag)
 
 
 def within(text: str, flag: str, *, read: Callable[[str, str], Any], low: float | None, high: float | None) -> Any:

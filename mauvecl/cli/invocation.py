@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 from mauvecl.cli.console import writes_to
+from mauvecl.cli.flags import Options
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
@@ -154,23 +155,11 @@ class Terminated(KeyboardInterrupt):
 
 
 @dataclass(eq=False)
-class Session:
+class Session(Options):
     """Session of one call of a verb; in its `with` block, only this process writes to the output folder."""
 
     verb: str
     study: Study
-    output: Path | None = None  # folder for everything written
-    as_json: bool = False
-    quiet: bool = False
-    pictures: bool = True
-    device: str | None = None  # device as for `Engine`; several are separated by commas
-    cluster: str | None = None  # as for `cluster.DaskWorkers`
-    # resume, restart: whether to continue or discard an unfinished run in the folder.
-    resume: bool = False
-    restart: bool = False
-    # Seconds after which finished parts are written to the disk; the default is that of `Checkpoint`.
-    keep_after: float | None = None
-    insist: bool = False  # whether to start runs that would take too long or too much space
     files: list[Path] = field(default_factory=list)
     started: float = field(default_factory=time.perf_counter)
     opened: Device | None = None  # device on which something was drawn without a pool, for the run record

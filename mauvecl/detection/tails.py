@@ -30,7 +30,7 @@ from mauvecl.detection.names import check_atom
 from mauvecl.detection.statistics import Differences
 from mauvecl.noise import layout
 from mauvecl.noise.scene import quantile_at_score
-from mauvecl.noise.unknowns import ADDITIVE
+from mauvecl.noise.unknowns import ADDITIVE, PROCESSES, SIGNAL_PARTS
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
@@ -441,14 +441,15 @@ def _factors(
     scene: Scene, towards: dict[str, tuple[float, float]], seed: int, block: int
 ) -> tuple[dict[str, Float], Float]:
     """Draw factors on light, sky and dark, each minus one, shape (BLOCK, 1), and the logarithms of their weights."""
-    factors = {name: np.ones((BLOCK, 1)) for name in ("light", "sky", "dark")}
+    factors = {name: np.ones((BLOCK, 1)) for name in SIGNAL_PARTS}
     kinds = [factor for _, factor in scene.modulations]
     # The scores of every second realisation are moved, which limits weights to two.
     moved = np.arange(BLOCK)[:, None] % 2 == 1
     ratio = np.zeros(BLOCK)
     for row, ((name, factor), table) in enumerate(zip(scene.modulations, scene.priors, strict=True)):
-        score = _normals(scene.n_frames if name == "jitter" else 1, seed, block, row, purpose=1)
-        if name != "jitter" and kinds.count(factor) == 1 and factor in towards:
+        each_frame = PROCESSES[name].when == "frame"
+        score = _normals(scene.n_frames if each_frame else 1, seed, block, row, purpose=1)
+        if not each_frame and kinds.count(factor) == 1 and factor in towards:
             mean, sd = towards[factor]
             score = np.where(moved, mean + sd * score, score)
             # Ratio of the moved density to the prior's.
@@ -465,7 +466,7 @@ def _responding(scene: Scene, z: Float, factors: dict[str, Float]) -> Float:
     more, warmer = factors["light"] + sky + factors["light"] * sky, factors["dark"]
     light, dark = more + 1.0, warmer + 1.0
     variance = light * r["light_variance"] + dark * r["dark_variance"] + r["other_variance"]
-    third, fourth, fifth = (light * r[f"light_{k}"] + dark * r[f"dark_{k}"] for k in ("third", "fourth", "fifth"))
+    third, fourth, fifth = (light * r[f"light_{k}"] + dark * r[f"dark_{k}"] for k in layout.CUMULANTS[1:])
     sd, skew = np.sqrt(variance), third / variance
     v = z * sd + skew * (z**2 - 1) / 6 + (fourth * (z**3 - 3 * z) / 24 - third * skew * (2 * z**3 - 5 * z) / 36) / sd**3
     if scene.quartic:

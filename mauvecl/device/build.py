@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING, Any
 
 from mauvecl.device import drivers as vendors
 from mauvecl.device.drivers import BuildError, DeviceError, choose_processor_level, driver_sources, kernel_cache
-from mauvecl.host.version import VERSION
+from mauvecl.host import VERSION
 from mauvecl.noise import layout, random_numbers
 from mauvecl.noise.scene import PIXEL_BLOCK
+from mauvecl.noise.unknowns import PROCESSES
 
 if TYPE_CHECKING:
     import pyopencl
@@ -224,7 +225,7 @@ def render(kernel_files: tuple[str, ...], variant: Variant) -> str:
         "fixed": len(layout.FIXED_STATISTICS),
         "linear": variant.linears > 0,
         "modulated": bool(variant.modulations),
-        "jitter": next((i for i, (name, _) in enumerate(variant.modulations) if name == "jitter"), None),
+        "jitter": next((i for i, (name, _) in enumerate(variant.modulations) if PROCESSES[name].when == "frame"), None),
         "prior_bits": layout.PRIOR_BITS,
         "prior_finest": layout.PRIOR_FINEST,
         "prior_nodes": layout.PRIOR_NODES,

@@ -54,8 +54,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import IO, Any, Literal
 
+from mauvecl.host import VERSION
 from mauvecl.host.tables.files import read_bytes
-from mauvecl.host.version import VERSION
 from mauvecl.schema.errors import InputError
 
 #: Sources by system and machine, as Python's `platform` spells them; "" is any other machine.

@@ -31,12 +31,13 @@ from mauvecl.device.engine import Engine, Stares, devices
 from mauvecl.flares.frames import Components
 from mauvecl.flares.stare import Stare
 from mauvecl.flares.stare_scene import Arrays, StaresRequest
+from mauvecl.host import VERSION
 from mauvecl.host.exposure.expectation import Expectation
-from mauvecl.host.version import VERSION
 from mauvecl.noise import layout, reference
 from mauvecl.noise.comparison import Comparison
-from mauvecl.noise.processes import NONE, CosmicRays, Processes, Uniform
+from mauvecl.noise.disturbances import CosmicRays, Uniform
 from mauvecl.noise.scene import prepare
+from mauvecl.noise.unknowns import NONE, Processes
 from mauvecl.schema.columns import Column
 
 if TYPE_CHECKING:

@@ -205,23 +205,29 @@ def intervals(
     spent = best.gain[:, None] - np.einsum("nk,nk->n", profile.along, profile.along)[:, None] - amplitude**2 / variance
     left = allowed - spent
 
-    def ends(one: Derived, spline: CubicSpline | None) -> tuple[Float, Float]:
-        if spline is None:
-            return np.where(np.isnan(low), -np.inf, np.exp(low)), np.where(np.isnan(high), np.inf, np.exp(high))
+    def ends(one: Derived, spline: CubicSpline) -> tuple[Float, Float]:
         if one.ratio is None:
             return _linear_interval(profile, spline, x, linear, variance, hot, left, allowed, closed)
         return _ratio_interval(profile, spline(x), hot, best.gain - allowed)
 
-    return ends_of_quantities(model, ends)
+    return ends_of_quantities(model, low, high, ends)
 
 
 def ends_of_quantities(
-    model: FlareModel, ends: Callable[[Derived, CubicSpline | None], tuple[Float, Float]]
+    model: FlareModel, log_low: Float, log_high: Float, ends: Callable[[Derived, CubicSpline], tuple[Float, Float]]
 ) -> tuple[Float, Float]:
-    """Return the ends of intervals of a model's quantities, low and high, (n, n_derived); multiples share theirs."""
+    """Return the ends of intervals of a model's quantities, low and high, (n, n_derived); multiples share theirs.
+
+    `log_low` and `log_high` are the ends of the log temperature, NaN without a limit; `ends` returns those of others.
+    """
+    kelvin = (
+        np.where(np.isnan(log_low), -np.inf, np.exp(log_low)),
+        np.where(np.isnan(log_high), np.inf, np.exp(log_high)),
+    )
     columns: list[tuple[Float, Float]] = []
     for one, spline, (first, times) in zip(model.derived, model.splines, model.multiples, strict=True):
-        low, high = columns[first] if first < len(columns) else ends(one, spline)
+        own = columns[first] if first < len(columns) else None
+        low, high = own or (kelvin if spline is None else ends(one, spline))
         # Light that contradicts every factor above zero limits nothing.
         none = low > high
         low, high = np.where(none, -np.inf, low), np.where(none, np.inf, high)
@@ -801,9 +807,7 @@ def bounded_intervals(
         without = profile.factor(x, np.zeros((*x.shape, len(model.linear))))
         of_light = without, np.moveaxis(light.weights_of(x), -1, 0), light.scale**-2.0
 
-    def ends(one: Derived, spline: CubicSpline | None) -> tuple[Float, Float]:
-        if spline is None:
-            return np.where(np.isnan(low), -np.inf, np.exp(low)), np.where(np.isnan(high), np.inf, np.exp(high))
+    def ends(one: Derived, spline: CubicSpline) -> tuple[Float, Float]:
         if one.ratio is None:
             factors = np.moveaxis(spline(x), -1, 0)
             found = _linear_ends(faces, factors, least, of_light)
@@ -816,7 +820,7 @@ def bounded_intervals(
         lowest, highest = _ratio_ends(products, faces, spline(x), least)
         return one.offset + lowest, one.offset + highest
 
-    lows, highs = ends_of_quantities(model, ends)
+    lows, highs = ends_of_quantities(model, low, high, ends)
     # A parabola through the outermost samples may exceed a bound.
     return np.maximum(lows, model.bounds), highs
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple, Self
 
 import numpy as np
 import scipy
@@ -26,7 +26,7 @@ from mauvecl.flares.frames import Components
 from mauvecl.flares.settings import Cooling
 from mauvecl.flares.shapes import Shape, shape_of
 from mauvecl.flares.stare import Stare
-from mauvecl.noise.unknowns import CHANGING, Changing
+from mauvecl.noise.unknowns import CHANGED_PART, CHANGING, Changing
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, table_of
 from mauvecl.schema.errors import InputError
@@ -239,7 +239,7 @@ def spreads_of(stare: Stare, first: int, end: int) -> dict[Changing, float]:
 
 def _with_change(unknown: Nuisances, quiet: Expectation, of: Changing, sd: float) -> Nuisances:
     """Return nuisance parameters with an unknown change of a stare, unless they have one of the same kind."""
-    name = {"temperature": "dark"}.get(of, of)
+    name = CHANGED_PART[of]
     if not sd > 0.0 or name in unknown.names:
         return unknown
     if name == "star":
@@ -557,39 +557,24 @@ def fit_cooling(
         raise InputError(f"a model of {', '.join(model.linear)}", "a blackbody alone", key="model")
     raw, stare = checked_frames(frames, quiet, stare)
     data = _data(raw, quiet, model, nuisances, stare, shape_of(shape), skipped_nm)
-    free = np.arange(len(PARAMETERS) if cooling else 4)
-    low, high = _limits(model, stare)
-    whitening = data.whitening(None)
-    theta = np.clip(_start(data, whitening, peak_s, half_width_s, cooling), low, high)
-    for _ in range(REFITS):
-        theta = _solve(data, whitening, theta, free, low, high)
-        whitening = data.whitening(theta)
-    theta = _solve(data, whitening, theta, free, low, high)
-
-    best = float(np.sum(data.residuals(theta, whitening) ** 2))
-    fit = _BestFit(data, whitening, theta, free, (low, high), best)
-    jacobian = data.jacobian(theta, whitening)[:, free]
+    fit = _BestFit.of(data, _limits(model, stare), peak_s, half_width_s, cooling=cooling)
+    theta, free, best = fit.theta, fit.free, fit.chi2
+    jacobian = data.jacobian(theta, fit.whitening)[:, free]
     covariance = np.linalg.pinv(jacobian.T @ jacobian, hermitian=True)
     quantities = _quantities(data, stare, cooling)
     estimates = np.array([one.value(theta, data) for one in quantities])
     scale = np.array([1.0 if one.place == 0 else value for one, value in zip(quantities, estimates, strict=True)])
     slopes = scale[:, None] * np.array([one.slope(theta, data) for one in quantities])[:, free]
     spread = slopes @ covariance @ slopes.T
-    ends = np.full((2, len(levels), len(quantities)), np.nan)
-    names = [one.name for one in quantities]
-    rises = [float(scipy.stats.chi2.ppf(level, 1)) for level in levels]
-    for q, one in enumerate(quantities):
-        if one.name.startswith("energy"):
-            fluence = names.index(one.name.replace("energy", "fluence"))
-            ends[:, :, q] = estimates[q] / estimates[fluence] * ends[:, :, fluence]
-        else:
-            ends[:, :, q] = fit.ends(one, float(np.sqrt(spread[q, q])) / max(abs(scale[q]), 1e-300), rises)
+    sd = np.sqrt(np.diag(spread)) / np.maximum(np.abs(scale), 1e-300)
+    ends = fit.ends_of_all(quantities, estimates, sd, [float(scipy.stats.chi2.ppf(level, 1)) for level in levels])
     dof = data.sums.size - free.size - sum(np.isinf(one.sd) for one in data.unknown)
     empty = np.full(theta.shape, -np.inf)
     without = data.whitening(theta, none=True)
     none = float(np.sum(data.residuals(np.where(np.arange(theta.size) == 2, empty, theta), without) ** 2))
     return Measurement(
-        tuple(names), tuple(one.unit for one in quantities), (-np.inf,) + (0.0,) * (len(quantities) - 1),
+        tuple(one.name for one in quantities), tuple(one.unit for one in quantities),
+        (-np.inf,) + (0.0,) * (len(quantities) - 1),
         estimates[None], spread[None], tuple(levels), ends[0][:, None], ends[1][:, None], np.array([best]),
         np.array([float(scipy.stats.chi2.sf(best, dof))]), dof, np.array([np.sqrt(max(none - best, 0.0))]),
         theta[3:4], np.exp(theta[2:3])[None], np.ones(1),
@@ -770,6 +755,35 @@ class _BestFit:
     free: NDArray[np.intp]  # places of fitted parameters
     limits: tuple[Float, Float]
     chi2: float
+
+    @classmethod
+    def of(cls, data: _Data, limits: tuple[Float, Float], peak_s: float, half_width_s: float, *, cooling: bool) -> Self:
+        """Fit a flare from a starting point, with the covariance of the frames at the fit before."""
+        free = np.arange(len(PARAMETERS) if cooling else 4)
+        whitening = data.whitening(None)
+        theta = np.clip(_start(data, whitening, peak_s, half_width_s, cooling), *limits)
+        for _ in range(REFITS):
+            theta = _solve(data, whitening, theta, free, *limits)
+            whitening = data.whitening(theta)
+        theta = _solve(data, whitening, theta, free, *limits)
+        return cls(data, whitening, theta, free, limits, float(np.sum(data.residuals(theta, whitening) ** 2)))
+
+    def ends_of_all(
+        self, quantities: Sequence[_Quantity], estimates: Float, sd: Float, rises: Sequence[float]
+    ) -> Float:
+        """Return the ends of the intervals of all quantities, shape (2, n_rise, n_quantity); `sd` as for `ends`.
+
+        An energy is a multiple of its fluence.
+        """
+        found = np.full((2, len(rises), len(quantities)), np.nan)
+        names = [one.name for one in quantities]
+        for q, one in enumerate(quantities):
+            if one.name.startswith("energy"):
+                fluence = names.index(one.name.replace("energy", "fluence"))
+                found[:, :, q] = estimates[q] / estimates[fluence] * found[:, :, fluence]
+            else:
+                found[:, :, q] = self.ends(one, float(sd[q]), rises)
+        return found
 
     def ends(self, quantity: _Quantity, sd: float, rises: Sequence[float]) -> Float:
         """Return the ends of a quantity's intervals, shape (2, n_rise), for rises of chi-squared.

@@ -397,11 +397,3 @@ def shape_of(given: Shape | str) -> Shape:
         return given
     check_shape(str(given))
     return SHAPES[str(given)]
-
-
-def half_width_of_altaipony(duration: float, shape: Shape | str) -> float:
-    """Return the half-width for AltaiPony's argument ``dur``, in the same unit.
-
-    AltaiPony 2.1.2 uses half of ``dur`` as t_1/2 in `davenport2014`, and all of it in `mendoza2022`.
-    """
-    return duration / 2 if shape_of(shape).name == "davenport2014" else duration

@@ -24,9 +24,8 @@ from mauvecl.flares.frames import MOST_STATISTICS, STEADY, Components
 from mauvecl.flares.stare import Stare
 from mauvecl.noise import layout
 from mauvecl.noise.drawing import Cumulants, expansion_error, joint_is_exact
-from mauvecl.noise.processes import NONE, Processes
 from mauvecl.noise.scene import Scene, padded, prepare
-from mauvecl.noise.unknowns import ADDITIVE
+from mauvecl.noise.unknowns import ADDITIVE, NONE, Processes
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range
@@ -141,31 +140,11 @@ class StareScene:
         if not scene.joint:
             raise _not_joint_error(x.name)
         size = padded(n_pixel)
-        mixtures = np.zeros(size, layout.MIXTURE)
-        mixtures["variance"] = 1.0
-        mixtures["rest"][:n_pixel] = x.mean_raw_dn - scene.base_dn[0]
-        for row, name in enumerate(STEADY):
-            mixtures[name][:n_pixel] = components.mean_dn[row]
-        for order, name in ((2, "variance"), (3, "third"), (4, "fourth"), (5, "fifth")):
-            constant, each = components.pixel_cumulants(order)
-            # Rounding is done by the kernels.
-            constant = constant - {2: 1 / 12, 4: -1 / 120}.get(order, 0.0)
-            mixtures[name][:n_pixel] = constant + each[: len(STEADY)].sum(axis=0)
-            mixtures[f"dark_{name}"][:n_pixel] = each[2]
-            mixtures[f"photon_{name}"][:n_pixel] = (
-                x.gain_dn_per_electron ** (order - 1) if order == 2 or x.photon_noise == "poisson" else 0.0
-            )
         spectra = np.zeros((components.n_flares, size), np.float32)
         spectra[:, :n_pixel] = components.mean_dn[len(STEADY) :]
         weights = np.zeros((components.n_statistics, size), np.float32)
         weights[:, :n_pixel] = components.weights
         constants = weights[:, :n_pixel].astype(np.float64) @ (scene.base_dn[0] - x.mean_raw_dn)
-        stare_job = np.zeros((), layout.STARE_JOB)
-        stare_job["frame_count"], stare_job["padded_frames"] = stare.n_frames, padded_frames(stare.n_frames)
-        stare_job["unknown_count"], stare_job["jittered"] = len(stare.unknowns), any(stare.jitters.values())
-        stare_job["light_jitter"], stare_job["sky_jitter"] = stare.light_jitter, stare.sky_jitter
-        stare_job["temperature_jitter"] = stare.temperature_jitter_c
-        stare_job["dark_slope"] = x.conditions["dark_slope_per_c"]
         curves = np.reshape([u.sd * u.curve for u in stare.unknowns], (len(stare.unknowns), stare.n_frames))
         return cls(
             components,
@@ -175,8 +154,8 @@ class StareScene:
             _known(components, stare),
             _padded(curves, np.float32),
             np.array([layout.MOVED.index(u.of) for u in stare.unknowns], np.uint32),
-            stare_job,
-            mixtures,
+            _stare_job(stare, x.conditions["dark_slope_per_c"]),
+            _mixtures(components, scene.base_dn[0]),
             spectra,
             weights,
             constants.astype(np.float32),
@@ -312,6 +291,37 @@ def _padded(values: NDArray[Any], kind: type) -> NDArray[Any]:
     """Pad with zeros to whole blocks of frames."""
     more = padded_frames(values.shape[-1]) - values.shape[-1]
     return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, more)]).astype(kind)
+
+
+def _mixtures(components: Components, base_dn: NDArray[np.int64]) -> NDArray[np.void]:
+    """Return the `layout.MIXTURE` structures, shape (n_padded,)."""
+    x, n_pixel = components.quiet, components.quiet.wavelength_nm.size
+    mixtures = np.zeros(padded(n_pixel), layout.MIXTURE)
+    mixtures["variance"] = 1.0
+    mixtures["rest"][:n_pixel] = x.mean_raw_dn - base_dn
+    for row, name in enumerate(STEADY):
+        mixtures[name][:n_pixel] = components.mean_dn[row]
+    for order, name in enumerate(layout.CUMULANTS, 2):
+        constant, each = components.pixel_cumulants(order)
+        # Rounding is done by the kernels.
+        constant = constant - {2: 1 / 12, 4: -1 / 120}.get(order, 0.0)
+        mixtures[name][:n_pixel] = constant + each[: len(STEADY)].sum(axis=0)
+        mixtures[f"dark_{name}"][:n_pixel] = each[2]
+        mixtures[f"photon_{name}"][:n_pixel] = (
+            x.gain_dn_per_electron ** (order - 1) if order == 2 or x.photon_noise == "poisson" else 0.0
+        )
+    return mixtures
+
+
+def _stare_job(stare: Stare, dark_slope_per_c: float) -> NDArray[np.void]:
+    """Return the `layout.STARE_JOB` structure without the values of flares."""
+    job = np.zeros((), layout.STARE_JOB)
+    job["frame_count"], job["padded_frames"] = stare.n_frames, padded_frames(stare.n_frames)
+    job["unknown_count"], job["jittered"] = len(stare.unknowns), any(stare.jitters.values())
+    job["light_jitter"], job["sky_jitter"] = stare.light_jitter, stare.sky_jitter
+    job["temperature_jitter"] = stare.temperature_jitter_c
+    job["dark_slope"] = dark_slope_per_c
+    return job
 
 
 def _known(components: Components, stare: Stare) -> Floats:

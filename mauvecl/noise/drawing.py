@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from mauvecl.noise import layout
 from mauvecl.noise.disturbances import Prior
-from mauvecl.noise.processes import NONE, Processes
-from mauvecl.noise.unknowns import PROCESSES, Conditions
+from mauvecl.noise.unknowns import NONE, PROCESSES, SIGNAL_PARTS, Conditions, Processes, SignalPart
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
@@ -343,14 +342,10 @@ class Factors:
 
     #: Shape (n_modulation, 2 * layout.PRIOR_NODES); quantile tables; see `table_of`.
     tables: NDArray[np.float32]
-    #: Factors at the priors' medians, to which the tables are relative.
-    light: float
-    dark: float
-    sky: float
+    #: Factors at the priors' medians, to which the tables are relative, in the order of `SIGNAL_PARTS`.
+    medians: dict[SignalPart, float]
     #: Smallest and largest factors of all priors together.
-    light_ends: tuple[float, float]
-    dark_ends: tuple[float, float]
-    sky_ends: tuple[float, float]
+    ends: dict[SignalPart, tuple[float, float]]
 
     @classmethod
     def of(cls, processes: Processes, conditions: Conditions) -> Self:
@@ -362,8 +357,7 @@ class Factors:
             Values of the expectation: ``temperature_c``, ``dark_slope_per_c``, ``light_loss``, ``pointing_loss``.
         """
         tables = np.empty((len(processes.modulations), 2 * layout.PRIOR_NODES), np.float32)
-        ends = {"light": (1.0, 1.0), "dark": (1.0, 1.0), "sky": (1.0, 1.0)}
-        centre = dict.fromkeys(ends, 1.0)
+        ends, centre = dict.fromkeys(SIGNAL_PARTS, (1.0, 1.0)), dict.fromkeys(SIGNAL_PARTS, 1.0)
         for row, (name, factor) in enumerate(processes.modulations):
             prior, varied = getattr(processes, name), PROCESSES[name]
             change = partial(varied.change, conditions)
@@ -376,7 +370,11 @@ class Factors:
             centre[factor] *= 1.0 + middle
             least, most = sorted(1.0 + change(np.array([first, last])))
             ends[factor] = ends[factor][0] * float(least), ends[factor][1] * float(most)
-        return cls(tables, centre["light"], centre["dark"], centre["sky"], ends["light"], ends["dark"], ends["sky"])
+        return cls(tables, centre, ends)
+
+    def median_on_light(self, share: Float) -> Float:
+        """Return `on_light` at the priors' medians."""
+        return self.on_light(self.medians["light"], self.medians["sky"], share)
 
     @staticmethod
     def on_light(light: float, sky: float, share: Float) -> Float:
@@ -442,7 +440,7 @@ def near_rail(x: Expectation, factors: Factors, processes: Processes) -> NDArray
     variance, light = x.unsaturated_variance_dn2 / x.n_frames, x.light_dn / x.n_frames
     mean = x.mean_raw_dn
     ends = []
-    for end_light, more_dark, sky in zip(factors.light_ends, factors.dark_ends, factors.sky_ends, strict=True):
+    for end_light, more_dark, sky in zip(*factors.ends.values(), strict=True):
         more_light = factors.on_light(end_light, sky, sky_share(x))
         there = mean + (more_light - 1.0) * light + (more_dark - 1.0) * x.dark_dn
         more = (more_light - 1.0) * x.gain_dn_per_electron * light + (more_dark - 1.0) * x.dark_variance_dn2
@@ -455,8 +453,7 @@ def near_rail(x: Expectation, factors: Factors, processes: Processes) -> NDArray
 
 def _corners(factors: Factors) -> list[tuple[float, float, float]]:
     """Return a grid of factors on light, dark and sky that spans the priors in steps of at most 2."""
-    ends = (factors.light_ends, factors.dark_ends, factors.sky_ends)
-    grids = [np.geomspace(low, high, 1 + int(np.ceil(np.log2(high / low)))) for low, high in ends]
+    grids = [np.geomspace(low, high, 1 + int(np.ceil(np.log2(high / low)))) for low, high in factors.ends.values()]
     return [(float(light), float(dark), float(sky)) for light in grids[0] for dark in grids[1] for sky in grids[2]]
 
 
@@ -516,12 +513,12 @@ def _draw_frames(
 
 def check_reach(x: Expectation, c: Cumulants, factors: Factors) -> None:
     """Raise InputError if the priors allow counts beyond the range in which the device rounds correctly."""
-    share = sky_share(x)
-    least, most = (factors.on_light(*ends, share) for ends in zip(factors.light_ends, factors.sky_ends, strict=True))
-    middle = factors.on_light(factors.light, factors.sky, share)
+    share, ends = sky_share(x), factors.ends
+    least, most = (factors.on_light(*both, share) for both in zip(ends["light"], ends["sky"], strict=True))
+    middle = factors.median_on_light(share)
     light = np.maximum(most - middle, middle - least)
-    dark = max(factors.dark_ends[1] - factors.dark, factors.dark - factors.dark_ends[0])
-    variance = c.variance + most * c.light_variance + factors.dark_ends[1] * c.dark_variance
+    dark = max(ends["dark"][1] - factors.medians["dark"], factors.medians["dark"] - ends["dark"][0])
+    variance = c.variance + most * c.light_variance + ends["dark"][1] * c.dark_variance
     reach = light * c.light_dn + dark * c.dark_dn + 8.0 * np.sqrt(variance)
     if (reach >= REACH_DN).any():
         pixel = int(np.argmax(reach))

@@ -37,6 +37,12 @@ STREAMS = {
 #: Offset of the stream for draws of a reference exposure.
 REFERENCE = 64
 
+
+def _fields(kind: str, *names: str) -> list[tuple[str, str]]:
+    """Return fields of a struct that have the same type."""
+    return [(name, kind) for name in names]
+
+
 #: Fields of a launch for the alias table of an additive process: its start, bits (0 if disabled) and lowest value.
 TABLE_FIELDS = (("table", "u4"), ("bits", "u4"), ("low", "i4"))
 #: Parameters of a launch: seed, sizes, numbers of the first frame and group of four pixels, alias tables of the charge
@@ -44,19 +50,21 @@ TABLE_FIELDS = (("table", "u4"), ("bits", "u4"), ("low", "i4"))
 #: variance of one exposure to the one used.
 JOB = np.dtype(
     [
-        ("seed_low", "u4"),
-        ("seed_high", "u4"),
-        ("pixel_count", "u4"),
-        ("padded_count", "u4"),
-        ("scenario_count", "u4"),
-        ("draw_count", "u4"),
-        ("frame_count", "u4"),
-        ("first_frame", "u4"),
-        ("first_group", "u4"),
+        *_fields(
+            "u4",
+            "seed_low",
+            "seed_high",
+            "pixel_count",
+            "padded_count",
+            "scenario_count",
+            "draw_count",
+            "frame_count",
+            "first_frame",
+            "first_group",
+        ),
         *((f"{name}_{field}", kind) for name in ADDITIVE for field, kind in TABLE_FIELDS),
-        ("reference_count", "u4"),
-        ("reference_weight", "f4"),
-        ("pair_scale", "f4"),
+        *_fields("u4", "reference_count"),
+        *_fields("f4", "reference_weight", "pair_scale"),
     ]
 )
 
@@ -66,64 +74,37 @@ PIXEL = np.dtype([("used", "f4"), ("element_end", "u4"), ("four_uneven", "u4"), 
 #: A scenario in a pixel, read in every inner loop: coefficients of the draw as a polynomial of z, whole DN between
 #: `nearest`'s result and the reference, the reference's inverse variance, and twice its product with the reference's
 #: fraction of a DN.
-LEVEL = np.dtype(
-    [
-        ("c0", "f4"),
-        ("c1", "f4"),
-        ("c2", "f4"),
-        ("c3", "f4"),
-        ("c4", "f4"),
-        ("shift", "f4"),
-        ("inverse_variance", "f4"),
-        ("twice", "f4"),
-    ]
-)
+LEVEL = np.dtype(_fields("f4", "c0", "c1", "c2", "c3", "c4", "shift", "inverse_variance", "twice"))
 
 #: A scenario in a pixel, read when needed: whole DN of one draw's mean that the kernels omit, zero and saturation on
 #: the scale of `nearest`, whole DN from the sum of draws to the reference, and, at an element's last pixel, the
 #: reference's fraction of a DN and inverse variance summed over the element.
 EDGE = np.dtype(
-    [
-        ("base", "i4"),
-        ("low", "f4"),
-        ("high", "f4"),
-        ("whole", "f4"),
-        ("element_offset", "f4"),
-        ("inverse_element_variance", "f4"),
-    ]
+    [*_fields("i4", "base"), *_fields("f4", "low", "high", "whole", "element_offset", "inverse_element_variance")]
 )
 
 #: A Poisson count relative to an integer near its mean: column + low of an alias table or, with bits = 0, the
 #: coefficients of the expansion; and DN per count.
 POISSON = np.dtype(
-    [
-        ("table", "u4"),
-        ("bits", "u4"),
-        ("low", "i4"),
-        ("offset", "f4"),
-        ("slope", "f4"),
-        ("cubic", "f4"),
-        ("gain", "f4"),
-    ]
+    [*_fields("u4", "table", "bits"), *_fields("i4", "low"), *_fields("f4", "offset", "slope", "cubic", "gain")]
 )
+
+#: Cumulants from the second on.
+CUMULANTS = ("variance", "third", "fourth", "fifth")
 
 #: Response of a joint draw to factors on light and dark: their means, variances and third to fifth cumulants, DN; and
 #: the sky's share of the light.
 RESPONSE = np.dtype(
-    [
-        ("light", "f4"),
-        ("dark", "f4"),
-        ("light_variance", "f4"),
-        ("dark_variance", "f4"),
-        ("other_variance", "f4"),
-        ("light_third", "f4"),
-        ("dark_third", "f4"),
-        ("light_fourth", "f4"),
-        ("dark_fourth", "f4"),
-        ("light_fifth", "f4"),
-        ("dark_fifth", "f4"),
-        ("sky_share", "f4"),
-    ]
+    _fields(
+        "f4",
+        "light",
+        "dark",
+        "light_variance",
+        "dark_variance",
+        "other_variance",
+        *(f"{part}_{name}" for name in CUMULANTS[1:] for part in ("light", "dark")),
+        "sky_share",
+    )
 )
 
 #: An observer's subtraction and noise in a pixel: net = value + net_offset, noise^2 = gain max(net, 0) + variance; and
@@ -144,42 +125,26 @@ GRID = np.dtype([("channel", "u4"), ("centre", "f4"), ("steps_per_unit", "f4")])
 #: neighbours at unit coefficients, DN; second to fifth cumulants of the photons divided by their mean, of the total at
 #: unit coefficients, and of the dark.
 MIXTURE = np.dtype(
-    [
-        ("rest", "f4"),
-        ("star", "f4"),
-        ("sky", "f4"),
-        ("dark", "f4"),
-        ("neighbours", "f4"),
-        ("photon_variance", "f4"),
-        ("photon_third", "f4"),
-        ("photon_fourth", "f4"),
-        ("photon_fifth", "f4"),
-        ("variance", "f4"),
-        ("third", "f4"),
-        ("fourth", "f4"),
-        ("fifth", "f4"),
-        ("dark_variance", "f4"),
-        ("dark_third", "f4"),
-        ("dark_fourth", "f4"),
-        ("dark_fifth", "f4"),
-    ]
+    _fields(
+        "f4",
+        "rest",
+        "star",
+        "sky",
+        "dark",
+        "neighbours",
+        *(f"photon_{name}" for name in CUMULANTS),
+        *CUMULANTS,
+        *(f"dark_{name}" for name in CUMULANTS),
+    )
 )
 
 #: Properties common to all frames of a stare: number of frames without and with padding, unknowns, jitters, slope of
 #: the dark with temperature, and numbers of rows of flares and of their amplitudes (one, or one per stare).
 STARE_JOB = np.dtype(
     [
-        ("frame_count", "u4"),
-        ("padded_frames", "u4"),
-        ("unknown_count", "u4"),
-        ("jittered", "u4"),
-        ("light_jitter", "f4"),
-        ("sky_jitter", "f4"),
-        ("temperature_jitter", "f4"),
-        ("dark_slope", "f4"),
-        ("scenario_count", "u4"),
-        ("flare_rows", "u4"),
-        ("amplitude_rows", "u4"),
+        *_fields("u4", "frame_count", "padded_frames", "unknown_count", "jittered"),
+        *_fields("f4", "light_jitter", "sky_jitter", "temperature_jitter", "dark_slope"),
+        *_fields("u4", "scenario_count", "flare_rows", "amplitude_rows"),
     ]
 )
 

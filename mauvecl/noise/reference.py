@@ -18,7 +18,7 @@ from mauvecl.noise import layout, random_numbers
 from mauvecl.noise.drawing import DrawingOptions
 from mauvecl.noise.random_numbers import Floats, Words, fma, four_normals, words
 from mauvecl.noise.scene import Scene, prepare
-from mauvecl.noise.unknowns import ADDITIVE
+from mauvecl.noise.unknowns import ADDITIVE, PROCESSES, SIGNAL_PARTS
 from mauvecl.schema.columns import Column, table_of
 
 if TYPE_CHECKING:
@@ -133,11 +133,11 @@ def factors(
     scene: Scene, realisation: NDArray[np.uint64], frame: int, seed: int, *, exposure: int = 0
 ) -> tuple[Floats, Floats, Floats]:
     """Draw factors on light, dark and sky, relative to the priors' medians and minus one, shape (n_realisation,)."""
-    factor_of = {factor: np.zeros(len(realisation), np.float32) for factor in ("light", "dark", "sky")}
+    factor_of = {factor: np.zeros(len(realisation), np.float32) for factor in SIGNAL_PARTS}
     kept = np.zeros(len(realisation), np.float32)
     first = int(scene.job["first_frame"]) + frame
     for (name, factor), table in zip(scene.modulations, scene.priors, strict=True):
-        if name != "jitter":
+        if PROCESSES[name].when != "frame":
             words = words_at(realisation, 0, name, 0, seed)
             factor_of[factor] = combine_factors(factor_of[factor], quantile(words[0], words[1], table))
             continue

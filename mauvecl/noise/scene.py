@@ -27,12 +27,12 @@ from mauvecl.noise.drawing import (
     sky_share,
 )
 from mauvecl.noise.layout import LARGEST_MEAN, SMALLEST_EXPANDED, AliasTable, table_of, table_set
-from mauvecl.noise.unknowns import ADDITIVE, SignalPart
+from mauvecl.noise.unknowns import ADDITIVE, PROCESSES, SIGNAL_PARTS, SignalPart
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
-    from mauvecl.noise.processes import Processes
+    from mauvecl.noise.unknowns import Processes
 
 Float = NDArray[np.float64]
 
@@ -117,7 +117,8 @@ class FactorDistributions:
     @classmethod
     def of(cls, scene: Scene) -> FactorDistributions | None:
         """Return the distributions of a scene, or None if it draws no factors."""
-        return cls._of(scene.modulations, scene.priors, scene.medians, scene.n_frames)
+        medians = dict(zip(SIGNAL_PARTS, scene.medians, strict=True))
+        return cls._of(scene.modulations, scene.priors, medians, scene.n_frames)
 
     @classmethod
     def from_processes(cls, processes: Processes, quiet: Expectation) -> FactorDistributions | None:
@@ -125,25 +126,23 @@ class FactorDistributions:
         if not processes.modulations:
             return None
         factors = Factors.of(processes, quiet.conditions)
-        medians = factors.light, factors.dark, factors.sky
-        return cls._of(processes.modulations, factors.tables, medians, quiet.n_frames)
+        return cls._of(processes.modulations, factors.tables, factors.medians, quiet.n_frames)
 
     @classmethod
     def _of(
         cls,
         modulations: Sequence[tuple[str, SignalPart]],
         tables: NDArray[np.float32],
-        medians: tuple[float, float, float],
+        medians: Mapping[SignalPart, float],
         n_frames: int,
     ) -> FactorDistributions | None:
-        spreads: dict[str, list[FactorDistribution]] = {}
+        spreads: dict[SignalPart, list[FactorDistribution]] = {}
         for (name, factor), table in zip(modulations, tables, strict=True):
             one = _of_table(table)
-            if name == "jitter" and n_frames > 1:
+            if PROCESSES[name].when == "frame" and n_frames > 1:
                 one = _normal(one.mean, one.sd / np.sqrt(n_frames))
             spreads.setdefault(factor, []).append(one)
-        median = dict(zip(("light", "dark", "sky"), medians, strict=True))
-        return cls({name: _product(ones, median[name]) for name, ones in spreads.items()}) if spreads else None
+        return cls({name: _product(ones, medians[name]) for name, ones in spreads.items()}) if spreads else None
 
     def nodes(self, x: Expectation, *, weighted: bool) -> tuple[list[Node], Float]:
         """Return the nodes over which a statistic of an exposure is integrated.
@@ -278,15 +277,15 @@ def fill_estimates(out: NDArray[np.void], reference: Expectation, fraction: Floa
 
 def fill_responses(out: NDArray[np.void], x: Expectation, c: Cumulants, factors: Factors) -> None:
     """Fill `out` with a draw's response to factors on light, dark and sky, relative to the priors' medians."""
-    share, dark = sky_share(x), factors.dark
-    light = factors.on_light(factors.light, factors.sky, share)
+    share, dark = sky_share(x), factors.medians["dark"]
+    light = factors.median_on_light(share)
     # The sky's light follows both factors.
-    out["sky_share"] = factors.light * factors.sky * share / light
+    out["sky_share"] = factors.medians["light"] * factors.medians["sky"] * share / light
     out["light"], out["dark"] = light * c.light_dn, dark * c.dark_dn
     out["light_variance"], out["dark_variance"] = light * c.light_variance, dark * c.dark_variance
     # A lower limit avoids 0 / 0 in pixels without noise.
     out["other_variance"] = np.maximum(c.variance - c.light_variance - c.dark_variance, NO_VARIANCE)
-    for order, name in ((3, "third"), (4, "fourth"), (5, "fifth")):
+    for order, name in enumerate(layout.CUMULANTS[1:], 3):
         out[f"light_{name}"] = light * c.photon_cumulant(order)
         out[f"dark_{name}"] = dark * c.dark_cumulant(order)
 
@@ -319,7 +318,7 @@ class Scene:
     responses: NDArray[np.void]  # shape (n_scenario, n_padded)
     tables: NDArray[np.uint32]  # concatenated alias tables
     priors: NDArray[np.float32]  # shape (n_modulation, 2 * PRIOR_NODES); quantile tables
-    medians: tuple[float, float, float]  # factors on light, dark and sky at the priors' medians
+    medians: tuple[float, ...]  # factors on light, dark and sky at the priors' medians
     #: Shape (n_scenario,); for each scenario, the scenario with whose mean and variance it is compared.
     references: NDArray[np.uint32]
     #: Shape (n_scenario, n_padded); reference rounded to whole DN minus the reference; zero for noisy reference
@@ -429,7 +428,7 @@ def prepare(
         dark_counts=darks,
         tables=np.concatenate([np.zeros(0, np.uint32), *(t.entries for t in tables)]).astype(np.uint32),
         priors=factors.tables,
-        medians=(factors.light, factors.dark, factors.sky),
+        medians=tuple(factors.medians.values()),
         references=compared,
         comparison=comparison,
         used=used,
@@ -493,8 +492,8 @@ class _PerScenario:
         """Return the mean, DN, to which a draw is relative; separate Poisson counts are relative to integers."""
         c, gain = method.cumulants[k], x.gain_dn_per_electron
         if method.joint:
-            light = factors.on_light(factors.light, factors.sky, sky_share(x))
-            return np.asarray(c.mean + (light - 1.0) * c.light_dn + (factors.dark - 1.0) * c.dark_dn)
+            light, dark = factors.median_on_light(sky_share(x)), factors.medians["dark"]
+            return np.asarray(c.mean + (light - 1.0) * c.light_dn + (dark - 1.0) * c.dark_dn)
         mean = method.each * x.bias_dn + dark_dn
         if method.photons:
             out = self.photon_counts[k, : dark_dn.size]

@@ -9,11 +9,24 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar, get_args
 
-from mauvecl.noise.disturbances import AdditiveProcess, CosmicRays, Normal, PointingDrifts, Prior, Uniform
+from pydantic import create_model
+
+from mauvecl.noise.disturbances import (
+    AdditiveProcess,
+    CosmicRays,
+    Normal,
+    ParticleRate,
+    PointingDrifts,
+    Prior,
+    PriorField,
+    Uniform,
+)
+from mauvecl.schema.calls import validated
 from mauvecl.schema.fields import range_of
 from mauvecl.schema.physical import DetectorTemperature
+from mauvecl.schema.section import Section
 
 if TYPE_CHECKING:
     import numpy as np
@@ -26,16 +39,17 @@ if TYPE_CHECKING:
 
 Conditions = Mapping[str, float]
 SignalPart = Literal["light", "dark", "sky"]
+SIGNAL_PARTS: tuple[SignalPart, ...] = get_args(SignalPart)
 #: Object of an unknown: a part of the signal, the wavelength dependence of the response, or an instrument value.
 Of = Literal["star", "light", "sky", "dark", "response", "instrument"]
 #: How often an unknown takes another value.
 When = Literal["frame", "exposure", "stare", "campaign"]
-#: Whether realisations are drawn with other values, statistics are marginalised over them, or both.
-Treatment = Literal["drawn", "marginalised", "both"]
 #: Quantities of a stare that change: the quiescent level of the star; the throughput for the light of star, flare and
 #: sky; the brightness of the sky; the temperature of the detector.
 Changing = Literal["star", "light", "sky", "temperature"]
 CHANGING: tuple[Changing, ...] = get_args(Changing)
+#: Part of the signal that each of them changes; a nuisance parameter of this name takes its place in a frame.
+CHANGED_PART: dict[Changing, Of] = {"star": "star", "light": "light", "sky": "sky", "temperature": "dark"}
 #: Sections of a stare's unknowns: independent from frame to frame; constant; a change per hour; an orbital cycle.
 Course = Literal["jitters", "offsets", "drifts", "cycles"]
 COURSES: tuple[Course, ...] = get_args(Course)
@@ -58,7 +72,6 @@ class Unknown:
     of: Of  # changed part of the signal, or "instrument"
     when: When  # how often it takes another value
     prior: Prior | Amplitude | None = None  # default prior; None if it is known by default
-    treatment: Treatment
     label: str = ""  # description in messages and tables
     source: str = ""  # source of the default prior, or "assumption"
 
@@ -69,7 +82,7 @@ class Process(Unknown):
 
     of: SignalPart = "light"
     when: When = "exposure"
-    treatment: Treatment = "drawn"
+    prior: Prior | None = None
     stream: int  # its number in `layout.STREAMS`
     #: Range of allowed values.
     low: float
@@ -83,21 +96,35 @@ class Process(Unknown):
         """Return the value in an expectation."""
         return conditions[self.expected] if isinstance(self.expected, str) else self.expected
 
+    @property
+    def moments(self) -> tuple[float, float]:
+        """Mean of the default prior relative to the expected value, and standard deviation, both without its cuts."""
+        # A default prior of a value that depends on the instrument is relative to that value.
+        expected = 0.0 if isinstance(self.expected, str) else self.expected
+        if isinstance(self.prior, Normal):
+            return self.prior.mean - expected, self.prior.sd
+        assert self.prior is not None
+        return (self.prior.low + self.prior.high) / 2 - expected, (self.prior.high - self.prior.low) / 12**0.5
+
 
 @dataclass(frozen=True, kw_only=True)
 class Nuisance(Unknown):
     """Unknown amplitude of a known spectrum, which statistics marginalise over."""
 
     when: When = "exposure"
-    treatment: Treatment = "marginalised"
+    prior: Amplitude | None = None
     #: Function of a quiescent expectation that returns DN of the exposure for unit amplitude, shape (n_pixel,).
     spectrum: Callable[[Expectation], Float]
     #: Function that returns the relative change of a flare's light for unit amplitude; None if it does not change.
     of_flare: Callable[[Expectation], Float] | None = None
     unit: str = "%"  # unit in messages; relative amplitudes are shown in per cent
     process: str = ""  # process that draws it in the documented set
-    scatter: float = math.nan  # root mean square of the amplitude that this process draws
     marginalised: str = ""  # description of the default prior for messages and documentation
+
+    @property
+    def scatter(self) -> float:
+        """Root mean square of the amplitude that its process draws."""
+        return math.hypot(*PROCESSES[self.process].moments)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,7 +135,7 @@ class StareChange(Unknown):
     """
 
     name: Changing
-    treatment: Treatment = "drawn"
+    prior: Amplitude | None = None
     unit: str = ""
     course: Course
 
@@ -119,7 +146,7 @@ class InstrumentValue(Unknown):
 
     of: Of = "instrument"
     when: When = "campaign"
-    treatment: Treatment = "drawn"
+    prior: Prior | None = None
     #: Value of the instrument that the unknown multiplies; by default it replaces the value of its own name.
     scales: str | None = None
     #: Whether it changes the throughput alone, so that modes of a calibrated throughput take its place.
@@ -169,13 +196,13 @@ def _by_name(*rows: Row) -> dict[str, Row]:
     return {row.name: row for row in rows}
 
 
-#: Additive processes: fields of `processes.Processes`, keys of studies' ``processes``.
+#: Additive processes: fields of `Processes`, keys of studies' ``processes``.
 ADDITIVE: dict[str, type[AdditiveProcess]] = {"cosmic_rays": CosmicRays}
 #: Processes of all light during a stare, which are drawn and marginalised: keys of studies' ``stare``, fields of
 #: `mauvecl.flares.stare.Stare`.
 STARE_PROCESSES: dict[str, type[PointingDrifts]] = {"pointing": PointingDrifts}
 
-#: Processes in the order of their tables in kernels: fields of `processes.Processes`, keys of studies' ``processes``.
+#: Processes in the order of their tables in kernels: fields of `Processes`, keys of studies' ``processes``.
 PROCESSES = _by_name(
     Process(
         name="jitter",
@@ -220,6 +247,71 @@ PROCESSES = _by_name(
     ),
 )
 
+#: Fields of `Processes`.
+_process_keys: Any = {name: (kind | None, None) for name, kind in ADDITIVE.items()} | dict.fromkeys(
+    PROCESSES, (PriorField | None, None)
+)
+
+
+@validated
+class Processes(create_model("_Processes", __base__=Section, **_process_keys)):  # type: ignore[misc]
+    """Optional noise processes, and the study section that enables them; those that are None are disabled.
+
+    Attributes
+    ----------
+    cosmic_rays : CosmicRays, optional
+        Hits by charged particles.
+    jitter : Prior, optional
+        Fraction of the light that a frame loses by pointing jitter, in addition to the expectation's losses; drawn per
+        frame. The paper expects ``Uniform(0, 0.05)``.
+    detector_temperature : Prior, optional
+        Temperature in deg C, drawn per realisation; the dark current follows the instrument's law.
+    light_loss, pointing_loss : Prior, optional
+        Replacements of the instrument's values, drawn per realisation.
+    qe_scale : Prior, optional
+        Factor on the quantum efficiency, drawn per realisation.
+    sky_level : Prior, optional
+        Factor on the sky's light, drawn per realisation.
+    """
+
+    @property
+    def additive(self) -> dict[str, AdditiveProcess]:
+        """Enabled additive processes by name."""
+        return {name: process for name in ADDITIVE if (process := getattr(self, name)) is not None}
+
+    @property
+    def modulations(self) -> tuple[tuple[str, SignalPart], ...]:
+        """Names of the enabled priors and the part of the signal that each changes."""
+        return tuple((name, varied.of) for name, varied in PROCESSES.items() if getattr(self, name) is not None)
+
+    @property
+    def additive_only(self) -> Self:
+        """The processes without priors."""
+        copy: Self = self.model_copy(update=dict.fromkeys(PROCESSES))
+        return copy
+
+    @property
+    def particle_processes(self) -> list[AdditiveProcess]:
+        """Enabled processes that incident particles cause."""
+        return [process for process in self.additive.values() if process.particles_per_cm2_s is not None]
+
+    @property
+    def particles_per_cm2_s(self) -> float:
+        """Largest rate of incident particles of the enabled processes; zero without any."""
+        return max((process.particles_per_cm2_s or 0.0 for process in self.particle_processes), default=0.0)
+
+    def with_particles(self, rate_per_cm2_s: ParticleRate) -> Self:
+        """Return a copy in which all processes caused by incident particles have this rate, enabled if necessary."""
+        every = {name: getattr(self, name) or kind() for name, kind in ADDITIVE.items()}
+        caused = {name: process for name, process in every.items() if process.particles_per_cm2_s is not None}
+        update = {name: one.with_particles(rate_per_cm2_s) for name, one in caused.items()}
+        copy: Self = self.model_copy(update=update)
+        return copy
+
+
+NONE = Processes()
+
+
 #: Nuisance parameters with built-in spectra; keys of studies' ``nuisances``.
 NUISANCES = _by_name(
     Nuisance(
@@ -229,7 +321,6 @@ NUISANCES = _by_name(
         unit="deg C",
         spectrum=lambda quiet: quiet.n_frames * quiet.dark_dn * quiet.conditions["dark_slope_per_c"],
         process="detector_temperature",
-        scatter=0.5,
         prior=Amplitude(math.inf),
         marginalised="free: the dark current follows the temperature by an exponential, which is no normal amplitude",
     ),
@@ -240,7 +331,6 @@ NUISANCES = _by_name(
         spectrum=lambda quiet: quiet.recorded_light_dn,
         of_flare=lambda quiet: 1.0 + 0.0 * quiet.wavelength_nm,
         process="jitter",
-        scatter=0.05 / 3**0.5,
         prior=Amplitude(math.inf),
         marginalised="free: the mean loss is unknown too, and so is the star's own level",
     ),
@@ -250,8 +340,7 @@ NUISANCES = _by_name(
         label="the sky level",
         spectrum=lambda quiet: quiet.sky_dn,
         process="sky_level",
-        scatter=0.1,
-        prior=Amplitude(0.1),
+        prior=Amplitude(PROCESSES["sky_level"].moments[1]),
         marginalised="10 %",
     ),
     Nuisance(
@@ -266,12 +355,23 @@ NUISANCES = _by_name(
 DOCUMENTED_NUISANCES = tuple(row for row in NUISANCES.values() if row.prior is not None)
 
 
-#: Default amplitudes of a stare's unknowns and their sources.
+if TYPE_CHECKING:
+    NuisanceName = str
+else:
+    NuisanceName = Literal[tuple(NUISANCES)]
+
+
+def _drawn_by(process: str) -> tuple[float, str]:
+    """Return the standard deviation of the default prior of a process, and its source."""
+    return PROCESSES[process].moments[1], PROCESSES[process].source
+
+
+#: Default amplitudes of a stare's unknowns and their sources, most of them those of processes.
 _STARE_DEFAULTS: dict[tuple[Course, Changing], tuple[float, str]] = {
-    ("jitters", "light"): (0.05 / 12**0.5, "standard deviation of the losses of the process jitter"),
-    ("offsets", "sky"): (0.1, "assumption: the scatter of the zodiacal light about its model"),
+    ("jitters", "light"): _drawn_by("jitter"),
+    ("offsets", "sky"): _drawn_by("sky_level"),
     ("drifts", "star"): (0.01, "assumption: slow variability of the star"),
-    ("cycles", "temperature"): (0.5, "assumption: the thermal cycle of one orbit"),
+    ("cycles", "temperature"): _drawn_by("detector_temperature"),
 }
 
 
@@ -279,7 +379,7 @@ def _stare_change(course: Course, name: Changing) -> StareChange:
     sd, source = _STARE_DEFAULTS.get((course, name), (None, ""))
     return StareChange(
         name=name,
-        of="dark" if name == "temperature" else name,
+        of=CHANGED_PART[name],
         when="frame" if course == "jitters" else "stare",
         prior=None if sd is None else Amplitude(sd),
         unit="deg C" if name == "temperature" else "",
@@ -348,7 +448,7 @@ def default_processes(temperature_c: float) -> dict[str, Prior]:
         if row.expected == "temperature_c" and isinstance(prior, Normal):
             t = temperature_c
             prior = Normal(t + prior.mean, prior.sd, t + prior.low, t + prior.high)
-        if isinstance(prior, Uniform | Normal):
+        if prior is not None:
             priors[row.name] = prior
     return priors
 
@@ -356,6 +456,6 @@ def default_processes(temperature_c: float) -> dict[str, Prior]:
 def default_spreads() -> dict[Course, dict[Changing, float]]:
     """Return the documented standard deviations of a stare's unknowns."""
     return {
-        course: {name: row.prior.sd for name, row in rows.items() if isinstance(row.prior, Amplitude)}
+        course: {name: row.prior.sd for name, row in rows.items() if row.prior is not None}
         for course, rows in STARE_CHANGES.items()
     }

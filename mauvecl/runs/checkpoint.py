@@ -31,8 +31,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from mauvecl.detection.requests import Countable, Divisible, Shard
+from mauvecl.host import VERSION
 from mauvecl.host.tables.files import UNFINISHED, json_data, read_bytes, read_text, write_whole
-from mauvecl.host.version import VERSION
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:

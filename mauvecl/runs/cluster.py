@@ -21,8 +21,8 @@ from mauvecl.detection.requests import Countable, Shard
 from mauvecl.detection.snr import Arrays
 from mauvecl.device.build import DeviceRecord
 from mauvecl.device.drivers import THREADS, DeviceError
+from mauvecl.host import VERSION
 from mauvecl.host.tables.files import is_file, json_data, read_text
-from mauvecl.host.version import VERSION
 from mauvecl.runs.checkpoint import Task, code_identity
 from mauvecl.runs.pool import Stopped
 from mauvecl.schema.calls import validated
@@ -324,26 +324,12 @@ def _client(where: str, distributed: Any) -> Iterator[Client]:
         if word == "local":
             if not (number.isdecimal() and len(number) <= 4 and 1 <= int(number) <= 1024):
                 raise InputError.of("cluster", where, "local:N with N from 1 to 1024")
-            threads = max((os.cpu_count() or 1) // int(number), 1)
             # The pool counts failures and submits shards again, so that it can report them.
             how = {"distributed.scheduler.allowed-failures": 0, "distributed.admin.tick.limit": "1h"}
             # No HTTP pages, since they have no authentication.
             how |= {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
             stack.enter_context(dask.config.set(how | {"logging": dict.fromkeys(LOGS, "critical")}))
-            cluster = distributed.LocalCluster(
-                n_workers=int(number),
-                threads_per_worker=1,
-                processes=True,
-                host="127.0.0.1",
-                dashboard_address=None,
-                scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
-                security=_private(distributed),
-                preload=__name__,
-                memory_limit=0,
-                silence_logs=logging.CRITICAL,
-                env=dict.fromkeys(THREADS, str(threads)),
-            )
-            stack.enter_context(cluster)
+            cluster = stack.enter_context(_local_cluster(int(number), distributed))
             how = {"address": cluster, "security": cluster.security}
         elif "://" in where and _is_address(where):
             how = {"address": where}
@@ -362,6 +348,24 @@ def _client(where: str, distributed: Any) -> Iterator[Client]:
         except (OSError, ValueError, TimeoutError) as error:
             raise DeviceError(f"no scheduler answers at {where}, expected one within {PATIENCE_S:g} s") from error
         yield client
+
+
+def _local_cluster(n_workers: int, distributed: Any) -> Any:
+    """Start workers on this machine, each with its share of the cores."""
+    threads = max((os.cpu_count() or 1) // n_workers, 1)
+    return distributed.LocalCluster(
+        n_workers=n_workers,
+        threads_per_worker=1,
+        processes=True,
+        host="127.0.0.1",
+        dashboard_address=None,
+        scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
+        security=_private(distributed),
+        preload=__name__,
+        memory_limit=0,
+        silence_logs=logging.CRITICAL,
+        env=dict.fromkeys(THREADS, str(threads)),
+    )
 
 
 def _is_address(where: str) -> bool:

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host import VERSION
 from mauvecl.host.tables.files import UNFINISHED, check_folder, parsing, write_whole, writing
-from mauvecl.host.version import VERSION
 from mauvecl.runs.store import CALIBRATION, COMMON_DRAWS, NOMINAL, Store, StoredScene, exposure_attributes
 from mauvecl.schema.errors import InputError
 

@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host import VERSION
 from mauvecl.host.tables.files import UNFINISHED, read_bytes, toml, write_whole, writing
-from mauvecl.host.version import VERSION
 from mauvecl.runs.checkpoint import differing_keys
 from mauvecl.schema.columns import Column, percent
 from mauvecl.schema.errors import InputError

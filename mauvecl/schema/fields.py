@@ -409,6 +409,17 @@ def _metadata(kind: Any) -> Iterator[Any]:
             yield from _metadata(part)
 
 
+def as_typed(value: Any, *, truth: tuple[str, str] = ("false", "true")) -> str:
+    """Return a value as people type it, with commas in a tuple; empty for None and for tables."""
+    if isinstance(value, tuple):
+        return ",".join(as_typed(one, truth=truth) for one in value)
+    if isinstance(value, bool):
+        return truth[value]
+    if not isinstance(value, str | int | float):
+        return ""
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
 @cache
 def range_of(kind: Any) -> Range:
     """Return the range of an annotation such as `physical.Magnitude`."""

@@ -71,13 +71,19 @@ def axes(texts: Sequence[str], name: str) -> list[dict[str, Any]]:
     return [axis(text, name) for text in texts]
 
 
+def assignment(text: str, name: str, expected: str) -> tuple[str, str]:
+    """Read a name and its value, with an equals sign between them."""
+    key, _, value = (part.strip() for part in text.rpartition("="))
+    if not (key and value):
+        raise refusal(name, text, expected)
+    return key, value
+
+
 def line_fluxes(texts: Sequence[str], name: str) -> dict[str, float]:
     """Read fluxes of emission lines, such as 'Mg II=0.05'."""
     lines = {}
     for text in texts:
-        line, equals, value = (part.strip() for part in text.rpartition("="))
-        if not (line and equals):
-            raise refusal(name, text, "NAME=FLUX, such as 'Mg II=0.05'")
+        line, value = assignment(text, name, "NAME=FLUX, such as 'Mg II=0.05'")
         lines[line] = number(value, f"{name} {shortened(text)}:")
     return lines
 

@@ -21,7 +21,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError, PydanticUndefined
 
 from mauvecl.schema.errors import InputError, shortened, shown
-from mauvecl.schema.fields import Flag, Help, Range, Unit, first, found, is_quantity, numbers
+from mauvecl.schema.fields import Flag, Help, Range, Unit, as_typed, first, found, is_quantity, numbers
 
 if TYPE_CHECKING:
     from pydantic._internal._model_construction import ModelMetaclass
@@ -275,8 +275,4 @@ def _default(field: Any, help: Help | None) -> str:
 def _text(value: Any) -> str:
     if isinstance(value, tuple):
         return f"[{', '.join(map(_text, value))}]"
-    if value is None or isinstance(value, BaseModel | dict):
-        return ""
-    if isinstance(value, bool):
-        return str(value).lower()
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    return as_typed(value)

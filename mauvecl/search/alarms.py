@@ -8,7 +8,7 @@ passes end when there are no more alarms.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
 
@@ -90,9 +90,8 @@ class Candidate:
 
 
 def alarms(
-    survey: SearchedStare, templates: Templates, sums: NDArray[Any], threshold: float, energy: Factor | None = None,
-    *, profiled: Collection[str] = QUANTITIES,
-) -> list[Alarm]:  # fmt: skip
+    survey: SearchedStare, templates: Templates, sums: NDArray[Any], threshold: float, energy: Factor | None = None
+) -> list[Alarm]:
     """Detect and fit all flares of a stare, largest statistic first.
 
     Parameters
@@ -104,12 +103,10 @@ def alarms(
     energy : callable, optional
         Logarithm of the energy per second of equivalent duration as a function of the logarithm of the temperature,
         and its derivative.
-    profiled : collection of str
-        Those of `QUANTITIES` whose intervals are computed; each takes many fits.
     """
     search = _StareSearch(StareSums(survey, templates, np.asarray(survey.net(sums[None])[0], np.float64)), threshold)
     search.run()
-    return sorted(_measured_alarms(search, energy, profiled), key=lambda alarm: -alarm.rho)
+    return sorted(_measured_alarms(search, energy), key=lambda alarm: -alarm.rho)
 
 
 @dataclass(eq=False)
@@ -345,7 +342,7 @@ def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
     return [(int(a), int(b)) for a, b in steps.reshape(-1, 2)]
 
 
-def _measured_alarms(search: _StareSearch, energy: Factor | None, profiled: Collection[str]) -> list[Alarm]:
+def _measured_alarms(search: _StareSearch, energy: Factor | None) -> list[Alarm]:
     """Measure all flares of a finished search."""
     measured_alarms = []
     for number, block in enumerate(search.blocks(), 1):
@@ -357,7 +354,7 @@ def _measured_alarms(search: _StareSearch, energy: Factor | None, profiled: Coll
             best, measured = better, []
             for j in range(len(block)):
                 gain = rows.without(best, j).chi2 - best.chi2
-                values, better = _measured(rows, best, j, gain, energy, profiled)
+                values, better = _measured(rows, best, j, gain, energy)
                 if better is not None:
                     break
                 measured.append(values)
@@ -367,53 +364,25 @@ def _measured_alarms(search: _StareSearch, energy: Factor | None, profiled: Coll
 
 
 def _measured(
-    rows: Block, best: BlendFit, j: int, gain: float, energy: Factor | None, profiled: Collection[str]
+    rows: Block, best: BlendFit, j: int, gain: float, energy: Factor | None
 ) -> tuple[tuple[FittedFlares, dict[str, tuple[float, float]], str], BlendFit | None]:
     """Return the values, intervals and note of a flare, and a better fit of its block if profiling finds one."""
     sums, theta = rows.sums, best.theta[j]
-    low, high = sums.bounds
-    at_low, at_high = (np.abs(theta - end) <= AT_BOUND * (high - low) for end in (low, high))
     snr = float(np.sqrt(max(gain, 0.0)))
-    missing = ""
-    if at_low[PEAK] or at_high[PEAK]:
-        missing = "its best fit peaks outside the stare"
-    elif at_low[WIDTH] or at_high[WIDTH]:
-        missing = f"its best fit is {'wider' if at_high[WIDTH] else 'narrower'} than the half-widths of the bank"
-    elif not best.converged:
-        missing = "its fit did not converge"
-    if missing:
+    if missing := _why_unmeasured(rows, best, j):
         nowhere = dict.fromkeys((*QUANTITIES, "energy"), (np.nan, np.nan))
         return (replace(UNMEASURED, snr=np.array([snr])), nowhere, f"detected but not measured: {missing}"), None
     area = sums.survey.bank.shape.equivalent_duration
     several = KELVIN in sums.free
-    covariance = best_covariance(rows, best, j)
+    covariance = np.asarray(rows.covariance(best.theta)[j, :, j, :])
+    found = _intervals(rows, best, j, snr, covariance, energy)
+    if isinstance(found, BlendFit):
+        return (UNMEASURED, {}, ""), found
+    intervals, note = found
     duration = np.array([1.0, 0.0, 1.0, 0.0])
     sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     sd_duration = float(np.sqrt(max(duration @ covariance @ duration, 0.0)))
     amplitude, width, kelvin = np.exp(theta[[AMPLITUDE, WIDTH, KELVIN]])
-    factors: dict[str, tuple[int, Factor | None, float]] = {
-        "peak_s": (PEAK, None, 0.0), "amplitude": (AMPLITUDE, None, 0.0), "half_width_s": (WIDTH, None, 0.0),
-        "temperature_k": (KELVIN, None, 0.0), "equivalent_duration_s": (AMPLITUDE, lambda _: (0.0, 0.0), np.log(area)),
-    }  # fmt: skip
-    if energy is not None:
-        factors["energy"] = (AMPLITUDE, energy, np.log(area))
-    intervals, notes = {"energy": (np.nan, np.nan)}, []
-    for name, (column, factor, offset) in factors.items():
-        if name not in (*profiled, "energy") or (column == KELVIN and not several):
-            intervals[name] = (np.nan, np.nan)
-            continue
-        if snr > MAX_PROFILED_SNR:
-            found = _by_curvature(theta, covariance, column, factor)
-        else:
-            found, better = rows.interval(best, j, column, factor, 1.0 + BARTLETT / max(snr, 1.0) ** 2)
-            if better is not None:
-                return (UNMEASURED, {}, ""), better
-        ends = np.array([found.low, found.high])
-        low_end, high_end = ends if column == PEAK else np.exp(ends + offset)
-        intervals[name] = (float(low_end), float(high_end))
-        if found.open_low or found.open_high:
-            notes.append(name.rsplit("_", 1)[0].replace("_", " "))
-    note = f"the interval of its {' and its '.join(notes)} ends where the fit does" if notes else ""
     values = (
         theta[PEAK], sd[PEAK], amplitude, amplitude * sd[AMPLITUDE], width, width * sd[WIDTH],
         kelvin if several else np.nan, kelvin * sd[KELVIN] if several else np.nan,
@@ -422,9 +391,45 @@ def _measured(
     return (FittedFlares(*(np.array([value]) for value in values)), intervals, note), None
 
 
-def best_covariance(rows: Block, best: BlendFit, j: int) -> Float:
-    """Return the covariance of one flare's parameters, shape (4, 4)."""
-    return np.asarray(rows.covariance(best.theta)[j, :, j, :])
+def _why_unmeasured(rows: Block, best: BlendFit, j: int) -> str:
+    """Return why a flare cannot be measured; empty if it can."""
+    theta, (low, high) = best.theta[j], rows.sums.bounds
+    at_low, at_high = (np.abs(theta - end) <= AT_BOUND * (high - low) for end in (low, high))
+    if at_low[PEAK] or at_high[PEAK]:
+        return "its best fit peaks outside the stare"
+    if at_low[WIDTH] or at_high[WIDTH]:
+        return f"its best fit is {'wider' if at_high[WIDTH] else 'narrower'} than the half-widths of the bank"
+    return "" if best.converged else "its fit did not converge"
+
+
+def _intervals(
+    rows: Block, best: BlendFit, j: int, snr: float, covariance: Float, energy: Factor | None
+) -> tuple[dict[str, tuple[float, float]], str] | BlendFit:
+    """Return the intervals of a flare's values and a note, or a better fit of its block if profiling finds one."""
+    area = np.log(rows.sums.survey.bank.shape.equivalent_duration)
+    factors: dict[str, tuple[int, Factor | None, float]] = {
+        "peak_s": (PEAK, None, 0.0), "amplitude": (AMPLITUDE, None, 0.0), "half_width_s": (WIDTH, None, 0.0),
+        "temperature_k": (KELVIN, None, 0.0), "equivalent_duration_s": (AMPLITUDE, lambda _: (0.0, 0.0), area),
+    }  # fmt: skip
+    if energy is not None:
+        factors["energy"] = (AMPLITUDE, energy, area)
+    intervals, notes = {"energy": (np.nan, np.nan)}, []
+    for name, (column, factor, offset) in factors.items():
+        if column == KELVIN and KELVIN not in rows.sums.free:
+            intervals[name] = (np.nan, np.nan)
+            continue
+        if snr > MAX_PROFILED_SNR:
+            found = _by_curvature(best.theta[j], covariance, column, factor)
+        else:
+            found, better = rows.interval(best, j, column, factor, 1.0 + BARTLETT / max(snr, 1.0) ** 2)
+            if better is not None:
+                return better
+        ends = np.array([found.low, found.high])
+        low_end, high_end = ends if column == PEAK else np.exp(ends + offset)
+        intervals[name] = (float(low_end), float(high_end))
+        if found.open_low or found.open_high:
+            notes.append(name.rsplit("_", 1)[0].replace("_", " "))
+    return intervals, f"the interval of its {' and its '.join(notes)} ends where the fit does" if notes else ""
 
 
 def _by_curvature(theta: Float, covariance: Float, column: int, factor: Factor | None) -> Interval:

@@ -187,11 +187,6 @@ class TemplateGrid:
         rate = self.templates_per_frame @ row_probabilities @ (density * sum(temperature_probabilities))
         return float(rate) / self.frame_s
 
-    def trials_per_frame(self, threshold: float) -> float:
-        """Return the number of independent trials per frame with the same false-alarm rate."""
-        rate = self.false_alarms_per_second(threshold)
-        return rate * self.frame_s / float(scipy.special.ndtr(-threshold))
-
     def peak_probabilities(self, threshold: float) -> Float:
         """Return each template's probability that a value above `threshold` is a local maximum.
 

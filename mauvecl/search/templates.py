@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from mauvecl.detection.nuisances import Nuisances, join_names
 from mauvecl.fits.flare_model import MeanSums
 from mauvecl.flares.settings import RANK, WINDOW_S
+from mauvecl.noise.unknowns import CHANGED_PART
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
@@ -317,10 +318,6 @@ class Templates:
         """Return the covariance added by the photon noise of a flare of the nearest temperature, (n_sum, n_sum)."""
         return np.asarray(self.noise[int(np.argmin(np.abs(np.log(np.array(self.temperatures_k) / kelvin))))])
 
-    def of_flares(self, flares_dn: Float) -> Float:
-        """Return the mean sums, (n, n_sum), for flare spectra in DN, (n, n_pixel)."""
-        return np.asarray(flares_dn @ self.weights.T)
-
 
 def frame_nuisances(
     quiet: Expectation, stare: Stare, more: Mapping[str, float] | Nuisances | None = None
@@ -334,8 +331,7 @@ def frame_nuisances(
     more : mapping of str to float, or Nuisances, optional
         Standard deviations by name, which replace jitters of the same kind; an infinite one is projected out.
     """
-    names = {"light": "light", "sky": "sky", "temperature": "dark"}
-    jitters = {names[of]: sd for of, sd in stare.jitters.items() if sd > 0}
+    jitters: dict[str, float] = {CHANGED_PART[of]: sd for of, sd in stare.jitters.items() if sd > 0}
     # Drifts and re-acquisitions change all light alike, by any amount and at any time.
     drifting = {} if stare.pointing is None else {"light": np.inf}
     jitters |= drifting

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field, create_model, model_validator
 
-from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, NUISANCES, Amplitude, default_processes
+from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, NUISANCES, default_processes
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.fields import Flag, Help
 from mauvecl.schema.section import Section
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
     from mauvecl.detection.nuisances import Nuisances
     from mauvecl.host.exposure.expectation import Expectation
-    from mauvecl.noise.processes import Processes
+    from mauvecl.noise.unknowns import Processes
 
 
 def _spread(given: Any) -> Any:
@@ -37,6 +38,11 @@ def _spread(given: Any) -> Any:
 
 
 Spread = Annotated[float | Literal["free"], BeforeValidator(_spread)]
+
+
+def sd_of(spread: Spread) -> float:
+    """Return the standard deviation of a spread, infinite for "free"."""
+    return math.inf if spread == "free" else spread
 
 
 class OwnNuisance(Section):
@@ -75,7 +81,7 @@ Own = Annotated[
         "--nuisance",
         kind=list[str],
         help=Help(
-            "Marginalise over dark, light, sky, tilt or a file's spectrum, with a standard deviation or free",
+            f"Marginalise over {', '.join(NUISANCES)} or a file's spectrum, with a standard deviation or free",
             "as in dark=0.1 or stray.txt=free",
         ),
     ),
@@ -101,11 +107,11 @@ class NuisanceChoice(create_model("_Amplitudes", __base__=Section, **_keys)):  #
         from mauvecl.detection.nuisances import Nuisances
 
         sd = usual_spreads(quiet) if self.usual else {}
-        sd |= {name: float("inf") if spread == "free" else spread for name, spread in self.spreads().items()}
+        sd |= {name: sd_of(spread) for name, spread in self.spreads().items()}
         own: dict[str, NDArray[np.float64]] = {}
         for name, one in self.own.items():
             own[name] = one.spectrum(name, quiet.wavelength_nm)
-            sd[name] = float("inf") if one.sd == "free" else float(one.sd)
+            sd[name] = sd_of(one.sd)
         return Nuisances.of(quiet, sd, own) if sd else None
 
     def spreads(self) -> dict[str, float | Literal["free"]]:
@@ -129,5 +135,5 @@ def usual_spreads(quiet: Expectation) -> dict[str, float]:
     return {
         row.name: row.prior.sd
         for row in DOCUMENTED_NUISANCES
-        if isinstance(row.prior, Amplitude) and spectrum_of(row.name, quiet).any()
+        if row.prior is not None and spectrum_of(row.name, quiet).any()
     }

@@ -21,13 +21,13 @@ from mauvecl.flares.settings import (
     per_day,
 )
 from mauvecl.noise.disturbances import PointingDrifts
-from mauvecl.noise.unknowns import COURSES, STARE_PROCESSES, Changing
+from mauvecl.noise.unknowns import COURSES, STARE_PROCESSES, Changing, NuisanceName
 from mauvecl.schema import parsing
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help, Range, Unit, Widget
 from mauvecl.schema.physical import Amplitude, Duration, Energy, Positive, Temperature, Wavelength
 from mauvecl.schema.section import Section
-from mauvecl.study.nuisances import Spread
+from mauvecl.study.nuisances import Spread, sd_of
 
 if TYPE_CHECKING:
     from mauvecl.flares.shapes import Shape
@@ -196,7 +196,7 @@ class SearchChoice(Section):
         Help("Window of the baseline", default="1800, or three orbits with a cycle"),
     ] = None
     frame: Annotated[
-        dict[Literal["dark", "light", "sky", "tilt"], Spread],
+        dict[NuisanceName, Spread],
         Help("Standard deviations of nuisance parameters of each frame, in addition to the stare's jitters"),
     ] = Field(default_factory=dict)
     false_alarms: Annotated[
@@ -242,6 +242,11 @@ class SearchChoice(Section):
         """False alarms per star-day."""
         return per_day(self.false_alarms, self.per)
 
+    @property
+    def rate_text(self) -> str:
+        """The false alarms as text, such as "1 false alarm per star-month"."""
+        return f"{self.false_alarms:g} false alarm{'' if self.false_alarms == 1 else 's'} per star-{self.per}"
+
     def white_bank(self, frame_s: float) -> Bank:
         """Return the template bank of the closed form: one sum per frame and no cycle."""
         from mauvecl.flares.shapes import shape_of
@@ -260,7 +265,7 @@ class SearchChoice(Section):
 
     def spreads(self) -> dict[str, float]:
         """Return the standard deviations of the parameters of `frame`; infinite for "free"."""
-        return {name: float("inf") if sd == "free" else float(sd) for name, sd in self.frame.items()}
+        return {name: sd_of(sd) for name, sd in self.frame.items()}
 
 
 #: Measures of the size of injected flares.

@@ -16,7 +16,7 @@ from pydantic.fields import FieldInfo
 from mauvecl.detection.requests import STATISTICS
 from mauvecl.host.stars.library import ModelStar, embedded, near_names, spectrum_name
 from mauvecl.schema.errors import InputError, shortened
-from mauvecl.schema.fields import Flag, Range, Unit, Widget, first, found, range_of, unit_of
+from mauvecl.schema.fields import Flag, Range, Unit, Widget, as_typed, first, found, range_of, unit_of
 from mauvecl.schema.physical import LineFraction
 from mauvecl.study.study import keys_with_flags, study_keys
 
@@ -244,19 +244,10 @@ class Field(Widget):
         return self.own_keys or (".".join(self.path),)
 
 
-def _text(value: Any) -> str:
-    """Return the text of a field for a value of its key."""
-    if value is None or value == ():
-        return ""
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    return f"{value:g}" if isinstance(value, float) else str(value)
-
-
 def _field(path: tuple[str, ...], field: FieldInfo, widget: Widget) -> Field:
     """Return the field of a key from its metadata."""
     default, unit = field.get_default(), first(field, Unit) or Unit("")
-    text = _text(default * widget.scale if isinstance(default, float) else default)
+    text = as_typed(default * widget.scale if isinstance(default, float) else default, truth=("no", "yes"))
     optional = text == "" if widget.first is None else not widget.first
     own = {
         "first": text if widget.first is None else widget.first,

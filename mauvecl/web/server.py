@@ -31,9 +31,9 @@ from tornado.iostream import IOStream
 from tornado.routing import Matcher, Rule
 from tornado.web import Application, RequestHandler
 
+from mauvecl.host import VERSION
 from mauvecl.host.exposure.star import KNOWN
 from mauvecl.host.stars.library import all_names, library_names, well_known_stars
-from mauvecl.host.version import VERSION
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.web import fields
 from mauvecl.web.closed_forms import TITLES, ClosedForms

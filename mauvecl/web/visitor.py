@@ -26,7 +26,7 @@ from tornado.websocket import WebSocketClosedError, WebSocketHandler
 from mauvecl.answers.verbs import VERBS
 from mauvecl.device.drivers import DeviceError
 from mauvecl.device.engine import Engine
-from mauvecl.host.version import VERSION
+from mauvecl.host import VERSION
 from mauvecl.runs.pool import LocalWorkers, Pool, Stopped
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.web.closed_forms import ClosedForms, other_payloads, solved

@@ -27,7 +27,7 @@ from mauvecl.charts.chart import (
 )
 from mauvecl.charts.detection import roc_columns
 from mauvecl.detection.requests import label
-from mauvecl.noise.unknowns import NUISANCES, Amplitude
+from mauvecl.noise.unknowns import NUISANCES, Nuisance
 from mauvecl.schema.columns import View
 from mauvecl.study.nuisances import NuisanceChoice
 from mauvecl.web.closed_forms import Answers, percent
@@ -167,7 +167,7 @@ def costs(closed: ClosedForms) -> tuple[float, list[Row]]:
     """Return the flare's matched S/N with everything known, and with unknowns alone and together."""
     # Without a sky its brightness is no unknown. Those without a default prior are projected out.
     there = {name: row for name, row in NUISANCES.items() if np.any(row.spectrum(closed.quiet))}
-    alone = [NuisanceChoice.model_validate({name: _spread(row.prior)}) for name, row in there.items()]
+    alone = [NuisanceChoice.model_validate({name: _spread(row)}) for name, row in there.items()]
     chosen = {spoken(choice).removeprefix("the "): choice for choice in alone}
     chosen["all the usual together"] = NuisanceChoice(usual=True)
     if closed.study.nuisances.own:
@@ -180,8 +180,8 @@ def costs(closed: ClosedForms) -> tuple[float, list[Row]]:
     return known, rows
 
 
-def _spread(prior: object) -> float | str:
-    return prior.sd if isinstance(prior, Amplitude) and np.isfinite(prior.sd) else "free"
+def _spread(row: Nuisance) -> float | str:
+    return "free" if row.prior is None or np.isinf(row.prior.sd) else row.prior.sd
 
 
 def _bars(canvas: Canvas, source: ColumnDataSource) -> None:

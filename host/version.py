@@ -1,3 +1,0 @@
-"""Version of the package; `tests/test_release.py` compares what repeats it."""
-
-VERSION = "1.0.0"
