@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
@@ -15,7 +15,7 @@ Answer = TypeVar("Answer")
 MOST_THREADS = 4
 
 
-def map_in_threads(work: Callable[[Item], Answer], items: Iterable[Item], *, small: bool = False) -> Iterator[Answer]:
+def map_in_threads(work: Callable[[Item], Answer], items: Iterable[Item], *, small: bool = False) -> Generator[Answer]:
     """Apply a function to items in several threads and yield the results in the order of the items.
 
     At most one result for each thread waits to be yielded, so that the memory stays limited.
