@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,10 +12,27 @@ from astropy.table import QTable, Row
 from scipy.stats import binom
 
 from mauvecl import Event, Study, stare
+from mauvecl.search.false_alarms import sampled_rate
 
 #: One false alarm in a star-month is at 4.9.
 FAINT: tuple[str, ...] = ('star=[{library="M3V", magnitude=9}]',)
 BRIGHT = ('star=[{library="G2V", magnitude=7.4}]', "search.half_widths_s=[22, 42, 77, 144]")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_threshold_per_star() -> Iterator[None]:
+    """Sample the false alarms of each star once: they depend on neither flares nor, but for the sampling, seeds."""
+    rates: dict[str, Any] = {}
+
+    def sampled_once(survey: Any, seed: int) -> Any:
+        name = survey.components.quiet.name
+        if name not in rates:
+            rates[name] = sampled_rate(survey, seed)
+        return rates[name]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("mauvecl.answers.stare.sampled_rate", sampled_once)
+        yield
 
 
 def found(events: list[Event], seed: int, settings: tuple[str, ...] = FAINT) -> QTable:
