@@ -17,7 +17,6 @@ from marks import long_but
 import mauvecl
 from mauvecl import Engine, Study
 
-FLARES = Path(__file__).parents[1] / "data" / "flares"
 SLOW = {
     "measure": ["measure.fits=20"],
     "stare": ["stare.duration_s=2000", "stare.search=true"],

@@ -18,9 +18,10 @@ from scenes import instrument, star
 from scipy import stats
 
 from mauvecl import Comparison, CosmicRays, Engine, Linear, Normal, PixelMap, Processes, Uniform
-from mauvecl.detection import requests
+from mauvecl.detection import counts, requests
+from mauvecl.device.launches import scene_launches
 from mauvecl.device.selftest import toy
-from mauvecl.noise import reference
+from mauvecl.noise import layout, reference
 from mauvecl.noise.scene import prepare
 
 RAYS = CosmicRays(rate_per_cm2_s=200.0)
@@ -137,6 +138,34 @@ def test_statistics_equal_reference(any_width: Engine, name: str, more: dict[str
     if more == {"comparison": Comparison(1)}:
         # Against one exposure, chi2 and chi2_pair differ only in the order of summation.
         np.testing.assert_allclose(values[0], values[2], rtol=1e-5)
+
+
+def test_tally_counts_values_at_the_ends_of_its_bins(any_width: Engine) -> None:
+    """Give the kernel values on each side of each end of the fine bins, which draws of chi2 seldom meet.
+
+    Each value stands once in a block of the kernel's loop and once after it. A step that belongs to the last bin is
+    neither in the sums of fine steps nor lost: the host counts it.
+    """
+    half, fine = layout.BINS // 2, 2**layout.FINE_BITS
+    inner, end = (half - 1) * fine, half * fine
+    # Halves are rounded to even steps.
+    steps = [inner - 1, inner - 0.5, inner, -inner, -inner - 0.5, -inner - 1, end - 1, end, -end, -end - 1, 0]
+    far = [np.nan, np.inf, -np.inf]
+    values = np.array([*steps, *far, 0, 0, *steps, *far], np.float32)
+    tally = counts.Tally([counts.Grid(0, 0.0, float(layout.STEPS_PER_SIGMA))])
+    tile = any_width._tiles.at(0, values.size, 4096)
+    with scene_launches(any_width.open_device, prepare([toy()]), 1) as launches:
+        launches._named["values"] = launches.upload(np.resize(values, tile.size))
+        launches.tally(tile, tally)
+        launches.flush(tally)
+    found, step = tally.distribution(0), np.rint(values)
+    inside = step[(step >= -inner) & (step < inner)].astype(np.int64)
+    np.testing.assert_array_equal(found.counts, np.bincount(inside // fine + half, minlength=layout.BINS))
+    assert (found.first, found.second) == (inside.sum(), (inside**2).sum())
+    assert (found.far.n, found.far.undefined) == (values.size - inside.size - 6, 6)
+    histogram, sums, outside = numpy_kernels.tally(values[None], tally.packed)
+    np.testing.assert_array_equal(histogram[0, 1:-1], found.counts[1:-1])
+    assert (*sums[0], outside[0]) == (found.first, found.second, values.size - inside.size)
 
 
 def test_saturating_star_is_drawn_frame_by_frame(engine: Engine) -> None:

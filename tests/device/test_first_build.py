@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 from commands import started
-from processes import printed, python
+from processes import forked, printed, python
 
 pytestmark = pytest.mark.long
 
@@ -60,7 +60,7 @@ OTHERS = {
 
 def run(cache: Path | str, before: str = "", **environment: str) -> dict[str, str]:
     """Run a separate process and return what it prints."""
-    return printed(python(RUN.format(before=before), cache=cache, **environment).stdout)
+    return printed(forked(RUN.format(before=before), cache=cache, **environment))
 
 
 @pytest.fixture(scope="module")

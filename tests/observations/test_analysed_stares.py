@@ -75,7 +75,8 @@ def test_blind_analysis_of_stares_with_pointing_losses_finds_the_flares_and_no_o
 
     The faint star hides its losses of light in the noise of the dark current. At 10 false alarms per star-day their
     bound fails by chance once in a thousand times, that of each 95 % interval once in 2700 times; a flare of these has
-    an S/N of 30 or more. `bench/observed.py` counts more of them.
+    an S/N of 30 or more. Intervals allow for drifts of the star, so that they are several times as wide as the noise
+    here; `test_spectra.py` tests those of stars that drift. `bench/observed.py` counts more stares.
     """
     stars = ((("M3V", 9.0, 0.3), 2940), (("M5V", 11.0, 1.0), 3108))
     outcome = loaded(Path(__file__).parents[2] / "bench" / "observed.py").outcome

@@ -37,15 +37,3 @@ def survey(stare, level, widths, *, star="G2V", magnitude=7.4, more=None, kelvin
     components = Components(quiet, one / quiet.gain_dn_per_electron, templates.weights)
     bank = Bank(widths, templates.directions[list(templates.chosen)], DAVENPORT, 5.0, level)
     return Survey(components, stare, bank), templates
-
-
-def consecutive_alarms(values, points, sigma):
-    """Return the frames that complete a run of `points` consecutive frames above `sigma`, one alarm per run."""
-    above = np.asarray(values > sigma)
-    alarm = np.zeros(above.shape, np.bool_)
-    if above.shape[-1] < points:
-        return alarm
-    windows = np.asarray(np.lib.stride_tricks.sliding_window_view(above, points, axis=-1).all(axis=-1))
-    before = np.concatenate([np.zeros((*above.shape[:-1], 1), np.bool_), windows[..., :-1]], axis=-1)
-    alarm[..., points - 1 :] = windows & ~before
-    return alarm
