@@ -14,7 +14,7 @@ threshold solves only those that can exceed it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
@@ -48,6 +48,9 @@ OTHER_NOISE = 0.5
 CHUNK_FRAMES, CHUNK_TEMPLATES = 256, 512
 #: Largest number of frames whose correlations are products with a matrix, which are faster than transforms then.
 MOST_DENSE = 128
+#: Number of frames from which templates share the transforms of light curves, the shortest blocks of these, and the
+#: length of a block in longest kernels of it.
+LEAST_SHARED, LEAST_BLOCK, KERNELS_PER_BLOCK = 2**14, 2**12, 4
 #: Approximate number of values in an array of a batch of light curves.
 BATCH = 2**21
 #: Number of values of light curves below which templates are searched one after another.
@@ -237,16 +240,16 @@ class ProcessSearch:
             searched.
         """
         rows = self.rows if above is None else [None] * len(self.filters)
-        scores = self.scores(sums)
+        scores = Correlations(self.scores(sums), [(one.shape.size, one.first) for one in self.filters])
         found = partial(self._values, scores, above)
         pairs = list(zip(self.filters, rows, strict=True))
-        yield from map_in_threads(lambda pair: found(*pair), pairs, small=scores.size < FEW_VALUES)
+        yield from map_in_threads(lambda pair: found(*pair), pairs, small=scores.values.size < FEW_VALUES)
 
     def _values(
-        self, scores: Float, above: float | None, one: Filter, row: FilterRow | None
+        self, scores: Correlations, above: float | None, one: Filter, row: FilterRow | None
     ) -> tuple[FilterRow, Float]:
         """Return a row, if it is not given, with rho; see `values`."""
-        correlated = _correlated(scores, one.shape, one.first)[..., one.peaks]
+        correlated = scores.of(one.shape, one.first)[..., one.peaks]
         rho = np.einsum("dk,sko->sdo", self.bank.directions, correlated)
         if row is None:
             assert above is not None
@@ -396,6 +399,50 @@ class ProcessSearch:
         place = self.at[begin:end, None] - starts + 1
         columns = padded[np.clip(place, 0, shape.size + 1, out=place)]
         return self.covariances[k].squared_norms(columns, int(begin), MOST_MARGIN)
+
+
+class Correlations:
+    """Correlations of light curves with many kernels, of which those of alike lengths share the transforms of the data.
+
+    Parameters
+    ----------
+    values : ndarray, shape (..., n)
+        Values outside are zero.
+    kernels : sequence of tuple of int
+        Length and first frame of each kernel.
+    """
+
+    def __init__(self, values: Float, kernels: Sequence[tuple[int, int]]) -> None:
+        from scipy.fft import rfft
+
+        self.values, n = values, values.shape[-1]
+        self._before = max(0, -min(first for _, first in kernels))
+        self._spectra: dict[int, NDArray[np.complex128]] = {}
+        for length in {self._length(size) for size, _ in kernels} if n > LEAST_SHARED else ():
+            # Blocks overlap by the longest kernel.
+            step = length - length // KERNELS_PER_BLOCK + 1
+            number = -(-(n + self._before + max(size + first for size, first in kernels)) // step)
+            after = (number - 1) * step + length - n - self._before
+            padded = np.pad(values, [(0, 0)] * (values.ndim - 1) + [(self._before, after)])
+            blocks = np.lib.stride_tricks.sliding_window_view(padded, length, axis=-1)[..., ::step, :]
+            self._spectra[length] = rfft(blocks, axis=-1)
+
+    @staticmethod
+    def _length(size: int) -> int:
+        """Return the length of the blocks for a kernel."""
+        return max(LEAST_BLOCK, KERNELS_PER_BLOCK << int(size - 1).bit_length())
+
+    def of(self, kernel: Float, first: int) -> Float:
+        """Return sum_k values[o + first + k] kernel[k] for every frame o of the last axis."""
+        from scipy.fft import irfft, rfft
+
+        n, length = self.values.shape[-1], self._length(kernel.size)
+        if length not in self._spectra:
+            return _correlated(self.values, kernel, first)
+        step = length - length // KERNELS_PER_BLOCK + 1
+        product = self._spectra[length] * rfft(kernel, length).conj()
+        found = irfft(product, length, axis=-1)[..., :step].reshape(*self.values.shape[:-1], -1)
+        return found[..., self._before + first : self._before + first + n]
 
 
 def _correlated(values: Float, kernel: Float, first: int) -> Float:

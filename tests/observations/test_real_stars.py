@@ -17,7 +17,7 @@ from scipy.linalg import null_space
 
 from mauvecl import SHAPES, Frames, read_frames
 from mauvecl.observations.process import Process, ProcessTerm, level_fit
-from mauvecl.observations.process_search import ProcessSearch
+from mauvecl.observations.process_search import LEAST_SHARED, Correlations, ProcessSearch
 from mauvecl.observations.search import bank_of, stare_of
 from mauvecl.search.search import select_frames
 
@@ -44,6 +44,19 @@ def one_over_f(rng: np.random.Generator, n: int, rms: float) -> Float:
     amplitude[1:] /= np.sqrt(frequency[1:])
     series = np.fft.irfft(amplitude)[:n]
     return rms * series / series.std()
+
+
+@pytest.mark.parametrize("n", [100, LEAST_SHARED // 4, LEAST_SHARED + 1, 3 * LEAST_SHARED])
+def test_correlations_are_sums_over_the_kernel(n: int) -> None:
+    rng = np.random.default_rng(411)
+    values = rng.standard_normal((2, 1, n))
+    kernels = [(1, 0), (30, -5), (1024, -1023), (1025, 3), (4097, -700)]
+    found = Correlations(values, kernels)
+    for size, first in kernels:
+        kernel = rng.standard_normal(size)
+        around = np.pad(values[1, 0], 5000)
+        expected = np.correlate(around, kernel, "valid")[5000 + first : 5000 + first + n]
+        np.testing.assert_allclose(found.of(kernel, first)[1, 0], expected, rtol=0, atol=1e-10)
 
 
 def test_covariance_is_that_of_dense_matrices() -> None:
