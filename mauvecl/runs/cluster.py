@@ -50,8 +50,13 @@ class _Attempt:
     task: Task
     #: Number of the attempt, of at most `MAX_TRIES`.
     tried: int = 1
-    #: Workers that may count it; None for all.
+    #: Workers that may count it, and those that may hold its request; None for all.
     workers: list[str] | None = None
+    holders: list[str] | None = None
+
+    def is_left_by(self, present: set[str]) -> bool:
+        """Return whether all workers that may count it, or hold its request, have left."""
+        return any(some and present.isdisjoint(some) for some in (self.workers, self.holders))
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +99,7 @@ class DaskWorkers:
         self._where, self._device, self.retries, self._sends = where, device, 0, 0
         self._lock = threading.Lock()
         self._closing = False
-        self._given: dict[str, DaskFuture[Any]] = {}
+        self._given: dict[str, tuple[DaskFuture[Any], list[str] | None]] = {}
         # Futures of submitted tasks.
         self._sent: dict[DaskFuture[Any], _Attempt] = {}
         # Addresses of workers with other code, which may have joined after the start.
@@ -162,13 +167,15 @@ class DaskWorkers:
                     # A task instead of scattered data, since the scheduler can repeat it if its worker is lost. Bytes,
                     # because a worker with other code might read and write a request differently.
                     content, key = pickle.dumps(task.request), f"mauvecl-request-{task.key}-{self._sends}"
-                    self._given[task.key] = self._client.submit(_keep, content, key=key, workers=attempt.workers)
+                    kept = self._client.submit(_keep, content, key=key, workers=attempt.workers)
+                    self._given[task.key] = kept, attempt.workers
                     if len(self._given) > MAX_REQUESTS:
                         del self._given[next(iter(self._given))]
+                request, attempt.holders = self._given[task.key]
                 self._sends += 1
                 sent = self._client.submit(
                     _count,
-                    self._given[task.key],
+                    request,
                     task.shard,
                     self._device,
                     key=f"mauvecl-{task.name}-{self._sends}",
@@ -214,9 +221,7 @@ class DaskWorkers:
                 # The client is closed or has lost the scheduler.
                 return
             with self._lock:
-                left = {
-                    sent: one for sent, one in self._sent.items() if one.workers and present.isdisjoint(one.workers)
-                }
+                left = {sent: one for sent, one in self._sent.items() if one.is_left_by(present)}
                 for sent in left:
                     del self._sent[sent]
             for attempt in left.values():

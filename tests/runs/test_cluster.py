@@ -334,6 +334,27 @@ def test_shards_whose_workers_have_left_are_sent_to_others(
     same(found, engine.detect(quiet, flares, realisations=150_000, seed=6))
 
 
+def test_shards_whose_request_has_left_are_sent_again(
+    tmp_path: Path, engine: Engine, scene: list[Expectation], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Restrict a request to a worker that has left, and only the first of the shards that need it."""
+    monkeypatch.setattr("mauvecl.runs.cluster.RECOUNT_S", 0.5)
+    quiet, *flares = scene
+    with by_hand(tmp_path) as (_, file):
+        workers = DaskWorkers(str(file))
+        workers._strangers.add("tcp://127.0.0.1:1")
+        threading.Thread(target=workers._watch, daemon=True).start()
+        allowed = iter([["tcp://127.0.0.1:2"]])
+        monkeypatch.setattr(workers, "_ours", lambda: next(allowed, None))
+        pool = Pool(workers)
+        late = threading.Timer(60, pool.stop)
+        late.start()
+        found = pool.detect(quiet, flares, realisations=50_000, seed=6)
+        late.cancel()
+        workers.close()
+    same(found, engine.detect(quiet, flares, realisations=50_000, seed=6))
+
+
 class Leaves:
     """A finished task whose worker leaves while the result is transferred."""
 
