@@ -61,8 +61,8 @@ from mauvecl.flares.stare_scene import (
 )
 from mauvecl.noise.comparison import NOISE_FREE, Comparison
 from mauvecl.noise.drawing import Drawing, DrawingOptions
+from mauvecl.noise.processes import NONE, Processes
 from mauvecl.noise.scene import BATCH, prepare
-from mauvecl.noise.unknowns import NONE, Processes
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import OneOrMore

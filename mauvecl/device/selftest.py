@@ -36,8 +36,8 @@ from mauvecl.host.exposure.expectation import Expectation
 from mauvecl.noise import layout, reference
 from mauvecl.noise.comparison import Comparison
 from mauvecl.noise.disturbances import CosmicRays, Uniform
+from mauvecl.noise.processes import NONE, Processes
 from mauvecl.noise.scene import prepare
-from mauvecl.noise.unknowns import NONE, Processes
 from mauvecl.schema.columns import Column
 
 if TYPE_CHECKING:

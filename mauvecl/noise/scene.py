@@ -32,7 +32,7 @@ from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
-    from mauvecl.noise.unknowns import Processes
+    from mauvecl.noise.processes import Processes
 
 Float = NDArray[np.float64]
 

@@ -9,24 +9,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar, get_args
-
-from pydantic import create_model
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 
 from mauvecl.noise.disturbances import (
     AdditiveProcess,
     CosmicRays,
     Normal,
-    ParticleRate,
     PointingDrifts,
     Prior,
-    PriorField,
     Uniform,
 )
-from mauvecl.schema.calls import validated
 from mauvecl.schema.fields import range_of
 from mauvecl.schema.physical import DetectorTemperature
-from mauvecl.schema.section import Section
 
 if TYPE_CHECKING:
     import numpy as np
@@ -246,71 +240,6 @@ PROCESSES = _by_name(
         source="assumption: the scatter of the zodiacal light about its model",
     ),
 )
-
-#: Fields of `Processes`.
-_process_keys: Any = {name: (kind | None, None) for name, kind in ADDITIVE.items()} | dict.fromkeys(
-    PROCESSES, (PriorField | None, None)
-)
-
-
-@validated
-class Processes(create_model("_Processes", __base__=Section, **_process_keys)):  # type: ignore[misc]
-    """Optional noise processes, and the study section that enables them; those that are None are disabled.
-
-    Attributes
-    ----------
-    cosmic_rays : CosmicRays, optional
-        Hits by charged particles.
-    jitter : Prior, optional
-        Fraction of the light that a frame loses by pointing jitter, in addition to the expectation's losses; drawn per
-        frame. The paper expects ``Uniform(0, 0.05)``.
-    detector_temperature : Prior, optional
-        Temperature in deg C, drawn per realisation; the dark current follows the instrument's law.
-    light_loss, pointing_loss : Prior, optional
-        Replacements of the instrument's values, drawn per realisation.
-    qe_scale : Prior, optional
-        Factor on the quantum efficiency, drawn per realisation.
-    sky_level : Prior, optional
-        Factor on the sky's light, drawn per realisation.
-    """
-
-    @property
-    def additive(self) -> dict[str, AdditiveProcess]:
-        """Enabled additive processes by name."""
-        return {name: process for name in ADDITIVE if (process := getattr(self, name)) is not None}
-
-    @property
-    def modulations(self) -> tuple[tuple[str, SignalPart], ...]:
-        """Names of the enabled priors and the part of the signal that each changes."""
-        return tuple((name, varied.of) for name, varied in PROCESSES.items() if getattr(self, name) is not None)
-
-    @property
-    def additive_only(self) -> Self:
-        """The processes without priors."""
-        copy: Self = self.model_copy(update=dict.fromkeys(PROCESSES))
-        return copy
-
-    @property
-    def particle_processes(self) -> list[AdditiveProcess]:
-        """Enabled processes that incident particles cause."""
-        return [process for process in self.additive.values() if process.particles_per_cm2_s is not None]
-
-    @property
-    def particles_per_cm2_s(self) -> float:
-        """Largest rate of incident particles of the enabled processes; zero without any."""
-        return max((process.particles_per_cm2_s or 0.0 for process in self.particle_processes), default=0.0)
-
-    def with_particles(self, rate_per_cm2_s: ParticleRate) -> Self:
-        """Return a copy in which all processes caused by incident particles have this rate, enabled if necessary."""
-        every = {name: getattr(self, name) or kind() for name, kind in ADDITIVE.items()}
-        caused = {name: process for name, process in every.items() if process.particles_per_cm2_s is not None}
-        update = {name: one.with_particles(rate_per_cm2_s) for name, one in caused.items()}
-        copy: Self = self.model_copy(update=update)
-        return copy
-
-
-NONE = Processes()
-
 
 #: Nuisance parameters with built-in spectra; keys of studies' ``nuisances``.
 NUISANCES = _by_name(

@@ -32,7 +32,7 @@ import scipy
 from numpy.typing import NDArray
 
 from mauvecl.flares.stare_scene import StaresRequest, method_for
-from mauvecl.noise.unknowns import NONE, Processes
+from mauvecl.noise.processes import NONE, Processes
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import DAY_S
 from mauvecl.search.templates import LEAST_SHARE, Bank, Template

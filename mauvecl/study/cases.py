@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from mauvecl.host.exposure.star import Neighbours
     from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.host.stars.source import Source
-    from mauvecl.noise.unknowns import Processes
+    from mauvecl.noise.processes import Processes
     from mauvecl.study.sections import Observation, SkyLight
     from mauvecl.study.study import Study
 

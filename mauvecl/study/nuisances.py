@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from mauvecl.detection.nuisances import Nuisances
     from mauvecl.host.exposure.expectation import Expectation
-    from mauvecl.noise.unknowns import Processes
+    from mauvecl.noise.processes import Processes
 
 
 def _spread(given: Any) -> Any:

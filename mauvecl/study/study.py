@@ -16,7 +16,8 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 from mauvecl.host.orbit.observing_limits import Limits
 from mauvecl.host.tables.ecsv import read_ecsv
 from mauvecl.host.tables.files import parsing, possible, read_bytes, read_text, toml, without_columns
-from mauvecl.noise.unknowns import COURSES, NONE, Processes
+from mauvecl.noise.processes import NONE, Processes
+from mauvecl.noise.unknowns import COURSES
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.fields import AnyUnit, Flag, found
