@@ -402,7 +402,7 @@ class Likelihood:
                 every = np.concatenate([place, elsewhere])
                 shared += epsilon**2 * light * (np.exp(-np.abs(place[:, None] - every) / LOG_TIME) @ whole)
                 variance += epsilon**2 * float(whole @ np.exp(-np.abs(every[:, None] - every) / LOG_TIME) @ whole)
-        factor = scipy.linalg.cholesky(covariance, lower=True, check_finite=False)
+        factor = scipy.linalg.cholesky(covariance, lower=True)
         # LAPACK's inverse from a factor, in half the time of a solution for each column; it leaves the upper half.
         lower = np.tril(scipy.linalg.lapack.dpotri(factor, lower=True)[0])
         inverse = lower + np.tril(lower, -1).T
@@ -429,7 +429,7 @@ class Likelihood:
         pairs = (weights[:, :, None] * weights[:, None]).reshape(len(weights), -1)
         # Long before the peak nothing is bright.
         largest = parts.max(axis=(0, 1))
-        bright = largest > DARK * largest.max()
+        bright = largest >= DARK * largest.max()
         parts, inverse = parts[:, :, bright], self.inverse[bright]
         toward, inverse = inverse @ values, inverse[:, bright]
         weighted = (parts.reshape(-1, len(inverse)) @ inverse).reshape(parts.shape)

@@ -419,8 +419,7 @@ class Correlations:
         self._before = max(0, -min(first for _, first in kernels))
         self._spectra: dict[int, NDArray[np.complex128]] = {}
         for length in {self._length(size) for size, _ in kernels} if n > LEAST_SHARED else ():
-            # Blocks overlap by the longest kernel.
-            step = length - length // KERNELS_PER_BLOCK + 1
+            step = self._step(length)
             number = -(-(n + self._before + max(size + first for size, first in kernels)) // step)
             after = (number - 1) * step + length - n - self._before
             padded = np.pad(values, [(0, 0)] * (values.ndim - 1) + [(self._before, after)])
@@ -432,6 +431,11 @@ class Correlations:
         """Return the length of the blocks for a kernel."""
         return max(LEAST_BLOCK, KERNELS_PER_BLOCK << int(size - 1).bit_length())
 
+    @staticmethod
+    def _step(length: int) -> int:
+        """Return the distance of blocks, which overlap by the longest kernel."""
+        return length - length // KERNELS_PER_BLOCK + 1
+
     def of(self, kernel: Float, first: int) -> Float:
         """Return sum_k values[o + first + k] kernel[k] for every frame o of the last axis."""
         from scipy.fft import irfft, rfft
@@ -439,9 +443,8 @@ class Correlations:
         n, length = self.values.shape[-1], self._length(kernel.size)
         if length not in self._spectra:
             return _correlated(self.values, kernel, first)
-        step = length - length // KERNELS_PER_BLOCK + 1
         product = self._spectra[length] * rfft(kernel, length).conj()
-        found = irfft(product, length, axis=-1)[..., :step].reshape(*self.values.shape[:-1], -1)
+        found = irfft(product, length, axis=-1)[..., : self._step(length)].reshape(*self.values.shape[:-1], -1)
         return found[..., self._before + first : self._before + first + n]
 
 

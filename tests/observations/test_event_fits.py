@@ -79,6 +79,14 @@ def test_fits_of_all_shapes_are_those_of_each() -> None:
             assert slope[k, node] == pytest.approx(model @ likelihood.inverse @ values, rel=1e-8, abs=1e-8)
 
 
+def test_parts_without_light_have_no_product_with_values() -> None:
+    n = 12
+    likelihood = Likelihood(SimpleNamespace(), np.eye(n), 0.0, np.zeros(n), 0.0, np.zeros(n), 0.0)  # type: ignore[arg-type]
+    slope, information = likelihood.matched(np.zeros((len(GENERAL.parts), 5, n)), GENERAL.weights, np.ones(n))
+    assert (slope == 0).all()
+    assert (information > 0).all()
+
+
 @pytest.mark.parametrize("mean", [-40.0, -5.0, 0.0, 3.0, 1e4])
 def test_quantiles_are_those_of_a_truncated_normal_distribution(mean: float) -> None:
     mixture = Mixture(np.log([0.2, 0.8]), np.full(2, mean), np.full(2, 2.0))

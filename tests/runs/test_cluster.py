@@ -315,22 +315,29 @@ def test_cluster_of_workers_with_other_code_raises(
         workers.close()
 
 
+@contextmanager
+def watched(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[DaskWorkers]:
+    """Connect to a worker started by hand, and watch for shards whose workers have left."""
+    monkeypatch.setattr("mauvecl.runs.cluster.RECOUNT_S", 0.5)
+    with by_hand(folder) as (_, file):
+        workers = DaskWorkers(str(file))
+        workers._strangers.add("tcp://127.0.0.1:1")
+        threading.Thread(target=workers._watch, daemon=True).start()
+        yield workers
+        workers.close()
+
+
 def test_shards_whose_workers_have_left_are_sent_to_others(
     tmp_path: Path, engine: Engine, scene: list[Expectation], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Restrict shards to a worker that ends and is replaced under another address."""
-    monkeypatch.setattr("mauvecl.runs.cluster.RECOUNT_S", 0.5)
     quiet, *flares = scene
-    with by_hand(tmp_path) as (_, file):
-        workers = DaskWorkers(str(file))
-        workers._strangers.add("tcp://127.0.0.1:1")
-        threading.Thread(target=workers._watch, daemon=True).start()
+    with watched(tmp_path, monkeypatch) as workers:
         pool = Pool(workers)
         (pid,) = workers._client.run(os.getpid).values()
 
         kill_after(pool, 5, lambda: os.kill(pid, signal.SIGKILL))
         found = pool.detect(quiet, flares, realisations=150_000, seed=6)
-        workers.close()
     same(found, engine.detect(quiet, flares, realisations=150_000, seed=6))
 
 
@@ -338,12 +345,8 @@ def test_shards_whose_request_has_left_are_sent_again(
     tmp_path: Path, engine: Engine, scene: list[Expectation], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Restrict a request to a worker that has left, and only the first of the shards that need it."""
-    monkeypatch.setattr("mauvecl.runs.cluster.RECOUNT_S", 0.5)
     quiet, *flares = scene
-    with by_hand(tmp_path) as (_, file):
-        workers = DaskWorkers(str(file))
-        workers._strangers.add("tcp://127.0.0.1:1")
-        threading.Thread(target=workers._watch, daemon=True).start()
+    with watched(tmp_path, monkeypatch) as workers:
         allowed = iter([["tcp://127.0.0.1:2"]])
         monkeypatch.setattr(workers, "_ours", lambda: next(allowed, None))
         pool = Pool(workers)
@@ -351,7 +354,6 @@ def test_shards_whose_request_has_left_are_sent_again(
         late.start()
         found = pool.detect(quiet, flares, realisations=50_000, seed=6)
         late.cancel()
-        workers.close()
     same(found, engine.detect(quiet, flares, realisations=50_000, seed=6))
 
 
