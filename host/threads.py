@@ -15,7 +15,12 @@ Answer = TypeVar("Answer")
 MOST_THREADS = 4
 
 
-def map_in_threads(work: Callable[[Item], Answer], items: Iterable[Item], *, small: bool = False) -> Generator[Answer]:
+def map_in_threads(
+    work: Callable[[Item], Answer],
+    items: Iterable[Item],
+    number: int | None = None,
+    stop: Callable[[], object] | None = None,
+) -> Generator[Answer]:
     """Apply a function to items in several threads and yield the results in the order of the items.
 
     At most one result for each thread waits to be yielded, so that the memory stays limited.
@@ -24,21 +29,27 @@ def map_in_threads(work: Callable[[Item], Answer], items: Iterable[Item], *, sma
     ----------
     work : callable
     items : iterable
-    small : bool, optional
-        Whether the work is too little for threads; it is then done in the caller's.
+    number : int, optional
+        Number of threads, by default that of the cores, up to `MOST_THREADS`; one works in the caller's thread.
+    stop : callable, optional
+        Ends work in progress if it fails, or if its caller needs no more results; without it, that work is awaited.
     """
-    number = min(os.cpu_count() or 1, MOST_THREADS)
-    if small or number == 1:
+    number = number or min(os.cpu_count() or 1, MOST_THREADS)
+    if number == 1:
         yield from map(work, items)
         return
     ahead: deque[Future[Answer]] = deque()
-    threads = ThreadPoolExecutor(number)
-    try:
-        for item in items:
-            ahead.append(threads.submit(work, item))
-            if len(ahead) > number:
+    with ThreadPoolExecutor(number) as threads:
+        try:
+            for item in items:
+                ahead.append(threads.submit(work, item))
+                if len(ahead) > number:
+                    yield ahead.popleft().result()
+            while ahead:
                 yield ahead.popleft().result()
-        while ahead:
-            yield ahead.popleft().result()
-    finally:
-        threads.shutdown(cancel_futures=True)
+        except BaseException:
+            for future in ahead:
+                future.cancel()
+            if stop is not None:
+                stop()
+            raise

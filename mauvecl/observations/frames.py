@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from enum import IntFlag
 from functools import cached_property
@@ -154,8 +154,13 @@ class Reason(IntFlag):
     @classmethod
     def all_words(cls, values: NDArray[Any]) -> NDArray[np.str_]:
         """Return the reasons of many frames in words."""
-        different, place = np.unique(values, return_inverse=True)
-        return np.array([cls.words(int(value)) for value in different], np.str_)[place]
+        return np.array(_worded(values, cls.words), np.str_)
+
+
+def _worded(values: NDArray[Any], words: Callable[[int], str]) -> list[str]:
+    """Return the words for many values, made once for each that differs."""
+    texts = {value: words(int(value)) for value in np.unique(values).tolist()}
+    return [texts[value] for value in values.tolist()]
 
 
 def _check_light(name: str, time: Float, light: Float) -> None:
@@ -391,9 +396,7 @@ class Frames:
         """Bits of the quality flag that exclude each frame, as in "Desat (32)"; empty for others."""
         if self.quality is None:
             return [""] * self.n_frames
-        bits = QualityBits(self.quality_mask, self.mission)
-        words = {int(value): bits.words(int(value)) for value in np.unique(self.quality)}
-        return [words[value] for value in self.quality.tolist()]
+        return _worded(self.quality, QualityBits(self.quality_mask, self.mission).words)
 
     def shifted(self, by_s: Annotated[Float, Unit("s")]) -> Self:
         """Return the frames with other times."""

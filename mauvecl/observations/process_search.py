@@ -199,7 +199,7 @@ class ProcessSearch:
             _ = self._before.filters
         _ = self._levels
         templates = [(template, phase) for template in self.bank.templates for phase in range(len(template.phases))]
-        filters = list(map_in_threads(lambda one: self._filter(*one), templates, small=self.n_grid < FEW_VALUES))
+        filters = list(map_in_threads(lambda one: self._filter(*one), templates, _threads(self.n_grid)))
         self._before = None
         return filters
 
@@ -243,7 +243,7 @@ class ProcessSearch:
         scores = Correlations(self.scores(sums), [(one.shape.size, one.first) for one in self.filters])
         found = partial(self._values, scores, above)
         pairs = list(zip(self.filters, rows, strict=True))
-        yield from map_in_threads(lambda pair: found(*pair), pairs, small=scores.values.size < FEW_VALUES)
+        yield from map_in_threads(lambda pair: found(*pair), pairs, _threads(scores.values.size))
 
     def _values(
         self, scores: Correlations, above: float | None, one: Filter, row: FilterRow | None
@@ -399,6 +399,11 @@ class ProcessSearch:
         place = self.at[begin:end, None] - starts + 1
         columns = padded[np.clip(place, 0, shape.size + 1, out=place)]
         return self.covariances[k].squared_norms(columns, int(begin), MOST_MARGIN)
+
+
+def _threads(n_values: int) -> int | None:
+    """Return the number of threads for templates in some values: one for few, or None for the default."""
+    return 1 if n_values < FEW_VALUES else None
 
 
 class Correlations:

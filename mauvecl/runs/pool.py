@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import uuid
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from mauvecl.detection.snr import Arrays, DetectionSums, SnrSums
 from mauvecl.device.engine import DeviceError, DeviceRecord, Engine, Stares
 from mauvecl.device.launches import Progress
 from mauvecl.flares.stare_scene import StaresRequest, StareSums
+from mauvecl.host.threads import map_in_threads
 from mauvecl.runs.checkpoint import Checkpoint, Task, fingerprint, shards
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
@@ -338,18 +338,4 @@ def map_in_order(
     if not isinstance(engine, Pool):
         yield from map(work, items)
         return
-    ahead: deque[Future[Answer]] = deque()
-    with ThreadPoolExecutor(engine.workers.count + PREPARED) as threads:
-        try:
-            for item in items:
-                ahead.append(threads.submit(work, item))
-                # Limit the number of results that wait to be yielded.
-                if len(ahead) > engine.workers.count + PREPARED:
-                    yield ahead.popleft().result()
-            while ahead:
-                yield ahead.popleft().result()
-        except BaseException:
-            for future in ahead:
-                future.cancel()
-            engine.stop()
-            raise
+    yield from map_in_threads(work, items, engine.workers.count + PREPARED, engine.stop)

@@ -18,13 +18,13 @@ def several_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "cpu_count", lambda: 8)
 
 
-@pytest.mark.parametrize("small", [False, True])
-def test_results_are_in_the_order_of_the_items(small: bool) -> None:
+@pytest.mark.parametrize("number", [None, 1, 3])
+def test_results_are_in_the_order_of_the_items(number: int | None) -> None:
     def work(k: int) -> int:
         time.sleep(0.002 * (k % 3))
         return k * k
 
-    assert list(map_in_threads(work, range(30), small=small)) == [k * k for k in range(30)]
+    assert list(map_in_threads(work, range(30), number)) == [k * k for k in range(30)]
 
 
 def test_items_are_worked_on_at_the_same_time() -> None:
