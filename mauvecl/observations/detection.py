@@ -25,7 +25,7 @@ Bool = NDArray[np.bool_]
 #: Statistic of events whose frames take no part in fits of the process.
 PROVISIONAL = 5.0
 #: Largest number of alternations of process and events, and of searches.
-ROUNDS, MAX_PASSES = 6, 40
+ROUNDS, MAX_PASSES = 12, 40
 #: Number of events after which no further ones are searched, and the same for each frame of a long light curve.
 MOST_EVENTS, MOST_PER_FRAME = 500, 1 / 500
 #: Largest number of events in independent noise that are compared with a process, and parameters of a flare.
@@ -42,9 +42,11 @@ MIN_QUIET = 20
 #: Share of a template's response to the flux of other events that a further event must exceed, since their shapes are
 #: not exactly known.
 UNCERTAIN = 0.5
-#: Flux of a template, in standard deviations of a frame, to which its tail belongs to the event; the longest tail and
-#: the beginning, in half-widths.
-FAINT, LONGEST_TAIL, BEGINNING = 0.05, 60.0, 1.2
+#: Flux of a template, in standard deviations of a frame, to which its tail belongs to the event: the smallest for which
+#: more than a few events leave most frames to the star (number and share assumed).
+FAINT, FEW, MOST_TAKEN = (0.05, 0.2, 0.8), 2, 0.3
+#: Longest tail and beginning of a template that belong to an event, in half-widths.
+LONGEST_TAIL, BEGINNING = 60.0, 1.2
 #: Statistic of an event, relative to that of an event next to it, below which it is that one's beginning or tail.
 BELONGING = 0.1
 #: Half-widths, and shortest time scales of the process, around a larger event in which smaller ones wait for the next
@@ -286,7 +288,15 @@ def detect_events(survey: SeriesSurvey, threshold: float, steps: Steps | None = 
     steps : Steps, optional
         Reports each search.
     """
-    steps = steps or Steps()
+    for faint in FAINT:
+        events, taken = _detect_to(survey, threshold, faint, steps or Steps())
+        if len(events) <= FEW or taken.mean() <= MOST_TAKEN:
+            break
+    return events, taken
+
+
+def _detect_to(survey: SeriesSurvey, threshold: float, faint: float, steps: Steps) -> tuple[list[Detection], Bool]:
+    """Detect events whose tails end at a flux in standard deviations of a frame, as `detect_events`."""
     n = survey.stare.n_frames
     taken, found = np.zeros(n, np.bool_), list[Detection]()
     light = np.zeros_like(survey.sums)
@@ -309,14 +319,14 @@ def detect_events(survey: SeriesSurvey, threshold: float, steps: Steps | None = 
             light[rows] += flux[:, None] * unit
         mine, free = [], int(left.sum())
         for one in new:
-            first, last = _extent(survey, taken, noise, one)
+            first, last = _extent(survey, taken, faint * noise, one)
             # Some frames are left for the level, the faintest of the event.
             short = MIN_QUIET - free + last - first + 1
             last = max(last - max(short, 0), first)
             mine.append((first, last))
             free -= int(np.count_nonzero(~taken[first : last + 1]))
             taken[first : last + 1] = True
-        mine = _extended(survey, taken, mine, new)
+        mine = _extended(survey, taken, mine, new, crowded=faint > FAINT[0])
         for (first, last), one in zip(mine, new, strict=True):
             taken[first : last + 1] = True
             found.append(replace(one, first=first, last=last))
@@ -347,9 +357,11 @@ def _merged(found: list[Detection]) -> list[Detection]:
 
 def _light_of(survey: SeriesSurvey, peak_s: float, half_width_s: float, amplitude: float) -> tuple[slice, Float]:
     """Return the frames in which a flare is not negligible, and its mean in each, in the unit of the amplitude."""
-    start = survey.stare.start_s
-    rows = slice(*np.searchsorted(start, [peak_s - REACH[0] * half_width_s, peak_s + REACH[1] * half_width_s]))
-    edges = np.column_stack([start[rows], start[rows] + survey.stare.frame_s])
+    start, frame_s = survey.stare.start_s, survey.stare.frame_s
+    # From the frame on in which it begins.
+    ends = [peak_s - REACH[0] * half_width_s - frame_s, peak_s + REACH[1] * half_width_s]
+    rows = slice(*np.searchsorted(start, ends))
+    edges = np.column_stack([start[rows], start[rows] + frame_s])
     return rows, amplitude * survey.bank.shape.mean_over(edges, peak_s, half_width_s)
 
 
@@ -384,10 +396,10 @@ def _search_once(part: SeriesSurvey, search: ProcessSearch, light: Float, thresh
     return accepted
 
 
-def _extent(survey: SeriesSurvey, taken: Bool, noise: float, one: Detection) -> tuple[int, int]:
-    """Return the first and last frame in which the template of an event is brighter than `FAINT` times the noise."""
+def _extent(survey: SeriesSurvey, taken: Bool, faint: float, one: Detection) -> tuple[int, int]:
+    """Return the first and last frame in which the template of an event is brighter than a flux."""
     tau = np.linspace(0.0, LONGEST_TAIL, 1200)
-    bright = tau[one.amplitude * survey.bank.shape.at(tau) > FAINT * noise]
+    bright = tau[one.amplitude * survey.bank.shape.at(tau) > faint]
     tail = max(1.0, float(bright[-1]) if bright.size else 0.0)
     frame_s = survey.stare.frame_s
     start = one.peak_s - BEGINNING * one.half_width_s - frame_s / 2
@@ -406,9 +418,12 @@ def _extent(survey: SeriesSurvey, taken: Bool, noise: float, one: Detection) -> 
 
 
 def _extended(
-    survey: SeriesSurvey, taken: Bool, extents: list[tuple[int, int]], found: list[Detection]
+    survey: SeriesSurvey, taken: Bool, extents: list[tuple[int, int]], found: list[Detection], *, crowded: bool
 ) -> list[tuple[int, int]]:
-    """Return events that go on as long as the frames at their ends are brighter than the level."""
+    """Return events that go on as long as the frames at their ends are brighter than the level.
+
+    In crowded light curves they end where these are not.
+    """
     quiet = ~taken
     if quiet.sum() < MIN_QUIET:
         return extents
@@ -417,6 +432,10 @@ def _extended(
     longer = []
     for (first, last), one in zip(extents, found, strict=True):
         sigma, length = sigmas[one.direction], last - first + 1
+        if crowded:
+            peak = first + int(sigma[first : last + 1].argmax())
+            while last > peak + 1 and sigma[max(peak, last + 1 - END_FRAMES) : last + 1].mean() < STILL_BRIGHT:
+                last -= 1
         # Gaps that are longer than it end an event.
         before, after = steps[max(0, first - length) : first] > length, steps[last : last + length] > length
         stop = last + (int(after.argmax()) if after.any() else length)

@@ -207,7 +207,10 @@ class Grid:
         """
         window = likelihood.window
         n_node = NODES if len(family.weights) == 1 else NODES_OF_MANY
-        brightest = np.exp(MAX_LOG_AMPLITUDE) * float(np.ptp(window.values[window.inside])) / window.scale
+        # The values of an event of one bin have no range.
+        inside = window.inside
+        light = max(float(np.ptp(window.values[inside])), float(np.sqrt(window.noise[inside].max())))
+        brightest = np.exp(MAX_LOG_AMPLITUDE) * light / window.scale
         for _ in range(REFINEMENTS):
             axes = [np.linspace(low, high, n_node) for low, high in box]
             p, w = (each.ravel() for each in np.meshgrid(axes[0], axes[1], indexing="ij"))

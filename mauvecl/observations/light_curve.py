@@ -105,11 +105,11 @@ def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, taken: Bool, steps
     ndarray of bool, shape (n_frame,)
     """
     none, process = np.zeros_like(taken), fitted.flux_process
-    rotates = any(term.kind == "rotation" for term in process.terms)
+    rotates = any(term.rotates for term in process.terms)
     slow_s = min(survey.stare.duration_s / 3, SLOW_S)
     noise = process.excess * float(np.sqrt(np.median(fitted.flux_variance)))
     fast = any(
-        term.kind != "rotation"
+        not term.rotates
         and term.scale_s < slow_s
         and term.sd * np.sqrt(term.scale_s / survey.stare.frame_s) > LEAST_LOSS * noise
         for term in process.terms

@@ -63,7 +63,7 @@ class Steps:
 
 
 Float = NDArray[np.float64]
-Kind = Literal["correlated", "smooth", "rotation"]
+Kind = Literal["correlated", "smooth", "rotation", "sharp rotation"]
 
 #: Largest number of values to which the parameters of a process are fitted; longer light curves are binned.
 MAX_FITTED = 20_000
@@ -87,7 +87,13 @@ SMOOTH_QUALITY = 2**-0.5
 #: Largest number of iterations of a fit, and the change of log likelihood at which it has converged.
 ITERATIONS, CONVERGED = 80, 1e-3
 #: Number of parameters of each kind of term.
-SIZES: dict[Kind, int] = {"correlated": 2, "smooth": 2, "rotation": 5}
+SIZES: dict[Kind, int] = {"correlated": 2, "smooth": 2, "rotation": 5, "sharp rotation": 4}
+#: Number of harmonics of rotation with sharp features, and their first standard deviation relative to that of the
+#: harmonic before.
+HARMONICS, EACH_HARMONIC = 6, 0.5
+#: Periods whose innovations are searched together for harmonics that the first two leave, and the chance with which
+#: noise has them (assumed).
+TOGETHER, BY_CHANCE = 8.0, 1e-3
 
 
 @dataclass(frozen=True)
@@ -96,7 +102,9 @@ class ProcessTerm:
 
     A correlated term has standard deviation and time scale, with covariances that fall exponentially; a smooth term has
     standard deviation and period of a critically damped oscillator; rotation has standard deviation, period, and
-    quality factor, difference of quality factors and share of the first harmonic of celerite2's `RotationTerm`.
+    quality factor, difference of quality factors and share of the first harmonic of celerite2's `RotationTerm`; sharp
+    rotation, of light with narrow minima or maxima, is the sum of `HARMONICS` oscillators that last equally long, with
+    standard deviation, period, quality factor of the first, and ratio of the standard deviations of neighbours.
     """
 
     kind: Kind
@@ -113,10 +121,15 @@ class ProcessTerm:
         return float(np.exp(self.parameters[1]))
 
     @property
+    def rotates(self) -> bool:
+        """True if the term is periodic."""
+        return self.kind in ("rotation", "sharp rotation")
+
+    @property
     def shortest_s(self) -> float:
         """Shortest time in which the term changes by much of its standard deviation."""
-        divisor = {"correlated": 1.0, "smooth": 2 * np.pi, "rotation": 4 * np.pi}[self.kind]
-        return self.scale_s / divisor
+        turns = {"correlated": 0.5 / np.pi, "smooth": 1, "rotation": 2, "sharp rotation": HARMONICS}[self.kind]
+        return self.scale_s / (2 * np.pi * turns)
 
     def kernel(self) -> Any:
         """Return the term of celerite2."""
@@ -126,8 +139,16 @@ class ProcessTerm:
             return terms.RealTerm(a=values[0] ** 2, c=1.0 / values[1])
         if self.kind == "smooth":
             return terms.SHOTerm(sigma=values[0], rho=values[1], Q=SMOOTH_QUALITY)
-        sigma, period, quality, difference, share = values
-        return terms.RotationTerm(sigma=sigma, period=period, Q0=quality, dQ=difference, f=share)
+        if self.kind == "rotation":
+            sigma, period, quality, difference, share = values
+            return terms.RotationTerm(sigma=sigma, period=period, Q0=quality, dQ=difference, f=share)
+        sigma, period, quality, ratio = values
+        number = np.arange(1, HARMONICS + 1)
+        sizes = ratio ** (number - 1.0)
+        sizes *= sigma / np.linalg.norm(sizes)
+        return terms.TermSum(
+            *(terms.SHOTerm(sigma=size, rho=period / k, Q=k * quality) for k, size in zip(number, sizes, strict=True))
+        )
 
 
 def _terms() -> Any:
@@ -183,9 +204,9 @@ class Process:
 
     def describe(self, unit: float) -> str:
         """Return a description of the terms; `unit` is the light of the star, to which standard deviations relate."""
-        words = {"correlated": "correlated noise", "smooth": "smooth variability", "rotation": "rotation"}
+        words = {"correlated": "correlated noise", "smooth": "smooth variability"}
         parts = [
-            f"{words[term.kind]} ({'period' if term.kind == 'rotation' else 'time scale'} {_time(term.scale_s)}, "
+            f"{words.get(term.kind, term.kind)} ({'period' if term.rotates else 'time scale'} {_time(term.scale_s)}, "
             f"{100 * term.sd / unit:.2g} % in the process)"
             for term in self.terms
         ]
@@ -403,8 +424,42 @@ def fit_process(data: Binned, start: Process | None = None, steps: Steps | None 
         if not lowest < value:
             break
         best, value = other, lowest
+        rotation = best.terms[-1]
+        if rotation.kind == "rotation" and _has_harmonics(data, best):
+            sharp, bic = _fitted(data, (*best.terms[:-1], _sharp(rotation)), np.log(best.excess))
+            tried[sharp.name] = bic
+            if bic < value:
+                best, value = sharp, bic
     least = min(tried.values())
     return Process(best.terms, best.excess, tuple((name, bic - least) for name, bic in tried.items()))
+
+
+def _sharp(rotation: ProcessTerm) -> ProcessTerm:
+    """Return the starting point of rotation with more harmonics."""
+    size, period, quality, *_ = rotation.parameters
+    return ProcessTerm("sharp rotation", (size, period, quality, float(np.log(EACH_HARMONIC))))
+
+
+def _has_harmonics(data: Binned, process: Process) -> bool:
+    """Return whether the innovations of a process that ends with rotation show further harmonics of its period.
+
+    Sine and cosine of each harmonic are fitted to the innovations of some periods together, which lowers their sum of
+    squares by a chi-squared variable if they are noise.
+    """
+    from scipy.stats import chi2
+
+    covariance = process.covariance(data.time_s, data.variance * process.excess**2)
+    left = covariance.whitened(data.values - level_fit(covariance, data.values).mean)
+    turns = (data.time_s - data.time_s[0]) / process.terms[-1].scale_s
+    phases = 2 * np.pi * turns[:, None] * np.arange(3, HARMONICS + 1)
+    waves = np.concatenate([np.sin(phases), np.cos(phases)], axis=1)
+    gain, number = 0.0, 0
+    for part in np.split(np.arange(turns.size), np.searchsorted(turns, np.arange(TOGETHER, turns[-1], TOGETHER))):
+        if part.size > 2 * waves.shape[1]:
+            fit, *_ = np.linalg.lstsq(waves[part], left[part], rcond=None)
+            gain += float(np.square(waves[part] @ fit).sum())
+            number += waves.shape[1]
+    return number > 0 and gain > float(chi2.isf(BY_CHANCE, number))
 
 
 def _starts(data: Binned, best: Process) -> Iterator[ProcessTerm]:
@@ -412,7 +467,7 @@ def _starts(data: Binned, best: Process) -> Iterator[ProcessTerm]:
     covariance = best.covariance(data.time_s, data.variance * best.excess**2)
     fit = level_fit(covariance, data.values)
     spread = max(float(np.std(data.values - fit.mean)), data.noise)
-    rotates = any(term.kind == "rotation" for term in best.terms)
+    rotates = any(term.rotates for term in best.terms)
     low, high = SCALES[0] * data.step_s, SCALES[1] * data.span_s
     for scale in (6 * data.step_s, float(np.sqrt(low * high))):
         size = data.noise if rotates else spread
@@ -446,11 +501,14 @@ def _period(data: Binned) -> float | None:
 def _bounds(data: Binned, kind: Kind, start: tuple[float, ...]) -> list[tuple[float, float]]:
     """Return the bounds of the logarithms of a term's parameters."""
     sizes = tuple(np.log(data.noise) + np.log(AMPLITUDES))
-    if kind != "rotation":
+    if kind in ("correlated", "smooth"):
         return [sizes, (np.log(SCALES[0] * data.step_s), np.log(SCALES[1] * data.span_s))]
     period = start[1]
     around = (max(period - 0.4, np.log(SHORTEST * data.step_s)), period + 0.4)
-    return [sizes, around, (np.log(0.6), np.log(1e4)), (np.log(1e-2), np.log(1e3)), (np.log(1e-3), np.log(2.0))]
+    qualities = (np.log(0.6), np.log(1e4))
+    if kind == "sharp rotation":
+        return [sizes, around, qualities, (np.log(0.05), np.log(0.99))]
+    return [sizes, around, qualities, (np.log(1e-2), np.log(1e3)), (np.log(1e-3), np.log(2.0))]
 
 
 def _fitted(data: Binned, terms: tuple[ProcessTerm, ...], log_excess: float) -> tuple[Process, float]:

@@ -123,6 +123,57 @@ def test_losses_are_found_at_their_frames_and_a_flare_is_none() -> None:
     assert not found[550:560].any()
 
 
+def sharp_rotator(rng: np.random.Generator, noise: float) -> tuple[Frames, list[tuple[float, float, float]]]:
+    """Draw ten days of frames of half an hour of a star whose rotation has three harmonics, with 16 flares.
+
+    Three of ten frames are flagged. Flares decay exponentially, with a time of 1.4 frames.
+
+    Returns
+    -------
+    frames : Frames
+    flares : list of tuple
+        Start of each flare, its equivalent duration, and the part of it in usable frames, s.
+    """
+    frame_s, n = 1765.0, 500
+    time = np.arange(n) * frame_s
+    turn = 2 * np.pi * time / (13.4 * 3600)
+    star, angles = np.ones(n), rng.uniform(0, 6, 3)
+    for k, size in enumerate((12e-3, 4e-3, 1.5e-3)):
+        star += size * np.sin((k + 1) * turn + angles[k])
+    flagged = rng.random(n) < 0.3
+    light, flares = np.zeros(n), []
+    for start in (np.arange(16) + rng.uniform(0.1, 0.6, 16)) * n / 16 * frame_s:
+        after = np.clip(time[:, None] + [0.0, frame_s] - start, 0, None)
+        unit = -np.diff(np.exp(-after / (1.4 * frame_s)))[:, 0] * 1.4
+        flare = 10 ** rng.uniform(-2.7, -1.5) * unit
+        light += flare
+        flares.append((float(start), *(float(flare[kept].sum() * frame_s) for kept in (flagged >= 0, ~flagged))))
+    flux = star + light + noise * rng.standard_normal(n)
+    # The stated errors are too small, as those of a star that flickers.
+    frames = Frames.of(time, flux, np.full(n, noise / 4), exposure_s=frame_s, quality=flagged.astype(int))
+    return frames, flares
+
+
+@pytest.mark.parametrize("seed", [4, pytest.param(5, marks=pytest.mark.long), pytest.param(6, marks=pytest.mark.long)])
+def test_flares_on_sharp_rotation_in_long_frames_are_detected(seed: int) -> None:
+    """Find all bright flares and nothing else, with their energies, and no minimum is a loss."""
+    frames, flares = sharp_rotator(np.random.default_rng([520, seed]), 2e-4)
+    answer = analysed(frames)
+    analysis, events = answer.analysis, answer.events[answer.events["verdict"] == "detected"]
+    assert analysis.level.process.name.startswith("sharp rotation")
+    assert not any("loss" in str(reason) for reason in answer.frames["reason"])
+    seen = [0.0] * len(events)
+    for start, energy, usable in flares:
+        inside = (events["tstart"].to_value("s") < start + 6000) & (start < events["tstop"].to_value("s"))
+        assert inside.any() or usable < 10.0
+        for k in np.flatnonzero(inside):
+            seen[k] += energy
+    assert all(seen)
+    # Flagged frames, of which some show a peak, and an unknown shape make the intervals wide.
+    low, high = (events[f"ed_{end}_95"].to_value("s") for end in ("low", "high"))
+    assert ((low < 1.1 * np.array(seen)) & (high > 0.9 * np.array(seen))).mean() > 0.85
+
+
 def spotted_binary(rng: np.random.Generator, days: float, frame_s: float) -> tuple[Float, Float, Float, list[float]]:
     """Draw times, light, depth of the eclipses and peaks of five flares of 0.8 to 15 %, with noise of 5e-4."""
     time = np.arange(int(days * 86_400 / frame_s)) * frame_s
