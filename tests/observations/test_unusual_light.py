@@ -147,7 +147,7 @@ def sharp_rotator(rng: np.random.Generator, noise: float) -> tuple[Frames, list[
         unit = -np.diff(np.exp(-after / (1.4 * frame_s)))[:, 0] * 1.4
         flare = 10 ** rng.uniform(-2.7, -1.5) * unit
         light += flare
-        flares.append((float(start), *(float(flare[kept].sum() * frame_s) for kept in (flagged >= 0, ~flagged))))
+        flares.append((float(start), float(flare.sum() * frame_s), float(flare[~flagged].sum() * frame_s)))
     flux = star + light + noise * rng.standard_normal(n)
     # The stated errors are too small, as those of a star that flickers.
     frames = Frames.of(time, flux, np.full(n, noise / 4), exposure_s=frame_s, quality=flagged.astype(int))
