@@ -165,12 +165,18 @@ def gapped(rng: np.random.Generator, n: int, most: int = 5) -> NDArray[np.bool_]
     return kept
 
 
-def rotation(rng: np.random.Generator, time_s: Float, period_s: float, amplitude: float, harmonic: float) -> Float:
-    """Draw the light of a spotted star that turns, relative to its mean; phase and size drift for every other one."""
+def rotation(
+    rng: np.random.Generator, time_s: Float, period_s: float, amplitude: float, harmonic: float, orders: int = 2
+) -> Float:
+    """Draw the light of a spotted star that turns, relative to its mean; phase and size drift for every other one.
+
+    Each harmonic is smaller than the one before by the same factor.
+    """
     turns = time_s / period_s
     drift = bool(rng.integers(2))
     total = np.zeros_like(time_s)
-    for order, size in ((1, amplitude), (2, amplitude * harmonic)):
+    for order in range(1, orders + 1):
+        size = amplitude * harmonic ** (order - 1)
         # A cycle of spots takes some ten turns.
         slow = np.sin(2 * np.pi * (turns[:, None] * rng.uniform(0.03, 0.12, 2) + rng.uniform(size=2)))
         phase = turns * order + rng.uniform() + drift * 0.15 * slow[:, 0]
@@ -211,18 +217,28 @@ def pointing_loss(rng: np.random.Generator, time_s: Float, most: float = 0.05, r
 
 
 def quiet(number: int, seed: int) -> Iterator[Trial]:
-    """Draw light curves without a flare: rotators, red noise, thermal cycles, pointing losses, white noise."""
+    """Draw light curves without a flare: rotators, red noise, thermal cycles, pointing losses, white noise.
+
+    Sharp rotators have three to five harmonics.
+    """
     for k in range(number):
-        for index, kind in enumerate(("rotator", "red", "thermal", "pointing", "white")):
+        for index, kind in enumerate(("rotator", "red", "thermal", "pointing", "white", "sharp")):
             rng = np.random.default_rng([seed, 1, index, k])
             n = int(rng.integers(1000, 4001))
-            cadences = [20.0, 60.0, 120.0, 600.0, 1800.0] if kind in ("rotator", "red", "white") else [5.0, 20.0, 60.0]
+            cadences = (
+                [20.0, 60.0, 120.0, 600.0, 1800.0]
+                if kind in ("rotator", "red", "white", "sharp")
+                else [5.0, 20.0, 60.0]
+            )
             cadence, noise = float(rng.choice(cadences)), between(rng, 1e-4, 5e-3)
             time_s = np.arange(n) * cadence
             level, loss = np.ones(n), np.zeros(n)
             if kind == "rotator":
                 level += rotation(rng, time_s, between(rng, 0.2, 12) * DAY_S, between(rng, 1e-3, 0.05),
                                   rng.uniform(0, 0.7))  # fmt: skip
+            elif kind == "sharp":
+                level += rotation(rng, time_s, between(rng, 0.2, 12) * DAY_S, between(rng, 1e-3, 0.05),
+                                  rng.uniform(0.3, 0.7), int(rng.integers(3, 6)))  # fmt: skip
             elif kind == "red":
                 level += noise * between(rng, 0.1, 2) * red_noise(rng, n, rng.uniform(0.5, 2))
             elif kind == "thermal":
@@ -283,21 +299,22 @@ def with_flares(part: str, kind: str, k: int, time_s: Float, cadence: float, noi
 
 
 def rotating_flares(number: int, seed: int) -> Iterator[Trial]:
-    """Draw the same flares, of the same S/N under the covariance, in white noise, on rotators and in red noise."""
+    """Draw the same flares, of the same S/N under the covariance, in white and red noise and on (sharp) rotators."""
     for k in range(number):
         common = np.random.default_rng([seed, 3, 0, k])
         n, cadence = int(common.integers(1000, 1601)), float(common.choice([20.0, 60.0, 120.0]))
         noise, snr = between(common, 1e-4, 5e-3), common.uniform(4, 15)
         time_s = np.arange(n) * cadence
         flare = Flare("davenport", common.uniform(0.1, 0.9) * time_s[-1], between(common, 1.5, 15) * cadence)
-        for index, kind in enumerate(("white", "rotator", "red")):
+        for index, kind in enumerate(("white", "rotator", "red", "sharp")):
             rng = np.random.default_rng([seed, 3, 1 + index, k])
             level, vary = np.ones(n), np.ones((n, 1))
             covariance = noise**2 * np.eye(n)
-            if kind == "rotator":
-                period = between(rng, 0.2, 12) * DAY_S
-                level += rotation(rng, time_s, period, between(rng, 1e-3, 0.05), rng.uniform(0, 0.7))
-                angle = 2 * np.pi * time_s[:, None] / period * [1, 2]
+            if kind in ("rotator", "sharp"):
+                period, orders = between(rng, 0.2, 12) * DAY_S, 2 if kind == "rotator" else 4
+                size, ratio = between(rng, 1e-3, 0.05), rng.uniform(0.0 if kind == "rotator" else 0.3, 0.7)
+                level += rotation(rng, time_s, period, size, ratio, orders)
+                angle = 2 * np.pi * time_s[:, None] / period * np.arange(1, orders + 1)
                 waves = np.hstack([np.sin(angle), np.cos(angle)])
                 slow = np.linspace(-1, 1, n)[:, None] ** np.arange(3)
                 vary = np.hstack([vary, *(waves * slow[:, [j]] for j in range(3))])

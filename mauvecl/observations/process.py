@@ -86,14 +86,18 @@ SCALES = (1.5, 3.0)
 SMOOTH_QUALITY = 2**-0.5
 #: Largest number of iterations of a fit, and the change of log likelihood at which it has converged.
 ITERATIONS, CONVERGED = 80, 1e-3
+#: Largest number of fits one after the other, and the change of log likelihood below which the last one is the best.
+STARTS, SAME = 4, 0.5
 #: Number of parameters of each kind of term.
 SIZES: dict[Kind, int] = {"correlated": 2, "smooth": 2, "rotation": 5, "sharp rotation": 4}
 #: Number of harmonics of rotation with sharp features, and their first standard deviation relative to that of the
 #: harmonic before.
 HARMONICS, EACH_HARMONIC = 6, 0.5
-#: Periods whose innovations are searched together for harmonics that the first two leave, and the chance with which
-#: noise has them (assumed).
-TOGETHER, BY_CHANCE = 8.0, 1e-3
+#: What these harmonics cost beyond their parameters, so that only very strong evidence prefers them to two (Kass &
+#: Raftery 1995, doi 10.1080/01621459.1995.10476572).
+STRONG = 10.0
+#: Largest number of values to which these harmonics are fitted before they replace two in a longer light curve.
+MAX_TRIED = 5000
 
 
 @dataclass(frozen=True)
@@ -415,7 +419,7 @@ def fit_process(data: Binned, start: Process | None = None, steps: Steps | None 
         options = []
         for term in _starts(data, best):
             if (size + SIZES[term.kind]) * VALUES_PER_PARAMETER <= data.values.size:
-                options.append(_fitted(data, (*best.terms, term), np.log(best.excess)))
+                options.append(_fitted(data, (*best.terms, term), np.log(noise)))
                 steps.step()
         # A combination has several starting points.
         for one, bic in options:
@@ -424,42 +428,24 @@ def fit_process(data: Binned, start: Process | None = None, steps: Steps | None 
         if not lowest < value:
             break
         best, value = other, lowest
-        rotation = best.terms[-1]
-        if rotation.kind == "rotation" and _has_harmonics(data, best):
-            sharp, bic = _fitted(data, (*best.terms[:-1], _sharp(rotation)), np.log(best.excess))
-            tried[sharp.name] = bic
-            if bic < value:
-                best, value = sharp, bic
-    least = min(tried.values())
-    return Process(best.terms, best.excess, tuple((name, bic - least) for name, bic in tried.items()))
+        if best.terms[-1].kind == "rotation" and (sharp := _sharper(data, best)) is not None:
+            tried[sharp[0].name] = sharp[1]
+            best, value = min((best, value), sharp, key=lambda pair: pair[1])
+    return Process(best.terms, best.excess, tuple((name, bic - value) for name, bic in tried.items()))
 
 
-def _sharp(rotation: ProcessTerm) -> ProcessTerm:
-    """Return the starting point of rotation with more harmonics."""
-    size, period, quality, *_ = rotation.parameters
-    return ProcessTerm("sharp rotation", (size, period, quality, float(np.log(EACH_HARMONIC))))
-
-
-def _has_harmonics(data: Binned, process: Process) -> bool:
-    """Return whether the innovations of a process that ends with rotation show further harmonics of its period.
-
-    Sine and cosine of each harmonic are fitted to the innovations of some periods together, which lowers their sum of
-    squares by a chi-squared variable if they are noise.
-    """
-    from scipy.stats import chi2
-
-    covariance = process.covariance(data.time_s, data.variance * process.excess**2)
-    left = covariance.whitened(data.values - level_fit(covariance, data.values).mean)
-    turns = (data.time_s - data.time_s[0]) / process.terms[-1].scale_s
-    phases = 2 * np.pi * turns[:, None] * np.arange(3, HARMONICS + 1)
-    waves = np.concatenate([np.sin(phases), np.cos(phases)], axis=1)
-    gain, number = 0.0, 0
-    for part in np.split(np.arange(turns.size), np.searchsorted(turns, np.arange(TOGETHER, turns[-1], TOGETHER))):
-        if part.size > 2 * waves.shape[1]:
-            fit, *_ = np.linalg.lstsq(waves[part], left[part], rcond=None)
-            gain += float(np.square(waves[part] @ fit).sum())
-            number += waves.shape[1]
-    return number > 0 and gain > float(chi2.isf(BY_CHANCE, number))
+def _sharper(data: Binned, process: Process) -> tuple[Process, float] | None:
+    """Return a process whose last term, rotation, has more harmonics, and its BIC; None if these are not seen."""
+    size, period, quality, *_ = process.terms[-1].parameters
+    sharp = ProcessTerm("sharp rotation", (size, period, quality, float(np.log(EACH_HARMONIC))))
+    terms, log_excess = (*process.terms[:-1], sharp), float(np.log(process.excess))
+    coarse = Binned.of(data.time_s, data.values, data.variance, data.step_s, MAX_TRIED)
+    fitted, bic = _fitted(coarse, terms, log_excess)
+    if coarse.step_s != data.step_s:
+        if bic + STRONG >= _fitted(coarse, process.terms, log_excess)[1]:
+            return None
+        fitted, bic = _fitted(data, fitted.terms, log_excess)
+    return fitted, bic + STRONG
 
 
 def _starts(data: Binned, best: Process) -> Iterator[ProcessTerm]:
@@ -539,8 +525,14 @@ def _fitted(data: Binned, terms: tuple[ProcessTerm, ...], log_excess: float) -> 
         value = 0.5 * ((x[0] - expected) / NOISE_PRIOR) ** 2 - level_fit(covariance, data.values).log_likelihood
         return value if np.isfinite(value) else 1e25
 
-    found = minimize(
-        cost, np.clip(start, low, high), method="L-BFGS-B", bounds=bounds,
-        options={"maxiter": ITERATIONS, "ftol": CONVERGED / max(abs(cost(np.clip(start, low, high))), 1.0)},
-    )  # fmt: skip
-    return made(found.x), 2 * float(found.fun) + start.size * float(np.log(data.values.size))
+    x, value = np.clip(start, low, high), np.inf
+    tolerance = CONVERGED / max(abs(cost(x)), 1.0)
+    # The estimate of the curvature may mislead a fit, which another one from its end on shows.
+    for _ in range(STARTS):
+        found = minimize(
+            cost, x, method="L-BFGS-B", bounds=bounds, options={"maxiter": ITERATIONS, "ftol": tolerance}
+        )  # fmt: skip
+        x, before, value = found.x, value, float(found.fun)
+        if before - value < SAME:
+            break
+    return made(x), 2 * value + start.size * float(np.log(data.values.size))
