@@ -196,6 +196,7 @@ SEPARATIONS = (
     "sep",
     "sep_arcsec",
     "angdist",
+    "dstarcsec",
     "target_separation (deg)",
     "dist",
     "_r",

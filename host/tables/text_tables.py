@@ -195,13 +195,17 @@ def _array(cell: str) -> NDArray[np.float64]:
 def _first_row(lines: Sequence[tuple[int, str]]) -> float:
     """Return the number of the first line that starts with two numbers or, if there is none, with one."""
     starting = []
-    for number, line in lines:
+    for place, (number, line) in enumerate(lines):
         first = re.split(r"[\s;|]+|,\s|,(?=[^\d])", line.strip().strip("|").strip())[0]
         if not _is_numeric(first.strip("\"'(")):
             continue
         starting.append(number)
         cells = re.split(r"[\s;|]+", line.strip())
         cells = line.split(",") if len(cells) == 1 else cells
+        below = lines[place + 1 :]
+        if below and all(map(str.isdecimal, cells)) and int(cells[0][:9]) == len(below):
+            # The numbers of rows and of other columns, as in POLARBASE's spectra.
+            continue
         # A line of a preamble, such as "2 columns" or "912 s", has no second number.
         if sum(_is_numeric(cell) or is_missing(cell) for cell in cells) > 1:
             return number
@@ -316,6 +320,9 @@ class TextRows:
             at += 1
         elif len(cells) > at + 1 and _are_units(cells[at], cells[at + 1]):
             units, at = cells[at], at + 1
+        if not mark and all(name.endswith(",") for name in names[:-1]):
+            # Commas divide the names and blanks the rows.
+            names = [name.rstrip(",") for name in names]
         names = [name or f"col{k + 1}" for k, name in enumerate(names)]
         # Names that occur twice get numbers, so that none is taken for the only one.
         while twice := [name for name, count in Counter(names).items() if count > 1]:
@@ -377,10 +384,14 @@ def text_table(text: str, what: str, commas: bool, expected: str = "CSV or ECSV"
         return Table.read([line for line in lines if line.strip()], format=form)
 
 
+def is_described(text: str) -> bool:
+    """Return whether a text is a machine-readable table of the journals, or of CDS with its description."""
+    return re.search(r"(?m)^\s*Byte-by-byte Description", text[:100_000]) is not None
+
+
 def _known_form(text: str) -> str | None:
     """Return the name in astropy of a form with units and types of its own, or None."""
-    if re.search(r"(?m)^\s*Byte-by-byte Description", text[:100_000]):
-        # Machine-readable tables of the journals, and tables of CDS with their description.
+    if is_described(text):
         return "ascii.mrt" if re.match(r"\s*Title:", text) else "ascii.cds"
     lines = [line for line in text[:100_000].splitlines() if line.strip() and line[0] not in "\\#"]
     rows = [line for line in lines if not line.startswith("|")]
@@ -408,7 +419,7 @@ def _mark(lines: Sequence[str], commas: bool) -> str:
         if not is_dated(cell)
     )
     # Other marks are rare in prose, so that several lines of a title may stand above the first line with one.
-    is_usual = best != "," and 2 * scores[best] >= len(sample)
+    is_usual = best != "," and scores[best] > 1
     start = next((k for k, line in enumerate(sample) if best in line), 0) if is_usual else 1
     return best if scores[best] and all(best in line for line in sample[start:]) and not in_words else ""
 

@@ -47,6 +47,8 @@ _SPELLINGS = {
 }  # fmt: skip
 _WORDS = {spelling: name for name, spellings in _SPELLINGS.items() for spelling in spellings.split()}
 _TYPOGRAPHY = str.maketrans("µμ−–⁻⁺⁰¹²³⁴⁵⁶⁷⁸⁹·⋅×Å", "uu---+0123456789..*Å")
+#: Marks of LaTeX that say nothing of a unit.
+_LATEX = re.compile(r"\$|\\(?:mathrm|rm|text|,|;|:|!|(?=AA))")
 SCALE = re.compile(
     r"(?:x\s*|\*\s*)?(?:10\s*(?:\^|\*\*)\s*\(?\s*([+-]?\d{1,3})\s*\)?|10([+-]\d{1,3})(?!\d)|(\d(?:\.\d*)?[eE][+-]?\d{1,3}))"
 )
@@ -74,7 +76,7 @@ def unit_of(text: str) -> u.UnitBase | u.function.FunctionUnitBase:
     """
     import astropy.units as u
 
-    name = text.translate(_TYPOGRAPHY).strip().strip("'\"").strip()
+    name = re.sub("[{}]", "", _LATEX.sub(" ", text.translate(_TYPOGRAPHY))).strip().strip("'\"").strip()
     if name[:1] == "[" and name[-1:] == "]":
         name = name[1:-1].strip()
     if _AB.fullmatch(name):

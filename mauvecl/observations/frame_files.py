@@ -115,7 +115,7 @@ KNOWN = {
     "time": ("time",),
     "flux": ("flux", "pdcsap_flux", "sap_flux", "kspsap_flux", "det_flux", "corr_flux", "corrected_flux", "fcor",
              "flux_corr", "detrended_flux", "rate", "rel_flux", "relative_flux", "normalized_flux", "norm_flux",
-             "rel_flux_t1", "ujy"),
+             "rel_flux_t1", "ujy", "count_rate", "countrate", "cps", "counts", "cal_aper_flux", "whitelight_flux"),
     "quality": ("quality", "sap_quality"),
     "temperature": ("temperature",),
 }  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
@@ -15,6 +16,7 @@ from mauvecl.host.tables.names import (
     SEXAGESIMAL,
     SPECTRAL_TYPES,
     STARS,
+    divided_unit,
     is_missing_position,
     key_of,
 )
@@ -183,7 +185,14 @@ class PlanTarget(Section):
         from mauvecl.host.orbit.orbit import Target
 
         if self.coordinates is None:
-            return Target.of(self.name, name=self.name, simbad=simbad)
+            try:
+                return Target.of(self.name, name=self.name, simbad=simbad)
+            except InputError as error:
+                if simbad or not self.unused:
+                    raise
+                fault = f"target {shortened(self.name)} is not in the embedded list, and its table has no coordinates"
+                expected = f"columns ra and dec, or coordinates, besides {shown(', '.join(self.unused), 200)}"
+                raise InputError(fault, expected, key="coordinates") from error
         place = Target.of(self.coordinates, name=self.name)
         try:
             known = Target.of(self.name)
@@ -298,8 +307,9 @@ def read_targets(path: Path) -> list[dict[str, Any]]:
 TARGET_COLUMNS = {
     "name": (*STARS, "hostname"), "ra": RIGHT_ASCENSIONS, "dec": DECLINATIONS, "spectral_type": SPECTRAL_TYPES,
     "magnitude": ("V", "vmag", "mag_v", "v_mag", "johnson_v", "flux_v", "sy_vmag", "mag"),
-    "distance_pc": ("distance", "dist", "d_pc", "dist_pc"), "parallax": ("parallax", "plx", "plx_value"),
-    "mass_msun": ("mass", "st_mass"), "age_myr": ("age",), "coordinates": ("coord", "coords", "position", "coord1"),
+    "distance_pc": ("distance", "dist", "d_pc", "dist_pc", "sy_dist"), "parallax": ("parallax", "plx", "plx_value"),
+    "mass_msun": ("mass", "st_mass"), "age_myr": ("age",),
+    "coordinates": ("coord", "coords", "position", "coord1", "radec", "ra_dec", "ra/dec"),
 }  # fmt: skip
 
 
@@ -357,6 +367,7 @@ def _target(
         else:
             # A text that is no number is refused with the key's own sentence.
             one[key] = rows.number(column, row, "" if unit is None else unit.name) if _is_number(text) else text
+    _check_band(rows, columns["magnitude"], row)
     parallax = columns["parallax"]
     if parallax is not None and "distance_pc" not in one:
         value = rows.number(parallax, row, "mas")
@@ -378,6 +389,16 @@ def _target(
     except ValidationError as error:
         raise input_error(named, PlanTarget, error) from error
     return one
+
+
+def _check_band(rows: Rows, column: str | None, row: int) -> None:
+    """Raise InputError if a magnitude of no stated band in its name has another than V in brackets or in a column."""
+    base, bracket = divided_unit(column or "")
+    if column is None or key_of(base) not in ("mag", "magnitude") or not rows.text(column, row):
+        return
+    bands = (re.sub(r"(?i)^mag(?:nitude)?s?$", "", bracket), rows.text(rows.first(("band", "filter", "passband")), row))
+    if odd := next((band for band in bands if band and not re.fullmatch(r"(?i)(?:johnson[\s_]*)?v", band)), None):
+        raise rows.error(f"row {row + 1} has {column} in the band {shortened(odd)}", "a magnitude in V", column)
 
 
 def _coordinates(rows: Rows, columns: dict[str, str | None], row: int, one: dict[str, Any]) -> str | None:
