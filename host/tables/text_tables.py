@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from mauvecl.host.tables.ecsv import check_cells, parse_ecsv
 from mauvecl.host.tables.files import parsing, read_text
 from mauvecl.host.tables.names import in_brackets, is_missing
-from mauvecl.host.tables.table import REMARKS, Values, is_known, number_in, plain_numbers, unquoted
-from mauvecl.host.tables.units import is_dated, is_stated, time_unit
+from mauvecl.host.tables.table import REMARKS, Values, is_known, number_in, plain_numbers, unit_in, unquoted
+from mauvecl.host.tables.units import is_dated, is_stated, time_unit, unit_of
 from mauvecl.schema.errors import InputError, shortened
 
 if TYPE_CHECKING:
@@ -50,23 +50,52 @@ MARKS = ("\t", ";", "|", ",")
 SAMPLE = 50
 
 
-def read_columns(what: str, kind: str, path: Path) -> NDArray[np.float64]:
-    """Read times and values from a file, shape (n, 2); # starts a comment.
+def read_columns(what: str, kind: str, path: Path, unit: str = "") -> NDArray[np.float64]:
+    """Read times and values from a file, shape (n, 2); see `columns`.
 
     `what` names the content and `kind` the values in messages.
     """
-    named = f"{what} {shortened(path.name)}"
-    pairs = columns(named, read_text(path, what))
-    if pairs.ndim != 2 or pairs.shape[1] != 2:
-        raise InputError(f"{named} has no two columns", f"times and {kind}", key=what)
-    return pairs
+    return columns(f"{what} {shortened(path.name)}", read_text(path, what), f"times and {kind}", unit)
 
 
-def columns(what: str, text: str) -> NDArray[np.float64]:
-    """Parse rows of numbers, shape (n, 2) if each row has two."""
-    with parsing(what, "two columns"):
-        rows = [line.split("#", 1)[0].split() for line in text.splitlines()]
-        return np.array([[float(word) for word in row] for row in rows if row])
+def columns(what: str, text: str, expected: str, unit: str = "") -> NDArray[np.float64]:
+    """Parse rows of two numbers in any form of text, shape (n, 2).
+
+    Parameters
+    ----------
+    what, expected : str
+        The text and its two columns, for messages.
+    unit : str
+        Unit of the first column of the result; the text is in it unless its header states another one.
+    """
+    with parsing(what, expected):
+        try:
+            lines = NumberLines(text, expected)
+            if odd := next((len(cells) for cells in lines.cells if len(cells) != 2), 0):
+                raise InputError(f"has {odd} column{'s' * (odd > 1)}", f"two: {expected}", key="columns")
+            first, second = (lines.column(k, str(k + 1)).numbers() for k in range(2))
+            return np.column_stack([_in_unit(first, lines.comments, unit) if unit else first, second])
+        except InputError as error:
+            raise error.within(what) from error
+
+
+#: A word that may be a unit, in the header of numbers: ``(nm)``, ``in Angstrom``, ``time_min``, ``unit: um``.
+_UNIT_WORD = re.compile(r"[\[(]\s*([^\[\](),;\s]+)|(?:\bin\s+|_|\bunits?\s*[:=]\s*)([A-Za-zµÅ]+)(?!\w)")
+
+
+def _in_unit(values: NDArray[np.float64], header: str, unit: str) -> NDArray[np.float64]:
+    """Return times or wavelengths in a unit; raise InputError if a header states several."""
+    import astropy.units as u
+
+    said = {}
+    for word in (match[1] or match[2] for match in _UNIT_WORD.finditer(header)):
+        with contextlib.suppress(ValueError, TypeError):
+            known = unit_in(word) if unit == "s" else unit_of(word)
+            if known.is_equivalent(u.Unit(unit), u.spectral() if unit == "nm" else []):
+                said[known] = word
+    if len(said) > 1:
+        raise InputError(f"has a header with {' and '.join(said.values())}", "one unit", key="unit")
+    return np.asarray((values * next(iter(said), u.Unit(unit))).to_value(unit, u.spectral()))
 
 
 def text_of(content: bytes) -> str:
