@@ -61,6 +61,17 @@ def divided_unit(name: str) -> tuple[str, str]:
     return (name.strip(), "") if match is None else (match[1], (match[2] or match[3] or "").strip())
 
 
+#: Columns of the band of the magnitudes in a column that names none.
+BANDS = ("band", "filter", "passband", "filt")
+
+
+def band_in_name(name: str) -> str:
+    """Return the band in brackets after a magnitude, as in ``mag (Ks)``; empty if there is a unit or nothing."""
+    base, bracket = divided_unit(name)
+    is_unit = re.fullmatch(r"(?:mag(?:nitude)?s?)?", bracket, re.IGNORECASE) is not None
+    return "" if is_unit or key_of(base) not in ("mag", "magnitude") else bracket
+
+
 def in_brackets(text: str) -> str:
     """Return the text without brackets around all of it, as in ``[s]`` or ``(ct/s)``."""
     match = re.fullmatch(r"\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))\s*", text)

@@ -11,11 +11,13 @@ from pydantic import ValidationError, field_validator, model_validator
 
 from mauvecl.host.orbit.observing_limits import Limits
 from mauvecl.host.tables.names import (
+    BANDS,
     DECLINATIONS,
     RIGHT_ASCENSIONS,
     SEXAGESIMAL,
     SPECTRAL_TYPES,
     STARS,
+    band_in_name,
     divided_unit,
     is_missing_position,
     key_of,
@@ -307,7 +309,8 @@ def read_targets(path: Path) -> list[dict[str, Any]]:
 TARGET_COLUMNS = {
     "name": (*STARS, "hostname"), "ra": RIGHT_ASCENSIONS, "dec": DECLINATIONS, "spectral_type": SPECTRAL_TYPES,
     "magnitude": ("V", "vmag", "mag_v", "v_mag", "johnson_v", "flux_v", "sy_vmag", "mag"),
-    "distance_pc": ("distance", "dist", "d_pc", "dist_pc", "sy_dist"), "parallax": ("parallax", "plx", "plx_value"),
+    "distance_pc": ("distance", "dist", "d_pc", "dist_pc", "sy_dist"),
+    "parallax": ("parallax", "plx", "plx_value", "parallax_mas", "plx_mas"),
     "mass_msun": ("mass", "st_mass"), "age_myr": ("age",),
     "coordinates": ("coord", "coords", "position", "coord1", "radec", "ra_dec", "ra/dec"),
 }  # fmt: skip
@@ -393,10 +396,9 @@ def _target(
 
 def _check_band(rows: Rows, column: str | None, row: int) -> None:
     """Raise InputError if a magnitude of no stated band in its name has another than V in brackets or in a column."""
-    base, bracket = divided_unit(column or "")
-    if column is None or key_of(base) not in ("mag", "magnitude") or not rows.text(column, row):
+    if column is None or key_of(divided_unit(column)[0]) not in ("mag", "magnitude") or not rows.text(column, row):
         return
-    bands = (re.sub(r"(?i)^mag(?:nitude)?s?$", "", bracket), rows.text(rows.first(("band", "filter", "passband")), row))
+    bands = (band_in_name(column), rows.text(rows.first(BANDS), row))
     if odd := next((band for band in bands if band and not re.fullmatch(r"(?i)(?:johnson[\s_]*)?v", band)), None):
         raise rows.error(f"row {row + 1} has {column} in the band {shortened(odd)}", "a magnitude in V", column)
 
