@@ -16,10 +16,12 @@ import astropy.units as u
 import corpus
 import numpy as np
 import pytest
-from corpus import CORPUS, Case, cases, mapping_of, value, written
+from corpus import CORPUS, FLUX, LIGHT, NM, Case, cases, mapping_of, value, written
 from refusals import refused
 
 from mauvecl import Source, read_frames
+from mauvecl.detection import nuisances
+from mauvecl.flares.settings import Curve
 from mauvecl.host.exposure.star import read_neighbours
 from mauvecl.host.spectra.formats import read_spectrum
 from mauvecl.host.stars.flare import read_flares
@@ -171,9 +173,25 @@ def _flares(path: Path, case: Case) -> tuple[str, ...]:
     return remarks
 
 
+def _unknown(path: Path, case: Case) -> tuple[str, ...]:
+    """Read the spectrum of an unknown, which is that of the corpus times 1e15."""
+    inside = NM[(NM > 200) & (NM < 700)]
+    found = nuisances.read_spectrum("own", path, inside)
+    np.testing.assert_allclose(found, np.interp(inside, NM, 1e15 * FLUX), rtol=1e-6)
+    return ()
+
+
+def _curve(path: Path, case: Case) -> tuple[str, ...]:
+    """Read a curve of time, which is the light curve of the corpus."""
+    time = value("t")
+    found = Curve(file=path).mean_over(time - 0.5e-3, 1e-3)
+    np.testing.assert_allclose(found, LIGHT, rtol=1e-6)
+    return ()
+
+
 READERS: dict[str, Callable[[Path, Case], tuple[str, ...]]] = {
     "spectrum": _spectrum, "points": _points, "frames": _frames, "summary": _summary, "targets": _targets,
-    "neighbours": _neighbours, "flares": _flares,
+    "neighbours": _neighbours, "flares": _flares, "unknown": _unknown, "curve": _curve,
 }  # fmt: skip
 
 

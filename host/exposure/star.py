@@ -15,7 +15,16 @@ from mauvecl.host.exposure.response import Order, electrons_per_second
 from mauvecl.host.stars.band_names import known_band
 from mauvecl.host.stars.library import embedded, library_table, nearest_spectrum
 from mauvecl.host.stars.source import Source
-from mauvecl.host.tables.names import DECLINATIONS, RIGHT_ASCENSIONS, SPECTRAL_TYPES, STARS, divided_unit, key_of
+from mauvecl.host.tables.names import (
+    BANDS,
+    DECLINATIONS,
+    RIGHT_ASCENSIONS,
+    SPECTRAL_TYPES,
+    STARS,
+    band_in_name,
+    divided_unit,
+    key_of,
+)
 from mauvecl.host.tables.opening import read_table
 from mauvecl.host.tables.table import Rows
 from mauvecl.schema.calls import validated
@@ -196,6 +205,7 @@ SEPARATIONS = (
     "sep",
     "sep_arcsec",
     "angdist",
+    "dstarcsec",
     "target_separation (deg)",
     "dist",
     "_r",
@@ -207,7 +217,7 @@ FILES = ("file", "spectrum", "spectrum_file")
 TEMPERATURES = ("teff_gspphot", "teff", "teff_val", "temperature", "temperature_k")
 COLOURS = ("bp_rp", "bp-rp", "bprp")
 #: All names of columns that are read, with that of a magnitude's band.
-KNOWN = (*STARS, *SEPARATIONS, *RIGHT_ASCENSIONS, *DECLINATIONS, *MAGNITUDES, "band", *TYPES, *FILES, *TEMPERATURES,
+KNOWN = (*STARS, *SEPARATIONS, *RIGHT_ASCENSIONS, *DECLINATIONS, *MAGNITUDES, *BANDS, *TYPES, *FILES, *TEMPERATURES,
          *COLOURS)  # fmt: skip
 _KEYS = {key_of(name) for name in KNOWN} | {key_of("target_separation")}
 #: Units of separations without a stated unit: ADQL's DISTANCE is in degrees.
@@ -267,14 +277,14 @@ class _Neighbours(Rows):
     @cached_property
     def band(self) -> str | None:
         """Column of bands."""
-        return self.first(("band",))
+        return self.first(BANDS)
 
     def magnitude(self, row: int) -> tuple[float | None, str]:
         """Return magnitude and band of a star; None if it has none."""
         for name, band in self.magnitudes:
             value = self.number(name, row, "mag")
             if value is not None:
-                return value, band or known_band(self.text(self.band, row) or "V")
+                return value, band or known_band(band_in_name(name) or self.text(self.band, row) or "V")
         return None, "V"
 
     def separations(self, own: int | None, target: str | None) -> tuple[Float, tuple[str, ...]]:

@@ -35,11 +35,15 @@ from mauvecl.host.tables.ecsv import parse_ecsv
 from mauvecl.host.tables.files import read_text
 from mauvecl.host.tables.names import is_missing_position
 from mauvecl.host.tables.units import offline
-from mauvecl.schema.errors import InputError, shortened
+from mauvecl.schema.errors import InputError, printable, shortened
 from mauvecl.schema.physical import DAY_S
 
 if TYPE_CHECKING:
     from astropy.table import Table
+
+
+#: NORAD catalogue number of Mauve.
+MAUVE = "66756"
 
 
 @dataclass(frozen=True)
@@ -68,9 +72,9 @@ class Elements:
 
     @classmethod
     def read(cls, path: str | Path) -> Elements:
-        """Read the first set of a file; titles and comments are ignored.
+        """Read the newest set of Mauve in a file, or of its only satellite; titles and comments are ignored.
 
-        Raises InputError if the file holds no set or a line's checksum is wrong.
+        Raises InputError if the file holds no set or those of several other satellites, or a line's checksum is wrong.
         """
         path = Path(path)
         return cls._of(read_text(path, "orbit file"), f"file {path.name}", shortened(str(path)))
@@ -84,12 +88,16 @@ class Elements:
     @classmethod
     def _of(cls, text: str, source: str, named: str) -> Elements:
         lines = [line.rstrip() for line in text.splitlines()]
-        for one, two in pairwise(lines):
-            if one.startswith("1 ") and two.startswith("2 "):
-                return cls(one, two, source)
-        raise InputError(
-            f"orbit file {named} holds no two lines of elements", "a line '1 ...' before '2 ...'", key="elements"
-        )
+        sets = [(one, two) for one, two in pairwise(lines) if one.startswith("1 ") and two.startswith("2 ")]
+        if not sets:
+            fault = f"orbit file {named} holds no two lines of elements"
+            raise InputError(fault, "a line '1 ...' before '2 ...'", key="elements")
+        sets = [(one, two) for one, two in sets if one[2:7] == MAUVE] or sets
+        if len(numbers := sorted({one[2:7] for one, _ in sets})) > 1:
+            held = printable(", ".join(numbers), 80)
+            fault = f"orbit file {named} holds elements of {len(numbers)} satellites ({held})"
+            raise InputError(fault, f"those of Mauve, {MAUVE}, or of one satellite", key="elements")
+        return max((cls(one, two, source) for one, two in sets), key=lambda elements: elements.epoch_jd)
 
     @cached_property
     def satellite(self) -> Any:

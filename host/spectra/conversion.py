@@ -63,6 +63,8 @@ Float = NDArray[np.float64]
 SEGMENTS = ("segment", "sporder", "order", "stripe")
 #: Names of columns that qualify arrays: their step, their length, and the validity of points.
 STEPS = ("deltaw", "delta_w", "delta_wavelength", "step", "dlam", "dlambda")
+#: Number, from 1, of the first valid point, to which a start refers (IUE's high dispersion, NEWSIPS manual 2.0).
+STARTS = ("startpix",)
 LENGTHS = ("npoints", "n_points", "nelem", "npts")
 #: Zero for invalid points (COS Data Handbook 5.1, section 2.4.3).
 WEIGHTS = ("dq_wgt",)
@@ -218,16 +220,17 @@ def _selected_rows(
     else:
         rows = [_row_asked(identifiers, asked, names)]
         identifier = (identifiers[rows[0]] or [""])[0]
-    steps, lengths, weights = (
+    steps, starts, lengths, weights = (
         next((c.cells for c, name in zip(table.columns, names, strict=True) if name in wanted), None)
-        for wanted in (STEPS, LENGTHS, WEIGHTS)
+        for wanted in (STEPS, STARTS, LENGTHS, WEIGHTS)
     )
     found = []
     for row in rows:
-        arrays = _arrays([cell[row] for cell in cells], None if steps is None else steps[row])
-        kept = np.ones(arrays[-1].size, bool)
+        first = 0 if starts is None else max(0, int(np.ravel(starts[row])[0]) - 1)
+        arrays = _arrays([cell[row] for cell in cells], None if steps is None else steps[row], first)
+        kept = np.arange(arrays[-1].size) >= first
         if lengths is not None and 1 < (count := int(np.ravel(lengths[row])[0])) < kept.size:
-            kept[count:] = False
+            kept[first + count :] = False
         if weights is not None and np.shape(weights[row]) == kept.shape:
             kept &= np.asarray(weights[row]) != 0
         if kept.any():
@@ -237,8 +240,8 @@ def _selected_rows(
     return found, identifier, messages
 
 
-def _arrays(cells: list[Any], step: Any) -> list[Any]:
-    """Return a row's cells as arrays of equal length; a start and a step are expanded."""
+def _arrays(cells: list[Any], step: Any, first: int) -> list[Any]:
+    """Return a row's cells as arrays of equal length; a step and the start, at point `first`, are expanded."""
     *axes, flux = (np.ma.asanyarray(cell).squeeze() for cell in cells)
     if flux.ndim != 1:
         raise InputError(f"its row: the flux has the shape {flux.shape}", "one spectrum", key="flux")
@@ -247,7 +250,7 @@ def _arrays(cells: list[Any], step: Any) -> list[Any]:
             raise InputError(
                 f"its row needs as many wavelengths as fluxes, or a step, but has one for {flux.size}", key="flux"
             )
-        axes = [float(axes[0]) + float(np.ravel(step)[0]) * np.arange(flux.size)]
+        axes = [float(axes[0]) + float(np.ravel(step)[0]) * (np.arange(flux.size) - first)]
     if any(axis.shape != flux.shape for axis in axes):
         raise InputError(
             f"its row needs as many wavelengths as fluxes, but has {axes[0].size} for {flux.size}", key="flux"

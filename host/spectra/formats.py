@@ -441,7 +441,7 @@ def _tables(
     from mauvecl.host.tables.ecsv import parse_ecsv
     from mauvecl.host.tables.opening import check_form, votables
     from mauvecl.host.tables.table import MemoryTable
-    from mauvecl.host.tables.text_tables import text_of
+    from mauvecl.host.tables.text_tables import is_described, text_of, text_table
 
     if content.form == "FITS":
         return fits_tables(content.file, name, origin, asked, check)
@@ -455,6 +455,8 @@ def _tables(
         table = MemoryTable(parse_ecsv(text, "it"), "it")
         own = table.header.get("name")
         return [_in_memory(table, own.strip()[:80] if isinstance(own, str) and own.strip() else name, origin)]
+    if is_described(text):
+        return [_in_memory(MemoryTable(text_table(text, "it", False, "a spectrum"), "it"), name, origin)]
     return [table_of_text(text, name, f"text {origin}", asked, *units)]
 
 

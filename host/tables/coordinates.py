@@ -100,6 +100,9 @@ def angle(text: str, unit: str = "", *, right_ascension: bool, pair: int = 3) ->
 
     plain = " ".join(text.translate(_TYPESET).strip().split())
     sexagesimal = "hourangle" if right_ascension else "deg"
+    if re.match(r"[+-]?0\d{3}", plain):
+        # Hours or degrees and minutes without a mark between them, as in J0042-0300.
+        raise ValueError(text)
     if _PLAIN.fullmatch(plain):
         # Astropy's angles take 50 us each.
         value = float(plain) if unit in ("", "deg") else _degrees(Angle(float(plain), unit))

@@ -241,7 +241,9 @@ WAVE_UNITS, FLUX_UNITS = ("CUNIT1", "XUNITS", "WAVEUNIT"), ("BUNIT", "YUNITS", "
 
 def unit_at(keys: Sequence[str], *headers: Any) -> str:
     """Return the unit that the first of some keywords states; empty if none does."""
-    return next((text for key in keys for header in headers if (text := text_at(header, key))), "")
+    stated = next((text for key in keys for header in headers if (text := text_at(header, key))), "")
+    # APOGEE: Flux (10^-17 erg/s/cm^2/Ang).
+    return re.sub(r"(?i)^flux(?: density)?\s*\((.*)\)$", r"\1", stated)
 
 
 def column_values(data: Any, column: Any) -> Any:

@@ -30,15 +30,26 @@ def is_missing_position(text: str) -> bool:
 STARS = ("name", "designation", "source_id", "source", "main_id", "id", "dr3name", "target", "target_name", "targname",
          "object", "star", "tic", "tic_id", "kic", "kepid", "epic", "hip", "star_name", "object_name", "identifier",
          "star_id", "epic_number", "sourceid", "kelt_sourceid", "tid")  # fmt: skip
-RIGHT_ASCENSIONS = ("ra", "ra_deg", "ra_icrs", "_raj2000", "raj2000", "ra_j2000", "_ra_icrs", "_ra", "s_ra", "ra_hours",
-                    "ra_h", "ra_rad", "right_ascension", "alpha_j2000", "radeg", "raj2000_deg", "raicrs",
-                    "r.a.", "ra.", "alpha")  # fmt: skip
-DECLINATIONS = ("dec", "dec_deg", "de_icrs", "_dej2000", "dej2000", "dec_j2000", "_de_icrs", "dec_icrs", "_de", "s_dec",
-                "de", "dec_rad", "declination", "delta_j2000", "dedeg", "decdeg", "dej2000_deg", "deicrs",
-                "decl.", "decl", "dec.", "delta")  # fmt: skip
+#: What follows names of coordinates in catalogues: their system, form or epoch. Pairs with the first ending count.
+_ENDS = ("", "_deg", "_icrs", ".icrs", "j2000", "_j2000", "_hours", "_hour", "_h", "_rad", "deg", "j2000_deg", "icrs",
+         "_icrs_deg", "_d", "_degrees", "2000", "_2000", "_fk5", "_epoch2000", "_hms", "_dms", "_obj", "_j2016_deg",
+         "_j2016", "_j2015.5")  # fmt: skip
+RIGHT_ASCENSIONS = tuple(
+    f"{name}{end}"
+    for end in _ENDS
+    for name in ("_ra", "ra", "s_ra", "r.a.", "ra.", "right_ascension", "rightascension", "alpha", "gaia_ra", "tic_ra",
+                 "kic_degree_ra")
+)  # fmt: skip
+DECLINATIONS = tuple(
+    f"{name}{end}"
+    for end in _ENDS
+    for name in ("_dec", "_de", "dec", "de", "s_dec", "decl", "decl.", "dec.", "declination", "delta", "gaia_dec",
+                 "tic_dec", "kic_dec")
+)  # fmt: skip
 #: Sexagesimal right ascensions in tables that have them in numbers as well.
 SEXAGESIMAL = ("ra_string", "rastr", "ra_str", "ra_hms", "ra_sexa")
-SPECTRAL_TYPES = ("spectral_type", "sptype", "sp_type", "spt", "spectype", "st_spectype", "spec._type")
+SPECTRAL_TYPES = ("spectral_type", "sptype", "sp_type", "spt", "spectype", "st_spectype", "spec._type", "sp._type",
+                  "sp.type")  # fmt: skip
 _UNIT = re.compile(r"(?s)(.*\S)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))\s*")
 #: Columns of magnitudes: ``mag``, ``Vmag``, ``mag_err``, ``INST_MAG1``, ``delta magnitude``.
 _MAGNITUDE = re.compile(r"(?:^|[^a-z])[a-z]{0,5}(?:mag|mags|magnitude|magnitudes)(?:$|[^a-z])")
@@ -48,6 +59,17 @@ def divided_unit(name: str) -> tuple[str, str]:
     """Divide ``flux (ct/s)`` or ``time [d]`` into name and unit, which is empty if there is none."""
     match = _UNIT.fullmatch(name.strip())
     return (name.strip(), "") if match is None else (match[1], (match[2] or match[3] or "").strip())
+
+
+#: Columns of the band of the magnitudes in a column that names none.
+BANDS = ("band", "filter", "passband", "filt")
+
+
+def band_in_name(name: str) -> str:
+    """Return the band in brackets after a magnitude, as in ``mag (Ks)``; empty if there is a unit or nothing."""
+    base, bracket = divided_unit(name)
+    is_unit = re.fullmatch(r"(?:mag(?:nitude)?s?)?", bracket, re.IGNORECASE) is not None
+    return "" if is_unit or key_of(base) not in ("mag", "magnitude") else bracket
 
 
 def in_brackets(text: str) -> str:
@@ -86,13 +108,13 @@ def first_of(wanted: Sequence[str], names: Iterable[str], what: str = "") -> str
 
     Raises InputError if several fit the same wanted name.
     """
-    held = list(names)
+    held = [(name, key_of(name), key_of(divided_unit(name)[0])) for name in names]
     for one in wanted:
         key = key_of(one)
         fitting = (
-            [name for name in held if name == one]
-            or [name for name in held if key_of(name) == key]
-            or [name for name in held if key_of(divided_unit(name)[0]) == key]
+            [name for name, _, _ in held if name == one]
+            or [name for name, plain, _ in held if plain == key]
+            or [name for name, _, base in held if base == key]
         )
         if len(fitting) > 1:
             place = f"{what}: " if what else ""

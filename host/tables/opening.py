@@ -297,7 +297,8 @@ FOREIGN = {
     b"\x89HDF": "HDF5 or NetCDF", b"CDF\x01": "NetCDF", b"CDF\x02": "NetCDF", b"CDF\x05": "NetCDF",
     b"READSERR": "QDP", b"READTERR": "QDP", b"#Regionfileformat": "a list of regions",
     b"versionhttps://git-lfs": "a pointer of Git LFS to another file", b"\x1f\x9d": "compressed by `compress`",
-    b"\x28\xb5\x2f\xfd": "compressed by zstd", b"7z\xbc\xaf": "a 7-Zip archive",
+    b"\\begin{": "LaTeX", b"\\documentclass": "LaTeX", b"\x28\xb5\x2f\xfd": "compressed by zstd",
+    b"7z\xbc\xaf": "a 7-Zip archive",
 }  # fmt: skip
 
 

@@ -575,6 +575,7 @@ def _with_coordinates(table: Table) -> Table:
 _SPELT = {"degc": "deg_C", "c": "deg_C", "celsius": "deg_C", "deg c": "deg_C", "°c": "deg_C",
           "percent": "%", "ppt": "1e-3", "ppm": "1e-6", "ppb": "1e-9", "solar mass": "solMass", "solar": "solMass",
           "solar masses": "solMass", "msun": "solMass", "m_sun": "solMass", "solmass": "solMass",
-          "rsun": "solRad", "k": "K", "years": "yr",
+          "rsun": "solRad", "k": "K", "years": "yr", "magnitude": "mag", "magnitudes": "mag", "mags": "mag",
+          "magnitude[v]": "mag",
           "ly": "lyr", "lyr": "lyr", "lightyears": "lyr", "light-years": "lyr", "light years": "lyr", "kpc": "kpc",
           "gyr": "Gyr", "myr": "Myr", "/d": "1/d", "1/day": "1/d", "d-1": "1/d", "per day": "1/d"}  # fmt: skip

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from mauvecl.host.tables.ecsv import check_cells, parse_ecsv
 from mauvecl.host.tables.files import parsing, read_text
 from mauvecl.host.tables.names import in_brackets, is_missing
-from mauvecl.host.tables.table import REMARKS, Values, is_known, number_in, plain_numbers, unquoted
-from mauvecl.host.tables.units import is_dated, is_stated, time_unit
+from mauvecl.host.tables.table import REMARKS, Values, is_known, number_in, plain_numbers, unit_in, unquoted
+from mauvecl.host.tables.units import is_dated, is_stated, time_unit, unit_of
 from mauvecl.schema.errors import InputError, shortened
 
 if TYPE_CHECKING:
@@ -50,23 +50,52 @@ MARKS = ("\t", ";", "|", ",")
 SAMPLE = 50
 
 
-def read_columns(what: str, kind: str, path: Path) -> NDArray[np.float64]:
-    """Read times and values from a file, shape (n, 2); # starts a comment.
+def read_columns(what: str, kind: str, path: Path, unit: str = "") -> NDArray[np.float64]:
+    """Read times and values from a file, shape (n, 2); see `columns`.
 
     `what` names the content and `kind` the values in messages.
     """
-    named = f"{what} {shortened(path.name)}"
-    pairs = columns(named, read_text(path, what))
-    if pairs.ndim != 2 or pairs.shape[1] != 2:
-        raise InputError(f"{named} has no two columns", f"times and {kind}", key=what)
-    return pairs
+    return columns(f"{what} {shortened(path.name)}", read_text(path, what), f"times and {kind}", unit)
 
 
-def columns(what: str, text: str) -> NDArray[np.float64]:
-    """Parse rows of numbers, shape (n, 2) if each row has two."""
-    with parsing(what, "two columns"):
-        rows = [line.split("#", 1)[0].split() for line in text.splitlines()]
-        return np.array([[float(word) for word in row] for row in rows if row])
+def columns(what: str, text: str, expected: str, unit: str = "") -> NDArray[np.float64]:
+    """Parse rows of two numbers in any form of text, shape (n, 2).
+
+    Parameters
+    ----------
+    what, expected : str
+        The text and its two columns, for messages.
+    unit : str
+        Unit of the first column of the result; the text is in it unless its header states another one.
+    """
+    with parsing(what, expected):
+        try:
+            lines = NumberLines(text, expected)
+            if odd := next((len(cells) for cells in lines.cells if len(cells) != 2), 0):
+                raise InputError(f"has {odd} column{'s' * (odd > 1)}", f"two: {expected}", key="columns")
+            first, second = (lines.column(k, str(k + 1)).numbers() for k in range(2))
+            return np.column_stack([_in_unit(first, lines.comments, unit) if unit else first, second])
+        except InputError as error:
+            raise error.within(what) from error
+
+
+#: A word that may be a unit, in the header of numbers: ``(nm)``, ``in Angstrom``, ``time_min``, ``unit: um``.
+_UNIT_WORD = re.compile(r"[\[(]\s*([^\[\](),;\s]+)|(?:\bin\s+|_|\bunits?\s*[:=]\s*)([A-Za-zµÅ]+)(?!\w)")
+
+
+def _in_unit(values: NDArray[np.float64], header: str, unit: str) -> NDArray[np.float64]:
+    """Return times or wavelengths in a unit; raise InputError if a header states several."""
+    import astropy.units as u
+
+    said = {}
+    for word in (match[1] or match[2] for match in _UNIT_WORD.finditer(header)):
+        with contextlib.suppress(ValueError, TypeError):
+            known = unit_in(word) if unit == "s" else unit_of(word)
+            if known.is_equivalent(u.Unit(unit), u.spectral() if unit == "nm" else []):
+                said[known] = word
+    if len(said) > 1:
+        raise InputError(f"has a header with {' and '.join(said.values())}", "one unit", key="unit")
+    return np.asarray((values * next(iter(said), u.Unit(unit))).to_value(unit, u.spectral()))
 
 
 def text_of(content: bytes) -> str:
@@ -195,13 +224,17 @@ def _array(cell: str) -> NDArray[np.float64]:
 def _first_row(lines: Sequence[tuple[int, str]]) -> float:
     """Return the number of the first line that starts with two numbers or, if there is none, with one."""
     starting = []
-    for number, line in lines:
+    for place, (number, line) in enumerate(lines):
         first = re.split(r"[\s;|]+|,\s|,(?=[^\d])", line.strip().strip("|").strip())[0]
         if not _is_numeric(first.strip("\"'(")):
             continue
         starting.append(number)
         cells = re.split(r"[\s;|]+", line.strip())
         cells = line.split(",") if len(cells) == 1 else cells
+        below = lines[place + 1 :]
+        if below and all(map(str.isdecimal, cells)) and int(cells[0][:9]) == len(below):
+            # The numbers of rows and of other columns, as in POLARBASE's spectra.
+            continue
         # A line of a preamble, such as "2 columns" or "912 s", has no second number.
         if sum(_is_numeric(cell) or is_missing(cell) for cell in cells) > 1:
             return number
@@ -316,6 +349,9 @@ class TextRows:
             at += 1
         elif len(cells) > at + 1 and _are_units(cells[at], cells[at + 1]):
             units, at = cells[at], at + 1
+        if not mark and all(name.endswith(",") for name in names[:-1]):
+            # Commas divide the names and blanks the rows.
+            names = [name.rstrip(",") for name in names]
         names = [name or f"col{k + 1}" for k, name in enumerate(names)]
         # Names that occur twice get numbers, so that none is taken for the only one.
         while twice := [name for name, count in Counter(names).items() if count > 1]:
@@ -377,10 +413,14 @@ def text_table(text: str, what: str, commas: bool, expected: str = "CSV or ECSV"
         return Table.read([line for line in lines if line.strip()], format=form)
 
 
+def is_described(text: str) -> bool:
+    """Return whether a text is a machine-readable table of the journals, or of CDS with its description."""
+    return re.search(r"(?m)^\s*Byte-by-byte Description", text[:100_000]) is not None
+
+
 def _known_form(text: str) -> str | None:
     """Return the name in astropy of a form with units and types of its own, or None."""
-    if re.search(r"(?m)^\s*Byte-by-byte Description", text[:100_000]):
-        # Machine-readable tables of the journals, and tables of CDS with their description.
+    if is_described(text):
         return "ascii.mrt" if re.match(r"\s*Title:", text) else "ascii.cds"
     lines = [line for line in text[:100_000].splitlines() if line.strip() and line[0] not in "\\#"]
     rows = [line for line in lines if not line.startswith("|")]
@@ -408,7 +448,7 @@ def _mark(lines: Sequence[str], commas: bool) -> str:
         if not is_dated(cell)
     )
     # Other marks are rare in prose, so that several lines of a title may stand above the first line with one.
-    is_usual = best != "," and 2 * scores[best] >= len(sample)
+    is_usual = best != "," and scores[best] > 1
     start = next((k for k, line in enumerate(sample) if best in line), 0) if is_usual else 1
     return best if scores[best] and all(best in line for line in sample[start:]) and not in_words else ""
 

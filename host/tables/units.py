@@ -47,6 +47,8 @@ _SPELLINGS = {
 }  # fmt: skip
 _WORDS = {spelling: name for name, spellings in _SPELLINGS.items() for spelling in spellings.split()}
 _TYPOGRAPHY = str.maketrans("µμ−–⁻⁺⁰¹²³⁴⁵⁶⁷⁸⁹·⋅×Å", "uu---+0123456789..*Å")
+#: Marks of LaTeX that say nothing of a unit.
+_LATEX = re.compile(r"\$|\\(?:mathrm|rm|text|,|;|:|!|(?=AA))")
 SCALE = re.compile(
     r"(?:x\s*|\*\s*)?(?:10\s*(?:\^|\*\*)\s*\(?\s*([+-]?\d{1,3})\s*\)?|10([+-]\d{1,3})(?!\d)|(\d(?:\.\d*)?[eE][+-]?\d{1,3}))"
 )
@@ -74,7 +76,7 @@ def unit_of(text: str) -> u.UnitBase | u.function.FunctionUnitBase:
     """
     import astropy.units as u
 
-    name = text.translate(_TYPOGRAPHY).strip().strip("'\"").strip()
+    name = re.sub("[{}]", "", _LATEX.sub(" ", text.translate(_TYPOGRAPHY))).strip().strip("'\"").strip()
     if name[:1] == "[" and name[-1:] == "]":
         name = name[1:-1].strip()
     if _AB.fullmatch(name):
@@ -198,7 +200,7 @@ _JULIAN = re.compile(
     rf"(?P<name>{'|'.join(sorted(set(_DAYS) - {'gps', 'unix'}, key=len, reverse=True))})"
     r"(?:[\s_(\[-]+(?P<scale>utc|tdb|tt|tai|tcb)[)\]]?)?"
     r"\s*(?:[-+]\s*(?P<less>\d+(?:\.\d*)?(?:e\d+)?)|[(\[]?(?P<plus>\d{4,}(?:\.\d*)?)\s*\+[)\]]?)?"
-    r"\s*[,;:]?\s*(?:[(\[]?d(?:ays?)?[)\]]?)?"
+    r"\s*[,;:]?\s*(?:[(\[]?d(?:ays?)?[)\]]?)?(?:\s*[(\[](?P<end>utc|tdb|tt|tai|tcb)[)\]])?"
 )
 #: Words in the names of times that say nothing of their unit: ``time_bjd``, ``TMID_BJD``, ``mjd_obs``.
 _TIME_OF = ("time", "t", "date", "tmid", "mid", "middle", "obs", "mean", "center", "centre")
@@ -243,7 +245,7 @@ def time_unit(text: str) -> TimeUnit | None:
     if match := _JULIAN.fullmatch(word):
         name = match["name"]
         mission = name in _MISSION_DAYS
-        scale = match["scale"] or ("tdb" if mission else "")
+        scale = match["scale"] or match["end"] or ("tdb" if mission else "")
         place = "BARYCENTER" if "b" in name else "HELIOCENTER" if name.startswith("h") else ""
         return TimeUnit("d", _DAYS[name] + float(match["less"] or match["plus"] or 0.0), scale, place)
     if (match := _SINCE.fullmatch(word)) and match["unit"] in _TIME_WORDS:

@@ -274,7 +274,8 @@ def read_spectrum(name: str, path: Path, wavelength_nm: NDArray[np.float64]) -> 
 
 def read_values(what: str, kind: str, path: Path, wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
     """Read values of a file of two columns, and interpolate them to pixels."""
-    rows = columns(what, read_text(path, kind if kind == "weights" else "spectrum"))
+    text = read_text(path, kind if kind == "weights" else "spectrum")
+    rows = columns(what, text, f"wavelengths and {kind}", "nm")
     return at_pixels(what, kind, rows, wavelength_nm)
 
 
@@ -291,12 +292,10 @@ def at_pixels(
         Wavelengths, nm, and values.
     wavelength_nm : ndarray, shape (n_pixel,)
     """
-    if rows.ndim != 2 or rows.shape[1] != 2 or not np.all(np.diff(rows[:, 0]) > 0):
-        raise InputError(
-            f"{what} have {rows.shape[1] if rows.ndim == 2 else 'no'} columns",
-            f"ascending wavelengths in nm and {kind}",
-            key=what,
-        )
+    if rows.ndim != 2 or rows.shape[1] != 2:
+        raise InputError(f"{what} have the shape {rows.shape}", f"two columns, nm and {kind}", key=what)
+    if not np.all(np.diff(rows[:, 0]) > 0):
+        raise InputError(f"{what} do not ascend in wavelength", f"ascending wavelengths and {kind}", key=what)
     sizes = np.abs(rows)
     bad = ~((rows == 0) | ((sizes >= SMALLEST) & (sizes <= LARGEST)))
     if bad.any():

@@ -47,6 +47,8 @@ if TYPE_CHECKING:
 Float = NDArray[np.float64]
 #: Light of a flare that counts for its energy: in the band of its amplitude, or at all wavelengths.
 Kind = Literal["band", "bolometric"]
+#: Energies below it, erg, are logarithms: a flare of a star has more than 1e20 erg.
+LIKELY_LOGARITHM = 1e3
 #: Number of points of the integral over a band; the step is at most a tenth of the sampling of the band.
 POINTS = 20_001
 
@@ -461,6 +463,9 @@ class RateTable(Rates):
             values = [rows.number(held, row, unit) for row in range(rows.n)]
             columns.append(np.array([np.nan if value is None else value for value in values]))
         energy, rate = columns
+        if np.nanmax(energy, initial=0.0) < LIKELY_LOGARITHM:
+            fault = f"{rows.named} has energies up to {np.nanmax(energy, initial=0.0):g}, which look like logarithms"
+            raise InputError(fault, "energies in erg", key="energy")
         rates = cls(energy_erg=energy, per_day=rate, band=band, source=path.name)
         return replace(rates, measured_erg=(float(energy[0]), float(energy[-1])))
 

@@ -121,7 +121,7 @@ class Curve(Section):
 
         from mauvecl.host.tables.text_tables import read_columns
 
-        rows = np.array(self.points) if self.file is None else read_columns("curve", "values", self.file)
+        rows = np.array(self.points) if self.file is None else read_columns("curve", "values", self.file, "s")
         if self.file is not None:
             _check_points(rows.tolist())
         return rows[:, 0], rows[:, 1]

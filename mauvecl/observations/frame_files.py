@@ -115,7 +115,7 @@ KNOWN = {
     "time": ("time",),
     "flux": ("flux", "pdcsap_flux", "sap_flux", "kspsap_flux", "det_flux", "corr_flux", "corrected_flux", "fcor",
              "flux_corr", "detrended_flux", "rate", "rel_flux", "relative_flux", "normalized_flux", "norm_flux",
-             "rel_flux_t1", "ujy"),
+             "rel_flux_t1", "ujy", "count_rate", "countrate", "cps", "counts", "cal_aper_flux", "whitelight_flux"),
     "quality": ("quality", "sap_quality"),
     "temperature": ("temperature",),
 }  # fmt: skip
@@ -621,7 +621,7 @@ def _time_unit(
     time: tuple[Values, ...], values: Float, file: TableFile, mapping: FrameMapping, stated: TimeSystem
 ) -> tuple[TimeUnit, list[str]]:
     """Return the unit of times and what it says of their zero: of the mapping, the column, its name, the header."""
-    if len({one.unit for one in time}) > 1 and not mapping.time_unit:
+    if len({one.unit or unit_in_name(one.name) for one in time}) > 1 and not mapping.time_unit:
         names = " and ".join(repr(one.name) for one in time)
         raise InputError(f"{file.what}: {names} have different units", "one unit", key="time")
     text = mapping.time_unit or time[0].unit or unit_in_name(time[0].name)
@@ -672,11 +672,16 @@ def _light(found: Quantities, mapping: FrameMapping) -> tuple[str, Values, Value
     if error.shape != found.flux.shape:
         raise InputError(f"{error.what}: {error.name!r} has the shape {error.shape}",
                          f"that of the flux, {found.flux.shape}", key="error")  # fmt: skip
-    if error.unit and unit and error.unit != unit and not mapping.flux_unit:
+    own = error.unit or unit_in_name(error.name)
+    if own and not unit and own.lower() in PARTS_OF_LEVEL:
+        raise InputError(f"{error.what}: {error.name!r} is in {own}, and {found.flux.name!r} is not",
+                         "errors in the unit of the light, or flux_unit = '1' in a mapping if its level is 1",
+                         key="error")  # fmt: skip
+    if own and unit and own not in (unit, stated):
         try:
-            factor = float(unit_in(error.unit).to(unit_in(unit)))
+            factor = float(unit_in(own).to(unit_in(unit)))
         except (ValueError, TypeError) as fault:
-            raise InputError(f"{error.what}: {error.name!r} is in {error.unit} and {found.flux.name!r} in {unit}",
+            raise InputError(f"{error.what}: {error.name!r} is in {own} and {found.flux.name!r} in {unit}",
                              "units of the same kind", key="error") from fault  # fmt: skip
         error = error.mapped(lambda values: values * factor, unit)
     return unit, found.flux, error, remarks

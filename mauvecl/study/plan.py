@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
@@ -10,11 +11,14 @@ from pydantic import ValidationError, field_validator, model_validator
 
 from mauvecl.host.orbit.observing_limits import Limits
 from mauvecl.host.tables.names import (
+    BANDS,
     DECLINATIONS,
     RIGHT_ASCENSIONS,
     SEXAGESIMAL,
     SPECTRAL_TYPES,
     STARS,
+    band_in_name,
+    divided_unit,
     is_missing_position,
     key_of,
 )
@@ -183,7 +187,14 @@ class PlanTarget(Section):
         from mauvecl.host.orbit.orbit import Target
 
         if self.coordinates is None:
-            return Target.of(self.name, name=self.name, simbad=simbad)
+            try:
+                return Target.of(self.name, name=self.name, simbad=simbad)
+            except InputError as error:
+                if simbad or not self.unused:
+                    raise
+                fault = f"target {shortened(self.name)} is not in the embedded list, and its table has no coordinates"
+                expected = f"columns ra and dec, or coordinates, besides {shown(', '.join(self.unused), 200)}"
+                raise InputError(fault, expected, key="coordinates") from error
         place = Target.of(self.coordinates, name=self.name)
         try:
             known = Target.of(self.name)
@@ -298,8 +309,10 @@ def read_targets(path: Path) -> list[dict[str, Any]]:
 TARGET_COLUMNS = {
     "name": (*STARS, "hostname"), "ra": RIGHT_ASCENSIONS, "dec": DECLINATIONS, "spectral_type": SPECTRAL_TYPES,
     "magnitude": ("V", "vmag", "mag_v", "v_mag", "johnson_v", "flux_v", "sy_vmag", "mag"),
-    "distance_pc": ("distance", "dist", "d_pc", "dist_pc"), "parallax": ("parallax", "plx", "plx_value"),
-    "mass_msun": ("mass", "st_mass"), "age_myr": ("age",), "coordinates": ("coord", "coords", "position", "coord1"),
+    "distance_pc": ("distance", "dist", "d_pc", "dist_pc", "sy_dist"),
+    "parallax": ("parallax", "plx", "plx_value", "parallax_mas", "plx_mas"),
+    "mass_msun": ("mass", "st_mass"), "age_myr": ("age",),
+    "coordinates": ("coord", "coords", "position", "coord1", "radec", "ra_dec", "ra/dec"),
 }  # fmt: skip
 
 
@@ -357,6 +370,7 @@ def _target(
         else:
             # A text that is no number is refused with the key's own sentence.
             one[key] = rows.number(column, row, "" if unit is None else unit.name) if _is_number(text) else text
+    _check_band(rows, columns["magnitude"], row)
     parallax = columns["parallax"]
     if parallax is not None and "distance_pc" not in one:
         value = rows.number(parallax, row, "mas")
@@ -378,6 +392,15 @@ def _target(
     except ValidationError as error:
         raise input_error(named, PlanTarget, error) from error
     return one
+
+
+def _check_band(rows: Rows, column: str | None, row: int) -> None:
+    """Raise InputError if a magnitude of no stated band in its name has another than V in brackets or in a column."""
+    if column is None or key_of(divided_unit(column)[0]) not in ("mag", "magnitude") or not rows.text(column, row):
+        return
+    bands = (band_in_name(column), rows.text(rows.first(BANDS), row))
+    if odd := next((band for band in bands if band and not re.fullmatch(r"(?i)(?:johnson[\s_]*)?v", band)), None):
+        raise rows.error(f"row {row + 1} has {column} in the band {shortened(odd)}", "a magnitude in V", column)
 
 
 def _coordinates(rows: Rows, columns: dict[str, str | None], row: int, one: dict[str, Any]) -> str | None:

@@ -280,13 +280,9 @@ def read_pairs(name: str, content: bytes) -> Points:
         text = content.decode("utf-8")
     except UnicodeDecodeError as error:
         raise InputError(f"{shortened(name)} is not text", "two columns, nm and DN", key="upload") from error
-    pairs = columns(f"upload {shortened(name)}", text)
-    if pairs.ndim != 2 or pairs.shape[1] != 2 or not 2 <= len(pairs) <= MOST_PAIRS:
-        raise InputError(
-            f"{shortened(name)} does not have two columns",
-            f"2 to {MOST_PAIRS} rows of two numbers, nm and DN",
-            key="upload",
-        )
+    pairs = columns(f"upload {shortened(name)}", text, "nm and DN", "nm")
+    if not 2 <= len(pairs) <= MOST_PAIRS:
+        raise InputError(f"{shortened(name)} has {len(pairs)} rows", f"2 to {MOST_PAIRS} of nm and DN", key="upload")
     if not np.isfinite(pairs).all() or (np.diff(pairs[:, 0]) <= 0).any():
         raise InputError(f"{shortened(name)} does not ascend in nm", "rows in ascending order", key="upload")
     return tuple((float(nm), float(dn)) for nm, dn in pairs)

@@ -93,6 +93,21 @@ def test_positions_equal_those_of_the_sgp4_verification(tmp_path: Path) -> None:
     assert count > 400
 
 
+def test_newest_elements_of_mauve_are_chosen_among_those_of_others(tmp_path: Path) -> None:
+    mauve = section().orbit().elements
+    older = f"{mauve.first[:20]}200{mauve.first[23:68]}"
+    older += str(sum(int(one) if one.isdigit() else one == "-" for one in older) % 10)
+    others = [tle for tle, _ in verification()[:3]]
+    path = tmp_path / "group.tle"
+    path.write_text("".join([*others, f"MAUVE\n{mauve.first}\n{mauve.second}\n{older}\n{mauve.second}\n"]))
+    assert section(tle=str(path)).orbit().elements.first == mauve.first
+    path.write_text(f"{older}\n{mauve.second}\n")
+    assert section(tle=str(path)).orbit().elements.first == older
+    path.write_text("".join(others))
+    with refused("elements", "3 satellites", "00005", "66756"):
+        section(tle=str(path)).orbit()
+
+
 def test_track_matches_the_verification_vectors(tmp_path: Path) -> None:
     """Compare a low orbit at the times of a plan; the text of its epoch is accurate to 20 m."""
     tle, rows = next(one for one in verification() if one[0][2:7] == "06251")
