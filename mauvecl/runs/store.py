@@ -12,6 +12,7 @@ import json
 import os
 import shutil
 import tempfile
+import threading
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -241,6 +242,7 @@ class Store:
     path: Path
     study: Study
     digests: dict[str, str] = field(default_factory=dict)  # of written chunks, by path
+    _listing: threading.Lock = field(default_factory=threading.Lock)
 
     def __post_init__(self) -> None:
         missing = [name for name in ("zarr", "xxhash", "google_crc32c") if find_spec(name) is None]
@@ -389,12 +391,13 @@ class Store:
                     self.digests[f"{scene.path}/{name}"] = written
 
     def note(self, chunk: Chunk, digest_text: str) -> None:
-        """Add a chunk's digest to its array's list."""
+        """Add a chunk's digest to its array's list; threads wait for each other."""
         self.digests[chunk.key] = digest_text
         line = _line(chunk.name, digest_text)
         what = f"{chunk.scene.path}/{DIGESTS} of {self.path.name}"
         # A single short write at the end. A line that a full disk cut short is terminated first.
         with (
+            self._listing,
             writing(what, self.path, "a writable disk with room; what was written before is kept", key="store"),
             (self.path / chunk.scene.path / DIGESTS).open("a+b", buffering=0) as file,
         ):
@@ -425,11 +428,11 @@ class Store:
         whole = np.ascontiguousarray(rows, chunk.scene.dtype)
         return memoryview(whole.data).cast("B"), crc(whole)
 
-    def place(self, chunk: Chunk, rows: NDArray[Any]) -> str:
-        """Write a chunk atomically and return its digest."""
+    def write(self, chunk: Chunk, rows: NDArray[Any]) -> None:
+        """Write a chunk atomically, and then its digest."""
         data, check = self.encode(chunk, rows)
         write_whole(self.path / chunk.key, data, check)
-        return digest(data, check)
+        self.note(chunk, digest(data, check))
 
     def has(self, chunk: Chunk) -> bool:
         """Return whether a chunk was written, by digest list and file size; `bulk.state` checks its content."""
