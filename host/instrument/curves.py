@@ -256,6 +256,8 @@ class PixelMap(ContentEquality):
         return np.asarray(part if COLUMNS[name] == u.DN else nominal * part)
 
 
+#: Share of the variances of a covariance that is lost by leaving out the smallest modes.
+LOST_VARIANCE = 1e-4
 #: Start of the names of columns with modes.
 MODE = "mode_"
 #: Values of an instrument that modes may change in addition to the throughput, in words.
@@ -328,7 +330,6 @@ class ThroughputErrors(ContentEquality):
         *,
         names: Sequence[str] = (),
         sums: Float | None = None,
-        lost: float = 1e-4,
     ) -> ThroughputErrors:
         """Return the modes of a covariance of log throughput and of the logarithms of other values.
 
@@ -342,8 +343,6 @@ class ThroughputErrors(ContentEquality):
         sums : ndarray, shape (n_sum, n), optional
             Weighted sums of the curve, such as the light in bands. The first modes hold all errors of these sums and of
             the other values.
-        lost : float
-            Share of the variances that is lost by leaving out the smallest modes.
         """
         nm, total = np.asarray(wavelength_nm, np.float64), np.asarray(covariance, np.float64)
         sd = np.sqrt(np.diag(total))
@@ -351,8 +350,8 @@ class ThroughputErrors(ContentEquality):
         variances, vectors = np.linalg.eigh(total / np.outer(scale, scale))
         variances, vectors = np.maximum(variances[::-1], 0.0), vectors[:, ::-1]
         left = 1.0 - np.cumsum(variances) / max(variances.sum(), np.finfo(float).tiny)
-        kept = int((left > lost).sum()) + 1
-        modes = scale[:, None] * (vectors * np.sqrt(variances))[:, :kept]
+        n_modes = int((left > LOST_VARIANCE).sum()) + 1
+        modes = scale[:, None] * (vectors * np.sqrt(variances))[:, :n_modes]
         first = np.vstack([np.zeros((0, nm.size)) if sums is None else sums]) @ modes[: nm.size]
         first = np.vstack([first, modes[nm.size :] / scale[nm.size :, None]])
         if len(first):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
@@ -426,8 +426,8 @@ class UnknownAnswer(Answer):
         return list(self.quiets)
 
 
-def unknown_table(study: Study, unknowns: Mapping[str, NuisanceChoice] = SHOWN) -> UnknownAnswer:
-    """Compute the S/N of a study's flares under each of several unknowns, which are given by name."""
+def unknown_table(study: Study) -> UnknownAnswer:
+    """Compute the S/N of a study's flares under each of the unknowns of `SHOWN`."""
     costs: dict[tuple[str, float], dict[str, Cost]] = {}
     quiets = []
     comparison = study.run.comparison()
@@ -436,7 +436,7 @@ def unknown_table(study: Study, unknowns: Mapping[str, NuisanceChoice] = SHOWN) 
         for amplitude, flare in zip(case.amplitudes, case.flares, strict=True):
             costs[case.label, amplitude] = {
                 unknown: unknown_cost(case.label, case.quiet, flare, choice, comparison)
-                for unknown, choice in unknowns.items()
+                for unknown, choice in SHOWN.items()
             }
     return UnknownAnswer(study, costs, tuple(quiets))
 

@@ -277,11 +277,11 @@ def _help(text: str | None) -> str:
     return re.sub(r"(?m)^mauvecl .*$", lambda found: "\b\n" + _broken(found[0]), text)
 
 
-def _broken(command: str, most: int = 72) -> str:
-    """Divide a long command into lines that end in a backslash before a flag."""
+def _broken(command: str) -> str:
+    """Divide a command longer than 72 characters into lines that end in a backslash before a flag."""
     lines = [""]
     for part in re.split(r" (?=-)", command):
-        if lines[-1] and len(lines[-1]) + len(part) > most:
+        if lines[-1] and len(lines[-1]) + len(part) > 72:
             lines[-1] += " \\"
             lines.append("   ")
         lines[-1] += f" {part}" if lines[-1] else part

@@ -204,9 +204,11 @@ def toy(
 
 
 PIXELS = 1600
+#: Shortest measurement of a rate, s.
+RATE_S = 0.125
 
 
-def chi2_rate(engine: Engine, seconds: float = 0.5) -> float:
+def chi2_rate(engine: Engine) -> float:
     """Measure chi2's pixel-realisations per second, for a quiescent and a flaring scenario on common draws."""
     quiet, flare = toy(PIXELS), toy(PIXELS, flare=0.1)
 
@@ -218,7 +220,7 @@ def chi2_rate(engine: Engine, seconds: float = 0.5) -> float:
     # The first call builds the kernels.
     work(64)
     count = 256
-    while (spent := work(count)) < seconds / 4:
+    while (spent := work(count)) < RATE_S:
         count *= 4
     return count * PIXELS / min(spent, work(count))
 

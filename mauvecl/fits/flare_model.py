@@ -636,7 +636,7 @@ class Reduction(MeanSums):
 
     @property
     def statistics(self) -> tuple[Linear, ...]:
-        """User-defined statistics equal to the sums, which a device draws by pixel; see `drawn_sums`."""
+        """User-defined statistics equal to the sums, which a device draws by pixel."""
         return tuple(Linear(f"sum {k}", weights) for k, weights in enumerate(self.weights))
 
     @property
@@ -683,11 +683,6 @@ class Exposures:
     def _excess(self, rows: NDArray[np.intp]) -> Iterator[Float]:
         for start in range(0, rows.size, FRAMES_AT_ONCE):
             yield self.raw[rows[start : start + FRAMES_AT_ONCE]] - self.mean_dn
-
-
-def drawn_sums(values: NDArray[np.float32], reduction: Reduction) -> Float:
-    """Return the sums of drawn exposures, (n, n_sum), from the result of `Engine.statistic_values` for one flare."""
-    return np.ascontiguousarray(values[-len(reduction.weights) :].T, np.float64)
 
 
 def variance_of(

@@ -429,32 +429,6 @@ def _fitted(
     }
 
 
-def fit_sums(sums: Float, model: FlareModel, reduction: Reduction) -> tuple[Float, Float]:
-    """Fit the sums of exposures, without intervals; a processor core fits about 3e5 exposures per second.
-
-    Parameters
-    ----------
-    sums : ndarray, shape (n, n_sum)
-    model : FlareModel
-    reduction : Reduction
-        Its variance is assumed for every exposure.
-
-    Returns
-    -------
-    estimates : ndarray, shape (n, n_derived)
-        Quantities of the model.
-    covariance : ndarray, shape (n, n_derived, n_derived)
-        Covariance from the Fisher information at the fit.
-    """
-    estimates, spreads = [], []
-    for start in range(0, len(sums), BATCH):
-        profile = Profile(reduction, sums[start : start + BATCH])
-        best = with_bounds(reduction, profile.sums, profile.best())
-        estimates.append(derived_values(model, best.log_k, best.linear))
-        spreads.append(covariance(model, profile, best))
-    return np.concatenate(estimates), np.concatenate(spreads)
-
-
 @dataclass(frozen=True, eq=False)
 class Forecast:
     """Expected errors of a measurement, from the Fisher information."""

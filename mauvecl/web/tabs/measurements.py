@@ -133,7 +133,7 @@ def region(closed: ClosedForms, answers: Answers) -> ChartData:
     return ChartData(text, series)
 
 
-def _ellipse(best: Float, ahead: Forecast, n: int = 161) -> tuple[Float, Float, Float]:
+def _ellipse(best: Float, ahead: Forecast) -> tuple[Float, Float, Float]:
     """Return the confidence region of the first two quantities, of normal errors of their logarithms.
 
     Its temperatures, with the smallest and largest amplitude at each, are empty for errors of 100 % or more.
@@ -141,7 +141,7 @@ def _ellipse(best: Float, ahead: Forecast, n: int = 161) -> tuple[Float, Float, 
     spread = ahead.covariance[:2, :2] / np.outer(best, best)
     if not (np.diag(spread) < 1.0).all():
         return np.empty(0), np.empty(0), np.empty(0)
-    angle, slope = np.linspace(-np.pi / 2, np.pi / 2, n), spread[0, 1] / spread[0, 0]
+    angle, slope = np.linspace(-np.pi / 2, np.pi / 2, 161), spread[0, 1] / spread[0, 0]
     along = np.sqrt(RISE_95 * spread[0, 0]) * np.sin(angle)
     half = np.sqrt(RISE_95 * (spread[1, 1] - slope * spread[0, 1])) * np.cos(angle)
     low, high = (best[1] * np.exp(slope * along + side) for side in (-half, half))
