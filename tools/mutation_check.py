@@ -475,8 +475,8 @@ MUTATIONS: dict[str, Mutation] = {
     "errors of changes with everything known": (
         "test_error_of_change_is_the_scatter_of_fits",
         (
-            "error_of_change(one.counts_dn, quiet, unknown), error_of_change",
-            "error_of_change(one.counts_dn, quiet, None), error_of_change",
+            "error_of_change(change.counts_dn, quiet, unknown), error_of_change",
+            "error_of_change(change.counts_dn, quiet, None), error_of_change",
         ),
     ),
     "one visit against a known mean": (

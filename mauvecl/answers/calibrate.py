@@ -197,8 +197,8 @@ class CalibrateAnswer(Answer):
         fits: dict[str, ThroughputFit | DarkFit | PhotonTransfer] = {
             "throughput": self.throughput, "dark current": self.dark, "photon transfer": self.transfer
         }  # fmt: skip
-        return [{"name": name, "chi2": one.chi2, "dof": float(one.dof), "p_value": one.p_value}
-                for name, one in fits.items() if one.dof > 0]  # fmt: skip
+        return [{"name": name, "chi2": fit.chi2, "dof": float(fit.dof), "p_value": fit.p_value}
+                for name, fit in fits.items() if fit.dof > 0]  # fmt: skip
 
     @cached_property
     def nominal_throughput(self) -> NDArray[np.float64]:
@@ -524,14 +524,14 @@ def _observations(
     )
     sources = stars or tuple(observation.source() for observation in asked.observations)
     observations = tuple(
-        CalibrationFrames.of(given, nominal, star, one.temperature_c)
-        for given, star, one in zip(read, sources, asked.observations, strict=True)
+        CalibrationFrames.of(given, nominal, star, source.temperature_c)
+        for given, star, source in zip(read, sources, asked.observations, strict=True)
     )
-    for k, one in enumerate(observations):
-        if not one.usable(nominal).any():
-            raise InputError.of("observations", one.name, "frames with a pixel below saturation")
-        if any(np.array_equal(one.raw_dn, other.raw_dn) for other in observations[:k]):
-            raise InputError.of("observations", one.name, "frames that no other observation has")
+    for k, observation in enumerate(observations):
+        if not observation.usable(nominal).any():
+            raise InputError.of("observations", observation.name, "frames with a pixel below saturation")
+        if any(np.array_equal(observation.raw_dn, other.raw_dn) for other in observations[:k]):
+            raise InputError.of("observations", observation.name, "frames that no other observation has")
     return nominal, observations
 
 

@@ -111,7 +111,7 @@ def spoken(choice: NuisanceChoice) -> str:
     sd: dict[str, float | str] = {row.name: row.prior.sd for row in documented if row.prior is not None}
     sd |= choice.spreads()
     sizes = [f"{NUISANCES[name].label} ({_size(value, NUISANCES[name].unit)})" for name, value in sd.items()]
-    return join_names(sizes + [f"{name!r} ({_size(one.sd, '')})" for name, one in choice.own.items()])
+    return join_names(sizes + [f"{name!r} ({_size(spectrum.sd, '')})" for name, spectrum in choice.own.items()])
 
 
 def _size(sd: float | str, unit: str) -> str:
@@ -209,10 +209,10 @@ def drawn(study: Study) -> DrawnStudies:
         changes: dict[str, Any] = {}
         at = nominal
         for name, value in zip(priors, row, strict=True):
-            one = rows[name].changes(at, float(value))
-            changes |= one
+            change = rows[name].changes(at, float(value))
+            changes |= change
             # The next mode is added to those before it.
-            at = at.model_copy(update=one) if isinstance(rows[name], ThroughputMode) else at
+            at = at.model_copy(update=change) if isinstance(rows[name], ThroughputMode) else at
         changed = certain.with_instrument(changes)
         try:
             nominal.with_(**changes)
@@ -232,7 +232,7 @@ def throughput_cases(case: Case) -> list[Case]:
     for mode in values_of(case.instrument).values():
         if isinstance(mode, ThroughputMode):
             signs = (replace(case, study=case.study.with_instrument(mode.changes(case.instrument, x))) for x in (1, -1))
-            same = next((one for one in signs if one.instrument.read_pixels == pixels), None)
+            same = next((sign for sign in signs if sign.instrument.read_pixels == pixels), None)
             if same is None:
                 raise InputError(
                     "an error of the calibrated wavelengths changes the pixels of the output range",

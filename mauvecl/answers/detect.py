@@ -206,7 +206,7 @@ def detect(
             # Meanwhile, the devices count the next star.
             paper = _paper(prepared)
         stars.append(star)
-    costs = [text for case, one in zip(prepared, stars, strict=True) for text in _template_costs(case, one)]
+    costs = [text for case, star in zip(prepared, stars, strict=True) for text in _template_costs(case, star)]
     answer = DetectAnswer(study, stars)
     blinding = [message.about(star.title) for star in stars for message in star.detection.messages]
     blinding += [message.about(star.title) for star in stars for message in star.detection.without_threshold(run.fap)]
@@ -303,15 +303,15 @@ def _wanted(asked: CampaignQuestion, tests: int, stack: int, seed: int) -> list[
     """Return sentences on the false-alarm probability per test for the campaign's wanted values."""
     lines = []
     if asked.fap is not None and asked.frames is not None:
-        one = per_test(asked.fap, asked.frames, stack, step=asked.step, seed=seed)
+        rate = per_test(asked.fap, asked.frames, stack, step=asked.step, seed=seed)
         text = (
             f"For a chance of {asked.fap:g} of any false alarm in the campaign each of its {tests} tests may have "
-            f"{one.independent:.4g} if they are independent, {one.at_least:.4g} in any case"
+            f"{rate.independent:.4g} if they are independent, {rate.at_least:.4g} in any case"
         )
-        if one.overlapping is not None:
-            o = one.overlapping
+        if rate.overlapping is not None:
+            o = rate.overlapping
             text += f", and with the overlap of its stacks {o.value:.3g} [{o.low:.3g}, {o.high:.3g}]"
-        lines.append(f"{text}: `fap={one.at_least:.4g}`.")
+        lines.append(f"{text}: `fap={rate.at_least:.4g}`.")
     if asked.alarms is not None:
         if not asked.alarms < tests:
             raise InputError(

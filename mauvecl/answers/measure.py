@@ -276,7 +276,7 @@ def measure(
         flares += some
     stares = [measured_stare(case, engine) for case in prepared if study.measure.along_stare]
     messages = collect_messages(expectations)
-    messages += [one.drawn for one in stares if isinstance(one.drawn, str)]
+    messages += [stare.drawn for stare in stares if isinstance(stare.drawn, str)]
     messages += dict.fromkeys(line for case in prepared for line in _not_marginalised(case))
     return MeasureAnswer(study, flares, [*messages, *_faint(flares), *_wrong(flares)], stares)
 
@@ -285,7 +285,7 @@ def _measured(case: Case, amplitude: float, flare: Expectation, engine: Engine |
     """Fit all models to simulated exposures of a flare."""
     study, quiet = case.study, case.quiet
     expected = expected_measurements(case, amplitude, flare)
-    models, unknown = [one.fitted for one in expected], expected[0].unknown
+    models, unknown = [forecast.fitted for forecast in expected], expected[0].unknown
     skipped = study.measure.skipped_nm
     weights = matched_filter(quiet, flare, case.unknowns(), skipped_nm=skipped)[0]
 
@@ -307,14 +307,14 @@ def _measured(case: Case, amplitude: float, flare: Expectation, engine: Engine |
         parts.append(kept(checkpoint, depends_on, partial(fitted, start, count)))
     selected = np.concatenate([arrays["detected"] for arrays in parts])
     measured = []
-    for k, one in enumerate(expected):
+    for k, forecast in enumerate(expected):
         own = [{key.removeprefix(f"{k} "): x for key, x in part.items() if key.startswith(f"{k} ")} for part in parts]
-        model = one.fitted
+        model = forecast.fitted
         of_batch = partial(
             Measurement.of_arrays, levels=LEVELS, names=model.names, units=model.units, bounds=model.bounds
         )
         found = Measurement.joined(list(map(of_batch, own)))
-        measured.append(MeasuredFlare(**vars(one), found=found, selected=selected, frame=parts[0]["first"]))
+        measured.append(MeasuredFlare(**vars(forecast), found=found, selected=selected, frame=parts[0]["first"]))
     return measured
 
 

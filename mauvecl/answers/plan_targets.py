@@ -336,8 +336,8 @@ def found_by_energy(critical_erg: Float, half_widths_s: Float, energy_erg: Float
     energy_erg : ndarray, shape (n_energy,)
     """
     of_width = np.empty((half_widths_s.size, energy_erg.size))
-    for row, one in zip(of_width, critical_erg, strict=True):
-        counted = np.sort(one[one > 0])
+    for row, energies in zip(of_width, critical_erg, strict=True):
+        counted = np.sort(energies[energies > 0])
         row[:] = np.searchsorted(counted, energy_erg, side="right") / max(counted.size, 1)
     nodes, weights = np.polynomial.hermite_e.hermegauss(15)
     half = np.log(law.half_width(energy_erg)[:, None] * 10 ** (law.scatter_dex * nodes))

@@ -263,10 +263,10 @@ class VisibleAnswer(Answer):
 
     def _longest_gap_d(self, k: int) -> float:
         """Return the longest time without a window, in days."""
-        one = self.windows[k]
+        windows = self.windows[k]
         ends = (
-            np.concatenate([[0.0], one.stop_s]),
-            np.concatenate([one.start_s, [self.times.n * self.times.step_s]]),
+            np.concatenate([[0.0], windows.stop_s]),
+            np.concatenate([windows.start_s, [self.times.n * self.times.step_s]]),
         )
         return float(np.max(ends[1] - ends[0])) / DAY_S
 
@@ -314,11 +314,11 @@ class VisibleAnswer(Answer):
         """Return the appointments of the calendar."""
         times, entries = self.times, list[Entry]()
         single = self.study.orbit.orbit().resolved(times) == "tle" and self.writes_windows
-        for k, one in enumerate(self.targets):
+        for k, target in enumerate(self.targets):
             if single:
                 windows = self.windows[k]
                 entries += [
-                    Entry(times.iso(float(a)), times.iso(float(b)), one.name, f"{(b - a) / 60:.0f} min of exposure")
+                    Entry(times.iso(float(a)), times.iso(float(b)), target.name, f"{(b - a) / 60:.0f} min of exposure")
                     for a, b in zip(windows.start_s, windows.stop_s, strict=True)
                 ]
                 continue
@@ -326,7 +326,7 @@ class VisibleAnswer(Answer):
             edges = np.flatnonzero(np.diff(np.concatenate([[False], hours >= SEEN_H, [False]])))
             for first, last in zip(edges[::2], edges[1::2], strict=True):
                 mean = f"{hours[first:last].mean():.1f} h of exposure a day"
-                entries.append(Entry(self.days[first], self.days[last - 1], one.name, mean))
+                entries.append(Entry(self.days[first], self.days[last - 1], target.name, mean))
         return entries
 
     @property
@@ -337,7 +337,7 @@ class VisibleAnswer(Answer):
     @property
     def messages(self) -> list[str]:
         """Messages on the orbit, assumptions, effects that are not modelled, and targets that are never visible."""
-        never = [one.name for one, part in zip(self.targets, self.visibility.share, strict=True) if part == 0]
+        never = [target.name for target, part in zip(self.targets, self.visibility.share, strict=True) if part == 0]
         lines = [f"{name} is never seen: {self.reason(name)}." for name in never]
         lines += self.study.orbit.orbit().messages(self.times)
         lines.append(

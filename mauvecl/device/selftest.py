@@ -442,7 +442,7 @@ CASES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     ),
 }
 #: Statistics of the fast kernel, which compares with the expectation only.
-FAST = tuple(name for name, one in STATISTICS.items() if not one.paired)
+FAST = tuple(name for name, statistic in STATISTICS.items() if not statistic.paired)
 #: Realisations that cross the boundary of the counter's first word.
 START, COUNT, SEED = 2**40 - 13, 40, 2**63 + 20_261_121
 

@@ -378,7 +378,7 @@ def _faults_of_description(store: Store, repair: bool) -> Iterator[Fault]:
         try:
             data = read_bytes(there, "description")
             if name.endswith("zarr.json"):
-                found, made = (without_version(json.loads(one)) for one in (data, content))
+                found, made = (without_version(json.loads(text)) for text in (data, content))
                 same, seen = found in (made, without_later_attributes(made)), "foreign"
             else:
                 same, seen = data == content, "damaged"

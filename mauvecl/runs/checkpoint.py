@@ -167,8 +167,8 @@ def _feed(digest: Any, value: Any, leave: tuple[str, ...] = ()) -> None:
             _feed(digest, value[key])
     elif isinstance(value, list | tuple):
         digest.update(f"<{len(value)}".encode())
-        for one in value:
-            _feed(digest, one)
+        for item in value:
+            _feed(digest, item)
     elif isinstance(value, float):
         digest.update(value.hex().encode())
     else:

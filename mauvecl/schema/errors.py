@@ -29,7 +29,7 @@ class Message(str):
 
 def of_kind(messages: Iterable[str], kind: str) -> list[str]:
     """Return the messages of a kind."""
-    return [one for one in messages if isinstance(one, Message) and one.kind == kind]
+    return [message for message in messages if isinstance(message, Message) and message.kind == kind]
 
 
 def shortened(text: str, most: int = 80) -> str:

@@ -159,7 +159,7 @@ def plain(key: str, given: Any, unit: str) -> Any:
     if is_quantity(given):
         return numbers(key, given, unit).tolist()
     if isinstance(given, list | tuple) and any(map(is_quantity, given)):
-        return [plain(key, one, unit) for one in given]
+        return [plain(key, item, unit) for item in given]
     if hasattr(given, "tolist"):
         return given.tolist()
     if hasattr(given, "utc") and hasattr(given, "isot"):
@@ -181,7 +181,7 @@ class Section(Record):
         old = getattr(self, key)
         new = value
         if inner:
-            many = tuple(one.with_value(inner, value) for one in (old if isinstance(old, tuple) else (old,)))
+            many = tuple(section.with_value(inner, value) for section in (old if isinstance(old, tuple) else (old,)))
             new = many if isinstance(old, tuple) else many[0]
         elif isinstance(old, tuple):
             new = (value,)

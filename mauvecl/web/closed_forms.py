@@ -66,12 +66,12 @@ class ClosedForms:
     @cached_property
     def odds(self) -> DetectionForms:
         """Closed form of the requested statistic, for Gaussian noise."""
-        one, setting = STATISTICS[self.question.statistic], self.case.setting(self.quiet, self.flare)
+        statistic, setting = STATISTICS[self.question.statistic], self.case.setting(self.quiet, self.flare)
         if not setting.used.any():
             name = self.quiet.name
             raise InputError(f"every pixel of {name} is saturated", "a fainter star", key="magnitude")
-        one.check(setting)
-        return one.detection_forms(setting, self.flare, self.question.fap)
+        statistic.check(setting)
+        return statistic.detection_forms(setting, self.flare, self.question.fap)
 
     @cached_property
     def chance(self) -> float:
@@ -150,14 +150,16 @@ class ClosedForms:
         as for another throughput.
         """
         q, base = self.question, self.quiet
-        one, rise = STATISTICS[q.statistic], self.flare.source_electrons - base.source_electrons
+        statistic, rise = STATISTICS[q.statistic], self.flare.source_electrons - base.source_electrons
         behind = base.sky_electrons * (light if sky else 1.0)
         quiet = replace(base, source_electrons=light * base.source_electrons, sky_electrons=behind)
         setting = self.case.setting(quiet)
         if not setting.used.any():
             return []
         electrons = (light * (base.source_electrons + more * rise) for more in rises)
-        return [one.detection_forms(setting, replace(quiet, source_electrons=light), q.fap) for light in electrons]
+        return [
+            statistic.detection_forms(setting, replace(quiet, source_electrons=light), q.fap) for light in electrons
+        ]
 
     @property
     def slow(self) -> bool:
@@ -232,12 +234,12 @@ def chances(closed: ClosedForms, answers: Answers) -> list[Chance]:
         try:
             assumed = closed.assuming(unknown)
             simulated = _simulated_chance(assumed, answers.get("detection" if assumed is closed else OTHER))
-            one = simulated or Chance(unknown, assumed.chance, f"in closed form{_spread(assumed)}")
+            chance = simulated or Chance(unknown, assumed.chance, f"in closed form{_spread(assumed)}")
         except InputError as error:
             if unknown == closed.question.unknown:
                 raise
-            one = Chance(unknown, float("nan"), str(error).partition(", expected ")[0])
-        found.append(one)
+            chance = Chance(unknown, float("nan"), str(error).partition(", expected ")[0])
+        found.append(chance)
     return found
 
 

@@ -275,7 +275,7 @@ def _reader(field: FieldInfo, widget: Widget, unit: str, *, optional: bool) -> C
     flag = first(field, Flag)
     if flag is not None and flag.kind == list[str] and flag.read is not None:
         read = flag.read
-        return lambda text: tuple(read([one for one in text.split(",") if one.strip()], widget.label))
+        return lambda text: tuple(read([word for word in text.split(",") if word.strip()], widget.label))
     reach = first(field, Range)
     if reach is None:
         return (lambda text: text.strip() or None) if optional else str
@@ -306,7 +306,7 @@ _OWN_FIELDS = {
     ),
     "statistic": Field(
         label="Detection statistic", first="matched", read=Choice(tuple(STATISTICS)),
-        hint="; ".join(f"{name}: {one.definition}" for name, one in STATISTICS.items()) + ".",
+        hint="; ".join(f"{name}: {statistic.definition}" for name, statistic in STATISTICS.items()) + ".",
         group="Detection", place=1, own_keys=("run.statistics",),
     ),
     "unknown": Field(
@@ -417,7 +417,7 @@ def _fields() -> dict[str, str]:
 def _flags() -> dict[str, str]:
     """Return the field of each flag whose key has one."""
     names = {".".join(field.path): name for name, field in FIELDS.items() if field.path}
-    return {flag: names[key] for key, _, one in keys_with_flags() if key in names for flag in one.names}
+    return {flag: names[key] for key, _, option in keys_with_flags() if key in names for flag in option.names}
 
 
 def field_of(key: str | None) -> str | None:

@@ -40,7 +40,7 @@ def card(closed: ClosedForms, answers: Answers) -> dict[str, Any]:
     """
     q, x = closed.question, closed.quiet
     cut, both = closed.odds.threshold, chances(closed, answers)
-    (chosen,) = (one for one in both if one.unknown == q.unknown)
+    (chosen,) = (chance for chance in both if chance.unknown == q.unknown)
     facts = []
     if "detection" in answers:
         (row,) = (row for row in answers["detection"].table if row["statistic"] == q.statistic)
@@ -58,7 +58,7 @@ def card(closed: ClosedForms, answers: Answers) -> dict[str, Any]:
     )
     return {
         "headline": True,
-        "numbers": [one.shown for one in both],
+        "numbers": [chance.shown for chance in both],
         "chosen": q.unknown,
         "shown": percent(chosen.value),
         "interval": f"{TITLES[q.unknown]}; {chosen.how}",

@@ -92,21 +92,21 @@ class Calibrate(Tab):
         archive: Observations = question.uploads["observations"]
         files = {name: VisitorFile(name, content) for name, content in archive.files.items()}
         frames, stars = [], []
-        for one in archive.rows:
-            mapping = files[str(one.mapping)] if one.mapping else None
-            frames.append(read_frames_of(files[str(one.frames)], mapping, "observations"))
+        for row in archive.rows:
+            mapping = files[str(row.mapping)] if row.mapping else None
+            frames.append(read_frames_of(files[str(row.frames)], mapping, "observations"))
             if sum(some.flux.size for some in frames) > MOST_VALUES:
                 raise InputError(
                     "the archive holds more raw values than are read here",
                     f"{MOST_VALUES}, or the command line",
                     key="observations",
                 )
-            if one.spectrum is None:
-                stars.append(one.source())
+            if row.spectrum is None:
+                stars.append(row.source())
                 continue
-            with reported_for("observations", str(one.spectrum)):
-                star = read_limited(files[str(one.spectrum)].content, Source)
-            stars.append(star if one.magnitude is None else star.at_magnitude(one.magnitude, one.band))
+            with reported_for("observations", str(row.spectrum)):
+                star = read_limited(files[str(row.spectrum)].content, Source)
+            stars.append(star if row.magnitude is None else star.at_magnitude(row.magnitude, row.band))
         return {"frames": tuple(frames), "stars": tuple(stars)}
 
     def words(self, question: Question) -> str:
@@ -179,8 +179,8 @@ def recovered_periods(closed: ClosedForms, answer: ChangeAnswer) -> ChartData:
     wide, high = (np.sqrt(points[1] / points[0]) for points in (r.periods_d, r.amplitudes))
     share = row.shares("value").ravel()
     errors = "; ".join(
-        f"{one.change.name} {(one.error if one.change.unit else 100 * one.error):.3g} {one.change.unit or '%'}"
-        for one in answer.periods
+        f"{row.change.name} {(row.error if row.change.unit else 100 * row.error):.3g} {row.change.unit or '%'}"
+        for row in answer.periods
     )
     text = (
         f"{r.time_d.size} visits within {np.ptp(r.time_d):.0f} days recover {100 * np.mean(share):.0f} % of the "

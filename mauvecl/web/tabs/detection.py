@@ -232,4 +232,4 @@ class Unknown(Tab):
             {"unknown": name, "plain": plain, "marginalised": marginal, "detected": float(power(marginal, fap))}
             for name, plain, marginal in given
         ]
-        return View(self.title, [one for one in COLUMNS if one.name in table[0]], table)
+        return View(self.title, [column for column in COLUMNS if column.name in table[0]], table)

@@ -79,8 +79,8 @@ def temperature_errors(closed: ClosedForms, answers: Answers) -> ChartData:
     """Return the relative error of the temperature against the amplitude of the flare."""
     own = 100 * closed.study.flare.amplitudes[0]
     series: dict[str, Any] = {}
-    for name, one in zip(NAMES, expected(closed).values(), strict=True):
-        ahead = one.forecasts(FACTORS, one.unknown)
+    for name, measurement in zip(NAMES, expected(closed).values(), strict=True):
+        ahead = measurement.forecasts(FACTORS, measurement.unknown)
         series[name] = own * FACTORS, [100 * f.errors[0] / f.values[0] for f in ahead]
     known, *_, free = expected(closed).values()
     which = "temperature" if isinstance(known.fitted, FlareModel) else "lower temperature"
@@ -92,8 +92,8 @@ def temperature_errors(closed: ClosedForms, answers: Answers) -> ChartData:
     return ChartData(text, series)
 
 
-def _error(one: ExpectedMeasurement) -> str:
-    return f"{short(one.ahead.errors[0])} K"
+def _error(measurement: ExpectedMeasurement) -> str:
+    return f"{short(measurement.ahead.errors[0])} K"
 
 
 @Chart(
@@ -119,8 +119,8 @@ def region(closed: ClosedForms, answers: Answers) -> ChartData:
         some = fits.found.estimates[:MOST_DOTS]
         series["fits"] = some[:, 0], 100 * some[:, 1]
     one_temperature = isinstance(all_known.fitted, FlareModel)
-    for name, one in (("known", all_known), ("free", free)):
-        kelvin, low, high = one.region(RISE_95) if one_temperature else _ellipse(best, one.ahead)
+    for name, measurement in (("known", all_known), ("free", free)):
+        kelvin, low, high = measurement.region(RISE_95) if one_temperature else _ellipse(best, measurement.ahead)
         series[name] = kelvin, 100 * low, 100 * high
     x = np.asarray(series["free"][0])
     text = (
@@ -163,20 +163,20 @@ def course(closed: ClosedForms, answers: Answers) -> ChartData:
     stares = answers["measure"].stares if "measure" in answers else []
     if not stares:
         return ChartData("No stare is measured yet: choose a joint fit or the S/N of bins, and simulate fits.")
-    (one,), words, series = stares, list[str](), dict[str, Any]()
-    if one.joint is not None:
-        (event,), stare = one.events, one.staring.stare
+    (stare_fit,), words, series = stares, list[str](), dict[str, Any]()
+    if stare_fit.joint is not None:
+        (event,), stare = stare_fit.events, stare_fit.staring.stare
         since = (stare.middle_s - event.peak_s) / event.half_width_s
         near = (since > -NEAR[0]) & (since < NEAR[1])
-        for name, fit in (("true", one.joint.true), ("joint", one.joint.fitted)):
+        for name, fit in (("true", stare_fit.joint.true), ("joint", stare_fit.joint.fitted)):
             series[name] = stare.middle_s[near], fit.kelvin[near]
-        found = one.joint.found
+        found = stare_fit.joint.found
         each = zip(found.names[:4], found.units, found.estimates[0], found.errors[0], strict=False)
         words += [f"{name} {short(best)} +- {short(error)} {unit}".strip() for name, unit, best, error in each]
-    if isinstance(one.drawn, str):
-        words.append(one.drawn)
-    elif one.drawn is not None:
-        bins = one.drawn
+    if isinstance(stare_fit.drawn, str):
+        words.append(stare_fit.drawn)
+    elif stare_fit.drawn is not None:
+        bins = stare_fit.drawn
         x, kelvin = (bins.start_s + bins.end_s) / 2, bins.found.estimates[:, 0]
         ends = (
             np.where(np.isfinite(end), end, kelvin) for end in (bins.found.low[-1, :, 0], bins.found.high[-1, :, 0])
@@ -214,14 +214,14 @@ class Measurement(Tab):
                 known.fitted.names,
                 known.fitted.units,
                 known.truth,
-                *(one.ahead.errors for one in each.values()),
+                *(measurement.ahead.errors for measurement in each.values()),
                 strict=True,
             )
         ]
         counted = () if fits is None else ("scatter", "coverage_95")
         if fits is not None:
             table = [row | counts for row, counts in zip(table, records(fits.rows()), strict=True)]
-        verb = {one.name: one for one in COLUMNS}
+        verb = {column.name: column for column in COLUMNS}
         errors = [replace(verb["error"], name=name, heading=f"error, {name}") for name in each]
         columns = [verb["quantity"], verb["unit"], verb["truth"], *errors, *(verb[name] for name in counted)]
         return View(self.title, columns, table)
