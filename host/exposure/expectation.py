@@ -377,7 +377,9 @@ class Expectation(Drawable, ContentEquality):
         }
         noise = {name: np.sqrt(variance) for name, variance in variances.items()}
         about = {"exposure_s": self.exposure_s, "name": self.name}
-        columns = [one for one in BUDGET_COLUMNS if one.name != "neighbour_photon" or self.neighbour_electrons.any()]
+        columns = [
+            column for column in BUDGET_COLUMNS if column.name != "neighbour_photon" or self.neighbour_electrons.any()
+        ]
         return table_of(columns, [{"wavelength": self.wavelength_nm} | noise], **about)
 
     @property

@@ -84,9 +84,9 @@ class Elements:
     @classmethod
     def _of(cls, text: str, source: str, named: str) -> Elements:
         lines = [line.rstrip() for line in text.splitlines()]
-        for one, two in pairwise(lines):
-            if one.startswith("1 ") and two.startswith("2 "):
-                return cls(one, two, source)
+        for first, second in pairwise(lines):
+            if first.startswith("1 ") and second.startswith("2 "):
+                return cls(first, second, source)
         raise InputError(
             f"orbit file {named} holds no two lines of elements", "a line '1 ...' before '2 ...'", key="elements"
         )

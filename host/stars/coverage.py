@@ -59,7 +59,7 @@ def check_points(name: str, wavelength: Float, flux: Float) -> None:
     close = np.flatnonzero(np.diff(wavelength) < CLOSEST * wavelength[1:])
     if close.size:
         i = int(close[0])
-        first, second = (float(one) for one in wavelength[i : i + 2])
+        first, second = (float(end) for end in wavelength[i : i + 2])
         same = f"{first!r} and {second!r} nm at points {i + 1} and {i + 2} are the same to within rounding"
         expected = f"wavelengths that differ by {CLOSEST:g} of their value"
         raise InputError(f"spectrum {name}: wavelengths {same}", expected, key="wavelength")

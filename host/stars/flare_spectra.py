@@ -225,7 +225,7 @@ class EmissionLine:
         wanted = name.strip().casefold().replace("_", " ")
         for known in (*LINES_NM, *LINE_GROUPS):
             if wanted == known.casefold():
-                return cls(known, tuple(LINES_NM[one] for one in LINE_GROUPS.get(known, (known,))))
+                return cls(known, tuple(LINES_NM[line] for line in LINE_GROUPS.get(known, (known,))))
         try:
             nm = float(name)
         except ValueError:

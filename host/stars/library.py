@@ -374,8 +374,8 @@ def as_type(text: str) -> str | None:
 def nearest_spectrum(spectral_type: str) -> str:
     """Return the name of the embedded spectrum of the nearest type; the first in the library if there are several."""
     wanted = subtype(spectral_type)
-    names = [(one["name"], one["spectral_type"]) for one in entries() if _TYPE.match(one["spectral_type"])]
-    return min(names, key=lambda one: abs(subtype(one[1]) - wanted))[0]
+    names = [(entry["name"], entry["spectral_type"]) for entry in entries() if _TYPE.match(entry["spectral_type"])]
+    return min(names, key=lambda entry: abs(subtype(entry[1]) - wanted))[0]
 
 
 @dataclass(frozen=True)
@@ -412,7 +412,7 @@ def resolve(text: str, *, own: bool = True) -> NamedStar | None:
     if entry is None and known is not None:
         # The library has the star under another of its names.
         entries = (embedded(name) for name in (known.name, *known.others))
-        entry = next((one for one in entries if one is not None), None)
+        entry = next((entry for entry in entries if entry is not None), None)
     mine = find(text) if own and entry is None else None
     spectrum = entry["name"] if entry is not None else None if mine is None else mine.name
     if known is not None:
@@ -473,4 +473,4 @@ def near_names(text: str, *, stars_only: bool = False) -> list[str]:
         known |= {name_key(name): name for name in library_names()}
         known |= {name_key(star.name): star.name for star in kept()}
     near = difflib.get_close_matches(name_key(text), known, n=4, cutoff=0.5)
-    return list(dict.fromkeys(known[one] for one in near)) or ["eps Eri", "AU Mic"] + ["G2V"] * (not stars_only)
+    return list(dict.fromkeys(known[key] for key in near)) or ["eps Eri", "AU Mic"] + ["G2V"] * (not stars_only)

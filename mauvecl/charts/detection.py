@@ -77,8 +77,8 @@ def _flare_note(stars: Sequence[Shown]) -> str:
 
 def _distributions(title: str, outcome: Detection, flares: Sequence[str], statistic: str, fap: float) -> Panel:
     """Return the histograms of a statistic without and with each flare, and its thresholds."""
-    one = outcome.statistic(statistic)
-    linear, chosen = isinstance(one, LinearStatistic), _drawn_flares(flares)
+    kind = outcome.statistic(statistic)
+    linear, chosen = isinstance(kind, LinearStatistic), _drawn_flares(flares)
     shapes: list[tuple[int | None, str, str]] = [(None, "drawn", "no flare")]
     shapes += [(k, colour, flares[k]) for k, colour in zip(chosen, cycle(COLOURS), strict=False)]
     series: list[Series] = []
@@ -90,7 +90,7 @@ def _distributions(title: str, outcome: Detection, flares: Sequence[str], statis
             Line(name, colour, step=True, at=(middle, height)),
         ]
     # Statistics that are scaled by the flare have a threshold per flare.
-    own = chosen if one.shaped and not linear else [0]
+    own = chosen if kind.shaped and not linear else [0]
     for k, colour in zip(own, cycle(COLOURS if len(own) > 1 else ["text"]), strict=False):
         try:
             cut = outcome.threshold(fap, statistic, template=k).value
@@ -136,9 +136,9 @@ def roc(curves: Roc | Sequence[tuple[str, Roc]], *, name: str = "") -> Panel:
 
     series: list[Series] = []
     named = [(name, curves)] if isinstance(curves, Roc) else curves
-    for colour, (one, curve) in zip(cycle(COLOURS), named, strict=False):
+    for colour, (title, curve) in zip(cycle(COLOURS), named, strict=False):
         fap, probability, low, high = roc_columns(curve)
-        text = f"{one}: area {curve.area.value:.4f}".removeprefix(": ")
+        text = f"{title}: area {curve.area.value:.4f}".removeprefix(": ")
         series += [Line(text, colour, at=(fap, probability)), Band("", colour, alpha=0.3, at=(fap, low, high))]
     x, y = Axis("false-alarm probability per test", log=True), Axis("detection probability", limits=(0, 1.02))
     return Panel(x, y, series)

@@ -63,9 +63,9 @@ def detection_map(answer: MapAnswer) -> Picture:
             axis.contour(x, y, probability, levels=list(levels), colors="black", linewidths=1.2, linestyles=strokes)
 
     x_axis, y_axis = (
-        Axis(QUANTITIES[one.quantity].label, log=one.log and not named[which],
+        Axis(QUANTITIES[sweep.quantity].label, log=sweep.log and not named[which],
              ticks=(place, getattr(answer, which)) if named[which] else None)
-        for which, one, place in (("x", question.x, x), ("y", question.y, y))
+        for which, sweep, place in (("x", question.x, x), ("y", question.y, y))
     )  # fmt: skip
     lines = [Line(f"detected in {100 * level:g} %", "text", dash=dash, at=([], [])) for level, dash in levels.items()]
     row = [

@@ -152,7 +152,7 @@ class Nuisances(ContentEquality):
 
     def _rows(self, kept: Sequence[int]) -> Nuisances:
         kept = list(kept)
-        spectra, sd, of_flare, mean = (one[kept] for one in (self.spectra, self.sd, self.of_flare, self.mean))
+        spectra, sd, of_flare, mean = (values[kept] for values in (self.spectra, self.sd, self.of_flare, self.mean))
         return Nuisances(tuple(self.names[i] for i in kept), spectra, sd, of_flare, mean, self.factor_prior)
 
     def with_spectrum(self, name: str, spectrum: Float, sd: float) -> Nuisances:
@@ -179,7 +179,7 @@ class Nuisances(ContentEquality):
 
     def with_prior(self, name: str, mean: float, sd: float) -> Nuisances:
         """Return the parameters with another prior of one amplitude."""
-        chosen = np.array([one == name for one in self.names])
+        chosen = np.array([other == name for other in self.names])
         return replace(self, sd=np.where(chosen, sd, self.sd), mean=np.where(chosen, mean, self.mean))
 
     @property

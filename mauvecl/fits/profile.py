@@ -62,9 +62,9 @@ class BestFit:
 
     def replaced(self, rows: NDArray[np.intp], others: BestFit) -> BestFit:
         """Return the fits with those of some frames replaced."""
-        every = [getattr(self, one.name).copy() for one in fields(self)]
-        for values, one in zip(every, fields(self), strict=True):
-            values[rows] = getattr(others, one.name)
+        every = [getattr(self, field.name).copy() for field in fields(self)]
+        for values, field in zip(every, fields(self), strict=True):
+            values[rows] = getattr(others, field.name)
         return BestFit(*every)
 
 
@@ -205,8 +205,8 @@ def intervals(
     spent = best.gain[:, None] - np.einsum("nk,nk->n", profile.along, profile.along)[:, None] - amplitude**2 / variance
     left = allowed - spent
 
-    def ends(one: Derived, spline: CubicSpline) -> tuple[Float, Float]:
-        if one.ratio is None:
+    def ends(derived: Derived, spline: CubicSpline) -> tuple[Float, Float]:
+        if derived.ratio is None:
             return _linear_interval(profile, spline, x, linear, variance, hot, left, allowed, closed)
         return _ratio_interval(profile, spline(x), hot, best.gain - allowed)
 
@@ -225,9 +225,9 @@ def ends_of_quantities(
         np.where(np.isnan(log_high), np.inf, np.exp(log_high)),
     )
     columns: list[tuple[Float, Float]] = []
-    for one, spline, (first, times) in zip(model.derived, model.splines, model.multiples, strict=True):
+    for derived, spline, (first, times) in zip(model.derived, model.splines, model.multiples, strict=True):
         own = columns[first] if first < len(columns) else None
-        low, high = own or (kelvin if spline is None else ends(one, spline))
+        low, high = own or (kelvin if spline is None else ends(derived, spline))
         # Light that contradicts every factor above zero limits nothing.
         none = low > high
         low, high = np.where(none, -np.inf, low), np.where(none, np.inf, high)
@@ -266,7 +266,7 @@ def _linear_interval(
     def reached(room: Float, sign: float, rows: NDArray[np.intp] | slice = slice(None)) -> Float:
         if known:
             return np.asarray(value[rows] + sign * np.sqrt(np.maximum(room, 0.0) * spread[rows]))
-        return Ratio(*(one[rows] for one in vars(ratio).values())).end(room, sign)
+        return Ratio(*(values[rows] for values in vars(ratio).values())).end(room, sign)
 
     ends = [_hull(reached(left, sign), outside, sign)[0] for sign in (-1.0, 1.0)]
     light = profile.reduction.light
@@ -323,8 +323,8 @@ def ratio_at(profile: Profile, spline: CubicSpline, log_k: Float, linear: Float,
         others = factors[..., 1:] @ inverse
         return factors[..., 0] - np.einsum("nsk,nsk->ns", others, hot @ basis.T), others
 
-    def covariance(one: tuple[Float, Float], other: tuple[Float, Float]) -> Float:
-        return np.asarray(one[0] * other[0] * variance + np.einsum("nsk,nsk->ns", one[1], other[1]))
+    def covariance(slopes: tuple[Float, Float], other: tuple[Float, Float]) -> Float:
+        return np.asarray(slopes[0] * other[0] * variance + np.einsum("nsk,nsk->ns", slopes[1], other[1]))
 
     factors = spline(log_k)
     value, own = np.einsum("nsl,nsl->ns", factors, linear), parts(factors)
@@ -438,7 +438,7 @@ def _likelihood_ratio(light: Float, away: Float) -> Float:
     """Return the maximum of light^2 less that of light^2 - away^2 over samples (..., n_sample)."""
     n = light.shape[-1]
     first = np.arange(0, light.size, n).reshape(light.shape[:-1])
-    at_best, held = (np.clip(one.argmax(axis=-1), 1, n - 2) + first for one in (light, light**2 - away**2))
+    at_best, held = (np.clip(peak.argmax(axis=-1), 1, n - 2) + first for peak in (light, light**2 - away**2))
     value, slope, bend = _parabola(light, at_best)
     t = np.clip(np.divide(-slope, bend, out=np.zeros_like(slope), where=bend < 0.0), -1.0, 1.0)
     free = value + t * (slope + t * bend / 2)
@@ -508,8 +508,8 @@ def _ratio_interval(profile: Profile, per: Float, hot: Float, least_gain: Float)
     root = np.sqrt(np.maximum(inside, 0.0))
     bounded = (a < 0.0) & (inside >= -1e-9 * b**2)
     with np.errstate(divide="ignore", invalid="ignore"):
-        one, other = (-b + root) / a, (-b - root) / a
-    smaller, larger = np.fmin(one, other), np.fmax(one, other)
+        first, second = (-b + root) / a, (-b - root) / a
+    smaller, larger = np.fmin(first, second), np.fmax(first, second)
     # Without a bound, all light may be recombination, and every jump above the larger root is allowed.
     open_low = (a >= 0.0) & (inside < 0.0)
     low = np.where(bounded, smaller, np.where(a >= 0.0, np.where(open_low, -np.inf, larger), np.inf))
@@ -687,7 +687,7 @@ class BoundedProfile(Profile):
     def products(self, log_k: Float) -> Products:
         """Return the inner products at temperatures (n, ...), or (1, ...) if common to all frames."""
         hot, fixed = self.hot(log_k), self.reduction.fixed
-        one = (1,) * (log_k.ndim - 1)
+        ones = (1,) * (log_k.ndim - 1)
         if log_k.shape[0] == 1:
             along = np.tensordot(self.sums, hot[0], (1, -1))
         else:
@@ -696,7 +696,7 @@ class BoundedProfile(Profile):
             along,
             np.einsum("...k,...k->...", hot, hot),
             np.moveaxis(hot @ fixed.T, -1, 0),
-            (fixed @ self.sums.T).reshape(len(fixed), len(self.sums), *one),
+            (fixed @ self.sums.T).reshape(len(fixed), len(self.sums), *ones),
             fixed @ fixed.T,
         )
 
@@ -807,8 +807,8 @@ def bounded_intervals(
         without = profile.factor(x, np.zeros((*x.shape, len(model.linear))))
         of_light = without, np.moveaxis(light.weights_of(x), -1, 0), light.scale**-2.0
 
-    def ends(one: Derived, spline: CubicSpline) -> tuple[Float, Float]:
-        if one.ratio is None:
+    def ends(derived: Derived, spline: CubicSpline) -> tuple[Float, Float]:
+        if derived.ratio is None:
             factors = np.moveaxis(spline(x), -1, 0)
             found = _linear_ends(faces, factors, least, of_light)
             if light is None or not light.prior.size:
@@ -818,7 +818,7 @@ def bounded_intervals(
             moved = light.change(value, factor, found[1] - found[0], allowed)
             return _linear_ends(faces, factors, least - moved[:, None], of_light)
         lowest, highest = _ratio_ends(products, faces, spline(x), least)
-        return one.offset + lowest, one.offset + highest
+        return derived.offset + lowest, derived.offset + highest
 
     lows, highs = ends_of_quantities(model, low, high, ends)
     # A parabola through the outermost samples may exceed a bound.

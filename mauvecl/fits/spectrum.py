@@ -117,7 +117,7 @@ class Measurement:
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
         """Return the measurements of several batches of frames as one."""
-        values: dict[str, Any] = {one.name: getattr(parts[0], one.name) for one in fields(cls)}
+        values: dict[str, Any] = {field.name: getattr(parts[0], field.name) for field in fields(cls)}
         for name, value in values.items():
             if isinstance(value, np.ndarray):
                 axis = 1 if name in ("low", "high") else 0
@@ -126,7 +126,7 @@ class Measurement:
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return all arrays that depend on the frames, for files; the inverse of `of_arrays`."""
-        values = {one.name: np.asarray(getattr(self, one.name)) for one in fields(self)}
+        values = {field.name: np.asarray(getattr(self, field.name)) for field in fields(self)}
         return {name: value for name, value in values.items() if name not in ("names", "units", "bounds", "levels")}
 
     @classmethod
@@ -146,10 +146,10 @@ class Measurement:
     def rows(self, which: NDArray[Any]) -> Self:
         """Return the measurements of some frames, by number or mask."""
         kept: dict[str, Any] = {}
-        for one in fields(self):
-            value = getattr(self, one.name)
+        for field in fields(self):
+            value = getattr(self, field.name)
             if isinstance(value, np.ndarray):
-                kept[one.name] = value[:, which] if one.name in ("low", "high") else value[which]
+                kept[field.name] = value[:, which] if field.name in ("low", "high") else value[which]
         return replace(self, **kept)
 
     def column(self, name: str) -> int:
@@ -261,7 +261,9 @@ def fit(
     order = np.argsort(np.concatenate([rows for rows, _ in parts]))
     along = {"low": 1, "high": 1}
     joined = {
-        name: np.take(np.concatenate([one[name] for _, one in parts], along.get(name, 0)), order, along.get(name, 0))
+        name: np.take(
+            np.concatenate([arrays[name] for _, arrays in parts], along.get(name, 0)), order, along.get(name, 0)
+        )
         for name in parts[0][1]
     }
     dof = joined.pop("dof")
@@ -397,8 +399,8 @@ def _fitted(
     at_nodes = profile.gain_at_nodes()
     best = profile.best(at_nodes)
     allowed = [float(scipy.stats.chi2.isf(1 - p, 1)) for p in levels]
-    ends = [intervals(model, profile, best, at_nodes, one) for one in allowed]
-    low, high = (np.stack([one[side] for one in ends]) for side in (0, 1))
+    ends = [intervals(model, profile, best, at_nodes, rise) for rise in allowed]
+    low, high = (np.stack([interval[side] for interval in ends]) for side in (0, 1))
     # Intervals differ from unbounded ones only if they reach a bound.
     reaches = (low <= np.array(model.bounds)) & np.isfinite(model.bounds)
     near = np.flatnonzero(reaches.any(axis=(0, 2)) | (best.linear < 0.0).any(axis=1))
@@ -406,8 +408,8 @@ def _fitted(
         bounded = BoundedProfile(reduction, sums[near], None if light is None else light[near])
         nodes = bounded.gain_at_nodes()
         there = bounded.best(nodes)
-        for k, one in enumerate(allowed):
-            low[k, near], high[k, near] = bounded_intervals(model, bounded, there, nodes, one)
+        for k, rise in enumerate(allowed):
+            low[k, near], high[k, near] = bounded_intervals(model, bounded, there, nodes, rise)
         best = best.replaced(near, there)
     left = np.einsum("nk,nk->n", sums, sums) - best.gain
     n_fitted = len(model.linear) + 1
@@ -566,7 +568,7 @@ def fit_two_temperatures(
     InputError
         For a model with a Balmer jump, and as for `fit`.
     """
-    if any(one.ratio is not None for one in model.derived):
+    if any(derived.ratio is not None for derived in model.derived):
         raise InputError("a model with a Balmer jump", "blackbodies, with lines or without", key="model")
     single = fit(frames, expectation, model, nuisances, levels=levels, skipped_nm=skipped_nm)
     exposures = checked_exposures(frames, expectation, levels, nuisances)
@@ -632,10 +634,10 @@ def with_second(model: FlareModel, log_k: float) -> FlareModel:
         # The ratio of the flux at the telescope to that at the surface is proportional to the area.
         return np.asarray(bolometric(x)[..., 0] / np.exp(4 * x))
 
-    def both(one: Derived, spline: scipy.interpolate.CubicSpline | None) -> Derived:
-        if one.factors is None or spline is None:
-            return one
-        return replace(one, factors=np.insert(one.factors[:end], 1, spline(log_k)[0], axis=1))
+    def both(derived: Derived, spline: scipy.interpolate.CubicSpline | None) -> Derived:
+        if derived.factors is None or spline is None:
+            return derived
+        return replace(derived, factors=np.insert(derived.factors[:end], 1, spline(log_k)[0], axis=1))
 
     share = Derived("second area", "", "area at the second temperature over that at the first",
                     ratio=area(log_k) / area(model.log_k[:end]), offset=0.0)  # fmt: skip
@@ -711,18 +713,18 @@ class _Search:
             factor[rows[here]] = profile.factor(own.log_k, own.linear)[here]
             values[:, model.sums[0]] = undimmed(values[:, model.sums[0]], factor[rows[here]])
             estimates[rows[here]] = np.insert(values, q - 2, np.exp(self._grid[node]), axis=1)
-            for k, one in enumerate(self._allowed):
-                there = np.flatnonzero(own.gain >= gain[rows] - one)
+            for k, rise in enumerate(self._allowed):
+                there = np.flatnonzero(own.gain >= gain[rows] - rise)
                 if not there.size:
                     continue
                 some = self._profile(int(node), rows[there])
                 limit = BestFit(own.log_k[there], own.linear[there], gain[rows[there]])
-                ends = bounded_intervals(model, some, limit, at_nodes[there], one)
+                ends = bounded_intervals(model, some, limit, at_nodes[there], rise)
                 for found, end, which in ((lows, ends[0], np.minimum), (highs, ends[1], np.maximum)):
                     columns = np.delete(np.arange(q), q - 2)
                     found[k][np.ix_(rows[there], columns)] = which(found[k][np.ix_(rows[there], columns)], end)
-        for k, one in enumerate(self._allowed):
-            lows[k, :, q - 2], highs[k, :, q - 2] = self._second_ends(gain, one)
+        for k, rise in enumerate(self._allowed):
+            lows[k, :, q - 2], highs[k, :, q - 2] = self._second_ends(gain, rise)
         best = BestFit(log_k, linear, gain)
         return best, lows, highs, self._grid[best_node], estimates, factor
 
@@ -754,8 +756,8 @@ def _covariance(
     jacobian = np.stack(columns, axis=1)
     over = np.where(factor > 0.0, factor, np.nan)
     gradient, by_factor = np.zeros((n, len(model.derived) + 2, m + 2)), np.zeros((n, len(model.derived) + 2))
-    for q, (one, spline) in enumerate(zip(model.derived, model.splines, strict=True)):
-        if spline is None or one.factors is None:
+    for q, (derived, spline) in enumerate(zip(model.derived, model.splines, strict=True)):
+        if spline is None or derived.factors is None:
             gradient[:, q, m] = np.exp(best.log_k)
             continue
         here, there = spline(best.log_k), spline(second)
@@ -775,7 +777,7 @@ def _covariance(
     own = np.zeros((n, by_factor.shape[1], by_factor.shape[1]))
     if reduction.light is not None:
         light = reduction.light
-        weights = [light.spline(best.log_k), light.spline(second), *(np.full(n, one) for one in light.fixed)]
+        weights = [light.spline(best.log_k), light.spline(second), *(np.full(n, value) for value in light.fixed)]
         weights += [a * light.spline(best.log_k, 1), b * light.spline(second, 1)]
         gradient -= by_factor[:, :, None] * np.stack(weights, axis=1)[:, None, :] / light.scale
         own = by_factor[:, :, None] * by_factor[:, None, :] / light.scale**2

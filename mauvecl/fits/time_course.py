@@ -230,8 +230,8 @@ def fit_bins(
 def spreads_of(stare: Stare, first: int, end: int) -> dict[Changing, float]:
     """Return the standard deviations of the unknown changes of a stare, averaged over some frames."""
     found = {of: sd**2 / (end - first) for of, sd in stare.jitters.items()} | {"star": 0.0}
-    for one in stare.unknowns:
-        found[one.of] += (one.sd * float(one.curve[first:end].mean())) ** 2
+    for unknown in stare.unknowns:
+        found[unknown.of] += (unknown.sd * float(unknown.curve[first:end].mean())) ** 2
     if stare.pointing is not None:
         found["light"] += stare.pointing.depth**2
     return {of: float(np.sqrt(found[of])) for of in CHANGING}
@@ -417,16 +417,16 @@ class _Data:
         if theta is not None:
             flare = self.strengths(theta)
             covariance = covariance + flare[0][:, None, None] * self.spread(flare[1])
-        for one in self.jitters:
-            changes = one.sd * one.around(flare)
+        for jitter in self.jitters:
+            changes = jitter.sd * jitter.around(flare)
             covariance = covariance + changes[:, :, None] * changes[:, None, :]
         inverse = np.linalg.inv(np.linalg.cholesky(covariance))
         if not self.unknown:
             return _Whitening(inverse, np.zeros((0, self.sums.size)), np.zeros(0))
-        changes = np.array([one.around(None if none else flare) for one in self.unknown])
+        changes = np.array([unknown.around(None if none else flare) for unknown in self.unknown])
         spectra = np.einsum("tij,utj->tiu", inverse, changes).reshape(self.sums.size, -1)
         # The prior acts as one more datum, which is not among the residuals because its mean is zero.
-        scale = np.linalg.cholesky(spectra.T @ spectra + np.diag([one.sd**-2.0 for one in self.unknown]))
+        scale = np.linalg.cholesky(spectra.T @ spectra + np.diag([unknown.sd**-2.0 for unknown in self.unknown]))
         basis = np.linalg.solve(scale, spectra.T)
         # I - B^T B = (I - B^T K B)^2, with K from the eigenvalues of B B^T.
         values, vectors = np.linalg.eigh(basis @ basis.T)
@@ -562,18 +562,20 @@ def fit_cooling(
     jacobian = data.jacobian(theta, fit.whitening)[:, free]
     covariance = np.linalg.pinv(jacobian.T @ jacobian, hermitian=True)
     quantities = _quantities(data, stare, cooling)
-    estimates = np.array([one.value(theta, data) for one in quantities])
-    scale = np.array([1.0 if one.place == 0 else value for one, value in zip(quantities, estimates, strict=True)])
-    slopes = scale[:, None] * np.array([one.slope(theta, data) for one in quantities])[:, free]
+    estimates = np.array([quantity.value(theta, data) for quantity in quantities])
+    scale = np.array(
+        [1.0 if quantity.place == 0 else value for quantity, value in zip(quantities, estimates, strict=True)]
+    )
+    slopes = scale[:, None] * np.array([quantity.slope(theta, data) for quantity in quantities])[:, free]
     spread = slopes @ covariance @ slopes.T
     sd = np.sqrt(np.diag(spread)) / np.maximum(np.abs(scale), 1e-300)
     ends = fit.ends_of_all(quantities, estimates, sd, [float(scipy.stats.chi2.ppf(level, 1)) for level in levels])
-    dof = data.sums.size - free.size - sum(np.isinf(one.sd) for one in data.unknown)
+    dof = data.sums.size - free.size - sum(np.isinf(unknown.sd) for unknown in data.unknown)
     empty = np.full(theta.shape, -np.inf)
     without = data.whitening(theta, none=True)
     none = float(np.sum(data.residuals(np.where(np.arange(theta.size) == 2, empty, theta), without) ** 2))
     return Measurement(
-        tuple(one.name for one in quantities), tuple(one.unit for one in quantities),
+        tuple(quantity.name for quantity in quantities), tuple(quantity.unit for quantity in quantities),
         (-np.inf,) + (0.0,) * (len(quantities) - 1),
         estimates[None], spread[None], tuple(levels), ends[0][:, None], ends[1][:, None], np.array([best]),
         np.array([float(scipy.stats.chi2.sf(best, dof))]), dof, np.array([np.sqrt(max(none - best, 0.0))]),
@@ -597,7 +599,7 @@ def cooling_course(
         cooling = Cooling(cooling, cooling, stare.frame_s)
     logs = np.log([event.half_width_s, event.amplitude, cooling.peak_k, cooling.end_k / cooling.peak_k, cooling.fold_s])
     theta = np.array([event.peak_s, *logs])
-    values = {one.name: one.value(theta, data) for one in _quantities(data, stare, cooling=True)}
+    values = {quantity.name: quantity.value(theta, data) for quantity in _quantities(data, stare, cooling=True)}
     rise, log_k = data.strengths(theta)
     used = (data.reduction.variance > 0).astype(np.float64)
     return CoolingCourse(
@@ -674,7 +676,7 @@ def _levels_of_stare(
     if stare.pointing is not None:
         jitters["light"] = float(np.hypot(jitters["light"], stare.pointing.depth))
     return (
-        tuple(level(one.of, one.sd, one.curve) for one in stare.unknowns),
+        tuple(level(unknown.of, unknown.sd, unknown.curve) for unknown in stare.unknowns),
         tuple(level(of, sd, ones) for of, sd in jitters.items() if sd > 0.0),
     )
 
@@ -736,12 +738,12 @@ def _quantities(data: _Data, stare: Stare, cooling: bool) -> list[_Quantity]:
     ]  # fmt: skip
     if cooling:
         found += [_Quantity("end temperature", "K", 4), _Quantity("cooling time", "s", 5)]
-    for one, spline in zip(data.model.derived, data.model.splines, strict=True):
-        kind, _, band = one.name.partition(" ")
+    for derived, spline in zip(data.model.derived, data.model.splines, strict=True):
+        kind, _, band = derived.name.partition(" ")
         if kind == "flux":
             found.append(_Quantity(f"fluence {band}", "erg / cm2", 2, spline, stare.frame_s))
         elif kind == "energy":
-            found.append(_Quantity(one.name, one.unit, 2, spline))
+            found.append(_Quantity(derived.name, derived.unit, 2, spline))
     return found
 
 
@@ -776,13 +778,13 @@ class _BestFit:
         An energy is a multiple of its fluence.
         """
         found = np.full((2, len(rises), len(quantities)), np.nan)
-        names = [one.name for one in quantities]
-        for q, one in enumerate(quantities):
-            if one.name.startswith("energy"):
-                fluence = names.index(one.name.replace("energy", "fluence"))
+        names = [quantity.name for quantity in quantities]
+        for q, quantity in enumerate(quantities):
+            if quantity.name.startswith("energy"):
+                fluence = names.index(quantity.name.replace("energy", "fluence"))
                 found[:, :, q] = estimates[q] / estimates[fluence] * found[:, :, fluence]
             else:
-                found[:, :, q] = self.ends(one, float(sd[q]), rises)
+                found[:, :, q] = self.ends(quantity, float(sd[q]), rises)
         return found
 
     def ends(self, quantity: _Quantity, sd: float, rises: Sequence[float]) -> Float:

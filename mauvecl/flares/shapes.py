@@ -110,7 +110,7 @@ class Shape(ABC):
         -------
         ndarray, shape (n_frame,), or (n, n_frame)
         """
-        edges, peak, scale = (np.asarray(one, np.float64) for one in (edges_s, peak_s, t_half_s))
+        edges, peak, scale = (np.asarray(values, np.float64) for values in (edges_s, peak_s, t_half_s))
         if edges.ndim == 2:
             integrals = self.integral((edges[:, 0] - peak) / scale, (edges[:, 1] - peak) / scale)
         else:

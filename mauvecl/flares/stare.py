@@ -407,7 +407,7 @@ def stare_along(
         light=whole.light[seen],
         sky=whole.sky[seen],
         temperature_c=temperature[seen],
-        unknowns=tuple(replace(one, curve=one.curve[seen]) for one in whole.unknowns),
+        unknowns=tuple(replace(unknown, curve=unknown.curve[seen]) for unknown in whole.unknowns),
     )
     hits = particles.rate_per_cm2_s(track)[seen]
     return OrbitStare(stare, hits, visible.shadow[seen], times.iso(0.0), tuple(orbit.messages(times)))

@@ -264,11 +264,13 @@ class Conditions:
 # The pixels of a stare are drawn in many parts.
 @lru_cache(maxsize=4)
 def _joint_throughout(x: Expectation, conditions: Conditions) -> bool:
-    one, counts = Cumulants.of(x, 1), x.photon_noise == "poisson"
+    cumulants, counts = Cumulants.of(x, 1), x.photon_noise == "poisson"
     for light, dark in conditions:
         photons = light / x.gain_dn_per_electron
         other = x.read_noise_dn**2 + (0.0 if counts else x.gain_dn_per_electron * light)
-        if not joint_is_exact(replace(one, gaussian=other, photons=photons, dark_dn=dark * one.dark_dn)).all():
+        if not joint_is_exact(
+            replace(cumulants, gaussian=other, photons=photons, dark_dn=dark * cumulants.dark_dn)
+        ).all():
             return False
     return True
 

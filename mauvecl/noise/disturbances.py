@@ -136,10 +136,10 @@ class CosmicRays(AdditiveProcess):
                 f"at most {2**23}: lower the rate, the charge or the exposure",
                 key="rate_per_cm2_s",
             )
-        one = np.zeros(size)
-        one[low : high + 1] = 1.0 if self.weights is None else self.weights
+        charge = np.zeros(size)
+        charge[low : high + 1] = 1.0 if self.weights is None else self.weights
         # This is the generating function of a Poisson number of hits; charges beyond `size` would alias.
-        spectrum = np.exp(hits * (np.fft.rfft(one / one.sum()) - 1.0))
+        spectrum = np.exp(hits * (np.fft.rfft(charge / charge.sum()) - 1.0))
         return np.asarray(np.maximum(np.fft.irfft(spectrum, size)[: most + 1], 0.0))
 
     def most_electrons(self, seconds: Annotated[float, Unit("s"), Range(0)]) -> int:

@@ -138,10 +138,10 @@ class FactorDistributions:
     ) -> FactorDistributions | None:
         spreads: dict[SignalPart, list[FactorDistribution]] = {}
         for (name, factor), table in zip(modulations, tables, strict=True):
-            one = _of_table(table)
+            spread = _of_table(table)
             if PROCESSES[name].when == "frame" and n_frames > 1:
-                one = _normal(one.mean, one.sd / np.sqrt(n_frames))
-            spreads.setdefault(factor, []).append(one)
+                spread = _normal(spread.mean, spread.sd / np.sqrt(n_frames))
+            spreads.setdefault(factor, []).append(spread)
         return cls({name: _product(ones, medians[name]) for name, ones in spreads.items()}) if spreads else None
 
     def nodes(self, x: Expectation, *, weighted: bool) -> tuple[list[Node], Float]:
@@ -200,8 +200,8 @@ def _product(ones: list[FactorDistribution], median: float) -> FactorDistributio
     """Return the distribution of a product of independent factors, which is normal if there are several."""
     if len(ones) == 1:
         return FactorDistribution(median * ones[0].values, ones[0].weights)
-    mean = np.prod([one.mean for one in ones])
-    square = np.prod([one.mean**2 + one.sd**2 for one in ones])
+    mean = np.prod([prior.mean for prior in ones])
+    square = np.prod([prior.mean**2 + prior.sd**2 for prior in ones])
     return _normal(float(median * mean), float(median * np.sqrt(square - mean**2)))
 
 

@@ -159,8 +159,8 @@ class Completeness:
         i = np.minimum(place.astype(int), WIDTHS - 2)
         # The logarithm of the gain is interpolated linearly between half-widths.
         part = (place - i)[..., None]
-        one = np.exp((1 - part) * np.log(gain[i]) + part * np.log(gain[i + 1]))
-        signal = amplitude[..., None] * signal_per_frame * one
+        growth = np.exp((1 - part) * np.log(gain[i]) + part * np.log(gain[i + 1]))
+        signal = amplitude[..., None] * signal_per_frame * growth
         # Small flares that noise lifts above the threshold, about 1 % of them, count as false alarms, since small
         # flares are arbitrarily frequent.
         p = np.where(signal > threshold / 2, stats.norm.sf(threshold - signal), 0.0).mean(axis=-1)
@@ -455,7 +455,7 @@ def fit_power_law(
 
     alpha = float(optimize.minimize_scalar(cost, bounds=EXPONENTS, method="bounded", options={"xatol": 1e-7}).x)
     log10_rate = float(np.log10(logs.size / (days * step * seen(alpha).sum())))
-    covariance = np.linalg.inv(_curvature(lambda one: cost(one[0], one[1]), np.array([alpha, log10_rate])))
+    covariance = np.linalg.inv(_curvature(lambda point: cost(point[0], point[1]), np.array([alpha, log10_rate])))
     return FittedPowerLaw(
         alpha=alpha,
         alpha_sd=float(np.sqrt(covariance[0, 0])),

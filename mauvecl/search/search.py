@@ -372,8 +372,8 @@ class Trend:
         star, sky = directions["star"], directions["sky"]
         neighbours = directions["light"] - star - sky
         dark = directions["temperature"] / slope_per_c if slope_per_c else np.zeros_like(sky)
-        curves = np.array([one.sd * one.curve for one in unknowns])
-        of = tuple(one.of for one in unknowns)
+        curves = np.array([unknown.sd * unknown.curve for unknown in unknowns])
+        of = tuple(unknown.of for unknown in unknowns)
         return cls(frames, frame_s, variance, of, curves, star, sky, neighbours, dark, slope_per_c)
 
     @cached_property
@@ -413,8 +413,8 @@ class Trend:
         """
         left = np.array(sums, np.float64)
         # One stare at a time, since the rounding of matrix products may depend on the number of stares.
-        for one in left:
-            one -= self.nonlinear_effect(self.fitted(one[None]))[0]
+        for row in left:
+            row -= self.nonlinear_effect(self.fitted(row[None]))[0]
         return left
 
     def nonlinear_effect(self, amplitudes: Float) -> Float:
