@@ -141,7 +141,7 @@ class Expectation(Drawable, ContentEquality):
             from astropy.nddata import StdDevUncertainty
             from specutils import Spectrum
         except ImportError as error:
-            raise InputError("specutils is missing", "`pip install 'mauvecl[spectra]'`", key="specutils") from error
+            raise InputError.missing("specutils", "a `Spectrum`", "spectra") from error
         return Spectrum(
             spectral_axis=self.wavelength_nm * u.nm,
             flux=self.signal_dn * u.adu,

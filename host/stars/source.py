@@ -342,7 +342,7 @@ class Source(Drawable, ContentEquality):
         try:
             from specutils import Spectrum
         except ImportError as error:
-            raise InputError("specutils is missing", "`pip install 'mauvecl[spectra]'`", key="specutils") from error
+            raise InputError.missing("specutils", "a `Spectrum`", "spectra") from error
         flam = u.erg / (u.s * u.cm**2 * u.AA)
         return Spectrum(
             spectral_axis=self.wavelength_nm * u.nm,
@@ -473,9 +473,7 @@ class Source(Drawable, ContentEquality):
         try:
             from dust_extinction import parameter_averages
         except ImportError as error:
-            raise InputError(
-                "extinction needs dust_extinction", "`pip install 'mauvecl[extinction]'`", key="dust_extinction"
-            ) from error
+            raise InputError.missing("dust_extinction", "extinction", "extinction") from error
         import astropy.units as u
 
         try:

@@ -260,7 +260,7 @@ def serve(
 
     number = within(port, "--port", read=count, low=1, high=65535)
     if find_spec("bokeh") is None or find_spec("tornado") is None:
-        raise InputError("Bokeh, which the page needs, is missing: pip install 'mauvecl[web]'", key="bokeh")
+        raise InputError.missing("bokeh", "the page", "web")
     from mauvecl.web.server import serve
 
     try:
@@ -274,7 +274,7 @@ def serve(
 def _help(text: str | None) -> str:
     """Return a help text with examples on separate lines of at most 80 columns, which can be pasted."""
     text = re.sub(r"(?m)^(Examples?:) (?=mauvecl )", r"\1\n\n", inspect.cleandoc(text or ""))
-    return re.sub(r"(?m)^mauvecl .*$", lambda found: "\b\n" + _broken(found[0]), text)
+    return re.sub(r"(?m)^mauvecl .*$", lambda match: "\b\n" + _broken(match[0]), text)
 
 
 def _broken(command: str) -> str:

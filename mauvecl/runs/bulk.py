@@ -137,7 +137,7 @@ def realise_file(
     file = Path(file)
     if file.exists() and not restart:
         raise InputError(
-            f"{str(file)!r} is there already", "another place, or `restart=True` to write it anew", key="restart"
+            f"{str(file)!r} exists already: use another name, or `restart=True` to replace it", key="restart"
         )
     store = Store(unfinished(file), study)
     store.make_folder()
@@ -164,8 +164,8 @@ def _complete(store: Store, engine: Engine | Pool, resume: bool, restart: bool, 
     todo = [chunk for chunk in store.chunks() if not store.has(chunk)]
     if begun and not resume and todo:
         raise InputError(
-            f"store {str(store.path)!r} holds {store.count() - len(todo)} of {store.count()} chunks",
-            "`resume=True` to draw the others, or another place",
+            f"store {str(store.path)!r} holds {store.count() - len(todo)} of {store.count()} chunks: use `resume=True` "
+            "to draw the others, or another place",
             key="resume",
         )
     _fill(store, todo, engine, progress)
@@ -327,8 +327,8 @@ def verify(
         total, there = store.count(first, last), sum(store.owns(key) for key, _ in files)
         if total - there > MAX_MISSING:
             raise InputError(
-                f"store {str(store.path)!r} holds {there} chunks of the {total} of its study",
-                f"at most {MAX_MISSING} missing: choose `rows`, or `mauvecl realise --resume` draws them",
+                f"store {str(store.path)!r} holds {there} of {total} chunks, but at most {MAX_MISSING} may be missing: "
+                "choose `rows`, or draw them with `mauvecl realise --resume`",
                 key="rows",
             )
         faults = list(_faults_of_description(store, repair))
@@ -355,9 +355,8 @@ def _fault(store: Store, chunk: Chunk, engine: Engine | Pool | None, repair: boo
     drawn = digest(*store.encode(chunk, rows))
     if store.digests.get(chunk.key, drawn) != drawn and not redraw:
         raise InputError(
-            f"{chunk.key} of {store.path.name} was written with the digest {store.digests[chunk.key]} and "
-            f"is now drawn with {drawn}",
-            "the same: its study or its list is wrong; `redraw=True` with `repair=True` trusts the study",
+            f"{chunk.key} of {store.path.name} was written with the digest {store.digests[chunk.key]}, but is drawn "
+            f"with {drawn}: its study or its list is wrong; use `redraw=True` with `repair=True` to trust the study",
             key="redraw",
         )
     if seen == "good":
@@ -378,8 +377,8 @@ def _faults_of_description(store: Store, repair: bool) -> Iterator[Fault]:
         try:
             data = read_bytes(there, "description")
             if name.endswith("zarr.json"):
-                found, made = (without_version(json.loads(text)) for text in (data, content))
-                same, seen = found in (made, without_later_attributes(made)), "foreign"
+                existing, made = (without_version(json.loads(text)) for text in (data, content))
+                same, seen = existing in (made, without_later_attributes(made)), "foreign"
             else:
                 same, seen = data == content, "damaged"
         except (ValueError, TypeError, AttributeError, RecursionError):

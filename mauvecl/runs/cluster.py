@@ -89,9 +89,7 @@ class DaskWorkers:
         try:
             import distributed
         except ImportError as error:
-            raise InputError(
-                "Dask is missing", "the package for Dask workers: pip install 'mauvecl[cluster]'", key="dask"
-            ) from error
+            raise InputError.missing("dask", "a cluster", "cluster") from error
         self._where, self._device, self._sends = where, device, 0
         self._lock = threading.Lock()
         self._closing = False
@@ -108,19 +106,19 @@ class DaskWorkers:
                 self._client.wait_for_workers(1, timeout=WORKER_PATIENCE_S)
             except TimeoutError as error:
                 raise DeviceError(
-                    f"cluster {where} has no worker, expected one within {WORKER_PATIENCE_S:g} s"
+                    f"no worker of cluster {where} answered within {WORKER_PATIENCE_S:g} s: start one"
                 ) from error
             introduced = self._client.run(_introduce, device, on_error="return")
             for worker, answer in introduced.items():
                 if isinstance(answer, BaseException):
                     raise DeviceError(
-                        f"worker {worker} cannot work ({answer}), expected mauvecl {VERSION} and OpenCL there"
+                        f"worker {worker} needs mauvecl {VERSION} and OpenCL, but cannot use them ({answer})"
                     )
                 if answer[0] != code_identity():
                     version, code = answer[0]
                     raise DeviceError(
-                        f"worker {worker} has mauvecl {version} (code {code}), expected "
-                        f"{VERSION} (code {code_identity()[1]}) as here"
+                        f"worker {worker} has mauvecl {version} (code {code}), but needs {VERSION} "
+                        f"(code {code_identity()[1]}) as here"
                     )
             self._devices = [record for _, record in introduced.values()]
             self._counted = len(introduced), time.monotonic()
@@ -139,7 +137,7 @@ class DaskWorkers:
         return self._counted[0]
 
     def _gone(self) -> DeviceError:
-        return DeviceError(f"the scheduler of cluster {self._where} is gone, expected it to stay to the end", "lost")
+        return DeviceError(f"the scheduler of cluster {self._where} ended before the work was done", "lost")
 
     def describe(self) -> list[DeviceRecord]:
         """Return the devices of the initial workers."""
@@ -332,7 +330,7 @@ def _client(where: str, distributed: Any) -> Iterator[Client]:
             address = scheduler.get("address") if isinstance(scheduler, dict) else None
             if not (isinstance(address, str) and _is_address(address)):
                 raise InputError(
-                    f"scheduler file {shortened(where)} names no address", "one that Dask wrote", key="cluster"
+                    f"scheduler file {shortened(where)} names no address: use one that Dask wrote", key="cluster"
                 )
             how = {"scheduler_file": where}
         else:
@@ -340,7 +338,7 @@ def _client(where: str, distributed: Any) -> Iterator[Client]:
         try:
             client = stack.enter_context(distributed.Client(**how, timeout=PATIENCE_S, set_as_default=False))
         except (OSError, ValueError, TimeoutError) as error:
-            raise DeviceError(f"no scheduler answers at {where}, expected one within {PATIENCE_S:g} s") from error
+            raise DeviceError(f"no scheduler answered at {where} within {PATIENCE_S:g} s: start one") from error
         yield client
 
 
@@ -385,11 +383,7 @@ def _private(distributed: Any) -> Any:
     try:
         return distributed.Security.temporary()
     except ImportError as error:
-        raise InputError(
-            "cryptography is missing",
-            "the package for workers on local:N: pip install 'mauvecl[cluster]'",
-            key="cryptography",
-        ) from error
+        raise InputError.missing("cryptography", "a cluster of this machine", "cluster") from error
 
 
 LOGS = ("distributed", *(f"distributed.{part}" for part in ("client", "nanny", "worker", "scheduler", "core")))

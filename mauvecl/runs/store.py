@@ -247,9 +247,7 @@ class Store:
     def __post_init__(self) -> None:
         missing = [name for name in ("zarr", "xxhash", "google_crc32c") if find_spec(name) is None]
         if missing:
-            raise InputError(
-                f"{missing[0]} is missing", "the packages for stores: pip install 'mauvecl[bulk]'", key=missing[0]
-            )
+            raise InputError.missing(missing[0], "a store", "bulk")
 
     @classmethod
     def open(cls, path: str | Path) -> Store:
@@ -266,8 +264,8 @@ class Store:
                 copies.setdefault(text, place.relative_to(path))
         if not copies:
             raise InputError(
-                f"{str(path)!r} is not a store of spectra",
-                "a folder that `mauvecl realise` wrote, with an intact copy of its study",
+                f"{str(path)!r} is not a store of spectra: give a folder that `mauvecl realise` wrote, with an intact "
+                "copy of its study",
                 key="store",
             )
         (text, first), *others = copies.items()
@@ -275,8 +273,8 @@ class Store:
             other, second = others[0]
             keys = ", ".join(differing_keys(toml(text, path.name), toml(other, path.name)))
             raise InputError(
-                f"store {str(path)!r} holds two studies, {str(first)!r} and {str(second)!r} differ in {keys}",
-                "one study: restore the file of the correct one",
+                f"store {str(path)!r} must hold one study, but {str(first)!r} and {str(second)!r} differ in {keys}: "
+                "restore the file of the correct one",
                 key="store",
             )
         store = cls(path, Study.build(toml(text, path.name), path.name))
@@ -336,7 +334,7 @@ class Store:
         other = [p.name for p in self.path.iterdir() if p.name not in ours and not p.name.startswith(UNFINISHED)]
         if other:
             raise InputError(
-                f"{str(self.path)!r} holds {min(other)!r} and no store", "an empty or a new folder", key="store"
+                f"{str(self.path)!r} holds {min(other)!r} and no store: use an empty or a new folder", key="store"
             )
         # The root comes last, so that its presence means that the description is complete.
         made = self.description()
@@ -350,12 +348,12 @@ class Store:
             room = shutil.disk_usage(self.path).total
         except OSError as error:
             raise InputError(
-                f"store {str(self.path)!r} cannot be made ({error.strerror})", "a writable folder", key="store"
+                f"store {str(self.path)!r} cannot be made ({error.strerror}): use a writable folder", key="store"
             ) from error
         if self.n_bytes > room:
             raise InputError(
-                f"spectra of {self.n_bytes / 2**30:.4g} GiB for {str(self.path)!r}",
-                f"less than its disk's {room / 2**30:.4g} GiB",
+                f"the spectra need {self.n_bytes / 2**30:.4g} GiB, but the disk of {str(self.path)!r} has "
+                f"{room / 2**30:.4g} GiB",
                 key="run.realisations",
             )
 
@@ -371,7 +369,7 @@ class Store:
         differing = differing_keys(self.study.model_dump(mode="json"), there.model_dump(mode="json"))
         if differing:
             raise InputError(
-                f"store {str(self.path)!r} was started by another study, which differs in {', '.join(differing)}",
+                f"store {str(self.path)!r} was started by another study, which differs in {', '.join(differing)}: use "
                 "the same study or another place",
                 key="store",
             )
@@ -471,8 +469,7 @@ class Store:
         other = [key for key, own in files if not own]
         if other:
             raise InputError(
-                f"store {str(self.path)!r} holds {other[0]!r}, which does not belong to it",
-                "no other files in a store that is removed",
+                f"a store that is removed must hold no other files, but {str(self.path)!r} holds {other[0]!r}",
                 key="store",
             )
         for key, _ in sorted(files, key=lambda entry: entry[0] == "zarr.json"):
