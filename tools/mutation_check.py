@@ -504,7 +504,7 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "coverage of upper ends alone": (
         "test_intervals_on_either_side_of_the_truth_do_not_cover[low-inf]",
-        ("(found.low[level] <= truth) & (truth <= found.high[level])", "truth <= found.high[level]"),
+        ("(measurement.low[level] <= truth) & (truth <= measurement.high[level])", "truth <= measurement.high[level]"),
     ),
     "whole ranges for their halves": (
         "test_correct_model_covers_and_simple_model_is_rejected",

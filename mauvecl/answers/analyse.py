@@ -224,10 +224,10 @@ class EventRow:
     @cached_property
     def colour(self) -> tuple[float, float, float]:
         """Blue over red rise with its error, and the p-value of an event without colour; NaN in a light curve."""
-        found = self.analysis.colour(self.event)
-        if found is None:
+        colour = self.analysis.colour(self.event)
+        if colour is None:
             return (float("nan"),) * 3
-        return found.blue_over_red, found.blue_over_red_error, found.p_value
+        return colour.blue_over_red, colour.blue_over_red_error, colour.p_value
 
     @property
     def note(self) -> str:

@@ -226,8 +226,8 @@ class ExpectedMeasurement(InCell):
         ]  # fmt: skip
         # Dense at the ends, where the two amplitudes converge like a root.
         log_k = (ends[0] + ends[1]) / 2 + (ends[1] - ends[0]) / 2 * np.sin(np.linspace(-np.pi / 2, np.pi / 2, n))
-        left, found = at(log_k)
-        low, high = (found.end(left, sign)[0] for sign in (-1.0, 1.0))
+        left, ratio = at(log_k)
+        low, high = (ratio.end(left, sign)[0] for sign in (-1.0, 1.0))
         return np.exp(log_k), np.maximum(low, 0.0), high
 
 
@@ -285,9 +285,9 @@ def models_of(case: Case) -> dict[str, FlareModel | TwoTemperatures]:
 
 def last_of_one_temperature(models: dict[str, FlareModel | TwoTemperatures]) -> tuple[str, FlareModel]:
     """Return the name and the model of the last one with a single temperature, or that of a blackbody."""
-    found = [(name, model) for name, model in models.items() if isinstance(model, FlareModel)]
-    if found:
-        return found[-1]
+    single = [(name, model) for name, model in models.items() if isinstance(model, FlareModel)]
+    if single:
+        return single[-1]
     (two,) = (model for model in models.values() if isinstance(model, TwoTemperatures))
     return "blackbody", two.single
 
@@ -479,16 +479,16 @@ def _joint_fit(case: Case, raw: Float, unknown: Nuisances | None) -> JointFit:
     """Fit a blackbody to the one flare of a stare; the search for the best fit starts from the true flare."""
     staring, (event,), model = case.stare_expectation, case.events, model_of(case.one_frame)
     quiet, stare, skipped = staring.quiet, staring.stare, case.study.measure.skipped_nm
-    found = fit_cooling(
+    measurement = fit_cooling(
         raw, quiet, model, unknown, peak_s=event.peak_s, half_width_s=event.half_width_s, shape=event.form,
         cooling=isinstance(event.temperature, Cooling), stare=stare, skipped_nm=skipped,
     )  # fmt: skip
     true, fitted = (
-        cooling_course(flare_event, found, raw, quiet, model, stare, skipped)
-        for flare_event in (event, cooling_event(found, event.form))
+        cooling_course(flare_event, measurement, raw, quiet, model, stare, skipped)
+        for flare_event in (event, cooling_event(measurement, event.form))
     )
     truth = true.values
     if not case.study.flare.is_blackbody:
         # Only the shape is that of the model.
         truth = np.where(np.arange(truth.size) < 2, truth, np.nan)
-    return JointFit(found, truth, true, fitted)
+    return JointFit(measurement, truth, true, fitted)

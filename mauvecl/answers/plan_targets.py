@@ -293,14 +293,14 @@ def inject_target(observation: TargetObservation, engine: Stares | Pool | None =
         }
 
     depends_on = ("completeness of a target", question.text(), observation.quiet, observation.scale)
-    found = kept(engine.checkpoint if isinstance(engine, Pool) else None, depends_on, computed)
+    arrays = kept(engine.checkpoint if isinstance(engine, Pool) else None, depends_on, computed)
     how = (
         f"{question.injections.count} injections of each of {WIDTHS} half-widths into stretches of "
-        f"{observation.window_s / 60:.0f} min, found above {float(found['threshold']):.2f} sigma, "
+        f"{observation.window_s / 60:.0f} min, found above {float(arrays['threshold']):.2f} sigma, "
         f"{study.search.false_alarms:g} false alarms per {study.search.per}"
-        + (", allowing for unknowns that the search leaves in" if found["shifted"] else "")
+        + (", allowing for unknowns that the search leaves in" if arrays["shifted"] else "")
     )
-    return Completeness(energy, found["probability"], BOLOMETRIC, how)
+    return Completeness(energy, arrays["probability"], BOLOMETRIC, how)
 
 
 def injection_case(observation: TargetObservation) -> Case:

@@ -377,8 +377,8 @@ class StareAnswer(Answer):
         for stare in self.stares:
             if isinstance(stare.search, SearchResult):
                 above = f"{stare.search.threshold:.2f}, {self.study.search.rate_text}"
-                found = table_of(FOUND_COLUMNS, stare.found)
-                views.append(View(f"Found at {stare.title} above {above}", FOUND_COLUMNS, found))
+                table = table_of(FOUND_COLUMNS, stare.found)
+                views.append(View(f"Found at {stare.title} above {above}", FOUND_COLUMNS, table))
         return views
 
     def light_curve(self, number: int = 0) -> QTable:

@@ -150,12 +150,12 @@ AROUND_NM = 15.0
 
 def along_magnitude(answer: ChangeAnswer, names: Sequence[str], scale: float) -> list[tuple[str, Any, Any]]:
     """Return name, magnitudes and smallest changes of the first star, times a factor, where they are known."""
-    found = []
+    lines = []
     for name in names:
         own = [row for row in answer.along if row.change.name == name]
         x, y = np.array([(row.magnitude, row.smallest.one) for row in own[: len(own) // answer.many]]).T
-        found.append((name, x[np.isfinite(y)], scale * y[np.isfinite(y)]))
-    return found
+        lines.append((name, x[np.isfinite(y)], scale * y[np.isfinite(y)]))
+    return lines
 
 
 @picture_of("ChangeAnswer", "change", when=lambda answer: bool(answer.along))
@@ -166,11 +166,11 @@ def change_against_magnitude(answer: ChangeAnswer) -> Picture:
     (title,), star, row = titles, answer.study.star[0], []
     for unit in dict.fromkeys(row.change.unit for row in answer.along):
         names = list(dict.fromkeys(row.change.name for row in answer.along if row.change.unit == unit))
-        found = [line for line in along_magnitude(answer, names, 1 if unit else 100) if line[1].size]
+        lines = [line for line in along_magnitude(answer, names, 1 if unit else 100) if line[1].size]
         here = [] if star.magnitude is None else [Rule(dash="dotted", at=star.magnitude)]
         # Without a pixel that does not saturate there is nothing to show.
-        y = Axis(f"smallest change ({unit or '%'})", log=bool(found))
-        row.append(Panel(Axis(f"magnitude ({star.band})"), y, [Targets(at=found), *here]))
+        y = Axis(f"smallest change ({unit or '%'})", log=bool(lines))
+        row.append(Panel(Axis(f"magnitude ({star.band})"), y, [Targets(at=lines), *here]))
     visits, exposure = answer.study.change.visits, answer.study.observation.exposure_s
     title = f"{title}: smallest change between {visits} visits of {exposure:g} s"
     return Picture([row], (1.0 + 3.3 * len(row), 3.6), title, (titles.note,))

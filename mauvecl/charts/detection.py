@@ -40,12 +40,12 @@ def _few(answer: DetectAnswer) -> First[Shown]:
     return First([star.shown for star in answer.stars], MOST_STARS, "stars")
 
 
-def _alone(found: Detection) -> list[Shown]:
-    return [(found.quiet.name, found, [f"flare {k + 1}" for k in range(len(found.flares))])]
+def _alone(outcome: Detection) -> list[Shown]:
+    return [(outcome.quiet.name, outcome, [f"flare {k + 1}" for k in range(len(outcome.flares))])]
 
 
 @picture_of("DetectAnswer", "detection", given=lambda answer: (_few(answer), answer.study.run.fap))
-@picture_of("Detection", "detection", given=lambda found: (_alone(found),))
+@picture_of("Detection", "detection", given=lambda outcome: (_alone(outcome),))
 @styled_picture
 def detection(stars: Sequence[Shown], fap: float = 1e-3) -> Picture:
     """Plot null and flare distributions, with a row per star and a column per statistic."""

@@ -36,9 +36,9 @@ def fits(flares: Sequence[MeasuredFlare]) -> Picture:
     """Plot the first exposure minus unknowns with the fitted flare, and the residuals, with a column per fit."""
     above, below = list[Panel](), list[Panel]()
     for flare in flares:
-        quiet, found = flare.quiet, flare.found
+        quiet, measurement = flare.quiet, flare.found
         mean, unknown = flare.fitted_dn()
-        kelvin = " and ".join(f"{x:.0f} K" for x in np.atleast_1d(np.exp(found.log_k[0])))
+        kelvin = " and ".join(f"{x:.0f} K" for x in np.atleast_1d(np.exp(measurement.log_k[0])))
         variance, used = usable_variance(quiet, mean, flare.skipped_nm)
         sums = [quiet.per_element(np.where(used, values, 0.0)) for values in (flare.frame - unknown, mean, variance)]
         # Resolution elements of which some pixels are not used are not shown.
@@ -133,13 +133,13 @@ def temperatures(star: MeasuredStare) -> Picture:
     assert drawn is not None
     assert not isinstance(drawn, str)
     assert perfect is not None
-    found = drawn.found
-    size = "area" if "area" in found.names else "amplitude"
-    light = "luminosity bolometric" if "area" in found.names else "flux bolometric"
+    measurement = drawn.found
+    size = "area" if "area" in measurement.names else "amplitude"
+    light = "luminosity bolometric" if "area" in measurement.names else "flux bolometric"
     middle, reach = (drawn.start_s + drawn.end_s) / 2, (drawn.end_s - drawn.start_s) / 2
     for name, colour in zip(("temperature", size, light), COLOURS, strict=False):
-        q = found.column(name)
-        estimate, low, high = found.estimates[:, q], found.low[-1, :, q], found.high[-1, :, q]
+        q = measurement.column(name)
+        estimate, low, high = measurement.estimates[:, q], measurement.low[-1, :, q], measurement.high[-1, :, q]
         ends = np.where(np.isfinite([low, high]), np.abs([estimate - low, high - estimate]), 0.0)
         limits, true = ~np.isfinite(high), perfect.found.estimates[:, q]
         series = [
@@ -148,7 +148,7 @@ def temperatures(star: MeasuredStare) -> Picture:
             Line("", step=True, at=(middle, true)),
         ]
         positive = [value for value in (*estimate, *true) if value > 0]
-        label = f"{name} ({found.units[q]})" if found.units[q] else name
+        label = f"{name} ({measurement.units[q]})" if measurement.units[q] else name
         y = Axis(label, log=True, limits=(0.5 * min(positive), 2 * max(positive)))
         rows.append([Panel(Axis("time from the start of the stare (s)"), y, series)])
     return Picture(rows, (7.2, 6.4), f"{star.title}: one simulated stare; nominal throughput", share_x=True)

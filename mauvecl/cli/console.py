@@ -456,17 +456,17 @@ def with_flags(text: str) -> str:
     return _REMEDY.sub(_as_flag, text) if "`" in text else text
 
 
-def _as_flag(found: re.Match[str]) -> str:
-    name = found["name"]
+def _as_flag(match: re.Match[str]) -> str:
+    name = match["name"]
     flag = _OTHERWISE.get(name) or next((flags[0] for command in _commands() if (flags := _flags(name, command))), None)
     if flag is None:
-        return found[0]
-    if found["value"] is None:
+        return match[0]
+    if match["value"] is None:
         return flag
     try:
-        value = ast.literal_eval(found["value"])
+        value = ast.literal_eval(match["value"])
     except (ValueError, SyntaxError):
-        value = found["value"]
+        value = match["value"]
     return flag if value is True else f"{flag} {shlex.quote(str(value))}"
 
 

@@ -197,11 +197,11 @@ class Nuisances(ContentEquality):
         order, factors = np.arange(len(self.names)), np.flatnonzero((self.of_flare == 1.0).all(axis=1))
         if factors.size:
             order = np.append(np.delete(order, factors[0]), factors[0])
-        found = self._rows(order.tolist())
-        spectra = found.spectra + found.of_flare * flare_dn
+        spread = self._rows(order.tolist())
+        spectra = spread.spectra + spread.of_flare * flare_dn
         if factors.size:
-            spectra[-1] = found.spectra[-1]
-        return replace(found, spectra=spectra)
+            spectra[-1] = spread.spectra[-1]
+        return replace(spread, spectra=spectra)
 
     @property
     def mean_factor(self) -> float:

@@ -268,8 +268,8 @@ class LinearStatistic(Statistic):
 
     def form(self, setting: Setting, seen: Differences, flare: Expectation | None = None) -> Gaussian:
         none = np.zeros((0, seen.mean.size))
-        (found,) = self.moved_forms(setting, seen, np.zeros((1, 0)), none, none, flare)
-        return found
+        (form,) = self.moved_forms(setting, seen, np.zeros((1, 0)), none, none, flare)
+        return form
 
     def moved_forms(
         self,

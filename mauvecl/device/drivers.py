@@ -85,8 +85,8 @@ def driver_sources(system: str | None = None, machine: str | None = None) -> str
     """Return the sources of drivers for a machine, by default this one, as the end of a sentence."""
     system = platform.system() if system is None else system
     machine = platform.machine() if machine is None else machine
-    found = SOURCES.get((system, machine)) or SOURCES.get((system, "")) or SOURCES["", ""]
-    return ", or ".join(found)
+    sources = SOURCES.get((system, machine)) or SOURCES.get((system, "")) or SOURCES["", ""]
+    return ", or ".join(sources)
 
 
 #: Free space that PoCL needs to build the kernels of a session, bytes.
@@ -390,10 +390,10 @@ def flags() -> frozenset[str]:
 
 def target(device: Any) -> tuple[str, str] | None:
     """Return the triple and processor name for which PoCL compiles, or None if they need no change."""
-    found = TARGET.search(str(device.version))
-    if found is None or not (CHOOSES_LIBRARY in str(device.platform.version) or found[2] == UNKNOWN):
+    match = TARGET.search(str(device.version))
+    if match is None or not (CHOOSES_LIBRARY in str(device.platform.version) or match[2] == UNKNOWN):
         return None
-    return found[1], found[2]
+    return match[1], match[2]
 
 
 def names(device: Any) -> tuple[str | None, ...]:
@@ -413,10 +413,10 @@ def set_processor_name(device: Any, name: str) -> bool:
 
 def _name_address(device: Any) -> int | None:
     """Return the address of the pointer to the processor's name in PoCL's record, or None if it is not found."""
-    found = target(device)
-    if found is None:
+    own_target = target(device)
+    if own_target is None:
         return None
-    triple, own = found
+    triple, own = own_target
     record = int(device.int_ptr)
     try:
         memory = os.open("/proc/self/mem", os.O_RDONLY)
@@ -710,8 +710,8 @@ def _read_outcome(key: str) -> Outcome | None:
     text = kernel_cache().read_text(key)
     if text is None:
         return None
-    found = json.loads(text)
-    outcome = Outcome(tuple((name, why) for name, why in found["tried"]), found["time_s"], found["by_driver"])
+    content = json.loads(text)
+    outcome = Outcome(tuple((name, why) for name, why in content["tried"]), content["time_s"], content["by_driver"])
     return outcome if outcome.current else None
 
 

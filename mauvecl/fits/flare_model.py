@@ -241,16 +241,16 @@ class FlareModel:
 
         A luminosity is a multiple of a flux, so that their intervals are computed once.
         """
-        found: list[tuple[int, float]] = []
+        references: list[tuple[int, float]] = []
         for k, derived in enumerate(self.derived):
-            found.append((k, 1.0))
+            references.append((k, 1.0))
             for first, other in enumerate(self.derived[:k]):
-                if derived.factors is None or other.factors is None or found[first][0] != first:
+                if derived.factors is None or other.factors is None or references[first][0] != first:
                     continue
                 times = float(np.sum(derived.factors * other.factors) / np.sum(other.factors**2))
                 if times > 0.0 and np.allclose(derived.factors, times * other.factors, rtol=1e-12, atol=0.0):
-                    found[k] = first, times
-        return tuple(found)
+                    references[k] = first, times
+        return tuple(references)
 
     @cached_property
     def sums(self) -> tuple[NDArray[np.bool_], scipy.interpolate.CubicSpline]:

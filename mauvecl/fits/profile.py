@@ -658,13 +658,13 @@ class Face:
 
     def value(self, factors: Float) -> Float:
         """Return a sum of the best amplitudes, with factors (n_linear, n, ...)."""
-        found = np.sum(factors[1:][list(self.some)] * self.others, axis=0)
-        return np.asarray(found if self.amplitude is None else found + factors[0] * self.amplitude)
+        total = np.sum(factors[1:][list(self.some)] * self.others, axis=0)
+        return np.asarray(total if self.amplitude is None else total + factors[0] * self.amplitude)
 
     def product(self, factors: Float, change: tuple[Float | None, Float, Float]) -> Float:
         """Return the covariance of a sum of amplitudes with the quantity of a `change`."""
-        found = np.sum(factors[1:][list(self.some)] * change[1], axis=0)
-        return np.asarray(found if change[0] is None else found + factors[0] * change[0])
+        total = np.sum(factors[1:][list(self.some)] * change[1], axis=0)
+        return np.asarray(total if change[0] is None else total + factors[0] * change[0])
 
     def change(self, factors: Float) -> tuple[Float | None, Float, Float]:
         """Return the changes of amplitudes per change of a linear quantity, and the quantity's variance.
@@ -775,9 +775,9 @@ class BoundedProfile(Profile):
             there = np.clip(best[:, None] + step * np.linspace(-1.0, 1.0, 9), low, high)
             best = there[np.arange(best.size), np.argmax(own.gain(there), axis=1)]
             step /= 4.0
-        found = x.copy()
-        found[rising] = best
-        return found
+        climbed = x.copy()
+        climbed[rising] = best
+        return climbed
 
     def solution(self, log_k: Float) -> BestFit:
         """Return the best fits at temperatures (n,)."""
@@ -810,12 +810,12 @@ def bounded_intervals(
     def ends(derived: Derived, spline: CubicSpline) -> tuple[Float, Float]:
         if derived.ratio is None:
             factors = np.moveaxis(spline(x), -1, 0)
-            found = _linear_ends(faces, factors, least, of_light)
+            linear_ends = _linear_ends(faces, factors, least, of_light)
             if light is None or not light.prior.size:
-                return found
+                return linear_ends
             factor = profile.factor(best.log_k, best.linear)
             value = np.einsum("nl,nl->n", spline(best.log_k), best.linear) / factor
-            moved = light.change(value, factor, found[1] - found[0], allowed)
+            moved = light.change(value, factor, linear_ends[1] - linear_ends[0], allowed)
             return _linear_ends(faces, factors, least - moved[:, None], of_light)
         lowest, highest = _ratio_ends(products, faces, spline(x), least)
         return derived.offset + lowest, derived.offset + highest
@@ -852,7 +852,7 @@ def _linear_ends(
             ratio = Ratio(middle, of_light[0] - face.value(of_light[1]), variance, dims[2] + of_light[2], -covariance)
         else:
             dims, ratio = change, None
-        for sign, found, which in ((-1.0, lows, np.minimum), (1.0, highs, np.maximum)):
+        for sign, bounds, which in ((-1.0, lows, np.minimum), (1.0, highs, np.maximum)):
             if ratio is None:
                 end = middle + sign * np.sqrt(left * variance)
                 reach = sign * np.sqrt(left / np.where(variance > 0, variance, np.inf))
@@ -867,7 +867,7 @@ def _linear_ends(
                 reach = np.where(np.isfinite(end), reach, 0.0)
             moved = None if face.amplitude is None or step is None else face.amplitude + reach * step
             there = inside & face.positive(moved, face.others + reach * steps)
-            which(found, end, out=found, where=there)
+            which(bounds, end, out=bounds, where=there)
     return extreme(lows, np.minimum), extreme(highs, np.maximum)
 
 

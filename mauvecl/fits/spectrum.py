@@ -306,8 +306,8 @@ def _pilot(
     def best(rows: NDArray[np.intp], reduction: Reduction) -> None:
         for start in range(0, rows.size, BATCH):
             some = rows[start : start + BATCH]
-            found = Profile(reduction, exposures.sums(reduction, some)).best()
-            log_k[some], linear[some] = found.log_k, found.linear
+            fit_of_some = Profile(reduction, exposures.sums(reduction, some)).best()
+            log_k[some], linear[some] = fit_of_some.log_k, fit_of_some.linear
 
     best(np.flatnonzero(counts == 0), usual)
     # Frames with about as many saturated pixels share the pixels that none of them saturates.
@@ -582,8 +582,8 @@ def fit_two_temperatures(
     groups = variance_groups(expectation, model, single.log_k, recorded, reduction_of, nuisances, exposures)
     for rows, reduction in groups:
         sums, rest, light = exposures.sums_and_rest(reduction, rows)
-        found = _Search(model, reduction, sums, allowed, light).measured()
-        best, low, high, second, estimates, factor = found
+        measured = _Search(model, reduction, sums, allowed, light).measured()
+        best, low, high, second, estimates, factor = measured
         chi2 = rest + np.einsum("nk,nk->n", sums, sums) - best.gain
         dof = reduction.n_used - reduction.n_free - len(model.linear) - 3
         check_enough(expectation, reduction.variance > 0.0, len(model.linear) + 3 + reduction.n_free)
@@ -720,9 +720,9 @@ class _Search:
                 some = self._profile(int(node), rows[there])
                 limit = BestFit(own.log_k[there], own.linear[there], gain[rows[there]])
                 ends = bounded_intervals(model, some, limit, at_nodes[there], rise)
-                for found, end, which in ((lows, ends[0], np.minimum), (highs, ends[1], np.maximum)):
+                for bounds, end, which in ((lows, ends[0], np.minimum), (highs, ends[1], np.maximum)):
                     columns = np.delete(np.arange(q), q - 2)
-                    found[k][np.ix_(rows[there], columns)] = which(found[k][np.ix_(rows[there], columns)], end)
+                    bounds[k][np.ix_(rows[there], columns)] = which(bounds[k][np.ix_(rows[there], columns)], end)
         for k, rise in enumerate(self._allowed):
             lows[k, :, q - 2], highs[k, :, q - 2] = self._second_ends(gain, rise)
         best = BestFit(log_k, linear, gain)

@@ -65,8 +65,8 @@ class View:
         """Return headings and cells, without `hidden` columns."""
         shown = [column for column in self.columns if column.heading and column.name not in hidden]
         table = [] if self.table is None else self.table
-        found = table if isinstance(table, Sequence) else records(table)
-        return [column.heading for column in shown], [[column.text(record) for column in shown] for record in found]
+        rows = table if isinstance(table, Sequence) else records(table)
+        return [column.heading for column in shown], [[column.text(record) for column in shown] for record in rows]
 
 
 def without_empty(headings: Sequence[str], cells: Sequence[Sequence[str]]) -> tuple[list[str], list[list[str]]]:

@@ -95,9 +95,9 @@ def _first_fault(model: type[BaseModel], error: ValidationError) -> InputError:
             unknown = f"unknown key {shortened(key)}"
             if not (near := difflib.get_close_matches(path[-1], fields, n=1)):
                 return InputError(unknown, f"one of {', '.join(fields)}", key=key)
-            found = InputError(f"{unknown}, did you mean {near[0]!r}?", key=key)
-            found.expected = near[0]
-            return found
+            fault = InputError(f"{unknown}, did you mean {near[0]!r}?", key=key)
+            fault.expected = near[0]
+            return fault
         case "missing":
             return InputError(f"{key!r} is missing", "a value", key=key)
         case "value_error":

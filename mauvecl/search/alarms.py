@@ -375,10 +375,10 @@ def _measured(
     area = sums.survey.bank.shape.equivalent_duration
     several = KELVIN in sums.free
     covariance = np.asarray(rows.covariance(best.theta)[j, :, j, :])
-    found = _intervals(rows, best, j, snr, covariance, energy)
-    if isinstance(found, BlendFit):
-        return (UNMEASURED, {}, ""), found
-    intervals, note = found
+    outcome = _intervals(rows, best, j, snr, covariance, energy)
+    if isinstance(outcome, BlendFit):
+        return (UNMEASURED, {}, ""), outcome
+    intervals, note = outcome
     duration = np.array([1.0, 0.0, 1.0, 0.0])
     sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     sd_duration = float(np.sqrt(max(duration @ covariance @ duration, 0.0)))
@@ -419,15 +419,15 @@ def _intervals(
             intervals[name] = (np.nan, np.nan)
             continue
         if snr > MAX_PROFILED_SNR:
-            found = _by_curvature(best.theta[j], covariance, column, factor)
+            interval = _by_curvature(best.theta[j], covariance, column, factor)
         else:
-            found, better = rows.interval(best, j, column, factor, 1.0 + BARTLETT / max(snr, 1.0) ** 2)
+            interval, better = rows.interval(best, j, column, factor, 1.0 + BARTLETT / max(snr, 1.0) ** 2)
             if better is not None:
                 return better
-        ends = np.array([found.low, found.high])
+        ends = np.array([interval.low, interval.high])
         low_end, high_end = ends if column == PEAK else np.exp(ends + offset)
         intervals[name] = (float(low_end), float(high_end))
-        if found.open_low or found.open_high:
+        if interval.open_low or interval.open_high:
             notes.append(name.rsplit("_", 1)[0].replace("_", " "))
     return intervals, f"the interval of its {' and its '.join(notes)} ends where the fit does" if notes else ""
 

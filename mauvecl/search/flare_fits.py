@@ -354,11 +354,11 @@ class Block:
         if not moved.any():
             return BlendFit(whole(start[moved]), self.chi2(whole(start[moved])), dof, True)
 
-        found = scipy.optimize.least_squares(
+        solution = scipy.optimize.least_squares(
             residual, start[moved], jacobian, bounds=(low[moved], high[moved]), x_scale=scale[moved],
             ftol=CONVERGED, xtol=1e-9, gtol=None, max_nfev=MAX_EVALUATIONS,
         )  # fmt: skip
-        return BlendFit(whole(found.x), 2 * float(found.cost), dof, bool(found.status > 0))
+        return BlendFit(whole(solution.x), 2 * float(solution.cost), dof, bool(solution.status > 0))
 
     def covariance(self, theta: Float) -> Float:
         """Return the covariance of all parameters, the inverse of the information, shape (n, 4, n, 4)."""
@@ -397,7 +397,7 @@ class Block:
         along = np.einsum("iajb,jb->ia", covariance, weights)
         variance = float(np.sum(weights * along))
         sd = np.sqrt(variance) if variance > 0 else 1e-3
-        found: list[tuple[float, bool]] = []
+        interval_ends: list[tuple[float, bool]] = []
         for sign, end in zip((-1.0, 1.0), ends, strict=True):
             furthest = abs(end - middle)
 
@@ -416,8 +416,8 @@ class Block:
                     reached = _interval_end(refit, best.chi2, rises, step, furthest, one.theta)
             if reached.better is not None:
                 return Interval(np.nan, np.nan), self.fit(reached.better.theta)
-            found.append((float(middle + sign * reached.step), reached.open))
-        (low, open_low), (high, open_high) = found
+            interval_ends.append((float(middle + sign * reached.step), reached.open))
+        (low, open_low), (high, open_high) = interval_ends
         return Interval(low, high, open_low, open_high), None
 
     def without(self, blended: BlendFit, j: int) -> BlendFit:

@@ -188,19 +188,19 @@ def sites_of(survey: Survey, widths_s: Sequence[float], peak_s: float, response:
     seen: list[list[_NearbyTemplates]] = [[] for _ in reaches]
     for number, (row, correlated) in enumerate(search.correlations(means[:, :, None])):
         times = (stare.numbers[0] + row.peaks + row.template.phases[row.phase]) * bank.frame_s
-        for found, reach, value in zip(seen, reaches, correlated[:, 0], strict=True):
+        for responses, reach, value in zip(seen, reaches, correlated[:, 0], strict=True):
             if row.template.half_width_s in reach.half_widths_s:
                 inside = (times >= reach.first_s) & (times <= reach.last_s) & (row.per_amplitude > 0)
                 onsets = np.flatnonzero(inside)
                 onsets = onsets[(along * value[onsets]).max(axis=0, initial=0) > 0]
-                found.append(_NearbyTemplates(number, onsets, times[onsets], along * value[onsets]))
-    for found in seen:
-        largest = max((float(response.values.max(initial=0)) for response in found), default=0.0)
-        found[:] = [response.above(OVERLAP * largest) for response in found]
-    filters = _filters(search, [response for found in seen for response in found])
+                responses.append(_NearbyTemplates(number, onsets, times[onsets], along * value[onsets]))
+    for responses in seen:
+        largest = max((float(response.values.max(initial=0)) for response in responses), default=0.0)
+        responses[:] = [response.above(OVERLAP * largest) for response in responses]
+    filters = _filters(search, [response for responses in seen for response in responses])
     return tuple(
-        _site(search, first, width, peak_s, mean, found, filters)
-        for width, mean, found in zip(widths_s, means, seen, strict=True)
+        _site(search, first, width, peak_s, mean, responses, filters)
+        for width, mean, responses in zip(widths_s, means, seen, strict=True)
     )
 
 

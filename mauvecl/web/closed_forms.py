@@ -229,7 +229,7 @@ class Chance:
 
 def chances(closed: ClosedForms, answers: Answers) -> list[Chance]:
     """Return the chance for each choice of what is unknown, simulated if it is among the answers."""
-    found = []
+    all_chances = []
     for unknown in UNKNOWN:
         try:
             assumed = closed.assuming(unknown)
@@ -239,8 +239,8 @@ def chances(closed: ClosedForms, answers: Answers) -> list[Chance]:
             if unknown == closed.question.unknown:
                 raise
             chance = Chance(unknown, float("nan"), str(error).partition(", expected ")[0])
-        found.append(chance)
-    return found
+        all_chances.append(chance)
+    return all_chances
 
 
 def _simulated_chance(assumed: ClosedForms, answer: DetectAnswer | None) -> Chance | None:

@@ -240,7 +240,7 @@ def as_file(tab: Tab, name: str, ending: str, closed: ClosedForms, answers: Answ
 
 def commands_and_programs(tab: Tab, question: Question, folder: Path) -> list[dict[str, str]]:
     """Return each of a tab's `questions` as a command and as a Python program; `folder` holds the visitor's files."""
-    found = []
+    entries = []
     for name in tab.questions:
         verb, study = asked(name, question.study(folder))
         for place, file in visitor_files(study).items():
@@ -248,8 +248,8 @@ def commands_and_programs(tab: Tab, question: Question, folder: Path) -> list[di
             study = study.with_value(place, Path(file.name))
         if rows := placed(study.calibrate.observations, lambda file: file.name):
             study = study.with_changes({"calibrate": {"observations": rows}}, None, "page")
-        found.append({"question": name, "command": as_command(verb, study), "python": as_program(verb, study)})
-    return found
+        entries.append({"question": name, "command": as_command(verb, study), "python": as_program(verb, study)})
+    return entries
 
 
 def asked_study(name: str, study: Study) -> tuple[str, bytes]:

@@ -274,8 +274,8 @@ def _target(row: dict[str, Any]) -> dict[str, str]:
     except InputError as error:
         return {"fault": sentence(error)}
     facts = {"spectral_type": star.spectral_type, "V": star.magnitude, "distance_pc": star.distance_pc}
-    found = {
+    target = {
         key: "" if value is None else f"{value:g}" if isinstance(value, float) else value
         for key, value in facts.items()
     }
-    return found | {"coordinates": f"{star.ra_deg:.3f} {star.dec_deg:+.3f}", "about": star.source}
+    return target | {"coordinates": f"{star.ra_deg:.3f} {star.dec_deg:+.3f}", "about": star.source}

@@ -360,12 +360,12 @@ class Visitor(WebSocketHandler):
 
     def answers(self, state: State) -> dict[str, Any]:
         """Return the simulated answers that hold for a question, by name."""
-        found: dict[str, Any] = {}
+        valid: dict[str, Any] = {}
         for (simulation, key), answers in list(self._answers.items()):
             if key == self._key(state, reads_of(simulation)):
-                found |= answers
+                valid |= answers
                 RESULTS.used(self, (simulation, key))
-        return found
+        return valid
 
     def _key(self, state: State, names: frozenset[str]) -> tuple[Any, ...]:
         """Return everything on which an answer to some fields depends."""

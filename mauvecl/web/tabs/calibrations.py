@@ -56,10 +56,10 @@ def throughput(closed: ClosedForms, answer: CalibrateAnswer) -> ChartData:
 ).data("calibrate", NO_FILES)  # fmt: skip
 def residuals(closed: ClosedForms, answer: CalibrateAnswer) -> ChartData:
     """Return the residuals of each star."""
-    found = residual_series(answer)
-    words = "; ".join(f"{name} {np.sqrt(np.mean(row**2)):.2f}" for name, _, row in found)
+    rows = residual_series(answer)
+    words = "; ".join(f"{name} {np.sqrt(np.mean(row**2)):.2f}" for name, _, row in rows)
     text = f"Root mean square, 1 for noise alone: {words}; p = {answer.throughput.p_value:.2g}."
-    return ChartData(text, {"residual": found})
+    return ChartData(text, {"residual": rows})
 
 
 @TRANSFER.data("calibrate", NO_FILES)
@@ -119,10 +119,10 @@ def _against_magnitude(name: str, title: str, label: str, units: Mapping[str, fl
 
     def along(closed: ClosedForms, answer: ChangeAnswer) -> ChartData:
         here = [row for row in answer.changes if row.change.unit in units]
-        found, words, own = [], list[str](), list[float]()
+        lines, words, own = [], list[str](), list[float]()
         for row in here:
             change, scale = row.change.name, units[row.change.unit]
-            found += along_magnitude(answer, [change], scale)
+            lines += along_magnitude(answer, [change], scale)
             hidden = np.isinf(row.smallest.one)
             words.append(f"{change} {'hidden' if hidden else f'{scale * row.smallest.one:.3g}'}")
             own += [] if hidden else [scale * row.smallest.one]
@@ -130,7 +130,7 @@ def _against_magnitude(name: str, title: str, label: str, units: Mapping[str, fl
             f"Smallest changes between {answer.study.change.visits} visits, in {label}: "
             f"{'; '.join(words) or 'none of this kind'}."
         )
-        return ChartData(text, {name: found, "own": ([closed.question.magnitude] * len(own), own)})
+        return ChartData(text, {name: lines, "own": ([closed.question.magnitude] * len(own), own)})
 
     axis, lines = Axis(f"smallest change ({label})", log=True), (Targets(name, tips=(label,)), Own("this star"))
     chart = Chart(name, title, Axis("magnitude"), axis, lines, sets="magnitude=x")

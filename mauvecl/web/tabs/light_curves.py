@@ -51,8 +51,8 @@ NO_FILE = "Choose a file of frames: a light curve or a sequence of spectra."
 
 def frames_of(closed: ClosedForms) -> Frames | None:
     """Return the frames of the question, or None if there is no file."""
-    found: Frames | None = closed.given.get("frames")
-    return found
+    frames: Frames | None = closed.given.get("frames")
+    return frames
 
 
 def minutes(frames: Frames, time_s: Any) -> Float:
@@ -276,10 +276,13 @@ def shares(closed: ClosedForms, answers: Answers) -> ChartData:
             "orbit, and searches it."
         )
         return ChartData(text, series)
-    found, parts = answers["completeness"].stars[0].injected, []
-    for k, width in enumerate(found.half_widths_s):
-        x, share = 100 * found.sizes, found.completeness[k]
-        series |= {f"band {k}": (x, found.completeness_low[k], found.completeness_high[k]), f"line {k}": (x, share)}
+    injected, parts = answers["completeness"].stars[0].injected, []
+    for k, width in enumerate(injected.half_widths_s):
+        x, share = 100 * injected.sizes, injected.completeness[k]
+        series |= {
+            f"band {k}": (x, injected.completeness_low[k], injected.completeness_high[k]),
+            f"line {k}": (x, share),
+        }
         seen = float(np.interp(np.log(closed.question.amplitude_percent), np.log(x), share))
         parts.append(f"{percent(seen)} of those of half-width {short(width)} s")
     peak = f"{closed.question.amplitude_percent:g} %"

@@ -261,14 +261,14 @@ def _labels(x: Float, y: Float, p: Float) -> tuple[Any, ...]:
     """Return the names of contours, each at another part of its line: the lines are close to each other."""
     from contourpy import contour_generator
 
-    found = []
+    labels = []
     for level, part in LABELLED.items():
         lines: list[Any] = list(contour_generator(x, y, p).lines(level))
         if lines:
             longest = max(lines, key=len)
             at = longest[np.argsort(longest[:, 0])][int(part * (len(longest) - 1))]
-            found.append((float(at[0]), float(at[1]), f"{100 * level:g} %"))
-    return tuple(zip(*found, strict=True)) or ([], [], [])
+            labels.append((float(at[0]), float(at[1]), f"{100 * level:g} %"))
+    return tuple(zip(*labels, strict=True)) or ([], [], [])
 
 
 class Limit(Tab):

@@ -49,11 +49,11 @@ def expected(closed: ClosedForms) -> dict[str, ExpectedMeasurement]:
     """Return the forecast with the flare's own model for each of `ASSUMED`."""
     case = closed.case
     own = dict(list(models_of(case).items())[-1:])
-    found = {}
+    measurements = {}
     for name, nuisances in ASSUMED.items():
         assumed = case.with_sections(nuisances=nuisances)
-        (found[name],) = expected_measurements(assumed, case.amplitudes[0], closed.flare, own)
-    return found
+        (measurements[name],) = expected_measurements(assumed, case.amplitudes[0], closed.flare, own)
+    return measurements
 
 
 def simulated(answers: Answers) -> MeasuredFlare | None:
@@ -170,8 +170,10 @@ def course(closed: ClosedForms, answers: Answers) -> ChartData:
         near = (since > -NEAR[0]) & (since < NEAR[1])
         for name, fit in (("true", stare_fit.joint.true), ("joint", stare_fit.joint.fitted)):
             series[name] = stare.middle_s[near], fit.kelvin[near]
-        found = stare_fit.joint.found
-        each = zip(found.names[:4], found.units, found.estimates[0], found.errors[0], strict=False)
+        measurement = stare_fit.joint.found
+        each = zip(
+            measurement.names[:4], measurement.units, measurement.estimates[0], measurement.errors[0], strict=False
+        )
         words += [f"{name} {short(best)} +- {short(error)} {unit}".strip() for name, unit, best, error in each]
     if isinstance(stare_fit.drawn, str):
         words.append(stare_fit.drawn)
