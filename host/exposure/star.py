@@ -312,13 +312,13 @@ class _Neighbours(Rows):
         return self._stated(name)
 
     def _stated(self, name: str) -> tuple[Float, tuple[str, ...]]:
-        stated, known = getattr(self.table[name], "unit", None) is not None, key_of(name)
-        if not stated and known == "_r":
+        stated, key = getattr(self.table[name], "unit", None) is not None, key_of(name)
+        if not stated and key == "_r":
             raise self.error(
                 f"the column {name} states no unit",
                 "a table with units (ECSV, FITS, VOTable), or the column separation, arcsec", name,
             )  # fmt: skip
-        factor = 1.0 if stated else {"deg": 3600.0}.get(UNSTATED.get(known, ""), 1.0)
+        factor = 1.0 if stated else {"deg": 3600.0}.get(UNSTATED.get(key, ""), 1.0)
         values = np.array([self._given(name, row, self.number(name, row, "arcsec")) for row in range(self.n)]) * factor
         negative = ~(values >= 0)
         if negative.any():
@@ -326,7 +326,7 @@ class _Neighbours(Rows):
             text = self.text(name, row)
             raise self.error(f"row {row + 1} has {name} = {text}", "an angle of 0 and above", name)
         note = f"Separations are the column {name} of {self.named}, read as degrees since it states no unit."
-        return values, (note,) if not stated and known == "dist" else ()
+        return values, (note,) if not stated and key == "dist" else ()
 
     def _from_positions(self, ra: str, dec: str, own: int | None, target: str) -> Float:
         from astropy.coordinates import angular_separation

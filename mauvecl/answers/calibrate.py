@@ -189,8 +189,8 @@ class CalibrateAnswer(Answer):
                   ("line width", f.fwhm_nm, n.gaussian_fwhm_nm),
                   ("line width, change to the red", f.fwhm_change_nm, 0.0))),
         ]  # fmt: skip
-        return [Fitted(name, value, error if known else float("nan"), usual, unit, known)
-                for name, value, error, usual, unit, known in rows]  # fmt: skip
+        return [Fitted(name, value, error if is_fitted else float("nan"), usual, unit, is_fitted)
+                for name, value, error, usual, unit, is_fitted in rows]  # fmt: skip
 
     @property
     def _fits(self) -> list[dict[str, Any]]:

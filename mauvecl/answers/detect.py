@@ -274,10 +274,10 @@ def _template_costs(case: Case, star: StarDetection) -> list[str]:
     for temperature in case.study.run.template_temperatures_k:
         right = Matched().closed_form(detection.setting, detection.flares[0], detection.flares[0]).mean
         name = f"matched {temperature:g} K"
-        kept = detection.closed_form(name, 0).mean / detection.closed_form(name).std / right if right else 0.0
+        share = detection.closed_form(name, 0).mean / detection.closed_form(name).std / right if right else 0.0
         lines.append(
             f"{star.label}: looking for a flare of {temperature:g} K in one of {light} keeps "
-            f"{100 * kept:.1f} % of the matched statistic's S/N."
+            f"{100 * share:.1f} % of the matched statistic's S/N."
         )
     return lines
 

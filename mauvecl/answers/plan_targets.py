@@ -48,8 +48,8 @@ class Conditions:
 
     def swings(self, orbits: int, orbit_s: float) -> tuple[tuple[float, float], ...]:
         """Return the swing of N orbits."""
-        kept = [point for point in self.swing if point[0] < orbit_s]
-        return tuple((n * orbit_s + t, value) for n in range(orbits) for t, value in kept)
+        points = [point for point in self.swing if point[0] < orbit_s]
+        return tuple((n * orbit_s + t, value) for n in range(orbits) for t, value in points)
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,11 +220,11 @@ def star_of(text: PlanTarget, simbad: bool) -> Star:
 
     Raises InputError if its type, magnitude or distance is neither given nor known.
     """
-    known = text.target(simbad)
+    target = text.target(simbad)
     given: dict[str, Any] = {
-        "spectral_type": text.spectral_type or known.spectral_type,
-        "magnitude": known.magnitude if text.magnitude is None else text.magnitude,
-        "distance_pc": known.distance_pc if text.distance_pc is None else text.distance_pc,
+        "spectral_type": text.spectral_type or target.spectral_type,
+        "magnitude": target.magnitude if text.magnitude is None else text.magnitude,
+        "distance_pc": target.distance_pc if text.distance_pc is None else text.distance_pc,
     }
     missing = [name for name, value in given.items() if value is None]
     if missing:

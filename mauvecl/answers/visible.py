@@ -50,6 +50,10 @@ def calendar_bytes(entries: Iterable[Entry], name: str) -> bytes:
         f"X-WR-CALNAME:{_text(name)}",
     ]
     for entry in entries:
+        stop = entry.stop
+        if _is_day(stop):
+            # An event ends at the beginning of the next day.
+            stop = (datetime.date.fromisoformat(stop) + datetime.timedelta(days=1)).isoformat()
         unique = hashlib.sha256("\0".join((entry.start, entry.stop, entry.title)).encode()).hexdigest()[:24]
         lines += [
             "BEGIN:VEVENT",
@@ -57,7 +61,7 @@ def calendar_bytes(entries: Iterable[Entry], name: str) -> bytes:
             # A fixed time, so that equal plans give equal files.
             f"DTSTAMP:{_moment(entry.start).removeprefix(':').removeprefix(';VALUE=DATE:')[:8]}T000000Z",
             f"DTSTART{_moment(entry.start)}",
-            f"DTEND{_moment(_day_after(entry.stop) if _is_day(entry.stop) else entry.stop)}",
+            f"DTEND{_moment(stop)}",
             f"SUMMARY:{_text(entry.title)}",
             *([f"DESCRIPTION:{_text(entry.text)}"] if entry.text else []),
             "TRANSP:TRANSPARENT",
@@ -74,10 +78,6 @@ def _is_day(text: str) -> bool:
 def _moment(text: str) -> str:
     plain = text.replace("-", "").replace(":", "")
     return f";VALUE=DATE:{plain}" if _is_day(text) else f":{plain}Z"
-
-
-def _day_after(text: str) -> str:
-    return (datetime.date.fromisoformat(text) + datetime.timedelta(days=1)).isoformat()
 
 
 def _text(value: str) -> str:
@@ -160,10 +160,6 @@ def _target_columns(answer: VisibleAnswer) -> tuple[Column, ...]:
     return (*COLUMNS[:place], *limits, *COLUMNS[place:])
 
 
-def _month_columns(answer: VisibleAnswer) -> tuple[Column, ...]:
-    return (Column("month"), *(Column(target.name, unit="h") for target in answer.targets))
-
-
 @dataclass(frozen=True, eq=False)
 class VisibleAnswer(Answer):
     """Answer of `visible`."""
@@ -181,7 +177,11 @@ class VisibleAnswer(Answer):
         about=lambda answer: {"start": answer.times.iso(0.0), "days": answer.times.days},
     )  # fmt: skip
     #: One row per month, one column of hours per target.
-    months = TableOf("months", _month_columns, "_hours_by_month")
+    months = TableOf(
+        "months",
+        lambda answer: (Column("month"), *(Column(target.name, unit="h") for target in answer.targets)),
+        "_hours_by_month",
+    )
     #: One row per target and day.
     by_day = TableOf("days", DAY_COLUMNS, "_day_rows")
     #: One row per window.
@@ -236,7 +236,7 @@ class VisibleAnswer(Answer):
             "dec": target.dec_deg,
             "hours": seen.hours[k],
             "share": seen.share[k],
-            **{f"leaves_{name}": kept[k] for name, kept in seen.kept_by.items()},
+            **{f"leaves_{name}": shares[k] for name, shares in seen.kept_by.items()},
             "windows": length.size,
             "median_window": float(np.median(length / 60)) if length.size else 0.0,
             "longest_gap": self._longest_gap_d(k),
@@ -353,7 +353,7 @@ class VisibleAnswer(Answer):
     def reason(self, name: str) -> str:
         """Return the reason why a target is never visible."""
         k = [target.name for target in self.targets].index(name)
-        alone = [limit for limit, kept in self.visibility.kept_by.items() if kept[k] == 0]
+        alone = [limit for limit, shares in self.visibility.kept_by.items() if shares[k] == 0]
         if not alone:
             return "its limits together leave nothing"
         ends = np.atleast_1d(getattr(self.visibility.limits, f"{alone[0]}_deg", ()))

@@ -73,7 +73,7 @@ def residual_series(answer: CalibrateAnswer) -> list[tuple[str, Any, Any]]:
     """Return name, wavelengths and averaged residuals of each star, without pixels that were not used."""
     nm, each = answer.throughput.binned_residuals(BIN)
     stars = zip(answer.stars, each, strict=True)
-    return [(star.name, nm[kept], row[kept]) for star, row in stars for kept in [np.isfinite(row)]]
+    return [(star.name, nm[finite], row[finite]) for star, row in stars for finite in [np.isfinite(row)]]
 
 
 @picture_of("CalibrateAnswer", "residuals")

@@ -109,8 +109,8 @@ def _overview(answer: PlanAnswer) -> Picture:
         if np.isfinite(ends[k][0]):
             right += [_bar("flare", ends[k], k), Dots("", "flare", size=7, at=([ends[k][0]], [k]))]
     # Limits at whole decades avoid labels that overlap.
-    known = np.log10([energy for pair in ends for energy in pair if np.isfinite(energy)])
-    decades = (10 ** np.floor(known.min()), 10 ** np.ceil(known.max())) if known.size else None
+    logs = np.log10([energy for pair in ends for energy in pair if np.isfinite(energy)])
+    decades = (10 ** np.floor(logs.min()), 10 ** np.ceil(logs.max())) if logs.size else None
     names = range(len(planned)), [f"{target.name} ({target.hours:.0f} h)" for target in planned]
     y, above = Axis(limits=(len(planned) - 0.5, -0.5), ticks=names), "expected (dot); 95 % of campaigns"
     row = [

@@ -251,8 +251,8 @@ def unknowns(answer: UnknownAnswer) -> Picture:
     for star in stars:
         amplitude, costs = next((a, c) for (s, a), c in answer.costs.items() if s == star)
         relative = np.geomspace(0.03, 300.0, 200) * answer.smallest(star, None)
-        known = next(iter(costs.values())).known
-        at = relative, power(known * relative / amplitude, fap)
+        known_snr = next(iter(costs.values())).known
+        at = relative, power(known_snr * relative / amplitude, fap)
         series: list[Series] = [Line("everything known", "text", width=4, at=at)]
         smallest = [Dots("", "text", size=12, at=([0], [answer.smallest(star, None)]))]
         for k, (colour, (unknown, cost)) in enumerate(zip(cycle(COLOURS), costs.items(), strict=False), 1):

@@ -256,11 +256,11 @@ def serve(
 
     Example: mauvecl serve --show
     """
-    from mauvecl.schema.errors import InputError, shortened
+    from mauvecl.schema.errors import InputError, missing_package, shortened
 
     number = within(port, "--port", read=count, low=1, high=65535)
     if find_spec("bokeh") is None or find_spec("tornado") is None:
-        raise InputError.missing("bokeh", "the page", "web")
+        raise missing_package("bokeh", "the page", "web")
     from mauvecl.web.server import serve
 
     try:

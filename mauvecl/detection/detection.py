@@ -394,10 +394,10 @@ class Detection(Drawable, ContentEquality, Hypotheses):
 
     def collect(self, plan: ChannelPlan, tally: Tally, samples: Sequence[TailSamples | None]) -> None:
         """Add the distributions and tails of one batch."""
-        for index, (key, kept) in enumerate(zip(plan.keys, samples, strict=True)):
+        for index, (key, samples_of_key) in enumerate(zip(plan.keys, samples, strict=True)):
             self._distributions[key] = tally.distribution(index)
-            if kept is not None:
-                self._samples[key] = kept
+            if samples_of_key is not None:
+                self._samples[key] = samples_of_key
 
     def distribution(self, statistic: str, flare: int | None = None, *, template: int = 0) -> Distribution:
         """Return the simulated distribution of a statistic.

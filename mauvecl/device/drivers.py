@@ -244,9 +244,9 @@ class KernelCache:
             shutil.rmtree(new, ignore_errors=True)
 
     def _prune(self) -> None:
-        kept = sorted(self.store.iterdir(), key=lambda p: p.stat().st_mtime, reverse=True)
+        entries = sorted(self.store.iterdir(), key=lambda p: p.stat().st_mtime, reverse=True)
         total = 0
-        for entry in kept:
+        for entry in entries:
             files = entry.rglob("*") if entry.is_dir() else [entry]
             total += sum(path.stat().st_size for path in files if path.is_file())
             if total > MAX_STORED:
@@ -476,8 +476,8 @@ def _folder() -> Path | None:
         return None
     system = os.environ.get(FOLDER_VARIABLES[1]) or DEFAULT_FOLDER
     folders = [system, os.path.join(sys.prefix, "etc", "OpenCL", "vendors")]
-    known = {path.name: _text(path) for place in reversed(folders) for path in sorted(Path(place).glob("*.icd"))}
-    drivers = {name: text for name, text in known.items() if DRIVER not in text or Path(text.strip()).exists()}
+    files = {path.name: _text(path) for place in reversed(folders) for path in sorted(Path(place).glob("*.icd"))}
+    drivers = {name: text for name, text in files.items() if DRIVER not in text or Path(text.strip()).exists()}
     if any(DRIVER in text for text in drivers.values()):
         # The system lists Intel's runtime already.
         return None
@@ -590,10 +590,6 @@ class Outcome:
     by_driver: bool = True
 
     @property
-    def succeeded(self) -> bool:
-        return not self.tried[-1][1]
-
-    @property
     def current(self) -> bool:
         """True if the outcome is still valid."""
         return not any(why for _, why in self.tried) or 0 <= time.time() - self.time_s < OUTCOME_LIFETIME_S
@@ -627,9 +623,9 @@ def choose_processor_level(device: Any, others: Callable[[], Sequence[Any]]) -> 
         with _one_at_a_time:
             if place not in settled:
                 outcome = _outcome(device, names(device), others)
-                if not outcome.succeeded:
+                name, reason = outcome.tried[-1]
+                if reason:
                     raise DeviceError(_failure_message(device, outcome))
-                name = outcome.tried[-1][0]
                 if name is not None:
                     set_processor_name(device, name)
                 settled[place] = name
@@ -642,7 +638,7 @@ def _outcome(device: Any, names: tuple[str | None, ...], others: Callable[[], Se
     limit_s = _limit_s()
     if limit_s == 0:
         return untried
-    kept, key = kernel_cache(), _key(device, names)
+    cache, key = kernel_cache(), _key(device, names)
     known = _read_outcome(key)
     if known is not None:
         return known
@@ -669,7 +665,7 @@ def _outcome(device: Any, names: tuple[str | None, ...], others: Callable[[], Se
                 _warn(device, name, failure, f"The next lower level, {names[place + 1]}, is tried.")
         outcome = Outcome(tuple(tried), time.time(), by_driver)
         if by_driver:
-            kept.write_text(key, json.dumps(asdict(outcome)))
+            cache.write_text(key, json.dumps(asdict(outcome)))
     return outcome
 
 

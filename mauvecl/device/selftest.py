@@ -362,10 +362,10 @@ def stare_case(name: str, count: int) -> tuple[Components, Stare, NDArray[np.flo
 
 def check_stares(engine: Engine) -> Iterator[Check]:
     """Compare every frame of some stares with the known answers."""
-    known = known_arrays()
+    arrays = known_arrays()
     for name in STARE_CASES:
         for part, ours in stare_results(engine, name, COUNT).items():
-            theirs = known[f"{name}: {part}"]
+            theirs = arrays[f"{name}: {part}"]
             scale = 1.0 if part == "noise of flares" else theirs.std(axis=(0, 1))
             apart = float(np.max(np.abs(ours - theirs).max(axis=(0, 1)) / scale))
             if engine.device.promise == SAME_BITS:
@@ -517,10 +517,10 @@ def known_answers(engine: Engine) -> Check:
 
 def check_results(engine: Engine) -> Iterator[Check]:
     """Compare every branch of every kernel with the known answers."""
-    known = known_arrays()
+    arrays = known_arrays()
     for name in CASES:
         ours = results(engine, name, COUNT)
-        theirs = {part: known[f"{name}: {part}"] for part in ours}
+        theirs = {part: arrays[f"{name}: {part}"] for part in ours}
         differ = [part for part in ours if ours[part].tobytes() != theirs[part].tobytes()]
         if not differ:
             passed, text = True, "digests " + " ".join(digest(array) for array in ours.values())

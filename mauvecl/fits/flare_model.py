@@ -444,9 +444,9 @@ class LightFactor:
             Width of the quantity's interval for a rise of chi-squared by `allowed`.
         """
         share = np.zeros_like(value)
-        known = np.isfinite(value) & np.isfinite(width) & (width > 0.0) & (factor > 0.0)
-        by_prior = value[known] * np.sqrt(self.prior_share) / (self.scale * factor[known])
-        share[known] = np.clip(4.0 * allowed * (by_prior / width[known]) ** 2, 0.0, 1.0)
+        usable = np.isfinite(value) & np.isfinite(width) & (width > 0.0) & (factor > 0.0)
+        by_prior = value[usable] * np.sqrt(self.prior_share) / (self.scale * factor[usable])
+        share[usable] = np.clip(4.0 * allowed * (by_prior / width[usable]) ** 2, 0.0, 1.0)
         return np.asarray(np.interp(share, SHARES, _thresholds(self.prior.tobytes(), allowed)) - allowed)
 
     def estimate(self, sums: Float, log_k: Float, linear: Float) -> Float:
@@ -623,8 +623,8 @@ class Reduction(MeanSums):
         check_distinct(power, np.einsum("tp,tp->t", plain, spanning), nuisances)
         length = np.sqrt(power)
         values, vectors = np.linalg.eigh(gram / np.outer(length, length))
-        kept = values > LEAST * values[-1]
-        weights = (vectors[:, kept] / length[:, None] / np.sqrt(values[kept])).T @ optimal
+        large = values > LEAST * values[-1]
+        weights = (vectors[:, large] / length[:, None] / np.sqrt(values[large])).T @ optimal
         hot, fixed = model.hot @ weights.T, model.fixed @ weights.T
         light = light_factor(model, unknown, rows)
         return cls(hot, fixed, model.log_k, variance, weights, rows, free, light=light)

@@ -151,10 +151,7 @@ class Profile:
         number = np.arange(self.nodes.size)
         lowest = np.where(inside, number, self.nodes.size).min(axis=1)
         highest = np.where(inside, number, -1).max(axis=1)
-        low, high = (
-            np.full(best.log_k.shape, np.nan),
-            np.full(best.log_k.shape, np.nan),
-        )
+        low, high = np.full((2, *best.log_k.shape), np.nan)
         for out, outermost, side in ((low, lowest, -1), (high, highest, 1)):
             known = (outermost >= 0) & (outermost < self.nodes.size)
             start = np.where(known, self.nodes[np.clip(outermost, 0, self.nodes.size - 1)], best.log_k)
@@ -256,15 +253,15 @@ def _linear_interval(
     closed: NDArray[np.bool_],
 ) -> tuple[Float, Float]:
     ratio = ratio_at(profile, spline, x, linear, variance, hot)
-    value, spread, known = ratio.top, ratio.top_variance, profile.reduction.light is None
+    value, spread, is_light_known = ratio.top, ratio.top_variance, profile.reduction.light is None
     # The ratio is straight where the recorded quantity less the ratio times the factor is.
     middle = ratio.value[:, SAMPLES // 2, None]
-    estimate = value if known else value - middle * ratio.bottom
+    estimate = value if is_light_known else value - middle * ratio.bottom
     outside = left < 0.0
     outside[:, [0, -1]] = False  # rounding decides at the ends themselves
 
     def reached(room: Float, sign: float, rows: NDArray[np.intp] | slice = slice(None)) -> Float:
-        if known:
+        if is_light_known:
             return np.asarray(value[rows] + sign * np.sqrt(np.maximum(room, 0.0) * spread[rows]))
         return Ratio(*(values[rows] for values in vars(ratio).values())).end(room, sign)
 
@@ -278,7 +275,7 @@ def _linear_interval(
         ends = [_hull(reached(left, sign), outside, sign)[0] for sign in (-1.0, 1.0)]
     bend = np.abs(estimate[:, 0] + estimate[:, -1] - 2 * estimate[:, SAMPLES // 2])
     # Simulated fits need the error of the temperature, which its interval gives if it has both ends.
-    wide = (ends[1] - ends[0]) * (1.0 if known else ratio.bottom[:, SAMPLES // 2])
+    wide = (ends[1] - ends[0]) * (1.0 if is_light_known else ratio.bottom[:, SAMPLES // 2])
     bent = np.flatnonzero(closed & np.isfinite(wide) & (bend > CURVED * np.sqrt(allowed) * wide))
     if bent.size:
         if light is not None:

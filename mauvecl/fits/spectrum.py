@@ -145,12 +145,12 @@ class Measurement:
 
     def rows(self, which: NDArray[Any]) -> Self:
         """Return the measurements of some frames, by number or mask."""
-        kept: dict[str, Any] = {}
+        rows: dict[str, Any] = {}
         for field in fields(self):
             value = getattr(self, field.name)
             if isinstance(value, np.ndarray):
-                kept[field.name] = value[:, which] if field.name in ("low", "high") else value[which]
-        return replace(self, **kept)
+                rows[field.name] = value[:, which] if field.name in ("low", "high") else value[which]
+        return replace(self, **rows)
 
     def column(self, name: str) -> int:
         """Return the index of a quantity.

@@ -203,10 +203,10 @@ def fit_bins(
     skipped_nm: Ranges = (),
 ) -> MeasuredBins:
     """Fit bins of frames; parameters as for `measure_along`, with the first frames of bins and their numbers."""
-    known, end = known_strengths(stare, quiet), first + count
+    strengths, end = known_strengths(stare, quiet), first + count
     alike: dict[tuple[float, ...], list[int]] = {}
     for k, (a, b) in enumerate(zip(first, end, strict=True)):
-        mean = [*known[a:b].mean(axis=0), *spreads_of(stare, a, b).values()]
+        mean = [*strengths[a:b].mean(axis=0), *spreads_of(stare, a, b).values()]
         alike.setdefault((float(b - a), *np.round(mean, DIGITS).tolist()), []).append(k)
     parts = []
     for (length, star, sky, dark, light, *spreads), rows in alike.items():
@@ -264,14 +264,14 @@ def _bins(
     quiet: Expectation,
     model: FlareModel,
     nuisances: Nuisances | None,
-    known: Float,
+    strengths: Float,
     stare: Stare,
     snr: float,
     skipped_nm: Ranges,
 ) -> list[tuple[int, int]]:
     """Return first frames and ends of the shortest runs of frames in which a matched filter reaches an S/N."""
     reduction = Reduction.of(model, quiet, None, nuisances, skipped_nm)
-    sums = less_known(raw, quiet, known, reduction.weights)
+    sums = less_known(raw, quiet, strengths, reduction.weights)
     total = np.vstack([np.zeros(sums.shape[1]), np.cumsum(sums, axis=0)])
     shapes = reduction.hot[::BINS_EVERY] / np.linalg.norm(reduction.hot[::BINS_EVERY], axis=1)[:, None]
     widths = 2 ** np.arange(int(np.log2(len(raw))) + 1)
@@ -430,9 +430,9 @@ class _Data:
         basis = np.linalg.solve(scale, spectra.T)
         # I - B^T B = (I - B^T K B)^2, with K from the eigenvalues of B B^T.
         values, vectors = np.linalg.eigh(basis @ basis.T)
-        kept = values > 1e-12
-        directions = vectors[:, kept].T @ basis / np.sqrt(values[kept])[:, None]
-        return _Whitening(inverse, directions, 1.0 - np.sqrt(np.maximum(1.0 - values[kept], 0.0)))
+        nonzero = values > 1e-12
+        directions = vectors[:, nonzero].T @ basis / np.sqrt(values[nonzero])[:, None]
+        return _Whitening(inverse, directions, 1.0 - np.sqrt(np.maximum(1.0 - values[nonzero], 0.0)))
 
     def residuals(self, theta: Float, whitening: _Whitening) -> Float:
         """Return residuals whose squares add up to chi-squared with the unknown levels marginalised over."""

@@ -202,9 +202,9 @@ class StareScene:
             if sign < 0 and stare.pointing is not None:
                 light = light * (1.0 - stare.pointing.depth)
             warm = np.exp(sign * REACH_SIGMA * abs(self.stare_job["dark_slope"]) * spread["temperature"])
-            known = (stare.light * stare.star * light * star, stare.light * stare.sky * light * sky)
+            lights = (stare.light * stare.star * light * star, stare.light * stare.sky * light * sky)
             dark = stare.dark_factor(self.components.quiet) * warm
-            ends.append(np.array([float(of(values)) for values in (*known, dark, stare.light * light)]))
+            ends.append(np.array([float(of(values)) for values in (*lights, dark, stare.light * light)]))
         return ends[0], ends[1]
 
     @property

@@ -405,9 +405,9 @@ def _from_study(given: Any) -> Prior:
     for kind, form in _FORMS.items():
         if isinstance(given, Mapping) and {key for key in given if given[key] is not None} == form.keys():
             return kind(*(value for key, n in form.items() for value in _values(key, given[key], n)))
-    known = [key for form in _FORMS.values() for key in form]
-    if isinstance(given, Mapping) and (other := next((key for key in given if key not in known), None)):
-        raise InputError(f"unknown key {other!r} of a prior", f"some of {', '.join(known)}", key=other)
+    keys = [key for form in _FORMS.values() for key in form]
+    if isinstance(given, Mapping) and (other := next((key for key in given if key not in keys), None)):
+        raise InputError(f"unknown key {other!r} of a prior", f"some of {', '.join(keys)}", key=other)
     raise InputError(
         "a prior is neither { uniform = [low, high] } nor { normal = [mean, sd], between = [low, high] }",
         "one of them",

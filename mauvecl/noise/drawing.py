@@ -269,9 +269,9 @@ class Drawing:
     first_frame: int = 0
 
     def __post_init__(self) -> None:
-        for name, value, known in (("mode", self.mode, get_args(Mode)), ("recipe", self.recipe, get_args(Recipe))):
-            if value not in known:
-                a, b, c = map(repr, known)
+        for name, value, choices in (("mode", self.mode, get_args(Mode)), ("recipe", self.recipe, get_args(Recipe))):
+            if value not in choices:
+                a, b, c = map(repr, choices)
                 raise InputError.of(name, value, f"{a}, {b} or {c}")
 
     @property

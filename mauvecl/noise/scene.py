@@ -267,12 +267,12 @@ def _both_of_a_pair(chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 def fill_estimates(out: NDArray[np.void], reference: Expectation, fraction: Float, mean_sum: Float) -> None:
     """Fill `out` for variances estimated by an observer who knows the detector; padding has a variance of 1."""
-    n_pixel, known = reference.wavelength_nm.size, reference.read_noise_dn**2 + reference.dark_variance_dn2 + 1 / 12
+    n_pixel, variance = reference.wavelength_nm.size, reference.read_noise_dn**2 + reference.dark_variance_dn2 + 1 / 12
     out["variance"] = 1.0
     out["fraction"] = fraction
     out["net_offset"][:n_pixel] = mean_sum - reference.n_frames * (reference.bias_dn + reference.dark_dn)
     out["gain"][:n_pixel] = reference.gain_dn_per_electron
-    out["variance"][:n_pixel] = np.maximum(reference.n_frames * known, NO_VARIANCE)
+    out["variance"][:n_pixel] = np.maximum(reference.n_frames * variance, NO_VARIANCE)
 
 
 def fill_responses(out: NDArray[np.void], x: Expectation, c: Cumulants, factors: Factors) -> None:

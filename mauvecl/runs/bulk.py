@@ -271,10 +271,10 @@ def state(store: Store, chunk: Chunk) -> str:
         return "damaged"
     if len(data) != size or crc(data[:-CRC_BYTES]) != data[-CRC_BYTES:]:
         return "damaged"
-    known = store.digests.get(chunk.key)
-    if known is None:
+    listed = store.digests.get(chunk.key)
+    if listed is None:
         return "unlisted"
-    return "good" if digest(data) == known else "foreign"
+    return "good" if digest(data) == listed else "foreign"
 
 
 @validated

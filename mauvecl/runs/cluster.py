@@ -26,7 +26,7 @@ from mauvecl.host.tables.files import is_file, json_data, read_text
 from mauvecl.runs.checkpoint import Task, code_identity
 from mauvecl.runs.pool import ShardLost, Stopped
 from mauvecl.schema.calls import validated
-from mauvecl.schema.errors import InputError, shortened
+from mauvecl.schema.errors import InputError, missing_package, shortened
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -89,7 +89,7 @@ class DaskWorkers:
         try:
             import distributed
         except ImportError as error:
-            raise InputError.missing("dask", "a cluster", "cluster") from error
+            raise missing_package("dask", "a cluster", "cluster") from error
         self._where, self._device, self._sends = where, device, 0
         self._lock = threading.Lock()
         self._closing = False
@@ -157,8 +157,8 @@ class DaskWorkers:
                     # A task instead of scattered data, since the scheduler can repeat it if its worker is lost. Bytes,
                     # because a worker with other code might read and write a request differently.
                     content, key = pickle.dumps(task.request), f"mauvecl-request-{task.key}-{self._sends}"
-                    kept = self._client.submit(_keep, content, key=key, workers=attempt.workers)
-                    self._given[task.key] = kept, attempt.workers
+                    request_task = self._client.submit(_keep, content, key=key, workers=attempt.workers)
+                    self._given[task.key] = request_task, attempt.workers
                     if len(self._given) > MAX_REQUESTS:
                         del self._given[next(iter(self._given))]
                 request, attempt.holders = self._given[task.key]
@@ -383,7 +383,7 @@ def _private(distributed: Any) -> Any:
     try:
         return distributed.Security.temporary()
     except ImportError as error:
-        raise InputError.missing("cryptography", "a cluster of this machine", "cluster") from error
+        raise missing_package("cryptography", "a cluster of this machine", "cluster") from error
 
 
 LOGS = ("distributed", *(f"distributed.{part}" for part in ("client", "nanny", "worker", "scheduler", "core")))

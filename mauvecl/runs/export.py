@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from mauvecl.host import VERSION
 from mauvecl.host.tables.files import UNFINISHED, check_folder, parsing, write_whole, writing
 from mauvecl.runs.store import CALIBRATION, COMMON_DRAWS, NOMINAL, Store, StoredScene, exposure_attributes
-from mauvecl.schema.errors import InputError
+from mauvecl.schema.errors import InputError, missing_package
 
 if TYPE_CHECKING:
     from astropy.io.fits import BinTableHDU, HDUList, ImageHDU
@@ -218,7 +218,7 @@ def _hdf5(selection: Selection, place: io.BytesIO) -> None:
     try:
         import h5py
     except ImportError as error:
-        raise InputError.missing("h5py", "an HDF5 file", "bulk") from error
+        raise missing_package("h5py", "an HDF5 file", "bulk") from error
 
     store = selection.store
     with h5py.File(place, "w") as file:

@@ -28,7 +28,7 @@ from mauvecl.host import VERSION
 from mauvecl.host.tables.files import UNFINISHED, read_bytes, toml, write_whole, writing
 from mauvecl.runs.checkpoint import differing_keys
 from mauvecl.schema.columns import Column, percent
-from mauvecl.schema.errors import InputError
+from mauvecl.schema.errors import InputError, missing_package
 from mauvecl.study.cases import cases, full_label
 from mauvecl.study.cases import collect_messages as messages_of
 from mauvecl.study.study import Study
@@ -114,9 +114,9 @@ def describe(study: Study, scenes: Sequence[StoredScene], folder: Path) -> None:
 
 def exposure_attributes(x: Expectation) -> dict[str, float | str]:
     """Return the attributes that describe the exposure in every row of an array."""
-    known: dict[str, float | str] = {"exposure_s": x.exposure_s, "frames": x.n_frames, "instrument": x.instrument}
-    known |= {"saturation_dn": float(x.saturation_dn), "dark_unit": x.dark_unit}
-    return known | ({"temperature_c": x.conditions["temperature_c"]} if "temperature_c" in x.conditions else {})
+    attributes: dict[str, float | str] = {"exposure_s": x.exposure_s, "frames": x.n_frames, "instrument": x.instrument}
+    attributes |= {"saturation_dn": float(x.saturation_dn), "dark_unit": x.dark_unit}
+    return attributes | ({"temperature_c": x.conditions["temperature_c"]} if "temperature_c" in x.conditions else {})
 
 
 def _values(group: Any, name: str, values: NDArray[Any], unit: str, dimensions: list[str]) -> None:
@@ -136,9 +136,9 @@ def signed(study: str) -> dict[str, str]:
 def study_in(place: Path) -> str | None:
     """Return the study's text in a description if its digest is correct, else None."""
     try:
-        kept = json.loads(read_bytes(place, "description"))["attributes"]
-        text = kept["study"]
-        return text if signed(text).items() <= kept.items() else None
+        attributes = json.loads(read_bytes(place, "description"))["attributes"]
+        text = attributes["study"]
+        return text if signed(text).items() <= attributes.items() else None
     except (InputError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
         return None
 
@@ -247,7 +247,7 @@ class Store:
     def __post_init__(self) -> None:
         missing = [name for name in ("zarr", "xxhash", "google_crc32c") if find_spec(name) is None]
         if missing:
-            raise InputError.missing(missing[0], "a store", "bulk")
+            raise missing_package(missing[0], "a store", "bulk")
 
     @classmethod
     def open(cls, path: str | Path) -> Store:
@@ -288,10 +288,10 @@ class Store:
 
     def scene(self, path: str) -> StoredScene:
         """Return an array by path, such as ``star-1/flare-2``."""
-        known = next((scene for scene in self.scenes if scene.path == path), None)
-        if known is None:
+        stored = next((scene for scene in self.scenes if scene.path == path), None)
+        if stored is None:
             raise InputError.of("scenes", path, f"one of {', '.join(s.path for s in self.scenes)}")
-        return known
+        return stored
 
     @property
     def rows(self) -> int:

@@ -254,9 +254,9 @@ def _validated(function: Public, owner: type | None = None) -> Public:
 class _Parameter:
     """A parameter, whose annotation is resolved when it is first given an argument."""
 
-    def __init__(self, function: Callable[..., Any], known: inspect.Parameter, owner: type | None) -> None:
-        self.name, self.default = known.name, known.default
-        self.text = known.annotation
+    def __init__(self, function: Callable[..., Any], parameter: inspect.Parameter, owner: type | None) -> None:
+        self.name, self.default = parameter.name, parameter.default
+        self.text = parameter.annotation
         self.modules = [function.__globals__]
         if owner is not None and function.__name__ == "__init__":
             # A dataclass inherits fields, whose annotations belong to the module of the base class.

@@ -110,10 +110,10 @@ class InputError(ValueError):
         place, after = f"{where}: " if where else "", f" {unit}" if unit else ""
         return cls(f"{place}{key} = {shown(value)}{after}", expected, key=key.replace(" ", "_"))
 
-    @classmethod
-    def missing(cls, package: str, purpose: str, extra: str) -> InputError:
-        """Return the error of a package that is not installed, with the extra of mauvecl that brings it."""
-        return cls(f"{purpose} needs {package}, which is missing: `pip install 'mauvecl[{extra}]'`", key=package)
+
+def missing_package(package: str, purpose: str, extra: str) -> InputError:
+    """Return the error of a package that is not installed, with the extra of mauvecl that brings it."""
+    return InputError(f"{purpose} needs {package}, which is missing: `pip install 'mauvecl[{extra}]'`", key=package)
 
 
 def reworded(error: InputError, sentence: str, key: str | None = None) -> InputError:

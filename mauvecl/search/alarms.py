@@ -302,18 +302,18 @@ class _StareSearch:
         others = np.array([candidate.theta for candidate in self.found if id(candidate) not in inside]).reshape(-1, 4)
         rows = sums.block(best.theta, np.vstack([others, best.theta]))
         best = rows.fit(best.theta)
-        kept = list(block)
-        while len(kept) > 1:
-            falls = [rows.without(best, j) for j in range(len(kept))]
+        left = list(block)
+        while len(left) > 1:
+            falls = [rows.without(best, j) for j in range(len(left))]
             j = int(np.argmin([fit.chi2 for fit in falls]))
             if falls[j].chi2 - best.chi2 >= self.threshold**2:
                 break
-            self.refused.append(kept[j].template)
-            self.found.remove(kept[j])
+            self.refused.append(left[j].template)
+            self.found.remove(left[j])
             best = falls[j]
-            del kept[j]
+            del left[j]
         moved = set()
-        for candidate, theta in zip(kept, best.theta, strict=True):
+        for candidate, theta in zip(left, best.theta, strict=True):
             if np.abs(theta - candidate.theta).max() > 1e-4:
                 moved.add(id(candidate))
             candidate.theta = theta

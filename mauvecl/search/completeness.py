@@ -15,6 +15,7 @@ from mauvecl.detection.distributions import Interval, central_counts, clopper_pe
 from mauvecl.flares.energies import EnergyScale, PowerLaw, Rates
 from mauvecl.flares.settings import HALF_WIDTHS_S as BANK_S
 from mauvecl.flares.shapes import Shape, consecutive_integrals, shape_of
+from mauvecl.host.arrays import set_read_only
 from mauvecl.host.exposure.expectation import Expectation
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
@@ -77,10 +78,7 @@ class Completeness:
     how: str
 
     def __post_init__(self) -> None:
-        for name in ("energy_erg", "probability"):
-            kept = np.array(getattr(self, name), np.float64)
-            kept.setflags(write=False)
-            object.__setattr__(self, name, kept)
+        set_read_only(self, energy_erg=self.energy_erg, probability=self.probability)
         energy, p = self.energy_erg, self.probability
         if energy.ndim != 1 or energy.shape != p.shape or energy.size < 2:
             raise InputError.of("probability", p.size, f"one for each of {energy.size} energies, at least 2")

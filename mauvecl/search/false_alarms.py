@@ -324,14 +324,14 @@ class SampledRate:
 
     def log_rate(self, threshold: float) -> tuple[float, float]:
         """Return the logarithm of false alarms per star-day, and its standard error."""
-        kept = self._trusted
+        trusted = self._trusted
         # All thresholds share draws, so that their errors are correlated and do not average out.
-        error = float(np.interp(threshold, self.thresholds[kept], self._relative))
+        error = float(np.interp(threshold, self.thresholds[trusted], self._relative))
         if self.shifted:
-            logs = np.log(-np.log1p(-self.probability[kept]) / self.days)
-            return float(scipy.interpolate.PchipInterpolator(self.thresholds[kept], logs)(threshold)), error
+            logs = np.log(-np.log1p(-self.probability[trusted]) / self.days)
+            return float(scipy.interpolate.PchipInterpolator(self.thresholds[trusted], logs)(threshold)), error
         coefficients = self._fit()
-        at = (threshold - self.thresholds[kept].mean()) ** np.arange(coefficients.size)
+        at = (threshold - self.thresholds[trusted].mean()) ** np.arange(coefficients.size)
         return float(scipy.special.log_ndtr(-threshold) + at @ coefficients), error
 
     def rate(self, threshold: float) -> Interval:
@@ -427,12 +427,12 @@ def sample_rate(search: Search, *, seed: int, draws: int = DRAWS) -> SampledRate
         values: list[list[Float]] = [[] for _ in range(count)]
         for (row, correlated), weight in zip(search.correlations(held), weights, strict=True):
             at = row.per_amplitude > 0
-            for n, kept in enumerate(values):
+            for n, nearby in enumerate(values):
                 c = along[n] * correlated[n, n_sum, at]
                 r = directions @ correlated[n, :n_sum, at].T - own[n] * c
-                kept.append(_near(np.array([r, c]), weight, LADDER[0]))
-        for n, kept in enumerate(values):
-            estimates[first + n] = _estimates(np.concatenate(kept, axis=1))
+                nearby.append(_near(np.array([r, c]), weight, LADDER[0]))
+        for n, nearby in enumerate(values):
+            estimates[first + n] = _estimates(np.concatenate(nearby, axis=1))
     estimates *= shares[-1]
     return SampledRate(
         np.array(LADDER), estimates.mean(axis=0), estimates.std(axis=0, ddof=1) / np.sqrt(draws),

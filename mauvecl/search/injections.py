@@ -236,8 +236,8 @@ class _NearbyTemplates:
     def above(self, least: float) -> _NearbyTemplates:
         """Return the templates that reach a value at any temperature, with `values` true where they reach it."""
         counts = self.values >= least
-        kept = counts.any(axis=0)
-        return _NearbyTemplates(self.row, self.onsets[kept], self.times_s[kept], counts[:, kept])
+        seen = counts.any(axis=0)
+        return _NearbyTemplates(self.row, self.onsets[seen], self.times_s[seen], counts[:, seen])
 
 
 def _search_near(survey: Survey, reaches: Sequence[_Reach]) -> tuple[Search, int]:
@@ -437,14 +437,16 @@ class CriticalAmplitudes:
             for column, site in zip(critical[part].T, self.sites, strict=True):
                 if len(site.filters):
                     column[:] = self._critical(site, self.values(site, drawn))
-        kept: dict[str, NDArray[Any]] = {"critical": critical}
+        arrays_of_fits: dict[str, NDArray[Any]] = {"critical": critical}
         if self.refit is not None:
             # Stares are processed one at a time, so that fits do not depend on the batch.
             these = range(min(len(values), max(0, self.start + self.refit.count - first)))
             each = [self._fitted(self.frame_noise(values[k : k + 1], glow[k : k + 1]), self.refit) for k in these]
             none = np.zeros((0, *self.refit.amplitudes.shape), np.float32)
-            kept |= {name: np.array([arrays[name] for arrays in each]) if each else none for name in FIT_QUANTITIES}
-        return kept
+            arrays_of_fits |= {
+                name: np.array([arrays[name] for arrays in each]) if each else none for name in FIT_QUANTITIES
+            }
+        return arrays_of_fits
 
     def frame_noise(self, values: Single, glow: Single) -> FrameNoise:
         """Prepare the random part of some stares."""
@@ -507,7 +509,7 @@ class CriticalAmplitudes:
 
     def _fitted(self, drawn: FrameNoise, refit: Refit) -> dict[str, Single]:
         """Fit the detected flares of one stare; arrays of shape (n_half_width, n_amplitude), NaN if not detected."""
-        kept = {name: np.full(refit.amplitudes.shape, np.nan, np.float32) for name in FIT_QUANTITIES}
+        estimates = {name: np.full(refit.amplitudes.shape, np.nan, np.float32) for name in FIT_QUANTITIES}
         for d, (site, row) in enumerate(zip(self.sites, refit.amplitudes, strict=True)):
             if not len(site.filters):
                 continue
@@ -525,8 +527,8 @@ class CriticalAmplitudes:
                 curves=None if self.curves is None else self.curves[:, here],
             )
             for name, values in refit.compared(recovered, row[alarm], site).items():
-                kept[name][d, alarm] = values
-        return kept
+                estimates[name][d, alarm] = values
+        return estimates
 
 
 @dataclass(frozen=True, eq=False)

@@ -135,7 +135,8 @@ class Search:
             Sums with unit covariance in each frame without a flare.
         """
         sums = self._checked(sums)
-        parts = [self._largest(sums[batch]) for batch in self._batches(len(sums))]
+        size = max(1, BATCH // (self._size * self.bank.directions.shape[1]))
+        parts = [self._largest(sums[i : i + size]) for i in range(0, len(sums), size)]
         return LargestValue(
             *(np.concatenate([getattr(p, name) for p in parts]) for name in LargestValue.__annotations__)
         )
@@ -211,10 +212,6 @@ class Search:
                 f"sums have the shape {sums.shape}", f"(n_stare, {expected[0]}, {expected[1]})", key="sums"
             )
         return sums
-
-    def _batches(self, count: int) -> list[slice]:
-        size = max(1, BATCH // (self._size * self.bank.directions.shape[1]))
-        return [slice(i, i + size) for i in range(0, count, size)]
 
     def _largest(self, sums: NDArray[Any]) -> LargestValue:
         n = len(sums)

@@ -186,10 +186,10 @@ class PlanTarget(Section):
             return Target.of(self.name, name=self.name, simbad=simbad)
         place = Target.of(self.coordinates, name=self.name)
         try:
-            known = Target.of(self.name)
+            target = Target.of(self.name)
         except InputError:
             return place
-        return replace(known, name=self.name, ra_deg=place.ra_deg, dec_deg=place.dec_deg, source="given")
+        return replace(target, name=self.name, ra_deg=place.ra_deg, dec_deg=place.dec_deg, source="given")
 
     def distribution(self, spectral_type: str) -> Rates:
         """Return the flare rates; raises InputError if none are given and the spectral type has no preset."""
@@ -204,9 +204,9 @@ class PlanTarget(Section):
         kind = self.rates or spectral_type.strip()[:1].upper()
         if kind not in ("G", "K", "M", "sunlike"):
             alpha = EXPONENTS.get(kind)
-            known = "" if alpha is None else f" except for an exponent of {alpha} (Althukair & Tsiklauri 2023)"
+            exception = "" if alpha is None else f" except for an exponent of {alpha} (Althukair & Tsiklauri 2023)"
             raise InputError(
-                f"flare rates of {self.name}, of the type {shortened(spectral_type)}, are unknown{known}",
+                f"flare rates of {self.name}, of the type {shortened(spectral_type)}, are unknown{exception}",
                 "alpha with rate_per_day and at_erg, rates, mass_msun and age_myr, or rates_file",
                 key="rates",
             )

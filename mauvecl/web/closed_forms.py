@@ -306,15 +306,15 @@ def solved(closed: ClosedForms) -> str:
     return f"{100 * asked.power:g} % of {flares}{where} with everything known, and {second} with the usual unknowns."
 
 
-def _limit(assumed: ClosedForms, known: float | None) -> float:
+def _limit(assumed: ClosedForms, limit: float | None) -> float:
     """Return the limit in closed form, as `mauvecl limit` finds it; faster with the limit if everything is known."""
     search, near = LimitSearch(assumed.case, assumed.question.statistic), None
-    if known is not None and search.of != "exposure":
+    if limit is not None and search.of != "exposure":
         nuisances, compared = assumed.study.nuisances, assumed.study.run.comparison()
         cost = unknown_cost("", assumed.quiet, assumed.flare, nuisances, compared)
         # Where dark noise dominates, the S/N is proportional to the light.
         loss = cost.known / cost.marginal if cost.marginal else 1.0
-        near = known * loss if search.of == "amplitude" else known - 2.5 * math.log10(loss)
+        near = limit * loss if search.of == "amplitude" else limit - 2.5 * math.log10(loss)
     return search.root(near)
 
 

@@ -61,10 +61,12 @@ def local(address: str) -> bool:
     if not address.strip():
         raise InputError("address = '' is empty", "an address such as 127.0.0.1, ::1 or 0.0.0.0", key="address")
     try:
-        known = {str(info[4][0]).split("%")[0] for info in socket.getaddrinfo(address, None, type=socket.SOCK_STREAM)}
+        addresses = {
+            str(info[4][0]).split("%")[0] for info in socket.getaddrinfo(address, None, type=socket.SOCK_STREAM)
+        }
     except (OSError, UnicodeError) as error:
         raise InputError.of("address", address, "one such as 127.0.0.1") from error
-    return all(ipaddress.ip_address(address).is_loopback for address in known)
+    return all(ipaddress.ip_address(address).is_loopback for address in addresses)
 
 
 def netloc(address: str, port: int) -> str:

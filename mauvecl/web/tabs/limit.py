@@ -105,8 +105,8 @@ def _map(kept: _Kept) -> tuple[Float, Float, Float]:
     (columns, rows), (low, high) = STEPS, np.log10(PERCENTS)
     x, y = np.linspace(*MAGNITUDES, columns), np.linspace(low, high, rows)
     # A saturated star has no detectable flare.
-    known = np.zeros((4, rows, columns))
-    known[0], known[2] = -30.0, 3.0
+    forms = np.zeros((4, rows, columns))
+    forms[0], forms[2] = -30.0, 3.0
     for i, magnitude in enumerate(x):
         for j, outcome in enumerate(odds(closed, magnitude, 10**y / closed.question.amplitude_percent)):
             unit, seen = outcome.null.std, outcome.flaring
@@ -114,9 +114,9 @@ def _map(kept: _Kept) -> tuple[Float, Float, Float]:
                 max(seen.mean - outcome.null.mean, 1e-9 * unit) / unit,
                 (outcome.threshold - outcome.null.mean) / unit,
             )
-            known[:, j, i] = np.log(part), np.log(seen.std / unit), cut, seen.third / seen.std**3
+            forms[:, j, i] = np.log(part), np.log(seen.std / unit), cut, seen.third / seen.std**3
     fine = np.linspace(*MAGNITUDES, 97), np.linspace(low, high, 61)
-    return *fine, _pearson(*PchipInterpolator(y, PchipInterpolator(x, known, axis=2)(fine[0]), axis=1)(fine[1]))
+    return *fine, _pearson(*PchipInterpolator(y, PchipInterpolator(x, forms, axis=2)(fine[0]), axis=1)(fine[1]))
 
 
 def _pearson(part: Float, spread: Float, cut: Float, skewness: Float) -> Float:

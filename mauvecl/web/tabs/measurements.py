@@ -82,11 +82,11 @@ def temperature_errors(closed: ClosedForms, answers: Answers) -> ChartData:
     for name, measurement in zip(NAMES, expected(closed).values(), strict=True):
         ahead = measurement.forecasts(FACTORS, measurement.unknown)
         series[name] = own * FACTORS, [100 * f.errors[0] / f.values[0] for f in ahead]
-    known, *_, free = expected(closed).values()
-    which = "temperature" if isinstance(known.fitted, FlareModel) else "lower temperature"
-    series["own"] = [own], [100 * known.ahead.errors[0] / known.ahead.values[0]]
+    all_known, *_, free = expected(closed).values()
+    which = "temperature" if isinstance(all_known.fitted, FlareModel) else "lower temperature"
+    series["own"] = [own], [100 * all_known.ahead.errors[0] / all_known.ahead.values[0]]
     text = (
-        f"With everything known the {which} has a standard error of {_error(known)}, with dark level and star "
+        f"With everything known the {which} has a standard error of {_error(all_known)}, with dark level and star "
         f"unknown one of {_error(free)}."
     )
     return ChartData(text, series)
@@ -209,13 +209,13 @@ class Measurement(Tab):
 
     def shown(self, closed: ClosedForms, answers: Answers) -> View:
         each, fits = expected(closed), simulated(answers)
-        known = next(iter(each.values()))
+        first = next(iter(each.values()))
         table = [
             {"quantity": name, "unit": unit, "truth": value, **dict(zip(each, errors, strict=True))}
             for name, unit, value, *errors in zip(
-                known.fitted.names,
-                known.fitted.units,
-                known.truth,
+                first.fitted.names,
+                first.fitted.units,
+                first.truth,
                 *(measurement.ahead.errors for measurement in each.values()),
                 strict=True,
             )
