@@ -40,12 +40,23 @@ from mauvecl import (
     fit,
     fit_two_temperatures,
 )
-from mauvecl.fits.flare_model import Reduction, drawn_sums
-from mauvecl.fits.spectrum import fit_sums
+from mauvecl.fits.flare_model import Reduction, derived_values
+from mauvecl.fits.profile import Profile, covariance, with_bounds
+from mauvecl.fits.spectrum import BATCH
 
 #: Fits of the slower ways, and rounds.
 FRAMES, SLOW, ROUNDS = 10_000, 100, 5
 BLOCK, PART = 16_384, 2_500
+
+
+def estimate(values: np.ndarray, model: FlareModel, reduction: Reduction) -> None:
+    """Fit the sums of drawn exposures, without intervals."""
+    sums = np.ascontiguousarray(values[-len(reduction.weights) :].T, np.float64)
+    for start in range(0, len(sums), BATCH):
+        profile = Profile(reduction, sums[start : start + BATCH])
+        best = with_bounds(reduction, profile.sums, profile.best())
+        derived_values(model, best.log_k, best.linear)
+        covariance(model, profile, best)
 
 
 def main() -> None:
@@ -73,7 +84,7 @@ def main() -> None:
             # The device draws the next block while this one is fitted.
             with ThreadPoolExecutor(1) as ahead:
                 for values in ahead.map(drawn, range(0, count, BLOCK)):
-                    fit_sums(drawn_sums(values, reduction), model, reduction)
+                    estimate(values, model, reduction)
 
         def frames(count: int, lit=lit, model=model) -> None:
             def drawn(start: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Results that are cached by the content of arrays, and equality by content."""
+"""Arrays that no caller can modify, results that are cached by the content of arrays, and equality by content."""
 
 from __future__ import annotations
 
@@ -9,9 +9,18 @@ from functools import lru_cache, wraps
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 P = ParamSpec("P")
 R = TypeVar("R")
+
+
+def set_read_only(owner: object, **arrays: ArrayLike) -> None:
+    """Set fields of a frozen dataclass to private copies of arrays, which no caller can modify."""
+    for name, values in arrays.items():
+        private = np.array(values, np.float64)
+        private.setflags(write=False)
+        object.__setattr__(owner, name, private)
 
 
 class _Arguments:

@@ -87,7 +87,7 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "foreign chunks unseen": (
         "test_damage_is_found_and_repaired_to_the_bit",
-        ('return "good" if digest(data) == known else "foreign"', 'return "good"'),
+        ('return "good" if digest(data) == listed else "foreign"', 'return "good"'),
     ),
     "half a failed shard kept": (
         "test_failed_launch_is_repeated",
@@ -475,8 +475,8 @@ MUTATIONS: dict[str, Mutation] = {
     "errors of changes with everything known": (
         "test_error_of_change_is_the_scatter_of_fits",
         (
-            "error_of_change(one.counts_dn, quiet, unknown), error_of_change",
-            "error_of_change(one.counts_dn, quiet, None), error_of_change",
+            "error, known_error = (error_of_change(change.counts_dn, quiet, unknowns) for unknowns in (unknown, None))",
+            "error, known_error = (error_of_change(change.counts_dn, quiet, unknowns) for unknowns in (None, None))",
         ),
     ),
     "one visit against a known mean": (
@@ -504,7 +504,7 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "coverage of upper ends alone": (
         "test_intervals_on_either_side_of_the_truth_do_not_cover[low-inf]",
-        ("(found.low[level] <= truth) & (truth <= found.high[level])", "truth <= found.high[level]"),
+        ("(measurement.low[level] <= truth) & (truth <= measurement.high[level])", "truth <= measurement.high[level]"),
     ),
     "whole ranges for their halves": (
         "test_correct_model_covers_and_simple_model_is_rejected",

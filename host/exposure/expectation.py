@@ -25,7 +25,7 @@ from mauvecl.host.stars.coverage import check_covers, continued
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, table_of
 from mauvecl.schema.drawable import Drawable
-from mauvecl.schema.errors import InputError, Message
+from mauvecl.schema.errors import InputError, Message, missing_package
 from mauvecl.schema.fields import Unit
 from mauvecl.schema.physical import Duration, Exposure, SkyBrightness
 
@@ -141,7 +141,7 @@ class Expectation(Drawable, ContentEquality):
             from astropy.nddata import StdDevUncertainty
             from specutils import Spectrum
         except ImportError as error:
-            raise InputError("specutils is missing", "`pip install 'mauvecl[spectra]'`", key="specutils") from error
+            raise missing_package("specutils", "a `Spectrum`", "spectra") from error
         return Spectrum(
             spectral_axis=self.wavelength_nm * u.nm,
             flux=self.signal_dn * u.adu,
@@ -366,18 +366,20 @@ class Expectation(Drawable, ContentEquality):
         """
         n, gain = self.n_frames, self.gain_dn_per_electron
         # Fraction of the light that saturation leaves.
-        kept = np.divide(self.recorded_light_dn, self.light_dn, out=np.ones_like(gain), where=self.light_dn > 0)
+        passed = np.divide(self.recorded_light_dn, self.light_dn, out=np.ones_like(gain), where=self.light_dn > 0)
         variances = {
-            "source_photon": n * gain**2 * self.source_electrons * kept,
-            "zodiacal_photon": n * gain**2 * self.sky_electrons * kept,
-            "neighbour_photon": n * gain**2 * self.neighbour_electrons * kept,
+            "source_photon": n * gain**2 * self.source_electrons * passed,
+            "zodiacal_photon": n * gain**2 * self.sky_electrons * passed,
+            "neighbour_photon": n * gain**2 * self.neighbour_electrons * passed,
             "dark": n * self.dark_variance_dn2,
             "read": n * self.read_noise_dn**2,
             "total": self._noise_dn2,
         }
         noise = {name: np.sqrt(variance) for name, variance in variances.items()}
         about = {"exposure_s": self.exposure_s, "name": self.name}
-        columns = [one for one in BUDGET_COLUMNS if one.name != "neighbour_photon" or self.neighbour_electrons.any()]
+        columns = [
+            column for column in BUDGET_COLUMNS if column.name != "neighbour_photon" or self.neighbour_electrons.any()
+        ]
         return table_of(columns, [{"wavelength": self.wavelength_nm} | noise], **about)
 
     @property

@@ -117,20 +117,24 @@ class Neighbours:
 
     def within(self, instrument: Instrument) -> list[Neighbour]:
         """Return the neighbours within the radius of the fibre."""
-        return [one for one in self.stars if one.separation_arcsec <= instrument.field_of_view_radius_arcsec]
+        return [
+            neighbour
+            for neighbour in self.stars
+            if neighbour.separation_arcsec <= instrument.field_of_view_radius_arcsec
+        ]
 
     def electrons_per_second(self, instrument: Instrument, order: Order = "paper") -> Float:
         """Return the mean electrons per second of all neighbours in the fibre, shape (n_pixel,)."""
         total = np.zeros(instrument.wavelength_nm.size)
-        for one in self.within(instrument):
-            total += self.share * rate_of(one, instrument, order)
+        for neighbour in self.within(instrument):
+            total += self.share * rate_of(neighbour, instrument, order)
         return total
 
     def provenance(self, instrument: Instrument) -> dict[str, str]:
         """Return the neighbours in the fibre with their spectra, for the record of an expectation."""
         inside = [
-            f"{one.name} ({one.separation_arcsec:.6g} arcsec, {one.spectrum[0]}, {one.source.digest})"
-            for one in self.within(instrument)
+            f"{star.name} ({star.separation_arcsec:.6g} arcsec, {star.spectrum[0]}, {star.source.digest})"
+            for star in self.within(instrument)
         ]
         return {"neighbours": "; ".join(inside), "share of neighbours": f"{self.share:g} (assumption)"}
 
@@ -141,20 +145,24 @@ class Neighbours:
         beyond = f"{_stars(outside)} beyond {'does' if outside == 1 else 'do'} not enter"
         if not inside:
             return [f"NEIGHBOURS of {target}: none within {radius:g} arcsec; {beyond}.", *self.notes]
-        names = ", ".join(f"{one.name} at {one.separation_arcsec:.3g} arcsec" for one in inside[:MOST_NAMED])
+        names = ", ".join(
+            f"{neighbour.name} at {neighbour.separation_arcsec:.3g} arcsec" for neighbour in inside[:MOST_NAMED]
+        )
         more = len(inside) - MOST_NAMED
         text = (
             f"NEIGHBOURS of {target}: the light of {_stars(len(inside))} within {radius:g} arcsec is in the fibre "
             f"({names}{f' and {more} more' if more > 0 else ''}); assumption: {100 * self.share:g} % of it enters"
         )
-        chosen = [f"Light of {one.name}, {one.spectrum[1]}." for one in inside if one.spectrum[1]]
+        chosen = [
+            f"Light of {neighbour.name}, {neighbour.spectrum[1]}." for neighbour in inside if neighbour.spectrum[1]
+        ]
         if len(chosen) > MOST_NAMED:
             chosen = [*chosen[:MOST_NAMED], f"Spectra of {len(chosen) - MOST_NAMED} more neighbours are chosen alike."]
         same = [
-            f"{one.name} is {one.separation_arcsec:.2g} arcsec from {target} and counts as a neighbour: if it is the "
+            f"{star.name} is {star.separation_arcsec:.2g} arcsec from {target} and counts as a neighbour: if it is the "
             "star itself, name its row in star.neighbours_of."
-            for one in inside
-            if one.separation_arcsec < SAME_STAR_ARCSEC
+            for star in inside
+            if star.separation_arcsec < SAME_STAR_ARCSEC
         ]
         return [f"{text}; {beyond}." if outside else f"{text}.", *same, *chosen, *self.notes]
 
@@ -175,7 +183,7 @@ def _stars(n: int) -> str:
 
 
 def _nearest(values: Sequence[tuple[str, float]], wanted: float) -> tuple[str, float]:
-    return min(values, key=lambda one: abs(one[1] - wanted))
+    return min(values, key=lambda colour: abs(colour[1] - wanted))
 
 
 def _typed() -> list[str]:
@@ -260,7 +268,7 @@ def read_neighbours(path: str | Path, target: str | None = None) -> tuple[tuple[
                 path.parent / spectrum if spectrum else None, table.number(temperature, k, "K", above=0.0),
                 table.number(colour, k, "mag"),
             ))  # fmt: skip
-    notes += table.unused([one for one in table.names if not {key_of(one), key_of(divided_unit(one)[0])} & _KEYS])
+    notes += table.unused([name for name in table.names if not {key_of(name), key_of(divided_unit(name)[0])} & _KEYS])
     return tuple(sorted(stars, key=lambda star: star.separation_arcsec)), notes
 
 
@@ -272,7 +280,11 @@ class _Neighbours(Rows):
         """Columns of magnitudes, and their bands."""
         held = [(self.first((name,)), name, band) for name, band in MAGNITUDES.items()]
         # Gmag is Gaia's in VizieR, gmag that of other surveys.
-        return [(one, band) for one, name, band in held if one is not None and not (name == "gmag" and one != "Gmag")]
+        return [
+            (column, band)
+            for column, name, band in held
+            if column is not None and not (name == "gmag" and column != "Gmag")
+        ]
 
     @cached_property
     def band(self) -> str | None:
@@ -310,13 +322,13 @@ class _Neighbours(Rows):
         return self._stated(name)
 
     def _stated(self, name: str) -> tuple[Float, tuple[str, ...]]:
-        stated, known = getattr(self.table[name], "unit", None) is not None, key_of(name)
-        if not stated and known == "_r":
+        stated, key = getattr(self.table[name], "unit", None) is not None, key_of(name)
+        if not stated and key == "_r":
             raise self.error(
                 f"the column {name} states no unit",
                 "a table with units (ECSV, FITS, VOTable), or the column separation, arcsec", name,
             )  # fmt: skip
-        factor = 1.0 if stated else {"deg": 3600.0}.get(UNSTATED.get(known, ""), 1.0)
+        factor = 1.0 if stated else {"deg": 3600.0}.get(UNSTATED.get(key, ""), 1.0)
         values = np.array([self._given(name, row, self.number(name, row, "arcsec")) for row in range(self.n)]) * factor
         negative = ~(values >= 0)
         if negative.any():
@@ -324,7 +336,7 @@ class _Neighbours(Rows):
             text = self.text(name, row)
             raise self.error(f"row {row + 1} has {name} = {text}", "an angle of 0 and above", name)
         note = f"Separations are the column {name} of {self.named}, read as degrees since it states no unit."
-        return values, (note,) if not stated and known == "dist" else ()
+        return values, (note,) if not stated and key == "dist" else ()
 
     def _from_positions(self, ra: str, dec: str, own: int | None, target: str) -> Float:
         from astropy.coordinates import angular_separation

@@ -12,7 +12,7 @@ import astropy.units as u
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mauvecl.host.arrays import ContentEquality
+from mauvecl.host.arrays import ContentEquality, set_read_only
 from mauvecl.host.tables.ecsv import read_numbers
 from mauvecl.host.tables.units import unit_of
 from mauvecl.schema.calls import validated
@@ -138,7 +138,7 @@ class PixelMap(ContentEquality):
         for name in COLUMNS:
             if getattr(self, name) is None:
                 continue
-            values = np.array(getattr(self, name), np.float64)
+            values = np.asarray(getattr(self, name), np.float64)
             if values.ndim != 1:
                 raise InputError(
                     f"{name} of the pixel map has the shape {values.shape}", "one value per pixel", key=name
@@ -150,8 +150,7 @@ class PixelMap(ContentEquality):
                 pixel = int(np.argmax(bad))
                 above = "above 0" if name == "gain" else "0 or more"
                 raise InputError.of(name, values[pixel], f"finite and {above}", where=f"pixel map, pixel {pixel}")
-            values.setflags(write=False)
-            object.__setattr__(self, name, values)
+            set_read_only(self, **{name: values})
             sizes.add(values.size)
         if len(sizes) != 1:
             raise InputError(
@@ -256,6 +255,8 @@ class PixelMap(ContentEquality):
         return np.asarray(part if COLUMNS[name] == u.DN else nominal * part)
 
 
+#: Share of the variances of a covariance that is lost by leaving out the smallest modes.
+LOST_VARIANCE = 1e-4
 #: Start of the names of columns with modes.
 MODE = "mode_"
 #: Values of an instrument that modes may change in addition to the throughput, in words.
@@ -295,14 +296,12 @@ class ThroughputErrors(ContentEquality):
     values: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        nm, modes = np.array(self.wavelength_nm, np.float64), np.array(self.modes, np.float64)
+        nm, modes = np.asarray(self.wavelength_nm, np.float64), np.asarray(self.modes, np.float64)
         if nm.ndim != 1 or nm.size < 2 or not np.isfinite(nm).all() or not (np.diff(nm) > 0).all():
             raise InputError.of("wavelength_nm", nm.shape, "at least two finite, ascending wavelengths")
         if modes.ndim != 2 or modes.shape[1] != nm.size or not np.isfinite(modes).all():
             raise InputError.of("modes", modes.shape, f"finite values of the shape (n_mode, {nm.size})")
-        for name, values in (("wavelength_nm", nm), ("modes", modes)):
-            values.setflags(write=False)
-            object.__setattr__(self, name, values)
+        set_read_only(self, wavelength_nm=nm, modes=modes)
         others = self.values
         if not isinstance(others, Mapping) or not set(others) <= set(CALIBRATED):
             raise InputError.of("values", others, f"some of {', '.join(CALIBRATED)}")
@@ -328,7 +327,6 @@ class ThroughputErrors(ContentEquality):
         *,
         names: Sequence[str] = (),
         sums: Float | None = None,
-        lost: float = 1e-4,
     ) -> ThroughputErrors:
         """Return the modes of a covariance of log throughput and of the logarithms of other values.
 
@@ -342,8 +340,6 @@ class ThroughputErrors(ContentEquality):
         sums : ndarray, shape (n_sum, n), optional
             Weighted sums of the curve, such as the light in bands. The first modes hold all errors of these sums and of
             the other values.
-        lost : float
-            Share of the variances that is lost by leaving out the smallest modes.
         """
         nm, total = np.asarray(wavelength_nm, np.float64), np.asarray(covariance, np.float64)
         sd = np.sqrt(np.diag(total))
@@ -351,8 +347,8 @@ class ThroughputErrors(ContentEquality):
         variances, vectors = np.linalg.eigh(total / np.outer(scale, scale))
         variances, vectors = np.maximum(variances[::-1], 0.0), vectors[:, ::-1]
         left = 1.0 - np.cumsum(variances) / max(variances.sum(), np.finfo(float).tiny)
-        kept = int((left > lost).sum()) + 1
-        modes = scale[:, None] * (vectors * np.sqrt(variances))[:, :kept]
+        n_modes = int((left > LOST_VARIANCE).sum()) + 1
+        modes = scale[:, None] * (vectors * np.sqrt(variances))[:, :n_modes]
         first = np.vstack([np.zeros((0, nm.size)) if sums is None else sums]) @ modes[: nm.size]
         first = np.vstack([first, modes[nm.size :] / scale[nm.size :, None]])
         if len(first):

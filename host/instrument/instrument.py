@@ -527,8 +527,8 @@ def _embedded(name: str) -> Instrument:
 def _from_file(name: str | Path) -> Instrument:
     path = instrument_path(name, Path())
     values, sources = read_values(path, FILES)
-    kept = {name: source for name, source in sources.items() if name not in LABELS}
-    return Instrument.build({**values, "sources": kept}, path.name)
+    own_sources = {name: source for name, source in sources.items() if name not in LABELS}
+    return Instrument.build({**values, "sources": own_sources}, path.name)
 
 
 #: Fields that do not affect a measurement.
@@ -626,5 +626,5 @@ class LineSpread:
             parts += [ends - self.top_hat / 2, ends + self.top_hat / 2]
         edges = np.unique(np.concatenate(parts))
         # Knots that differ only by rounding would make empty panels.
-        kept: Float = edges[np.append(True, np.diff(edges) > 1e-9)]
-        return kept
+        distinct: Float = edges[np.append(True, np.diff(edges) > 1e-9)]
+        return distinct

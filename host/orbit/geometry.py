@@ -41,11 +41,6 @@ def direction(longitude_deg: NDArray[np.float64] | float, latitude_deg: NDArray[
     return np.stack(np.broadcast_arrays(np.cos(d) * np.cos(a), np.cos(d) * np.sin(a), np.sin(d)), axis=-1)
 
 
-def sidereal_rad(midnight: NDArray[np.float64], days: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return Greenwich mean sidereal time (1982), rad: the angle from SGP4's frame to the Earth-fixed frame."""
-    return np.asarray(erfa.gmst82(midnight, days))
-
-
 def to_j2000(midnight: float, days: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the matrices from SGP4's frame (true equator, mean equinox of date) to J2000, shape (n, 3, 3).
 
@@ -78,7 +73,8 @@ def subsatellite_point(
     midnight, days : ndarray, shape (n,)
         Parts of the Julian date, UTC.
     """
-    theta = sidereal_rad(midnight, days)
+    # The angle from SGP4's frame to the Earth-fixed frame.
+    theta = erfa.gmst82(midnight, days)
     x = np.cos(theta) * position_km[:, 0] + np.sin(theta) * position_km[:, 1]
     y = -np.sin(theta) * position_km[:, 0] + np.cos(theta) * position_km[:, 1]
     longitude, latitude, _ = erfa.gc2gd(1, np.stack([x, y, position_km[:, 2]], axis=1) * 1e3)

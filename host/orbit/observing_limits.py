@@ -66,7 +66,7 @@ class Limits(Section):
             if not -90 <= low < high <= 90:
                 raise InputError.of("declination_deg", (low, high), "two rising values within -90 to 90")
         if self.anomaly and (
-            len(self.anomaly) < 3 or not all(math.isfinite(one) for corner in self.anomaly for one in corner)
+            len(self.anomaly) < 3 or not all(math.isfinite(angle) for corner in self.anomaly for angle in corner)
         ):
             raise InputError(
                 f"anomaly is a polygon of {len(self.anomaly)} corners", "at least 3, finite", key="anomaly"
@@ -102,5 +102,5 @@ SOURCES = {
 
 def _text(value: object) -> str:
     if isinstance(value, tuple):
-        return " ".join(_text(one) for one in value)
+        return " ".join(_text(item) for item in value)
     return f"{value:g}" if isinstance(value, float) else str(value)

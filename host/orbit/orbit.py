@@ -88,16 +88,18 @@ class Elements:
     @classmethod
     def _of(cls, text: str, source: str, named: str) -> Elements:
         lines = [line.rstrip() for line in text.splitlines()]
-        sets = [(one, two) for one, two in pairwise(lines) if one.startswith("1 ") and two.startswith("2 ")]
+        sets = [
+            (first, second) for first, second in pairwise(lines) if first.startswith("1 ") and second.startswith("2 ")
+        ]
         if not sets:
             fault = f"orbit file {named} holds no two lines of elements"
             raise InputError(fault, "a line '1 ...' before '2 ...'", key="elements")
-        sets = [(one, two) for one, two in sets if one[2:7] == MAUVE] or sets
-        if len(numbers := sorted({one[2:7] for one, _ in sets})) > 1:
+        sets = [(first, second) for first, second in sets if first[2:7] == MAUVE] or sets
+        if len(numbers := sorted({first[2:7] for first, _ in sets})) > 1:
             held = printable(", ".join(numbers), 80)
             fault = f"orbit file {named} holds elements of {len(numbers)} satellites ({held})"
             raise InputError(fault, f"those of Mauve, {MAUVE}, or of one satellite", key="elements")
-        return max((cls(one, two, source) for one, two in sets), key=lambda elements: elements.epoch_jd)
+        return max((cls(first, second, source) for first, second in sets), key=lambda elements: elements.epoch_jd)
 
     @cached_property
     def satellite(self) -> Any:

@@ -206,7 +206,7 @@ class Visibility:
         """Compute the visibility of targets, unit vectors in the frame of star catalogues of shape (k, 3)."""
         limits = limits or Limits()
         n, k = track.times.n, len(target)
-        seen, kept = np.ones((n, k), bool), {}
+        seen, kept_by = np.ones((n, k), bool), {}
         for name, rule in _rules(track, target, limits).items():
             count = np.zeros(k)
             for first in range(0, n, CHUNK):
@@ -214,11 +214,11 @@ class Visibility:
                 flags = rule(part)
                 seen[part] &= flags
                 count += np.broadcast_to(flags, (part.stop - part.start, k)).sum(axis=0)
-            kept[name] = count / n
+            kept_by[name] = count / n
         if limits.shortest_s > 0:
             _drop_short(seen, track.times.step_s, limits.shortest_s)
         # The track's own grid holds its times as arrays.
-        return cls(track.orbit, replace(track.times), target, limits, seen, kept)
+        return cls(track.orbit, replace(track.times), target, limits, seen, kept_by)
 
     @property
     def track(self) -> Track:

@@ -85,9 +85,9 @@ def add(
         write_whole(place, text.getvalue().encode(), shared=True)
     except InputError as error:
         raise error.within("star folder (MAUVECL_DATA_DIR sets another)") from error
-    known = find(name)
-    assert known is not None
-    return known
+    star = find(name)
+    assert star is not None
+    return star
 
 
 def _place_of(name: str, *, replace: bool) -> Path:
@@ -261,8 +261,8 @@ def _check_address(address: str) -> None:
     """Raise InputError unless the address is a URL of a supported scheme."""
     with parsing(f"address {shortened(address)}", "one such as https://host/folder/"):
         parts = urlsplit(address)
-        known = parts.scheme in SCHEMES and bool(parts.hostname) and parts.port != 0
-    if not (known and address.isprintable() and " " not in address):
+        is_address = parts.scheme in SCHEMES and bool(parts.hostname) and parts.port != 0
+    if not (is_address and address.isprintable() and " " not in address):
         raise InputError.of("base", address, "one such as https://host/folder/")
 
 

@@ -21,7 +21,7 @@ ALIASES = {
 def known_band(name: str) -> str:
     """Return the name of a band, given its name or alias in any case."""
     wanted = name.strip().casefold()
-    for known, others in ALIASES.items():
-        if wanted in (known.casefold(), *(other.casefold() for other in others)):
-            return known
+    for band, others in ALIASES.items():
+        if wanted in (band.casefold(), *(other.casefold() for other in others)):
+            return band
     raise InputError(f"band {name!r} is unknown", f"one of {', '.join(ALIASES)}", key="band")

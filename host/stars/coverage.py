@@ -59,7 +59,7 @@ def check_points(name: str, wavelength: Float, flux: Float) -> None:
     close = np.flatnonzero(np.diff(wavelength) < CLOSEST * wavelength[1:])
     if close.size:
         i = int(close[0])
-        first, second = (float(one) for one in wavelength[i : i + 2])
+        first, second = (float(end) for end in wavelength[i : i + 2])
         same = f"{first!r} and {second!r} nm at points {i + 1} and {i + 2} are the same to within rounding"
         expected = f"wavelengths that differ by {CLOSEST:g} of their value"
         raise InputError(f"spectrum {name}: wavelengths {same}", expected, key="wavelength")
@@ -106,12 +106,12 @@ def without_undefined_ends(name: str, wavelength: Float, flux: Float) -> tuple[F
     low, high = (np.flatnonzero(bad & side) for side in (wavelength < NEEDED_NM[0], wavelength > NEEDED_NM[1]))
     start = int(low[-1]) + 1 if low.size else 0
     stop = int(high[0]) if high.size else wavelength.size
-    kept = wavelength[start:stop]
-    if kept.size < 2:
+    defined = wavelength[start:stop]
+    if defined.size < 2:
         fault = f"spectrum {name} has no defined flux in {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm"
         raise InputError(fault, "some", key="flux")
-    note = f"cut to {kept[0]:.1f}-{kept[-1]:.1f} nm: undefined flux beyond"
-    return kept, flux[start:stop], (note,)
+    note = f"cut to {defined[0]:.1f}-{defined[-1]:.1f} nm: undefined flux beyond"
+    return defined, flux[start:stop], (note,)
 
 
 def check_flux(name: str, wavelength: Float, flux: Float) -> None:

@@ -224,10 +224,10 @@ def flares_of(table: Table | Any, name: str = "flare table") -> QTable:
     columns = {"amplitude": (amplitude, "1"), "start": (start, "d"), "stop": (stop, "d")}
     cells = [[rows.number(held, row, unit) for held, unit in columns.values()] for row in range(rows.n)]
     # AltaiPony's tables have an empty row for a star without flares.
-    kept = [row for row, values in enumerate(cells) if any(value is not None for value in values)]
-    if not 0 < len(kept) <= MAX_FLARES:
-        raise rows.error(f"holds {len(kept)} flares", f"1 to {MAX_FLARES}", "amplitude")
-    for row in kept:
+    filled = [row for row, values in enumerate(cells) if any(value is not None for value in values)]
+    if not 0 < len(filled) <= MAX_FLARES:
+        raise rows.error(f"holds {len(filled)} flares", f"1 to {MAX_FLARES}", "amplitude")
+    for row in filled:
         value = cells[row][0]
         if value is None or not SMALLEST <= value <= LARGEST:
             shown_value = "no amplitude" if value is None else f"an amplitude of {value:g}"
@@ -235,10 +235,10 @@ def flares_of(table: Table | Any, name: str = "flare table") -> QTable:
         begin, end = cells[row][1:]
         if begin is not None and end is not None and end < begin:
             raise rows.error(f"row {row + 1} begins at {begin:.10g} d and ends at {end:.10g} d", "a later end", "stop")
-    flares = QTable({"amplitude": [cells[row][0] for row in kept]})
+    flares = QTable({"amplitude": [cells[row][0] for row in filled]})
     for place, (title, (held, unit)) in enumerate(columns.items()):
         if place and held is not None:
-            flares[title] = np.array([cells[row][place] for row in kept], float)
+            flares[title] = np.array([cells[row][place] for row in filled], float)
             flares[title].unit = unit
     flares.meta["comments"] = list(rows.unused([name for name in rows.names if name not in (amplitude, start, stop)]))
     flares["amplitude"].info.description = "relative rise above the quiescent flux, in the band of the light curve"

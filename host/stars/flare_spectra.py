@@ -15,7 +15,7 @@ from typing import Annotated, Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mauvecl.host.arrays import ContentEquality
+from mauvecl.host.arrays import ContentEquality, set_read_only
 from mauvecl.host.spectra.formats import read_spectrum
 from mauvecl.host.spectra.units import NEEDED_NM
 from mauvecl.host.stars.blackbody import blackbody
@@ -225,7 +225,7 @@ class EmissionLine:
         wanted = name.strip().casefold().replace("_", " ")
         for known in (*LINES_NM, *LINE_GROUPS):
             if wanted == known.casefold():
-                return cls(known, tuple(LINES_NM[one] for one in LINE_GROUPS.get(known, (known,))))
+                return cls(known, tuple(LINES_NM[line] for line in LINE_GROUPS.get(known, (known,))))
         try:
             nm = float(name)
         except ValueError:
@@ -351,10 +351,7 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
     surface: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        for name in ("wavelength_nm", "flux_flam"):
-            array = np.array(getattr(self, name), np.float64)
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
+        set_read_only(self, wavelength_nm=self.wavelength_nm, flux_flam=self.flux_flam)
         check_points(self.name, self.wavelength_nm, self.flux_flam)
         ends = float(self.wavelength_nm[0]), float(self.wavelength_nm[-1])
         if ends[0] > NEEDED_NM[0] or ends[1] < NEEDED_NM[1]:

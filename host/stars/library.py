@@ -374,8 +374,8 @@ def as_type(text: str) -> str | None:
 def nearest_spectrum(spectral_type: str) -> str:
     """Return the name of the embedded spectrum of the nearest type; the first in the library if there are several."""
     wanted = subtype(spectral_type)
-    names = [(one["name"], one["spectral_type"]) for one in entries() if _TYPE.match(one["spectral_type"])]
-    return min(names, key=lambda one: abs(subtype(one[1]) - wanted))[0]
+    names = [(entry["name"], entry["spectral_type"]) for entry in entries() if _TYPE.match(entry["spectral_type"])]
+    return min(names, key=lambda entry: abs(subtype(entry[1]) - wanted))[0]
 
 
 @dataclass(frozen=True)
@@ -408,15 +408,15 @@ def resolve(text: str, *, own: bool = True) -> NamedStar | None:
     model = ModelStar.named(text)
     if model is not None:
         return NamedStar(model.name, model.name, None)
-    entry, known = embedded(text), by_key().get(name_key(text))
-    if entry is None and known is not None:
+    entry, star = embedded(text), by_key().get(name_key(text))
+    if entry is None and star is not None:
         # The library has the star under another of its names.
-        entries = (embedded(name) for name in (known.name, *known.others))
-        entry = next((one for one in entries if one is not None), None)
+        entries = (embedded(name) for name in (star.name, *star.others))
+        entry = next((entry for entry in entries if entry is not None), None)
     mine = find(text) if own and entry is None else None
     spectrum = entry["name"] if entry is not None else None if mine is None else mine.name
-    if known is not None:
-        return NamedStar(known.name, spectrum, known)
+    if star is not None:
+        return NamedStar(star.name, spectrum, star)
     if spectrum is not None:
         return NamedStar(spectrum, spectrum, None)
     spectral_type = as_type(text)
@@ -468,9 +468,9 @@ def near_names(text: str, *, stars_only: bool = False) -> list[str]:
     stars_only : bool
         Whether names must be of stars with known coordinates.
     """
-    known = {key: star.name for key, star in by_key().items()}
+    names = {key: star.name for key, star in by_key().items()}
     if not stars_only:
-        known |= {name_key(name): name for name in library_names()}
-        known |= {name_key(star.name): star.name for star in kept()}
-    near = difflib.get_close_matches(name_key(text), known, n=4, cutoff=0.5)
-    return list(dict.fromkeys(known[one] for one in near)) or ["eps Eri", "AU Mic"] + ["G2V"] * (not stars_only)
+        names |= {name_key(name): name for name in library_names()}
+        names |= {name_key(star.name): star.name for star in kept()}
+    near = difflib.get_close_matches(name_key(text), names, n=4, cutoff=0.5)
+    return list(dict.fromkeys(names[key] for key in near)) or ["eps Eri", "AU Mic"] + ["G2V"] * (not stars_only)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mauvecl.host.arrays import ContentEquality
+from mauvecl.host.arrays import ContentEquality, set_read_only
 from mauvecl.host.spectra.formats import read_spectrum
 from mauvecl.host.spectra.units import SPAN_NM
 from mauvecl.host.stars import bands
@@ -32,7 +32,7 @@ from mauvecl.host.stars.flare_spectra import Blackbody, FlareSpectrum
 from mauvecl.host.stars.library import ModelStar, embedded, find, spectrum, spectrum_table
 from mauvecl.schema.calls import validated
 from mauvecl.schema.drawable import Drawable
-from mauvecl.schema.errors import InputError
+from mauvecl.schema.errors import InputError, missing_package
 from mauvecl.schema.fields import AnyUnit, Unit
 from mauvecl.schema.physical import Amplitude, BinWidth, Magnitude, Reddening, Temperature
 
@@ -101,11 +101,7 @@ class Source(Drawable, ContentEquality):
     temperature_k: Temperature | None = None
 
     def __post_init__(self) -> None:
-        for field in ("wavelength_nm", "flux_flam"):
-            # A private copy, which no caller can modify.
-            array = np.array(getattr(self, field), dtype=np.float64)
-            array.setflags(write=False)
-            object.__setattr__(self, field, array)
+        set_read_only(self, wavelength_nm=self.wavelength_nm, flux_flam=self.flux_flam)
         check_points(self.name, self.wavelength_nm, self.flux_flam)
         check_measured(self.name, self.wavelength_nm)
         check_flux(self.name, self.wavelength_nm, self.flux_flam)
@@ -342,7 +338,7 @@ class Source(Drawable, ContentEquality):
         try:
             from specutils import Spectrum
         except ImportError as error:
-            raise InputError("specutils is missing", "`pip install 'mauvecl[spectra]'`", key="specutils") from error
+            raise missing_package("specutils", "a `Spectrum`", "spectra") from error
         flam = u.erg / (u.s * u.cm**2 * u.AA)
         return Spectrum(
             spectral_axis=self.wavelength_nm * u.nm,
@@ -473,9 +469,7 @@ class Source(Drawable, ContentEquality):
         try:
             from dust_extinction import parameter_averages
         except ImportError as error:
-            raise InputError(
-                "extinction needs dust_extinction", "`pip install 'mauvecl[extinction]'`", key="dust_extinction"
-            ) from error
+            raise missing_package("dust_extinction", "extinction", "extinction") from error
         import astropy.units as u
 
         try:

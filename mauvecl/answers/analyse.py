@@ -140,8 +140,8 @@ class EventRow:
     @property
     def measured(self) -> Measurement | str:
         """The flare fitted to its spectrum, or the reason why none is."""
-        one = self.analysis.spectra
-        return NO_SPECTRA if one is None else one.measured[self.number]
+        spectra = self.analysis.spectra
+        return NO_SPECTRA if spectra is None else spectra.measured[self.number]
 
     @property
     def unmeasured(self) -> str:
@@ -152,11 +152,11 @@ class EventRow:
 
     def quantity(self, name: str) -> tuple[float, float, float]:
         """Return estimate and 68 % interval of a measured quantity; NaN if it is not measured."""
-        one = self.measured
-        if isinstance(one, str) or name not in one.names:
+        fit = self.measured
+        if isinstance(fit, str) or name not in fit.names:
             return (float("nan"),) * 3
-        k = one.column(name)
-        return float(one.estimates[0, k]), float(one.low[0, 0, k]), float(one.high[0, 0, k])
+        k = fit.column(name)
+        return float(fit.estimates[0, k]), float(fit.low[0, 0, k]), float(fit.high[0, 0, k])
 
     def time_d(self, frame: int) -> float:
         """Return the time of a searched frame, in days."""
@@ -224,10 +224,10 @@ class EventRow:
     @cached_property
     def colour(self) -> tuple[float, float, float]:
         """Blue over red rise with its error, and the p-value of an event without colour; NaN in a light curve."""
-        found = self.analysis.colour(self.event)
-        if found is None:
+        colour = self.analysis.colour(self.event)
+        if colour is None:
             return (float("nan"),) * 3
-        return found.blue_over_red, found.blue_over_red_error, found.p_value
+        return colour.blue_over_red, colour.blue_over_red_error, colour.p_value
 
     @property
     def note(self) -> str:
@@ -516,14 +516,14 @@ class AnalyseAnswer(Answer):
 
     @property
     def _event_views(self) -> list[View]:
-        one = self.analysis
-        wanted = f"{one.wanted:.3g} false alarms per star-day"
-        if not one.events:
-            title = f"Nothing above {one.candidates:.2f} in {one.days:.3g} star-days of {one.frames.name} ({wanted})."
-            return [View(title)]
+        analysis = self.analysis
+        where = f"in {analysis.days:.3g} star-days of {analysis.frames.name}"
+        wanted = f"{analysis.wanted:.3g} false alarms per star-day"
+        if not analysis.events:
+            return [View(f"Nothing above {analysis.candidates:.2f} {where} ({wanted}).")]
         title = (
-            f"Events in {one.days:.3g} star-days of {one.frames.name}; detected above {one.threshold:.2f} ({wanted}), "
-            f"candidates above {one.candidates:.2f}"
+            f"Events {where}; detected above {analysis.threshold:.2f} ({wanted}), "
+            f"candidates above {analysis.candidates:.2f}"
         )
         views = [AnalyseAnswer.events.view(self, title)]
         if len(self.measured):

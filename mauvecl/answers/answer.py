@@ -141,7 +141,7 @@ class Answer(Drawable, ContentEquality, ABC):
 
     def _declared(self) -> list[TableOf]:
         """Return the declarations of the tables that the answer has."""
-        return [one for one in vars(type(self)).values() if isinstance(one, TableOf) and one.when(self)]
+        return [table for table in vars(type(self)).values() if isinstance(table, TableOf) and table.when(self)]
 
     @property
     def tables(self) -> dict[str, Table]:

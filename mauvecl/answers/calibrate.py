@@ -183,22 +183,22 @@ class CalibrateAnswer(Answer):
             ("bias", float(d.bias_dn.mean()), float(d.bias_error.mean()), n.bias_dn, "DN", "bias" not in assumed),
             ("gain", t.noise.gain, t.gain_error, n.gain_dn_per_electron, "DN / electron", "gain" not in assumed),
             ("read noise", t.read_noise_dn, t.read_noise_error, n.read_noise_dn, "DN", "read noise" not in assumed),
-            *((name, found.value if found else usual, found.error if found else np.nan, usual, "nm", found is not None)
-              for name, found, usual in (
+            *((name, fit.value if fit else usual, fit.error if fit else np.nan, usual, "nm", fit is not None)
+              for name, fit, usual in (
                   ("wavelength shift", f.shift_nm, 0.0), ("wavelength stretch", f.stretch_nm, 0.0),
                   ("line width", f.fwhm_nm, n.gaussian_fwhm_nm),
                   ("line width, change to the red", f.fwhm_change_nm, 0.0))),
         ]  # fmt: skip
-        return [Fitted(name, value, error if known else float("nan"), usual, unit, known)
-                for name, value, error, usual, unit, known in rows]  # fmt: skip
+        return [Fitted(name, value, error if is_fitted else float("nan"), usual, unit, is_fitted)
+                for name, value, error, usual, unit, is_fitted in rows]  # fmt: skip
 
     @property
     def _fits(self) -> list[dict[str, Any]]:
         fits: dict[str, ThroughputFit | DarkFit | PhotonTransfer] = {
             "throughput": self.throughput, "dark current": self.dark, "photon transfer": self.transfer
         }  # fmt: skip
-        return [{"name": name, "chi2": one.chi2, "dof": float(one.dof), "p_value": one.p_value}
-                for name, one in fits.items() if one.dof > 0]  # fmt: skip
+        return [{"name": name, "chi2": fit.chi2, "dof": float(fit.dof), "p_value": fit.p_value}
+                for name, fit in fits.items() if fit.dof > 0]  # fmt: skip
 
     @cached_property
     def nominal_throughput(self) -> NDArray[np.float64]:
@@ -311,29 +311,29 @@ class CalibrateAnswer(Answer):
     def changes(self) -> dict[str, Any]:
         """Plain values of the fitted instrument by name."""
         n, d, t, f = self.nominal, self.dark, self.transfer, self.throughput
-        found: dict[str, Any] = {}
+        values: dict[str, Any] = {}
         if "dark current" not in d.assumed:
-            found["dark_slope_per_c"] = d.slope_per_c
-            found["dark_scale_dn_per_s"] = float(np.mean(d.level_dn_per_s) * np.exp(-d.slope_per_c * d.reference_c))
-            found["bias_dn"] = float(d.bias_dn.mean())
+            values["dark_slope_per_c"] = d.slope_per_c
+            values["dark_scale_dn_per_s"] = float(np.mean(d.level_dn_per_s) * np.exp(-d.slope_per_c * d.reference_c))
+            values["bias_dn"] = float(d.bias_dn.mean())
         if "gain" not in t.assumed:
             volts = n.adc_range_v / 2**n.adc_bits
-            found |= {"conversion_uv_per_electron": float(t.noise.gain * volts * 1e6), "read_noise_dn": t.read_noise_dn,
-                      "dark_unit": t.dark_unit}  # fmt: skip
+            values["conversion_uv_per_electron"] = float(t.noise.gain * volts * 1e6)
+            values |= {"read_noise_dn": t.read_noise_dn, "dark_unit": t.dark_unit}
         if f.shift_nm is not None and f.stretch_nm is not None:
             # A feature is found at a pixel whose nominal wavelength is too small by the shift.
             half = np.ptp(f.wavelength_nm) / 2
-            found["dispersion_nm_per_pixel"] = n.dispersion_nm_per_pixel * (1 + f.stretch_nm.value / half)
+            values["dispersion_nm_per_pixel"] = n.dispersion_nm_per_pixel * (1 + f.stretch_nm.value / half)
             first = n.pixel_zero_nm - f.wavelength_nm.mean()
-            found["pixel_zero_nm"] = n.pixel_zero_nm + f.shift_nm.value + f.stretch_nm.value * first / half
+            values["pixel_zero_nm"] = n.pixel_zero_nm + f.shift_nm.value + f.stretch_nm.value * first / half
             # The pixels that were observed stay those that are read.
-            step, read = found["dispersion_nm_per_pixel"], n.read_pixels
-            lowest, highest = (found["pixel_zero_nm"] + step * end for end in (read.start - 0.5, read.stop - 0.5))
-            found["output_min_nm"] = max(n.output_min_nm, float(lowest))
-            found["output_max_nm"] = min(n.output_max_nm, float(highest))
+            step, read = values["dispersion_nm_per_pixel"], n.read_pixels
+            lowest, highest = (values["pixel_zero_nm"] + step * end for end in (read.start - 0.5, read.stop - 0.5))
+            values["output_min_nm"] = max(n.output_min_nm, float(lowest))
+            values["output_max_nm"] = min(n.output_max_nm, float(highest))
         if f.fwhm_nm is not None:
-            found["gaussian_fwhm_nm"] = f.fwhm_nm.value
-        return found
+            values["gaussian_fwhm_nm"] = f.fwhm_nm.value
+        return values
 
     @cached_property
     def instrument_tables(self) -> dict[str, Table]:
@@ -524,14 +524,14 @@ def _observations(
     )
     sources = stars or tuple(observation.source() for observation in asked.observations)
     observations = tuple(
-        CalibrationFrames.of(given, nominal, star, one.temperature_c)
-        for given, star, one in zip(read, sources, asked.observations, strict=True)
+        CalibrationFrames.of(given, nominal, star, source.temperature_c)
+        for given, star, source in zip(read, sources, asked.observations, strict=True)
     )
-    for k, one in enumerate(observations):
-        if not one.usable(nominal).any():
-            raise InputError.of("observations", one.name, "frames with a pixel below saturation")
-        if any(np.array_equal(one.raw_dn, other.raw_dn) for other in observations[:k]):
-            raise InputError.of("observations", one.name, "frames that no other observation has")
+    for k, observation in enumerate(observations):
+        if not observation.usable(nominal).any():
+            raise InputError.of("observations", observation.name, "frames with a pixel below saturation")
+        if any(np.array_equal(observation.raw_dn, other.raw_dn) for other in observations[:k]):
+            raise InputError.of("observations", observation.name, "frames that no other observation has")
     return nominal, observations
 
 
@@ -539,7 +539,7 @@ def _variances(
     observations: tuple[CalibrationFrames, ...], dark: DarkFit, nominal: Instrument
 ) -> list[MeasuredVariance]:
     """Measure the variances of all observations, of dark frames apart for each temperature."""
-    found = []
+    variances = []
     for observation in observations:
         usable = observation.usable(nominal)
         breaks = np.flatnonzero(np.abs(np.diff(observation.temperature_c)) > SAME_TEMPERATURE_C) + 1
@@ -549,5 +549,5 @@ def _variances(
             same = replace(observation, raw_dn=observation.raw_dn[part], temperature_c=observation.temperature_c[part])
             mean = dark.mean_dn(same)
             light = np.zeros(mean.size) if observation.star is None else same.raw_dn.mean(axis=0) - mean
-            found.append(measured_variance(same.raw_dn, light, mean - dark.bias_dn, usable))
-    return found
+            variances.append(measured_variance(same.raw_dn, light, mean - dark.bias_dn, usable))
+    return variances

@@ -307,11 +307,13 @@ def _changes(case: Case, file: Source | None) -> list[ChangeRow]:
     unit = smallest_change(1.0, study.change.visits, study.run.fap, study.limit.power)
     rows = []
     for name in study.change.of:
-        one = Change.named(name, case.source, quiet, case.instrument, study.observation.order, file, study.change.band)
-        error, known = error_of_change(one.counts_dn, quiet, unknown), error_of_change(one.counts_dn, quiet, None)
-        smallest = Smallest(one.size(error * unit.one), one.size(error * unit.scatter))
-        lost, own = pixels_of(one.counts_dn, quiet), (one.size(error), one.size(known))
-        rows.append(ChangeRow(case.label, case.at, one, *own, smallest, case.star.magnitude, lost))
+        change = Change.named(
+            name, case.source, quiet, case.instrument, study.observation.order, file, study.change.band
+        )
+        error, known_error = (error_of_change(change.counts_dn, quiet, unknowns) for unknowns in (unknown, None))
+        smallest = Smallest(change.size(error * unit.one), change.size(error * unit.scatter))
+        lost, own = pixels_of(change.counts_dn, quiet), (change.size(error), change.size(known_error))
+        rows.append(ChangeRow(case.label, case.at, change, *own, smallest, case.star.magnitude, lost))
     return rows
 
 
@@ -320,12 +322,12 @@ def _indices(case: Case) -> list[IndexRow]:
     rows = []
     for index in covered_indices(quiet):
         value = IndexValue.of(index, quiet, case.instrument, case.study.observation.order)
-        error, known = (error_of_index(value.weights, quiet, one) for one in (unknown, None))
+        error, known_error = (error_of_index(value.weights, quiet, nuisances) for nuisances in (unknown, None))
         lost = pixels_of(value.weights, quiet)
         if lost[0]:
             value = replace(value, value=np.nan, equivalent_width_nm=np.nan)
         flux = flux_per_dn(quiet, case.instrument) * quiet.signal_dn
-        rows.append(IndexRow(case.label, case.at, value, error, known, quiet.wavelength_nm, flux, lost))
+        rows.append(IndexRow(case.label, case.at, value, error, known_error, quiet.wavelength_nm, flux, lost))
     return rows
 
 

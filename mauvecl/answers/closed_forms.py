@@ -61,14 +61,14 @@ def unknown_cost(
     if unknown is None or not delta.any():
         return Cost(of, 0.0, 0.0, 0.0)
     weights = matched.plain_weights(plain, flare)
-    known = float(weights @ delta)
+    known_snr = float(weights @ delta)
     spread = scatter(unknown, usual=chosen.usual) * np.abs(unknown.spectra @ weights)
     try:
         marginal = matched.weights_per_dn(Setting(quiet, used, comparison, nuisances=unknown), flare)
     except InputError:
         # The flare has the spectrum of an unknown.
         marginal = np.zeros_like(weights)
-    return Cost(of, known, float(known / np.sqrt(1.0 + np.sum(spread**2))), float(marginal @ delta))
+    return Cost(of, known_snr, float(known_snr / np.sqrt(1.0 + np.sum(spread**2))), float(marginal @ delta))
 
 
 def scatter(unknown: Nuisances, *, usual: bool) -> NDArray[np.float64]:
@@ -111,7 +111,7 @@ def spoken(choice: NuisanceChoice) -> str:
     sd: dict[str, float | str] = {row.name: row.prior.sd for row in documented if row.prior is not None}
     sd |= choice.spreads()
     sizes = [f"{NUISANCES[name].label} ({_size(value, NUISANCES[name].unit)})" for name, value in sd.items()]
-    return join_names(sizes + [f"{name!r} ({_size(one.sd, '')})" for name, one in choice.own.items()])
+    return join_names(sizes + [f"{name!r} ({_size(spectrum.sd, '')})" for name, spectrum in choice.own.items()])
 
 
 def _size(sd: float | str, unit: str) -> str:
@@ -139,10 +139,10 @@ def chance_with_unknowns(prepared: Sequence[Case]) -> list[str]:
     if study.nuisances != NuisanceChoice() or study.run.comparison().estimated:
         return []
     flares = [(case, flare) for case in prepared for flare in range(len(case.amplitudes))][:MAX_FLARES]
-    known = {item: chance for item in flares if (chance := _chance(*item)) is not None}
-    if not known:
+    chances = {item: chance for item in flares if (chance := _chance(*item)) is not None}
+    if not chances:
         return []
-    case, flare = min(known, key=lambda item: abs(known[item] - 0.5))
+    case, flare = min(chances, key=lambda item: abs(chances[item] - 0.5))
     of = f"{case.label}, flare of {100 * case.amplitudes[flare]:g} %"
     try:
         unknown = _chance(case.with_sections(nuisances=NuisanceChoice(usual=True)), flare)
@@ -153,7 +153,7 @@ def chance_with_unknowns(prepared: Sequence[Case]) -> list[str]:
         return []
     text = (
         f"Everything but the noise is taken as known: {of} is then detected by the matched statistic with a chance of "
-        f"{100 * known[case, flare]:.1f} %, with the usual unknowns of {100 * unknown:.1f} % (closed forms; "
+        f"{100 * chances[case, flare]:.1f} %, with the usual unknowns of {100 * unknown:.1f} % (closed forms; "
         f"`nuisances.usual` draws them). These are {spoken(NuisanceChoice(usual=True))}."
     )
     return [Message(text, BOTH_CHANCES)]
@@ -209,10 +209,10 @@ def drawn(study: Study) -> DrawnStudies:
         changes: dict[str, Any] = {}
         at = nominal
         for name, value in zip(priors, row, strict=True):
-            one = rows[name].changes(at, float(value))
-            changes |= one
+            change = rows[name].changes(at, float(value))
+            changes |= change
             # The next mode is added to those before it.
-            at = at.model_copy(update=one) if isinstance(rows[name], ThroughputMode) else at
+            at = at.model_copy(update=change) if isinstance(rows[name], ThroughputMode) else at
         changed = certain.with_instrument(changes)
         try:
             nominal.with_(**changes)
@@ -232,7 +232,7 @@ def throughput_cases(case: Case) -> list[Case]:
     for mode in values_of(case.instrument).values():
         if isinstance(mode, ThroughputMode):
             signs = (replace(case, study=case.study.with_instrument(mode.changes(case.instrument, x))) for x in (1, -1))
-            same = next((one for one in signs if one.instrument.read_pixels == pixels), None)
+            same = next((sign for sign in signs if sign.instrument.read_pixels == pixels), None)
             if same is None:
                 raise InputError(
                     "an error of the calibrated wavelengths changes the pixels of the output range",
@@ -246,8 +246,8 @@ def throughput_cases(case: Case) -> list[Case]:
 def _unknown_priors(study: Study, nominal: Instrument) -> dict[str, Prior]:
     """Return the priors of unknown values of a study's instrument; values that the study sets are known."""
     o = study.observation
-    known = {*o.changes, *(() if o.temperature_c is None else ("temperature_c",))}
-    priors = {name: prior for name, prior in study.unknowns.priors(nominal).items() if name not in known}
+    fixed = {*o.changes, *(() if o.temperature_c is None else ("temperature_c",))}
+    priors = {name: prior for name, prior in study.unknowns.priors(nominal).items() if name not in fixed}
     if study.unknowns.draws and not priors:
         raise InputError("no instrument value is unknown", "a prior, or unknowns.draws = 0", key="unknowns.draws")
     return priors
@@ -286,8 +286,8 @@ def shares(draws: DrawnStudies, outcome: Float) -> dict[str, float]:
     draws : DrawnStudies
     outcome : ndarray, shape (n_draw,)
     """
-    names, kept = draws.names, np.isfinite(outcome)
-    x, y = draws.values[kept], outcome[kept]
+    names, finite = draws.names, np.isfinite(outcome)
+    x, y = draws.values[finite], outcome[finite]
     if len(y) <= x.shape[1] + 1 or y.std() == 0.0:
         return dict.fromkeys((*names, REST), float("nan"))
     scaled = (x - x.mean(axis=0)) / x.std(axis=0)
@@ -344,9 +344,9 @@ class InterpolatedForm:
         at = np.linspace(form.mean - 5 * form.std, form.mean + 6 * form.std, 14)
         beyond = np.array([form.sf(value) for value in at])
         # Probabilities that round to 0 or 1 have no finite probit.
-        kept = (beyond > 1e-12) & (beyond < 1 - 1e-12)
-        self._probit = PchipInterpolator(at[kept], special.ndtri(beyond[kept]), extrapolate=True)
-        self._inverse = PchipInterpolator(-special.ndtri(beyond[kept]), at[kept], extrapolate=True)
+        inside = (beyond > 1e-12) & (beyond < 1 - 1e-12)
+        self._probit = PchipInterpolator(at[inside], special.ndtri(beyond[inside]), extrapolate=True)
+        self._inverse = PchipInterpolator(-special.ndtri(beyond[inside]), at[inside], extrapolate=True)
 
     def sf(self, value: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the probabilities of exceeding values."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
@@ -206,7 +206,7 @@ def detect(
             # Meanwhile, the devices count the next star.
             paper = _paper(prepared)
         stars.append(star)
-    costs = [text for case, one in zip(prepared, stars, strict=True) for text in _template_costs(case, one)]
+    costs = [text for case, star in zip(prepared, stars, strict=True) for text in _template_costs(case, star)]
     answer = DetectAnswer(study, stars)
     blinding = [message.about(star.title) for star in stars for message in star.detection.messages]
     blinding += [message.about(star.title) for star in stars for message in star.detection.without_threshold(run.fap)]
@@ -274,10 +274,10 @@ def _template_costs(case: Case, star: StarDetection) -> list[str]:
     for temperature in case.study.run.template_temperatures_k:
         right = Matched().closed_form(detection.setting, detection.flares[0], detection.flares[0]).mean
         name = f"matched {temperature:g} K"
-        kept = detection.closed_form(name, 0).mean / detection.closed_form(name).std / right if right else 0.0
+        share = detection.closed_form(name, 0).mean / detection.closed_form(name).std / right if right else 0.0
         lines.append(
             f"{star.label}: looking for a flare of {temperature:g} K in one of {light} keeps "
-            f"{100 * kept:.1f} % of the matched statistic's S/N."
+            f"{100 * share:.1f} % of the matched statistic's S/N."
         )
     return lines
 
@@ -303,15 +303,15 @@ def _wanted(asked: CampaignQuestion, tests: int, stack: int, seed: int) -> list[
     """Return sentences on the false-alarm probability per test for the campaign's wanted values."""
     lines = []
     if asked.fap is not None and asked.frames is not None:
-        one = per_test(asked.fap, asked.frames, stack, step=asked.step, seed=seed)
+        rate = per_test(asked.fap, asked.frames, stack, step=asked.step, seed=seed)
         text = (
             f"For a chance of {asked.fap:g} of any false alarm in the campaign each of its {tests} tests may have "
-            f"{one.independent:.4g} if they are independent, {one.at_least:.4g} in any case"
+            f"{rate.independent:.4g} if they are independent, {rate.at_least:.4g} in any case"
         )
-        if one.overlapping is not None:
-            o = one.overlapping
+        if rate.overlapping is not None:
+            o = rate.overlapping
             text += f", and with the overlap of its stacks {o.value:.3g} [{o.low:.3g}, {o.high:.3g}]"
-        lines.append(f"{text}: `fap={one.at_least:.4g}`.")
+        lines.append(f"{text}: `fap={rate.at_least:.4g}`.")
     if asked.alarms is not None:
         if not asked.alarms < tests:
             raise InputError(
@@ -426,8 +426,8 @@ class UnknownAnswer(Answer):
         return list(self.quiets)
 
 
-def unknown_table(study: Study, unknowns: Mapping[str, NuisanceChoice] = SHOWN) -> UnknownAnswer:
-    """Compute the S/N of a study's flares under each of several unknowns, which are given by name."""
+def unknown_table(study: Study) -> UnknownAnswer:
+    """Compute the S/N of a study's flares under each of the unknowns of `SHOWN`."""
     costs: dict[tuple[str, float], dict[str, Cost]] = {}
     quiets = []
     comparison = study.run.comparison()
@@ -436,7 +436,7 @@ def unknown_table(study: Study, unknowns: Mapping[str, NuisanceChoice] = SHOWN) 
         for amplitude, flare in zip(case.amplitudes, case.flares, strict=True):
             costs[case.label, amplitude] = {
                 unknown: unknown_cost(case.label, case.quiet, flare, choice, comparison)
-                for unknown, choice in unknowns.items()
+                for unknown, choice in SHOWN.items()
             }
     return UnknownAnswer(study, costs, tuple(quiets))
 

@@ -84,12 +84,12 @@ def coverage(result: SnrResult) -> NDArray[np.float64]:
     """
     seen = result.observers[: result.scene.n_pixel]
     signal = result.expectation.light_dn
-    gain, known = seen["gain"].astype(float), seen["variance"].astype(float)
+    gain, variance = seen["gain"].astype(float), seen["variance"].astype(float)
     # Ends of the observed signals whose interval reaches the true one: net -+ sqrt(gain max(net, 0) + known) = signal.
-    root = np.sqrt(gain**2 / 4 + gain * signal + known)
+    root = np.sqrt(gain**2 / 4 + gain * signal + variance)
     high = signal + gain / 2 + root
     low = signal + gain / 2 - root
-    low = np.where(low < 0, signal - np.sqrt(known), low)
+    low = np.where(low < 0, signal - np.sqrt(variance), low)
     width = 2.0 ** seen["bin_shift"].astype(float)
     shares = np.empty(signal.size)
     for p in range(signal.size):

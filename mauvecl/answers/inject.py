@@ -377,18 +377,18 @@ def _completeness(case: Case, engine: Stares | Pool, report: Callable[[float], N
     """Inject flares into the stare of a case and search for them; `report` receives the share that is done."""
     choice, asked, seed = case.study.search, case.study.injections, case.study.run.seed
     processes = case.study.processes.additive_only
-    known = survey_star(case)
-    survey = known.survey
+    star = survey_star(case)
+    survey = star.survey
     drawn, tail, threshold = _threshold(case, survey, engine)
     sizes = Sizes.chosen(case)
-    values = injected_sizes(case, sizes, known.unit_snr, threshold.value)
+    values = injected_sizes(case, sizes, star.unit_snr, threshold.value)
     positions = min(asked.positions, asked.count)
     injections = Injections(
         survey, 0, asked.half_widths_s, threshold.value, seed, positions, -(-asked.count // positions), processes
     )
     widths = np.array(injections.half_widths_s)
     amplitudes = np.asarray(sizes.amplitude(values[None], widths[:, None]))
-    refit = Refit(known.fit, amplitudes, case.study.flare.temperature_k, -(-asked.fitted // positions))
+    refit = Refit(star.fit, amplitudes, case.study.flare.temperature_k, -(-asked.fitted // positions))
 
     def at_one_peak(position: int) -> Arrays:
         return _reduced(engine, injections.request(position, refit if refit.count else None))
@@ -406,7 +406,7 @@ def _completeness(case: Case, engine: Stares | Pool, report: Callable[[float], N
     return StarCompleteness(
         case.label,
         case.at,
-        known,
+        star,
         sizes,
         threshold,
         simulated,

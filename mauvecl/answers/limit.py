@@ -232,7 +232,7 @@ def _unknown_columns(digits: str) -> tuple[Column, ...]:
 
 
 def _draw_columns(answer: LimitAnswer) -> tuple[Column, ...]:
-    draws = next(one.unknown.draws for one in answer.limits if one.unknown is not None)
+    draws = next(limit.unknown.draws for limit in answer.limits if limit.unknown is not None)
     values = (column.of(attrgetter("unknown")) for column in draw_columns(draws))
     limit = Column(answer.study.limit.of, "unknown.limits", description="closed-form limit")
     return (*answer.flare_columns, *values, limit)
@@ -405,10 +405,10 @@ def limit(
         return outcome
 
     outcomes = list(map_in_order(engine, solved, range(len(asked))))
-    errors = [one for one in outcomes if isinstance(one, InputError)]
+    errors = [outcome for outcome in outcomes if isinstance(outcome, InputError)]
     if len(errors) == len(outcomes):
         raise errors[0]
-    result.limits.extend(one for one in outcomes if isinstance(one, Limit))
+    result.limits.extend(outcome for outcome in outcomes if isinstance(outcome, Limit))
     result.failed = tuple(dict.fromkeys(map(str, errors)))
     return result
 

@@ -99,13 +99,13 @@ class LimitSearch:
     def theory(self, value: float) -> float:
         """Return the detection probability for Gaussian noise; 0 if every pixel saturates."""
         quiet, flare = self.scaled(value)
-        setting, one = self.case.setting(quiet, flare), STATISTICS[self.statistic]
+        setting, statistic = self.case.setting(quiet, flare), STATISTICS[self.statistic]
         if not setting.used.any():
             return 0.0
-        one.check(setting)
-        if one.shaped and not flare.saturated[setting.used].all():
+        statistic.check(setting)
+        if statistic.shaped and not flare.saturated[setting.used].all():
             check_shape(quiet, flare, setting.used)
-        return one.detection_forms(setting, flare, self.fap).probability
+        return statistic.detection_forms(setting, flare, self.fap).probability
 
     def simulated(self, value: float, seed: int) -> Interval:
         """Simulate the detection probability and return it with its interval."""
@@ -193,11 +193,11 @@ class LimitSearch:
     def sign_clause(self, value: float) -> str:
         """Return the clause of an error message on a weighted sum that the flare lowers at a value."""
         quiet, flare = self.scaled(value)
-        setting, one = self.case.setting(quiet, flare), STATISTICS[self.statistic]
-        if not isinstance(one, LinearStatistic) or not setting.used.any() or flare.saturated[setting.used].all():
+        setting, statistic = self.case.setting(quiet, flare), STATISTICS[self.statistic]
+        if not isinstance(statistic, LinearStatistic) or not setting.used.any() or flare.saturated[setting.used].all():
             return ""
-        shape = flare if one.shaped else None
-        falls = fall_between(*(one.closed_form(setting, x, shape) for x in (quiet, flare)))
+        shape = flare if statistic.shaped else None
+        falls = fall_between(*(statistic.closed_form(setting, x, shape) for x in (quiet, flare)))
         if not falls:
             return ""
         return (

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from mauvecl.study.sections import Run
 
 #: Quantities of the flare alone: cells that differ in them share their quiescent star, and one launch.
-OF_FLARE = tuple(name for name, one in QUANTITIES.items() if one.path[0] == "flare")
+OF_FLARE = tuple(name for name, quantity in QUANTITIES.items() if quantity.path[0] == "flare")
 
 
 #: Columns of the table of cells, after those of the two axes.

@@ -64,8 +64,8 @@ class MeasuredFlare(ExpectedMeasurement):
 
     def fitted_dn(self) -> tuple[Float, Float]:
         """Return the mean of the fitted flare in the first exposure, and the best values of unknowns, DN."""
-        found = self.found
-        mean = self.fitted.counts(np.exp(found.log_k[0]), found.factor[0] * found.amplitudes[0])
+        measurement = self.found
+        mean = self.fitted.counts(np.exp(measurement.log_k[0]), measurement.factor[0] * measurement.amplitudes[0])
         if self.unknown is None:
             return mean, np.zeros_like(mean)
         unknown, expected = self.unknown.around(mean), self.unknown.mean_dn
@@ -276,7 +276,7 @@ def measure(
         flares += some
     stares = [measured_stare(case, engine) for case in prepared if study.measure.along_stare]
     messages = collect_messages(expectations)
-    messages += [one.drawn for one in stares if isinstance(one.drawn, str)]
+    messages += [stare.drawn for stare in stares if isinstance(stare.drawn, str)]
     messages += dict.fromkeys(line for case in prepared for line in _not_marginalised(case))
     return MeasureAnswer(study, flares, [*messages, *_faint(flares), *_wrong(flares)], stares)
 
@@ -285,7 +285,7 @@ def _measured(case: Case, amplitude: float, flare: Expectation, engine: Engine |
     """Fit all models to simulated exposures of a flare."""
     study, quiet = case.study, case.quiet
     expected = expected_measurements(case, amplitude, flare)
-    models, unknown = [one.fitted for one in expected], expected[0].unknown
+    models, unknown = [forecast.fitted for forecast in expected], expected[0].unknown
     skipped = study.measure.skipped_nm
     weights = matched_filter(quiet, flare, case.unknowns(), skipped_nm=skipped)[0]
 
@@ -294,8 +294,8 @@ def _measured(case: Case, amplitude: float, flare: Expectation, engine: Engine |
         excess = raw - quiet.recorded_dn
         arrays: Arrays = {"first": excess[0], "detected": excess @ weights >= scipy.stats.norm.isf(study.run.fap)}
         for k, model in enumerate(models):
-            found = fit_model(raw, quiet, model, unknown, skipped)
-            arrays |= {f"{k} {key}": value for key, value in found.arrays().items()}
+            measurement = fit_model(raw, quiet, model, unknown, skipped)
+            arrays |= {f"{k} {key}": value for key, value in measurement.arrays().items()}
         return arrays
 
     checkpoint = engine.checkpoint if isinstance(engine, Pool) else None
@@ -307,20 +307,20 @@ def _measured(case: Case, amplitude: float, flare: Expectation, engine: Engine |
         parts.append(kept(checkpoint, depends_on, partial(fitted, start, count)))
     selected = np.concatenate([arrays["detected"] for arrays in parts])
     measured = []
-    for k, one in enumerate(expected):
+    for k, forecast in enumerate(expected):
         own = [{key.removeprefix(f"{k} "): x for key, x in part.items() if key.startswith(f"{k} ")} for part in parts]
-        model = one.fitted
+        model = forecast.fitted
         of_batch = partial(
             Measurement.of_arrays, levels=LEVELS, names=model.names, units=model.units, bounds=model.bounds
         )
-        found = Measurement.joined(list(map(of_batch, own)))
-        measured.append(MeasuredFlare(**vars(one), found=found, selected=selected, frame=parts[0]["first"]))
+        measurement = Measurement.joined(list(map(of_batch, own)))
+        measured.append(MeasuredFlare(**vars(forecast), found=measurement, selected=selected, frame=parts[0]["first"]))
     return measured
 
 
-def _coverage(found: Measurement, truth: Float, level: int, which: NDArray[np.bool_]) -> Float:
+def _coverage(measurement: Measurement, truth: Float, level: int, which: NDArray[np.bool_]) -> Float:
     """Return coverage and its 95 % interval for each quantity, shape (3, n_derived); NaN without a truth."""
-    inside = (found.low[level] <= truth) & (truth <= found.high[level])
+    inside = (measurement.low[level] <= truth) & (truth <= measurement.high[level])
     cover = np.full((3, truth.size), np.nan)
     n = int(which.sum())
     for q in np.flatnonzero(np.isfinite(truth)) if n else ():
@@ -352,11 +352,11 @@ def _not_marginalised(case: Case) -> list[str]:
 
 def _faint(flares: Sequence[MeasuredFlare]) -> list[str]:
     """Return a message for each flare whose intervals are approximate because it is faint."""
-    found = {f"{flare.title}, flare of {100 * flare.amplitude:g} %": flare.snr[1] for flare in flares}
+    snr_of = {f"{flare.title}, flare of {100 * flare.amplitude:g} %": flare.snr[1] for flare in flares}
     return [
         f"{title}: of an S/N of {snr:.2g} with unknowns marginalised over; below {WILKS_SNR:g} intervals of 95 % cover "
         "93 to 99 %: the table counts how often they do."
-        for title, snr in found.items()
+        for title, snr in snr_of.items()
         if snr < WILKS_SNR
     ]
 

@@ -132,8 +132,8 @@ class Truth:
             (self._light.fractions, self._scale * self._light.continuum_flux),
             (self._light.fluxes_cgs, 1.0),
         ):
-            for one, value in mapping.items():
-                if EmissionLine.named(one).name == EmissionLine.named(name).name:
+            for line, value in mapping.items():
+                if EmissionLine.named(line).name == EmissionLine.named(name).name:
                     return factor * value
         return 0.0
 
@@ -226,8 +226,8 @@ class ExpectedMeasurement(InCell):
         ]  # fmt: skip
         # Dense at the ends, where the two amplitudes converge like a root.
         log_k = (ends[0] + ends[1]) / 2 + (ends[1] - ends[0]) / 2 * np.sin(np.linspace(-np.pi / 2, np.pi / 2, n))
-        left, found = at(log_k)
-        low, high = (found.end(left, sign)[0] for sign in (-1.0, 1.0))
+        left, ratio = at(log_k)
+        low, high = (ratio.end(left, sign)[0] for sign in (-1.0, 1.0))
         return np.exp(log_k), np.maximum(low, 0.0), high
 
 
@@ -280,14 +280,14 @@ def models_of(case: Case) -> dict[str, FlareModel | TwoTemperatures]:
     """Return the models that are fitted to exposures of a case, the simplest first."""
     asked = fitted_models(case.study.measure, case.study.flare)
     models = {name: model_of(case, jump=jump, lines=lines) for name, jump, lines in asked}
-    return {name: TwoTemperatures(one) if name == "two-temperatures" else one for name, one in models.items()}
+    return {name: TwoTemperatures(model) if name == "two-temperatures" else model for name, model in models.items()}
 
 
 def last_of_one_temperature(models: dict[str, FlareModel | TwoTemperatures]) -> tuple[str, FlareModel]:
     """Return the name and the model of the last one with a single temperature, or that of a blackbody."""
-    found = [(name, one) for name, one in models.items() if isinstance(one, FlareModel)]
-    if found:
-        return found[-1]
+    single = [(name, model) for name, model in models.items() if isinstance(model, FlareModel)]
+    if single:
+        return single[-1]
     (two,) = (model for model in models.values() if isinstance(model, TwoTemperatures))
     return "blackbody", two.single
 
@@ -300,7 +300,7 @@ def expected_measurements(
     band, skipped = case.study.flare.band, case.study.measure.skipped_nm
     truth = Truth(case.star, case.source, case.flaring(amplitude), light, band, quiet.exposure_s)
     lit = flare.recorded_dn - quiet.recorded_dn
-    known_snr, snr = (matched_filter(quiet, flare, one, lit, skipped)[1] for one in (None, case.unknowns()))
+    known_snr, snr = (matched_filter(quiet, flare, nuisances, lit, skipped)[1] for nuisances in (None, case.unknowns()))
     calibrated = throughput_cases(case)
     # A fit in few pixels may differ from the flare in those that saturate, which its errors must not use.
     lost = (*skipped, *_saturated_nm(flare))
@@ -308,7 +308,8 @@ def expected_measurements(
     for name, model in (models or models_of(case)).items():
         perfect = fit_model(_mean_exposure(quiet, lit, unknown), quiet, model, unknown, skipped)
         known, ahead = (
-            forecast_model(quiet, model, perfect.log_k[0], perfect.amplitudes[0], one, lost) for one in (None, unknown)
+            forecast_model(quiet, model, perfect.log_k[0], perfect.amplitudes[0], nuisances, lost)
+            for nuisances in (None, unknown)
         )
         true = np.array([truth.value(quantity) for quantity in model.names])
         of_throughput = None
@@ -478,16 +479,16 @@ def _joint_fit(case: Case, raw: Float, unknown: Nuisances | None) -> JointFit:
     """Fit a blackbody to the one flare of a stare; the search for the best fit starts from the true flare."""
     staring, (event,), model = case.stare_expectation, case.events, model_of(case.one_frame)
     quiet, stare, skipped = staring.quiet, staring.stare, case.study.measure.skipped_nm
-    found = fit_cooling(
+    measurement = fit_cooling(
         raw, quiet, model, unknown, peak_s=event.peak_s, half_width_s=event.half_width_s, shape=event.form,
         cooling=isinstance(event.temperature, Cooling), stare=stare, skipped_nm=skipped,
     )  # fmt: skip
     true, fitted = (
-        cooling_course(one, found, raw, quiet, model, stare, skipped)
-        for one in (event, cooling_event(found, event.form))
+        cooling_course(flare_event, measurement, raw, quiet, model, stare, skipped)
+        for flare_event in (event, cooling_event(measurement, event.form))
     )
     truth = true.values
     if not case.study.flare.is_blackbody:
         # Only the shape is that of the model.
         truth = np.where(np.arange(truth.size) < 2, truth, np.nan)
-    return JointFit(found, truth, true, fitted)
+    return JointFit(measurement, truth, true, fitted)

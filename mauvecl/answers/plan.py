@@ -211,9 +211,17 @@ class PlanAnswer(Answer):
             ("stars known by name", "V, spectral type",
              "V of the Hipparcos catalogue (variable stars to 0.2 mag), rounded types (to some two subtypes)"),
             ("spectra", "library", "the embedded spectrum of the nearest type stands for the star, scaled to its V"),
-            *((f"flare rates of {one.name}", one.rates.source, _measured(one)) for one in self.planned if one.rates),
+            *(
+                (f"flare rates of {target.name}", target.rates.source, _measured(target))
+                for target in self.planned
+                if target.rates
+            ),
             *(("where the satellite will be", "", text) for text in orbit.messages(self.seen.times)),
-            *((f"completeness of {one.name}", "", one.completeness.how) for one in self.planned if one.completeness),
+            *(
+                (f"completeness of {target.name}", "", target.completeness.how)
+                for target in self.planned
+                if target.completeness
+            ),
         ]  # fmt: skip
 
     @property
@@ -254,14 +262,14 @@ class PlanAnswer(Answer):
                 f"Flare rates of {', '.join(typical)} are those typical of their types at 1000 Myr: mass_msun and "
                 "age_myr, or their own rates, are more accurate."
             )
-        for one in self.planned:
-            if one.no_rates:
-                lines.append(f"{one.no_rates[0].upper()}{one.no_rates[1:]}; its expected flares are not given.")
-            if one.rates is not None and one.completeness is not None and one.extrapolated:
-                low, high = one.rates.measured_erg
+        for target in self.planned:
+            if target.no_rates:
+                lines.append(f"{target.no_rates[0].upper()}{target.no_rates[1:]}; its expected flares are not given.")
+            if target.rates is not None and target.completeness is not None and target.extrapolated:
+                low, high = target.rates.measured_erg
                 lines.append(
-                    f"E50 of {one.name}, {one.energy_at(0.5):.2g} erg, lies outside the {low:.2g} to {high:.2g} erg "
-                    "for which its flare rates are published: they are extrapolated."
+                    f"E50 of {target.name}, {target.energy_at(0.5):.2g} erg, lies outside the {low:.2g} to {high:.2g} "
+                    "erg for which its flare rates are published: they are extrapolated."
                 )
         study = self.study
         if study.plan.completeness == "closed form" and (study.stare.has_unknowns or study.nuisances.usual):
@@ -279,10 +287,12 @@ class PlanAnswer(Answer):
         return list(dict.fromkeys(lines))
 
 
-def _measured(one: Planned) -> str:
-    assert one.rates is not None
-    low, high = one.rates.measured_erg
-    return f"published for {low:.2g} to {high:.2g} erg, bolometric; scatter {one.rates.scatter_dex:g} dex (assumption)"
+def _measured(target: Planned) -> str:
+    assert target.rates is not None
+    low, high = target.rates.measured_erg
+    return (
+        f"published for {low:.2g} to {high:.2g} erg, bolometric; scatter {target.rates.scatter_dex:g} dex (assumption)"
+    )
 
 
 @validated
@@ -342,21 +352,21 @@ def plan(
             yield k, observe(base, text, star, seen, k, along)
 
     def planned_for(item: tuple[int, TargetObservation]) -> Planned:
-        k, one = item
+        k, target = item
         exposed = float(seen.visibility.hours[k])
         observed = exposed if study.plan.hours is None else min(exposed, study.plan.hours)
         order = np.argsort(-hours[:, k], kind="stable")[: study.plan.best_months]
         best = tuple(names[i] for i in sorted(order) if hours[i, k] > 0)
         its = None
-        if one.window_s > 0:
-            its = completeness(one) if one.signal_per_frame > 0 else NOTHING
-        rates, why = rates_of(study.plan.targets[k], one)
+        if target.window_s > 0:
+            its = completeness(target) if target.signal_per_frame > 0 else NOTHING
+        rates, why = rates_of(study.plan.targets[k], target)
         recovered = None
         if rates is not None:
             days = observed * 3600 / DAY_S
             recovered = Yield.of_expected(0.0, 0.0) if its is None else Yield.of(rates, its, days)
-        of_throughput = errors_of_throughput(one, rates)
-        return Planned(one, exposed, observed, its, rates, recovered, best, why, of_throughput)
+        of_throughput = errors_of_throughput(target, rates)
+        return Planned(target, exposed, observed, its, rates, recovered, best, why, of_throughput)
 
     # With a pool, the noise of a target is drawn while the threshold of the next one is sampled.
     planned = tuple(reported(map_in_order(engine, planned_for, observations()), len(stars), progress))
@@ -375,7 +385,7 @@ LEGEND = (
 
 def target_lines(answer: PlanAnswer, k: int) -> list[tuple[str, str, str]]:
     """Return the lines on a target: quantity, value, and the file and column of the value."""
-    one, observation = answer.planned[k], answer.planned[k].observation
+    target, observation = answer.planned[k], answer.planned[k].observation
     record = records(answer.table)[k]
     columns = PlanAnswer.table.columns_of(answer)
     said = {column.name: column.text(record) for column in columns if column.heading}
@@ -388,7 +398,7 @@ def target_lines(answer: PlanAnswer, k: int) -> list[tuple[str, str, str]]:
         ("V; distance", f"{observation.star.magnitude:g}; {observation.star.distance_pc:g} pc", "stars: V, distance"),
         ("seen; observed", f"{said['seen']} h; {said['hours']} h", "plan: seen, hours"),
     ]  # fmt: skip
-    if one.seen_h == 0:
+    if target.seen_h == 0:
         return [*lines, ("never seen", seen.reason(place.name), "assumptions")]
     away = seen.elongation_deg(k)
     lines += [
@@ -398,16 +408,16 @@ def target_lines(answer: PlanAnswer, k: int) -> list[tuple[str, str, str]]:
         ("detector; hits by particles", f"{observation.quiet.conditions['temperature_c']:.1f} deg C; "
          f"{observation.hits_per_cm2_s:.2f} per cm^2 and s", "stars: temperature, hits"),
         ("S/N of a frame at amplitude 1", f"{observation.signal_per_frame:.4g}", "stars: signal_per_frame"),
-        ("half of flares recovered from", energy(one.energy_at(0.5), " erg"), "plan: E50; energies: recovered"),
-        ("90 % of flares recovered from", energy(one.energy_at(0.9), " erg"), "plan: E90; energies: recovered"),
+        ("half of flares recovered from", energy(target.energy_at(0.5), " erg"), "plan: E50; energies: recovered"),
+        ("90 % of flares recovered from", energy(target.energy_at(0.9), " erg"), "plan: E90; energies: recovered"),
     ]  # fmt: skip
-    if one.recovered is not None:
+    if target.recovered is not None:
         lines += [
             ("flares recovered, expected", said["expected"], "plan: expected; stars: recovered_per_day"),
             ("95 % of campaigns", said["low"], "plan: low, high; stars: scatter"),
             ("probability of at least one", said["at_least_one"], "plan: at_least_one"),
         ]
     lines.append(("false alarms expected", said["false_alarms"], "plan: false_alarms"))
-    rates = one.no_rates if one.rates is None else one.rates.source
+    rates = target.no_rates if target.rates is None else target.rates.source
     lines.append(("flare rates", rates, "stars: rates; assumptions"))
     return lines

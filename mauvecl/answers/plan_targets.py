@@ -48,8 +48,8 @@ class Conditions:
 
     def swings(self, orbits: int, orbit_s: float) -> tuple[tuple[float, float], ...]:
         """Return the swing of N orbits."""
-        kept = [point for point in self.swing if point[0] < orbit_s]
-        return tuple((n * orbit_s + t, value) for n in range(orbits) for t, value in kept)
+        points = [point for point in self.swing if point[0] < orbit_s]
+        return tuple((n * orbit_s + t, value) for n in range(orbits) for t, value in points)
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,11 +220,11 @@ def star_of(text: PlanTarget, simbad: bool) -> Star:
 
     Raises InputError if its type, magnitude or distance is neither given nor known.
     """
-    known = text.target(simbad)
+    target = text.target(simbad)
     given: dict[str, Any] = {
-        "spectral_type": text.spectral_type or known.spectral_type,
-        "magnitude": known.magnitude if text.magnitude is None else text.magnitude,
-        "distance_pc": known.distance_pc if text.distance_pc is None else text.distance_pc,
+        "spectral_type": text.spectral_type or target.spectral_type,
+        "magnitude": target.magnitude if text.magnitude is None else text.magnitude,
+        "distance_pc": target.distance_pc if text.distance_pc is None else text.distance_pc,
     }
     missing = [name for name, value in given.items() if value is None]
     if missing:
@@ -293,14 +293,14 @@ def inject_target(observation: TargetObservation, engine: Stares | Pool | None =
         }
 
     depends_on = ("completeness of a target", question.text(), observation.quiet, observation.scale)
-    found = kept(engine.checkpoint if isinstance(engine, Pool) else None, depends_on, computed)
+    arrays = kept(engine.checkpoint if isinstance(engine, Pool) else None, depends_on, computed)
     how = (
         f"{question.injections.count} injections of each of {WIDTHS} half-widths into stretches of "
-        f"{observation.window_s / 60:.0f} min, found above {float(found['threshold']):.2f} sigma, "
+        f"{observation.window_s / 60:.0f} min, found above {float(arrays['threshold']):.2f} sigma, "
         f"{study.search.false_alarms:g} false alarms per {study.search.per}"
-        + (", allowing for unknowns that the search leaves in" if found["shifted"] else "")
+        + (", allowing for unknowns that the search leaves in" if arrays["shifted"] else "")
     )
-    return Completeness(energy, found["probability"], BOLOMETRIC, how)
+    return Completeness(energy, arrays["probability"], BOLOMETRIC, how)
 
 
 def injection_case(observation: TargetObservation) -> Case:
@@ -336,8 +336,8 @@ def found_by_energy(critical_erg: Float, half_widths_s: Float, energy_erg: Float
     energy_erg : ndarray, shape (n_energy,)
     """
     of_width = np.empty((half_widths_s.size, energy_erg.size))
-    for row, one in zip(of_width, critical_erg, strict=True):
-        counted = np.sort(one[one > 0])
+    for row, energies in zip(of_width, critical_erg, strict=True):
+        counted = np.sort(energies[energies > 0])
         row[:] = np.searchsorted(counted, energy_erg, side="right") / max(counted.size, 1)
     nodes, weights = np.polynomial.hermite_e.hermegauss(15)
     half = np.log(law.half_width(energy_erg)[:, None] * 10 ** (law.scatter_dex * nodes))

@@ -197,15 +197,15 @@ def _one(case: Case, snr: float, wavelength_nm: float, per: Per) -> tuple[Exposu
         # The frames may exceed one exposure.
         return replace(frame, n_frames=frames)
 
-    one = snr_at(after(1), wavelength_nm, per)
-    if not one > 0 or (snr / one) ** 2 * frame_s > LONGEST_S:
+    single = snr_at(after(1), wavelength_nm, per)
+    if not single > 0 or (snr / single) ** 2 * frame_s > LONGEST_S:
         raise InputError(
-            f"{case.one_frame.label} has an S/N of {one:.3g} per {per} at {wavelength_nm:g} nm in one frame",
+            f"{case.one_frame.label} has an S/N of {single:.3g} per {per} at {wavelength_nm:g} nm in one frame",
             f"enough for {snr:g} within {LONGEST_S:g} s{frame.saturation_clause}",
             key="signal.snr",
         )
     # S/N is proportional to the root of the number of frames, so only rounding has to be corrected.
-    frames = max(int(np.ceil((snr / one) ** 2)), 1)
+    frames = max(int(np.ceil((snr / single) ** 2)), 1)
     while frames > 1 and snr_at(after(frames - 1), wavelength_nm, per) >= snr:
         frames -= 1
     while snr_at(after(frames), wavelength_nm, per) < snr:
@@ -280,7 +280,7 @@ class SimulateAnswer(Answer):
     @property
     def tables(self) -> dict[str, Table]:
         """One per observation."""
-        return {f"observation-{n}": one.table for n, one in enumerate(self.observations, 1)}
+        return {f"observation-{n}": observation.table for n, observation in enumerate(self.observations, 1)}
 
     @property
     def inputs(self) -> list[Expectation]:

@@ -54,16 +54,16 @@ if TYPE_CHECKING:
 NO_TIME_MJD = 61_041.0
 
 
-def light_curve_file(one: StarStare, sky: SkyLight, *, seed: int, number: int) -> bytes:
+def light_curve_file(star: StarStare, sky: SkyLight, *, seed: int, number: int) -> bytes:
     """Return the FITS file of the stare of some number at a star; `sky` has its position and time."""
     from astropy.io import fits
 
-    primary, times = fits.PrimaryHDU(), _times(one.staring.stare, sky)
+    primary, times = fits.PrimaryHDU(), _times(star.staring.stare, sky)
     primary.header.update({
-        "OBJECT": (one.label, "star, simulated"),
+        "OBJECT": (star.label, "star, simulated"),
         "TELESCOP": ("Mauve", "simulated"),
-        "INSTRUME": (one.staring.quiet.instrument, ""),
-        "CCD-TEMP": (one.staring.quiet.conditions["temperature_c"], "[Celsius] detector, where nothing heats it"),
+        "INSTRUME": (star.staring.quiet.instrument, ""),
+        "CCD-TEMP": (star.staring.quiet.conditions["temperature_c"], "[Celsius] detector, where nothing heats it"),
         "CREATOR": (f"mauvecl {VERSION}", ""),
         "SEED": (str(seed), "of the draws"),
         "STARENO": (number, "number of the stare"),
@@ -73,11 +73,11 @@ def light_curve_file(one: StarStare, sky: SkyLight, *, seed: int, number: int) -
             place = parse_position(sky.target).icrs
         position = {"RA_OBJ": (place.ra.deg, "[deg]"), "DEC_OBJ": (place.dec.deg, "[deg]")}
         primary.header.update({"RADESYS": "ICRS", **position})
-    tables = [_table(one), _intervals(one)]
+    tables = [_table(star), _intervals(star)]
     for table in tables:
         table.header.update(times)
     content = io.BytesIO()
-    fits.HDUList([primary, *tables, *_spectra(one)]).writeto(content)
+    fits.HDUList([primary, *tables, *_spectra(star)]).writeto(content)
     return content.getvalue()
 
 
@@ -100,44 +100,44 @@ def _times(stare: Stare, sky: SkyLight) -> dict[str, tuple[str | float, str]]:
     }
 
 
-def _table(one: StarStare) -> fits.BinTableHDU:
+def _table(star: StarStare) -> fits.BinTableHDU:
     from astropy.io import fits
 
-    stare, light = one.staring.stare, one.light
+    stare, light = star.staring.stare, star.light
     columns: list[tuple[str, str, str | None, Any]] = [
         ("TIME", "D", "d", stare.middle_s / DAY_S),
         ("CADENCENO", "J", None, stare.numbers),
-        ("QUALITY", "J", None, one.staring.quality),
+        ("QUALITY", "J", None, star.staring.quality),
     ]
     for k, name in enumerate(light.bands):
         for kind, (attribute, _) in LIGHT.items():
             columns.append((kind.upper() + band_suffix(name, k), "E", "adu/s", getattr(light, attribute)[:, k]))
-    if one.pointing_loss is not None:
-        columns.append(("POINTING_LOSS", "E", None, one.pointing_loss))
+    if star.pointing_loss is not None:
+        columns.append(("POINTING_LOSS", "E", None, star.pointing_loss))
     made = [fits.Column(*about, array=values) for *about, values in columns]
     hdu = fits.BinTableHDU.from_columns(made, name="LIGHTCURVE")
     hdu.header["BANDS"] = ", ".join(light.bands)
     hdu.header["COMMENT"] = "FLUX: star and sky, bias and known dark taken off. MEAN: the same without noise."
     hdu.header["COMMENT"] = "TIME: middle of the frame, days after MJDREF. QUALITY 1: saturated pixels. 0: none."
-    if one.pointing_loss is not None:
-        lost = int(np.count_nonzero(one.pointing_loss))
+    if star.pointing_loss is not None:
+        lost = int(np.count_nonzero(star.pointing_loss))
         hdu.header["LOSTFRMS"] = (lost, "frames that lost light, assumed drifts")
         hdu.header["COMMENT"] = "POINTING_LOSS: share of all light lost in the frame, as drawn."
     return hdu
 
 
-def _intervals(one: StarStare) -> fits.BinTableHDU:
+def _intervals(star: StarStare) -> fits.BinTableHDU:
     from astropy.io import fits
 
-    start, stop = one.staring.stare.gtis.T / DAY_S
+    start, stop = star.staring.stare.gtis.T / DAY_S
     columns = [fits.Column(name="START", format="D", unit="d", array=start), fits.Column("STOP", "D", "d", array=stop)]
     return fits.BinTableHDU.from_columns(columns, name="GTI")
 
 
-def _spectra(one: StarStare) -> list[Any]:
+def _spectra(star: StarStare) -> list[Any]:
     from astropy.io import fits
 
-    light = one.light
+    light = star.light
     images = []
     for name, values in (("SPECTRUM", light.spectrum), ("SPECTRUM_ERR", light.spectrum_sd)):
         image = fits.ImageHDU(np.asarray(values, np.float32), name=name)
@@ -377,24 +377,24 @@ class StareAnswer(Answer):
         for stare in self.stares:
             if isinstance(stare.search, SearchResult):
                 above = f"{stare.search.threshold:.2f}, {self.study.search.rate_text}"
-                found = table_of(FOUND_COLUMNS, stare.found)
-                views.append(View(f"Found at {stare.title} above {above}", FOUND_COLUMNS, found))
+                table = table_of(FOUND_COLUMNS, stare.found)
+                views.append(View(f"Found at {stare.title} above {above}", FOUND_COLUMNS, table))
         return views
 
     def light_curve(self, number: int = 0) -> QTable:
         """Return the frames of a star in a cell: time, cadence number, quality, and light in every band."""
-        one = self.stares[number]
-        columns = [*FRAME_COLUMNS, *(() if one.pointing_loss is None else (LOSS_COLUMN,))]
-        columns += [_light_column(kind, band, k) for k, band in enumerate(one.light.bands) for kind in LIGHT]
-        return table_of(columns, [one], star=one.label, **_seed(self), **one.at)
+        star = self.stares[number]
+        columns = [*FRAME_COLUMNS, *(() if star.pointing_loss is None else (LOSS_COLUMN,))]
+        columns += [_light_column(kind, band, k) for k, band in enumerate(star.light.bands) for kind in LIGHT]
+        return table_of(columns, [star], star=star.label, **_seed(self), **star.at)
 
     @property
     def tables(self) -> dict[str, Table]:
         """The stares, their flares, and a light curve of each."""
         curves = {
             f"light-curve-{n}": self.light_curve(n - 1)
-            for n, one in enumerate(self.stares, 1)
-            if one.staring.stare.n_frames <= MOST_ROWS
+            for n, star in enumerate(self.stares, 1)
+            if star.staring.stare.n_frames <= MOST_ROWS
         }
         return super().tables | curves
 
@@ -403,7 +403,7 @@ class StareAnswer(Answer):
         """A FITS file of each star and cell: light curve, good time intervals, dynamic spectrum."""
         study = self.study
         of = partial(light_curve_file, sky=study.sky, seed=study.run.seed, number=study.stare.number)
-        return {f"light-curve-{n}.fits": partial(of, one) for n, one in enumerate(self.stares, 1)}
+        return {f"light-curve-{n}.fits": partial(of, star) for n, star in enumerate(self.stares, 1)}
 
     @property
     def inputs(self) -> list[Expectation]:
@@ -509,8 +509,8 @@ def _search(case: Case, draw: Draw, checkpoint: Checkpoint | None) -> SearchResu
     """Search the stare of a case for flares, or return a message if no search is possible."""
     study, staring = case.study, case.stare_expectation
     try:
-        known = survey_star(case)
-        survey = replace(known.survey, components=staring.components(known.templates.weights))
+        star = survey_star(case)
+        survey = replace(star.survey, components=staring.components(star.templates.weights))
 
         def computed() -> Arrays:
             tail = sampled_rate(survey, study.run.seed)
@@ -520,8 +520,8 @@ def _search(case: Case, draw: Draw, checkpoint: Checkpoint | None) -> SearchResu
         threshold = float(tail["threshold"])
     except InputError as error:
         return Message(f"{case.label} is not searched: {error}.", "not searched")
-    scale = _log_energy(case, known.templates.temperatures_k)
-    raised = alarms(survey, known.templates, draw(survey.components), threshold, scale)
+    scale = _log_energy(case, star.templates.temperatures_k)
+    raised = alarms(survey, star.templates, draw(survey.components), threshold, scale)
     return SearchResult(threshold, [_found_flare(case, alarm) for alarm in raised], bool(tail["shifted"]))
 
 
@@ -530,7 +530,7 @@ def _found_flare(case: Case, alarm: Alarm) -> FoundFlare:
     if not alarm.measured:
         return FoundFlare(case.label, case.at, alarm, float("nan"), 0)
     event = _event_of(case, alarm.recovered)
-    away = [abs(one.peak_s - event.peak_s) for one in case.events]
+    away = [abs(other.peak_s - event.peak_s) for other in case.events]
     nearest = int(np.argmin(away)) if away else -1
     reach = 2 * case.stare_expectation.stare.frame_s
     near = nearest >= 0 and away[nearest] <= case.events[nearest].half_width_s + reach
@@ -551,12 +551,12 @@ def _log_energy(case: Case, kelvin: Sequence[float]) -> Factor | None:
 
     Returns None if the star's size is unknown, or a template's temperature gives no energy.
     """
-    one = Event(0.0, 1.0, 1.0, kelvin[0], case.study.search.shape)
-    events = [replace(one, temperature=k) for k in kelvin]
+    unit = Event(0.0, 1.0, 1.0, kelvin[0], case.study.search.shape)
+    events = [replace(unit, temperature=k) for k in kelvin]
     energies = np.array([_found_energy(case, event) for event in events])
     if len(kelvin) < 2 or not (np.isfinite(energies) & (energies > 0)).all():
         return None
-    spline = CubicSpline(np.log(kelvin), np.log(energies / one.equivalent_duration_s))
+    spline = CubicSpline(np.log(kelvin), np.log(energies / unit.equivalent_duration_s))
     return lambda x: (float(spline(x)), float(spline(x, 1)))
 
 

@@ -89,8 +89,8 @@ class Verb:
 
     def accepts(self, key: str) -> bool:
         """Return whether the command has the flags of a key or section of the study."""
-        taken = (one for one in (*self.observation, *self.takes) if one != self.without)
-        return key != self.without and any(key == one or key.startswith(f"{one}.") for one in taken)
+        taken = (key for key in (*self.observation, *self.takes) if key != self.without)
+        return key != self.without and any(key == prefix or key.startswith(f"{prefix}.") for prefix in taken)
 
     @property
     def ask(self) -> Callable[..., Any]:
@@ -120,8 +120,8 @@ def _formula_grid(given: dict[str, Any]) -> Study:
 
 #: By name, in the order of `mauvecl --help`: one star, flares, hours and campaigns.
 VERBS: dict[str, Verb] = {
-    one.name: one
-    for one in (
+    verb.name: verb
+    for verb in (
         Verb(
             "simulate",
             """Simulate one observation, and show what it consists of.

@@ -50,6 +50,10 @@ def calendar_bytes(entries: Iterable[Entry], name: str) -> bytes:
         f"X-WR-CALNAME:{_text(name)}",
     ]
     for entry in entries:
+        stop = entry.stop
+        if _is_day(stop):
+            # An event ends at the beginning of the next day.
+            stop = (datetime.date.fromisoformat(stop) + datetime.timedelta(days=1)).isoformat()
         unique = hashlib.sha256("\0".join((entry.start, entry.stop, entry.title)).encode()).hexdigest()[:24]
         lines += [
             "BEGIN:VEVENT",
@@ -57,7 +61,7 @@ def calendar_bytes(entries: Iterable[Entry], name: str) -> bytes:
             # A fixed time, so that equal plans give equal files.
             f"DTSTAMP:{_moment(entry.start).removeprefix(':').removeprefix(';VALUE=DATE:')[:8]}T000000Z",
             f"DTSTART{_moment(entry.start)}",
-            f"DTEND{_moment(_day_after(entry.stop) if _is_day(entry.stop) else entry.stop)}",
+            f"DTEND{_moment(stop)}",
             f"SUMMARY:{_text(entry.title)}",
             *([f"DESCRIPTION:{_text(entry.text)}"] if entry.text else []),
             "TRANSP:TRANSPARENT",
@@ -74,10 +78,6 @@ def _is_day(text: str) -> bool:
 def _moment(text: str) -> str:
     plain = text.replace("-", "").replace(":", "")
     return f";VALUE=DATE:{plain}" if _is_day(text) else f":{plain}Z"
-
-
-def _day_after(text: str) -> str:
-    return (datetime.date.fromisoformat(text) + datetime.timedelta(days=1)).isoformat()
 
 
 def _text(value: str) -> str:
@@ -160,10 +160,6 @@ def _target_columns(answer: VisibleAnswer) -> tuple[Column, ...]:
     return (*COLUMNS[:place], *limits, *COLUMNS[place:])
 
 
-def _month_columns(answer: VisibleAnswer) -> tuple[Column, ...]:
-    return (Column("month"), *(Column(target.name, unit="h") for target in answer.targets))
-
-
 @dataclass(frozen=True, eq=False)
 class VisibleAnswer(Answer):
     """Answer of `visible`."""
@@ -181,7 +177,11 @@ class VisibleAnswer(Answer):
         about=lambda answer: {"start": answer.times.iso(0.0), "days": answer.times.days},
     )  # fmt: skip
     #: One row per month, one column of hours per target.
-    months = TableOf("months", _month_columns, "_hours_by_month")
+    months = TableOf(
+        "months",
+        lambda answer: (Column("month"), *(Column(target.name, unit="h") for target in answer.targets)),
+        "_hours_by_month",
+    )
     #: One row per target and day.
     by_day = TableOf("days", DAY_COLUMNS, "_day_rows")
     #: One row per window.
@@ -236,7 +236,7 @@ class VisibleAnswer(Answer):
             "dec": target.dec_deg,
             "hours": seen.hours[k],
             "share": seen.share[k],
-            **{f"leaves_{name}": kept[k] for name, kept in seen.kept_by.items()},
+            **{f"leaves_{name}": shares[k] for name, shares in seen.kept_by.items()},
             "windows": length.size,
             "median_window": float(np.median(length / 60)) if length.size else 0.0,
             "longest_gap": self._longest_gap_d(k),
@@ -263,10 +263,10 @@ class VisibleAnswer(Answer):
 
     def _longest_gap_d(self, k: int) -> float:
         """Return the longest time without a window, in days."""
-        one = self.windows[k]
+        windows = self.windows[k]
         ends = (
-            np.concatenate([[0.0], one.stop_s]),
-            np.concatenate([one.start_s, [self.times.n * self.times.step_s]]),
+            np.concatenate([[0.0], windows.stop_s]),
+            np.concatenate([windows.start_s, [self.times.n * self.times.step_s]]),
         )
         return float(np.max(ends[1] - ends[0])) / DAY_S
 
@@ -314,11 +314,11 @@ class VisibleAnswer(Answer):
         """Return the appointments of the calendar."""
         times, entries = self.times, list[Entry]()
         single = self.study.orbit.orbit().resolved(times) == "tle" and self.writes_windows
-        for k, one in enumerate(self.targets):
+        for k, target in enumerate(self.targets):
             if single:
                 windows = self.windows[k]
                 entries += [
-                    Entry(times.iso(float(a)), times.iso(float(b)), one.name, f"{(b - a) / 60:.0f} min of exposure")
+                    Entry(times.iso(float(a)), times.iso(float(b)), target.name, f"{(b - a) / 60:.0f} min of exposure")
                     for a, b in zip(windows.start_s, windows.stop_s, strict=True)
                 ]
                 continue
@@ -326,7 +326,7 @@ class VisibleAnswer(Answer):
             edges = np.flatnonzero(np.diff(np.concatenate([[False], hours >= SEEN_H, [False]])))
             for first, last in zip(edges[::2], edges[1::2], strict=True):
                 mean = f"{hours[first:last].mean():.1f} h of exposure a day"
-                entries.append(Entry(self.days[first], self.days[last - 1], one.name, mean))
+                entries.append(Entry(self.days[first], self.days[last - 1], target.name, mean))
         return entries
 
     @property
@@ -337,7 +337,7 @@ class VisibleAnswer(Answer):
     @property
     def messages(self) -> list[str]:
         """Messages on the orbit, assumptions, effects that are not modelled, and targets that are never visible."""
-        never = [one.name for one, part in zip(self.targets, self.visibility.share, strict=True) if part == 0]
+        never = [target.name for target, part in zip(self.targets, self.visibility.share, strict=True) if part == 0]
         lines = [f"{name} is never seen: {self.reason(name)}." for name in never]
         lines += self.study.orbit.orbit().messages(self.times)
         lines.append(
@@ -353,7 +353,7 @@ class VisibleAnswer(Answer):
     def reason(self, name: str) -> str:
         """Return the reason why a target is never visible."""
         k = [target.name for target in self.targets].index(name)
-        alone = [limit for limit, kept in self.visibility.kept_by.items() if kept[k] == 0]
+        alone = [limit for limit, shares in self.visibility.kept_by.items() if shares[k] == 0]
         if not alone:
             return "its limits together leave nothing"
         ends = np.atleast_1d(getattr(self.visibility.limits, f"{alone[0]}_deg", ()))

@@ -65,7 +65,7 @@ def fitted_throughput(answer: CalibrateAnswer) -> Picture:
     """Plot the fitted throughput with its 95 % band next to the nominal one, and their ratio."""
     above = THROUGHPUT.panel(throughput_series(answer), f"nominal: {answer.nominal.name}")
     ratio = THROUGHPUT.panel(throughput_series(answer, "ratio"))
-    below = Panel(WAVELENGTH, Axis("fitted / nominal"), [replace(one, listed=False) for one in ratio.series])
+    below = Panel(WAVELENGTH, Axis("fitted / nominal"), [replace(item, listed=False) for item in ratio.series])
     return Picture([[above], [below]], (5.2, 4.6), f"Throughput {answer.source}", share_x=True)
 
 
@@ -73,7 +73,7 @@ def residual_series(answer: CalibrateAnswer) -> list[tuple[str, Any, Any]]:
     """Return name, wavelengths and averaged residuals of each star, without pixels that were not used."""
     nm, each = answer.throughput.binned_residuals(BIN)
     stars = zip(answer.stars, each, strict=True)
-    return [(one.name, nm[kept], row[kept]) for one, row in stars for kept in [np.isfinite(row)]]
+    return [(star.name, nm[finite], row[finite]) for star, row in stars for finite in [np.isfinite(row)]]
 
 
 @picture_of("CalibrateAnswer", "residuals")
@@ -120,14 +120,18 @@ def dark_current(answer: CalibrateAnswer) -> Picture:
     """Plot the dark current of each pixel, and its mean against temperature with the fit."""
     d, n = answer.dark, answer.nominal
     pixels = Dots("", "star", size=2, at=(n.wavelength_nm, d.level_dn_per_s))
-    dark = [one for one in answer.observations if one.star is None]
-    celsius = np.concatenate([np.atleast_1d(one.temperature_c) for one in dark])
+    dark = [observation for observation in answer.observations if observation.star is None]
+    celsius = np.concatenate([np.atleast_1d(observation.temperature_c) for observation in dark])
     kelvin = np.linspace(celsius.min(), celsius.max(), 101)
     usual = n.dark_scale_dn_per_s * np.exp(n.dark_slope_per_c * kelvin)
     mean = [
         *(
-            Dots("", "star", at=(one.temperature_c, (one.raw_dn - d.bias_dn).mean(axis=1) / one.exposure_s))
-            for one in dark
+            Dots(
+                "",
+                "star",
+                at=(observation.temperature_c, (observation.raw_dn - d.bias_dn).mean(axis=1) / observation.exposure_s),
+            )
+            for observation in dark
         ),
         Line("fitted", "flare", at=(kelvin, d.level_dn_per_s.mean() * d.growth(kelvin))),
         Line("nominal", dash="dashed", at=(kelvin, usual)),
@@ -146,12 +150,12 @@ AROUND_NM = 15.0
 
 def along_magnitude(answer: ChangeAnswer, names: Sequence[str], scale: float) -> list[tuple[str, Any, Any]]:
     """Return name, magnitudes and smallest changes of the first star, times a factor, where they are known."""
-    found = []
+    lines = []
     for name in names:
-        own = [one for one in answer.along if one.change.name == name]
-        x, y = np.array([(one.magnitude, one.smallest.one) for one in own[: len(own) // answer.many]]).T
-        found.append((name, x[np.isfinite(y)], scale * y[np.isfinite(y)]))
-    return found
+        own = [row for row in answer.along if row.change.name == name]
+        x, y = np.array([(row.magnitude, row.smallest.one) for row in own[: len(own) // answer.many]]).T
+        lines.append((name, x[np.isfinite(y)], scale * y[np.isfinite(y)]))
+    return lines
 
 
 @picture_of("ChangeAnswer", "change", when=lambda answer: bool(answer.along))
@@ -162,11 +166,11 @@ def change_against_magnitude(answer: ChangeAnswer) -> Picture:
     (title,), star, row = titles, answer.study.star[0], []
     for unit in dict.fromkeys(row.change.unit for row in answer.along):
         names = list(dict.fromkeys(row.change.name for row in answer.along if row.change.unit == unit))
-        found = [one for one in along_magnitude(answer, names, 1 if unit else 100) if one[1].size]
+        lines = [line for line in along_magnitude(answer, names, 1 if unit else 100) if line[1].size]
         here = [] if star.magnitude is None else [Rule(dash="dotted", at=star.magnitude)]
         # Without a pixel that does not saturate there is nothing to show.
-        y = Axis(f"smallest change ({unit or '%'})", log=bool(found))
-        row.append(Panel(Axis(f"magnitude ({star.band})"), y, [Targets(at=found), *here]))
+        y = Axis(f"smallest change ({unit or '%'})", log=bool(lines))
+        row.append(Panel(Axis(f"magnitude ({star.band})"), y, [Targets(at=lines), *here]))
     visits, exposure = answer.study.change.visits, answer.study.observation.exposure_s
     title = f"{title}: smallest change between {visits} visits of {exposure:g} s"
     return Picture([row], (1.0 + 3.3 * len(row), 3.6), title, (titles.note,))
@@ -177,12 +181,12 @@ def change_against_magnitude(answer: ChangeAnswer) -> Picture:
 def recovered_periods(answer: ChangeAnswer) -> Picture:
     """Plot the share of recovered periods over period and semi-amplitude, for the first changes."""
     first, row = First(answer.periods, MOST, "changes"), []
-    for one in first:
-        r, scale = one.recovery, one.error * (1 if one.change.unit else 100)
-        shares = 100 * one.shares("value")
+    for row_of_change in first:
+        r, scale = row_of_change.recovery, row_of_change.error * (1 if row_of_change.change.unit else 100)
+        shares = 100 * row_of_change.shares("value")
         mesh = Mesh("recovered (%)", high=100, at=(r.periods_d, scale * r.amplitudes, shares))
-        y = Axis(f"semi-amplitude ({one.change.unit or '%'})", log=True)
-        row.append(Panel(Axis("period (d)", log=True), y, [mesh], one.change.name))
+        y = Axis(f"semi-amplitude ({row_of_change.change.unit or '%'})", log=True)
+        row.append(Panel(Axis("period (d)", log=True), y, [mesh], row_of_change.change.name))
     time = first[0].recovery.time_d
     title = f"{first[0].title}: periods that {time.size} visits within {np.ptp(time):.0f} days recover"
     return Picture([row], (1.0 + 2.9 * len(row), 3.2), title, (first.note,))
@@ -193,12 +197,12 @@ def recovered_periods(answer: ChangeAnswer) -> Picture:
 def line_indices(answer: ChangeAnswer) -> Picture:
     """Plot the mean calibrated spectrum around each line index, with its band and continuum."""
     title, row = answer.indices[0].title, []
-    for one in answer.indices:
-        if one.title != title:
+    for index_row in answer.indices:
+        if index_row.title != title:
             continue
-        index, nm = one.value.index, one.wavelength_nm
+        index, nm = index_row.value.index, index_row.wavelength_nm
         near = (nm > index.continuum_nm[0][0] - AROUND_NM) & (nm < index.continuum_nm[-1][1] + AROUND_NM)
-        line = Line("", "star", at=(nm[near], one.flux[near]))
+        line = Line("", "star", at=(nm[near], index_row.flux[near]))
         band, continua = np.array([index.band_nm]).T, np.array(index.continuum_nm).T
         series = [line, Strips("", "read", at=band), Strips(alpha=0.2, at=continua)]
         row.append(Panel(Axis("nm"), Axis("erg / (s cm² nm)"), series, index.name))

@@ -46,13 +46,13 @@ def _calendars(answer: VisibleAnswer, hours: Any) -> Picture:
     x = Axis("day of the month (UTC)", ticks=([1, 8, 15, 22, 29],))
     names = np.arange(0, len(months), step), [_month(name) for name in months[::step]]
     y, panels = Axis(limits=(len(months) - 0.5, -0.5), ticks=names), list[Panel]()
-    for one, seen, total in zip(answer.targets, hours, answer.visibility.hours, strict=True):
+    for target, seen, total in zip(answer.targets, hours, answer.visibility.hours, strict=True):
         grid = np.full((len(months), 31), np.nan)
         for day, value in zip(answer.days, seen, strict=True):
             grid[months.index(day[:7]), int(day[8:]) - 1] = value
         at = np.arange(0.5, 32), np.arange(-0.5, len(months)), grid
         mesh = Mesh("hours a day", high=max(float(hours.max()), 0.1), edges="white", at=at)
-        panels.append(Panel(x, y, [mesh], f"{one.name}: {total:.0f} h in {answer.times.days:g} d"))
+        panels.append(Panel(x, y, [mesh], f"{target.name}: {total:.0f} h in {answer.times.days:g} d"))
     rows = [panels[k : k + across] for k in range(0, len(panels), across)]
     height = max(1.3, 0.17 * len(months) + 0.8)
     return Picture(rows, (3.9 * across + 0.8, height * len(rows) + 0.4), share_x=True)
@@ -63,7 +63,7 @@ def _rows(answer: VisibleAnswer, hours: Any) -> Picture:
     n = len(answer.targets)
     mesh = Mesh("hours a day", high=None, at=(np.arange(len(answer.days) + 1) - 0.5, np.arange(n + 1) - 0.5, hours))
     step = max(1, n // 60)
-    names = np.arange(0, n, step), [one.name for one in answer.targets[::step]]
+    names = np.arange(0, n, step), [target.name for target in answer.targets[::step]]
     firsts = [i for i, day in enumerate(answer.days) if day.endswith("-01")]
     firsts = firsts[:: max(1, len(firsts) // 13)]
     x = Axis(ticks=(firsts, [_month(answer.days[i]) for i in firsts]))
@@ -98,18 +98,20 @@ def overview(answer: PlanAnswer) -> Picture:
 def _overview(answer: PlanAnswer) -> Picture:
     """Return each target's expected number of flares with the range of 95 % of campaigns, and E50 to E90."""
     planned, left, right = answer.planned, list[Series](), list[Series]()
-    ends = [(one.energy_at(0.5), one.energy_at(0.9)) for one in planned]
-    for k, one in enumerate(planned):
-        if one.recovered is not None and one.recovered.high > 0:
+    ends = [(target.energy_at(0.5), target.energy_at(0.9)) for target in planned]
+    for k, target in enumerate(planned):
+        if target.recovered is not None and target.recovered.high > 0:
             # A logarithmic axis cannot show zero.
-            low, high, expected = np.maximum([one.recovered.low, one.recovered.high, one.recovered.expected], 0.05)
+            low, high, expected = np.maximum(
+                [target.recovered.low, target.recovered.high, target.recovered.expected], 0.05
+            )
             left += [_bar("star", (low, high), k), Dots("", "star", size=7, at=([expected], [k]))]
         if np.isfinite(ends[k][0]):
             right += [_bar("flare", ends[k], k), Dots("", "flare", size=7, at=([ends[k][0]], [k]))]
     # Limits at whole decades avoid labels that overlap.
-    known = np.log10([energy for pair in ends for energy in pair if np.isfinite(energy)])
-    decades = (10 ** np.floor(known.min()), 10 ** np.ceil(known.max())) if known.size else None
-    names = range(len(planned)), [f"{one.name} ({one.hours:.0f} h)" for one in planned]
+    logs = np.log10([energy for pair in ends for energy in pair if np.isfinite(energy)])
+    decades = (10 ** np.floor(logs.min()), 10 ** np.ceil(logs.max())) if logs.size else None
+    names = range(len(planned)), [f"{target.name} ({target.hours:.0f} h)" for target in planned]
     y, above = Axis(limits=(len(planned) - 0.5, -0.5), ticks=names), "expected (dot); 95 % of campaigns"
     row = [
         Panel(Axis("flares recovered", log=True, limits=(0.05, None)), y, left, above),
@@ -276,7 +278,7 @@ def _target(answer: PlanAnswer, k: int) -> Any:
 
 def _panels(figure: Any, answer: PlanAnswer, k: int) -> None:
     """Plot daily hours with elongation, monthly hours, and recovered fraction with the rate by energy."""
-    one, seen = answer.planned[k], answer.seen
+    target, seen = answer.planned[k], answer.seen
     top, bottom = figure.subplots(2, 1)
     figure.subplots_adjust(**PANELS)
     days = np.arange(len(seen.days))
@@ -291,10 +293,10 @@ def _panels(figure: Any, answer: PlanAnswer, k: int) -> None:
     sun.spines["right"].set_visible(True)
     sun.yaxis.label.set_color(COLOURS[4])
     top.set_title("when it is seen")
-    if one.completeness is None:
+    if target.completeness is None:
         bottom.set_visible(False)
         return
-    energy, p = one.completeness.energy_erg, one.completeness.probability
+    energy, p = target.completeness.energy_erg, target.completeness.probability
     first = int(np.argmax(p > 0))
     shown = slice(max(first - 4, 0), min(first + 100, energy.size))
     bottom.plot(energy[shown], p[shown], color=COLOURS[0])
@@ -302,15 +304,15 @@ def _panels(figure: Any, answer: PlanAnswer, k: int) -> None:
     bottom.yaxis.label.set_color(COLOURS[0])
     _plain_decades(bottom.xaxis)
     for share, dash in ((0.5, "--"), (0.9, ":")):
-        if np.isfinite(one.energy_at(share)):
-            bottom.axvline(one.energy_at(share), color=NULL, linestyle=dash, linewidth=0.8)
+        if np.isfinite(target.energy_at(share)):
+            bottom.axvline(target.energy_at(share), color=NULL, linestyle=dash, linewidth=0.8)
     bottom.set_title("flares recovered (E50 dashed, E90 dotted), and how often they are")
-    if one.rates is not None:
+    if target.rates is not None:
         often = bottom.twinx()
-        rate = one.rates.per_day_above(energy[shown]) * one.hours / 24
+        rate = target.rates.per_day_above(energy[shown]) * target.hours / 24
         used = rate > 0
         often.plot(energy[shown][used], rate[used], color=COLOURS[4])
-        often.set(yscale="log", ylabel=f"flares above this energy in {one.hours:.0f} h")
+        often.set(yscale="log", ylabel=f"flares above this energy in {target.hours:.0f} h")
         often.spines["right"].set_visible(True)
         often.yaxis.label.set_color(COLOURS[4])
         _plain_decades(often.yaxis)
@@ -346,11 +348,11 @@ def plan_html(answer: PlanAnswer) -> bytes:
         html_image(partial(overview, answer), "flares expected and energies of all targets"),
         *(f"<p>{escape(message)}</p>" for message in answer.messages),
     ]
-    for k, one in enumerate(answer.planned):
+    for k, target in enumerate(answer.planned):
         lines = html_table(("", "", "table: column"), target_lines(answer, k))
-        parts.append(f"<section id=target-{k}><h2>{escape(one.name)}</h2>{lines}")
-        if one.seen_h > 0:
-            parts.append(html_image(partial(target_figure, answer, k), f"hours and energies of {one.name}"))
+        parts.append(f"<section id=target-{k}><h2>{escape(target.name)}</h2>{lines}")
+        if target.seen_h > 0:
+            parts.append(html_image(partial(target_figure, answer, k), f"hours and energies of {target.name}"))
         parts.append("</section>")
     table = answer.assumptions
     rows = [tuple(str(cell) for cell in row) for row in table]

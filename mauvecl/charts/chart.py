@@ -195,7 +195,7 @@ class Chart:
 
     def panel(self, series: Mapping[str, Any], title: str = "") -> Panel:
         """Return the chart with the data of its series; those without data are left out."""
-        filled = [replace(one, at=series[one.key]) for one in self.series if one.key in series]
+        filled = [replace(item, at=series[item.key]) for item in self.series if item.key in series]
         return Panel(self.x, self.y, filled, title)
 
     def data(self, of: str = "", before: str = "") -> Callable[[Callable[[Any, Any], ChartData]], Chart]:
@@ -211,19 +211,19 @@ class Chart:
         data = ChartData(self.before)
         if self.fill is not None and (not self.of or self.of in answers):
             data = self.fill(closed, answers[self.of] if self.of else answers)
-        assert data.series.keys() <= {one.key for one in self.series}
+        assert data.series.keys() <= {item.key for item in self.series}
         sources, props, names = dict[str, Any](), dict(data.props), dict[str, str]()
-        for one in self.series:
-            given = data.series.get(one.key, one.at)
-            if isinstance(one, Rule):
-                props[one.key] = {"location": given}
-            elif isinstance(one, Targets):
+        for item in self.series:
+            given = data.series.get(item.key, item.at)
+            if isinstance(item, Rule):
+                props[item.key] = {"location": given}
+            elif isinstance(item, Targets):
                 for k, (name, x, y) in enumerate([*(given or ()), *[("", [], [])] * MOST_TARGETS][:MOST_TARGETS]):
-                    sources[f"{one.key} {k}"] = {"x": x, "y": y}
+                    sources[f"{item.key} {k}"] = {"x": x, "y": y}
                     names |= {f"target {k + 1}": name} if name else {}
-            elif not isinstance(one, Listed):
-                columns = [[]] * len(one.columns) if given is None else given
-                sources[one.key] = dict(zip(one.columns, columns, strict=True))
+            elif not isinstance(item, Listed):
+                columns = [[]] * len(item.columns) if given is None else given
+                sources[item.key] = dict(zip(item.columns, columns, strict=True))
         return {"text": data.text, "sources": sources, "props": props, "names": names}
 
 
@@ -313,8 +313,8 @@ def _made_of(thing: Any, *, document: bool) -> list[tuple[str, Callable[..., Any
     """Return the functions of an object's class by name, numbered ones in the order of their numbers."""
     load()
     own = next((ENTRIES[kind.__name__] for kind in type(thing).__mro__ if kind.__name__ in ENTRIES), [])
-    made = [one for entry in own if entry.document is document and entry.when(thing) for one in entry.of(thing)]
-    return [(name, make) for _, name, make in sorted(made, key=lambda one: one[0])]
+    made = [part for entry in own if entry.document is document and entry.when(thing) for part in entry.of(thing)]
+    return [(name, make) for _, name, make in sorted(made, key=lambda pair: pair[0])]
 
 
 @cache

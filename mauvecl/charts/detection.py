@@ -40,12 +40,12 @@ def _few(answer: DetectAnswer) -> First[Shown]:
     return First([star.shown for star in answer.stars], MOST_STARS, "stars")
 
 
-def _alone(found: Detection) -> list[Shown]:
-    return [(found.quiet.name, found, [f"flare {k + 1}" for k in range(len(found.flares))])]
+def _alone(outcome: Detection) -> list[Shown]:
+    return [(outcome.quiet.name, outcome, [f"flare {k + 1}" for k in range(len(outcome.flares))])]
 
 
 @picture_of("DetectAnswer", "detection", given=lambda answer: (_few(answer), answer.study.run.fap))
-@picture_of("Detection", "detection", given=lambda found: (_alone(found),))
+@picture_of("Detection", "detection", given=lambda outcome: (_alone(outcome),))
 @styled_picture
 def detection(stars: Sequence[Shown], fap: float = 1e-3) -> Picture:
     """Plot null and flare distributions, with a row per star and a column per statistic."""
@@ -77,8 +77,8 @@ def _flare_note(stars: Sequence[Shown]) -> str:
 
 def _distributions(title: str, outcome: Detection, flares: Sequence[str], statistic: str, fap: float) -> Panel:
     """Return the histograms of a statistic without and with each flare, and its thresholds."""
-    one = outcome.statistic(statistic)
-    linear, chosen = isinstance(one, LinearStatistic), _drawn_flares(flares)
+    kind = outcome.statistic(statistic)
+    linear, chosen = isinstance(kind, LinearStatistic), _drawn_flares(flares)
     shapes: list[tuple[int | None, str, str]] = [(None, "drawn", "no flare")]
     shapes += [(k, colour, flares[k]) for k, colour in zip(chosen, cycle(COLOURS), strict=False)]
     series: list[Series] = []
@@ -90,7 +90,7 @@ def _distributions(title: str, outcome: Detection, flares: Sequence[str], statis
             Line(name, colour, step=True, at=(middle, height)),
         ]
     # Statistics that are scaled by the flare have a threshold per flare.
-    own = chosen if one.shaped and not linear else [0]
+    own = chosen if kind.shaped and not linear else [0]
     for k, colour in zip(own, cycle(COLOURS if len(own) > 1 else ["text"]), strict=False):
         try:
             cut = outcome.threshold(fap, statistic, template=k).value
@@ -136,9 +136,9 @@ def roc(curves: Roc | Sequence[tuple[str, Roc]], *, name: str = "") -> Panel:
 
     series: list[Series] = []
     named = [(name, curves)] if isinstance(curves, Roc) else curves
-    for colour, (one, curve) in zip(cycle(COLOURS), named, strict=False):
+    for colour, (title, curve) in zip(cycle(COLOURS), named, strict=False):
         fap, probability, low, high = roc_columns(curve)
-        text = f"{one}: area {curve.area.value:.4f}".removeprefix(": ")
+        text = f"{title}: area {curve.area.value:.4f}".removeprefix(": ")
         series += [Line(text, colour, at=(fap, probability)), Band("", colour, alpha=0.3, at=(fap, low, high))]
     x, y = Axis("false-alarm probability per test", log=True), Axis("detection probability", limits=(0, 1.02))
     return Panel(x, y, series)
@@ -251,8 +251,8 @@ def unknowns(answer: UnknownAnswer) -> Picture:
     for star in stars:
         amplitude, costs = next((a, c) for (s, a), c in answer.costs.items() if s == star)
         relative = np.geomspace(0.03, 300.0, 200) * answer.smallest(star, None)
-        known = next(iter(costs.values())).known
-        at = relative, power(known * relative / amplitude, fap)
+        known_snr = next(iter(costs.values())).known
+        at = relative, power(known_snr * relative / amplitude, fap)
         series: list[Series] = [Line("everything known", "text", width=4, at=at)]
         smallest = [Dots("", "text", size=12, at=([0], [answer.smallest(star, None)]))]
         for k, (colour, (unknown, cost)) in enumerate(zip(cycle(COLOURS), costs.items(), strict=False), 1):

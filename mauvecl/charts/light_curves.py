@@ -132,23 +132,23 @@ MOST_POINTS, MOST_ROWS = 4000, 600
 IN_SECONDS_S, IN_MINUTES_S = 600.0, 4 * 3600.0
 
 
-@picture_of("StareAnswer", "light-curve", each=lambda answer: [(one,) for one in answer.stares])
+@picture_of("StareAnswer", "light-curve", each=lambda answer: [(star,) for star in answer.stares])
 @styled_picture
-def light_curves(one: StarStare) -> Picture:
+def light_curves(star: StarStare) -> Picture:
     """Plot light curves in all bands, relative to the quiescent star.
 
     Dotted lines are injected flares, triangles detections. Shaded frames lose light in pointing drifts.
     """
-    stare, light, rows = one.staring.stare, one.light, list[list[Panel]]()
+    stare, light, rows = star.staring.stare, star.light, list[list[Panel]]()
     scale, unit = time_unit(stare.duration_s)
     level, gaps = np.median(light.mean, axis=0), _runs(stare.numbers)
-    lost = stare.numbers[:0] if one.pointing_loss is None else stare.numbers[one.pointing_loss > 0]
+    lost = stare.numbers[:0] if star.pointing_loss is None else stare.numbers[star.pointing_loss > 0]
     ends = [(lost[part[0]] * stare.frame_s, (lost[part[-1]] + 1) * stare.frame_s) for part in _runs(lost) if part.size]
     always = [
         Strips(alpha=0.2, at=np.reshape(ends, (-1, 2)).T / scale),
-        Rule(dash="dotted", at=[flare.event.peak_s / scale for flare in one.flares]),
+        Rule(dash="dotted", at=[flare.event.peak_s / scale for flare in star.flares]),
     ]
-    peaks = [float(flare.alarm.recovered.peak_s[0]) / scale for flare in one.found if flare.alarm.measured]
+    peaks = [float(flare.alarm.recovered.peak_s[0]) / scale for flare in star.found if flare.alarm.measured]
 
     def finish(axis: Any) -> None:
         axis.plot(peaks, [1.0] * len(peaks), "v", color=COLOURS[4], markersize=4, transform=axis.get_xaxis_transform())
@@ -163,7 +163,7 @@ def light_curves(one: StarStare) -> Picture:
             series += [Dots("", colour, size=1.7, alpha=0.6, at=(time, flux)), Line("", width=1.1, at=(time, mean))]
         x, y = Axis(f"time from the start of the stare ({unit})"), Axis("relative light")
         rows.append([Panel(x, y, series, band, finish)])
-    title = f"{one.title}: one simulated stare; nominal throughput"
+    title = f"{star.title}: one simulated stare; nominal throughput"
     return Picture(rows, (7.2, 1.5 * len(rows) + 0.7), title, share_x=True)
 
 
@@ -180,8 +180,8 @@ def compare_light_curves(answers: Sequence[tuple[str, StareAnswer]], band: int =
     """
     rows: list[list[Panel]] = [[] for _ in answers[0][1].stares]
     for title, answer in answers:
-        for row, one in zip(rows, answer.stares, strict=True):
-            light, stare = one.light, one.staring.stare
+        for row, star in zip(rows, answer.stares, strict=True):
+            light, stare = star.light, star.staring.stare
             scale, unit = time_unit(stare.duration_s)
             level, time = np.median(light.mean[:, band]), stare.middle_s / scale
             series = [
@@ -189,19 +189,19 @@ def compare_light_curves(answers: Sequence[tuple[str, StareAnswer]], band: int =
                 Line("", width=1.1, at=(time, light.mean[:, band] / level)),
             ]
             above = f"{title}\n" if row is rows[0] else ""
-            heading = f"{above}{one.title}, {light.bands[band]}"
+            heading = f"{above}{star.title}, {light.bands[band]}"
             row.append(Panel(Axis(f"time ({unit})"), Axis("relative light"), series, heading))
     size = 3.7 * len(answers), 1.5 * len(rows) + 0.8
     return Picture(rows, size, share_x=True, share_y="row")
 
 
-@picture_of("StareAnswer", "dynamic-spectrum", each=lambda answer: [(one,) for one in answer.stares])
+@picture_of("StareAnswer", "dynamic-spectrum", each=lambda answer: [(star,) for star in answer.stares])
 @styled_picture
-def dynamic_spectrum(one: StarStare) -> Picture:
+def dynamic_spectrum(star: StarStare) -> Picture:
     """Plot each resolution element and frame, in standard deviations from the median over the stare."""
-    light = one.light
-    panel, column_s = spectra_panel(one.staring.stare, light.spectrum, light.spectrum_sd, light.element_nm)
-    return Picture([[panel]], (7.2, 3.6), f"{one.title}: dynamic spectrum, {column_s:g} s to a column")
+    light = star.light
+    panel, column_s = spectra_panel(star.staring.stare, light.spectrum, light.spectrum_sd, light.element_nm)
+    return Picture([[panel]], (7.2, 3.6), f"{star.title}: dynamic spectrum, {column_s:g} s to a column")
 
 
 def spectra_panel(
@@ -271,9 +271,9 @@ KINDS = "events above {:.2f} (blue), candidates (grey), look-alikes (red)"
 BRIGHT = 30.0
 
 
-def _minutes(one: Analysis, time_s: Any) -> Any:
+def _minutes(analysis: Analysis, time_s: Any) -> Any:
     """Return times in minutes from the first frame."""
-    return (time_s - one.frames.time_s[0]) / 60.0
+    return (time_s - analysis.frames.time_s[0]) / 60.0
 
 
 @picture_of("AnalyseAnswer", "light-curve")
@@ -283,56 +283,59 @@ def observed_light_curve(answer: AnalyseAnswer) -> Picture:
 
     If there are bright events, a second panel shows the part near the level.
     """
-    one = answer.analysis
-    time, used, (level, error) = _minutes(one, one.frames.time_s), one.level.used, (one.level.level, one.level.error)
-    left_out, off = ~used & np.isfinite(one.flux), 2 * one.level.level_error
+    analysis = answer.analysis
+    time, used = _minutes(analysis, analysis.frames.time_s), analysis.level.used
+    level, error = analysis.level.level, analysis.level.error
+    left_out, off = ~used & np.isfinite(analysis.flux), 2 * analysis.level.level_error
     series: list[Series] = [
         Strips(
             "",
-            _colour(one, event),
+            _colour(analysis, event),
             alpha=0.2,
-            at=[[_minutes(one, one.survey.time_s[k])] for k in (event.first, event.last)],
+            at=[[_minutes(analysis, analysis.survey.time_s[k])] for k in (event.first, event.last)],
         )
-        for event in one.events
+        for event in analysis.events
     ]
     series += [
-        Dots("", "text", size=2.5, alpha=0.7, at=(time[used], one.flux[used])),
+        Dots("", "text", size=2.5, alpha=0.7, at=(time[used], analysis.flux[used])),
         Line("", "sky", width=1.1, at=(time, level)),
         Band("", "sky", alpha=0.3, at=(time, level - off, level + off)),
-        Dots("", COLOURS[1], size=8, marker="x", at=(time[left_out], one.flux[left_out])),
+        Dots("", COLOURS[1], size=8, marker="x", at=(time[left_out], analysis.flux[left_out])),
     ]
-    x = Axis(f"time (min) from {one.frames.date(float(one.frames.time_s[0]))[:19]}")
-    label = f"flux ({one.frames.unit})" if one.frames.unit else "flux"
-    around = float(np.min((one.flux - error)[used])), float(np.max((one.flux + error)[used]))
+    x = Axis(f"time (min) from {analysis.frames.date(float(analysis.frames.time_s[0]))[:19]}")
+    label = f"flux ({analysis.frames.unit})" if analysis.frames.unit else "flux"
+    around = float(np.min((analysis.flux - error)[used])), float(np.max((analysis.flux + error)[used]))
     ranges: list[Any] = [around]
-    if (((one.flux - level) / error)[used] > BRIGHT).any():
+    if (((analysis.flux - level) / error)[used] > BRIGHT).any():
         ranges = [None, (float(np.min((level - 6 * error)[used])), float(np.max((level + BRIGHT / 2 * error)[used])))]
     rows = [[Panel(x, Axis(label, limits=limits), series)] for limits in ranges]
-    title = f"{one.frames.name}: {KINDS.format(one.threshold)}"
+    title = f"{analysis.frames.name}: {KINDS.format(analysis.threshold)}"
     return Picture(rows, (7.2, 1.1 + 1.8 * len(rows)), title, share_x=True)
 
 
-def _colour(one: Analysis, event: ObservedEvent) -> str:
+def _colour(analysis: Analysis, event: ObservedEvent) -> str:
     """Return the colour of an event."""
     if event.kind != "flare":
         return "flare"
-    return "star" if event.value >= one.threshold else "drawn"
+    return "star" if event.value >= analysis.threshold else "drawn"
 
 
 @picture_of("AnalyseAnswer", "dynamic-spectrum", when=lambda answer: answer.analysis.spectra is not None)
 @styled_picture
 def observed_dynamic_spectrum(answer: AnalyseAnswer) -> Picture:
     """Plot the searched spectra, in standard deviations from their median, and mark the events."""
-    one, spectra = answer.analysis, answer.analysis.spectra
+    analysis, spectra = answer.analysis, answer.analysis.spectra
     assert spectra is not None
-    stare, noise = one.survey.stare, spectra.series.noise
+    stare, noise = analysis.survey.stare, spectra.series.noise
     sd = np.broadcast_to(noise.used, spectra.series.excess.shape)
     marks = []
-    for event in one.events:
+    for event in analysis.events:
         first, last = (stare.start_s[k] - stare.start_s[0] for k in (event.first, event.last))
-        marks.append((np.array([first, last + stare.frame_s]) / time_unit(stare.duration_s)[0], _colour(one, event)))
+        marks.append(
+            (np.array([first, last + stare.frame_s]) / time_unit(stare.duration_s)[0], _colour(analysis, event))
+        )
     panel, _ = spectra_panel(stare, spectra.series.excess, sd, noise.wavelength_nm, marks)
-    return Picture([[panel]], (7.2, 3.6), f"{one.frames.name}: {KINDS.format(one.threshold)}")
+    return Picture([[panel]], (7.2, 3.6), f"{analysis.frames.name}: {KINDS.format(analysis.threshold)}")
 
 
 @picture_of("AnalyseAnswer", "noise-per-pixel", when=lambda answer: answer.analysis.spectra is not None)
@@ -357,9 +360,9 @@ def observed_pixel_noise(answer: AnalyseAnswer) -> Picture:
 @styled_picture
 def observed_residuals(answer: AnalyseAnswer) -> Picture:
     """Plot the residuals of the fitted process against time, their autocorrelation, and their quantiles."""
-    one = answer.analysis
-    residual, likeness = one.residual[:, 0], one.likeness
-    time = _minutes(one, one.survey.time_s)[one.quiet]
+    analysis = answer.analysis
+    residual, likeness = analysis.residual[:, 0], analysis.likeness
+    time = _minutes(analysis, analysis.survey.time_s)[analysis.quiet]
     lags = np.arange(1, likeness.correlations.size + 1)
     normal = ndtri((np.arange(residual.size) + 0.5) / residual.size)
     course = [Dots("", "text", size=1.7, alpha=0.7, at=(time, residual))]
@@ -376,7 +379,9 @@ def observed_residuals(answer: AnalyseAnswer) -> Picture:
         Panel(Axis("lag (frames)"), Axis("autocorrelation"), correlation),
         Panel(Axis("normal quantile"), Axis("quantile of the residuals"), quantiles),
     ]
-    title = f"{one.frames.name}: residuals of {one.level.process.name}; grey: 95 % of independent, normal noise"
+    title = (
+        f"{analysis.frames.name}: residuals of {analysis.level.process.name}; grey: 95 % of independent, normal noise"
+    )
     return Picture([row], (9.6, 2.9), title, widths=(2, 1, 1))
 
 

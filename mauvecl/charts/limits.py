@@ -63,9 +63,9 @@ def detection_map(answer: MapAnswer) -> Picture:
             axis.contour(x, y, probability, levels=list(levels), colors="black", linewidths=1.2, linestyles=strokes)
 
     x_axis, y_axis = (
-        Axis(QUANTITIES[one.quantity].label, log=one.log and not named[which],
+        Axis(QUANTITIES[sweep.quantity].label, log=sweep.log and not named[which],
              ticks=(place, getattr(answer, which)) if named[which] else None)
-        for which, one, place in (("x", question.x, x), ("y", question.y, y))
+        for which, sweep, place in (("x", question.x, x), ("y", question.y, y))
     )  # fmt: skip
     lines = [Line(f"detected in {100 * level:g} %", "text", dash=dash, at=([], [])) for level, dash in levels.items()]
     row = [
@@ -167,9 +167,9 @@ def snr_sweep(answer: SnrAnswer) -> Picture:
         for star in answer.stars:
             name = star.label if first != "magnitude" else star.label.split(" V = ")[0]
             rest = full_label(name, {k: v for k, v in star.at.items() if k != first})
-            found = star.result.element[place_of(star.result.expectation, wavelength, "element")]
-            ends = (max(found[q], 1e-3) for q in ("q2.5", "q97.5"))
-            lines.setdefault(rest, []).append((star.at[first], found["expected"], *ends))
+            element = star.result.element[place_of(star.result.expectation, wavelength, "element")]
+            ends = (max(element[q], 1e-3) for q in ("q2.5", "q97.5"))
+            lines.setdefault(rest, []).append((star.at[first], element["expected"], *ends))
         series: list[Series] = []
         for (name, points), colour in zip(lines.items(), cycle(COLOURS), strict=False):
             x, expected, low, high = zip(*points, strict=True)

@@ -134,15 +134,15 @@ def _plain_numbers(axis: Any) -> None:
     """Label logarithmic ticks as plain numbers (0.1, 20, 500), with intermediate ticks only over few decades."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-    for one in (axis.xaxis, axis.yaxis):
-        if one.get_scale() != "log":
+    for side in (axis.xaxis, axis.yaxis):
+        if side.get_scale() != "log":
             continue
-        low, high = sorted(one.get_view_interval())
+        low, high = sorted(side.get_view_interval())
         decades = float(np.log10(high / low))
-        one.set_major_locator(LogLocator(subs=(1.0,) if decades > 2 else (1.0, 2.0, 5.0)))
+        side.set_major_locator(LogLocator(subs=(1.0,) if decades > 2 else (1.0, 2.0, 5.0)))
         if decades < 4 and high < 1e6:
-            one.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        one.set_minor_formatter(NullFormatter())
+            side.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        side.set_minor_formatter(NullFormatter())
 
 
 def _renderer(figure: Any) -> Any:
@@ -228,44 +228,46 @@ def _draw_panel(axis: Any, panel: Panel, *, legend: bool) -> dict[str, Any]:
         getattr(axis, f"set_{name}label")(of.label)
         if of.log:
             getattr(axis, f"set_{name}scale")("log")
-    bars = {one.called: mesh for one in panel.series if (mesh := _draw_series(axis, one)) is not None}
+    bars = {item.called: mesh for item in panel.series if (mesh := _draw_series(axis, item)) is not None}
     axis.set_title(panel.title)
     if legend and axis.get_legend_handles_labels()[1]:
         axis.legend()
     return bars
 
 
-def _draw_series(axis: Any, one: Series) -> Any:
+def _draw_series(axis: Any, item: Series) -> Any:
     """Draw a series, and return what a colour bar is of, if any."""
     look = {
-        "color": INK.get(one.colour, one.colour),
-        "alpha": one.alpha,
-        "label": (one.called if one.listed else "") or None,
+        "color": INK.get(item.colour, item.colour),
+        "alpha": item.alpha,
+        "label": (item.called if item.listed else "") or None,
     }
-    width, at = {"linewidth": 0.75 * one.width}, one.at
-    match one:
+    width, at = {"linewidth": 0.75 * item.width}, item.at
+    match item:
         case Mesh():
-            look = {"cmap": one.palette, "rasterized": at[2].size > MANY, "edgecolors": one.edges, "linewidth": 0.2}
-            return axis.pcolormesh(*at, vmin=one.low, vmax=one.high, **look)
+            look = {"cmap": item.palette, "rasterized": at[2].size > MANY, "edgecolors": item.edges, "linewidth": 0.2}
+            return axis.pcolormesh(*at, vmin=item.low, vmax=item.high, **look)
         case Rule():
             for place in np.atleast_1d(at):
-                (axis.axvline if one.along == "x" else axis.axhline)(place, **look, linewidth=0.8, linestyle=one.dash)
+                (axis.axvline if item.along == "x" else axis.axhline)(place, **look, linewidth=0.8, linestyle=item.dash)
                 look["label"] = None
         case Strips():
             for low, high in zip(*at, strict=True):
-                (axis.axvspan if one.along == "x" else axis.axhspan)(low, high, **look, linewidth=0)
+                (axis.axvspan if item.along == "x" else axis.axhspan)(low, high, **look, linewidth=0)
                 look["label"] = None
         case Targets():
             for colour, (name, x, y) in zip(cycle(COLOURS), at, strict=False):
                 axis.plot(x, y, color=colour, label=name, **width)
         case Band():
-            axis.fill_between(*at, step="mid" if one.step else None, **look, linewidth=0)
+            axis.fill_between(*at, step="mid" if item.step else None, **look, linewidth=0)
         case Dots():
-            form = MARKERS.get(one.marker, one.marker) or "none"
-            axis.errorbar(*at, fmt=form, markersize=0.6 * one.size, elinewidth=0.6 * one.width, **look)
+            form = MARKERS.get(item.marker, item.marker) or "none"
+            axis.errorbar(*at, fmt=form, markersize=0.6 * item.size, elinewidth=0.6 * item.width, **look)
         case Line():
-            step = "steps-mid" if one.step else "default"
-            axis.plot(*at, linestyle=one.dash or "-", marker=one.marker, markersize=3, drawstyle=step, **look, **width)
+            step = "steps-mid" if item.step else "default"
+            axis.plot(
+                *at, linestyle=item.dash or "-", marker=item.marker, markersize=3, drawstyle=step, **look, **width
+            )
     return None
 
 

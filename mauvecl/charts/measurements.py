@@ -35,12 +35,12 @@ def _few(answer: MeasureAnswer) -> tuple[Any, ...]:
 def fits(flares: Sequence[MeasuredFlare]) -> Picture:
     """Plot the first exposure minus unknowns with the fitted flare, and the residuals, with a column per fit."""
     above, below = list[Panel](), list[Panel]()
-    for one in flares:
-        quiet, found = one.quiet, one.found
-        mean, unknown = one.fitted_dn()
-        kelvin = " and ".join(f"{x:.0f} K" for x in np.atleast_1d(np.exp(found.log_k[0])))
-        variance, used = usable_variance(quiet, mean, one.skipped_nm)
-        sums = [quiet.per_element(np.where(used, values, 0.0)) for values in (one.frame - unknown, mean, variance)]
+    for flare in flares:
+        quiet, measurement = flare.quiet, flare.found
+        mean, unknown = flare.fitted_dn()
+        kelvin = " and ".join(f"{x:.0f} K" for x in np.atleast_1d(np.exp(measurement.log_k[0])))
+        variance, used = usable_variance(quiet, mean, flare.skipped_nm)
+        sums = [quiet.per_element(np.where(used, values, 0.0)) for values in (flare.frame - unknown, mean, variance)]
         # Resolution elements of which some pixels are not used are not shown.
         whole = quiet.per_element(used.astype(np.float64)) == quiet.per_element(np.ones(used.size))
         data, fit, variance = (np.where(whole, values, np.nan) for values in sums)
@@ -48,7 +48,7 @@ def fits(flares: Sequence[MeasuredFlare]) -> Picture:
         x = Axis("wavelength (nm)")
         dots = Dots("exposure less star and unknowns", size=4, at=(nm, data, noise))
         line = Line(f"fit: {kelvin}", "star", at=(nm, fit))
-        above.append(Panel(x, Axis("DN per resolution element"), [dots, line], one.name))
+        above.append(Panel(x, Axis("DN per resolution element"), [dots, line], flare.name))
         residuals = Dots("", "star", size=4, at=(nm, (data - fit) / noise))
         below.append(Panel(x, Axis("residual / noise"), [residuals, Rule(along="y", dash="-", at=0.0)]))
     size = 3.6 * len(flares), 4.6
@@ -57,11 +57,11 @@ def fits(flares: Sequence[MeasuredFlare]) -> Picture:
 
 def _each(flares: Sequence[MeasuredFlare], panel: Callable[[MeasuredFlare], Panel]) -> Picture:
     """Return a picture with a panel per flare."""
-    return Picture([[panel(one) for one in flares]], (3.4 * len(flares), 3.1), notes=(note_of(flares),))
+    return Picture([[panel(flare) for flare in flares]], (3.4 * len(flares), 3.1), notes=(note_of(flares),))
 
 
 def _single(answer: MeasureAnswer) -> tuple[Any, ...]:
-    single = [one for one in answer.flares if isinstance(one.fitted, FlareModel)]
+    single = [flare for flare in answer.flares if isinstance(flare.fitted, FlareModel)]
     return (First(single, MOST_FLARES, "flares"),)
 
 
@@ -70,16 +70,16 @@ def _single(answer: MeasureAnswer) -> tuple[Any, ...]:
 def contours(flares: Sequence[MeasuredFlare]) -> Picture:
     """Plot expected confidence regions of temperature and amplitude, with unknowns marginalised."""
 
-    def panel(one: MeasuredFlare) -> Panel:
+    def panel(flare: MeasuredFlare) -> Panel:
         series: list[Series] = []
         for rise, dash in zip(RISES, ("-", "dashed"), strict=True):
-            kelvin, low, high = one.region(rise)
+            kelvin, low, high = flare.region(rise)
             around = np.concatenate([kelvin, kelvin[::-1], kelvin[:1]]), np.concatenate([low, high[::-1], low[:1]])
             series.append(Line("", "star", dash=dash, at=around))
-        series.append(Dots("", "flare", marker="+", size=10, at=one.perfect.estimates[0, :2]))
-        if np.isfinite(one.truth[:2]).all():
-            series.append(Dots("", "text", marker="x", size=10, at=one.truth[:2]))
-        return Panel(Axis("temperature (K)"), Axis("amplitude"), series, one.name)
+        series.append(Dots("", "flare", marker="+", size=10, at=flare.perfect.estimates[0, :2]))
+        if np.isfinite(flare.truth[:2]).all():
+            series.append(Dots("", "text", marker="x", size=10, at=flare.truth[:2]))
+        return Panel(Axis("temperature (K)"), Axis("amplitude"), series, flare.name)
 
     return _each(flares, panel)
 
@@ -90,17 +90,17 @@ def pulls(flares: Sequence[MeasuredFlare]) -> Picture:
     """Plot the pulls of estimates, (estimate - truth) / standard error, and the standard normal."""
     x, edges = np.linspace(-5.0, 5.0, 201), np.linspace(-5.0, 5.0, 41)
 
-    def panel(one: MeasuredFlare) -> Panel:
+    def panel(flare: MeasuredFlare) -> Panel:
         series: list[Series] = []
         # Temperature, amplitude and the next one; an observed flare has only fluxes.
-        for colour, q in zip(COLOURS, np.flatnonzero(np.isfinite(one.truth))[:3], strict=False):
+        for colour, q in zip(COLOURS, np.flatnonzero(np.isfinite(flare.truth))[:3], strict=False):
             with np.errstate(invalid="ignore", divide="ignore"):
-                pull = (one.found.estimates[:, q] - one.truth[q]) / one.found.errors[:, q]
+                pull = (flare.found.estimates[:, q] - flare.truth[q]) / flare.found.errors[:, q]
             density, _ = np.histogram(np.clip(pull[np.isfinite(pull)], -5, 5), edges, density=True)
-            series.append(Line(one.found.names[q], colour, step=True, at=((edges[1:] + edges[:-1]) / 2, density)))
+            series.append(Line(flare.found.names[q], colour, step=True, at=((edges[1:] + edges[:-1]) / 2, density)))
         normal = np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi)
         series.append(Line("normal", dash="dashed", at=(x, normal)))
-        return Panel(Axis("(estimate - truth) / error"), Axis("density"), series, one.name)
+        return Panel(Axis("(estimate - truth) / error"), Axis("density"), series, flare.name)
 
     return _each(flares, panel)
 
@@ -110,36 +110,36 @@ def pulls(flares: Sequence[MeasuredFlare]) -> Picture:
 def errors(flares: Sequence[MeasuredFlare]) -> Picture:
     """Plot forecast errors of temperature and amplitude against the amplitude, with and without unknowns."""
 
-    def panel(one: MeasuredFlare) -> Panel:
-        amplitudes, series = FACTORS * one.perfect.estimates[0, 1], list[Series]()
-        for unknown, dash in {None: "dashed", one.unknown: "-"}.items():
-            ahead, whose = one.forecasts(FACTORS, unknown), "all known" if unknown is None else "unknowns free"
+    def panel(flare: MeasuredFlare) -> Panel:
+        amplitudes, series = FACTORS * flare.perfect.estimates[0, 1], list[Series]()
+        for unknown, dash in {None: "dashed", flare.unknown: "-"}.items():
+            ahead, whose = flare.forecasts(FACTORS, unknown), "all known" if unknown is None else "unknowns free"
             for colour, q in zip(COLOURS, range(2), strict=False):
                 relative = [f.errors[q] / f.values[q] for f in ahead]
-                series.append(Line(f"{one.fitted.names[q]}, {whose}", colour, dash=dash, at=(amplitudes, relative)))
-        return Panel(Axis("amplitude", log=True), Axis("relative error", log=True), series, one.name)
+                series.append(Line(f"{flare.fitted.names[q]}, {whose}", colour, dash=dash, at=(amplitudes, relative)))
+        return Panel(Axis("amplitude", log=True), Axis("relative error", log=True), series, flare.name)
 
     return _each(flares, panel)
 
 
-@picture_of("MeasureAnswer", "temperatures", each=lambda answer: [(one,) for one in answer.stares if one.perfect])
+@picture_of("MeasureAnswer", "temperatures", each=lambda answer: [(star,) for star in answer.stares if star.perfect])
 @styled_picture
-def temperatures(one: MeasuredStare) -> Picture:
+def temperatures(star: MeasuredStare) -> Picture:
     """Plot temperature, size and light of the flares of a stare against time, with 95 % intervals.
 
     Lines are the fits to the same frames without noise.
     """
-    drawn, perfect, rows = one.drawn, one.perfect, list[list[Panel]]()
+    drawn, perfect, rows = star.drawn, star.perfect, list[list[Panel]]()
     assert drawn is not None
     assert not isinstance(drawn, str)
     assert perfect is not None
-    found = drawn.found
-    size = "area" if "area" in found.names else "amplitude"
-    light = "luminosity bolometric" if "area" in found.names else "flux bolometric"
+    measurement = drawn.found
+    size = "area" if "area" in measurement.names else "amplitude"
+    light = "luminosity bolometric" if "area" in measurement.names else "flux bolometric"
     middle, reach = (drawn.start_s + drawn.end_s) / 2, (drawn.end_s - drawn.start_s) / 2
     for name, colour in zip(("temperature", size, light), COLOURS, strict=False):
-        q = found.column(name)
-        estimate, low, high = found.estimates[:, q], found.low[-1, :, q], found.high[-1, :, q]
+        q = measurement.column(name)
+        estimate, low, high = measurement.estimates[:, q], measurement.low[-1, :, q], measurement.high[-1, :, q]
         ends = np.where(np.isfinite([low, high]), np.abs([estimate - low, high - estimate]), 0.0)
         limits, true = ~np.isfinite(high), perfect.found.estimates[:, q]
         series = [
@@ -148,17 +148,17 @@ def temperatures(one: MeasuredStare) -> Picture:
             Line("", step=True, at=(middle, true)),
         ]
         positive = [value for value in (*estimate, *true) if value > 0]
-        label = f"{name} ({found.units[q]})" if found.units[q] else name
+        label = f"{name} ({measurement.units[q]})" if measurement.units[q] else name
         y = Axis(label, log=True, limits=(0.5 * min(positive), 2 * max(positive)))
         rows.append([Panel(Axis("time from the start of the stare (s)"), y, series)])
-    return Picture(rows, (7.2, 6.4), f"{one.title}: one simulated stare; nominal throughput", share_x=True)
+    return Picture(rows, (7.2, 6.4), f"{star.title}: one simulated stare; nominal throughput", share_x=True)
 
 
-@picture_of("MeasureAnswer", "joint", each=lambda answer: [(one, one.joint) for one in answer.stares if one.joint])
+@picture_of("MeasureAnswer", "joint", each=lambda answer: [(star, star.joint) for star in answer.stares if star.joint])
 @styled_picture
-def joint(one: MeasuredStare, fit: JointFit) -> Picture:
+def joint(star: MeasuredStare, fit: JointFit) -> Picture:
     """Plot the light of a flare in each frame, the joint fit of its shape and spectrum, residuals and temperature."""
-    stare, (event,), (drawn, mean) = one.staring.stare, one.events, (fit.fitted.drawn_dn, fit.fitted.mean_dn)
+    stare, (event,), (drawn, mean) = star.staring.stare, star.events, (fit.fitted.drawn_dn, fit.fitted.mean_dn)
     since = (stare.middle_s - event.peak_s) / event.half_width_s
     near = (since > -BEFORE) & (since < AFTER)
     x, time = Axis("time from the start of the stare (s)"), stare.middle_s[near]
@@ -173,5 +173,5 @@ def joint(one: MeasuredStare, fit: JointFit) -> Picture:
     ]
     axes = {"DN per frame": light, "residual (DN)": [off, Rule(along="y", dash="-", at=0.0)], "temperature (K)": kelvin}
     rows = [[Panel(x, Axis(label), series)] for label, series in axes.items()]
-    title = f"{one.title}: one simulated stare; nominal throughput"
+    title = f"{star.title}: one simulated stare; nominal throughput"
     return Picture(rows, (7.2, 6.4), title, share_x=True, heights=(2, 1, 1.5))

@@ -256,11 +256,11 @@ def serve(
 
     Example: mauvecl serve --show
     """
-    from mauvecl.schema.errors import InputError, shortened
+    from mauvecl.schema.errors import InputError, missing_package, shortened
 
     number = within(port, "--port", read=count, low=1, high=65535)
     if find_spec("bokeh") is None or find_spec("tornado") is None:
-        raise InputError("Bokeh, which the page needs, is missing: pip install 'mauvecl[web]'", key="bokeh")
+        raise missing_package("bokeh", "the page", "web")
     from mauvecl.web.server import serve
 
     try:
@@ -274,14 +274,14 @@ def serve(
 def _help(text: str | None) -> str:
     """Return a help text with examples on separate lines of at most 80 columns, which can be pasted."""
     text = re.sub(r"(?m)^(Examples?:) (?=mauvecl )", r"\1\n\n", inspect.cleandoc(text or ""))
-    return re.sub(r"(?m)^mauvecl .*$", lambda found: "\b\n" + _broken(found[0]), text)
+    return re.sub(r"(?m)^mauvecl .*$", lambda match: "\b\n" + _broken(match[0]), text)
 
 
-def _broken(command: str, most: int = 72) -> str:
-    """Divide a long command into lines that end in a backslash before a flag."""
+def _broken(command: str) -> str:
+    """Divide a command longer than 72 characters into lines that end in a backslash before a flag."""
     lines = [""]
     for part in re.split(r" (?=-)", command):
-        if lines[-1] and len(lines[-1]) + len(part) > most:
+        if lines[-1] and len(lines[-1]) + len(part) > 72:
             lines[-1] += " \\"
             lines.append("   ")
         lines[-1] += f" {part}" if lines[-1] else part

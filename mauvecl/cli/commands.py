@@ -64,7 +64,7 @@ class Command:
         options = self._options().items()
         parameters = [
             inspect.Parameter("study_file", named, default=None, annotation=StudyFile),
-            *(inspect.Parameter(key, named, default=None, annotation=one.kind) for key, one in flags.items()),
+            *(inspect.Parameter(key, named, default=None, annotation=flag.kind) for key, flag in flags.items()),
             inspect.Parameter("set", named, default=None, annotation=SetFlag),
             *(p.replace(kind=named, annotation=kinds[p.name]) for p in own if p.name != "given"),
             *(inspect.Parameter(key, named, default=usual, annotation=kind) for key, (kind, usual) in options),
@@ -93,9 +93,9 @@ class Command:
         given = {key: values.pop(key, None) for key in (*flags, "set")}
         study_file = _placed(study_file, given)
         if study_file is None:
-            for one in flags.values():
-                if given[one.name] is None:
-                    given[one.name] = defaults.get(f"{one.section}.{one.key}")
+            for flag in flags.values():
+                if given[flag.name] is None:
+                    given[flag.name] = defaults.get(f"{flag.section}.{flag.key}")
         how = {key: values.pop(key, usual) for key, (_, usual) in self._options().items()}
         if tells_flags:
             values["given"] = given

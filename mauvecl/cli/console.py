@@ -433,9 +433,9 @@ def _commands() -> Iterator[Any]:
         called = getattr(called, "commands", {}).get(word, called)
     yield called
     while others:
-        one = others.pop()
-        yield one
-        others += getattr(one, "commands", {}).values()
+        command = others.pop()
+        yield command
+        others += getattr(command, "commands", {}).values()
 
 
 def _flags(name: str, command: Any) -> list[str]:
@@ -447,7 +447,7 @@ def _flags(name: str, command: Any) -> list[str]:
     wanted = {name} | {parameter for key, parameter in parameters.items() if f".{key}".endswith(f".{name}")}
     for parameter in command.params:
         if parameter.name in wanted:
-            return sorted((one for one in parameter.opts if one.startswith("-")), key=len, reverse=True)
+            return sorted((flag for flag in parameter.opts if flag.startswith("-")), key=len, reverse=True)
     return []
 
 
@@ -456,17 +456,17 @@ def with_flags(text: str) -> str:
     return _REMEDY.sub(_as_flag, text) if "`" in text else text
 
 
-def _as_flag(found: re.Match[str]) -> str:
-    name = found["name"]
-    flag = _OTHERWISE.get(name) or next((flags[0] for one in _commands() if (flags := _flags(name, one))), None)
+def _as_flag(match: re.Match[str]) -> str:
+    name = match["name"]
+    flag = _OTHERWISE.get(name) or next((flags[0] for command in _commands() if (flags := _flags(name, command))), None)
     if flag is None:
-        return found[0]
-    if found["value"] is None:
+        return match[0]
+    if match["value"] is None:
         return flag
     try:
-        value = ast.literal_eval(found["value"])
+        value = ast.literal_eval(match["value"])
     except (ValueError, SyntaxError):
-        value = found["value"]
+        value = match["value"]
     return flag if value is True else f"{flag} {shlex.quote(str(value))}"
 
 
@@ -489,4 +489,4 @@ def name_flag(error: InputError) -> str:
 
 
 def _gives(word: str, flags: list[str]) -> bool:
-    return any(word.partition("=")[0] == one if one.startswith("--") else word.startswith(one) for one in flags)
+    return any(word.partition("=")[0] == flag if flag.startswith("--") else word.startswith(flag) for flag in flags)

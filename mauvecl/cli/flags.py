@@ -71,7 +71,7 @@ def study_flags(*keys: str, defaults: Mapping[str, Any]) -> dict[str, StudyFlag]
 
     flags: dict[str, StudyFlag] = {}
     for wanted in keys:
-        of_key = [one for one in keys_with_flags() if one[0] == wanted or one[0].startswith(f"{wanted}.")]
+        of_key = [entry for entry in keys_with_flags() if entry[0] == wanted or entry[0].startswith(f"{wanted}.")]
         assert of_key, wanted
         for path, field, flag in of_key:
             section, _, key = path.rpartition(".")
@@ -208,18 +208,18 @@ def study_of(
     study = Study.read(file) if file is not None else default(given) if default else Study()
     changes: dict[str, dict[str, Any]] = {"sky": sky_of(given)}
     setting: dict[tuple[str, str], str] = {}
-    for name, one in flags.items():
-        if one.section not in ("star", "sky") and name != "nuisance":
+    for name, flag in flags.items():
+        if flag.section not in ("star", "sky") and name != "nuisance":
             value = given[name]
             if value is not None:
-                other = setting.setdefault((one.section, one.key), name)
+                other = setting.setdefault((flag.section, flag.key), name)
                 if other != name:
                     raise InputError(
                         f"--{other} and --{name} are both given",
-                        f"one of them: both set {one.section}.{one.key}",
+                        f"one of them: both set {flag.section}.{flag.key}",
                         key=other,
                     )
-                changes.setdefault(one.section, {})[one.key] = one.value(value)
+                changes.setdefault(flag.section, {})[flag.key] = flag.value(value)
     if given.get("nuisance"):
         changes.setdefault("nuisances", {}).update(nuisances_of(study, given["nuisance"]))
     changed = study.with_changes(changes, stars_of(study, given, flags), "command line")
@@ -288,7 +288,7 @@ def nuisances_of(study: Study, texts: list[str]) -> dict[str, Any]:
     from mauvecl.noise.unknowns import NUISANCES
 
     nuisances: dict[str, Any] = {}
-    own = {name: one.model_dump(exclude_none=True) for name, one in study.nuisances.own.items()}
+    own = {name: choice.model_dump(exclude_none=True) for name, choice in study.nuisances.own.items()}
     for text in texts:
         expected = f"NAME=SD, with a name of {', '.join(NUISANCES)} or a file's, and a standard deviation or free"
         name, sd = assignment(text, "--nuisance", expected)
@@ -307,7 +307,7 @@ def stars_of(study: Study, given: dict[str, Any], flags: Mapping[str, StudyFlag]
     if "star" not in given:
         return None
     names, magnitudes = given["star"], given["magnitude"]
-    of_stars = {one.key: given[name] for name, one in flags.items() if one.section == "star"}
+    of_stars = {flag.key: given[name] for name, flag in flags.items() if flag.section == "star"}
     changed = {
         key: value for key, value in of_stars.items() if value is not None and key not in ("library", "magnitude")
     }
@@ -317,7 +317,7 @@ def stars_of(study: Study, given: dict[str, Any], flags: Mapping[str, StudyFlag]
         return None
     if names:
         # A name of an existing file is a file; other names are searched for in the library.
-        each = [one for name in names for one in ([name] if _is_there(name) else map(str.strip, name.split(",")))]
+        each = [star for name in names for star in ([name] if _is_there(name) else map(str.strip, name.split(",")))]
         stars: list[dict[str, Any]] = [{"file": name} if _is_file(name) else {"library": name} for name in each]
     else:
         stars = [entry.model_dump(exclude_none=True) for entry in study.star]
@@ -361,7 +361,7 @@ def as_text(parameter: inspect.Parameter) -> tuple[inspect.Parameter, Callable[[
     if get_origin(parameter.annotation) is not Annotated:
         return parameter, None
     wanted, option, *_ = get_args(parameter.annotation)
-    (inner, *_) = [one for one in (get_args(wanted) or (wanted,)) if one is not NoneType]
+    (inner, *_) = [kind for kind in (get_args(wanted) or (wanted,)) if kind is not NoneType]
     many = get_origin(inner) is list or get_origin(wanted) is list
     each = get_args(inner)[0] if get_origin(inner) is list else inner
     if each not in (float, int):
@@ -369,7 +369,7 @@ def as_text(parameter: inspect.Parameter) -> tuple[inspect.Parameter, Callable[[
     option, low, high = copy(option), option.min, option.max
     option.min = option.max = None
     option.metavar = ("NUMBER" if each is float else "INTEGER") + (",..." if many else "")
-    named = (one for one in option.param_decls or () if one.startswith("--"))
+    named = (flag for flag in option.param_decls or () if flag.startswith("--"))
     flag = next(named, "--" + parameter.name.replace("_", "-"))
     read = partial(within, read=number if each is float else count, low=low, high=high)
     texts: Any = list[str] if many else str

@@ -252,10 +252,10 @@ class Session(Options):
         return Meter(quiet=self.quiet or self.as_json, unit=unit, work=work)
 
     def _kept(self, checkpoint: Checkpoint) -> str:
-        kept = checkpoint.kept
-        if not kept:
+        parts_kept = checkpoint.kept
+        if not parts_kept:
             return "nothing was written, and nothing is half written"
-        parts = f"{kept} part{'s' if kept > 1 else ''} of the work"
+        parts = f"{parts_kept} part{'s' if parts_kept > 1 else ''} of the work"
         return f"{parts} kept in {str(checkpoint.folder)!r}, and the same command with --resume continues from there"
 
     def say(self, lines: Sequence[str]) -> None:
@@ -357,8 +357,8 @@ class Session(Options):
     def _written(self) -> str:
         """Describe what an interruption leaves while files are written."""
         whole = ", ".join(path.name for path in self.files) or "nothing"
-        kept = None if self._checkpoint is None else self._checkpoint.kept
-        again = "the same command with --resume" if kept else "the same command"
+        parts_kept = None if self._checkpoint is None else self._checkpoint.kept
+        again = "the same command with --resume" if parts_kept else "the same command"
         return f"{whole} written to {str(self.folder)!r}, each file whole, and {again} writes all of them"
 
     def print_json(self, content: dict[str, Any]) -> None:
@@ -395,7 +395,7 @@ def working(device: str | None, cluster: str | None) -> Iterator[Workers]:
 
 
 @contextmanager
-def report_interrupts(kept: Callable[[], str]) -> Iterator[None]:
+def report_interrupts(message: Callable[[], str]) -> Iterator[None]:
     """Stop the work in order at Ctrl-C and SIGTERM, with a message on kept results; exit codes 130 and 143."""
 
     def terminate(*_: object) -> None:
@@ -407,7 +407,7 @@ def report_interrupts(kept: Callable[[], str]) -> Iterator[None]:
         yield
     except KeyboardInterrupt as stop:
         terminated = isinstance(stop, Terminated)
-        print(f"mauvecl: {'terminated' if terminated else 'interrupted'}; {kept()}", file=sys.stderr)
+        print(f"mauvecl: {'terminated' if terminated else 'interrupted'}; {message()}", file=sys.stderr)
         sys.exit(143 if terminated else 130)
     finally:
         if main:

@@ -81,9 +81,9 @@ class Chi2(QuadraticStatistic):
         taken, root = rows @ basis, np.linalg.cholesky(noise)
         weight, vectors = np.linalg.eigh(root.T @ root - (taken @ root).T @ (taken @ root))
         # Projected-out directions have no weight.
-        kept = weight > 1e-9 * weight[-1]
+        large = weight > 1e-9 * weight[-1]
         shift = vectors.T @ solve_triangular(root, basis.T @ (delta / scale), lower=True)
-        weights, shifts = np.append(weight[kept], rest), np.append(shift[kept], np.zeros(rest.size))
+        weights, shifts = np.append(weight[large], rest), np.append(shift[large], np.zeros(rest.size))
         return QuadraticForm(weights, shifts)
 
     def values(self, setting: Setting, x: Float, variance: Float, flare: Expectation | None = None) -> Float:
@@ -277,8 +277,8 @@ class Smoothing:
     def _eigenmodes(self, scale: Float, variance: Float) -> tuple[Float, Float]:
         """Return the variances of the modes, and their weights per centre, shape (n_centre, n_mode)."""
         values, vectors = np.linalg.eigh(self._covariance(scale, variance))
-        kept = values > MIN_MODE_VARIANCE * values[-1]
-        return values[kept], vectors[:, kept]
+        large = values > MIN_MODE_VARIANCE * values[-1]
+        return values[large], vectors[:, large]
 
     def _covariance(self, scale: Float, variance: Float) -> Float:
         """Return the covariance of the smoothed values times the roots of their factors."""

@@ -124,9 +124,9 @@ def sums_of(values: NDArray[np.float32]) -> tuple[int, int]:
     mantissa = (mantissa ^ (image >> 31)) - (image >> 31)
     first = second = 0
     low, high = int(exponent.min(initial=255)), int(exponent.max(initial=0))
-    for one in range(low, high + 1):
-        mine = mantissa if low == high else mantissa[exponent == one]
-        shift = max(one, 1) - 1
+    for power in range(low, high + 1):
+        mine = mantissa if low == high else mantissa[exponent == power]
+        shift = max(power, 1) - 1
         first += int(mine.sum(dtype=np.int64)) << shift
         for begin in range(0, mine.size, CHUNK):
             part = mine[begin : begin + CHUNK].astype(np.int64).view(np.uint64)

@@ -148,7 +148,7 @@ def departure_table(detection: Detection, amplitudes: Sequence[float], fap: floa
     def amplitude(row: Departure) -> float:
         return amplitudes[row.template] if detection.statistic(row.statistic).shaped else float("nan")
 
-    columns = [replace(one, get=amplitude) if one.name == "amplitude" else one for one in DEPARTURE_COLUMNS]
+    columns = [replace(column, get=amplitude) if column.name == "amplitude" else column for column in DEPARTURE_COLUMNS]
     return table_of(columns, rows, fap=fap)
 
 
@@ -178,23 +178,23 @@ def _skewed_fap(detection: Detection, statistic: str, template: int, null: Form,
     scene, quiet = detection.scene, detection.quiet
     each = 1 if scene.frames else quiet.n_frames
     c, draws = Cumulants.of(quiet, each), quiet.n_frames // each
-    one, flare = detection.statistic(statistic), detection.shape(statistic, template)
+    kind, flare = detection.statistic(statistic), detection.shape(statistic, template)
     # Cumulants of the difference between an exposure and the mean of reference exposures.
-    added = one.added_variance(detection.setting)
+    added = kind.added_variance(detection.setting)
     third, fourth, sixth = (
         draws * (c.photon_cumulant(r) + c.dark_cumulant(r)) * (1.0 + (-1.0) ** r * added ** (r - 1)) for r in (3, 4, 6)
     )
-    variance = one.variance(detection.setting)
-    if isinstance(one, LinearStatistic):
-        weights = one.weights_per_dn(detection.setting, flare)
+    variance = kind.variance(detection.setting)
+    if isinstance(kind, LinearStatistic):
+        weights = kind.weights_per_dn(detection.setting, flare)
         sd = float(np.sqrt(weights**2 @ variance))
         z, skew, excess = cut / null.std, weights**3 @ third / sd**3, weights**4 @ fourth / sd**4
         # Edgeworth series (Abramowitz & Stegun 26.2.48).
         series = skew * (z**2 - 1) / 6 + excess * (z**3 - 3 * z) / 24 + skew**2 * (z**5 - 10 * z**3 + 15 * z) / 72
         return float(null.sf(cut) + np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi) * series)
-    assert isinstance(one, QuadraticStatistic)
+    assert isinstance(kind, QuadraticStatistic)
     # The square of a skewed variable has more variance and skew than that of a normal one.
-    weights = one.square_weights(detection.setting, flare)
+    weights = kind.square_weights(detection.setting, flare)
     second = null.std**2
     skewed = null.third
     more = weights**2 @ fourth, weights**3 @ (12.0 * fourth * variance + 10.0 * third**2 + sixth)
@@ -214,10 +214,10 @@ def _shifted_fap(
     detection: Detection, statistic: str, template: int, shift: Float, variance: Float, cut: float
 ) -> float:
     """Return the false-alarm probability at a threshold for a changed mean and variance of each pixel."""
-    one, used = detection.statistic(statistic), detection.scene.used
-    added = one.added_variance(detection.setting)
+    kind, used = detection.statistic(statistic), detection.scene.used
+    added = kind.added_variance(detection.setting)
     moved = Differences(np.where(used, (1.0 - (added > 0)) * shift, 0.0), (1.0 + added) * variance)
-    return one.integrate_drawn(detection.setting, detection.quiet, moved, detection.shape(statistic, template)).sf(cut)
+    return kind.integrate_drawn(detection.setting, detection.quiet, moved, detection.shape(statistic, template)).sf(cut)
 
 
 def _adc_moments(x: Expectation) -> tuple[tuple[Float, Float], tuple[Float, Float]]:
@@ -394,10 +394,10 @@ class Detection(Drawable, ContentEquality, Hypotheses):
 
     def collect(self, plan: ChannelPlan, tally: Tally, samples: Sequence[TailSamples | None]) -> None:
         """Add the distributions and tails of one batch."""
-        for index, (key, kept) in enumerate(zip(plan.keys, samples, strict=True)):
+        for index, (key, samples_of_key) in enumerate(zip(plan.keys, samples, strict=True)):
             self._distributions[key] = tally.distribution(index)
-            if kept is not None:
-                self._samples[key] = kept
+            if samples_of_key is not None:
+                self._samples[key] = samples_of_key
 
     def distribution(self, statistic: str, flare: int | None = None, *, template: int = 0) -> Distribution:
         """Return the simulated distribution of a statistic.

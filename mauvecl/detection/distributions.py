@@ -131,8 +131,8 @@ def _beta(a: float, b: float, probability: float) -> float:
     return _probit(float(special.betaincinv(a, b, probability)))
 
 
-def _combined(one: float, other: float, shared: float) -> float:
-    return float(np.sqrt(max(one**2 + other**2 - 2.0 * shared * one * other, 0.0)))
+def _combined(sd: float, other: float, shared: float) -> float:
+    return float(np.sqrt(max(sd**2 + other**2 - 2.0 * shared * sd * other, 0.0)))
 
 
 def _exceedance_correlation(fap: float, probability: float, correlation: float) -> float:

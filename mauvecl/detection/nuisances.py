@@ -150,10 +150,10 @@ class Nuisances(ContentEquality):
         """Return all parameters but those named."""
         return self._rows([i for i, name in enumerate(self.names) if name not in names])
 
-    def _rows(self, kept: Sequence[int]) -> Nuisances:
-        kept = list(kept)
-        spectra, sd, of_flare, mean = (one[kept] for one in (self.spectra, self.sd, self.of_flare, self.mean))
-        return Nuisances(tuple(self.names[i] for i in kept), spectra, sd, of_flare, mean, self.factor_prior)
+    def _rows(self, rows: Sequence[int]) -> Nuisances:
+        rows = list(rows)
+        spectra, sd, of_flare, mean = (values[rows] for values in (self.spectra, self.sd, self.of_flare, self.mean))
+        return Nuisances(tuple(self.names[i] for i in rows), spectra, sd, of_flare, mean, self.factor_prior)
 
     def with_spectrum(self, name: str, spectrum: Float, sd: float) -> Nuisances:
         """Return the parameters with another one that leaves the light of a flare as it is."""
@@ -179,7 +179,7 @@ class Nuisances(ContentEquality):
 
     def with_prior(self, name: str, mean: float, sd: float) -> Nuisances:
         """Return the parameters with another prior of one amplitude."""
-        chosen = np.array([one == name for one in self.names])
+        chosen = np.array([other == name for other in self.names])
         return replace(self, sd=np.where(chosen, sd, self.sd), mean=np.where(chosen, mean, self.mean))
 
     @property
@@ -197,11 +197,11 @@ class Nuisances(ContentEquality):
         order, factors = np.arange(len(self.names)), np.flatnonzero((self.of_flare == 1.0).all(axis=1))
         if factors.size:
             order = np.append(np.delete(order, factors[0]), factors[0])
-        found = self._rows(order.tolist())
-        spectra = found.spectra + found.of_flare * flare_dn
+        spread = self._rows(order.tolist())
+        spectra = spread.spectra + spread.of_flare * flare_dn
         if factors.size:
-            spectra[-1] = found.spectra[-1]
-        return replace(found, spectra=spectra)
+            spectra[-1] = spread.spectra[-1]
+        return replace(spread, spectra=spectra)
 
     @property
     def mean_factor(self) -> float:
@@ -215,8 +215,8 @@ class Nuisances(ContentEquality):
 
     def finite(self, spectra: Float) -> Float:
         """Return the spectra with finite priors times their standard deviations, shape (k_finite, n)."""
-        known = np.isfinite(self.sd)
-        return np.asarray(spectra[known] * self.sd[known, None])
+        has_prior = np.isfinite(self.sd)
+        return np.asarray(spectra[has_prior] * self.sd[has_prior, None])
 
     def rows(self, variance: Float, spectra: Float) -> Float:
         """Return the rows of x^T C^-1 x = sum x^2 / v - sum (rows @ x)^2 (Woodbury identity), shape (k, n).

@@ -41,7 +41,7 @@ from mauvecl.schema.physical import FirstRealisation, Realisations, Seed
 
 #: All statistics in the order of tables and plots; add a new one here.
 STATISTICS: dict[str, Statistic] = {
-    one.name: one for one in (Chi2(), Chi2Element(), Chi2Pair(), Matched(), UvExcess(), Paper())
+    statistic.name: statistic for statistic in (Chi2(), Chi2Element(), Chi2Pair(), Matched(), UvExcess(), Paper())
 }
 
 
@@ -53,17 +53,17 @@ def statistics_by_name(asked: Sequence[str | Linear]) -> dict[str, Statistic]:
     """
     named: dict[str, Statistic] = {}
     own: set[str] = set()
-    for one in asked:
-        if isinstance(one, str):
-            check_statistic(one)
-            named.setdefault(one, STATISTICS[one])
+    for statistic in asked:
+        if isinstance(statistic, str):
+            check_statistic(statistic)
+            named.setdefault(statistic, STATISTICS[statistic])
             continue
-        if one.name in STATISTICS:
-            raise InputError(f"statistic {one.name!r} is one of mauvecl's own", "another name", key="statistics")
-        if one.name in own:
-            raise InputError.of("statistics", one.name, "different names")
-        own.add(one.name)
-        named[one.name] = one
+        if statistic.name in STATISTICS:
+            raise InputError(f"statistic {statistic.name!r} is one of mauvecl's own", "another name", key="statistics")
+        if statistic.name in own:
+            raise InputError.of("statistics", statistic.name, "different names")
+        own.add(statistic.name)
+        named[statistic.name] = statistic
     if not named:
         raise InputError("no statistic named", f"some of {', '.join(STATISTICS)}", key="statistics")
     return named
@@ -99,13 +99,13 @@ class Hypotheses:
         self.statistics = tuple(self._chosen)
         drawn = FactorDistributions.of(self.scene) if self.nuisances else None
         self.setting = Setting(self.quiet, self.scene.used, self.scene.comparison, self.flares, self.nuisances, drawn)
-        shaped = next((name for name, one in self._chosen.items() if one.shaped), None)
+        shaped = next((name for name, statistic in self._chosen.items() if statistic.shaped), None)
         if shaped is not None and not self.flares:
             raise InputError("no flare given", f"at least one for the statistic {shaped!r}", key="flares")
         if not self.scene.used.any():
             raise InputError(f"every pixel of {self.quiet.name} is saturated", "a fainter star", key="quiet")
-        for one in self._chosen.values():
-            one.check(self.setting)
+        for statistic in self._chosen.values():
+            statistic.check(self.setting)
         if "matched" in self._chosen:
             self._check_shapes()
 
@@ -134,10 +134,10 @@ class Hypotheses:
         template : int
             Index of the flare that shaped statistics use as template.
         """
-        one = self.statistic(statistic)
+        kind = self.statistic(statistic)
         return (
-            one.weights_per_dn(self.setting, self.shape(statistic, template))
-            if isinstance(one, LinearStatistic)
+            kind.weights_per_dn(self.setting, self.shape(statistic, template))
+            if isinstance(kind, LinearStatistic)
             else None
         )
 
@@ -289,18 +289,20 @@ def _rows(hypotheses: Hypotheses, asked: Sequence[Statistic], batch: Sequence[in
         # Quiescent draws are compared with every flare's template, draws of a flare only with its own.
         shapes = [flare for i, flare in enumerate(batch) if scenario in (0, i + 1)]
         # Shaped statistics come first, since the kernel fuses the first row, and sums over elements last.
-        for one in sorted(asked, key=lambda s: (s.by_element, not s.shaped)):
-            if one.by_element:
+        for statistic in sorted(asked, key=lambda s: (s.by_element, not s.shaped)):
+            if statistic.by_element:
                 weighted.end_pixels()
-            for flare in shapes if one.shaped else [0]:
-                looked_for = hypotheses.shape(one.name, flare)
-                if isinstance(one, LinearStatistic):
-                    weighted.add(one.name, scenario, flare, one.weights_per_dn(hypotheses.setting, looked_for))
-                elif isinstance(one, QuadraticStatistic) and one.kernel_sum is not None:
-                    for number, own in enumerate(one.subtracted_rows(hypotheses.setting)):
-                        weighted.add(one.name, scenario, number, own)
-                elif isinstance(one, Paper):
-                    smoothed.add(one.name, scenario, flare, one.scale(hypotheses.setting, looked_for))
+            for flare in shapes if statistic.shaped else [0]:
+                looked_for = hypotheses.shape(statistic.name, flare)
+                if isinstance(statistic, LinearStatistic):
+                    weighted.add(
+                        statistic.name, scenario, flare, statistic.weights_per_dn(hypotheses.setting, looked_for)
+                    )
+                elif isinstance(statistic, QuadraticStatistic) and statistic.kernel_sum is not None:
+                    for number, own in enumerate(statistic.subtracted_rows(hypotheses.setting)):
+                        weighted.add(statistic.name, scenario, number, own)
+                elif isinstance(statistic, Paper):
+                    smoothed.add(statistic.name, scenario, flare, statistic.scale(hypotheses.setting, looked_for))
         weighted.end()
         smoothed.end()
     return weighted, smoothed
@@ -315,37 +317,37 @@ def plan_channels(hypotheses: Hypotheses, batch: Sequence[int], *, first: bool) 
     weighted, smoothed = _rows(hypotheses, asked, batch)
     n_scenario, fixed = 1 + len(batch), len(FIXED_STATISTICS)
 
-    def row(one: Statistic, scenario: int, flare: int) -> int:
-        if one.kernel_sum is not None:
-            return fixed * scenario + FIXED_STATISTICS.index(one.kernel_sum)
-        where = one.name, scenario, flare if one.shaped else 0
-        if isinstance(one, LinearStatistic):
+    def row(statistic: Statistic, scenario: int, flare: int) -> int:
+        if statistic.kernel_sum is not None:
+            return fixed * scenario + FIXED_STATISTICS.index(statistic.kernel_sum)
+        where = statistic.name, scenario, flare if statistic.shaped else 0
+        if isinstance(statistic, LinearStatistic):
             return fixed * n_scenario + weighted.index[where]
         return fixed * n_scenario + len(weighted.rows) + smoothed.index[where]
 
     nuisances = hypotheses.setting.nuisances
     subtractions = []
-    for one in asked if nuisances else []:
-        for scenario in range(n_scenario) if one.kernel_sum is not None else []:
-            begin = fixed * n_scenario + weighted.index[one.name, scenario, 0]
-            subtractions.append((row(one, scenario, 0), begin, begin + len(nuisances.names if nuisances else ())))
+    for statistic in asked if nuisances else []:
+        for scenario in range(n_scenario) if statistic.kernel_sum is not None else []:
+            begin = fixed * n_scenario + weighted.index[statistic.name, scenario, 0]
+            subtractions.append((row(statistic, scenario, 0), begin, begin + len(nuisances.names if nuisances else ())))
     grids: list[Grid] = []
     keys: list[Key] = []
 
-    def add(one: Statistic, role: Role, flare: int, channel: int, shape: Form) -> None:
+    def add(statistic: Statistic, role: Role, flare: int, channel: int, shape: Form) -> None:
         grids.append(Grid(channel, shape.mean, shape.std))
-        keys.append((one.name, role, flare))
+        keys.append((statistic.name, role, flare))
 
-    for one in asked:
-        if first and not one.shaped:
-            add(one, "null", 0, row(one, 0, 0), hypotheses.closed_form(one.name))
+    for statistic in asked:
+        if first and not statistic.shaped:
+            add(statistic, "null", 0, row(statistic, 0, 0), hypotheses.closed_form(statistic.name))
         for i, flare in enumerate(batch):
-            null = hypotheses.closed_form(one.name, template=flare)
-            if one.shaped:
-                add(one, "null", flare, row(one, 0, flare), null)
-            channel = row(one, i + 1, flare)
-            add(one, "flare_on_null_grid", flare, channel, null)
-            add(one, "flare", flare, channel, hypotheses.closed_form(one.name, flare))
+            null = hypotheses.closed_form(statistic.name, template=flare)
+            if statistic.shaped:
+                add(statistic, "null", flare, row(statistic, 0, flare), null)
+            channel = row(statistic, i + 1, flare)
+            add(statistic, "flare_on_null_grid", flare, channel, null)
+            add(statistic, "flare", flare, channel, hypotheses.closed_form(statistic.name, flare))
     weights = np.zeros((len(weighted.rows), len(hypotheses.scene.pixels)), np.float32)
     weights[:, : hypotheses.scene.n_pixel] = np.array(weighted.rows).reshape(len(weights), hypotheses.scene.n_pixel)
     scales = np.array(smoothed.rows, np.float32) if smoothed.rows else np.zeros((0, 1), np.float32)

@@ -291,9 +291,9 @@ def pack_detection(tally: Tally, samples: Sequence[TailSamples | None]) -> Array
         if beyond.n or beyond.undefined:
             shard |= _pack_counts(f"far-{number}", beyond.keys, beyond.counts)
             shard[f"far-{number}-sums"] = np.array([str(x) for x in (beyond.first, beyond.second, beyond.undefined)])
-    for number, kept in enumerate(samples):
-        if kept is not None:
-            shard[f"values-{number}"], shard[f"realisations-{number}"] = kept.values, kept.realisations
+    for number, tail in enumerate(samples):
+        if tail is not None:
+            shard[f"values-{number}"], shard[f"realisations-{number}"] = tail.values, tail.realisations
     return shard
 
 
@@ -321,9 +321,9 @@ class DetectionSums:
             if f"far-{number}" in shard:
                 first, second, undefined = (int(value) for value in shard[f"far-{number}-sums"])
                 far.merge(FarCounts(*_unpack_counts(f"far-{number}", shard), first, second, undefined))
-        for number, kept in enumerate(samples):
-            if kept is not None:
-                kept.merge(shard[f"values-{number}"], shard[f"realisations-{number}"])
+        for number, tail in enumerate(samples):
+            if tail is not None:
+                tail.merge(shard[f"values-{number}"], shard[f"realisations-{number}"])
 
     def answer(self) -> Detection:
         """Return the result, once all shards are added."""

@@ -201,7 +201,7 @@ class Statistic(ABC):
         `amounts` has the shape (n, k), `means` and `variances` the shape (k, n_pixel).
         """
         moved = ((seen.mean + each @ means, seen.variance + each @ variances) for each in amounts)
-        return [self.form(setting, Differences(*one, scatter=seen.scatter), flare) for one in moved]
+        return [self.form(setting, Differences(*moments, scatter=seen.scatter), flare) for moments in moved]
 
     @abstractmethod
     def dof(self, setting: Setting) -> int:
@@ -268,8 +268,8 @@ class LinearStatistic(Statistic):
 
     def form(self, setting: Setting, seen: Differences, flare: Expectation | None = None) -> Gaussian:
         none = np.zeros((0, seen.mean.size))
-        (found,) = self.moved_forms(setting, seen, np.zeros((1, 0)), none, none, flare)
-        return found
+        (form,) = self.moved_forms(setting, seen, np.zeros((1, 0)), none, none, flare)
+        return form
 
     def moved_forms(
         self,
@@ -292,7 +292,7 @@ class LinearStatistic(Statistic):
         if seen.estimated:
             # In units of its standard deviation.
             mean, spread = mean / spread, np.ones(mean.size)
-        return [Gaussian(*one) for one in zip(mean.tolist(), spread.tolist(), strict=True)]
+        return [Gaussian(*moments) for moments in zip(mean.tolist(), spread.tolist(), strict=True)]
 
     def values(self, setting: Setting, x: Float, variance: Float, flare: Expectation | None = None) -> Float:
         weights = self.weights_per_dn(setting, flare)

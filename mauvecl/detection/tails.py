@@ -315,11 +315,12 @@ class _Tilt:
     @classmethod
     def for_alarms(cls, fap: float, hypotheses: Hypotheses, statistic: str, template: int) -> _Tilt:
         """Choose a tilt that makes alarms of a given probability common."""
-        one, setting, flare = hypotheses.statistic(statistic), hypotheses.setting, hypotheses.shape(statistic, template)
-        tilt = one.tilt(setting, flare)
-        nothing = Differences(np.zeros(setting.used.size), one.variance(setting), setting.comparison.estimated)
+        kind, setting = hypotheses.statistic(statistic), hypotheses.setting
+        flare = hypotheses.shape(statistic, template)
+        tilt = kind.tilt(setting, flare)
+        nothing = Differences(np.zeros(setting.used.size), kind.variance(setting), setting.comparison.estimated)
         # Nuisance parameters that are not drawn do not scatter.
-        null = one.integrate_drawn(setting, hypotheses.quiet, nothing, flare, priors=False)
+        null = kind.integrate_drawn(setting, hypotheses.quiet, nothing, flare, priors=False)
         goal = null.isf(fap)
         parts, chance, scores = null.parts if isinstance(null, Mixture) else (null,), np.ones(1), {}
         if isinstance(null, Mixture):
@@ -391,10 +392,10 @@ def _block(
     hypotheses: Hypotheses, statistic: str, template: int, tilt: _Tilt, seed: int, block: int
 ) -> tuple[Float, Float]:
     scene = hypotheses.scene
-    one = hypotheses.statistic(statistic)
-    exposures = 1 if one.paired else scene.comparison.exposures
+    kind = hypotheses.statistic(statistic)
+    exposures = 1 if kind.paired else scene.comparison.exposures
     z, *others = (_normals(scene.n_pixel, seed, block, exposure) for exposure in range(1 + exposures))
-    added = one.added_variance(hypotheses.setting)
+    added = kind.added_variance(hypotheses.setting)
     # Only the difference is tilted; orthogonal combinations remain as drawn.
     root = np.sqrt(1.0 + added)
     difference = (z - added * sum(others)) / root
@@ -411,12 +412,12 @@ def _block(
 
 def _value(hypotheses: Hypotheses, statistic: str, template: int, excess: Float, mean: Float) -> Float:
     """Return the statistic of draws from observed and subtracted counts, DN above the reference, shape (n, n_pixel)."""
-    scene, one = hypotheses.scene, hypotheses.statistic(statistic)
-    x, added = excess - mean, one.added_variance(hypotheses.setting)
-    variance = np.broadcast_to(one.variance(hypotheses.setting), x.shape)
+    scene, kind = hypotheses.scene, hypotheses.statistic(statistic)
+    x, added = excess - mean, kind.added_variance(hypotheses.setting)
+    variance = np.broadcast_to(kind.variance(hypotheses.setting), x.shape)
     if scene.comparison.estimated:
         variance = _estimated(scene, excess) + added * _estimated(scene, mean)
-    return one.values(hypotheses.setting, x, variance, hypotheses.shape(statistic, template))
+    return kind.values(hypotheses.setting, x, variance, hypotheses.shape(statistic, template))
 
 
 def _estimated(scene: Scene, excess: Float) -> Float:

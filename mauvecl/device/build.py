@@ -277,7 +277,7 @@ def build(context: pyopencl.Context, source: str) -> pyopencl.Program:
     options = ["-cl-std=CL1.2", "-w"]
     if not weaknesses(device):
         options.append("-cl-fp32-correctly-rounded-divide-sqrt")
-    kept = kernel_cache()
+    cache = kernel_cache()
     # The key contains the processor level, since machines with the same device name, such as "AMD EPYC", may share the
     # store, and the installation, since PoCL compiles a program of another installation again at every start.
     target = (
@@ -288,9 +288,9 @@ def build(context: pyopencl.Context, source: str) -> pyopencl.Program:
         sys.prefix,
     )
     key = hashlib.sha256("\0".join((source, *options, *target)).encode()).hexdigest()[:32]
-    restored = kept.restore(key)
+    restored = cache.restore(key)
     try:
-        with warnings.catch_warnings(), contextlib.nullcontext() if restored else kept.building(key):
+        with warnings.catch_warnings(), contextlib.nullcontext() if restored else cache.building(key):
             # Some compilers print a greeting.
             warnings.simplefilter("ignore", cl.CompilerWarning)
             program: pyopencl.Program = cl.Program(context, source).build(options, cache_dir=False)

@@ -85,8 +85,8 @@ def driver_sources(system: str | None = None, machine: str | None = None) -> str
     """Return the sources of drivers for a machine, by default this one, as the end of a sentence."""
     system = platform.system() if system is None else system
     machine = platform.machine() if machine is None else machine
-    found = SOURCES.get((system, machine)) or SOURCES.get((system, "")) or SOURCES["", ""]
-    return ", or ".join(found)
+    sources = SOURCES.get((system, machine)) or SOURCES.get((system, "")) or SOURCES["", ""]
+    return ", or ".join(sources)
 
 
 #: Free space that PoCL needs to build the kernels of a session, bytes.
@@ -244,9 +244,9 @@ class KernelCache:
             shutil.rmtree(new, ignore_errors=True)
 
     def _prune(self) -> None:
-        kept = sorted(self.store.iterdir(), key=lambda p: p.stat().st_mtime, reverse=True)
+        entries = sorted(self.store.iterdir(), key=lambda p: p.stat().st_mtime, reverse=True)
         total = 0
-        for entry in kept:
+        for entry in entries:
             files = entry.rglob("*") if entry.is_dir() else [entry]
             total += sum(path.stat().st_size for path in files if path.is_file())
             if total > MAX_STORED:
@@ -390,10 +390,10 @@ def flags() -> frozenset[str]:
 
 def target(device: Any) -> tuple[str, str] | None:
     """Return the triple and processor name for which PoCL compiles, or None if they need no change."""
-    found = TARGET.search(str(device.version))
-    if found is None or not (CHOOSES_LIBRARY in str(device.platform.version) or found[2] == UNKNOWN):
+    match = TARGET.search(str(device.version))
+    if match is None or not (CHOOSES_LIBRARY in str(device.platform.version) or match[2] == UNKNOWN):
         return None
-    return found[1], found[2]
+    return match[1], match[2]
 
 
 def names(device: Any) -> tuple[str | None, ...]:
@@ -413,10 +413,10 @@ def set_processor_name(device: Any, name: str) -> bool:
 
 def _name_address(device: Any) -> int | None:
     """Return the address of the pointer to the processor's name in PoCL's record, or None if it is not found."""
-    found = target(device)
-    if found is None:
+    own_target = target(device)
+    if own_target is None:
         return None
-    triple, own = found
+    triple, own = own_target
     record = int(device.int_ptr)
     try:
         memory = os.open("/proc/self/mem", os.O_RDONLY)
@@ -476,8 +476,8 @@ def _folder() -> Path | None:
         return None
     system = os.environ.get(FOLDER_VARIABLES[1]) or DEFAULT_FOLDER
     folders = [system, os.path.join(sys.prefix, "etc", "OpenCL", "vendors")]
-    known = {path.name: _text(path) for place in reversed(folders) for path in sorted(Path(place).glob("*.icd"))}
-    drivers = {name: text for name, text in known.items() if DRIVER not in text or Path(text.strip()).exists()}
+    files = {path.name: _text(path) for place in reversed(folders) for path in sorted(Path(place).glob("*.icd"))}
+    drivers = {name: text for name, text in files.items() if DRIVER not in text or Path(text.strip()).exists()}
     if any(DRIVER in text for text in drivers.values()):
         # The system lists Intel's runtime already.
         return None
@@ -590,10 +590,6 @@ class Outcome:
     by_driver: bool = True
 
     @property
-    def succeeded(self) -> bool:
-        return not self.tried[-1][1]
-
-    @property
     def current(self) -> bool:
         """True if the outcome is still valid."""
         return not any(why for _, why in self.tried) or 0 <= time.time() - self.time_s < OUTCOME_LIFETIME_S
@@ -627,9 +623,9 @@ def choose_processor_level(device: Any, others: Callable[[], Sequence[Any]]) -> 
         with _one_at_a_time:
             if place not in settled:
                 outcome = _outcome(device, names(device), others)
-                if not outcome.succeeded:
+                name, reason = outcome.tried[-1]
+                if reason:
                     raise DeviceError(_failure_message(device, outcome))
-                name = outcome.tried[-1][0]
                 if name is not None:
                     set_processor_name(device, name)
                 settled[place] = name
@@ -642,7 +638,7 @@ def _outcome(device: Any, names: tuple[str | None, ...], others: Callable[[], Se
     limit_s = _limit_s()
     if limit_s == 0:
         return untried
-    kept, key = kernel_cache(), _key(device, names)
+    cache, key = kernel_cache(), _key(device, names)
     known = _read_outcome(key)
     if known is not None:
         return known
@@ -669,7 +665,7 @@ def _outcome(device: Any, names: tuple[str | None, ...], others: Callable[[], Se
                 _warn(device, name, failure, f"The next lower level, {names[place + 1]}, is tried.")
         outcome = Outcome(tuple(tried), time.time(), by_driver)
         if by_driver:
-            kept.write_text(key, json.dumps(asdict(outcome)))
+            cache.write_text(key, json.dumps(asdict(outcome)))
     return outcome
 
 
@@ -710,8 +706,8 @@ def _read_outcome(key: str) -> Outcome | None:
     text = kernel_cache().read_text(key)
     if text is None:
         return None
-    found = json.loads(text)
-    outcome = Outcome(tuple((name, why) for name, why in found["tried"]), found["time_s"], found["by_driver"])
+    content = json.loads(text)
+    outcome = Outcome(tuple((name, why) for name, why in content["tried"]), content["time_s"], content["by_driver"])
     return outcome if outcome.current else None
 
 

@@ -227,8 +227,8 @@ class Stares:
                 parts.extend(reduced)
 
             self._tiles.for_each(there.start, there.count, each, work)
-        kept = joined(parts, adds=reduction.adds)
-        return kept | {"start": np.array(there.start)} if shard else kept
+        arrays = joined(parts, adds=reduction.adds)
+        return arrays | {"start": np.array(there.start)} if shard else arrays
 
     def _launches(
         self,
@@ -532,9 +532,9 @@ class Engine:
             def work(tile: Tile, done: int) -> None:
                 launches.statistics(tile)
                 launches.tally(tile, tally)
-                for grid, kept in zip(tally.grids, samples, strict=True):
-                    if kept is not None:
-                        kept.add(launches.channel(tile, grid.channel), shard.start + done)
+                for grid, samples_of_grid in zip(tally.grids, samples, strict=True):
+                    if samples_of_grid is not None:
+                        samples_of_grid.add(launches.channel(tile, grid.channel), shard.start + done)
 
             self._tiles.for_each(shard.start, shard.count, 4 * plan.n_rows, work, before=before, total=total)
             launches.flush(tally)

@@ -204,9 +204,11 @@ def toy(
 
 
 PIXELS = 1600
+#: Shortest measurement of a rate, s.
+RATE_S = 0.125
 
 
-def chi2_rate(engine: Engine, seconds: float = 0.5) -> float:
+def chi2_rate(engine: Engine) -> float:
     """Measure chi2's pixel-realisations per second, for a quiescent and a flaring scenario on common draws."""
     quiet, flare = toy(PIXELS), toy(PIXELS, flare=0.1)
 
@@ -218,7 +220,7 @@ def chi2_rate(engine: Engine, seconds: float = 0.5) -> float:
     # The first call builds the kernels.
     work(64)
     count = 256
-    while (spent := work(count)) < seconds / 4:
+    while (spent := work(count)) < RATE_S:
         count *= 4
     return count * PIXELS / min(spent, work(count))
 
@@ -360,10 +362,10 @@ def stare_case(name: str, count: int) -> tuple[Components, Stare, NDArray[np.flo
 
 def check_stares(engine: Engine) -> Iterator[Check]:
     """Compare every frame of some stares with the known answers."""
-    known = known_arrays()
+    arrays = known_arrays()
     for name in STARE_CASES:
         for part, ours in stare_results(engine, name, COUNT).items():
-            theirs = known[f"{name}: {part}"]
+            theirs = arrays[f"{name}: {part}"]
             scale = 1.0 if part == "noise of flares" else theirs.std(axis=(0, 1))
             apart = float(np.max(np.abs(ours - theirs).max(axis=(0, 1)) / scale))
             if engine.device.promise == SAME_BITS:
@@ -440,7 +442,7 @@ CASES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     ),
 }
 #: Statistics of the fast kernel, which compares with the expectation only.
-FAST = tuple(name for name, one in STATISTICS.items() if not one.paired)
+FAST = tuple(name for name, statistic in STATISTICS.items() if not statistic.paired)
 #: Realisations that cross the boundary of the counter's first word.
 START, COUNT, SEED = 2**40 - 13, 40, 2**63 + 20_261_121
 
@@ -515,10 +517,10 @@ def known_answers(engine: Engine) -> Check:
 
 def check_results(engine: Engine) -> Iterator[Check]:
     """Compare every branch of every kernel with the known answers."""
-    known = known_arrays()
+    arrays = known_arrays()
     for name in CASES:
         ours = results(engine, name, COUNT)
-        theirs = {part: known[f"{name}: {part}"] for part in ours}
+        theirs = {part: arrays[f"{name}: {part}"] for part in ours}
         differ = [part for part in ours if ours[part].tobytes() != theirs[part].tobytes()]
         if not differ:
             passed, text = True, "digests " + " ".join(digest(array) for array in ours.values())

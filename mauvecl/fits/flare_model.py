@@ -171,9 +171,9 @@ class FlareModel:
         # Ratio of the flux at the telescope to that at the flare's surface, for an amplitude of one.
         scale = np.array([light / photons(nm, blackbody(nm, float(k)), band) for k in kelvin])
         extra = ([balmer_continuum(grid, electron_temperature_k)] if jump else []) + [
-            one.profile(grid) for one in chosen
+            line.profile(grid) for line in chosen
         ]
-        names = ("amplitude", *(["balmer"] if jump else []), *(f"line {one.name}" for one in chosen))
+        names = ("amplitude", *(["balmer"] if jump else []), *(f"line {line.name}" for line in chosen))
         matrix = response_matrix(instrument, grid, order)
         dn = quiet.exposure_s * instrument.per_pixel("response", 1.0) * quiet.gain_dn_per_electron
         fluxes = np.vstack([scale[:, None] * bodies, *extra]) if extra else scale[:, None] * bodies
@@ -202,25 +202,27 @@ class FlareModel:
             Mean share of the flare's light that reaches the detector.
         """
         derived = tuple(
-            replace(one, factors=n * one.factors) if one.name.startswith("energy") and one.factors is not None else one
-            for one in self.derived
+            replace(derived, factors=n * derived.factors)
+            if derived.name.startswith("energy") and derived.factors is not None
+            else derived
+            for derived in self.derived
         )
         return replace(self, hot=n * light * self.hot, fixed=n * light * self.fixed, derived=derived)
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the reported quantities."""
-        return tuple(one.name for one in self.derived)
+        return tuple(derived.name for derived in self.derived)
 
     @property
     def bounds(self) -> tuple[float, ...]:
         """Smallest possible values of the reported quantities."""
-        return tuple(one.bound for one in self.derived)
+        return tuple(derived.bound for derived in self.derived)
 
     @property
     def units(self) -> tuple[str, ...]:
         """Units of the reported quantities."""
-        return tuple(one.unit for one in self.derived)
+        return tuple(derived.unit for derived in self.derived)
 
     @cached_property
     def hot_spline(self) -> scipy.interpolate.CubicSpline:
@@ -230,7 +232,7 @@ class FlareModel:
     @cached_property
     def splines(self) -> tuple[scipy.interpolate.CubicSpline | None, ...]:
         """Splines over log temperature from which derived quantities are computed."""
-        values = [one.factors if one.ratio is None else one.ratio for one in self.derived]
+        values = [derived.factors if derived.ratio is None else derived.ratio for derived in self.derived]
         return tuple(None if value is None else scipy.interpolate.CubicSpline(self.log_k, value) for value in values)
 
     @cached_property
@@ -239,23 +241,23 @@ class FlareModel:
 
         A luminosity is a multiple of a flux, so that their intervals are computed once.
         """
-        found: list[tuple[int, float]] = []
-        for k, one in enumerate(self.derived):
-            found.append((k, 1.0))
+        references: list[tuple[int, float]] = []
+        for k, derived in enumerate(self.derived):
+            references.append((k, 1.0))
             for first, other in enumerate(self.derived[:k]):
-                if one.factors is None or other.factors is None or found[first][0] != first:
+                if derived.factors is None or other.factors is None or references[first][0] != first:
                     continue
-                times = float(np.sum(one.factors * other.factors) / np.sum(other.factors**2))
-                if times > 0.0 and np.allclose(one.factors, times * other.factors, rtol=1e-12, atol=0.0):
-                    found[k] = first, times
-        return tuple(found)
+                times = float(np.sum(derived.factors * other.factors) / np.sum(other.factors**2))
+                if times > 0.0 and np.allclose(derived.factors, times * other.factors, rtol=1e-12, atol=0.0):
+                    references[k] = first, times
+        return tuple(references)
 
     @cached_property
     def sums(self) -> tuple[NDArray[np.bool_], scipy.interpolate.CubicSpline]:
         """Which derived quantities are sums of amplitudes, and the spline of their factors, (n_sums, n_linear)."""
-        factors = [one.factors for one in self.derived]
-        which = np.array([one is not None for one in factors])
-        stacked = np.stack([one for one in factors if one is not None], axis=1)
+        factors = [derived.factors for derived in self.derived]
+        which = np.array([factor is not None for factor in factors])
+        stacked = np.stack([factor for factor in factors if factor is not None], axis=1)
         return which, scipy.interpolate.CubicSpline(self.log_k, stacked)
 
     def counts(self, temperature_k: Temperature, amplitudes: Sequence[float] | Float) -> Float:
@@ -274,7 +276,8 @@ class FlareModel:
     ) -> Float:
         """Return the model's amplitudes, shape (n_linear,), for a Balmer jump ratio and line fluxes, erg s-1 cm-2."""
         ratio = next(
-            (spline for spline, one in zip(self.splines, self.derived, strict=True) if one.ratio is not None), None
+            (spline for spline, derived in zip(self.splines, self.derived, strict=True) if derived.ratio is not None),
+            None,
         )
         if ratio is None and jump != 1.0:
             raise InputError(f"jump = {jump:g} of a model without a Balmer continuum", "1", key="jump")
@@ -300,12 +303,12 @@ def derived_values(model: FlareModel, log_k: Float, linear: Float) -> Float:
     which, spline = model.sums
     values[:, which] = np.einsum("nql,nl->nq", spline(log_k), linear)
     for q in np.flatnonzero(~which):
-        one, ratio = model.derived[q], model.splines[q]
+        derived, ratio = model.derived[q], model.splines[q]
         values[:, q] = np.exp(log_k)
         if ratio is not None:
             positive = linear[:, 0] > 0.0
             over = np.divide(linear[:, 1], linear[:, 0], out=np.full(log_k.size, np.nan), where=positive)
-            values[:, q] = one.offset + ratio(log_k) * over
+            values[:, q] = derived.offset + ratio(log_k) * over
     return values
 
 
@@ -441,9 +444,9 @@ class LightFactor:
             Width of the quantity's interval for a rise of chi-squared by `allowed`.
         """
         share = np.zeros_like(value)
-        known = np.isfinite(value) & np.isfinite(width) & (width > 0.0) & (factor > 0.0)
-        by_prior = value[known] * np.sqrt(self.prior_share) / (self.scale * factor[known])
-        share[known] = np.clip(4.0 * allowed * (by_prior / width[known]) ** 2, 0.0, 1.0)
+        usable = np.isfinite(value) & np.isfinite(width) & (width > 0.0) & (factor > 0.0)
+        by_prior = value[usable] * np.sqrt(self.prior_share) / (self.scale * factor[usable])
+        share[usable] = np.clip(4.0 * allowed * (by_prior / width[usable]) ** 2, 0.0, 1.0)
         return np.asarray(np.interp(share, SHARES, _thresholds(self.prior.tobytes(), allowed)) - allowed)
 
     def estimate(self, sums: Float, log_k: Float, linear: Float) -> Float:
@@ -620,8 +623,8 @@ class Reduction(MeanSums):
         check_distinct(power, np.einsum("tp,tp->t", plain, spanning), nuisances)
         length = np.sqrt(power)
         values, vectors = np.linalg.eigh(gram / np.outer(length, length))
-        kept = values > LEAST * values[-1]
-        weights = (vectors[:, kept] / length[:, None] / np.sqrt(values[kept])).T @ optimal
+        large = values > LEAST * values[-1]
+        weights = (vectors[:, large] / length[:, None] / np.sqrt(values[large])).T @ optimal
         hot, fixed = model.hot @ weights.T, model.fixed @ weights.T
         light = light_factor(model, unknown, rows)
         return cls(hot, fixed, model.log_k, variance, weights, rows, free, light=light)
@@ -636,7 +639,7 @@ class Reduction(MeanSums):
 
     @property
     def statistics(self) -> tuple[Linear, ...]:
-        """User-defined statistics equal to the sums, which a device draws by pixel; see `drawn_sums`."""
+        """User-defined statistics equal to the sums, which a device draws by pixel."""
         return tuple(Linear(f"sum {k}", weights) for k, weights in enumerate(self.weights))
 
     @property
@@ -677,17 +680,12 @@ class Exposures:
             sums = excess @ reduction.weights.T
             own = np.zeros(0) if light is None else excess @ light.weights
             parts.append((sums, reduction.rest(excess, sums), own))
-        sums, rest, own = (np.concatenate(one) for one in zip(*parts, strict=True))
+        sums, rest, own = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
         return sums, rest, None if light is None else own
 
     def _excess(self, rows: NDArray[np.intp]) -> Iterator[Float]:
         for start in range(0, rows.size, FRAMES_AT_ONCE):
             yield self.raw[rows[start : start + FRAMES_AT_ONCE]] - self.mean_dn
-
-
-def drawn_sums(values: NDArray[np.float32], reduction: Reduction) -> Float:
-    """Return the sums of drawn exposures, (n, n_sum), from the result of `Engine.statistic_values` for one flare."""
-    return np.ascontiguousarray(values[-len(reduction.weights) :].T, np.float64)
 
 
 def variance_of(

@@ -62,9 +62,9 @@ class BestFit:
 
     def replaced(self, rows: NDArray[np.intp], others: BestFit) -> BestFit:
         """Return the fits with those of some frames replaced."""
-        every = [getattr(self, one.name).copy() for one in fields(self)]
-        for values, one in zip(every, fields(self), strict=True):
-            values[rows] = getattr(others, one.name)
+        every = [getattr(self, field.name).copy() for field in fields(self)]
+        for values, field in zip(every, fields(self), strict=True):
+            values[rows] = getattr(others, field.name)
         return BestFit(*every)
 
 
@@ -151,10 +151,7 @@ class Profile:
         number = np.arange(self.nodes.size)
         lowest = np.where(inside, number, self.nodes.size).min(axis=1)
         highest = np.where(inside, number, -1).max(axis=1)
-        low, high = (
-            np.full(best.log_k.shape, np.nan),
-            np.full(best.log_k.shape, np.nan),
-        )
+        low, high = np.full((2, *best.log_k.shape), np.nan)
         for out, outermost, side in ((low, lowest, -1), (high, highest, 1)):
             known = (outermost >= 0) & (outermost < self.nodes.size)
             start = np.where(known, self.nodes[np.clip(outermost, 0, self.nodes.size - 1)], best.log_k)
@@ -205,8 +202,8 @@ def intervals(
     spent = best.gain[:, None] - np.einsum("nk,nk->n", profile.along, profile.along)[:, None] - amplitude**2 / variance
     left = allowed - spent
 
-    def ends(one: Derived, spline: CubicSpline) -> tuple[Float, Float]:
-        if one.ratio is None:
+    def ends(derived: Derived, spline: CubicSpline) -> tuple[Float, Float]:
+        if derived.ratio is None:
             return _linear_interval(profile, spline, x, linear, variance, hot, left, allowed, closed)
         return _ratio_interval(profile, spline(x), hot, best.gain - allowed)
 
@@ -225,9 +222,9 @@ def ends_of_quantities(
         np.where(np.isnan(log_high), np.inf, np.exp(log_high)),
     )
     columns: list[tuple[Float, Float]] = []
-    for one, spline, (first, times) in zip(model.derived, model.splines, model.multiples, strict=True):
+    for derived, spline, (first, times) in zip(model.derived, model.splines, model.multiples, strict=True):
         own = columns[first] if first < len(columns) else None
-        low, high = own or (kelvin if spline is None else ends(one, spline))
+        low, high = own or (kelvin if spline is None else ends(derived, spline))
         # Light that contradicts every factor above zero limits nothing.
         none = low > high
         low, high = np.where(none, -np.inf, low), np.where(none, np.inf, high)
@@ -256,17 +253,17 @@ def _linear_interval(
     closed: NDArray[np.bool_],
 ) -> tuple[Float, Float]:
     ratio = ratio_at(profile, spline, x, linear, variance, hot)
-    value, spread, known = ratio.top, ratio.top_variance, profile.reduction.light is None
+    value, spread, is_light_known = ratio.top, ratio.top_variance, profile.reduction.light is None
     # The ratio is straight where the recorded quantity less the ratio times the factor is.
     middle = ratio.value[:, SAMPLES // 2, None]
-    estimate = value if known else value - middle * ratio.bottom
+    estimate = value if is_light_known else value - middle * ratio.bottom
     outside = left < 0.0
     outside[:, [0, -1]] = False  # rounding decides at the ends themselves
 
     def reached(room: Float, sign: float, rows: NDArray[np.intp] | slice = slice(None)) -> Float:
-        if known:
+        if is_light_known:
             return np.asarray(value[rows] + sign * np.sqrt(np.maximum(room, 0.0) * spread[rows]))
-        return Ratio(*(one[rows] for one in vars(ratio).values())).end(room, sign)
+        return Ratio(*(values[rows] for values in vars(ratio).values())).end(room, sign)
 
     ends = [_hull(reached(left, sign), outside, sign)[0] for sign in (-1.0, 1.0)]
     light = profile.reduction.light
@@ -278,7 +275,7 @@ def _linear_interval(
         ends = [_hull(reached(left, sign), outside, sign)[0] for sign in (-1.0, 1.0)]
     bend = np.abs(estimate[:, 0] + estimate[:, -1] - 2 * estimate[:, SAMPLES // 2])
     # Simulated fits need the error of the temperature, which its interval gives if it has both ends.
-    wide = (ends[1] - ends[0]) * (1.0 if known else ratio.bottom[:, SAMPLES // 2])
+    wide = (ends[1] - ends[0]) * (1.0 if is_light_known else ratio.bottom[:, SAMPLES // 2])
     bent = np.flatnonzero(closed & np.isfinite(wide) & (bend > CURVED * np.sqrt(allowed) * wide))
     if bent.size:
         if light is not None:
@@ -323,8 +320,8 @@ def ratio_at(profile: Profile, spline: CubicSpline, log_k: Float, linear: Float,
         others = factors[..., 1:] @ inverse
         return factors[..., 0] - np.einsum("nsk,nsk->ns", others, hot @ basis.T), others
 
-    def covariance(one: tuple[Float, Float], other: tuple[Float, Float]) -> Float:
-        return np.asarray(one[0] * other[0] * variance + np.einsum("nsk,nsk->ns", one[1], other[1]))
+    def covariance(slopes: tuple[Float, Float], other: tuple[Float, Float]) -> Float:
+        return np.asarray(slopes[0] * other[0] * variance + np.einsum("nsk,nsk->ns", slopes[1], other[1]))
 
     factors = spline(log_k)
     value, own = np.einsum("nsl,nsl->ns", factors, linear), parts(factors)
@@ -438,7 +435,7 @@ def _likelihood_ratio(light: Float, away: Float) -> Float:
     """Return the maximum of light^2 less that of light^2 - away^2 over samples (..., n_sample)."""
     n = light.shape[-1]
     first = np.arange(0, light.size, n).reshape(light.shape[:-1])
-    at_best, held = (np.clip(one.argmax(axis=-1), 1, n - 2) + first for one in (light, light**2 - away**2))
+    at_best, held = (np.clip(peak.argmax(axis=-1), 1, n - 2) + first for peak in (light, light**2 - away**2))
     value, slope, bend = _parabola(light, at_best)
     t = np.clip(np.divide(-slope, bend, out=np.zeros_like(slope), where=bend < 0.0), -1.0, 1.0)
     free = value + t * (slope + t * bend / 2)
@@ -508,8 +505,8 @@ def _ratio_interval(profile: Profile, per: Float, hot: Float, least_gain: Float)
     root = np.sqrt(np.maximum(inside, 0.0))
     bounded = (a < 0.0) & (inside >= -1e-9 * b**2)
     with np.errstate(divide="ignore", invalid="ignore"):
-        one, other = (-b + root) / a, (-b - root) / a
-    smaller, larger = np.fmin(one, other), np.fmax(one, other)
+        first, second = (-b + root) / a, (-b - root) / a
+    smaller, larger = np.fmin(first, second), np.fmax(first, second)
     # Without a bound, all light may be recombination, and every jump above the larger root is allowed.
     open_low = (a >= 0.0) & (inside < 0.0)
     low = np.where(bounded, smaller, np.where(a >= 0.0, np.where(open_low, -np.inf, larger), np.inf))
@@ -658,13 +655,13 @@ class Face:
 
     def value(self, factors: Float) -> Float:
         """Return a sum of the best amplitudes, with factors (n_linear, n, ...)."""
-        found = np.sum(factors[1:][list(self.some)] * self.others, axis=0)
-        return np.asarray(found if self.amplitude is None else found + factors[0] * self.amplitude)
+        total = np.sum(factors[1:][list(self.some)] * self.others, axis=0)
+        return np.asarray(total if self.amplitude is None else total + factors[0] * self.amplitude)
 
     def product(self, factors: Float, change: tuple[Float | None, Float, Float]) -> Float:
         """Return the covariance of a sum of amplitudes with the quantity of a `change`."""
-        found = np.sum(factors[1:][list(self.some)] * change[1], axis=0)
-        return np.asarray(found if change[0] is None else found + factors[0] * change[0])
+        total = np.sum(factors[1:][list(self.some)] * change[1], axis=0)
+        return np.asarray(total if change[0] is None else total + factors[0] * change[0])
 
     def change(self, factors: Float) -> tuple[Float | None, Float, Float]:
         """Return the changes of amplitudes per change of a linear quantity, and the quantity's variance.
@@ -687,7 +684,7 @@ class BoundedProfile(Profile):
     def products(self, log_k: Float) -> Products:
         """Return the inner products at temperatures (n, ...), or (1, ...) if common to all frames."""
         hot, fixed = self.hot(log_k), self.reduction.fixed
-        one = (1,) * (log_k.ndim - 1)
+        ones = (1,) * (log_k.ndim - 1)
         if log_k.shape[0] == 1:
             along = np.tensordot(self.sums, hot[0], (1, -1))
         else:
@@ -696,7 +693,7 @@ class BoundedProfile(Profile):
             along,
             np.einsum("...k,...k->...", hot, hot),
             np.moveaxis(hot @ fixed.T, -1, 0),
-            (fixed @ self.sums.T).reshape(len(fixed), len(self.sums), *one),
+            (fixed @ self.sums.T).reshape(len(fixed), len(self.sums), *ones),
             fixed @ fixed.T,
         )
 
@@ -775,9 +772,9 @@ class BoundedProfile(Profile):
             there = np.clip(best[:, None] + step * np.linspace(-1.0, 1.0, 9), low, high)
             best = there[np.arange(best.size), np.argmax(own.gain(there), axis=1)]
             step /= 4.0
-        found = x.copy()
-        found[rising] = best
-        return found
+        climbed = x.copy()
+        climbed[rising] = best
+        return climbed
 
     def solution(self, log_k: Float) -> BestFit:
         """Return the best fits at temperatures (n,)."""
@@ -807,18 +804,18 @@ def bounded_intervals(
         without = profile.factor(x, np.zeros((*x.shape, len(model.linear))))
         of_light = without, np.moveaxis(light.weights_of(x), -1, 0), light.scale**-2.0
 
-    def ends(one: Derived, spline: CubicSpline) -> tuple[Float, Float]:
-        if one.ratio is None:
+    def ends(derived: Derived, spline: CubicSpline) -> tuple[Float, Float]:
+        if derived.ratio is None:
             factors = np.moveaxis(spline(x), -1, 0)
-            found = _linear_ends(faces, factors, least, of_light)
+            linear_ends = _linear_ends(faces, factors, least, of_light)
             if light is None or not light.prior.size:
-                return found
+                return linear_ends
             factor = profile.factor(best.log_k, best.linear)
             value = np.einsum("nl,nl->n", spline(best.log_k), best.linear) / factor
-            moved = light.change(value, factor, found[1] - found[0], allowed)
+            moved = light.change(value, factor, linear_ends[1] - linear_ends[0], allowed)
             return _linear_ends(faces, factors, least - moved[:, None], of_light)
         lowest, highest = _ratio_ends(products, faces, spline(x), least)
-        return one.offset + lowest, one.offset + highest
+        return derived.offset + lowest, derived.offset + highest
 
     lows, highs = ends_of_quantities(model, low, high, ends)
     # A parabola through the outermost samples may exceed a bound.
@@ -852,7 +849,7 @@ def _linear_ends(
             ratio = Ratio(middle, of_light[0] - face.value(of_light[1]), variance, dims[2] + of_light[2], -covariance)
         else:
             dims, ratio = change, None
-        for sign, found, which in ((-1.0, lows, np.minimum), (1.0, highs, np.maximum)):
+        for sign, bounds, which in ((-1.0, lows, np.minimum), (1.0, highs, np.maximum)):
             if ratio is None:
                 end = middle + sign * np.sqrt(left * variance)
                 reach = sign * np.sqrt(left / np.where(variance > 0, variance, np.inf))
@@ -867,7 +864,7 @@ def _linear_ends(
                 reach = np.where(np.isfinite(end), reach, 0.0)
             moved = None if face.amplitude is None or step is None else face.amplitude + reach * step
             there = inside & face.positive(moved, face.others + reach * steps)
-            which(found, end, out=found, where=there)
+            which(bounds, end, out=bounds, where=there)
     return extreme(lows, np.minimum), extreme(highs, np.maximum)
 
 

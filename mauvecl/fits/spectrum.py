@@ -117,7 +117,7 @@ class Measurement:
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
         """Return the measurements of several batches of frames as one."""
-        values: dict[str, Any] = {one.name: getattr(parts[0], one.name) for one in fields(cls)}
+        values: dict[str, Any] = {field.name: getattr(parts[0], field.name) for field in fields(cls)}
         for name, value in values.items():
             if isinstance(value, np.ndarray):
                 axis = 1 if name in ("low", "high") else 0
@@ -126,7 +126,7 @@ class Measurement:
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return all arrays that depend on the frames, for files; the inverse of `of_arrays`."""
-        values = {one.name: np.asarray(getattr(self, one.name)) for one in fields(self)}
+        values = {field.name: np.asarray(getattr(self, field.name)) for field in fields(self)}
         return {name: value for name, value in values.items() if name not in ("names", "units", "bounds", "levels")}
 
     @classmethod
@@ -145,12 +145,12 @@ class Measurement:
 
     def rows(self, which: NDArray[Any]) -> Self:
         """Return the measurements of some frames, by number or mask."""
-        kept: dict[str, Any] = {}
-        for one in fields(self):
-            value = getattr(self, one.name)
+        rows: dict[str, Any] = {}
+        for field in fields(self):
+            value = getattr(self, field.name)
             if isinstance(value, np.ndarray):
-                kept[one.name] = value[:, which] if one.name in ("low", "high") else value[which]
-        return replace(self, **kept)
+                rows[field.name] = value[:, which] if field.name in ("low", "high") else value[which]
+        return replace(self, **rows)
 
     def column(self, name: str) -> int:
         """Return the index of a quantity.
@@ -261,7 +261,9 @@ def fit(
     order = np.argsort(np.concatenate([rows for rows, _ in parts]))
     along = {"low": 1, "high": 1}
     joined = {
-        name: np.take(np.concatenate([one[name] for _, one in parts], along.get(name, 0)), order, along.get(name, 0))
+        name: np.take(
+            np.concatenate([arrays[name] for _, arrays in parts], along.get(name, 0)), order, along.get(name, 0)
+        )
         for name in parts[0][1]
     }
     dof = joined.pop("dof")
@@ -304,8 +306,8 @@ def _pilot(
     def best(rows: NDArray[np.intp], reduction: Reduction) -> None:
         for start in range(0, rows.size, BATCH):
             some = rows[start : start + BATCH]
-            found = Profile(reduction, exposures.sums(reduction, some)).best()
-            log_k[some], linear[some] = found.log_k, found.linear
+            fit_of_some = Profile(reduction, exposures.sums(reduction, some)).best()
+            log_k[some], linear[some] = fit_of_some.log_k, fit_of_some.linear
 
     best(np.flatnonzero(counts == 0), usual)
     # Frames with about as many saturated pixels share the pixels that none of them saturates.
@@ -397,8 +399,8 @@ def _fitted(
     at_nodes = profile.gain_at_nodes()
     best = profile.best(at_nodes)
     allowed = [float(scipy.stats.chi2.isf(1 - p, 1)) for p in levels]
-    ends = [intervals(model, profile, best, at_nodes, one) for one in allowed]
-    low, high = (np.stack([one[side] for one in ends]) for side in (0, 1))
+    ends = [intervals(model, profile, best, at_nodes, rise) for rise in allowed]
+    low, high = (np.stack([interval[side] for interval in ends]) for side in (0, 1))
     # Intervals differ from unbounded ones only if they reach a bound.
     reaches = (low <= np.array(model.bounds)) & np.isfinite(model.bounds)
     near = np.flatnonzero(reaches.any(axis=(0, 2)) | (best.linear < 0.0).any(axis=1))
@@ -406,8 +408,8 @@ def _fitted(
         bounded = BoundedProfile(reduction, sums[near], None if light is None else light[near])
         nodes = bounded.gain_at_nodes()
         there = bounded.best(nodes)
-        for k, one in enumerate(allowed):
-            low[k, near], high[k, near] = bounded_intervals(model, bounded, there, nodes, one)
+        for k, rise in enumerate(allowed):
+            low[k, near], high[k, near] = bounded_intervals(model, bounded, there, nodes, rise)
         best = best.replaced(near, there)
     left = np.einsum("nk,nk->n", sums, sums) - best.gain
     n_fitted = len(model.linear) + 1
@@ -427,32 +429,6 @@ def _fitted(
         "dof": np.full(len(sums), reduction.n_used - reduction.n_free - n_fitted),
         "snr": np.sqrt(best.gain),
     }
-
-
-def fit_sums(sums: Float, model: FlareModel, reduction: Reduction) -> tuple[Float, Float]:
-    """Fit the sums of exposures, without intervals; a processor core fits about 3e5 exposures per second.
-
-    Parameters
-    ----------
-    sums : ndarray, shape (n, n_sum)
-    model : FlareModel
-    reduction : Reduction
-        Its variance is assumed for every exposure.
-
-    Returns
-    -------
-    estimates : ndarray, shape (n, n_derived)
-        Quantities of the model.
-    covariance : ndarray, shape (n, n_derived, n_derived)
-        Covariance from the Fisher information at the fit.
-    """
-    estimates, spreads = [], []
-    for start in range(0, len(sums), BATCH):
-        profile = Profile(reduction, sums[start : start + BATCH])
-        best = with_bounds(reduction, profile.sums, profile.best())
-        estimates.append(derived_values(model, best.log_k, best.linear))
-        spreads.append(covariance(model, profile, best))
-    return np.concatenate(estimates), np.concatenate(spreads)
 
 
 @dataclass(frozen=True, eq=False)
@@ -592,7 +568,7 @@ def fit_two_temperatures(
     InputError
         For a model with a Balmer jump, and as for `fit`.
     """
-    if any(one.ratio is not None for one in model.derived):
+    if any(derived.ratio is not None for derived in model.derived):
         raise InputError("a model with a Balmer jump", "blackbodies, with lines or without", key="model")
     single = fit(frames, expectation, model, nuisances, levels=levels, skipped_nm=skipped_nm)
     exposures = checked_exposures(frames, expectation, levels, nuisances)
@@ -606,8 +582,8 @@ def fit_two_temperatures(
     groups = variance_groups(expectation, model, single.log_k, recorded, reduction_of, nuisances, exposures)
     for rows, reduction in groups:
         sums, rest, light = exposures.sums_and_rest(reduction, rows)
-        found = _Search(model, reduction, sums, allowed, light).measured()
-        best, low, high, second, estimates, factor = found
+        measured = _Search(model, reduction, sums, allowed, light).measured()
+        best, low, high, second, estimates, factor = measured
         chi2 = rest + np.einsum("nk,nk->n", sums, sums) - best.gain
         dof = reduction.n_used - reduction.n_free - len(model.linear) - 3
         check_enough(expectation, reduction.variance > 0.0, len(model.linear) + 3 + reduction.n_free)
@@ -658,10 +634,10 @@ def with_second(model: FlareModel, log_k: float) -> FlareModel:
         # The ratio of the flux at the telescope to that at the surface is proportional to the area.
         return np.asarray(bolometric(x)[..., 0] / np.exp(4 * x))
 
-    def both(one: Derived, spline: scipy.interpolate.CubicSpline | None) -> Derived:
-        if one.factors is None or spline is None:
-            return one
-        return replace(one, factors=np.insert(one.factors[:end], 1, spline(log_k)[0], axis=1))
+    def both(derived: Derived, spline: scipy.interpolate.CubicSpline | None) -> Derived:
+        if derived.factors is None or spline is None:
+            return derived
+        return replace(derived, factors=np.insert(derived.factors[:end], 1, spline(log_k)[0], axis=1))
 
     share = Derived("second area", "", "area at the second temperature over that at the first",
                     ratio=area(log_k) / area(model.log_k[:end]), offset=0.0)  # fmt: skip
@@ -737,18 +713,18 @@ class _Search:
             factor[rows[here]] = profile.factor(own.log_k, own.linear)[here]
             values[:, model.sums[0]] = undimmed(values[:, model.sums[0]], factor[rows[here]])
             estimates[rows[here]] = np.insert(values, q - 2, np.exp(self._grid[node]), axis=1)
-            for k, one in enumerate(self._allowed):
-                there = np.flatnonzero(own.gain >= gain[rows] - one)
+            for k, rise in enumerate(self._allowed):
+                there = np.flatnonzero(own.gain >= gain[rows] - rise)
                 if not there.size:
                     continue
                 some = self._profile(int(node), rows[there])
                 limit = BestFit(own.log_k[there], own.linear[there], gain[rows[there]])
-                ends = bounded_intervals(model, some, limit, at_nodes[there], one)
-                for found, end, which in ((lows, ends[0], np.minimum), (highs, ends[1], np.maximum)):
+                ends = bounded_intervals(model, some, limit, at_nodes[there], rise)
+                for bounds, end, which in ((lows, ends[0], np.minimum), (highs, ends[1], np.maximum)):
                     columns = np.delete(np.arange(q), q - 2)
-                    found[k][np.ix_(rows[there], columns)] = which(found[k][np.ix_(rows[there], columns)], end)
-        for k, one in enumerate(self._allowed):
-            lows[k, :, q - 2], highs[k, :, q - 2] = self._second_ends(gain, one)
+                    bounds[k][np.ix_(rows[there], columns)] = which(bounds[k][np.ix_(rows[there], columns)], end)
+        for k, rise in enumerate(self._allowed):
+            lows[k, :, q - 2], highs[k, :, q - 2] = self._second_ends(gain, rise)
         best = BestFit(log_k, linear, gain)
         return best, lows, highs, self._grid[best_node], estimates, factor
 
@@ -780,8 +756,8 @@ def _covariance(
     jacobian = np.stack(columns, axis=1)
     over = np.where(factor > 0.0, factor, np.nan)
     gradient, by_factor = np.zeros((n, len(model.derived) + 2, m + 2)), np.zeros((n, len(model.derived) + 2))
-    for q, (one, spline) in enumerate(zip(model.derived, model.splines, strict=True)):
-        if spline is None or one.factors is None:
+    for q, (derived, spline) in enumerate(zip(model.derived, model.splines, strict=True)):
+        if spline is None or derived.factors is None:
             gradient[:, q, m] = np.exp(best.log_k)
             continue
         here, there = spline(best.log_k), spline(second)
@@ -801,7 +777,7 @@ def _covariance(
     own = np.zeros((n, by_factor.shape[1], by_factor.shape[1]))
     if reduction.light is not None:
         light = reduction.light
-        weights = [light.spline(best.log_k), light.spline(second), *(np.full(n, one) for one in light.fixed)]
+        weights = [light.spline(best.log_k), light.spline(second), *(np.full(n, value) for value in light.fixed)]
         weights += [a * light.spline(best.log_k, 1), b * light.spline(second, 1)]
         gradient -= by_factor[:, :, None] * np.stack(weights, axis=1)[:, None, :] / light.scale
         own = by_factor[:, :, None] * by_factor[:, None, :] / light.scale**2

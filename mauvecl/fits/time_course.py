@@ -82,14 +82,14 @@ class MeasuredBins:
     @property
     def columns(self) -> list[Column]:
         """Columns of the table; those of the quantities depend on the model."""
-        found = self.found
+        measurement = self.found
         return [
             Column("start", "start_s", "s", "start of the bin, from the start of the stare", "from (s)", "g"),
             Column("end", "end_s", "s", "end of the bin", "to (s)", "g"),
             Column("frames", "count", "", "frames of the bin"),
             Column("snr", "found.snr", "", "S/N of the flare in the bin", "S/N", ".1f"),
-            *(column for q in range(len(found.names)) for column in self._quantity(q)),
-            Column("chi2", "found.chi2", "", f"chi-squared of the fit, of {found.dof} degrees of freedom"),
+            *(column for q in range(len(measurement.names)) for column in self._quantity(q)),
+            Column("chi2", "found.chi2", "", f"chi-squared of the fit, of {measurement.dof} degrees of freedom"),
             Column("p_value", "found.p_value", "",
                    "probability of a chi-squared at least as large if the model is correct", "p-value", ".2g"),
         ]  # fmt: skip
@@ -98,14 +98,14 @@ class MeasuredBins:
         """Return the columns of a quantity's estimates, errors and intervals."""
         from astropy import units
 
-        found, name = self.found, self.found.names[q]
-        column, unit = name.replace(" ", "_"), str(units.Unit(found.units[q]))
+        measurement, name = self.found, self.found.names[q]
+        column, unit = name.replace(" ", "_"), str(units.Unit(measurement.units[q]))
         heading, spec, error = SHOWN.get(column, ("", "", ""))
         columns = [
             Column(column, lambda bins: bins.found.estimates[:, q], unit, f"{name} of the flare", heading, spec),
             Column(f"{column}_error", lambda bins: bins.found.errors[:, q], unit, "its standard error", error, spec),
         ]
-        for k, level in enumerate(found.levels):
+        for k, level in enumerate(measurement.levels):
             text = f"end of its {100 * level:.4g} % interval; infinite where there is none"
             columns += [
                 Column(f"{column}_low_{100 * level:.0f}", self._end("low", k, q), unit, f"lower {text}"),
@@ -203,10 +203,10 @@ def fit_bins(
     skipped_nm: Ranges = (),
 ) -> MeasuredBins:
     """Fit bins of frames; parameters as for `measure_along`, with the first frames of bins and their numbers."""
-    known, end = known_strengths(stare, quiet), first + count
+    strengths, end = known_strengths(stare, quiet), first + count
     alike: dict[tuple[float, ...], list[int]] = {}
     for k, (a, b) in enumerate(zip(first, end, strict=True)):
-        mean = [*known[a:b].mean(axis=0), *spreads_of(stare, a, b).values()]
+        mean = [*strengths[a:b].mean(axis=0), *spreads_of(stare, a, b).values()]
         alike.setdefault((float(b - a), *np.round(mean, DIGITS).tolist()), []).append(k)
     parts = []
     for (length, star, sky, dark, light, *spreads), rows in alike.items():
@@ -223,18 +223,18 @@ def fit_bins(
         own = unknown if unknown.names else None
         parts.append(fit(added, stacked, model.stacked(n, light), own, levels=levels, skipped_nm=skipped_nm))
     order = np.argsort(np.concatenate(list(alike.values())))
-    found = Measurement.joined(parts).rows(order)
-    return MeasuredBins(first, count, stare.start_s[first], stare.start_s[end - 1] + stare.frame_s, found)
+    measurement = Measurement.joined(parts).rows(order)
+    return MeasuredBins(first, count, stare.start_s[first], stare.start_s[end - 1] + stare.frame_s, measurement)
 
 
 def spreads_of(stare: Stare, first: int, end: int) -> dict[Changing, float]:
     """Return the standard deviations of the unknown changes of a stare, averaged over some frames."""
-    found = {of: sd**2 / (end - first) for of, sd in stare.jitters.items()} | {"star": 0.0}
-    for one in stare.unknowns:
-        found[one.of] += (one.sd * float(one.curve[first:end].mean())) ** 2
+    variances = {of: sd**2 / (end - first) for of, sd in stare.jitters.items()} | {"star": 0.0}
+    for unknown in stare.unknowns:
+        variances[unknown.of] += (unknown.sd * float(unknown.curve[first:end].mean())) ** 2
     if stare.pointing is not None:
-        found["light"] += stare.pointing.depth**2
-    return {of: float(np.sqrt(found[of])) for of in CHANGING}
+        variances["light"] += stare.pointing.depth**2
+    return {of: float(np.sqrt(variances[of])) for of in CHANGING}
 
 
 def _with_change(unknown: Nuisances, quiet: Expectation, of: Changing, sd: float) -> Nuisances:
@@ -264,14 +264,14 @@ def _bins(
     quiet: Expectation,
     model: FlareModel,
     nuisances: Nuisances | None,
-    known: Float,
+    strengths: Float,
     stare: Stare,
     snr: float,
     skipped_nm: Ranges,
 ) -> list[tuple[int, int]]:
     """Return first frames and ends of the shortest runs of frames in which a matched filter reaches an S/N."""
     reduction = Reduction.of(model, quiet, None, nuisances, skipped_nm)
-    sums = less_known(raw, quiet, known, reduction.weights)
+    sums = less_known(raw, quiet, strengths, reduction.weights)
     total = np.vstack([np.zeros(sums.shape[1]), np.cumsum(sums, axis=0)])
     shapes = reduction.hot[::BINS_EVERY] / np.linalg.norm(reduction.hot[::BINS_EVERY], axis=1)[:, None]
     widths = 2 ** np.arange(int(np.log2(len(raw))) + 1)
@@ -417,22 +417,22 @@ class _Data:
         if theta is not None:
             flare = self.strengths(theta)
             covariance = covariance + flare[0][:, None, None] * self.spread(flare[1])
-        for one in self.jitters:
-            changes = one.sd * one.around(flare)
+        for jitter in self.jitters:
+            changes = jitter.sd * jitter.around(flare)
             covariance = covariance + changes[:, :, None] * changes[:, None, :]
         inverse = np.linalg.inv(np.linalg.cholesky(covariance))
         if not self.unknown:
             return _Whitening(inverse, np.zeros((0, self.sums.size)), np.zeros(0))
-        changes = np.array([one.around(None if none else flare) for one in self.unknown])
+        changes = np.array([unknown.around(None if none else flare) for unknown in self.unknown])
         spectra = np.einsum("tij,utj->tiu", inverse, changes).reshape(self.sums.size, -1)
         # The prior acts as one more datum, which is not among the residuals because its mean is zero.
-        scale = np.linalg.cholesky(spectra.T @ spectra + np.diag([one.sd**-2.0 for one in self.unknown]))
+        scale = np.linalg.cholesky(spectra.T @ spectra + np.diag([unknown.sd**-2.0 for unknown in self.unknown]))
         basis = np.linalg.solve(scale, spectra.T)
         # I - B^T B = (I - B^T K B)^2, with K from the eigenvalues of B B^T.
         values, vectors = np.linalg.eigh(basis @ basis.T)
-        kept = values > 1e-12
-        directions = vectors[:, kept].T @ basis / np.sqrt(values[kept])[:, None]
-        return _Whitening(inverse, directions, 1.0 - np.sqrt(np.maximum(1.0 - values[kept], 0.0)))
+        nonzero = values > 1e-12
+        directions = vectors[:, nonzero].T @ basis / np.sqrt(values[nonzero])[:, None]
+        return _Whitening(inverse, directions, 1.0 - np.sqrt(np.maximum(1.0 - values[nonzero], 0.0)))
 
     def residuals(self, theta: Float, whitening: _Whitening) -> Float:
         """Return residuals whose squares add up to chi-squared with the unknown levels marginalised over."""
@@ -483,9 +483,9 @@ class _Quantity:
     def slope(self, theta: Float, data: _Data) -> Float:
         """Return the derivatives of the quantity's logarithm, or of the peak time, shape (6,)."""
         if self.spline is None:
-            found = np.zeros(len(PARAMETERS))
-            found[[self.place, 3] if self.place == 4 else self.place] = 1.0
-            return found
+            gradient = np.zeros(len(PARAMETERS))
+            gradient[[self.place, 3] if self.place == 4 else self.place] = 1.0
+            return gradient
         (rise, log_k), (of_rise, of_log_k) = data.strengths(theta), data.slopes(theta)
         light, change = self.spline(log_k)[:, 0], self.spline(log_k, 1)[:, 0]
         total = float(np.sum(data.intrinsic(rise) * light))
@@ -562,18 +562,20 @@ def fit_cooling(
     jacobian = data.jacobian(theta, fit.whitening)[:, free]
     covariance = np.linalg.pinv(jacobian.T @ jacobian, hermitian=True)
     quantities = _quantities(data, stare, cooling)
-    estimates = np.array([one.value(theta, data) for one in quantities])
-    scale = np.array([1.0 if one.place == 0 else value for one, value in zip(quantities, estimates, strict=True)])
-    slopes = scale[:, None] * np.array([one.slope(theta, data) for one in quantities])[:, free]
+    estimates = np.array([quantity.value(theta, data) for quantity in quantities])
+    scale = np.array(
+        [1.0 if quantity.place == 0 else value for quantity, value in zip(quantities, estimates, strict=True)]
+    )
+    slopes = scale[:, None] * np.array([quantity.slope(theta, data) for quantity in quantities])[:, free]
     spread = slopes @ covariance @ slopes.T
     sd = np.sqrt(np.diag(spread)) / np.maximum(np.abs(scale), 1e-300)
     ends = fit.ends_of_all(quantities, estimates, sd, [float(scipy.stats.chi2.ppf(level, 1)) for level in levels])
-    dof = data.sums.size - free.size - sum(np.isinf(one.sd) for one in data.unknown)
+    dof = data.sums.size - free.size - sum(np.isinf(unknown.sd) for unknown in data.unknown)
     empty = np.full(theta.shape, -np.inf)
     without = data.whitening(theta, none=True)
     none = float(np.sum(data.residuals(np.where(np.arange(theta.size) == 2, empty, theta), without) ** 2))
     return Measurement(
-        tuple(one.name for one in quantities), tuple(one.unit for one in quantities),
+        tuple(quantity.name for quantity in quantities), tuple(quantity.unit for quantity in quantities),
         (-np.inf,) + (0.0,) * (len(quantities) - 1),
         estimates[None], spread[None], tuple(levels), ends[0][:, None], ends[1][:, None], np.array([best]),
         np.array([float(scipy.stats.chi2.sf(best, dof))]), dof, np.array([np.sqrt(max(none - best, 0.0))]),
@@ -583,7 +585,7 @@ def fit_cooling(
 
 def cooling_course(
     event: Event,
-    found: Measurement,
+    measurement: Measurement,
     frames: Float,
     quiet: Expectation,
     model: FlareModel,
@@ -597,20 +599,20 @@ def cooling_course(
         cooling = Cooling(cooling, cooling, stare.frame_s)
     logs = np.log([event.half_width_s, event.amplitude, cooling.peak_k, cooling.end_k / cooling.peak_k, cooling.fold_s])
     theta = np.array([event.peak_s, *logs])
-    values = {one.name: one.value(theta, data) for one in _quantities(data, stare, cooling=True)}
+    values = {quantity.name: quantity.value(theta, data) for quantity in _quantities(data, stare, cooling=True)}
     rise, log_k = data.strengths(theta)
     used = (data.reduction.variance > 0).astype(np.float64)
     return CoolingCourse(
-        np.array([values[name] for name in found.names]),
+        np.array([values[name] for name in measurement.names]),
         less_known(frames, quiet, known_strengths(stare, quiet), used[None])[:, 0],
         rise * (model.hot_spline(log_k) @ used),
         np.exp(log_k),
     )
 
 
-def cooling_event(found: Measurement, shape: Shape) -> Event:
+def cooling_event(measurement: Measurement, shape: Shape) -> Event:
     """Return the flare that `fit_cooling` found."""
-    best = dict(zip(found.names, found.estimates[0].tolist(), strict=True))
+    best = dict(zip(measurement.names, measurement.estimates[0].tolist(), strict=True))
     kelvin: float | Cooling = best["temperature"]
     if "cooling time" in best:
         kelvin = Cooling(best["temperature"], min(best["end temperature"], best["temperature"]), best["cooling time"])
@@ -645,12 +647,12 @@ def _data(
 
 def _constant_levels(nuisances: Nuisances, model: FlareModel, weights: Float, n_frames: int) -> tuple[_Level, ...]:
     """Return unknown levels that are constant over a stare."""
-    found = []
+    levels = []
     for sd, spectrum, of_flare in zip(nuisances.sd, nuisances.spectra, nuisances.of_flare, strict=True):
         sums = np.tile(weights @ spectrum, (n_frames, 1))
         spline = scipy.interpolate.CubicSpline(model.log_k, (model.hot * of_flare) @ weights.T)
-        found.append(_Level(float(sd), sums, np.full(n_frames, float(of_flare.any())), spline))
-    return tuple(found)
+        levels.append(_Level(float(sd), sums, np.full(n_frames, float(of_flare.any())), spline))
+    return tuple(levels)
 
 
 def _levels_of_stare(
@@ -674,7 +676,7 @@ def _levels_of_stare(
     if stare.pointing is not None:
         jitters["light"] = float(np.hypot(jitters["light"], stare.pointing.depth))
     return (
-        tuple(level(one.of, one.sd, one.curve) for one in stare.unknowns),
+        tuple(level(unknown.of, unknown.sd, unknown.curve) for unknown in stare.unknowns),
         tuple(level(of, sd, ones) for of, sd in jitters.items() if sd > 0.0),
     )
 
@@ -718,31 +720,31 @@ def _solve(data: _Data, whitening: _Whitening, theta: Float, free: NDArray[np.in
     def jacobian(values: Float) -> Float:
         return data.jacobian(with_free(values), whitening)[:, free]
 
-    found = scipy.optimize.least_squares(
+    solution = scipy.optimize.least_squares(
         residuals,
         np.clip(theta[free], low[free] + 1e-9, high[free] - 1e-9),
         jacobian,
         bounds=(low[free], high[free]),
         x_scale=scale,
     )
-    return with_free(found.x)
+    return with_free(solution.x)
 
 
 def _quantities(data: _Data, stare: Stare, cooling: bool) -> list[_Quantity]:
     """Return the quantities that a fit reports."""
-    found = [
+    quantities = [
         _Quantity("peak time", "s", 0), _Quantity("half width", "s", 1), _Quantity("amplitude", "", 2),
         _Quantity("temperature", "K", 3),
     ]  # fmt: skip
     if cooling:
-        found += [_Quantity("end temperature", "K", 4), _Quantity("cooling time", "s", 5)]
-    for one, spline in zip(data.model.derived, data.model.splines, strict=True):
-        kind, _, band = one.name.partition(" ")
+        quantities += [_Quantity("end temperature", "K", 4), _Quantity("cooling time", "s", 5)]
+    for derived, spline in zip(data.model.derived, data.model.splines, strict=True):
+        kind, _, band = derived.name.partition(" ")
         if kind == "flux":
-            found.append(_Quantity(f"fluence {band}", "erg / cm2", 2, spline, stare.frame_s))
+            quantities.append(_Quantity(f"fluence {band}", "erg / cm2", 2, spline, stare.frame_s))
         elif kind == "energy":
-            found.append(_Quantity(one.name, one.unit, 2, spline))
-    return found
+            quantities.append(_Quantity(derived.name, derived.unit, 2, spline))
+    return quantities
 
 
 @dataclass(frozen=True, eq=False)
@@ -775,27 +777,27 @@ class _BestFit:
 
         An energy is a multiple of its fluence.
         """
-        found = np.full((2, len(rises), len(quantities)), np.nan)
-        names = [one.name for one in quantities]
-        for q, one in enumerate(quantities):
-            if one.name.startswith("energy"):
-                fluence = names.index(one.name.replace("energy", "fluence"))
-                found[:, :, q] = estimates[q] / estimates[fluence] * found[:, :, fluence]
+        ends = np.full((2, len(rises), len(quantities)), np.nan)
+        names = [quantity.name for quantity in quantities]
+        for q, quantity in enumerate(quantities):
+            if quantity.name.startswith("energy"):
+                fluence = names.index(quantity.name.replace("energy", "fluence"))
+                ends[:, :, q] = estimates[q] / estimates[fluence] * ends[:, :, fluence]
             else:
-                found[:, :, q] = self.ends(one, float(sd[q]), rises)
-        return found
+                ends[:, :, q] = self.ends(quantity, float(sd[q]), rises)
+        return ends
 
     def ends(self, quantity: _Quantity, sd: float, rises: Sequence[float]) -> Float:
         """Return the ends of a quantity's intervals, shape (2, n_rise), for rises of chi-squared.
 
         `sd` is the standard deviation of the peak, or of the logarithm of another quantity.
         """
-        found = np.empty((2, len(rises)))
+        interval_ends = np.empty((2, len(rises)))
         for side, sign in enumerate((-1.0, 1.0)):
             for k, rise in enumerate(rises):
                 end = self._newton_end(quantity, sign, self.chi2 + rise)
-                found[side, k] = self._root_end(quantity, sign * sd, self.chi2 + rise) if end is None else end
-        return found
+                interval_ends[side, k] = self._root_end(quantity, sign * sd, self.chi2 + rise) if end is None else end
+        return interval_ends
 
     def _newton_end(self, quantity: _Quantity, sign: float, allowed: float) -> float | None:
         """Return the end of an interval on one side, or None if Newton's steps do not find it within the limits.
@@ -847,8 +849,8 @@ class _BestFit:
             ):
                 return float(np.copysign(np.inf, step))
         there = theta
-        found = scipy.optimize.brentq(rise, inner, outer, xtol=1e-3 * abs(step), rtol=1e-6)
-        return float(centre + found if place == 0 else centre * np.exp(found))
+        offset = scipy.optimize.brentq(rise, inner, outer, xtol=1e-3 * abs(step), rtol=1e-6)
+        return float(centre + offset if place == 0 else centre * np.exp(offset))
 
     def _held(self, quantity: _Quantity, log_factor: float, theta: Float) -> Float:
         """Return parameters with a changed quantity: by a difference for the peak, otherwise by a factor."""
@@ -882,10 +884,10 @@ class _BestFit:
             return np.asarray(each[:, rest] - np.outer(each[:, quantity.place], slope[rest] / slope[quantity.place]))
 
         low, high = (end[rest] for end in self.limits)
-        found = scipy.optimize.least_squares(
+        solution = scipy.optimize.least_squares(
             residuals, np.clip(there[rest], low + 1e-9, high - 1e-9), jacobian, bounds=(low, high),
             x_scale=np.where(rest == 0, np.exp(self.theta[1]), 1.0), xtol=1e-6, ftol=1e-8,
         )  # fmt: skip
         fitted = there.copy()
-        fitted[rest] = found.x
-        return fitted, 2 * float(found.cost)
+        fitted[rest] = solution.x
+        return fitted, 2 * float(solution.cost)

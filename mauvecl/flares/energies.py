@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.flares.shapes import Shape, shape_of
+from mauvecl.host.arrays import set_read_only
 from mauvecl.host.stars.bands import band as find_band
 from mauvecl.host.stars.bands import photons
 from mauvecl.host.stars.blackbody import blackbody
@@ -433,10 +434,7 @@ class RateTable(Rates):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("energy_erg", "per_day"):
-            kept = np.array(getattr(self, name), np.float64)
-            kept.setflags(write=False)
-            object.__setattr__(self, name, kept)
+        set_read_only(self, energy_erg=self.energy_erg, per_day=self.per_day)
         energy, rate = self.energy_erg, self.per_day
         if energy.ndim != 1 or energy.shape != rate.shape or energy.size < 2:
             raise InputError.of("per_day", rate.size, f"one rate for each of {energy.size} energies, at least 2")

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.arrays import set_read_only
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
@@ -58,17 +59,16 @@ class Components:
         if self.quiet.n_frames != 1:
             raise InputError.of("n_frames", self.quiet.n_frames, "one frame of the stare")
         for name, what, least in (("flare_electrons", "flare spectra", 0), ("weights", "spectral weights", 1)):
-            kept = np.array(getattr(self, name), np.float64)
-            if kept.ndim != 2 or kept.shape[1] != n_pixel or len(kept) < least:
-                raise InputError(f"{what} have the shape {kept.shape}", f"(n, {n_pixel})", key=name)
-            if not np.isfinite(kept).all():
+            spectra = np.asarray(getattr(self, name), np.float64)
+            if spectra.ndim != 2 or spectra.shape[1] != n_pixel or len(spectra) < least:
+                raise InputError(f"{what} have the shape {spectra.shape}", f"(n, {n_pixel})", key=name)
+            if not np.isfinite(spectra).all():
                 raise InputError(
-                    f"{what} of pixel {int(np.argmin(np.isfinite(kept).all(axis=0)))} are not finite",
+                    f"{what} of pixel {int(np.argmin(np.isfinite(spectra).all(axis=0)))} are not finite",
                     "finite numbers",
                     key=name,
                 )
-            kept.setflags(write=False)
-            object.__setattr__(self, name, kept)
+            set_read_only(self, **{name: spectra})
         if (self.flare_electrons < 0).any():
             pixel = int(np.argmax((self.flare_electrons < 0).any(axis=0)))
             raise InputError(

@@ -16,6 +16,7 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.flares.settings import check_shape
+from mauvecl.host.arrays import set_read_only
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.physical import Duration
@@ -110,7 +111,7 @@ class Shape(ABC):
         -------
         ndarray, shape (n_frame,), or (n, n_frame)
         """
-        edges, peak, scale = (np.asarray(one, np.float64) for one in (edges_s, peak_s, t_half_s))
+        edges, peak, scale = (np.asarray(values, np.float64) for values in (edges_s, peak_s, t_half_s))
         if edges.ndim == 2:
             integrals = self.integral((edges[:, 0] - peak) / scale, (edges[:, 1] - peak) / scale)
         else:
@@ -348,10 +349,7 @@ class TableShape(Shape):
                 "finite values of at least 0, some above 0",
                 key="values",
             )
-        values = values / values.max()
-        for name, array in (("tau", tau), ("values", values)):
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
+        set_read_only(self, tau=tau, values=values / values.max())
 
     def at(self, tau: ArrayLike) -> Float:
         return np.asarray(np.interp(np.asarray(tau, np.float64), self.tau, self.values, left=0.0, right=0.0))

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.flares.settings import ORBIT_S, Curve, Sinusoid
+from mauvecl.host.arrays import set_read_only
 from mauvecl.host.orbit.geometry import TimeGrid, sunlight
 from mauvecl.host.orbit.observing_limits import Limits
 from mauvecl.host.orbit.orbit import Orbit, Target, Track
@@ -43,8 +44,9 @@ class StareUnknown:
     curve: Float  # effect of unit amplitude on each frame, shape (n_frame,)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "curve", _read_only(self.curve))
-        _check_quantity(self.of)
+        set_read_only(self, curve=self.curve)
+        if self.of not in CHANGING:
+            raise InputError.of("of", self.of, f"one of {', '.join(CHANGING)}")
         _check_spread(self.name, self.of, self.sd)
 
 
@@ -101,12 +103,13 @@ class Stare:
     pointing: PointingDrifts | None = None
 
     def __post_init__(self) -> None:
-        for name in ("start_s", "star", "light", "sky", "temperature_c"):
-            object.__setattr__(self, name, _read_only(getattr(self, name)))
+        own = {name: getattr(self, name) for name in ("start_s", "star", "light", "sky", "temperature_c")}
+        set_read_only(self, **own)
         n = self.start_s.size
         if not 1 <= n <= MOST_FRAMES:
             raise InputError.of("n_frames", n, f"1 to {MOST_FRAMES}")
-        for name, values in self._per_frame():
+        curves = [(unknown.name, unknown.curve) for unknown in self.unknowns]
+        for name, values in [*((name, getattr(self, name)) for name in own), *curves]:
             if values.shape != (n,):
                 raise InputError(f"{name} of the stare has the shape {values.shape}", f"({n},)", key=name)
             if not np.isfinite(values).all():
@@ -128,10 +131,6 @@ class Stare:
             _check_spread(f"{of} jitter", of, sd, least=0.0)
         for unknown in self.unknowns:
             _check_spread(unknown.name, unknown.of, unknown.sd * float(np.abs(unknown.curve).max()), least=0.0)
-
-    def _per_frame(self) -> list[tuple[str, Float]]:
-        named = [(name, getattr(self, name)) for name in ("start_s", "star", "light", "sky", "temperature_c")]
-        return named + [(unknown.name, unknown.curve) for unknown in self.unknowns]
 
     @classmethod
     def of(
@@ -196,10 +195,10 @@ class Stare:
             return np.zeros(start.size) if curve is None else curve.mean_over(start, float(frame_s), orbit_s)
 
         spread = dict(jitters or {})
-        known = STARE_CHANGES["jitters"]
-        other = next((name for name in spread if name not in known), None)
+        components = STARE_CHANGES["jitters"]
+        other = next((name for name in spread if name not in components), None)
         if other is not None:
-            raise InputError.of("jitters", other, f"one of {', '.join(known)}")
+            raise InputError.of("jitters", other, f"one of {', '.join(components)}")
         return cls(
             start,
             float(frame_s),
@@ -274,12 +273,12 @@ class Stare:
 def _frames_outside_gaps(gaps: Sequence[tuple[float, float]], start: Float, frame_s: float) -> NDArray[np.bool_]:
     """Return which frames do not overlap a gap."""
     # The tolerance keeps a frame that starts at the end of a gap.
-    kept, tolerance = np.ones(start.size, np.bool_), 1e-9 * frame_s
+    outside, tolerance = np.ones(start.size, np.bool_), 1e-9 * frame_s
     for first, last in gaps:
         if not (np.isfinite([first, last]).all() and first < last):
             raise InputError.of("gaps", (first, last), "two times, ascending", unit="s")
-        kept &= (start + frame_s <= first + tolerance) | (start >= last - tolerance)
-    return kept
+        outside &= (start + frame_s <= first + tolerance) | (start >= last - tolerance)
+    return outside
 
 
 def _unknowns(
@@ -298,17 +297,6 @@ def _unknowns(
     for of, sd in cycles.items():
         unknowns += [StareUnknown(f"{of} sine", of, sd, sine), StareUnknown(f"{of} cosine", of, sd, cosine)]
     return tuple(unknowns)
-
-
-def _read_only(values: Float) -> Float:
-    kept = np.array(values, np.float64)
-    kept.setflags(write=False)
-    return kept
-
-
-def _check_quantity(of: str) -> None:
-    if of not in CHANGING:
-        raise InputError.of("of", of, f"one of {', '.join(CHANGING)}")
 
 
 def _check_spread(name: str, of: Changing, sd: float, least: float = 1e-300) -> None:
@@ -407,7 +395,7 @@ def stare_along(
         light=whole.light[seen],
         sky=whole.sky[seen],
         temperature_c=temperature[seen],
-        unknowns=tuple(replace(one, curve=one.curve[seen]) for one in whole.unknowns),
+        unknowns=tuple(replace(unknown, curve=unknown.curve[seen]) for unknown in whole.unknowns),
     )
     hits = particles.rate_per_cm2_s(track)[seen]
     return OrbitStare(stare, hits, visible.shadow[seen], times.iso(0.0), tuple(orbit.messages(times)))

@@ -202,9 +202,9 @@ class StareScene:
             if sign < 0 and stare.pointing is not None:
                 light = light * (1.0 - stare.pointing.depth)
             warm = np.exp(sign * REACH_SIGMA * abs(self.stare_job["dark_slope"]) * spread["temperature"])
-            known = (stare.light * stare.star * light * star, stare.light * stare.sky * light * sky)
+            lights = (stare.light * stare.star * light * star, stare.light * stare.sky * light * sky)
             dark = stare.dark_factor(self.components.quiet) * warm
-            ends.append(np.array([float(of(values)) for values in (*known, dark, stare.light * light)]))
+            ends.append(np.array([float(of(values)) for values in (*lights, dark, stare.light * light)]))
         return ends[0], ends[1]
 
     @property
@@ -264,11 +264,13 @@ class Conditions:
 # The pixels of a stare are drawn in many parts.
 @lru_cache(maxsize=4)
 def _joint_throughout(x: Expectation, conditions: Conditions) -> bool:
-    one, counts = Cumulants.of(x, 1), x.photon_noise == "poisson"
+    cumulants, counts = Cumulants.of(x, 1), x.photon_noise == "poisson"
     for light, dark in conditions:
         photons = light / x.gain_dn_per_electron
         other = x.read_noise_dn**2 + (0.0 if counts else x.gain_dn_per_electron * light)
-        if not joint_is_exact(replace(one, gaussian=other, photons=photons, dark_dn=dark * one.dark_dn)).all():
+        if not joint_is_exact(
+            replace(cumulants, gaussian=other, photons=photons, dark_dn=dark * cumulants.dark_dn)
+        ).all():
             return False
     return True
 

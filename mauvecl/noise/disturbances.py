@@ -136,10 +136,10 @@ class CosmicRays(AdditiveProcess):
                 f"at most {2**23}: lower the rate, the charge or the exposure",
                 key="rate_per_cm2_s",
             )
-        one = np.zeros(size)
-        one[low : high + 1] = 1.0 if self.weights is None else self.weights
+        charge = np.zeros(size)
+        charge[low : high + 1] = 1.0 if self.weights is None else self.weights
         # This is the generating function of a Poisson number of hits; charges beyond `size` would alias.
-        spectrum = np.exp(hits * (np.fft.rfft(one / one.sum()) - 1.0))
+        spectrum = np.exp(hits * (np.fft.rfft(charge / charge.sum()) - 1.0))
         return np.asarray(np.maximum(np.fft.irfft(spectrum, size)[: most + 1], 0.0))
 
     def most_electrons(self, seconds: Annotated[float, Unit("s"), Range(0)]) -> int:
@@ -405,9 +405,9 @@ def _from_study(given: Any) -> Prior:
     for kind, form in _FORMS.items():
         if isinstance(given, Mapping) and {key for key in given if given[key] is not None} == form.keys():
             return kind(*(value for key, n in form.items() for value in _values(key, given[key], n)))
-    known = [key for form in _FORMS.values() for key in form]
-    if isinstance(given, Mapping) and (other := next((key for key in given if key not in known), None)):
-        raise InputError(f"unknown key {other!r} of a prior", f"some of {', '.join(known)}", key=other)
+    keys = [key for form in _FORMS.values() for key in form]
+    if isinstance(given, Mapping) and (other := next((key for key in given if key not in keys), None)):
+        raise InputError(f"unknown key {other!r} of a prior", f"some of {', '.join(keys)}", key=other)
     raise InputError(
         "a prior is neither { uniform = [low, high] } nor { normal = [mean, sd], between = [low, high] }",
         "one of them",

@@ -269,9 +269,9 @@ class Drawing:
     first_frame: int = 0
 
     def __post_init__(self) -> None:
-        for name, value, known in (("mode", self.mode, get_args(Mode)), ("recipe", self.recipe, get_args(Recipe))):
-            if value not in known:
-                a, b, c = map(repr, known)
+        for name, value, choices in (("mode", self.mode, get_args(Mode)), ("recipe", self.recipe, get_args(Recipe))):
+            if value not in choices:
+                a, b, c = map(repr, choices)
                 raise InputError.of(name, value, f"{a}, {b} or {c}")
 
     @property
@@ -446,7 +446,7 @@ def near_rail(x: Expectation, factors: Factors, processes: Processes) -> NDArray
         there = mean + (more_light - 1.0) * light + (more_dark - 1.0) * x.dark_dn
         more = (more_light - 1.0) * x.gain_dn_per_electron * light + (more_dark - 1.0) * x.dark_variance_dn2
         ends.append((there, RAIL_SIGMA * np.sqrt(variance + np.maximum(more, 0.0))))
-    added = x.gain_dn_per_electron * sum(one.most_electrons(x.frame_s) for one in processes.additive.values())
+    added = x.gain_dn_per_electron * sum(process.most_electrons(x.frame_s) for process in processes.additive.values())
     low: NDArray[np.bool_] = ends[0][0] - ends[0][1] < 0.0
     high: NDArray[np.bool_] = ends[1][0] + ends[1][1] + added > x.highest_dn
     return low | high

@@ -223,15 +223,6 @@ class AliasTable:
     bits: int  # base-2 logarithm of the number of columns
     entries: NDArray[np.uint32]  # alias << (32 - bits) | threshold, shape (2**bits,)
 
-    def words_per_column(self) -> NDArray[np.int64]:
-        """Return the number of the 2**32 words that give each column: its exact probability."""
-        shift = WORD_BITS - self.bits
-        threshold = self.entries.astype(np.int64) & ((1 << shift) - 1)
-        alias = self.entries.astype(np.int64) >> shift
-        words = threshold.copy()
-        np.add.at(words, alias, (1 << shift) - threshold)
-        return np.asarray(words)
-
 
 def alias_table(mean: float) -> AliasTable:
     """Compute the alias table of a Poisson distribution with a mean of 0 to 1e8, to 2**-32 in each probability.

@@ -134,7 +134,7 @@ def factors(
 ) -> tuple[Floats, Floats, Floats]:
     """Draw factors on light, dark and sky, relative to the priors' medians and minus one, shape (n_realisation,)."""
     factor_of = {factor: np.zeros(len(realisation), np.float32) for factor in SIGNAL_PARTS}
-    kept = np.zeros(len(realisation), np.float32)
+    constant = np.zeros(len(realisation), np.float32)
     first = int(scene.job["first_frame"]) + frame
     for (name, factor), table in zip(scene.modulations, scene.priors, strict=True):
         if PROCESSES[name].when != "frame":
@@ -143,10 +143,10 @@ def factors(
             continue
         for f in range(first, first + (1 if scene.frames else scene.n_frames)):
             words = words_at(realisation, f // 4, name, 0, seed, exposure)
-            kept = kept + quantile(words[f % 4], words[(f + 1) % 4], table)
+            constant = constant + quantile(words[f % 4], words[(f + 1) % 4], table)
         if not scene.frames:
-            kept = kept * (np.float32(1.0) / np.float32(scene.n_frames))
-    return combine_factors(factor_of["light"], kept), factor_of["dark"], factor_of["sky"]
+            constant = constant * (np.float32(1.0) / np.float32(scene.n_frames))
+    return combine_factors(factor_of["light"], constant), factor_of["dark"], factor_of["sky"]
 
 
 def analogue(

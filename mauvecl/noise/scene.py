@@ -138,10 +138,10 @@ class FactorDistributions:
     ) -> FactorDistributions | None:
         spreads: dict[SignalPart, list[FactorDistribution]] = {}
         for (name, factor), table in zip(modulations, tables, strict=True):
-            one = _of_table(table)
+            spread = _of_table(table)
             if PROCESSES[name].when == "frame" and n_frames > 1:
-                one = _normal(one.mean, one.sd / np.sqrt(n_frames))
-            spreads.setdefault(factor, []).append(one)
+                spread = _normal(spread.mean, spread.sd / np.sqrt(n_frames))
+            spreads.setdefault(factor, []).append(spread)
         return cls({name: _product(ones, medians[name]) for name, ones in spreads.items()}) if spreads else None
 
     def nodes(self, x: Expectation, *, weighted: bool) -> tuple[list[Node], Float]:
@@ -200,8 +200,8 @@ def _product(ones: list[FactorDistribution], median: float) -> FactorDistributio
     """Return the distribution of a product of independent factors, which is normal if there are several."""
     if len(ones) == 1:
         return FactorDistribution(median * ones[0].values, ones[0].weights)
-    mean = np.prod([one.mean for one in ones])
-    square = np.prod([one.mean**2 + one.sd**2 for one in ones])
+    mean = np.prod([prior.mean for prior in ones])
+    square = np.prod([prior.mean**2 + prior.sd**2 for prior in ones])
     return _normal(float(median * mean), float(median * np.sqrt(square - mean**2)))
 
 
@@ -267,12 +267,12 @@ def _both_of_a_pair(chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 def fill_estimates(out: NDArray[np.void], reference: Expectation, fraction: Float, mean_sum: Float) -> None:
     """Fill `out` for variances estimated by an observer who knows the detector; padding has a variance of 1."""
-    n_pixel, known = reference.wavelength_nm.size, reference.read_noise_dn**2 + reference.dark_variance_dn2 + 1 / 12
+    n_pixel, variance = reference.wavelength_nm.size, reference.read_noise_dn**2 + reference.dark_variance_dn2 + 1 / 12
     out["variance"] = 1.0
     out["fraction"] = fraction
     out["net_offset"][:n_pixel] = mean_sum - reference.n_frames * (reference.bias_dn + reference.dark_dn)
     out["gain"][:n_pixel] = reference.gain_dn_per_electron
-    out["variance"][:n_pixel] = np.maximum(reference.n_frames * known, NO_VARIANCE)
+    out["variance"][:n_pixel] = np.maximum(reference.n_frames * variance, NO_VARIANCE)
 
 
 def fill_responses(out: NDArray[np.void], x: Expectation, c: Cumulants, factors: Factors) -> None:

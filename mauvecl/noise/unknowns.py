@@ -359,14 +359,16 @@ def values_of(instrument: Instrument) -> dict[str, InstrumentValue]:
     errors = instrument.throughput_errors
     if errors is None:
         return dict(INSTRUMENT_VALUES)
-    known = {name for name, source in instrument.sources.items() if source.startswith("C: fitted")} | set(errors.values)
-    kept = {name: row for name, row in INSTRUMENT_VALUES.items() if not row.of_throughput and name not in known}
+    measured = {name for name, source in instrument.sources.items() if source.startswith("C: fitted")} | set(
+        errors.values
+    )
+    values = {name: row for name, row in INSTRUMENT_VALUES.items() if not row.of_throughput and name not in measured}
     modes = []
     for k in range(min(len(errors.modes), MAX_MODES)):
         others = {name: steps[k] for name, steps in errors.values.items() if k < len(steps) and steps[k]}
         label = f"calibration, mode {k + 1}"
         modes.append(ThroughputMode(name=f"throughput_{k + 1}", label=label, prior=MODE_PRIOR, number=k, others=others))
-    return kept | _by_name(*modes)
+    return values | _by_name(*modes)
 
 
 def default_processes(temperature_c: float) -> dict[str, Prior]:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.tables.files import UNFINISHED, check_size, read_bytes, write_whole
+from mauvecl.host.threads import map_in_threads
 from mauvecl.runs.checkpoint import locked
 from mauvecl.runs.export import Selection, export
 from mauvecl.runs.pool import Pool, map_in_order
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 Progress = Callable[[int, int], None]
 
 #: Chunks drawn at once, and threads that write them while the next are drawn.
-CHUNKS_AT_ONCE, WRITERS = 4, 2
+CHUNKS_AT_ONCE, WRITERS = 4, 4
 #: Largest number of missing chunks that `verify` lists, since a study can ask for any number.
 MAX_MISSING = 100_000
 
@@ -137,7 +137,7 @@ def realise_file(
     file = Path(file)
     if file.exists() and not restart:
         raise InputError(
-            f"{str(file)!r} is there already", "another place, or `restart=True` to write it anew", key="restart"
+            f"{str(file)!r} exists already: use another name, or `restart=True` to replace it", key="restart"
         )
     store = Store(unfinished(file), study)
     store.make_folder()
@@ -164,8 +164,8 @@ def _complete(store: Store, engine: Engine | Pool, resume: bool, restart: bool, 
     todo = [chunk for chunk in store.chunks() if not store.has(chunk)]
     if begun and not resume and todo:
         raise InputError(
-            f"store {str(store.path)!r} holds {store.count() - len(todo)} of {store.count()} chunks",
-            "`resume=True` to draw the others, or another place",
+            f"store {str(store.path)!r} holds {store.count() - len(todo)} of {store.count()} chunks: use `resume=True` "
+            "to draw the others, or another place",
             key="resume",
         )
     _fill(store, todo, engine, progress)
@@ -187,59 +187,34 @@ def forget(path: str | Path) -> None:
 
 
 def _fill(store: Store, todo: list[Chunk], engine: Engine | Pool, progress: Progress | None) -> None:
+    """Draw and write chunks; after an error, those in progress are completed and the rest is left for a resume."""
     total = store.rows * len(store.scenes)
     done = total - sum(chunk.stop - chunk.start for chunk in todo)
     if progress is not None:
         progress(done, total)
-    waiting: deque[tuple[Chunk, Future[str]]] = deque()
 
-    def collect(left: int) -> None:
-        nonlocal done
-        while len(waiting) > left:
-            chunk, placed = waiting.popleft()
-            store.note(chunk, placed.result())
-            done += chunk.stop - chunk.start
+    def write(drawn: tuple[Chunk, NDArray[Any]]) -> int:
+        store.write(*drawn)
+        return len(drawn[1])
+
+    if isinstance(engine, Pool) and engine.workers.count > 1:
+        # A single chunk per request limits the size of transfers.
+        written = map_in_order(engine, lambda chunk: write(next(_drawn(store.study, [chunk], engine))), todo)
+    else:
+        written = map_in_threads(write, _drawn(store.study, todo, engine), WRITERS)
+    with closing(written):
+        for rows in written:
+            done += rows
             if progress is not None:
                 progress(done, total)
 
-    with ThreadPoolExecutor(WRITERS) as writers:
-        try:
-            for block, rows in _drawn(store.study, todo, engine):
-                # The buffer of the previous block is free once all its chunks are written.
-                collect(0)
-                for chunk in block:
-                    part = rows[chunk.start - block[0].start : chunk.stop - block[0].start]
-                    waiting.append((chunk, writers.submit(store.place, chunk, part)))
-            collect(0)
-        except BaseException:
-            # Chunks that are being written are completed and listed; the rest is left for a resume.
-            for _, placed in waiting:
-                placed.cancel()
-            writers.shutdown()
-            for chunk, placed in waiting:
-                if not placed.cancelled() and placed.exception() is None:
-                    store.note(chunk, placed.result())
-            raise
 
-
-def _drawn(study: Study, todo: Sequence[Chunk], engine: Engine | Pool) -> Iterator[tuple[list[Chunk], NDArray[Any]]]:
-    """Yield blocks of neighbouring chunks and their rows, in order."""
-    if isinstance(engine, Pool) and engine.workers.count > 1:
-        # A single chunk per request limits the size of transfers.
-        def rows_of(block: list[Chunk]) -> NDArray[Any]:
-            return draw(study, block[0].scene, engine, block[0].start, block[0].stop - block[0].start)
-
-        blocks = list(_blocks(todo, 1))
-        yield from zip(blocks, map_in_order(engine, rows_of, blocks), strict=True)
-        return
-    # Two alternating buffers, one being drawn while the other is written, keep the memory constant.
-    buffers: list[NDArray[Any]] = [np.empty(0)] * 2
-    for number, block in enumerate(_blocks(todo, CHUNKS_AT_ONCE)):
-        scene, count = block[0].scene, block[-1].stop - block[0].start
-        there = buffers[number % 2]
-        if there.shape[1:] != scene.row or there.dtype != scene.dtype or len(there) < count:
-            there = buffers[number % 2] = np.empty((count, *scene.row), scene.dtype)
-        yield block, draw(study, scene, engine, block[0].start, count, there[:count])
+def _drawn(study: Study, todo: Sequence[Chunk], engine: Engine | Pool) -> Iterator[tuple[Chunk, NDArray[Any]]]:
+    """Yield chunks and their rows, drawing several neighbouring ones at once."""
+    for block in _blocks(todo, CHUNKS_AT_ONCE):
+        first = block[0].start
+        rows = draw(study, block[0].scene, engine, first, block[-1].stop - first)
+        yield from ((chunk, rows[chunk.start - first : chunk.stop - first]) for chunk in block)
 
 
 def _blocks(chunks: Sequence[Chunk], max_chunks: int) -> Iterator[list[Chunk]]:
@@ -296,10 +271,10 @@ def state(store: Store, chunk: Chunk) -> str:
         return "damaged"
     if len(data) != size or crc(data[:-CRC_BYTES]) != data[-CRC_BYTES:]:
         return "damaged"
-    known = store.digests.get(chunk.key)
-    if known is None:
+    listed = store.digests.get(chunk.key)
+    if listed is None:
         return "unlisted"
-    return "good" if digest(data) == known else "foreign"
+    return "good" if digest(data) == listed else "foreign"
 
 
 @validated
@@ -352,8 +327,8 @@ def verify(
         total, there = store.count(first, last), sum(store.owns(key) for key, _ in files)
         if total - there > MAX_MISSING:
             raise InputError(
-                f"store {str(store.path)!r} holds {there} chunks of the {total} of its study",
-                f"at most {MAX_MISSING} missing: choose `rows`, or `mauvecl realise --resume` draws them",
+                f"store {str(store.path)!r} holds {there} of {total} chunks, but at most {MAX_MISSING} may be missing: "
+                "choose `rows`, or draw them with `mauvecl realise --resume`",
                 key="rows",
             )
         faults = list(_faults_of_description(store, repair))
@@ -380,19 +355,18 @@ def _fault(store: Store, chunk: Chunk, engine: Engine | Pool | None, repair: boo
     drawn = digest(*store.encode(chunk, rows))
     if store.digests.get(chunk.key, drawn) != drawn and not redraw:
         raise InputError(
-            f"{chunk.key} of {store.path.name} was written with the digest {store.digests[chunk.key]} and "
-            f"is now drawn with {drawn}",
-            "the same: its study or its list is wrong; `redraw=True` with `repair=True` trusts the study",
+            f"{chunk.key} of {store.path.name} was written with the digest {store.digests[chunk.key]}, but is drawn "
+            f"with {drawn}: its study or its list is wrong; use `redraw=True` with `repair=True` to trust the study",
             key="redraw",
         )
     if seen == "good":
         if drawn == store.digests[chunk.key]:
             return None
         seen = "differs"
-    if repair:
-        if seen != "unlisted" or digest((store.path / chunk.key).read_bytes()) != drawn:
-            store.place(chunk, rows)
+    if repair and seen == "unlisted" and digest((store.path / chunk.key).read_bytes()) == drawn:
         store.note(chunk, drawn)
+    elif repair:
+        store.write(chunk, rows)
     return Fault(chunk.key, seen, repair)
 
 
@@ -403,8 +377,8 @@ def _faults_of_description(store: Store, repair: bool) -> Iterator[Fault]:
         try:
             data = read_bytes(there, "description")
             if name.endswith("zarr.json"):
-                found, made = (without_version(json.loads(one)) for one in (data, content))
-                same, seen = found in (made, without_later_attributes(made)), "foreign"
+                existing, made = (without_version(json.loads(text)) for text in (data, content))
+                same, seen = existing in (made, without_later_attributes(made)), "foreign"
             else:
                 same, seen = data == content, "damaged"
         except (ValueError, TypeError, AttributeError, RecursionError):

@@ -49,7 +49,7 @@ def locked(folder: Path, what: str) -> Iterator[None]:
         handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     except OSError as error:
         raise InputError(
-            f"{what} {str(folder)!r} cannot be opened ({error.strerror})", "a folder", key="lock"
+            f"{what} {str(folder)!r} cannot be opened ({error.strerror}): use a readable folder", key="lock"
         ) from error
     try:
         try:
@@ -167,8 +167,8 @@ def _feed(digest: Any, value: Any, leave: tuple[str, ...] = ()) -> None:
             _feed(digest, value[key])
     elif isinstance(value, list | tuple):
         digest.update(f"<{len(value)}".encode())
-        for one in value:
-            _feed(digest, one)
+        for item in value:
+            _feed(digest, item)
     elif isinstance(value, float):
         digest.update(value.hex().encode())
     else:
@@ -270,8 +270,8 @@ class Checkpoint:
             return
         if not self._resume:
             raise InputError(
-                f"{str(self.folder)!r} holds an unfinished run",
-                "`resume=True` to continue it or `restart=True` to discard it",
+                f"{str(self.folder)!r} holds an unfinished run: use `resume=True` to continue it or `restart=True` to "
+                "discard it",
                 key="resume",
             )
         try:
@@ -290,16 +290,16 @@ class Checkpoint:
             return
         if form != FORM:
             raise InputError(
-                f"the unfinished run in {str(self.folder)!r} has counts in the format {form}",
-                f"format {FORM} of this version: `restart=True` to discard it",
+                f"the unfinished run in {str(self.folder)!r} has counts in format {form}, but this version needs "
+                f"format {FORM}: use `restart=True` to discard it",
                 key="restart",
             )
         ours = {"mauvecl": VERSION, "verb": self.verb, **self._plain_study()}
         differing = differing_keys(ours, theirs)
         if differing:
             raise InputError(
-                f"the unfinished run in {str(self.folder)!r} differs in {', '.join(differing)}",
-                "the same study, or `restart=True` to discard it",
+                f"the unfinished run in {str(self.folder)!r} differs in {', '.join(differing)}: use the same study, or "
+                "`restart=True` to discard it",
                 key="restart",
             )
 
@@ -397,11 +397,11 @@ def kept(checkpoint: Checkpoint | None, question: object, compute: Callable[[], 
     if checkpoint is None:
         return compute()
     name = f"{fingerprint(question)}-0-0-1"
-    found = checkpoint.get(name)
-    if found is None:
-        found = compute()
-        checkpoint.put(name, found)
-    return found
+    arrays = checkpoint.get(name)
+    if arrays is None:
+        arrays = compute()
+        checkpoint.put(name, arrays)
+    return arrays
 
 
 def _is_ours(manifest: Path) -> bool:

@@ -24,9 +24,9 @@ from mauvecl.device.drivers import THREADS, DeviceError
 from mauvecl.host import VERSION
 from mauvecl.host.tables.files import is_file, json_data, read_text
 from mauvecl.runs.checkpoint import Task, code_identity
-from mauvecl.runs.pool import Stopped
+from mauvecl.runs.pool import ShardLost, Stopped
 from mauvecl.schema.calls import validated
-from mauvecl.schema.errors import InputError, shortened
+from mauvecl.schema.errors import InputError, missing_package, shortened
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -36,8 +36,6 @@ if TYPE_CHECKING:
 
 #: Timeouts of the scheduler and of the first worker, s.
 PATIENCE_S, WORKER_PATIENCE_S = 30.0, 120.0
-#: Number of attempts at a shard before the run fails; a shrinking cluster may lose several workers at once.
-MAX_TRIES = 8
 #: Interval between counts of the workers, s, and largest number of requests kept on the workers.
 RECOUNT_S, MAX_REQUESTS = 5.0, 32
 
@@ -48,8 +46,6 @@ class _Attempt:
 
     awaited: Future[Arrays]
     task: Task
-    #: Number of the attempt, of at most `MAX_TRIES`.
-    tried: int = 1
     #: Workers that may count it, and those that may hold its request; None for all.
     workers: list[str] | None = None
     holders: list[str] | None = None
@@ -93,10 +89,8 @@ class DaskWorkers:
         try:
             import distributed
         except ImportError as error:
-            raise InputError(
-                "Dask is missing", "the package for Dask workers: pip install 'mauvecl[cluster]'", key="dask"
-            ) from error
-        self._where, self._device, self.retries, self._sends = where, device, 0, 0
+            raise missing_package("dask", "a cluster", "cluster") from error
+        self._where, self._device, self._sends = where, device, 0
         self._lock = threading.Lock()
         self._closing = False
         self._given: dict[str, tuple[DaskFuture[Any], list[str] | None]] = {}
@@ -112,19 +106,19 @@ class DaskWorkers:
                 self._client.wait_for_workers(1, timeout=WORKER_PATIENCE_S)
             except TimeoutError as error:
                 raise DeviceError(
-                    f"cluster {where} has no worker, expected one within {WORKER_PATIENCE_S:g} s"
+                    f"no worker of cluster {where} answered within {WORKER_PATIENCE_S:g} s: start one"
                 ) from error
             introduced = self._client.run(_introduce, device, on_error="return")
             for worker, answer in introduced.items():
                 if isinstance(answer, BaseException):
                     raise DeviceError(
-                        f"worker {worker} cannot work ({answer}), expected mauvecl {VERSION} and OpenCL there"
+                        f"worker {worker} needs mauvecl {VERSION} and OpenCL, but cannot use them ({answer})"
                     )
                 if answer[0] != code_identity():
                     version, code = answer[0]
                     raise DeviceError(
-                        f"worker {worker} has mauvecl {version} (code {code}), expected "
-                        f"{VERSION} (code {code_identity()[1]}) as here"
+                        f"worker {worker} has mauvecl {version} (code {code}), but needs {VERSION} "
+                        f"(code {code_identity()[1]}) as here"
                     )
             self._devices = [record for _, record in introduced.values()]
             self._counted = len(introduced), time.monotonic()
@@ -143,7 +137,7 @@ class DaskWorkers:
         return self._counted[0]
 
     def _gone(self) -> DeviceError:
-        return DeviceError(f"the scheduler of cluster {self._where} is gone, expected it to stay to the end", "lost")
+        return DeviceError(f"the scheduler of cluster {self._where} ended before the work was done", "lost")
 
     def describe(self) -> list[DeviceRecord]:
         """Return the devices of the initial workers."""
@@ -152,23 +146,19 @@ class DaskWorkers:
     def submit(self, task: Task) -> Future[Arrays]:
         """Submit a shard to any free worker; raw spectra are returned, and the task's `out` is not used."""
         awaited: Future[Arrays] = Future()
-        self._send(_Attempt(awaited, task))
-        return awaited
-
-    def _send(self, attempt: _Attempt) -> None:
-        awaited, task = attempt.awaited, attempt.task
+        attempt = _Attempt(awaited, task)
         with self._lock:
             if self._closing:
                 awaited.set_exception(Stopped())
-                return
+                return awaited
             try:
                 attempt.workers = self._ours()
                 if task.key not in self._given:
                     # A task instead of scattered data, since the scheduler can repeat it if its worker is lost. Bytes,
                     # because a worker with other code might read and write a request differently.
                     content, key = pickle.dumps(task.request), f"mauvecl-request-{task.key}-{self._sends}"
-                    kept = self._client.submit(_keep, content, key=key, workers=attempt.workers)
-                    self._given[task.key] = kept, attempt.workers
+                    request_task = self._client.submit(_keep, content, key=key, workers=attempt.workers)
+                    self._given[task.key] = request_task, attempt.workers
                     if len(self._given) > MAX_REQUESTS:
                         del self._given[next(iter(self._given))]
                 request, attempt.holders = self._given[task.key]
@@ -185,9 +175,10 @@ class DaskWorkers:
             except (OSError, RuntimeError) as error:
                 # Dask raises either if its client has lost the scheduler.
                 awaited.set_exception(self._gone().with_traceback(error.__traceback__))
-                return
+                return awaited
             self._sent[sent] = attempt
         sent.add_done_callback(partial(self._came, attempt))
+        return awaited
 
     def _ours(self) -> list[str] | None:
         """Return the addresses of workers with our code; None for all, also if those with our code have left."""
@@ -212,7 +203,7 @@ class DaskWorkers:
         return new
 
     def _watch(self) -> None:
-        """Send shards again whose workers have all left, since Dask gives them to no others."""
+        """Give up attempts whose workers have all left, since Dask gives their shards to no others."""
         while True:
             time.sleep(RECOUNT_S)
             try:
@@ -221,23 +212,20 @@ class DaskWorkers:
                 # The client is closed or has lost the scheduler.
                 return
             with self._lock:
-                left = {sent: one for sent, one in self._sent.items() if one.is_left_by(present)}
+                left = {sent: attempt for sent, attempt in self._sent.items() if attempt.is_left_by(present)}
                 for sent in left:
                     del self._sent[sent]
             for attempt in left.values():
-                self._again(attempt, lost=True)
+                self._forget_request(attempt)
+                attempt.awaited.set_exception(ShardLost("its workers have left", failed=False))
 
-    def _again(self, attempt: _Attempt, *, tried: int = 0, lost: bool = False) -> None:
-        """Send a shard again, with its request if that was lost with its workers, and add failures to its count."""
+    def _forget_request(self, attempt: _Attempt) -> None:
+        """Let the next attempt send the request again, which may be lost with its workers."""
         with self._lock:
-            self.retries += 1
-            if lost:
-                self._given.pop(attempt.task.key, None)
-        attempt.tried += tried
-        self._send(attempt)
+            self._given.pop(attempt.task.key, None)
 
     def _came(self, attempt: _Attempt, sent: DaskFuture[Any]) -> None:
-        awaited, task = attempt.awaited, attempt.task
+        awaited = attempt.awaited
         with self._lock:
             if self._sent.pop(sent, None) is None:
                 # The result is no longer needed.
@@ -246,8 +234,9 @@ class DaskWorkers:
             if sent.status == "finished":
                 try:
                     answer = _result(sent)
-                except _LostError:
-                    self._again(attempt, lost=True)
+                except ShardLost as lost:
+                    self._forget_request(attempt)
+                    awaited.set_exception(lost)
                     return
                 except OSError as broken:
                     # The connection may break between the end of a shard and the transfer of its counts.
@@ -258,17 +247,19 @@ class DaskWorkers:
                     return
             error = sent.exception() if sent.status == "error" else None
             if sent.status in ("finished", "error") and self._find_strangers():
-                # Counted by a worker with other code.
-                self._again(attempt)
-                return
-            known = isinstance(error, InputError | DeviceError)
-            if known or attempt.tried == MAX_TRIES:
-                reason = error or ("workers with other code" if sent.status == "finished" else "the scheduler is gone")
-                awaited.set_exception(DeviceError(f"cluster {self._where} failed at {task.shard}: {reason}", "failed"))
+                awaited.set_exception(ShardLost("counted by a worker with other code", failed=False))
+            elif isinstance(error, InputError | DeviceError):
+                # Another attempt would end as this one.
+                awaited.set_exception(
+                    DeviceError(f"cluster {self._where} failed at {attempt.task.shard}: {error}", "failed")
+                )
             elif sent.status in ("cancelled", "lost") and self._client.status != "running":
                 awaited.set_exception(self._gone())
             else:
-                self._again(attempt, tried=1, lost=error is None)
+                if error is None:
+                    self._forget_request(attempt)
+                other = "workers with other code" if sent.status == "finished" else "workers that have left"
+                awaited.set_exception(ShardLost(f"cluster {self._where}: {error or other}"))
         except BaseException as error:
             if not awaited.done():
                 awaited.set_exception(self._gone() if isinstance(error, OSError) else error)
@@ -297,12 +288,8 @@ class DaskWorkers:
         self._open.close()
 
 
-class _LostError(Exception):
-    """The worker of a finished shard has left before its counts were transferred."""
-
-
 def _result(sent: DaskFuture[Any]) -> Any:
-    """Return the result of a finished task; raise `_LostError` if its worker has left with it.
+    """Return the result of a finished task; raise `ShardLost` if its worker has left with it.
 
     Dask would wait until the task is repeated, which never happens if all workers that may do so have left; it calls
     the functions of all finished tasks in one thread, so that every other shard would wait, too.
@@ -312,7 +299,7 @@ def _result(sent: DaskFuture[Any]) -> Any:
             return sent.result(timeout=RECOUNT_S)
         except TimeoutError:
             if sent.status != "finished":
-                raise _LostError from None
+                raise ShardLost("its worker has left with its counts", failed=False) from None
 
 
 @contextlib.contextmanager
@@ -343,7 +330,7 @@ def _client(where: str, distributed: Any) -> Iterator[Client]:
             address = scheduler.get("address") if isinstance(scheduler, dict) else None
             if not (isinstance(address, str) and _is_address(address)):
                 raise InputError(
-                    f"scheduler file {shortened(where)} names no address", "one that Dask wrote", key="cluster"
+                    f"scheduler file {shortened(where)} names no address: use one that Dask wrote", key="cluster"
                 )
             how = {"scheduler_file": where}
         else:
@@ -351,7 +338,7 @@ def _client(where: str, distributed: Any) -> Iterator[Client]:
         try:
             client = stack.enter_context(distributed.Client(**how, timeout=PATIENCE_S, set_as_default=False))
         except (OSError, ValueError, TimeoutError) as error:
-            raise DeviceError(f"no scheduler answers at {where}, expected one within {PATIENCE_S:g} s") from error
+            raise DeviceError(f"no scheduler answered at {where} within {PATIENCE_S:g} s: start one") from error
         yield client
 
 
@@ -396,11 +383,7 @@ def _private(distributed: Any) -> Any:
     try:
         return distributed.Security.temporary()
     except ImportError as error:
-        raise InputError(
-            "cryptography is missing",
-            "the package for workers on local:N: pip install 'mauvecl[cluster]'",
-            key="cryptography",
-        ) from error
+        raise missing_package("cryptography", "a cluster of this machine", "cluster") from error
 
 
 LOGS = ("distributed", *(f"distributed.{part}" for part in ("client", "nanny", "worker", "scheduler", "core")))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from mauvecl.host import VERSION
 from mauvecl.host.tables.files import UNFINISHED, check_folder, parsing, write_whole, writing
 from mauvecl.runs.store import CALIBRATION, COMMON_DRAWS, NOMINAL, Store, StoredScene, exposure_attributes
-from mauvecl.schema.errors import InputError
+from mauvecl.schema.errors import InputError, missing_package
 
 if TYPE_CHECKING:
     from astropy.io.fits import BinTableHDU, HDUList, ImageHDU
@@ -63,14 +63,13 @@ class Selection:
         size = sum((stop - first) * scene.row_bytes for scene in chosen)
         if size > MAX_BYTES:
             raise InputError(
-                f"{size / 2**30:.1f} GiB of spectra",
-                f"at most {MAX_BYTES // 2**30} GiB in one file: choose rows",
+                f"one file may hold {MAX_BYTES // 2**30} GiB, but the spectra have {size / 2**30:.1f} GiB: choose rows",
                 key="rows",
             )
         for chunk in store.chunks(first, stop):
             if any(chunk.scene is s for s in chosen) and not store.has(chunk):
                 raise InputError(
-                    f"{chunk.key} is missing", "a complete store: `mauvecl realise --resume` completes it", key="store"
+                    f"{chunk.key} is missing: use `mauvecl realise --resume` to complete the store", key="store"
                 )
         return selection
 
@@ -86,8 +85,8 @@ class Selection:
             rows = np.asarray(zarr.open_array(place, mode="r")[self.first : self.stop])
         if rows.shape != (self.stop - self.first, *scene.row) or rows.dtype != scene.dtype:
             raise InputError(
-                f"array {scene.path} has the shape {rows.shape} and the type {rows.dtype}",
-                f"{(self.stop - self.first, *scene.row)} and {scene.dtype} as its study says",
+                f"array {scene.path} has the shape {rows.shape} and the type {rows.dtype}, but its study needs "
+                f"{(self.stop - self.first, *scene.row)} and {scene.dtype}",
                 key="store",
             )
         return rows
@@ -114,8 +113,8 @@ def export(selection: Selection, path: str | Path, *, replace: bool = False) -> 
     if path.suffix not in ENDINGS:
         raise InputError.of("file", path.name, f"a name ending in {', '.join(ENDINGS)}")
     if path.exists() and not (replace and path.is_file()):
-        expected = "another name, or `replace=True`" if path.is_file() else "a file's name"
-        raise InputError(f"export {str(path)!r} exists already", expected, key="file")
+        others = "another name, or `replace=True`" if path.is_file() else "the name of a file"
+        raise InputError(f"export {str(path)!r} exists already: use {others}", key="file")
     if path.suffix != ".fits":
         # Written to memory first, because the HDF5 library aborts the process on a full disk.
         packed = io.BytesIO()
@@ -219,7 +218,7 @@ def _hdf5(selection: Selection, place: io.BytesIO) -> None:
     try:
         import h5py
     except ImportError as error:
-        raise InputError("h5py is missing", "the package for HDF5: pip install 'mauvecl[bulk]'", key="h5py") from error
+        raise missing_package("h5py", "an HDF5 file", "bulk") from error
 
     store = selection.store
     with h5py.File(place, "w") as file:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 import uuid
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import partial
@@ -29,8 +30,8 @@ if TYPE_CHECKING:
     from mauvecl.detection.snr import SnrResult
     from mauvecl.host.exposure.expectation import Expectation
 
-#: Number of attempts at a shard before the run fails.
-MAX_TRIES = 3
+#: Number of failures at a shard after which the run fails; a shrinking cluster may lose several workers at once.
+MAX_FAILURES = 8
 #: Submitted shards per worker: one being counted and one waiting.
 SHARDS_PER_WORKER = 2
 #: Items of `map_in_order` in progress beyond the number of workers, which are prepared while devices count others.
@@ -47,16 +48,26 @@ class Stopped(Exception):  # noqa: N818
     """Raised between two tiles of a shard whose result is no longer needed."""
 
 
+class ShardLost(Exception):  # noqa: N818
+    """Raised by workers that could not count a shard, which the pool then submits again.
+
+    Attributes
+    ----------
+    failed : bool
+        Whether to count it as a failure of the shard, of which there may be `MAX_FAILURES`.
+    """
+
+    def __init__(self, reason: object, *, failed: bool = True) -> None:
+        super().__init__(str(reason))
+        self.failed = failed
+
+
 class Workers(Protocol):
     """Interface of the workers that count shards."""
 
     @property
     def count(self) -> int:
         """Number of concurrent workers."""
-
-    @property
-    def retries(self) -> int:
-        """Number of shards that were counted again."""
 
     @property
     def first(self) -> Engine | None:
@@ -66,7 +77,7 @@ class Workers(Protocol):
         """Return the devices, for run records."""
 
     def submit(self, task: Task) -> Future[Arrays]:
-        """Submit a shard for counting."""
+        """Submit a shard for counting; its future raises `ShardLost` if another attempt may succeed."""
 
     def stop(self) -> None:
         """Stop work in progress as soon as possible."""
@@ -88,7 +99,7 @@ class LocalWorkers:
     """
 
     def __init__(self, devices: Sequence[str | None] = (None,), *, make: Callable[..., Engine] = Engine) -> None:
-        self._make, self._devices, self.retries = make, list(devices), 0
+        self._make, self._devices = make, list(devices)
         self._ticks: list[Callable[[int], None] | None] = [None] * len(devices)
         self._stopping = False
         self._engines: list[Engine] = [self._made(place) for place in range(len(devices))]
@@ -130,26 +141,15 @@ class LocalWorkers:
         with self._lock:
             place = self._free.pop(0)
         self._ticks[place] = task.tick
+        engine = self._engines[place]
         try:
-            for tried in range(1, MAX_TRIES + 1):
-                try:
-                    return self._engines[place].count(task.request, task.shard, out=task.out)
-                except Exception as error:
-                    engine = self._engines[place]
-                    launch = isinstance(error, engine.open_device.cl.Error)
-                    if not launch or self._stopping:
-                        raise
-                    if tried == MAX_TRIES:
-                        raise DeviceError(
-                            f"{engine.device_name} failed {MAX_TRIES} times at {task.shard} ({error}), expected a "
-                            "device that works",
-                            "failed",
-                        ) from error
-                    with self._lock:
-                        self.retries += 1
-                    # A failed launch may have corrupted the context, so count the whole shard again in a new one.
-                    self._engines[place] = self._made(place)
-            raise AssertionError
+            return engine.count(task.request, task.shard, out=task.out)
+        except engine.open_device.cl.Error as error:
+            if self._stopping:
+                raise
+            # A failed launch may have corrupted the context, so the next shard is counted in a new one.
+            self._engines[place] = self._made(place)
+            raise ShardLost(f"{engine.device_name}: {error}") from error
         finally:
             self._ticks[place] = None
             with self._lock:
@@ -208,7 +208,7 @@ class Pool:
         self._meanwhile = meanwhile
         self.checkpoint, self._progress = checkpoint, progress
         self._lock = threading.RLock()
-        self._done = self._total = self._shards = self._of = self._resumed = self._expected = 0
+        self._done = self._total = self._shards = self._of = self._resumed = self._expected = self._retries = 0
         self._partly: dict[str, int] = {}
         self._stopping = False
 
@@ -237,7 +237,7 @@ class Pool:
         """Progress of the work."""
         partly = sum(self._partly.values())
         total = max(self._total, self._expected)
-        return PoolProgress(self._done + partly, total, self._shards, self._of, self.workers.retries, self._resumed)
+        return PoolProgress(self._done + partly, total, self._shards, self._of, self._retries, self._resumed)
 
     def detect(self, quiet: Expectation, flares: Sequence[Expectation] | Expectation, **how: Any) -> Detection:
         """Compute a detection; parameters as for `Engine.detect`."""
@@ -266,11 +266,10 @@ class Pool:
 
         Concurrent calls use several workers.
         """
-        if self._stopping:
-            raise Stopped
         request = RealiseRequest.of(expectation, count, **how)
         task = Task(request, uuid.uuid4().hex, Shard(0, request.start, request.realisations), out=out)
-        rows: NDArray[Any] = self.workers.submit(task).result()["rows"]
+        ((_, drawn),) = self._counted([task])
+        rows: NDArray[Any] = drawn["rows"]
         if out is None or rows is out:
             return rows
         out[:] = rows
@@ -283,31 +282,53 @@ class Pool:
             self._total += sum(shard.count for shard in todo)
             self._of += len(todo)
         self._report_progress()
-        waiting: dict[Future[Arrays], Task] = {}
-        for shard in todo:
-            task = Task(request, key, shard, partial(self._tick, f"{key}-{shard.name}"))
-            known = None if self.checkpoint is None else self.checkpoint.get(task.name)
-            if known is not None:
-                sums.add(shard.part, known)
-                self._finished(task, resumed=True)
-                continue
-            if self._stopping:
-                raise Stopped
-            while len(waiting) >= self.workers.count * SHARDS_PER_WORKER:
-                self._collect(sums, waiting)
-            waiting[self.workers.submit(task)] = task
-        while waiting:
-            self._collect(sums, waiting)
-
-    def _collect(self, sums: Sums, waiting: dict[Future[Arrays], Task]) -> None:
-        finished, _ = wait(waiting, return_when=FIRST_COMPLETED)
-        for future in finished:
-            task = waiting.pop(future)
-            counted = future.result()
+        tasks = (Task(request, key, shard, partial(self._tick, f"{key}-{shard.name}")) for shard in todo)
+        for task, counted in self._counted(self._without_resumed(tasks, sums)):
             sums.add(task.shard.part, counted)
             if self.checkpoint is not None:
                 self.checkpoint.put(task.name, counted)
             self._finished(task)
+
+    def _without_resumed(self, tasks: Iterable[Task], sums: Sums) -> Iterator[Task]:
+        """Add shards of the checkpoint to the sums, and yield the others."""
+        for task in tasks:
+            resumed = None if self.checkpoint is None else self.checkpoint.get(task.name)
+            if resumed is None:
+                yield task
+            else:
+                sums.add(task.shard.part, resumed)
+                self._finished(task, resumed=True)
+
+    def _counted(self, tasks: Iterable[Task]) -> Iterator[tuple[Task, Arrays]]:
+        """Count tasks with all workers, and yield them with their arrays, in the order in which they are finished."""
+        waiting: dict[Future[Arrays], Task] = {}
+        failures: Counter[str] = Counter()
+
+        def finished() -> Iterator[tuple[Task, Arrays]]:
+            for future in wait(waiting, return_when=FIRST_COMPLETED).done:
+                task = waiting.pop(future)
+                try:
+                    counted = future.result()
+                except ShardLost as lost:
+                    failures[task.name] += lost.failed
+                    if failures[task.name] >= MAX_FAILURES:
+                        raise DeviceError(
+                            f"{task.shard} failed {MAX_FAILURES} times, the last time with: {lost}", "failed"
+                        ) from lost
+                    with self._lock:
+                        self._retries += 1
+                    waiting[self.workers.submit(task)] = task
+                else:
+                    yield task, counted
+
+        for task in tasks:
+            if self._stopping:
+                raise Stopped
+            while len(waiting) >= self.workers.count * SHARDS_PER_WORKER:
+                yield from finished()
+            waiting[self.workers.submit(task)] = task
+        while waiting:
+            yield from finished()
 
     def _tick(self, name: str, done: int) -> None:
         with self._lock:
@@ -333,7 +354,7 @@ class Pool:
 
 def map_in_order(
     engine: Engine | Pool | Stares | None, work: Callable[[Item], Answer], items: Iterable[Item]
-) -> Iterator[Answer]:
+) -> Generator[Answer]:
     """Apply `work` to items and yield the results in order; with a pool, several items are in progress at once."""
     if not isinstance(engine, Pool):
         yield from map(work, items)

@@ -12,6 +12,7 @@ import json
 import os
 import shutil
 import tempfile
+import threading
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -27,7 +28,7 @@ from mauvecl.host import VERSION
 from mauvecl.host.tables.files import UNFINISHED, read_bytes, toml, write_whole, writing
 from mauvecl.runs.checkpoint import differing_keys
 from mauvecl.schema.columns import Column, percent
-from mauvecl.schema.errors import InputError
+from mauvecl.schema.errors import InputError, missing_package
 from mauvecl.study.cases import cases, full_label
 from mauvecl.study.cases import collect_messages as messages_of
 from mauvecl.study.study import Study
@@ -113,9 +114,9 @@ def describe(study: Study, scenes: Sequence[StoredScene], folder: Path) -> None:
 
 def exposure_attributes(x: Expectation) -> dict[str, float | str]:
     """Return the attributes that describe the exposure in every row of an array."""
-    known: dict[str, float | str] = {"exposure_s": x.exposure_s, "frames": x.n_frames, "instrument": x.instrument}
-    known |= {"saturation_dn": float(x.saturation_dn), "dark_unit": x.dark_unit}
-    return known | ({"temperature_c": x.conditions["temperature_c"]} if "temperature_c" in x.conditions else {})
+    attributes: dict[str, float | str] = {"exposure_s": x.exposure_s, "frames": x.n_frames, "instrument": x.instrument}
+    attributes |= {"saturation_dn": float(x.saturation_dn), "dark_unit": x.dark_unit}
+    return attributes | ({"temperature_c": x.conditions["temperature_c"]} if "temperature_c" in x.conditions else {})
 
 
 def _values(group: Any, name: str, values: NDArray[Any], unit: str, dimensions: list[str]) -> None:
@@ -135,9 +136,9 @@ def signed(study: str) -> dict[str, str]:
 def study_in(place: Path) -> str | None:
     """Return the study's text in a description if its digest is correct, else None."""
     try:
-        kept = json.loads(read_bytes(place, "description"))["attributes"]
-        text = kept["study"]
-        return text if signed(text).items() <= kept.items() else None
+        attributes = json.loads(read_bytes(place, "description"))["attributes"]
+        text = attributes["study"]
+        return text if signed(text).items() <= attributes.items() else None
     except (InputError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
         return None
 
@@ -241,13 +242,12 @@ class Store:
     path: Path
     study: Study
     digests: dict[str, str] = field(default_factory=dict)  # of written chunks, by path
+    _listing: threading.Lock = field(default_factory=threading.Lock)
 
     def __post_init__(self) -> None:
         missing = [name for name in ("zarr", "xxhash", "google_crc32c") if find_spec(name) is None]
         if missing:
-            raise InputError(
-                f"{missing[0]} is missing", "the packages for stores: pip install 'mauvecl[bulk]'", key=missing[0]
-            )
+            raise missing_package(missing[0], "a store", "bulk")
 
     @classmethod
     def open(cls, path: str | Path) -> Store:
@@ -264,8 +264,8 @@ class Store:
                 copies.setdefault(text, place.relative_to(path))
         if not copies:
             raise InputError(
-                f"{str(path)!r} is not a store of spectra",
-                "a folder that `mauvecl realise` wrote, with an intact copy of its study",
+                f"{str(path)!r} is not a store of spectra: give a folder that `mauvecl realise` wrote, with an intact "
+                "copy of its study",
                 key="store",
             )
         (text, first), *others = copies.items()
@@ -273,8 +273,8 @@ class Store:
             other, second = others[0]
             keys = ", ".join(differing_keys(toml(text, path.name), toml(other, path.name)))
             raise InputError(
-                f"store {str(path)!r} holds two studies, {str(first)!r} and {str(second)!r} differ in {keys}",
-                "one study: restore the file of the correct one",
+                f"store {str(path)!r} must hold one study, but {str(first)!r} and {str(second)!r} differ in {keys}: "
+                "restore the file of the correct one",
                 key="store",
             )
         store = cls(path, Study.build(toml(text, path.name), path.name))
@@ -288,10 +288,10 @@ class Store:
 
     def scene(self, path: str) -> StoredScene:
         """Return an array by path, such as ``star-1/flare-2``."""
-        known = next((scene for scene in self.scenes if scene.path == path), None)
-        if known is None:
+        stored = next((scene for scene in self.scenes if scene.path == path), None)
+        if stored is None:
             raise InputError.of("scenes", path, f"one of {', '.join(s.path for s in self.scenes)}")
-        return known
+        return stored
 
     @property
     def rows(self) -> int:
@@ -334,7 +334,7 @@ class Store:
         other = [p.name for p in self.path.iterdir() if p.name not in ours and not p.name.startswith(UNFINISHED)]
         if other:
             raise InputError(
-                f"{str(self.path)!r} holds {min(other)!r} and no store", "an empty or a new folder", key="store"
+                f"{str(self.path)!r} holds {min(other)!r} and no store: use an empty or a new folder", key="store"
             )
         # The root comes last, so that its presence means that the description is complete.
         made = self.description()
@@ -348,12 +348,12 @@ class Store:
             room = shutil.disk_usage(self.path).total
         except OSError as error:
             raise InputError(
-                f"store {str(self.path)!r} cannot be made ({error.strerror})", "a writable folder", key="store"
+                f"store {str(self.path)!r} cannot be made ({error.strerror}): use a writable folder", key="store"
             ) from error
         if self.n_bytes > room:
             raise InputError(
-                f"spectra of {self.n_bytes / 2**30:.4g} GiB for {str(self.path)!r}",
-                f"less than its disk's {room / 2**30:.4g} GiB",
+                f"the spectra need {self.n_bytes / 2**30:.4g} GiB, but the disk of {str(self.path)!r} has "
+                f"{room / 2**30:.4g} GiB",
                 key="run.realisations",
             )
 
@@ -369,7 +369,7 @@ class Store:
         differing = differing_keys(self.study.model_dump(mode="json"), there.model_dump(mode="json"))
         if differing:
             raise InputError(
-                f"store {str(self.path)!r} was started by another study, which differs in {', '.join(differing)}",
+                f"store {str(self.path)!r} was started by another study, which differs in {', '.join(differing)}: use "
                 "the same study or another place",
                 key="store",
             )
@@ -389,12 +389,13 @@ class Store:
                     self.digests[f"{scene.path}/{name}"] = written
 
     def note(self, chunk: Chunk, digest_text: str) -> None:
-        """Add a chunk's digest to its array's list."""
+        """Add a chunk's digest to its array's list; threads wait for each other."""
         self.digests[chunk.key] = digest_text
         line = _line(chunk.name, digest_text)
         what = f"{chunk.scene.path}/{DIGESTS} of {self.path.name}"
         # A single short write at the end. A line that a full disk cut short is terminated first.
         with (
+            self._listing,
             writing(what, self.path, "a writable disk with room; what was written before is kept", key="store"),
             (self.path / chunk.scene.path / DIGESTS).open("a+b", buffering=0) as file,
         ):
@@ -425,11 +426,11 @@ class Store:
         whole = np.ascontiguousarray(rows, chunk.scene.dtype)
         return memoryview(whole.data).cast("B"), crc(whole)
 
-    def place(self, chunk: Chunk, rows: NDArray[Any]) -> str:
-        """Write a chunk atomically and return its digest."""
+    def write(self, chunk: Chunk, rows: NDArray[Any]) -> None:
+        """Write a chunk atomically, and then its digest."""
         data, check = self.encode(chunk, rows)
         write_whole(self.path / chunk.key, data, check)
-        return digest(data, check)
+        self.note(chunk, digest(data, check))
 
     def has(self, chunk: Chunk) -> bool:
         """Return whether a chunk was written, by digest list and file size; `bulk.state` checks its content."""
@@ -468,8 +469,7 @@ class Store:
         other = [key for key, own in files if not own]
         if other:
             raise InputError(
-                f"store {str(self.path)!r} holds {other[0]!r}, which does not belong to it",
-                "no other files in a store that is removed",
+                f"a store that is removed must hold no other files, but {str(self.path)!r} holds {other[0]!r}",
                 key="store",
             )
         for key, _ in sorted(files, key=lambda entry: entry[0] == "zarr.json"):

@@ -46,7 +46,7 @@ def schema_of(hint: Any) -> CoreSchema:
             schema = metadata.__get_pydantic_core_schema__(args[0], lambda _, inner=schema: inner)
         return schema
     if origin in (Union, UnionType) and NoneType in args:
-        others = tuple(one for one in args if one is not NoneType)
+        others = tuple(kind for kind in args if kind is not NoneType)
         return core_schema.nullable_schema(schema_of(Union[others]))  # noqa: UP007
     if numpy := sys.modules.get("numpy"):
         if hint == numpy.typing.ArrayLike:
@@ -54,7 +54,7 @@ def schema_of(hint: Any) -> CoreSchema:
         if origin is numpy.ndarray:
             return _leaf(_real_array, "an array of numbers")
     if origin in (Union, UnionType):
-        choices: Any = [(schema_of(one), ALTERNATIVE) for one in args]
+        choices: Any = [(schema_of(kind), ALTERNATIVE) for kind in args]
         return core_schema.union_schema(choices, mode="left_to_right")
     if origin is Literal:
         return core_schema.literal_schema(list(args))
@@ -136,9 +136,11 @@ def _real_array(value: Any) -> Any:
 
 
 def _items(value: Any, size: int | None = None) -> Any:
-    one = isinstance(value, str | bytes | Mapping) or not isinstance(value, Iterable) or getattr(value, "ndim", 1) == 0
-    items = () if one else tuple(value)
-    if one or size not in (None, len(items)):
+    is_single = (
+        isinstance(value, str | bytes | Mapping) or not isinstance(value, Iterable) or getattr(value, "ndim", 1) == 0
+    )
+    items = () if is_single else tuple(value)
+    if is_single or size not in (None, len(items)):
         raise PydanticCustomError("expected", f"Input should be a sequence{'' if size is None else f' of {size}'}")
     return items
 
@@ -161,7 +163,7 @@ LEAVES: dict[Any, tuple[Callable[[Any], Any], str]] = {
 
 
 def _sequence(origin: Any, args: tuple[Any, ...]) -> CoreSchema:
-    items = [schema_of(one) for one in args if one is not ...]
+    items = [schema_of(kind) for kind in args if kind is not ...]
     if origin is list:
         return core_schema.no_info_before_validator_function(_items, core_schema.list_schema(items[0]))
     if origin is tuple and ... not in args:
@@ -252,9 +254,9 @@ def _validated(function: Public, owner: type | None = None) -> Public:
 class _Parameter:
     """A parameter, whose annotation is resolved when it is first given an argument."""
 
-    def __init__(self, function: Callable[..., Any], known: inspect.Parameter, owner: type | None) -> None:
-        self.name, self.default = known.name, known.default
-        self.text = known.annotation
+    def __init__(self, function: Callable[..., Any], parameter: inspect.Parameter, owner: type | None) -> None:
+        self.name, self.default = parameter.name, parameter.default
+        self.text = parameter.annotation
         self.modules = [function.__globals__]
         if owner is not None and function.__name__ == "__init__":
             # A dataclass inherits fields, whose annotations belong to the module of the base class.
@@ -282,7 +284,7 @@ def _input_error(name: str, error: ValidationError) -> InputError:
         (tuple(part for part in fault["loc"] if part != ALTERNATIVE), fault)
         for fault in error.errors(include_url=False)
     ]
-    place, first = max(faults, key=lambda one: len(one[0]))
+    place, first = max(faults, key=lambda item: len(item[0]))
     expected = dict.fromkeys(fault["msg"].removeprefix("Input should be ") for at, fault in faults if at == place)
     where = name + "".join(f"[{part!r}]" for part in place if part != "[key]")
     return InputError(f"{where} = {shown(first['input'])}", " or ".join(expected), key=name)

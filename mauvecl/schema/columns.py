@@ -63,10 +63,10 @@ class View:
 
     def texts(self, hidden: Collection[str] = ()) -> tuple[list[str], list[list[str]]]:
         """Return headings and cells, without `hidden` columns."""
-        shown = [one for one in self.columns if one.heading and one.name not in hidden]
+        shown = [column for column in self.columns if column.heading and column.name not in hidden]
         table = [] if self.table is None else self.table
-        found = table if isinstance(table, Sequence) else records(table)
-        return [one.heading for one in shown], [[one.text(record) for one in shown] for record in found]
+        rows = table if isinstance(table, Sequence) else records(table)
+        return [column.heading for column in shown], [[column.text(record) for column in shown] for record in rows]
 
 
 def without_empty(headings: Sequence[str], cells: Sequence[Sequence[str]]) -> tuple[list[str], list[list[str]]]:
@@ -82,8 +82,8 @@ def table_of(columns: Iterable[Column], rows: Iterable[object], **meta: object) 
     from astropy.table import QTable
 
     table, unit_of = QTable(), cache(u.Unit)
-    named = [one for one in columns if one.name]
-    parts = [np.broadcast_arrays(*(np.atleast_1d(one.value(row)) for one in named)) for row in rows]
+    named = [column for column in columns if column.name]
+    parts = [np.broadcast_arrays(*(np.atleast_1d(column.value(row)) for column in named)) for row in rows]
     for k, column in enumerate(named):
         values = np.concatenate([part[k].ravel() for part in parts] or [np.array([], column.kind or float)])
         if values.dtype == object:
@@ -111,7 +111,7 @@ def stacked(first: Sequence[Column], parts: Iterable[tuple[object, Table]], **me
 
     def taken(name: str) -> Column:
         having = [table[name] for table in tables if name in table.colnames]
-        (unit, *others) = dict.fromkeys(str(one.unit or "") for one in having)
+        (unit, *others) = dict.fromkeys(str(column.unit or "") for column in having)
         if others:
             raise ValueError(f"column {name} has several units")
         kind = None if len(having) == len(tables) else having[0].dtype.type
@@ -119,7 +119,7 @@ def stacked(first: Sequence[Column], parts: Iterable[tuple[object, Table]], **me
         return Column(name, lambda part: values(part, name), unit, text, kind=kind)
 
     names = dict.fromkeys(name for table in tables for name in table.colnames)
-    return table_of([*(one.of(itemgetter(0)) for one in first), *map(taken, names)], every, **shared | meta)
+    return table_of([*(column.of(itemgetter(0)) for column in first), *map(taken, names)], every, **shared | meta)
 
 
 def records(table: Table) -> list[dict[str, Any]]:

@@ -29,7 +29,7 @@ class Message(str):
 
 def of_kind(messages: Iterable[str], kind: str) -> list[str]:
     """Return the messages of a kind."""
-    return [one for one in messages if isinstance(one, Message) and one.kind == kind]
+    return [message for message in messages if isinstance(message, Message) and message.kind == kind]
 
 
 def shortened(text: str, most: int = 80) -> str:
@@ -111,8 +111,13 @@ class InputError(ValueError):
         return cls(f"{place}{key} = {shown(value)}{after}", expected, key=key.replace(" ", "_"))
 
 
+def missing_package(package: str, purpose: str, extra: str) -> InputError:
+    """Return the error of a package that is not installed, with the extra of mauvecl that brings it."""
+    return InputError(f"{purpose} needs {package}, which is missing: `pip install 'mauvecl[{extra}]'`", key=package)
+
+
 def reworded(error: InputError, sentence: str, key: str | None = None) -> InputError:
     """Return the same error with another sentence and, if given, another key."""
-    found = InputError(sentence, key=key or error.key)
-    found.expected = error.expected
-    return found
+    changed = InputError(sentence, key=key or error.key)
+    changed.expected = error.expected
+    return changed

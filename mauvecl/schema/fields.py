@@ -69,8 +69,8 @@ def number(
     if type(value) is float:
         plain = value
     else:
-        one = _plain(what, value, unit, wanted)
-        plain = float(one) if not one.ndim else math.nan
+        given = _plain(what, value, unit, wanted)
+        plain = float(given) if not given.ndim else math.nan
     if not (math.isfinite(plain) and low <= plain <= high):
         raise InputError.of(what, value, wanted)
     return plain
@@ -197,7 +197,7 @@ class Unit:
         if type(value) in (float, int):
             return value
         if isinstance(value, list | tuple):
-            return [self.plain(one) for one in value]
+            return [self.plain(item) for item in value]
         return without_unit(value, self.name) if is_quantity(value) else value
 
 
@@ -387,7 +387,7 @@ class Widget:
 
 def found(kind: Any, of: type[Metadata]) -> list[Metadata]:
     """Return all metadata of a class in an annotation or field, outermost first."""
-    return [one for one in _metadata(kind) if isinstance(one, of)]
+    return [entry for entry in _metadata(kind) if isinstance(entry, of)]
 
 
 def first(kind: Any, of: type[Metadata]) -> Metadata | None:
@@ -412,7 +412,7 @@ def _metadata(kind: Any) -> Iterator[Any]:
 def as_typed(value: Any, *, truth: tuple[str, str] = ("false", "true")) -> str:
     """Return a value as people type it, with commas in a tuple; empty for None and for tables."""
     if isinstance(value, tuple):
-        return ",".join(as_typed(one, truth=truth) for one in value)
+        return ",".join(as_typed(item, truth=truth) for item in value)
     if isinstance(value, bool):
         return truth[value]
     if not isinstance(value, str | int | float):

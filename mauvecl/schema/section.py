@@ -95,9 +95,9 @@ def _first_fault(model: type[BaseModel], error: ValidationError) -> InputError:
             unknown = f"unknown key {shortened(key)}"
             if not (near := difflib.get_close_matches(path[-1], fields, n=1)):
                 return InputError(unknown, f"one of {', '.join(fields)}", key=key)
-            found = InputError(f"{unknown}, did you mean {near[0]!r}?", key=key)
-            found.expected = near[0]
-            return found
+            fault = InputError(f"{unknown}, did you mean {near[0]!r}?", key=key)
+            fault.expected = near[0]
+            return fault
         case "missing":
             return InputError(f"{key!r} is missing", "a value", key=key)
         case "value_error":
@@ -159,7 +159,7 @@ def plain(key: str, given: Any, unit: str) -> Any:
     if is_quantity(given):
         return numbers(key, given, unit).tolist()
     if isinstance(given, list | tuple) and any(map(is_quantity, given)):
-        return [plain(key, one, unit) for one in given]
+        return [plain(key, item, unit) for item in given]
     if hasattr(given, "tolist"):
         return given.tolist()
     if hasattr(given, "utc") and hasattr(given, "isot"):
@@ -181,7 +181,7 @@ class Section(Record):
         old = getattr(self, key)
         new = value
         if inner:
-            many = tuple(one.with_value(inner, value) for one in (old if isinstance(old, tuple) else (old,)))
+            many = tuple(section.with_value(inner, value) for section in (old if isinstance(old, tuple) else (old,)))
             new = many if isinstance(old, tuple) else many[0]
         elif isinstance(old, tuple):
             new = (value,)

@@ -123,18 +123,18 @@ class _StareSearch:
         """Search and fit until there are no alarms and no block improves with a further flare."""
         while new := self._searched() or self._split():
             self.found += new
-            changed = {id(one) for one in new}
+            changed = {id(candidate) for candidate in new}
             for _ in range(TURNS):
                 changed = self._fitted(changed)
 
     @property
     def thetas(self) -> Float:
         """Parameters of all flares, shape (n_flare, 4)."""
-        return np.array([one.theta for one in self.found]).reshape(len(self.found), 4)
+        return np.array([candidate.theta for candidate in self.found]).reshape(len(self.found), 4)
 
     def blocks(self) -> list[list[Candidate]]:
         """Group overlapping flares in order of time, with at most `MAX_FLARES_PER_FIT` flares per group."""
-        spans = sorted(((*self.sums.overlap(one.theta), k) for k, one in enumerate(self.found)))
+        spans = sorted(((*self.sums.overlap(candidate.theta), k) for k, candidate in enumerate(self.found)))
         blocks: list[list[Candidate]] = []
         reach = -np.inf
         for first, last, k in spans:
@@ -148,9 +148,9 @@ class _StareSearch:
     def _near(self, peaks: Float, width_s: float) -> Float:
         """Return the sum of the statistics of flares within reach of templates, shape of `peaks`."""
         total = np.zeros(peaks.shape)
-        for one in self.found:
-            reach = TAIL * np.exp(one.theta[WIDTH]) + LEAD * width_s
-            total += np.where(np.abs(peaks - one.theta[PEAK]) < reach, one.rho, 0.0)
+        for candidate in self.found:
+            reach = TAIL * np.exp(candidate.theta[WIDTH]) + LEAD * width_s
+            total += np.where(np.abs(peaks - candidate.theta[PEAK]) < reach, candidate.rho, 0.0)
         return total
 
     def _values(self, near_share: float = 0.0) -> Iterator[tuple[Float, Float, Float, NDArray[np.int64], Row]]:
@@ -184,14 +184,14 @@ class _StareSearch:
         candidates = []
         for rho, excess, peaks, which, row in self._values(LEFT_BEHIND):
             for k in np.flatnonzero(excess >= self.threshold):
-                one = self._candidate(float(rho[k]), float(peaks[k]), row, int(k), int(which[k]))
-                candidates.append((float(excess[k]), one))
+                candidate = self._candidate(float(rho[k]), float(peaks[k]), row, int(k), int(which[k]))
+                candidates.append((float(excess[k]), candidate))
         candidates.sort(key=lambda pair: -pair[0])
         # An alarm near a larger one may be caused by it and waits for the next pass, as do the alarms near it.
         waiting = np.zeros(len(sums.net), np.bool_)
         new = []
-        for _, one in candidates:
-            peak, width = one.template
+        for _, candidate in candidates:
+            peak, width = candidate.template
             if self._was_refused(peak, width):
                 continue
             lead, tail = (frames * bank.frame_s for frames in bank.window(width))
@@ -199,7 +199,7 @@ class _StareSearch:
             waits = waiting[window].any()
             waiting[window] = True
             if not waits:
-                new.append(one)
+                new.append(candidate)
         return new
 
     def _split(self) -> list[Candidate]:
@@ -207,7 +207,7 @@ class _StareSearch:
         blocks = [block for block in self.blocks() if self._key(block) not in self.complete]
         if not blocks:
             return []
-        overlaps = [[self.sums.overlap(one.theta) for one in block] for block in blocks]
+        overlaps = [[self.sums.overlap(candidate.theta) for candidate in block] for block in blocks]
         spans = [(min(a for a, _ in each), max(b for _, b in each)) for each in overlaps]
         best: list[list[tuple[float, Candidate]]] = [[] for _ in blocks]
         for rho, excess, peaks, which, row in self._values():
@@ -215,22 +215,22 @@ class _StareSearch:
                 inside = np.flatnonzero((peaks >= first) & (peaks <= last) & np.isfinite(excess))
                 if inside.size:
                     k = int(inside[np.argmax(excess[inside])])
-                    one = self._candidate(float(rho[k]), float(peaks[k]), row, k, int(which[k]))
-                    several.append((float(excess[k]), one))
+                    candidate = self._candidate(float(rho[k]), float(peaks[k]), row, k, int(which[k]))
+                    several.append((float(excess[k]), candidate))
         for block, several in zip(blocks, best, strict=True):
             several.sort(key=lambda pair: -pair[0])
-            for _, one in several[:SPLITS]:
-                if not self._was_refused(*one.template) and self._improves(block, one):
-                    return [one]
+            for _, candidate in several[:SPLITS]:
+                if not self._was_refused(*candidate.template) and self._improves(block, candidate):
+                    return [candidate]
             self.complete.add(self._key(block))
         return []
 
-    def _improves(self, block: list[Candidate], one: Candidate) -> bool:
+    def _improves(self, block: list[Candidate], candidate: Candidate) -> bool:
         """Return whether a further flare improves a block significantly, and update the flares to the better fit."""
         before = np.array([each.theta for each in block])
-        with_it = [*block, one]
-        rows = self.sums.block(np.array([each.theta for each in with_it]), np.vstack([self.thetas, one.theta]))
-        best = self._best(rows, with_it, {id(one)})
+        with_it = [*block, candidate]
+        rows = self.sums.block(np.array([each.theta for each in with_it]), np.vstack([self.thetas, candidate.theta]))
+        best = self._best(rows, with_it, {id(candidate)})
         # The other flares alone may fit better from their new parameters.
         alone = min((rows.fit(before), rows.without(best, len(block))), key=lambda fit: fit.chi2)
         fall = alone.chi2 - best.chi2
@@ -244,12 +244,12 @@ class _StareSearch:
             return False
         for each, theta in zip(with_it, best.theta, strict=True):
             each.theta = theta
-        one.rho = float(np.sqrt(fall))
+        candidate.rho = float(np.sqrt(fall))
         return True
 
     @staticmethod
     def _key(block: list[Candidate]) -> tuple[float, ...]:
-        return tuple(np.round([one.theta for one in block], 2).ravel().tolist())
+        return tuple(np.round([candidate.theta for candidate in block], 2).ravel().tolist())
 
     def _at_end(self, theta: Float) -> NDArray[np.bool_]:
         """Return which flares peak at an end of the stare or are at an end of the bank, shape (n_flare,)."""
@@ -285,47 +285,47 @@ class _StareSearch:
     def _fitted(self, changed: set[int]) -> set[int]:
         """Fit all blocks that have changed or adjoin changed ones, and return the flares whose parameters changed."""
         moved: set[int] = set()
-        spans = [self.sums.window(one.theta) for one in self.found if id(one) in changed]
+        spans = [self.sums.window(candidate.theta) for candidate in self.found if id(candidate) in changed]
         for block in self.blocks():
-            mine = [self.sums.window(one.theta) for one in block]
+            mine = [self.sums.window(candidate.theta) for candidate in block]
             if any(a < d and c < b for a, b in mine for c, d in spans):
-                moved |= self._fit(block, {id(one) for one in block} & changed)
+                moved |= self._fit(block, {id(candidate) for candidate in block} & changed)
         return moved
 
     def _fit(self, block: list[Candidate], new: set[int]) -> set[int]:
         sums = self.sums
-        before = np.array([one.theta for one in block])
+        before = np.array([candidate.theta for candidate in block])
         rows = sums.block(before, self.thetas)
         best = self._best(rows, block, new)
         # The noise depends on the fitted flares.
-        inside = {id(one) for one in block}
-        others = np.array([one.theta for one in self.found if id(one) not in inside]).reshape(-1, 4)
+        inside = {id(candidate) for candidate in block}
+        others = np.array([candidate.theta for candidate in self.found if id(candidate) not in inside]).reshape(-1, 4)
         rows = sums.block(best.theta, np.vstack([others, best.theta]))
         best = rows.fit(best.theta)
-        kept = list(block)
-        while len(kept) > 1:
-            falls = [rows.without(best, j) for j in range(len(kept))]
-            j = int(np.argmin([one.chi2 for one in falls]))
+        left = list(block)
+        while len(left) > 1:
+            falls = [rows.without(best, j) for j in range(len(left))]
+            j = int(np.argmin([fit.chi2 for fit in falls]))
             if falls[j].chi2 - best.chi2 >= self.threshold**2:
                 break
-            self.refused.append(kept[j].template)
-            self.found.remove(kept[j])
+            self.refused.append(left[j].template)
+            self.found.remove(left[j])
             best = falls[j]
-            del kept[j]
+            del left[j]
         moved = set()
-        for one, theta in zip(kept, best.theta, strict=True):
-            if np.abs(theta - one.theta).max() > 1e-4:
-                moved.add(id(one))
-            one.theta = theta
+        for candidate, theta in zip(left, best.theta, strict=True):
+            if np.abs(theta - candidate.theta).max() > 1e-4:
+                moved.add(id(candidate))
+            candidate.theta = theta
         return moved
 
     def _best(self, rows: Block, block: list[Candidate], new: set[int]) -> BlendFit:
         """Return the best of several fits with different starting points for blends with a new flare."""
-        start = np.array([one.theta for one in block])
+        start = np.array([candidate.theta for candidate in block])
         fits = [rows.fit(start)]
         if len(block) > 1:
-            for k, one in enumerate(block):
-                if id(one) not in new:
+            for k, candidate in enumerate(block):
+                if id(candidate) not in new:
                     continue
                 # A flare that was fitted alone may be too wide because it includes another.
                 for j in range(len(block)):
@@ -333,7 +333,7 @@ class _StareSearch:
                         other = start.copy()
                         other[j, WIDTH] = start[k, WIDTH]
                         fits.append(rows.fit(other))
-        return min(fits, key=lambda one: one.chi2)
+        return min(fits, key=lambda fit: fit.chi2)
 
 
 def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
@@ -346,7 +346,7 @@ def _measured_alarms(search: _StareSearch, energy: Factor | None) -> list[Alarm]
     """Measure all flares of a finished search."""
     measured_alarms = []
     for number, block in enumerate(search.blocks(), 1):
-        theta = np.array([one.theta for one in block])
+        theta = np.array([candidate.theta for candidate in block])
         rows = search.sums.block(theta, search.thetas)
         better: BlendFit | None = rows.fit(theta)
         while better is not None:
@@ -358,8 +358,8 @@ def _measured_alarms(search: _StareSearch, energy: Factor | None) -> list[Alarm]
                 if better is not None:
                     break
                 measured.append(values)
-        for one, values in zip(block, measured, strict=True):
-            measured_alarms.append(Alarm(one.rho, *values, number, len(block), best.chi2, best.dof, best.p_value))
+        for candidate, values in zip(block, measured, strict=True):
+            measured_alarms.append(Alarm(candidate.rho, *values, number, len(block), best.chi2, best.dof, best.p_value))
     return measured_alarms
 
 
@@ -375,10 +375,10 @@ def _measured(
     area = sums.survey.bank.shape.equivalent_duration
     several = KELVIN in sums.free
     covariance = np.asarray(rows.covariance(best.theta)[j, :, j, :])
-    found = _intervals(rows, best, j, snr, covariance, energy)
-    if isinstance(found, BlendFit):
-        return (UNMEASURED, {}, ""), found
-    intervals, note = found
+    outcome = _intervals(rows, best, j, snr, covariance, energy)
+    if isinstance(outcome, BlendFit):
+        return (UNMEASURED, {}, ""), outcome
+    intervals, note = outcome
     duration = np.array([1.0, 0.0, 1.0, 0.0])
     sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     sd_duration = float(np.sqrt(max(duration @ covariance @ duration, 0.0)))
@@ -419,15 +419,15 @@ def _intervals(
             intervals[name] = (np.nan, np.nan)
             continue
         if snr > MAX_PROFILED_SNR:
-            found = _by_curvature(best.theta[j], covariance, column, factor)
+            interval = _by_curvature(best.theta[j], covariance, column, factor)
         else:
-            found, better = rows.interval(best, j, column, factor, 1.0 + BARTLETT / max(snr, 1.0) ** 2)
+            interval, better = rows.interval(best, j, column, factor, 1.0 + BARTLETT / max(snr, 1.0) ** 2)
             if better is not None:
                 return better
-        ends = np.array([found.low, found.high])
+        ends = np.array([interval.low, interval.high])
         low_end, high_end = ends if column == PEAK else np.exp(ends + offset)
         intervals[name] = (float(low_end), float(high_end))
-        if found.open_low or found.open_high:
+        if interval.open_low or interval.open_high:
             notes.append(name.rsplit("_", 1)[0].replace("_", " "))
     return intervals, f"the interval of its {' and its '.join(notes)} ends where the fit does" if notes else ""
 

@@ -15,6 +15,7 @@ from mauvecl.detection.distributions import Interval, central_counts, clopper_pe
 from mauvecl.flares.energies import EnergyScale, PowerLaw, Rates
 from mauvecl.flares.settings import HALF_WIDTHS_S as BANK_S
 from mauvecl.flares.shapes import Shape, consecutive_integrals, shape_of
+from mauvecl.host.arrays import set_read_only
 from mauvecl.host.exposure.expectation import Expectation
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
@@ -77,10 +78,7 @@ class Completeness:
     how: str
 
     def __post_init__(self) -> None:
-        for name in ("energy_erg", "probability"):
-            kept = np.array(getattr(self, name), np.float64)
-            kept.setflags(write=False)
-            object.__setattr__(self, name, kept)
+        set_read_only(self, energy_erg=self.energy_erg, probability=self.probability)
         energy, p = self.energy_erg, self.probability
         if energy.ndim != 1 or energy.shape != p.shape or energy.size < 2:
             raise InputError.of("probability", p.size, f"one for each of {energy.size} energies, at least 2")
@@ -159,8 +157,8 @@ class Completeness:
         i = np.minimum(place.astype(int), WIDTHS - 2)
         # The logarithm of the gain is interpolated linearly between half-widths.
         part = (place - i)[..., None]
-        one = np.exp((1 - part) * np.log(gain[i]) + part * np.log(gain[i + 1]))
-        signal = amplitude[..., None] * signal_per_frame * one
+        growth = np.exp((1 - part) * np.log(gain[i]) + part * np.log(gain[i + 1]))
+        signal = amplitude[..., None] * signal_per_frame * growth
         # Small flares that noise lifts above the threshold, about 1 % of them, count as false alarms, since small
         # flares are arbitrarily frequent.
         p = np.where(signal > threshold / 2, stats.norm.sf(threshold - signal), 0.0).mean(axis=-1)
@@ -455,7 +453,7 @@ def fit_power_law(
 
     alpha = float(optimize.minimize_scalar(cost, bounds=EXPONENTS, method="bounded", options={"xatol": 1e-7}).x)
     log10_rate = float(np.log10(logs.size / (days * step * seen(alpha).sum())))
-    covariance = np.linalg.inv(_curvature(lambda one: cost(one[0], one[1]), np.array([alpha, log10_rate])))
+    covariance = np.linalg.inv(_curvature(lambda point: cost(point[0], point[1]), np.array([alpha, log10_rate])))
     return FittedPowerLaw(
         alpha=alpha,
         alpha_sd=float(np.sqrt(covariance[0, 0])),

@@ -165,19 +165,19 @@ class TemplateGrid:
         for k, (template, filters) in enumerate(zip(bank.templates, rows, strict=True)):
             adjacent_rows = rows[max(k - 1, 0) : k] + rows[k + 1 : k + 2]
             # The phases within a frame are followed by those of the next onset.
-            onsets = [one.shifted(n * template.stride) for n in (-1, 0, 1) for one in filters]
-            for p, one in enumerate(filters, len(filters)):
+            onsets = [onset_filter.shifted(n * template.stride) for n in (-1, 0, 1) for onset_filter in filters]
+            for p, onset_filter in enumerate(filters, len(filters)):
                 per_frame.append(1 / template.stride)
-                onset.append(_neighbour_correlations(one, [onsets[p - 1], onsets[p + 1]]))
+                onset.append(_neighbour_correlations(onset_filter, [onsets[p - 1], onsets[p + 1]]))
                 aligned = [
-                    max((one.best_alignment(other) for other in row), key=lambda pair: pair[0])[1]
+                    max((onset_filter.best_alignment(other) for other in row), key=lambda pair: pair[0])[1]
                     for row in adjacent_rows
                 ]
-                width.append(_neighbour_correlations(one, aligned))
+                width.append(_neighbour_correlations(onset_filter, aligned))
         directions = [UnitFilter(direction, 0) for direction in bank.directions]
         temperature = [
-            _neighbour_correlations(one, directions[max(k - 1, 0) : k] + directions[k + 1 : k + 2])
-            for k, one in enumerate(directions)
+            _neighbour_correlations(direction, directions[max(k - 1, 0) : k] + directions[k + 1 : k + 2])
+            for k, direction in enumerate(directions)
         ]
         return cls(bank.frame_s, np.array(per_frame), tuple(onset), tuple(width), tuple(temperature))
 
@@ -205,7 +205,9 @@ class TemplateGrid:
             _probability_neighbours_below(z, onset) * _probability_neighbours_below(z, width)
             for onset, width in zip(self.onset_correlations, self.width_correlations, strict=True)
         ]
-        temperatures = [_probability_neighbours_below(z, one) for one in self.temperature_correlations]
+        temperatures = [
+            _probability_neighbours_below(z, correlations) for correlations in self.temperature_correlations
+        ]
         return density, np.array(rows), np.array(temperatures)
 
 
@@ -217,9 +219,9 @@ def _detrended(template: Template, shape: Float, powers: tuple[int, ...]) -> Uni
     return UnitFilter(shape / np.linalg.norm(shape), template.first)
 
 
-def _neighbour_correlations(one: UnitFilter, neighbours: list[UnitFilter]) -> tuple[float, ...]:
+def _neighbour_correlations(unit_filter: UnitFilter, neighbours: list[UnitFilter]) -> tuple[float, ...]:
     """Return the correlations with the neighbours and, if there are two, between them."""
-    correlations = [one.correlation(other) for other in neighbours]
+    correlations = [unit_filter.correlation(other) for other in neighbours]
     if len(neighbours) == 2:
         correlations.append(neighbours[0].correlation(neighbours[1]))
     return tuple(correlations)
@@ -322,14 +324,14 @@ class SampledRate:
 
     def log_rate(self, threshold: float) -> tuple[float, float]:
         """Return the logarithm of false alarms per star-day, and its standard error."""
-        kept = self._trusted
+        trusted = self._trusted
         # All thresholds share draws, so that their errors are correlated and do not average out.
-        error = float(np.interp(threshold, self.thresholds[kept], self._relative))
+        error = float(np.interp(threshold, self.thresholds[trusted], self._relative))
         if self.shifted:
-            logs = np.log(-np.log1p(-self.probability[kept]) / self.days)
-            return float(scipy.interpolate.PchipInterpolator(self.thresholds[kept], logs)(threshold)), error
+            logs = np.log(-np.log1p(-self.probability[trusted]) / self.days)
+            return float(scipy.interpolate.PchipInterpolator(self.thresholds[trusted], logs)(threshold)), error
         coefficients = self._fit()
-        at = (threshold - self.thresholds[kept].mean()) ** np.arange(coefficients.size)
+        at = (threshold - self.thresholds[trusted].mean()) ** np.arange(coefficients.size)
         return float(scipy.special.log_ndtr(-threshold) + at @ coefficients), error
 
     def rate(self, threshold: float) -> Interval:
@@ -425,12 +427,12 @@ def sample_rate(search: Search, *, seed: int, draws: int = DRAWS) -> SampledRate
         values: list[list[Float]] = [[] for _ in range(count)]
         for (row, correlated), weight in zip(search.correlations(held), weights, strict=True):
             at = row.per_amplitude > 0
-            for n, kept in enumerate(values):
+            for n, nearby in enumerate(values):
                 c = along[n] * correlated[n, n_sum, at]
                 r = directions @ correlated[n, :n_sum, at].T - own[n] * c
-                kept.append(_near(np.array([r, c]), weight, LADDER[0]))
-        for n, kept in enumerate(values):
-            estimates[first + n] = _estimates(np.concatenate(kept, axis=1))
+                nearby.append(_near(np.array([r, c]), weight, LADDER[0]))
+        for n, nearby in enumerate(values):
+            estimates[first + n] = _estimates(np.concatenate(nearby, axis=1))
     estimates *= shares[-1]
     return SampledRate(
         np.array(LADDER), estimates.mean(axis=0), estimates.std(axis=0, ddof=1) / np.sqrt(draws),
@@ -556,8 +558,8 @@ def draw_shifts(survey: Survey, seed: int, part: Survey | None = None) -> Unknow
     log = -np.sum(z**2, axis=1) / 2
     weights = np.exp(log - np.logaddexp(log, log / WIDENING**2 - n * np.log(WIDENING)))
     moved = {of: np.zeros((RATE_DRAWS, at.size)) for of in ("star", "light", "sky", "temperature")}
-    for amplitude, one in zip(z.T, stare.unknowns, strict=True):
-        moved[one.of] += amplitude[:, None] * one.sd * one.curve[at]
+    for amplitude, unknown in zip(z.T, stare.unknowns, strict=True):
+        moved[unknown.of] += amplitude[:, None] * unknown.sd * unknown.curve[at]
     slope = components.quiet.conditions["dark_slope_per_c"]
     coefficients = np.broadcast_to(survey.coefficients[at], (RATE_DRAWS, at.size, survey.coefficients.shape[1])).copy()
     coefficients[..., 0] *= (1 + moved["light"]) * (1 + moved["star"])

@@ -154,24 +154,24 @@ class StareSums:
         start = self.survey.stare.start_s
         return np.searchsorted(start, first_s - self.survey.stare.frame_s), np.searchsorted(start, last_s)
 
-    def mean(self, one: Float, frames: Any) -> Float:
+    def mean(self, flare: Float, frames: Any) -> Float:
         """Return the mean of a flare's shape over frames, including throughput, shape (n_frame,)."""
         shape = self.survey.bank.shape
-        mean = shape.mean_over(self.edges[frames], one[PEAK], np.exp(one[WIDTH]))
+        mean = shape.mean_over(self.edges[frames], flare[PEAK], np.exp(flare[WIDTH]))
         return np.asarray(self.survey.stare.light[frames] * mean)
 
     def light(self, theta: Float, frames: slice = slice(None)) -> Float:
         """Return the mean sums of flares in some frames, shape (n_frame, n_sum)."""
         total = np.zeros_like(self.net)[frames]
-        for one, inside, mean in self._shining(theta, frames):
-            total[inside] += mean[:, None] * self.templates.mean_sums.spline(one[KELVIN])
+        for flare, inside, mean in self._shining(theta, frames):
+            total[inside] += mean[:, None] * self.templates.mean_sums.spline(flare[KELVIN])
         return total
 
     def noise(self, theta: Float, light: Float, frames: slice = slice(None)) -> Float:
         """Return the covariance of frames' sums with flares, shape (n_frame, n_sum, n_sum)."""
         total = self.covariance[frames].copy()
-        for one, inside, mean in self._shining(theta, frames):
-            total[inside] += mean[:, None, None] * self.templates.noise_of(float(np.exp(one[KELVIN])))
+        for flare, inside, mean in self._shining(theta, frames):
+            total[inside] += mean[:, None, None] * self.templates.noise_of(float(np.exp(flare[KELVIN])))
         jitter = self.survey.stare.light_jitter
         if jitter and len(theta):
             # Star and flare light jitter together; the star's jitter is already in the covariance.
@@ -185,25 +185,25 @@ class StareSums:
         first, last, _ = frames.indices(len(self.net))
         peak, width = theta[:, PEAK], np.exp(theta[:, WIDTH])
         starts, stops = self._overlapping(peak - LIGHT_BEFORE * width, peak + LIGHT_AFTER * width)
-        for one, start, stop in zip(theta, np.maximum(starts, first), np.minimum(stops, last), strict=True):
+        for flare, start, stop in zip(theta, np.maximum(starts, first), np.minimum(stops, last), strict=True):
             if start < stop:
-                mean = np.exp(one[AMPLITUDE]) * self.mean(one, slice(start, stop))
-                yield one, slice(start - first, stop - first), mean
+                mean = np.exp(flare[AMPLITUDE]) * self.mean(flare, slice(start, stop))
+                yield flare, slice(start - first, stop - first), mean
 
-    def window(self, one: Float) -> tuple[float, float]:
+    def window(self, flare: Float) -> tuple[float, float]:
         """Return start and end of a flare's window, s."""
-        lead, tail = self.survey.bank.window(float(np.exp(one[WIDTH])))
+        lead, tail = self.survey.bank.window(float(np.exp(flare[WIDTH])))
         frame_s = self.survey.stare.frame_s
-        return one[PEAK] - (lead + 1) * frame_s, one[PEAK] + (tail + 1) * frame_s
+        return flare[PEAK] - (lead + 1) * frame_s, flare[PEAK] + (tail + 1) * frame_s
 
-    def overlap(self, one: Float) -> tuple[float, float]:
+    def overlap(self, flare: Float) -> tuple[float, float]:
         """Return start and end of the interval in which a flare overlaps others, s."""
-        width = np.exp(one[WIDTH])
-        return one[PEAK] - OVERLAP_BEFORE * width, one[PEAK] + OVERLAP_AFTER * width
+        width = np.exp(flare[WIDTH])
+        return flare[PEAK] - OVERLAP_BEFORE * width, flare[PEAK] + OVERLAP_AFTER * width
 
     def block(self, inside: Float, every: Float) -> Block:
         """Build the block of the flares `inside` among all flares `every`."""
-        windows = [self.window(one) for one in inside]
+        windows = [self.window(flare) for flare in inside]
         used = np.zeros(len(self.net), np.bool_)
         for first, last in windows:
             used[self.frames(first, last)] = True
@@ -354,11 +354,11 @@ class Block:
         if not moved.any():
             return BlendFit(whole(start[moved]), self.chi2(whole(start[moved])), dof, True)
 
-        found = scipy.optimize.least_squares(
+        solution = scipy.optimize.least_squares(
             residual, start[moved], jacobian, bounds=(low[moved], high[moved]), x_scale=scale[moved],
             ftol=CONVERGED, xtol=1e-9, gtol=None, max_nfev=MAX_EVALUATIONS,
         )  # fmt: skip
-        return BlendFit(whole(found.x), 2 * float(found.cost), dof, bool(found.status > 0))
+        return BlendFit(whole(solution.x), 2 * float(solution.cost), dof, bool(solution.status > 0))
 
     def covariance(self, theta: Float) -> Float:
         """Return the covariance of all parameters, the inverse of the information, shape (n, 4, n, 4)."""
@@ -397,7 +397,7 @@ class Block:
         along = np.einsum("iajb,jb->ia", covariance, weights)
         variance = float(np.sum(weights * along))
         sd = np.sqrt(variance) if variance > 0 else 1e-3
-        found: list[tuple[float, bool]] = []
+        interval_ends: list[tuple[float, bool]] = []
         for sign, end in zip((-1.0, 1.0), ends, strict=True):
             furthest = abs(end - middle)
 
@@ -416,8 +416,8 @@ class Block:
                     reached = _interval_end(refit, best.chi2, rises, step, furthest, one.theta)
             if reached.better is not None:
                 return Interval(np.nan, np.nan), self.fit(reached.better.theta)
-            found.append((float(middle + sign * reached.step), reached.open))
-        (low, open_low), (high, open_high) = found
+            interval_ends.append((float(middle + sign * reached.step), reached.open))
+        (low, open_low), (high, open_high) = interval_ends
         return Interval(low, high, open_low, open_high), None
 
     def without(self, blended: BlendFit, j: int) -> BlendFit:
@@ -460,13 +460,13 @@ def _interval_end(
     for _ in range(MAX_REFITS):
         at_end = step >= furthest
         step = min(step, furthest)
-        one = refit(step, start)
-        if one.chi2 - chi2 < -BETTER:
-            return _IntervalEnd(step, False, one.theta, one)
-        root = float(np.sqrt(max(one.chi2 - chi2, 0.0) / rises))
+        fit = refit(step, start)
+        if fit.chi2 - chi2 < -BETTER:
+            return _IntervalEnd(step, False, fit.theta, fit)
+        root = float(np.sqrt(max(fit.chi2 - chi2, 0.0) / rises))
         if abs(root - 1.0) < CLOSE or (at_end and root < 1.0):
-            return _IntervalEnd(step, at_end and root < 1.0 - CLOSE, one.theta)
-        start = one.theta
+            return _IntervalEnd(step, at_end and root < 1.0 - CLOSE, fit.theta)
+        start = fit.theta
         if root < 1.0:
             inner, root_inner = step, root
         else:
@@ -477,7 +477,7 @@ def _interval_end(
             # The root of the rise is nearly linear: use regula falsi, but keep away from both ends.
             share = (1.0 - root_inner) / (root_outer - root_inner)
             step = inner + (outer - inner) * float(np.clip(share, 0.08, 0.92))
-    return _IntervalEnd(step, root < 1.0 - CLOSE, one.theta)
+    return _IntervalEnd(step, root < 1.0 - CLOSE, fit.theta)
 
 
 #: Largest number of steps of a fit, and the change of chi-squared at which it has converged.
@@ -624,7 +624,7 @@ class SingleFlareFit:
         _, first, count = np.unique(number // several, return_index=True, return_counts=True)
         rows = first[count == several][:, None] + np.arange(several)
         variance = np.ones(start_s.size) if variance is None else variance
-        mean = np.stack([one[rows].mean(axis=1) for one in sums])
+        mean = np.stack([values[rows].mean(axis=1) for values in sums])
         return (
             mean, start_s[rows[:, 0]], variance[rows].mean(axis=1) / several,
             None if curves is None else curves[:, rows].mean(axis=2),

@@ -188,19 +188,19 @@ def sites_of(survey: Survey, widths_s: Sequence[float], peak_s: float, response:
     seen: list[list[_NearbyTemplates]] = [[] for _ in reaches]
     for number, (row, correlated) in enumerate(search.correlations(means[:, :, None])):
         times = (stare.numbers[0] + row.peaks + row.template.phases[row.phase]) * bank.frame_s
-        for found, reach, value in zip(seen, reaches, correlated[:, 0], strict=True):
+        for responses, reach, value in zip(seen, reaches, correlated[:, 0], strict=True):
             if row.template.half_width_s in reach.half_widths_s:
                 inside = (times >= reach.first_s) & (times <= reach.last_s) & (row.per_amplitude > 0)
                 onsets = np.flatnonzero(inside)
                 onsets = onsets[(along * value[onsets]).max(axis=0, initial=0) > 0]
-                found.append(_NearbyTemplates(number, onsets, times[onsets], along * value[onsets]))
-    for found in seen:
-        largest = max((float(one.values.max(initial=0)) for one in found), default=0.0)
-        found[:] = [one.above(OVERLAP * largest) for one in found]
-    filters = _filters(search, [one for found in seen for one in found])
+                responses.append(_NearbyTemplates(number, onsets, times[onsets], along * value[onsets]))
+    for responses in seen:
+        largest = max((float(response.values.max(initial=0)) for response in responses), default=0.0)
+        responses[:] = [response.above(OVERLAP * largest) for response in responses]
+    filters = _filters(search, [response for responses in seen for response in responses])
     return tuple(
-        _site(search, first, width, peak_s, mean, found, filters)
-        for width, mean, found in zip(widths_s, means, seen, strict=True)
+        _site(search, first, width, peak_s, mean, responses, filters)
+        for width, mean, responses in zip(widths_s, means, seen, strict=True)
     )
 
 
@@ -236,8 +236,8 @@ class _NearbyTemplates:
     def above(self, least: float) -> _NearbyTemplates:
         """Return the templates that reach a value at any temperature, with `values` true where they reach it."""
         counts = self.values >= least
-        kept = counts.any(axis=0)
-        return _NearbyTemplates(self.row, self.onsets[kept], self.times_s[kept], counts[:, kept])
+        seen = counts.any(axis=0)
+        return _NearbyTemplates(self.row, self.onsets[seen], self.times_s[seen], counts[:, seen])
 
 
 def _search_near(survey: Survey, reaches: Sequence[_Reach]) -> tuple[Search, int]:
@@ -256,8 +256,8 @@ def _search_near(survey: Survey, reaches: Sequence[_Reach]) -> tuple[Search, int
 def _filters(search: Search, seen: Sequence[_NearbyTemplates]) -> dict[int, tuple[NDArray[np.int64], Single]]:
     """Return for each row the onsets of templates near any flare, ascending, and their filters."""
     filters = {}
-    for number in sorted({one.row for one in seen}):
-        onsets = np.unique(np.concatenate([one.onsets for one in seen if one.row == number]))
+    for number in sorted({response.row for response in seen}):
+        onsets = np.unique(np.concatenate([response.onsets for response in seen if response.row == number]))
         in_time = search.in_time(search.grid[number], onsets)
         filters[number] = onsets, (np.rint(in_time / STEP) * STEP).astype(np.float32)
     return filters
@@ -268,11 +268,11 @@ def _site(
     filters: dict[int, tuple[NDArray[np.int64], Single]],
 ) -> InjectionSite:  # fmt: skip
     none = np.zeros((0, mean.size), np.float32)
-    own = [filters[one.row][1][np.searchsorted(filters[one.row][0], one.onsets)] for one in seen]
+    own = [filters[response.row][1][np.searchsorted(filters[response.row][0], response.onsets)] for response in seen]
     weights = np.concatenate([none, *own])
     used = np.flatnonzero(weights.any(axis=0))
     ends = slice(int(used[0]), int(used[-1]) + 1) if used.size else slice(0, 0)
-    widths = [np.full(one.onsets.size, search.grid[one.row].template.half_width_s) for one in seen]
+    widths = [np.full(response.onsets.size, search.grid[response.row].template.half_width_s) for response in seen]
     no_counts = np.zeros((len(search.bank.directions), 0), np.bool_)
     return InjectionSite(
         width_s,
@@ -281,8 +281,8 @@ def _site(
         np.ascontiguousarray(weights[:, ends]),
         mean[ends].astype(np.float32),
         np.concatenate([np.zeros(0), *widths]),
-        np.concatenate([np.zeros(0), *(one.times_s for one in seen)]),
-        np.concatenate([no_counts, *(one.values for one in seen)], axis=1),
+        np.concatenate([np.zeros(0), *(response.times_s for response in seen)]),
+        np.concatenate([no_counts, *(response.values for response in seen)], axis=1),
     )
 
 
@@ -437,14 +437,16 @@ class CriticalAmplitudes:
             for column, site in zip(critical[part].T, self.sites, strict=True):
                 if len(site.filters):
                     column[:] = self._critical(site, self.values(site, drawn))
-        kept: dict[str, NDArray[Any]] = {"critical": critical}
+        arrays_of_fits: dict[str, NDArray[Any]] = {"critical": critical}
         if self.refit is not None:
             # Stares are processed one at a time, so that fits do not depend on the batch.
             these = range(min(len(values), max(0, self.start + self.refit.count - first)))
             each = [self._fitted(self.frame_noise(values[k : k + 1], glow[k : k + 1]), self.refit) for k in these]
             none = np.zeros((0, *self.refit.amplitudes.shape), np.float32)
-            kept |= {name: np.array([one[name] for one in each]) if each else none for name in FIT_QUANTITIES}
-        return kept
+            arrays_of_fits |= {
+                name: np.array([arrays[name] for arrays in each]) if each else none for name in FIT_QUANTITIES
+            }
+        return arrays_of_fits
 
     def frame_noise(self, values: Single, glow: Single) -> FrameNoise:
         """Prepare the random part of some stares."""
@@ -507,7 +509,7 @@ class CriticalAmplitudes:
 
     def _fitted(self, drawn: FrameNoise, refit: Refit) -> dict[str, Single]:
         """Fit the detected flares of one stare; arrays of shape (n_half_width, n_amplitude), NaN if not detected."""
-        kept = {name: np.full(refit.amplitudes.shape, np.nan, np.float32) for name in FIT_QUANTITIES}
+        estimates = {name: np.full(refit.amplitudes.shape, np.nan, np.float32) for name in FIT_QUANTITIES}
         for d, (site, row) in enumerate(zip(self.sites, refit.amplitudes, strict=True)):
             if not len(site.filters):
                 continue
@@ -525,8 +527,8 @@ class CriticalAmplitudes:
                 curves=None if self.curves is None else self.curves[:, here],
             )
             for name, values in refit.compared(recovered, row[alarm], site).items():
-                kept[name][d, alarm] = values
-        return kept
+                estimates[name][d, alarm] = values
+        return estimates
 
 
 @dataclass(frozen=True, eq=False)

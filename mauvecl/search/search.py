@@ -135,7 +135,8 @@ class Search:
             Sums with unit covariance in each frame without a flare.
         """
         sums = self._checked(sums)
-        parts = [self._largest(sums[batch]) for batch in self._batches(len(sums))]
+        size = max(1, BATCH // (self._size * self.bank.directions.shape[1]))
+        parts = [self._largest(sums[i : i + size]) for i in range(0, len(sums), size)]
         return LargestValue(
             *(np.concatenate([getattr(p, name) for p in parts]) for name in LargestValue.__annotations__)
         )
@@ -211,10 +212,6 @@ class Search:
                 f"sums have the shape {sums.shape}", f"(n_stare, {expected[0]}, {expected[1]})", key="sums"
             )
         return sums
-
-    def _batches(self, count: int) -> list[slice]:
-        size = max(1, BATCH // (self._size * self.bank.directions.shape[1]))
-        return [slice(i, i + size) for i in range(0, count, size)]
 
     def _largest(self, sums: NDArray[Any]) -> LargestValue:
         n = len(sums)
@@ -372,8 +369,8 @@ class Trend:
         star, sky = directions["star"], directions["sky"]
         neighbours = directions["light"] - star - sky
         dark = directions["temperature"] / slope_per_c if slope_per_c else np.zeros_like(sky)
-        curves = np.array([one.sd * one.curve for one in unknowns])
-        of = tuple(one.of for one in unknowns)
+        curves = np.array([unknown.sd * unknown.curve for unknown in unknowns])
+        of = tuple(unknown.of for unknown in unknowns)
         return cls(frames, frame_s, variance, of, curves, star, sky, neighbours, dark, slope_per_c)
 
     @cached_property
@@ -413,8 +410,8 @@ class Trend:
         """
         left = np.array(sums, np.float64)
         # One stare at a time, since the rounding of matrix products may depend on the number of stares.
-        for one in left:
-            one -= self.nonlinear_effect(self.fitted(one[None]))[0]
+        for row in left:
+            row -= self.nonlinear_effect(self.fitted(row[None]))[0]
         return left
 
     def nonlinear_effect(self, amplitudes: Float) -> Float:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from mauvecl.detection.nuisances import Nuisances, join_names
 from mauvecl.fits.flare_model import MeanSums
 from mauvecl.flares.settings import RANK, WINDOW_S
+from mauvecl.host.arrays import set_read_only
 from mauvecl.noise.unknowns import CHANGED_PART
 from mauvecl.schema.errors import InputError
 
@@ -118,13 +119,11 @@ class Bank:
             raise InputError.of("half_widths_s", list(widths), "ascending times above 0")
         if not (np.isfinite(self.frame_s) and self.frame_s > 0):
             raise InputError.of("frame_s", self.frame_s, "a time above 0")
-        kept = np.atleast_2d(np.array(self.directions, np.float64))
-        length = np.linalg.norm(kept, axis=1, keepdims=True)
+        directions = np.atleast_2d(np.array(self.directions, np.float64))
+        length = np.linalg.norm(directions, axis=1, keepdims=True)
         if not (length > 0).all():
             raise InputError("a direction of the bank is zero", "flares that change a sum of a frame", key="directions")
-        kept = kept / length
-        kept.setflags(write=False)
-        object.__setattr__(self, "directions", kept)
+        set_read_only(self, directions=directions / length)
 
     @cached_property
     def templates(self) -> tuple[Template, ...]:
@@ -267,8 +266,8 @@ class Templates:
             )
         length = np.sqrt(power)
         values, vectors = np.linalg.eigh(gram / np.outer(length, length))
-        kept = [k for k in range(len(values))[::-1][:rank] if values[k] > MIN_SINGULAR**2 * values[-1]]
-        weights = (vectors[:, kept] / length[:, None] / np.sqrt(values[kept])).T @ optimal
+        modes = [k for k in range(len(values))[::-1][:rank] if values[k] > MIN_SINGULAR**2 * values[-1]]
+        weights = (vectors[:, modes] / length[:, None] / np.sqrt(values[modes])).T @ optimal
         # Signs are arbitrary; choose them so that the hottest flare increases each sum.
         weights *= np.where(weights @ flares[-1] < 0, -1.0, 1.0)[:, None]
         photons = flares * photon_variance

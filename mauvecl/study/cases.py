@@ -455,14 +455,14 @@ class Case:
 def cases(study: Study, *, swept: bool = True) -> list[Case]:
     """Return the cases of a study: every star at every combination of sweep values, or at the study's own values."""
     loader = Loader()
-    found = []
+    all_cases = []
     for values in study.sweep.cells() if swept else ({},):
         cell = study.model_copy(update={"sweep": Sweep()})
         for quantity, value in values.items():
             cell = cell.at(quantity, value)
         stars = [Case(cell.model_copy(update={"star": (star,)}), values, loader) for star in cell.star]
-        found += [case.at_observed_brightness() for case in stars] if cell.flare.spectrum.as_observed else stars
-    return found
+        all_cases += [case.at_observed_brightness() for case in stars] if cell.flare.spectrum.as_observed else stars
+    return all_cases
 
 
 #: Read noise, DN, above which rounding acts like independent noise at any signal: it damps the first harmonic of the

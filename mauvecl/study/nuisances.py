@@ -109,9 +109,9 @@ class NuisanceChoice(create_model("_Amplitudes", __base__=Section, **_keys)):  #
         sd = usual_spreads(quiet) if self.usual else {}
         sd |= {name: sd_of(spread) for name, spread in self.spreads().items()}
         own: dict[str, NDArray[np.float64]] = {}
-        for name, one in self.own.items():
-            own[name] = one.spectrum(name, quiet.wavelength_nm)
-            sd[name] = sd_of(one.sd)
+        for name, nuisance in self.own.items():
+            own[name] = nuisance.spectrum(name, quiet.wavelength_nm)
+            sd[name] = sd_of(nuisance.sd)
         return Nuisances.of(quiet, sd, own) if sd else None
 
     def spreads(self) -> dict[str, float | Literal["free"]]:

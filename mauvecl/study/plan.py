@@ -197,10 +197,10 @@ class PlanTarget(Section):
                 raise InputError(fault, expected, key="coordinates") from error
         place = Target.of(self.coordinates, name=self.name)
         try:
-            known = Target.of(self.name)
+            target = Target.of(self.name)
         except InputError:
             return place
-        return replace(known, name=self.name, ra_deg=place.ra_deg, dec_deg=place.dec_deg, source="given")
+        return replace(target, name=self.name, ra_deg=place.ra_deg, dec_deg=place.dec_deg, source="given")
 
     def distribution(self, spectral_type: str) -> Rates:
         """Return the flare rates; raises InputError if none are given and the spectral type has no preset."""
@@ -215,9 +215,9 @@ class PlanTarget(Section):
         kind = self.rates or spectral_type.strip()[:1].upper()
         if kind not in ("G", "K", "M", "sunlike"):
             alpha = EXPONENTS.get(kind)
-            known = "" if alpha is None else f" except for an exponent of {alpha} (Althukair & Tsiklauri 2023)"
+            exception = "" if alpha is None else f" except for an exponent of {alpha} (Althukair & Tsiklauri 2023)"
             raise InputError(
-                f"flare rates of {self.name}, of the type {shortened(spectral_type)}, are unknown{known}",
+                f"flare rates of {self.name}, of the type {shortened(spectral_type)}, are unknown{exception}",
                 "alpha with rate_per_day and at_erg, rates, mass_msun and age_myr, or rates_file",
                 key="rates",
             )
@@ -290,7 +290,7 @@ def targets_of(orbit: OrbitQuestion, plan: PlanQuestion) -> list[Target]:
     ]
     if not targets:
         raise InputError("no targets", "names or coordinates, such as `orbit.targets='eps Eri'`", key="orbit.targets")
-    names = [one.name for one in targets]
+    names = [target.name for target in targets]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise InputError(f"the target {twice!r} is named twice, but targets must differ", key="orbit.targets")
@@ -358,7 +358,7 @@ def _target(
 ) -> dict[str, Any]:
     """Return the data of a target from the cells of its row."""
     named = f"{rows.named}: row {row + 1}"
-    one: dict[str, Any] = {}
+    target: dict[str, Any] = {}
     for key, field in PlanTarget.model_fields.items():
         column = columns.get(key)
         text = rows.text(column, row)
@@ -366,32 +366,32 @@ def _target(
             continue
         unit = first(field, Unit)
         if unit is None and first(field, Range) is None:
-            one[key] = text
+            target[key] = text
         else:
             # A text that is no number is refused with the key's own sentence.
-            one[key] = rows.number(column, row, "" if unit is None else unit.name) if _is_number(text) else text
+            target[key] = rows.number(column, row, "" if unit is None else unit.name) if _is_number(text) else text
     _check_band(rows, columns["magnitude"], row)
     parallax = columns["parallax"]
-    if parallax is not None and "distance_pc" not in one:
+    if parallax is not None and "distance_pc" not in target:
         value = rows.number(parallax, row, "mas")
-        one |= {"distance_pc": 1000.0 / value} if value is not None and value > 0 else {}
-    if (coordinates := _coordinates(rows, columns, row, one)) is not None:
-        one["coordinates"] = coordinates
+        target |= {"distance_pc": 1000.0 / value} if value is not None and value > 0 else {}
+    if (coordinates := _coordinates(rows, columns, row, target)) is not None:
+        target["coordinates"] = coordinates
     for key in PATH_KEYS:
-        if folder is not None and isinstance(one.get(key), str):
-            one[key] = folder / one[key]
-    alone = [key for key in ("mass_msun", "age_myr") if key in one]
+        if folder is not None and isinstance(target.get(key), str):
+            target[key] = folder / target[key]
+    alone = [key for key in ("mass_msun", "age_myr") if key in target]
     if len(alone) == 1 and (held := columns[alone[0]]) is not None and key_of(held) != alone[0]:
         # Catalogues have the mass of most stars and the age of few.
-        del one[alone[0]]
+        del target[alone[0]]
         unused += (held,)
     if unused:
-        one["unused"] = unused
+        target["unused"] = unused
     try:
-        PlanTarget.model_validate(one)
+        PlanTarget.model_validate(target)
     except ValidationError as error:
         raise input_error(named, PlanTarget, error) from error
-    return one
+    return target
 
 
 def _check_band(rows: Rows, column: str | None, row: int) -> None:
@@ -403,7 +403,7 @@ def _check_band(rows: Rows, column: str | None, row: int) -> None:
         raise rows.error(f"row {row + 1} has {column} in the band {shortened(odd)}", "a magnitude in V", column)
 
 
-def _coordinates(rows: Rows, columns: dict[str, str | None], row: int, one: dict[str, Any]) -> str | None:
+def _coordinates(rows: Rows, columns: dict[str, str | None], row: int, target: dict[str, Any]) -> str | None:
     """Return the coordinates of a target in degrees from the columns ra and dec, or None if it has none there.
 
     Raises InputError for one of the two, for sexagesimal ones that differ, and for a star without any that is not in
@@ -413,7 +413,7 @@ def _coordinates(rows: Rows, columns: dict[str, str | None], row: int, one: dict
 
     ra, dec = columns["ra"], columns["dec"]
     given = [name for name in (ra, dec) if rows.text(name, row)]
-    if len(given) == 1 or (given and "coordinates" in one):
+    if len(given) == 1 or (given and "coordinates" in target):
         raise InputError(f"{rows.named}: row {row + 1} needs either coordinates, or both ra and dec", key="coordinates")
     if ra is not None and dec is not None and given:
         east, north = (rows.degrees(name, row, right_ascension=name == ra) for name in (ra, dec))
@@ -423,7 +423,7 @@ def _coordinates(rows: Rows, columns: dict[str, str | None], row: int, one: dict
             fault = f"row {row + 1} has {ra} = {rows.text(ra, row)} and {again} = {rows.text(again, row)}, which differ"
             raise rows.error(fault, "numbers in degrees, or only one of these columns", ra)
         return f"{east!r} {north!r}"
-    if "coordinates" not in one and name_key(name := one.get("name", "")) not in by_key():
+    if "coordinates" not in target and name_key(name := target.get("name", "")) not in by_key():
         for column in (ra, columns["coordinates"]):
             if column is not None and _is_marked_missing(text := str(rows.table[column][row])):
                 fault = f"row {row + 1} has no coordinates ({column} = {' '.join(text.split())}), and {shortened(name)}"

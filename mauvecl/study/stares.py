@@ -81,10 +81,10 @@ def stare_of(study: Study, instrument: Instrument) -> Stare:
         StarePrior.of(name, getattr(study.processes, name), instrument) for name, _ in study.processes.modulations
     ]
     spreads: dict[Course, dict[Changing, float]] = {how: dict(getattr(q, how)) for how in COURSES}
-    for one in priors:
+    for prior in priors:
         # Independent normal amplitudes of one change add up to one.
-        given = spreads[one.course]
-        given[one.changes] = math.hypot(given.get(one.changes, 0.0), one.sd)
+        given = spreads[prior.course]
+        given[prior.changes] = math.hypot(given.get(prior.changes, 0.0), prior.sd)
     spreads = {how: {of: given[of] for of in CHANGING if of in given} for how, given in spreads.items()}
     if study.nuisances.usual:
         spreads = {how: documented | spreads[how] for how, documented in default_spreads().items()}
@@ -102,8 +102,8 @@ def stare_of(study: Study, instrument: Instrument) -> Stare:
             thermal=q.thermal,
             **changes,
         )
-    for one in priors:
-        stare = one.applied(stare)
+    for prior in priors:
+        stare = prior.applied(stare)
     return stare
 
 
@@ -264,11 +264,11 @@ def _of_energy(study: Study, source: Source, choice: EventChoice, event: Event, 
     if choice.energy_erg is None:
         return event
     # The energy is linear in the amplitude.
-    one = energy_of(study, source, event, choice.energy, temperatures_k)
-    if one is None:
+    energy = energy_of(study, source, event, choice.energy, temperatures_k)
+    if energy is None:
         raise InputError(
             f"the amplitude of a flare of {choice.energy_erg:g} erg on {source.name} is unknown",
             "the star's distance_pc, or radius_rsun and effective_temperature_k",
             key="events.energy_erg",
         )
-    return replace(event, amplitude=choice.energy_erg / one)
+    return replace(event, amplitude=choice.energy_erg / energy)

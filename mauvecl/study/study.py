@@ -96,7 +96,9 @@ def _named_files(data: dict[str, Any]) -> list[tuple[dict[str, Any], str]]:
     rows = asked.get("observations") if isinstance(asked, dict) else None
     sections += [(row, key) for row in (rows if isinstance(rows, list) else []) for key in PATHS]
     sections += [(data.get("change"), "file")]
-    return [(one, key) for one, key in sections if isinstance(one, dict) and isinstance(one.get(key), str)]
+    return [
+        (section, key) for section, key in sections if isinstance(section, dict) and isinstance(section.get(key), str)
+    ]
 
 
 def locate_files(data: dict[str, Any], table: Path) -> None:
@@ -361,8 +363,8 @@ class Study(Section):
             raise InputError(
                 f"quantity {shortened(str(quantity))!r} is unknown", f"one of {', '.join(QUANTITIES)}", key="quantity"
             )
-        one = QUANTITIES[quantity]
-        return self.with_value(one.path, one.checked(value))
+        swept = QUANTITIES[quantity]
+        return self.with_value(swept.path, swept.checked(value))
 
     @property
     def has_neighbours(self) -> bool:

@@ -66,12 +66,12 @@ class ClosedForms:
     @cached_property
     def odds(self) -> DetectionForms:
         """Closed form of the requested statistic, for Gaussian noise."""
-        one, setting = STATISTICS[self.question.statistic], self.case.setting(self.quiet, self.flare)
+        statistic, setting = STATISTICS[self.question.statistic], self.case.setting(self.quiet, self.flare)
         if not setting.used.any():
             name = self.quiet.name
             raise InputError(f"every pixel of {name} is saturated", "a fainter star", key="magnitude")
-        one.check(setting)
-        return one.detection_forms(setting, self.flare, self.question.fap)
+        statistic.check(setting)
+        return statistic.detection_forms(setting, self.flare, self.question.fap)
 
     @cached_property
     def chance(self) -> float:
@@ -150,14 +150,16 @@ class ClosedForms:
         as for another throughput.
         """
         q, base = self.question, self.quiet
-        one, rise = STATISTICS[q.statistic], self.flare.source_electrons - base.source_electrons
+        statistic, rise = STATISTICS[q.statistic], self.flare.source_electrons - base.source_electrons
         behind = base.sky_electrons * (light if sky else 1.0)
         quiet = replace(base, source_electrons=light * base.source_electrons, sky_electrons=behind)
         setting = self.case.setting(quiet)
         if not setting.used.any():
             return []
         electrons = (light * (base.source_electrons + more * rise) for more in rises)
-        return [one.detection_forms(setting, replace(quiet, source_electrons=light), q.fap) for light in electrons]
+        return [
+            statistic.detection_forms(setting, replace(quiet, source_electrons=light), q.fap) for light in electrons
+        ]
 
     @property
     def slow(self) -> bool:
@@ -227,18 +229,18 @@ class Chance:
 
 def chances(closed: ClosedForms, answers: Answers) -> list[Chance]:
     """Return the chance for each choice of what is unknown, simulated if it is among the answers."""
-    found = []
+    all_chances = []
     for unknown in UNKNOWN:
         try:
             assumed = closed.assuming(unknown)
             simulated = _simulated_chance(assumed, answers.get("detection" if assumed is closed else OTHER))
-            one = simulated or Chance(unknown, assumed.chance, f"in closed form{_spread(assumed)}")
+            chance = simulated or Chance(unknown, assumed.chance, f"in closed form{_spread(assumed)}")
         except InputError as error:
             if unknown == closed.question.unknown:
                 raise
-            one = Chance(unknown, float("nan"), str(error).partition(", expected ")[0])
-        found.append(one)
-    return found
+            chance = Chance(unknown, float("nan"), str(error).partition(", expected ")[0])
+        all_chances.append(chance)
+    return all_chances
 
 
 def _simulated_chance(assumed: ClosedForms, answer: DetectAnswer | None) -> Chance | None:
@@ -304,15 +306,15 @@ def solved(closed: ClosedForms) -> str:
     return f"{100 * asked.power:g} % of {flares}{where} with everything known, and {second} with the usual unknowns."
 
 
-def _limit(assumed: ClosedForms, known: float | None) -> float:
+def _limit(assumed: ClosedForms, limit: float | None) -> float:
     """Return the limit in closed form, as `mauvecl limit` finds it; faster with the limit if everything is known."""
     search, near = LimitSearch(assumed.case, assumed.question.statistic), None
-    if known is not None and search.of != "exposure":
+    if limit is not None and search.of != "exposure":
         nuisances, compared = assumed.study.nuisances, assumed.study.run.comparison()
         cost = unknown_cost("", assumed.quiet, assumed.flare, nuisances, compared)
         # Where dark noise dominates, the S/N is proportional to the light.
         loss = cost.known / cost.marginal if cost.marginal else 1.0
-        near = known * loss if search.of == "amplitude" else known - 2.5 * math.log10(loss)
+        near = limit * loss if search.of == "amplitude" else limit - 2.5 * math.log10(loss)
     return search.root(near)
 
 

@@ -73,9 +73,9 @@ def _plain(value: Any) -> Any:
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json", exclude_defaults=True, exclude_none=True)
     if isinstance(value, tuple):
-        return [_plain(one) for one in value]
+        return [_plain(item) for item in value]
     if isinstance(value, dict):
-        return {key: _plain(one) for key, one in value.items()}
+        return {key: _plain(item) for key, item in value.items()}
     return str(value) if isinstance(value, Path) else value
 
 
@@ -97,10 +97,10 @@ def as_command(verb: str, study: Study) -> str:
     from_file = ["mauvecl", verb, STUDY_FILE]
     if any(file is not None for file in (study.flare.spectrum.file, *(star.file for star in study.star))):
         return shlex.join(from_file)
-    one = VERBS[verb]
-    base = Study().with_settings([f"{key}={value}" for key, value in (one.defaults or {}).items()])
+    question = VERBS[verb]
+    base = Study().with_settings([f"{key}={value}" for key, value in (question.defaults or {}).items()])
     words = ["mauvecl", verb]
-    for name, value in keys_used(one, study, base):
+    for name, value in keys_used(question, study, base):
         if name == "data.file":
             words.insert(2, value)
         elif name == "star":
@@ -108,7 +108,7 @@ def as_command(verb: str, study: Study) -> str:
         elif name == "sky":
             words += _sky_words(value)
         else:
-            words += _flag_words(name, value, one) or ["--set", f"{name}={_toml(value)}"]
+            words += _flag_words(name, value, question) or ["--set", f"{name}={_toml(value)}"]
     long = any(len(word) > MOST_CHARACTERS for word in words)
     return shlex.join(from_file if long else words)
 
@@ -138,8 +138,8 @@ def _flag_words(name: str, value: Any, verb: Verb) -> list[str]:
             return [flag.names[0], ":".join(spaced + ["log"] * value.get("log", False))]
         if flag.read in (None, parsing.words) and flag.kind in (None, str, list[str]):
             values = value if isinstance(value, list) else [value]
-            if all(isinstance(one, str | int | float) for one in values):
-                return [word for one in values for word in (flag.names[0], _text(one))]
+            if all(isinstance(item, str | int | float) for item in values):
+                return [word for item in values for word in (flag.names[0], _text(item))]
     return []
 
 
@@ -172,7 +172,7 @@ def _key(key: str) -> str:
 def _toml(value: Any) -> str:
     """Return a value as TOML on one line."""
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{_key(key)} = {_toml(one)}" for key, one in value.items()) + "}"
+        return "{" + ", ".join(f"{_key(key)} = {_toml(item)}" for key, item in value.items()) + "}"
     if isinstance(value, list):
         return f"[{', '.join(map(_toml, value))}]"
     return json.dumps(value, ensure_ascii=False)
@@ -210,7 +210,7 @@ def visitor_files(study: Study) -> dict[tuple[str, ...], Path]:
 def observation_files(study: Study) -> list[Path]:
     """Return the visitor's files that the observations of a calibration name, without duplicates."""
     rows = study.calibrate.observations
-    every = (getattr(one, key) for one in rows for key in PATHS)
+    every = (getattr(row, key) for row in rows for key in PATHS)
     return list(dict.fromkeys(file for file in every if file is not None))
 
 
@@ -240,7 +240,7 @@ def as_file(tab: Tab, name: str, ending: str, closed: ClosedForms, answers: Answ
 
 def commands_and_programs(tab: Tab, question: Question, folder: Path) -> list[dict[str, str]]:
     """Return each of a tab's `questions` as a command and as a Python program; `folder` holds the visitor's files."""
-    found = []
+    entries = []
     for name in tab.questions:
         verb, study = asked(name, question.study(folder))
         for place, file in visitor_files(study).items():
@@ -248,13 +248,13 @@ def commands_and_programs(tab: Tab, question: Question, folder: Path) -> list[di
             study = study.with_value(place, Path(file.name))
         if rows := placed(study.calibrate.observations, lambda file: file.name):
             study = study.with_changes({"calibrate": {"observations": rows}}, None, "page")
-        found.append({"question": name, "command": as_command(verb, study), "python": as_program(verb, study)})
-    return found
+        entries.append({"question": name, "command": as_command(verb, study), "python": as_program(verb, study)})
+    return entries
 
 
 def asked_study(name: str, study: Study) -> tuple[str, bytes]:
     """Return the study file of one of a tab's `questions`; raises InputError for any other name."""
-    if name not in {one for tab in TABS.values() for one in tab.questions}:
+    if name not in {question for tab in TABS.values() for question in tab.questions}:
         raise InputError(f"no tab asks {name[:40]!r}", "a question of a tab", key="name")
     _, wanted = asked(name, study)
     return study_file(wanted, "study")

@@ -146,12 +146,12 @@ def day(text: str) -> str:
 
     expected = f"a day such as 2027-01-31, from {YEARS[0]} to {YEARS[1] - 1}"
     try:
-        found = datetime.date.fromisoformat(text.strip())
+        date = datetime.date.fromisoformat(text.strip())
     except ValueError:
         raise InputError(f"{shortened(text)} is not a day", expected, key="start") from None
-    if not YEARS[0] <= found.year < YEARS[1]:
-        raise InputError(f"{found} is out of range", expected, key="start")
-    return found.isoformat()
+    if not YEARS[0] <= date.year < YEARS[1]:
+        raise InputError(f"{date} is out of range", expected, key="start")
+    return date.isoformat()
 
 
 def targets(text: str, *, check: bool = True) -> tuple[dict[str, Any], ...]:
@@ -275,7 +275,7 @@ def _reader(field: FieldInfo, widget: Widget, unit: str, *, optional: bool) -> C
     flag = first(field, Flag)
     if flag is not None and flag.kind == list[str] and flag.read is not None:
         read = flag.read
-        return lambda text: tuple(read([one for one in text.split(",") if one.strip()], widget.label))
+        return lambda text: tuple(read([word for word in text.split(",") if word.strip()], widget.label))
     reach = first(field, Range)
     if reach is None:
         return (lambda text: text.strip() or None) if optional else str
@@ -306,7 +306,7 @@ _OWN_FIELDS = {
     ),
     "statistic": Field(
         label="Detection statistic", first="matched", read=Choice(tuple(STATISTICS)),
-        hint="; ".join(f"{name}: {one.definition}" for name, one in STATISTICS.items()) + ".",
+        hint="; ".join(f"{name}: {statistic.definition}" for name, statistic in STATISTICS.items()) + ".",
         group="Detection", place=1, own_keys=("run.statistics",),
     ),
     "unknown": Field(
@@ -417,7 +417,7 @@ def _fields() -> dict[str, str]:
 def _flags() -> dict[str, str]:
     """Return the field of each flag whose key has one."""
     names = {".".join(field.path): name for name, field in FIELDS.items() if field.path}
-    return {flag: names[key] for key, _, one in keys_with_flags() if key in names for flag in one.names}
+    return {flag: names[key] for key, _, option in keys_with_flags() if key in names for flag in option.names}
 
 
 def field_of(key: str | None) -> str | None:
@@ -428,29 +428,29 @@ def field_of(key: str | None) -> str | None:
 def sentence(error: InputError, keys: Mapping[str, str] = NO_KEYS) -> str:
     """Return the message of an error as the page shows it; `keys` maps other names of its keys to fields."""
     text = _VALUE.sub(
-        lambda found: f"{_label(found['key'], keys)} {'is empty' if found['empty'] else '= '}", str(error)
+        lambda match: f"{_label(match['key'], keys)} {'is empty' if match['empty'] else '= '}", str(error)
     )
     return note(text.removeprefix("page: "), keys)
 
 
 def note(text: str, keys: Mapping[str, str] = NO_KEYS) -> str:
     """Return a message with the labels of fields in place of keys and flags."""
-    text = _FLAG.sub(lambda found: f"“{FIELDS[_flags()[found[0]]].label}”" if found[0] in _flags() else found[0], text)
-    text = _REMEDY.sub(lambda found: _remedy(found, keys), text)
-    return _KEY.sub(lambda found: _label(found[0], keys), text)
+    text = _FLAG.sub(lambda match: f"“{FIELDS[_flags()[match[0]]].label}”" if match[0] in _flags() else match[0], text)
+    text = _REMEDY.sub(lambda match: _remedy(match, keys), text)
+    return _KEY.sub(lambda match: _label(match[0], keys), text)
 
 
-def _remedy(found: re.Match[str], keys: Mapping[str, str]) -> str:
-    label = _label(found["key"], keys)
-    if label == found["key"]:
+def _remedy(match: re.Match[str], keys: Mapping[str, str]) -> str:
+    label = _label(match["key"], keys)
+    if label == match["key"]:
         return label
-    return f"{label} {found['value']}" if found["value"] else f"“{label}”"
+    return f"{label} {match['value']}" if match["value"] else f"“{label}”"
 
 
 def remedies(error: InputError, keys: Mapping[str, str] = NO_KEYS) -> list[tuple[str, str]]:
     """Return the values that a message proposes for fields, as pairs of field and text."""
     each = _REMEDY.finditer(str(error))
-    named = ((field_of(keys.get(found["key"], found["key"])), found["value"]) for found in each)
+    named = ((field_of(keys.get(match["key"], match["key"])), match["value"]) for match in each)
     return [(name, value) for name, value in named if name is not None and value]
 
 

@@ -83,13 +83,13 @@ class Canvas:
         self.legend: list[tuple[str, str, str, str]] = []
         if chart.x.kind == "wavelength":
             self._mark()
-        own = [one for one in chart.series if isinstance(one, Own)]
-        for series in (*(one for one in chart.series if one not in own), *self._pins(), *own):
+        own = [item for item in chart.series if isinstance(item, Own)]
+        for series in (*(item for item in chart.series if item not in own), *self._pins(), *own):
             self._add(series)
 
     def _frame(self, x: Axis, y: Axis) -> Any:
         """Return a figure with axes only."""
-        ranges = {f"{name}_range": one for name, axis in (("x", x), ("y", y)) if (one := self._range(name, axis))}
+        ranges = {f"{name}_range": bounds for name, axis in (("x", x), ("y", y)) if (bounds := self._range(name, axis))}
         plot = figure(
             x_axis_label=x.label,
             y_axis_label=y.label,
@@ -153,12 +153,12 @@ class Canvas:
 
     def _pins(self) -> list[Series]:
         """Return a line for each scenario that can be pinned, drawn as the series that it repeats."""
-        repeated = [one for one in self.chart.series if one.key == self.chart.pins]
+        repeated = [item for item in self.chart.series if item.key == self.chart.pins]
         looks = enumerate(self.pins)
         return [
-            replace(one, called=f"pinned {k + 1}", name=f"pin {k}", colour=colour, dash=dash, width=2.0, show="pins",
+            replace(item, called=f"pinned {k + 1}", name=f"pin {k}", colour=colour, dash=dash, width=2.0, show="pins",
                     tips=(), listed=False)
-            for k, (colour, dash) in looks for one in repeated
+            for k, (colour, dash) in looks for item in repeated
         ]  # fmt: skip
 
     def _add(self, series: Series) -> None:

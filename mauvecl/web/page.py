@@ -40,7 +40,7 @@ def card(closed: ClosedForms, answers: Answers) -> dict[str, Any]:
     """
     q, x = closed.question, closed.quiet
     cut, both = closed.odds.threshold, chances(closed, answers)
-    (chosen,) = (one for one in both if one.unknown == q.unknown)
+    (chosen,) = (chance for chance in both if chance.unknown == q.unknown)
     facts = []
     if "detection" in answers:
         (row,) = (row for row in answers["detection"].table if row["statistic"] == q.statistic)
@@ -58,7 +58,7 @@ def card(closed: ClosedForms, answers: Answers) -> dict[str, Any]:
     )
     return {
         "headline": True,
-        "numbers": [one.shown for one in both],
+        "numbers": [chance.shown for chance in both],
         "chosen": q.unknown,
         "shown": percent(chosen.value),
         "interval": f"{TITLES[q.unknown]}; {chosen.how}",
@@ -274,8 +274,8 @@ def _target(row: dict[str, Any]) -> dict[str, str]:
     except InputError as error:
         return {"fault": sentence(error)}
     facts = {"spectral_type": star.spectral_type, "V": star.magnitude, "distance_pc": star.distance_pc}
-    found = {
+    target = {
         key: "" if value is None else f"{value:g}" if isinstance(value, float) else value
         for key, value in facts.items()
     }
-    return found | {"coordinates": f"{star.ra_deg:.3f} {star.dec_deg:+.3f}", "about": star.source}
+    return target | {"coordinates": f"{star.ra_deg:.3f} {star.dec_deg:+.3f}", "about": star.source}

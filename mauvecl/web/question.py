@@ -80,8 +80,8 @@ class Question:
         """Return the question as the data of a study, whose files are written to a folder."""
         values = self.values
         data: dict[str, Any] = {}
-        for name, one in FIELDS.items():
-            if one.path and name not in CONDITIONAL:
+        for name, page_field in FIELDS.items():
+            if page_field.path and name not in CONDITIONAL:
                 self._set_valid(data, name, folder)
         data["star"] = [self._star(data["star"], folder)]
         data["sky"] = {
@@ -124,24 +124,26 @@ class Question:
 
     def _set_valid(self, data: dict[str, Any], name: str, folder: Path | None) -> None:
         """Set the key of a field in the data of a study, in place, unless it is empty; its file goes to a folder."""
-        one, value = FIELDS[name], self.values[name]
-        if one.kind in ("file", "upload"):
+        page_field, value = FIELDS[name], self.values[name]
+        if page_field.kind in ("file", "upload"):
             if folder is None or name not in self.uploads:
                 return
             upload = self.uploads[name]
-            written = write_spectrum(upload, folder, SPECTRA[name]) if one.kind == "file" else upload.written(folder)
+            written = (
+                write_spectrum(upload, folder, SPECTRA[name]) if page_field.kind == "file" else upload.written(folder)
+            )
             value = str(written) if isinstance(written, Path) else written
         if value is not None:
-            self._set(data, one, value)
+            self._set(data, page_field, value)
 
     @staticmethod
-    def _set(data: dict[str, Any], one: Field, value: Any) -> None:
+    def _set(data: dict[str, Any], target: Field, value: Any) -> None:
         """Set the key of a field in the data of a study, in place."""
-        *sections, key = one.path
+        *sections, key = target.path
         for section in sections:
             data = data.setdefault(section, {})
-        if one.scale != 1.0:
-            value = value / one.scale
+        if target.scale != 1.0:
+            value = value / target.scale
         # A single flare.
         data[key] = [value] if key == "amplitudes" else value
 

@@ -155,8 +155,8 @@ def _main() -> int:
     try:
         module, names = READERS[asked["reader"]]
         read: Any = attrgetter(names)(import_module(module))
-        found = read(Path(asked["file"]), **asked["options"])
-        values = {field.name: getattr(found, field.name) for field in fields(found)}
+        content = read(Path(asked["file"]), **asked["options"])
+        values = {field.name: getattr(content, field.name) for field in fields(content)}
         arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
         rest = json.dumps({name: value for name, value in values.items() if name not in arrays})
         out = io.BytesIO()

@@ -61,10 +61,12 @@ def local(address: str) -> bool:
     if not address.strip():
         raise InputError("address = '' is empty", "an address such as 127.0.0.1, ::1 or 0.0.0.0", key="address")
     try:
-        known = {str(info[4][0]).split("%")[0] for info in socket.getaddrinfo(address, None, type=socket.SOCK_STREAM)}
+        addresses = {
+            str(info[4][0]).split("%")[0] for info in socket.getaddrinfo(address, None, type=socket.SOCK_STREAM)
+        }
     except (OSError, UnicodeError) as error:
         raise InputError.of("address", address, "one such as 127.0.0.1") from error
-    return all(ipaddress.ip_address(one).is_loopback for one in known)
+    return all(ipaddress.ip_address(address).is_loopback for address in addresses)
 
 
 def netloc(address: str, port: int) -> str:
@@ -101,7 +103,7 @@ def hosts(address: str, port: int, allowed: Iterable[str]) -> frozenset[str]:
             key="address",
         )
     own = {"127.0.0.1", "localhost", "::1"} | ({address} if local(address) else set())
-    return frozenset(plain(netloc(one, port)) for one in own) | named
+    return frozenset(plain(netloc(host, port)) for host in own) | named
 
 
 class RefusalHandler(RequestHandler):
@@ -166,10 +168,10 @@ class BoundedServer(HTTPServer):
 
     def handle_stream(self, stream: IOStream, address: tuple[Any, ...]) -> None:
         """Serve a new connection."""
-        self._streams = [one for one in self._streams if not one.closed()]
+        self._streams = [stream for stream in self._streams if not stream.closed()]
         if len(self._streams) >= self.max_connections:
             pages = {id(page.ws_connection.stream) for page in Visitor.here if page.ws_connection is not None}
-            oldest = next((one for one in self._streams if id(one) not in pages), stream)
+            oldest = next((other for other in self._streams if id(other) not in pages), stream)
             oldest.close()
             if oldest is stream:
                 return
@@ -202,7 +204,7 @@ def _line(text: str) -> str:
 def _where(error: BaseException) -> str:
     """Return modules and lines of a traceback: those of mauvecl, or the last one."""
     frames = [(frame.f_globals.get("__name__", "?"), line) for frame, line in traceback.walk_tb(error.__traceback__)]
-    ours = [one for one in frames if one[0].startswith("mauvecl.")] or frames[-1:]
+    ours = [frame for frame in frames if frame[0].startswith("mauvecl.")] or frames[-1:]
     return ", ".join(f"{name} line {line}" for name, line in ours)
 
 
@@ -272,9 +274,9 @@ def close_unused() -> None:
         reading(release_memory)
 
     now = time.monotonic()
-    for one in list(Visitor.here):
-        if now - one.used > IDLE_S and one.job is None:
-            one.close(UNUSED, "not used for a long time")
+    for visitor in list(Visitor.here):
+        if now - visitor.used > IDLE_S and visitor.job is None:
+            visitor.close(UNUSED, "not used for a long time")
 
 
 def warm() -> None:
@@ -313,8 +315,8 @@ def serve(address: str, port: int, *, show: bool = False, allow_origin: Sequence
             await asyncio.Event().wait()
         finally:
             # Simulations would keep the process until they end.
-            for one in list(Visitor.here):
-                one.on_close()
+            for visitor in list(Visitor.here):
+                visitor.on_close()
 
     install()
     limit_arenas()
@@ -403,12 +405,12 @@ def _words() -> dict[str, Any]:
         "example": "AU Mic\nYZ CMi\neps Eri",
         "asks": {name: sorted(reads_of(name)) for name in SIMULATIONS},
         "uploads": {
-            name: {"entered": one.entered, "options": list(one.options.values()), "most": one.most}
-            for name, one in UPLOADS.items()
+            name: {"entered": upload.entered, "options": list(upload.options.values()), "most": upload.most}
+            for name, upload in UPLOADS.items()
         },
         "withFile": fields.WITH_FILE,
         "columns": sorted({*KNOWN}),
-        "needs": {name: one.needs for name, one in SIMULATIONS.items() if one.needs},
+        "needs": {name: simulation.needs for name, simulation in SIMULATIONS.items() if simulation.needs},
         "under": fields.ASKED_UNDER,
         "presets": fields.PRESETS,
         "seen": {name: field.first for name, field in SEEN.items()},

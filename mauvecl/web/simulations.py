@@ -79,9 +79,9 @@ class Simulation:
         if counted > 1:
             pool.expect(counted * asked.run.realisations)
         answers: dict[str, Any] = {}
-        for name, verb, one in wanted:
+        for name, verb, question in wanted:
             try:
-                answers[name] = VERBS[verb].ask(one, pool, progress, **(given or {} if verb == main else {}))
+                answers[name] = VERBS[verb].ask(question, pool, progress, **(given or {} if verb == main else {}))
             except InputError:
                 if name not in self.others:
                     raise
@@ -119,8 +119,8 @@ def asked(name: str, study: Study) -> tuple[str, Study]:
     """Return the verb of a simulation, or the verb of that name, with its study derived from the page's."""
     if name not in SIMULATIONS:
         return name, study
-    one = SIMULATIONS[name]
-    return next(iter(one.verbs.values())), one.asked(study)
+    simulation = SIMULATIONS[name]
+    return next(iter(simulation.verbs.values())), simulation.asked(study)
 
 
 def verbs_of(name: str) -> tuple[str, ...]:

@@ -184,7 +184,7 @@ def observations_in(files: Mapping[str, bytes]) -> tuple[CalibrationObservation,
 
     Raises InputError unless exactly one file is such a study, and the archive contains all files that it names.
     """
-    studies = [rows for name, one in files.items() if name.endswith(".toml") and (rows := _observations(name, one))]
+    studies = [rows for name, file in files.items() if name.endswith(".toml") and (rows := _observations(name, file))]
     if len(studies) != 1:
         raise InputError(
             f"{len(studies)} files of the archive list observations", "one TOML file with [[calibrate.observations]]",
@@ -339,7 +339,11 @@ UPLOADS: Mapping[str, Upload] = {
     "flare_quiescent": Upload(_quiescent, options=_options("wavelength_unit", "flux_unit", prefix="flare_")),
     "change_file": Upload(_added, options=_options("wavelength_unit", "flux_unit", "extend", prefix="change_")),
     "own_unknown": Upload(read_pairs, UPLOADED_UNKNOWN, most=MOST_PAIRS_BYTES),
-    **{name: Upload(VisitorFile.of, most=MOST_KEPT_BYTES) for name, one in FIELDS.items() if one.kind == "upload"},
+    **{
+        name: Upload(VisitorFile.of, most=MOST_KEPT_BYTES)
+        for name, page_field in FIELDS.items()
+        if page_field.kind == "upload"
+    },
     "observations": Upload(Observations.of, most=MOST_KEPT_BYTES),
 }
 
@@ -397,8 +401,8 @@ class Shelf:
                 oldest = next(iter(self._held))
                 gone.append(self._held[oldest][1])
                 self._remove(oldest)
-        for one in gone:
-            one()
+        for release in gone:
+            release()
 
     def used(self, owner: object, key: Hashable) -> None:
         """Note that a value was used."""
@@ -428,12 +432,12 @@ def size_of(value: object) -> int:
     while waiting and len(seen) < MOST_OBJECTS:
         # The oldest first, so that the top is counted before the details.
         level, waiting = waiting, []
-        for one in level:
-            if id(one) in seen or isinstance(one, PROGRAM):
+        for item in level:
+            if id(item) in seen or isinstance(item, PROGRAM):
                 continue
-            seen.add(id(one))
-            size += sys.getsizeof(one, 0)
-            waiting += gc.get_referents(one)
-            if isinstance(one, np.ndarray) and one.base is not None:
-                waiting.append(one.base)
+            seen.add(id(item))
+            size += sys.getsizeof(item, 0)
+            waiting += gc.get_referents(item)
+            if isinstance(item, np.ndarray) and item.base is not None:
+                waiting.append(item.base)
     return size

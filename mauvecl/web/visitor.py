@@ -360,12 +360,12 @@ class Visitor(WebSocketHandler):
 
     def answers(self, state: State) -> dict[str, Any]:
         """Return the simulated answers that hold for a question, by name."""
-        found: dict[str, Any] = {}
+        valid: dict[str, Any] = {}
         for (simulation, key), answers in list(self._answers.items()):
             if key == self._key(state, reads_of(simulation)):
-                found |= answers
+                valid |= answers
                 RESULTS.used(self, (simulation, key))
-        return found
+        return valid
 
     def _key(self, state: State, names: frozenset[str]) -> tuple[Any, ...]:
         """Return everything on which an answer to some fields depends."""
@@ -524,7 +524,7 @@ class Visitor(WebSocketHandler):
         self._uploads.pop(field, None)
         state = self.state(asked["link"])
         names = tuple(upload.options.values())
-        options = tuple(state.entered[one] for one in names)
+        options = tuple(state.entered[name] for name in names)
         self._digests[field] = hashlib.sha256(content + repr(options).encode()).hexdigest()
 
         def came(future: Future[Any]) -> None:
@@ -532,7 +532,7 @@ class Visitor(WebSocketHandler):
                 self._uploads[field] = future.result()
                 UPLOADED.keep(self, field, self._uploads[field], partial(self._uploads.pop, field, None))
             except InputError as error:
-                proposed = [one for one in remedies(error, upload.options) if one[0] in names]
+                proposed = [remedy for remedy in remedies(error, upload.options) if remedy[0] in names]
                 self.send(n=n, field=field, lacks=sentence(error, upload.options), remedies=proposed)
             except Exception as error:
                 log.exception("an upload failed")
@@ -557,7 +557,7 @@ class Visitor(WebSocketHandler):
     def file(self, state: State, tab: str, name: str, ending: str) -> tuple[str, bytes]:
         """Send a table or study of the question; the last ones are cached."""
         # The page asks for the study of a question by its name alone.
-        front = TABS.get(tab) or next((one for one in TABS.values() if name in one.questions), tab_of(tab))
+        front = TABS.get(tab) or next((other for other in TABS.values() if name in other.questions), tab_of(tab))
         # A simulation asks what its own answers depend on, which their tables state.
         reads = reads_of(name) if tab not in TABS and name in SIMULATIONS else front.reads
         answers = self.answers(state)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import random
@@ -293,6 +294,34 @@ def test_full_or_read_only_file_system_raises(small_disk: Path, painted: dict[st
     subprocess.run(["mount", "-o", "remount,rw", small_disk], check=True)
     bulk.realise(study(1000), path, Painter())  # type: ignore[arg-type]
     assert tree(path) == painted
+
+
+def test_no_chunk_is_being_written_when_a_stopped_run_has_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Stop after the first chunk, while threads write others: the store stays locked until they have ended."""
+    write, is_locked = Store.write, list[bool]()
+
+    def slow(store: Store, chunk: Any, rows: Any) -> None:
+        time.sleep(0.2)
+        write(store, chunk, rows)
+        folder = os.open(store.path, os.O_RDONLY)
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            is_locked.append(False)
+        except BlockingIOError:
+            is_locked.append(True)
+        os.close(folder)
+
+    def stop(done: int, total: int) -> None:
+        if done:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(Store, "write", slow)
+    with pytest.raises(KeyboardInterrupt):
+        bulk.realise(study(1000), tmp_path / "frames.zarr", Painter(), progress=stop)  # type: ignore[arg-type]
+    assert all(is_locked)
+    assert len(is_locked) == len(Store.open(tmp_path / "frames.zarr").digests) > 4
 
 
 def test_store_stopped_by_progress_is_resumed(tmp_path: Path, painted: dict[str, bytes]) -> None:

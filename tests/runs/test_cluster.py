@@ -128,13 +128,13 @@ def test_strangers_cannot_connect(workers: DaskWorkers) -> None:
 
 def test_error_on_a_worker_raises(workers: DaskWorkers) -> None:
     """Check that errors which another try would not mend are raised at once."""
-    before = workers.retries
+    pool = Pool(workers)
     (bright,) = star(magnitude=-0.7, payload=instrument(part=True))
     with pytest.raises(DeviceError) as error:
-        Pool(workers).realise(bright, start=0, count=10, seed=1, mode="stacked")
+        pool.realise(bright, start=0, count=10, seed=1, mode="stacked")
     assert error.value.kind == "failed"
     assert "realisations 0 to 9: mode = 'stacked'" in str(error.value)
-    assert workers.retries == before
+    assert pool.standing.retries == 0
 
 
 class Silent:
@@ -295,7 +295,7 @@ def test_shards_of_workers_with_other_code_are_drawn_again(
             workers._client.wait_for_workers(2, timeout=60)
             found = pool.detect(quiet, flares, realisations=n, seed=6)
             assert len(workers._strangers) == 1
-            assert workers.retries >= 1
+            assert pool.standing.retries >= 1
         finally:
             other.terminate()
             other.wait(20)
@@ -363,6 +363,9 @@ class Leaves:
     status = "finished"
     asked = 0
 
+    def add_done_callback(self, came: Callable[[Any], None]) -> None:
+        threading.Thread(target=came, args=(self,)).start()
+
     def result(self, timeout: float) -> None:
         self.asked += 1
         self.status = "finished" if self.asked < 3 else "lost"
@@ -383,25 +386,23 @@ def test_end_during_a_transfer_is_noticed(
     """Send a shard again whose worker leaves with its result, and report a scheduler that is lost."""
     with by_hand(tmp_path) as (_, file):
         workers = DaskWorkers(str(file))
-        send, given = workers._send, list[Leaves]()
+        submit, pool, given = workers._client.submit, Pool(workers), list[Leaves]()
 
-        def lose_the_first(attempt: Any) -> None:
-            if given:
-                send(attempt)
-                return
+        def lose_the_first(work: Any, *arguments: Any, **how: Any) -> Any:
+            if work.__name__ != "_count" or given:
+                return submit(work, *arguments, **how)
             given.append(kind())
-            workers._sent[given[0]] = attempt  # type: ignore[index]
-            threading.Thread(target=workers._came, args=(attempt, given[0])).start()
+            return given[0]
 
-        workers._send = lose_the_first  # type: ignore[method-assign]
+        workers._client.submit = lose_the_first
         if kind is Leaves:
-            found = Pool(workers).detect(scene[0], scene[1:], realisations=N, seed=1)
+            found = pool.detect(scene[0], scene[1:], realisations=N, seed=1)
             assert given[0].asked == 3
-            assert workers.retries == 1
+            assert pool.standing.retries == 1
             same(found, engine.detect(scene[0], scene[1:], realisations=N, seed=1))
         else:
             with pytest.raises(DeviceError) as error:
-                Pool(workers).detect(scene[0], scene[1:], realisations=N, seed=1)
+                pool.detect(scene[0], scene[1:], realisations=N, seed=1)
             assert error.value.kind == "lost"
         workers.close()
 

@@ -197,7 +197,7 @@ def test_device_that_always_fails_raises(engine: Engine, scene: list[Expectation
     with pytest.raises(DeviceError) as error:
         pool.detect(quiet, flares, realisations=N, seed=5)
     assert error.value.kind == "failed"
-    assert "3 times at realisations 0 to 4095 " in str(error.value)
+    assert "realisations 0 to 4095 failed 8 times" in str(error.value)
     assert "OUT_OF_RESOURCES" in str(error.value)
 
 

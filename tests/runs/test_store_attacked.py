@@ -197,7 +197,7 @@ def test_store_larger_than_any_disk_raises(tmp_path: Path, monkeypatch: pytest.M
         (path / name).parent.mkdir(parents=True, exist_ok=True)
         (path / name).write_bytes(content)
     first = next(vast.chunks())
-    vast.note(first, vast.place(first, bulk.draw(asked, first.scene, PAINTER, 0, first.stop)))
+    vast.write(first, bulk.draw(asked, first.scene, PAINTER, 0, first.stop))
     for repair in (False, True):
         with refused("rows", "1", "100000"):
             bulk.verify(path, PAINTER, repair=repair)

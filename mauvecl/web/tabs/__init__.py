@@ -14,8 +14,8 @@ from mauvecl.web.tabs.tab import Compare, Tab
 
 #: Tabs with pictures, in the order of the page.
 DRAWN: dict[str, Tab] = {
-    one.name: one
-    for one in (
+    tab.name: tab
+    for tab in (
         Detection(),
         Spectrum(),
         Signal(),

@@ -56,10 +56,10 @@ def throughput(closed: ClosedForms, answer: CalibrateAnswer) -> ChartData:
 ).data("calibrate", NO_FILES)  # fmt: skip
 def residuals(closed: ClosedForms, answer: CalibrateAnswer) -> ChartData:
     """Return the residuals of each star."""
-    found = residual_series(answer)
-    words = "; ".join(f"{name} {np.sqrt(np.mean(row**2)):.2f}" for name, _, row in found)
+    rows = residual_series(answer)
+    words = "; ".join(f"{name} {np.sqrt(np.mean(row**2)):.2f}" for name, _, row in rows)
     text = f"Root mean square, 1 for noise alone: {words}; p = {answer.throughput.p_value:.2g}."
-    return ChartData(text, {"residual": found})
+    return ChartData(text, {"residual": rows})
 
 
 @TRANSFER.data("calibrate", NO_FILES)
@@ -92,21 +92,21 @@ class Calibrate(Tab):
         archive: Observations = question.uploads["observations"]
         files = {name: VisitorFile(name, content) for name, content in archive.files.items()}
         frames, stars = [], []
-        for one in archive.rows:
-            mapping = files[str(one.mapping)] if one.mapping else None
-            frames.append(read_frames_of(files[str(one.frames)], mapping, "observations"))
+        for row in archive.rows:
+            mapping = files[str(row.mapping)] if row.mapping else None
+            frames.append(read_frames_of(files[str(row.frames)], mapping, "observations"))
             if sum(some.flux.size for some in frames) > MOST_VALUES:
                 raise InputError(
                     "the archive holds more raw values than are read here",
                     f"{MOST_VALUES}, or the command line",
                     key="observations",
                 )
-            if one.spectrum is None:
-                stars.append(one.source())
+            if row.spectrum is None:
+                stars.append(row.source())
                 continue
-            with reported_for("observations", str(one.spectrum)):
-                star = read_limited(files[str(one.spectrum)].content, Source)
-            stars.append(star if one.magnitude is None else star.at_magnitude(one.magnitude, one.band))
+            with reported_for("observations", str(row.spectrum)):
+                star = read_limited(files[str(row.spectrum)].content, Source)
+            stars.append(star if row.magnitude is None else star.at_magnitude(row.magnitude, row.band))
         return {"frames": tuple(frames), "stars": tuple(stars)}
 
     def words(self, question: Question) -> str:
@@ -119,10 +119,10 @@ def _against_magnitude(name: str, title: str, label: str, units: Mapping[str, fl
 
     def along(closed: ClosedForms, answer: ChangeAnswer) -> ChartData:
         here = [row for row in answer.changes if row.change.unit in units]
-        found, words, own = [], list[str](), list[float]()
+        lines, words, own = [], list[str](), list[float]()
         for row in here:
             change, scale = row.change.name, units[row.change.unit]
-            found += along_magnitude(answer, [change], scale)
+            lines += along_magnitude(answer, [change], scale)
             hidden = np.isinf(row.smallest.one)
             words.append(f"{change} {'hidden' if hidden else f'{scale * row.smallest.one:.3g}'}")
             own += [] if hidden else [scale * row.smallest.one]
@@ -130,7 +130,7 @@ def _against_magnitude(name: str, title: str, label: str, units: Mapping[str, fl
             f"Smallest changes between {answer.study.change.visits} visits, in {label}: "
             f"{'; '.join(words) or 'none of this kind'}."
         )
-        return ChartData(text, {name: found, "own": ([closed.question.magnitude] * len(own), own)})
+        return ChartData(text, {name: lines, "own": ([closed.question.magnitude] * len(own), own)})
 
     axis, lines = Axis(f"smallest change ({label})", log=True), (Targets(name, tips=(label,)), Own("this star"))
     chart = Chart(name, title, Axis("magnitude"), axis, lines, sets="magnitude=x")
@@ -179,8 +179,8 @@ def recovered_periods(closed: ClosedForms, answer: ChangeAnswer) -> ChartData:
     wide, high = (np.sqrt(points[1] / points[0]) for points in (r.periods_d, r.amplitudes))
     share = row.shares("value").ravel()
     errors = "; ".join(
-        f"{one.change.name} {(one.error if one.change.unit else 100 * one.error):.3g} {one.change.unit or '%'}"
-        for one in answer.periods
+        f"{row.change.name} {(row.error if row.change.unit else 100 * row.error):.3g} {row.change.unit or '%'}"
+        for row in answer.periods
     )
     text = (
         f"{r.time_d.size} visits within {np.ptp(r.time_d):.0f} days recover {100 * np.mean(share):.0f} % of the "

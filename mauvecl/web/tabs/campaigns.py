@@ -29,13 +29,13 @@ def _energy(value: Any) -> str:
 
 def _columns(answer: PlanAnswer) -> list[tuple[str, Any, Any, Any]]:
     """Return name, energies, recovered fraction at each, and flares above each in the campaign, of seen targets."""
-    found, table = [], answer.by_energy
+    columns, table = [], answer.by_energy
     for star in answer.planned:
         # Beyond the pictures' ends there is nothing to see.
         rows = table[(np.asarray(table["target"]) == star.name) & (table["energy"].to_value("erg") <= ENERGIES[1])]
         above = np.asarray(rows["rate_above"].to_value("1 / h") * star.hours, float)
-        found.append((star.name, rows["energy"].to_value("erg"), np.asarray(rows["recovered"], float), above))
-    return found
+        columns.append((star.name, rows["energy"].to_value("erg"), np.asarray(rows["recovered"], float), above))
+    return columns
 
 
 ENERGY = Axis("bolometric energy of the flare (erg)", log=True, limits=ENERGIES)
@@ -62,16 +62,16 @@ def recovered(closed: ClosedForms, answer: PlanAnswer) -> ChartData:
 ).data("plan", "The number of flares expected to be found on each target.")  # fmt: skip
 def expected(closed: ClosedForms, answer: PlanAnswer) -> ChartData:
     """Return the numbers of recovered flares above an energy."""
-    found, parts = [], []
+    lines, parts = [], []
     for row, (name, energy, recovered, above) in zip(answer.table, _columns(answer), strict=True):
         # Each step of the rate is recovered as at its middle.
         steps = (above[:-1] - above[1:]) * (recovered[:-1] + recovered[1:]) / 2
         flares = np.append(np.cumsum(steps[::-1])[::-1], 0.0) + (above[-1] * recovered[-1] if above.size else 0.0)
-        found.append((name, energy, np.where(flares > 0, flares, np.nan)[: energy.size]))
+        lines.append((name, energy, np.where(flares > 0, flares, np.nan)[: energy.size]))
         number = f"{row['expected']:.3g} flares" if np.isfinite(row["expected"]) else "no rates are known"
         seen = f"{row['target']} in {short(row['hours'].value)} h: {number}"
         parts.append(seen if row["seen"] > 0 else f"{row['target']} is never seen")
-    return ChartData(f"Expected to be recovered: {'; '.join(parts)}.", {"found": found})
+    return ChartData(f"Expected to be recovered: {'; '.join(parts)}.", {"found": lines})
 
 
 class Plan(Tab):
@@ -113,17 +113,17 @@ def hours(closed: ClosedForms, answers: Answers) -> ChartData:
         text = "For each target, how many hours of each day it is seen."
         return ChartData(text, {"hours": [(name, [], []) for name in names]})
     table = answers["seen"]["by_day"]
-    found, parts = [], []
+    lines, parts = [], []
     for name in names:
         hours = np.asarray(table[np.asarray(table["target"]) == name]["hours"].to_value("h"))
         # Milliseconds, as browsers count time.
         days = (np.datetime64(question.start, "ms") + np.arange(hours.size) * np.timedelta64(1, "D")).astype(float)
-        found.append((name, days, hours))
+        lines.append((name, days, hours))
         parts.append(
             f"{name} on {np.count_nonzero(hours)} of {hours.size} days, {short(float(hours.sum()))} h in all and "
             f"{hours.max():.3g} h on its best day"
         )
-    return ChartData(f"From {question.start} on are seen: {'; '.join(parts)}.", {"hours": found})
+    return ChartData(f"From {question.start} on are seen: {'; '.join(parts)}.", {"hours": lines})
 
 
 class Visibility(Tab):

@@ -172,12 +172,12 @@ def costs(closed: ClosedForms) -> tuple[float, list[Row]]:
     chosen["all the usual together"] = NuisanceChoice(usual=True)
     if closed.study.nuisances.own:
         chosen["your own spectrum"] = NuisanceChoice(own=closed.study.nuisances.own)
-    rows, known = list[Row](), 0.0
+    rows, known_snr = list[Row](), 0.0
     for name, choice in chosen.items():
         cost = unknown_cost(name, closed.quiet, closed.flare, choice, closed.study.run.comparison())
-        known = cost.known or known
+        known_snr = cost.known or known_snr
         rows.append((name, cost.plain, cost.marginal))
-    return known, rows
+    return known_snr, rows
 
 
 def _spread(row: Nuisance) -> float | str:
@@ -203,14 +203,14 @@ def _bars(canvas: Canvas, source: ColumnDataSource) -> None:
 ).data()  # fmt: skip
 def unknown_costs(closed: ClosedForms, answers: Answers) -> ChartData:
     """Return the matched S/N with each unknown, plain and marginalised."""
-    known, rows = costs(closed)
+    known_snr, rows = costs(closed)
     names, plain, marginal = zip(*rows[::-1], strict=True)
     worst = min(rows, key=lambda row: row[2])
     text = (
-        f"With everything known the flare has a matched S/N of {known:.3g}; {worst[0]} leaves {worst[2]:.3g} "
+        f"With everything known the flare has a matched S/N of {known_snr:.3g}; {worst[0]} leaves {worst[2]:.3g} "
         "of it, the least of these."
     )
-    bars = names, np.array(plain), np.array(marginal), np.full(len(rows), known)
+    bars = names, np.array(plain), np.array(marginal), np.full(len(rows), known_snr)
     return ChartData(text, {"bars": bars}, {"y range": {"factors": names}})
 
 
@@ -225,11 +225,11 @@ class Unknown(Tab):
     pictures = (unknown_costs,)
 
     def shown(self, closed: ClosedForms, answers: Answers) -> View:
-        known, rows = costs(closed)
-        given: list[Row] = [("nothing: everything is known", known, known), *rows]
+        known_snr, rows = costs(closed)
+        given: list[Row] = [("nothing: everything is known", known_snr, known_snr), *rows]
         fap = closed.question.fap
         table = [
             {"unknown": name, "plain": plain, "marginalised": marginal, "detected": float(power(marginal, fap))}
             for name, plain, marginal in given
         ]
-        return View(self.title, [one for one in COLUMNS if one.name in table[0]], table)
+        return View(self.title, [column for column in COLUMNS if column.name in table[0]], table)

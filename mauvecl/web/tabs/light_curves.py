@@ -51,8 +51,8 @@ NO_FILE = "Choose a file of frames: a light curve or a sequence of spectra."
 
 def frames_of(closed: ClosedForms) -> Frames | None:
     """Return the frames of the question, or None if there is no file."""
-    found: Frames | None = closed.given.get("frames")
-    return found
+    frames: Frames | None = closed.given.get("frames")
+    return frames
 
 
 def minutes(frames: Frames, time_s: Any) -> Float:
@@ -89,15 +89,17 @@ def light_curve(closed: ClosedForms, answers: Answers) -> ChartData:
     text = f"{frames.n_frames} frames of {frames.name}. Analyse searches them for flares."
     if "analyse" in answers:
         answer = answers["analyse"]
-        one: Analysis = answer.analysis
-        flux, used = one.flux, one.level.used
-        chosen = thinned(one.level.level, MOST_POINTS)
-        series["level"] = minutes(frames, frames.time_s[chosen]), one.level.level[chosen]
-        text = _summary(answer.rows, one)
+        analysis: Analysis = answer.analysis
+        flux, used = analysis.flux, analysis.level.used
+        chosen = thinned(analysis.level.level, MOST_POINTS)
+        series["level"] = minutes(frames, frames.time_s[chosen]), analysis.level.level[chosen]
+        text = _summary(answer.rows, analysis)
         half = frames.cadence_s / 2
         for verdict in VERDICTS:
             rows = [row.event for row in answer.rows if row.verdict == verdict]
-            ends = np.array([(one.survey.time_s[event.first], one.survey.time_s[event.last]) for event in rows])
+            ends = np.array(
+                [(analysis.survey.time_s[event.first], analysis.survey.time_s[event.last]) for event in rows]
+            )
             series[f"{verdict} events"] = minutes(frames, ends.reshape(-1, 2) + [-half, half]).T
     for name, which in (("searched", used), ("left out", ~used & np.isfinite(flux))):
         chosen = np.flatnonzero(which)
@@ -106,12 +108,12 @@ def light_curve(closed: ClosedForms, answers: Answers) -> ChartData:
     return ChartData(text, series, {"y axis": {"axis_label": f"flux ({frames.unit})" if frames.unit else "flux"}})
 
 
-def _summary(rows: Any, one: Analysis) -> str:
+def _summary(rows: Any, analysis: Analysis) -> str:
     """Return the numbers of events in words."""
     verdicts = [row.verdict for row in rows]
     named = [verdict for verdict in VERDICTS if verdict != "undecided" or verdict in verdicts]
     counts = ", ".join(f"{verdicts.count(verdict)} {verdict}" for verdict in named)
-    return f"Events in {short(one.days)} star-days: {counts}; detected above an S/N of {one.threshold:.2f}."
+    return f"Events in {short(analysis.days)} star-days: {counts}; detected above an S/N of {analysis.threshold:.2f}."
 
 
 def _image(canvas: Canvas, source: ColumnDataSource) -> None:
@@ -144,8 +146,8 @@ def dynamic_spectrum(closed: ClosedForms, answers: Answers) -> ChartData:
     length = float(minutes(frames, frames.time_s[-1] + frames.cadence_s))
     series: dict[str, Any] = {"dynamic": (image[None], [0.0], [nm[0]], [length], [max(nm[-1] - nm[0], 1.0)])}
     if "analyse" in answers:
-        one: Analysis = answers["analyse"].analysis
-        ends = [minutes(frames, one.survey.time_s[[event.first, event.last]]) for event in one.events]
+        analysis: Analysis = answers["analyse"].analysis
+        ends = [minutes(frames, analysis.survey.time_s[[event.first, event.last]]) for event in analysis.events]
         above = float(nm[-1] + 0.02 * (nm[-1] - nm[0]))
         series["marks"] = [list(map(float, x)) for x in ends], [[above, above]] * len(ends)
     text = f"{frames.n_frames} spectra of {nm.size} pixels, {nm[0]:.0f} to {nm[-1]:.0f} nm."
@@ -156,7 +158,9 @@ def _shades(colour: str) -> tuple[str, ...]:
     """Return shades from a colour to white."""
     ends = np.array([[int(colour[k : k + 2], 16) for k in (1, 3, 5)], [247, 247, 247]])
     steps = np.linspace(0.0, 1.0, 128)[:, None]
-    return tuple("#" + "".join(f"{round(one):02x}" for one in row) for row in ends[0] * (1 - steps) + ends[1] * steps)
+    return tuple(
+        "#" + "".join(f"{round(value):02x}" for value in row) for row in ends[0] * (1 - steps) + ends[1] * steps
+    )
 
 
 def _deviations(frames: Frames) -> Float:
@@ -272,10 +276,13 @@ def shares(closed: ClosedForms, answers: Answers) -> ChartData:
             "orbit, and searches it."
         )
         return ChartData(text, series)
-    found, parts = answers["completeness"].stars[0].injected, []
-    for k, width in enumerate(found.half_widths_s):
-        x, share = 100 * found.sizes, found.completeness[k]
-        series |= {f"band {k}": (x, found.completeness_low[k], found.completeness_high[k]), f"line {k}": (x, share)}
+    injected, parts = answers["completeness"].stars[0].injected, []
+    for k, width in enumerate(injected.half_widths_s):
+        x, share = 100 * injected.sizes, injected.completeness[k]
+        series |= {
+            f"band {k}": (x, injected.completeness_low[k], injected.completeness_high[k]),
+            f"line {k}": (x, share),
+        }
         seen = float(np.interp(np.log(closed.question.amplitude_percent), np.log(x), share))
         parts.append(f"{percent(seen)} of those of half-width {short(width)} s")
     peak = f"{closed.question.amplitude_percent:g} %"

@@ -79,7 +79,7 @@ def _curve(kept: _Kept) -> tuple[Float, Float]:
 
     def exact(magnitudes: Float) -> list[float]:
         each = (odds(closed, magnitude, np.ones(1)) for magnitude in magnitudes)
-        return [one[0].probability if one else 0.0 for one in each]
+        return [forms[0].probability if forms else 0.0 for forms in each]
 
     x = np.linspace(*MAGNITUDES, FIRST)
     y = np.array(exact(x))
@@ -105,15 +105,18 @@ def _map(kept: _Kept) -> tuple[Float, Float, Float]:
     (columns, rows), (low, high) = STEPS, np.log10(PERCENTS)
     x, y = np.linspace(*MAGNITUDES, columns), np.linspace(low, high, rows)
     # A saturated star has no detectable flare.
-    known = np.zeros((4, rows, columns))
-    known[0], known[2] = -30.0, 3.0
+    forms = np.zeros((4, rows, columns))
+    forms[0], forms[2] = -30.0, 3.0
     for i, magnitude in enumerate(x):
-        for j, one in enumerate(odds(closed, magnitude, 10**y / closed.question.amplitude_percent)):
-            unit, seen = one.null.std, one.flaring
-            part, cut = max(seen.mean - one.null.mean, 1e-9 * unit) / unit, (one.threshold - one.null.mean) / unit
-            known[:, j, i] = np.log(part), np.log(seen.std / unit), cut, seen.third / seen.std**3
+        for j, outcome in enumerate(odds(closed, magnitude, 10**y / closed.question.amplitude_percent)):
+            unit, seen = outcome.null.std, outcome.flaring
+            part, cut = (
+                max(seen.mean - outcome.null.mean, 1e-9 * unit) / unit,
+                (outcome.threshold - outcome.null.mean) / unit,
+            )
+            forms[:, j, i] = np.log(part), np.log(seen.std / unit), cut, seen.third / seen.std**3
     fine = np.linspace(*MAGNITUDES, 97), np.linspace(low, high, 61)
-    return *fine, _pearson(*PchipInterpolator(y, PchipInterpolator(x, known, axis=2)(fine[0]), axis=1)(fine[1]))
+    return *fine, _pearson(*PchipInterpolator(y, PchipInterpolator(x, forms, axis=2)(fine[0]), axis=1)(fine[1]))
 
 
 def _pearson(part: Float, spread: Float, cut: Float, skewness: Float) -> Float:
@@ -144,7 +147,7 @@ def curve(closed: ClosedForms, answers: Answers) -> ChartData:
         x, y = series["closed form"] = _curve(_Kept(closed, q.amplitude_percent))
         text = f"{100 * power:g} % of such flares are detected {_reach(x, y, power, q.band)}"
     if "limit" in answers:
-        limits = [one for one in answers["limit"].limits if one.statistic == q.statistic]
+        limits = [limit for limit in answers["limit"].limits if limit.statistic == q.statistic]
         words = LIMITS[closed.study.limit.of]
         for one in limits:
             # Points of another quantity than the axis's are reported in words only.
@@ -258,14 +261,14 @@ def _labels(x: Float, y: Float, p: Float) -> tuple[Any, ...]:
     """Return the names of contours, each at another part of its line: the lines are close to each other."""
     from contourpy import contour_generator
 
-    found = []
+    labels = []
     for level, part in LABELLED.items():
         lines: list[Any] = list(contour_generator(x, y, p).lines(level))
         if lines:
             longest = max(lines, key=len)
             at = longest[np.argsort(longest[:, 0])][int(part * (len(longest) - 1))]
-            found.append((float(at[0]), float(at[1]), f"{100 * level:g} %"))
-    return tuple(zip(*found, strict=True)) or ([], [], [])
+            labels.append((float(at[0]), float(at[1]), f"{100 * level:g} %"))
+    return tuple(zip(*labels, strict=True)) or ([], [], [])
 
 
 class Limit(Tab):

@@ -49,11 +49,11 @@ def expected(closed: ClosedForms) -> dict[str, ExpectedMeasurement]:
     """Return the forecast with the flare's own model for each of `ASSUMED`."""
     case = closed.case
     own = dict(list(models_of(case).items())[-1:])
-    found = {}
+    measurements = {}
     for name, nuisances in ASSUMED.items():
         assumed = case.with_sections(nuisances=nuisances)
-        (found[name],) = expected_measurements(assumed, case.amplitudes[0], closed.flare, own)
-    return found
+        (measurements[name],) = expected_measurements(assumed, case.amplitudes[0], closed.flare, own)
+    return measurements
 
 
 def simulated(answers: Answers) -> MeasuredFlare | None:
@@ -79,21 +79,21 @@ def temperature_errors(closed: ClosedForms, answers: Answers) -> ChartData:
     """Return the relative error of the temperature against the amplitude of the flare."""
     own = 100 * closed.study.flare.amplitudes[0]
     series: dict[str, Any] = {}
-    for name, one in zip(NAMES, expected(closed).values(), strict=True):
-        ahead = one.forecasts(FACTORS, one.unknown)
+    for name, measurement in zip(NAMES, expected(closed).values(), strict=True):
+        ahead = measurement.forecasts(FACTORS, measurement.unknown)
         series[name] = own * FACTORS, [100 * f.errors[0] / f.values[0] for f in ahead]
-    known, *_, free = expected(closed).values()
-    which = "temperature" if isinstance(known.fitted, FlareModel) else "lower temperature"
-    series["own"] = [own], [100 * known.ahead.errors[0] / known.ahead.values[0]]
+    all_known, *_, free = expected(closed).values()
+    which = "temperature" if isinstance(all_known.fitted, FlareModel) else "lower temperature"
+    series["own"] = [own], [100 * all_known.ahead.errors[0] / all_known.ahead.values[0]]
     text = (
-        f"With everything known the {which} has a standard error of {_error(known)}, with dark level and star "
+        f"With everything known the {which} has a standard error of {_error(all_known)}, with dark level and star "
         f"unknown one of {_error(free)}."
     )
     return ChartData(text, series)
 
 
-def _error(one: ExpectedMeasurement) -> str:
-    return f"{short(one.ahead.errors[0])} K"
+def _error(measurement: ExpectedMeasurement) -> str:
+    return f"{short(measurement.ahead.errors[0])} K"
 
 
 @Chart(
@@ -119,8 +119,8 @@ def region(closed: ClosedForms, answers: Answers) -> ChartData:
         some = fits.found.estimates[:MOST_DOTS]
         series["fits"] = some[:, 0], 100 * some[:, 1]
     one_temperature = isinstance(all_known.fitted, FlareModel)
-    for name, one in (("known", all_known), ("free", free)):
-        kelvin, low, high = one.region(RISE_95) if one_temperature else _ellipse(best, one.ahead)
+    for name, measurement in (("known", all_known), ("free", free)):
+        kelvin, low, high = measurement.region(RISE_95) if one_temperature else _ellipse(best, measurement.ahead)
         series[name] = kelvin, 100 * low, 100 * high
     x = np.asarray(series["free"][0])
     text = (
@@ -133,7 +133,7 @@ def region(closed: ClosedForms, answers: Answers) -> ChartData:
     return ChartData(text, series)
 
 
-def _ellipse(best: Float, ahead: Forecast, n: int = 161) -> tuple[Float, Float, Float]:
+def _ellipse(best: Float, ahead: Forecast) -> tuple[Float, Float, Float]:
     """Return the confidence region of the first two quantities, of normal errors of their logarithms.
 
     Its temperatures, with the smallest and largest amplitude at each, are empty for errors of 100 % or more.
@@ -141,7 +141,7 @@ def _ellipse(best: Float, ahead: Forecast, n: int = 161) -> tuple[Float, Float, 
     spread = ahead.covariance[:2, :2] / np.outer(best, best)
     if not (np.diag(spread) < 1.0).all():
         return np.empty(0), np.empty(0), np.empty(0)
-    angle, slope = np.linspace(-np.pi / 2, np.pi / 2, n), spread[0, 1] / spread[0, 0]
+    angle, slope = np.linspace(-np.pi / 2, np.pi / 2, 161), spread[0, 1] / spread[0, 0]
     along = np.sqrt(RISE_95 * spread[0, 0]) * np.sin(angle)
     half = np.sqrt(RISE_95 * (spread[1, 1] - slope * spread[0, 1])) * np.cos(angle)
     low, high = (best[1] * np.exp(slope * along + side) for side in (-half, half))
@@ -163,20 +163,22 @@ def course(closed: ClosedForms, answers: Answers) -> ChartData:
     stares = answers["measure"].stares if "measure" in answers else []
     if not stares:
         return ChartData("No stare is measured yet: choose a joint fit or the S/N of bins, and simulate fits.")
-    (one,), words, series = stares, list[str](), dict[str, Any]()
-    if one.joint is not None:
-        (event,), stare = one.events, one.staring.stare
+    (stare_fit,), words, series = stares, list[str](), dict[str, Any]()
+    if stare_fit.joint is not None:
+        (event,), stare = stare_fit.events, stare_fit.staring.stare
         since = (stare.middle_s - event.peak_s) / event.half_width_s
         near = (since > -NEAR[0]) & (since < NEAR[1])
-        for name, fit in (("true", one.joint.true), ("joint", one.joint.fitted)):
+        for name, fit in (("true", stare_fit.joint.true), ("joint", stare_fit.joint.fitted)):
             series[name] = stare.middle_s[near], fit.kelvin[near]
-        found = one.joint.found
-        each = zip(found.names[:4], found.units, found.estimates[0], found.errors[0], strict=False)
+        measurement = stare_fit.joint.found
+        each = zip(
+            measurement.names[:4], measurement.units, measurement.estimates[0], measurement.errors[0], strict=False
+        )
         words += [f"{name} {short(best)} +- {short(error)} {unit}".strip() for name, unit, best, error in each]
-    if isinstance(one.drawn, str):
-        words.append(one.drawn)
-    elif one.drawn is not None:
-        bins = one.drawn
+    if isinstance(stare_fit.drawn, str):
+        words.append(stare_fit.drawn)
+    elif stare_fit.drawn is not None:
+        bins = stare_fit.drawn
         x, kelvin = (bins.start_s + bins.end_s) / 2, bins.found.estimates[:, 0]
         ends = (
             np.where(np.isfinite(end), end, kelvin) for end in (bins.found.low[-1, :, 0], bins.found.high[-1, :, 0])
@@ -207,21 +209,21 @@ class Measurement(Tab):
 
     def shown(self, closed: ClosedForms, answers: Answers) -> View:
         each, fits = expected(closed), simulated(answers)
-        known = next(iter(each.values()))
+        first = next(iter(each.values()))
         table = [
             {"quantity": name, "unit": unit, "truth": value, **dict(zip(each, errors, strict=True))}
             for name, unit, value, *errors in zip(
-                known.fitted.names,
-                known.fitted.units,
-                known.truth,
-                *(one.ahead.errors for one in each.values()),
+                first.fitted.names,
+                first.fitted.units,
+                first.truth,
+                *(measurement.ahead.errors for measurement in each.values()),
                 strict=True,
             )
         ]
         counted = () if fits is None else ("scatter", "coverage_95")
         if fits is not None:
             table = [row | counts for row, counts in zip(table, records(fits.rows()), strict=True)]
-        verb = {one.name: one for one in COLUMNS}
+        verb = {column.name: column for column in COLUMNS}
         errors = [replace(verb["error"], name=name, heading=f"error, {name}") for name in each]
         columns = [verb["quantity"], verb["unit"], verb["truth"], *errors, *(verb[name] for name in counted)]
         return View(self.title, columns, table)

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 def budget(closed: ClosedForms, answers: Answers) -> ChartData:
     """Return the noise of a pixel by origin."""
     series = budget_series(closed.quiet)
-    power = {one: float(np.nansum(series[one.key][1] ** 2)) for one in BUDGET.series[:-1] if one.key in series}
-    most = max(power, key=lambda one: power[one])
+    power = {part: float(np.nansum(series[part.key][1] ** 2)) for part in BUDGET.series[:-1] if part.key in series}
+    most = max(power, key=lambda name: power[name])
     share = 100 * power[most] / (sum(power.values()) or 1.0)
     return ChartData(f"Most of the noise's power comes from {most.called}: {share:.0f} % over all pixels.", series)
 
@@ -147,10 +147,10 @@ def telescope(closed: ClosedForms, answers: Answers) -> ChartData:
     nm = flare.wavelength_nm[(flare.wavelength_nm >= 190) & (flare.wavelength_nm <= 710)]
     light = [np.interp(nm, source.wavelength_nm, source.flux_flam) for source in (star, flare)]
     # Logarithms show nothing of zero.
-    one, two = (np.where(flux > 0, flux, np.nan) for flux in light)
-    rise = np.nanmax(two / one)
+    quiet, flaring = (np.where(flux > 0, flux, np.nan) for flux in light)
+    rise = np.nanmax(flaring / quiet)
     text = f"The flare multiplies the star's light by up to {short(rise)} between 190 and 710 nm."
-    return ChartData(text, {"star": (nm, one), "flare": (nm, two)})
+    return ChartData(text, {"star": (nm, quiet), "flare": (nm, flaring)})
 
 
 class Spectrum(Tab):
