@@ -49,6 +49,8 @@ SLOW_S = 172_800.0
 LEAST_LOSS = 0.5
 #: Largest share of the frames in losses; more of them are the level of the star, before or after a step (assumed).
 MOST_LOST = 0.4
+#: The same where the light returns from losses to a constant level, which it does not after a step (assumed).
+MOST_LOST_CONSTANT = 0.8
 #: Standard deviations of a frame above the median of a constant light from which frames belong to flares; their number
 #: before and, relative to the length, after the bright frames; the largest share of such frames (assumed).
 BRIGHT, BEFORE, DECAY, MOST_BRIGHT = 4.0, 2, 3, 0.3
@@ -130,7 +132,10 @@ def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, taken: Bool, steps
             none[dark] = lost
             return none
     other, losses = alternate(down, guessed, None, steps)
-    if 0 < losses.mean() < MOST_LOST:
+    constant = not other.flux_process.terms and other.flux_process.excess < MOST_EXCESS
+    inner = np.flatnonzero(losses)
+    returns = bool(inner.size) and inner[0] > 0 and not losses[inner[0] :].all()
+    if 0 < losses.mean() < (MOST_LOST_CONSTANT if constant and returns else MOST_LOST):
         light = light_of_events(other, losses)
         if criterion(other, light, losses, shapeless=True) < criterion(fitted, light_of_events(fitted, taken), taken):
             none[dark] = losses
