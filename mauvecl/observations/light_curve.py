@@ -50,7 +50,7 @@ LEAST_LOSS = 0.5
 #: Largest share of the frames in losses; more of them are the level of the star, before or after a step (assumed).
 MOST_LOST = 0.4
 #: The same where the light returns from losses to a constant level, which it does not after a step (assumed).
-MOST_LOST_CONSTANT = 0.8
+MOST_LOST_CONSTANT = 0.9
 #: Standard deviations of a frame above the median of a constant light from which frames belong to flares; their number
 #: before and, relative to the length, after the bright frames; the largest share of such frames (assumed).
 BRIGHT, BEFORE, DECAY, MOST_BRIGHT = 4.0, 2, 3, 0.3
@@ -137,7 +137,10 @@ def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, taken: Bool, steps
     returns = bool(inner.size) and inner[0] > 0 and not losses[inner[0] :].all()
     if 0 < losses.mean() < (MOST_LOST_CONSTANT if constant and returns else MOST_LOST):
         light = light_of_events(other, losses)
-        if criterion(other, light, losses, shapeless=True) < criterion(fitted, light_of_events(fitted, taken), taken):
+        # The star is constant beside losses, and more than its noise beside flares in even more frames.
+        simpler = constant and returns and losses.mean() < taken.mean() and process.excess > MOST_EXCESS
+        usual = np.inf if simpler else criterion(fitted, light_of_events(fitted, taken), taken)
+        if criterion(other, light, losses, shapeless=True) < usual:
             none[dark] = losses
     return none
 

@@ -123,6 +123,33 @@ def test_losses_are_found_at_their_frames_and_a_flare_is_none() -> None:
     assert not found[550:560].any()
 
 
+@pytest.mark.long
+def test_losses_in_most_frames_are_no_flares_between_them() -> None:
+    """Observe a star that is out of the fibre for two thirds of the time, and returns to its light."""
+    rng, frame_s, noise = np.random.default_rng([504, 1]), 5.0, 1e-4
+    time = np.arange(1260) * frame_s
+    loss = np.zeros(time.size)
+    for start, length, size, out, back in ((900, 770, 0.042, 20, 110), (2400, 700, 0.047, 130, 420)):
+        gone = 1 - np.exp(-np.clip(time - start, 0, length) / out)
+        loss = np.maximum(loss, size * gone * np.exp(-np.clip(time - start - length, 0, None) / back))
+    flux = 1 - loss + noise * rng.standard_normal(time.size)
+    answer = analysed(Frames.of(time, flux, np.full(time.size, noise)))
+    assert not detected(answer.analysis, PER_MONTH)
+    lost = np.array(["loss" in str(reason) for reason in answer.frames["reason"]])
+    assert lost[loss > 10 * noise].mean() > 0.95
+
+
+@pytest.mark.long
+def test_bumps_of_every_orbit_are_no_flares() -> None:
+    """Observe eight orbits in each of which the light rises and falls smoothly, by changing sizes."""
+    rng, frame_s, noise = np.random.default_rng([505, 1]), 30.0, 2e-4
+    phase = np.arange(1520) * frame_s / 5700.0 + 0.3
+    bump = np.exp(4 * (np.cos(2 * np.pi * phase) - 1)) * (1 + 0.2 * np.sin(2 * np.pi * (0.12 * phase + 0.4)))
+    flux = 1 + 0.012 * bump + noise * rng.standard_normal(phase.size)
+    answer = analysed(Frames.of(phase * 5700.0, flux, np.full(phase.size, noise)))
+    assert "detected" not in set(answer.events["verdict"])
+
+
 def sharp_rotator(rng: np.random.Generator, noise: float) -> tuple[Frames, list[tuple[float, float, float]]]:
     """Draw ten days of frames of half an hour of a star whose rotation has three harmonics, with 16 flares.
 
