@@ -14,7 +14,7 @@ from mauvecl.detection.distributions import Interval, clopper_pearson
 from mauvecl.fits.spectrum import Measurement
 from mauvecl.flares.settings import RANK, Per, per_day
 from mauvecl.flares.shapes import shape_of
-from mauvecl.observations.detection import detect_events, most_events
+from mauvecl.observations.detection import LONG_S, detect_events, most_events
 from mauvecl.observations.event_spectra import Colour, EventSpectrum, event_colour, event_spectrum, measure_flare
 from mauvecl.observations.events import ObservedEvent, measure_events
 from mauvecl.observations.false_alarms import CHANCE_DIP, SimulatedRate, innovations, largest_dip, simulated_rates
@@ -159,9 +159,9 @@ def _power(part: SeriesSurvey, width: float) -> float:
 STAGES = (0.0, 0.45, 0.55, 0.65, 0.95, 1.0)
 #: False alarms per star-day above which events are candidates.
 CANDIDATES = 1.0
-#: Share of the searched frames in events, their number, and length of the light curve in seconds or in half-widths of
-#: the longest event, above which the events are no exception from the light of the star (assumed).
-MOST_IN_EVENTS, MOST_EVENTS, LONG_S, LONG = 0.5, 2, 2 * DAY_S, 100.0
+#: Share of the searched frames in events, their number, and length of the light curve in half-widths of the longest
+#: event, above which the events are no exception from the light of the star (assumed).
+MOST_IN_EVENTS, MOST_EVENTS, LONG = 0.5, 2, 100.0
 
 
 @dataclass(frozen=True, eq=False)

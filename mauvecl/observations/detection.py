@@ -18,6 +18,7 @@ from mauvecl.observations.event_windows import REACH
 from mauvecl.observations.process import Binned, Process, Steps, fit_process, level_fit
 from mauvecl.observations.process_search import FilterRow, ProcessSearch
 from mauvecl.observations.search import Detection, SeriesSurvey
+from mauvecl.schema.physical import DAY_S
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -45,6 +46,8 @@ UNCERTAIN = 0.5
 #: Flux of a template, in standard deviations of a frame, to which its tail belongs to the event: the smallest for which
 #: more than a few events leave most frames to the star (number and share assumed).
 FAINT, FEW, MOST_TAKEN = (0.05, 0.2, 0.8), 2, 0.3
+#: Length of a light curve above which events are an exception from the light of the star (assumed).
+LONG_S = 2 * DAY_S
 #: Longest tail and beginning of a template that belong to an event, in half-widths.
 LONGEST_TAIL, BEGINNING = 60.0, 1.2
 #: Statistic of an event, relative to that of an event next to it, below which it is that one's beginning or tail.
@@ -288,8 +291,9 @@ def detect_events(survey: SeriesSurvey, threshold: float, steps: Steps | None = 
     steps : Steps, optional
         Reports each search.
     """
-    # Where the star is constant, whatever changes is in events, however many frames they take.
-    for faint in FAINT if any(process.terms for process in survey.processes) else FAINT[:1]:
+    # Where the star is constant, or seen for a short time, events may take any number of frames.
+    star = survey.stare.duration_s > LONG_S and any(process.terms for process in survey.processes)
+    for faint in FAINT if star else FAINT[:1]:
         events, taken = _detect_to(survey, threshold, faint, steps or Steps())
         if len(events) <= FEW or taken.mean() <= MOST_TAKEN:
             break
