@@ -194,6 +194,14 @@ class Job:
 
 log = logging.getLogger(__name__)
 
+
+def _sent(message: asyncio.Future[None]) -> None:
+    """Report an error of a message that was sent, but for that of a visitor who has left meanwhile."""
+    error = None if message.cancelled() else message.exception()
+    if error is not None and not isinstance(error, WebSocketClosedError):
+        log.error("a message could not be sent", exc_info=error)
+
+
 #: Seconds between two looks at a simulation.
 LOOK_S = 0.25
 #: Number of threads, besides the event loop, that make closed forms, pictures and files for all visitors.
@@ -266,9 +274,9 @@ class Visitor(WebSocketHandler):
         if self.ws_connection is None or self not in self.here:
             return
         try:
-            self.write_message(json.dumps(message, allow_nan=False))
+            self.write_message(json.dumps(message, allow_nan=False)).add_done_callback(_sent)
             if content is not None:
-                self.write_message(content, binary=True)
+                self.write_message(content, binary=True).add_done_callback(_sent)
         except WebSocketClosedError:
             return
 
