@@ -292,8 +292,8 @@ def detect_events(survey: SeriesSurvey, threshold: float, steps: Steps | None = 
         Reports each search.
     """
     # Where the star is constant, or seen for a short time, events may take any number of frames.
-    star = survey.stare.duration_s > LONG_S and any(process.terms for process in survey.processes)
-    for faint in FAINT if star else FAINT[:1]:
+    varies_for_days = survey.stare.duration_s > LONG_S and any(process.terms for process in survey.processes)
+    for faint in FAINT if varies_for_days else FAINT[:1]:
         events, taken = _detect_to(survey, threshold, faint, steps or Steps())
         if len(events) <= FEW or taken.mean() <= MOST_TAKEN:
             break

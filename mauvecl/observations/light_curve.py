@@ -132,15 +132,18 @@ def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, taken: Bool, steps
             none[dark] = lost
             return none
     other, losses = alternate(down, guessed, None, steps)
-    constant = not other.flux_process.terms and other.flux_process.excess < MOST_EXCESS
-    inner = np.flatnonzero(losses)
-    returns = bool(inner.size) and inner[0] > 0 and not losses[inner[0] :].all()
-    if 0 < losses.mean() < (MOST_LOST_CONSTANT if constant and returns else MOST_LOST):
-        light = light_of_events(other, losses)
-        # The star is constant beside losses, and more than its noise beside flares in even more frames.
-        simpler = constant and returns and losses.mean() < taken.mean() and process.excess > MOST_EXCESS
-        usual = np.inf if simpler else criterion(fitted, light_of_events(fitted, taken), taken)
-        if criterion(other, light, losses, shapeless=True) < usual:
+    runs = _runs(losses)
+    # The star is constant before and after a loss.
+    constant = (
+        bool(runs) and runs[0][0] > 0 and runs[0][1] < losses.size - 1
+        and not other.flux_process.terms and other.flux_process.excess < MOST_EXCESS
+    )  # fmt: skip
+    if 0 < losses.mean() < (MOST_LOST_CONSTANT if constant else MOST_LOST):
+        # Beside flares in even more frames, the star would be more than its noise.
+        simpler = constant and losses.mean() < taken.mean() and process.excess > MOST_EXCESS
+        if simpler or criterion(other, light_of_events(other, losses), losses, shapeless=True) < criterion(
+            fitted, light_of_events(fitted, taken), taken
+        ):
             none[dark] = losses
     return none
 
