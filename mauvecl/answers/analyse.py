@@ -249,6 +249,8 @@ class EventRow:
             notes.append("its frames are together fainter than the level by more than its error")
         if event.kind == "flare" and not event.energy.peak_observed:
             notes.append("no frame shows its peak")
+        elif event.kind == "flare" and event.gap_at_peak:
+            notes.append("frames next to its brightest one are missing: they may have held its peak")
         return "; ".join(notes)
 
 

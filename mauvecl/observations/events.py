@@ -287,6 +287,7 @@ class ObservedEvent:
     # the dark current or the sky, or a cosmic ray.
     kind: Kind
     energy: Energy
+    gap_at_peak: bool  # true if frames are missing next to the brightest, for as long as the half-width of the fit
 
     @property
     def equivalent_duration_s(self) -> float:
@@ -340,6 +341,9 @@ def measure_event(
     rows = slice(first, last + 1)
     energy = measure_energy(survey, taken, level, found)
     flux, numbers = (survey.flux[rows] - level[rows]) * survey.scale, survey.stare.numbers
+    brightest = first + int(np.argmax(flux))
+    around = numbers[max(brightest - 1, 0) : brightest + 2]
+    missing_s = (int(np.diff(around).max()) - 1) * survey.stare.frame_s
     ends = (first == 0, last == survey.stare.n_frames - 1)
     cut = any(ends) or bool((np.diff(numbers[[first - 1, first, last, last + 1]])[::2] > GAP_FRAMES).any())
     kind = cause
@@ -349,7 +353,7 @@ def measure_event(
     # Fits of scipy leave circular references to arrays of some 20 MB, which are few objects and would be kept long.
     gc.collect(1)
     return ObservedEvent(
-        found.value, first, last, first + int(np.argmax(flux)), found.half_width_s,
+        found.value, first, last, brightest, found.half_width_s,
         float(flux.max()) / survey.level / energy.level, int(numbers[last] - numbers[first] + 1 - flux.size), cut, kind,
-        energy,
+        energy, missing_s >= min(found.half_width_s, energy.flares[0].half_width_s),
     )  # fmt: skip

@@ -132,12 +132,9 @@ def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, taken: Bool, steps
             none[dark] = lost
             return none
     other, losses = alternate(down, guessed, None, steps)
-    runs = _runs(losses)
-    # The star is constant before and after a loss.
-    constant = (
-        bool(runs) and runs[0][0] > 0 and runs[0][1] < losses.size - 1
-        and not other.flux_process.terms and other.flux_process.excess < MOST_EXCESS
-    )  # fmt: skip
+    # The star is constant between losses, or before and after one; not only before or after a step.
+    returns = np.count_nonzero([last - first >= END_FRAMES for first, last in _runs(~losses)]) > 1
+    constant = returns and not other.flux_process.terms and other.flux_process.excess < MOST_EXCESS
     if 0 < losses.mean() < (MOST_LOST_CONSTANT if constant else MOST_LOST):
         # Beside flares in even more frames, the star would be more than its noise.
         simpler = constant and losses.mean() < taken.mean() and process.excess > MOST_EXCESS

@@ -124,12 +124,20 @@ def test_losses_are_found_at_their_frames_and_a_flare_is_none() -> None:
 
 
 @pytest.mark.long
-def test_losses_in_most_frames_are_no_flares_between_them() -> None:
-    """Observe a star that is out of the fibre for two thirds of the time, and returns to its light."""
+@pytest.mark.parametrize(
+    "losses",
+    [
+        ((900, 770, 0.042, 20, 110), (2400, 700, 0.047, 130, 420)),
+        ((-400, 1200, 0.03, 20, 60), (1500, 900, 0.045, 90, 60), (3800, 500, 0.02, 30, 200), (5600, 900, 0.04, 60, 90)),
+    ],
+    ids=["between", "at both ends"],
+)
+def test_losses_in_most_frames_are_no_flares_between_them(losses: tuple[tuple[float, ...], ...]) -> None:
+    """Observe a star that is out of the fibre for half of the time or more, and returns to its light."""
     rng, frame_s, noise = np.random.default_rng([504, 1]), 5.0, 1e-4
     time = np.arange(1260) * frame_s
     loss = np.zeros(time.size)
-    for start, length, size, out, back in ((900, 770, 0.042, 20, 110), (2400, 700, 0.047, 130, 420)):
+    for start, length, size, out, back in losses:
         gone = 1 - np.exp(-np.clip(time - start, 0, length) / out)
         loss = np.maximum(loss, size * gone * np.exp(-np.clip(time - start - length, 0, None) / back))
     flux = 1 - loss + noise * rng.standard_normal(time.size)
@@ -137,6 +145,22 @@ def test_losses_in_most_frames_are_no_flares_between_them() -> None:
     assert not detected(answer.analysis, PER_MONTH)
     lost = np.array(["loss" in str(reason) for reason in answer.frames["reason"]])
     assert lost[loss > 10 * noise].mean() > 0.95
+
+
+@pytest.mark.parametrize("missing", [True, False])
+def test_missing_frames_that_may_have_held_a_peak_are_stated(missing: bool) -> None:
+    """Observe a flare shorter than a frame, with and without its brightest frame."""
+    rng, frame_s, noise = np.random.default_rng(506), 600.0, 1e-3
+    time = np.arange(300) * frame_s
+    flux = 1 + noise * rng.standard_normal(time.size)
+    decay_s, start_s = 400.0, 150 * frame_s + 30.0
+    ages = np.clip(time[:, None] + np.array([-0.5, 0.5]) * frame_s - start_s, 0, None)
+    flux -= 0.2 * decay_s / frame_s * np.diff(np.exp(-ages / decay_s))[:, 0]
+    kept = np.ones(time.size, np.bool_)
+    kept[150] = not missing
+    answer = analysed(Frames.of(time[kept], flux[kept], np.full(int(kept.sum()), noise)), per="month")
+    (row,) = (row for row in answer.rows if row.verdict == "detected")
+    assert ("are missing: they may have held its peak" in row.note) is missing
 
 
 @pytest.mark.long
