@@ -11,6 +11,7 @@ from scipy.ndimage import median_filter, uniform_filter1d
 from mauvecl.flares.shapes import Shape
 from mauvecl.observations.detection import (
     END_FRAMES,
+    LONG_S,
     PROVISIONAL,
     alternate,
     criterion,
@@ -31,6 +32,7 @@ from mauvecl.observations.level import (
     single_frames,
     spikes,
 )
+from mauvecl.observations.level_steps import relative_level
 from mauvecl.observations.process import Binned, Steps, fit_process, level_fit
 from mauvecl.observations.search import SeriesSurvey, bank_of
 from mauvecl.schema.errors import InputError
@@ -286,6 +288,11 @@ def survey_light_curve(
     if counts is None:
         reasons[spikes(frames.numbers, flux, error, reasons == 0)] |= Reason.SPIKE
     used = reasons == 0
+    steps_of_level = np.ones(flux.size)
+    if counts is None and np.ptp(frames.time_s) > LONG_S:
+        relative = relative_level(frames.time_s[used], frames.numbers[used], flux[used], frames.cadence_s)
+        steps_of_level = relative[np.clip(np.searchsorted(np.flatnonzero(used), np.arange(flux.size)), 0, used.sum() - 1)]
+        flux, error = flux / steps_of_level, None if error is None else error / steps_of_level
     # A frame of no count at the least has the Poisson noise of one.
     least = 0.0 if counts is None else float(np.sqrt(max(np.median(flux[used]) * counts, 1.0))) / counts
     guessed = np.zeros(flux.size, np.bool_)
@@ -322,7 +329,7 @@ def survey_light_curve(
     survey = survey.frames(used[searched_among(survey, frames)])
     draws = steps.part(0.9, 1.0)
     light = quiescent_light(frames, flux, error, survey, used, used & ~guessed, reasons, seed, draws)
-    return survey, light, frames
+    return survey, light.times(steps_of_level), frames
 
 
 def searched_among(survey: SeriesSurvey, frames: Frames) -> NDArray[np.intp]:

@@ -1,0 +1,143 @@
+"""Steps of the level of a light curve: sudden changes that last, by the instrument or where observations are joined."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.observations.level import PER_MAD, guess_flares
+from mauvecl.observations.process import MAX_TRIED, Binned, Process, fit_process, level_fit
+from mauvecl.schema.physical import DAY_S
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+Places = NDArray[np.intp]
+
+#: Numbers of frames on each side whose parabolas are compared, and their difference in its usual deviations from which
+#: it may be a step (assumed).
+SIDES, SUDDEN = (12, 40), 8.0
+#: Largest number of steps (assumed).
+MOST_STEPS = 30
+#: Time after a rise that may belong to a flare, and lengths of time before it and after that time whose medians differ
+#: by the step to within a factor, s (assumed).
+FLARE_S, LENGTHS_S, LASTS = DAY_S / 4, (DAY_S, 2 * DAY_S), 2.0
+#: Smallest step relative to its standard error, and without the frames that may belong to a flare (assumed).
+SIGNIFICANT, AFTER_FLARE = 6.0, 2.5
+#: Largest number of fits of the process and the steps.
+ROUNDS = 4
+#: Largest ratio of the levels before and after a step (assumed).
+LARGEST = 2.0
+
+
+def relative_level(time_s: Float, numbers: NDArray[np.int64], flux: Float, frame_s: float) -> Float:
+    """Return the level of each frame relative to the median one, which changes by steps only, shape (n_frame,).
+
+    Sudden changes that last are fitted together with the process of the light. They are steps if each is larger than
+    its error allows, with and without the frames in which a flare may have begun there, and if together they lower the
+    Bayesian information criterion.
+
+    Parameters
+    ----------
+    time_s, numbers, flux : ndarray, shape (n_frame,)
+        Times, numbers on the regular grid, and flux of the frames without a fault.
+    frame_s : float
+        Time from frame to frame on the grid.
+    """
+    constant = np.ones(flux.size)
+    noise = PER_MAD * float(np.median(np.abs(np.diff(flux)))) / np.sqrt(2.0)
+    values = flux / noise
+    places, sizes = _sudden_changes(time_s, values)
+    typical = float(np.median(values))
+    process: Process | None = None
+    if not places.size or not typical > 0:
+        return constant
+
+    def binned(light: Float) -> Binned:
+        return Binned.of(time_s[quiet], light[quiet], np.ones(int(quiet.sum())), frame_s, MAX_TRIED)
+
+    for _ in range(ROUNDS):
+        left = values - _light_of_steps(values.size, places, sizes)
+        quiet = ~guess_flares(numbers, left)
+        process = fit_process(binned(left), process)
+        change, error = _fitted_steps(process, time_s, left, quiet, places)
+        apart, error_apart = _fitted_steps(process, time_s, left, quiet & ~_after_rises(time_s, places, sizes), places)
+        before, sizes = sizes, sizes + change
+        kept = (np.abs(sizes) > SIGNIFICANT * error) & ((before + apart) / np.sign(sizes) > AFTER_FLARE * error_apart)
+        settled = kept.all() and (np.abs(change) < error).all()
+        places, sizes = places[kept], sizes[kept]
+        if settled or not places.size:
+            break
+    if not places.size:
+        return constant
+    added = _light_of_steps(values.size, places, sizes)
+    costs = []
+    for light, each, n_steps in ((values - added, process, places.size), (values, None, 0)):
+        data = binned(light)
+        fitted = fit_process(data, each)
+        covariance = fitted.covariance(data.time_s, data.variance * fitted.excess**2)
+        cost = (2 * n_steps + fitted.n_parameters) * float(np.log(data.values.size))
+        costs.append(cost - 2 * level_fit(covariance, data.values).log_likelihood)
+    level = 1.0 + added / typical
+    level = level / np.median(level)
+    return level if costs[0] < costs[1] and 1 / LARGEST < level.min() and level.max() < LARGEST else constant
+
+
+def _sudden_changes(time_s: Float, flux: Float) -> tuple[Places, Float]:
+    """Return the first frames after sudden changes that last, in order of time, and the changes of the flux."""
+    found: dict[int, tuple[float, float]] = {}
+    for side in SIDES:
+        if flux.size < 4 * side:
+            continue
+        # Parabolas through the frames before and after, half a frame beyond their ends.
+        weights = np.linalg.pinv(np.vander(np.arange(side) - (side - 0.5), 3))[-1]
+        before = np.convolve(flux, weights[::-1], mode="valid")[:-side]
+        change = np.convolve(flux, weights, mode="valid")[side:] - before
+        usual = max(PER_MAD * float(np.median(np.abs(change))), 1e-300)
+        for k in np.flatnonzero(np.abs(change) > SUDDEN * usual):
+            largest = np.abs(change[max(0, k - side) : k + side + 1]).max()
+            if np.abs(change[k]) >= largest and not any(abs(k + side - one) <= side for one in found):
+                found[int(k + side)] = (float(np.abs(change[k])) / usual, float(change[k]))
+    most = sorted(found, key=lambda one: found[one], reverse=True)[:MOST_STEPS]
+    places = np.array(sorted(one for one in most if _lasts(time_s, flux, one, found[one][1])), np.intp)
+    return places, np.array([found[int(one)][1] for one in places])
+
+
+def _lasts(time_s: Float, flux: Float, place: int, size: float) -> bool:
+    """Return whether a change is not undone within a day or two, as that of a flare or a loss of light is.
+
+    The light of a star that turns in less time has the same median before and after.
+    """
+    apart_s = time_s - time_s[place]
+    for length_s in LENGTHS_S:
+        before = flux[(apart_s < 0) & (apart_s >= -length_s)]
+        after = flux[(apart_s > FLARE_S) & (apart_s <= FLARE_S + length_s)]
+        if min(before.size, after.size) >= SIDES[0]:
+            share = float(np.median(after) - np.median(before)) / size
+            if 1 / LASTS < share < LASTS:
+                return True
+    return False
+
+
+def _light_of_steps(n_frames: int, places: Places, sizes: Float) -> Float:
+    """Return the sum of steps in each frame."""
+    added = np.zeros(n_frames)
+    added[places] = sizes
+    return np.cumsum(added)
+
+
+def _after_rises(time_s: Float, places: Places, sizes: Float) -> Bool:
+    """Return the frames in which a flare may shine that began at a rise."""
+    inside = np.zeros(time_s.size, np.bool_)
+    for start in time_s[places[sizes > 0]]:
+        inside |= (time_s >= start) & (time_s < start + FLARE_S)
+    return inside
+
+
+def _fitted_steps(process: Process, time_s: Float, flux: Float, quiet: Bool, places: Places) -> tuple[Float, Float]:
+    """Return the steps of a light curve by generalised least squares, and their standard errors, (n_step,) each."""
+    rows = np.flatnonzero(quiet)
+    covariance = process.covariance(time_s[quiet], np.full(rows.size, process.excess**2))
+    columns = np.column_stack([np.ones(rows.size), *(rows >= place for place in places), flux[quiet]])
+    white = covariance.whitened(columns.astype(np.float64))
+    spread = np.linalg.pinv(white[:, :-1].T @ white[:, :-1])
+    return (spread @ (white[:, :-1].T @ white[:, -1]))[1:], np.sqrt(np.diag(spread))[1:]
