@@ -291,7 +291,9 @@ def survey_light_curve(
     steps_of_level = np.ones(flux.size)
     if counts is None and np.ptp(frames.time_s) > LONG_S:
         relative = relative_level(frames.time_s[used], frames.numbers[used], flux[used], frames.cadence_s)
-        steps_of_level = relative[np.clip(np.searchsorted(np.flatnonzero(used), np.arange(flux.size)), 0, used.sum() - 1)]
+        steps_of_level = relative[
+            np.clip(np.searchsorted(np.flatnonzero(used), np.arange(flux.size)), 0, used.sum() - 1)
+        ]
         flux, error = flux / steps_of_level, None if error is None else error / steps_of_level
     # A frame of no count at the least has the Poisson noise of one.
     least = 0.0 if counts is None else float(np.sqrt(max(np.median(flux[used]) * counts, 1.0))) / counts

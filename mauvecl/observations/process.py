@@ -78,6 +78,8 @@ NOISE_PRIOR = 0.3
 PERIODIC = 1e-3
 #: Smallest period in steps between values, and largest as a share of the length of the light curve.
 SHORTEST, LONGEST = 4.0, 1.0
+#: Period as a share of the length above which rotation is also searched in what a polynomial of a degree leaves.
+FEW_TURNS, DEGREE = 0.2, 8
 #: Range of standard deviations of a term, in standard deviations of the noise of a value.
 AMPLITUDES = (1e-2, 1e5)
 #: Range of time scales of correlated and smooth terms: in steps between values, and in lengths of the light curve.
@@ -417,9 +419,9 @@ def fit_process(data: Binned, start: Process | None = None, steps: Steps | None 
     while len(best.terms) < MAX_TERMS:
         size = best.n_parameters
         options = []
-        for term in _starts(data, best):
-            if (size + SIZES[term.kind]) * VALUES_PER_PARAMETER <= data.values.size:
-                options.append(_fitted(data, (*best.terms, term), np.log(noise)))
+        for terms in _starts(data, best):
+            if (size + sum(SIZES[term.kind] for term in terms)) * VALUES_PER_PARAMETER <= data.values.size:
+                options.append(_fitted(data, (*best.terms, *terms), np.log(noise)))
                 steps.step()
         # A combination has several starting points.
         for one, bic in options:
@@ -448,8 +450,8 @@ def _sharper(data: Binned, process: Process) -> tuple[Process, float] | None:
     return fitted, bic + STRONG
 
 
-def _starts(data: Binned, best: Process) -> Iterator[ProcessTerm]:
-    """Yield starting points of a further term."""
+def _starts(data: Binned, best: Process) -> Iterator[tuple[ProcessTerm, ...]]:
+    """Yield starting points of a further term, or of rotation with a slower change of the light."""
     covariance = best.covariance(data.time_s, data.variance * best.excess**2)
     fit = level_fit(covariance, data.values)
     spread = max(float(np.std(data.values - fit.mean)), data.noise)
@@ -457,23 +459,44 @@ def _starts(data: Binned, best: Process) -> Iterator[ProcessTerm]:
     low, high = SCALES[0] * data.step_s, SCALES[1] * data.span_s
     for scale in (6 * data.step_s, float(np.sqrt(low * high))):
         size = data.noise if rotates else spread
-        yield ProcessTerm("correlated", (np.log(size), np.log(np.clip(scale, low, high))))
-    if not rotates:
-        yield ProcessTerm("smooth", (np.log(spread), np.log(0.2 * data.span_s)))
-        if (period := _period(data)) is not None:
-            for factor in (1.0, 2.0):
-                parameters = (spread, factor * period, 10.0, 1.0, 0.3)
-                yield ProcessTerm("rotation", tuple(float(np.log(one)) for one in parameters))
+        yield (ProcessTerm("correlated", (np.log(size), np.log(np.clip(scale, low, high)))),)
+    if rotates:
+        return
+    smooth = ProcessTerm("smooth", (np.log(spread), np.log(0.2 * data.span_s)))
+    yield (smooth,)
+    if (period := _period(data, data.values, LONGEST)) is None:
+        return
+    for factor in (1.0, 2.0):
+        yield (_rotation(spread, factor * period),)
+    if not best.terms and period > FEW_TURNS * data.span_s:
+        # Beside changes as long as the light curve, rotation is not the highest peak.
+        slow = np.polynomial.Polynomial.fit(data.time_s, data.values, DEGREE)(data.time_s)
+        if (faster := _period(data, data.values - slow, FEW_TURNS)) is not None:
+            yield smooth, _rotation(spread, faster)
 
 
-def _period(data: Binned) -> float | None:
-    """Return the period of the highest peak of the Lomb-Scargle periodogram in seconds, or None if it is noise."""
+def _rotation(size: float, period: float) -> ProcessTerm:
+    """Return the starting point of rotation."""
+    return ProcessTerm("rotation", tuple(float(np.log(one)) for one in (size, period, 10.0, 1.0, 0.3)))
+
+
+def _period(data: Binned, values: Float, share: float) -> float | None:
+    """Return the period of the highest peak of a Lomb-Scargle periodogram in seconds, or None if it is noise.
+
+    Parameters
+    ----------
+    data : Binned
+    values : ndarray, shape (n_value,)
+        Values of the data, or what is left of them.
+    share : float
+        Longest period as a share of the length of the light curve.
+    """
     from astropy.timeseries import LombScargle
 
-    longest, shortest = LONGEST * data.span_s, SHORTEST * data.step_s
-    if data.values.size < 30 or longest <= shortest:
+    longest, shortest = share * data.span_s, SHORTEST * data.step_s
+    if values.size < 30 or longest <= shortest:
         return None
-    periodogram = LombScargle(data.time_s, data.values - data.values.mean())
+    periodogram = LombScargle(data.time_s, values - values.mean())
     frequency, power = periodogram.autopower(
         minimum_frequency=1 / longest, maximum_frequency=1 / shortest, samples_per_peak=5, method="fast"
     )
