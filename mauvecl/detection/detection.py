@@ -221,13 +221,9 @@ def _shifted_fap(
 
 
 def _adc_moments(x: Expectation) -> tuple[tuple[Float, Float], tuple[Float, Float]]:
-    """Compute the mean shift and the variance of an exposure behind the ADC, without and with its lower limit, in DN.
+    """Return mean shift and variance of an exposure behind the ADC, DN, without and with its lower limit.
 
     Saturation at the upper limit is part of the closed forms.
-
-    Returns
-    -------
-    rounded, clipped : (shift, variance), each shape (n_pixel,)
     """
     mean, sd = x.mean_raw_dn, np.sqrt(np.maximum(x.unsaturated_variance_dn2 / x.n_frames - 1 / 12, 0.0))
     recorded = x.recorded_dn / x.n_frames

@@ -50,12 +50,9 @@ CLIPPED_COLUMNS = tuple(
 
 
 def observers(x: Expectation, scene: Scene) -> NDArray[np.void]:
-    """Return the bias and dark that an observer subtracts, and the noise model, of each pixel.
+    """Return the `layout.OBSERVER` structures: subtracted bias and dark, and noise model, shape (n_padded,).
 
-    Returns
-    -------
-    ndarray of layout.OBSERVER, shape (n_padded,)
-        The sky is subtracted per resolution element.
+    The sky is subtracted per resolution element.
     """
     table = np.zeros(len(scene.pixels), layout.OBSERVER)
     table["variance"] = 1.0  # padding: 0 / 1
@@ -70,11 +67,9 @@ def observers(x: Expectation, scene: Scene) -> NDArray[np.void]:
 
 
 def elements(x: Expectation) -> NDArray[np.void]:
-    """Return the resolution elements with bins centred on the closed-form S/N and scaled to its linearised spread.
+    """Return the `layout.ELEMENT` structures of the resolution elements, shape (n_element,).
 
-    Returns
-    -------
-    ndarray of layout.ELEMENT, shape (n_element,)
+    Bins are centred on the closed-form S/N and scaled to its linearised spread.
     """
     first = np.searchsorted(x.element, np.arange(x.element_wavelength_nm.size))
     table = np.zeros(first.size, layout.ELEMENT)

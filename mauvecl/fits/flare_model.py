@@ -434,14 +434,8 @@ class LightFactor:
     def change(self, value: Float, factor: Float, width: Float, allowed: float) -> Float:
         """Return how far the thresholds of quantities are from `allowed`, since the prior is not normal, shape (n,).
 
-        The part of a quantity's scatter that comes from the prior has the distribution of the prior.
-
-        Parameters
-        ----------
-        value, factor : ndarray, shape (n,)
-            Quantity, and the best factor on light.
-        width : ndarray, shape (n,)
-            Width of the quantity's interval for a rise of chi-squared by `allowed`.
+        The part of a quantity's scatter that comes from the prior has the distribution of the prior. `width` is that of
+        the quantity's interval for a rise of chi-squared by `allowed`.
         """
         share = np.zeros_like(value)
         usable = np.isfinite(value) & np.isfinite(width) & (width > 0.0) & (factor > 0.0)
@@ -590,20 +584,11 @@ class Reduction(MeanSums):
         highest_dn: Float | None = None,
         clipped: NDArray[np.bool_] | None = None,
     ) -> Self:
-        """Compute the reduction for exposures with the variance of a given flare.
+        """Compute the reduction for exposures with the variance of a flare, whose recorded mean is `added_dn`.
 
-        Raises InputError if too few pixels can be used, or the flare is degenerate with the unknowns.
-
-        Parameters
-        ----------
-        added_dn : ndarray, shape (n_pixel,), optional
-            Mean DN of the flare as it is recorded; none by default.
-        skipped_nm : sequence of tuple
-            Wavelength ranges of pixels that are not used, in addition to saturated ones.
-        highest_dn : ndarray, shape (n_pixel,), optional
-            Largest mean DN of the flares of the exposures, which decides on saturation; `added_dn` by default.
-        clipped : ndarray of bool, shape (n_pixel,), optional
-            Other pixels that are not used.
+        The largest mean of the exposures' flares, `highest_dn`, decides on saturation; pixels at `skipped_nm` and
+        `clipped` ones are not used either. Raises InputError if too few pixels can be used, or the flare is degenerate
+        with the unknowns.
         """
         added = np.zeros(quiet.wavelength_nm.size) if added_dn is None else added_dn
         variance, used = usable_variance(quiet, added, skipped_nm, nuisances, highest_dn)

@@ -302,14 +302,10 @@ def _linear_interval(
 
 
 def ratio_at(profile: Profile, spline: CubicSpline, log_k: Float, linear: Float, variance: Float, hot: Float) -> Ratio:
-    """Return a quantity that is linear in the amplitudes, at temperatures (n, n_sample), over the factor on all light.
+    """Return a sum of the amplitudes at temperatures (n, n_sample), over the factor on all light.
 
-    Parameters
-    ----------
-    spline : CubicSpline
-        Factors of the amplitudes over log temperature.
-    linear, variance, hot
-        Best amplitudes at these temperatures; variance and sums of the blackbody, as of `Profile.parts`.
+    `spline` holds the factors of the amplitudes over log temperature; `variance` and `hot` are those of
+    `Profile.parts`.
     """
     basis, inverse = profile.reduction.basis
 
@@ -358,17 +354,9 @@ class _Thresholds:
         """Return the thresholds at ends, (n,), below which ratios are as probable as below Wilks' `allowed`.
 
         Simulated sums have even distances along the gradient of the quantity, weighted by their probability, and the
-        same noise for all ends in the other directions in which the mean sums change.
-
-        Parameters
-        ----------
-        rows : ndarray, shape (n,)
-            Numbers of the frames.
-        x, moved : ndarray, shape (n,)
-            Log temperature at the end, and its distance from the best value there in standard errors.
-        error : ndarray, shape (n,)
-            Standard error of the log temperature.
-        allowed : float
+        same noise for all ends in the other directions in which the mean sums change. `x` is the log temperature at the
+        end, `moved` the distance from the best value there in standard errors, and `error` the standard error of the
+        log temperature.
         """
         profile, reduction = self._profile, self._profile.reduction
         there, (basis, inverse) = _held_direction(reduction, self._spline, x), reduction.basis

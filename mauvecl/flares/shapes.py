@@ -98,18 +98,10 @@ class Shape(ABC):
         return between(sides(self, first), sides(self, last))
 
     def mean_over(self, edges_s: ArrayLike, peak_s: ArrayLike, t_half_s: ArrayLike) -> Float:
-        """Return the exact mean over each frame.
+        """Return the exact mean over each frame, shape (n_frame,), or (n, n_frame) for peaks of the shape (n, 1).
 
-        Parameters
-        ----------
-        edges_s : array_like, shape (n_frame + 1,) or (n_frame, 2)
-            Edges of consecutive frames, or start and end of each frame.
-        peak_s, t_half_s : array_like
-            Time at which tau is 0, and half-width, s; shape (n, 1) gives one row for each.
-
-        Returns
-        -------
-        ndarray, shape (n_frame,), or (n, n_frame)
+        Edges are those of consecutive frames, (n_frame + 1,), or start and end of each frame, (n_frame, 2). The peak is
+        the time at which tau is 0.
         """
         edges, peak, scale = (np.asarray(values, np.float64) for values in (edges_s, peak_s, t_half_s))
         if edges.ndim == 2:

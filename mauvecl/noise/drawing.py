@@ -142,15 +142,9 @@ def truncation_distance(c: Cumulants, *, fourth_power: bool, varying: bool = Fal
     """Estimate Pearson's distance between a draw and its polynomial from the next terms, shape (n_pixel,).
 
     A term a He_k(z) changes the density by a He_(k + 1)(z) times the normal's, and the squares of these integrate to
-    a^2 (k + 1)!. Rounding to whole DN can only reduce the distance.
-
-    Parameters
-    ----------
-    fourth_power : bool
-        Whether the polynomial includes z^4.
-    varying : bool
-        Whether to use the kernels' polynomial for factors on light and dark instead of `polynomial`. Without the fourth
-        power, it has no terms of gamma_5.
+    a^2 (k + 1)!. Rounding to whole DN can only reduce the distance. `fourth_power` tells whether the polynomial
+    includes z^4, and `varying` selects the kernels' polynomial for factors on light and dark instead of `polynomial`;
+    without the fourth power, it has no terms of gamma_5.
     """
     return expansion_error(c.over_sd(7), fourth_power=fourth_power, varying=varying)
 
@@ -188,21 +182,14 @@ def needs_fourth_power(c: Cumulants, *, varying: bool = False) -> bool:
 
 
 def stack_is_exact(c: Cumulants, x: Expectation) -> NDArray[np.bool_]:
-    """Return the pixels whose frames can be drawn as one stack, shape (n_pixel,).
+    """Return the pixels whose frames can be drawn as one stack, from the cumulants of ONE frame.
 
-    Parameters
-    ----------
-    c : Cumulants
-        Cumulants of ONE frame.
-
-    Notes
-    -----
     A stack treats each frame's rounding error as noise of mean 0 and variance 1/12 that is Gaussian in the sum. The
     error is a sawtooth, the sum over k of sin(2 pi k x) / (pi k), which depends on the frame's noise through its
     characteristic function at 2 pi k (Widrow, Kollar & Liu 1996, doi 10.1109/19.492748): its modulus f_k and the slope
-    l_k of its logarithm. Given the sum of N frames of variance v, the conditional mean of a frame's sine is at most
-    f_k exp(u_k / 2) with u_k = l_k^2 / (N v), which changes the density of the sum by Pearson's distance below. Counts
-    of whole DN do not smooth the rounding. The sum of N uniform errors has the fourth cumulant -N / 120.
+    l_k of its logarithm. Given the sum of N frames of variance v, the conditional mean of a frame's sine is at most f_k
+    exp(u_k / 2) with u_k = l_k^2 / (N v), which changes the density of the sum by Pearson's distance below. Counts of
+    whole DN do not smooth the rounding. The sum of N uniform errors has the fourth cumulant -N / 120.
 
     Poisson counts whose steps are visible in the sum are ignored: given the counts, only the remaining noise smooths
     the rounding, and a mixture is never easier to distinguish than its components.
@@ -291,13 +278,10 @@ AUTOMATIC = Drawing()
 
 @cache
 def nodes() -> Float:
-    """Return the probabilities of the table's nodes from an end of a prior to its median.
+    """Return the probabilities of the table's nodes from an end of a prior to its median, (layout.PRIOR_NODES,).
 
-    Returns
-    -------
-    ndarray, shape (layout.PRIOR_NODES,)
-        Octaves from 2**-56 to 1/2 with 2**PRIOR_BITS cells each; the last node is repeated for words that float32
-        rounds up.
+    There are octaves from 2**-56 to 1/2 with 2**PRIOR_BITS cells each; the last node is repeated for words that float32
+    rounds up.
     """
     cells = 2**layout.PRIOR_BITS
     number = np.arange(layout.PRIOR_NODES - 1)
@@ -317,20 +301,11 @@ def _quantiles(prior: Prior) -> tuple[Float, Float]:
 
 
 def table_of(prior: Prior, change: Callable[[Float], Float]) -> tuple[NDArray[np.float32], float]:
-    """Compute the quantile table of a prior.
+    """Compute the quantile table of a prior, shape (2 * PRIOR_NODES,), and the factor at its median, minus one.
 
-    Parameters
-    ----------
-    change : callable
-        Function that converts the prior's values to a factor minus one.
-
-    Returns
-    -------
-    table : ndarray of float32, shape (2 * PRIOR_NODES,)
-        Factors at `nodes` from the low end, then from the high end, divided by the factor at the median, minus one.
-        In this form float32 resolves priors of any width and location.
-    centre : float
-        Factor at the median, minus one.
+    `change` converts the prior's values to a factor minus one. The table holds factors at `nodes` from the low end,
+    then from the high end, divided by the factor at the median, minus one. In this form float32 resolves priors of any
+    width and location.
     """
     at_nodes, median = _quantiles(prior)
     values, centre = change(at_nodes), float(change(median)[0])
@@ -350,13 +325,7 @@ class Factors:
 
     @classmethod
     def of(cls, processes: Processes, conditions: Conditions) -> Self:
-        """Compute the quantile tables of the priors' factors.
-
-        Parameters
-        ----------
-        conditions : mapping of float
-            Values of the expectation: ``temperature_c``, ``dark_slope_per_c``, ``light_loss``, ``pointing_loss``.
-        """
+        """Compute the quantile tables of the priors' factors for the conditions of an expectation."""
         tables = np.empty((len(processes.modulations), 2 * layout.PRIOR_NODES), np.float32)
         ends, centre = dict.fromkeys(SIGNAL_PARTS, (1.0, 1.0)), dict.fromkeys(SIGNAL_PARTS, 1.0)
         for row, (name, factor) in enumerate(processes.modulations):

@@ -285,19 +285,9 @@ def _pack(words: NDArray[np.int64], bits: int) -> NDArray[np.uint32]:
 
 
 def table_set(means: Iterable[float], tables: list[AliasTable]) -> tuple[list[AliasTable], list[int]]:
-    """Append a table for each distinct mean.
+    """Append a table for each distinct mean to `tables`, which are contiguous on the device.
 
-    Parameters
-    ----------
-    tables : list of AliasTable
-        Tables that are contiguous on the device; new ones are appended.
-
-    Returns
-    -------
-    each : list of AliasTable
-        Table of each mean.
-    starts : list of int
-        Start of each mean's table.
+    Return the table of each mean, and where it starts.
     """
     size = sum(table.entries.size for table in tables)
     distinct: dict[float, tuple[AliasTable, int]] = {}

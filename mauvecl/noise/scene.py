@@ -145,18 +145,10 @@ class FactorDistributions:
         return cls({name: _product(ones, medians[name]) for name, ones in spreads.items()}) if spreads else None
 
     def nodes(self, x: Expectation, *, weighted: bool) -> tuple[list[Node], Float]:
-        """Return the nodes over which a statistic of an exposure is integrated.
+        """Return the nodes over which a statistic of an exposure is integrated, and spectra of normal amplitudes.
 
-        Parameters
-        ----------
-        weighted : bool
-            Whether the statistic is a weighted sum instead of a sum of squares.
-
-        Returns
-        -------
-        nodes : list of Node
-        rows : ndarray, shape (k, n_pixel)
-            Spectra of factors treated as normal amplitudes, DN per standard deviation.
+        Factors that are treated as normal amplitudes have spectra, DN per standard deviation, (k, n_pixel). `weighted`
+        tells whether the statistic is a weighted sum instead of a sum of squares.
         """
         light, sky, dark = zip(*changes_of(x), strict=True)
         moved = {"dark": dark, "light": light, "sky": sky}
@@ -343,13 +335,9 @@ class Scene:
     def constants(
         self, weights: NDArray[np.float32], linear_end: NDArray[np.uint32], pixels_end: NDArray[np.uint32]
     ) -> NDArray[np.float32]:
-        """Compute the contribution of the reference's fractions of a DN to chi-squared and to each linear statistic.
+        """Compute what the reference's fractions of a DN add to chi-squared and to each linear statistic.
 
-        Sums of resolution elements include them already.
-
-        Returns
-        -------
-        ndarray of float32, shape (n_scenario + n_linear,)
+        Sums of resolution elements include them already. The shape is (n_scenario + n_linear,).
         """
         chi2 = np.sum(self.levels["inverse_variance"] * self.fraction**2, axis=1)
         scenario = np.searchsorted(linear_end, np.arange(len(weights)), side="right")
@@ -378,23 +366,12 @@ def prepare(
     first_group: int = 0,
     **words: Unpack[DrawingOptions],
 ) -> Scene:
-    """Compute the arrays of scenarios for the device.
+    """Compute the arrays of scenarios for the device, from expectations that differ only in their light.
 
+    Options of the draw can also be given as keywords. Each scenario is compared with one of the quiescent `references`,
+    by default the first; `first_group` is the number of the first group of four pixels in the generator's counter.
     Raises InputError if scenarios differ in more than their light, stacked draws are requested near a rail, or a
     process needs joint draws that are not exact.
-
-    Parameters
-    ----------
-    scenarios : sequence of Expectation
-        Expectations that differ only in their light.
-    drawing : Drawing, optional
-        Options of the draw, which can also be given as keywords.
-    references : sequence of int, optional
-        For each scenario, the quiescent one with which it is compared; by default the first.
-    comparison : Comparison
-        Subtracted reference and variances.
-    first_group : int
-        Number of the first group of four pixels in the generator's counter.
     """
     drawing = drawing or Drawing(**words)
     quiet = scenarios[0]

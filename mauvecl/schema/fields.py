@@ -50,20 +50,10 @@ def is_quantity(value: Any) -> bool:
 def number(
     what: str, value: Any, unit: str = "", *, low: float = -math.inf, high: float = math.inf, expected: str = ""
 ) -> float:
-    """Return one finite number in a unit.
+    """Return one finite number in a unit, as astropy reads it, from a number or a Quantity.
 
-    Raises InputError if the value is not a finite number in the range and unit.
-
-    Parameters
-    ----------
-    what : str
-        Name of the value, for messages.
-    unit : str
-        As astropy reads it. Wavelengths may come as frequencies or energies, temperatures on any scale.
-    low, high : float
-        Closed range of accepted values.
-    expected : str
-        Accepted values, for messages; from unit and range by default.
+    Wavelengths may come as frequencies or energies, temperatures on any scale. Raises InputError, with `expected` or
+    the unit and the closed range, if the value is not a finite number in them.
     """
     wanted = expected or _expected(unit, low, high)
     if type(value) is float:
@@ -433,15 +423,7 @@ def unit_of(kind: Any) -> str:
 
 
 def checked(kind: Any, what: str, value: Any) -> float:
-    """Return a number in the unit and range of an annotation such as `physical.Magnitude`.
-
-    Parameters
-    ----------
-    kind : type
-        Annotation with `Unit` and `Range`.
-    what : str
-        Name of the value, for messages.
-    """
+    """Return a number in the unit and range of an annotation such as `physical.Magnitude`."""
     return checked_number(what, value, unit_of(kind), range_of(kind))
 
 

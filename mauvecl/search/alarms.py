@@ -92,17 +92,10 @@ class Candidate:
 def alarms(
     survey: SearchedStare, templates: Templates, sums: NDArray[Any], threshold: float, energy: Factor | None = None
 ) -> list[Alarm]:
-    """Detect and fit all flares of a stare, largest statistic first.
+    """Detect and fit all flares of a stare in its simulated sums, (n_frame, n_sum), largest statistic first.
 
-    Parameters
-    ----------
-    templates : Templates
-        Templates from which the survey's bank and components are made.
-    sums : ndarray, shape (n_frame, n_sum)
-        Simulated sums; known means are subtracted here.
-    energy : callable, optional
-        Logarithm of the energy per second of equivalent duration as a function of the logarithm of the temperature,
-        and its derivative.
+    `templates` are those from which the survey's bank and components are made. `energy` returns the logarithm of the
+    energy per second of equivalent duration, and its derivative, for the logarithm of the temperature.
     """
     search = _StareSearch(StareSums(survey, templates, np.asarray(survey.net(sums[None])[0], np.float64)), threshold)
     search.run()

@@ -293,14 +293,10 @@ class Block:
         return float(left @ left)
 
     def fit(self, theta: Float, fixed: tuple[int, int, float, Factor | None] | None = None) -> BlendFit:
-        """Fit all flares from a starting point.
+        """Fit all flares from a starting point, shape (n_flare, 4).
 
-        Parameters
-        ----------
-        theta : ndarray, shape (n_flare, 4)
-        fixed : (int, int, float, callable or None), optional
-            Flare, column, value and factor of a constraint: the column has the value, or with a factor, the sum of
-            log amplitude, log half-width and the factor.
+        `fixed` is a constraint of flare, column, value and factor: the column has the value, or with a factor, the sum
+        of log amplitude, log half-width and the factor.
         """
         low, high = (np.tile(end, (len(theta), 1)) for end in self.sums.bounds)
         moved = np.zeros(theta.shape, np.bool_)
@@ -374,16 +370,10 @@ class Block:
     def interval(
         self, best: BlendFit, j: int, column: int, factor: Factor | None = None, rises: float = 1.0
     ) -> tuple[Interval, BlendFit | None]:
-        """Return the interval of a parameter or product, and a better fit if profiling finds one.
+        """Return the interval of a flare's parameter, and a better fit if profiling finds one.
 
-        Parameters
-        ----------
-        j, column : int
-            Flare and column.
-        factor : callable, optional
-            If given, the interval is that of amplitude x half-width x factor.
-        rises : float, optional
-            Rise of chi-squared at the ends of the interval.
+        With a factor, the interval is that of amplitude x half-width x factor. Chi-squared rises by `rises` at its
+        ends.
         """
         covariance, theta = self.covariance(best.theta), best.theta
         weights = np.zeros(theta.shape)
@@ -443,18 +433,11 @@ def _interval_end(
     refit: Callable[[float, Float | None], BlendFit], chi2: float, rises: float, step: float, furthest: float,
     start: Float | None = None,
 ) -> _IntervalEnd:  # fmt: skip
-    """Return the end of an interval on one side of the best fit.
+    """Return the end of an interval on one side of the best fit, at which chi-squared has risen by `rises`.
 
-    Parameters
-    ----------
-    refit : callable
-        Returns the best fit at a distance from the best one, from given or extrapolated starting parameters.
-    chi2, rises : float
-        Chi-squared of the best fit, and its rise at the end of the interval.
-    step, furthest : float
-        First guess of the distance to the end, and distance to the bound of the fit.
-    start : ndarray, optional
-        Starting parameters of the first fit.
+    `refit` returns the best fit at a distance from the best one, from given or extrapolated starting parameters. `step`
+    is the first guess of the distance, `furthest` that to the bound of the fit, and `start` the first starting
+    parameters.
     """
     inner, outer, root_inner, root_outer = 0.0, np.inf, 0.0, np.inf
     for _ in range(MAX_REFITS):
@@ -526,19 +509,10 @@ class SingleFlareFit:
         variance: Float | None = None,
         curves: Float | None = None,
     ) -> FittedFlares:
-        """Fit one flare to each of several light curves.
+        """Fit one flare to each of several light curves: sums less their known mean, (n, n_frame, n_sum).
 
-        Parameters
-        ----------
-        sums : ndarray, shape (n, n_frame, n_sum)
-            Sums less their known mean.
-        start_s : ndarray, shape (n_frame,)
-        peak_s, half_width_s : array_like, shape (n,)
-            Starting points, such as those of the template that detected each flare.
-        variance : ndarray, shape (n_frame,), optional
-            Variance of each frame's sums; 1 by default.
-        curves : ndarray, shape (n_curve, n_frame), optional
-            Baseline curves; see `Search`.
+        Starting points are the peak and half-width of, for example, the template that detected each flare. The variance
+        of the frames' sums is 1 by default; see `Search` for `curves`.
         """
         n = len(sums)
         peak, log_width = (np.array(np.broadcast_to(value, n), np.float64) for value in (peak_s, np.log(half_width_s)))

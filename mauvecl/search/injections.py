@@ -170,12 +170,7 @@ class InjectionSite:
 def sites_of(survey: Survey, widths_s: Sequence[float], peak_s: float, response: Float) -> tuple[InjectionSite, ...]:
     """Return the sites of flares of several half-widths that peak at one time.
 
-    Parameters
-    ----------
-    widths_s : sequence of float
-        Half-widths of the flares.
-    response : ndarray, shape (n_sum,)
-        Mean sums of a frame for a flare of unit amplitude.
+    `response`, (n_sum,), holds the mean sums of a frame for a flare of unit amplitude.
     """
     bank = survey.bank
     reaches = [_Reach.of(bank, width, peak_s) for width in widths_s]

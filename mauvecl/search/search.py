@@ -386,12 +386,9 @@ class Trend:
         return bool((np.sum(nonlinear**2 / self.variance[:, None], axis=(1, 2)) > LEAST**2).any())
 
     def effect(self, amplitudes: Float) -> Float:
-        """Return the effect of unknowns on the sums, (n_stare, n_frame, n_sum).
+        """Return the effect of unknowns, (n_stare, n_unknown) in standard deviations, on the sums.
 
-        Parameters
-        ----------
-        amplitudes : ndarray, shape (n_stare, n_unknown)
-            In standard deviations.
+        The result has the shape (n_stare, n_frame, n_sum).
         """
         return self._moved(self._changes(amplitudes))
 
@@ -401,13 +398,7 @@ class Trend:
         return replace(self, curves=self.curves[:, part], **{name: getattr(self, name)[part] for name in names})
 
     def subtracted(self, sums: NDArray[Any]) -> NDArray[np.float64]:
-        """Fit the unknowns to sums and subtract their effect beyond first order.
-
-        Parameters
-        ----------
-        sums : ndarray, shape (n_stare, n_frame, n_sum)
-            Sums less their known mean.
-        """
+        """Fit the unknowns to sums less their known mean, and subtract their effect beyond first order."""
         left = np.array(sums, np.float64)
         # One stare at a time, since the rounding of matrix products may depend on the number of stares.
         for row in left:
@@ -415,13 +406,7 @@ class Trend:
         return left
 
     def nonlinear_effect(self, amplitudes: Float) -> Float:
-        """Return the effect of unknowns less its linear part, (n_stare, n_frame, n_sum).
-
-        Parameters
-        ----------
-        amplitudes : ndarray, shape (n_stare, n_unknown)
-            In standard deviations.
-        """
+        """Return the `effect` of unknowns less its linear part, (n_stare, n_frame, n_sum)."""
         linear = np.array([self._linear[of] for of in self.of])
         first = np.einsum("nu,ut,uk->ntk", amplitudes, self.curves, linear, optimize=True)
         return np.asarray(self.effect(amplitudes) - first)
@@ -580,15 +565,7 @@ class Survey:
         return self.unknowns if self.unknowns is not None and self.unknowns.is_nonlinear else None
 
     def unsubtracted(self, amplitudes: Float) -> Float:
-        """Return the effect of unknowns on the sums that is not subtracted before the search.
-
-        The shape is (n_stare, n_frame, n_sum).
-
-        Parameters
-        ----------
-        amplitudes : ndarray, shape (n_stare, n_unknown)
-            In standard deviations.
-        """
+        """Return the `effect` of unknowns on the sums that is not subtracted before the search."""
         if self.unknowns is None:
             return np.zeros((len(amplitudes), self.stare.n_frames, self.components.n_statistics))
         moved = self.unknowns.effect(amplitudes)
