@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, fields
 from functools import cached_property
-from typing import Annotated, Any, ClassVar, Literal, Protocol, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -381,9 +381,27 @@ def check_last(start: int, realisations: int) -> None:
 
 
 class Countable:
-    """Base class of requests, which are pickled without cached results."""
+    """Base class of requests, which are divided into shards, and pickled without cached results."""
 
+    #: Smallest number of realisations of a shard, a power of two.
     least: ClassVar[int] = 2**12
+
+    if TYPE_CHECKING:
+        # Fields of each request.
+        @property
+        def realisations(self) -> int: ...
+        @property
+        def start(self) -> int: ...
+
+    @property
+    def parts(self) -> int:
+        """Number of parts, whose launches differ."""
+        return 1
+
+    @property
+    def work(self) -> int:
+        """Approximate work per realisation: pixels times scenarios."""
+        raise NotImplementedError
 
     @classmethod
     def of(cls, *what: Any, **how: Any) -> Self:
@@ -400,7 +418,7 @@ class _RealisationRequest(Countable):
     """Base class of requests for realisations."""
 
     def __post_init__(self) -> None:
-        check_last(vars(self)["start"], vars(self)["realisations"])
+        check_last(self.start, self.realisations)
 
 
 @validated
@@ -463,8 +481,6 @@ class SnrRequest(_RealisationRequest):
     start: FirstRealisation = 0
     drawing: Drawing = AUTOMATIC
 
-    parts = 1
-
     @cached_property
     def scene(self) -> Scene:
         """Scene to draw."""
@@ -486,29 +502,3 @@ class RealiseRequest(_RealisationRequest):
     seed: Seed
     start: FirstRealisation = 0
     drawing: Drawing = AUTOMATIC
-
-
-class Divisible(Protocol):
-    """Request that can be divided into shards.
-
-    Attributes
-    ----------
-    realisations, start : int
-    parts : int
-        Number of parts, whose launches differ.
-    work : int
-        Approximate work per realisation: pixels times scenarios.
-    least : int
-        Smallest number of realisations of a shard, a power of two.
-    """
-
-    @property
-    def realisations(self) -> int: ...
-    @property
-    def start(self) -> int: ...
-    @property
-    def parts(self) -> int: ...
-    @property
-    def work(self) -> int: ...
-    @property
-    def least(self) -> int: ...
