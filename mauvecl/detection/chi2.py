@@ -232,7 +232,7 @@ class Smoothing:
 
     def _preserves_sum(self, flare: Expectation, used: NDArray[np.bool_]) -> bool:
         """Return whether non-negative factors of the centres reproduce the mean of the sum over all pixels."""
-        scale, squares = self.scale(flare), _squares(used.size, self.sigma) @ (used * flare.variance_dn2)
+        scale, squares = self.scale(flare), _rows(used.size, self.sigma).power(2) @ (used * flare.variance_dn2)
         whole, ours = float(self._inverse_flare(flare) @ squares), float(scale @ squares[self.centres])
         return bool((scale >= 0).all() and abs(ours - whole) <= MAX_MEAN_ERROR * whole)
 
@@ -327,12 +327,6 @@ def _rows(n: int, sigma: float) -> csr_array:
     from scipy.sparse import csr_array
 
     return csr_array(gaussian_filter1d(np.eye(n), sigma, axis=0, mode="nearest"))
-
-
-@lru_cache(maxsize=2)
-def _squares(n: int, sigma: float) -> csr_array:
-    """Return the squared weights of `_rows`."""
-    return _rows(n, sigma).power(2)
 
 
 class Paper(QuadraticStatistic):

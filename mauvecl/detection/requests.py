@@ -106,12 +106,8 @@ class Hypotheses:
             raise InputError(f"every pixel of {self.quiet.name} is saturated", "a fainter star", key="quiet")
         for statistic in self._chosen.values():
             statistic.check(self.setting)
-        if "matched" in self._chosen:
-            self._check_shapes()
-
-    def _check_shapes(self) -> None:
-        """Raise InputError for a flare without effect, unless it saturates every pixel, which `messages` report."""
-        for k, flare in enumerate(self.flares):
+        for k, flare in enumerate(self.flares if "matched" in self._chosen else ()):
+            # `messages` report a flare that saturates every pixel.
             if k not in self.blinding:
                 check_shape(self.quiet, flare, self.scene.used, k)
 
@@ -191,13 +187,10 @@ class Hypotheses:
         # Only the nulls of shaped statistics depend on the template.
         key = statistic, flare, template if flare is None and self.statistic(statistic).shaped else 0
         if key not in self._forms:
-            self._forms[key] = self._closed_form(statistic, flare, template)
+            observed = self.quiet if flare is None else self.flares[flare]
+            looked_for = self.shape(statistic, template if flare is None else flare)
+            self._forms[key] = self.statistic(statistic).closed_form(self.setting, observed, looked_for)
         return self._forms[key]
-
-    def _closed_form(self, statistic: str, flare: int | None, template: int) -> Form:
-        observed = self.quiet if flare is None else self.flares[flare]
-        looked_for = self.shape(statistic, template if flare is None else flare)
-        return self.statistic(statistic).closed_form(self.setting, observed, looked_for)
 
     def dof(self, statistic: str) -> int:
         """Return the degrees of freedom without a flare: pixels, resolution elements, or one."""

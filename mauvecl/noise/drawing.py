@@ -9,9 +9,9 @@ realistic number of draws reveals the difference.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
-from typing import TYPE_CHECKING, Literal, Self, TypedDict, get_args
+from typing import TYPE_CHECKING, Literal, Self, TypedDict, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,12 +116,11 @@ class Cumulants:
     def scaled(self, light: float | Float, dark: float) -> Cumulants:
         """Return the cumulants with light and dark multiplied by factors."""
         gaussian_light = np.where(self.photon_step > 0, 0.0, self.light_variance)
-        return Cumulants(
+        return replace(
+            self,
             mean=self.mean + (light - 1.0) * self.light_dn + (dark - 1.0) * self.dark_dn,
             gaussian=self.gaussian + (light - 1.0) * gaussian_light,
             photons=light * self.photons,
-            photon_step=self.photon_step,
-            dark_step=self.dark_step,
             dark_dn=dark * self.dark_dn,
             light_dn=light * self.light_dn,
             light_variance=light * self.light_variance,
@@ -264,12 +263,7 @@ class Drawing:
     @property
     def options(self) -> DrawingOptions:
         """Fields as keyword arguments."""
-        return {
-            "mode": self.mode,
-            "recipe": self.recipe,
-            "processes": self.processes,
-            "first_frame": self.first_frame,
-        }
+        return cast(DrawingOptions, dict(vars(self)))
 
 
 #: Options that follow from the noise.

@@ -347,10 +347,7 @@ class Trend:
     variance: Float  # of each frame's sums, shape (n_frame,)
     of: tuple[Changing, ...]  # quantity that each unknown changes
     curves: Float  # change per standard deviation of each unknown, shape (n_unknown, n_frame)
-    star: Float  # known mean, shape (n_frame, n_sum)
-    sky: Float  # known mean, shape (n_frame, n_sum)
-    neighbours: Float  # known mean, shape (n_frame, n_sum)
-    dark: Float  # known mean, shape (n_frame, n_sum)
+    known: Float  # means of star, sky, neighbours and dark, shape (4, n_frame, n_sum)
     slope_per_c: float  # relative change of the dark current per deg C
 
     @classmethod
@@ -371,7 +368,7 @@ class Trend:
         dark = directions["temperature"] / slope_per_c if slope_per_c else np.zeros_like(sky)
         curves = np.array([unknown.sd * unknown.curve for unknown in unknowns])
         of = tuple(unknown.of for unknown in unknowns)
-        return cls(frames, frame_s, variance, of, curves, star, sky, neighbours, dark, slope_per_c)
+        return cls(frames, frame_s, variance, of, curves, np.stack([star, sky, neighbours, dark]), slope_per_c)
 
     @cached_property
     def extremes(self) -> Float:
@@ -394,8 +391,13 @@ class Trend:
 
     def part(self, part: slice) -> Trend:
         """Return the trend of some frames."""
-        names = ("frames", "variance", "star", "sky", "neighbours", "dark")
-        return replace(self, curves=self.curves[:, part], **{name: getattr(self, name)[part] for name in names})
+        frames, variance, curves, known = (
+            self.frames[part],
+            self.variance[part],
+            self.curves[:, part],
+            self.known[:, part],
+        )
+        return replace(self, frames=frames, variance=variance, curves=curves, known=known)
 
     def subtracted(self, sums: NDArray[Any]) -> NDArray[np.float64]:
         """Fit the unknowns to sums less their known mean, and subtract their effect beyond first order."""
@@ -432,7 +434,7 @@ class Trend:
     @cached_property
     def _linear(self) -> dict[str, Float]:
         """Mean response of the sums to each kind of change, shape (n_sum,)."""
-        star, sky, near, dark = (x.mean(axis=0) for x in (self.star, self.sky, self.neighbours, self.dark))
+        star, sky, near, dark = self.known.mean(axis=1)
         return {"star": star, "light": star + sky + near, "sky": sky, "temperature": self.slope_per_c * dark}
 
     @cached_property
@@ -442,20 +444,9 @@ class Trend:
         first = np.flatnonzero(np.diff(number, prepend=-1))
         weight = np.add.reduceat(1.0 / self.variance, first)
 
-        def mean(values: Float, axis: int = 0) -> Float:
-            over = self.variance if axis else self.variance[:, None]
-            return np.asarray(np.add.reduceat(values / over, first, axis=axis) / (weight if axis else weight[:, None]))
-
-        means = replace(
-            self,
-            frames=number[first],
-            variance=1.0 / weight,
-            curves=mean(self.curves, 1),
-            star=mean(self.star),
-            sky=mean(self.sky),
-            neighbours=mean(self.neighbours),
-            dark=mean(self.dark),
-        )
+        curves = np.add.reduceat(self.curves / self.variance, first, axis=1) / weight
+        known = np.add.reduceat(self.known / self.variance[:, None], first, axis=1) / weight[:, None]
+        means = replace(self, frames=number[first], variance=1.0 / weight, curves=curves, known=known)
         return first, weight, means
 
     def _changes(self, amplitudes: Float) -> dict[str, Float]:
@@ -471,18 +462,18 @@ class Trend:
         light = changes["light"] + 1
         star, sky = light * (1 + changes["star"]) - 1, light * (1 + changes["sky"]) - 1
         warm = np.expm1(self.slope_per_c * changes["temperature"])
-        lit = star[..., None] * self.star + sky[..., None] * self.sky + changes["light"][..., None] * self.neighbours
-        return np.asarray(lit + warm[..., None] * self.dark)
+        each = (change[..., None] for change in (star, sky, changes["light"], warm))
+        return np.asarray(sum(change * known for change, known in zip(each, self.known, strict=True)))
 
     def _gradient(self, changes: Mapping[str, Float]) -> Float:
         """Return the derivatives of `_moved` by the amplitudes, (n_stare, n_unknown, n_frame, n_sum)."""
         light, star, sky = (1 + changes[of][..., None] for of in ("light", "star", "sky"))
         warm = np.exp(self.slope_per_c * changes["temperature"])[..., None]
         each = {
-            "star": light * self.star,
-            "light": star * self.star + sky * self.sky + self.neighbours,
-            "sky": light * self.sky,
-            "temperature": self.slope_per_c * warm * self.dark,
+            "star": light * self.known[0],
+            "light": star * self.known[0] + sky * self.known[1] + self.known[2],
+            "sky": light * self.known[1],
+            "temperature": self.slope_per_c * warm * self.known[3],
         }
         return np.stack([each[of] * curve[:, None] for of, curve in zip(self.of, self.curves, strict=True)], axis=1)
 
