@@ -30,7 +30,7 @@ from mauvecl.fits.flare_model import Ratio, derived_values
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
 
-    from mauvecl.fits.flare_model import Derived, FlareModel, LightFactor, MeanSums, Reduction
+    from mauvecl.fits.flare_model import Derived, FlareModel, MeanSums, Reduction
 
 Float = NDArray[np.float64]
 
@@ -502,33 +502,18 @@ def _ratio_interval(profile: Profile, per: Float, hot: Float, least_gain: Float)
     return 1.0 + extreme(low, np.minimum), 1.0 + extreme(high, np.maximum)
 
 
-def covariance(model: FlareModel, profile: Profile, best: BestFit) -> Float:
-    """Return the covariance of quantities from the Fisher information at the fit, (n, n_derived, n_derived)."""
-    hot = profile.hot(best.log_k)
-    slope = profile.reduction.spline(best.log_k, 1)
-    n, m = best.linear.shape
-    jacobian = np.zeros((n, m + 1, hot.shape[1]))
-    jacobian[:, 0], jacobian[:, 1:m] = hot, profile.reduction.fixed
-    jacobian[:, m] = best.linear[:, :1] * slope
-    factor = profile.factor(best.log_k, best.linear)
-    information = jacobian @ jacobian.transpose(0, 2, 1)
-    return covariance_of(model, best.log_k, best.linear, information, profile.reduction.light, factor)
-
-
-def covariance_of(
-    model: FlareModel,
-    log_k: Float,
-    linear: Float,
-    information: Float,
-    light: LightFactor | None = None,
-    factor: Float | float = 1.0,
-) -> Float:
-    """Return the covariance of quantities, (n, n_derived, n_derived), from the information on the parameters.
+def covariance(model: FlareModel, reduction: MeanSums, best: BestFit, factor: Float) -> Float:
+    """Return the covariance of quantities from the Fisher information at the fit, (n, n_derived, n_derived).
 
     The parameters are the amplitudes as they are recorded and the log temperature, and the factor on all light if it is
     unknown. The result is NaN if a flare adds no light, or if its temperature and amplitudes are degenerate.
     """
-    m = linear.shape[1]
+    hot, slope = reduction.spline(best.log_k), reduction.spline(best.log_k, 1)
+    n, m = best.linear.shape
+    jacobian = np.zeros((n, m + 1, hot.shape[1]))
+    jacobian[:, 0], jacobian[:, 1:m] = hot, reduction.fixed
+    jacobian[:, m] = best.linear[:, :1] * slope
+    information = jacobian @ jacobian.transpose(0, 2, 1)
     scale = np.sqrt(np.einsum("nii->ni", information))
     good = (scale > 0.0).all(axis=1)
     scale[~good] = 1.0
@@ -537,11 +522,11 @@ def covariance_of(
     normal[~good] = np.eye(m + 1)
     inverse = np.linalg.inv(normal) / scale[:, :, None] / scale[:, None, :]
     inverse[~good] = np.nan
-    over = np.broadcast_to(np.asarray(factor, np.float64), log_k.shape)
+    log_k, linear, light = best.log_k, best.linear, reduction.light
     gradient = gradient_of(model, log_k, linear)
     if light is None:
         return np.asarray(gradient @ inverse @ gradient.transpose(0, 2, 1))
-    over = np.where(over > 0.0, over, np.nan)
+    over = np.where(factor > 0.0, factor, np.nan)
     which, _ = model.sums
     gradient[:, which] /= over[:, None, None]
     # The best factor follows the amplitudes and the temperature, and scatters about that.

@@ -213,6 +213,12 @@ class Stare:
             pointing,
         )
 
+    def part(self, frames: slice | NDArray[np.bool_]) -> Self:
+        """Return the stare with some of its frames."""
+        names = ("start_s", "star", "light", "sky", "temperature_c")
+        unknowns = tuple(replace(unknown, curve=unknown.curve[frames]) for unknown in self.unknowns)
+        return replace(self, unknowns=unknowns, **{name: getattr(self, name)[frames] for name in names})
+
     @property
     def jitters(self) -> dict[Changing, float]:
         """Standard deviations from frame to frame."""
@@ -388,15 +394,7 @@ def stare_along(
     # All but the temperature follow from a stare without gaps.
     whole = Stare.of(count * frame_s, frame_s=frame_s, **unknowns)
     temperature = _temperature(orbit, track, thermal)
-    stare = replace(
-        whole,
-        start_s=whole.start_s[seen],
-        star=whole.star[seen],
-        light=whole.light[seen],
-        sky=whole.sky[seen],
-        temperature_c=temperature[seen],
-        unknowns=tuple(replace(unknown, curve=unknown.curve[seen]) for unknown in whole.unknowns),
-    )
+    stare = replace(whole, temperature_c=temperature).part(seen)
     hits = particles.rate_per_cm2_s(track)[seen]
     return OrbitStare(stare, hits, visible.shadow[seen], times.iso(0.0), tuple(orbit.messages(times)))
 

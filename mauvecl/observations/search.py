@@ -13,7 +13,6 @@ from mauvecl.flares.stare import Stare
 from mauvecl.observations.level import process_level
 from mauvecl.observations.process import Process
 from mauvecl.observations.process_search import ProcessSearch
-from mauvecl.search.search import select_frames
 from mauvecl.search.templates import Bank, Baseline, Templates
 
 if TYPE_CHECKING:
@@ -154,7 +153,7 @@ class SeriesSurvey:
 
     def frames(self, kept: Bool) -> SeriesSurvey:
         """Return the survey of some of the frames."""
-        part = select_frames(self.stare, kept)
+        part = self.stare.part(kept)
         names = ("sums", "variance", "flux", "flux_variance", "time_s")
         return replace(self, stare=part, **{name: getattr(self, name)[kept] for name in names})
 

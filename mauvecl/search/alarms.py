@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from mauvecl.search.flare_fits import (
@@ -266,12 +267,10 @@ class _StareSearch:
         evened = left.copy()
         # The baseline under a flare is the median of the surrounding frames without excess noise.
         times = self.sums.edges[:, 0]
-        for start, stop in _runs(loud):
-            near = ~loud & (
-                np.abs(times - times[(start + stop) // 2]) < self.sums.survey.bank.baseline.window_s / 2 + 1
-            )
+        for (rows,) in scipy.ndimage.find_objects(scipy.ndimage.label(loud)[0]):
+            middle = times[(rows.start + rows.stop) // 2]
+            near = ~loud & (np.abs(times - middle) < self.sums.survey.bank.baseline.window_s / 2 + 1)
             level = np.median(left[near], axis=0) if near.any() else np.zeros(left.shape[1])
-            rows = slice(start, stop)
             evened[rows] = level + (left[rows] - level) / np.sqrt(excess[rows])[:, None]
         return evened
 
@@ -327,12 +326,6 @@ class _StareSearch:
                         other[j, WIDTH] = start[k, WIDTH]
                         fits.append(rows.fit(other))
         return min(fits, key=lambda fit: fit.chi2)
-
-
-def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return the start and end of each run of true values."""
-    steps = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    return [(int(a), int(b)) for a, b in steps.reshape(-1, 2)]
 
 
 def _measured_alarms(search: _StareSearch, energy: Factor | None) -> list[Alarm]:

@@ -27,7 +27,7 @@ from mauvecl.flares.stare_scene import Method, StaresRequest, method_for
 from mauvecl.noise.processes import NONE, Processes
 from mauvecl.schema.columns import Column
 from mauvecl.schema.errors import InputError
-from mauvecl.search.search import Search, select_frames, subtract_known
+from mauvecl.search.search import Search, subtract_known
 
 if TYPE_CHECKING:
     from mauvecl.search.flare_fits import FittedFlares, SingleFlareFit
@@ -245,7 +245,7 @@ def _search_near(survey: Survey, reaches: Sequence[_Reach]) -> tuple[Search, int
     near = {width for reach in reaches for width in reach.half_widths_s}
     bank = replace(survey.bank, half_widths_s=tuple(sorted(near)))
     curves = None if survey.curves is None else survey.curves[:, part]
-    return Search(bank, select_frames(stare, part), curves, survey.variance[part]), part.start
+    return Search(bank, stare.part(part), curves, survey.variance[part]), part.start
 
 
 def _filters(search: Search, seen: Sequence[_NearbyTemplates]) -> dict[int, tuple[NDArray[np.int64], Single]]:
@@ -371,7 +371,7 @@ class Injections:
         first = min((part.start for part in reached), default=0)
         window = slice(first, max((part.stop for part in reached), default=1))
         start = (1 + position) * NUMBERS
-        stare = select_frames(survey.stare, window)
+        stare = survey.stare.part(window)
         injecting = CriticalAmplitudes(
             tuple(site.within(first) for site in sites),
             self.threshold,

@@ -577,7 +577,7 @@ class Survey:
     def of_days(self, days: float) -> Survey:
         """Return the survey of at most the first `days` star-days of the stare."""
         n = int(days * DAY_S / self.stare.frame_s)
-        return self if self.stare.n_frames <= n else replace(self, stare=select_frames(self.stare, slice(0, n)))
+        return self if self.stare.n_frames <= n else replace(self, stare=self.stare.part(slice(0, n)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -607,10 +607,3 @@ def subtract_known(sums: NDArray[Any], known: NDArray[Any], trend: Trend | None)
     """Subtract from simulated sums, (n_stare, n_frame, n_sum), their known mean and, if given, the fitted trend."""
     left = sums - known
     return np.asarray(left if trend is None else trend.subtracted(left), np.float32)
-
-
-def select_frames(stare: Stare, part: slice | NDArray[np.bool_]) -> Stare:
-    """Return a stare with some of the frames."""
-    names = ("start_s", "star", "light", "sky", "temperature_c")
-    unknowns = tuple(replace(unknown, curve=unknown.curve[part]) for unknown in stare.unknowns)
-    return replace(stare, unknowns=unknowns, **{name: getattr(stare, name)[part] for name in names})
