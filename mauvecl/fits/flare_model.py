@@ -392,33 +392,16 @@ def _thresholds(prior: bytes, allowed: float) -> Float:
 
 @dataclass(frozen=True, eq=False)
 class LightFactor:
-    """Weighted sum of an exposure that estimates the factor on its light, and its means for the flares of a model.
+    """Weighted sum of an exposure that estimates the factor on its light, and its means for the flares of a model."""
 
-    Attributes
-    ----------
-    weights : ndarray, shape (n_pixel,)
-        Weights per DN; the sum has unit variance if the flare is known.
-    scale : float
-        Change of the sum for a change of the factor by one.
-    expected : float
-        Factor for which the mean of the sum is zero without a flare.
-    log_k, hot : ndarray, shape (n_node,)
-        Temperatures of the model, and mean sums for a blackbody of amplitude 1.
-    fixed : ndarray, shape (n_linear - 1,)
-        Mean sums of the other components for unit amplitude.
-    prior_share : float
-        Share of the prior in the information on the factor if the flare is known.
-    prior : ndarray, shape (2, n)
-        Deviations of the prior in standard deviations, and their probabilities; empty if it is normal.
-    """
-
-    weights: Float
-    scale: float
-    expected: float
-    log_k: Float
-    hot: Float
-    fixed: Float
-    prior_share: float
+    weights: Float  # per DN, shape (n_pixel,); the sum has unit variance if the flare is known
+    scale: float  # change of the sum for a change of the factor by one
+    expected: float  # factor for which the mean of the sum is zero without a flare
+    log_k: Float  # temperatures of the model, shape (n_node,)
+    hot: Float  # mean sums for a blackbody of amplitude 1, shape (n_node,)
+    fixed: Float  # mean sums of the other components for unit amplitude, shape (n_linear - 1,)
+    prior_share: float  # share of the prior in the information on the factor if the flare is known
+    # Deviations of the prior in standard deviations, and their probabilities, shape (2, n); empty if it is normal.
     prior: Float
 
     @cached_property
@@ -553,24 +536,12 @@ class MeanSums:
 
 @dataclass(frozen=True, eq=False)
 class Reduction(MeanSums):
-    """Weights of sums, and the mean sums of a model's flares.
+    """Weights of sums, and the mean sums of a model's flares."""
 
-    Attributes
-    ----------
-    variance : ndarray, shape (n_pixel,)
-        Variance of the exposure, zero in pixels that are not used.
-    weights : ndarray, shape (n_sum, n_pixel)
-        Weights per DN, for which the sums have unit covariance.
-    rows : ndarray, shape (k, n_pixel)
-        Weights of the sums whose squares marginalisation subtracts from chi-squared.
-    n_free : int
-        Number of unknowns that are projected out.
-    """
-
-    variance: Float
-    weights: Float
-    rows: Float
-    n_free: int
+    variance: Float  # of the exposure, zero in pixels that are not used, shape (n_pixel,)
+    weights: Float  # per DN, for which the sums have unit covariance, shape (n_sum, n_pixel)
+    rows: Float  # weights of the sums whose squares marginalisation subtracts from chi-squared, shape (k, n_pixel)
+    n_free: int  # number of unknowns that are projected out
 
     @classmethod
     def of(

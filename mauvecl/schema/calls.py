@@ -108,19 +108,14 @@ def _truth(value: Any) -> bool:
     return bool(value)
 
 
-def _text(value: Any) -> Any:
-    _require(isinstance(value, str))
-    return value
+def _taken_if(accepts: Callable[[Any], bool]) -> Callable[[Any], Any]:
+    """Return a function that returns an accepted value as it is, and raises ValueError for others."""
 
+    def take(value: Any) -> Any:
+        _require(accepts(value))
+        return value
 
-def _path(value: Any) -> Any:
-    _require(isinstance(value, str | os.PathLike))
-    return value
-
-
-def _function(value: Any) -> Any:
-    _require(callable(value))
-    return value
+    return take
 
 
 def _array(value: Any) -> Any:
@@ -156,9 +151,9 @@ LEAVES: dict[Any, tuple[Callable[[Any], Any], str]] = {
     float: (_number, "a number"),
     int: (_whole, "a whole number"),
     bool: (_truth, "true or false"),
-    str: (_text, "text"),
-    Path: (_path, "a path"),
-    Callable: (_function, "a function"),
+    str: (_taken_if(lambda value: isinstance(value, str)), "text"),
+    Path: (_taken_if(lambda value: isinstance(value, str | os.PathLike)), "a path"),
+    Callable: (_taken_if(callable), "a function"),
 }
 
 

@@ -177,10 +177,6 @@ class Search:
                 correlated *= scale.astype(real)
                 yield row, correlated
 
-    def template(self, row: Row, onset: int, direction: int) -> Float:
-        """Return the weights of each sum in rho of a template, shape (n_frame, n_sum): rho = sum(weights * sums)."""
-        return np.asarray(self.in_time(row, np.array([onset]))[0][:, None] * self.bank.directions[direction])
-
     def in_time(self, row: Row, onsets: NDArray[np.int64]) -> Float:
         """Return the weights of frames in templates of a row, without their direction, shape (n_onset, n_frame)."""
         size, first = row.template.time.size, row.peaks[onsets] + row.template.first
