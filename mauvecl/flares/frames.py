@@ -33,6 +33,11 @@ MOST_FLARES, MOST_STATISTICS = 8, 8
 ROUNDING_FOURTH = -1.0 / 120.0
 
 
+def known_strengths(stare: Stare, quiet: Expectation) -> Float:
+    """Return known strengths of star, sky, dark, and neighbours and flares in each frame, shape (n_frame, 4)."""
+    return np.column_stack([stare.light * stare.star, stare.light * stare.sky, stare.dark_factor(quiet), stare.light])
+
+
 @dataclass(frozen=True, eq=False)
 class Components:
     """Spectra of a stare's frames, and weights of the sums that are computed for each frame.
@@ -152,8 +157,7 @@ class Components:
         `flare` holds the amplitude of each flare spectrum in each frame, (n_frame, n_flare).
         """
         factors = np.zeros((stare.n_frames, len(STEADY) + self.n_flares))
-        factors[:, 0], factors[:, 1] = stare.light * stare.star, stare.light * stare.sky
-        factors[:, 2], factors[:, 3] = stare.dark_factor(self.quiet), stare.light
+        factors[:, : len(STEADY)] = known_strengths(stare, self.quiet)
         if flare is not None:
             if np.shape(flare) != (stare.n_frames, self.n_flares):
                 raise InputError(
@@ -181,6 +185,14 @@ class Components:
     def fourth(self, coefficients: Float) -> Float:
         """Return the joint fourth cumulants of the statistics, with one axis more than those of `third`."""
         return self._of(4, coefficients)
+
+    def jittered_covariance(self, coefficients: Float, stare: Stare) -> Float:
+        """Return `covariance` with the jitters of a stare."""
+        covariance, directions = self.covariance(coefficients), self.directions(coefficients)
+        for of, sd in stare.jitters.items():
+            moved = sd * directions[of]
+            covariance = covariance + moved[..., :, None] * moved[..., None, :]
+        return covariance
 
     def _of(self, order: int, coefficients: Float) -> Float:
         constant, each = self._sums[order]

@@ -558,10 +558,7 @@ def draw_shifts(survey: Survey, seed: int, part: Survey | None = None) -> Unknow
     coefficients[..., 1] *= (1 + moved["light"]) * (1 + moved["sky"])
     coefficients[..., 2] *= np.exp(slope * moved["temperature"])
     coefficients[..., 3] *= 1 + moved["light"]
-    covariance = components.covariance(coefficients)
-    for of, direction in components.directions(coefficients).items():
-        jitter = stare.jitters.get(of, 0.0)  # type: ignore[call-overload]
-        covariance += jitter**2 * direction[..., :, None] * direction[..., None, :]
+    covariance = components.jittered_covariance(coefficients, stare)
     variance = np.einsum("dk,ntkl,dl->ntd", rows, covariance, rows, optimize=True) / survey.variance[at, None]
     scales = np.sqrt(np.maximum(variance, 1e-12)).reshape(RATE_DRAWS, -1)
     searched = survey if part is None else part

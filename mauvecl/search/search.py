@@ -504,11 +504,7 @@ class Survey:
 
     def covariance(self) -> Float:
         """Return the covariance of each frame's sums without a flare, shape (n_frame, n_sum, n_sum)."""
-        covariance = self.components.covariance(self.coefficients)
-        for of, sd in self.stare.jitters.items():
-            moved = sd * self.directions[of]
-            covariance = covariance + moved[:, :, None] * moved[:, None, :]
-        return covariance
+        return self.components.jittered_covariance(self.coefficients, self.stare)
 
     @cached_property
     def variance(self) -> Float:
