@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -232,9 +233,7 @@ def fit(
     """
     exposures = checked_exposures(frames, expectation, levels, nuisances)
 
-    def reduction_of(added_dn: Float | None, **how: Any) -> Reduction:
-        return Reduction.of(model, expectation, added_dn, nuisances, skipped_nm, **how)
-
+    reduction_of = partial(Reduction.of, model, expectation, nuisances=nuisances, skipped_nm=skipped_nm)
     log_k, linear, cut = _pilot(exposures, expectation, model, reduction_of)
     every = np.arange(len(exposures.raw))
     # Exposures with saturated pixels start far from the flare, which decides on the pixels that saturate.
@@ -541,9 +540,7 @@ def fit_two_temperatures(
     single = fit(frames, expectation, model, nuisances, levels=levels, skipped_nm=skipped_nm)
     exposures = checked_exposures(frames, expectation, levels, nuisances)
 
-    def reduction_of(added_dn: Float | None, **how: Any) -> Reduction:
-        return Reduction.of(model, expectation, added_dn, nuisances, skipped_nm, **how)
-
+    reduction_of = partial(Reduction.of, model, expectation, nuisances=nuisances, skipped_nm=skipped_nm)
     allowed = [float(scipy.stats.chi2.isf(1 - p, 1)) for p in levels]
     parts, order, whole = [], [], TwoTemperatures(model)
     recorded = single.amplitudes * single.factor[:, None]

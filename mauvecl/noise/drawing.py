@@ -294,7 +294,7 @@ def _quantiles(prior: Prior) -> tuple[Float, Float]:
     return values, prior.quantile(np.array([0.5]))
 
 
-def table_of(prior: Prior, change: Callable[[Float], Float]) -> tuple[NDArray[np.float32], float]:
+def quantile_table(prior: Prior, change: Callable[[Float], Float]) -> tuple[NDArray[np.float32], float]:
     """Compute the quantile table of a prior, shape (2 * PRIOR_NODES,), and the factor at its median, minus one.
 
     `change` converts the prior's values to a factor minus one. The table holds factors at `nodes` from the low end,
@@ -310,7 +310,7 @@ def table_of(prior: Prior, change: Callable[[Float], Float]) -> tuple[NDArray[np
 class Factors:
     """Factors of priors on light, dark and sky; factors on light include the sky's light."""
 
-    #: Shape (n_modulation, 2 * layout.PRIOR_NODES); quantile tables; see `table_of`.
+    #: Shape (n_modulation, 2 * layout.PRIOR_NODES); quantile tables; see `quantile_table`.
     tables: NDArray[np.float32]
     #: Factors at the priors' medians, to which the tables are relative, in the order of `SIGNAL_PARTS`.
     medians: dict[SignalPart, float]
@@ -330,7 +330,7 @@ class Factors:
                 raise InputError.of(
                     name, [float(first), float(last)], f"a prior within {varied.low:g} to {varied.high:g}"
                 )
-            tables[row], middle = table_of(prior, change)
+            tables[row], middle = quantile_table(prior, change)
             centre[factor] *= 1.0 + middle
             least, most = sorted(1.0 + change(np.array([first, last])))
             ends[factor] = ends[factor][0] * float(least), ends[factor][1] * float(most)

@@ -241,10 +241,10 @@ def alias_table(mean: float) -> AliasTable:
     counts = np.arange(low, high + 1)
     p = np.exp(special.xlogy(counts, mean) - mean - special.gammaln(counts + 1.0))
     inside = np.flatnonzero((np.cumsum(p) >= 2.0**-33) & (np.cumsum(p[::-1])[::-1] >= 2.0**-33))
-    return table_of(p[inside[0] : inside[-1] + 1], low + int(inside[0]))
+    return alias_table_of(p[inside[0] : inside[-1] + 1], low + int(inside[0]))
 
 
-def table_of(probability: NDArray[np.float64], low: int = 0) -> AliasTable:
+def alias_table_of(probability: NDArray[np.float64], low: int = 0) -> AliasTable:
     """Compute the alias table of a distribution over the integers from `low` on.
 
     `probability` has up to 2**24 values, which need not sum to one.

@@ -26,7 +26,7 @@ from mauvecl.noise.drawing import (
     polynomial,
     sky_share,
 )
-from mauvecl.noise.layout import LARGEST_MEAN, SMALLEST_EXPANDED, AliasTable, table_of, table_set
+from mauvecl.noise.layout import LARGEST_MEAN, SMALLEST_EXPANDED, AliasTable, alias_table_of, table_set
 from mauvecl.noise.unknowns import ADDITIVE, PROCESSES, SIGNAL_PARTS, SignalPart
 from mauvecl.schema.errors import InputError
 
@@ -533,7 +533,7 @@ def _job(
     job["reference_count"], job["reference_weight"] = comparison.exposures, comparison.added_variance
     job["pair_scale"] = variance_factor(comparison) / 2.0
     for name, process in drawing.processes.additive.items():
-        table = table_of(process.charge(method.each * quiet.frame_s))
+        table = alias_table_of(process.charge(method.each * quiet.frame_s))
         job[f"{name}_table"] = sum(t.entries.size for t in tables)
         job[f"{name}_bits"], job[f"{name}_low"] = table.bits, table.low
         tables.append(table)

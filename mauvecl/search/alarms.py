@@ -25,9 +25,9 @@ from mauvecl.search.flare_fits import (
     Block,
     Factor,
     FittedFlares,
-    Interval,
+    ProfileInterval,
     SearchedStare,
-    StareSums,
+    SummedStare,
 )
 from mauvecl.search.templates import LEAD, TAIL
 
@@ -98,7 +98,7 @@ def alarms(
     `templates` are those from which the survey's bank and components are made. `energy` returns the logarithm of the
     energy per second of equivalent duration, and its derivative, for the logarithm of the temperature.
     """
-    search = _StareSearch(StareSums(survey, templates, np.asarray(survey.net(sums[None])[0], np.float64)), threshold)
+    search = _StareSearch(SummedStare(survey, templates, np.asarray(survey.net(sums[None])[0], np.float64)), threshold)
     search.run()
     return sorted(_measured_alarms(search, energy), key=lambda alarm: -alarm.rho)
 
@@ -107,7 +107,7 @@ def alarms(
 class _StareSearch:
     """State of the search of one stare."""
 
-    sums: StareSums
+    sums: SummedStare
     threshold: float
     found: list[Candidate] = field(default_factory=list)
     refused: list[tuple[float, float]] = field(default_factory=list)
@@ -418,11 +418,11 @@ def _intervals(
     return intervals, f"the interval of its {' and its '.join(notes)} ends where the fit does" if notes else ""
 
 
-def _by_curvature(theta: Float, covariance: Float, column: int, factor: Factor | None) -> Interval:
+def _by_curvature(theta: Float, covariance: Float, column: int, factor: Factor | None) -> ProfileInterval:
     if factor is None:
         middle, sd = theta[column], np.sqrt(covariance[column, column])
     else:
         value, slope = factor(theta[KELVIN])
         along = np.array([1.0, 0.0, 1.0, slope])
         middle, sd = theta[AMPLITUDE] + theta[WIDTH] + value, np.sqrt(along @ covariance @ along)
-    return Interval(float(middle - sd), float(middle + sd))
+    return ProfileInterval(float(middle - sd), float(middle + sd))

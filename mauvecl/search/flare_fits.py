@@ -72,7 +72,7 @@ class BlendFit:
 
 
 @dataclass(frozen=True, eq=False)
-class Interval:
+class ProfileInterval:
     """A 68 % interval from the profile likelihood."""
 
     low: float
@@ -112,7 +112,7 @@ class SearchedStare(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class StareSums:
+class SummedStare:
     """The sums of a stare to which flares are fitted."""
 
     survey: SearchedStare
@@ -249,7 +249,7 @@ class StareSums:
 class Block:
     """Frames and noise of flares that are fitted together."""
 
-    sums: StareSums
+    sums: SummedStare
     used: NDArray[np.bool_]  # frames of the stare, shape (n_frame,)
     whiten: Float  # whitening matrices, shape (n_used, n_sum, n_sum)
     basis: Float  # orthonormal columns of the whitened baseline, shape (n_used * n_sum, n_term)
@@ -369,7 +369,7 @@ class Block:
 
     def interval(
         self, best: BlendFit, j: int, column: int, factor: Factor | None = None, rises: float = 1.0
-    ) -> tuple[Interval, BlendFit | None]:
+    ) -> tuple[ProfileInterval, BlendFit | None]:
         """Return the interval of a flare's parameter, and a better fit if profiling finds one.
 
         With a factor, the interval is that of amplitude x half-width x factor. Chi-squared rises by `rises` at its
@@ -405,10 +405,10 @@ class Block:
                 if one.chi2 - best.chi2 < rises * (1.0 - CLOSE) ** 2:
                     reached = _interval_end(refit, best.chi2, rises, step, furthest, one.theta)
             if reached.better is not None:
-                return Interval(np.nan, np.nan), self.fit(reached.better.theta)
+                return ProfileInterval(np.nan, np.nan), self.fit(reached.better.theta)
             interval_ends.append((float(middle + sign * reached.step), reached.open))
         (low, open_low), (high, open_high) = interval_ends
-        return Interval(low, high, open_low, open_high), None
+        return ProfileInterval(low, high, open_low, open_high), None
 
     def without(self, blended: BlendFit, j: int) -> BlendFit:
         """Fit all flares except flare `j`."""
