@@ -646,8 +646,8 @@ class _Search:
             if rows.size:
                 self._gain[rows, node] = self._profile(int(node), rows).best().gain
 
-    def measured(self) -> tuple[BestFit, Float, Float, Float, Float, Float]:
-        """Return best fits, intervals (n_level, n, n_derived), second log temperatures, estimates, and factors."""
+    def _evaluate_intervals(self) -> None:
+        """Compute the largest gain at second temperatures in and next to the intervals."""
         n, nodes = self._gain.shape
         coarse = np.zeros((n, nodes), np.bool_)
         coarse[:, ::COARSE] = True
@@ -661,6 +661,11 @@ class _Search:
             for share in np.linspace(0.0, 1.0, TRIES + 1):
                 fine[np.arange(n), np.rint(low + share * (high - low)).astype(np.intp)] = True
             self._evaluate(fine)
+
+    def measured(self) -> tuple[BestFit, Float, Float, Float, Float, Float]:
+        """Return best fits, intervals (n_level, n, n_derived), second log temperatures, estimates, and factors."""
+        self._evaluate_intervals()
+        n = len(self._gain)
         best_node = self._gain.argmax(axis=1)
         gain = self._gain.max(axis=1)
         q = len(self._model.derived) + 2

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property, lru_cache
+from functools import cache, cached_property
 from typing import TYPE_CHECKING, Annotated, NamedTuple, Self
 
 import numpy as np
@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.detection.nuisances import Nuisances, spectrum_of
 from mauvecl.fits.flare_model import EVERY, Exposures, Ranges, Reduction
+from mauvecl.fits.profile import remembering
 from mauvecl.fits.spectrum import LEVELS, Measurement, clipped_pixels, fit
 from mauvecl.flares.events import Event
 from mauvecl.flares.frames import Components, known_strengths
@@ -307,16 +308,6 @@ NO_STEP = 1e-9
 NEWTON_STEPS, LONGEST, CONVERGED, WORST_CONDITION = 20, 1.5, 1e-6, 1e10
 
 
-def _remembering(function: Callable[[Float], Pair]) -> Callable[[Float], Pair]:
-    """Return a function that keeps its last results, since it is asked at the same parameters in turn."""
-
-    @lru_cache(maxsize=2)
-    def of_bytes(theta: bytes) -> Pair:
-        return function(np.frombuffer(theta))
-
-    return lambda theta: of_bytes(theta.tobytes())
-
-
 @dataclass(frozen=True, eq=False)
 class _Level:
     """Unknown amplitude of known changes of the frames."""
@@ -369,12 +360,12 @@ class _Data:
     @cached_property
     def strengths(self) -> Callable[[Float], Pair]:
         """Function of the parameters that returns the amplitude and log temperature of each frame."""
-        return _remembering(self._strengths)
+        return remembering(self._strengths)
 
     @cached_property
     def slopes(self) -> Callable[[Float], Pair]:
         """Function that returns the derivatives of `strengths` by the parameters, each of shape (6, n_frame)."""
-        return _remembering(self._slopes)
+        return remembering(self._slopes)
 
     def _strengths(self, theta: Float) -> Pair:
         rise = np.exp(theta[2]) * self.light * self.shape.mean_over(self.edges, theta[0], np.exp(theta[1]))

@@ -23,7 +23,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_
 from pydantic_core import CoreSchema, PydanticCustomError, SchemaValidator, ValidationError, core_schema
 
 from mauvecl.schema.errors import InputError, shown
-from mauvecl.schema.fields import is_quantity, without_unit
+from mauvecl.schema.fields import is_quantity, is_truth, without_unit
 
 #: Place of an error inside an alternative of a union.
 ALTERNATIVE = "|"
@@ -94,7 +94,7 @@ def _number(value: Any) -> float:
 def _whole(value: Any) -> int:
     if is_quantity(value):
         value = without_unit(value, "")
-    _require(not _is_truth(value) and not getattr(value, "ndim", 0))
+    _require(not is_truth(value) and not getattr(value, "ndim", 0))
     try:
         return operator.index(value)
     except TypeError:
@@ -104,7 +104,7 @@ def _whole(value: Any) -> int:
 
 
 def _truth(value: Any) -> bool:
-    _require(_is_truth(value))
+    _require(is_truth(value))
     return bool(value)
 
 
@@ -194,11 +194,6 @@ def _kind(value: Any) -> str:
 
         value = np.asarray(value)
     return str(getattr(value.dtype, "kind", ""))
-
-
-def _is_truth(value: Any) -> bool:
-    # NumPy's own type has this name as well, and need not be loaded.
-    return type(value).__name__ in ("bool", "bool_")
 
 
 def _require(condition: bool) -> None:

@@ -159,6 +159,11 @@ class Range:
         return f"{noun} {' and '.join(ends)}" if ends else noun
 
 
+def is_truth(value: Any) -> bool:
+    """Return whether a value is true or false; NumPy's own type counts too and need not be loaded."""
+    return type(value).__name__ in ("bool", "bool_")
+
+
 def number(what: str, value: Any, unit: str = "", reach: Range | None = None) -> float:
     """Return one finite number in a unit, as astropy reads it, and a range, from a number or a Quantity.
 
@@ -189,7 +194,7 @@ def count(what: str, value: Any) -> int:
     """Return a whole number of at least 0, given as an int, a float such as 1e5 or a dimensionless Quantity."""
     try:
         # Whole numbers beyond 2**53 are no floats.
-        whole = number(what, value) if isinstance(value, bool) else operator.index(value)
+        whole = number(what, value) if is_truth(value) else operator.index(value)
     except TypeError:
         whole = number(what, value)
     if whole != int(whole) or not 0 <= whole < 2**63:

@@ -24,7 +24,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from mauvecl.fits.profile import Profile
+from mauvecl.fits.profile import Profile, remembering
 from mauvecl.flares.shapes import between, sides
 
 if TYPE_CHECKING:
@@ -317,26 +317,21 @@ class Block:
                     every[j, AMPLITUDE] = value - every[j, WIDTH] - factor(every[j, KELVIN])[0]
             return every
 
-        held: dict[bytes, Float] = {}
-
+        @remembering
         def triangle(x: Float) -> Float:
             """Return the triangular factor of derivatives and residuals as columns.
 
             Its columns have the same scalar products, on which alone the fit depends. It has few rows.
             """
-            # Residuals and derivatives are evaluated at the same point, one after the other.
-            if x.tobytes() not in held:
-                held.clear()
-                every = whole(x)
-                model, derivatives = self.model(every)
-                if fixed is not None and fixed[3] is not None:
-                    j = fixed[0]
-                    tied = derivatives[:, j, AMPLITUDE].copy()
-                    derivatives[:, j, WIDTH] -= tied
-                    derivatives[:, j, KELVIN] -= fixed[3](every[j, KELVIN])[1] * tied
-                columns = np.column_stack([-derivatives[:, moved], self.data - model])
-                held[x.tobytes()] = np.asarray(np.linalg.qr(columns, mode="r"))
-            return held[x.tobytes()]
+            every = whole(x)
+            model, derivatives = self.model(every)
+            if fixed is not None and fixed[3] is not None:
+                j = fixed[0]
+                tied = derivatives[:, j, AMPLITUDE].copy()
+                derivatives[:, j, WIDTH] -= tied
+                derivatives[:, j, KELVIN] -= fixed[3](every[j, KELVIN])[1] * tied
+            columns = np.column_stack([-derivatives[:, moved], self.data - model])
+            return np.asarray(np.linalg.qr(columns, mode="r"))
 
         def residual(x: Float) -> Float:
             return triangle(x)[:, -1]
