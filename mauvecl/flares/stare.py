@@ -213,12 +213,6 @@ class Stare:
             pointing,
         )
 
-    def part(self, frames: slice | NDArray[np.bool_]) -> Self:
-        """Return the stare with some of its frames."""
-        names = ("start_s", "star", "light", "sky", "temperature_c")
-        unknowns = tuple(replace(unknown, curve=unknown.curve[frames]) for unknown in self.unknowns)
-        return replace(self, unknowns=unknowns, **{name: getattr(self, name)[frames] for name in names})
-
     @property
     def jitters(self) -> dict[Changing, float]:
         """Standard deviations from frame to frame."""
@@ -274,6 +268,13 @@ class Stare:
         """Return the factor on an expectation's dark current in each frame, shape (n_frame,)."""
         slope, at = quiet.conditions["dark_slope_per_c"], quiet.conditions["temperature_c"]
         return np.asarray(np.exp(slope * (self.temperature_c - at)))
+
+
+def select_frames(stare: Stare, part: slice | NDArray[np.bool_]) -> Stare:
+    """Return a stare with some of its frames."""
+    names = ("start_s", "star", "light", "sky", "temperature_c")
+    unknowns = tuple(replace(unknown, curve=unknown.curve[part]) for unknown in stare.unknowns)
+    return replace(stare, unknowns=unknowns, **{name: getattr(stare, name)[part] for name in names})
 
 
 def _frames_outside_gaps(gaps: Sequence[tuple[float, float]], start: Float, frame_s: float) -> NDArray[np.bool_]:
@@ -394,7 +395,7 @@ def stare_along(
     # All but the temperature follow from a stare without gaps.
     whole = Stare.of(count * frame_s, frame_s=frame_s, **unknowns)
     temperature = _temperature(orbit, track, thermal)
-    stare = replace(whole, temperature_c=temperature).part(seen)
+    stare = select_frames(replace(whole, temperature_c=temperature), seen)
     hits = particles.rate_per_cm2_s(track)[seen]
     return OrbitStare(stare, hits, visible.shadow[seen], times.iso(0.0), tuple(orbit.messages(times)))
 

@@ -138,7 +138,8 @@ class FactorDistributions:
     ) -> FactorDistributions | None:
         spreads: dict[SignalPart, list[FactorDistribution]] = {}
         for (name, factor), table in zip(modulations, tables, strict=True):
-            spread = _of_table(table)
+            # Relative to the factor at the median, as the table is.
+            spread = FactorDistribution(1.0 + quantile_at_score(table, SCORE), WEIGHTS)
             if PROCESSES[name].when == "frame" and n_frames > 1:
                 spread = _normal(spread.mean, spread.sd / np.sqrt(n_frames))
             spreads.setdefault(factor, []).append(spread)
@@ -174,11 +175,6 @@ class FactorDistributions:
 
 def _normal(mean: float, sd: float) -> FactorDistribution:
     return FactorDistribution(mean + sd * SCORE, WEIGHTS)
-
-
-def _of_table(table: NDArray[np.float32]) -> FactorDistribution:
-    """Return the distribution given by a device's quantile table, relative to the factor at the median."""
-    return FactorDistribution(1.0 + quantile_at_score(table, SCORE), WEIGHTS)
 
 
 def quantile_at_score(table: NDArray[np.float32], score: Float) -> Float:

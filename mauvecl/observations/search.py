@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.flares.stare import Stare
+from mauvecl.flares.stare import Stare, select_frames
 from mauvecl.observations.level import process_level
 from mauvecl.observations.process import Process
 from mauvecl.observations.process_search import ProcessSearch
@@ -153,7 +153,7 @@ class SeriesSurvey:
 
     def frames(self, kept: Bool) -> SeriesSurvey:
         """Return the survey of some of the frames."""
-        part = self.stare.part(kept)
+        part = select_frames(self.stare, kept)
         names = ("sums", "variance", "flux", "flux_variance", "time_s")
         return replace(self, stare=part, **{name: getattr(self, name)[kept] for name in names})
 

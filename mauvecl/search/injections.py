@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.flares.frames import STEADY, Components
+from mauvecl.flares.stare import select_frames
 from mauvecl.flares.stare_scene import Method, StaresRequest, method_for
 from mauvecl.noise.processes import NONE, Processes
 from mauvecl.schema.columns import Column
@@ -103,8 +104,9 @@ class FitAccuracy:
         none = count == 0
 
         def quantile(name: str, q: float) -> Float:
-            filled = np.where(none[:, :, None], 0.0, each[name])
-            return np.where(none, np.nan, np.nanquantile(filled, q, axis=2))
+            blank = ~np.isfinite(each[name]).any(axis=2)
+            filled = np.where(blank[:, :, None], 0.0, each[name])
+            return np.where(blank, np.nan, np.nanquantile(filled, q, axis=2))
 
         peak = [quantile("peak", q) for q in (0.16, 0.5, 0.84)]
         return cls(
@@ -114,17 +116,11 @@ class FitAccuracy:
             energy_ratio_high=quantile("energy", 0.84),
             amplitude_ratio=quantile("amplitude", 0.5),
             half_width_ratio=quantile("half_width", 0.5),
-            temperature_ratio=_quiet_median(each["temperature"], none),
+            temperature_ratio=quantile("temperature", 0.5),
             peak_offset=peak[1],
             peak_scatter=(peak[2] - peak[0]) / 2,
             energy_covered=np.where(none, np.nan, np.nanmean(np.where(none[:, :, None], 0.0, each["covered"]), axis=2)),
         )
-
-
-def _quiet_median(values: NDArray[Any], none: NDArray[np.bool_]) -> Float:
-    """Return the median over stares, NaN for cells without fitted temperatures."""
-    blank = none | ~np.isfinite(values).any(axis=2)
-    return np.where(blank, np.nan, np.nanmedian(np.where(blank[:, :, None], 0.0, values), axis=2))
 
 
 Single = NDArray[np.float32]
@@ -245,7 +241,7 @@ def _search_near(survey: Survey, reaches: Sequence[_Reach]) -> tuple[Search, int
     near = {width for reach in reaches for width in reach.half_widths_s}
     bank = replace(survey.bank, half_widths_s=tuple(sorted(near)))
     curves = None if survey.curves is None else survey.curves[:, part]
-    return Search(bank, stare.part(part), curves, survey.variance[part]), part.start
+    return Search(bank, select_frames(stare, part), curves, survey.variance[part]), part.start
 
 
 def _filters(search: Search, seen: Sequence[_NearbyTemplates]) -> dict[int, tuple[NDArray[np.int64], Single]]:
@@ -371,7 +367,7 @@ class Injections:
         first = min((part.start for part in reached), default=0)
         window = slice(first, max((part.stop for part in reached), default=1))
         start = (1 + position) * NUMBERS
-        stare = survey.stare.part(window)
+        stare = select_frames(survey.stare, window)
         injecting = CriticalAmplitudes(
             tuple(site.within(first) for site in sites),
             self.threshold,

@@ -31,6 +31,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from mauvecl.flares.stare import select_frames
 from mauvecl.flares.stare_scene import StaresRequest, method_for
 from mauvecl.noise.processes import NONE, Processes
 from mauvecl.schema.errors import InputError
@@ -569,7 +570,7 @@ class Survey:
     def of_days(self, days: float) -> Survey:
         """Return the survey of at most the first `days` star-days of the stare."""
         n = int(days * DAY_S / self.stare.frame_s)
-        return self if self.stare.n_frames <= n else replace(self, stare=self.stare.part(slice(0, n)))
+        return self if self.stare.n_frames <= n else replace(self, stare=select_frames(self.stare, slice(0, n)))
 
 
 @dataclass(frozen=True, eq=False)

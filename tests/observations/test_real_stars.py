@@ -16,6 +16,7 @@ from scipy import stats
 from scipy.linalg import null_space
 
 from mauvecl import SHAPES, Frames, read_frames
+from mauvecl.flares.stare import select_frames
 from mauvecl.observations.process import Process, ProcessTerm, level_fit
 from mauvecl.observations.process_search import LEAST_SHARED, Correlations, ProcessSearch
 from mauvecl.observations.search import bank_of, stare_of
@@ -111,7 +112,7 @@ def test_statistics_have_unit_variance_over_gaps_and_changing_noise(
     if taken:
         left = ((number < n // 2) | (number > n // 2 + 40)) & (number > 10)
         number, variance = number[left], variance[left]
-        search = ProcessSearch(bank, search.stare.part(left), (process,), variance, search)
+        search = ProcessSearch(bank, select_frames(search.stare, left), (process,), variance, search)
     time = number * 120.0
     dense = np.linalg.inv(process.at(time[:, None] - time) + np.diag(variance))
     ones = dense.sum(axis=1)
@@ -140,7 +141,7 @@ def test_values_above_a_threshold_are_those_of_all_solved_denominators(threshold
     for above in (None, threshold):
         whole = ProcessSearch(bank, stare, (ROTATOR,), np.ones(number.size))
         list(whole.values(np.zeros((1, number.size, 1)), above))
-        searches.append(ProcessSearch(bank, stare.part(left), (ROTATOR,), np.ones(left.sum()), whole))
+        searches.append(ProcessSearch(bank, select_frames(stare, left), (ROTATOR,), np.ones(left.sum()), whole))
     sums = rng.standard_normal((2, int(left.sum()), 1))
     exact, quick = (list(one.values(sums, above)) for one, above in zip(searches, (None, threshold), strict=True))
     for (_, values), (_, found) in zip(exact, quick, strict=True):
