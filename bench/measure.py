@@ -56,7 +56,7 @@ def estimate(values: np.ndarray, model: FlareModel, reduction: Reduction) -> Non
         profile = Profile(reduction, sums[start : start + BATCH])
         best = with_bounds(reduction, profile.sums, profile.best())
         derived_values(model, best.log_k, best.linear)
-        covariance(model, profile, best)
+        covariance(model, reduction, best, profile.factor(best.log_k, best.linear))
 
 
 def main() -> None:

@@ -389,7 +389,7 @@ class Instrument(Section):
     def _within(self, wavelength_nm: ArrayLike) -> Float:
         """Return wavelengths; raises InputError outside the curves."""
         low, high = self.curves_nm
-        return numbers("wavelength_nm", wavelength_nm, "nm", low=low, high=high)
+        return numbers("wavelength_nm", wavelength_nm, "nm", Range(low, high))
 
     def efficiency(self, wavelength_nm: Wavelengths) -> Float:
         """Return the fraction of the light that reaches the detector, without the quantum efficiency.
@@ -473,7 +473,7 @@ class Instrument(Section):
         held : bool
             Whether to extend a curve beyond its ends by its end value (an assumption) instead of raising InputError.
         """
-        nm = numbers("wavelength_nm", wavelength_nm, "nm", low=0.0) if held else self._within(wavelength_nm)
+        nm = numbers("wavelength_nm", wavelength_nm, "nm", Range(0.0)) if held else self._within(wavelength_nm)
         per_joule = self._optics(nm) * self.quantum_efficiency_a_per_w.at(nm) / ELECTRON_C
         return self.collecting_area_cm2 * per_joule
 

@@ -231,7 +231,7 @@ class EmissionLine:
         except ValueError:
             names = ", ".join((*LINE_GROUPS, *LINES_NM))
             raise InputError.of("lines", name, f"a wavelength in nm or one of {names}") from None
-        return cls(name.strip(), (number(f"wavelength of the line {name!r}", nm, "nm", low=100.0, high=1000.0),))
+        return cls(name.strip(), (number(f"wavelength of the line {name!r}", nm, "nm", Range(100.0, 1000.0)),))
 
     @property
     def nodes_nm(self) -> Float:

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 from mauvecl.host.tables.ecsv import Numbers, parse_numbers, read_ecsv
 from mauvecl.schema.columns import Column
 from mauvecl.schema.errors import InputError, shortened
-from mauvecl.schema.fields import Range, checked, checked_number
+from mauvecl.schema.fields import Range, checked, number
 from mauvecl.schema.physical import Temperature
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ class ModelStar:
             return None
         if found["body"] is not None:
             return cls(checked(Temperature, "temperature of the blackbody", float(found["kelvin"])), None)
-        return cls(None, checked_number("index of the power law", float(found["index"]), "", INDEX))
+        return cls(None, number("index of the power law", float(found["index"]), "", INDEX))
 
     @property
     def name(self) -> str:

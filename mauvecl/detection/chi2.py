@@ -126,25 +126,12 @@ class Chi2(QuadraticStatistic):
 
 
 def _span(vectors: Float, ratio: Float) -> tuple[Float, Float]:
-    """Return an orthonormal basis of the vectors' parts in groups of pixels, and the weights outside its span.
+    """Return an orthonormal basis of vectors' parts in groups of pixels, (n, m), and the weights outside its span.
 
-    Parameters
-    ----------
-    vectors : ndarray, shape (k, n)
-        Vectors in standard deviations of each value.
-    ratio : ndarray, shape (n,)
-        True variances divided by the model's.
-
-    Returns
-    -------
-    basis : ndarray, shape (n, m)
-    rest : ndarray, shape (n - m,)
-        Coefficients of squares along the directions outside the span: the mean of the group, which preserves the sum.
-
-    Notes
-    -----
-    The result is exact if ratios are equal within groups. Groups are `GROUP_WIDTH` wide, and the coupling of the span
-    to the rest changes eigenvalues by the square of this width.
+    The vectors, (k, n), are in standard deviations of each value, and `ratio` holds true variances divided by the
+    model's. The weights, (n - m,), are the mean of the group, which preserves the sum. The result is exact if ratios
+    are equal within groups. Groups are `GROUP_WIDTH` wide, and the coupling of the span to the rest changes eigenvalues
+    by the square of this width.
     """
     order = np.argsort(ratio)
     group = np.floor(np.log(ratio[order] / ratio[order[0]]) / GROUP_WIDTH)
@@ -245,7 +232,7 @@ class Smoothing:
 
     def _preserves_sum(self, flare: Expectation, used: NDArray[np.bool_]) -> bool:
         """Return whether non-negative factors of the centres reproduce the mean of the sum over all pixels."""
-        scale, squares = self.scale(flare), _squares(used.size, self.sigma) @ (used * flare.variance_dn2)
+        scale, squares = self.scale(flare), _rows(used.size, self.sigma).power(2) @ (used * flare.variance_dn2)
         whole, ours = float(self._inverse_flare(flare) @ squares), float(scale @ squares[self.centres])
         return bool((scale >= 0).all() and abs(ours - whole) <= MAX_MEAN_ERROR * whole)
 
@@ -317,11 +304,7 @@ class Smoothing:
 def _interpolation(n: int, step: int) -> tuple[NDArray[np.int64], Float]:
     """Return evenly spaced pixels, including both ends, and the interpolation from them to all pixels.
 
-    Returns
-    -------
-    centres : ndarray of int, shape (n_centre,)
-    between : ndarray, shape (n, n_centre)
-        Lagrange polynomials through the nearest eight centres.
+    The interpolation, (n, n_centre), is by Lagrange polynomials through the nearest eight centres.
     """
     even = np.linspace(0, n - 1, -(-(n - 1) // step) + 1).round().astype(int)
     # One more centre next to each end, where interpolation is least accurate.
@@ -344,12 +327,6 @@ def _rows(n: int, sigma: float) -> csr_array:
     from scipy.sparse import csr_array
 
     return csr_array(gaussian_filter1d(np.eye(n), sigma, axis=0, mode="nearest"))
-
-
-@lru_cache(maxsize=2)
-def _squares(n: int, sigma: float) -> csr_array:
-    """Return the squared weights of `_rows`."""
-    return _rows(n, sigma).power(2)
 
 
 class Paper(QuadraticStatistic):

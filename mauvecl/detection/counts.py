@@ -135,17 +135,31 @@ def sums_of(values: NDArray[np.float32]) -> tuple[int, int]:
     return first, second
 
 
-@dataclass(frozen=True, eq=False)
-class FarCounts:
-    """Values of a distribution outside its fine bins."""
+class FarCounts(SparseCounts):
+    """Values of a distribution outside its fine bins, counted by the keys of their bins."""
 
-    keys: NDArray[np.int64]  # filled bins, ascending, shape (m,)
-    counts: NDArray[np.int64]  # shape (m,)
-    first: int = 0  # sum of values, in units of 2**-149
-    second: int = 0  # sum of squares, in units of 2**-298
-    undefined: int = 0  # number of infinite values and NaN
+    def __init__(self) -> None:
+        super().__init__()
+        # Sums of values and of their squares, in units of 2**-149 and 2**-298, and number of infinite values and NaN.
+        self.first = self.second = self.undefined = 0
 
-    @cached_property
+    def add_values(self, values: NDArray[np.float32], *, above: bool) -> None:
+        """Count values outside the fine bins, all above or all below them."""
+        finite = np.isfinite(values)
+        if not finite.all():
+            self.undefined += int(values.size - finite.sum())
+            values = values[finite]
+        if values.size:
+            self.count(keys_of(values, above=above))
+            self.add_sums(*sums_of(values))
+
+    def add_sums(self, first: int, second: int, undefined: int = 0) -> None:
+        """Add sums of other realisations."""
+        self.first += first
+        self.second += second
+        self.undefined += undefined
+
+    @property
     def n(self) -> int:
         """Number of finite values."""
         return int(self.counts.sum())
@@ -162,37 +176,6 @@ class FarCounts:
         """Return whether all counts and sums are equal."""
         mine, theirs = ((x.first, x.second, x.undefined, x.keys.tolist(), x.counts.tolist()) for x in (self, other))
         return mine == theirs
-
-
-class FarTally:
-    """Accumulator of `FarCounts`."""
-
-    def __init__(self) -> None:
-        self.bins = SparseCounts()
-        self.first = self.second = self.undefined = 0
-
-    def add(self, values: NDArray[np.float32], *, above: bool) -> None:
-        """Count values outside the fine bins, all above or all below them."""
-        finite = np.isfinite(values)
-        if not finite.all():
-            self.undefined += int(values.size - finite.sum())
-            values = values[finite]
-        if values.size:
-            self.bins.count(keys_of(values, above=above))
-            first, second = sums_of(values)
-            self.first += first
-            self.second += second
-
-    def merge(self, other: FarCounts) -> None:
-        """Add counts of other realisations."""
-        self.bins.add(other.keys, other.counts)
-        self.first += other.first
-        self.second += other.second
-        self.undefined += other.undefined
-
-    def frozen(self) -> FarCounts:
-        """Return the counts so far."""
-        return FarCounts(self.bins.keys, self.bins.counts, self.first, self.second, self.undefined)
 
 
 @dataclass(frozen=True)
@@ -233,7 +216,7 @@ class Tally:
         self.fine = SparseCounts()
         # Sums of steps in fine bins and of their squares; Python integers, since squares may exceed 64 bits.
         self.sums = np.zeros((len(grids), 2), object)
-        self.far = [FarTally() for _ in grids]
+        self.far = [FarCounts() for _ in grids]
         self.n = 0
 
     def add(self, histogram: NDArray[np.integer], sums: NDArray[np.generic], n: int) -> None:
@@ -262,7 +245,7 @@ class Tally:
         below = ~(steps >= LOW_STEP)
         for there, side in ((above, True), (below, False)):
             if there.any():
-                self.far[index].add(values if there.all() else values[there], above=side)
+                self.far[index].add_values(values if there.all() else values[there], above=side)
         return int(above.sum() + below.sum())
 
     def distribution(self, index: int) -> Distribution:
@@ -278,7 +261,7 @@ class Tally:
             first=first,
             second=second,
             n=self.n,
-            far=self.far[index].frozen(),
+            far=self.far[index],
         )
 
 

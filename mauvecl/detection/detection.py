@@ -221,13 +221,9 @@ def _shifted_fap(
 
 
 def _adc_moments(x: Expectation) -> tuple[tuple[Float, Float], tuple[Float, Float]]:
-    """Compute the mean shift and the variance of an exposure behind the ADC, without and with its lower limit, in DN.
+    """Return mean shift and variance of an exposure behind the ADC, DN, without and with its lower limit.
 
     Saturation at the upper limit is part of the closed forms.
-
-    Returns
-    -------
-    rounded, clipped : (shift, variance), each shape (n_pixel,)
     """
     mean, sd = x.mean_raw_dn, np.sqrt(np.maximum(x.unsaturated_variance_dn2 / x.n_frames - 1 / 12, 0.0))
     recorded = x.recorded_dn / x.n_frames
@@ -454,7 +450,17 @@ class Detection(Drawable, ContentEquality, Hypotheses):
         NoThresholdError
             If no threshold has this probability, because one value of the statistic is more probable.
         """
-        return self._cut(fap, statistic, template)
+        sampled = self.tail(fap, statistic, template=template)
+        if sampled is not None:
+            return sampled.threshold
+        null = self._at(self._null_key(statistic, template))
+        n_low, n_high = central_counts(null.n, fap)
+        wanted = (int(np.floor(fap * null.n * (1 + 1e-12))), n_high, max(n_low - 1, 0))
+        # The lowest edges of the null's bins with few enough counts above.
+        cut = Interval(*map(null.edge_with_at_most, wanted))
+        beyond, at = null.around(cut.value)
+        check_atom(f"{statistic} of {self.quiet.name}", fap, beyond / null.n, at / null.n)
+        return cut
 
     def tail(self, fap: float, statistic: str = "chi2", *, template: int = 0) -> Tail | None:
         """Return the importance sampling behind a threshold, or None if realisations were counted."""
@@ -487,7 +493,7 @@ class Detection(Drawable, ContentEquality, Hypotheses):
                 probabilities.append(Interval(np.nan, np.nan, np.nan))
                 continue
             try:
-                cut = self._cut(fap, statistic, flare)
+                cut = self.threshold(fap, statistic, template=flare)
             except NoThresholdError:
                 probabilities.append(Interval(np.nan, np.nan, np.nan))
                 continue
@@ -506,7 +512,7 @@ class Detection(Drawable, ContentEquality, Hypotheses):
         for statistic in self.statistics:
             for template in range(len(self.flares)) if self.statistic(statistic).shaped else (0,):
                 try:
-                    self._cut(fap, statistic, template)
+                    self.threshold(fap, statistic, template=template)
                 except NoThresholdError as error:
                     sentences.append(Message(f"NO THRESHOLD: {error}.", "no threshold"))
         return tuple(dict.fromkeys(sentences))
@@ -599,7 +605,7 @@ class Detection(Drawable, ContentEquality, Hypotheses):
     def _fap_error(self, fap: float, statistic: str, template: int) -> float:
         """Return the relative standard error of the false-alarm probability at a threshold, NaN where there is none."""
         try:
-            self._cut(fap, statistic, template)
+            self.threshold(fap, statistic, template=template)
         except NoThresholdError:
             return float("nan")
         tail = self.tail(fap, statistic, template=template)
@@ -610,19 +616,6 @@ class Detection(Drawable, ContentEquality, Hypotheses):
 
     def _null(self, statistic: str, template: int) -> int:
         return template if self.statistic(statistic).shaped else 0
-
-    def _cut(self, fap: float, statistic: str, template: int) -> Interval:
-        """Return the sampled threshold, or the lowest edges of the null's bins with few enough counts above."""
-        sampled = self.tail(fap, statistic, template=template)
-        if sampled is not None:
-            return sampled.threshold
-        null = self._at(self._null_key(statistic, template))
-        n_low, n_high = central_counts(null.n, fap)
-        wanted = (int(np.floor(fap * null.n * (1 + 1e-12))), n_high, max(n_low - 1, 0))
-        cut = Interval(*map(null.edge_with_at_most, wanted))
-        beyond, at = null.around(cut.value)
-        check_atom(f"{statistic} of {self.quiet.name}", fap, beyond / null.n, at / null.n)
-        return cut
 
 
 def _detected(probability: float, threshold: float) -> str:

@@ -83,22 +83,11 @@ def detection_interval(above: Sequence[float], trials: int, fap: float, correlat
     """Return the fraction of flares above an estimated threshold, with an interval of the detection probability.
 
     The interval is for the probability above the true threshold, at the level `CONFIDENCE` of the threshold's interval.
+    `above` holds the numbers of flares at or above the threshold, the upper end and the lower end of its interval.
+    `correlation` is that of null and flare statistic if the threshold was estimated from the flares' own draws, and 0
+    if it was not or if it is unknown; the interval is then too wide, by a few per cent if the probability is much
+    larger than `fap`.
 
-    Parameters
-    ----------
-    above : sequence of three numbers
-        Number of flares at or above the threshold, the upper end and the lower end of its interval.
-    trials : int
-        Number of flares.
-    fap : float
-        False-alarm probability of the threshold.
-    correlation : float
-        Correlation of null and flare statistic, 0 to 1, if the threshold was estimated from the flares' own draws. Use
-        0 if it was not, or if the correlation is unknown; the interval is then too wide, by a few per cent if the
-        probability is much larger than `fap`.
-
-    Notes
-    -----
     Let A and B be the fractions of null and flare realisations above the true threshold, and r the ratio of their
     densities there. To first order, the fraction of flares above the estimated threshold is B - r (A - fap) (Bahadur
     1966, doi 10.1214/aoms/1177699450). Its variance is that of B plus that of r A minus twice their covariance. The

@@ -221,16 +221,8 @@ class Nuisances(ContentEquality):
     def rows(self, variance: Float, spectra: Float) -> Float:
         """Return the rows of x^T C^-1 x = sum x^2 / v - sum (rows @ x)^2 (Woodbury identity), shape (k, n).
 
-        Parameters
-        ----------
-        variance : ndarray, shape (n,)
-            Diagonal v; zero for unused values.
-        spectra : ndarray, shape (k, n)
-
-        Raises
-        ------
-        InputError
-            If projected-out spectra are linearly dependent.
+        The diagonal v, `variance`, is zero for unused values. Raises InputError if projected-out spectra are linearly
+        dependent.
         """
         inverse = np.divide(1.0, variance, out=np.zeros_like(variance), where=variance > 0)
         information = np.diag(self.sd**-2.0) + (spectra * inverse) @ spectra.T
@@ -282,15 +274,9 @@ def read_values(what: str, kind: str, path: Path, wavelength_nm: NDArray[np.floa
 def at_pixels(
     what: str, kind: str, rows: NDArray[np.float64], wavelength_nm: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Interpolate values linearly to pixels, 0 outside their range, shape (n_pixel,).
+    """Interpolate rows of wavelength, nm, and value linearly to pixels, 0 outside their range.
 
-    Parameters
-    ----------
-    what, kind : str
-        Names of the source and of its values, for messages.
-    rows : ndarray, shape (n, 2)
-        Wavelengths, nm, and values.
-    wavelength_nm : ndarray, shape (n_pixel,)
+    `what` and `kind` name the source and its values in messages.
     """
     if rows.ndim != 2 or rows.shape[1] != 2:
         raise InputError(f"{what} have the shape {rows.shape}", f"two columns, nm and {kind}", key=what)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, fields
 from functools import cached_property
-from typing import Annotated, Any, ClassVar, Literal, Protocol, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,12 +106,8 @@ class Hypotheses:
             raise InputError(f"every pixel of {self.quiet.name} is saturated", "a fainter star", key="quiet")
         for statistic in self._chosen.values():
             statistic.check(self.setting)
-        if "matched" in self._chosen:
-            self._check_shapes()
-
-    def _check_shapes(self) -> None:
-        """Raise InputError for a flare without effect, unless it saturates every pixel, which `messages` report."""
-        for k, flare in enumerate(self.flares):
+        for k, flare in enumerate(self.flares if "matched" in self._chosen else ()):
+            # `messages` report a flare that saturates every pixel.
             if k not in self.blinding:
                 check_shape(self.quiet, flare, self.scene.used, k)
 
@@ -191,13 +187,10 @@ class Hypotheses:
         # Only the nulls of shaped statistics depend on the template.
         key = statistic, flare, template if flare is None and self.statistic(statistic).shaped else 0
         if key not in self._forms:
-            self._forms[key] = self._closed_form(statistic, flare, template)
+            observed = self.quiet if flare is None else self.flares[flare]
+            looked_for = self.shape(statistic, template if flare is None else flare)
+            self._forms[key] = self.statistic(statistic).closed_form(self.setting, observed, looked_for)
         return self._forms[key]
-
-    def _closed_form(self, statistic: str, flare: int | None, template: int) -> Form:
-        observed = self.quiet if flare is None else self.flares[flare]
-        looked_for = self.shape(statistic, template if flare is None else flare)
-        return self.statistic(statistic).closed_form(self.setting, observed, looked_for)
 
     def dof(self, statistic: str) -> int:
         """Return the degrees of freedom without a flare: pixels, resolution elements, or one."""
@@ -381,9 +374,27 @@ def check_last(start: int, realisations: int) -> None:
 
 
 class Countable:
-    """Base class of requests, which are pickled without cached results."""
+    """Base class of requests, which are divided into shards, and pickled without cached results."""
 
+    #: Smallest number of realisations of a shard, a power of two.
     least: ClassVar[int] = 2**12
+
+    if TYPE_CHECKING:
+        # Fields of each request.
+        @property
+        def realisations(self) -> int: ...
+        @property
+        def start(self) -> int: ...
+
+    @property
+    def parts(self) -> int:
+        """Number of parts, whose launches differ."""
+        return 1
+
+    @property
+    def work(self) -> int:
+        """Approximate work per realisation: pixels times scenarios."""
+        raise NotImplementedError
 
     @classmethod
     def of(cls, *what: Any, **how: Any) -> Self:
@@ -400,7 +411,7 @@ class _RealisationRequest(Countable):
     """Base class of requests for realisations."""
 
     def __post_init__(self) -> None:
-        check_last(vars(self)["start"], vars(self)["realisations"])
+        check_last(self.start, self.realisations)
 
 
 @validated
@@ -463,8 +474,6 @@ class SnrRequest(_RealisationRequest):
     start: FirstRealisation = 0
     drawing: Drawing = AUTOMATIC
 
-    parts = 1
-
     @cached_property
     def scene(self) -> Scene:
         """Scene to draw."""
@@ -486,29 +495,3 @@ class RealiseRequest(_RealisationRequest):
     seed: Seed
     start: FirstRealisation = 0
     drawing: Drawing = AUTOMATIC
-
-
-class Divisible(Protocol):
-    """Request that can be divided into shards.
-
-    Attributes
-    ----------
-    realisations, start : int
-    parts : int
-        Number of parts, whose launches differ.
-    work : int
-        Approximate work per realisation: pixels times scenarios.
-    least : int
-        Smallest number of realisations of a shard, a power of two.
-    """
-
-    @property
-    def realisations(self) -> int: ...
-    @property
-    def start(self) -> int: ...
-    @property
-    def parts(self) -> int: ...
-    @property
-    def work(self) -> int: ...
-    @property
-    def least(self) -> int: ...

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.detection.counts import FarCounts, SparseCounts, TailSamples, Tally
+from mauvecl.detection.counts import SparseCounts, TailSamples, Tally
 from mauvecl.detection.detection import Detection
 from mauvecl.detection.requests import DetectRequest, SnrRequest
 from mauvecl.host.arrays import ContentEquality
@@ -50,12 +50,9 @@ CLIPPED_COLUMNS = tuple(
 
 
 def observers(x: Expectation, scene: Scene) -> NDArray[np.void]:
-    """Return the bias and dark that an observer subtracts, and the noise model, of each pixel.
+    """Return the `layout.OBSERVER` structures: subtracted bias and dark, and noise model, shape (n_padded,).
 
-    Returns
-    -------
-    ndarray of layout.OBSERVER, shape (n_padded,)
-        The sky is subtracted per resolution element.
+    The sky is subtracted per resolution element.
     """
     table = np.zeros(len(scene.pixels), layout.OBSERVER)
     table["variance"] = 1.0  # padding: 0 / 1
@@ -70,11 +67,9 @@ def observers(x: Expectation, scene: Scene) -> NDArray[np.void]:
 
 
 def elements(x: Expectation) -> NDArray[np.void]:
-    """Return the resolution elements with bins centred on the closed-form S/N and scaled to its linearised spread.
+    """Return the `layout.ELEMENT` structures of the resolution elements, shape (n_element,).
 
-    Returns
-    -------
-    ndarray of layout.ELEMENT, shape (n_element,)
+    Bins are centred on the closed-form S/N and scaled to its linearised spread.
     """
     first = np.searchsorted(x.element, np.arange(x.element_wavelength_nm.size))
     table = np.zeros(first.size, layout.ELEMENT)
@@ -287,10 +282,9 @@ def pack_detection(tally: Tally, samples: Sequence[TailSamples | None]) -> Array
     shard["sums"] = np.array([[str(value) for value in row] for row in tally.sums])
     shard["n"] = np.array(tally.n)
     for number, far in enumerate(tally.far):
-        beyond = far.frozen()
-        if beyond.n or beyond.undefined:
-            shard |= _pack_counts(f"far-{number}", beyond.keys, beyond.counts)
-            shard[f"far-{number}-sums"] = np.array([str(x) for x in (beyond.first, beyond.second, beyond.undefined)])
+        if far.n or far.undefined:
+            shard |= _pack_counts(f"far-{number}", far.keys, far.counts)
+            shard[f"far-{number}-sums"] = np.array([str(x) for x in (far.first, far.second, far.undefined)])
     for number, tail in enumerate(samples):
         if tail is not None:
             shard[f"values-{number}"], shard[f"realisations-{number}"] = tail.values, tail.realisations
@@ -319,8 +313,8 @@ class DetectionSums:
         tally.merge(*_unpack_counts("counts", shard), sums, int(shard["n"]))
         for number, far in enumerate(tally.far):
             if f"far-{number}" in shard:
-                first, second, undefined = (int(value) for value in shard[f"far-{number}-sums"])
-                far.merge(FarCounts(*_unpack_counts(f"far-{number}", shard), first, second, undefined))
+                far.add(*_unpack_counts(f"far-{number}", shard))
+                far.add_sums(*(int(value) for value in shard[f"far-{number}-sums"]))
         for number, tail in enumerate(samples):
             if tail is not None:
                 tail.merge(shard[f"values-{number}"], shard[f"realisations-{number}"])

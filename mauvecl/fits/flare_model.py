@@ -392,33 +392,16 @@ def _thresholds(prior: bytes, allowed: float) -> Float:
 
 @dataclass(frozen=True, eq=False)
 class LightFactor:
-    """Weighted sum of an exposure that estimates the factor on its light, and its means for the flares of a model.
+    """Weighted sum of an exposure that estimates the factor on its light, and its means for the flares of a model."""
 
-    Attributes
-    ----------
-    weights : ndarray, shape (n_pixel,)
-        Weights per DN; the sum has unit variance if the flare is known.
-    scale : float
-        Change of the sum for a change of the factor by one.
-    expected : float
-        Factor for which the mean of the sum is zero without a flare.
-    log_k, hot : ndarray, shape (n_node,)
-        Temperatures of the model, and mean sums for a blackbody of amplitude 1.
-    fixed : ndarray, shape (n_linear - 1,)
-        Mean sums of the other components for unit amplitude.
-    prior_share : float
-        Share of the prior in the information on the factor if the flare is known.
-    prior : ndarray, shape (2, n)
-        Deviations of the prior in standard deviations, and their probabilities; empty if it is normal.
-    """
-
-    weights: Float
-    scale: float
-    expected: float
-    log_k: Float
-    hot: Float
-    fixed: Float
-    prior_share: float
+    weights: Float  # per DN, shape (n_pixel,); the sum has unit variance if the flare is known
+    scale: float  # change of the sum for a change of the factor by one
+    expected: float  # factor for which the mean of the sum is zero without a flare
+    log_k: Float  # temperatures of the model, shape (n_node,)
+    hot: Float  # mean sums for a blackbody of amplitude 1, shape (n_node,)
+    fixed: Float  # mean sums of the other components for unit amplitude, shape (n_linear - 1,)
+    prior_share: float  # share of the prior in the information on the factor if the flare is known
+    # Deviations of the prior in standard deviations, and their probabilities, shape (2, n); empty if it is normal.
     prior: Float
 
     @cached_property
@@ -434,14 +417,8 @@ class LightFactor:
     def change(self, value: Float, factor: Float, width: Float, allowed: float) -> Float:
         """Return how far the thresholds of quantities are from `allowed`, since the prior is not normal, shape (n,).
 
-        The part of a quantity's scatter that comes from the prior has the distribution of the prior.
-
-        Parameters
-        ----------
-        value, factor : ndarray, shape (n,)
-            Quantity, and the best factor on light.
-        width : ndarray, shape (n,)
-            Width of the quantity's interval for a rise of chi-squared by `allowed`.
+        The part of a quantity's scatter that comes from the prior has the distribution of the prior. `width` is that of
+        the quantity's interval for a rise of chi-squared by `allowed`.
         """
         share = np.zeros_like(value)
         usable = np.isfinite(value) & np.isfinite(width) & (width > 0.0) & (factor > 0.0)
@@ -559,24 +536,12 @@ class MeanSums:
 
 @dataclass(frozen=True, eq=False)
 class Reduction(MeanSums):
-    """Weights of sums, and the mean sums of a model's flares.
+    """Weights of sums, and the mean sums of a model's flares."""
 
-    Attributes
-    ----------
-    variance : ndarray, shape (n_pixel,)
-        Variance of the exposure, zero in pixels that are not used.
-    weights : ndarray, shape (n_sum, n_pixel)
-        Weights per DN, for which the sums have unit covariance.
-    rows : ndarray, shape (k, n_pixel)
-        Weights of the sums whose squares marginalisation subtracts from chi-squared.
-    n_free : int
-        Number of unknowns that are projected out.
-    """
-
-    variance: Float
-    weights: Float
-    rows: Float
-    n_free: int
+    variance: Float  # of the exposure, zero in pixels that are not used, shape (n_pixel,)
+    weights: Float  # per DN, for which the sums have unit covariance, shape (n_sum, n_pixel)
+    rows: Float  # weights of the sums whose squares marginalisation subtracts from chi-squared, shape (k, n_pixel)
+    n_free: int  # number of unknowns that are projected out
 
     @classmethod
     def of(
@@ -590,20 +555,11 @@ class Reduction(MeanSums):
         highest_dn: Float | None = None,
         clipped: NDArray[np.bool_] | None = None,
     ) -> Self:
-        """Compute the reduction for exposures with the variance of a given flare.
+        """Compute the reduction for exposures with the variance of a flare, whose recorded mean is `added_dn`.
 
-        Raises InputError if too few pixels can be used, or the flare is degenerate with the unknowns.
-
-        Parameters
-        ----------
-        added_dn : ndarray, shape (n_pixel,), optional
-            Mean DN of the flare as it is recorded; none by default.
-        skipped_nm : sequence of tuple
-            Wavelength ranges of pixels that are not used, in addition to saturated ones.
-        highest_dn : ndarray, shape (n_pixel,), optional
-            Largest mean DN of the flares of the exposures, which decides on saturation; `added_dn` by default.
-        clipped : ndarray of bool, shape (n_pixel,), optional
-            Other pixels that are not used.
+        The largest mean of the exposures' flares, `highest_dn`, decides on saturation; pixels at `skipped_nm` and
+        `clipped` ones are not used either. Raises InputError if too few pixels can be used, or the flare is degenerate
+        with the unknowns.
         """
         added = np.zeros(quiet.wavelength_nm.size) if added_dn is None else added_dn
         variance, used = usable_variance(quiet, added, skipped_nm, nuisances, highest_dn)

@@ -17,9 +17,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
-from functools import cache, cached_property
+from functools import cache, cached_property, lru_cache
 from itertools import chain, combinations
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import scipy
@@ -30,9 +30,10 @@ from mauvecl.fits.flare_model import Ratio, derived_values
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
 
-    from mauvecl.fits.flare_model import Derived, FlareModel, LightFactor, MeanSums, Reduction
+    from mauvecl.fits.flare_model import Derived, FlareModel, MeanSums, Reduction
 
 Float = NDArray[np.float64]
+T = TypeVar("T")
 
 #: Steps of the search for the end of an interval.
 STEPS = 12
@@ -50,6 +51,16 @@ ALONG, BEYOND, SMOOTH = 0.8, 2.0, 0.3
 TRIED, REACH = 25, 6.0
 #: Steps of Newton's method for a threshold.
 NEWTON = 3
+
+
+def remembering(function: Callable[[Float], T]) -> Callable[[Float], T]:
+    """Return a function that keeps its last results, since fits ask for several at the same parameters in turn."""
+
+    @lru_cache(maxsize=2)
+    def of_bytes(parameters: bytes) -> T:
+        return function(np.frombuffer(parameters))
+
+    return lambda parameters: of_bytes(parameters.tobytes())
 
 
 @dataclass(frozen=True, eq=False)
@@ -302,14 +313,10 @@ def _linear_interval(
 
 
 def ratio_at(profile: Profile, spline: CubicSpline, log_k: Float, linear: Float, variance: Float, hot: Float) -> Ratio:
-    """Return a quantity that is linear in the amplitudes, at temperatures (n, n_sample), over the factor on all light.
+    """Return a sum of the amplitudes at temperatures (n, n_sample), over the factor on all light.
 
-    Parameters
-    ----------
-    spline : CubicSpline
-        Factors of the amplitudes over log temperature.
-    linear, variance, hot
-        Best amplitudes at these temperatures; variance and sums of the blackbody, as of `Profile.parts`.
+    `spline` holds the factors of the amplitudes over log temperature; `variance` and `hot` are those of
+    `Profile.parts`.
     """
     basis, inverse = profile.reduction.basis
 
@@ -358,17 +365,9 @@ class _Thresholds:
         """Return the thresholds at ends, (n,), below which ratios are as probable as below Wilks' `allowed`.
 
         Simulated sums have even distances along the gradient of the quantity, weighted by their probability, and the
-        same noise for all ends in the other directions in which the mean sums change.
-
-        Parameters
-        ----------
-        rows : ndarray, shape (n,)
-            Numbers of the frames.
-        x, moved : ndarray, shape (n,)
-            Log temperature at the end, and its distance from the best value there in standard errors.
-        error : ndarray, shape (n,)
-            Standard error of the log temperature.
-        allowed : float
+        same noise for all ends in the other directions in which the mean sums change. `x` is the log temperature at the
+        end, `moved` the distance from the best value there in standard errors, and `error` the standard error of the
+        log temperature.
         """
         profile, reduction = self._profile, self._profile.reduction
         there, (basis, inverse) = _held_direction(reduction, self._spline, x), reduction.basis
@@ -514,33 +513,18 @@ def _ratio_interval(profile: Profile, per: Float, hot: Float, least_gain: Float)
     return 1.0 + extreme(low, np.minimum), 1.0 + extreme(high, np.maximum)
 
 
-def covariance(model: FlareModel, profile: Profile, best: BestFit) -> Float:
-    """Return the covariance of quantities from the Fisher information at the fit, (n, n_derived, n_derived)."""
-    hot = profile.hot(best.log_k)
-    slope = profile.reduction.spline(best.log_k, 1)
-    n, m = best.linear.shape
-    jacobian = np.zeros((n, m + 1, hot.shape[1]))
-    jacobian[:, 0], jacobian[:, 1:m] = hot, profile.reduction.fixed
-    jacobian[:, m] = best.linear[:, :1] * slope
-    factor = profile.factor(best.log_k, best.linear)
-    information = jacobian @ jacobian.transpose(0, 2, 1)
-    return covariance_of(model, best.log_k, best.linear, information, profile.reduction.light, factor)
-
-
-def covariance_of(
-    model: FlareModel,
-    log_k: Float,
-    linear: Float,
-    information: Float,
-    light: LightFactor | None = None,
-    factor: Float | float = 1.0,
-) -> Float:
-    """Return the covariance of quantities, (n, n_derived, n_derived), from the information on the parameters.
+def covariance(model: FlareModel, reduction: MeanSums, best: BestFit, factor: Float) -> Float:
+    """Return the covariance of quantities from the Fisher information at the fit, (n, n_derived, n_derived).
 
     The parameters are the amplitudes as they are recorded and the log temperature, and the factor on all light if it is
     unknown. The result is NaN if a flare adds no light, or if its temperature and amplitudes are degenerate.
     """
-    m = linear.shape[1]
+    hot, slope = reduction.spline(best.log_k), reduction.spline(best.log_k, 1)
+    n, m = best.linear.shape
+    jacobian = np.zeros((n, m + 1, hot.shape[1]))
+    jacobian[:, 0], jacobian[:, 1:m] = hot, reduction.fixed
+    jacobian[:, m] = best.linear[:, :1] * slope
+    information = jacobian @ jacobian.transpose(0, 2, 1)
     scale = np.sqrt(np.einsum("nii->ni", information))
     good = (scale > 0.0).all(axis=1)
     scale[~good] = 1.0
@@ -549,11 +533,11 @@ def covariance_of(
     normal[~good] = np.eye(m + 1)
     inverse = np.linalg.inv(normal) / scale[:, :, None] / scale[:, None, :]
     inverse[~good] = np.nan
-    over = np.broadcast_to(np.asarray(factor, np.float64), log_k.shape)
+    log_k, linear, light = best.log_k, best.linear, reduction.light
     gradient = gradient_of(model, log_k, linear)
     if light is None:
         return np.asarray(gradient @ inverse @ gradient.transpose(0, 2, 1))
-    over = np.where(over > 0.0, over, np.nan)
+    over = np.where(factor > 0.0, factor, np.nan)
     which, _ = model.sums
     gradient[:, which] /= over[:, None, None]
     # The best factor follows the amplitudes and the temperature, and scatters about that.

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -23,12 +24,9 @@ from mauvecl.fits.flare_model import (
     FlareModel,
     Ranges,
     Reduction,
-    check_distinct,
     check_enough,
     derived_values,
-    light_factor,
     undimmed,
-    usable_variance,
 )
 from mauvecl.fits.profile import (
     BestFit,
@@ -36,7 +34,6 @@ from mauvecl.fits.profile import (
     Profile,
     bounded_intervals,
     covariance,
-    covariance_of,
     intervals,
     with_bounds,
 )
@@ -122,7 +119,7 @@ class Measurement:
             if isinstance(value, np.ndarray):
                 axis = 1 if name in ("low", "high") else 0
                 values[name] = np.concatenate([getattr(part, name) for part in parts], axis)
-        return cls(**values)
+        return cls(**values | {"dof": min(part.dof for part in parts)})
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return all arrays that depend on the frames, for files; the inverse of `of_arrays`."""
@@ -236,9 +233,7 @@ def fit(
     """
     exposures = checked_exposures(frames, expectation, levels, nuisances)
 
-    def reduction_of(added_dn: Float | None, **how: Any) -> Reduction:
-        return Reduction.of(model, expectation, added_dn, nuisances, skipped_nm, **how)
-
+    reduction_of = partial(Reduction.of, model, expectation, nuisances=nuisances, skipped_nm=skipped_nm)
     log_k, linear, cut = _pilot(exposures, expectation, model, reduction_of)
     every = np.arange(len(exposures.raw))
     # Exposures with saturated pixels start far from the flare, which decides on the pixels that saturate.
@@ -248,27 +243,23 @@ def fit(
         groups = variance_groups(expectation, model, log_k[rows], linear[rows], reduction_of, nuisances, some_of)
         for some, reduction in groups:
             own = rows[some]
-            for start in range(0, own.size, BATCH):
-                batch = own[start : start + BATCH]
-                best = _estimated(exposures, batch, reduction)
+            for batch in _batches(own):
+                profile = Profile(reduction, exposures.sums(reduction, batch))
+                best = with_bounds(reduction, profile.sums, profile.best())
                 log_k[batch], linear[batch] = best.log_k, best.linear
-    parts: list[tuple[NDArray[np.intp], dict[str, Any]]] = []
+    parts, order = [], []
     near = exposures if cut.any() else None
     for some, reduction in variance_groups(expectation, model, log_k, linear, reduction_of, nuisances, near):
-        for start in range(0, some.size, BATCH):
-            batch = some[start : start + BATCH]
-            parts.append((batch, _fitted(exposures, batch, model, reduction, levels)))
-    order = np.argsort(np.concatenate([rows for rows, _ in parts]))
-    along = {"low": 1, "high": 1}
-    joined = {
-        name: np.take(
-            np.concatenate([arrays[name] for _, arrays in parts], along.get(name, 0)), order, along.get(name, 0)
-        )
-        for name in parts[0][1]
-    }
-    dof = joined.pop("dof")
-    joined["p_value"] = np.asarray(scipy.stats.chi2.sf(joined["chi2"], dof))
-    return Measurement(model.names, model.units, model.bounds, levels=tuple(levels), dof=int(dof.min()), **joined)
+        for batch in _batches(some):
+            parts.append(_fitted(exposures, batch, model, reduction, levels))
+            order.append(batch)
+    return Measurement.joined(parts).rows(np.argsort(np.concatenate(order)))
+
+
+def _batches(rows: NDArray[np.intp]) -> Iterator[NDArray[np.intp]]:
+    """Yield the numbers of frames that are fitted together."""
+    for start in range(0, rows.size, BATCH):
+        yield rows[start : start + BATCH]
 
 
 def checked_exposures(
@@ -304,8 +295,7 @@ def _pilot(
             counts[start : start + BATCH] = (raw > ceiling)[:, used].sum(axis=1)
 
     def best(rows: NDArray[np.intp], reduction: Reduction) -> None:
-        for start in range(0, rows.size, BATCH):
-            some = rows[start : start + BATCH]
+        for some in _batches(rows):
             fit_of_some = Profile(reduction, exposures.sums(reduction, some)).best()
             log_k[some], linear[some] = fit_of_some.log_k, fit_of_some.linear
 
@@ -314,8 +304,7 @@ def _pilot(
     alike = np.rint(np.log(np.maximum(counts, 1)) / SATURATED_STEP).astype(np.intp)
     for key in np.unique(alike[counts > 0]):
         rows = np.flatnonzero((alike == key) & (counts > 0))
-        for start in range(0, rows.size, BATCH):
-            some = rows[start : start + BATCH]
+        for some in _batches(rows):
             shared = clipped_pixels(exposures, quiet, some)
             if (~shared & used).sum() >= LEAST_SHARED * (used.sum() - counts[some].max()):
                 best(some, reduction_of(None, clipped=shared))
@@ -384,16 +373,10 @@ def variance_groups(
         yield rows, reduction_of(mean, highest_dn=highest, clipped=clipped)
 
 
-def _estimated(exposures: Exposures, rows: NDArray[np.intp], reduction: Reduction) -> BestFit:
-    """Return the best fits of some frames of one variance."""
-    profile = Profile(reduction, exposures.sums(reduction, rows))
-    return with_bounds(reduction, profile.sums, profile.best())
-
-
 def _fitted(
     exposures: Exposures, rows: NDArray[np.intp], model: FlareModel, reduction: Reduction, levels: Sequence[float]
-) -> dict[str, Any]:
-    """Return the attributes of `Measurement` for some frames of one variance."""
+) -> Measurement:
+    """Measure the flares of some frames of one variance."""
     sums, rest, light = exposures.sums_and_rest(reduction, rows)
     profile = Profile(reduction, sums, light)
     at_nodes = profile.gain_at_nodes()
@@ -411,24 +394,17 @@ def _fitted(
         for k, rise in enumerate(allowed):
             low[k, near], high[k, near] = bounded_intervals(model, bounded, there, nodes, rise)
         best = best.replaced(near, there)
-    left = np.einsum("nk,nk->n", sums, sums) - best.gain
-    n_fitted = len(model.linear) + 1
+    chi2 = rest + (np.einsum("nk,nk->n", sums, sums) - best.gain)
+    dof = reduction.n_used - reduction.n_free - len(model.linear) - 1
     factor = profile.factor(best.log_k, best.linear)
     estimates = derived_values(model, best.log_k, best.linear)
     which, _ = model.sums
     estimates[:, which] = undimmed(estimates[:, which], factor)
-    return {
-        "log_k": best.log_k,
-        "amplitudes": undimmed(best.linear, factor),
-        "factor": factor,
-        "estimates": estimates,
-        "covariance": covariance(model, profile, best),
-        "low": low,
-        "high": high,
-        "chi2": rest + left,
-        "dof": np.full(len(sums), reduction.n_used - reduction.n_free - n_fitted),
-        "snr": np.sqrt(best.gain),
-    }
+    return Measurement(
+        model.names, model.units, model.bounds, estimates, covariance(model, reduction, best, factor), tuple(levels),
+        low, high, chi2, np.asarray(scipy.stats.chi2.sf(chi2, dof)), dof, np.sqrt(best.gain), best.log_k,
+        undimmed(best.linear, factor), factor,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -485,21 +461,12 @@ def forecast(
     # The flare as it is recorded.
     counts = factor * model.counts(temperature_k, amplitudes)
     log_k, linear = np.array([np.log(temperature_k)]), factor * np.asarray(amplitudes, np.float64)[None]
-    variance, used = usable_variance(expectation, counts, skipped_nm, nuisances, counts / min(1.0, factor))
-    check_enough(expectation, used, len(model.linear) + 1 + (nuisances.free if nuisances else 0))
-    slope = linear[0, 0] * model.hot_spline(log_k[0], 1)
-    rows = np.vstack([model.hot_spline(log_k[0]), model.fixed, slope, counts]) * used
-    plain = np.divide(rows, variance, out=np.zeros_like(rows), where=used) @ rows.T
-    unknown = nuisances.around(counts) if nuisances else None
-    weights = unknown.rows(variance, unknown.spectra * used) if unknown else np.zeros((0, used.size))
-    lost = weights @ rows.T
-    information = plain - lost.T @ lost
-    check_distinct(np.diag(information)[:-2], np.diag(plain)[:-2], nuisances)
-    light = light_factor(model, unknown, weights)
-    spread = covariance_of(model, log_k, linear, information[None, :-1, :-1], light, factor)[0]
+    reduction = Reduction.of(model, expectation, counts, nuisances, skipped_nm, highest_dn=counts / min(1.0, factor))
+    sums = linear[0] @ np.vstack([reduction.spline(log_k), reduction.fixed])
+    best = BestFit(log_k, linear, np.array([sums @ sums]))
+    spread = covariance(model, reduction, best, np.array([factor]))[0]
     values = derived_values(model, log_k, linear / factor)[0]
-    snr = float(np.sqrt(max(information[-1, -1], 0.0)))
-    return Forecast(model.names, model.units, values, np.sqrt(np.diag(spread)), spread, snr)
+    return Forecast(model.names, model.units, values, np.sqrt(np.diag(spread)), spread, float(np.linalg.norm(sums)))
 
 
 #: Number of second temperatures per node of the model, in steps of 0.6 %.
@@ -573,9 +540,7 @@ def fit_two_temperatures(
     single = fit(frames, expectation, model, nuisances, levels=levels, skipped_nm=skipped_nm)
     exposures = checked_exposures(frames, expectation, levels, nuisances)
 
-    def reduction_of(added_dn: Float | None, **how: Any) -> Reduction:
-        return Reduction.of(model, expectation, added_dn, nuisances, skipped_nm, **how)
-
+    reduction_of = partial(Reduction.of, model, expectation, nuisances=nuisances, skipped_nm=skipped_nm)
     allowed = [float(scipy.stats.chi2.isf(1 - p, 1)) for p in levels]
     parts, order, whole = [], [], TwoTemperatures(model)
     recorded = single.amplitudes * single.factor[:, None]
@@ -587,10 +552,10 @@ def fit_two_temperatures(
         chi2 = rest + np.einsum("nk,nk->n", sums, sums) - best.gain
         dof = reduction.n_used - reduction.n_free - len(model.linear) - 3
         check_enough(expectation, reduction.variance > 0.0, len(model.linear) + 3 + reduction.n_free)
-        covariance = _covariance(model, reduction, best, second, estimates, factor)
+        spread = _covariance(model, reduction, best, second, estimates, factor)
         parts.append(
             Measurement(
-                whole.names, whole.units, whole.bounds, estimates, covariance, tuple(levels), low, high, chi2,
+                whole.names, whole.units, whole.bounds, estimates, spread, tuple(levels), low, high, chi2,
                 np.asarray(scipy.stats.chi2.sf(chi2, dof)), dof, np.sqrt(best.gain),
                 np.column_stack([best.log_k, second]), undimmed(best.linear, factor), factor,
             )
@@ -681,8 +646,8 @@ class _Search:
             if rows.size:
                 self._gain[rows, node] = self._profile(int(node), rows).best().gain
 
-    def measured(self) -> tuple[BestFit, Float, Float, Float, Float, Float]:
-        """Return best fits, intervals (n_level, n, n_derived), second log temperatures, estimates, and factors."""
+    def _evaluate_intervals(self) -> None:
+        """Compute the largest gain at second temperatures in and next to the intervals."""
         n, nodes = self._gain.shape
         coarse = np.zeros((n, nodes), np.bool_)
         coarse[:, ::COARSE] = True
@@ -696,6 +661,11 @@ class _Search:
             for share in np.linspace(0.0, 1.0, TRIES + 1):
                 fine[np.arange(n), np.rint(low + share * (high - low)).astype(np.intp)] = True
             self._evaluate(fine)
+
+    def measured(self) -> tuple[BestFit, Float, Float, Float, Float, Float]:
+        """Return best fits, intervals (n_level, n, n_derived), second log temperatures, estimates, and factors."""
+        self._evaluate_intervals()
+        n = len(self._gain)
         best_node = self._gain.argmax(axis=1)
         gain = self._gain.max(axis=1)
         q = len(self._model.derived) + 2

@@ -9,9 +9,9 @@ over. Those of all light change that of the flare as well.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property, lru_cache
+from functools import cache, cached_property
 from typing import TYPE_CHECKING, Annotated, NamedTuple, Self
 
 import numpy as np
@@ -20,9 +20,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.detection.nuisances import Nuisances, spectrum_of
 from mauvecl.fits.flare_model import EVERY, Exposures, Ranges, Reduction
+from mauvecl.fits.profile import remembering
 from mauvecl.fits.spectrum import LEVELS, Measurement, clipped_pixels, fit
 from mauvecl.flares.events import Event
-from mauvecl.flares.frames import Components
+from mauvecl.flares.frames import Components, known_strengths
 from mauvecl.flares.settings import Cooling
 from mauvecl.flares.shapes import Shape, shape_of
 from mauvecl.flares.stare import Stare
@@ -247,11 +248,6 @@ def _with_change(unknown: Nuisances, quiet: Expectation, of: Changing, sd: float
     return unknown.joined(Nuisances.of(quiet, {name: sd})) if spectrum_of(name, quiet).any() else unknown
 
 
-def known_strengths(stare: Stare, quiet: Expectation) -> Float:
-    """Return known strengths of star, sky, dark, and flare and neighbours in each frame, shape (n_frame, 4)."""
-    return np.column_stack([stare.light * stare.star, stare.light * stare.sky, stare.dark_factor(quiet), stare.light])
-
-
 def less_known(raw: Float, quiet: Expectation, known: Float, weights: Float) -> Float:
     """Return weighted sums, (n_frame, n_sum), of frames less their means without a flare for `known_strengths`."""
     means = np.vstack([quiet.net_source_dn, quiet.sky_dn, quiet.dark_dn, quiet.neighbour_dn, quiet.bias_dn])
@@ -312,16 +308,6 @@ NO_STEP = 1e-9
 NEWTON_STEPS, LONGEST, CONVERGED, WORST_CONDITION = 20, 1.5, 1e-6, 1e10
 
 
-def _remembering(function: Callable[[Float], Pair]) -> Callable[[Float], Pair]:
-    """Return a function that keeps its last results, since it is asked at the same parameters in turn."""
-
-    @lru_cache(maxsize=2)
-    def of_bytes(theta: bytes) -> Pair:
-        return function(np.frombuffer(theta))
-
-    return lambda theta: of_bytes(theta.tobytes())
-
-
 @dataclass(frozen=True, eq=False)
 class _Level:
     """Unknown amplitude of known changes of the frames."""
@@ -374,12 +360,12 @@ class _Data:
     @cached_property
     def strengths(self) -> Callable[[Float], Pair]:
         """Function of the parameters that returns the amplitude and log temperature of each frame."""
-        return _remembering(self._strengths)
+        return remembering(self._strengths)
 
     @cached_property
     def slopes(self) -> Callable[[Float], Pair]:
         """Function that returns the derivatives of `strengths` by the parameters, each of shape (6, n_frame)."""
-        return _remembering(self._slopes)
+        return remembering(self._slopes)
 
     def _strengths(self, theta: Float) -> Pair:
         rise = np.exp(theta[2]) * self.light * self.shape.mean_over(self.edges, theta[0], np.exp(theta[1]))
@@ -633,11 +619,11 @@ def _data(
     reduction = Reduction.of(model, quiet, skipped_nm=skipped_nm, clipped=clipped)
     weights, strengths = reduction.weights, known_strengths(stare, quiet)
     sums = less_known(raw, quiet, strengths, weights)
-    constant, each = Components(quiet, np.zeros((0, weights.shape[1])), weights).sum_cumulants(2)
-    covariance = constant + np.tensordot(strengths, each, 1)
+    components = Components(quiet, np.zeros((0, weights.shape[1])), weights)
+    covariance = components.covariance(strengths)
     edges = np.column_stack([stare.start_s, stare.start_s + stare.frame_s])
     gain = np.asarray(quiet.gain_dn_per_electron) * np.ones(weights.shape[1])
-    unknown, jitters = _levels_of_stare(quiet, reduction, stare, strengths)
+    unknown, jitters = _levels_of_stare(components.directions(strengths), reduction, stare)
     light = strengths[:, 3]
     if nuisances is not None:
         unknown = (*_constant_levels(nuisances, model, weights, len(sums)), *unknown)
@@ -656,23 +642,15 @@ def _constant_levels(nuisances: Nuisances, model: FlareModel, weights: Float, n_
 
 
 def _levels_of_stare(
-    quiet: Expectation, reduction: Reduction, stare: Stare, strengths: Float
+    changes: Mapping[str, Float], reduction: Reduction, stare: Stare
 ) -> tuple[tuple[_Level, ...], tuple[_Level, ...]]:
     """Return the unknown changes of a stare, and its jitters."""
-    star, sky, dark, near = (
-        part[:, None] * (reduction.weights @ mean)
-        for part, mean in zip(
-            strengths.T, (quiet.net_source_dn, quiet.sky_dn, quiet.dark_dn, quiet.neighbour_dn), strict=True
-        )
-    )
-    slope = quiet.conditions["dark_slope_per_c"]
-    changes = {"star": star, "light": star + sky + near, "sky": sky, "temperature": slope * dark}
 
     def level(of: Changing, sd: float, curve: Float) -> _Level:
         of_flare = curve if of == "light" else np.zeros_like(curve)
         return _Level(sd, curve[:, None] * changes[of], of_flare, reduction.spline)
 
-    ones, jitters = np.ones(len(strengths)), dict(stare.jitters)
+    ones, jitters = np.ones(stare.n_frames), dict(stare.jitters)
     if stare.pointing is not None:
         jitters["light"] = float(np.hypot(jitters["light"], stare.pointing.depth))
     return (
@@ -707,7 +685,6 @@ def _limits(model: FlareModel, stare: Stare) -> tuple[Float, Float]:
 
 def _solve(data: _Data, whitening: _Whitening, theta: Float, free: NDArray[np.intp], low: Float, high: Float) -> Float:
     """Return the least-squares parameters; fixed ones are unchanged."""
-    scale = np.where(free == 0, np.exp(theta[1]), 1.0)
 
     def with_free(values: Float) -> Float:
         there = theta.copy()
@@ -720,14 +697,9 @@ def _solve(data: _Data, whitening: _Whitening, theta: Float, free: NDArray[np.in
     def jacobian(values: Float) -> Float:
         return data.jacobian(with_free(values), whitening)[:, free]
 
-    solution = scipy.optimize.least_squares(
-        residuals,
-        np.clip(theta[free], low[free] + 1e-9, high[free] - 1e-9),
-        jacobian,
-        bounds=(low[free], high[free]),
-        x_scale=scale,
-    )
-    return with_free(solution.x)
+    low, high, scale = low[free], high[free], np.where(free == 0, np.exp(theta[1]), 1.0)
+    start = np.clip(theta[free], low + 1e-9, high - 1e-9)
+    return with_free(scipy.optimize.least_squares(residuals, start, jacobian, bounds=(low, high), x_scale=scale).x)
 
 
 def _quantities(data: _Data, stare: Stare, cooling: bool) -> list[_Quantity]:

@@ -33,6 +33,11 @@ MOST_FLARES, MOST_STATISTICS = 8, 8
 ROUNDING_FOURTH = -1.0 / 120.0
 
 
+def known_strengths(stare: Stare, quiet: Expectation) -> Float:
+    """Return known strengths of star, sky, dark, and neighbours and flares in each frame, shape (n_frame, 4)."""
+    return np.column_stack([stare.light * stare.star, stare.light * stare.sky, stare.dark_factor(quiet), stare.light])
+
+
 @dataclass(frozen=True, eq=False)
 class Components:
     """Spectra of a stare's frames, and weights of the sums that are computed for each frame.
@@ -130,12 +135,9 @@ class Components:
         return constant, each
 
     def sum_cumulants(self, order: int) -> tuple[Float, Float]:
-        """Return the joint cumulants of the weighted sums.
+        """Return the joint cumulants of the weighted sums, with as many axes of n_statistic as the order.
 
-        Returns
-        -------
-        constant : ndarray, shape (n_statistic,) * order
-        each : ndarray, shape (4 + n_flare,) + (n_statistic,) * order
+        They are the constant part, and a row for each component at a coefficient of one, as of `pixel_cumulants`.
         """
         constant, each = self.pixel_cumulants(order)
         rows = np.vstack([constant, each])
@@ -150,22 +152,12 @@ class Components:
         return {order: self.sum_cumulants(order) for order in (1, 2, 3, 4)}
 
     def coefficients(self, stare: Stare, flare: Float | None = None) -> Float:
-        """Return the known coefficients of each frame.
+        """Return the known coefficients of star, sky, dark, neighbours and flares, shape (n_frame, 4 + n_flare).
 
-        Parameters
-        ----------
-        stare : Stare
-        flare : ndarray, shape (n_frame, n_flare), optional
-            Amplitude of each flare spectrum in each frame.
-
-        Returns
-        -------
-        ndarray, shape (n_frame, 4 + n_flare)
-            Coefficients of star, sky, dark, neighbours and flares.
+        `flare` holds the amplitude of each flare spectrum in each frame, (n_frame, n_flare).
         """
         factors = np.zeros((stare.n_frames, len(STEADY) + self.n_flares))
-        factors[:, 0], factors[:, 1] = stare.light * stare.star, stare.light * stare.sky
-        factors[:, 2], factors[:, 3] = stare.dark_factor(self.quiet), stare.light
+        factors[:, : len(STEADY)] = known_strengths(stare, self.quiet)
         if flare is not None:
             if np.shape(flare) != (stare.n_frames, self.n_flares):
                 raise InputError(
@@ -193,6 +185,14 @@ class Components:
     def fourth(self, coefficients: Float) -> Float:
         """Return the joint fourth cumulants of the statistics, with one axis more than those of `third`."""
         return self._of(4, coefficients)
+
+    def jittered_covariance(self, coefficients: Float, stare: Stare) -> Float:
+        """Return `covariance` with the jitters of a stare."""
+        covariance, directions = self.covariance(coefficients), self.directions(coefficients)
+        for of, sd in stare.jitters.items():
+            moved = sd * directions[of]
+            covariance = covariance + moved[..., :, None] * moved[..., None, :]
+        return covariance
 
     def _of(self, order: int, coefficients: Float) -> Float:
         constant, each = self._sums[order]
@@ -271,22 +271,11 @@ class StareExpectation:
         return float(np.sqrt(np.einsum("tk,kl,tl->", flare, spectra / variance @ spectra.T, flare, optimize=True)))
 
     def net(self, weights: Float, draw: Draw, kind: type[np.floating[Any]] = np.float64) -> tuple[Any, Any, Any]:
-        """Draw the net light in weighted sums of pixels, and return it with its standard deviation and mean, DN/s.
+        """Draw net light in weighted sums of pixels; return it with its standard deviation and mean, DN/s.
 
         Net light is the raw count minus bias and dark current at the known temperature; it includes the sky and
-        neighbours.
-
-        Parameters
-        ----------
-        weights : ndarray, shape (n_sum, n_pixel)
-            Zero in pixels that are not used.
-        kind : type
-            Type of the arrays.
-
-        Returns
-        -------
-        net, sd, mean : ndarray of `kind`, shape (n_frame, n_sum)
-            The standard deviation is that of photons, dark current and read noise, without jitter.
+        neighbours. Weights, (n_sum, n_pixel), are zero in pixels that are not used. The standard deviation is that of
+        photons, dark current and read noise, without jitter. Arrays are of type `kind` and shape (n_frame, n_sum).
         """
         frame_s, coefficients = self.stare.frame_s, self.coefficients
         net, sd, mean = (np.empty((self.stare.n_frames, len(weights)), kind) for _ in range(3))
@@ -342,16 +331,10 @@ class LightCurves:
 def draw_light_curves(
     expectation: StareExpectation, bands_nm: Sequence[tuple[float, float]], draw: Draw
 ) -> LightCurves:
-    """Draw a stare in bands and resolution elements, all from the same pixels.
+    """Draw a stare in bands and resolution elements; `draw` draws the same pixels for all sums.
 
-    Raises InputError if a band contains no pixel.
-
-    Parameters
-    ----------
-    bands_nm : sequence of (float, float)
-        Wavelengths, nm; the upper limit is excluded, and saturated pixels are not used.
-    draw : callable
-        Draws the same pixels for all sums.
+    The upper limit of a band is excluded, and saturated pixels are not used. Raises InputError if a band contains no
+    pixel.
     """
     quiet, used = expectation.quiet, expectation.used.astype(np.float64)
     rows = []

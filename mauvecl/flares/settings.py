@@ -90,6 +90,17 @@ class Cooling(CoolingLaw):
         return self.peak_k - self.end_k < SAME_K
 
 
+def integral_between_points(x: Float, y: Float, t: Float) -> Float:
+    """Return the integral from the first point to t of what is linear between points, and zero outside them."""
+    import numpy as np
+
+    slope = np.diff(y) / np.diff(x)
+    areas = np.concatenate([[0.0], np.cumsum(np.diff(x) * (y[1:] + y[:-1]) / 2)])
+    k = np.clip(np.searchsorted(x, t, side="right") - 1, 0, x.size - 2)
+    past = np.clip(t, x[0], x[-1]) - x[k]
+    return np.asarray(areas[k] + past * (y[k] + slope[k] * past / 2))
+
+
 @validated
 class Curve(Section):
     """Slow change with time: a sinusoid, points, or a file with two columns, time in s and value.
@@ -151,11 +162,7 @@ class Curve(Section):
         import numpy as np
 
         time, value = self._time_and_value
-        slope = np.diff(value) / np.diff(time)
-        areas = np.concatenate([[0.0], np.cumsum(np.diff(time) * (value[1:] + value[:-1]) / 2)])
-        k = np.clip(np.searchsorted(time, t, side="right") - 1, 0, time.size - 2)
-        past = np.clip(t, time[0], time[-1]) - time[k]
-        inside = areas[k] + past * (value[k] + slope[k] * past / 2)
+        inside = integral_between_points(time, value, t)
         return np.asarray(inside + np.minimum(t - time[0], 0) * value[0] + np.maximum(t - time[-1], 0) * value[-1])
 
 

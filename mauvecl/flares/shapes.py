@@ -15,7 +15,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from mauvecl.flares.settings import check_shape
+from mauvecl.flares.settings import check_shape, integral_between_points
 from mauvecl.host.arrays import set_read_only
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened
@@ -98,18 +98,10 @@ class Shape(ABC):
         return between(sides(self, first), sides(self, last))
 
     def mean_over(self, edges_s: ArrayLike, peak_s: ArrayLike, t_half_s: ArrayLike) -> Float:
-        """Return the exact mean over each frame.
+        """Return the exact mean over each frame, shape (n_frame,), or (n, n_frame) for peaks of the shape (n, 1).
 
-        Parameters
-        ----------
-        edges_s : array_like, shape (n_frame + 1,) or (n_frame, 2)
-            Edges of consecutive frames, or start and end of each frame.
-        peak_s, t_half_s : array_like
-            Time at which tau is 0, and half-width, s; shape (n, 1) gives one row for each.
-
-        Returns
-        -------
-        ndarray, shape (n_frame,), or (n, n_frame)
+        Edges are those of consecutive frames, (n_frame + 1,), or start and end of each frame, (n_frame, 2). The peak is
+        the time at which tau is 0.
         """
         edges, peak, scale = (np.asarray(values, np.float64) for values in (edges_s, peak_s, t_half_s))
         if edges.ndim == 2:
@@ -355,13 +347,7 @@ class TableShape(Shape):
         return np.asarray(np.interp(np.asarray(tau, np.float64), self.tau, self.values, left=0.0, right=0.0))
 
     def before(self, tau: ArrayLike) -> Float:
-        x, y = self.tau, self.values
-        t = np.clip(np.asarray(tau, np.float64), x[0], x[-1])
-        steps = np.diff(x)
-        areas = np.concatenate([[0.0], np.cumsum(steps * (y[1:] + y[:-1]) / 2)])
-        k = np.clip(np.searchsorted(x, t, side="right") - 1, 0, x.size - 2)
-        past = t - x[k]
-        return np.asarray(areas[k] + past * (y[k] + (y[k + 1] - y[k]) / steps[k] * past / 2))
+        return integral_between_points(self.tau, self.values, np.asarray(tau, np.float64))
 
     def after(self, tau: ArrayLike) -> Float:
         mirrored = TableShape(-self.tau[::-1], self.values[::-1])

@@ -270,6 +270,13 @@ class Stare:
         return np.asarray(np.exp(slope * (self.temperature_c - at)))
 
 
+def select_frames(stare: Stare, part: slice | NDArray[np.bool_]) -> Stare:
+    """Return a stare with some of its frames."""
+    names = ("start_s", "star", "light", "sky", "temperature_c")
+    unknowns = tuple(replace(unknown, curve=unknown.curve[part]) for unknown in stare.unknowns)
+    return replace(stare, unknowns=unknowns, **{name: getattr(stare, name)[part] for name in names})
+
+
 def _frames_outside_gaps(gaps: Sequence[tuple[float, float]], start: Float, frame_s: float) -> NDArray[np.bool_]:
     """Return which frames do not overlap a gap."""
     # The tolerance keeps a frame that starts at the end of a gap.
@@ -388,15 +395,7 @@ def stare_along(
     # All but the temperature follow from a stare without gaps.
     whole = Stare.of(count * frame_s, frame_s=frame_s, **unknowns)
     temperature = _temperature(orbit, track, thermal)
-    stare = replace(
-        whole,
-        start_s=whole.start_s[seen],
-        star=whole.star[seen],
-        light=whole.light[seen],
-        sky=whole.sky[seen],
-        temperature_c=temperature[seen],
-        unknowns=tuple(replace(unknown, curve=unknown.curve[seen]) for unknown in whole.unknowns),
-    )
+    stare = select_frames(replace(whole, temperature_c=temperature), seen)
     hits = particles.rate_per_cm2_s(track)[seen]
     return OrbitStare(stare, hits, visible.shadow[seen], times.iso(0.0), tuple(orbit.messages(times)))
 

@@ -403,7 +403,6 @@ class StaresRequest(Countable):
     #: Number of the stare of the first row of flares and amplitudes, if these differ between stares.
     rows_from: int = field(init=False, default=0)
 
-    parts = 1
     least: ClassVar[int] = 64
 
     def __post_init__(self) -> None:

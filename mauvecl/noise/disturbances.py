@@ -236,17 +236,10 @@ class PointingDrifts(Section):
     ] = 0.5
 
     def drifts(self, numbers: NDArray[np.uint64], end_s: float, seed: int) -> tuple[Float, Float, Float]:
-        """Draw the drifts of stares up to a time.
+        """Draw start, duration and depth of the drifts of stares up to a time, shape (n_stare, n_drift) each.
 
-        Parameters
-        ----------
-        numbers : ndarray, shape (n_stare,)
-            Numbers of the stares; each depends only on the seed and its number.
-
-        Returns
-        -------
-        start_s, duration_s, depth : ndarray, shape (n_stare, n_drift)
-            In order of time; the last drift of each stare begins at `end_s` or later.
+        Each stare depends only on the seed and its number. Drifts are in order of time, and the last one of each stare
+        begins at `end_s` or later.
         """
         import numpy as np
 
@@ -270,11 +263,7 @@ class PointingDrifts(Section):
     def losses(self, numbers: NDArray[np.uint64], start_s: NDArray[np.float64], frame_s: float, seed: int) -> Float:
         """Draw the mean share of the light that each frame loses, shape (n_stare, n_frame).
 
-        Parameters
-        ----------
-        numbers : ndarray, shape (n_stare,)
-        start_s : ndarray, shape (n_frame,)
-            Start of the frames after the start of the stare.
+        Frames start at `start_s` after the start of the stare.
         """
         import numpy as np
 

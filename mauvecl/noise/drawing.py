@@ -9,9 +9,9 @@ realistic number of draws reveals the difference.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
-from typing import TYPE_CHECKING, Literal, Self, TypedDict, get_args
+from typing import TYPE_CHECKING, Literal, Self, TypedDict, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,12 +116,11 @@ class Cumulants:
     def scaled(self, light: float | Float, dark: float) -> Cumulants:
         """Return the cumulants with light and dark multiplied by factors."""
         gaussian_light = np.where(self.photon_step > 0, 0.0, self.light_variance)
-        return Cumulants(
+        return replace(
+            self,
             mean=self.mean + (light - 1.0) * self.light_dn + (dark - 1.0) * self.dark_dn,
             gaussian=self.gaussian + (light - 1.0) * gaussian_light,
             photons=light * self.photons,
-            photon_step=self.photon_step,
-            dark_step=self.dark_step,
             dark_dn=dark * self.dark_dn,
             light_dn=light * self.light_dn,
             light_variance=light * self.light_variance,
@@ -142,15 +141,9 @@ def truncation_distance(c: Cumulants, *, fourth_power: bool, varying: bool = Fal
     """Estimate Pearson's distance between a draw and its polynomial from the next terms, shape (n_pixel,).
 
     A term a He_k(z) changes the density by a He_(k + 1)(z) times the normal's, and the squares of these integrate to
-    a^2 (k + 1)!. Rounding to whole DN can only reduce the distance.
-
-    Parameters
-    ----------
-    fourth_power : bool
-        Whether the polynomial includes z^4.
-    varying : bool
-        Whether to use the kernels' polynomial for factors on light and dark instead of `polynomial`. Without the fourth
-        power, it has no terms of gamma_5.
+    a^2 (k + 1)!. Rounding to whole DN can only reduce the distance. `fourth_power` tells whether the polynomial
+    includes z^4, and `varying` selects the kernels' polynomial for factors on light and dark instead of `polynomial`;
+    without the fourth power, it has no terms of gamma_5.
     """
     return expansion_error(c.over_sd(7), fourth_power=fourth_power, varying=varying)
 
@@ -188,21 +181,14 @@ def needs_fourth_power(c: Cumulants, *, varying: bool = False) -> bool:
 
 
 def stack_is_exact(c: Cumulants, x: Expectation) -> NDArray[np.bool_]:
-    """Return the pixels whose frames can be drawn as one stack, shape (n_pixel,).
+    """Return the pixels whose frames can be drawn as one stack, from the cumulants of ONE frame.
 
-    Parameters
-    ----------
-    c : Cumulants
-        Cumulants of ONE frame.
-
-    Notes
-    -----
     A stack treats each frame's rounding error as noise of mean 0 and variance 1/12 that is Gaussian in the sum. The
     error is a sawtooth, the sum over k of sin(2 pi k x) / (pi k), which depends on the frame's noise through its
     characteristic function at 2 pi k (Widrow, Kollar & Liu 1996, doi 10.1109/19.492748): its modulus f_k and the slope
-    l_k of its logarithm. Given the sum of N frames of variance v, the conditional mean of a frame's sine is at most
-    f_k exp(u_k / 2) with u_k = l_k^2 / (N v), which changes the density of the sum by Pearson's distance below. Counts
-    of whole DN do not smooth the rounding. The sum of N uniform errors has the fourth cumulant -N / 120.
+    l_k of its logarithm. Given the sum of N frames of variance v, the conditional mean of a frame's sine is at most f_k
+    exp(u_k / 2) with u_k = l_k^2 / (N v), which changes the density of the sum by Pearson's distance below. Counts of
+    whole DN do not smooth the rounding. The sum of N uniform errors has the fourth cumulant -N / 120.
 
     Poisson counts whose steps are visible in the sum are ignored: given the counts, only the remaining noise smooths
     the rounding, and a mixture is never easier to distinguish than its components.
@@ -277,12 +263,7 @@ class Drawing:
     @property
     def options(self) -> DrawingOptions:
         """Fields as keyword arguments."""
-        return {
-            "mode": self.mode,
-            "recipe": self.recipe,
-            "processes": self.processes,
-            "first_frame": self.first_frame,
-        }
+        return cast(DrawingOptions, dict(vars(self)))
 
 
 #: Options that follow from the noise.
@@ -291,13 +272,10 @@ AUTOMATIC = Drawing()
 
 @cache
 def nodes() -> Float:
-    """Return the probabilities of the table's nodes from an end of a prior to its median.
+    """Return the probabilities of the table's nodes from an end of a prior to its median, (layout.PRIOR_NODES,).
 
-    Returns
-    -------
-    ndarray, shape (layout.PRIOR_NODES,)
-        Octaves from 2**-56 to 1/2 with 2**PRIOR_BITS cells each; the last node is repeated for words that float32
-        rounds up.
+    There are octaves from 2**-56 to 1/2 with 2**PRIOR_BITS cells each; the last node is repeated for words that float32
+    rounds up.
     """
     cells = 2**layout.PRIOR_BITS
     number = np.arange(layout.PRIOR_NODES - 1)
@@ -316,21 +294,12 @@ def _quantiles(prior: Prior) -> tuple[Float, Float]:
     return values, prior.quantile(np.array([0.5]))
 
 
-def table_of(prior: Prior, change: Callable[[Float], Float]) -> tuple[NDArray[np.float32], float]:
-    """Compute the quantile table of a prior.
+def quantile_table(prior: Prior, change: Callable[[Float], Float]) -> tuple[NDArray[np.float32], float]:
+    """Compute the quantile table of a prior, shape (2 * PRIOR_NODES,), and the factor at its median, minus one.
 
-    Parameters
-    ----------
-    change : callable
-        Function that converts the prior's values to a factor minus one.
-
-    Returns
-    -------
-    table : ndarray of float32, shape (2 * PRIOR_NODES,)
-        Factors at `nodes` from the low end, then from the high end, divided by the factor at the median, minus one.
-        In this form float32 resolves priors of any width and location.
-    centre : float
-        Factor at the median, minus one.
+    `change` converts the prior's values to a factor minus one. The table holds factors at `nodes` from the low end,
+    then from the high end, divided by the factor at the median, minus one. In this form float32 resolves priors of any
+    width and location.
     """
     at_nodes, median = _quantiles(prior)
     values, centre = change(at_nodes), float(change(median)[0])
@@ -341,7 +310,7 @@ def table_of(prior: Prior, change: Callable[[Float], Float]) -> tuple[NDArray[np
 class Factors:
     """Factors of priors on light, dark and sky; factors on light include the sky's light."""
 
-    #: Shape (n_modulation, 2 * layout.PRIOR_NODES); quantile tables; see `table_of`.
+    #: Shape (n_modulation, 2 * layout.PRIOR_NODES); quantile tables; see `quantile_table`.
     tables: NDArray[np.float32]
     #: Factors at the priors' medians, to which the tables are relative, in the order of `SIGNAL_PARTS`.
     medians: dict[SignalPart, float]
@@ -350,13 +319,7 @@ class Factors:
 
     @classmethod
     def of(cls, processes: Processes, conditions: Conditions) -> Self:
-        """Compute the quantile tables of the priors' factors.
-
-        Parameters
-        ----------
-        conditions : mapping of float
-            Values of the expectation: ``temperature_c``, ``dark_slope_per_c``, ``light_loss``, ``pointing_loss``.
-        """
+        """Compute the quantile tables of the priors' factors for the conditions of an expectation."""
         tables = np.empty((len(processes.modulations), 2 * layout.PRIOR_NODES), np.float32)
         ends, centre = dict.fromkeys(SIGNAL_PARTS, (1.0, 1.0)), dict.fromkeys(SIGNAL_PARTS, 1.0)
         for row, (name, factor) in enumerate(processes.modulations):
@@ -367,7 +330,7 @@ class Factors:
                 raise InputError.of(
                     name, [float(first), float(last)], f"a prior within {varied.low:g} to {varied.high:g}"
                 )
-            tables[row], middle = table_of(prior, change)
+            tables[row], middle = quantile_table(prior, change)
             centre[factor] *= 1.0 + middle
             least, most = sorted(1.0 + change(np.array([first, last])))
             ends[factor] = ends[factor][0] * float(least), ends[factor][1] * float(most)

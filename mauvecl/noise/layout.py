@@ -241,10 +241,10 @@ def alias_table(mean: float) -> AliasTable:
     counts = np.arange(low, high + 1)
     p = np.exp(special.xlogy(counts, mean) - mean - special.gammaln(counts + 1.0))
     inside = np.flatnonzero((np.cumsum(p) >= 2.0**-33) & (np.cumsum(p[::-1])[::-1] >= 2.0**-33))
-    return table_of(p[inside[0] : inside[-1] + 1], low + int(inside[0]))
+    return alias_table_of(p[inside[0] : inside[-1] + 1], low + int(inside[0]))
 
 
-def table_of(probability: NDArray[np.float64], low: int = 0) -> AliasTable:
+def alias_table_of(probability: NDArray[np.float64], low: int = 0) -> AliasTable:
     """Compute the alias table of a distribution over the integers from `low` on.
 
     `probability` has up to 2**24 values, which need not sum to one.
@@ -285,19 +285,9 @@ def _pack(words: NDArray[np.int64], bits: int) -> NDArray[np.uint32]:
 
 
 def table_set(means: Iterable[float], tables: list[AliasTable]) -> tuple[list[AliasTable], list[int]]:
-    """Append a table for each distinct mean.
+    """Append a table for each distinct mean to `tables`, which are contiguous on the device.
 
-    Parameters
-    ----------
-    tables : list of AliasTable
-        Tables that are contiguous on the device; new ones are appended.
-
-    Returns
-    -------
-    each : list of AliasTable
-        Table of each mean.
-    starts : list of int
-        Start of each mean's table.
+    Return the table of each mean, and where it starts.
     """
     size = sum(table.entries.size for table in tables)
     distinct: dict[float, tuple[AliasTable, int]] = {}

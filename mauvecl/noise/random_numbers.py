@@ -41,14 +41,9 @@ _TWO_LN2 = np.float32(float.fromhex(TWO_LN2))
 
 
 def philox(counter: Sequence[ArrayLike], seed: int) -> Words:
-    """Compute Philox4x32-10 (Salmon et al. 2011, doi 10.1145/2063384.2063405).
+    """Compute Philox4x32-10 (Salmon et al. 2011, doi 10.1145/2063384.2063405) of a counter and a 64-bit key.
 
-    Parameters
-    ----------
-    counter : four array_like of uint32
-        Words that are broadcast against each other.
-    seed : int
-        The 64-bit key.
+    The four words of the counter are broadcast against each other.
     """
     c0, c1, c2, c3 = np.broadcast_arrays(*(np.asarray(c, dtype=np.uint64) for c in counter))
     half, low_half = np.uint64(32), np.uint64(0xFFFFFFFF)
@@ -63,17 +58,10 @@ def philox(counter: Sequence[ArrayLike], seed: int) -> Words:
 
 
 def words(realisation: ArrayLike, frame: ArrayLike, stream: int, group: ArrayLike, seed: int) -> Words:
-    """Return the four words that four neighbouring pixels share in a stream, given by its number.
+    """Return the four words that four neighbouring pixels share in a stream.
 
-    Parameters
-    ----------
-    realisation : array_like of int
-        64-bit indices.
-    frame : array_like of int
-    stream : int
-        Top byte of the counter's last word.
-    group : array_like of int
-        Pixel index divided by four.
+    The number of the stream is the top byte of the counter's last word, and the group is the pixel index divided by
+    four.
     """
     index = np.asarray(realisation, dtype=np.uint64)
     last = np.uint64(stream << 24) | np.asarray(group, dtype=np.uint64)

@@ -34,17 +34,8 @@ def words_at(
 ) -> Words:
     """Return the four words that four neighbouring pixels of a realisation and frame share in a stream.
 
-    Parameters
-    ----------
-    realisation : array_like of int
-        64-bit indices.
-    frame : array_like of int
-    stream : str
-        A key of `layout.STREAMS`.
-    group : array_like of int
-        Pixel index divided by four.
-    exposure : int
-        0 for the observed exposure, `layout.REFERENCE` for the reference.
+    The stream is a key of `layout.STREAMS`, the group is the pixel index divided by four, and the exposure is 0 for the
+    observed one and `layout.REFERENCE` for the reference.
     """
     return words(realisation, frame, exposure + layout.STREAMS[stream], group, seed)
 
@@ -221,12 +212,7 @@ def observed(
     number: int = 0,
     scenarios: Sequence[int] | None = None,
 ) -> NDArray[np.int64]:
-    """Sum the DN above the base over the draws of exposure `number`, for each scenario.
-
-    Returns
-    -------
-    ndarray of int64, shape (n_scenario, n_padded, n_realisation)
-    """
+    """Sum the DN above the base over the draws of exposure `number`, (n_scenario, n_padded, n_realisation)."""
     chosen = range(len(scene.levels)) if scenarios is None else scenarios
     total = np.zeros((len(chosen), len(scene.pixels), len(realisation)), np.int64)
     drawn_frames = range(number * scene.n_draws, (number + 1) * scene.n_draws)
@@ -257,12 +243,7 @@ def _all_frames(
 
 
 def clipped(scene: Scene, realisation: NDArray[np.uint64], seed: int) -> NDArray[np.int64]:
-    """Count the frames in which each pixel of scenario 0 is below zero and above saturation.
-
-    Returns
-    -------
-    ndarray of int64, shape (n_realisation, n_pixel, 2)
-    """
+    """Count the frames below zero and above saturation of scenario 0, shape (n_realisation, n_pixel, 2)."""
     count = np.zeros((len(realisation), len(scene.pixels), 2), np.int64)
     if scene.clip:
         index, frames, changes = _all_frames(scene, realisation, range(scene.n_draws), seed)

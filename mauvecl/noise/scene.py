@@ -26,7 +26,7 @@ from mauvecl.noise.drawing import (
     polynomial,
     sky_share,
 )
-from mauvecl.noise.layout import LARGEST_MEAN, SMALLEST_EXPANDED, AliasTable, table_of, table_set
+from mauvecl.noise.layout import LARGEST_MEAN, SMALLEST_EXPANDED, AliasTable, alias_table_of, table_set
 from mauvecl.noise.unknowns import ADDITIVE, PROCESSES, SIGNAL_PARTS, SignalPart
 from mauvecl.schema.errors import InputError
 
@@ -138,25 +138,18 @@ class FactorDistributions:
     ) -> FactorDistributions | None:
         spreads: dict[SignalPart, list[FactorDistribution]] = {}
         for (name, factor), table in zip(modulations, tables, strict=True):
-            spread = _of_table(table)
+            # Relative to the factor at the median, as the table is.
+            spread = FactorDistribution(1.0 + quantile_at_score(table, SCORE), WEIGHTS)
             if PROCESSES[name].when == "frame" and n_frames > 1:
                 spread = _normal(spread.mean, spread.sd / np.sqrt(n_frames))
             spreads.setdefault(factor, []).append(spread)
         return cls({name: _product(ones, medians[name]) for name, ones in spreads.items()}) if spreads else None
 
     def nodes(self, x: Expectation, *, weighted: bool) -> tuple[list[Node], Float]:
-        """Return the nodes over which a statistic of an exposure is integrated.
+        """Return the nodes over which a statistic of an exposure is integrated, and spectra of normal amplitudes.
 
-        Parameters
-        ----------
-        weighted : bool
-            Whether the statistic is a weighted sum instead of a sum of squares.
-
-        Returns
-        -------
-        nodes : list of Node
-        rows : ndarray, shape (k, n_pixel)
-            Spectra of factors treated as normal amplitudes, DN per standard deviation.
+        Factors that are treated as normal amplitudes have spectra, DN per standard deviation, (k, n_pixel). `weighted`
+        tells whether the statistic is a weighted sum instead of a sum of squares.
         """
         light, sky, dark = zip(*changes_of(x), strict=True)
         moved = {"dark": dark, "light": light, "sky": sky}
@@ -182,11 +175,6 @@ class FactorDistributions:
 
 def _normal(mean: float, sd: float) -> FactorDistribution:
     return FactorDistribution(mean + sd * SCORE, WEIGHTS)
-
-
-def _of_table(table: NDArray[np.float32]) -> FactorDistribution:
-    """Return the distribution given by a device's quantile table, relative to the factor at the median."""
-    return FactorDistribution(1.0 + quantile_at_score(table, SCORE), WEIGHTS)
 
 
 def quantile_at_score(table: NDArray[np.float32], score: Float) -> Float:
@@ -343,13 +331,9 @@ class Scene:
     def constants(
         self, weights: NDArray[np.float32], linear_end: NDArray[np.uint32], pixels_end: NDArray[np.uint32]
     ) -> NDArray[np.float32]:
-        """Compute the contribution of the reference's fractions of a DN to chi-squared and to each linear statistic.
+        """Compute what the reference's fractions of a DN add to chi-squared and to each linear statistic.
 
-        Sums of resolution elements include them already.
-
-        Returns
-        -------
-        ndarray of float32, shape (n_scenario + n_linear,)
+        Sums of resolution elements include them already. The shape is (n_scenario + n_linear,).
         """
         chi2 = np.sum(self.levels["inverse_variance"] * self.fraction**2, axis=1)
         scenario = np.searchsorted(linear_end, np.arange(len(weights)), side="right")
@@ -378,23 +362,12 @@ def prepare(
     first_group: int = 0,
     **words: Unpack[DrawingOptions],
 ) -> Scene:
-    """Compute the arrays of scenarios for the device.
+    """Compute the arrays of scenarios for the device, from expectations that differ only in their light.
 
+    Options of the draw can also be given as keywords. Each scenario is compared with one of the quiescent `references`,
+    by default the first; `first_group` is the number of the first group of four pixels in the generator's counter.
     Raises InputError if scenarios differ in more than their light, stacked draws are requested near a rail, or a
     process needs joint draws that are not exact.
-
-    Parameters
-    ----------
-    scenarios : sequence of Expectation
-        Expectations that differ only in their light.
-    drawing : Drawing, optional
-        Options of the draw, which can also be given as keywords.
-    references : sequence of int, optional
-        For each scenario, the quiescent one with which it is compared; by default the first.
-    comparison : Comparison
-        Subtracted reference and variances.
-    first_group : int
-        Number of the first group of four pixels in the generator's counter.
     """
     drawing = drawing or Drawing(**words)
     quiet = scenarios[0]
@@ -556,7 +529,7 @@ def _job(
     job["reference_count"], job["reference_weight"] = comparison.exposures, comparison.added_variance
     job["pair_scale"] = variance_factor(comparison) / 2.0
     for name, process in drawing.processes.additive.items():
-        table = table_of(process.charge(method.each * quiet.frame_s))
+        table = alias_table_of(process.charge(method.each * quiet.frame_s))
         job[f"{name}_table"] = sum(t.entries.size for t in tables)
         job[f"{name}_bits"], job[f"{name}_low"] = table.bits, table.low
         tables.append(table)

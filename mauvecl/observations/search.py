@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.flares.stare import Stare
+from mauvecl.flares.stare import Stare, select_frames
 from mauvecl.observations.level import process_level
 from mauvecl.observations.process import Process
 from mauvecl.observations.process_search import ProcessSearch
-from mauvecl.search.search import select_frames
 from mauvecl.search.templates import Bank, Baseline, Templates
 
 if TYPE_CHECKING:

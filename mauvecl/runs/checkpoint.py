@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
-from mauvecl.detection.requests import Countable, Divisible, Shard
+from mauvecl.detection.requests import Countable, Shard
 from mauvecl.host import VERSION
 from mauvecl.host.tables.files import UNFINISHED, json_data, read_bytes, read_text, write_whole
 from mauvecl.schema.errors import InputError
@@ -92,7 +92,7 @@ SHARD_WORK = 2**34
 MAX_SHARDS = 2**13
 
 
-def shards(request: Divisible) -> list[Shard]:
+def shards(request: Countable) -> list[Shard]:
     """Divide a request into shards at multiples of a power of two, independently of the workers."""
     wanted = max(SHARD_WORK // request.work, request.realisations // MAX_SHARDS)
     size = 1 << (max(wanted, request.least).bit_length() - 1)

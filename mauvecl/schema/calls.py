@@ -23,7 +23,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_
 from pydantic_core import CoreSchema, PydanticCustomError, SchemaValidator, ValidationError, core_schema
 
 from mauvecl.schema.errors import InputError, shown
-from mauvecl.schema.fields import is_quantity, without_unit
+from mauvecl.schema.fields import is_quantity, is_truth, without_unit
 
 #: Place of an error inside an alternative of a union.
 ALTERNATIVE = "|"
@@ -94,7 +94,7 @@ def _number(value: Any) -> float:
 def _whole(value: Any) -> int:
     if is_quantity(value):
         value = without_unit(value, "")
-    _require(not _is_truth(value) and not getattr(value, "ndim", 0))
+    _require(not is_truth(value) and not getattr(value, "ndim", 0))
     try:
         return operator.index(value)
     except TypeError:
@@ -104,23 +104,18 @@ def _whole(value: Any) -> int:
 
 
 def _truth(value: Any) -> bool:
-    _require(_is_truth(value))
+    _require(is_truth(value))
     return bool(value)
 
 
-def _text(value: Any) -> Any:
-    _require(isinstance(value, str))
-    return value
+def _taken_if(accepts: Callable[[Any], bool]) -> Callable[[Any], Any]:
+    """Return a function that returns an accepted value as it is, and raises ValueError for others."""
 
+    def take(value: Any) -> Any:
+        _require(accepts(value))
+        return value
 
-def _path(value: Any) -> Any:
-    _require(isinstance(value, str | os.PathLike))
-    return value
-
-
-def _function(value: Any) -> Any:
-    _require(callable(value))
-    return value
+    return take
 
 
 def _array(value: Any) -> Any:
@@ -156,9 +151,9 @@ LEAVES: dict[Any, tuple[Callable[[Any], Any], str]] = {
     float: (_number, "a number"),
     int: (_whole, "a whole number"),
     bool: (_truth, "true or false"),
-    str: (_text, "text"),
-    Path: (_path, "a path"),
-    Callable: (_function, "a function"),
+    str: (_taken_if(lambda value: isinstance(value, str)), "text"),
+    Path: (_taken_if(lambda value: isinstance(value, str | os.PathLike)), "a path"),
+    Callable: (_taken_if(callable), "a function"),
 }
 
 
@@ -199,11 +194,6 @@ def _kind(value: Any) -> str:
 
         value = np.asarray(value)
     return str(getattr(value.dtype, "kind", ""))
-
-
-def _is_truth(value: Any) -> bool:
-    # NumPy's own type has this name as well, and need not be loaded.
-    return type(value).__name__ in ("bool", "bool_")
 
 
 def _require(condition: bool) -> None:

@@ -160,20 +160,7 @@ T = TypeVar("T")
 
 
 class First(list[T]):
-    """The first items of a list, and a note on their number.
-
-    Parameters
-    ----------
-    most : int
-        Largest number of items.
-    name : str
-        Plural noun for the items.
-
-    Attributes
-    ----------
-    note : str
-        As in "6 of 9 stars shown"; empty if all are kept.
-    """
+    """The first items of a list, with a `note` such as "6 of 9 stars shown" if it has more."""
 
     def __init__(self, things: Collection[T], most: int, name: str) -> None:
         super().__init__(islice(things, most))

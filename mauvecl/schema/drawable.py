@@ -3,20 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-
-class Registry(Protocol):
-    """The registry of pictures, as this module needs it."""
-
-    def pictures_of(self, thing: Any) -> dict[str, Callable[..., Any]]:
-        """Return every picture of a thing by the name of its file."""
-
-    def documents_of(self, thing: Any) -> dict[str, Callable[[], bytes]]:
-        """Return the functions that make the documents of an object, by file name."""
 
 
 class Drawable:
@@ -25,7 +15,8 @@ class Drawable:
     @property
     def pictures(self) -> dict[str, Callable[..., Any]]:
         """Every picture by the name of its file; each is called with a `path`, with axes `ax`, or with neither."""
-        return _registry().pictures_of(self)
+        pictures: dict[str, Callable[..., Any]] = _registry().pictures_of(self)
+        return pictures
 
     def plot(self, path: str | Path | None = None, *, ax: Any = None) -> Any:
         """Draw the first picture and return the figure, the path of the saved file, or `ax`; needs matplotlib."""
@@ -37,13 +28,14 @@ class Drawable:
 
 def documents_of(thing: Drawable) -> dict[str, Callable[[], bytes]]:
     """Return the functions that make the registered documents of an object, by file name."""
-    return _registry().documents_of(thing)
+    documents: dict[str, Callable[[], bytes]] = _registry().documents_of(thing)
+    return documents
 
 
-def connect(find: Callable[[], Registry]) -> None:
-    """Name the function that imports the registry; the package itself calls this when it is imported."""
+def connect(find: Callable[[], Any]) -> None:
+    """Name the function that imports the module of pictures; the package calls this when it is imported."""
     global _registry
     _registry = find
 
 
-_registry: Callable[[], Registry]
+_registry: Callable[[], Any]

@@ -47,82 +47,6 @@ def is_quantity(value: Any) -> bool:
     return hasattr(value, "to_value") and hasattr(value, "unit")
 
 
-def number(
-    what: str, value: Any, unit: str = "", *, low: float = -math.inf, high: float = math.inf, expected: str = ""
-) -> float:
-    """Return one finite number in a unit.
-
-    Raises InputError if the value is not a finite number in the range and unit.
-
-    Parameters
-    ----------
-    what : str
-        Name of the value, for messages.
-    unit : str
-        As astropy reads it. Wavelengths may come as frequencies or energies, temperatures on any scale.
-    low, high : float
-        Closed range of accepted values.
-    expected : str
-        Accepted values, for messages; from unit and range by default.
-    """
-    wanted = expected or _expected(unit, low, high)
-    if type(value) is float:
-        plain = value
-    else:
-        given = _plain(what, value, unit, wanted)
-        plain = float(given) if not given.ndim else math.nan
-    if not (math.isfinite(plain) and low <= plain <= high):
-        raise InputError.of(what, value, wanted)
-    return plain
-
-
-def numbers(
-    what: str, values: Any, unit: str = "", *, low: float = -math.inf, high: float = math.inf
-) -> NDArray[np.float64]:
-    """Return finite numbers in a unit, in the shape of `values`; parameters and errors as for `number`."""
-    import numpy as np
-
-    wanted = _expected(unit, low, high)
-    plain = _plain(what, values, unit, wanted)
-    bad = ~(np.isfinite(plain) & (plain >= low) & (plain <= high))
-    if bad.any():
-        first = plain[np.unravel_index(int(np.argmax(bad)), plain.shape)]
-        raise InputError.of(what, float(first), wanted, unit=unit)
-    return plain
-
-
-def count(what: str, value: Any, *, low: int = 0, high: int = 2**63 - 1) -> int:
-    """Return a whole number, given as an int, a float such as 1e5 or a dimensionless Quantity.
-
-    Raises InputError if the value is not a whole number from `low` to `high`.
-    """
-    wanted = f"a whole number from {low} to {high}" if high < 2**63 - 1 else f"a whole number of at least {low}"
-    try:
-        # Whole numbers beyond 2**53 are no floats.
-        whole = operator.index(_no_truth(value))
-    except TypeError:
-        plain = number(what, value, expected=wanted)
-        if not plain.is_integer():
-            raise InputError.of(what, value, wanted) from None
-        whole = int(plain)
-    if not low <= whole <= high:
-        raise InputError.of(what, whole, wanted)
-    return whole
-
-
-def _plain(what: str, value: Any, unit: str, wanted: str) -> NDArray[np.float64]:
-    import numpy as np
-
-    try:
-        if is_quantity(value):
-            value = without_unit(value, unit)
-        if isinstance(value, str | bytes) or np.asarray(value).dtype.kind not in "iuf":
-            raise TypeError("no number")
-        return np.asarray(value, np.float64)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise InputError.of(what, value, wanted) from error
-
-
 def without_unit(value: Any, unit: str) -> Any:
     """Return a Quantity as plain numbers: a float, or an array of its shape.
 
@@ -145,22 +69,9 @@ def without_unit(value: Any, unit: str) -> Any:
     return converted if getattr(converted, "ndim", 0) else float(converted)
 
 
-def _no_truth(value: Any) -> Any:
-    if isinstance(value, bool):
-        raise TypeError("true or false is no number")
-    return value
-
-
 def word_of(unit: str) -> str:
     """Return the words for a unit in a message."""
     return WORDS.get(unit, unit)
-
-
-def _expected(unit: str, low: float, high: float) -> str:
-    word = WORDS.get(unit, unit)
-    if math.isfinite(low) and math.isfinite(high):
-        return f"{low:g} to {high:g}{f' {unit}' if unit else ''}"
-    return f"{word} of at least {low:g}" if math.isfinite(low) else word
 
 
 Metadata = TypeVar("Metadata")
@@ -218,7 +129,7 @@ class Range:
         schema = core_schema.no_info_after_validator_function(self._check, inner)
         return _or_error(schema, self.words(unit, whole=int in (source, *get_args(source))), unit=unit)
 
-    def __contains__(self, value: float) -> bool:
+    def __contains__(self, value: Any) -> bool:
         if not math.isfinite(value) or not self.low <= value <= self.high:
             return False
         return not ((self.open_low and value == self.low) or (self.open_high and value == self.high))
@@ -246,6 +157,62 @@ class Range:
         ends = [f"above {low}" if self.open_low else f"of at least {low}"] if has_low else []
         ends += [f"below {high}" if self.open_high else f"up to {high}"] if has_high else []
         return f"{noun} {' and '.join(ends)}" if ends else noun
+
+
+def is_truth(value: Any) -> bool:
+    """Return whether a value is true or false; NumPy's own type counts too and need not be loaded."""
+    return type(value).__name__ in ("bool", "bool_")
+
+
+def number(what: str, value: Any, unit: str = "", reach: Range | None = None) -> float:
+    """Return one finite number in a unit, as astropy reads it, and a range, from a number or a Quantity.
+
+    Wavelengths may come as frequencies or energies, temperatures on any scale. Raises InputError for other values.
+    """
+    reach = reach or Range()
+    plain: Any = value if type(value) is float else _plain(what, value, unit, reach)
+    if getattr(plain, "ndim", 0):
+        raise InputError.of(what, value, reach.words(unit))
+    if plain not in reach:
+        raise InputError.of(what, float(plain), reach.words(unit))
+    return float(plain)
+
+
+def numbers(what: str, values: Any, unit: str = "", reach: Range | None = None) -> NDArray[np.float64]:
+    """Return finite numbers in a unit and a closed range, in the shape of `values`; errors as for `number`."""
+    import numpy as np
+
+    reach = reach or Range()
+    plain = _plain(what, values, unit, reach)
+    bad = ~(np.isfinite(plain) & (plain >= reach.low) & (plain <= reach.high))
+    if bad.any():
+        raise InputError.of(what, float(plain[bad][0]), reach.words(unit), unit=unit)
+    return plain
+
+
+def count(what: str, value: Any) -> int:
+    """Return a whole number of at least 0, given as an int, a float such as 1e5 or a dimensionless Quantity."""
+    try:
+        # Whole numbers beyond 2**53 are no floats.
+        whole = number(what, value) if is_truth(value) else operator.index(value)
+    except TypeError:
+        whole = number(what, value)
+    if whole != int(whole) or not 0 <= whole < 2**63:
+        raise InputError.of(what, value, "a whole number of at least 0")
+    return int(whole)
+
+
+def _plain(what: str, value: Any, unit: str, reach: Range) -> NDArray[np.float64]:
+    import numpy as np
+
+    try:
+        if is_quantity(value):
+            value = without_unit(value, unit)
+        if isinstance(value, str | bytes) or np.asarray(value).dtype.kind not in "iuf":
+            raise TypeError("no number")
+        return np.asarray(value, np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError.of(what, value, reach.words(unit)) from error
 
 
 class AnyUnit:
@@ -433,22 +400,5 @@ def unit_of(kind: Any) -> str:
 
 
 def checked(kind: Any, what: str, value: Any) -> float:
-    """Return a number in the unit and range of an annotation such as `physical.Magnitude`.
-
-    Parameters
-    ----------
-    kind : type
-        Annotation with `Unit` and `Range`.
-    what : str
-        Name of the value, for messages.
-    """
-    return checked_number(what, value, unit_of(kind), range_of(kind))
-
-
-def checked_number(what: str, value: Any, unit: str, reach: Range) -> float:
-    """Return a number in a unit and a range, from a Quantity or a plain number."""
-    expected = reach.words(unit)
-    plain = number(what, value, unit, expected=expected)
-    if plain not in reach:
-        raise InputError.of(what, plain, expected)
-    return plain
+    """Return a number in the unit and range of an annotation such as `physical.Magnitude`."""
+    return number(what, value, unit_of(kind), range_of(kind))

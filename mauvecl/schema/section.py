@@ -21,7 +21,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError, PydanticUndefined
 
 from mauvecl.schema.errors import InputError, shortened, shown
-from mauvecl.schema.fields import Flag, Help, Range, Unit, as_typed, first, found, is_quantity, numbers
+from mauvecl.schema.fields import Flag, Help, Range, Unit, as_typed, first, found, is_quantity, is_truth, numbers
 
 if TYPE_CHECKING:
     from pydantic._internal._model_construction import ModelMetaclass
@@ -72,8 +72,7 @@ def holds_truth(given: Any) -> bool:
     """Return whether a value is true or false, or a list that has one; nested records check their own."""
     if isinstance(given, list | tuple):
         return any(map(holds_truth, given))
-    # NumPy's own too, which need not be loaded.
-    return type(given).__name__ in ("bool", "bool_")
+    return is_truth(given)
 
 
 def _takes_truth(annotation: Any) -> bool:

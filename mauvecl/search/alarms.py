@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from mauvecl.search.flare_fits import (
@@ -24,9 +25,9 @@ from mauvecl.search.flare_fits import (
     Block,
     Factor,
     FittedFlares,
-    Interval,
+    ProfileInterval,
     SearchedStare,
-    StareSums,
+    SummedStare,
 )
 from mauvecl.search.templates import LEAD, TAIL
 
@@ -92,19 +93,12 @@ class Candidate:
 def alarms(
     survey: SearchedStare, templates: Templates, sums: NDArray[Any], threshold: float, energy: Factor | None = None
 ) -> list[Alarm]:
-    """Detect and fit all flares of a stare, largest statistic first.
+    """Detect and fit all flares of a stare in its simulated sums, (n_frame, n_sum), largest statistic first.
 
-    Parameters
-    ----------
-    templates : Templates
-        Templates from which the survey's bank and components are made.
-    sums : ndarray, shape (n_frame, n_sum)
-        Simulated sums; known means are subtracted here.
-    energy : callable, optional
-        Logarithm of the energy per second of equivalent duration as a function of the logarithm of the temperature,
-        and its derivative.
+    `templates` are those from which the survey's bank and components are made. `energy` returns the logarithm of the
+    energy per second of equivalent duration, and its derivative, for the logarithm of the temperature.
     """
-    search = _StareSearch(StareSums(survey, templates, np.asarray(survey.net(sums[None])[0], np.float64)), threshold)
+    search = _StareSearch(SummedStare(survey, templates, np.asarray(survey.net(sums[None])[0], np.float64)), threshold)
     search.run()
     return sorted(_measured_alarms(search, energy), key=lambda alarm: -alarm.rho)
 
@@ -113,7 +107,7 @@ def alarms(
 class _StareSearch:
     """State of the search of one stare."""
 
-    sums: StareSums
+    sums: SummedStare
     threshold: float
     found: list[Candidate] = field(default_factory=list)
     refused: list[tuple[float, float]] = field(default_factory=list)
@@ -273,12 +267,10 @@ class _StareSearch:
         evened = left.copy()
         # The baseline under a flare is the median of the surrounding frames without excess noise.
         times = self.sums.edges[:, 0]
-        for start, stop in _runs(loud):
-            near = ~loud & (
-                np.abs(times - times[(start + stop) // 2]) < self.sums.survey.bank.baseline.window_s / 2 + 1
-            )
+        for (rows,) in scipy.ndimage.find_objects(scipy.ndimage.label(loud)[0]):
+            middle = times[(rows.start + rows.stop) // 2]
+            near = ~loud & (np.abs(times - middle) < self.sums.survey.bank.baseline.window_s / 2 + 1)
             level = np.median(left[near], axis=0) if near.any() else np.zeros(left.shape[1])
-            rows = slice(start, stop)
             evened[rows] = level + (left[rows] - level) / np.sqrt(excess[rows])[:, None]
         return evened
 
@@ -334,12 +326,6 @@ class _StareSearch:
                         other[j, WIDTH] = start[k, WIDTH]
                         fits.append(rows.fit(other))
         return min(fits, key=lambda fit: fit.chi2)
-
-
-def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return the start and end of each run of true values."""
-    steps = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    return [(int(a), int(b)) for a, b in steps.reshape(-1, 2)]
 
 
 def _measured_alarms(search: _StareSearch, energy: Factor | None) -> list[Alarm]:
@@ -432,11 +418,11 @@ def _intervals(
     return intervals, f"the interval of its {' and its '.join(notes)} ends where the fit does" if notes else ""
 
 
-def _by_curvature(theta: Float, covariance: Float, column: int, factor: Factor | None) -> Interval:
+def _by_curvature(theta: Float, covariance: Float, column: int, factor: Factor | None) -> ProfileInterval:
     if factor is None:
         middle, sd = theta[column], np.sqrt(covariance[column, column])
     else:
         value, slope = factor(theta[KELVIN])
         along = np.array([1.0, 0.0, 1.0, slope])
         middle, sd = theta[AMPLITUDE] + theta[WIDTH] + value, np.sqrt(along @ covariance @ along)
-    return Interval(float(middle - sd), float(middle + sd))
+    return ProfileInterval(float(middle - sd), float(middle + sd))

@@ -204,14 +204,8 @@ def frame_signal(
 ) -> float:
     """Return the S/N of one frame with a flare of amplitude 1, with optimal weights.
 
-    Parameters
-    ----------
-    quiet, flare : Expectation
-        One frame each; pixels that saturate without a flare are excluded.
-    amplitude : float
-        Amplitude of the flare in `flare`.
-    added_variance_dn2 : ndarray, shape (n_pixel,), optional
-        Additional variance, such as that of particle hits.
+    `amplitude` is that of the flare in `flare`, and `added_variance_dn2`, (n_pixel,), additional variance such as that
+    of particle hits. Pixels that saturate without a flare are excluded.
     """
     if quiet.n_frames != 1 or flare.n_frames != 1:
         raise InputError.of("n_frames", (quiet.n_frames, flare.n_frames), "one frame each")
@@ -300,10 +294,7 @@ class InjectedCompleteness:
     def limit(self, power: float, half_width: int | None) -> Interval:
         """Return the size at which the fraction `power` is detected, with a 95 % interval; infinite if never reached.
 
-        Parameters
-        ----------
-        half_width : int, optional
-            Index of a half-width; by default the average over all.
+        `half_width` is the index of a half-width; None averages over all.
         """
         critical = self.critical if half_width is None else self.critical[half_width : half_width + 1]
         by_position = np.moveaxis(critical, 1, 0).reshape(critical.shape[1], -1)

@@ -501,14 +501,9 @@ class UnknownShifts:
         return bool(np.abs(self.scales - 1).max() < NEGLIGIBLE and not self.shifts.any())
 
     def alarm_probability(self, threshold: float, days: float, rate: Callable[[Float], Float]) -> Float:
-        """Return the probability of an alarm in each draw, shape (n_draw,).
+        """Return the probability of an alarm in each draw of a stare of some star-days, shape (n_draw,).
 
-        Parameters
-        ----------
-        days : float
-            Star-days of the stare.
-        rate : callable
-            False alarms per star-day at a threshold for the noise that the search assumes.
+        `rate` returns the false alarms per star-day at a threshold for the noise that the search assumes.
         """
         rates = np.zeros(self.weights.size)
         largest = np.zeros(self.weights.size)
@@ -544,10 +539,7 @@ def sampled_rate(survey: Survey, seed: int) -> SampledRate:
 def draw_shifts(survey: Survey, seed: int, part: Survey | None = None) -> UnknownShifts:
     """Draw the unknowns of a stare and compute scatter and shift of templates' values.
 
-    Parameters
-    ----------
-    part : Survey, optional
-        Part of the stare in which shifts are evaluated; all of it by default.
+    Shifts are evaluated in a `part` of the stare, by default in all of it.
     """
     stare, components, rows = survey.stare, survey.components, survey.bank.directions
     at = np.unique(np.linspace(0, stare.n_frames - 1, POINTS).astype(int))
@@ -566,10 +558,7 @@ def draw_shifts(survey: Survey, seed: int, part: Survey | None = None) -> Unknow
     coefficients[..., 1] *= (1 + moved["light"]) * (1 + moved["sky"])
     coefficients[..., 2] *= np.exp(slope * moved["temperature"])
     coefficients[..., 3] *= 1 + moved["light"]
-    covariance = components.covariance(coefficients)
-    for of, direction in components.directions(coefficients).items():
-        jitter = stare.jitters.get(of, 0.0)  # type: ignore[call-overload]
-        covariance += jitter**2 * direction[..., :, None] * direction[..., None, :]
+    covariance = components.jittered_covariance(coefficients, stare)
     variance = np.einsum("dk,ntkl,dl->ntd", rows, covariance, rows, optimize=True) / survey.variance[at, None]
     scales = np.sqrt(np.maximum(variance, 1e-12)).reshape(RATE_DRAWS, -1)
     searched = survey if part is None else part

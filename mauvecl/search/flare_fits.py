@@ -24,7 +24,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from mauvecl.fits.profile import Profile
+from mauvecl.fits.profile import Profile, remembering
 from mauvecl.flares.shapes import between, sides
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ class BlendFit:
 
 
 @dataclass(frozen=True, eq=False)
-class Interval:
+class ProfileInterval:
     """A 68 % interval from the profile likelihood."""
 
     low: float
@@ -112,7 +112,7 @@ class SearchedStare(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class StareSums:
+class SummedStare:
     """The sums of a stare to which flares are fitted."""
 
     survey: SearchedStare
@@ -249,7 +249,7 @@ class StareSums:
 class Block:
     """Frames and noise of flares that are fitted together."""
 
-    sums: StareSums
+    sums: SummedStare
     used: NDArray[np.bool_]  # frames of the stare, shape (n_frame,)
     whiten: Float  # whitening matrices, shape (n_used, n_sum, n_sum)
     basis: Float  # orthonormal columns of the whitened baseline, shape (n_used * n_sum, n_term)
@@ -293,14 +293,10 @@ class Block:
         return float(left @ left)
 
     def fit(self, theta: Float, fixed: tuple[int, int, float, Factor | None] | None = None) -> BlendFit:
-        """Fit all flares from a starting point.
+        """Fit all flares from a starting point, shape (n_flare, 4).
 
-        Parameters
-        ----------
-        theta : ndarray, shape (n_flare, 4)
-        fixed : (int, int, float, callable or None), optional
-            Flare, column, value and factor of a constraint: the column has the value, or with a factor, the sum of
-            log amplitude, log half-width and the factor.
+        `fixed` is a constraint of flare, column, value and factor: the column has the value, or with a factor, the sum
+        of log amplitude, log half-width and the factor.
         """
         low, high = (np.tile(end, (len(theta), 1)) for end in self.sums.bounds)
         moved = np.zeros(theta.shape, np.bool_)
@@ -321,26 +317,21 @@ class Block:
                     every[j, AMPLITUDE] = value - every[j, WIDTH] - factor(every[j, KELVIN])[0]
             return every
 
-        held: dict[bytes, Float] = {}
-
+        @remembering
         def triangle(x: Float) -> Float:
             """Return the triangular factor of derivatives and residuals as columns.
 
             Its columns have the same scalar products, on which alone the fit depends. It has few rows.
             """
-            # Residuals and derivatives are evaluated at the same point, one after the other.
-            if x.tobytes() not in held:
-                held.clear()
-                every = whole(x)
-                model, derivatives = self.model(every)
-                if fixed is not None and fixed[3] is not None:
-                    j = fixed[0]
-                    tied = derivatives[:, j, AMPLITUDE].copy()
-                    derivatives[:, j, WIDTH] -= tied
-                    derivatives[:, j, KELVIN] -= fixed[3](every[j, KELVIN])[1] * tied
-                columns = np.column_stack([-derivatives[:, moved], self.data - model])
-                held[x.tobytes()] = np.asarray(np.linalg.qr(columns, mode="r"))
-            return held[x.tobytes()]
+            every = whole(x)
+            model, derivatives = self.model(every)
+            if fixed is not None and fixed[3] is not None:
+                j = fixed[0]
+                tied = derivatives[:, j, AMPLITUDE].copy()
+                derivatives[:, j, WIDTH] -= tied
+                derivatives[:, j, KELVIN] -= fixed[3](every[j, KELVIN])[1] * tied
+            columns = np.column_stack([-derivatives[:, moved], self.data - model])
+            return np.asarray(np.linalg.qr(columns, mode="r"))
 
         def residual(x: Float) -> Float:
             return triangle(x)[:, -1]
@@ -373,17 +364,11 @@ class Block:
 
     def interval(
         self, best: BlendFit, j: int, column: int, factor: Factor | None = None, rises: float = 1.0
-    ) -> tuple[Interval, BlendFit | None]:
-        """Return the interval of a parameter or product, and a better fit if profiling finds one.
+    ) -> tuple[ProfileInterval, BlendFit | None]:
+        """Return the interval of a flare's parameter, and a better fit if profiling finds one.
 
-        Parameters
-        ----------
-        j, column : int
-            Flare and column.
-        factor : callable, optional
-            If given, the interval is that of amplitude x half-width x factor.
-        rises : float, optional
-            Rise of chi-squared at the ends of the interval.
+        With a factor, the interval is that of amplitude x half-width x factor. Chi-squared rises by `rises` at its
+        ends.
         """
         covariance, theta = self.covariance(best.theta), best.theta
         weights = np.zeros(theta.shape)
@@ -415,10 +400,10 @@ class Block:
                 if one.chi2 - best.chi2 < rises * (1.0 - CLOSE) ** 2:
                     reached = _interval_end(refit, best.chi2, rises, step, furthest, one.theta)
             if reached.better is not None:
-                return Interval(np.nan, np.nan), self.fit(reached.better.theta)
+                return ProfileInterval(np.nan, np.nan), self.fit(reached.better.theta)
             interval_ends.append((float(middle + sign * reached.step), reached.open))
         (low, open_low), (high, open_high) = interval_ends
-        return Interval(low, high, open_low, open_high), None
+        return ProfileInterval(low, high, open_low, open_high), None
 
     def without(self, blended: BlendFit, j: int) -> BlendFit:
         """Fit all flares except flare `j`."""
@@ -443,18 +428,11 @@ def _interval_end(
     refit: Callable[[float, Float | None], BlendFit], chi2: float, rises: float, step: float, furthest: float,
     start: Float | None = None,
 ) -> _IntervalEnd:  # fmt: skip
-    """Return the end of an interval on one side of the best fit.
+    """Return the end of an interval on one side of the best fit, at which chi-squared has risen by `rises`.
 
-    Parameters
-    ----------
-    refit : callable
-        Returns the best fit at a distance from the best one, from given or extrapolated starting parameters.
-    chi2, rises : float
-        Chi-squared of the best fit, and its rise at the end of the interval.
-    step, furthest : float
-        First guess of the distance to the end, and distance to the bound of the fit.
-    start : ndarray, optional
-        Starting parameters of the first fit.
+    `refit` returns the best fit at a distance from the best one, from given or extrapolated starting parameters. `step`
+    is the first guess of the distance, `furthest` that to the bound of the fit, and `start` the first starting
+    parameters.
     """
     inner, outer, root_inner, root_outer = 0.0, np.inf, 0.0, np.inf
     for _ in range(MAX_REFITS):
@@ -526,19 +504,10 @@ class SingleFlareFit:
         variance: Float | None = None,
         curves: Float | None = None,
     ) -> FittedFlares:
-        """Fit one flare to each of several light curves.
+        """Fit one flare to each of several light curves: sums less their known mean, (n, n_frame, n_sum).
 
-        Parameters
-        ----------
-        sums : ndarray, shape (n, n_frame, n_sum)
-            Sums less their known mean.
-        start_s : ndarray, shape (n_frame,)
-        peak_s, half_width_s : array_like, shape (n,)
-            Starting points, such as those of the template that detected each flare.
-        variance : ndarray, shape (n_frame,), optional
-            Variance of each frame's sums; 1 by default.
-        curves : ndarray, shape (n_curve, n_frame), optional
-            Baseline curves; see `Search`.
+        Starting points are the peak and half-width of, for example, the template that detected each flare. The variance
+        of the frames' sums is 1 by default; see `Search` for `curves`.
         """
         n = len(sums)
         peak, log_width = (np.array(np.broadcast_to(value, n), np.float64) for value in (peak_s, np.log(half_width_s)))

@@ -23,11 +23,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.flares.frames import STEADY, Components
+from mauvecl.flares.stare import select_frames
 from mauvecl.flares.stare_scene import Method, StaresRequest, method_for
 from mauvecl.noise.processes import NONE, Processes
 from mauvecl.schema.columns import Column
 from mauvecl.schema.errors import InputError
-from mauvecl.search.search import Search, select_frames, subtract_known
+from mauvecl.search.search import Search, subtract_known
 
 if TYPE_CHECKING:
     from mauvecl.search.flare_fits import FittedFlares, SingleFlareFit
@@ -103,8 +104,9 @@ class FitAccuracy:
         none = count == 0
 
         def quantile(name: str, q: float) -> Float:
-            filled = np.where(none[:, :, None], 0.0, each[name])
-            return np.where(none, np.nan, np.nanquantile(filled, q, axis=2))
+            blank = ~np.isfinite(each[name]).any(axis=2)
+            filled = np.where(blank[:, :, None], 0.0, each[name])
+            return np.where(blank, np.nan, np.nanquantile(filled, q, axis=2))
 
         peak = [quantile("peak", q) for q in (0.16, 0.5, 0.84)]
         return cls(
@@ -114,17 +116,11 @@ class FitAccuracy:
             energy_ratio_high=quantile("energy", 0.84),
             amplitude_ratio=quantile("amplitude", 0.5),
             half_width_ratio=quantile("half_width", 0.5),
-            temperature_ratio=_quiet_median(each["temperature"], none),
+            temperature_ratio=quantile("temperature", 0.5),
             peak_offset=peak[1],
             peak_scatter=(peak[2] - peak[0]) / 2,
             energy_covered=np.where(none, np.nan, np.nanmean(np.where(none[:, :, None], 0.0, each["covered"]), axis=2)),
         )
-
-
-def _quiet_median(values: NDArray[Any], none: NDArray[np.bool_]) -> Float:
-    """Return the median over stares, NaN for cells without fitted temperatures."""
-    blank = none | ~np.isfinite(values).any(axis=2)
-    return np.where(blank, np.nan, np.nanmedian(np.where(blank[:, :, None], 0.0, values), axis=2))
 
 
 Single = NDArray[np.float32]
@@ -170,12 +166,7 @@ class InjectionSite:
 def sites_of(survey: Survey, widths_s: Sequence[float], peak_s: float, response: Float) -> tuple[InjectionSite, ...]:
     """Return the sites of flares of several half-widths that peak at one time.
 
-    Parameters
-    ----------
-    widths_s : sequence of float
-        Half-widths of the flares.
-    response : ndarray, shape (n_sum,)
-        Mean sums of a frame for a flare of unit amplitude.
+    `response`, (n_sum,), holds the mean sums of a frame for a flare of unit amplitude.
     """
     bank = survey.bank
     reaches = [_Reach.of(bank, width, peak_s) for width in widths_s]

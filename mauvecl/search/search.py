@@ -31,6 +31,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from mauvecl.flares.stare import select_frames
 from mauvecl.flares.stare_scene import StaresRequest, method_for
 from mauvecl.noise.processes import NONE, Processes
 from mauvecl.schema.errors import InputError
@@ -176,10 +177,6 @@ class Search:
                 )
                 correlated *= scale.astype(real)
                 yield row, correlated
-
-    def template(self, row: Row, onset: int, direction: int) -> Float:
-        """Return the weights of each sum in rho of a template, shape (n_frame, n_sum): rho = sum(weights * sums)."""
-        return np.asarray(self.in_time(row, np.array([onset]))[0][:, None] * self.bank.directions[direction])
 
     def in_time(self, row: Row, onsets: NDArray[np.int64]) -> Float:
         """Return the weights of frames in templates of a row, without their direction, shape (n_onset, n_frame)."""
@@ -347,10 +344,7 @@ class Trend:
     variance: Float  # of each frame's sums, shape (n_frame,)
     of: tuple[Changing, ...]  # quantity that each unknown changes
     curves: Float  # change per standard deviation of each unknown, shape (n_unknown, n_frame)
-    star: Float  # known mean, shape (n_frame, n_sum)
-    sky: Float  # known mean, shape (n_frame, n_sum)
-    neighbours: Float  # known mean, shape (n_frame, n_sum)
-    dark: Float  # known mean, shape (n_frame, n_sum)
+    known: Float  # means of star, sky, neighbours and dark, shape (4, n_frame, n_sum)
     slope_per_c: float  # relative change of the dark current per deg C
 
     @classmethod
@@ -371,7 +365,7 @@ class Trend:
         dark = directions["temperature"] / slope_per_c if slope_per_c else np.zeros_like(sky)
         curves = np.array([unknown.sd * unknown.curve for unknown in unknowns])
         of = tuple(unknown.of for unknown in unknowns)
-        return cls(frames, frame_s, variance, of, curves, star, sky, neighbours, dark, slope_per_c)
+        return cls(frames, frame_s, variance, of, curves, np.stack([star, sky, neighbours, dark]), slope_per_c)
 
     @cached_property
     def extremes(self) -> Float:
@@ -386,28 +380,24 @@ class Trend:
         return bool((np.sum(nonlinear**2 / self.variance[:, None], axis=(1, 2)) > LEAST**2).any())
 
     def effect(self, amplitudes: Float) -> Float:
-        """Return the effect of unknowns on the sums, (n_stare, n_frame, n_sum).
+        """Return the effect of unknowns, (n_stare, n_unknown) in standard deviations, on the sums.
 
-        Parameters
-        ----------
-        amplitudes : ndarray, shape (n_stare, n_unknown)
-            In standard deviations.
+        The result has the shape (n_stare, n_frame, n_sum).
         """
         return self._moved(self._changes(amplitudes))
 
     def part(self, part: slice) -> Trend:
         """Return the trend of some frames."""
-        names = ("frames", "variance", "star", "sky", "neighbours", "dark")
-        return replace(self, curves=self.curves[:, part], **{name: getattr(self, name)[part] for name in names})
+        frames, variance, curves, known = (
+            self.frames[part],
+            self.variance[part],
+            self.curves[:, part],
+            self.known[:, part],
+        )
+        return replace(self, frames=frames, variance=variance, curves=curves, known=known)
 
     def subtracted(self, sums: NDArray[Any]) -> NDArray[np.float64]:
-        """Fit the unknowns to sums and subtract their effect beyond first order.
-
-        Parameters
-        ----------
-        sums : ndarray, shape (n_stare, n_frame, n_sum)
-            Sums less their known mean.
-        """
+        """Fit the unknowns to sums less their known mean, and subtract their effect beyond first order."""
         left = np.array(sums, np.float64)
         # One stare at a time, since the rounding of matrix products may depend on the number of stares.
         for row in left:
@@ -415,13 +405,7 @@ class Trend:
         return left
 
     def nonlinear_effect(self, amplitudes: Float) -> Float:
-        """Return the effect of unknowns less its linear part, (n_stare, n_frame, n_sum).
-
-        Parameters
-        ----------
-        amplitudes : ndarray, shape (n_stare, n_unknown)
-            In standard deviations.
-        """
+        """Return the `effect` of unknowns less its linear part, (n_stare, n_frame, n_sum)."""
         linear = np.array([self._linear[of] for of in self.of])
         first = np.einsum("nu,ut,uk->ntk", amplitudes, self.curves, linear, optimize=True)
         return np.asarray(self.effect(amplitudes) - first)
@@ -447,7 +431,7 @@ class Trend:
     @cached_property
     def _linear(self) -> dict[str, Float]:
         """Mean response of the sums to each kind of change, shape (n_sum,)."""
-        star, sky, near, dark = (x.mean(axis=0) for x in (self.star, self.sky, self.neighbours, self.dark))
+        star, sky, near, dark = self.known.mean(axis=1)
         return {"star": star, "light": star + sky + near, "sky": sky, "temperature": self.slope_per_c * dark}
 
     @cached_property
@@ -457,20 +441,9 @@ class Trend:
         first = np.flatnonzero(np.diff(number, prepend=-1))
         weight = np.add.reduceat(1.0 / self.variance, first)
 
-        def mean(values: Float, axis: int = 0) -> Float:
-            over = self.variance if axis else self.variance[:, None]
-            return np.asarray(np.add.reduceat(values / over, first, axis=axis) / (weight if axis else weight[:, None]))
-
-        means = replace(
-            self,
-            frames=number[first],
-            variance=1.0 / weight,
-            curves=mean(self.curves, 1),
-            star=mean(self.star),
-            sky=mean(self.sky),
-            neighbours=mean(self.neighbours),
-            dark=mean(self.dark),
-        )
+        curves = np.add.reduceat(self.curves / self.variance, first, axis=1) / weight
+        known = np.add.reduceat(self.known / self.variance[:, None], first, axis=1) / weight[:, None]
+        means = replace(self, frames=number[first], variance=1.0 / weight, curves=curves, known=known)
         return first, weight, means
 
     def _changes(self, amplitudes: Float) -> dict[str, Float]:
@@ -486,18 +459,18 @@ class Trend:
         light = changes["light"] + 1
         star, sky = light * (1 + changes["star"]) - 1, light * (1 + changes["sky"]) - 1
         warm = np.expm1(self.slope_per_c * changes["temperature"])
-        lit = star[..., None] * self.star + sky[..., None] * self.sky + changes["light"][..., None] * self.neighbours
-        return np.asarray(lit + warm[..., None] * self.dark)
+        each = (change[..., None] for change in (star, sky, changes["light"], warm))
+        return np.asarray(sum(change * known for change, known in zip(each, self.known, strict=True)))
 
     def _gradient(self, changes: Mapping[str, Float]) -> Float:
         """Return the derivatives of `_moved` by the amplitudes, (n_stare, n_unknown, n_frame, n_sum)."""
         light, star, sky = (1 + changes[of][..., None] for of in ("light", "star", "sky"))
         warm = np.exp(self.slope_per_c * changes["temperature"])[..., None]
         each = {
-            "star": light * self.star,
-            "light": star * self.star + sky * self.sky + self.neighbours,
-            "sky": light * self.sky,
-            "temperature": self.slope_per_c * warm * self.dark,
+            "star": light * self.known[0],
+            "light": star * self.known[0] + sky * self.known[1] + self.known[2],
+            "sky": light * self.known[1],
+            "temperature": self.slope_per_c * warm * self.known[3],
         }
         return np.stack([each[of] * curve[:, None] for of, curve in zip(self.of, self.curves, strict=True)], axis=1)
 
@@ -532,11 +505,7 @@ class Survey:
 
     def covariance(self) -> Float:
         """Return the covariance of each frame's sums without a flare, shape (n_frame, n_sum, n_sum)."""
-        covariance = self.components.covariance(self.coefficients)
-        for of, sd in self.stare.jitters.items():
-            moved = sd * self.directions[of]
-            covariance = covariance + moved[:, :, None] * moved[:, None, :]
-        return covariance
+        return self.components.jittered_covariance(self.coefficients, self.stare)
 
     @cached_property
     def variance(self) -> Float:
@@ -580,15 +549,7 @@ class Survey:
         return self.unknowns if self.unknowns is not None and self.unknowns.is_nonlinear else None
 
     def unsubtracted(self, amplitudes: Float) -> Float:
-        """Return the effect of unknowns on the sums that is not subtracted before the search.
-
-        The shape is (n_stare, n_frame, n_sum).
-
-        Parameters
-        ----------
-        amplitudes : ndarray, shape (n_stare, n_unknown)
-            In standard deviations.
-        """
+        """Return the `effect` of unknowns on the sums that is not subtracted before the search."""
         if self.unknowns is None:
             return np.zeros((len(amplitudes), self.stare.n_frames, self.components.n_statistics))
         moved = self.unknowns.effect(amplitudes)
@@ -639,10 +600,3 @@ def subtract_known(sums: NDArray[Any], known: NDArray[Any], trend: Trend | None)
     """Subtract from simulated sums, (n_stare, n_frame, n_sum), their known mean and, if given, the fitted trend."""
     left = sums - known
     return np.asarray(left if trend is None else trend.subtracted(left), np.float32)
-
-
-def select_frames(stare: Stare, part: slice | NDArray[np.bool_]) -> Stare:
-    """Return a stare with some of the frames."""
-    names = ("start_s", "star", "light", "sky", "temperature_c")
-    unknowns = tuple(replace(unknown, curve=unknown.curve[part]) for unknown in stare.unknowns)
-    return replace(stare, unknowns=unknowns, **{name: getattr(stare, name)[part] for name in names})

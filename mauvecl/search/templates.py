@@ -131,13 +131,7 @@ class Bank:
         return tuple(self.template(w) for w in self.half_widths_s)
 
     def template(self, half_width_s: float, phases: Sequence[float] | None = None) -> Template:
-        """Compute the template of a half-width.
-
-        Parameters
-        ----------
-        phases : sequence of float, optional
-            Positions of peaks within their frames; by default one or two, depending on the half-width.
-        """
+        """Compute the template of a half-width, by default with one or two phases, depending on the half-width."""
         frames = half_width_s / self.frame_s
         if phases is None:
             phases = (0.25, 0.75) if frames < SUB_FRAME else (0.5,)
@@ -202,20 +196,10 @@ class Templates:
         nuisances: Nuisances | None = None,
         rank: int = RANK,
     ) -> Self:
-        """Compute weights from one frame of the quiescent star and flare spectra.
+        """Compute weights from one frame of the quiescent star and the mean DN of flares, (n_temperature, n_pixel).
 
-        Parameters
-        ----------
-        quiet : Expectation
-            One frame.
-        flares_dn : ndarray, shape (n_temperature, n_pixel)
-            Mean DN per frame of flares of unit amplitude.
-        temperatures_k : sequence of float
-            Temperatures of these flares, ascending, in steps small enough for `chosen`.
-        nuisances : Nuisances, optional
-            Nuisance parameters that are independent in each frame, such as jitter.
-        rank : int
-            Largest number of sums.
+        Flares have unit amplitude and ascending temperatures, in steps small enough for `chosen`. `nuisances` are
+        independent in each frame, such as jitter, and `rank` is the largest number of sums.
         """
         used = ~quiet.saturated
         if not used.any():
@@ -238,16 +222,8 @@ class Templates:
     ) -> Self:
         """Compute weights from the noise of a quiescent frame and flare spectra, all in one unit.
 
-        Parameters
-        ----------
-        variance : ndarray, shape (n_pixel,)
-            Variance of a quiescent frame; zero in pixels that are not used.
-        flares : ndarray, shape (n_temperature, n_pixel)
-            Flares of unit amplitude; zero in pixels that are not used.
-        photon_variance : ndarray, shape (n_pixel,)
-            Rise of the variance with the flux.
-        temperatures_k, nuisances, rank
-            As for `of`.
+        `variance` and `flares` are zero in pixels that are not used, and `photon_variance` is the rise of the variance
+        with the flux; other arguments are those of `of`.
         """
         used = variance > 0
         plain = np.divide(flares, variance, out=np.zeros_like(flares), where=used)
@@ -321,14 +297,9 @@ class Templates:
 def frame_nuisances(
     quiet: Expectation, stare: Stare, more: Mapping[str, float] | Nuisances | None = None
 ) -> Nuisances | None:
-    """Return the nuisance parameters of each frame: the stare's jitters, and additional ones.
+    """Return the nuisance parameters of each frame: the stare's jitters, and `more`.
 
-    Parameters
-    ----------
-    quiet : Expectation
-        One frame.
-    more : mapping of str to float, or Nuisances, optional
-        Standard deviations by name, which replace jitters of the same kind; an infinite one is projected out.
+    Standard deviations by name in `more` replace jitters of the same kind; an infinite one is projected out.
     """
     jitters: dict[str, float] = {CHANGED_PART[of]: sd for of, sd in stare.jitters.items() if sd > 0}
     # Drifts and re-acquisitions change all light alike, by any amount and at any time.

@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 
 from mauvecl.schema import parsing
 from mauvecl.schema.errors import InputError, shown
-from mauvecl.schema.fields import Flag, Help, Quantity, Range, Slider, Unit, Widget, checked_number, first
+from mauvecl.schema.fields import Flag, Help, Quantity, Range, Slider, Unit, Widget, first, number
 from mauvecl.schema.physical import Positive, Probability, Wavelength
 from mauvecl.schema.section import Section, fields_of
 from mauvecl.study.sections import Flare, Observation, SkyLight, Star
@@ -33,7 +33,7 @@ class StudyQuantity(Quantity):
 
     def checked(self, value: Any) -> float | str:
         """Return a value in the unit of the quantity; raises InputError if it is outside of the range."""
-        return value if self.is_name else checked_number(self.name.replace("_", " "), value, self.unit, self.range)
+        return value if self.is_name else number(self.name.replace("_", " "), value, self.unit, self.range)
 
     @property
     def suffix(self) -> str:

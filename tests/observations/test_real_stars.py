@@ -16,10 +16,10 @@ from scipy import stats
 from scipy.linalg import null_space
 
 from mauvecl import SHAPES, Frames, read_frames
+from mauvecl.flares.stare import select_frames
 from mauvecl.observations.process import Process, ProcessTerm, level_fit
 from mauvecl.observations.process_search import LEAST_SHARED, Correlations, ProcessSearch
 from mauvecl.observations.search import bank_of, stare_of
-from mauvecl.search.search import select_frames
 
 Float = NDArray[np.float64]
 DAVENPORT = SHAPES["davenport2014"]
