@@ -35,11 +35,11 @@ from mauvecl.fits.spectrum import forecast as forecast
 from mauvecl.fits.time_course import fit_cooling as fit_cooling
 from mauvecl.fits.time_course import measure_along as measure_along
 from mauvecl.flares.energies import EnergyScale as EnergyScale
-from mauvecl.flares.events import Event as Event
 from mauvecl.flares.settings import Cooling as Cooling
 from mauvecl.flares.settings import Sinusoid as Sinusoid
 from mauvecl.flares.shapes import SHAPES as SHAPES
 from mauvecl.flares.shapes import TableShape as TableShape
+from mauvecl.flares.stare import Event as Event
 from mauvecl.flares.stare import Stare as Stare
 from mauvecl.host.exposure.expectation import Expectation as Expectation
 from mauvecl.host.exposure.expectation import expect as expect

@@ -53,8 +53,7 @@ def question_values(study: Study, *, detects: bool) -> None:
     """
     from mauvecl.detection.names import check_fap, check_statistic
     from mauvecl.host.instrument.paths import instrument_path
-    from mauvecl.host.stars.band_names import known_band
-    from mauvecl.host.stars.library import spectrum_name
+    from mauvecl.host.stars.library import known_band, spectrum_name
 
     for star in study.star:
         if star.library is not None:

@@ -69,7 +69,7 @@ def statistics_by_name(asked: Sequence[str | Linear]) -> dict[str, Statistic]:
     return named
 
 
-def label(name: str) -> str:
+def statistic_label(name: str) -> str:
     """Return the axis label of a statistic; that of a user-defined one is its name."""
     return STATISTICS[name].label if name in STATISTICS else name
 

@@ -21,11 +21,10 @@ from numpy.typing import ArrayLike, NDArray
 from mauvecl.detection.nuisances import Nuisances, spectrum_of
 from mauvecl.fits.flare_model import EVERY, Exposures, Ranges, Reduction
 from mauvecl.fits.spectrum import LEVELS, Measurement, clipped_pixels, fit
-from mauvecl.flares.events import Event
 from mauvecl.flares.frames import Components
 from mauvecl.flares.settings import Cooling
 from mauvecl.flares.shapes import Shape, shape_of
-from mauvecl.flares.stare import Stare
+from mauvecl.flares.stare import Event, Stare
 from mauvecl.noise.unknowns import CHANGED_PART, CHANGING, Changing
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, table_of

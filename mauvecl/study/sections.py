@@ -10,7 +10,7 @@ from pydantic import Field, create_model, field_validator, model_validator
 
 from mauvecl.detection.names import DEFAULT_STATISTICS, STATISTIC_NAMES
 from mauvecl.host.exposure import DEFAULT_SKY
-from mauvecl.host.stars.band_names import ALIASES
+from mauvecl.host.stars.library import ALIASES
 from mauvecl.noise.disturbances import Prior, PriorField
 from mauvecl.noise.unknowns import INSTRUMENT_VALUES, values_of
 from mauvecl.schema import parsing
