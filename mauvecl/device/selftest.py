@@ -10,7 +10,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from importlib import resources
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -22,10 +22,9 @@ from scipy import special
 from mauvecl.detection.counts import Distribution
 from mauvecl.detection.requests import STATISTICS
 from mauvecl.detection.snr import Counts
-from mauvecl.device import build as program
 from mauvecl.device import drivers as first_build
 from mauvecl.device import drivers as processor
-from mauvecl.device.build import SAME_BITS, DeviceRecord, Variant, choose_device, load_opencl, out_of_memory
+from mauvecl.device.build import SAME_BITS, DeviceRecord, choose_device, load_opencl, out_of_memory
 from mauvecl.device.drivers import BuildError, DeviceError, kernel_cache
 from mauvecl.device.engine import Engine, Stares, devices
 from mauvecl.flares.frames import Components
@@ -44,84 +43,19 @@ if TYPE_CHECKING:
     from mauvecl.device.build import Device
 
 
-class Probes:
-    """Probe kernels of a device.
-
-    Parameters
-    ----------
-    width : int, optional
-        Realisations per vector; by default the device's.
-    vector_forms : bool, optional
-        Whether to use the fast forms for PoCL instead of built-in functions; by default the device's choice.
-    """
-
-    def __init__(self, *, width: int | None = None, vector_forms: bool | None = None, device: Device) -> None:
-        self.cl, self.context, self.queue = device.cl, device.context, device.queue
-        plain = device.variant
-        self.width = width or plain.width
-        forms = plain.vector_forms if vector_forms is None else vector_forms
-        variant = Variant(width=self.width, vector_forms=forms and self.width > 1, chunk=32 if self.width > 1 else 4)
-        self.program = program.build(self.context, program.render(("probes",), variant))
-
-    def run(
-        self,
-        name: str,
-        items: int,
-        out: NDArray[Any],
-        *inputs: Any,
-        out_first: NDArray[Any] | None = None,
-        start: NDArray[Any] | None = None,
-    ) -> NDArray[Any]:
-        """Launch a probe kernel and return `out`, its last argument.
-
-        Input arrays are uploaded. `out_first` is an output before `out`, and `start` the initial contents of `out`.
-        """
-        flags = self.cl.mem_flags
-        arguments = [
-            self.cl.Buffer(self.context, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=np.ascontiguousarray(x))
-            if isinstance(x, np.ndarray)
-            else x
-            for x in inputs
-        ]
-        outs = [x for x in (out_first, out) if x is not None]
-        buffers = [self.cl.Buffer(self.context, flags.READ_WRITE, x.nbytes) for x in outs]
-        if start is not None:
-            self.cl.enqueue_copy(self.queue, buffers[-1], start)
-        local = (1,) if self.width > 1 and name != "probe_layout" else None
-        self.cl.Kernel(self.program, name)(self.queue, (items,), local, *arguments, *buffers)
-        for array, buffer in zip(outs, buffers, strict=True):
-            self.cl.enqueue_copy(self.queue, array, buffer)
-        return out
-
-    def philox(self, counters: NDArray[np.uint32], keys: NDArray[np.uint32]) -> NDArray[np.uint32]:
-        """Return eight words per counter: four of the plain generator, four of its loop-invariant form."""
-        out = np.empty((len(counters), 8), np.uint32)
-        return self.run("probe_philox", len(counters), out, np.uint32(len(counters)), counters, keys)
-
-    def normal(self, radius: NDArray[np.uint32], angle: NDArray[np.uint32]) -> NDArray[np.float32]:
-        """Return two rows of normal deviates from two words each; sizes are multiples of the width."""
-        words = np.stack([radius, angle])
-        return self.run("probe_normal", radius.size // self.width, np.empty(words.shape, np.float32), words)
-
-    def alias(self, words: NDArray[np.uint32], table: NDArray[np.uint32], bits: int) -> NDArray[np.uint32]:
-        """Return the column that each word selects."""
-        items = words.size // self.width
-        return self.run("probe_alias", items, np.empty(words.size, np.uint32), words, table, np.uint32(bits))
-
-    def prior(
-        self, word: NDArray[np.uint32], finer: NDArray[np.uint32], table: NDArray[np.float32]
-    ) -> NDArray[np.float32]:
-        """Return a prior's factors minus one at the probabilities given by two words each."""
-        words = np.stack([word, finer])
-        return self.run("probe_prior", word.size // self.width, np.empty(word.size, np.float32), words, table)
-
-    def expansion(self, radius: NDArray[np.uint32], angle: NDArray[np.uint32], mean: float) -> NDArray[np.int64]:
-        """Return two rows of counts relative to the mean rounded to an integer."""
-        words, root = np.stack([radius, angle]), np.sqrt(mean)
-        offset, slope, cubic = mean - np.rint(mean) - 1 / 6, root - 1 / (36 * root), -1 / (72 * root)
-        coefficients = [np.float32(c) for c in (offset, slope, cubic)]
-        out = np.empty(words.shape, np.float32)
-        return self.run("probe_expansion", radius.size // self.width, out, words, *coefficients).astype(np.int64)
+def philox(device: Device, counters: NDArray[np.uint32], keys: NDArray[np.uint32]) -> NDArray[np.uint32]:
+    """Return eight words per counter: four of the plain generator, four of its loop-invariant form."""
+    wide = device.width > 1
+    variant = replace(device.variant, chunk=32 if wide else 4)
+    kernel = device.kernel(("probes",), variant, "probe_philox")
+    flags, out = device.cl.mem_flags, np.empty((len(counters), 8), np.uint32)
+    given = [
+        device.cl.Buffer(device.context, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=x) for x in (counters, keys)
+    ]
+    words = device.cl.Buffer(device.context, flags.WRITE_ONLY, out.nbytes)
+    kernel(device.queue, (len(counters),), (1,) if wide else None, np.uint32(len(counters)), *given, words)
+    device.cl.enqueue_copy(device.queue, out, words)
+    return out
 
 
 @dataclass(frozen=True)
@@ -510,7 +444,7 @@ def digest(array: NDArray[Any]) -> str:
 def known_answers(engine: Engine) -> Check:
     """Compare Philox on the device with Random123's vectors."""
     counters, keys, answers = (np.array([row[i] for row in PHILOX_VECTORS], np.uint32) for i in range(3))
-    out = Probes(device=engine.open_device).philox(counters, keys)
+    out = philox(engine.open_device, counters, keys)
     right = np.array_equal(out[:, :4], answers) and np.array_equal(out[:, 4:], answers)
     return Check("Philox4x32-10, known answers", right, f"{len(PHILOX_VECTORS)} vectors of Random123")
 
