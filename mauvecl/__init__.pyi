@@ -52,10 +52,10 @@ from mauvecl.host.stars.flare_spectra import FlareWithLines as FlareWithLines
 from mauvecl.host.stars.flare_spectra import ObservedFlare as ObservedFlare
 from mauvecl.host.stars.flare_spectra import TwoBlackbodies as TwoBlackbodies
 from mauvecl.host.stars.source import Source as Source
-from mauvecl.noise.comparison import Comparison as Comparison
 from mauvecl.noise.disturbances import CosmicRays as CosmicRays
 from mauvecl.noise.disturbances import Normal as Normal
 from mauvecl.noise.disturbances import Uniform as Uniform
+from mauvecl.noise.processes import Comparison as Comparison
 from mauvecl.noise.processes import Processes as Processes
 from mauvecl.observations.frame_files import read_frames as read_frames
 from mauvecl.observations.frames import Frames as Frames

@@ -22,8 +22,7 @@ from scipy import special
 from mauvecl.detection.counts import Distribution
 from mauvecl.detection.requests import STATISTICS
 from mauvecl.detection.snr import Counts
-from mauvecl.device import drivers as first_build
-from mauvecl.device import drivers as processor
+from mauvecl.device import drivers
 from mauvecl.device.build import SAME_BITS, DeviceRecord, choose_device, load_opencl, out_of_memory
 from mauvecl.device.drivers import BuildError, DeviceError, kernel_cache
 from mauvecl.device.engine import Engine, Stares, devices
@@ -33,9 +32,8 @@ from mauvecl.flares.stare_scene import Arrays, StaresRequest
 from mauvecl.host import VERSION
 from mauvecl.host.exposure.expectation import Expectation
 from mauvecl.noise import layout, reference
-from mauvecl.noise.comparison import Comparison
 from mauvecl.noise.disturbances import CosmicRays, Uniform
-from mauvecl.noise.processes import NONE, Processes
+from mauvecl.noise.processes import NONE, Comparison, Processes
 from mauvecl.noise.scene import prepare
 from mauvecl.schema.columns import Column
 
@@ -200,13 +198,13 @@ def list_devices(*, measure: bool = True) -> list[dict[str, Any]]:
 def child(request: dict[str, Any]) -> None:
     """Build and run kernels within the limits; print the reason of a failure, and exit with a code that says whose."""
     limit(request)
-    code = first_build.DRIVER_FAILED
+    code = drivers.DRIVER_FAILED
     try:
         why = _build(request)
     except Exception as error:
         why = str(error).splitlines()[0] if str(error) else type(error).__name__
         if not _is_drivers(error):
-            code = first_build.OTHER_FAILED
+            code = drivers.OTHER_FAILED
     if why:
         print(why)
     sys.exit(code if why else 0)
@@ -226,7 +224,7 @@ def limit(request: dict[str, Any]) -> None:
     # The hard limit ends the process even if the compiler handles the signal of the soft one.
     _lower(resource.RLIMIT_CPU, seconds, seconds + 5)
     # The alarm ends this process if the parent is killed.
-    signal.alarm(max(1, round(first_build.CLOCK * request["limit_s"])))
+    signal.alarm(max(1, round(drivers.CLOCK * request["limit_s"])))
     if request["memory"] is not None:
         _lower(resource.RLIMIT_DATA, request["memory"], request["memory"])
 
@@ -246,9 +244,9 @@ def _build(request: dict[str, Any]) -> str:
     if record.label != request["label"]:
         raise DeviceError(f"device {request['number']} is {record.label} in a new process, not {request['label']}")
     name = request["name"]
-    if name is not None and not processor.set_processor_name(handle, name):
+    if name is not None and not drivers.set_processor_name(handle, name):
         return "PoCL's record of the device is not understood"
-    first_build.settled[int(handle.int_ptr)] = name
+    drivers.settled[int(handle.int_ptr)] = name
     engine, quiet, flare = Engine(str(request["number"])), toy(), toy(flare=0.3)
     raw = engine.realise(quiet, count=64, seed=1)
     engine.detect(quiet, [flare], realisations=64, seed=1)

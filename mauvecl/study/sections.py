@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.host.stars.flare_spectra import FlareSpectrum
     from mauvecl.host.stars.source import Source
-    from mauvecl.noise.comparison import Comparison
+    from mauvecl.noise.processes import Comparison
 
 
 def amplitudes_in(path: Path, _: str) -> list[float]:
@@ -547,7 +547,7 @@ class Run(Section):
 
     def comparison(self) -> Comparison:
         """Return the reference of the comparison for the engine."""
-        from mauvecl.noise.comparison import Comparison
+        from mauvecl.noise.processes import Comparison
 
         return Comparison.of(self.reference, self.variances)
 
