@@ -16,7 +16,7 @@ import numpy as np
 
 from mauvecl.answers.inject import StarSurvey, survey_star
 from mauvecl.answers.stare import _log_energy
-from mauvecl.flares.events import Event, coefficients
+from mauvecl.flares.stare import Event, coefficients
 from mauvecl.search.alarms import Alarm, alarms
 from mauvecl.search.flare_fits import Factor
 from mauvecl.study.cases import Case

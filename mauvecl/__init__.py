@@ -24,14 +24,11 @@ from importlib import import_module
 from typing import Any
 
 from mauvecl.host import VERSION
-from mauvecl.schema import drawable
 
 if sys.platform == "win32":
     from mauvecl.device.drivers import driver_sources
 
     raise ImportError(f"mauvecl does not run on Windows itself, expected {driver_sources('Windows')}")
-
-drawable.connect(lambda: import_module("mauvecl.charts.chart"))
 
 __version__ = VERSION
 

@@ -35,11 +35,11 @@ from mauvecl.fits.spectrum import forecast as forecast
 from mauvecl.fits.time_course import fit_cooling as fit_cooling
 from mauvecl.fits.time_course import measure_along as measure_along
 from mauvecl.flares.energies import EnergyScale as EnergyScale
-from mauvecl.flares.events import Event as Event
 from mauvecl.flares.settings import Cooling as Cooling
 from mauvecl.flares.settings import Sinusoid as Sinusoid
 from mauvecl.flares.shapes import SHAPES as SHAPES
 from mauvecl.flares.shapes import TableShape as TableShape
+from mauvecl.flares.stare import Event as Event
 from mauvecl.flares.stare import Stare as Stare
 from mauvecl.host.exposure.expectation import Expectation as Expectation
 from mauvecl.host.exposure.expectation import expect as expect
@@ -52,10 +52,10 @@ from mauvecl.host.stars.flare_spectra import FlareWithLines as FlareWithLines
 from mauvecl.host.stars.flare_spectra import ObservedFlare as ObservedFlare
 from mauvecl.host.stars.flare_spectra import TwoBlackbodies as TwoBlackbodies
 from mauvecl.host.stars.source import Source as Source
-from mauvecl.noise.comparison import Comparison as Comparison
 from mauvecl.noise.disturbances import CosmicRays as CosmicRays
 from mauvecl.noise.disturbances import Normal as Normal
 from mauvecl.noise.disturbances import Uniform as Uniform
+from mauvecl.noise.processes import Comparison as Comparison
 from mauvecl.noise.processes import Processes as Processes
 from mauvecl.observations.frame_files import read_frames as read_frames
 from mauvecl.observations.frames import Frames as Frames

@@ -21,7 +21,7 @@ from mauvecl import InputError, bulk
 from mauvecl.schema.section import Record
 
 #: Modules below the validation, and the inner interface of statistics, whose methods public classes inherit.
-INNER = ("mauvecl.schema.drawable", "mauvecl.schema.section", "mauvecl.detection.statistics")
+INNER = ("mauvecl.schema.columns", "mauvecl.schema.section", "mauvecl.detection.statistics")
 #: Other units in which a parameter of each unit is given.
 EQUIVALENT = {"nm": ("um", "THz"), "K": ("kK", "deg_C"), "deg_C": ("K",), "s": ("min",), "mag": ("mmag",)}
 

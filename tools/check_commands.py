@@ -30,11 +30,9 @@ from mauvecl.schema.errors import InputError
 from mauvecl.web.closed_forms import ClosedForms
 from mauvecl.web.downloads import commands_and_programs
 from mauvecl.web.fields import FIELDS, UPLOADED_FILE, Choice, Number
-from mauvecl.web.page import State
-from mauvecl.web.question import Question
-from mauvecl.web.simulations import SIMULATIONS
-from mauvecl.web.tabs import TABS, reads_of
-from mauvecl.web.tabs.tab import Tab
+from mauvecl.web.page import TABS, State, reads_of
+from mauvecl.web.question import SIMULATIONS, Question
+from mauvecl.web.tab import Tab
 
 #: Names of the commands' files, where they are not those of the page.
 WRITTEN = {"observation": "observation-2", "snr": "snr-element"}

@@ -57,7 +57,7 @@ def record(folder: Path) -> None:
     from mauvecl.device import build as program
     from mauvecl.device import launches
     from mauvecl.device.engine import Engine
-    from mauvecl.device.selftest import CASES, digests
+    from mauvecl.device.selftest import CASES, COUNT, results
 
     recorded: list[dict[str, Any]] = []
 
@@ -88,7 +88,7 @@ def record(folder: Path) -> None:
     launches.Launches._launch = launch  # type: ignore[method-assign]
     engine = Engine(width=1)
     for case in CASES:
-        digests(engine, case)
+        results(engine, case, COUNT)
     (folder / "launches.pickle").write_bytes(pickle.dumps(recorded))
 
 

@@ -23,8 +23,7 @@ from mauvecl.host.instrument.instrument import Instrument, LineSpread
 from mauvecl.host.spectra.units import SPAN_NM
 from mauvecl.host.stars.coverage import check_covers, continued
 from mauvecl.schema.calls import validated
-from mauvecl.schema.columns import Column, table_of
-from mauvecl.schema.drawable import Drawable
+from mauvecl.schema.columns import Column, Drawable, table_of
 from mauvecl.schema.errors import InputError, Message, missing_package
 from mauvecl.schema.fields import Unit
 from mauvecl.schema.physical import Duration, Exposure, SkyBrightness

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.exposure.response import Order, electrons_per_second
-from mauvecl.host.stars.band_names import known_band
-from mauvecl.host.stars.library import embedded, library_table, nearest_spectrum
+from mauvecl.host.stars.library import embedded, known_band, library_table, nearest_spectrum
 from mauvecl.host.stars.source import Source
 from mauvecl.host.tables.names import (
     BANDS,

@@ -18,9 +18,8 @@ from astropy.constants import c, h
 from numpy.typing import NDArray
 
 from mauvecl.host.arrays import array_cache
-from mauvecl.host.stars.band_names import known_band
 from mauvecl.host.stars.blackbody import ANGSTROM
-from mauvecl.host.stars.library import band_table, embedded, spectrum_table
+from mauvecl.host.stars.library import band_table, embedded, known_band, spectrum_table
 from mauvecl.schema.errors import InputError, shortened
 
 Float = NDArray[np.float64]

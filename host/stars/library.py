@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from astropy.table import Table
     from numpy.typing import NDArray
 
+
 #: Names by which they are offered.
 EXAMPLES = ("blackbody 9000 K", "power law -2")
 #: Indices of power laws that are accepted; steeper spectra say nothing of stars (assumed).
@@ -474,3 +475,26 @@ def near_names(text: str, *, stars_only: bool = False) -> list[str]:
         names |= {name_key(star.name): star.name for star in kept()}
     near = difflib.get_close_matches(name_key(text), names, n=4, cutoff=0.5)
     return list(dict.fromkeys(names[key] for key in near)) or ["eps Eri", "AU Mic"] + ["G2V"] * (not stars_only)
+
+
+#: Aliases by band name.
+ALIASES = {
+    "B": ("Johnson B",),
+    "V": ("Johnson V",),
+    "Kepler": ("Kp", "Kepler Kp"),
+    "TESS": ("T",),
+    "Gaia G": ("G", "Gaia DR2 G"),
+    "Gaia BP": ("BP", "Gaia DR2 BP"),
+    "Gaia RP": ("RP", "Gaia DR2 RP"),
+    "GALEX NUV": ("NUV",),
+    "GALEX NUV Vega": ("NUV Vega",),
+}
+
+
+def known_band(name: str) -> str:
+    """Return the name of a band, given its name or alias in any case."""
+    wanted = name.strip().casefold()
+    for band, others in ALIASES.items():
+        if wanted in (band.casefold(), *(other.casefold() for other in others)):
+            return band
+    raise InputError(f"band {name!r} is unknown", f"one of {', '.join(ALIASES)}", key="band")

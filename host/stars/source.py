@@ -31,7 +31,7 @@ from mauvecl.host.stars.flare import Geometry, with_flare
 from mauvecl.host.stars.flare_spectra import Blackbody, FlareSpectrum
 from mauvecl.host.stars.library import ModelStar, embedded, find, spectrum, spectrum_table
 from mauvecl.schema.calls import validated
-from mauvecl.schema.drawable import Drawable
+from mauvecl.schema.columns import Drawable
 from mauvecl.schema.errors import InputError, missing_package
 from mauvecl.schema.fields import AnyUnit, Unit
 from mauvecl.schema.physical import Amplitude, BinWidth, Magnitude, Reddening, Temperature

@@ -21,8 +21,7 @@ from mauvecl.host.arrays import ContentEquality
 from mauvecl.host.exposure.star import Neighbour, rate_of
 from mauvecl.host.tables.files import check_size, json_text, open_regular, read_text, write_whole, writing
 from mauvecl.schema.calls import validated
-from mauvecl.schema.columns import Column, View, percent, records, stacked, table_of
-from mauvecl.schema.drawable import Drawable, documents_of
+from mauvecl.schema.columns import Column, Drawable, View, documents_of, percent, records, stacked, table_of
 from mauvecl.schema.errors import InputError
 from mauvecl.study.cases import assumption_line, cases, full_label, place_columns
 from mauvecl.study.study import read_embedded_study

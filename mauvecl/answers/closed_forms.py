@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from mauvecl.detection.distributions import Form
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.host.instrument.instrument import Instrument
-    from mauvecl.noise.comparison import Comparison
     from mauvecl.noise.disturbances import Prior
+    from mauvecl.noise.processes import Comparison
     from mauvecl.study.study import Study
 
 

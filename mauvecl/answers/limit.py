@@ -27,9 +27,9 @@ from mauvecl.study.cases import (
     amplitude_column,
     cases,
     collect_messages,
-    label,
     place_columns,
     star_column,
+    star_label,
     worst_first,
 )
 from mauvecl.study.questions import QUANTITIES, UNITS
@@ -335,9 +335,9 @@ def solve(case: Case, statistic: str, engine: Engine | Pool, report: Callable[[i
     named = case.star.model_copy(update={"magnitude": None}) if question.of == "magnitude" else case.star
     rise = value.value if question.of == "amplitude" else case.amplitudes[0]
     there = f"exposure {value.value:.0f} s" if question.of == "exposure" else f"{question.of} {value.value:.4g}"
-    where = f"{label(named, quiet)} at {there}, flare of {100 * rise:.4g} %"
+    where = f"{star_label(named, quiet)} at {there}, flare of {100 * rise:.4g} %"
     return Limit(
-        star=label(named, quiet),
+        star=star_label(named, quiet),
         amplitude=float("nan") if question.of == "amplitude" else case.amplitudes[0],
         of=question.of,
         statistic=statistic,

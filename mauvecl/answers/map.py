@@ -32,8 +32,8 @@ from mauvecl.study.cases import (
     assumption_line,
     cases,
     collect_messages,
-    label,
     quantity_column,
+    star_label,
     worst_first,
 )
 from mauvecl.study.nuisances import NuisanceChoice
@@ -175,7 +175,7 @@ def map(
     ]
     return MapAnswer(
         study=study,
-        star="stars of the axis" if "star" in names else label(star, quiet),
+        star="stars of the axis" if "star" in names else star_label(star, quiet),
         x=cells.x,
         y=cells.y,
         statistics=study.run.statistics,

@@ -52,8 +52,8 @@ from mauvecl.study.analyses import fitted_models
 if TYPE_CHECKING:
     from mauvecl.detection.nuisances import Nuisances
     from mauvecl.device.engine import Engine
-    from mauvecl.flares.events import Event
     from mauvecl.flares.frames import Components, StareExpectation
+    from mauvecl.flares.stare import Event
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.host.stars.flare_spectra import FlareSpectrum
     from mauvecl.host.stars.source import Source

@@ -20,7 +20,7 @@ from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, View, stacked
 from mauvecl.schema.errors import InputError, Message
 from mauvecl.schema.physical import DAY_S, FirstRealisation, Wavelength
-from mauvecl.study.cases import Case, cases, collect_messages, label, star_column
+from mauvecl.study.cases import Case, cases, collect_messages, star_column, star_label
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
@@ -319,7 +319,7 @@ def simulate(
     for case in reported(prepared, len(prepared), progress):
         xs = case.expectations if flaring else [case.quiet]
         for i, x in enumerate(xs):
-            title = label(case.star, x) + (f", flare {100 * case.amplitudes[i - 1]:g} %" if i else "")
+            title = star_label(case.star, x) + (f", flare {100 * case.amplitudes[i - 1]:g} %" if i else "")
             table = components(x, realisation=realisation, seed=study.run.seed, **case.draw_options)
             table.meta["study"] = study.text()
             observations.append(Observation(title, x, table))

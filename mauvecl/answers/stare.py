@@ -23,8 +23,8 @@ from mauvecl.answers.answer import Answer, InCell, TableOf, reported
 from mauvecl.answers.inject import survey_star
 from mauvecl.device.engine import Stares
 from mauvecl.flares.energies import Kind
-from mauvecl.flares.events import Event, coefficients, temperatures_of
 from mauvecl.flares.frames import Draw, LightCurves, StareExpectation, draw_light_curves
+from mauvecl.flares.stare import Event, coefficients, temperatures_of
 from mauvecl.host import VERSION
 from mauvecl.host.exposure.sky import parse_position, parse_time
 from mauvecl.host.tables.units import offline

@@ -77,7 +77,7 @@ class Verb:
     defaults: Mapping[str, Any] | None = None
     # Makes the study from the flags where no file is given; the paper's question by default.
     default: DefaultStudy | None = None
-    # Whether the page has a tab with this answer; one without a class in `web.tabs` shows its first view.
+    # Whether the page has a tab with this answer; one without a class of its own shows its first view.
     tab: bool = False
     # Module of `mauvecl.answers` that holds the function, if it is not named after it; it is imported at the first use.
     home: str = ""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mauvecl.charts.chart import WAVELENGTH, Axis, Band, Dots, Line, Panel, Picture, Rule, Series, picture_of
 from mauvecl.charts.matplotlib import COLOURS, COLUMN, MAX_COLUMNS, UNBROKEN, styled_picture
 from mauvecl.detection.names import NoThresholdError
-from mauvecl.detection.requests import label
+from mauvecl.detection.requests import statistic_label
 from mauvecl.detection.statistics import LinearStatistic
 from mauvecl.schema.columns import First, note_of, part_note
 from mauvecl.study.questions import QUANTITIES
@@ -98,7 +98,7 @@ def _distributions(title: str, outcome: Detection, flares: Sequence[str], statis
             continue
         series.append(Rule(f"threshold, fap {fap:g} per test", colour, listed=len(own) == 1, at=cut))
     y = Axis(f"{title}\nrealisations, each peak = 1", limits=(0, None))
-    return Panel(Axis(label(statistic)), y, series, finish=partial(_scaled, linear=linear))
+    return Panel(Axis(statistic_label(statistic)), y, series, finish=partial(_scaled, linear=linear))
 
 
 def _scaled(axis: Any, linear: bool) -> None:

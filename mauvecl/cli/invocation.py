@@ -35,10 +35,8 @@ YEAR_S = 365.25 * 86_400.0
 #: Pixel-realisations a second of one core, counted per scenario: the best of `bench/results/rates.ecsv`, 1.2e10 on two
 #: cores with 16 scenarios, so that no feasible run raises an error.
 CORE_RATE = 6e9
-#: Assumed speed of a selected device, in cores: that of an accelerator.
-DEVICE_RATE = 100 * CORE_RATE
-#: Assumed number of cores of a cluster, as in the documentation's plan.
-CLUSTER_CORES = 1000
+#: Assumed number of cores of a cluster or of accelerators, as in the documentation's plan.
+OTHER_CORES = 1000
 #: The engine's index of realisations has 63 bits: `Engine._check`.
 MOST_REALISATIONS = 2**63 - 1
 
@@ -52,9 +50,8 @@ def question_values(study: Study, *, detects: bool) -> None:
         Whether the verb needs flares and thresholds.
     """
     from mauvecl.detection.names import check_fap, check_statistic
-    from mauvecl.host.instrument.paths import instrument_path
-    from mauvecl.host.stars.band_names import known_band
-    from mauvecl.host.stars.library import spectrum_name
+    from mauvecl.host.instrument.instrument import instrument_path
+    from mauvecl.host.stars.library import known_band, spectrum_name
 
     for star in study.star:
         if star.library is not None:
@@ -99,12 +96,13 @@ def question_time(study: Study, *, device: str | None, cluster: str | None, insi
     scenarios = 1 + len(study.flare.amplitudes)
     combinations = study.sweep.size
     drawn = count * len(study.star) * combinations * scenarios * study.observation.load_instrument().pixels
-    rate, by = _rate(device, cluster)
+    cores = (os.cpu_count() or 1) if device is None and cluster is None else OTHER_CORES
+    rate = cores * CORE_RATE
     years = drawn / rate / YEAR_S
     if years > 1.0:
         raise InputError(
             f"realisations = {count:.3g} of {len(study.star) * combinations} stars draw {drawn:.2g} "
-            f"pixels and take some {years:.2g} years at {rate:.2g} a second ({by})",
+            f"pixels and take some {years:.2g} years at {rate:.2g} a second ({cores} cores)",
             "less than a year; --insist starts it anyway",
             key="realisations",
         )
@@ -124,17 +122,6 @@ def question_room(store: Store, *, insist: bool) -> None:
             f"at most {rows} of them, or another place; --insist starts it anyway",
             key="realisations",
         )
-
-
-def _rate(device: str | None, cluster: str | None) -> tuple[float, str]:
-    """Return the highest pixel-realisations per second, and the source of this rate."""
-    cores = os.cpu_count() or 1
-    if cluster is not None and not cluster.startswith("local:"):
-        return CLUSTER_CORES * CORE_RATE, f"assumed of {CLUSTER_CORES} cores"
-    if device is not None:
-        devices = device.count(",") + 1
-        return max(devices * DEVICE_RATE, cores * CORE_RATE), f"assumed of {devices} accelerators"
-    return cores * CORE_RATE, f"the best measured on {cores} cores"
 
 
 def _held(folder: Path) -> int:

@@ -30,8 +30,7 @@ from mauvecl.host.arrays import ContentEquality
 from mauvecl.noise.drawing import Cumulants
 from mauvecl.noise.unknowns import ADDITIVE
 from mauvecl.schema.calls import validated
-from mauvecl.schema.columns import INTERVAL, Column, interval, number, percent, table_of
-from mauvecl.schema.drawable import Drawable
+from mauvecl.schema.columns import INTERVAL, Column, Drawable, interval, number, percent, table_of
 from mauvecl.schema.errors import Message
 from mauvecl.schema.fields import Range
 

@@ -30,9 +30,9 @@ from mauvecl.detection.statistics import (
     UvExcess,
 )
 from mauvecl.host.exposure.expectation import Expectation
-from mauvecl.noise.comparison import NOISE_FREE, Comparison
 from mauvecl.noise.drawing import AUTOMATIC, Drawing, DrawingOptions
 from mauvecl.noise.layout import FIXED_STATISTICS
+from mauvecl.noise.processes import NOISE_FREE, Comparison
 from mauvecl.noise.scene import BATCH, FactorDistributions, Scene, prepare
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, Message
@@ -69,7 +69,7 @@ def statistics_by_name(asked: Sequence[str | Linear]) -> dict[str, Statistic]:
     return named
 
 
-def label(name: str) -> str:
+def statistic_label(name: str) -> str:
     """Return the axis label of a statistic; that of a user-defined one is its name."""
     return STATISTICS[name].label if name in STATISTICS else name
 

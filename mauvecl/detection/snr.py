@@ -16,8 +16,7 @@ from mauvecl.host.arrays import ContentEquality
 from mauvecl.noise import layout
 from mauvecl.noise.random_numbers import Floats, fma
 from mauvecl.noise.scene import Scene
-from mauvecl.schema.columns import Column, table_of
-from mauvecl.schema.drawable import Drawable
+from mauvecl.schema.columns import Column, Drawable, table_of
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:

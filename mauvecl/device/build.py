@@ -14,8 +14,15 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mauvecl.device import drivers as vendors
-from mauvecl.device.drivers import BuildError, DeviceError, choose_processor_level, driver_sources, kernel_cache
+from mauvecl.device.drivers import (
+    FOLDER_VARIABLES,
+    BuildError,
+    DeviceError,
+    choose_processor_level,
+    driver_sources,
+    kernel_cache,
+    show_intel_runtime,
+)
 from mauvecl.host import VERSION
 from mauvecl.noise import layout, random_numbers
 from mauvecl.noise.scene import PIXEL_BLOCK
@@ -137,7 +144,7 @@ def _provide_libraries(folder: Path) -> None:
 def _devices() -> list[Any]:
     cl = load_opencl()
     try:
-        with vendors.show_intel_runtime():
+        with show_intel_runtime():
             platforms = cl.get_platforms()
     except cl.Error:
         platforms = []
@@ -149,7 +156,7 @@ def _devices() -> list[Any]:
             continue
     if not handles:
         # If a variable names a folder, loaders search only that.
-        folders = ", ".join(f"{name}={os.environ[name]}" for name in vendors.FOLDER_VARIABLES if os.environ.get(name))
+        folders = ", ".join(f"{name}={os.environ[name]}" for name in FOLDER_VARIABLES if os.environ.get(name))
         searched = f" ({folders})" if folders else ""
         raise DeviceError(f"no OpenCL device found{searched}: install {driver_sources()}", "no device")
     # PoCL on the CPU comes first, because the first device is the default.

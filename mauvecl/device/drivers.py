@@ -14,13 +14,13 @@ PoCL 5 and later, and Debian's 3.1, name the processor after the library; their 
 
 Kernel cache. PoCL aborts the process on a damaged cache entry and finds no device if its cache folder cannot be
 created. It is therefore given a working folder of this process alone. A store next to it keeps each program's files
-with their digests and restores only files that match. If the store is damaged, full or read-only, kernels are built
-again.
+in an archive with checksums and restores only intact ones. If the store is damaged, full or read-only, kernels are
+built again.
 
 First builds. A driver's compiler may crash, hang or exhaust the memory, which would end the user's process without a
 message. The first build for a device, driver and version of mauvecl therefore runs in a child process with limits of
-time and memory, which draws a small scene and compares the counts with NumPy's. If it fails twice, the next lower level
-of the processor is tried. The outcome is saved with the compiled kernels, so that later processes read one small file,
+time and memory, which draws a small scene and compares the counts with NumPy's. If it fails, the next lower level of
+the processor is tried. The outcome is saved with the compiled kernels, so that later processes read one small file,
 unless something else than the driver failed: a child that was killed, the linker, or memory.
 """
 
@@ -31,6 +31,7 @@ import contextlib
 import ctypes
 import fcntl
 import hashlib
+import io
 import itertools
 import json
 import os
@@ -40,22 +41,22 @@ import resource
 import secrets
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
 import threading
 import time
 import warnings
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import IO, Any, Literal
+from zipfile import BadZipFile, ZipFile
 
 from mauvecl.host import VERSION
-from mauvecl.host.tables.files import read_bytes
 from mauvecl.schema.errors import InputError
 
 #: Sources by system and machine, as Python's `platform` spells them; "" is any other machine.
@@ -95,10 +96,8 @@ MIN_FREE_BYTES = 64 * 2**20
 MAX_STORED = 128 * 2**20
 #: Name prefix of working folders, name of the lock in each, and prefix of folders that are being created.
 WORK, LOCK, MAKING = "mauvecl-work-", "lock", ".mauvecl-making-"
-#: Random identifier of each boot, shared by all containers of a host (Linux, admin-guide/sysctl/kernel.rst).
-BOOT = Path("/proc/sys/kernel/random/boot_id")
-#: Age after which a folder of another host, whose locks may be invisible here, counts as abandoned.
-ABANDONED_S = 30 * 86400.0
+#: Age after which an unlocked folder counts as abandoned; the locks of other hosts that share a home may be invisible.
+ABANDONED_S = 86400.0
 
 
 class KernelCache:
@@ -111,7 +110,7 @@ class KernelCache:
     pid : int
         Process that owns the working folder.
     store : Path
-        Folder with one subfolder per program, named by its key, with a manifest of digests; need not exist.
+        Folder with an archive of each program and with texts, by their keys; need not exist.
     """
 
     def __init__(self, base: Path | None, work: Path) -> None:
@@ -125,30 +124,27 @@ class KernelCache:
         self._grown = False
 
     def restore(self, key: str) -> bool:
-        """Copy a program's files to the working folder if all match their digests; return whether they do."""
+        """Copy a program's files to the working folder if they are intact; return whether they are."""
         if key in self._folders:
             # The file of a loaded kernel must not be written again.
             return True
-        folder = self.store / key
-        if not (folder / "manifest.json").exists():
-            return False
+        path = self.store / f"{key}.zip"
         try:
-            manifest = json.loads(read_bytes(folder / "manifest.json", "manifest"))
-            there, contents = self.work / manifest["folder"], {}
-            for name, digest in manifest["files"].items():
-                contents[name] = read_bytes(folder / name, "kernel")
-                if hashlib.sha256(contents[name]).hexdigest() != digest:
-                    raise ValueError(name)
-        except (OSError, ValueError, KeyError, TypeError, AttributeError):
-            shutil.rmtree(folder, ignore_errors=True)
+            with ZipFile(path) as archive:
+                contents = {name: archive.read(name) for name in archive.namelist()}
+            folder = "/".join(next(iter(contents)).split("/")[:2])
+        except FileNotFoundError:
+            return False
+        except (OSError, ValueError, BadZipFile, NotImplementedError, RuntimeError, StopIteration, zlib.error):
+            path.unlink(missing_ok=True)
             return False
         for name, content in contents.items():
-            target = there / name
+            target = self.work / name
             target.parent.mkdir(parents=True, exist_ok=True)
             target.write_bytes(content)
         with contextlib.suppress(OSError):
-            os.utime(folder)
-        self._folders[key], self._published[key] = manifest["folder"], len(contents)
+            os.utime(path)
+        self._folders[key], self._published[key] = folder, len(contents)
         return True
 
     @contextlib.contextmanager
@@ -189,13 +185,19 @@ class KernelCache:
 
     def write_text(self, key: str, text: str) -> None:
         """Store a text with its digest; failures to write are ignored."""
-        path = self.store / f"{key}.txt"
-        self._grown = True
         with contextlib.suppress(OSError):
-            self.store.mkdir(parents=True, exist_ok=True)
-            new = path.with_name(f".{key}-{secrets.token_hex(8)}")
-            new.write_text(f"{hashlib.sha256(text.encode()).hexdigest()}\n{text}", encoding="utf-8")
-            new.replace(path)
+            self._write(f"{key}.txt", f"{hashlib.sha256(text.encode()).hexdigest()}\n{text}".encode())
+
+    def _write(self, name: str, content: bytes) -> None:
+        """Write a file of the store; a reader finds the old one, none, or the new one."""
+        self._grown = True
+        self.store.mkdir(parents=True, exist_ok=True)
+        new = self.store / f".{name}-{secrets.token_hex(8)}"
+        try:
+            new.write_bytes(content)
+            new.replace(self.store / name)
+        finally:
+            new.unlink(missing_ok=True)
 
     def forget(self, prefix: str) -> int:
         """Remove stored texts whose keys begin with `prefix`, and return their number."""
@@ -221,36 +223,19 @@ class KernelCache:
                     path for path in (self.work / folder).rglob("*") if path.suffix in (".bc", ".so") and path.is_file()
                 ]
                 if len(files) != self._published.get(key):
-                    self._put(key, folder, files)
+                    packed = io.BytesIO()
+                    with ZipFile(packed, "w") as archive:
+                        for path in files:
+                            archive.writestr(path.relative_to(self.work).as_posix(), path.read_bytes())
+                    self._write(f"{key}.zip", packed.getvalue())
                     self._published[key] = len(files)
 
-    def _put(self, key: str, folder: str, files: list[Path]) -> None:
-        self._grown = True
-        self.store.mkdir(parents=True, exist_ok=True)
-        new = Path(tempfile.mkdtemp(prefix=".new-", dir=self.store))
-        try:
-            digests = {}
-            for path in files:
-                name = path.relative_to(self.work / folder).as_posix()
-                content = path.read_bytes()
-                (new / name).parent.mkdir(parents=True, exist_ok=True)
-                (new / name).write_bytes(content)
-                digests[name] = hashlib.sha256(content).hexdigest()
-            (new / "manifest.json").write_text(json.dumps({"folder": folder, "files": digests}), encoding="utf-8")
-            # A reader finds the old folder, none, or the new one.
-            shutil.rmtree(self.store / key, ignore_errors=True)
-            new.rename(self.store / key)
-        finally:
-            shutil.rmtree(new, ignore_errors=True)
-
     def _prune(self) -> None:
-        entries = sorted(self.store.iterdir(), key=lambda p: p.stat().st_mtime, reverse=True)
         total = 0
-        for entry in entries:
-            files = entry.rglob("*") if entry.is_dir() else [entry]
-            total += sum(path.stat().st_size for path in files if path.is_file())
+        for path in sorted(self.store.iterdir(), key=lambda p: p.stat().st_mtime, reverse=True):
+            total += path.stat().st_size
             if total > MAX_STORED:
-                shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+                path.unlink()
 
     def close(self) -> None:
         """Publish and remove the working folder, except in a forked child."""
@@ -286,8 +271,7 @@ def kernel_cache() -> KernelCache:
 def _working_folder(parent: Path) -> Path | None:
     """Create a working folder under `parent`, or return None if that fails or the free space is too small.
 
-    The name contains host and boot, since hosts may share a home. A lock marks the folder as in use, since process
-    numbers are not unique across hosts and containers.
+    A lock marks the folder as in use, since process numbers are not unique across hosts and containers.
     """
     try:
         parent.mkdir(parents=True, exist_ok=True)
@@ -303,32 +287,19 @@ def _working_folder(parent: Path) -> Path | None:
             # On a file system without locks, age alone shows whether the folder is in use.
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         # The handle is never closed: the operating system releases the lock when the process ends.
-        return making.rename(parent / f"{WORK}{_here()}-{secrets.token_hex(8)}")
+        return making.rename(parent / f"{WORK}{secrets.token_hex(8)}")
     except OSError:
         return None
 
 
-def _here() -> str:
-    """Return an identifier of this host and its last boot."""
-    host = re.sub(r"[^A-Za-z0-9]", "", socket.gethostname())[:32]
-    with contextlib.suppress(OSError):
-        return f"{host}-{BOOT.read_text().strip().replace('-', '')}"
-    return f"{host}-unknown"
-
-
 def _sweep(parent: Path) -> None:
-    """Remove folders of killed processes: those of this host if unlocked, those of other hosts if also old."""
-    here = _here()
+    """Remove folders of killed processes."""
     for folder in [*parent.glob(f"{WORK}*"), *parent.glob(f"{MAKING}*")]:
-        try:
-            # Containers of a host share a kernel, which knows all locks, but may differ in host name.
-            same = not here.endswith("unknown") and here.rpartition("-")[2] == folder.name.split("-")[-2]
+        with contextlib.suppress(OSError):
             lock = folder / LOCK
             age = time.time() - (lock if lock.exists() else folder).stat().st_mtime
-            if ((same and lock.exists()) or age > ABANDONED_S) and _is_free(lock):
+            if age > ABANDONED_S and _is_free(lock):
                 shutil.rmtree(folder, ignore_errors=True)
-        except (OSError, IndexError):
-            continue
 
 
 def _is_free(lock: Path) -> bool:
@@ -539,8 +510,6 @@ THREADS = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")
 OUTCOME_LIFETIME_S = 86400.0
 #: Beginning of the outcomes' names in the cache, and the command that forgets them.
 OUTCOME_KEY, FORGET = "first-build-", "`mauvecl devices --forget`"
-#: Number of attempts at each level, since a failure may not occur again.
-ATTEMPTS = 2
 #: Exit codes of the child: the driver failed, or something else.
 DRIVER_FAILED, OTHER_FAILED = 1, 3
 #: Code of the child, which searches the same import path as its parent.
@@ -569,14 +538,12 @@ _one_at_a_time = threading.Lock()
 
 @dataclass(frozen=True)
 class Failure:
-    """Failed attempt of the first build."""
+    """Failed first build at a level."""
 
     #: Reason, as the end of a sentence about the attempt.
     why: str
     #: Whether the driver is at fault, so that it would fail again.
     by_driver: bool = True
-    #: Whether another attempt at the same level would take as long.
-    slow: bool = False
 
 
 @dataclass(frozen=True)
@@ -654,7 +621,7 @@ def _outcome(device: Any, names: tuple[str | None, ...], others: Callable[[], Se
         by_driver = True
         for place, name in enumerate(names):
             try:
-                failure = _attempts(name, number, device, limit_s)
+                failure = _try(name, number, device, limit_s)
             except InterruptedError:
                 return untried
             tried.append((name, failure.why if failure else ""))
@@ -662,29 +629,16 @@ def _outcome(device: Any, names: tuple[str | None, ...], others: Callable[[], Se
                 break
             by_driver &= failure.by_driver
             if place + 1 < len(names):
-                _warn(device, name, failure, f"The next lower level, {names[place + 1]}, is tried.")
+                level = f" at level {name}" if name else ""
+                warnings.warn(
+                    f"The first build of kernels for {device.name.strip()}{level} {failure.why}. "
+                    f"The next lower level, {names[place + 1]}, is tried.",
+                    stacklevel=2,
+                )
         outcome = Outcome(tuple(tried), time.time(), by_driver)
         if by_driver:
             cache.write_text(key, json.dumps(asdict(outcome)))
     return outcome
-
-
-def _attempts(name: str | None, number: int, device: Any, limit_s: float) -> Failure | None:
-    """Build for a level in one or more attempts, and return the last failure, or None after a success."""
-    for attempt in range(ATTEMPTS):
-        failure = _try(name, number, device, limit_s)
-        if failure is None or failure.slow:
-            break
-        if attempt + 1 < ATTEMPTS and not failure.by_driver:
-            _warn(device, name, failure, "It is tried again.")
-    return failure
-
-
-def _warn(device: Any, name: str | None, failure: Failure, what_follows: str) -> None:
-    """Warn of a failure, because further attempts take time."""
-    level = f" at level {name}" if name else ""
-    message = f"The first build of kernels for {device.name.strip()}{level} {failure.why}. {what_follows}"
-    warnings.warn(message, stacklevel=2)
 
 
 def _limit_s() -> float:
@@ -757,7 +711,7 @@ def _try(name: str | None, number: int, device: Any, limit_s: float) -> Failure 
         try:
             code = child.wait(CLOCK * limit_s)
         except subprocess.TimeoutExpired:
-            return Failure(f"was not finished after {CLOCK * limit_s:g} s", by_driver=False, slow=True)
+            return Failure(f"was not finished after {CLOCK * limit_s:g} s", by_driver=False)
         finally:
             # The child and the compilers and linkers that it has started.
             with contextlib.suppress(ProcessLookupError):
@@ -783,7 +737,7 @@ def _failure(code: int, out: str, log: str, limit_s: float, used_s: float) -> Fa
         return None
     # A compiler that handles SIGXCPU is killed at the hard limit.
     if -code == signal.SIGXCPU or (-code == signal.SIGKILL and used_s >= limit_s):
-        return Failure(f"was not finished after {limit_s:g} s of processor time", slow=True)
+        return Failure(f"was not finished after {limit_s:g} s of processor time")
     cause = next((cause for words, cause in OTHER_CAUSES.items() if words in log), None)
     if cause is not None and -code not in (signal.SIGSEGV, signal.SIGBUS, signal.SIGILL, signal.SIGFPE):
         return Failure(f"failed ({cause})", by_driver=False)

@@ -59,9 +59,8 @@ from mauvecl.flares.stare_scene import (
     joined,
     padded_frames,
 )
-from mauvecl.noise.comparison import NOISE_FREE, Comparison
 from mauvecl.noise.drawing import Drawing, DrawingOptions
-from mauvecl.noise.processes import NONE, Processes
+from mauvecl.noise.processes import NOISE_FREE, NONE, Comparison, Processes
 from mauvecl.noise.scene import BATCH, prepare
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError

@@ -10,7 +10,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from importlib import resources
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -22,10 +22,8 @@ from scipy import special
 from mauvecl.detection.counts import Distribution
 from mauvecl.detection.requests import STATISTICS
 from mauvecl.detection.snr import Counts
-from mauvecl.device import build as program
-from mauvecl.device import drivers as first_build
-from mauvecl.device import drivers as processor
-from mauvecl.device.build import SAME_BITS, DeviceRecord, Variant, choose_device, load_opencl, out_of_memory
+from mauvecl.device import drivers
+from mauvecl.device.build import SAME_BITS, DeviceRecord, choose_device, load_opencl, out_of_memory
 from mauvecl.device.drivers import BuildError, DeviceError, kernel_cache
 from mauvecl.device.engine import Engine, Stares, devices
 from mauvecl.flares.frames import Components
@@ -34,9 +32,8 @@ from mauvecl.flares.stare_scene import Arrays, StaresRequest
 from mauvecl.host import VERSION
 from mauvecl.host.exposure.expectation import Expectation
 from mauvecl.noise import layout, reference
-from mauvecl.noise.comparison import Comparison
 from mauvecl.noise.disturbances import CosmicRays, Uniform
-from mauvecl.noise.processes import NONE, Processes
+from mauvecl.noise.processes import NONE, Comparison, Processes
 from mauvecl.noise.scene import prepare
 from mauvecl.schema.columns import Column
 
@@ -44,84 +41,19 @@ if TYPE_CHECKING:
     from mauvecl.device.build import Device
 
 
-class Probes:
-    """Probe kernels of a device.
-
-    Parameters
-    ----------
-    width : int, optional
-        Realisations per vector; by default the device's.
-    vector_forms : bool, optional
-        Whether to use the fast forms for PoCL instead of built-in functions; by default the device's choice.
-    """
-
-    def __init__(self, *, width: int | None = None, vector_forms: bool | None = None, device: Device) -> None:
-        self.cl, self.context, self.queue = device.cl, device.context, device.queue
-        plain = device.variant
-        self.width = width or plain.width
-        forms = plain.vector_forms if vector_forms is None else vector_forms
-        variant = Variant(width=self.width, vector_forms=forms and self.width > 1, chunk=32 if self.width > 1 else 4)
-        self.program = program.build(self.context, program.render(("probes",), variant))
-
-    def run(
-        self,
-        name: str,
-        items: int,
-        out: NDArray[Any],
-        *inputs: Any,
-        out_first: NDArray[Any] | None = None,
-        start: NDArray[Any] | None = None,
-    ) -> NDArray[Any]:
-        """Launch a probe kernel and return `out`, its last argument.
-
-        Input arrays are uploaded. `out_first` is an output before `out`, and `start` the initial contents of `out`.
-        """
-        flags = self.cl.mem_flags
-        arguments = [
-            self.cl.Buffer(self.context, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=np.ascontiguousarray(x))
-            if isinstance(x, np.ndarray)
-            else x
-            for x in inputs
-        ]
-        outs = [x for x in (out_first, out) if x is not None]
-        buffers = [self.cl.Buffer(self.context, flags.READ_WRITE, x.nbytes) for x in outs]
-        if start is not None:
-            self.cl.enqueue_copy(self.queue, buffers[-1], start)
-        local = (1,) if self.width > 1 and name != "probe_layout" else None
-        self.cl.Kernel(self.program, name)(self.queue, (items,), local, *arguments, *buffers)
-        for array, buffer in zip(outs, buffers, strict=True):
-            self.cl.enqueue_copy(self.queue, array, buffer)
-        return out
-
-    def philox(self, counters: NDArray[np.uint32], keys: NDArray[np.uint32]) -> NDArray[np.uint32]:
-        """Return eight words per counter: four of the plain generator, four of its loop-invariant form."""
-        out = np.empty((len(counters), 8), np.uint32)
-        return self.run("probe_philox", len(counters), out, np.uint32(len(counters)), counters, keys)
-
-    def normal(self, radius: NDArray[np.uint32], angle: NDArray[np.uint32]) -> NDArray[np.float32]:
-        """Return two rows of normal deviates from two words each; sizes are multiples of the width."""
-        words = np.stack([radius, angle])
-        return self.run("probe_normal", radius.size // self.width, np.empty(words.shape, np.float32), words)
-
-    def alias(self, words: NDArray[np.uint32], table: NDArray[np.uint32], bits: int) -> NDArray[np.uint32]:
-        """Return the column that each word selects."""
-        items = words.size // self.width
-        return self.run("probe_alias", items, np.empty(words.size, np.uint32), words, table, np.uint32(bits))
-
-    def prior(
-        self, word: NDArray[np.uint32], finer: NDArray[np.uint32], table: NDArray[np.float32]
-    ) -> NDArray[np.float32]:
-        """Return a prior's factors minus one at the probabilities given by two words each."""
-        words = np.stack([word, finer])
-        return self.run("probe_prior", word.size // self.width, np.empty(word.size, np.float32), words, table)
-
-    def expansion(self, radius: NDArray[np.uint32], angle: NDArray[np.uint32], mean: float) -> NDArray[np.int64]:
-        """Return two rows of counts relative to the mean rounded to an integer."""
-        words, root = np.stack([radius, angle]), np.sqrt(mean)
-        offset, slope, cubic = mean - np.rint(mean) - 1 / 6, root - 1 / (36 * root), -1 / (72 * root)
-        coefficients = [np.float32(c) for c in (offset, slope, cubic)]
-        out = np.empty(words.shape, np.float32)
-        return self.run("probe_expansion", radius.size // self.width, out, words, *coefficients).astype(np.int64)
+def philox(device: Device, counters: NDArray[np.uint32], keys: NDArray[np.uint32]) -> NDArray[np.uint32]:
+    """Return eight words per counter: four of the plain generator, four of its loop-invariant form."""
+    wide = device.width > 1
+    variant = replace(device.variant, chunk=32 if wide else 4)
+    kernel = device.kernel(("probes",), variant, "probe_philox")
+    flags, out = device.cl.mem_flags, np.empty((len(counters), 8), np.uint32)
+    given = [
+        device.cl.Buffer(device.context, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=x) for x in (counters, keys)
+    ]
+    words = device.cl.Buffer(device.context, flags.WRITE_ONLY, out.nbytes)
+    kernel(device.queue, (len(counters),), (1,) if wide else None, np.uint32(len(counters)), *given, words)
+    device.cl.enqueue_copy(device.queue, out, words)
+    return out
 
 
 @dataclass(frozen=True)
@@ -266,13 +198,13 @@ def list_devices(*, measure: bool = True) -> list[dict[str, Any]]:
 def child(request: dict[str, Any]) -> None:
     """Build and run kernels within the limits; print the reason of a failure, and exit with a code that says whose."""
     limit(request)
-    code = first_build.DRIVER_FAILED
+    code = drivers.DRIVER_FAILED
     try:
         why = _build(request)
     except Exception as error:
         why = str(error).splitlines()[0] if str(error) else type(error).__name__
         if not _is_drivers(error):
-            code = first_build.OTHER_FAILED
+            code = drivers.OTHER_FAILED
     if why:
         print(why)
     sys.exit(code if why else 0)
@@ -292,7 +224,7 @@ def limit(request: dict[str, Any]) -> None:
     # The hard limit ends the process even if the compiler handles the signal of the soft one.
     _lower(resource.RLIMIT_CPU, seconds, seconds + 5)
     # The alarm ends this process if the parent is killed.
-    signal.alarm(max(1, round(first_build.CLOCK * request["limit_s"])))
+    signal.alarm(max(1, round(drivers.CLOCK * request["limit_s"])))
     if request["memory"] is not None:
         _lower(resource.RLIMIT_DATA, request["memory"], request["memory"])
 
@@ -312,9 +244,9 @@ def _build(request: dict[str, Any]) -> str:
     if record.label != request["label"]:
         raise DeviceError(f"device {request['number']} is {record.label} in a new process, not {request['label']}")
     name = request["name"]
-    if name is not None and not processor.set_processor_name(handle, name):
+    if name is not None and not drivers.set_processor_name(handle, name):
         return "PoCL's record of the device is not understood"
-    first_build.settled[int(handle.int_ptr)] = name
+    drivers.settled[int(handle.int_ptr)] = name
     engine, quiet, flare = Engine(str(request["number"])), toy(), toy(flare=0.3)
     raw = engine.realise(quiet, count=64, seed=1)
     engine.detect(quiet, [flare], realisations=64, seed=1)
@@ -510,7 +442,7 @@ def digest(array: NDArray[Any]) -> str:
 def known_answers(engine: Engine) -> Check:
     """Compare Philox on the device with Random123's vectors."""
     counters, keys, answers = (np.array([row[i] for row in PHILOX_VECTORS], np.uint32) for i in range(3))
-    out = Probes(device=engine.open_device).philox(counters, keys)
+    out = philox(engine.open_device, counters, keys)
     right = np.array_equal(out[:, :4], answers) and np.array_equal(out[:, 4:], answers)
     return Check("Philox4x32-10, known answers", right, f"{len(PHILOX_VECTORS)} vectors of Random123")
 

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from scipy import special
 
 from mauvecl.noise import layout
-from mauvecl.noise.comparison import NOISE_FREE, Comparison
 from mauvecl.noise.drawing import (
     Cumulants,
     Drawing,
@@ -27,6 +26,7 @@ from mauvecl.noise.drawing import (
     sky_share,
 )
 from mauvecl.noise.layout import LARGEST_MEAN, SMALLEST_EXPANDED, AliasTable, alias_table_of, table_set
+from mauvecl.noise.processes import NOISE_FREE, Comparison
 from mauvecl.noise.unknowns import ADDITIVE, PROCESSES, SIGNAL_PARTS, SignalPart
 from mauvecl.schema.errors import InputError
 

@@ -285,8 +285,10 @@ class Analysis:
         if steps := self.level.steps:
             largest = max(steps, key=lambda step: abs(step[1]))[1]
             often = "once" if len(steps) == 1 else f"{len(steps)} times"
-            lines.append(f"The level changes {often} suddenly and for good, by {100 * largest:+.2g} % at the most: light "
-                         "is relative to the level after each change, and the table of frames has that level.")  # fmt: skip
+            lines.append(
+                f"The level changes {often} suddenly and for good, by {100 * largest:+.2g} % at the most: light is "
+                "relative to the level after each change, and the table of frames has that level."
+            )
         if self.level.process.terms:
             # A light curve that shows few periods of a process has another standard deviation than the process.
             spread = self.level.level[self.level.used].std() / self.survey.level

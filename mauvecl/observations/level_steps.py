@@ -79,7 +79,7 @@ def relative_level(time_s: Float, numbers: NDArray[np.int64], flux: Float, frame
         costs.append(cost - 2 * level_fit(covariance, data.values).log_likelihood)
     level = 1.0 + added / typical
     level = level / np.median(level)
-    return level if costs[0] < costs[1] and 1 / LARGEST < level.min() and level.max() < LARGEST else constant
+    return level if costs[0] < costs[1] and level.min() > 1 / LARGEST and level.max() < LARGEST else constant
 
 
 def _sudden_changes(time_s: Float, flux: Float) -> tuple[Places, Float]:

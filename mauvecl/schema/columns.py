@@ -1,4 +1,4 @@
-"""Columns of tables, their views and JSON, and notes on tables that are shown in part."""
+"""What people see of results: columns of tables, views, JSON, notes on tables that are shown in part, and pictures."""
 
 from __future__ import annotations
 
@@ -6,12 +6,16 @@ import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from importlib import import_module
 from itertools import islice
 from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from astropy.table import QTable, Table
+
 
 #: Heading of an interval, which stays next to the column before it.
 INTERVAL = "95 % interval"
@@ -175,3 +179,31 @@ def part_note(shown: int, total: int, name: str) -> str:
 def note_of(things: Iterable[object]) -> str:
     """Return the note of items that are a part of a list, or nothing."""
     return things.note if isinstance(things, First) else ""
+
+
+class Drawable:
+    """An object with pictures; neither matplotlib nor the functions that draw are imported before they are used."""
+
+    @property
+    def pictures(self) -> dict[str, Callable[..., Any]]:
+        """Every picture by the name of its file; each is called with a `path`, with axes `ax`, or with neither."""
+        pictures: dict[str, Callable[..., Any]] = _charts().pictures_of(self)
+        return pictures
+
+    def plot(self, path: str | Path | None = None, *, ax: Any = None) -> Any:
+        """Draw the first picture and return the figure, the path of the saved file, or `ax`; needs matplotlib."""
+        return self._draw(path, ax)
+
+    def _draw(self, path: str | Path | None, ax: Any, **options: Any) -> Any:
+        return next(iter(self.pictures.values()))(path, ax=ax, **options)
+
+
+def documents_of(thing: Drawable) -> dict[str, Callable[[], bytes]]:
+    """Return the functions that make the registered documents of an object, by file name."""
+    documents: dict[str, Callable[[], bytes]] = _charts().documents_of(thing)
+    return documents
+
+
+def _charts() -> Any:
+    """Return the registry of pictures, which lies above everything that is drawn."""
+    return import_module("mauvecl.charts.chart")

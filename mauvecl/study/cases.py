@@ -22,9 +22,8 @@ if TYPE_CHECKING:
 
     from mauvecl.detection.nuisances import Nuisances
     from mauvecl.detection.statistics import Setting
-    from mauvecl.flares.events import Event
     from mauvecl.flares.frames import StareExpectation
-    from mauvecl.flares.stare import Stare
+    from mauvecl.flares.stare import Event, Stare
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.host.exposure.sky import Sky
     from mauvecl.host.exposure.star import Neighbours
@@ -150,7 +149,7 @@ def unused_unknowns(study: Study, uses: Collection[Use]) -> list[str]:
     return [key for use, keys in given.items() if use not in uses for key in keys] + usual + near
 
 
-def label(star: Star, x: Expectation) -> str:
+def star_label(star: Star, x: Expectation) -> str:
     """Return a star's name and magnitude, for tables and plots."""
     name = star.library or x.name
     system = {"catalogue": "", "vega": " (Vega = 0)", "ab": " (AB)"}[star.magnitude_system]
@@ -262,7 +261,7 @@ class Case:
     @cached_property
     def label(self) -> str:
         """Name and magnitude of the star, for tables and plots."""
-        return label(self.star, self.quiet)
+        return star_label(self.star, self.quiet)
 
     @property
     def source(self) -> Source:

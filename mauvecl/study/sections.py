@@ -10,7 +10,7 @@ from pydantic import Field, create_model, field_validator, model_validator
 
 from mauvecl.detection.names import DEFAULT_STATISTICS, STATISTIC_NAMES
 from mauvecl.host.exposure import DEFAULT_SKY
-from mauvecl.host.stars.band_names import ALIASES
+from mauvecl.host.stars.library import ALIASES
 from mauvecl.noise.disturbances import Prior, PriorField
 from mauvecl.noise.unknowns import INSTRUMENT_VALUES, values_of
 from mauvecl.schema import parsing
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.host.stars.flare_spectra import FlareSpectrum
     from mauvecl.host.stars.source import Source
-    from mauvecl.noise.comparison import Comparison
+    from mauvecl.noise.processes import Comparison
 
 
 def amplitudes_in(path: Path, _: str) -> list[float]:
@@ -547,7 +547,7 @@ class Run(Section):
 
     def comparison(self) -> Comparison:
         """Return the reference of the comparison for the engine."""
-        from mauvecl.noise.comparison import Comparison
+        from mauvecl.noise.processes import Comparison
 
         return Comparison.of(self.reference, self.variances)
 

@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.flares.energies import EnergyScale, Kind, amplitude_of, amplitude_of_peak
-from mauvecl.flares.events import Event, check_contributions, coefficients, temperatures_of
 from mauvecl.flares.frames import StareExpectation
 from mauvecl.flares.settings import Cooling
-from mauvecl.flares.stare import Stare
+from mauvecl.flares.stare import Event, Stare, check_contributions, coefficients, temperatures_of
 from mauvecl.noise.disturbances import Normal, Prior
 from mauvecl.noise.unknowns import CHANGING, COURSES, PROCESSES, STARE_PROCESSES, Changing, Course, default_spreads
 from mauvecl.schema.errors import InputError, Message

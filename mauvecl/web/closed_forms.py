@@ -19,7 +19,7 @@ from mauvecl.detection.requests import STATISTICS
 from mauvecl.schema.errors import InputError
 from mauvecl.study.cases import collect_messages
 from mauvecl.web.fields import FIELDS, UNKNOWN, Choice, star_words
-from mauvecl.web.simulations import OTHER
+from mauvecl.web.question import OTHER
 
 if TYPE_CHECKING:
     from mauvecl.answers.detect import DetectAnswer

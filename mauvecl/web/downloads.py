@@ -22,15 +22,15 @@ from mauvecl.schema.fields import Flag, found
 from mauvecl.study.analyses import PATHS
 from mauvecl.study.sections import Star
 from mauvecl.study.study import Study, keys_with_flags
-from mauvecl.web.simulations import asked
-from mauvecl.web.tabs import TABS
+from mauvecl.web.page import TABS
+from mauvecl.web.question import asked
 from mauvecl.web.uploads import placed
 
 if TYPE_CHECKING:
     from mauvecl.answers.verbs import Verb
     from mauvecl.web.closed_forms import Answers, ClosedForms
     from mauvecl.web.question import Question
-    from mauvecl.web.tabs.tab import Tab
+    from mauvecl.web.tab import Tab
 
 #: Keys that are stated even at their default, so that readers see what was assumed.
 STATED = ("star", "flare.amplitudes", "observation.exposure_s", "observation.instrument", "sky", "run.fap",

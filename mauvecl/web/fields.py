@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args, get_origin
+from typing import Any, Literal, NamedTuple, get_args, get_origin
 
 from pydantic.fields import FieldInfo
 
@@ -19,9 +19,6 @@ from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.fields import Flag, Range, Unit, Widget, as_typed, first, found, range_of, unit_of
 from mauvecl.schema.physical import LineFraction
 from mauvecl.study.study import keys_with_flags, study_keys
-
-if TYPE_CHECKING:
-    pass
 
 #: Texts of fields with an uploaded file: those that also accept a name or numbers, and all others.
 UPLOADED, UPLOADED_UNKNOWN, UPLOADED_FILE = "uploaded star", "uploaded spectrum", "uploaded file"

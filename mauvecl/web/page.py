@@ -1,4 +1,4 @@
-"""The page's state, its card, and the stars that it knows.
+"""The page's tabs, its state, its card, and the stars that it knows.
 
 The state is independent of the page's appearance: the page enters text, and shows `entered` and `faults`. It holds the
 text of all fields, their errors, and the question if all are valid.
@@ -11,6 +11,7 @@ from typing import Any
 from urllib.parse import parse_qsl, urlencode
 
 from mauvecl.answers.closed_forms import BOTH_CHANCES
+from mauvecl.answers.verbs import VERBS
 from mauvecl.detection.names import check_fap
 from mauvecl.host.exposure.sky import parse_position, parse_time
 from mauvecl.host.stars.library import resolve
@@ -18,12 +19,59 @@ from mauvecl.host.tables.units import offline
 from mauvecl.schema.errors import InputError, of_kind, shortened
 from mauvecl.study.plan import PlanTarget
 from mauvecl.web.closed_forms import TITLES, Answers, ClosedForms, chances, percent, short
+from mauvecl.web.exposure_tabs import Detection, Noise, Signal, Spectrum, Unknown
 from mauvecl.web.fields import FIELDS, UPLOADED, Choice, Field, note, sentence, targets
-from mauvecl.web.question import Question
-from mauvecl.web.simulations import OTHER, SIMULATIONS
-from mauvecl.web.tabs import TABS
-from mauvecl.web.tabs.tab import Tab
+from mauvecl.web.flare_tabs import Limit, Measurement
+from mauvecl.web.observation_tabs import Analyse, Calibrate, Change, Completeness, Periods, Plan, Visibility
+from mauvecl.web.question import OTHER, SIMULATIONS, Question
+from mauvecl.web.tab import Compare, Tab
 from mauvecl.web.uploads import UPLOADS
+
+#: Tabs with pictures, in the order of the page.
+DRAWN: dict[str, Tab] = {
+    tab.name: tab
+    for tab in (
+        Detection(),
+        Spectrum(),
+        Signal(),
+        Noise(),
+        Limit(),
+        Measurement(),
+        Unknown(),
+        Change(),
+        Periods(),
+        Completeness(),
+        Analyse(),
+        Calibrate(),
+        Visibility(),
+        Plan(),
+    )
+}
+
+
+def _tab_of(verb: str) -> Tab:
+    """Return the tab with the first view of a verb's answer."""
+    made: Tab = type(verb.capitalize(), (Tab,), {"verb": verb})()
+    return made
+
+
+#: All tabs by name, in the order of the page.
+TABS: dict[str, Tab] = {
+    **DRAWN,
+    **{name: _tab_of(name) for name, verb in VERBS.items() if verb.tab and name not in DRAWN},
+    Compare.name: Compare(),
+}
+
+
+def asking(simulation: str) -> Tab:
+    """Return the tab whose button starts a simulation."""
+    return next(tab for tab in TABS.values() if simulation in tab.simulations)
+
+
+def reads_of(simulation: str) -> frozenset[str]:
+    """Return the fields on which the answers of a simulation depend."""
+    return asking(simulation).reads_of(simulation)
+
 
 #: Part of the message about the throughput, which the page shows once.
 NOMINAL = "The throughput is nominal"

@@ -38,9 +38,8 @@ from mauvecl.schema.errors import InputError, shortened
 from mauvecl.web import fields
 from mauvecl.web.closed_forms import TITLES, ClosedForms
 from mauvecl.web.figures import INKS, PINS, Canvas
-from mauvecl.web.page import SEEN, State
-from mauvecl.web.simulations import SIMULATIONS
-from mauvecl.web.tabs import TABS, reads_of
+from mauvecl.web.page import SEEN, TABS, State, reads_of
+from mauvecl.web.question import SIMULATIONS
 from mauvecl.web.uploads import UPLOADS, remove_abandoned
 from mauvecl.web.visitor import UNUSED, Job, Visitor, limit_arenas, reading, release_memory, shown
 

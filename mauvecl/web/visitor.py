@@ -32,15 +32,14 @@ from mauvecl.schema.errors import InputError, shortened
 from mauvecl.web.closed_forms import ClosedForms, other_payloads, solved
 from mauvecl.web.downloads import as_file, asked_study, commands_and_programs
 from mauvecl.web.fields import FIELDS, field_of, remedies, sentence
-from mauvecl.web.page import State, card, known, without_headline
-from mauvecl.web.simulations import DRAWING, SIMULATIONS, verbs_of
-from mauvecl.web.tabs import TABS, asking, reads_of
+from mauvecl.web.page import TABS, State, asking, card, known, reads_of, without_headline
+from mauvecl.web.question import DRAWING, SIMULATIONS, verbs_of
 from mauvecl.web.uploads import RESULTS, UPLOADS, visitor_folder
 from mauvecl.web.uploads import UPLOAD_SHELF as UPLOADED
 
 if TYPE_CHECKING:
     from mauvecl.web.closed_forms import Answers
-    from mauvecl.web.tabs.tab import Tab
+    from mauvecl.web.tab import Tab
 
 #: Simulations that a server computes at the same time; others wait.
 TOGETHER = 2

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import stat
 import subprocess
@@ -122,7 +121,7 @@ def test_failure_is_reused_for_a_day_or_until_it_is_forgotten(tmp_path: Path) ->
     assert run(tmp_path, COUNT).keys() == {"tried", "sentence"}
 
 
-def test_first_build_that_is_killed_once_succeeds(tmp_path: Path, plain) -> None:
+def test_first_build_that_is_killed_is_tried_again_by_the_next_run(tmp_path: Path, plain) -> None:
     """Kill the child from outside, as the kernel does when memory is short."""
     environment = os.environ | {"MAUVECL_CACHE_DIR": str(tmp_path)}
     command = [sys.executable, "-c", RUN.format(before="")]
@@ -138,26 +137,18 @@ def test_first_build_that_is_killed_once_succeeds(tmp_path: Path, plain) -> None
         out, log = parent.communicate(timeout=120)
     finally:
         parent.kill()
-    assert printed(out) == plain[1]
-    assert "stopped from outside (killed)" in log
-    assert "It is tried again." in log
+    assert "stopped from outside (killed)" in log + out
+    assert run(tmp_path) == plain[1]
 
 
-@pytest.mark.parametrize("failures", [1, 100])
-def test_failing_linker_is_not_stored_as_failure_of_driver(failures: int, tmp_path: Path, plain) -> None:
-    """Let `ld` fail once, or always."""
-    linker, count, folder = shutil.which("ld"), tmp_path / "count", tmp_path / "bin"
+def test_failing_linker_is_not_stored_as_failure_of_driver(tmp_path: Path, plain) -> None:
+    folder = tmp_path / "bin"
     folder.mkdir()
-    (folder / "ld").write_text(
-        f'#!/bin/sh\necho x >> {count}\n[ $(wc -l < {count}) -le {failures} ] && exit 1\nexec {linker} "$@"\n'
-    )
+    (folder / "ld").write_text("#!/bin/sh\nexit 1\n")
     (folder / "ld").chmod(0o755)
     found = run(tmp_path / "cache", PATH=f"{folder}{os.pathsep}{os.environ['PATH']}")
-    if failures == 1:
-        assert found == plain[1]
-    else:
-        assert "the linker `ld` failed" in found["sentence"]
-        assert run(tmp_path / "cache") == plain[1]
+    assert "the linker `ld` failed" in found["sentence"]
+    assert run(tmp_path / "cache") == plain[1]
 
 
 def test_outcome_is_reused_until_driver_or_version_change(plain: tuple[Path, dict[str, str]]) -> None:

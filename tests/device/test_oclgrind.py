@@ -23,7 +23,7 @@ import numpy as np
 from reference import known_answers
 from mauvecl.device import selftest
 from mauvecl.device.engine import Engine
-from mauvecl.device.selftest import Probes
+from probes import Probes
 from mauvecl.noise import layout
 
 width = int(sys.argv[1])

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pytest
+from probes import Probes
 
 from mauvecl import Engine
-from mauvecl.device.selftest import Probes
 
 
 @pytest.fixture(scope="session", params=["vector forms", "vectors of built-ins", "scalar"])

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+from probes import Probes
 
-from mauvecl.device.selftest import Probes
 from mauvecl.noise import layout
 
 

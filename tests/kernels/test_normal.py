@@ -6,9 +6,9 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from probes import Probes
 from scipy import special, stats
 
-from mauvecl.device.selftest import Probes
 from mauvecl.noise import random_numbers, reference
 
 #: Words at every end of every branch: zeros, ones, signs, quadrants, the split of the logarithm.

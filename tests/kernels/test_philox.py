@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import randomgen
+from probes import Probes
 
-from mauvecl.device.selftest import Probes
 from mauvecl.noise import random_numbers
 
 Words = tuple[int, ...]

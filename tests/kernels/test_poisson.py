@@ -8,9 +8,10 @@ import exact
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from probes import Probes
 from scipy import stats
 
-from mauvecl.device.selftest import Probes, toy
+from mauvecl.device.selftest import toy
 from mauvecl.noise import layout, random_numbers, reference
 from mauvecl.noise.scene import prepare
 

@@ -8,9 +8,10 @@ from functools import cache
 
 import numpy as np
 import pytest
+from probes import Probes
 
 from mauvecl import Normal, Processes, Uniform
-from mauvecl.device.selftest import Probes, toy
+from mauvecl.device.selftest import toy
 from mauvecl.noise import layout, reference
 from mauvecl.noise.scene import prepare
 

@@ -11,7 +11,7 @@ from mauvecl.answers.verbs import VERBS
 from mauvecl.schema.columns import View, without_empty
 from mauvecl.web.closed_forms import Answers
 from mauvecl.web.fields import FIELDS, star_words
-from mauvecl.web.simulations import verbs_of
+from mauvecl.web.question import verbs_of
 
 if TYPE_CHECKING:
     from astropy.table import Table

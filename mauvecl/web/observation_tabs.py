@@ -1,0 +1,628 @@
+"""Tabs of observations: light curves, calibrations, changes between visits, and campaigns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from bokeh.models import FixedTicker, HoverTool, LinearColorMapper
+from bokeh.models.annotations import ColorBar
+from numpy.typing import NDArray
+
+from mauvecl.answers.plan import COLUMNS
+from mauvecl.charts.calibrations import (
+    BIN,
+    THROUGHPUT,
+    TRANSFER,
+    along_magnitude,
+    residual_series,
+    throughput_series,
+    transfer_series,
+)
+from mauvecl.charts.chart import (
+    WAVELENGTH,
+    Axis,
+    Band,
+    Chart,
+    ChartData,
+    Contours,
+    Custom,
+    Dots,
+    Line,
+    Listed,
+    Own,
+    Rule,
+    Strips,
+    Targets,
+)
+from mauvecl.charts.light_curves import SCATTER, scatter_series
+from mauvecl.host.stars.source import Source
+from mauvecl.schema.columns import View
+from mauvecl.schema.errors import InputError
+from mauvecl.web.closed_forms import Answers, percent, short
+from mauvecl.web.sandboxed_reader import read_limited
+from mauvecl.web.tab import Tab, target_words
+from mauvecl.web.uploads import MOST_VALUES, VisitorFile, read_frames_of, reported_for
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+    from bokeh.models.sources import ColumnDataSource
+
+    from mauvecl.answers.analyse import AnalyseAnswer
+    from mauvecl.answers.calibrate import CalibrateAnswer
+    from mauvecl.answers.change import ChangeAnswer
+    from mauvecl.answers.plan import PlanAnswer
+    from mauvecl.observations.analysis import Analysis
+    from mauvecl.observations.frames import Frames
+    from mauvecl.web.closed_forms import ClosedForms
+    from mauvecl.web.figures import Canvas
+    from mauvecl.web.question import Question
+    from mauvecl.web.uploads import Observations
+
+
+Float = NDArray[np.float64]
+
+#: Largest numbers of points of a light curve, and of columns and rows of a dynamic spectrum.
+MOST_POINTS, MOST_COLUMNS, MOST_ROWS = 8000, 600, 300
+#: Verdicts on events, with their colours.
+VERDICTS = {"detected": "star", "candidate": "drawn", "rejected": "own", "undecided": "dark"}
+#: Colours of the dynamic spectrum.
+BLUE, RED = "#0072B2", "#D55E00"
+NO_FRAMES = "Choose a file of frames: a light curve or a sequence of spectra."
+
+
+def frames_of(closed: ClosedForms) -> Frames | None:
+    """Return the frames of the question, or None if there is no file."""
+    frames: Frames | None = closed.given.get("frames")
+    return frames
+
+
+def minutes(frames: Frames, time_s: Any) -> Float:
+    """Return times in minutes from the first frame."""
+    return np.asarray(time_s - frames.time_s[0]) / 60.0
+
+
+def thinned(values: Float, most: int) -> NDArray[np.int64]:
+    """Return the indices of at most `most` values, including the smallest and largest of each part."""
+    if values.size <= most:
+        return np.arange(values.size)
+    parts = np.array_split(np.arange(values.size), most // 2)
+    ends = [(part[np.argmin(values[part])], part[np.argmax(values[part])]) for part in parts]
+    return np.unique(np.array(ends))
+
+
+@Chart(
+    "frames", "Light curve", Axis("time from the first frame (min)"), Axis("flux"),
+    (
+        *(Strips(verdict, colour, f"{verdict} events") for verdict, colour in VERDICTS.items()),
+        Line("quiescent level", "flare", "level"),
+        # A bad frame far away does not compress the others.
+        Dots("frames", "text", "searched", size=3, tips=("minute", "flux"), alone=True),
+        Dots("not searched", "own", "left out", size=6, marker="x"),
+    ),
+    logs=("y",),
+).data()  # fmt: skip
+def light_curve(closed: ClosedForms, answers: Answers) -> ChartData:
+    """Return the light curve, its quiescent level, and the events."""
+    frames, series = frames_of(closed), dict[str, Any]()
+    if frames is None:
+        return ChartData(NO_FRAMES)
+    flux, used = frames.white_light[0], frames.faults == 0
+    text = f"{frames.n_frames} frames of {frames.name}. Analyse searches them for flares."
+    if "analyse" in answers:
+        answer = answers["analyse"]
+        analysis: Analysis = answer.analysis
+        flux, used = analysis.flux, analysis.level.used
+        chosen = thinned(analysis.level.level, MOST_POINTS)
+        series["level"] = minutes(frames, frames.time_s[chosen]), analysis.level.level[chosen]
+        text = _summary(answer.rows, analysis)
+        half = frames.cadence_s / 2
+        for verdict in VERDICTS:
+            rows = [row.event for row in answer.rows if row.verdict == verdict]
+            ends = np.array(
+                [(analysis.survey.time_s[event.first], analysis.survey.time_s[event.last]) for event in rows]
+            )
+            series[f"{verdict} events"] = minutes(frames, ends.reshape(-1, 2) + [-half, half]).T
+    for name, which in (("searched", used), ("left out", ~used & np.isfinite(flux))):
+        chosen = np.flatnonzero(which)
+        chosen = chosen[thinned(flux[chosen], MOST_POINTS)]
+        series[name] = minutes(frames, frames.time_s[chosen]), flux[chosen]
+    return ChartData(text, series, {"y axis": {"axis_label": f"flux ({frames.unit})" if frames.unit else "flux"}})
+
+
+def _summary(rows: Any, analysis: Analysis) -> str:
+    """Return the numbers of events in words."""
+    verdicts = [row.verdict for row in rows]
+    named = [verdict for verdict in VERDICTS if verdict != "undecided" or verdict in verdicts]
+    counts = ", ".join(f"{verdicts.count(verdict)} {verdict}" for verdict in named)
+    return f"Events in {short(analysis.days)} star-days: {counts}; detected above an S/N of {analysis.threshold:.2f}."
+
+
+def _image(canvas: Canvas, source: ColumnDataSource) -> None:
+    from bokeh.models import HoverTool, LinearColorMapper
+    from bokeh.palettes import diverging_palette
+
+    colours = diverging_palette(_shades(BLUE), _shades(RED), 255)
+    mapper = LinearColorMapper(palette=colours, name="deviation", low=-5, high=5, nan_color=canvas.ink["grid"])
+    image = canvas.plot.image("image", "x", "y", "dw", "dh", source=source, color_mapper=mapper)
+    shown = [("standard deviations", "@image{0.0}"), ("minute", "$x{0.0}"), ("nm", "$y{0.0}")]
+    canvas.plot.add_tools(HoverTool(renderers=[image], tooltips=shown))
+
+
+@Chart(
+    "dynamic", "Dynamic spectrum", Axis("time from the first frame (min)"), Axis("wavelength (nm)"),
+    (
+        Custom("dynamic", columns=("image", "x", "y", "dw", "dh"), draw=_image),
+        Contours("events", "star", "marks", show="if any", width=5),
+        Listed("brighter than the median", RED, form="bar"),
+        Listed("fainter", BLUE, form="bar"),
+    ),
+).data()  # fmt: skip
+def dynamic_spectrum(closed: ClosedForms, answers: Answers) -> ChartData:
+    """Return every spectrum against time, in standard deviations from the median."""
+    frames = frames_of(closed)
+    if frames is None or frames.wavelength_nm is None:
+        return ChartData("A light curve has no spectra." if frames else NO_FRAMES)
+    image, nm = _deviations(frames), frames.wavelength_nm
+    reach = max(3.0, float(np.nanpercentile(np.abs(image), 99.5)))
+    length = float(minutes(frames, frames.time_s[-1] + frames.cadence_s))
+    series: dict[str, Any] = {"dynamic": (image[None], [0.0], [nm[0]], [length], [max(nm[-1] - nm[0], 1.0)])}
+    if "analyse" in answers:
+        analysis: Analysis = answers["analyse"].analysis
+        ends = [minutes(frames, analysis.survey.time_s[[event.first, event.last]]) for event in analysis.events]
+        above = float(nm[-1] + 0.02 * (nm[-1] - nm[0]))
+        series["marks"] = [list(map(float, x)) for x in ends], [[above, above]] * len(ends)
+    text = f"{frames.n_frames} spectra of {nm.size} pixels, {nm[0]:.0f} to {nm[-1]:.0f} nm."
+    return ChartData(text, series, {"deviation": {"low": -reach, "high": reach}})
+
+
+def _shades(colour: str) -> tuple[str, ...]:
+    """Return shades from a colour to white."""
+    ends = np.array([[int(colour[k : k + 2], 16) for k in (1, 3, 5)], [247, 247, 247]])
+    steps = np.linspace(0.0, 1.0, 128)[:, None]
+    return tuple(
+        "#" + "".join(f"{round(value):02x}" for value in row) for row in ends[0] * (1 - steps) + ends[1] * steps
+    )
+
+
+def _deviations(frames: Frames) -> Float:
+    """Return spectra less their median in standard deviations, averaged, shape (n_row, n_column); gaps are NaN."""
+    columns = _means(frames.flux, frames.numbers, MOST_COLUMNS)
+    image = _means(columns.T, np.arange(frames.flux.shape[1]), MOST_ROWS)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        image = image - np.nanmedian(image, axis=1, keepdims=True)
+        steps = np.diff(image, axis=1)
+        # Differences of neighbouring columns hold noise alone; 1.4826 makes a median absolute deviation a normal one's.
+        return np.asarray(image / (1.4826 / np.sqrt(2.0) * np.nanmedian(np.abs(steps), axis=1, keepdims=True)))
+
+
+def _means(values: Float, numbers: NDArray[np.int64], most: int) -> Float:
+    """Return the means of rows by their number, at most `most`; rows that do not exist are NaN."""
+    bins = numbers // -(-(int(numbers[-1]) + 1) // most)
+    sums = np.zeros((int(bins[-1]) + 1, values.shape[1]))
+    counts = np.zeros_like(sums)
+    finite = np.isfinite(values)
+    np.add.at(sums, bins, np.where(finite, values, 0.0))
+    np.add.at(counts, bins, finite)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(sums / counts)
+
+
+@SCATTER.data("analyse", "Analyse checks the noise.")
+def scatter(closed: ClosedForms, answer: AnalyseAnswer) -> ChartData:
+    """Return the scatter of means of quiescent frames against that of independent ones."""
+    rows, series = answer.analysis.scatter, scatter_series(answer)
+    red = next((row for row in rows if row.red), None) if series else None
+    text = "Analyse checks the noise."
+    if rows:
+        text = "Quiescent frames are independent." if series else "Too few consecutive quiescent frames for means."
+    if red is not None:
+        of = "Single frames" if red.frames == 1 else f"Means of {red.frames} frames"
+        text = f"{of} scatter {red.measured / red.white:.2f} times as much as independent frames."
+    return ChartData(text, series)
+
+
+class Analyse(Tab):
+    """Flares in observed frames."""
+
+    verb = "analyse"
+    about = (
+        "Flares in your own light curve or spectra: the noise is checked first, and every event has its false-alarm "
+        "rate in the noise as measured. The star's fields are for spectra of Mauve."
+    )
+    headline = False
+    pictures = (light_curve, dynamic_spectrum, scatter)
+    files = dict.fromkeys(("events", "measured", "frames", "noise", "limits", "completeness"), "analyse")
+    documents = {"analyse.html": "analyse"}  # noqa: RUF012
+
+    def given(self, question: Question) -> dict[str, Any]:
+        """Read the frames; raises InputError with the name of the field whose file cannot be read."""
+        if "frames" not in question.uploads:
+            return {}
+        frames = read_frames_of(
+            question.uploads["frames"], question.uploads.get("mapping"), "frames", quality_bits=question.quality_bits
+        )
+        if frames.flux.size > MOST_VALUES:
+            raise InputError.of("frames", frames.flux.size, f"at most {MOST_VALUES} values, or the command line")
+        return {"frames": frames}
+
+    def words(self, question: Question) -> str:
+        """Return the name of the file."""
+        return question.uploads["frames"].name if "frames" in question.uploads else "no file of frames yet"
+
+    def offers(self, name: str, answers: Answers) -> bool:
+        """Return whether the answer has a table; some exist only for spectra."""
+        return self.answer in answers and name in answers[self.answer].tables
+
+    def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
+        """Return a table of the answer; raises InputError for one that only spectra have."""
+        tables = answers[self.answer].tables
+        if name not in tables:
+            raise InputError(f"a light curve has no table {name}", f"one of {', '.join(tables)}", key="name")
+        table: Table = tables[name]
+        return table
+
+    def shown(self, closed: ClosedForms, answers: Answers) -> View | None:
+        """Return the table of events; without an event, the sentence that says so."""
+        view = super().shown(closed, answers)
+        return view if view is not None and view.columns else None
+
+
+#: Half-widths of the flares: as many as there are lines.
+LENGTHS = ("shortest", "middle", "longest")
+
+
+@Chart(
+    "shares", "Share of flares that a search of a stare finds",
+    Axis("peak amplitude of the flare (%)", log=True, limits=(0.01, 100)),
+    Axis("share of flares found", limits=(-0.03, 1.05)),
+    (
+        *(
+            series
+            for k, called in enumerate(LENGTHS)
+            for series in (
+                Band(f"{called} flares", called, f"band {k}", listed=False),
+                Line(f"{called} flares", called, f"line {k}", width=2,
+                     tips=("amplitude (%)", f"found of the {called}")),
+            )
+        ),
+        Rule("amplitude of your question", "own", "own"),
+    ),
+).data()  # fmt: skip
+def shares(closed: ClosedForms, answers: Answers) -> ChartData:
+    """Return the fraction of injected flares that the search finds against their amplitude."""
+    series: dict[str, Any] = {"own": closed.question.amplitude_percent}
+    if "completeness" not in answers:
+        text = (
+            "Nothing is injected yet: Inject flares puts flares of several lengths and sizes into a stare of one "
+            "orbit, and searches it."
+        )
+        return ChartData(text, series)
+    injected, parts = answers["completeness"].stars[0].injected, []
+    for k, width in enumerate(injected.half_widths_s):
+        x, share = 100 * injected.sizes, injected.completeness[k]
+        series |= {
+            f"band {k}": (x, injected.completeness_low[k], injected.completeness_high[k]),
+            f"line {k}": (x, share),
+        }
+        seen = float(np.interp(np.log(closed.question.amplitude_percent), np.log(x), share))
+        parts.append(f"{percent(seen)} of those of half-width {short(width)} s")
+    peak = f"{closed.question.amplitude_percent:g} %"
+    return ChartData(f"Of flares that peak at {peak} the search finds {'; '.join(parts)}.", series)
+
+
+class Completeness(Tab):
+    """Tab of completeness."""
+
+    name, title = "completeness", "Stare"
+    about = (
+        "One exposure sees a flare at its peak; a stare sees it rise and fade. This tab shows which flares a search of "
+        "one orbit finds at the chosen rate of false alarms, with losses while the star drifts out of the fibre."
+    )
+    pictures = (shares,)
+    headline = False
+    # The picture reads off the share of flares of this size.
+    also = ("amplitude_percent",)
+    simulations = {"completeness": "Inject flares"}  # noqa: RUF012
+    answer, view = "completeness", 1
+    files = {"completeness": "completeness", "limits": "completeness"}  # noqa: RUF012
+
+
+NO_OBSERVATIONS = "Choose an archive of observations; Calibrate then fits the instrument."
+
+
+@THROUGHPUT.data("calibrate", NO_OBSERVATIONS)
+def throughput(closed: ClosedForms, answer: CalibrateAnswer) -> ChartData:
+    """Return the fitted throughput with its 95 % band, and the nominal one."""
+    ratio = answer.throughput_table["ratio"]
+    text = f"{answer.notice} It is {ratio.min():.3g} to {ratio.max():.3g} times the nominal one."
+    return ChartData(text, throughput_series(answer))
+
+
+@Chart(
+    "residuals", "Observed less fitted spectra", WAVELENGTH, Axis(f"residual of {BIN} pixels (sigma)"),
+    (
+        Targets("residual", tips=("residual (sigma)",)),
+        Rule("2 sigma", "threshold", "above", along="y", at=2.0),
+        Rule("2 sigma", "threshold", "below", along="y", listed=False, at=-2.0),
+    ),
+).data("calibrate", NO_OBSERVATIONS)  # fmt: skip
+def residuals(closed: ClosedForms, answer: CalibrateAnswer) -> ChartData:
+    """Return the residuals of each star."""
+    rows = residual_series(answer)
+    words = "; ".join(f"{name} {np.sqrt(np.mean(row**2)):.2f}" for name, _, row in rows)
+    text = f"Root mean square, 1 for noise alone: {words}; p = {answer.throughput.p_value:.2g}."
+    return ChartData(text, {"residual": rows})
+
+
+@TRANSFER.data("calibrate", NO_OBSERVATIONS)
+def photon_transfer(closed: ClosedForms, answer: CalibrateAnswer) -> ChartData:
+    """Return the measured over the fitted variance."""
+    t = answer.transfer
+    text = f"Gain {t.noise.gain:.4g} +- {t.gain_error:.1g} DN per electron, read noise {t.read_noise_dn:.3g} DN."
+    if "gain" in t.assumed:
+        text = "The frames do not determine the gain: it is nominal."
+    return ChartData(text, transfer_series(answer)[0])
+
+
+class Calibrate(Tab):
+    """Instrument fitted to observations of standard stars."""
+
+    verb = "calibrate"
+    about = (
+        "The instrument from frames of standard stars and of no light: throughput with its errors, dark current, gain "
+        "and line width, next to the nominal values."
+    )
+    headline = False
+    pictures = (throughput, residuals, photon_transfer)
+    files = dict.fromkeys(("calibrate", "fits", "throughput", "dark"), "calibrate")
+    documents = {"instrument.zip": "calibrate"}  # noqa: RUF012
+
+    def given(self, question: Question) -> dict[str, Any]:
+        """Read frames and spectra; raises InputError if a file cannot be read."""
+        if "observations" not in question.uploads:
+            return {}
+        archive: Observations = question.uploads["observations"]
+        files = {name: VisitorFile(name, content) for name, content in archive.files.items()}
+        frames, stars = [], []
+        for row in archive.rows:
+            mapping = files[str(row.mapping)] if row.mapping else None
+            frames.append(read_frames_of(files[str(row.frames)], mapping, "observations"))
+            if sum(some.flux.size for some in frames) > MOST_VALUES:
+                raise InputError(
+                    "the archive holds more raw values than are read here",
+                    f"{MOST_VALUES}, or the command line",
+                    key="observations",
+                )
+            if row.spectrum is None:
+                stars.append(row.source())
+                continue
+            with reported_for("observations", str(row.spectrum)):
+                star = read_limited(files[str(row.spectrum)].content, Source)
+            stars.append(star if row.magnitude is None else star.at_magnitude(row.magnitude, row.band))
+        return {"frames": tuple(frames), "stars": tuple(stars)}
+
+    def words(self, question: Question) -> str:
+        """Return the name of the archive."""
+        return question.uploads["observations"].name if "observations" in question.uploads else "no observations yet"
+
+
+def _against_magnitude(name: str, title: str, label: str, units: Mapping[str, float]) -> Chart:
+    """Return the chart of the smallest changes of some units, with the factor from each to that of the axis."""
+
+    def along(closed: ClosedForms, answer: ChangeAnswer) -> ChartData:
+        here = [row for row in answer.changes if row.change.unit in units]
+        lines, words, own = [], list[str](), list[float]()
+        for row in here:
+            change, scale = row.change.name, units[row.change.unit]
+            lines += along_magnitude(answer, [change], scale)
+            hidden = np.isinf(row.smallest.one)
+            words.append(f"{change} {'hidden' if hidden else f'{scale * row.smallest.one:.3g}'}")
+            own += [] if hidden else [scale * row.smallest.one]
+        text = (
+            f"Smallest changes between {answer.study.change.visits} visits, in {label}: "
+            f"{'; '.join(words) or 'none of this kind'}."
+        )
+        return ChartData(text, {name: lines, "own": ([closed.question.magnitude] * len(own), own)})
+
+    axis, lines = Axis(f"smallest change ({label})", log=True), (Targets(name, tips=(label,)), Own("this star"))
+    chart = Chart(name, title, Axis("magnitude"), axis, lines, sets="magnitude=x")
+    return chart.data("change", "Change computes which differences between visits are detected.")(along)
+
+
+class Change(Tab):
+    """Changes between visits."""
+
+    verb = "change"
+    about = "How small a difference between visits is seen: of lines, bands, the Balmer jump and the colour."
+    pictures = (
+        _against_magnitude(
+            "changes", "Smallest change of the star's own light", "% or 0.01 mag", {"": 100, "mag": 100}
+        ),
+        _against_magnitude("fluxes", "Smallest change of the flux of lines", "erg/s/cm²", {"erg / (s cm2)": 1.0}),
+    )
+    headline = False
+    # Visits are evenly spaced, without an orbit, and the seed is that of periods.
+    never = ("targets", "start", "days", "shortest_d", "longest_d", "seed")
+    files = {"change": "change", "indices": "change"}  # noqa: RUF012
+
+
+def _cells(canvas: Canvas, source: ColumnDataSource) -> None:
+    plot, mapper = canvas.plot, LinearColorMapper(palette="Cividis256", low=0, high=1)
+    cells = plot.quad("left", "right", "bottom", "top", source=source, line_color=None,
+                      fill_color={"field": "share", "transform": mapper})  # fmt: skip
+    cells.name = "recovered"
+    shown = [("recovered", "@share{0 %}"), ("period", "@period{0.[00]} d"), ("amplitude", "@amplitude{0.00}")]
+    plot.add_tools(HoverTool(renderers=[cells], tooltips=shown))
+    plot.xaxis.ticker = FixedTicker(ticks=[0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200])
+    plot.yaxis.ticker = FixedTicker(ticks=[0.5, 1, 2, 4])
+    plot.add_layout(ColorBar(color_mapper=mapper, width=10, title="recovered", **canvas.bar_text), "right")
+
+
+@Chart(
+    "periods", "Share of periods that visits recover", Axis("period (d)", log=True),
+    Axis("semi-amplitude (errors of a visit)", log=True),
+    (Custom("cells", columns=("left", "right", "bottom", "top", "period", "amplitude", "share"), draw=_cells),),
+).data("periods", "For each period and amplitude, how often it is found in visits that the orbit allows.")  # fmt: skip
+def recovered_periods(closed: ClosedForms, answer: ChangeAnswer) -> ChartData:
+    """Return the share of recovered periods over period and semi-amplitude."""
+    row, *_ = answer.periods
+    r = row.recovery
+    x, y = (values.ravel() for values in np.meshgrid(r.periods_d, r.amplitudes))
+    wide, high = (np.sqrt(points[1] / points[0]) for points in (r.periods_d, r.amplitudes))
+    share = row.shares("value").ravel()
+    errors = "; ".join(
+        f"{row.change.name} {(row.error if row.change.unit else 100 * row.error):.3g} {row.change.unit or '%'}"
+        for row in answer.periods
+    )
+    text = (
+        f"{r.time_d.size} visits within {np.ptp(r.time_d):.0f} days recover {100 * np.mean(share):.0f} % of the "
+        f"map's periods. The error of a visit is {errors}."
+    )
+    return ChartData(text, {"cells": (x / wide, x * wide, y / high, y * high, x, y, share)})
+
+
+class Periods(Tab):
+    """Recovered periods."""
+
+    verb, name, title = "change", "periods", "Periods"
+    about = (
+        "Which periods of the star are found in visits to the first target, at times that the orbit allows, by a "
+        "Lomb-Scargle periodogram with a false-alarm probability of 1 %."
+    )
+    pictures = (recovered_periods,)
+    headline = False
+    simulations = {"periods": "Map periods"}  # noqa: RUF012
+    answer, view = "periods", 2
+    # The power is that of differences.
+    never = ("power", "fap")
+    files = {"periods": "periods"}  # noqa: RUF012
+
+
+#: Ends of the axes, erg, the same for all questions.
+ENERGIES = (1e28, 1e37)
+
+
+def _energy(value: Any) -> str:
+    """Format an energy for readers."""
+    return f"{value.value:.2g} erg" if np.isfinite(value) else "no energy"
+
+
+def _columns(answer: PlanAnswer) -> list[tuple[str, Any, Any, Any]]:
+    """Return name, energies, recovered fraction at each, and flares above each in the campaign, of seen targets."""
+    columns, table = [], answer.by_energy
+    for star in answer.planned:
+        # Beyond the pictures' ends there is nothing to see.
+        rows = table[(np.asarray(table["target"]) == star.name) & (table["energy"].to_value("erg") <= ENERGIES[1])]
+        above = np.asarray(rows["rate_above"].to_value("1 / h") * star.hours, float)
+        columns.append((star.name, rows["energy"].to_value("erg"), np.asarray(rows["recovered"], float), above))
+    return columns
+
+
+ENERGY = Axis("bolometric energy of the flare (erg)", log=True, limits=ENERGIES)
+
+
+@Chart(
+    "recovered", "Share of flares that the search recovers", ENERGY, Axis("share recovered", limits=(-0.03, 1.05)),
+    (Targets("recovered", tips=("share recovered",)),),
+).data("plan", "The share of flares that are found on each target, against their energy.")  # fmt: skip
+def recovered(closed: ClosedForms, answer: PlanAnswer) -> ChartData:
+    """Return the fraction of flares that the search recovers against their energy."""
+    parts = [
+        f"{row['target']}: half of the flares at {_energy(row['E50'])}, 90 % at {_energy(row['E90'])}"
+        if row["seen"] > 0
+        else f"{row['target']} is never seen"
+        for row in answer.table
+    ]
+    return ChartData(f"Recovered: {'; '.join(parts)}.", {"recovered": [columns[:3] for columns in _columns(answer)]})
+
+
+@Chart(
+    "expected", "Recovered flares above an energy, in the whole campaign", ENERGY,
+    Axis("flares", log=True, limits=(1e-3, 1e4)), (Targets("found", tips=("recovered flares",)),),
+).data("plan", "The number of flares expected to be found on each target.")  # fmt: skip
+def expected(closed: ClosedForms, answer: PlanAnswer) -> ChartData:
+    """Return the numbers of recovered flares above an energy."""
+    lines, parts = [], []
+    for row, (name, energy, recovered, above) in zip(answer.table, _columns(answer), strict=True):
+        # Each step of the rate is recovered as at its middle.
+        steps = (above[:-1] - above[1:]) * (recovered[:-1] + recovered[1:]) / 2
+        flares = np.append(np.cumsum(steps[::-1])[::-1], 0.0) + (above[-1] * recovered[-1] if above.size else 0.0)
+        lines.append((name, energy, np.where(flares > 0, flares, np.nan)[: energy.size]))
+        number = f"{row['expected']:.3g} flares" if np.isfinite(row["expected"]) else "no rates are known"
+        seen = f"{row['target']} in {short(row['hours'].value)} h: {number}"
+        parts.append(seen if row["seen"] > 0 else f"{row['target']} is never seen")
+    return ChartData(f"Expected to be recovered: {'; '.join(parts)}.", {"found": lines})
+
+
+class Plan(Tab):
+    """Tab of campaigns."""
+
+    verb = "plan"
+    about = (
+        "What a campaign would find: hours, energies recovered, flares expected. Spectrum and flare rates are those of "
+        "each target's type; completeness is in closed form, and assumptions have a table."
+    )
+    headline = False
+    # The page has no star-time of a campaign's false alarms: one a month. Flares of all sizes are expected.
+    never = ("false_alarms", "as_observed")
+    pictures = (recovered, expected)
+    files = dict.fromkeys(("plan", "stars", "energies", "assumptions"), "plan")
+
+    def words(self, question: Question) -> str:
+        """Return the targets, hours and days."""
+        return f"{target_words(question)}, {question.hours:g} h each at most"
+
+    def rows(self, closed: ClosedForms, answers: Answers) -> list[list[str]]:
+        """Return the table of targets; before a plan, which columns it will have."""
+        if "plan" in answers:
+            return super().rows(closed, answers)
+        names = [target["name"] for target in closed.question.targets] or ["each target"]
+        headings = [column.heading for column in COLUMNS if column.heading]
+        return [headings, *([name, *("·" for _ in headings[1:])] for name in names)]
+
+
+@Chart(
+    "hours", "Hours in which targets are seen, day by day", Axis(kind="dates"),
+    Axis("hours in the day", limits=(-0.5, 24.5)), (Targets("hours", tips=("hours",)),),
+).data()  # fmt: skip
+def hours(closed: ClosedForms, answers: Answers) -> ChartData:
+    """Return the daily hours of visibility."""
+    question = closed.question
+    names = [target["name"] for target in question.targets]
+    if "visible" not in answers:
+        text = "For each target, how many hours of each day it is seen."
+        return ChartData(text, {"hours": [(name, [], []) for name in names]})
+    table = answers["seen"]["by_day"]
+    lines, parts = [], []
+    for name in names:
+        hours = np.asarray(table[np.asarray(table["target"]) == name]["hours"].to_value("h"))
+        # Milliseconds, as browsers count time.
+        days = (np.datetime64(question.start, "ms") + np.arange(hours.size) * np.timedelta64(1, "D")).astype(float)
+        lines.append((name, days, hours))
+        parts.append(
+            f"{name} on {np.count_nonzero(hours)} of {hours.size} days, {short(float(hours.sum()))} h in all and "
+            f"{hours.max():.3g} h on its best day"
+        )
+    return ChartData(f"From {question.start} on are seen: {'; '.join(parts)}.", {"hours": lines})
+
+
+class Visibility(Tab):
+    """Tab of the visibility."""
+
+    verb, name, title = "visible", "visibility", "Visibility"
+    about = "When the satellite can look at targets: clear of Earth, Sun, Moon and radiation."
+    headline = False
+    pictures = (hours,)
+    answer = "visible"
+    simulations = {"visible": "Find when"}  # noqa: RUF012
+    view = 1
+    files = {"visible": "visible", "months": "visible", "days": "visible"}  # noqa: RUF012
+
+    def words(self, question: Question) -> str:
+        """Return the targets and days."""
+        return target_words(question)
+
+    def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
+        return answers["seen"][{"visible": "table", "months": "months", "days": "by_day"}[name]]
