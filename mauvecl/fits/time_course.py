@@ -22,12 +22,7 @@ from mauvecl.detection.nuisances import Nuisances, spectrum_of
 from mauvecl.fits.flare_model import EVERY, Exposures, Ranges, Reduction
 from mauvecl.fits.profile import remembering
 from mauvecl.fits.spectrum import LEVELS, Measurement, clipped_pixels, fit
-<<<<<<< HEAD
-from mauvecl.flares.events import Event
 from mauvecl.flares.frames import Components, known_strengths
-=======
-from mauvecl.flares.frames import Components
->>>>>>> wt45
 from mauvecl.flares.settings import Cooling
 from mauvecl.flares.shapes import Shape, shape_of
 from mauvecl.flares.stare import Event, Stare

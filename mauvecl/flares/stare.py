@@ -226,21 +226,12 @@ def temperatures_of(events: Sequence[Event]) -> Float:
 
 
 def coefficients(events: Sequence[Event], start_s: Float, frame_s: float, temperatures_k: Float) -> Float:
-    """Return the mean amplitude of each flare spectrum in each frame.
+    """Return the mean amplitude of each flare spectrum in each frame, shape (n_frame, n_temperature).
 
     Flares of constant temperature are integrated exactly. The light of a flare that cools is interpolated linearly in
     1 / T between the spectra of the two neighbouring temperatures, with a constant temperature in each step of a frame.
-    Raises InputError if a flare has a temperature outside the range of `temperatures_k`.
-
-    Parameters
-    ----------
-    start_s : ndarray, shape (n_frame,)
-    temperatures_k : ndarray, shape (n_temperature,)
-        Ascending; at least those of `temperatures_of`.
-
-    Returns
-    -------
-    ndarray, shape (n_frame, n_temperature)
+    Raises InputError if a flare has a temperature outside the range of `temperatures_k`, which are ascending and at
+    least those of `temperatures_of`.
     """
     factors = np.zeros((start_s.size, temperatures_k.size))
     for event in events:
