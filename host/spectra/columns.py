@@ -124,7 +124,7 @@ def role_of(name: str, unit: str | None = None, ucd: str = "") -> Role:
     if kind == "unknown" and not words:
         # A name that is only a unit, as in a line "nm, flam".
         kind, score = ("wavelength", 3) if spectral else ("flux", 3) if flux != "other" else (kind, 0)
-    if kind == "unknown" and is_stated(unit) and flux == "density":
+    if kind == "unknown" and stated is not None and flux == "density":
         kind, score = "flux", 1
     # A unit of another kind contradicts the name; an unknown unit raises InputError at conversion.
     if is_known and kind in ("flux", "model"):
@@ -222,7 +222,7 @@ def divided(name: str) -> tuple[str, str | None]:
         for k in range(1, len(parts)):
             tail = parts[k:]
             spelt = "/".join(tail) if len(tail) > 1 and not re.search(r"[/\-−]", "".join(tail)) else " ".join(tail)
-            if _fits(parts[:k], spelt):
+            if _fits(parts[:k], spelt) or spelt.lower() in ("cgs", "si"):
                 base, unit = "_".join(parts[:k]), spelt
                 break
     return base, unit if unit is None else balanced(unit)

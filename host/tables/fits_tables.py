@@ -323,6 +323,21 @@ def paired_images(hdus: Any) -> list[tuple[str, Any, Any]]:
     return pairs
 
 
+def spextool_spectra(header: Any, data: Any) -> tuple[Any, Any, list[str]] | None:
+    """Return wavelengths and fluxes of Spextool's images, one row for each order and aperture, and names of these.
+
+    Rows are wavelength, flux, error and, since 2014, flags (Cushing et al. 2004, PASP 116, 362; `mc_mkspexhdr.pro`).
+    Returns None for other images.
+    """
+    if not {"NAPS", "NORDERS", "XUNITS", "YUNITS"} <= {*header} or np.ndim(data) < 2 or data.shape[-2] not in (3, 4):
+        return None
+    cube = np.asarray(data).reshape(-1, *data.shape[-2:])
+    orders = [word.strip() for word in text_at(header, "ORDERS").split(",")]
+    apertures = range(1, int(header["NAPS"]) + 1)
+    names = [order if len(apertures) == 1 else f"{order} aperture {k}" for order in orders for k in apertures]
+    return cube[:, 0], cube[:, 1], names if len(names) == len(cube) else [str(k + 1) for k in range(len(cube))]
+
+
 def is_survey_image(hdu: Any, telescope: str) -> bool:
     """Return whether an image holds one spectrum with its errors and masks, as files of LAMOST and SDSS-I/II do.
 

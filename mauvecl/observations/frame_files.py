@@ -115,7 +115,8 @@ KNOWN = {
     "time": ("time",),
     "flux": ("flux", "pdcsap_flux", "sap_flux", "kspsap_flux", "det_flux", "corr_flux", "corrected_flux", "fcor",
              "flux_corr", "detrended_flux", "rate", "rel_flux", "relative_flux", "normalized_flux", "norm_flux",
-             "rel_flux_t1", "ujy", "count_rate", "countrate", "cps", "counts", "cal_aper_flux", "whitelight_flux"),
+             "flux_norm", "flux_normalized", "rel_flux_t1", "ujy", "count_rate", "countrate", "cps", "counts",
+             "cal_aper_flux", "whitelight_flux"),
     "quality": ("quality", "sap_quality"),
     "temperature": ("temperature",),
 }  # fmt: skip
@@ -132,6 +133,9 @@ PARTS = {"start": 0.0, "middle": 0.5, "end": 1.0}
 DATES_MJD = (-5000.0, 150_000.0)
 #: Units in which light is given as a deviation from its level, as TASOC does.
 PARTS_OF_LEVEL = {"%": 1e-2, "percent": 1e-2, "ppt": 1e-3, "ppm": 1e-6, "ppb": 1e-9}
+#: Extension of the light curves of CHEOPS. UTC in its header is that of the start and the end of a visit;
+#: BJD_TIME is in TT: pycheops 1.1.14, documentation of `Dataset`.
+CHEOPS = "SCI_COR_LIGHTCURVE"
 #: Standard errors by which a level is above zero.
 SURE = 5.0
 #: What a cell of times may be.
@@ -457,6 +461,15 @@ def _temperature_c(file: TableFile, found: Quantities, mapping: FrameMapping, n:
     return np.full(n, float(nominal)) if isinstance(nominal, int | float) else None
 
 
+def _brite_exposure_s(file: TableFile) -> float | None:
+    """Return the exposure time in the header of BRITE's light curves, in milliseconds for each image of a stack."""
+    try:
+        found = 1e-3 * float(file.header["ObsExpoT"]) * float(file.header.get("ObsStack", 1.0))
+    except (KeyError, ValueError):
+        return None
+    return found if 0.0 < found < np.inf else None
+
+
 def _without_marks(light: Float) -> tuple[Float, Sequence[str]]:
     """Return light without marks of missing values, and what to say about them."""
     marks, said = marks_in(light, "values")
@@ -500,8 +513,8 @@ def _frames_in(
     time, exposure_s, dates, remarks = _times(found.time, file, mapping)
     if found.exposure is not None:
         exposure_s = converted(found.exposure, mapping.exposure_unit, "s", "exposure_unit").numbers().reshape(n)
-    elif mapping.exposure_s is not None:
-        exposure_s = np.full(n, mapping.exposure_s)
+    elif (one_s := mapping.exposure_s or _brite_exposure_s(file)) is not None:
+        exposure_s = np.full(n, one_s)
     unit, flux, error, more = _light(found, mapping)
     remarks += (*more, *(f"{what}: {text}" for text in file.remarks))
     wavelength = None if found.wavelength is None else _vacuum_nm(found.wavelength, mapping.wavelength_unit, file)
@@ -606,6 +619,12 @@ def _times(
                     f"{stated.epoch_mjd:g} by its header", "one epoch, or a mapping with epoch", key="epoch",
                 )  # fmt: skip
             epoch = said.epoch_mjd if stated.epoch_mjd is None else stated.epoch_mjd
+    is_cheops = str(file.header.get("EXTNAME", "")).upper().startswith(CHEOPS)
+    if is_cheops and position == "BARYCENTER" and not mapping.scale:
+        scale = "tt"
+        remarks.append(
+            f"{time[0].name} of {file.what} is in TT, as in all files of CHEOPS; UTC is the scale of its other dates"
+        )
     exposure = None if len(edges) == 1 else np.asarray(((edges[1] - edges[0]) * unit).to_value(u.s))
     seconds, first_d = seconds_from_first(np.mean(edges, axis=0) + offset, unit)
     at = 0.5 if len(edges) == 2 else PARTS.get(mapping.time_at or "", stated.at)
