@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
 
-from mauvecl.host.tables.units import SCALE, FluxKind, balanced, flux_kind, is_spectral, is_stated, unit_of
+from mauvecl.host.tables.units import NO_FLUX, SCALE, FluxKind, balanced, flux_kind, is_spectral, is_stated, unit_of
 from mauvecl.schema.errors import InputError, shortened
 
 Kind = Literal[
@@ -127,7 +127,7 @@ def role_of(name: str, unit: str | None = None, ucd: str = "") -> Role:
     if kind == "unknown" and stated is not None and flux == "density":
         kind, score = "flux", 1
     # A unit of another kind contradicts the name; an unknown unit raises InputError at conversion.
-    if is_known and kind in ("flux", "model"):
+    if kind in ("flux", "model") and (is_known or (stated is not None and NO_FLUX.search(stated))):
         score += 1 if flux in ("density", "total") else -6
     if is_known and kind == "wavelength":
         score += 1 if spectral else -6
@@ -143,6 +143,9 @@ def role_of(name: str, unit: str | None = None, ucd: str = "") -> Role:
 
 def _kind_of(words: Sequence[str]) -> tuple[Kind, int]:
     """Return the kind of column that the words of a name indicate, and their score."""
+    if words == ("spectral",):
+        # The axis of SSAP.
+        return "wavelength", 1
     has = {_WORDS.get(word, "label") for word in words if _WORDS.get(word) != "logarithm"}
     if len(words) == 1 and len(words[0]) == 1:
         # An "e" may be an energy, a "d" a distance.

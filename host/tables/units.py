@@ -66,7 +66,7 @@ _AB = re.compile(r"(?:m(?:ag)?s?[_ (]*)?ab[) ]*(?:[_ ]?mag(?:nitude)?s?)?", re.I
 _ST = re.compile(r"(?:m(?:ag)?s?[_ (]*)?st[) ]*(?:[_ ]?mag(?:nitude)?s?)?", re.IGNORECASE)
 _NANOMAGGIES = re.compile(r"n(?:ano)?m(?:ag)?g(?:y|ies|ys)", re.IGNORECASE)
 _LOGARITHM = re.compile(r"(?:log(?:_?10)?|dex)(?:\s*[\s_(\[]\s*(.*?)\s*\]?)?", re.IGNORECASE)
-_NO_FLUX = re.compile(r"mag|^(counts?|cts|adu|dn|fn|electrons?)\b", re.IGNORECASE)
+NO_FLUX = re.compile(r"mag|^(counts?|cts?|adu|dn|fn|electrons?)\b|^e-", re.IGNORECASE)
 # "na" is a nanoyear.
 _NO_UNIT = {*MISSING_WORDS} - {"na"}
 
@@ -97,7 +97,7 @@ def unit_of(text: str) -> u.UnitBase | u.function.FunctionUnitBase:
     expected = "a unit such as Angstrom, nm or erg / (s cm2 Angstrom)"
     if match := _LOGARITHM.fullmatch(name):
         return u.dex(_linear_unit(balanced(match[1]), text, expected)) if match[1] else u.dex
-    if _NO_FLUX.search(name):
+    if NO_FLUX.search(name):
         raise InputError.of("unit", text.strip(), f"a flux density, not a magnitude or count: {expected}")
     return _linear_unit(name, text, expected)
 
@@ -202,9 +202,10 @@ EPOCHS_MJD = {
     "gps": 44_244.0,
     "unix": 40_587.0,
 }
-#: Days of Julian dates by other names: heliocentric and barycentric. TJD is that of NASA (JD - 2440000.5) or of TESS.
+#: Days of Julian dates by other names: heliocentric, barycentric, and those of CoRoT (N2 data description).
+#: TJD is that of NASA (JD - 2440000.5) or of TESS.
 _DAYS = EPOCHS_MJD | {"hjd": -2_400_000.5, "gjd": -2_400_000.5, "bmjd": 0.0, "mbjd": 0.0, "hmjd": 0.0, "mhjd": 0.0,
-                      "tbjd": 56_999.5, "kbjd": 54_832.5}  # fmt: skip
+                      "tbjd": 56_999.5, "kbjd": 54_832.5, "corot julian day": 51_544.5}  # fmt: skip
 #: Scale and position of the missions' own dates.
 _MISSION_DAYS = ("btjd", "tbjd", "bkjd", "kbjd")
 #: Units of time in words, by the names of astropy.
@@ -240,8 +241,9 @@ SCALES = {"utc": "utc", "ut": "utc", "gmt": "utc", "tai": "tai", "iat": "tai", "
 #: Values of TREFPOS (standard 4.0, table 31) and of the older TIMEREF that mean the same place.
 POSITIONS = {"SOLARSYSTEM": "BARYCENTER", "SSBARYCENTER": "BARYCENTER", "BARYCENTRE": "BARYCENTER",
              "GEOCENTRIC": "GEOCENTER", "HELIOCENTRIC": "HELIOCENTER", "LOCAL": "TOPOCENTER"}  # fmt: skip
-#: Keywords of the reference time, and the modified Julian date of their zero.
-REFERENCES = {"MJDREF": 0.0, "BJDREF": -2_400_000.5, "JDREF": -2_400_000.5, "HJDREF": -2_400_000.5}
+#: Keywords of the reference time, and the modified Julian date of their zero; JD_REF is that of SuperWASP.
+REFERENCES = {"MJDREF": 0.0, "BJDREF": -2_400_000.5, "JDREF": -2_400_000.5, "HJDREF": -2_400_000.5,
+              "JD_REF": -2_400_000.5}  # fmt: skip
 #: Keywords of a time that is added to all others, in TIMEUNIT: of the standard, and of OGIP (memo 93-003).
 OFFSETS = ("TIMEOFFS", "TIMEZERO")
 

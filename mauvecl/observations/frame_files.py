@@ -133,6 +133,8 @@ PARTS = {"start": 0.0, "middle": 0.5, "end": 1.0}
 DATES_MJD = (-5000.0, 150_000.0)
 #: Units in which light is given as a deviation from its level, as TASOC does.
 PARTS_OF_LEVEL = {"%": 1e-2, "percent": 1e-2, "ppt": 1e-3, "ppm": 1e-6, "ppb": 1e-9}
+#: Times of Gaia DR3's epoch photometry, BJD in TCB less 2455197.5 (documentation of vari_epoch_photometry).
+GAIA_DAYS = TimeUnit("d", 55_197.0, "tcb", "BARYCENTER")
 #: Extension of the light curves of CHEOPS. UTC in its header is that of the start and the end of a visit;
 #: BJD_TIME is in TT: pycheops 1.1.14, documentation of `Dataset`.
 CHEOPS = "SCI_COR_LIGHTCURVE"
@@ -339,8 +341,8 @@ def _recognised(file: TableFile) -> FrameMapping:
     if columns["time"] is None:
         said = {name: found for name in names if (found := time_in_name(name)) is not None}
         dated = [name for name, one in said.items() if one.epoch_mjd is not None]
-        for place in ("HELIOCENTER", "BARYCENTER"):
-            # Dates at the barycentre are those of the light.
+        for place in ("BARYCENTER", "HELIOCENTER"):
+            # Dates at the barycentre are those of the light; those at the Sun are seconds from them.
             dated = [name for name in dated if said[name].position == place] or dated
         if len(dated) > 1:
             fault = f"{file.what}: {len(dated)} columns may be the time: {', '.join(map(shortened, dated))}"
@@ -654,6 +656,9 @@ def _time_unit(
             converted(replace(time[0], unit=text), None, "s", "time_unit")
             said = TimeUnit(str(unit_in(text)))
     if said is None:
+        if {"transit_id", "rejected_by_photometry"} <= {*map(key_of, file.columns)}:
+            assumed = f"the times of {file.what} are days from 2010-01-01 in TCB, as in Gaia DR3's epoch photometry"
+            return GAIA_DAYS, [f"ASSUMED: {assumed}; it states no unit"]
         words = {str(file.header.get(key, "") or "").strip().upper() for key in ("MISSION", "TELESCOP")}
         mission = next((one for one in MISSIONS if one in words), None)
         finite = values[np.isfinite(values)]
