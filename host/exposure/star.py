@@ -223,7 +223,8 @@ SEPARATIONS = (
     "_r",
 )
 #: Columns of magnitudes, with their bands; the first that a row has counts. Gmag is Gaia's in VizieR.
-MAGNITUDES = {"magnitude": "", "mag": "", "v": "V", "vmag": "V", "phot_g_mean_mag": "Gaia G", "gmag": "Gaia G"}
+MAGNITUDES = {"magnitude": "", "mag": "", "v": "V", "vmag": "V", "flux_v": "V", "phot_g_mean_mag": "Gaia G",
+              "gmag": "Gaia G"}  # fmt: skip
 TYPES = (*SPECTRAL_TYPES, "type")
 FILES = ("file", "spectrum", "spectrum_file")
 TEMPERATURES = ("teff_gspphot", "teff", "teff_val", "temperature", "temperature_k")

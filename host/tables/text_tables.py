@@ -288,11 +288,11 @@ class TextRows:
             lines[:n_marked] = [f"#{line[1:]}" for line in lines[:n_marked]] if n_marked > 1 else lines[:1]
         check_cells([line for line in lines if line[0] != "#"], what)
         mark = _mark([line for line in lines if line.lstrip()[0] != "#"], commas) if like is None else like.mark
-        # SIMBAD calls its first column #.
+        # SIMBAD calls its first column #, as wide as its number of stars.
         is_comment = [
             _COMMENT.match(line) is not None
             and line.lstrip()[0] != mark
-            and not (mark == "|" and line.startswith("#|"))
+            and not (mark == "|" and re.match(r"#\s*\|", line))
             for line in lines
         ]
         data = [line for line, comment in zip(lines, is_comment, strict=True) if not comment]

@@ -56,56 +56,6 @@ def _keys(values: Values) -> NDArray[Any]:
     return np.asarray(values.numbers() if texts is None or not any(map(is_dated, texts)) else texts)
 
 
-def spectra_of_rows(
-    time: tuple[Values, ...],
-    flux: Values,
-    error: Values | None,
-    quality: Values | None,
-    exposure: Values | None,
-    temperature: Values | None,
-    wavelength: Values,
-    what: str,
-) -> tuple[tuple[Values, ...], Values, Values | None, Values | None, Values | None, Values | None, Values]:
-    """Return the quantities of a long table with a row for each frame; errors and quality flags for each pixel.
-
-    Raises InputError if a frame lacks a wavelength that another has, has one twice, or has two exposure times or
-    temperatures.
-    """
-    key = _keys(time[0])
-    nm = wavelength.numbers()
-    frames, frame = np.unique(key, return_inverse=True)
-    pixels, pixel = np.unique(nm, return_inverse=True)
-    counts = np.zeros((frames.size, pixels.size), np.int64)
-    np.add.at(counts, (frame, pixel), 1)
-    if (counts != 1).any():
-        row, column = np.argwhere(counts != 1)[0]
-        raise InputError(
-            f"{what}: the frame at {frames[row]} has {counts[row, column]} rows of wavelength {pixels[column]:g}",
-            "one row for each pixel of each frame", key="wavelength"
-        )  # fmt: skip
-    place = np.empty(counts.shape, np.int64)
-    place[frame, pixel] = np.arange(key.size)
-
-    def spectra(values: Values | None) -> Values | None:
-        return None if values is None else Values.of(values.name, values.numbers()[place], values.unit, what)
-
-    def single(values: Values | None) -> Values | None:
-        if values is None:
-            return None
-        rows = _keys(values)[place]
-        if (rows != rows[:, :1]).any():
-            fault = f"{what}: {values.name!r} changes within a frame"
-            raise InputError(fault, "one value for each frame", key=values.name)
-        return Values.of(values.name, rows[:, 0], values.unit, what)
-
-    light = spectra(flux)
-    assert light is not None
-    return (
-        tuple(one for values in time if (one := single(values)) is not None), light, spectra(error), spectra(quality),
-        single(exposure), single(temperature), Values.of(wavelength.name, pixels, wavelength.unit, what),
-    )  # fmt: skip
-
-
 Float = NDArray[np.float64]
 
 FORMATS = "FITS, HDF5, ECSV, CSV, a Zarr store or a folder of spectra"
@@ -401,7 +351,44 @@ class Quantities:
                 f"at most {most // 32}; MAUVECL_LARGEST_CONTENT_MIB sets the limit",
                 key="MAUVECL_LARGEST_CONTENT_MIB",
             )
-        return cls(*spectra_of_rows(times, flux, one.error, one.quality, one.exposure, one.temperature, nm, file.what))
+        return one._of_frames(nm, file.what)
+
+    def _of_frames(self, wavelength: Values, what: str) -> Quantities:
+        """Return the quantities of a long table with a row for each frame; errors and flags for each pixel.
+
+        Raises InputError if a frame lacks a wavelength that another has, has one twice, or has two exposure times or
+        temperatures.
+        """
+        key, nm = _keys(self.time[0]), wavelength.numbers()
+        frames, frame = np.unique(key, return_inverse=True)
+        pixels, pixel = np.unique(nm, return_inverse=True)
+        counts = np.zeros((frames.size, pixels.size), np.int64)
+        np.add.at(counts, (frame, pixel), 1)
+        if (counts != 1).any():
+            row, column = np.argwhere(counts != 1)[0]
+            fault = (
+                f"{what}: the frame at {frames[row]} has {counts[row, column]} rows of wavelength {pixels[column]:g}"
+            )
+            raise InputError(fault, "one row for each pixel of each frame", key="wavelength")
+        place = np.empty(counts.shape, np.int64)
+        place[frame, pixel] = np.arange(key.size)
+
+        def spectra(values: Values) -> Values:
+            return Values.of(values.name, values.numbers()[place], values.unit, what)
+
+        def single(values: Values) -> Values:
+            rows = _keys(values)[place]
+            if (rows != rows[:, :1]).any():
+                fault = f"{what}: {values.name!r} changes within a frame"
+                raise InputError(fault, "one value for each frame", key=values.name)
+            return Values.of(values.name, rows[:, 0], values.unit, what)
+
+        error, quality = (one and spectra(one) for one in (self.error, self.quality))
+        exposure, temperature = (one and single(one) for one in (self.exposure, self.temperature))
+        axis = Values.of(wavelength.name, pixels, wavelength.unit, what)
+        return Quantities(
+            tuple(map(single, self.time)), spectra(self.flux), error, quality, exposure, temperature, axis
+        )
 
 
 def _flags(quality: Values | None) -> Values | None:
