@@ -215,20 +215,28 @@ def divided(name: str) -> tuple[str, str | None]:
         inner = match[1].strip()
         if is_unit(inner) or re.search(r"\d|\^|/", inner) or _NO_DENSITY.search(inner):
             base, unit = name[: match.start()], inner
+    elif found := _after_underscore(name.split("_")):
+        base, unit = found
     elif (match := re.search(r"\s?/\s*(\S+)$|\sin\s+(\S+)$", name)) and is_unit(match[1] or match[2]):
         base, unit = name[: match.start()], match[1] or match[2]
     elif (match := SCALE.search(name)) and match.start() > 0:
         # A factor without a unit, as in "flux/10^-15", is not a unit.
         base, unit = re.sub(r"\s*[/*]\s*$|\s+x\s*$", "", name[: match.start()]), name[match.start() :]
-    else:
-        parts = name.split("_")
-        for k in range(1, len(parts)):
-            tail = parts[k:]
-            spelt = "/".join(tail) if len(tail) > 1 and not re.search(r"[/\-−]", "".join(tail)) else " ".join(tail)
-            if _fits(parts[:k], spelt) or spelt.lower() in ("cgs", "si"):
-                base, unit = "_".join(parts[:k]), spelt
-                break
     return base, unit if unit is None else balanced(unit)
+
+
+def _after_underscore(parts: Sequence[str]) -> tuple[str, str] | None:
+    """Divide a name at an underscore before its unit, as in ``flux_W_m2_nm`` and ``f_1e-15_erg_s-1_cm-2_A-1``."""
+    for k in range(1, len(parts)):
+        base, tail = "_".join(parts[:k]), parts[k:]
+        for spelt in ("/".join(tail), " ".join(tail)):
+            if _NO_DENSITY.fullmatch(spelt):
+                return base, spelt
+            if _fits(parts[:k], spelt):
+                # A factor between the name and the unit.
+                match = SCALE.search(base)
+                return (base, spelt) if match is None else (base[: match.start()], f"{base[match.start() :]} {spelt}")
+    return None
 
 
 def _fits(base: Sequence[str], unit: str) -> bool:
