@@ -282,10 +282,10 @@ class TextRows:
     def __init__(self, text: str, what: str, commas: bool, like: Layout | None = None, first: int = 0) -> None:
         self.what, self.first = what, first
         lines = [line for line in text.splitlines() if not _RULE.fullmatch(line)]
-        if lines[:1] and lines[0].startswith("c ") and lines[-1][:2] != "c ":
-            # Fortran's mark of comments, in the header of BRITE's light curves.
-            n_marked = next(k for k, line in enumerate(lines) if not line.startswith("c "))
-            lines[:n_marked] = [f"#{line[1:]}" for line in lines[:n_marked]] if n_marked > 1 else lines[:1]
+        n_marked = next((k for k, line in enumerate(lines) if not re.match(r"c(?:\s+[a-z]|\s*$)", line, re.I)), 0)
+        if n_marked > 1:
+            # Fortran's mark of comments, in the header of BRITE's light curves. Rows have numbers after a letter.
+            lines[:n_marked] = [f"#{line[1:]}" for line in lines[:n_marked]]
         check_cells([line for line in lines if line[0] != "#"], what)
         mark = _mark([line for line in lines if line.lstrip()[0] != "#"], commas) if like is None else like.mark
         # SIMBAD calls its first column #, as wide as its number of stars.
@@ -387,8 +387,8 @@ class TextRows:
         if n < 2:
             return [], []
         numbered = numbered_names((line for line in above if line.lower().startswith("col")), n)
-        if len(numbered) == n:
-            return [numbered[k] for k in range(n)], []
+        if len(numbered) > 1:
+            return [numbered.get(k, f"col{k + 1}") for k in range(n)], []
         found = [
             cells for line in above[-2:] if (cells := divided_names(line, n, mark)) and not keywords_of([f"#{line}"])
         ]
