@@ -333,9 +333,16 @@ def spextool_spectra(header: Any, data: Any) -> tuple[Any, Any, list[str]] | Non
         return None
     cube = np.asarray(data).reshape(-1, *data.shape[-2:])
     orders = [word.strip() for word in text_at(header, "ORDERS").split(",")]
-    apertures = range(1, int(header["NAPS"]) + 1)
-    names = [order if len(apertures) == 1 else f"{order} aperture {k}" for order in orders for k in apertures]
-    return cube[:, 0], cube[:, 1], names if len(names) == len(cube) else [str(k + 1) for k in range(len(cube))]
+    n_orders, n_apertures = int(header["NORDERS"]), int(header["NAPS"])
+    if n_orders * n_apertures == len(cube) and len(orders) != n_orders:
+        # Merged orders are one, whatever their list says.
+        orders = [str(k + 1) for k in range(n_orders)]
+    if len(orders) * n_apertures != len(cube):
+        fault = f"has {len(cube)} spectra of {len(orders)} orders and {n_apertures} apertures (NAPS)"
+        raise InputError(fault, "one for each order and aperture", key="NAPS")
+    if n_apertures > 1:
+        orders = [f"{order} aperture {k + 1}" for order in orders for k in range(n_apertures)]
+    return cube[:, 0], cube[:, 1], orders
 
 
 def is_survey_image(hdu: Any, telescope: str) -> bool:
