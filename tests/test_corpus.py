@@ -157,6 +157,8 @@ def _same(found: Any, wanted: Any, rtol: float = 1e-6) -> bool:
 
 def _neighbours(path: Path, case: Case) -> tuple[str, ...]:
     stars, notes = read_neighbours(path, case.get("of") or None)
+    if case.get("lit") and all(star.spectral_type for star in stars):
+        assert all(star.source for star in stars)
     for key, wanted in case["stars"].items():
         how = {"type": lambda star: star.spectrum[0], "last": lambda star: star.name[-1]}
         found = [how.get(key, attrgetter(key))(star) for star in stars]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache
@@ -48,7 +49,7 @@ class Neighbour:
     name: str
     separation_arcsec: float  # from the target
     magnitude: float | None = None  # in `band`; None if unknown
-    band: str = "V"
+    band: str = "V"  # as the table names it if its passband is unknown
     spectral_type: str = ""  # empty if unknown; the nearest spectrum of the library is used
     file: Path | None = None  # spectrum file, in place of a type
     temperature_k: float | None = None  # effective temperature, which chooses the spectrum if the type is unknown
@@ -95,7 +96,10 @@ class Neighbour:
             )
         star = Source.from_library(name) if self.file is None else Source.read(self.file)
         if self.magnitude is not None:
-            star = star.at_magnitude(self.magnitude, self.band)
+            try:
+                star = star.at_magnitude(self.magnitude, known_band(self.band))
+            except InputError as error:
+                raise error.within(f"neighbour {self.name}, {self.separation_arcsec:.3g} arcsec away") from error
         if star.unscaled:
             raise InputError(
                 f"the spectrum of neighbour {self.name} is not as bright as the star is seen: {star.unscaled}",
@@ -218,7 +222,8 @@ SEPARATIONS = (
     "_r",
 )
 #: Columns of magnitudes, with their bands; the first that a row has counts. Gmag is Gaia's in VizieR.
-MAGNITUDES = {"magnitude": "", "mag": "", "v": "V", "vmag": "V", "phot_g_mean_mag": "Gaia G", "gmag": "Gaia G"}
+MAGNITUDES = {"magnitude": "", "mag": "", "v": "V", "vmag": "V", "flux_v": "V", "phot_g_mean_mag": "Gaia G",
+              "gmag": "Gaia G"}  # fmt: skip
 TYPES = (*SPECTRAL_TYPES, "type")
 FILES = ("file", "spectrum", "spectrum_file")
 TEMPERATURES = ("teff_gspphot", "teff", "teff_val", "temperature", "temperature_k")
@@ -295,7 +300,11 @@ class _Neighbours(Rows):
         for name, band in self.magnitudes:
             value = self.number(name, row, "mag")
             if value is not None:
-                return value, band or known_band(band_in_name(name) or self.text(self.band, row) or "V")
+                stated = band or band_in_name(name) or self.text(self.band, row) or "V"
+                # Only stars within the fibre need a band with a passband.
+                with contextlib.suppress(InputError):
+                    return value, known_band(stated)
+                return value, stated
         return None, "V"
 
     def separations(self, own: int | None, target: str | None) -> tuple[Float, tuple[str, ...]]:

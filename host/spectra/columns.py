@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
 
-from mauvecl.host.tables.units import SCALE, FluxKind, balanced, flux_kind, is_spectral, is_stated, unit_of
+from mauvecl.host.tables.units import NO_FLUX, SCALE, FluxKind, balanced, flux_kind, is_spectral, is_stated, unit_of
 from mauvecl.schema.errors import InputError, shortened
 
 Kind = Literal[
@@ -124,10 +124,10 @@ def role_of(name: str, unit: str | None = None, ucd: str = "") -> Role:
     if kind == "unknown" and not words:
         # A name that is only a unit, as in a line "nm, flam".
         kind, score = ("wavelength", 3) if spectral else ("flux", 3) if flux != "other" else (kind, 0)
-    if kind == "unknown" and is_stated(unit) and flux == "density":
+    if kind == "unknown" and stated is not None and flux == "density":
         kind, score = "flux", 1
     # A unit of another kind contradicts the name; an unknown unit raises InputError at conversion.
-    if is_known and kind in ("flux", "model"):
+    if kind in ("flux", "model") and (is_known or (stated is not None and NO_FLUX.search(stated))):
         score += 1 if flux in ("density", "total") else -6
     if is_known and kind == "wavelength":
         score += 1 if spectral else -6
@@ -143,6 +143,9 @@ def role_of(name: str, unit: str | None = None, ucd: str = "") -> Role:
 
 def _kind_of(words: Sequence[str]) -> tuple[Kind, int]:
     """Return the kind of column that the words of a name indicate, and their score."""
+    if words == ("spectral",):
+        # The axis of SSAP.
+        return "wavelength", 1
     has = {_WORDS.get(word, "label") for word in words if _WORDS.get(word) != "logarithm"}
     if len(words) == 1 and len(words[0]) == 1:
         # An "e" may be an energy, a "d" a distance.
@@ -212,20 +215,28 @@ def divided(name: str) -> tuple[str, str | None]:
         inner = match[1].strip()
         if is_unit(inner) or re.search(r"\d|\^|/", inner) or _NO_DENSITY.search(inner):
             base, unit = name[: match.start()], inner
+    elif found := _after_underscore(name.split("_")):
+        base, unit = found
     elif (match := re.search(r"\s?/\s*(\S+)$|\sin\s+(\S+)$", name)) and is_unit(match[1] or match[2]):
         base, unit = name[: match.start()], match[1] or match[2]
     elif (match := SCALE.search(name)) and match.start() > 0:
         # A factor without a unit, as in "flux/10^-15", is not a unit.
         base, unit = re.sub(r"\s*[/*]\s*$|\s+x\s*$", "", name[: match.start()]), name[match.start() :]
-    else:
-        parts = name.split("_")
-        for k in range(1, len(parts)):
-            tail = parts[k:]
-            spelt = "/".join(tail) if len(tail) > 1 and not re.search(r"[/\-−]", "".join(tail)) else " ".join(tail)
-            if _fits(parts[:k], spelt):
-                base, unit = "_".join(parts[:k]), spelt
-                break
     return base, unit if unit is None else balanced(unit)
+
+
+def _after_underscore(parts: Sequence[str]) -> tuple[str, str] | None:
+    """Divide a name at an underscore before its unit, as in ``flux_W_m2_nm`` and ``f_1e-15_erg_s-1_cm-2_A-1``."""
+    for k in range(1, len(parts)):
+        base, tail = "_".join(parts[:k]), parts[k:]
+        for spelt in ("/".join(tail), " ".join(tail)):
+            if _NO_DENSITY.fullmatch(spelt):
+                return base, spelt
+            if _fits(parts[:k], spelt):
+                # A factor between the name and the unit.
+                match = SCALE.search(base)
+                return (base, spelt) if match is None else (base[: match.start()], f"{base[match.start() :]} {spelt}")
+    return None
 
 
 def _fits(base: Sequence[str], unit: str) -> bool:

@@ -112,6 +112,8 @@ def spectrum_in(tables: Sequence[SpectrumTable], asked: Sequence[str]) -> RawSpe
     if len(found) > 1 and not named:
         # SDSS: the sum of all exposures, next to each of them.
         found = [one for one in found if one.table.label.strip().lower() == "coadd"] or found
+        # A legend beside the spectrum has no column of fluxes.
+        found = [one for one in found if one.flux_role.kind == "flux"] or found
     if len(found) > 1 and found[0].table.group is not None and len({one.table.group for one in found}) == 1:
         parts = listed([one.table.label for one in found])
         segments = [segment for one in found for segment in one.segments]

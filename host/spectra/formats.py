@@ -32,11 +32,12 @@ from mauvecl.host.tables.fits_tables import (
     paired_images,
     reading,
     rows_of,
+    spextool_spectra,
     text_at,
     unit_at,
 )
 from mauvecl.host.tables.table import Values
-from mauvecl.host.tables.text_tables import PROSE, NumberLines, bracketed, divided_names, keywords_of
+from mauvecl.host.tables.text_tables import PROSE, NumberLines, bracketed, divided_names, keywords_of, numbered_names
 from mauvecl.host.tables.units import is_stated, time_in_name
 from mauvecl.schema.errors import InputError, shortened
 
@@ -51,8 +52,6 @@ if TYPE_CHECKING:
 TEXT_UNITS = ("nm", "erg / (s cm2 Angstrom)")
 #: Gaia DR3's sampled mean spectra: 343 fluxes at 336 + 2 i nm (documentation of gaiadr3.xp_sampled_mean_spectrum).
 GAIA_NM, GAIA_FLUX = 336.0 + 2.0 * np.arange(343), "W m-2 nm-1"
-
-_NUMBERED = re.compile(r"(?:col(?:umn)?s?\.?\s*)?[(\[]?(\d{1,3})[)\]]?\s*[:=.)\-]?\s+(.+)", re.IGNORECASE)
 
 
 def table_of_text(
@@ -192,11 +191,8 @@ def _units(lines: NumberLines, names_at: int) -> list[str]:
 
 def _numbered(lines: NumberLines) -> list[str]:
     """Return names from lines such as "column 2: flux"; columns without such a line are named by number."""
-    found: dict[int, str] = {}
-    for line, _ in lines.header:
-        if (match := _NUMBERED.fullmatch(line.strip())) and 1 <= int(match[1]) <= lines.n:
-            found.setdefault(int(match[1]), re.split(r"[,;:]|\s-\s", match[2])[0].strip()[:60])
-    names = [found.get(k + 1, str(k + 1)) for k in range(lines.n)]
+    found = numbered_names((line for line, _ in lines.header), lines.n)
+    names = [found.get(k, str(k + 1)) for k in range(lines.n)]
     return names if len(found) > 1 and _recognised(names) else []
 
 
@@ -273,10 +269,14 @@ class _Reader:
         named = labels & {word.lower() for word in self.asked}
         if any("flux" in kind and kind & {"wavelength", "lower edge"} for kind in kinds) and not named:
             return tables
-        if errors and not tables and not images:
+        is_bare = not any(kind & {"flux", "model", "magnitude"} for kind in kinds)
+        if errors and not images and (not tables or (is_bare and not self.asked)):
             raise errors[0]
         if not tables and not images:
             raise InputError("has no table and no image", "a FITS table with WAVELENGTH and FLUX", key="table")
+        if images and not self.asked and is_bare:
+            # A table of wavelengths, of lines or of a log is no spectrum.
+            return images
         return [*tables, *images]
 
     def _label(self, number: int, hdu: Any) -> str:
@@ -346,17 +346,39 @@ class _Reader:
         flux = [one for one in images if one.label.strip().lower() in ("flux", "sci", "spectrum")]
         return (flux if flux and not self.asked else images), errors
 
+    def _axis_beside(self, n: int) -> Values | None:
+        """Return the only column of wavelengths in a table that has one for each of `n` pixels, or None."""
+        held = [
+            self.file.column(number, str(title))
+            for number in self.file.tables
+            for title in self.hdus[number].columns.names
+            if role_of(str(title)).kind == "wavelength"
+        ]
+        axes = [one for one in held if one is not None and np.prod(one.shape) == n]
+        return Values.of(axes[0].name, axes[0].numbers().ravel(), axes[0].unit) if len(axes) == 1 else None
+
     def _of_image(self, number: int, hdu: Any) -> SpectrumTable:
         header = hdu.header
+        if (found := spextool_spectra(header, hdu.data)) is not None:
+            wave, light, orders = found
+            columns = [Values.of("wavelength", wave if len(wave) > 1 else wave[0], text_at(header, "XUNITS")),
+                       Values.of("flux", light if len(light) > 1 else light[0], text_at(header, "YUNITS"))]  # fmt: skip
+            if int(header["NAPS"]) == 1:
+                columns.append(Values.of("order", np.array(orders)))
+            return self._table(header, columns, self._label(number, hdu), row_names=orders)
         flux, names, note = rows_of(hdu, text_at(self.primary, "TELESCOP"), bool(self.asked))
         system = text_at(header, "CTYPE1").upper()
         if system.endswith("-TAB") or system.startswith("MULTISPE"):
             axis = self.file.tabulated(header) if "-" in system else multispec_axis(header, flux.shape[-1])
             columns = [axis, Values.of("flux", flux, text_at(header, "BUNIT"))]
             return self._table(header, columns, self._label(number, hdu), notes=note, row_names=names)
-        axis, unit, kind, notes = axis_of(header, self.primary, flux.shape[-1])
         # SDSS-I/II writes erg/cm/s/Ang for erg/cm2/s/Ang.
         flux_unit = re.sub(r"erg/cm/s/", "erg/cm2/s/", unit_at(FLUX_UNITS, header, self.primary))
+        is_bare = not {"CRVAL1", "COEFF0"} & {*header, *self.primary}
+        if is_bare and (beside := self._axis_beside(flux.shape[-1])) is not None:
+            columns = [beside, Values.of("flux", flux, flux_unit)]
+            return self._table(header, columns, self._label(number, hdu), notes=note, row_names=names)
+        axis, unit, kind, notes = axis_of(header, self.primary, flux.shape[-1])
         columns = [Values.of("wavelength", axis, unit), Values.of("flux", flux, flux_unit)]
         remarks = "\nair wavelength" if kind == "AWAV" else "\nvacuum" if kind == "WAVE" else ""
         return self._table(

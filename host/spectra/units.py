@@ -28,7 +28,7 @@ _ATOM = (
     rf"(?:[Ee][Rr][Gg][Ss]?|m?W|[Ww]atts?|J|s|S|[Ss]ec(?:onds?)?|SEC|[cC]?[mM]|A|(?<=/)a|{_PER}|{_LENGTH})"
     rf"(?![A-Za-z]){_EXPONENT}"
 )
-_SCALE = rf"(?:10{_B}(?:\^|\*\*){_B}\(?[-+−]?\d+\)?|10[⁻⁺]?[⁰¹²³⁴⁵⁶⁷⁸⁹]+|\d(?:\.\d*)?[eE][-+]?\d+)"
+_SCALE = rf"(?:10{_B}(?:\^|\*\*){_B}\(?[-+−]?\d+\)?|10[⁻⁺]?[⁰¹²³⁴⁵⁶⁷⁸⁹]+|\d+(?:\.\d*)?[eEdD][-+]?\d+)"
 _FLUX = re.compile(
     rf"(?:{_SCALE}{_B}[*x×.]?{_B})?"
     rf"(?<![A-Za-z])(?:[Ee][Rr][Gg][Ss]?|m?W|[Ww]atts?|[Pp]hotons?|ph)(?![A-Za-z]){_EXPONENT}"

@@ -323,6 +323,28 @@ def paired_images(hdus: Any) -> list[tuple[str, Any, Any]]:
     return pairs
 
 
+def spextool_spectra(header: Any, data: Any) -> tuple[Any, Any, list[str]] | None:
+    """Return wavelengths and fluxes of Spextool's images, one row for each order and aperture, and names of these.
+
+    Rows are wavelength, flux, error and, since 2014, flags (Cushing et al. 2004, PASP 116, 362; `mc_mkspexhdr.pro`).
+    Returns None for other images.
+    """
+    if not {"NAPS", "NORDERS", "XUNITS", "YUNITS"} <= {*header} or np.ndim(data) < 2 or data.shape[-2] not in (3, 4):
+        return None
+    cube = np.asarray(data).reshape(-1, *data.shape[-2:])
+    orders = [word.strip() for word in text_at(header, "ORDERS").split(",")]
+    n_orders, n_apertures = int(header["NORDERS"]), int(header["NAPS"])
+    if n_orders * n_apertures == len(cube) and len(orders) != n_orders:
+        # Merged orders are one, whatever their list says.
+        orders = [str(k + 1) for k in range(n_orders)]
+    if len(orders) * n_apertures != len(cube):
+        fault = f"has {len(cube)} spectra of {len(orders)} orders and {n_apertures} apertures (NAPS)"
+        raise InputError(fault, "one for each order and aperture", key="NAPS")
+    if n_apertures > 1:
+        orders = [f"{order} aperture {k + 1}" for order in orders for k in range(n_apertures)]
+    return cube[:, 0], cube[:, 1], orders
+
+
 def is_survey_image(hdu: Any, telescope: str) -> bool:
     """Return whether an image holds one spectrum with its errors and masks, as files of LAMOST and SDSS-I/II do.
 

@@ -30,35 +30,46 @@ def is_missing_position(text: str) -> bool:
 STARS = ("name", "designation", "source_id", "source", "main_id", "id", "dr3name", "target", "target_name", "targname",
          "object", "star", "tic", "tic_id", "kic", "kepid", "epic", "hip", "star_name", "object_name", "identifier",
          "star_id", "epic_number", "sourceid", "kelt_sourceid", "tid")  # fmt: skip
-#: What follows names of coordinates in catalogues: their system, form or epoch. Pairs with the first ending count.
-_ENDS = ("", "_deg", "_icrs", ".icrs", "j2000", "_j2000", "_hours", "_hour", "_h", "_rad", "deg", "j2000_deg", "icrs",
-         "_icrs_deg", "_d", "_degrees", "2000", "_2000", "_fk5", "_epoch2000", "_hms", "_dms", "_obj", "_j2016_deg",
-         "_j2016", "_j2015.5")  # fmt: skip
-RIGHT_ASCENSIONS = tuple(
-    f"{name}{end}"
-    for end in _ENDS
-    for name in ("_ra", "ra", "s_ra", "r.a.", "ra.", "right_ascension", "rightascension", "alpha", "gaia_ra", "tic_ra",
-                 "kic_degree_ra")
-)  # fmt: skip
-DECLINATIONS = tuple(
-    f"{name}{end}"
-    for end in _ENDS
-    for name in ("_dec", "_de", "dec", "de", "s_dec", "decl", "decl.", "dec.", "declination", "delta", "gaia_dec",
-                 "tic_dec", "kic_dec")
-)  # fmt: skip
+#: Right ascensions and declinations, by precedence: plain ones and those of ObsCore; of Gaia, TIC and KIC; of VizieR,
+#: CDS, Hipparcos, 2MASS and SExtractor; with a unit; of SIMBAD, of headers of Kepler and TESS, and of other epochs.
+_COORDINATES = """
+    ra dec, _ra _de, ra de, ra decl, s_ra s_dec, r.a. decl., ra. dec., right_ascension declination, alpha delta,
+    rightascension decl, gaia_ra gaia_dec, tic_ra tic_dec, kic_degree_ra kic_dec,
+    ra_deg dec_deg, radeg dedeg, ra_icrs de_icrs, ra_icrs dec_icrs, raicrs deicrs, _ra.icrs _de.icrs,
+    _ra_icrs _de_icrs, raj2000 dej2000, raj2000 decj2000, _raj2000 _dej2000, ra_j2000 de_j2000, ra_j2000 dec_j2000,
+    alpha_j2000 delta_j2000, ra_hours dec_degrees, ra_hour dec_deg, ra_h dec_d, ra_rad dec_rad, ra_degrees dec_degrees,
+    ra_d dec_d, ra_hms dec_dms, ra_obj dec_obj, ra2000 dec2000, ra2000 de2000, ra_2000 dec_2000,
+    ra_epoch2000 dec_epoch2000, ra_fk5 dec_fk5, ra_j2016_deg de_j2016_deg, ra_j2016 dec_j2016
+"""
+_PAIRS = [pair.split() for pair in _COORDINATES.split(",")]
+RIGHT_ASCENSIONS = tuple(dict.fromkeys(ra for ra, _ in _PAIRS))
+DECLINATIONS = tuple(dict.fromkeys(dec for _, dec in _PAIRS))
 #: Sexagesimal right ascensions in tables that have them in numbers as well.
 SEXAGESIMAL = ("ra_string", "rastr", "ra_str", "ra_hms", "ra_sexa")
 SPECTRAL_TYPES = ("spectral_type", "sptype", "sp_type", "spt", "spectype", "st_spectype", "spec._type", "sp._type",
                   "sp.type")  # fmt: skip
 _UNIT = re.compile(r"(?s)(.*\S)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))\s*")
+#: Units of light after an underscore, as in ``flux_jy`` and ``flux_e_s``, and words for them.
+_LIGHT = re.compile(
+    r"(.*[a-z\d])_((?:e-?|electrons?|cts?|counts?|adu|dn)(?:_per_|_|/)s(?:ec(?:ond)?)?"
+    r"|[mun]?jy|adu|counts|electrons|pp[mtb]|percent)", re.IGNORECASE,
+)  # fmt: skip
+_LIGHT_WORDS = {"e": "electron", "e-": "electron", "electrons": "electron", "counts": "ct", "count": "ct", "cts": "ct",
+                "sec": "s", "second": "s", "jy": "Jy", "ujy": "uJy", "njy": "nJy", "mjy": "mJy"}  # fmt: skip
 #: Columns of magnitudes: ``mag``, ``Vmag``, ``mag_err``, ``INST_MAG1``, ``delta magnitude``.
 _MAGNITUDE = re.compile(r"(?:^|[^a-z])[a-z]{0,5}(?:mag|mags|magnitude|magnitudes)(?:$|[^a-z])")
 
 
 def divided_unit(name: str) -> tuple[str, str]:
-    """Divide ``flux (ct/s)`` or ``time [d]`` into name and unit, which is empty if there is none."""
-    match = _UNIT.fullmatch(name.strip())
-    return (name.strip(), "") if match is None else (match[1], (match[2] or match[3] or "").strip())
+    """Divide ``flux (ct/s)``, ``time [d]`` or ``flux_jy`` into name and unit, which is empty if there is none."""
+    name = name.strip()
+    if match := _UNIT.fullmatch(name):
+        return match[1], (match[2] or match[3] or "").strip()
+    # MJY may be a million or a thousandth.
+    if (match := _LIGHT.fullmatch(name)) and match[2] not in ("MJy", "MJY"):
+        words = [word for word in re.split(r"_per_|_|/", match[2].lower()) if word]
+        return match[1], "/".join(_LIGHT_WORDS.get(word, word) for word in words)
+    return name, ""
 
 
 #: Columns of the band of the magnitudes in a column that names none.

@@ -513,9 +513,8 @@ class Rows:
         if not stated or stated == unit or not unit:
             return 1.0
         try:
-            days = time_unit(stated)
-            spelt = days.unit if days else _SPELT.get(stated.lower(), stated)
-            return float(u.Unit((unit in ANGLES.values() and angle_unit(stated)) or spelt).to(unit))
+            angle = unit in ANGLES.values() and angle_unit(stated)
+            return float((u.Unit(angle) if angle else unit_in(stated)).to(unit))
         except (ValueError, TypeError, u.UnitsError) as error:
             like = re.search(r"\d|[/^%]|mag", stated, re.IGNORECASE) or is_known(stated)
             if getattr(self.table[name], "unit", None) is None and not like:

@@ -37,6 +37,8 @@ _THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(?:,\d{3})+")
 _RULE = re.compile(r"[\s,;|]*|\s*(?:={3,}(?:\s+|$))*|\s*(?=[-=:|]*\+)[-=+:|]+\s*|\"?sep=.\"?", re.IGNORECASE)
 #: Dates and times of day in cells of their own.
 _DAY, _CLOCK = re.compile(r"\d{4}-\d\d-\d\d"), re.compile(r"\d\d:\d\d(?::\d\d(?:\.\d*)?)?")
+#: Comments on times that are those of the start of frames.
+_AT_START = re.compile(r"\b(?:dates?|times?|H?JD)\b[^.]*\bat (?:the )?start of (?:the )?exposure", re.IGNORECASE)
 #: Types of the columns of an RDB table, below their names.
 _RDB = re.compile(r"\d*[NSM]")
 _QUOTED = re.compile(r'"[^"]*"')
@@ -280,13 +282,17 @@ class TextRows:
     def __init__(self, text: str, what: str, commas: bool, like: Layout | None = None, first: int = 0) -> None:
         self.what, self.first = what, first
         lines = [line for line in text.splitlines() if not _RULE.fullmatch(line)]
+        n_marked = next((k for k, line in enumerate(lines) if not re.match(r"c(?:\s+[a-z]|\s*$)", line, re.I)), 0)
+        if n_marked > 1:
+            # Fortran's mark of comments, in the header of BRITE's light curves. Rows have numbers after a letter.
+            lines[:n_marked] = [f"#{line[1:]}" for line in lines[:n_marked]]
         check_cells([line for line in lines if line[0] != "#"], what)
         mark = _mark([line for line in lines if line.lstrip()[0] != "#"], commas) if like is None else like.mark
-        # SIMBAD calls its first column #.
+        # SIMBAD calls its first column #, as wide as its number of stars.
         is_comment = [
             _COMMENT.match(line) is not None
             and line.lstrip()[0] != mark
-            and not (mark == "|" and line.startswith("#|"))
+            and not (mark == "|" and re.match(r"#\s*\|", line))
             for line in lines
         ]
         data = [line for line, comment in zip(lines, is_comment, strict=True) if not comment]
@@ -309,6 +315,8 @@ class TextRows:
         held = zip(*self.cells, strict=True) if self.cells else ((),) * len(names)
         table = Table({name: np.array(one, str) for name, one in zip(names, held, strict=True)})
         table.meta |= {"comments": self.comments} | keywords_of(self.comments)
+        if any(map(_AT_START.search, self.comments)):
+            table.meta.setdefault("TIMEPIXR", 0.0)
         if self.layout.decimal:
             table.meta[REMARKS] = (DECIMAL_COMMAS,)
         for name, unit in zip(names, units, strict=False):
@@ -378,6 +386,9 @@ class TextRows:
         """Return the names in the last line above the rows, and the units in it or below it; empty without names."""
         if n < 2:
             return [], []
+        numbered = numbered_names((line for line in above if line.lower().startswith("col")), n)
+        if len(numbered) > 1:
+            return [numbered.get(k, f"col{k + 1}") for k in range(n)], []
         found = [
             cells for line in above[-2:] if (cells := divided_names(line, n, mark)) and not keywords_of([f"#{line}"])
         ]
@@ -553,6 +564,21 @@ def _is_unit(text: str) -> bool:
 
     plain = in_brackets(text)
     return is_stated(text) and (time_unit(plain) is not None or angle_unit(plain) is not None or is_known(text))
+
+
+#: A line on one column: ``column 2: flux``, ``(3) error``, ``column1 = HJD / Heliocentric Julian Date``.
+_NUMBERED = re.compile(r"(?:col(?:umn)?s?\.?\s*)?[(\[]?(\d{1,3})[)\]]?\s*[:=.)\-]?\s+(.+)", re.IGNORECASE)
+
+
+def numbered_names(lines: Iterable[str], n: int) -> dict[int, str]:
+    """Return the names that lines such as "column 2: flux" give to some of `n` columns, by place."""
+    found: dict[int, str] = {}
+    for line in lines:
+        if (match := _NUMBERED.fullmatch(line.strip())) and 1 <= int(match[1]) <= n:
+            unit = re.search(r"\s/\s.*(\[[^\[\]]+\])$", match[2])
+            name = re.split(r"[,;:]|\s-\s|\s/\s", match[2])[0].strip()[:60]
+            found.setdefault(int(match[1]) - 1, f"{name} {unit[1]}" if unit else name)
+    return found
 
 
 def keywords_of(lines: Sequence[str]) -> dict[str, str]:

@@ -31,6 +31,11 @@ _DENSITIES = {
     "photlam": "photon / (s cm2 Angstrom)",
     "photnu": "photon / (s cm2 Hz)",
     "jy": "Jy",
+    "mjy": "mJy",
+    "ujy": "uJy",
+    "njy": "nJy",
+    # As in Spextool's documentation.
+    "wm-2um-1": "W / (m2 um)",
     "jansky": "Jy",
     "janskys": "Jy",
 }
@@ -50,14 +55,18 @@ _TYPOGRAPHY = str.maketrans("µμ−–⁻⁺⁰¹²³⁴⁵⁶⁷⁸⁹·⋅×�
 #: Marks of LaTeX that say nothing of a unit.
 _LATEX = re.compile(r"\$|\\(?:mathrm|rm|text|,|;|:|!|(?=AA))")
 SCALE = re.compile(
-    r"(?:x\s*|\*\s*)?(?:10\s*(?:\^|\*\*)\s*\(?\s*([+-]?\d{1,3})\s*\)?|10([+-]\d{1,3})(?!\d)|(\d(?:\.\d*)?[eE][+-]?\d{1,3}))"
+    r"(?:x\s*|\*\s*)?(?:10\s*(?:\^|\*\*)\s*\(?\s*([+-]?\d{1,3})\s*\)?|10([+-]\d{1,3})(?!\d)|(\d+(?:\.\d*)?[eEdD][+-]?\d{1,3}))"
 )
+#: Wavenumbers in the denominator: W m-2 / cm-1, erg / (s cm2 cm-1), mW m-2 (cm-1)-1, W cm / m2.
+_PER_WAVENUMBER = re.compile(r"/.*\bcm\s*(?:\^|\*\*)?\s*[({]?-1|\(cm\^?-1\)|\bc?m\^?-?2\s+cm$|\bcm\s*/\s*m\^?2$")
+#: Factors of which the first is 1e-16 to those who write it for 10^-16; the second may multiply or divide the numbers.
+_AMBIGUOUS = re.compile(r"(10(?:\.0*)?)[eEdD]([+-]?\d+)|(?<=.)[*x]\s*10\s*(?:\^|\*\*)\s*\+?(\d+)")
 # Magnitudes with a defined zero point; nanomaggies are linear, 22.5 mag (AB) each (SDSS DR18, "magnitudes").
 _AB = re.compile(r"(?:m(?:ag)?s?[_ (]*)?ab[) ]*(?:[_ ]?mag(?:nitude)?s?)?", re.IGNORECASE)
 _ST = re.compile(r"(?:m(?:ag)?s?[_ (]*)?st[) ]*(?:[_ ]?mag(?:nitude)?s?)?", re.IGNORECASE)
 _NANOMAGGIES = re.compile(r"n(?:ano)?m(?:ag)?g(?:y|ies|ys)", re.IGNORECASE)
 _LOGARITHM = re.compile(r"(?:log(?:_?10)?|dex)(?:\s*[\s_(\[]\s*(.*?)\s*\]?)?", re.IGNORECASE)
-_NO_FLUX = re.compile(r"mag|^(counts?|cts|adu|dn|fn|electrons?)\b", re.IGNORECASE)
+NO_FLUX = re.compile(r"mag|^(counts?|cts?|adu|dn|fn|electrons?)\b|^e-", re.IGNORECASE)
 # "na" is a nanoyear.
 _NO_UNIT = {*MISSING_WORDS} - {"na"}
 
@@ -88,7 +97,7 @@ def unit_of(text: str) -> u.UnitBase | u.function.FunctionUnitBase:
     expected = "a unit such as Angstrom, nm or erg / (s cm2 Angstrom)"
     if match := _LOGARITHM.fullmatch(name):
         return u.dex(_linear_unit(balanced(match[1]), text, expected)) if match[1] else u.dex
-    if _NO_FLUX.search(name):
+    if NO_FLUX.search(name):
         raise InputError.of("unit", text.strip(), f"a flux density, not a magnitude or count: {expected}")
     return _linear_unit(name, text, expected)
 
@@ -100,15 +109,24 @@ def _linear_unit(name: str, text: str, expected: str) -> u.UnitBase:
     # astropy takes a comma for a structure of two units.
     if not name or len(name) > MAX_UNIT_LENGTH or "," in name:
         raise unknown
+    if match := _AMBIGUOUS.search(name):
+        power = int(match[2] or match[3])
+        other = f"1e{power + 1}" if match[2] else f"1e{-power}"
+        fault = f"unit = {shortened(text.strip())}: its factor may be 1e{power} or {other}"
+        usual = f"a unit such as '1e{-abs(power)} erg / (s cm2 Angstrom)': `flux_unit` names it"
+        raise InputError(fault, usual, key="unit")
     scale = 1.0
     if match := SCALE.match(name):
-        scale = float(match[3] or f"1e{match[1] or match[2]}")
+        scale = float((match[3] or f"1e{match[1] or match[2]}").lower().replace("d", "e"))
         name = re.sub(r"^\s*[*.x]?\s*", "", name[match.end() :])
-    elif match := re.search(rf"\s*[*x]\s*({SCALE.pattern})\)?$", name):
+    elif match := re.search(rf"\s*[(\[]?\s*[*x]\s*({SCALE.pattern})[)\]]?$", name):
         scale = float(match[4] or f"1e{match[2] or match[3]}")
         name = name[: match.start()]
-    name = balanced(name)
-    name = _DENSITIES.get(name.lower(), name)
+    name = balanced(name.rstrip(". "))
+    if name not in ("MJy", "MJY"):
+        name = _DENSITIES.get(name.lower(), name)
+    per_wavenumber = _PER_WAVENUMBER.search(name) is not None
+    name = re.sub(r"\(\s*cm\^?-1\s*\)\s*(?:\^|\*\*)?\(?-1\)?", "cm", name)
     name = re.sub(r"\bper\b", "/", name, flags=re.IGNORECASE)
     # Exponents in brackets: s**(-1), cm^{-2}.
     name = re.sub(r"(?:\^|\*\*)\s*[({]\s*([+-]?\d+)\s*[)}]", r"**\1", name)
@@ -122,9 +140,13 @@ def _linear_unit(name: str, text: str, expected: str) -> u.UnitBase:
             with warnings.catch_warnings():
                 # Several slashes are discouraged but common.
                 warnings.simplefilter("ignore")
-                return u.CompositeUnit(scale, [u.Unit(spelling)], [1]) if scale != 1.0 else u.Unit(spelling)
+                found = u.CompositeUnit(scale, [u.Unit(spelling)], [1]) if scale != 1.0 else u.Unit(spelling)
         except (ValueError, TypeError, OverflowError, RecursionError):
             continue
+        if per_wavenumber and any(found.is_equivalent(one) for one in (u.W / u.m, u.photon / u.s / u.m)):
+            # Per frequency, which is the wavenumber times the speed of light; astropy reduces cm-2 / cm-1 to cm-1.
+            return found / u.CompositeUnit(299_792_458.0, [u.m, u.s], [1, -1])
+        return found
     raise unknown
 
 
@@ -180,9 +202,10 @@ EPOCHS_MJD = {
     "gps": 44_244.0,
     "unix": 40_587.0,
 }
-#: Days of Julian dates by other names: heliocentric and barycentric. TJD is that of NASA (JD - 2440000.5) or of TESS.
+#: Days of Julian dates by other names: heliocentric, barycentric, and those of CoRoT (N2 data description).
+#: TJD is that of NASA (JD - 2440000.5) or of TESS.
 _DAYS = EPOCHS_MJD | {"hjd": -2_400_000.5, "gjd": -2_400_000.5, "bmjd": 0.0, "mbjd": 0.0, "hmjd": 0.0, "mhjd": 0.0,
-                      "tbjd": 56_999.5, "kbjd": 54_832.5}  # fmt: skip
+                      "tbjd": 56_999.5, "kbjd": 54_832.5, "corot julian day": 51_544.5}  # fmt: skip
 #: Scale and position of the missions' own dates.
 _MISSION_DAYS = ("btjd", "tbjd", "bkjd", "kbjd")
 #: Units of time in words, by the names of astropy.
@@ -218,8 +241,9 @@ SCALES = {"utc": "utc", "ut": "utc", "gmt": "utc", "tai": "tai", "iat": "tai", "
 #: Values of TREFPOS (standard 4.0, table 31) and of the older TIMEREF that mean the same place.
 POSITIONS = {"SOLARSYSTEM": "BARYCENTER", "SSBARYCENTER": "BARYCENTER", "BARYCENTRE": "BARYCENTER",
              "GEOCENTRIC": "GEOCENTER", "HELIOCENTRIC": "HELIOCENTER", "LOCAL": "TOPOCENTER"}  # fmt: skip
-#: Keywords of the reference time, and the modified Julian date of their zero.
-REFERENCES = {"MJDREF": 0.0, "BJDREF": -2_400_000.5, "JDREF": -2_400_000.5, "HJDREF": -2_400_000.5}
+#: Keywords of the reference time, and the modified Julian date of their zero; JD_REF is that of SuperWASP.
+REFERENCES = {"MJDREF": 0.0, "BJDREF": -2_400_000.5, "JDREF": -2_400_000.5, "HJDREF": -2_400_000.5,
+              "JD_REF": -2_400_000.5}  # fmt: skip
 #: Keywords of a time that is added to all others, in TIMEUNIT: of the standard, and of OGIP (memo 93-003).
 OFFSETS = ("TIMEOFFS", "TIMEZERO")
 
@@ -262,7 +286,8 @@ def time_in_name(name: str) -> TimeUnit | None:
     if (found := time_unit(name) if is_long else None) or (found := time_unit(unit) if unit else None):
         return found
     held = re.split(r"[\s_.]+", base.strip().lower())
-    words = [word for word in held if word not in (*_TIME_OF, *_PLACES)]
+    # The scale follows the dates: time_utc_mjd.
+    words = sorted((word for word in held if word not in (*_TIME_OF, *_PLACES)), key=SCALES.__contains__)
     found = time_unit(" ".join(words)) if words and len(words) < len(held) else None
     place = next((_PLACES[word] for word in held if word in _PLACES), "")
     return replace(found, position=place) if found is not None and place else found

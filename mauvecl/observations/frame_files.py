@@ -56,56 +56,6 @@ def _keys(values: Values) -> NDArray[Any]:
     return np.asarray(values.numbers() if texts is None or not any(map(is_dated, texts)) else texts)
 
 
-def spectra_of_rows(
-    time: tuple[Values, ...],
-    flux: Values,
-    error: Values | None,
-    quality: Values | None,
-    exposure: Values | None,
-    temperature: Values | None,
-    wavelength: Values,
-    what: str,
-) -> tuple[tuple[Values, ...], Values, Values | None, Values | None, Values | None, Values | None, Values]:
-    """Return the quantities of a long table with a row for each frame; errors and quality flags for each pixel.
-
-    Raises InputError if a frame lacks a wavelength that another has, has one twice, or has two exposure times or
-    temperatures.
-    """
-    key = _keys(time[0])
-    nm = wavelength.numbers()
-    frames, frame = np.unique(key, return_inverse=True)
-    pixels, pixel = np.unique(nm, return_inverse=True)
-    counts = np.zeros((frames.size, pixels.size), np.int64)
-    np.add.at(counts, (frame, pixel), 1)
-    if (counts != 1).any():
-        row, column = np.argwhere(counts != 1)[0]
-        raise InputError(
-            f"{what}: the frame at {frames[row]} has {counts[row, column]} rows of wavelength {pixels[column]:g}",
-            "one row for each pixel of each frame", key="wavelength"
-        )  # fmt: skip
-    place = np.empty(counts.shape, np.int64)
-    place[frame, pixel] = np.arange(key.size)
-
-    def spectra(values: Values | None) -> Values | None:
-        return None if values is None else Values.of(values.name, values.numbers()[place], values.unit, what)
-
-    def single(values: Values | None) -> Values | None:
-        if values is None:
-            return None
-        rows = _keys(values)[place]
-        if (rows != rows[:, :1]).any():
-            fault = f"{what}: {values.name!r} changes within a frame"
-            raise InputError(fault, "one value for each frame", key=values.name)
-        return Values.of(values.name, rows[:, 0], values.unit, what)
-
-    light = spectra(flux)
-    assert light is not None
-    return (
-        tuple(one for values in time if (one := single(values)) is not None), light, spectra(error), spectra(quality),
-        single(exposure), single(temperature), Values.of(wavelength.name, pixels, wavelength.unit, what),
-    )  # fmt: skip
-
-
 Float = NDArray[np.float64]
 
 FORMATS = "FITS, HDF5, ECSV, CSV, a Zarr store or a folder of spectra"
@@ -115,7 +65,8 @@ KNOWN = {
     "time": ("time",),
     "flux": ("flux", "pdcsap_flux", "sap_flux", "kspsap_flux", "det_flux", "corr_flux", "corrected_flux", "fcor",
              "flux_corr", "detrended_flux", "rate", "rel_flux", "relative_flux", "normalized_flux", "norm_flux",
-             "rel_flux_t1", "ujy", "count_rate", "countrate", "cps", "counts", "cal_aper_flux", "whitelight_flux"),
+             "flux_norm", "flux_normalized", "rel_flux_t1", "ujy", "count_rate", "countrate", "cps", "counts",
+             "cal_aper_flux", "whitelight_flux"),
     "quality": ("quality", "sap_quality"),
     "temperature": ("temperature",),
 }  # fmt: skip
@@ -132,6 +83,11 @@ PARTS = {"start": 0.0, "middle": 0.5, "end": 1.0}
 DATES_MJD = (-5000.0, 150_000.0)
 #: Units in which light is given as a deviation from its level, as TASOC does.
 PARTS_OF_LEVEL = {"%": 1e-2, "percent": 1e-2, "ppt": 1e-3, "ppm": 1e-6, "ppb": 1e-9}
+#: Times of Gaia DR3's epoch photometry, BJD in TCB less 2455197.5 (documentation of vari_epoch_photometry).
+GAIA_DAYS = TimeUnit("d", 55_197.0, "tcb", "BARYCENTER")
+#: Extension of the light curves of CHEOPS. UTC in its header is that of the start and the end of a visit;
+#: BJD_TIME is in TT: pycheops 1.1.14, documentation of `Dataset`.
+CHEOPS = "SCI_COR_LIGHTCURVE"
 #: Standard errors by which a level is above zero.
 SURE = 5.0
 #: What a cell of times may be.
@@ -335,8 +291,8 @@ def _recognised(file: TableFile) -> FrameMapping:
     if columns["time"] is None:
         said = {name: found for name in names if (found := time_in_name(name)) is not None}
         dated = [name for name, one in said.items() if one.epoch_mjd is not None]
-        for place in ("HELIOCENTER", "BARYCENTER"):
-            # Dates at the barycentre are those of the light.
+        for place in ("BARYCENTER", "HELIOCENTER"):
+            # Dates at the barycentre are those of the light; those at the Sun are seconds from them.
             dated = [name for name in dated if said[name].position == place] or dated
         if len(dated) > 1:
             fault = f"{file.what}: {len(dated)} columns may be the time: {', '.join(map(shortened, dated))}"
@@ -395,7 +351,44 @@ class Quantities:
                 f"at most {most // 32}; MAUVECL_LARGEST_CONTENT_MIB sets the limit",
                 key="MAUVECL_LARGEST_CONTENT_MIB",
             )
-        return cls(*spectra_of_rows(times, flux, one.error, one.quality, one.exposure, one.temperature, nm, file.what))
+        return one._of_frames(nm, file.what)
+
+    def _of_frames(self, wavelength: Values, what: str) -> Quantities:
+        """Return the quantities of a long table with a row for each frame; errors and flags for each pixel.
+
+        Raises InputError if a frame lacks a wavelength that another has, has one twice, or has two exposure times or
+        temperatures.
+        """
+        key, nm = _keys(self.time[0]), wavelength.numbers()
+        frames, frame = np.unique(key, return_inverse=True)
+        pixels, pixel = np.unique(nm, return_inverse=True)
+        counts = np.zeros((frames.size, pixels.size), np.int64)
+        np.add.at(counts, (frame, pixel), 1)
+        if (counts != 1).any():
+            row, column = np.argwhere(counts != 1)[0]
+            fault = (
+                f"{what}: the frame at {frames[row]} has {counts[row, column]} rows of wavelength {pixels[column]:g}"
+            )
+            raise InputError(fault, "one row for each pixel of each frame", key="wavelength")
+        place = np.empty(counts.shape, np.int64)
+        place[frame, pixel] = np.arange(key.size)
+
+        def spectra(values: Values) -> Values:
+            return Values.of(values.name, values.numbers()[place], values.unit, what)
+
+        def single(values: Values) -> Values:
+            rows = _keys(values)[place]
+            if (rows != rows[:, :1]).any():
+                fault = f"{what}: {values.name!r} changes within a frame"
+                raise InputError(fault, "one value for each frame", key=values.name)
+            return Values.of(values.name, rows[:, 0], values.unit, what)
+
+        error, quality = (one and spectra(one) for one in (self.error, self.quality))
+        exposure, temperature = (one and single(one) for one in (self.exposure, self.temperature))
+        axis = Values.of(wavelength.name, pixels, wavelength.unit, what)
+        return Quantities(
+            tuple(map(single, self.time)), spectra(self.flux), error, quality, exposure, temperature, axis
+        )
 
 
 def _flags(quality: Values | None) -> Values | None:
@@ -457,6 +450,15 @@ def _temperature_c(file: TableFile, found: Quantities, mapping: FrameMapping, n:
     return np.full(n, float(nominal)) if isinstance(nominal, int | float) else None
 
 
+def _brite_exposure_s(file: TableFile) -> float | None:
+    """Return the exposure time in the header of BRITE's light curves, in milliseconds for each image of a stack."""
+    try:
+        found = 1e-3 * float(file.header["ObsExpoT"]) * float(file.header.get("ObsStack", 1.0))
+    except (KeyError, ValueError):
+        return None
+    return found if 0.0 < found < np.inf else None
+
+
 def _without_marks(light: Float) -> tuple[Float, Sequence[str]]:
     """Return light without marks of missing values, and what to say about them."""
     marks, said = marks_in(light, "values")
@@ -500,8 +502,8 @@ def _frames_in(
     time, exposure_s, dates, remarks = _times(found.time, file, mapping)
     if found.exposure is not None:
         exposure_s = converted(found.exposure, mapping.exposure_unit, "s", "exposure_unit").numbers().reshape(n)
-    elif mapping.exposure_s is not None:
-        exposure_s = np.full(n, mapping.exposure_s)
+    elif (one_s := mapping.exposure_s or _brite_exposure_s(file)) is not None:
+        exposure_s = np.full(n, one_s)
     unit, flux, error, more = _light(found, mapping)
     remarks += (*more, *(f"{what}: {text}" for text in file.remarks))
     wavelength = None if found.wavelength is None else _vacuum_nm(found.wavelength, mapping.wavelength_unit, file)
@@ -606,6 +608,12 @@ def _times(
                     f"{stated.epoch_mjd:g} by its header", "one epoch, or a mapping with epoch", key="epoch",
                 )  # fmt: skip
             epoch = said.epoch_mjd if stated.epoch_mjd is None else stated.epoch_mjd
+    is_cheops = str(file.header.get("EXTNAME", "")).upper().startswith(CHEOPS)
+    if is_cheops and position == "BARYCENTER" and not mapping.scale:
+        scale = "tt"
+        remarks.append(
+            f"{time[0].name} of {file.what} is in TT, as in all files of CHEOPS; UTC is the scale of its other dates"
+        )
     exposure = None if len(edges) == 1 else np.asarray(((edges[1] - edges[0]) * unit).to_value(u.s))
     seconds, first_d = seconds_from_first(np.mean(edges, axis=0) + offset, unit)
     at = 0.5 if len(edges) == 2 else PARTS.get(mapping.time_at or "", stated.at)
@@ -635,6 +643,9 @@ def _time_unit(
             converted(replace(time[0], unit=text), None, "s", "time_unit")
             said = TimeUnit(str(unit_in(text)))
     if said is None:
+        if {"transit_id", "rejected_by_photometry"} <= {*map(key_of, file.columns)}:
+            assumed = f"the times of {file.what} are days from 2010-01-01 in TCB, as in Gaia DR3's epoch photometry"
+            return GAIA_DAYS, [f"ASSUMED: {assumed}; it states no unit"]
         words = {str(file.header.get(key, "") or "").strip().upper() for key in ("MISSION", "TELESCOP")}
         mission = next((one for one in MISSIONS if one in words), None)
         finite = values[np.isfinite(values)]
