@@ -20,7 +20,7 @@ SIDES, SUDDEN = (12, 40), 8.0
 MOST_STEPS = 30
 #: Time after a rise that may belong to a flare, and lengths of time before it and after that time whose medians differ
 #: by the step to within a factor, s (assumed).
-FLARE_S, LENGTHS_S, LASTS = DAY_S / 4, (DAY_S, 2 * DAY_S), 2.0
+FLARE_S, LENGTHS_S, LASTS = DAY_S / 4, (2 * DAY_S, 4 * DAY_S), 2.0
 #: Smallest step relative to its standard error, and without the frames that may belong to a flare (assumed).
 SIGNIFICANT, AFTER_FLARE = 6.0, 2.5
 #: Largest number of fits of the process and the steps.
@@ -103,7 +103,7 @@ def _sudden_changes(time_s: Float, flux: Float) -> tuple[Places, Float]:
 
 
 def _lasts(time_s: Float, flux: Float, place: int, size: float) -> bool:
-    """Return whether a change is not undone within a day or two, as that of a flare or a loss of light is.
+    """Return whether a change is not undone within days, as that of a flare or a loss of light is.
 
     The light of a star that turns in less time has the same median before and after.
     """
