@@ -87,22 +87,6 @@ def drawn(probes_fast: Probes) -> dict[tuple[str, float], np.ndarray]:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("mean", MEANS)
-def test_pearson_of_the_table(drawn: dict[tuple[str, float], np.ndarray], mean: float) -> None:
-    """Pearson's test at 1e7 draws; fails by chance once in 1e6 runs of a new seed.
-
-    Words between the edges that are tested above must give the same counts as the edges. A rounded normal of mean 2225
-    gives p < 1e-70 here.
-    """
-    counts = drawn["table", mean]
-    assert counts.sum() == OF_TABLE
-    if mean == 0.0:
-        assert counts[0] == counts.sum()
-    else:
-        assert pearson(counts, layout.alias_table(mean).low, mean) > 1e-6
-
-
-@pytest.mark.long
 @pytest.mark.parametrize("mean", EXPANDED)
 def test_pearson_of_the_expansion(drawn: dict[tuple[str, float], np.ndarray], mean: float) -> None:
     """The same at 1e8 draws from the expansion. A rounded normal of mean 2225 gives p < 1e-100 here."""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from answers import small
 
-from mauvecl import Engine, Instrument, Source, Stares, Study, detect, expect, limit, simulate, stare
+from mauvecl import Engine, Instrument, Source, Stares, Study, detect, expect, simulate, stare
 
 PART = {"changes": {"output_min_nm": 300.0, "output_max_nm": 330.0}}
 
@@ -67,13 +67,6 @@ def test_sky_is_common_to_both_hypotheses(engine: Engine) -> None:
     )
 
 
-def test_limiting_magnitude_needs_no_magnitude(engine: Engine) -> None:
-    run = {"realisations": 20_000, "fap": 0.01, "statistics": ["matched"]}
-    asked = Study.build({"star": [{"library": "G2V"}], "flare": {"amplitudes": [0.3]}, "run": run}, "test")
-    (found,) = limit(asked, engine).limits
-    assert found.value.low < found.value.value < found.value.high
-
-
 #: Normal priors whose effect exceeds the noise of a frame's total light; the cuts are five standard deviations away.
 PRIORS = {
     "jitter": {"normal": [0.25, 0.05], "between": [0.0, 0.5]},
@@ -115,17 +108,6 @@ def test_stare_draws_prior_as_exposure_does(engine: Engine, name: str) -> None:
     assert exposures.std() > 3 * np.sqrt(quiet.unsaturated_variance_dn2.sum())
     assert abs(found.mean() - exposures.mean()) < 5 * np.hypot(found.std(), exposures.std()) / np.sqrt(N)
     assert abs(np.log(found.std() / exposures.std())) < 5 / np.sqrt(N)
-
-
-def test_stare_draws_cosmic_rays() -> None:
-    rays = asked("cosmic_rays", {})
-    drawn, plain = frames(asked(None), 50, seed=1, processes=rays.processes), frames(asked(None), 50, seed=1)
-    assert (drawn != plain).any()
-    assert (drawn >= plain - 1.0).all()
-    flux, without = (
-        stare(study.with_settings(["stare.duration_s=600"])).stares[0].light.flux for study in (rays, asked(None))
-    )
-    assert (flux != without).any()
 
 
 def test_spreads_of_process_and_stare_add_in_quadrature() -> None:
