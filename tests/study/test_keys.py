@@ -1,4 +1,4 @@
-"""Keys of studies: their units, ranges and types wherever a value can be given, their paths, and older files."""
+"""Keys of studies: their units and ranges wherever a value can be given, their paths, and older files."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ from typing import Any, get_args
 import astropy.units as u
 import numpy as np
 import pytest
-from pydantic import BaseModel, ValidationError
 from refusals import refused
-from study_keys import fields, metadata, models_in
+from study_keys import fields, metadata
 
 from mauvecl import BalmerFlare, InputError, Instrument, Sky, Source, Study, TwoBlackbodies, detect, expect
 from mauvecl.web.page import State
@@ -157,49 +156,6 @@ def test_keys_of_one_kind_share_a_range() -> None:
     for low, high in ((-41, 25), (15, 66)):
         with refused("detector_temperature", expected="-40 to 65"):
             detect(Study().with_settings(["run.realisations=100000", prior.format(low, high)]))
-
-
-# Types
-
-
-def models(model: type[BaseModel]) -> Iterator[type[BaseModel]]:
-    """Yield a model and all models of its fields."""
-    yield model
-    for field in model.model_fields.values():
-        for inner in models_in(field.annotation):
-            yield from models(inner)
-
-
-def types(annotation: Any) -> set[Any]:
-    """Return the types of single values in an annotation."""
-    parts = get_args(annotation)[:1] if hasattr(annotation, "__metadata__") else get_args(annotation)
-    return set().union(*map(types, parts)) if parts else {annotation}
-
-
-#: Numeric keys of studies and instruments by their model.
-NUMBERS = {
-    model: names
-    for root in (Study, Instrument)
-    for model in models(root)
-    if (names := [name for name, field in model.model_fields.items()
-                  if types(field.annotation) & {int, float} and bool not in types(field.annotation)])
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("model", sorted(NUMBERS, key=lambda one: one.__name__))
-def test_booleans_as_numbers_raise(model: type[BaseModel]) -> None:
-    """All numeric keys of studies and instruments reject booleans of Python and NumPy, alone and in lists."""
-    for name in NUMBERS[model]:
-        for value in (True, False, np.True_, [True], [0.5, True], (False,)):
-            with pytest.raises(ValidationError) as error:
-                model.model_validate({name: value})
-            assert any(fault["loc"][0] == name for fault in error.value.errors()), (name, value)
-
-
-def test_numeric_keys_are_found() -> None:
-    names = {f"{model.__name__}.{name}" for model, numeric in NUMBERS.items() for name in numeric}
-    assert {"Star.bin_nm", "Flare.amplitudes", "Run.seed", "Instrument.read_noise_dn", "Axis.values"} <= names
-    assert len(names) > 100
 
 
 # Paths
