@@ -18,7 +18,6 @@ from scipy import stats
 from mauvecl import Engine, Nuisances, Processes, Sky, Source, Study, detect, detection_map, expect, limiting_magnitude
 from mauvecl.answers.detect import unknown_table
 from mauvecl.noise.scene import prepare
-from mauvecl.study.cases import Case
 
 STRAY = "200 1\n450 3\n700 1  # DN\n"
 
@@ -136,15 +135,21 @@ def test_own_unknowns_are_read_from_files_points_and_flags(tmp_path: Path, engin
     assert thresholds == [by_hand.threshold(0.01, "matched").value] * 2
 
 
+def drawn(asked: Study) -> Processes:
+    """Return the processes of a study that its answers draw."""
+    celsius = asked.observation.load_instrument().temperature_c
+    return asked.nuisances.processes(asked.processes, celsius) if asked.nuisances.usual else asked.processes
+
+
 def test_usual_unknowns_follow_the_observation() -> None:
     """Check that they are centred on the study's temperature, and that the study's own processes stay."""
     asked = study(usual=True).with_settings(
         ["observation.temperature_c=13", "processes.jitter={uniform=[0.0, 0.01]}", "nuisances.dark=0.3"]
     )
-    processes = Case(asked).processes
+    processes = drawn(asked)
     assert processes.detector_temperature.mean == 13
     assert processes.jitter.high == 0.01
-    assert Case(study()).processes.detector_temperature is None
+    assert drawn(study()).detector_temperature is None
     quiet = expectations(asked)[0]
     found = asked.nuisances.marginalised(quiet)
     assert found is not None
@@ -156,7 +161,7 @@ def test_usual_unknowns_follow_the_observation() -> None:
 
 
 def usual_processes(temperature: float) -> Processes:
-    return Case(study(usual=True).with_settings([f"observation.temperature_c={temperature}"])).processes
+    return drawn(study(usual=True).with_settings([f"observation.temperature_c={temperature}"]))
 
 
 @pytest.mark.long

@@ -6,11 +6,13 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scenes import star
 
-from mauvecl import Expectation, Instrument, Nuisances, Sky, Source, expect
+from mauvecl import Expectation, Instrument, Normal, Nuisances, Processes, Sky, Source, Uniform, expect
 from mauvecl.detection import requests
 from mauvecl.detection.distributions import QuadraticForm
-from mauvecl.detection.statistics import Setting
+from mauvecl.detection.statistics import Differences, Setting
+from mauvecl.noise.scene import FactorDistributions, changes_of, prepare
 
 FREE = float("inf")
 
@@ -44,6 +46,13 @@ def test_subtracted_rows_give_the_inverse_covariance(name: str) -> None:
     assert one.values(s, x, np.broadcast_to(one.variance(s), x.shape)) == pytest.approx(wanted, rel=1e-9)
 
 
+def test_projected_out_unknowns_take_degrees_of_freedom() -> None:
+    quiet, _ = pair()
+    s = setting(quiet, {"dark": FREE, "light": 0.01})
+    wanted = {"chi2": quiet.wavelength_nm.size - 1, "chi2_element": quiet.element_wavelength_nm.size - 1, "matched": 1}
+    assert {name: requests.STATISTICS[name].dof(s) for name in wanted} == wanted
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("amplitude", [0.24, 3.0])
 def test_closed_form_in_a_span_equals_the_full_one(amplitude: float) -> None:
@@ -63,3 +72,29 @@ def test_closed_form_in_a_span_equals_the_full_one(amplitude: float) -> None:
     assert found.std == pytest.approx(full.std, rel=1e-5)
     for probability in (0.9, 0.1, 1e-3, 1e-6):
         assert found.sf(full.isf(probability)) == pytest.approx(probability, rel=1e-4)
+
+
+@pytest.mark.parametrize("name", ["matched", "uv_excess"])
+def test_weighted_sums_over_drawn_unknowns_have_the_moments_of_their_nodes(name: str) -> None:
+    """Compare each node's mean and variance with the sums over pixels at its temperature and light."""
+    quiet, flare = star(amplitudes=(0.1,))
+    processes = Processes(
+        jitter=Uniform(0.0, 0.05),
+        detector_temperature=Normal(21.0, 0.5, 18.5, 23.5),
+        sky_level=Normal(1.0, 0.1, 0.5, 1.5),
+    )
+    drawn, statistic = FactorDistributions.of(prepare([quiet], processes=processes)), requests.STATISTICS[name]
+    setting = Setting(quiet, ~quiet.saturated, nuisances=Nuisances.of(quiet, {"dark": 0.5, "sky": 0.1}))
+    assert drawn is not None
+    nodes, rows = drawn.nodes(flare, weighted=True)
+    amounts = np.array([node.amounts for node in nodes])
+    assert len(nodes) > 100
+    means, variances = changes_of(flare)
+    delta = flare.recorded_light_dn - quiet.recorded_light_dn
+    weights = statistic.weights_per_dn(setting, flare)
+    seen = Differences(delta, flare.variance_dn2, scatter=rows)
+    found = statistic.moved_forms(setting, seen, amounts, means, variances, flare)
+    for one, amount in zip(found, amounts, strict=True):
+        variance = weights**2 @ (flare.variance_dn2 + amount @ variances) + np.sum((rows @ weights) ** 2)
+        wanted = float(weights @ (delta + amount @ means)), float(np.sqrt(variance))
+        assert (one.mean, one.std) == pytest.approx(wanted, rel=1e-12)
