@@ -275,6 +275,31 @@ def test_window_that_begins_in_a_tail_has_the_energy_relative_to_the_star(
     assert abs(event.energy.fitted_s - right) < 0.1 * right
 
 
+@pytest.mark.long
+def test_faint_star_with_a_great_flare_has_its_energy() -> None:
+    """340 frames of mean 30.4 and noise 5.5, amplitude 120: the error is that of the level, to which it is relative."""
+    rng = np.random.default_rng(403)
+    time = (np.arange(340) + 0.5) * 5.0
+    flux = 30.4 * (1 + 120 * flare(time, 5.0, 900.0, 90.0)) + 5.5 * rng.standard_normal(340)
+    (event,) = analysed(Frames.of(time, flux, np.full(340, 5.5))).analysis.events
+    error = (event.energy.high_s[0] - event.energy.low_s[0]) / 2
+    assert abs(event.energy.fitted_s - 19_730) < 3 * error
+    assert 0.005 < error / event.energy.fitted_s < 0.03
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("period_d", "cadence_s", "noise"), [(1.0, 120.0, 1e-4), (3.0, 1800.0, 1e-4)])
+def test_rotation_is_no_flare(period_d: float, cadence_s: float, noise: float) -> None:
+    """Sinusoids of 1 % at one false alarm a century: fails by chance once in 2000 times or less."""
+    rng = np.random.default_rng(404)
+    time = np.arange(2000) * cadence_s
+    flux = 1 + 0.01 * np.sin(2 * np.pi * time / (period_d * 86_400)) + noise * rng.standard_normal(time.size)
+    analysis = analysed(Frames.of(time, flux, np.full(time.size, noise))).analysis
+    assert not detected(analysis, PER_CENTURY)
+    assert analysis.level.used.mean() > 0.95
+    assert float(np.median(analysis.level.error)) == pytest.approx(noise, rel=0.1)
+
+
 def test_standard_deviation_of_a_varying_star_is_that_of_its_light() -> None:
     """The process of a star that shows three rotations may have another standard deviation."""
     rng = np.random.default_rng(7)
