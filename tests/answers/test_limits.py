@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from answers import expectations, of_kind
+from marks import long_but
 
 from mauvecl import (
     Engine,
@@ -75,6 +76,36 @@ def test_limit_inverts_detect(engine: Engine) -> None:
     assert shortest.value.value % 5 == 0
     assert abs(shortest.value.value - 50) <= 5
     assert shortest.value.low <= shortest.value.value <= shortest.value.high
+
+
+@pytest.mark.parametrize(
+    "harder",
+    long_but(
+        [
+            {"observation": {"exposure_s": 25.0}},
+            {"observation": {"temperature_c": 25.0}},
+            {"flare": {"amplitudes": [0.12]}},
+            {"sky": {"surface_brightness": 14.0}},
+        ],
+        {"flare": {"amplitudes": [0.12]}},
+    ),
+)
+def test_limits_are_monotone(engine: Engine, harder: dict[str, Any]) -> None:
+    (plain,), (worse,) = (limiting_magnitude(study(run=FEW, **c), engine).limits for c in ({}, harder))
+    assert worse.value.value < plain.value.value
+
+
+@pytest.mark.long
+def test_cooler_detector_gains_as_predicted(engine: Engine) -> None:
+    """Compare 13 and 21 deg C, whose dark currents have a ratio of 0.58, with the closed form."""
+    few = {"statistics": ("matched",)}
+    (warm,), (cool,) = (
+        limiting_magnitude(study(run=few, observation={"temperature_c": t}), engine).limits for t in (21.0, 13.0)
+    )
+    gain = cool.value.value - warm.value.value
+    assert gain == pytest.approx(cool.closed_form - warm.closed_form, abs=0.02)
+    # Dark alone: 1.25 log10 of its ratio; the read noise and the star leave less.
+    assert 0.15 < gain < 1.25 * 0.0684 * 8 / np.log(10)
 
 
 @pytest.mark.parametrize(("verb", "faint", "kind"), [("limit", 25.0, "no limit"), ("exposure", 28.0, "no answer")])
@@ -183,6 +214,18 @@ def test_each_cell_equals_its_own_detection(engine: Engine, x: dict, y: dict) ->
     assert (found.probability <= found.high).all()
 
 
+def test_probability_decreases_with_magnitude(engine: Engine) -> None:
+    """Check that brighter stars and larger flares are detected as often or more, but for the threshold's error."""
+    found = detection_map(mapped(MAGNITUDE, AMPLITUDE), engine)
+    slack = 5e-3
+    assert (np.diff(found.probability, axis=2) < slack).all()
+    assert (np.diff(found.probability, axis=1) > -slack).all()
+    assert (found.probability[1] > found.probability[0] - slack).all()
+    # Near the closed form: the threshold at 1e-2 of 20 000 is uncertain by 0.03 of a standard deviation.
+    error = np.sqrt(found.closed_form * (1 - found.closed_form) / N)
+    assert (np.abs(found.probability - found.closed_form) < 5 * (error + 0.4 * 0.03) + 1e-3).all()
+
+
 def sunlike(magnitude: float = 7.4, **observation: float) -> Study:
     return Study.build({"star": [{"library": "G2V", "magnitude": magnitude}], "observation": observation}, "test")
 
@@ -204,6 +247,15 @@ def test_exposure_inverts_snr(per: str, frames: int, wavelength: float) -> None:
     assert same.snr_one_frame_less < snr <= same.snr * (1 + 1e-9)
     (more,) = exposure_for(asked, snr * (1 + 1e-9), wavelength, per=per).exposures
     assert more.frames == frames + 1
+
+
+def test_engine_finds_the_wanted_snr(engine: Engine) -> None:
+    """Compare the mean S/N of realisations at the answer within 5 standard errors and 1 % for the curved root."""
+    (found,) = exposure_for(sunlike(), 20.0, 300.0).exposures
+    quiet = expectations(sunlike(exposure_s=found.exposure_s))[0]
+    table = engine.snr(quiet, realisations=20_000, seed=4).element
+    row = table[int(np.argmin(np.abs(table["wavelength"].value - 300.0)))]
+    assert row["mean"] == pytest.approx(found.snr, abs=5 * row["std"] / np.sqrt(20_000) + 0.01 * found.snr)
 
 
 def test_fainter_stars_need_longer_exposures_and_saturation_is_reported() -> None:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
 from scenes import star
 
-from mauvecl import Expectation, Instrument, Normal, Nuisances, Processes, Sky, Source, Uniform, expect
+from mauvecl import Expectation, Instrument, Linear, Normal, Nuisances, Processes, Sky, Source, Uniform, expect
 from mauvecl.detection import requests
 from mauvecl.detection.distributions import QuadraticForm
 from mauvecl.detection.statistics import Differences, Setting
@@ -29,6 +30,59 @@ def setting(quiet: Expectation, sd: dict[str, float]) -> Setting:
     return Setting(quiet, ~quiet.saturated, nuisances=Nuisances.of(quiet, sd))
 
 
+@pytest.mark.parametrize(
+    ("star", "known", "dark", "light", "both"),
+    [
+        (("G2V", 7.4, 0.02), 8.36, (0.23, 3.06), (4.12, 5.67), 3.05),
+        (("G2V", 7.4, 0.081), 33.88, (0.92, 12.39), (16.7, 23.0), 12.36),
+        (("K3V", 3.7, 0.0076), 92.9, (2.94, 34.1), (3.15, 71.9), 32.7),
+        (("M3V", 9.0, 0.24), 46.5, (1.25, 17.0), (44.8, 45.1), 13.6),
+    ],
+)
+def test_costs_of_unknowns_equal_those_computed_elsewhere(
+    star: Any, known: float, dark: tuple[float, float], light: tuple[float, float], both: float
+) -> None:
+    """Compare with numbers of another program (Vega at V = 0) to 1 %, or half a digit of 0.23."""
+    quiet, flare = pair(*star)
+    matched, plain = requests.STATISTICS["matched"], Setting(quiet, ~quiet.saturated)
+    weights, delta = matched.plain_weights(plain, flare), flare.signal_dn - quiet.signal_dn
+    assert matched.closed_form(plain, flare, flare).mean == pytest.approx(known, rel=0.01)
+    for sd, (naive, marginal) in (({"dark": 0.1}, dark), ({"light": 0.01}, light)):
+        s = setting(quiet, sd)
+        assert s.nuisances is not None
+        noise = weights**2 @ quiet.variance_dn2 + np.sum((s.nuisances.finite(s.nuisances.spectra) @ weights) ** 2)
+        assert weights @ delta / np.sqrt(noise) == pytest.approx(naive, rel=0.022 if naive < 0.5 else 0.01)
+        assert matched.closed_form(s, flare, flare).mean == pytest.approx(marginal, rel=0.01)
+    s = setting(quiet, {"dark": FREE, "light": FREE})
+    assert matched.closed_form(s, flare, flare).mean == pytest.approx(both, rel=0.01)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("sd", [{"dark": 0.1}, {"dark": FREE, "light": 0.02}, {"dark": 0.3, "sky": 1.0, "tilt": FREE}])
+@pytest.mark.parametrize("name", ["chi2", "chi2_element", "matched", "uv_excess", "own"])
+def test_distributions_agree_with_drawn_nuisances(name: str, sd: dict[str, float]) -> None:
+    """Compare 4000 spectra with and without a flare.
+
+    60 means and standard deviations lie within 5 standard errors: by chance one run in 3e4 fails.
+    """
+    quiet, flare = pair(amplitude=0.081)
+    n = quiet.wavelength_nm.size
+    one = Linear("own", 1.0 + np.arange(n) / n) if name == "own" else requests.STATISTICS[name]
+    s = setting(quiet, sd)
+    assert s.nuisances is not None
+    rng = np.random.default_rng(20_261_122)
+    size = 4000
+    for observed in (quiet, flare):
+        x = rng.normal(size=(size, n)) * np.sqrt(observed.variance_dn2) + (observed.signal_dn - quiet.signal_dn)
+        for spectrum, spread in zip(s.nuisances.spectra, s.nuisances.sd, strict=True):
+            # What is projected out may be as large as it likes.
+            x += rng.normal(size=(size, 1)) * (spread if np.isfinite(spread) else 7.0) * spectrum
+        values = one.values(s, x, np.broadcast_to(one.variance(s), x.shape), flare)
+        form = one.closed_form(s, observed, flare)
+        assert abs(values.mean() - form.mean) < 5 * form.std / np.sqrt(size)
+        assert abs(values.std() / form.std - 1) < 5 / np.sqrt(2 * size) * (1.0 if name != "chi2_element" else 1.3)
+
+
 @pytest.mark.parametrize("name", ["chi2", "chi2_element"])
 def test_subtracted_rows_give_the_inverse_covariance(name: str) -> None:
     """Compare with x^T C^-1 x for the full matrix C."""
@@ -44,6 +98,18 @@ def test_subtracted_rows_give_the_inverse_covariance(name: str) -> None:
     full = np.diag(variance[counts]) + (spectra[:, counts].T * s.nuisances.sd**2) @ spectra[:, counts]
     wanted = np.einsum("ni,ij,nj->n", seen[:, counts], np.linalg.inv(full), seen[:, counts])
     assert one.values(s, x, np.broadcast_to(one.variance(s), x.shape)) == pytest.approx(wanted, rel=1e-9)
+
+
+def test_projected_out_spectra_do_not_change_the_statistic() -> None:
+    quiet, flare = pair()
+    s = setting(quiet, {"dark": FREE, "light": FREE})
+    assert s.nuisances is not None
+    x = np.random.default_rng(6).normal(size=(1, quiet.wavelength_nm.size)) * np.sqrt(quiet.variance_dn2)
+    moved = x + 100.0 * s.nuisances.spectra[0] - 3.0 * s.nuisances.spectra[1]
+    for name in ("chi2", "chi2_element", "matched", "uv_excess"):
+        one = requests.STATISTICS[name]
+        before, after = (one.values(s, v, np.broadcast_to(one.variance(s), v.shape), flare) for v in (x, moved))
+        assert after == pytest.approx(before, abs=1e-3)
 
 
 def test_projected_out_unknowns_take_degrees_of_freedom() -> None:

@@ -23,6 +23,18 @@ def seen(engine: Engine, amplitudes: np.ndarray) -> Detection:
 
 
 @pytest.mark.long
+def test_batches_of_flares_equal_all_at_once(engine: Engine) -> None:
+    amplitudes = np.geomspace(0.001, 3.0, 40)
+    table = seen(engine, amplitudes).table(0.01)
+    n = len(KIND["statistics"])
+    for first in range(0, 40, 7):
+        part = seen(engine, amplitudes[first : first + 7]).table(0.01)
+        whole = table[n * first : n * (first + 7)]
+        for name in part.colnames:
+            np.testing.assert_array_equal(part[name], whole[name])
+
+
+@pytest.mark.long
 def test_memory_per_flare_is_bounded(engine: Engine) -> None:
     """Include bright flares, which fill many bins, and faint ones; a full histogram would take 2 MB."""
     sizes = {}

@@ -150,3 +150,22 @@ def test_surface_or_relative_fluxes_need_a_magnitude() -> None:
         with refused("magnitude"):
             expect(star, mauve, exposure=5.0)
         assert expect(star.at_magnitude(7.5), mauve, exposure=5.0).signal_dn.max() > 0
+
+
+def test_calspec_files_that_start_within_the_line_function_are_continued() -> None:
+    """Cut a whole file where three of CALSPEC's begin (180.02-180.10 nm) and P330E does (199.95 nm)."""
+    star = Source.read(HERE / "18sco_stis_004.fits")
+    assert star.name == "18SCO"
+    mauve = Instrument.load("mauve")
+    whole = expect(star, mauve, exposure=50.0)
+    for start in (180.02, 180.10, 199.95):
+        kept = star.wavelength_nm >= start
+        short = Source.from_arrays(star.wavelength_nm[kept], star.flux_flam[kept], name="short")
+        assert any(
+            f"starts at {star.wavelength_nm[kept][0]:g} nm and is continued to 180 nm" in t for t in short.messages
+        )
+        found = expect(short, mauve, exposure=50.0)
+        # A tenth of the noise at most, and a tenth of the light.
+        error = np.abs(found.signal_dn - whole.signal_dn)
+        assert (error < 0.1 * np.sqrt(whole.variance_dn2)).all()
+        assert any("continued to 180 nm" in message for message in found.messages)

@@ -57,36 +57,58 @@ def test_extreme_words_and_column_edges(probes: Probes, mean: float) -> None:
     np.testing.assert_array_equal(ours, np.where(below, column, alias[column]))
 
 
-#: Draws of each mean, so many at a time.
-DRAWS, AT_ONCE = 100_000_000, 10_000_000
+def pearson(counts: np.ndarray, low: int, mean: float) -> float:
+    """Return the two-sided p-value of Pearson's statistic with scipy's probabilities of low, low + 1, ..."""
+    return exact.pearson(counts, stats.poisson.pmf(low + np.arange(counts.size), mean))
+
+
+#: Draws of each mean by expansion, and by table.
+DRAWS, OF_TABLE = 100_000_000, 10_000_000
 EXPANDED = [SMALLEST_EXPANDED, 2225.0, 22250.0, 222500.0]
 
 
 @pytest.fixture(scope="module")
-def drawn(probes_fast: Probes) -> dict[float, np.ndarray]:
-    """Count the draws of each value by expansion for each mean."""
+def drawn(probes_fast: Probes) -> dict[tuple[str, float], np.ndarray]:
+    """Count the draws of each value for each mean, by table and by expansion."""
+    tables = {mean: layout.alias_table(mean) for mean in MEANS}
     half = {mean: int(10 * np.sqrt(mean)) for mean in EXPANDED}
-    counts = {mean: np.zeros(2 * half[mean], np.int64) for mean in EXPANDED}
+    counts = {("table", mean): np.zeros(2**table.bits, np.int64) for mean, table in tables.items()}
+    counts |= {("expansion", mean): np.zeros(2 * half[mean], np.int64) for mean in EXPANDED}
     rng = np.random.Generator(np.random.Philox(99))
-    for _ in range(DRAWS // AT_ONCE):
-        w = rng.integers(0, 2**32, (4, AT_ONCE // 4), np.uint32)
+    w = rng.integers(0, 2**32, OF_TABLE, np.uint32)
+    for mean, table in tables.items():
+        counts["table", mean] += np.bincount(probes_fast.alias(w, table.entries, table.bits), minlength=2**table.bits)
+    for _ in range(DRAWS // OF_TABLE):
+        w = rng.integers(0, 2**32, (4, OF_TABLE // 4), np.uint32)
         for mean in EXPANDED:
             found = probes_fast.expansion(w[[0, 2]].ravel(), w[[1, 3]].ravel(), mean)
-            counts[mean] += np.bincount(found.ravel() + half[mean], minlength=2 * half[mean])
+            counts["expansion", mean] += np.bincount(found.ravel() + half[mean], minlength=2 * half[mean])
     return counts
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("mean", EXPANDED)
-def test_pearson_of_the_expansion(drawn: dict[float, np.ndarray], mean: float) -> None:
-    """Pearson's test at 1e8 draws; fails by chance once in 1e6 runs of a new seed.
+@pytest.mark.parametrize("mean", MEANS)
+def test_pearson_of_the_table(drawn: dict[tuple[str, float], np.ndarray], mean: float) -> None:
+    """Pearson's test at 1e7 draws; fails by chance once in 1e6 runs of a new seed.
 
-    A rounded normal of mean 2225 gives p < 1e-100 here. Tables are tested with raw counts in `test_joint.py`.
+    Words between the edges that are tested above must give the same counts as the edges. A rounded normal of mean 2225
+    gives p < 1e-70 here.
     """
-    counts = drawn[mean]
+    counts = drawn["table", mean]
+    assert counts.sum() == OF_TABLE
+    if mean == 0.0:
+        assert counts[0] == counts.sum()
+    else:
+        assert pearson(counts, layout.alias_table(mean).low, mean) > 1e-6
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("mean", EXPANDED)
+def test_pearson_of_the_expansion(drawn: dict[tuple[str, float], np.ndarray], mean: float) -> None:
+    """The same at 1e8 draws from the expansion. A rounded normal of mean 2225 gives p < 1e-100 here."""
+    counts = drawn["expansion", mean]
     assert counts.sum() == DRAWS
-    low = round(mean) - int(10 * np.sqrt(mean))
-    assert exact.pearson(counts, stats.poisson.pmf(low + np.arange(counts.size), mean)) > 1e-6
+    assert pearson(counts, round(mean) - int(10 * np.sqrt(mean)), mean) > 1e-6
 
 
 @pytest.mark.parametrize("mean", [SMALLEST_EXPANDED, 2225.0, 22250.0, 1e6])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from answers import small
 
-from mauvecl import Engine, Instrument, Source, Stares, Study, detect, expect, simulate, stare
+from mauvecl import Engine, Instrument, Source, Stares, Study, detect, expect, limit, simulate, stare
 
 PART = {"changes": {"output_min_nm": 300.0, "output_max_nm": 330.0}}
 
@@ -65,6 +65,13 @@ def test_sky_is_common_to_both_hypotheses(engine: Engine) -> None:
     assert bright.false_alarm_probability(net.threshold(0.01, "matched").value, "matched").value == pytest.approx(
         0.01, abs=5 * np.sqrt(2 * 0.01 / 20_000)
     )
+
+
+def test_limiting_magnitude_needs_no_magnitude(engine: Engine) -> None:
+    run = {"realisations": 20_000, "fap": 0.01, "statistics": ["matched"]}
+    asked = Study.build({"star": [{"library": "G2V"}], "flare": {"amplitudes": [0.3]}, "run": run}, "test")
+    (found,) = limit(asked, engine).limits
+    assert found.value.low < found.value.value < found.value.high
 
 
 #: Normal priors whose effect exceeds the noise of a frame's total light; the cuts are five standard deviations away.
