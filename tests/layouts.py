@@ -1,72 +1,14 @@
-"""Frames with a known truth as a FITS table, and the files of the page about mappings; others are in the corpus."""
+"""The files of the page about mappings; others are in the corpus."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import astropy.units as u
 import numpy as np
 from astropy.io import fits
 from astropy.table import Table
 from astropy.time import Time
-from numpy.typing import NDArray
-
-from mauvecl.observations.mapping import FrameMapping
-
-Float = NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class Truth:
-    """Quantities of spectra as a file holds them: times in days after MJD 61000, wavelengths in Angstrom."""
-
-    time_s: Float
-    wavelength_nm: Float
-    flux: Float  # adu/s
-    error: Float
-    quality: NDArray[np.int64]
-    exposure_s: Float
-    temperature_c: Float
-
-    @classmethod
-    def of(cls, seed: int = 29, n: int = 40, n_pixel: int = 6) -> Truth:
-        """Draw spectra with noise and one flagged frame."""
-        rng = np.random.default_rng(seed)
-        flux = rng.normal(1000.0, 5.0, (n, n_pixel)) * np.linspace(0.5, 1.5, n_pixel)
-        return cls(20.0 * np.arange(n) + 10.0, np.linspace(250.5, 650.5, n_pixel), flux, 0.01 * flux,
-                   (np.arange(n) == 7).astype(np.int64), np.full(n, 18.0), 21.0 + 0.1 * np.arange(n))  # fmt: skip
-
-    @property
-    def time_d(self) -> Float:
-        """Times in days."""
-        return self.time_s / 86_400
-
-
-COMMON: dict[str, Any] = {"flux": "FLUX", "error": "ERR", "quality": "QUAL", "exposure": "EXPT", "temperature": "TEMP",
-                          "time": "T", "epoch": "2025-11-21", "scale": "tt", "position": "geocenter"}  # fmt: skip
-
-
-def scalars(truth: Truth) -> dict[str, Any]:
-    """Return the quantities of frames."""
-    return {"T": truth.time_d, "QUAL": truth.quality, "EXPT": truth.exposure_s, "TEMP": truth.temperature_c}
-
-
-def with_units(table: Table) -> Table:
-    """Give the columns of a table their units."""
-    for name, unit in {"T": "d", "EXPT": "s", "TEMP": "deg_C", "FLUX": "adu/s", "ERR": "adu/s", "W": "AA"}.items():
-        if name in table.colnames:
-            table[name].unit = unit
-    return table
-
-
-def row_per_frame(truth: Truth, folder: Path) -> tuple[Path, FrameMapping]:
-    """Write a FITS table with a spectrum in each row."""
-    waves = np.tile(truth.wavelength_nm * 10, (truth.time_s.size, 1))
-    table = with_units(Table(scalars(truth) | {"FLUX": truth.flux, "ERR": truth.error, "W": waves}))
-    table.write(folder / "rows.fits")
-    return folder / "rows.fits", FrameMapping(**COMMON, wavelength="W")
 
 
 def documented_files(folder: Path) -> None:

@@ -15,7 +15,6 @@ import mauvecl
 from mauvecl import SHAPES, Expectation, Frames, Instrument, Sky, Source, Stare, Study, analyse, expect
 from mauvecl.flares import stare_scene
 from mauvecl.flares.frames import Components
-from mauvecl.host.exposure.star import Neighbour, Neighbours
 
 Float = NDArray[np.float64]
 
@@ -33,7 +32,12 @@ PER_MONTH, PER_CENTURY = 12 / 365.25, 1 / 36_525
 N_STARES, FIRST_STARE = 200, 2**32 - 70
 
 #: Half of a hotter star 0.6 magnitudes fainter than `star`.
-NEAR = Neighbours((Neighbour("B", 10.0, 8.0, "V", "F5V"),), 0.5)
+NEAR: Any = Study().with_settings(
+    [f"star=[{{library='G2V', neighbours='{Path(__file__).parent}/data/studies/near.csv', neighbour_share=0.5}}]"]
+).star[0].near()  # fmt: skip
+
+#: Band and continuum of the Mg II line, nm.
+MG_II: Any = {"band_nm": (278.5, 281.5), "continuum_nm": ((275.5, 278.0), (282.0, 284.5))}
 
 
 def instrument(name: str = "mauve", *, part: bool = False, **changes: Any) -> Instrument:
@@ -51,7 +55,7 @@ def star(
     amplitudes: tuple[float, ...] = (),
     exposure: float = 50.0,
     payload: Instrument | None = None,
-    neighbours: Neighbours | None = None,
+    neighbours: Any = None,
 ) -> list[Expectation]:
     """Return the expectations of the quiescent star and its flares."""
     payload = payload or instrument()

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 from commands import run
 from golden_inputs import DATA, write_inputs
-from scenes import NEAR, instrument, source, star
+from scenes import MG_II, NEAR, instrument, source, star
 from stores import CHUNK, flip
 from stores import study as stored_study
 
@@ -68,7 +68,7 @@ from mauvecl import (
     what_matters,
 )
 from mauvecl.flares.frames import Components
-from mauvecl.observations.visits import MG_II_CONTINUUM_NM, MG_II_NM, line_index, recover_periods
+from mauvecl.observations.visits import line_index, recover_periods
 
 GOLDEN = Path(__file__).parent / "data" / "golden" / "python"
 # Of longer arrays evenly spaced values are kept.
@@ -385,7 +385,7 @@ def lines_and_periods(folder: Path) -> Answer:
     found: Answer = {}
     for path in sorted((DATA / "flares" / "aumic_iue").glob("lp*.txt"))[:4]:
         angstrom, flux, error = np.loadtxt(path, skiprows=19, usecols=(0, 1, 2)).T
-        one = line_index(angstrom / 10, 10 * flux, 10 * error, band_nm=MG_II_NM, continuum_nm=MG_II_CONTINUUM_NM)
+        one = line_index(angstrom / 10, 10 * flux, 10 * error, **MG_II)
         found[path.stem] = [one.flux, one.error]
     time_d = np.sort(np.random.Generator(np.random.PCG64(1)).uniform(0, 60, 30))
     periods = recover_periods(time_d, np.array([2.0, 10.0]), np.array([1.0, 3.0]), fap=0.05)

@@ -254,15 +254,25 @@ def records(record: type[Record] = Record) -> Iterator[type[Record]]:
         yield from records(one)
 
 
+def types(hint: Any) -> set[Any]:
+    """Return the types of single values in an annotation."""
+    inner = get_args(hint)[:1] if hasattr(hint, "__metadata__") else get_args(hint)
+    return set().union(*map(types, inner)) if inner else {hint}
+
+
 @pytest.mark.parametrize("record", sorted(records(), key=lambda one: one.__name__), ids=lambda one: one.__name__)
 def test_wrong_fields_of_records_raise(record: type[Record]) -> None:
-    """Errors of pydantic never leave a section of a study or an instrument."""
-    wrong = (3 * u.kg, np.nan, [1, "a"], "no such thing", object(), np.ones((2, 3)), True, None)
+    """Errors of pydantic never leave a section of a study or an instrument, and truths are no numbers."""
+    wrong = (3 * u.kg, np.nan, [1, "a"], "no such thing", object(), np.ones((2, 3)), None)
+    truths = (True, False, np.True_, [True], [0.5, True], (False,))
     for field in (*record.model_fields, "no_such_key"):
-        for value in wrong:
+        hint = record.model_fields[field].annotation if field in record.model_fields else None
+        numeric = {int, float} & types(hint) and bool not in types(hint)
+        for value in (*wrong, *truths):
             error = error_of(lambda field=field, value=value: record(**{field: value}))
             if error is None:
-                assert type(value) is not object or record.model_fields[field].annotation is Any, field
+                assert type(value) is not object or hint is Any, field
+                assert not numeric or not any(value is one for one in truths), (field, value)
             else:
                 assert "\n" not in str(error)
                 assert says_what_is_accepted(str(error)) or "did you mean" in str(error), error

@@ -36,7 +36,7 @@ SHAPE = "    g1, g2, g3 = c.shape()\n    sd ="
 MUTATIONS: dict[str, Mutation] = {
     # Draws, statistics, stores and runs.
     "one unknown's row dropped": (
-        "test_marginalised_statistics_keep_false_alarms_and_power[0.1]",
+        "test_closed_forms_integrate_over_drawn_unknowns[half a degree]",
         ("nuisances.names if nuisances else ()))", "nuisances.names[1:] if nuisances else ()))"),
     ),
     "a sky that follows no level": (

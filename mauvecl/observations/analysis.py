@@ -286,8 +286,8 @@ class Analysis:
             largest = max(steps, key=lambda step: abs(step[1]))[1]
             often = "once" if len(steps) == 1 else f"{len(steps)} times"
             lines.append(
-                f"The level changes {often} suddenly for a day or more, by {100 * largest:+.2g} % at the most: light is "
-                "relative to the level after each change, and the table of frames has that level."
+                f"The level changes {often} suddenly for a day or more, by {100 * largest:+.2g} % at the most: light "
+                "is relative to the level after each change, and the table of frames has that level."
             )
         if self.level.process.terms:
             # A light curve that shows few periods of a process has another standard deviation than the process.

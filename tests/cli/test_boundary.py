@@ -5,12 +5,10 @@ from __future__ import annotations
 import gzip
 import os
 import re
-import shlex
 import shutil
 import subprocess
 import sys
 import time
-import tomllib
 from pathlib import Path
 from unittest import mock
 
@@ -18,7 +16,6 @@ import numpy as np
 import pytest
 from commands import ended, run
 from refusals import refused as refused_by_key
-from test_refusals import TABLES
 
 from mauvecl import InputError, Instrument, Source, Study, exposure
 
@@ -53,24 +50,6 @@ def test_documentation_names_every_exit_code(tmp_path: Path) -> None:
     for code in (1, 2, 70, 74, 130, 141, 143):
         assert f" {code} " in shown
         assert f"| {code} |" in documented
-
-
-def test_refusals_are_one_sentence_on_standard_error(tmp_path: Path) -> None:
-    """Check the form of what `test_refusals.py` checks the content of."""
-    rows = [
-        row for name in ("cli", "cli-limits") for row in tomllib.loads((TABLES / f"{name}.toml").read_text())["refusal"]
-    ]
-    for number, row in enumerate(rows):
-        folder = tmp_path / str(number)
-        folder.mkdir()
-        for name, text in row.get("files", {}).items():
-            (folder / name).write_text(text)
-        code, out, reported = ended(*shlex.split(row["run"]), folder=folder)
-        assert (code, out, reported.count("\n")) == (2, "", 1), row
-        assert reported.startswith("mauvecl: ")
-        # Parameters are named by their flags.
-        assert "`" not in re.sub(r"`mauvecl [^`]*`", "", reported), reported
-    assert len(rows) > 100
 
 
 @pytest.mark.long
@@ -160,10 +139,6 @@ def test_extreme_numbers_in_settings_raise(key: str, value: str) -> None:
         exposure(Study().with_settings(["signal={snr=5, wavelength_nm=300}", f"{key}={value}"]))
     assert "\n" not in str(error.value)
     assert len(str(error.value)) < 1100
-
-
-def test_long_number_is_shortened_in_the_message(tmp_path: Path) -> None:
-    refused("exposure", "--snr", "5", "--at", "300", "--set", f"run.seed={'9' * 5000}", folder=tmp_path)
 
 
 def test_extreme_numbers_in_instruments_raise(tmp_path: Path) -> None:

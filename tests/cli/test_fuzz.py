@@ -12,7 +12,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from unittest import mock
 
-import numpy as np
 import pytest
 from commands import ended
 from hypothesis import HealthCheck, Phase, given, settings
@@ -185,22 +184,6 @@ def test_verbs_never_crash(folder: Path, verb: str, value: str) -> None:
     check(folder, *words)
 
 
-def _spectra() -> tuple[bytes, ...]:
-    from astropy.io import fits
-
-    wavelength = np.linspace(170.0, 800.0, 200)
-    flux = np.full(200, 1e-12)
-    text = "".join(f"{w:.3f} {f:.3e}\n" for w, f in zip(wavelength, flux, strict=True)).encode()
-    header = (
-        "# %ECSV 1.0\n# ---\n# datatype:\n# - {name: wavelength, unit: nm, datatype: float64}\n"
-        "# - {name: flux, unit: erg / (s cm2 Angstrom), datatype: float64}\n"
-    )
-    columns = [fits.Column("WAVELENGTH", "D", array=wavelength * 10), fits.Column("FLUX", "D", array=flux)]
-    content = io.BytesIO()
-    fits.HDUList([fits.PrimaryHDU(), fits.BinTableHDU.from_columns(columns)]).writeto(content)
-    return text, header.encode() + b"wavelength flux\n" + text, content.getvalue()
-
-
 def _flares() -> tuple[bytes, ...]:
     from astropy.table import Table
 
@@ -237,16 +220,6 @@ SPOILS = {
     "cut": st.sampled_from([0, 1, 5, 80, 3000]),
     "pack": st.sampled_from([False, False, False, True]),
 }
-
-
-@many(30)
-@given(kind=st.integers(0, 2), ending=st.sampled_from([".txt", ".ecsv", ".fits", ".csv", ".gz", ""]), **SPOILS)
-def test_spectra_never_crash(
-    folder: Path, kind: int, ending: str, place: float, splice: bytes, cut: int, pack: bool
-) -> None:
-    file = folder / f"star{ending}"
-    file.write_bytes(spoilt(_spectra()[kind], place, splice, cut, pack))
-    check(folder, *ASK[:-4], "--magnitude", "7.4", "--star", str(file))
 
 
 @many(25)

@@ -53,36 +53,6 @@ def test_flare_follows_its_closed_form(found: Detection, statistic: str, flare: 
     assert ks_probability(found.distribution(statistic, flare), found.closed_form(statistic, flare).sf) > 1e-6
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("statistic", STATISTICS)
-@pytest.mark.parametrize("fap", [1e-2, 1e-3])
-def test_detection_probabilities_agree_with_the_closed_form(found: Detection, statistic: str, fap: float) -> None:
-    """Compare 48 values within 4 standard errors, binomial and of the threshold; fails once in 500 seeds at most."""
-    for flare, p in enumerate(found.detection_probability(fap, statistic)):
-        theory = found.closed_form(statistic, flare)
-        null = found.closed_form(statistic, template=flare)
-        cut = null.isf(fap)
-        exact = theory.sf(cut)
-        # How the probability moves when the simulated threshold errs by its own standard error.
-        shifted = theory.sf(null.isf(fap + np.sqrt(fap * (1 - fap) / N)))
-        error = np.hypot(np.sqrt(exact * (1 - exact) / N), shifted - exact)
-        # A bin is 1/512 of a standard deviation, and the threshold its upper edge.
-        grain = exact - theory.sf(cut + null.std / 512)
-        assert abs(p.value - exact) < 4 * error + grain + 3 / N
-        assert p.low <= p.value <= p.high
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("flare", range(len(AMPLITUDES)))
-def test_area_under_the_roc_equals_its_closed_form(found: Detection, flare: int) -> None:
-    """Compare with Phi(d / sqrt(2)) within 4 half-widths of DeLong's interval; fails in 6e-15 of seeds."""
-    null, with_flare = (found.closed_form("matched", f, template=flare) for f in (None, flare))
-    exact = stats.norm.cdf((with_flare.mean - null.mean) / np.hypot(null.std, with_flare.std))
-    area = found.roc("matched", flare).area
-    assert abs(area.value - exact) <= 2 * max(area.high - area.low, 1e-6)
-    assert area.low <= area.value <= area.high
-
-
 def test_delong_interval_agrees_with_repeated_draws(engine: Engine) -> None:
     """Check that 178 of 200 intervals contain the exact area; fails once in 1e4 new seeds."""
     quiet, flare = star(amplitudes=(0.015,), payload=instrument(output_min_nm=300.0, output_max_nm=310.0))

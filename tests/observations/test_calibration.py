@@ -141,20 +141,6 @@ def test_fit_recovers_another_width_and_wavelength_scale() -> None:
     assert abs(f.shift_nm.value - 0.1) < FAR * f.shift_nm.error
 
 
-@pytest.mark.long
-def test_throughput_with_kinks_is_followed() -> None:
-    """A quantum efficiency of another shape, whose ratio to the nominal one has kinks every 25 to 50 nm.
-
-    Some tens of independent values lie within 4 standard errors, and nothing is blamed on the stars.
-    """
-    true = truth(throughput_factor=None, quantum_efficiency_a_per_w=curve([450.0], [0.15]))
-    f = answer_of(STARS, true, 7).throughput
-    off = f.log_factor - np.log(true.throughput(f.wavelength_nm) / NOMINAL.throughput(f.wavelength_nm))
-    assert np.abs(off / f.error).max() < FAR
-    assert f.spectrum_error == 0
-    assert f.p_value > 1e-4
-
-
 def test_written_instrument_is_the_fitted_one(answer: Any, tmp_path: Path) -> None:
     answer.write(tmp_path)
     read = Instrument.load(tmp_path / "instrument.toml")

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy
+from scenes import MG_II
 
 from mauvecl import Engine, Expectation, Instrument, Nuisances, Sky, Source, Study, change, expect
 from mauvecl.observations.visits import line_index, recover_periods
@@ -132,12 +133,7 @@ def test_indices_of_au_mic_are_those_of_a_direct_integration(file: str, tmp_path
     direct = np.trapezoid(np.interp(fine, nm, flux) - np.polyval(line, fine), fine)
     assert row["flux"].value == pytest.approx(direct, rel=0.01, abs=0)
     # The index at the resolution of IUE, times the share that is captured, leaves the continuum's curvature.
-    sharp = line_index(
-        source.wavelength_nm,
-        10 * source.flux_flam,
-        band_nm=(278.5, 281.5),
-        continuum_nm=((275.5, 278.0), (282.0, 284.5)),
-    )
+    sharp = line_index(source.wavelength_nm, 10 * source.flux_flam, **MG_II)
     assert 0.2 < row["flux"].value / (row["captured"] * float(sharp.flux)) < 5
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.io import fits
-from layouts import Truth, row_per_frame
+from astropy.table import Table
 
 from mauvecl import InputError, read_frames
 from mauvecl.observations.frame_files import reduce_frames
@@ -42,50 +42,21 @@ np.savez({out!r}, white=frames.flux, one=reduced.light_curves[0].flux, two=reduc
 """
 
 
+def _light() -> np.ndarray:
+    return (PATTERN[:, None] + np.arange(PIXELS)).astype(np.float32)
+
+
 def _image(path: Path) -> None:
-    """Write an image of 256 MiB in pieces, with its times and wavelengths."""
-    header = fits.ImageHDU(np.zeros((1, 1), np.float32), name="FLUX").header
-    header["NAXIS1"], header["NAXIS2"] = PIXELS, FRAMES
-    rest = [fits.ImageHDU(np.arange(PIXELS) + 200.0, name="WAVES"), fits.ImageHDU(np.arange(FRAMES) * 5.0, name="TIME")]
-    with path.open("wb") as file:
-        file.write(fits.PrimaryHDU().header.tostring().encode() + header.tostring().encode())
-        _rows(file, lambda rows: rows.astype(">f4"))
-        for hdu in rest:
-            held = fits.HDUList([fits.PrimaryHDU(), hdu])
-            held.writeto(path.with_suffix(".part"), overwrite=True)
-            file.write(path.with_suffix(".part").read_bytes()[fits.PrimaryHDU().header.tostring().__len__() :])
+    """Write an image of 256 MiB, with its times and wavelengths."""
+    images = {"FLUX": _light(), "WAVES": np.arange(PIXELS) + 200.0, "TIME": np.arange(FRAMES) * 5.0}
+    fits.HDUList([fits.PrimaryHDU(), *(fits.ImageHDU(one, name=name) for name, one in images.items())]).writeto(path)
 
 
 def _table(path: Path) -> None:
-    """Write a table of 256 MiB in pieces, a spectrum in each row, with its wavelengths in another extension."""
-    row = np.dtype([("TIME", ">f8"), ("FLUX", ">f4", (PIXELS,))])
-    columns = [fits.Column("TIME", "D"), fits.Column("FLUX", f"{PIXELS}E")]
-    header = fits.BinTableHDU.from_columns(columns, nrows=1).header
-    header["NAXIS2"] = FRAMES
-    primary = fits.PrimaryHDU().header.tostring().encode()
-    start = 0
-
-    def rows_of(rows: np.ndarray) -> np.ndarray:
-        nonlocal start
-        made = np.empty(len(rows), row)
-        made["TIME"], made["FLUX"] = (start + np.arange(len(rows))) * 5.0, rows
-        start += len(rows)
-        return made
-
-    waves = fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(np.arange(PIXELS) + 200.0, name="WAVES")])
-    waves.writeto(path.with_suffix(".part"), overwrite=True)
-    with path.open("wb") as file:
-        file.write(primary + header.tostring().encode())
-        _rows(file, rows_of)
-        file.write(path.with_suffix(".part").read_bytes()[len(primary) :])
-
-
-def _rows(file, form) -> None:  # type: ignore[no-untyped-def]
-    size = 0
-    for start in range(0, FRAMES, 4096):
-        raw = form(PATTERN[start : start + 4096, None] + np.arange(PIXELS)).tobytes()
-        size += file.write(raw)
-    file.write(b"\0" * (-size % 2880))
+    """Write a table of 256 MiB, a spectrum in each row, with its wavelengths in another extension."""
+    times = fits.Column("TIME", "D", array=np.arange(FRAMES) * 5.0)
+    table = fits.BinTableHDU.from_columns([times, fits.Column("FLUX", f"{PIXELS}E", array=_light())])
+    fits.HDUList([fits.PrimaryHDU(), table, fits.ImageHDU(np.arange(PIXELS) + 200.0, name="WAVES")]).writeto(path)
 
 
 @pytest.mark.long
@@ -113,19 +84,22 @@ def test_a_file_larger_than_memory_is_reduced_in_pieces(write, tmp_path: Path) -
 
 @pytest.mark.long
 def test_pieces_give_what_the_whole_gives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    truth = Truth.of(n=1500, n_pixel=50)
-    flux = truth.flux.copy()
+    rng, n, path = np.random.default_rng(29), 1500, tmp_path / "rows.fits"
+    flux = rng.normal(1000.0, 5.0, (n, 50)) * np.linspace(0.5, 1.5, 50)
+    error = 0.01 * flux
     flux[:, 4], flux[11, 5] = np.nan, np.nan
-    path, mapping = row_per_frame(Truth(**(vars(truth) | {"flux": flux})), tmp_path)
+    columns = {"T": 20.0 * np.arange(n), "QUAL": (np.arange(n) == 7).astype(int), "FLUX": flux, "ERR": error,
+               "W": np.tile(np.linspace(250.5, 650.5, 50), (n, 1))}  # fmt: skip
+    Table(columns, units={"T": "s", "FLUX": "adu/s", "ERR": "adu/s", "W": "nm"}).write(path)
+    mapping = FrameMapping(time="T", flux="FLUX", error="ERR", quality="QUAL", wavelength="W", exposure_s=18.0)
     whole = read_frames(path, mapping)
     monkeypatch.setattr("mauvecl.host.tables.table.PIECE_BYTES", 8 * 50 * 400)
     monkeypatch.setattr("mauvecl.host.tables.fits_tables.PIECE_BYTES", 0)
     monkeypatch.setenv("MAUVECL_LARGEST_CONTENT_MIB", "1")
     pieces = read_frames(path, mapping)
     assert pieces.error is not None
-    light, error = whole.white_light
-    np.testing.assert_allclose(pieces.flux, light)
-    np.testing.assert_allclose(pieces.error, error)
+    for found, wanted in zip((pieces.flux, pieces.error), whole.white_light, strict=True):
+        np.testing.assert_allclose(found, wanted)
     np.testing.assert_array_equal(pieces.quality, whole.quality)
     assert "1 pixel is not finite in most frames" in pieces.remarks[-1]
     pixels = reduce_frames(path, mapping=mapping).pixels
@@ -135,7 +109,7 @@ def test_pieces_give_what_the_whole_gives(tmp_path: Path, monkeypatch: pytest.Mo
     steps = np.diff(np.where(np.arange(1500)[:, None] == 7, np.nan, flux), axis=0)
     np.testing.assert_allclose(pixels.scatter[6:], np.sqrt(np.nanmean(steps[:, 6:] ** 2, axis=0) / 2))
     assert pixels.stated is not None
-    np.testing.assert_allclose(pixels.stated[6:], np.sqrt((np.delete(truth.error, 7, axis=0)[:, 6:] ** 2).mean(axis=0)))
+    np.testing.assert_allclose(pixels.stated[6:], np.sqrt((np.delete(error, 7, axis=0)[:, 6:] ** 2).mean(axis=0)))
 
 
 CSV_CHILD = """

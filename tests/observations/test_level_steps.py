@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 from scenes import analysed, flare
 
 from mauvecl import Frames
-from mauvecl.schema.physical import DAY_S
 
 Float = NDArray[np.float64]
 
+DAY_S = 86_400.0
 #: Frames of half an hour for 82 days, the frames before which the level changes, and by how much.
 FRAME_S, N_FRAMES, NOISE = 1765.0, 4000, 4e-4
 STEPS = {1400: -0.03, 2300: 0.012, 3400: 0.03}

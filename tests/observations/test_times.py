@@ -97,18 +97,6 @@ def test_barycentric_times_stay_as_they_are() -> None:
     assert "barycentric already" in again.remarks[-1]
 
 
-@pytest.mark.parametrize("ending", ["csv", "fits"])
-@pytest.mark.parametrize("word", ["", "null", "N/A", "--", "NaT", "None", "<NA>", "masked"])
-def test_frames_without_a_date_are_left_out(word: str, ending: str, tmp_path: Path) -> None:
-    dates = [f"2026-03-01T00:00:{2 * k:02d}" for k in range(24)]
-    dates[3] = word
-    table = Table({"TIME": dates, "FLUX": np.arange(24.0)})
-    table.write(tmp_path / f"dates.{ending}")
-    frames = read_frames(tmp_path / f"dates.{ending}")
-    assert frames.flux.tolist() == [float(k) for k in range(24) if k != 3]
-    np.testing.assert_allclose(np.diff(frames.time_s), [2.0, 2.0, 4.0, *[2.0] * 19], atol=1e-4)
-
-
 @pytest.mark.long
 def test_tables_of_an_analysis_state_epoch_scale_and_place(tmp_path: Path) -> None:
     hdu = fits.table_to_hdu(Table({"TIME": TIME, "FLUX": FLUX}))

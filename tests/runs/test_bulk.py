@@ -24,7 +24,7 @@ from astropy.wcs import WCS
 from commands import run
 from marks import long_but
 from refusals import refused
-from stores import CHUNK, LAST, Painter, expectations, flip, forked, full_after, killed, locked, study, tree
+from stores import CHUNK, LAST, Painter, expectations, flip, forked, full_after, killed, study, tree
 
 from mauvecl import Engine, Study, bulk
 from mauvecl.runs.store import Store
@@ -184,15 +184,6 @@ def test_foreign_files_are_named_and_kept(path: Path, engine: Engine) -> None:
 def test_another_study_raises_with_the_difference(path: Path, engine: Engine) -> None:
     with refused("store", "run.seed", "star.0.magnitude"):
         bulk.realise(study(run={"seed": 3}).at("magnitude", 7.0), path, engine)
-    assert bulk.verify(path) == []
-
-
-def test_second_writer_raises(path: Path, engine: Engine) -> None:
-    with locked(path):
-        with refused("lock", str(path)):
-            bulk.realise(study(), path, engine)
-        with refused("lock", str(path)):
-            bulk.verify(path)
     assert bulk.verify(path) == []
 
 

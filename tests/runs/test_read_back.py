@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from commands import run
-from refusals import refused
 from stores import Painter, expectations, study
 
 from mauvecl import Engine, Study, bulk, read_frames
@@ -85,29 +83,6 @@ def folder(tmp_path: Path) -> Path:
 def exported(folder: Path, *words: str) -> str:
     """Return the refusal of an export."""
     return run("export", "s.zarr", *words, folder=folder, code=2).stderr
-
-
-#: Calls with the folder, the key of the error, and what its sentence names.
-CALLS: dict[str, tuple[Callable[[Path], object], str, *tuple[str, ...]]] = {
-    "a folder of other files": (lambda at: bulk.realise(study(), at / "notes", PAINTER), "store", "'mine.txt'"),
-    "removal of other files": (lambda at: bulk.forget(at / "notes"), "store"),
-    "a store in a file": (lambda at: bulk.realise(study(), at / "notes" / "mine.txt" / "s", PAINTER), "store"),
-    "no store": (lambda at: bulk.read(at / "nowhere"), "store"),
-    "no such array": (lambda at: bulk.read(at / "s.zarr", "star-9/quiescent"), "scenes", "'star-9/quiescent'"),
-    "a frame beyond the exposure": (
-        lambda at: bulk.realise(study(ROWS, bulk={"frames": [7]}), at / "t.zarr", PAINTER), "bulk.frames"),
-    "frames of an unnamed array": (lambda at: read_frames(at / "s.zarr"), "hdu", "star-1/quiescent",
-                                   "FILE[star-1/flare-1]"),
-    "frames of an unknown array": (lambda at: read_frames(f"{at / 's.zarr'}[star-2]"), "hdu", "star-2"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", CALLS)
-def test_bad_input_raises(name: str, folder: Path) -> None:
-    call, key, *facts = CALLS[name]
-    with refused(key, *facts):
-        call(folder)
-    assert (folder / "notes" / "mine.txt").read_text() == "keep me"
 
 
 def test_bad_exports_are_refused(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

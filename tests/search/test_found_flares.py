@@ -84,19 +84,6 @@ def test_unfitted_shape_leaves_at_most_a_small_residual() -> None:
 
 
 @pytest.mark.long
-def test_separate_flares_are_found_in_order_of_value() -> None:
-    events = [Event(1500.0, 40.0, 0.1), Event(3000.0, 60.0, 0.3), Event(4500.0, 100.0, 0.05)]
-    several = found(events, 1, BRIGHT)
-    assert (np.diff(several["value"]) < 0).all()
-    assert list(several["event"]) == [2, 1, 3]
-    for row in several:
-        event = events[row["event"] - 1]
-        # Beyond five standard errors once in 2e6.
-        assert abs(row["amplitude"] - event.amplitude) < 5 * row["amplitude_error"]
-        check(row, event)
-
-
-@pytest.mark.long
 @pytest.mark.parametrize("apart", [60.0, 120.0, 300.0, 900.0])
 def test_two_equal_flares_are_separated(apart: float) -> None:
     """S/N 83 each. Fitted one after another, those 120 s apart came back as four, one of ten times the energy."""

@@ -1,4 +1,4 @@
-"""Keys of studies: their units, ranges and types wherever a value can be given, their paths, and older files."""
+"""Keys of studies: their units and ranges wherever a value can be given, their paths, and older files."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ from typing import Any, get_args
 import astropy.units as u
 import numpy as np
 import pytest
-from pydantic import BaseModel, ValidationError
 from refusals import refused
-from study_keys import fields, metadata, models_in
+from study_keys import fields, metadata
 
 from mauvecl import BalmerFlare, InputError, Instrument, Sky, Source, Study, TwoBlackbodies, detect, expect
 from mauvecl.web.page import State
@@ -40,29 +39,6 @@ def test_values_in_range_are_plain_numbers(key: str, value: Any, plain: Any) -> 
     found = getattr(getattr(Study.build({section: {name: value}}, "test"), section), name)
     np.testing.assert_allclose(found, plain, rtol=1e-12) if plain is not None else None
     assert type(found) is type(plain)
-
-
-@pytest.mark.parametrize(
-    ("key", "value", "expected"),
-    [
-        ("observation.exposure_s", 0, "seconds above 0 and up to 86400"),
-        ("observation.exposure_s", 3 * u.kg, "seconds above 0 and up to 86400"),
-        ("observation.exposure_s", "a minute", "seconds above 0 and up to 86400"),
-        ("observation.exposure_s", float("nan"), "seconds above 0 and up to 86400"),
-        ("observation.temperature_c", 66, "-40 to 65 deg C"),
-        ("signal.wavelength_nm", -1 * u.um, "nm above 0"),
-        ("run.fap", 1, "a number above 0 and below 1"),
-        ("run.seed", -1, "a whole number from 0 to 18446744073709551615"),
-        ("run.realisations", 1.5, "a whole number"),
-        ("run.realisations", 0, "a whole number of at least 1"),
-        ("search.window_s", float("inf"), "seconds"),
-        ("measure.bands_nm.0.0", [[1, 2] * u.s], "nm above 0"),
-    ],
-)
-def test_other_values_raise(key: str, value: Any, expected: str) -> None:
-    section, name, *_ = key.split(".")
-    with refused(key, expected=expected):
-        Study.build({section: {name: value}}, "test")
 
 
 # Ranges of quantities
@@ -180,49 +156,6 @@ def test_keys_of_one_kind_share_a_range() -> None:
     for low, high in ((-41, 25), (15, 66)):
         with refused("detector_temperature", expected="-40 to 65"):
             detect(Study().with_settings(["run.realisations=100000", prior.format(low, high)]))
-
-
-# Types
-
-
-def models(model: type[BaseModel]) -> Iterator[type[BaseModel]]:
-    """Yield a model and all models of its fields."""
-    yield model
-    for field in model.model_fields.values():
-        for inner in models_in(field.annotation):
-            yield from models(inner)
-
-
-def types(annotation: Any) -> set[Any]:
-    """Return the types of single values in an annotation."""
-    parts = get_args(annotation)[:1] if hasattr(annotation, "__metadata__") else get_args(annotation)
-    return set().union(*map(types, parts)) if parts else {annotation}
-
-
-#: Numeric keys of studies and instruments by their model.
-NUMBERS = {
-    model: names
-    for root in (Study, Instrument)
-    for model in models(root)
-    if (names := [name for name, field in model.model_fields.items()
-                  if types(field.annotation) & {int, float} and bool not in types(field.annotation)])
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("model", sorted(NUMBERS, key=lambda one: one.__name__))
-def test_booleans_as_numbers_raise(model: type[BaseModel]) -> None:
-    """All numeric keys of studies and instruments reject booleans of Python and NumPy, alone and in lists."""
-    for name in NUMBERS[model]:
-        for value in (True, False, np.True_, [True], [0.5, True], (False,)):
-            with pytest.raises(ValidationError) as error:
-                model.model_validate({name: value})
-            assert any(fault["loc"][0] == name for fault in error.value.errors()), (name, value)
-
-
-def test_numeric_keys_are_found() -> None:
-    names = {f"{model.__name__}.{name}" for model, numeric in NUMBERS.items() for name in numeric}
-    assert {"Star.bin_nm", "Flare.amplitudes", "Run.seed", "Instrument.read_noise_dn", "Axis.values"} <= names
-    assert len(names) > 100
 
 
 # Paths

@@ -117,17 +117,6 @@ def test_stare_draws_prior_as_exposure_does(engine: Engine, name: str) -> None:
     assert abs(np.log(found.std() / exposures.std())) < 5 / np.sqrt(N)
 
 
-def test_stare_draws_cosmic_rays() -> None:
-    rays = asked("cosmic_rays", {})
-    drawn, plain = frames(asked(None), 50, seed=1, processes=rays.processes), frames(asked(None), 50, seed=1)
-    assert (drawn != plain).any()
-    assert (drawn >= plain - 1.0).all()
-    flux, without = (
-        stare(study.with_settings(["stare.duration_s=600"])).stares[0].light.flux for study in (rays, asked(None))
-    )
-    assert (flux != without).any()
-
-
 def test_spreads_of_process_and_stare_add_in_quadrature() -> None:
     study = asked("qe_scale", PRIORS["qe_scale"]).with_settings(["stare.offsets={light=0.1}"])
     found = stare(study).stares[0].staring.stare

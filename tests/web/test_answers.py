@@ -211,28 +211,6 @@ def test_limits_are_detected_with_the_wanted_probability(server: Server, of: str
     server.visited(work)
 
 
-#: Questions whose closed form is compared with a simulation.
-SIMULATED = ({}, {"statistic": "chi2", "magnitude": "8"}, {"statistic": "uv_excess", "amplitude_percent": "5"})
-
-
-@pytest.mark.parametrize("more", long_but(SIMULATED, SIMULATED[0]))
-def test_closed_forms_follow_the_simulation_of_the_page(server: Server, more: dict[str, str]) -> None:
-    """Within five standard deviations of 100 000 realisations; unknowns of 3 %, which closed forms round, included."""
-    asked = link(**M_DWARF | more)
-
-    async def work(talk: Talk) -> None:
-        await talk.answer(asked)
-        closed = await talk.chances(asked)
-        assert (await talk.simulate("detection", asked)).startswith("Done: ")
-        for one, value in zip((await talk.answer(asked))["answer"]["numbers"], closed, strict=True):
-            assert "of 100,000 simulated" in one["interval"]
-            assert one["value"] != value
-            # The threshold is drawn, too.
-            assert one["value"] == pytest.approx(value, abs=5 * np.sqrt(value * (1 - value) / 1e5 + (value / 30) ** 2))
-
-    server.visited(work)
-
-
 # Pictures
 
 
