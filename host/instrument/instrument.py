@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property, partial
-from importlib import resources
-from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -19,7 +16,8 @@ from pydantic_core import PydanticCustomError
 from scipy.special import erf, ndtr
 
 from mauvecl.host.instrument.curves import MAX_PIXELS, Curve, PixelMap, ThroughputErrors
-from mauvecl.host.tables.files import is_file, read_text, toml
+from mauvecl.host.instrument.paths import instrument_path, shipped_names
+from mauvecl.host.tables.files import read_text, toml
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.fields import Help, Range, Unit, count, is_quantity, numbers, word_of
@@ -631,36 +629,3 @@ class LineSpread:
         # Knots that differ only by rounding would make empty panels.
         distinct: Float = edges[np.append(True, np.diff(edges) > 1e-9)]
         return distinct
-
-
-def shipped_names() -> tuple[str, ...]:
-    """Return the names of the instruments that the package contains."""
-    files = resources.files(__package__).joinpath("instruments").iterdir()
-    return tuple(sorted(file.name.removesuffix(".toml") for file in files if file.name.endswith(".toml")))
-
-
-def instrument_path(name: str | Path, folder: Path) -> Path:
-    """Return the path of an embedded instrument or of a user's file, relative to `folder`."""
-    if not isinstance(name, str | Path):
-        raise InputError.of("instrument", name, "a name or the path of a TOML file")
-    names = shipped_names()
-    if name in names:
-        return _local(resources.files(__package__).joinpath("instruments", f"{name}.toml"))
-    path = folder / name
-    if is_file(path):
-        return path
-    if path.is_dir():
-        raise InputError(f"instrument {shortened(str(path))} is a folder", "a name or a TOML file", key="instrument")
-    if path.suffix == ".toml":
-        raise InputError(f"instrument file {shortened(str(path))} does not exist", "a TOML file", key="instrument")
-    near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.0)[0]
-    raise InputError(
-        f"unknown instrument {shortened(str(name))}",
-        f"{' or '.join(names)} (nearest: {near!r}) or the path of a TOML file",
-        key="instrument",
-    )
-
-
-def _local(resource: Traversable) -> Path:
-    # setuptools installs real files; a zipped package would have to be extracted.
-    return Path(str(resource))

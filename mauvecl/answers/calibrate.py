@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from mauvecl.answers.answer import Answer, TableOf, ecsv_text
 from mauvecl.host.exposure.expectation import expect
 from mauvecl.host.instrument.curves import CALIBRATED, MODE, ThroughputErrors
-from mauvecl.host.instrument.instrument import Instrument, shipped_names
+from mauvecl.host.instrument.instrument import Instrument
+from mauvecl.host.instrument.paths import shipped_names
 from mauvecl.observations.detector import (
     CalibrationFrames,
     DarkFit,
