@@ -59,8 +59,9 @@ def relative_level(time_s: Float, numbers: NDArray[np.int64], flux: Float, frame
         left = values - _light_of_steps(values.size, places, sizes)
         quiet = ~guess_flares(numbers, left)
         process = fit_process(binned(left), process)
-        change, error = _fitted_steps(process, time_s, left, quiet, places)
-        apart, error_apart = _fitted_steps(process, time_s, left, quiet & ~_after_rises(time_s, places, sizes), places)
+        change, error = _fitted_steps(process, time_s, left, quiet, places, frame_s)
+        no_flare = quiet & ~_after_rises(time_s, places, sizes)
+        apart, error_apart = _fitted_steps(process, time_s, left, no_flare, places, frame_s)
         before, sizes = sizes, sizes + change
         kept = (np.abs(sizes) > SIGNIFICANT * error) & ((before + apart) / np.sign(sizes) > AFTER_FLARE * error_apart)
         settled = kept.all() and (np.abs(change) < error).all()
@@ -97,8 +98,8 @@ def _sudden_changes(time_s: Float, flux: Float) -> tuple[Places, Float]:
             largest = np.abs(change[max(0, k - side) : k + side + 1]).max()
             if np.abs(change[k]) >= largest and not any(abs(k + side - one) <= side for one in found):
                 found[int(k + side)] = (float(np.abs(change[k])) / usual, float(change[k]))
-    most = sorted(found, key=lambda one: found[one], reverse=True)[:MOST_STEPS]
-    places = np.array(sorted(one for one in most if _lasts(time_s, flux, one, found[one][1])), np.intp)
+    lasting = [one for one in found if _lasts(time_s, flux, one, found[one][1])]
+    places = np.array(sorted(sorted(lasting, key=lambda one: found[one], reverse=True)[:MOST_STEPS]), np.intp)
     return places, np.array([found[int(one)][1] for one in places])
 
 
@@ -107,10 +108,10 @@ def _lasts(time_s: Float, flux: Float, place: int, size: float) -> bool:
 
     The light of a star that turns in less time has the same median before and after.
     """
-    apart_s = time_s - time_s[place]
+    start = time_s[place]
     for length_s in LENGTHS_S:
-        before = flux[(apart_s < 0) & (apart_s >= -length_s)]
-        after = flux[(apart_s > FLARE_S) & (apart_s <= FLARE_S + length_s)]
+        first, later, last = np.searchsorted(time_s, [start - length_s, start + FLARE_S, start + FLARE_S + length_s])
+        before, after = flux[first:place], flux[later:last]
         if min(before.size, after.size) >= SIDES[0]:
             share = float(np.median(after) - np.median(before)) / size
             if 1 / LASTS < share < LASTS:
@@ -133,11 +134,18 @@ def _after_rises(time_s: Float, places: Places, sizes: Float) -> Bool:
     return inside
 
 
-def _fitted_steps(process: Process, time_s: Float, flux: Float, quiet: Bool, places: Places) -> tuple[Float, Float]:
+def _fitted_steps(
+    process: Process, time_s: Float, flux: Float, quiet: Bool, places: Places, frame_s: float
+) -> tuple[Float, Float]:
     """Return the steps of a light curve by generalised least squares, and their standard errors, (n_step,) each."""
-    rows = np.flatnonzero(quiet)
-    covariance = process.covariance(time_s[quiet], np.full(rows.size, process.excess**2))
-    columns = np.column_stack([np.ones(rows.size), *(rows >= place for place in places), flux[quiet]])
-    white = covariance.whitened(columns.astype(np.float64))
+    rows, time = np.flatnonzero(quiet), time_s[quiet]
+
+    def binned(column: Float | Bool) -> Binned:
+        return Binned.of(time, column.astype(np.float64), np.ones(rows.size), frame_s)
+
+    data = binned(flux[quiet])
+    columns = [np.ones(data.values.size), *(binned(rows >= place).values for place in places), data.values]
+    covariance = process.covariance(data.time_s, data.variance * process.excess**2)
+    white = covariance.whitened(np.column_stack(columns))
     spread = np.linalg.pinv(white[:, :-1].T @ white[:, :-1])
     return (spread @ (white[:, :-1].T @ white[:, -1]))[1:], np.sqrt(np.diag(spread))[1:]
