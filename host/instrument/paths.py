@@ -1,4 +1,4 @@
-"""Paths of instrument files, embedded or a user's; found without NumPy, so that mistakes are told at once."""
+"""Names and paths of instrument files. NumPy is not imported here, so that a wrong name is reported at once."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ class Comparison:
 
     @property
     def plain(self) -> bool:
-        """Whether only the expectation and the model's variances are used."""
+        """True if the comparison uses only the expectation and the variances of the model."""
         return not (self.exposures or self.estimated)
 
 

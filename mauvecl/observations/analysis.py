@@ -282,9 +282,9 @@ class Analysis:
                 "The throughput changes, as by pointing losses; short changes may resemble flares: "
                 'search.frame.light = "free", the default, searches without the light that all pixels share.'
             )
-        if steps := self.level.steps:
-            largest = max(steps, key=lambda step: abs(step[1]))[1]
-            often = "once" if len(steps) == 1 else f"{len(steps)} times"
+        if changes := self.level.changes:
+            largest = max(changes, key=lambda change: abs(change[1]))[1]
+            often = "once" if len(changes) == 1 else f"{len(changes)} times"
             lines.append(
                 f"The level changes {often} suddenly for a day or more, by {100 * largest:+.2g} % at the most: light "
                 "is relative to the level after each change, and the table of frames has that level."

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mauvecl.observations.event_fits import flares_of
 from mauvecl.observations.event_windows import REACH
-from mauvecl.observations.process import Binned, Process, Steps, fit_process, level_fit
+from mauvecl.observations.process import Binned, Process, Steps, criterion_of_process, fit_process
 from mauvecl.observations.process_search import FilterRow, ProcessSearch
 from mauvecl.observations.search import Detection, SeriesSurvey
 from mauvecl.schema.physical import DAY_S
@@ -202,7 +202,7 @@ def _criterion_of(survey: SeriesSurvey, fits: Sequence[EventLight], kept: Bool, 
             noise = (survey.variance + extra)[kept]
             process = fit_process(Binned(start, column, noise, survey.stare.frame_s), process)
             noise = noise * process.excess**2
-        total += _criterion_of_process(process, Binned(start, column, noise, survey.stare.frame_s), size)
+        total += criterion_of_process(process, Binned(start, column, noise, survey.stare.frame_s), size)
     return total
 
 
@@ -229,14 +229,8 @@ def _criterion_alone(survey: SeriesSurvey, event: Detection, size: float, *alter
         data = Binned(survey.stare.start_s[rows], values, variance, survey.stare.frame_s)
         process = fit_process(data) if event.last - event.first >= MIN_QUIET else Process((), 1.0)
         noise = replace(data, variance=variance * process.excess**2)
-        costs.append(PARAMETERS * n_flares * size + _criterion_of_process(process, noise, size))
+        costs.append(PARAMETERS * n_flares * size + criterion_of_process(process, noise, size))
     return min(costs)
-
-
-def _criterion_of_process(process: Process, data: Binned, size: float) -> float:
-    """Return the criterion of a process for values with the variance of their noise."""
-    covariance = process.covariance(data.time_s, data.variance)
-    return process.n_parameters * size - 2 * level_fit(covariance, data.values).log_likelihood
 
 
 def _seen_once(survey: SeriesSurvey) -> bool:

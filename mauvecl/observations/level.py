@@ -63,14 +63,14 @@ class QuiescentLevel:
     quiet: Bool  # shape (n_frame,); frames that are searched and belong to no event
     reasons: NDArray[np.int64]  # shape (n_frame,); why frames are not searched; see `frames.Reason`
     process: Process  # in standard deviations of the noise of a typical frame
-    steps: tuple[tuple[int, float], ...] = ()  # first frames after steps of the level, and its relative changes
+    changes: tuple[tuple[int, float], ...] = ()  # first frames after steps of the level, and its relative changes
 
     def times(self, relative: Float) -> QuiescentLevel:
         """Return the level of light that was divided by one which changes in steps, shape (n_frame,)."""
         places = np.flatnonzero(np.diff(relative)) + 1
-        steps = tuple((int(place), float(relative[place] / relative[place - 1] - 1)) for place in places)
+        changes = tuple((int(place), float(relative[place] / relative[place - 1] - 1)) for place in places)
         level, level_error, error = (each * relative for each in (self.level, self.level_error, self.error))
-        return replace(self, level=level, level_error=level_error, error=error, steps=steps)
+        return replace(self, level=level, level_error=level_error, error=error, changes=changes)
 
     @property
     def used(self) -> Bool:

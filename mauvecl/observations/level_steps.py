@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.observations.level import PER_MAD, guess_flares
-from mauvecl.observations.process import MAX_TRIED, Binned, Process, fit_process, level_fit
+from mauvecl.observations.process import MAX_TRIED, Binned, Process, criterion_of_process, fit_process
 from mauvecl.schema.physical import DAY_S
 
 Float = NDArray[np.float64]
@@ -44,8 +46,7 @@ def relative_level(time_s: Float, numbers: NDArray[np.int64], flux: Float, frame
         Time from frame to frame on the grid.
     """
     constant = np.ones(flux.size)
-    noise = PER_MAD * float(np.median(np.abs(np.diff(flux)))) / np.sqrt(2.0)
-    values = flux / noise
+    values = flux / Binned(time_s, flux, constant, frame_s).noise
     places, sizes = _sudden_changes(time_s, values)
     typical = float(np.median(values))
     process: Process | None = None
@@ -75,9 +76,9 @@ def relative_level(time_s: Float, numbers: NDArray[np.int64], flux: Float, frame
     for light, each, n_steps in ((values - added, process, places.size), (values, None, 0)):
         data = binned(light)
         fitted = fit_process(data, each)
-        covariance = fitted.covariance(data.time_s, data.variance * fitted.excess**2)
-        cost = (2 * n_steps + fitted.n_parameters) * float(np.log(data.values.size))
-        costs.append(cost - 2 * level_fit(covariance, data.values).log_likelihood)
+        size = float(np.log(data.values.size))
+        noise = replace(data, variance=data.variance * fitted.excess**2)
+        costs.append(2 * n_steps * size + criterion_of_process(fitted, noise, size))
     level = 1.0 + added / typical
     level = level / np.median(level)
     return level if costs[0] < costs[1] and level.min() > 1 / LARGEST and level.max() < LARGEST else constant

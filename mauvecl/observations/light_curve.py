@@ -33,7 +33,7 @@ from mauvecl.observations.level import (
     spikes,
 )
 from mauvecl.observations.level_steps import relative_level
-from mauvecl.observations.process import Binned, Steps, fit_process, level_fit
+from mauvecl.observations.process import Binned, Steps, criterion_of_process, fit_process
 from mauvecl.observations.search import SeriesSurvey, bank_of
 from mauvecl.schema.errors import InputError
 
@@ -166,9 +166,9 @@ def _eclipses(survey: SeriesSurvey, usual: float) -> Bool:
     # The light in eclipses may have any smooth shape.
     dim = survey.frames(guessed)
     data = Binned(dim.stare.start_s, dim.sums[:, 0], dim.variance, dim.stare.frame_s)
-    process = fit_process(data)
-    light = level_fit(process.covariance(data.time_s, data.variance * process.excess**2), data.values)
-    cost = (EPHEMERIS + process.n_parameters) * float(np.log(guessed.size)) - 2 * light.log_likelihood
+    process, size = fit_process(data), float(np.log(guessed.size))
+    dim_light = replace(data, variance=data.variance * process.excess**2)
+    cost = EPHEMERIS * size + criterion_of_process(process, dim_light, size)
     if criterion(fitted, light_of_events(fitted, taken), taken) + cost >= usual:
         return none
     quiet = ~guessed

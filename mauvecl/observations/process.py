@@ -398,6 +398,19 @@ class Binned:
         return cls(total(time_s) / count, total(values) / count, total(variance) / count**2, factor * step_s)
 
 
+def criterion_of_process(process: Process, data: Binned, size: float) -> float:
+    """Return the Bayesian information criterion of a process for values with the variance of their noise.
+
+    Parameters
+    ----------
+    process, data
+    size : float
+        Cost of a parameter.
+    """
+    covariance = process.covariance(data.time_s, data.variance)
+    return process.n_parameters * size - 2 * level_fit(covariance, data.values).log_likelihood
+
+
 def fit_process(data: Binned, start: Process | None = None, steps: Steps | None = None) -> Process:
     """Fit a process to a light curve without flares.
 

@@ -1,4 +1,4 @@
-"""What people see of results: columns of tables, views, JSON, notes on tables that are shown in part, and pictures."""
+"""Columns of tables, their views and JSON, notes on tables that are shown in part, and objects with pictures."""
 
 from __future__ import annotations
 
