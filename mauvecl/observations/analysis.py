@@ -189,7 +189,7 @@ class Analysis:
     measured: SimulatedRate  # the same with residuals resampled from quiescent frames
     threshold: float  # threshold for the wanted rate: the higher of the thresholds of both
     candidates: float  # threshold for candidates
-    dip: float  # statistic of the largest dip if it is too large for the noise, else NaN
+    dip: float  # statistic of the largest dip, which is the threshold if it is too large for the noise
     events: list[ObservedEvent]  # events above the threshold of candidates, in order of time
     completeness: Completeness  # share of flares that the search detects in these frames
     scatter: list[Scatter]
@@ -299,9 +299,11 @@ class Analysis:
         if not self.likeness.alike:
             lines.append(
                 f"Residuals of the quiescent light are correlated ({self.likeness.correlation:.2f} at a lag of "
-                f"{self.likeness.lag} frames), which the fitted process does not describe: there are no verdicts."
+                f"{self.likeness.lag} frames), which the fitted process does not describe: there are no verdicts. "
+                f"Sudden dips, which are no flares, have an S/N of up to {max(self.dip, self.candidates):.3g}: rises "
+                "of that size are no evidence of flares."
             )
-        if np.isfinite(self.dip):
+        elif self.dip == self.threshold:
             lines.append(
                 f"The light falls suddenly, as by losses of light, with an S/N of {self.dip:.3g}: rises of that size "
                 "may be returns from a loss, and only larger ones are called detected."
@@ -370,8 +372,6 @@ def analyse_frames(
     days = survey.stare.observed_s / DAY_S
     if -np.expm1(-max(one.rate(dip) for one in (modelled, measured)) * days) < CHANCE_DIP:
         threshold = max(threshold, dip)
-    else:
-        dip = float("nan")
     detected, taken = detect_events(survey, candidates, search_steps)
     seen = None if series is None else [event_spectrum(survey, series, taken, one) for one in detected]
     causes = None if seen is None else [one.cause for one in seen]
