@@ -367,7 +367,7 @@ def observed_residuals(answer: AnalyseAnswer) -> Picture:
     normal = ndtri((np.arange(residual.size) + 0.5) / residual.size)
     course = [Dots("", "text", size=1.7, alpha=0.7, at=(time, residual))]
     correlation = [
-        Strips(along="y", alpha=0.4, at=([-2 * likeness.error], [2 * likeness.error])),
+        Strips(along="y", alpha=0.4, at=([-2 * likeness.errors[0]], [2 * likeness.errors[0]])),
         Line("", "star", marker="o", at=(lags, likeness.correlations)),
     ]
     quantiles = [

@@ -30,6 +30,7 @@ from mauvecl.host.tables.table import (
     without_indefinite,
 )
 from mauvecl.host.tables.units import (
+    EPOCHS_MJD,
     MISSIONS,
     TimeSystem,
     TimeUnit,
@@ -60,18 +61,20 @@ Float = NDArray[np.float64]
 
 FORMATS = "FITS, HDF5, ECSV, CSV, a Zarr store or a folder of spectra"
 #: Names of columns that need no mapping, in order of preference, in any case: those of mauvecl, of the pipelines of
-#: Kepler, K2 and TESS, of lightkurve and AltaiPony, and of K2SFF, QLP, eleanor and TASOC.
+#: Kepler, K2 and TESS, of lightkurve and AltaiPony, and of K2SFF, QLP, eleanor, TASOC and gPhoton.
 KNOWN = {
     "time": ("time",),
-    "flux": ("flux", "pdcsap_flux", "sap_flux", "kspsap_flux", "det_flux", "corr_flux", "corrected_flux", "fcor",
-             "flux_corr", "detrended_flux", "rate", "rel_flux", "relative_flux", "normalized_flux", "norm_flux",
-             "flux_norm", "flux_normalized", "rel_flux_t1", "ujy", "count_rate", "countrate", "cps", "counts",
-             "cal_aper_flux", "whitelight_flux"),
+    "flux": ("flux_bgsub", "flux", "pdcsap_flux", "sap_flux", "kspsap_flux", "det_flux", "corr_flux", "corrected_flux",
+             "fcor", "flux_corr", "detrended_flux", "rate", "rel_flux", "relative_flux", "normalized_flux",
+             "norm_flux", "flux_norm", "flux_normalized", "rel_flux_t1", "ujy", "count_rate", "countrate", "cps",
+             "counts", "cal_aper_flux", "whitelight_flux"),
     "quality": ("quality", "sap_quality"),
     "temperature": ("temperature",),
 }  # fmt: skip
 #: Names of times where no column is called time and none is named after its dates, such as BJD.
 OTHER_TIMES = ("t", "date", "datetime", "timestamp", "date-obs", "date_obs", "utc", "ut")
+#: Names of the times at which frames start and end, where no column is called time or named after its dates.
+EDGES = ("t0", "t1")
 #: Columns of bands and of stars, of which a light curve has one.
 GROUPS = ("band", "filter", "filt", "passband", "bandpass", "filtercode", "phot_filter", "source_id", "tic",
           "tic_id", "ticid", "kic", "kepid", "epic", "object", "target", "star", "f")  # fmt: skip
@@ -83,8 +86,15 @@ PARTS = {"start": 0.0, "middle": 0.5, "end": 1.0}
 DATES_MJD = (-5000.0, 150_000.0)
 #: Units in which light is given as a deviation from its level, as TASOC does.
 PARTS_OF_LEVEL = {"%": 1e-2, "percent": 1e-2, "ppt": 1e-3, "ppm": 1e-6, "ppb": 1e-9}
-#: Times of Gaia DR3's epoch photometry, BJD in TCB less 2455197.5 (documentation of vari_epoch_photometry).
-GAIA_DAYS = TimeUnit("d", 55_197.0, "tcb", "BARYCENTER")
+#: Columns of files that state no unit of their times, these times, and what they are: Gaia DR3's epoch photometry, BJD
+#: in TCB less 2455197.5 (documentation of vari_epoch_photometry), and GALEX, Unix time less 315964800 s (user guide of
+#: gPhoton), of which the columns are those of gPhoton's light curves.
+TIMES_OF_COLUMNS = (
+    ({"transit_id", "rejected_by_photometry"}, TimeUnit("d", 55_197.0, "tcb", "BARYCENTER"),
+     "days from 2010-01-01 in TCB, as in Gaia DR3's epoch photometry"),
+    ({"t0", "t1", "cps", "cps_err"}, TimeUnit("s", EPOCHS_MJD["gps"], "utc"),
+     "seconds from 1980-01-06 in UTC, as in GALEX light curves of gPhoton"),
+)  # fmt: skip
 #: Extension of the light curves of CHEOPS. UTC in its header is that of the start and the end of a visit;
 #: BJD_TIME is in TT: pycheops 1.1.14, documentation of `Dataset`.
 CHEOPS = "SCI_COR_LIGHTCURVE"
@@ -287,7 +297,7 @@ def _recognised(file: TableFile) -> FrameMapping:
     """Return the mapping of a file whose columns have known names."""
     # Of FITS files also images, but no columns of other extensions.
     names = [*file.columns, *(name for name in file.names if "/" not in name and name not in file.columns)]
-    columns = {key: first_of(known, names, file.what) for key, known in KNOWN.items()}
+    columns: dict[str, Any] = {key: first_of(known, names, file.what) for key, known in KNOWN.items()}
     if columns["time"] is None:
         said = {name: found for name in names if (found := time_in_name(name)) is not None}
         dated = [name for name, one in said.items() if one.epoch_mjd is not None]
@@ -298,7 +308,11 @@ def _recognised(file: TableFile) -> FrameMapping:
             fault = f"{file.what}: {len(dated)} columns may be the time: {', '.join(map(shortened, dated))}"
             raise InputError(fault, "a mapping that names one", key="time")
         timed = [name for name in said if re.match(r"t(?:ime)?[\s_.]", name, re.IGNORECASE)]
-        columns["time"] = dated[0] if dated else first_of((*OTHER_TIMES, *timed), names, file.what)
+        edges = tuple(first_of((name,), names, file.what) for name in EDGES)
+        if dated:
+            columns["time"] = dated[0]
+        else:
+            columns["time"] = first_of((*OTHER_TIMES, *timed), names, file.what) if None in edges else edges
     flux = divided_unit(columns["flux"] or "")[0]
     # Errors of another flux would be wrong ones.
     ends = ("_err", "_error", "err", "_e", "_unc", "_uncertainty", "_sigma", "_std")
@@ -643,9 +657,10 @@ def _time_unit(
             converted(replace(time[0], unit=text), None, "s", "time_unit")
             said = TimeUnit(str(unit_in(text)))
     if said is None:
-        if {"transit_id", "rejected_by_photometry"} <= {*map(key_of, file.columns)}:
-            assumed = f"the times of {file.what} are days from 2010-01-01 in TCB, as in Gaia DR3's epoch photometry"
-            return GAIA_DAYS, [f"ASSUMED: {assumed}; it states no unit"]
+        held = {*map(key_of, file.columns)}
+        for columns, times, text in TIMES_OF_COLUMNS:
+            if columns <= held:
+                return times, [f"ASSUMED: the times of {file.what} are {text}; it states no unit"]
         words = {str(file.header.get(key, "") or "").strip().upper() for key in ("MISSION", "TELESCOP")}
         mission = next((one for one in MISSIONS if one in words), None)
         finite = values[np.isfinite(values)]

@@ -301,25 +301,29 @@ CORRELATED, SIGNIFICANT = 0.12, 5.0
 class Likeness:
     """Comparison of the residuals of the fitted process with independent noise."""
 
-    correlations: (
-        Float  # shape (n_lag,); autocorrelation at lags of 1, 2 ... frames, of the sum that is most correlated
-    )
-    error: float  # its standard error for independent residuals
+    # Shape (n_lag,); autocorrelation at lags of 1, 2 ... frames, of the sum that is most correlated.
+    correlations: Float
+    errors: Float  # shape (n_lag,); their standard errors for independent residuals, of which long lags have fewer
+
+    @property
+    def excess(self) -> Float:
+        """Correlations relative to the largest that the process may leave, shape (n_lag,)."""
+        return np.asarray(np.abs(self.correlations) / np.maximum(CORRELATED, SIGNIFICANT * self.errors))
 
     @property
     def lag(self) -> int:
-        """Lag of the largest correlation in frames."""
-        return int(np.argmax(np.abs(self.correlations))) + 1
+        """Lag of the clearest correlation in frames."""
+        return int(np.argmax(self.excess)) + 1
 
     @property
     def correlation(self) -> float:
-        """Largest correlation."""
+        """Clearest correlation."""
         return float(self.correlations[self.lag - 1])
 
     @property
     def alike(self) -> bool:
         """True unless the residuals are significantly and clearly correlated."""
-        return abs(self.correlation) < max(CORRELATED, SIGNIFICANT * self.error)
+        return bool(self.excess.max() < 1)
 
 
 def likeness(numbers: NDArray[np.int64], residual: Float) -> Likeness:
@@ -335,13 +339,15 @@ def likeness(numbers: NDArray[np.int64], residual: Float) -> Likeness:
     scaled = np.clip(residual, -4.0, 4.0)
     scaled = (scaled - scaled.mean(axis=0)) / np.maximum(scaled.std(axis=0), 1e-300)
     lags = np.arange(1, max(2, min(MAX_LAG, len(numbers) // 4) + 1))
-    found = np.zeros((residual.shape[1], lags.size))
+    found, errors = np.zeros((residual.shape[1], lags.size)), np.ones(lags.size)
     for k, lag in enumerate(lags):
-        pairs = numbers[lag:] - numbers[:-lag] == lag
-        if pairs.sum() > 10:
-            found[:, k] = (scaled[lag:][pairs] * scaled[:-lag][pairs]).mean(axis=0)
-    worst = int(np.argmax(np.abs(found).max(axis=1)))
-    return Likeness(found[worst], float(len(numbers) ** -0.5))
+        # Frames that are a lag apart, with any number of others between them.
+        _, first, second = np.intersect1d(numbers, numbers - lag, return_indices=True)
+        if first.size > 10:
+            found[:, k] = (scaled[first] * scaled[second]).mean(axis=0)
+            errors[k] = first.size**-0.5
+    each = [Likeness(one, errors) for one in found]
+    return max(each, key=lambda one: float(one.excess.max()))
 
 
 @dataclass(frozen=True)

@@ -78,6 +78,8 @@ NOISE_PRIOR = 0.3
 PERIODIC = 1e-3
 #: Smallest period in steps between values, and largest as a share of the length of the light curve.
 SHORTEST, LONGEST = 4.0, 1.0
+#: Frequencies of a periodogram in the width of a peak, and in all, approximately.
+PER_PEAK, MOST_FREQUENCIES = 5, 2**17
 #: Period as a share of the length above which rotation is also searched in what a polynomial of a degree leaves.
 FEW_TURNS, DEGREE = 0.2, 8
 #: Range of standard deviations of a term, in standard deviations of the noise of a value.
@@ -506,12 +508,14 @@ def _period(data: Binned, values: Float, share: float) -> float | None:
     """
     from astropy.timeseries import LombScargle
 
-    longest, shortest = share * data.span_s, SHORTEST * data.step_s
+    # Visits over years have few frames and many frequencies.
+    longest = share * data.span_s
+    shortest = max(SHORTEST * data.step_s, PER_PEAK * data.span_s / MOST_FREQUENCIES)
     if values.size < 30 or longest <= shortest:
         return None
     periodogram = LombScargle(data.time_s, values - values.mean())
     frequency, power = periodogram.autopower(
-        minimum_frequency=1 / longest, maximum_frequency=1 / shortest, samples_per_peak=5, method="fast"
+        minimum_frequency=1 / longest, maximum_frequency=1 / shortest, samples_per_peak=PER_PEAK, method="fast"
     )
     if not power.size or not np.isfinite(power).all():
         return None

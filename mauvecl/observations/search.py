@@ -13,6 +13,7 @@ from mauvecl.flares.stare import Stare, select_frames
 from mauvecl.observations.level import process_level
 from mauvecl.observations.process import Process
 from mauvecl.observations.process_search import ProcessSearch
+from mauvecl.schema.physical import DAY_S
 from mauvecl.search.templates import Bank, Baseline, Templates
 
 if TYPE_CHECKING:
@@ -24,7 +25,7 @@ Bool = NDArray[np.bool_]
 
 #: Step between half-widths of a bank: the same as that of `lightcurve.defaults.HALF_WIDTHS_S`.
 WIDTH_STEP = 1.86
-#: Narrowest template in frames, and widest as a share of the time in all frames and in seconds.
+#: Narrowest template in frames, and widest as a share of the time in frames without gaps of a day, and in seconds.
 NARROWEST, WIDEST, WIDEST_S = 1.5, 0.15, 7200.0
 #: Smallest window around an event, in cadences and seconds.
 WINDOW_FRAMES, WINDOW_S = 120, 1800.0
@@ -177,6 +178,8 @@ def bank_of(stare: Stare, directions: Float, shape: Shape) -> Bank:
 def half_widths(stare: Stare) -> tuple[float, ...]:
     """Return the half-widths of a bank for a light curve, s."""
     low = NARROWEST * stare.frame_s
-    high = max(low, min(WIDEST * stare.n_frames * stare.frame_s, WIDEST_S))
+    gaps = np.flatnonzero(np.diff(stare.numbers) * stare.frame_s > DAY_S) + 1
+    longest = int(np.diff(np.concatenate([[0], gaps, [stare.n_frames]])).max())
+    high = max(low, min(WIDEST * longest * stare.frame_s, WIDEST_S))
     steps = max(1, round(np.log(high / low) / np.log(WIDTH_STEP)) + 1)
     return tuple(float(w) for w in low * WIDTH_STEP ** np.arange(steps))

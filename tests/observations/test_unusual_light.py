@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -333,3 +335,28 @@ def test_sudden_flares_of_a_few_frames_that_decay_exponentially_have_their_energ
             low, high = (float(events[name].to_value("s")[near][0]) for name in ("ed_low_95", "ed_high_95"))
             inside += low < duration < high
     assert inside >= 9
+
+
+@pytest.mark.long
+def test_visits_over_years_take_little_memory() -> None:
+    """Observe twelve visits of 20 minutes in six years in frames of 10 s, each with a flare.
+
+    Periodograms up to the frequency of frames took 10 GB.
+    """
+    rng, frame_s = np.random.default_rng([506, 1]), 10.0
+    starts = np.sort(rng.uniform(0, 6 * 365 * 86_400, 12) // frame_s * frame_s)
+    time = (starts[:, None] + frame_s * np.arange(120)).ravel()
+    light = np.ones(time.size)
+    for start in starts:
+        light += flare(time, frame_s, start + 400.0, 60.0)
+    light += 0.05 * rng.standard_normal(time.size)
+    tracemalloc.start()
+    try:
+        answer = analyse(Study(), frames=Frames.of(time, light, np.full(time.size, 0.05), exposure_s=frame_s))
+        assert tracemalloc.get_traced_memory()[1] < 2**30
+    finally:
+        tracemalloc.stop()
+    events = answer.events[answer.events["verdict"] == "detected"]
+    assert len(events) == 12
+    for start, peak in zip(starts, events["tpeak"].to_value("s"), strict=True):
+        assert abs(peak - start - 400.0) < 30
