@@ -64,9 +64,9 @@ def triangle(rng: np.random.Generator, k: int) -> Drawn:
     ("draw", "seed", "number", "snr", "missed", "most"),
     [
         (published, 407, 18, (25, 3000), 0.1, (0.6827, 0.95)),
-        (other, 408, 8, (50, 3000), 0, (1, 1)),
+        (other, 408, 4, (50, 3000), 0, (1, 1)),
         (without_peak, 409, 6, (1000, 5000), 1 / 3, (1, 1)),
-        (triangle, 410, 5, (1000, 5000), 0, (1, 1)),
+        (triangle, 410, 3, (1000, 5000), 0, (1, 1)),
     ],
 )
 def test_recommended_energies_are_in_their_intervals(
@@ -82,7 +82,8 @@ def test_recommended_energies_are_in_their_intervals(
     The sum of squares of 18 pulls notices intervals of half the width in 92 of 100 sets, and of twice the width in 68;
     counts of 28 intervals at 95 and at 68 % do so in 86 and 63.
 
-    Intervals may hold more than stated where no shape of the average is the true one. Some slow flares are taken for
+    Intervals may hold more than stated where no shape of the average is the true one: pulls of each of the other shapes
+    once notice intervals of a third of the width, as do those of each twice. Some slow flares are taken for
     variability of the star. Departures of a fifth from published shapes, which have other tails, once explained
     triangles, with up to 1.9 times their energy: the allowed error of a fifth is 18 times the largest one when the test
     was written.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from marks import long_but
 from numpy.typing import NDArray
 from scenes import PER_MONTH, analysed, detected, flare
 
@@ -15,14 +16,17 @@ DURATION = SHAPES["davenport2014"].equivalent_duration
 
 @pytest.mark.parametrize(
     ("half_width_s", "after", "amplitude", "window", "seed"),
-    [
+    long_but(
+        [
+            (60.0, 1.5, 60.0, 12.0, 1),
+            (60.0, 2.0, 60.0, 12.0, 2),
+            (40.0, 1.0, 20.0, 13.0, 3),
+            (90.0, 1.2, 200.0, 11.0, 4),
+            (60.0, 0.7, 5.0, 12.0, 5),
+            (120.0, 1.5, 30.0, 15.0, 6),
+        ],
         (60.0, 1.5, 60.0, 12.0, 1),
-        pytest.param(60.0, 2.0, 60.0, 12.0, 2, marks=pytest.mark.long),
-        pytest.param(40.0, 1.0, 20.0, 13.0, 3, marks=pytest.mark.long),
-        pytest.param(90.0, 1.2, 200.0, 11.0, 4, marks=pytest.mark.long),
-        pytest.param(60.0, 0.7, 5.0, 12.0, 5, marks=pytest.mark.long),
-        pytest.param(120.0, 1.5, 30.0, 15.0, 6, marks=pytest.mark.long),
-    ],
+    ),
 )
 def test_tail_of_a_bright_flare_without_its_peak_is_an_event(
     half_width_s: float, after: float, amplitude: float, window: float, seed: int
@@ -47,7 +51,7 @@ def test_tail_of_a_bright_flare_without_its_peak_is_an_event(
     assert abs(event.energy.fitted_s - truth) < 2.5 * (high - low)
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.long), pytest.param(3, marks=pytest.mark.long)])
+@pytest.mark.parametrize("seed", long_but([1, 2], 1))
 def test_two_flares_that_look_like_one_are_fitted_as_two(seed: int) -> None:
     """A third flare that is longer than the window must not stand for either; five standard errors of the energy.
 
@@ -205,7 +209,7 @@ def sharp_rotator(rng: np.random.Generator, noise: float) -> tuple[Frames, list[
     return frames, flares
 
 
-@pytest.mark.parametrize("seed", [4, pytest.param(5, marks=pytest.mark.long), pytest.param(6, marks=pytest.mark.long)])
+@pytest.mark.parametrize("seed", long_but([4, 5], 4))
 def test_flares_on_sharp_rotation_in_long_frames_are_detected(seed: int) -> None:
     """Find all bright flares and nothing else, with their energies, and no minimum is a loss."""
     frames, flares = sharp_rotator(np.random.default_rng([520, seed]), 2e-4)
