@@ -81,8 +81,11 @@ def test_mistakes_load_no_heavy_package(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "started", [["-m", "mauvecl"], ["-c", "import sys; sys.argv[0] = 'mauvecl'; import mauvecl.cli.app"]]
 )
-@pytest.mark.parametrize("module", ["importlib", "typing", "__future__", "mauvecl.schema.errors", "typer"])
-@pytest.mark.parametrize("in_class", [False, True])
+@pytest.mark.parametrize(
+    ("module", "in_class"),
+    [*((name, False) for name in ("importlib", "typing", "__future__", "mauvecl.schema.errors", "typer")),
+     ("importlib", True), ("typer", True)],
+)  # fmt: skip
 def test_interrupt_during_imports_prints_one_line(
     started: list[str], module: str, in_class: bool, tmp_path: Path
 ) -> None:
