@@ -69,34 +69,6 @@ def test_two_flares_that_look_like_one_are_fitted_as_two(seed: int) -> None:
     assert abs(event.energy.fitted_s - truth) < 2.5 * (event.energy.high_s[0] - event.energy.low_s[0])
 
 
-#: Flares that no template resembles, as functions of tau: a bell, a slow rise with a fast decay, and a fast tail.
-ODD_SHAPES = {
-    "bell": lambda tau: np.exp(-4 * np.log(2) * tau**2),
-    "slow-rise": lambda tau: np.where(tau < 0, np.maximum(1 + tau / 3, 0.0), np.maximum(1 - tau, 0.0)),
-    "fast-tail": lambda tau: np.where(
-        tau < 0, np.maximum(1 + tau, 0.0), 0.7 * np.exp(-1.6 * np.abs(tau)) + 0.3 * np.exp(-0.6 * np.abs(tau))
-    ),
-}
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("shape", "snr"), [("bell", 50.0), ("slow-rise", 50.0), ("slow-rise", 500.0), ("fast-tail", 3000.0)]
-)
-def test_flare_of_another_shape_in_a_short_window_is_no_process(shape: str, snr: float) -> None:
-    """Find its light as one flare, with the energy in the frames to a fifth: the wrong shape, not noise, limits it."""
-    rng, frame_s, half_width_s = np.random.default_rng([507, *shape.encode()]), 5.0, 150.0
-    time = (np.arange(360) + 0.5) * frame_s
-    tau = (time[:, None] + (np.arange(60) - 29.5) / 60 * frame_s - 600.0) / half_width_s
-    light = ODD_SHAPES[shape](tau).mean(axis=1)
-    noise = 5e-3
-    amplitude = snr * noise / float(np.sqrt(light @ light))
-    flux = 1 + amplitude * light + noise * rng.standard_normal(time.size)
-    (event,) = detected(analysed(Frames.of(time, flux, np.full(time.size, noise))).analysis, PER_MONTH)
-    assert event.value > 0.6 * snr
-    assert event.energy.fitted_s == pytest.approx(amplitude * float(light.sum()) * frame_s, rel=0.2)
-
-
 @pytest.mark.long
 def test_end_of_a_search_at_its_largest_number_of_events_is_stated(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(503)
