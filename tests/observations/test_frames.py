@@ -59,7 +59,6 @@ def test_the_errors_are_those_of_the_chosen_flux() -> None:
     assert frames.flux.tolist() == ones.tolist()
     assert frames.error is None
     frames = frames_of(Table({name: columns[name] for name in columns if name != "flux"}, units={"time": "s"}))
-    assert frames.error is not None
     assert (frames.flux[0], frames.error[0]) == (2.0, 3.0)
 
 
@@ -73,7 +72,6 @@ def test_time_series_of_astropy_are_frames() -> None:
     series = TimeSeries(time=WHEN, data={"flux": LIGHT[:, 0] * u.Jy, "flux_err": np.full(N, 1000.0) * u.mJy})
     frames = frames_of(series)
     np.testing.assert_allclose(frames.flux, LIGHT[:, 0])
-    assert frames.error is not None
     np.testing.assert_allclose(frames.error, 1.0)
     np.testing.assert_allclose(frames.time_s, np.arange(N) * 20.0, atol=2e-5)
     assert (frames.unit, frames.scale, frames.reference_mjd) == ("Jy", "tdb", pytest.approx(61_000.0))
@@ -99,13 +97,11 @@ def test_spectra_of_specutils_are_frames(kind: type | None) -> None:
     )
     frames = frames_of(spectra, time=WHEN)
     np.testing.assert_allclose(frames.flux, np.where(mask, np.nan, LIGHT))
-    assert frames.wavelength_nm is not None
     np.testing.assert_allclose(frames.wavelength_nm, NM)
     assert (frames.unit, frames.name, frames.scale) == ("adu", "AU Mic", "tdb")
     if kind is None:
         assert frames.error is None
     else:
-        assert frames.error is not None
         np.testing.assert_allclose(frames.error, 0.5)
 
 
@@ -121,9 +117,7 @@ def test_every_example_of_the_page_gives_the_same_frames(tmp_path: Path) -> None
         (tmp_path / name).write_text(text)
         frames = read_frames(tmp_path / file, tmp_path / name)
         np.testing.assert_allclose(frames.flux, 100.0 + np.arange(120.0).reshape(30, 4))
-        assert frames.error is not None
         np.testing.assert_allclose(frames.error, frames.flux / 10)
-        assert frames.wavelength_nm is not None
         # The page's images have wavelengths in air, by a refractive index of 1.00028 within 1e-5.
         np.testing.assert_allclose(frames.wavelength_nm, [300.25, 400.25, 500.25, 600.25], rtol=2e-5)
         assert frames.date(float(frames.time_s[0]))[:21] == ("2026-03-01T00:00:02.5")

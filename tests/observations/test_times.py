@@ -44,7 +44,6 @@ def _geocentric_s(start: str) -> np.ndarray:
 
 
 def _late_s(frames: Frames, start: str) -> np.ndarray:
-    assert frames.reference_mjd is not None
     return (frames.reference_mjd - float(Time(start, scale="utc").mjd)) * 86_400 + frames.time_s - TIME
 
 
@@ -74,8 +73,6 @@ def test_other_scales_give_the_same_instants() -> None:
     utc = barycentric(_frames(NEAR, "GEOCENTER"), AU_MIC)
     tt = Frames.of(TIME, FLUX, reference_mjd=float(Time(NEAR, scale="utc").tt.mjd), scale="tt", position="GEOCENTER")
     found = barycentric(tt, AU_MIC)
-    assert found.reference_mjd is not None
-    assert utc.reference_mjd is not None
     assert (found.reference_mjd - utc.reference_mjd) * 86_400 == pytest.approx(0.0, abs=2e-6)
     np.testing.assert_allclose(found.time_s, utc.time_s, atol=1e-6)
 

@@ -620,7 +620,6 @@ STANDARDS = link(observations=FILE)
 def fits_of(source: Source | None, temperatures: list[float], seed: int) -> bytes:
     frames = frames_of(truth(), source, temperatures, 20, np.random.default_rng(seed))
     times = Table({"TIME": frames.time_s, "TEMPERATURE": frames.temperature_c})
-    assert frames.wavelength_nm is not None
     images = [fits.ImageHDU(frames.flux, name="RAW"), fits.ImageHDU(frames.wavelength_nm, name="WAVELENGTH")]
     out = io.BytesIO()
     fits.HDUList([fits.PrimaryHDU(), fits.BinTableHDU(times, name="FRAMES"), *images]).writeto(out)
