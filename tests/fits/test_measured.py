@@ -196,8 +196,8 @@ def test_skipped_wavelengths_change_no_fit_along_a_stare() -> None:
 
 @pytest.mark.parametrize(
     ("unknown", "count"),
-    [(False, 12), pytest.param(False, 100, marks=pytest.mark.long), pytest.param(True, 100, marks=pytest.mark.long)],
-    ids=["few", "known", "unknown"],
+    [(False, 12), pytest.param(True, 100, marks=pytest.mark.long)],
+    ids=["known", "unknown"],
 )
 def test_intervals_of_joint_fits_cover(unknown: bool, count: int, engine: Engine) -> None:
     """Draw pixels with unknown levels of dark and of all light that are equal in all frames of a stare.
