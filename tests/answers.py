@@ -63,11 +63,8 @@ def expectations(study: Study) -> list[Expectation]:
     return list(inputs[: len(inputs) // len(study.star)])
 
 
-def same_snr(ours: Any, theirs: Any) -> None:
-    same_counts(ours.counts, theirs.counts)
-
-
-def same_counts(ours: Any, theirs: Any) -> None:
+def same_snr(one: Any, other: Any) -> None:
+    ours, theirs = one.counts, other.counts
     for name in ("pixel", "element", "clipped", "n"):
         np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
     for kind, far in ours.far.items():

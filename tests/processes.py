@@ -63,7 +63,6 @@ def forked(code: str, *, cache: Path | str, **environment: str) -> str:
     """Run code as `python` does, with mauvecl imported already, and return what it prints."""
     process = forking()
     assert process.stdin is not None
-    assert process.stdout is not None
     with TemporaryDirectory() as folder:
         out, reported = files = [Path(folder) / name for name in ("out", "reported")]
         more = environment | {"MAUVECL_CACHE_DIR": str(cache)}

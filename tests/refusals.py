@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 import pytest
@@ -39,14 +39,3 @@ def refused(key: str | None, *facts: str, expected: str | None = None) -> Iterat
 def says_what_is_accepted(message: str) -> bool:
     """Return whether the sentence of an error says what is accepted."""
     return bool(re.search(r"\b(expected|needs?|must|may|give|use|try|wait|start|install|did you mean)\b", message))
-
-
-#: A call that raises, the key that its error names, and numbers and names of its sentence.
-Row = tuple[Callable[[], object], str, *tuple[str, ...]]
-
-
-def check(row: Row) -> None:
-    """Check that the call of a row raises its error."""
-    call, key, *facts = row
-    with refused(key, *facts):
-        call()

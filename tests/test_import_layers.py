@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from mauvecl.runs.checkpoint import DRAWING_PACKAGES
+from mauvecl.runs import checkpoint
 
 ROOT = Path(__file__).parent.parent
 FORBIDDEN = tomllib.loads((ROOT / "tests" / "data" / "forbidden_imports.toml").read_text(encoding="utf-8"))
@@ -64,8 +64,8 @@ def test_digest_of_the_code_covers_what_counts() -> None:
     grimp = pytest.importorskip("grimp")
     graph = grimp.build_graph("mauvecl", cache_dir=None)
     needed = {name.split(".")[1] for name in graph.find_upstream_modules("mauvecl.device.engine")}
-    assert needed - {"host", "schema"} <= set(DRAWING_PACKAGES)
-    assert all(list((ROOT / "mauvecl" / name).glob("*.*")) for name in DRAWING_PACKAGES)
+    assert needed - {"host", "schema"} <= set(checkpoint.DRAWING_PACKAGES)
+    assert all(list((ROOT / "mauvecl" / name).glob("*.*")) for name in checkpoint.DRAWING_PACKAGES)
 
 
 def packages_in(graph: Any, package: str) -> set[str]:

@@ -72,16 +72,6 @@ ALTAIPONY = """istart,istop,cstart,cstop,tstart,tstop,ed_rec,ed_rec_err,ampl_rec
 """
 
 
-def test_lightkurve_flares_are_read() -> None:
-    lightkurve = pytest.importorskip("lightkurve")
-    flux = np.ones(200)
-    flux[[50, 120]] = 1.1, 1.02
-    curve = lightkurve.LightCurve(time=np.linspace(1325.0, 1326.0, 200), flux=flux)
-    peaks = curve[curve.flux > 1.01]
-    peaks["amplitude"] = peaks.flux - 1.0
-    np.testing.assert_allclose(flares_of(peaks)["amplitude"], [0.1, 0.02])
-
-
 def test_altaipony_table_is_read(tmp_path: Path) -> None:
     """Read the columns that FlareLightCurve.flares writes to CSV; the corpus compares them."""
     file = tmp_path / "flares.csv"

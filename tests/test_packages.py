@@ -138,5 +138,4 @@ def test_licences_are_in_both(packages: Packages, tmp_path: Path) -> None:
             if path.parts[0] == "host":
                 assert wheel.read(f"mauvecl/{path}") == text.read_bytes()
             member = sdist.extractfile(f"mauvecl-{VERSION}/{path}")
-            assert member is not None
             assert member.read() == text.read_bytes()

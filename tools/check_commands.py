@@ -56,6 +56,8 @@ TEXTS: dict[str, tuple[str, ...]] = {
     "exposure_s": ("7.5", "50", "333.3", "1800"),
     "seed": ("1", "7", "123456789"),
     "joint_fit": ("no",),
+    # The numbers of a year take half a minute.
+    "days": ("3", "20", "31"),
 }
 
 

@@ -117,7 +117,6 @@ def test_flares_are_measured_along_a_stare(engine: Engine, tmp_path: Path) -> No
     assert list(joint["quantity"][:6]) == names
     np.testing.assert_allclose(joint["truth"][:6], [100.0, 40.0, 2.0, 14_000.0, 7000.0, 80.0])
     fit = answer.stares[0].joint
-    assert fit is not None
     away = (fit.found.estimates[0] - fit.truth)[:6]
     distance = away @ np.linalg.solve(fit.found.covariance[0, :6, :6], away)
     assert stats.chi2.ppf(1e-9, 6) < distance < stats.chi2.isf(1e-9, 6)

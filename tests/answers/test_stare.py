@@ -92,14 +92,6 @@ def test_fits_file_has_the_columns_of_lightkurve(found):
         assert hdus[0].header["OBJECT"] == "G2V V = 7.4"
 
 
-def test_lightkurve_reads_the_fits_file(found, tmp_path):
-    lightkurve = pytest.importorskip("lightkurve")
-    found.write(tmp_path)
-    curve = lightkurve.read(str(tmp_path / "light-curve-1.fits"))
-    np.testing.assert_allclose(curve.flux.value, found.stares[0].light.flux[:, 0], rtol=1e-6)
-    assert curve.time[0].iso == "2026-01-01 00:00:02.500"
-
-
 @pytest.mark.long
 def test_search_finds_only_the_injected_flares(stares):
     """Search flares of S/N 8, 32, 96 and 3, of which the last may be missed, at one false alarm per star-month."""

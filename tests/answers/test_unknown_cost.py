@@ -46,7 +46,6 @@ def test_cost_equals_that_of_the_methods(
     assert said in sentence
     assert f"Statistics are marginalised over {said}." in answer.messages
     found = re.search(r"S/N of (\S+) with .* it is (\S+) by the plain statistic and (\S+) marginalised", sentence)
-    assert found is not None
     # Two digits of the plain S/N are printed, three of the others.
     assert [float(one) for one in found.groups()] == pytest.approx([8.36, plain, marginal], rel=0.022, abs=1e-9)
     quiet, flare = expectations(study())
@@ -125,11 +124,9 @@ def test_usual_unknowns_follow_the_observation() -> None:
     assert Case(study()).processes.detector_temperature is None
     quiet = expectations(asked)[0]
     found = asked.nuisances.marginalised(quiet)
-    assert found is not None
     assert dict(zip(found.names, found.sd, strict=True)) == {"dark": 0.3, "light": np.inf, "sky": 0.1}
     dark_sky = asked.with_changes({"sky": {"none": True}}, None)
     found = dark_sky.nuisances.marginalised(expectations(dark_sky)[0])
-    assert found is not None
     assert found.names == ("dark", "light")
 
 

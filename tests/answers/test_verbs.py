@@ -36,12 +36,6 @@ def test_each_verb_has_one_name_and_one_signature(name: str) -> None:
     assert all(one.kind is one.KEYWORD_ONLY and one.default is not one.empty for one in own)
 
 
-def test_older_names_still_work() -> None:
-    for older, name in (("limiting_magnitude", "limit"), ("detection_map", "map"), ("gaussian_report", "gaussian")):
-        assert getattr(mauvecl, older) is getattr(mauvecl, name)
-        assert older in mauvecl.__all__
-
-
 def test_command_line_has_every_verb_in_order(tmp_path: Path) -> None:
     first = [line.strip("│ ").split(" ")[0] for line in run("--help", folder=tmp_path).stdout.splitlines()]
     assert [word for word in first if word in VERBS] == list(VERBS)

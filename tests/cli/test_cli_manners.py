@@ -12,6 +12,8 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from commands import started
@@ -81,8 +83,11 @@ def test_mistakes_load_no_heavy_package(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "started", [["-m", "mauvecl"], ["-c", "import sys; sys.argv[0] = 'mauvecl'; import mauvecl.cli.app"]]
 )
-@pytest.mark.parametrize("module", ["importlib", "typing", "__future__", "mauvecl.schema.errors", "typer"])
-@pytest.mark.parametrize("in_class", [False, True])
+@pytest.mark.parametrize(
+    ("module", "in_class"),
+    [*((name, False) for name in ("importlib", "typing", "__future__", "mauvecl.schema.errors", "typer")),
+     ("importlib", True), ("typer", True)],
+)  # fmt: skip
 def test_interrupt_during_imports_prints_one_line(
     started: list[str], module: str, in_class: bool, tmp_path: Path
 ) -> None:
@@ -129,20 +134,15 @@ def test_interrupt_after_any_delay_shows_no_traceback_of_mauvecl(script: bool, t
     assert "mauvecl: interrupted\n" in said
 
 
-class Clock:
-    """A clock that a test advances."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.now = 1e6
-        monkeypatch.setattr(time, "monotonic", lambda: self.now)
-
-
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    return Clock(monkeypatch)
+def clock(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Return a clock that a test advances."""
+    found = SimpleNamespace(now=1e6)
+    monkeypatch.setattr(time, "monotonic", lambda: found.now)
+    return found
 
 
-def test_time_left_is_unknown_after_few_realisations(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
+def test_time_left_is_unknown_after_few_realisations(clock: Any, capsys: pytest.CaptureFixture[str]) -> None:
     """Wait for more than the first tile, by whose rate 1e12 realisations would take 348 000 years."""
     with Meter() as meter:
         for done in (0, 1):
@@ -158,7 +158,7 @@ def test_time_left_is_unknown_after_few_realisations(clock: Clock, capsys: pytes
 @pytest.mark.parametrize(
     ("done", "left"), [(100, "99 s left"), (20, "9 min left"), (50, "3 min left"), (2, "time left unknown")]
 )
-def test_time_left_is_estimated(done: int, left: str, clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
+def test_time_left_is_estimated(done: int, left: str, clock: Any, capsys: pytest.CaptureFixture[str]) -> None:
     with Meter(unit="cells") as meter:
         meter(0, 1000)
         clock.now += 11.0
@@ -166,7 +166,7 @@ def test_time_left_is_estimated(done: int, left: str, clock: Clock, capsys: pyte
     assert capsys.readouterr().err.rstrip().endswith(left)
 
 
-def test_late_progress_is_ignored(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
+def test_late_progress_is_ignored(clock: Any, capsys: pytest.CaptureFixture[str]) -> None:
     """Ignore a smaller number than before; the rate continues from the start."""
     with Meter() as meter:
         meter(0, 1000)
@@ -177,7 +177,7 @@ def test_late_progress_is_ignored(clock: Clock, capsys: pytest.CaptureFixture[st
     assert last == "500 of 1000 realisations, 16.7 a second, 30 s left"
 
 
-def test_meter_restarts_for_the_next_star(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
+def test_meter_restarts_for_the_next_star(clock: Any, capsys: pytest.CaptureFixture[str]) -> None:
     with Meter() as meter:
         for total in (1000, 2000):
             meter(0, total)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import shlex
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -83,34 +85,10 @@ def many_comments(path: Path) -> None:
 
 REPLACED: tuple[Callable[[Path], None], ...] = (sparse, fifo, endless)
 ANALYSE = ("analyse", "--no-pictures", "--quiet", "--output", "out")
-#: What reads a file: the file, and the command.
-READERS = {
-    "frames": ("f.csv", (*ANALYSE, "f.csv", "--mapping", "m.toml")),
-    "frames in FITS": ("f.fits", (*ANALYSE, "f.fits", "--mapping", "w.toml")),
-    "mapping": ("m.toml", (*ANALYSE, "f.csv", "--mapping", "m.toml")),
-    "a file of a folder": ("spectra/07.fits", (*ANALYSE, "spectra", "--mapping", "folder.toml")),
-    "the first file of a folder": ("spectra/00.fits", (*ANALYSE, "spectra", "--mapping", "folder.toml")),
-    "wavelengths that a mapping names": ("nm.csv", (*ANALYSE, "i.fits", "--mapping", "named.toml")),
-    "table that a mapping names": ("times.csv", (*ANALYSE, "spectra", "--mapping", "listed.toml")),
-    "spectrum": ("s.ecsv", ("library", "add", "s.ecsv")),
-    "study": ("study.toml", ("exposure", "study.toml", "--snr", "20", "--at", "500", "--output", "out")),
-    "instrument": ("own.toml", ("exposure", "--snr", "9", "--at", "500", "--star", "G2V", "--magnitude", "8",
-                                "--instrument", "own.toml")),
-    "targets": ("targets.csv", ("visible", "--targets", "targets.csv", "--days", "1", "--no-pictures", "--output",
-                                "out")),
-    "description of a store": ("frames.zarr/star-1/quiescent/zarr.json", (*ANALYSE, "frames.zarr[star-1/quiescent]")),
-    "exported description": ("frames.zarr/star-1/quiescent/zarr.json", ("export", "frames.zarr", "new.h5")),
-    "exported chunk": ("frames.zarr/star-1/quiescent/c/0/0", ("export", "frames.zarr", "new.h5")),
-    "chunk of a store": ("frames.zarr/star-1/quiescent/c/0/0", (*ANALYSE, "frames.zarr[star-1/quiescent]")),
-}  # fmt: skip
-#: Files that `verify` finds at fault.
-VERIFIED = {
-    "verified description of a store": ("frames.zarr/star-1/quiescent/zarr.json", ("verify", "frames.zarr")),
-    "verified chunk of a store": ("frames.zarr/star-1/quiescent/c/0/0", ("verify", "frames.zarr")),
-    "digests of a store": ("frames.zarr/star-1/quiescent/digests.txt", ("verify", "frames.zarr")),
-    "table of an answer": ("answer/exposure.ecsv", ("verify", "answer")),
-    "study of an answer": ("answer/study.toml", ("verify", "answer")),
-}
+TABLE = tomllib.loads((ROOT / "tests" / "data" / "hostile.toml").read_text(encoding="utf-8"))
+#: What reads a file, and what finds it at fault: the file, and the command.
+READERS, VERIFIED = ({name: (file, tuple(shlex.split(words))) for name, (file, words) in TABLE[kind].items()}
+                     for kind in ("read", "verified"))  # fmt: skip
 
 
 def prepare(place: Path) -> None:

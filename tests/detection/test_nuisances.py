@@ -49,7 +49,6 @@ def test_costs_of_unknowns_equal_those_computed_elsewhere(
     assert matched.closed_form(plain, flare, flare).mean == pytest.approx(known, rel=0.01)
     for sd, (naive, marginal) in (({"dark": 0.1}, dark), ({"light": 0.01}, light)):
         s = setting(quiet, sd)
-        assert s.nuisances is not None
         noise = weights**2 @ quiet.variance_dn2 + np.sum((s.nuisances.finite(s.nuisances.spectra) @ weights) ** 2)
         assert weights @ delta / np.sqrt(noise) == pytest.approx(naive, rel=0.022 if naive < 0.5 else 0.01)
         assert matched.closed_form(s, flare, flare).mean == pytest.approx(marginal, rel=0.01)
@@ -69,7 +68,6 @@ def test_distributions_agree_with_drawn_nuisances(name: str, sd: dict[str, float
     n = quiet.wavelength_nm.size
     one = Linear("own", 1.0 + np.arange(n) / n) if name == "own" else requests.STATISTICS[name]
     s = setting(quiet, sd)
-    assert s.nuisances is not None
     rng = np.random.default_rng(20_261_122)
     size = 4000
     for observed in (quiet, flare):
@@ -88,7 +86,6 @@ def test_subtracted_rows_give_the_inverse_covariance(name: str) -> None:
     """Compare with x^T C^-1 x for the full matrix C."""
     quiet, _ = pair()
     s, one = setting(quiet, {"dark": 0.1, "light": 0.02, "tilt": 0.05}), requests.STATISTICS[name]
-    assert s.nuisances is not None
     x = np.random.default_rng(5).normal(size=(3, quiet.wavelength_nm.size)) * np.sqrt(quiet.variance_dn2)
     spectra, variance, seen = s.nuisances.spectra * s.used, quiet.variance_dn2 * s.used, x * s.used
     if name == "chi2_element":
@@ -103,7 +100,6 @@ def test_subtracted_rows_give_the_inverse_covariance(name: str) -> None:
 def test_projected_out_spectra_do_not_change_the_statistic() -> None:
     quiet, flare = pair()
     s = setting(quiet, {"dark": FREE, "light": FREE})
-    assert s.nuisances is not None
     x = np.random.default_rng(6).normal(size=(1, quiet.wavelength_nm.size)) * np.sqrt(quiet.variance_dn2)
     moved = x + 100.0 * s.nuisances.spectra[0] - 3.0 * s.nuisances.spectra[1]
     for name in ("chi2", "chi2_element", "matched", "uv_excess"):
@@ -126,7 +122,6 @@ def test_closed_form_in_a_span_equals_the_full_one(amplitude: float) -> None:
     quiet, flare = pair(amplitude=amplitude)
     used = np.arange(quiet.wavelength_nm.size) % 4 == 0
     s = Setting(quiet, used, nuisances=Nuisances.of(quiet, {"dark": 0.5, "light": FREE, "sky": 0.1}))
-    assert s.nuisances is not None
     spectra, model, true = s.nuisances.spectra[:, used], quiet.variance_dn2[used], flare.variance_dn2[used]
     rows, drawn = s.nuisances.rows(model, spectra), s.nuisances.finite(spectra)
     root = np.linalg.cholesky(np.diag(true) + drawn.T @ drawn)
@@ -151,7 +146,6 @@ def test_weighted_sums_over_drawn_unknowns_have_the_moments_of_their_nodes(name:
     )
     drawn, statistic = FactorDistributions.of(prepare([quiet], processes=processes)), requests.STATISTICS[name]
     setting = Setting(quiet, ~quiet.saturated, nuisances=Nuisances.of(quiet, {"dark": 0.5, "sky": 0.1}))
-    assert drawn is not None
     nodes, rows = drawn.nodes(flare, weighted=True)
     amounts = np.array([node.amounts for node in nodes])
     assert len(nodes) > 100

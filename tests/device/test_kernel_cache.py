@@ -188,7 +188,6 @@ def test_folder_of_killed_process_is_removed(filled: tuple[Path, str], tmp_path:
         stdout=subprocess.PIPE,
         text=True,
     )
-    assert child.stdout is not None
     assert child.stdout.readline() == "up\n"
     left = list(tmp_path.glob("*/mauvecl-work-*"))
     assert len(left) == 1

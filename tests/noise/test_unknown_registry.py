@@ -55,7 +55,6 @@ def drawn(**priors: Normal | Uniform) -> tuple[FactorDistributions, float]:
     """Return the distributions for a few pixels, and the slope of the dark with temperature."""
     quiet, *_ = star(payload=instrument(part=True))
     found = FactorDistributions.of(prepare([quiet], processes=Processes(**priors)))
-    assert found is not None
     return found, quiet.conditions["dark_slope_per_c"]
 
 
@@ -89,7 +88,6 @@ def test_nodes_sum_to_one_and_have_mean_of_factors(weighted: bool) -> None:
         sky_level=Normal(1.0, 0.1, 0.5, 1.5),
     )
     found = FactorDistributions.of(prepare([quiet], processes=how))
-    assert found is not None
     nodes, rows = found.nodes(quiet, weighted=weighted)
     share = np.array([node.probability for node in nodes])
     assert share.sum() == pytest.approx(1.0, abs=1e-12)

@@ -1,12 +1,22 @@
-"""Frames from arrays: order, gaps, and faults."""
+"""Frames from arrays, from containers of other packages and from the layouts of the documentation."""
 
 from __future__ import annotations
 
-import numpy as np
-from astropy.table import Table
+import re
+from pathlib import Path
 
-from mauvecl import Frames
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.nddata import InverseVariance, StdDevUncertainty
+from astropy.table import Table
+from astropy.time import Time
+from astropy.timeseries import BinnedTimeSeries, TimeSeries
+from layouts import documented_files
+
+from mauvecl import Frames, read_frames
 from mauvecl.observations.frame_files import frames_of
+from mauvecl.observations.mapping import FrameMapping
 
 RNG = np.random.default_rng(29)
 TIME = np.arange(100) * 20.0
@@ -49,5 +59,67 @@ def test_the_errors_are_those_of_the_chosen_flux() -> None:
     assert frames.flux.tolist() == ones.tolist()
     assert frames.error is None
     frames = frames_of(Table({name: columns[name] for name in columns if name != "flux"}, units={"time": "s"}))
-    assert frames.error is not None
     assert (frames.flux[0], frames.error[0]) == (2.0, 3.0)
+
+
+N = 30
+WHEN = Time(61_000.0, np.arange(N) * 20.0 / 86_400, format="mjd", scale="tdb")
+LIGHT = np.random.default_rng(3).normal(100.0, 1.0, (N, 4))
+NM = np.array([300.0, 400.0, 500.0, 600.0])
+
+
+def test_time_series_of_astropy_are_frames() -> None:
+    series = TimeSeries(time=WHEN, data={"flux": LIGHT[:, 0] * u.Jy, "flux_err": np.full(N, 1000.0) * u.mJy})
+    frames = frames_of(series)
+    np.testing.assert_allclose(frames.flux, LIGHT[:, 0])
+    np.testing.assert_allclose(frames.error, 1.0)
+    np.testing.assert_allclose(frames.time_s, np.arange(N) * 20.0, atol=2e-5)
+    assert (frames.unit, frames.scale, frames.reference_mjd) == ("Jy", "tdb", pytest.approx(61_000.0))
+
+
+def test_binned_time_series_are_frames_through_a_mapping() -> None:
+    series = BinnedTimeSeries(time_bin_start=WHEN, time_bin_size=18.0 * u.s, data={"flux": LIGHT[:, 0]})
+    how = FrameMapping(time="time_bin_start", time_at="start", exposure="time_bin_size", flux="flux")
+    frames = frames_of(series, how)
+    np.testing.assert_allclose(frames.time_s, np.arange(N) * 20.0 + 9.0, atol=2e-5)
+    np.testing.assert_allclose(frames.exposure_s, 18.0)
+
+
+@pytest.mark.parametrize("kind", [StdDevUncertainty, InverseVariance, None])
+def test_spectra_of_specutils_are_frames(kind: type | None) -> None:
+    specutils = pytest.importorskip("specutils")
+    error = np.full(LIGHT.shape, 0.5)
+    uncertainty = None if kind is None else StdDevUncertainty(error).represent_as(kind)
+    mask = np.zeros(LIGHT.shape, bool)
+    mask[3, 1] = True
+    spectra = specutils.Spectrum(
+        flux=LIGHT * u.adu, spectral_axis=NM * 10 * u.AA, uncertainty=uncertainty, mask=mask, meta={"OBJECT": "AU Mic"}
+    )
+    frames = frames_of(spectra, time=WHEN)
+    np.testing.assert_allclose(frames.flux, np.where(mask, np.nan, LIGHT))
+    np.testing.assert_allclose(frames.wavelength_nm, NM)
+    assert (frames.unit, frames.name, frames.scale) == ("adu", "AU Mic", "tdb")
+    if kind is None:
+        assert frames.error is None
+    else:
+        np.testing.assert_allclose(frames.error, 0.5)
+
+
+def test_every_example_of_the_page_gives_the_same_frames(tmp_path: Path) -> None:
+    documented_files(tmp_path)
+    page = (Path(__file__).parents[2] / "docs" / "mapping.md").read_text(encoding="utf-8")
+    examples = re.findall(
+        r"```toml\n# ([\w-]+\.toml)\n(.*?)```.*?read_frames\(\"([\w.-]+)\", \"\1\"\)", page, re.DOTALL
+    )
+    assert [name for name, _, _ in examples] == re.findall(r"^# ([\w-]+\.toml)$", page, re.MULTILINE)
+    assert len(examples) == 6
+    for name, text, file in examples:
+        (tmp_path / name).write_text(text)
+        frames = read_frames(tmp_path / file, tmp_path / name)
+        np.testing.assert_allclose(frames.flux, 100.0 + np.arange(120.0).reshape(30, 4))
+        np.testing.assert_allclose(frames.error, frames.flux / 10)
+        # The page's images have wavelengths in air, by a refractive index of 1.00028 within 1e-5.
+        np.testing.assert_allclose(frames.wavelength_nm, [300.25, 400.25, 500.25, 600.25], rtol=2e-5)
+        assert frames.date(float(frames.time_s[0]))[:21] == ("2026-03-01T00:00:02.5")
+        np.testing.assert_allclose(np.diff(frames.time_s), 5.0, atol=1e-3)
+        np.testing.assert_allclose(frames.exposure_s, 5.0)

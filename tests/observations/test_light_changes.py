@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from mauvecl.observations import frame_model as module
-from mauvecl.observations.frame_model import light_changes
 
 Float = NDArray[np.float64]
 N, PIXELS = 720, 48
@@ -24,7 +23,7 @@ def found(rng: np.random.Generator, added: Float | float = 0.0, numbers: NDArray
           frames: NDArray[np.intp] | None = None) -> list[Any]:  # fmt: skip
     excess = np.broadcast_to(np.asarray(added, np.float64), (N, PIXELS)) + SD * rng.standard_normal((N, PIXELS))
     numbers = np.arange(N) if numbers is None else numbers
-    return light_changes(excess, np.arange(N) if frames is None else frames, numbers, STAR, OTHERS, SD)
+    return module.light_changes(excess, np.arange(N) if frames is None else frames, numbers, STAR, OTHERS, SD)
 
 
 def lost(start: int, stop: int, share: float) -> Float:
@@ -67,4 +66,4 @@ def test_gaps_are_not_bridged_and_frames_left_out_are_not_compared() -> None:
 
 
 def test_few_frames_have_no_changes() -> None:
-    assert light_changes(np.zeros((5, PIXELS)), np.arange(5), np.arange(5), STAR, OTHERS, SD) == []
+    assert module.light_changes(np.zeros((5, PIXELS)), np.arange(5), np.arange(5), STAR, OTHERS, SD) == []

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scenes import analysed, flare
+from scenes import PER_MONTH, analysed, detected, flare
 from scipy import stats
 
 from mauvecl import SHAPES, Frames, TableShape
@@ -64,9 +64,9 @@ def triangle(rng: np.random.Generator, k: int) -> Drawn:
     ("draw", "seed", "number", "snr", "missed", "most"),
     [
         (published, 407, 18, (25, 3000), 0.1, (0.6827, 0.95)),
-        (other, 408, 8, (50, 3000), 0, (1, 1)),
+        (other, 408, 4, (50, 3000), 0, (1, 1)),
         (without_peak, 409, 6, (1000, 5000), 1 / 3, (1, 1)),
-        (triangle, 410, 5, (1000, 5000), 0, (1, 1)),
+        (triangle, 410, 3, (1000, 5000), 0, (1, 1)),
     ],
 )
 def test_recommended_energies_are_in_their_intervals(
@@ -82,7 +82,8 @@ def test_recommended_energies_are_in_their_intervals(
     The sum of squares of 18 pulls notices intervals of half the width in 92 of 100 sets, and of twice the width in 68;
     counts of 28 intervals at 95 and at 68 % do so in 86 and 63.
 
-    Intervals may hold more than stated where no shape of the average is the true one. Some slow flares are taken for
+    Intervals may hold more than stated where no shape of the average is the true one: pulls of each of the other shapes
+    once notice intervals of a third of the width, as do those of each twice. Some slow flares are taken for
     variability of the star. Departures of a fifth from published shapes, which have other tails, once explained
     triangles, with up to 1.9 times their energy: the allowed error of a fifth is 18 times the largest one when the test
     was written.
@@ -95,14 +96,18 @@ def test_recommended_energies_are_in_their_intervals(
         size = np.exp(rng.uniform(*np.log(snr))) / np.sqrt(float(light @ light))
         flux = 1e4 + size * light + rng.standard_normal(time.size)
         # Rarer false alarms take long to simulate for windows this short.
-        events = analysed(Frames.of(time, flux, np.ones(time.size)), false_alarms=10.0).analysis.events
-        if not events:
+        analysis = analysed(Frames.of(time, flux, np.ones(time.size)), false_alarms=10.0).analysis
+        if not analysis.events:
             continue
-        energy, truth = max(events, key=lambda one: one.value).energy, size / 1e4 * width * shape.equivalent_duration
+        event = max(analysis.events, key=lambda one: one.value)
+        energy, truth = event.energy, size / 1e4 * width * shape.equivalent_duration
         end = (energy.high_s if truth > energy.fitted_s else energy.low_s)[1]
         pulls.append(stats.norm.isf(0.025) * (truth - energy.fitted_s) / (end - energy.fitted_s))
         inside += [low <= truth <= high for low, high in zip(energy.low_s, energy.high_s, strict=True)]
-        assert draw is not triangle or energy.fitted_s == pytest.approx(truth, rel=0.2)
+        assert draw not in (triangle, other) or energy.fitted_s == pytest.approx(truth, rel=0.2)
+        # A flare of another shape is one flare, and no process.
+        assert draw is not other or detected(analysis, PER_MONTH) == [event]
+        assert draw is not other or event.value > 0.6 * size * np.linalg.norm(light)
     seen = len(pulls)
     assert number - seen <= missed * number
     assert (inside >= stats.binom.ppf(0.00125, seen, [0.6827, 0.95])).all(), inside

@@ -79,7 +79,6 @@ def threshold() -> float:
 def test_frames_of_other_wavelengths_or_units_are_searched_in_white_light() -> None:
     frames = drawn(np.random.default_rng(2))
     nm = frames.wavelength_nm
-    assert nm is not None
     for changed, key in (({"unit": "K"}, "unit"), ({"wavelength_nm": nm + 7}, "wavelength")):
         answer = analyse(STUDY, frames=replace(frames, **changed))  # type: ignore[arg-type]
         assert answer.analysis.spectra is None
@@ -95,7 +94,7 @@ def analysed_counts() -> tuple[Frames, Any]:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("unit", ["erg / (s cm2 Angstrom)", "W / (m2 um)", "Jy"])
+@pytest.mark.parametrize("unit", ["W / (m2 um)", "Jy"])
 def test_flux_densities_are_searched_by_their_spectrum_as_counts_are(unit: str) -> None:
     """Calibrated by a hot standard star: counts over its counts, times its flux.
 
@@ -103,7 +102,6 @@ def test_flux_densities_are_searched_by_their_spectrum_as_counts_are(unit: str) 
     """
     counts, one = analysed_counts()
     nm = counts.wavelength_nm
-    assert nm is not None
     standard = Study(star=[{"library": "B2IV", "magnitude": 9.0}])
     there = frame_model(standard, counts)
     assert not isinstance(there, str)
@@ -113,7 +111,6 @@ def test_flux_densities_are_searched_by_their_spectrum_as_counts_are(unit: str) 
     values = (np.array(mean) * u.Unit("erg / (s cm2 Angstrom)")).to_value(u.Unit(unit), u.spectral_density(nm * u.nm))
     electrons = there.quiet.n_frames * there.quiet.source_electrons
     factor = values / (there.bins @ (electrons * there.quiet.gain_dn_per_electron) * there.per_dn)
-    assert counts.error is not None
     how: Any = {"exposure_s": FRAME_S, "wavelength_nm": nm, "name": "M3V"}
     fluxes = Frames.of(TIME, counts.flux * factor, counts.error * factor, unit=unit, **how)
     other = analyse(STUDY, frames=fluxes)
@@ -250,7 +247,6 @@ def test_look_alikes_are_rejected_by_their_spectrum(kind: str, spectrum: str, si
     added = flare(1800.0, 90.0, size) if not spectrum else size * np.outer(shape, model().unknowns(light())[spectrum])
     frames = drawn(np.random.default_rng(305), added)
     analysis = analyse(Study(star=STAR, search=OFTEN | {"frame": {"light": 1e-6}}), frames=frames).analysis
-    assert analysis.spectra is not None
     event, found = max(zip(analysis.events, analysis.spectra.found, strict=True), key=lambda pair: pair[0].value)
     assert abs(analysis.survey.time_s[event.brightest] - 1800.0) < 60
     assert (event.kind, found.cause) == (kind, kind)

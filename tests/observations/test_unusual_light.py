@@ -6,6 +6,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
+from marks import long_but
 from numpy.typing import NDArray
 from scenes import PER_MONTH, analysed, detected, flare
 
@@ -17,14 +18,17 @@ DURATION = SHAPES["davenport2014"].equivalent_duration
 
 @pytest.mark.parametrize(
     ("half_width_s", "after", "amplitude", "window", "seed"),
-    [
+    long_but(
+        [
+            (60.0, 1.5, 60.0, 12.0, 1),
+            (60.0, 2.0, 60.0, 12.0, 2),
+            (40.0, 1.0, 20.0, 13.0, 3),
+            (90.0, 1.2, 200.0, 11.0, 4),
+            (60.0, 0.7, 5.0, 12.0, 5),
+            (120.0, 1.5, 30.0, 15.0, 6),
+        ],
         (60.0, 1.5, 60.0, 12.0, 1),
-        pytest.param(60.0, 2.0, 60.0, 12.0, 2, marks=pytest.mark.long),
-        pytest.param(40.0, 1.0, 20.0, 13.0, 3, marks=pytest.mark.long),
-        pytest.param(90.0, 1.2, 200.0, 11.0, 4, marks=pytest.mark.long),
-        pytest.param(60.0, 0.7, 5.0, 12.0, 5, marks=pytest.mark.long),
-        pytest.param(120.0, 1.5, 30.0, 15.0, 6, marks=pytest.mark.long),
-    ],
+    ),
 )
 def test_tail_of_a_bright_flare_without_its_peak_is_an_event(
     half_width_s: float, after: float, amplitude: float, window: float, seed: int
@@ -49,7 +53,7 @@ def test_tail_of_a_bright_flare_without_its_peak_is_an_event(
     assert abs(event.energy.fitted_s - truth) < 2.5 * (high - low)
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.long), pytest.param(3, marks=pytest.mark.long)])
+@pytest.mark.parametrize("seed", long_but([1, 2], 1))
 def test_two_flares_that_look_like_one_are_fitted_as_two(seed: int) -> None:
     """A third flare that is longer than the window must not stand for either; five standard errors of the energy.
 
@@ -65,34 +69,6 @@ def test_two_flares_that_look_like_one_are_fitted_as_two(seed: int) -> None:
     assert sorted(one.peak_s for one in event.energy.flares) == pytest.approx(peaks, abs=8.0)
     truth = DURATION * sum(size * width for size, width in zip(sizes, widths, strict=True))
     assert abs(event.energy.fitted_s - truth) < 2.5 * (event.energy.high_s[0] - event.energy.low_s[0])
-
-
-#: Flares that no template resembles, as functions of tau: a bell, a slow rise with a fast decay, and a fast tail.
-ODD_SHAPES = {
-    "bell": lambda tau: np.exp(-4 * np.log(2) * tau**2),
-    "slow-rise": lambda tau: np.where(tau < 0, np.maximum(1 + tau / 3, 0.0), np.maximum(1 - tau, 0.0)),
-    "fast-tail": lambda tau: np.where(
-        tau < 0, np.maximum(1 + tau, 0.0), 0.7 * np.exp(-1.6 * np.abs(tau)) + 0.3 * np.exp(-0.6 * np.abs(tau))
-    ),
-}
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("shape", "snr"), [("bell", 50.0), ("slow-rise", 50.0), ("slow-rise", 500.0), ("fast-tail", 3000.0)]
-)
-def test_flare_of_another_shape_in_a_short_window_is_no_process(shape: str, snr: float) -> None:
-    """Find its light as one flare, with the energy in the frames to a fifth: the wrong shape, not noise, limits it."""
-    rng, frame_s, half_width_s = np.random.default_rng([507, *shape.encode()]), 5.0, 150.0
-    time = (np.arange(360) + 0.5) * frame_s
-    tau = (time[:, None] + (np.arange(60) - 29.5) / 60 * frame_s - 600.0) / half_width_s
-    light = ODD_SHAPES[shape](tau).mean(axis=1)
-    noise = 5e-3
-    amplitude = snr * noise / float(np.sqrt(light @ light))
-    flux = 1 + amplitude * light + noise * rng.standard_normal(time.size)
-    (event,) = detected(analysed(Frames.of(time, flux, np.full(time.size, noise))).analysis, PER_MONTH)
-    assert event.value > 0.6 * snr
-    assert event.energy.fitted_s == pytest.approx(amplitude * float(light.sum()) * frame_s, rel=0.2)
 
 
 @pytest.mark.long
@@ -207,7 +183,7 @@ def sharp_rotator(rng: np.random.Generator, noise: float) -> tuple[Frames, list[
     return frames, flares
 
 
-@pytest.mark.parametrize("seed", [4, pytest.param(5, marks=pytest.mark.long), pytest.param(6, marks=pytest.mark.long)])
+@pytest.mark.parametrize("seed", long_but([4, 5], 4))
 def test_flares_on_sharp_rotation_in_long_frames_are_detected(seed: int) -> None:
     """Find all bright flares and nothing else, with their energies, and no minimum is a loss."""
     frames, flares = sharp_rotator(np.random.default_rng([520, seed]), 2e-4)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,6 @@ from mauvecl.noise import layout, random_numbers, reference
 
 if TYPE_CHECKING:
     from mauvecl.detection import requests
-    from mauvecl.noise.scene import Scene
 
 Floats = NDArray[np.float32]
 
@@ -21,7 +20,7 @@ fma = random_numbers.fma
 
 
 def statistics(
-    scene: Scene,
+    scene: Any,
     realisation: NDArray[np.uint64],
     seed: int,
     plan: requests.ChannelPlan,
@@ -109,7 +108,7 @@ def _variance(x: Floats, estimate: NDArray[np.void]) -> Floats:
 
 
 def _element_sums(
-    scene: Scene, k: int, y: Floats, variance: Floats, weights: NDArray[np.float32]
+    scene: Any, k: int, y: Floats, variance: Floats, weights: NDArray[np.float32]
 ) -> tuple[Floats, Floats]:
     """Return `chi2_element` of a scenario, shape (n,), and weighted sums of its elements, shape (m, n)."""
     total: Floats = np.zeros_like(y[0])
@@ -171,7 +170,7 @@ class Smoothed:
         return out
 
 
-def _above_reference(scene: Scene, counts: NDArray[np.int64]) -> NDArray[np.float32]:
+def _above_reference(scene: Any, counts: NDArray[np.int64]) -> NDArray[np.float32]:
     above = counts.astype(np.float32)
     if scene.frames:
         return np.asarray(above + scene.edges["whole"][:, :, None])
@@ -188,7 +187,7 @@ def _summed(values: NDArray[np.float32], weights: NDArray[np.float32]) -> Floats
 
 
 def histograms(
-    scene: Scene,
+    scene: Any,
     observers: NDArray[np.void],
     elements: NDArray[np.void],
     realisation: NDArray[np.uint64],

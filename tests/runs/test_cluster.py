@@ -252,6 +252,13 @@ def by_hand(folder: Path) -> Iterator[tuple[subprocess.Popen[bytes], Path]]:
             process.wait(20)
 
 
+@pytest.fixture(scope="module")
+def scheduler_file(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Start a scheduler and a worker for all tests that end neither."""
+    with by_hand(tmp_path_factory.mktemp("started")) as (_, file):
+        yield str(file)
+
+
 #: Changes of the code of a worker that joins later, whose counts are wrong.
 OTHER_CODE = {
     "version": "shards.VERSION = '0.9.0'; identity.cache_clear()",
@@ -274,57 +281,50 @@ if not hasattr(cluster, "changed"):
 
 @pytest.mark.parametrize("change", OTHER_CODE)
 def test_shards_of_workers_with_other_code_are_drawn_again(
-    change: str, tmp_path: Path, engine: Engine, scene: list[Expectation]
+    change: str, scheduler_file: str, tmp_path: Path, engine: Engine, scene: list[Expectation]
 ) -> None:
     """Let a worker with other code join a running cluster: its counts are not used."""
     quiet, *flares = scene
     (tmp_path / "other_code.py").write_text(PRELOAD.format(change=OTHER_CODE[change]))
     n = 200_000
-    with by_hand(tmp_path) as (_, file):
-        workers = DaskWorkers(str(file))
-        pool = Pool(workers)
-        dask = Path(sys.executable).with_name("dask")
-        command = [dask, "worker", "--nthreads", "1", "--no-nanny", "--preload", tmp_path / "other_code.py"]
-        other = subprocess.Popen(
-            [*command, "--scheduler-file", file, "--no-dashboard"],
-            cwd=tmp_path,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        try:
-            workers._client.wait_for_workers(2, timeout=60)
-            found = pool.detect(quiet, flares, realisations=n, seed=6)
-            assert len(workers._strangers) == 1
-            assert pool.standing.retries >= 1
-        finally:
-            other.terminate()
-            other.wait(20)
-            workers.close()
+    workers = DaskWorkers(scheduler_file)
+    pool = Pool(workers)
+    dask = Path(sys.executable).with_name("dask")
+    command = [dask, "worker", "--nthreads", "1", "--no-nanny", "--preload", tmp_path / "other_code.py"]
+    command += ["--scheduler-file", scheduler_file, "--no-dashboard"]
+    other = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        workers._client.wait_for_workers(2, timeout=60)
+        found = pool.detect(quiet, flares, realisations=n, seed=6)
+        assert len(workers._strangers) == 1
+        assert pool.standing.retries >= 1
+    finally:
+        other.terminate()
+        other.wait(20)
+        workers.close()
     same(found, engine.detect(quiet, flares, realisations=n, seed=6))
 
 
 def test_cluster_of_workers_with_other_code_raises(
-    tmp_path: Path, scene: list[Expectation], monkeypatch: pytest.MonkeyPatch
+    scheduler_file: str, scene: list[Expectation], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Replace the only worker by one with other code."""
-    with by_hand(tmp_path) as (_, file):
-        workers = DaskWorkers(str(file))
-        monkeypatch.setattr("mauvecl.runs.cluster.code_identity", lambda: ("1.0.0", "another"))
-        with pytest.raises(DeviceError, match="workers with other code"):
-            Pool(workers).detect(scene[0], scene[1:], realisations=N, seed=1)
-        workers.close()
+    workers = DaskWorkers(scheduler_file)
+    monkeypatch.setattr("mauvecl.runs.cluster.code_identity", lambda: ("1.0.0", "another"))
+    with pytest.raises(DeviceError, match="workers with other code"):
+        Pool(workers).detect(scene[0], scene[1:], realisations=N, seed=1)
+    workers.close()
 
 
 @contextmanager
-def watched(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[DaskWorkers]:
+def watched(file: Path | str, monkeypatch: pytest.MonkeyPatch) -> Iterator[DaskWorkers]:
     """Connect to a worker started by hand, and watch for shards whose workers have left."""
     monkeypatch.setattr("mauvecl.runs.cluster.RECOUNT_S", 0.5)
-    with by_hand(folder) as (_, file):
-        workers = DaskWorkers(str(file))
-        workers._strangers.add("tcp://127.0.0.1:1")
-        threading.Thread(target=workers._watch, daemon=True).start()
-        yield workers
-        workers.close()
+    workers = DaskWorkers(str(file))
+    workers._strangers.add("tcp://127.0.0.1:1")
+    threading.Thread(target=workers._watch, daemon=True).start()
+    yield workers
+    workers.close()
 
 
 def test_shards_whose_workers_have_left_are_sent_to_others(
@@ -332,7 +332,7 @@ def test_shards_whose_workers_have_left_are_sent_to_others(
 ) -> None:
     """Restrict shards to a worker that ends and is replaced under another address."""
     quiet, *flares = scene
-    with watched(tmp_path, monkeypatch) as workers:
+    with by_hand(tmp_path) as (_, file), watched(file, monkeypatch) as workers:
         pool = Pool(workers)
         (pid,) = workers._client.run(os.getpid).values()
 
@@ -342,11 +342,11 @@ def test_shards_whose_workers_have_left_are_sent_to_others(
 
 
 def test_shards_whose_request_has_left_are_sent_again(
-    tmp_path: Path, engine: Engine, scene: list[Expectation], monkeypatch: pytest.MonkeyPatch
+    scheduler_file: str, engine: Engine, scene: list[Expectation], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Restrict a request to a worker that has left, and only the first of the shards that need it."""
     quiet, *flares = scene
-    with watched(tmp_path, monkeypatch) as workers:
+    with watched(scheduler_file, monkeypatch) as workers:
         allowed = iter([["tcp://127.0.0.1:2"]])
         monkeypatch.setattr(workers, "_ours", lambda: next(allowed, None))
         pool = Pool(workers)
@@ -381,30 +381,29 @@ class Disconnects(Leaves):
 
 @pytest.mark.parametrize("kind", [Leaves, Disconnects])
 def test_end_during_a_transfer_is_noticed(
-    kind: type[Leaves], tmp_path: Path, engine: Engine, scene: list[Expectation]
+    kind: type[Leaves], scheduler_file: str, engine: Engine, scene: list[Expectation]
 ) -> None:
     """Send a shard again whose worker leaves with its result, and report a scheduler that is lost."""
-    with by_hand(tmp_path) as (_, file):
-        workers = DaskWorkers(str(file))
-        submit, pool, given = workers._client.submit, Pool(workers), list[Leaves]()
+    workers = DaskWorkers(scheduler_file)
+    submit, pool, given = workers._client.submit, Pool(workers), list[Leaves]()
 
-        def lose_the_first(work: Any, *arguments: Any, **how: Any) -> Any:
-            if work.__name__ != "_count" or given:
-                return submit(work, *arguments, **how)
-            given.append(kind())
-            return given[0]
+    def lose_the_first(work: Any, *arguments: Any, **how: Any) -> Any:
+        if work.__name__ != "_count" or given:
+            return submit(work, *arguments, **how)
+        given.append(kind())
+        return given[0]
 
-        workers._client.submit = lose_the_first
-        if kind is Leaves:
-            found = pool.detect(scene[0], scene[1:], realisations=N, seed=1)
-            assert given[0].asked == 3
-            assert pool.standing.retries == 1
-            same(found, engine.detect(scene[0], scene[1:], realisations=N, seed=1))
-        else:
-            with pytest.raises(DeviceError) as error:
-                pool.detect(scene[0], scene[1:], realisations=N, seed=1)
-            assert error.value.kind == "lost"
-        workers.close()
+    workers._client.submit = lose_the_first
+    if kind is Leaves:
+        found = pool.detect(scene[0], scene[1:], realisations=N, seed=1)
+        assert given[0].asked == 3
+        assert pool.standing.retries == 1
+        same(found, engine.detect(scene[0], scene[1:], realisations=N, seed=1))
+    else:
+        with pytest.raises(DeviceError) as error:
+            pool.detect(scene[0], scene[1:], realisations=N, seed=1)
+        assert error.value.kind == "lost"
+    workers.close()
 
 
 @pytest.fixture(scope="module")

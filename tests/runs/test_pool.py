@@ -7,6 +7,7 @@ import itertools
 import json
 import pickle
 import random
+import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -25,6 +26,7 @@ from stores import flip, full_after
 
 from mauvecl import (
     Comparison,
+    DaskWorkers,
     Detection,
     Engine,
     Expectation,
@@ -43,7 +45,6 @@ from mauvecl import (
 from mauvecl.detection import requests
 from mauvecl.device.drivers import DeviceError
 from mauvecl.runs import checkpoint as shards
-from mauvecl.runs.checkpoint import Checkpoint
 from mauvecl.runs.pool import Stopped, map_in_order
 
 pytestmark = pytest.mark.usefixtures("small_shards")
@@ -288,7 +289,7 @@ def interrupting(after: int) -> Callable[[int, int], None]:
 def at_work(folder: Path, engine: Engine, progress: Any = None, study: Study | None = None, **how: Any) -> Any:
     """Ask for a detection whose shards are kept; return it, the pool and the checkpoint."""
     quiet, *flares = SCENE
-    with Checkpoint(folder, "detect", study or small(), patience_s=0.0, **how) as checkpoint:
+    with shards.Checkpoint(folder, "detect", study or small(), patience_s=0.0, **how) as checkpoint:
         pool = Pool(LocalWorkers([None], make=lambda d, progress: engine), checkpoint=checkpoint, progress=progress)
         return pool.detect(quiet, flares, realisations=N, seed=5), pool, checkpoint
 
@@ -364,7 +365,7 @@ def test_unfinished_run_is_not_overwritten(begun: Path, engine: Engine) -> None:
     other = small().with_settings(["run.seed=4", "flare.amplitudes=[0.1]"])
     with refused("restart", "flare.amplitudes.0", "flare.amplitudes.1"):
         at_work(begun, engine, study=other, resume=True)
-    with Checkpoint(begun, "detect", small(), resume=True), refused("lock"):
+    with shards.Checkpoint(begun, "detect", small(), resume=True), refused("lock"):
         at_work(begun, engine)
     _, pool, _ = at_work(begun, engine, restart=True)
     assert pool.standing.resumed == 0
@@ -380,7 +381,7 @@ def test_counts_of_another_form_raise(begun: Path, engine: Engine) -> None:
 
 
 def test_short_runs_leave_no_files(tmp_path: Path, engine: Engine) -> None:
-    with Checkpoint(tmp_path, "detect", small()) as checkpoint:
+    with shards.Checkpoint(tmp_path, "detect", small()) as checkpoint:
         pool = Pool(LocalWorkers([None], make=lambda d, progress: engine), checkpoint=checkpoint)
         pool.detect(SCENE[0], SCENE[1:], realisations=N, seed=5)
     assert list(tmp_path.iterdir()) == []
@@ -456,3 +457,18 @@ def test_progress_that_raises_stops_the_work_ahead_of_it(engine: Engine) -> None
             pool.detect(SCENE[0], SCENE[1:], realisations=N, seed=5)
     else:
         pytest.fail("the progress was not asked")
+
+
+@pytest.mark.parametrize("package", ["distributed", "cryptography"])
+def test_missing_package_raises(package: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Refuse to start a cluster without encryption."""
+    monkeypatch.setitem(sys.modules, package, None)
+    with refused({"distributed": "dask"}.get(package, package), "'mauvecl[cluster]'"):
+        DaskWorkers("local:2")
+
+
+def test_absent_scheduler_raises(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mauvecl.runs.cluster.PATIENCE_S", 1.0)
+    with pytest.raises(DeviceError) as error:
+        DaskWorkers("tcp://127.0.0.1:1")
+    assert "tcp://127.0.0.1:1" in str(error.value)

@@ -28,18 +28,14 @@ def test_stores_are_read_back_with_their_metadata(tmp_path: Path, engine: Engine
     raw = bulk.read(tmp_path / "frames.zarr", "star-1/flare-1").values.reshape(-1, x.wavelength_nm.size)
     n = 2 if which == "stacked" else 1
     np.testing.assert_allclose(frames.flux, raw - n * (x.bias_dn + x.dark_dn), rtol=1e-12, atol=1e-9)
-    assert frames.wavelength_nm is not None
     np.testing.assert_allclose(frames.wavelength_nm, x.wavelength_nm)
     exposure, times = (10.0, [5.0, 15.0, 25.0, 35.0]) if which == "stacked" else (5.0, [2.5, 12.5, 17.5, 27.5])
     np.testing.assert_allclose(frames.exposure_s, exposure)
     np.testing.assert_allclose(frames.time_s[:4], times)
-    assert frames.temperature_c is not None
     np.testing.assert_allclose(frames.temperature_c, 21.0)
     assert (frames.instrument, frames.unit, frames.name) == ("mauve", "adu", "G2V V = 7.4")
     # The mean of the squared errors is the variance of the model: 40 rows of 197 pixels know it to a percent.
-    assert frames.error is not None
     np.testing.assert_allclose((frames.error**2).mean(), (x.variance_dn2 / x.n_frames * n).mean(), rtol=0.03)
-    assert frames.quality is not None
     assert not frames.quality.any()
 
 
@@ -53,8 +49,6 @@ def test_stores_are_reduced_in_pieces(
     monkeypatch.setattr("mauvecl.host.tables.table.PIECE_BYTES", 7 * 8 * 197)
     (curve,) = reduce_frames(path).light_curves
     np.testing.assert_allclose(curve.flux, light, rtol=1e-12)
-    assert curve.error is not None
-    assert error is not None
     np.testing.assert_allclose(curve.error, error, rtol=1e-12)
 
 

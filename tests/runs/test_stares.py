@@ -16,7 +16,6 @@ from scenes import flaring_stares as request
 
 from mauvecl import Engine, LocalWorkers, Pool, Stare, Stares
 from mauvecl.runs import checkpoint as shards
-from mauvecl.runs.checkpoint import Checkpoint
 from mauvecl.runs.pool import Stopped
 
 pytestmark = pytest.mark.usefixtures("small_shards")
@@ -92,9 +91,9 @@ def test_run_of_stares_is_resumed(engine: Engine, tmp_path: Path) -> None:
                 raise Stopped
             return super().submit(*given, **more)
 
-    with pytest.raises(Stopped), Checkpoint(tmp_path, "inject", study, patience_s=0.0) as kept:
+    with pytest.raises(Stopped), shards.Checkpoint(tmp_path, "inject", study, patience_s=0.0) as kept:
         Pool(Stopping(3), checkpoint=kept).stares(asked)
-    with Checkpoint(tmp_path, "inject", study, resume=True) as kept:
+    with shards.Checkpoint(tmp_path, "inject", study, resume=True) as kept:
         workers = Stopping(99)
         found = Pool(workers, checkpoint=kept).stares(asked)
         assert 1 <= kept.resumed < 5

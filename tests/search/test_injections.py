@@ -175,7 +175,6 @@ def test_light_of_star_and_flare_is_lost_in_pointing_drifts(stares: Stares) -> N
     for amplitude in (1e-6, 3.0):
         answer = stare(study(stare=frames, star=star, flare={"amplitudes": [amplitude]}), stares)
         table, loss = answer.light_curve(), answer.stares[0].pointing_loss
-        assert loss is not None
         assert loss.max() > 0.8
         assert 0.1 < np.mean(loss > 0) < 0.5
         off = (table["flux"] / table["mean"] - (1 - loss)) * table["mean"] / table["flux_err"]

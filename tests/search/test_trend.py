@@ -1,22 +1,17 @@
-"""Unknowns beyond first order: random drifts and cycles, nulls drawn by NumPy alone, and flares."""
+"""Unknowns beyond first order in sums that NumPy draws alone; `test_injections.py` counts their false alarms."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from refusals import refused
 from searches import DAVENPORT, survey
 
-from mauvecl import Sinusoid, Stare
-from mauvecl.search.false_alarms import sample_rate, sampled_rate
+from mauvecl import Stare
 from mauvecl.search.flare_fits import SingleFlareFit
 from mauvecl.search.templates import Baseline
 
-#: One false alarm a month of 365.25 / 12 days.
-PER_MONTH = 12 / 365.25
 
-
-def drawn(one, rng, count, farther=1.0):
+def drawn(one, rng, count, farther):
     """Draw stares without a flare from the pixels' means and variances; return them and their unknown amplitudes.
 
     The dark of each pixel is exponential in the temperature; photons, dark and reading are normal.
@@ -44,71 +39,6 @@ def drawn(one, rng, count, farther=1.0):
         root = np.linalg.cholesky(weights * mean * step @ weights.T)
         sums += (factor - 1) * (weights @ mean) + np.sqrt(factor) * (rng.standard_normal(shape) @ root.T)
     return sums, z
-
-
-def random_stare(rng):
-    """Return a stare with or without gaps, cycles, drifts and offsets, and the options of its search."""
-    duration, cycle = float(rng.uniform(6000, 12_000)), bool(rng.integers(2))
-    starts = rng.uniform(0, duration, rng.integers(0, 3))
-    stare = Stare.of(
-        duration,
-        gaps=[(float(a), float(a + rng.uniform(100, 800))) for a in starts],
-        thermal=Sinusoid(rng.uniform(0, 0.5)),
-        drifts={"temperature": rng.uniform(0.05, 0.4)} | ({"star": 0.005} if rng.integers(2) else {}),
-        offsets={"temperature": rng.uniform(0.1, 1.0)} if rng.integers(2) else {},
-        cycles={"temperature": rng.uniform(0.05, 0.5)} if cycle else {},
-    )
-    return stare, Baseline(cycle=cycle, window_s=17_000.0 if cycle else 1800.0)
-
-
-@pytest.mark.long
-def test_false_alarms_with_random_drifts_and_cycles():
-    """Count alarms in 8 random stares within 4 standard errors; fails once in 10^4 runs.
-
-    With unknowns three times as far out, at the threshold for one false alarm per star-month, fewer than 6 alarms,
-    where a chance of one in 10^5 has as many for the 0.4 that are expected.
-    """
-    rng = np.random.default_rng(26)
-    asked, count, alarms, far = 0.2, 20, 0, 0
-    for number in range(8):
-        stare, level = random_stare(rng)
-        one, _ = survey(stare, level, (25.0, 120.0, 600.0), star="K2.5V", magnitude=5.0)
-        tail = sampled_rate(one, number)
-        cut = tail.threshold(-np.log1p(-asked) / (stare.observed_s / 86_400)).value
-        alarms += int(np.sum(one.search.largest(one.net(drawn(one, rng, count)[0])).maximum > cut))
-        cut = tail.threshold(PER_MONTH).value
-        far += int(np.sum(one.search.largest(one.net(drawn(one, rng, 10, 3.0)[0])).maximum > cut))
-    assert abs(alarms - 8 * count * asked) < 4 * np.sqrt(8 * count * asked * (1 - asked))
-    assert far < 6
-
-
-@pytest.mark.long
-def test_thresholds_allow_for_residual_variability():
-    """Check that unmodelled cycles and drifts raise the threshold, or that the search is refused.
-
-    In four random stares, alarms at the threshold for two stares in ten are as often as asked for, within a factor of
-    1.3 and 4 standard errors: once in 10^4 runs it fails by chance. At the threshold for no unknowns many more do.
-    """
-    rng = np.random.default_rng(27)
-    asked, count, alarms, plain = 0.2, 50, 0, 0
-    for number in range(4):
-        how = {"cycles": rng.uniform(6e-4, 1.2e-3)} if rng.integers(2) else {"drifts": rng.uniform(6e-4, 1.2e-3)}
-        ((kind, sd),) = how.items()
-        stare = Stare.of(rng.uniform(7000, 11_000), **{kind: {"temperature": sd}})
-        level = Baseline(slope=kind == "cycles", window_s=12_000.0)
-        one, _ = survey(stare, level, (25.0, 120.0, 600.0), star="K2.5V", magnitude=5.0)
-        rate = -np.log1p(-asked) / (stare.observed_s / 86_400)
-        tail = sampled_rate(one, number)
-        assert tail.shifted
-        maxima = one.search.largest(one.net(drawn(one, rng, count)[0])).maximum
-        alarms += int(np.sum(maxima > tail.threshold(rate).value))
-        plain += int(np.sum(maxima > sample_rate(one.search, seed=number).threshold(rate).value))
-    expected, spread = 4 * count * asked, np.sqrt(4 * count * asked * (1 - asked))
-    assert expected / 1.3 - 4 * spread < alarms < 1.3 * expected + 4 * spread
-    assert plain > 1.5 * alarms
-    one, _ = survey(Stare.of(6000.0, drifts={"temperature": 0.1}), Baseline(slope=False), (25.0,), part=True)
-    with refused("false_alarms"):
-        sampled_rate(one, 1).threshold(PER_MONTH)
 
 
 @pytest.fixture(scope="module")

@@ -205,11 +205,8 @@ def test_study_of_an_older_version_is_read_and_keeps_its_keys() -> None:
     limits, stare = study.orbit.limits, study.stare
     assert (limits.earth_limb_deg, limits.sun_deg, limits.moon_deg, limits.declination_deg) == (20, None, None, None)
     assert (limits.normal_cone_deg, limits.anomaly) == (39.1, ((-90, -50), (40, -50), (0, 0)))
-    assert stare.thermal is not None
     assert (stare.thermal.amplitude, stare.thermal.phase, stare.thermal.points) == (0.5, 1.0, None)
-    assert stare.sky is not None
     assert stare.sky.points == ((0, 0), (600, 0.1))
-    assert study.events[0].cooling is not None
     assert (study.events[0].cooling.end_k, study.events[0].cooling.fold_s) == (6000.0, 300.0)
     written = tomllib.loads(study.toml())
     usual = Study().orbit.limits.model_dump(mode="json")

@@ -330,14 +330,14 @@ def test_memory_of_uploads_and_answers_is_bounded(tmp_path: Path) -> None:
         content = b"\xff" + bytes(2**24 - 2)
         assert "entered" in await first.upload(content, "frames", "mine.csv")
         for _ in range(2):
-            others = [await served.talk() for _ in range(12)]
+            others = [await served.talk() for _ in range(8)]
             for one in others:
                 assert "entered" in await one.upload(content, "frames", "mine.csv")
             assert await has_file(first)
             for one in others:
                 one.end()
             await asyncio.sleep(0.5)
-        others = [await served.talk() for _ in range(17)]
+        others = [await served.talk() for _ in range(16)]
         for one in others:
             await one.upload(content, "frames", "mine.csv")
         assert not await has_file(first)
@@ -346,11 +346,11 @@ def test_memory_of_uploads_and_answers_is_bounded(tmp_path: Path) -> None:
             one.end()
         # The positions of a year, 110 MB, once stayed with every plan that a connection kept.
         for kind in ("visible", "plan"):
-            for number, days in enumerate(("360", "361", "362")):
+            memory = []
+            for days in ("360", "361"):
                 assert (await first.simulate(kind, link(targets="AU Mic", days=days))).startswith("Done")
-                if number == 0:
-                    before = served.memory()
-            assert served.memory() - before < 150
+                memory.append(served.memory())
+            assert memory[1] - memory[0] < 60
 
     served.visited(work)
     served.kill()
@@ -395,23 +395,21 @@ def test_folders_end_with_their_server(tmp_path: Path) -> None:
         served.visited(work)
         assert not re.search("ERROR|Traceback|note:", served.log.read_text()), served.log.read_text()
 
-    ended_by(start("first"), signal.SIGTERM)
-    assert folders() == 0
-    ended_by(start("second"), signal.SIGKILL)
+    ended_by(start("first"), signal.SIGKILL)
     assert folders() == 1, "nothing can clean up after this"
-    third = start("third")
+    second = start("second")
     assert folders() == 0, "the folder of the killed one is gone"
 
     async def stays(talk: Talk) -> None:
         assert folders() == 1
-        fourth = await asyncio.to_thread(start, "fourth")
+        third = await asyncio.to_thread(start, "third")
         assert folders() == 1, "that of a running server stays"
         assert "answer" in await talk.answer()
-        await asyncio.to_thread(ended_by, fourth, signal.SIGINT)
+        await asyncio.to_thread(ended_by, third, signal.SIGINT)
+        assert folders() == 1
 
-    third.visited(stays)
-    third.process.send_signal(signal.SIGINT)
-    third.process.wait(60)
+    second.visited(stays)
+    ended_by(second, signal.SIGTERM)
     for _ in range(50):
         if folders() == 0:
             break
