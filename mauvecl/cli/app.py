@@ -38,7 +38,6 @@ WhereFlag = Annotated[
 
 def devices(
     rate: Annotated[bool, typer.Option("--rate/--no-rate", help="Measure each device for a second.")] = True,
-    forget: Annotated[bool, typer.Option("--forget", help="Retry drivers that failed to build kernels.")] = False,
     as_json: JsonFlag = False,
 ) -> None:
     """List the OpenCL devices that can run the kernels, and rates.
@@ -48,12 +47,9 @@ def devices(
 
     Example: mauvecl devices
     """
-    from mauvecl.device.drivers import forget_outcomes
     from mauvecl.device.selftest import DEVICE_COLUMNS, list_devices
     from mauvecl.schema.columns import View
 
-    if forget:
-        forget_outcomes()
     records = list_devices() if rate else list_devices(measure=False)
     if as_json:
         print(json.dumps(records, indent=2))

@@ -47,6 +47,10 @@ LONGEST = 1000
 #: Error numbers of full disks and quotas, which name no file.
 DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EMFILE, errno.ENFILE)
 
+#: What to do instead of giving a flag that has gone.
+GONE = {
+    "--forget": "leave it out: a driver that failed is tried again by every run",
+}
 #: Libraries that write to standard output for mauvecl.
 PRINTERS = ("click", "typer", "rich", "mauvecl.cli")
 #: Output folder of the verb, once known, to which tracebacks are written.
@@ -107,6 +111,9 @@ def _failed(error: Exception) -> int:
     if hasattr(error, "format_message") and isinstance(getattr(error, "exit_code", None), int):
         # A usage error of Click, or the help text of an empty command line, which Click prints itself.
         text = str(error.format_message())
+        gone = GONE.get(getattr(error, "option_name", None) or "")
+        if gone is not None:
+            text = f"{text.split(' Did')[0].rstrip('.')}: it has gone, {gone}."
         return _say(text.splitlines()[0] if text else "", BAD_INPUT) if text.strip() else BAD_INPUT
     if type(error).__name__ == "Abort" or isinstance(error.__cause__, KeyboardInterrupt):
         return _say("interrupted", INTERRUPTED)
