@@ -247,10 +247,10 @@ class Session(Options):
 
     def say(self, lines: Sequence[str]) -> None:
         """Print messages, unless standard output is reserved for JSON."""
-        from mauvecl.cli.console import show, with_flags
+        from mauvecl.cli.console import show
 
         if lines and not self.as_json:
-            show([with_flags(line) for line in lines])
+            show(lines)
 
     @cached_property
     def draws_pictures(self) -> bool:
@@ -317,11 +317,7 @@ class Session(Options):
         with report_interrupts(self._written):
             self._leave_all(answer)
         if self.as_json:
-            from mauvecl.cli.console import with_flags
-
-            content = answer.as_json()
-            remarks = {"assumed": answer.assumed, "messages": [with_flags(line) for line in content["messages"]]}
-            self.print_json(remarks | {key: value for key, value in content.items() if key != "messages"})
+            self.print_json({"assumed": answer.assumed} | answer.as_json())
             return
         from mauvecl.cli.console import show_view
 

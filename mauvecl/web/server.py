@@ -98,7 +98,7 @@ def hosts(address: str, port: int, allowed: Iterable[str]) -> frozenset[str]:
     if not local(address) and not named:
         raise InputError(
             f"address = {shortened(address)} accepts other machines",
-            "`allow_origin` with the address that visitors' browsers will show, such as https://mauve.example.org",
+            "`--allow-origin` with the address that visitors' browsers will show, such as https://mauve.example.org",
             key="address",
         )
     own = {"127.0.0.1", "localhost", "::1"} | ({address} if local(address) else set())
