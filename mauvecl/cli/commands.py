@@ -102,7 +102,7 @@ class Command:
         study = study_of(study_file, given, flags, verb.default)
         question_values(study, detects={"fap", "realisations"} <= flags.keys())
         if self.draws:
-            question_time(study, **{key: how[key] for key in ("device", "cluster", "insist")})
+            question_time(study, insist=how["insist"])
         with Session(verb.name, study, **how) as session:
             self.run(session, **values)
 
