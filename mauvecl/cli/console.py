@@ -48,6 +48,8 @@ DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.E
 #: What to do instead of giving a flag that has gone.
 GONE = {
     "--forget": "leave it out: a driver that failed is tried again by every run",
+    "--keep-after": "leave it out: finished parts of a run are saved after 20 s",
+    "--trials": "give --set change.trials=NUMBER",
 }
 #: Libraries that write to standard output for mauvecl.
 PRINTERS = ("click", "typer", "rich", "mauvecl.cli")
@@ -109,9 +111,9 @@ def _failed(error: Exception) -> int:
     if hasattr(error, "format_message") and isinstance(getattr(error, "exit_code", None), int):
         # A usage error of Click, or the help text of an empty command line, which Click prints itself.
         text = str(error.format_message())
-        gone = GONE.get(getattr(error, "option_name", None) or "")
-        if gone is not None:
-            text = f"{text.split(' Did')[0].rstrip('.')}: it has gone, {gone}."
+        flag = getattr(error, "option_name", "")
+        if flag in GONE:
+            text = f"the flag {flag} has gone, {GONE[flag]}"
         return _say(text.splitlines()[0] if text else "", BAD_INPUT) if text.strip() else BAD_INPUT
     if type(error).__name__ == "Abort" or isinstance(error.__cause__, KeyboardInterrupt):
         return _say("interrupted", INTERRUPTED)

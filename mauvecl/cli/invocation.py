@@ -193,10 +193,7 @@ class Session(Options):
         """Keep finished parts of the work in the output folder, and report interruptions."""
         from mauvecl.runs.checkpoint import Checkpoint
 
-        how: dict[str, Any] = {"resume": self.resume, "restart": self.restart}
-        if self.keep_after is not None:
-            how["patience_s"] = self.keep_after
-        checkpoint = Checkpoint(self.folder, self.verb, self.study, held=True, **how)
+        checkpoint = Checkpoint(self.folder, self.verb, self.study, resume=self.resume, restart=self.restart, held=True)
         with report_interrupts(lambda: self._kept(checkpoint)), checkpoint:
             self.say(checkpoint.messages)
             yield checkpoint

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import atexit
 import contextlib
-import fcntl
 import hashlib
 import io
 import re
-import shutil
 import tempfile
 import threading
 import tomllib
@@ -18,9 +15,8 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cache
 from pathlib import Path, PureWindowsPath
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
@@ -34,25 +30,6 @@ from mauvecl.study.analyses import PATHS, CalibrateQuestion, CalibrationObservat
 from mauvecl.web.fields import FIELDS, UPLOADED, UPLOADED_FILE, UPLOADED_UNKNOWN
 from mauvecl.web.sandboxed_reader import Spectrum, read_frames_limited, read_limited
 
-PREFIX = "mauvecl-page-"
-#: File that a running server holds locked.
-LOCK = "in-use"
-
-
-@cache
-def _own() -> tuple[Path, IO[bytes]]:
-    """Make the folder of this server, with its lock, which the system releases however the server ends."""
-    folder = Path(tempfile.mkdtemp(prefix=PREFIX))
-    lock = (folder / LOCK).open("wb")
-    _locked(lock)
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return folder, lock
-
-
-def visitor_folder() -> tempfile.TemporaryDirectory[str]:
-    """Make a folder for a visitor in that of this server."""
-    return tempfile.TemporaryDirectory(dir=_own()[0])
-
 
 def content_folder(folder: Path, content: bytes, fill: Callable[[Path], object]) -> Path:
     """Return the subfolder for some content, named after its digest; the first call fills it."""
@@ -64,24 +41,6 @@ def content_folder(folder: Path, content: bytes, fill: Callable[[Path], object])
         with contextlib.suppress(OSError):
             new.rename(home)
     return home
-
-
-def remove_abandoned() -> None:
-    """Remove the folders of servers that were killed."""
-    for folder in Path(tempfile.gettempdir()).glob(f"{PREFIX}*"):
-        # Those of other users cannot be opened; one without a lock is being made, or of an older version.
-        with contextlib.suppress(OSError), (folder / LOCK).open("r+b") as lock:
-            if _locked(lock):
-                shutil.rmtree(folder, ignore_errors=True)
-
-
-def _locked(file: IO[bytes]) -> bool:
-    """Lock a file; return False if a running server holds it, or the file system has no locks."""
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        return False
-    return True
 
 
 #: Largest numbers of files and observations of an archive, and of bytes to which it unpacks.

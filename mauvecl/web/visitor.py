@@ -10,6 +10,7 @@ import hashlib
 import json
 import logging
 import math
+import tempfile
 import threading
 import time
 from collections import OrderedDict
@@ -34,7 +35,7 @@ from mauvecl.web.downloads import as_file, asked_study, commands_and_programs
 from mauvecl.web.fields import FIELDS, field_of, remedies, sentence
 from mauvecl.web.page import TABS, State, asking, card, known, reads_of, without_headline
 from mauvecl.web.question import DRAWING, SIMULATIONS, verbs_of
-from mauvecl.web.uploads import RESULTS, UPLOAD_SHELF, UPLOADS, visitor_folder
+from mauvecl.web.uploads import RESULTS, UPLOAD_SHELF, UPLOADS
 
 if TYPE_CHECKING:
     from mauvecl.web.closed_forms import Answers
@@ -245,7 +246,7 @@ class Visitor(WebSocketHandler):
         self._closed: tuple[tuple[Any, ...], ClosedForms] | None = None
         self._answers: OrderedDict[tuple[str, tuple[Any, ...]], dict[str, Any]] = OrderedDict()
         self._files: OrderedDict[tuple[Any, ...], tuple[str, bytes]] = OrderedDict()
-        self._folder = visitor_folder()
+        self._folder = tempfile.TemporaryDirectory(prefix="mauvecl-page-")
 
     def check_origin(self, origin: str) -> bool:
         """Accept every origin, since `access.AccessMatcher` has checked it."""
