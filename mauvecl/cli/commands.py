@@ -435,6 +435,6 @@ def analyse(session: Session) -> None:
     """Find the flares in observed frames, with progress in frames."""
     from mauvecl.answers.analyse import analyse as compute
 
-    with session.metered("frames", "searching") as meter:
+    with session.metered("frames") as meter:
         answer = compute(session.study, progress=meter)
     session.answer(answer)

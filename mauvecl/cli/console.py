@@ -21,7 +21,6 @@ from mauvecl.schema.columns import INTERVAL, View, without_empty
 
 if TYPE_CHECKING:
     import typer
-    from rich.progress import Progress, TaskID
     from rich.table import Table
 
     from mauvecl.runs.pool import PoolProgress
@@ -245,29 +244,31 @@ PATIENCE_S = 2.0
 WIDEST = 100_000
 #: Fraction of the work after which the remaining time is estimated, since the first tile's rate is unreliable.
 TOLD_FROM = 0.01
+#: Clears the line of a terminal.
+CLEARED = "\r\x1b[K"
 
 
 class Meter:
     """Progress with rate and time left, on standard error, for work longer than two seconds.
 
-    On a terminal and in a notebook it is a bar; elsewhere a plain line every ten seconds.
+    On a terminal and in a notebook it is one line that changes; elsewhere a line every ten seconds.
     """
 
     # Returns the progress of a pool, with parts from a checkpoint and parts that were counted again.
     standing: Callable[[], PoolProgress] | None = None
 
-    def __init__(self, *, quiet: bool = False, unit: str = "realisations", work: str = "drawing") -> None:
-        self._quiet, self._unit, self._work = quiet, unit, work
+    def __init__(self, *, quiet: bool = False, unit: str = "realisations") -> None:
+        self._quiet, self._unit = quiet, unit
         self._started = self._shown = time.monotonic()
         self._last = self._total = 0
-        self._bar: Progress | None = None
-        self._task: TaskID | None = None
+        self._changes = sys.stderr.isatty() or "ipykernel" in sys.modules
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._stop()
+        if self._changes and self._shown > self._started:
+            print(CLEARED, end="", file=sys.stderr, flush=True)
 
     def __call__(self, done: int, total: int) -> None:
         """Record how much work is done, in the meter's unit."""
@@ -277,18 +278,14 @@ class Meter:
             return
         if done <= self._last:
             # Start of the next star's work.
-            self._stop()
             self._started = self._shown = now
         self._last, self._total = done, total
-        if self._quiet or now - self._started < PATIENCE_S:
+        if self._quiet or now - self._started < PATIENCE_S or now - self._shown < (0.2 if self._changes else 10.0):
             return
-        if sys.stderr.isatty() or "ipykernel" in sys.modules:
-            self._draw(done, total)
-        elif now - self._shown >= 10.0:
-            self._shown = now
-            rate = self._rate(done)
-            left = self._left(done, total, rate)
-            print(f"{done} of {total} {self._unit}, {rate:.3g} a second, {left}{self._retries()}", file=sys.stderr)
+        self._shown = now
+        rate = self._rate(done)
+        line = f"{done} of {total} {self._unit}, {rate:.3g} a second, {self._left(done, total, rate)}{self._retries()}"
+        print(*((CLEARED, line) if self._changes else (line, "\n")), sep="", end="", file=sys.stderr, flush=True)
 
     def _left(self, done: int, total: int, rate: float) -> str:
         """Return the remaining time, once enough work is done to estimate it."""
@@ -309,33 +306,6 @@ class Meter:
         """Return a note on failed devices, if any."""
         retries = 0 if self.standing is None else self.standing().retries
         return f", {retries} parts counted again" if retries else ""
-
-    def _draw(self, done: int, total: int) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
-
-        if self._bar is None:
-            self._bar = Progress(
-                TextColumn(self._work),
-                BarColumn(),
-                TaskProgressColumn(),
-                TextColumn(f"{{task.fields[rate]}} {self._unit}/s"),
-                TimeRemainingColumn(),
-                TextColumn("left{task.fields[retries]}"),
-                console=Console(stderr=True),
-                transient=True,
-            )
-            self._bar.start()
-            self._task = self._bar.add_task("", total=total, rate="", retries="")
-        assert self._task is not None
-        self._bar.update(
-            self._task, completed=done, total=total, rate=f"{self._rate(done):,.0f}", retries=self._retries()
-        )
-
-    def _stop(self) -> None:
-        if self._bar is not None:
-            self._bar.stop()
-            self._bar = None
 
 
 def show(lines: Sequence[str]) -> None:

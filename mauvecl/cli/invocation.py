@@ -216,11 +216,11 @@ class Session(Options):
         if self.pictures and available():
             style()
 
-    def metered(self, unit: str, work: str = "drawing") -> Meter:
-        """Return the progress in a unit, for a `with` block; a word names the work."""
+    def metered(self, unit: str) -> Meter:
+        """Return the progress in a unit, for a `with` block."""
         from mauvecl.cli.console import Meter
 
-        return Meter(quiet=self.quiet or self.as_json, unit=unit, work=work)
+        return Meter(quiet=self.quiet or self.as_json, unit=unit)
 
     def _kept(self, checkpoint: Checkpoint) -> str:
         parts_kept = checkpoint.kept
