@@ -90,8 +90,8 @@ def driver_sources(system: str | None = None, machine: str | None = None) -> str
 MIN_FREE_BYTES = 64 * 2**20
 #: Largest size of the stored archives in bytes; the oldest are removed.
 MAX_STORED = 128 * 2**20
-#: Name prefix of working folders, and the age after which a folder was left by a killed process.
-WORK, ABANDONED_S = "mauvecl-work-", 7 * 86400.0
+#: Name prefix of working folders, and the age after which a folder was left by a killed process: longer than any run.
+WORK, ABANDONED_S = "mauvecl-work-", 90 * 86400.0
 
 
 class KernelCache:

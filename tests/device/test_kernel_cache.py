@@ -162,14 +162,14 @@ def test_unusable_cache_folder_is_replaced(filled: tuple[Path, str]) -> None:
     assert not found["work"].startswith("/dev/null")
 
 
-@pytest.mark.parametrize("days", [0, 6, 8])
-def test_working_folder_of_killed_process_is_removed_after_a_week(tmp_path: Path, days: int) -> None:
+@pytest.mark.parametrize("days", [0, 89, 91])
+def test_working_folder_of_killed_process_is_removed_after_90_days(tmp_path: Path, days: int) -> None:
     folder = tmp_path / f"{drivers.WORK}01234567"
     folder.mkdir()
     then = time.time() - days * 86400
     os.utime(folder, (then, then))
     assert drivers._working_folder(tmp_path) is not None
-    assert folder.exists() == (days < 7)
+    assert folder.exists() == (days < 90)
 
 
 @pytest.mark.long
