@@ -22,7 +22,7 @@ from typer.main import get_command
 
 from mauvecl.answers.verbs import VERBS
 from mauvecl.cli.commands import COMMANDS, add_plain_commands, export, verify
-from mauvecl.cli.console import EXIT_CODES, guarded, name_flags_of
+from mauvecl.cli.console import EXIT_CODES, guarded
 from mauvecl.cli.flags import DeviceFlag, JsonFlag, QuietFlag, option_of, within
 from mauvecl.host import VERSION
 from mauvecl.schema.parsing import count
@@ -38,7 +38,6 @@ WhereFlag = Annotated[
 
 def devices(
     rate: Annotated[bool, typer.Option("--rate/--no-rate", help="Measure each device for a second.")] = True,
-    forget: Annotated[bool, typer.Option("--forget", help="Retry drivers that failed to build kernels.")] = False,
     as_json: JsonFlag = False,
 ) -> None:
     """List the OpenCL devices that can run the kernels, and rates.
@@ -48,12 +47,9 @@ def devices(
 
     Example: mauvecl devices
     """
-    from mauvecl.device.drivers import forget_outcomes
     from mauvecl.device.selftest import DEVICE_COLUMNS, list_devices
     from mauvecl.schema.columns import View
 
-    if forget:
-        forget_outcomes()
     records = list_devices() if rate else list_devices(measure=False)
     if as_json:
         print(json.dumps(records, indent=2))
@@ -352,8 +348,6 @@ app = typer.Typer(
     "Start with `mauvecl detect`, which answers the question of the MauveSim paper. The throughput is nominal, not a "
     f"flight calibration. {EXIT_CODES}",
 )
-
-name_flags_of(app)
 
 
 def _version(wanted: bool) -> None:

@@ -102,7 +102,7 @@ class Command:
         study = study_of(study_file, given, flags, verb.default)
         question_values(study, detects={"fap", "realisations"} <= flags.keys())
         if self.draws:
-            question_time(study, **{key: how[key] for key in ("device", "cluster", "insist")})
+            question_time(study, insist=how["insist"])
         with Session(verb.name, study, **how) as session:
             self.run(session, **values)
 
@@ -435,6 +435,6 @@ def analyse(session: Session) -> None:
     """Find the flares in observed frames, with progress in frames."""
     from mauvecl.answers.analyse import analyse as compute
 
-    with session.metered("frames", "searching") as meter:
+    with session.metered("frames") as meter:
         answer = compute(session.study, progress=meter)
     session.answer(answer)

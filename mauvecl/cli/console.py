@@ -1,21 +1,19 @@
-"""Text on the terminal: tables, errors with flags in place of keys, and exit codes."""
+"""Text on the terminal: tables, errors with their flags, and exit codes."""
 
 from __future__ import annotations
 
-import ast
 import contextlib
 import datetime
 import errno
 import os
 import platform
 import re
-import shlex
 import sys
 import tempfile
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 
@@ -23,7 +21,6 @@ from mauvecl.schema.columns import INTERVAL, View, without_empty
 
 if TYPE_CHECKING:
     import typer
-    from rich.progress import Progress, TaskID
     from rich.table import Table
 
     from mauvecl.runs.pool import PoolProgress
@@ -47,6 +44,12 @@ LONGEST = 1000
 #: Error numbers of full disks and quotas, which name no file.
 DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EMFILE, errno.ENFILE)
 
+#: What to do instead of giving a flag that has gone.
+GONE = {
+    "--forget": "leave it out: a driver that failed is tried again by every run",
+    "--keep-after": "leave it out: finished parts of a run are saved after 20 s",
+    "--trials": "give --set change.trials=NUMBER",
+}
 #: Libraries that write to standard output for mauvecl.
 PRINTERS = ("click", "typer", "rich", "mauvecl.cli")
 #: Output folder of the verb, once known, to which tracebacks are written.
@@ -90,7 +93,7 @@ def _run(app: typer.Typer) -> int:
     try:
         code = app(standalone_mode=False)
     except InputError as error:
-        return _say(name_flag(error), BAD_INPUT)
+        return _say(with_flag(error), BAD_INPUT)
     except MemoryError:
         return _say("the memory does not suffice for this question, expected a smaller one or more of it", BAD_INPUT)
     except OSError as error:
@@ -107,6 +110,9 @@ def _failed(error: Exception) -> int:
     if hasattr(error, "format_message") and isinstance(getattr(error, "exit_code", None), int):
         # A usage error of Click, or the help text of an empty command line, which Click prints itself.
         text = str(error.format_message())
+        flag = getattr(error, "option_name", "")
+        if flag in GONE:
+            text = f"the flag {flag} has gone, {GONE[flag]}"
         return _say(text.splitlines()[0] if text else "", BAD_INPUT) if text.strip() else BAD_INPUT
     if type(error).__name__ == "Abort" or isinstance(error.__cause__, KeyboardInterrupt):
         return _say("interrupted", INTERRUPTED)
@@ -238,29 +244,31 @@ PATIENCE_S = 2.0
 WIDEST = 100_000
 #: Fraction of the work after which the remaining time is estimated, since the first tile's rate is unreliable.
 TOLD_FROM = 0.01
+#: Clears the line of a terminal.
+CLEARED = "\r\x1b[K"
 
 
 class Meter:
     """Progress with rate and time left, on standard error, for work longer than two seconds.
 
-    On a terminal and in a notebook it is a bar; elsewhere a plain line every ten seconds.
+    On a terminal and in a notebook it is one line that changes; elsewhere a line every ten seconds.
     """
 
     # Returns the progress of a pool, with parts from a checkpoint and parts that were counted again.
     standing: Callable[[], PoolProgress] | None = None
 
-    def __init__(self, *, quiet: bool = False, unit: str = "realisations", work: str = "drawing") -> None:
-        self._quiet, self._unit, self._work = quiet, unit, work
+    def __init__(self, *, quiet: bool = False, unit: str = "realisations") -> None:
+        self._quiet, self._unit = quiet, unit
         self._started = self._shown = time.monotonic()
         self._last = self._total = 0
-        self._bar: Progress | None = None
-        self._task: TaskID | None = None
+        self._changes = sys.stderr.isatty() or "ipykernel" in sys.modules
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._stop()
+        if self._changes and self._shown > self._started:
+            print(CLEARED, end="", file=sys.stderr, flush=True)
 
     def __call__(self, done: int, total: int) -> None:
         """Record how much work is done, in the meter's unit."""
@@ -270,18 +278,14 @@ class Meter:
             return
         if done <= self._last:
             # Start of the next star's work.
-            self._stop()
             self._started = self._shown = now
         self._last, self._total = done, total
-        if self._quiet or now - self._started < PATIENCE_S:
+        if self._quiet or now - self._started < PATIENCE_S or now - self._shown < (0.2 if self._changes else 10.0):
             return
-        if sys.stderr.isatty() or "ipykernel" in sys.modules:
-            self._draw(done, total)
-        elif now - self._shown >= 10.0:
-            self._shown = now
-            rate = self._rate(done)
-            left = self._left(done, total, rate)
-            print(f"{done} of {total} {self._unit}, {rate:.3g} a second, {left}{self._retries()}", file=sys.stderr)
+        self._shown = now
+        rate = self._rate(done)
+        line = f"{done} of {total} {self._unit}, {rate:.3g} a second, {self._left(done, total, rate)}{self._retries()}"
+        print(*((CLEARED, line) if self._changes else (line, "\n")), sep="", end="", file=sys.stderr, flush=True)
 
     def _left(self, done: int, total: int, rate: float) -> str:
         """Return the remaining time, once enough work is done to estimate it."""
@@ -302,33 +306,6 @@ class Meter:
         """Return a note on failed devices, if any."""
         retries = 0 if self.standing is None else self.standing().retries
         return f", {retries} parts counted again" if retries else ""
-
-    def _draw(self, done: int, total: int) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
-
-        if self._bar is None:
-            self._bar = Progress(
-                TextColumn(self._work),
-                BarColumn(),
-                TaskProgressColumn(),
-                TextColumn(f"{{task.fields[rate]}} {self._unit}/s"),
-                TimeRemainingColumn(),
-                TextColumn("left{task.fields[retries]}"),
-                console=Console(stderr=True),
-                transient=True,
-            )
-            self._bar.start()
-            self._task = self._bar.add_task("", total=total, rate="", retries="")
-        assert self._task is not None
-        self._bar.update(
-            self._task, completed=done, total=total, rate=f"{self._rate(done):,.0f}", retries=self._retries()
-        )
-
-    def _stop(self) -> None:
-        if self._bar is not None:
-            self._bar.stop()
-            self._bar = None
 
 
 def show(lines: Sequence[str]) -> None:
@@ -409,84 +386,20 @@ def _parts(columns: Sequence[str], cells: Sequence[Sequence[Any]], filled: list[
     return parts
 
 
-#: A remedy in a message: `extend`, `resume=True`, `wavelength_unit='Angstrom'`, `fap=0.001`.
-_REMEDY = re.compile(r"`(?P<name>[a-z][a-z0-9_.]*)(?:=(?P<value>[^`]+))?`")
-#: Parameters with flags of other names that are not keys of the study.
-_OTHERWISE = {"setting": "--set"}
-
-#: The command line whose flags messages name, alone in a list.
-_app: list[typer.Typer] = []
-
-
-def name_flags_of(app: typer.Typer) -> None:
-    """Set the command line whose flags messages name."""
-    _app[:] = [app]
-
-
-def _commands() -> Iterator[Any]:
-    """Yield the called command, then all others."""
-    from typer.main import get_command
-
-    called: Any = get_command(_app[0])
-    others = [called]
-    for word in sys.argv[1:]:
-        called = getattr(called, "commands", {}).get(word, called)
-    yield called
-    while others:
-        command = others.pop()
-        yield command
-        others += getattr(command, "commands", {}).values()
-
-
-def _flags(name: str, command: Any) -> list[str]:
-    """Return the flags that set a parameter or a key of the study, the long one first."""
+def with_flag(error: InputError) -> str:
+    """Return the error's message after the flag that gave its value, if one did: "flag: sentence"."""
     from mauvecl.study.study import keys_with_flags
 
-    # If a key has several flags, the last takes its value unchanged.
-    parameters = {key: flag.parameter for key, _, flag in keys_with_flags()}
-    wanted = {name} | {parameter for key, parameter in parameters.items() if f".{key}".endswith(f".{name}")}
-    for parameter in command.params:
-        if parameter.name in wanted:
-            return sorted((flag for flag in parameter.opts if flag.startswith("-")), key=len, reverse=True)
-    return []
+    key = re.sub(r"\.\d+(?=\.|$)", "", error.key or "")
+    of_keys = [flag.names for path, _, flag in keys_with_flags() if key and f".{path}".endswith(f".{key}")]
+    given = (
+        max(names, key=len)
+        for names in (*of_keys, ("--" + key.replace("_", "-"),))
+        if any(_gives(word, name) for word in sys.argv[1:] for name in names)
+    )
+    flag = next(given, None)
+    return str(error) if flag is None or flag in str(error) else f"{flag}: {error}"
 
 
-def with_flags(text: str) -> str:
-    """Return a message with flags instead of the remedies in backticks."""
-    return _REMEDY.sub(_as_flag, text) if "`" in text else text
-
-
-def _as_flag(match: re.Match[str]) -> str:
-    name = match["name"]
-    flag = _OTHERWISE.get(name) or next((flags[0] for command in _commands() if (flags := _flags(name, command))), None)
-    if flag is None:
-        return match[0]
-    if match["value"] is None:
-        return flag
-    try:
-        value = ast.literal_eval(match["value"])
-    except (ValueError, SyntaxError):
-        value = match["value"]
-    return flag if value is True else f"{flag} {shlex.quote(str(value))}"
-
-
-def name_flag(error: InputError) -> str:
-    """Return the error's message with a flag instead of its key, if that flag gave the value."""
-    text, key = with_flags(str(error)), error.key
-    if key is None:
-        return text
-    name = re.sub(r"\.\d+(?=\.|$)", "", key)
-    flags = [_OTHERWISE[name]] if name in _OTHERWISE else _flags(name, command := next(_commands()))
-    if not flags:
-        # "flare amplitude" is the amplitude of a flare.
-        flags = _flags(name.removeprefix("flare_"), command)
-    if not any(_gives(word, flags) for word in sys.argv[1:]):
-        return text
-    # The key as written, which may contain blanks, after its location.
-    section, _, own = re.escape(key).replace("_", "[_ ]").rpartition(r"\.")
-    shown = rf"(?:{section}\.)?{own}" if section else own
-    return re.sub(rf"^(?:[^:=]*: )?{shown} = ", lambda _: f"{flags[0]} ", text)
-
-
-def _gives(word: str, flags: list[str]) -> bool:
-    return any(word.partition("=")[0] == flag if flag.startswith("--") else word.startswith(flag) for flag in flags)
+def _gives(word: str, flag: str) -> bool:
+    return word.partition("=")[0] == flag if flag.startswith("--") else word.startswith(flag)

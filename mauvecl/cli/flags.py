@@ -180,10 +180,6 @@ class Options:
     ] = None
     resume: Annotated[bool, _option("--resume", text="Continue the unfinished run in the output folder.")] = False
     restart: Annotated[bool, _option("--restart", text="Discard the unfinished run in the output folder.")] = False
-    keep_after: Annotated[
-        float | None,
-        _option("--keep-after", text="Seconds after which finished parts of a run are saved to disk [20].", min=0.0),
-    ] = None
     insist: Annotated[
         bool,
         _option("--insist", text="Run even if the estimated time exceeds a year, or the files the free disk space."),
@@ -191,7 +187,7 @@ class Options:
 
 
 #: Options of verbs that can be resumed and draw no realisations, and of those that draw.
-RESUMING = ("resume", "restart", "keep_after")
+RESUMING = ("resume", "restart")
 WORKERS = ("device", "cluster", *RESUMING, "insist")
 
 
@@ -222,7 +218,7 @@ def study_of(
                 changes.setdefault(flag.section, {})[flag.key] = flag.value(value)
     if given.get("nuisance"):
         changes.setdefault("nuisances", {}).update(nuisances_of(study, given["nuisance"]))
-    changed = study.with_changes(changes, stars_of(study, given, flags), "command line")
+    changed = study.with_changes(changes, stars_of(study, given, flags), "")
     return changed.with_settings(given["set"], "--set") if given["set"] else changed
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import signal
 import sys
@@ -31,12 +30,9 @@ if TYPE_CHECKING:
     from mauvecl.runs.store import Store
     from mauvecl.study.study import Study
 
-YEAR_S = 365.25 * 86_400.0
-#: Pixel-realisations a second of one core, counted per scenario: the best of `bench/results/rates.ecsv`, 1.2e10 on two
-#: cores with 16 scenarios, so that no feasible run raises an error.
-CORE_RATE = 6e9
-#: Assumed number of cores of a cluster or of accelerators, as in the documentation's plan.
-OTHER_CORES = 1000
+#: Drawn spectra above which a run is questioned: they take a year on a hundred cores at the best rate of
+#: `bench/results/rates.ecsv`, 6e9 pixels a second and core.
+MOST_SPECTRA = 1e16
 #: The engine's index of realisations has 63 bits: `Engine._check`.
 MOST_REALISATIONS = 2**63 - 1
 
@@ -82,28 +78,19 @@ def _check_file(file: Path) -> None:
         read_bytes(place, "spectrum file")
 
 
-def question_time(study: Study, *, device: str | None, cluster: str | None, insist: bool) -> None:
-    """Raise InputError for a study whose smallest number of draws takes more than a year; `insist` skips this check.
+def question_time(study: Study, *, insist: bool) -> None:
+    """Raise InputError for a study that no device could finish; `insist` skips this check.
 
-    The message contains the estimate and names `--insist`. More realisations than the index can count always raise it.
+    More realisations than the index can count always raise it.
     """
     count = study.run.realisations
     if count > MOST_REALISATIONS:
         raise InputError.of("realisations", count, f"at most {MOST_REALISATIONS}: the index has 63 bits")
-    if insist or count < 10**9:
-        # A billion ends within hours on any device, so the instrument need not be loaded.
-        return
-    scenarios = 1 + len(study.flare.amplitudes)
-    combinations = study.sweep.size
-    drawn = count * len(study.star) * combinations * scenarios * study.observation.load_instrument().pixels
-    cores = (os.cpu_count() or 1) if device is None and cluster is None else OTHER_CORES
-    rate = cores * CORE_RATE
-    years = drawn / rate / YEAR_S
-    if years > 1.0:
+    spectra = count * len(study.star) * study.sweep.size * (1 + len(study.flare.amplitudes))
+    if spectra >= MOST_SPECTRA and not insist:
         raise InputError(
-            f"realisations = {count:.3g} of {len(study.star) * combinations} stars draw {drawn:.2g} "
-            f"pixels and take some {years:.2g} years at {rate:.2g} a second ({cores} cores)",
-            "less than a year; --insist starts it anyway",
+            f"realisations = {count:.3g} take {spectra / MOST_SPECTRA:.2g} years on a hundred cores",
+            "fewer; --insist starts them anyway",
             key="realisations",
         )
 
@@ -206,10 +193,7 @@ class Session(Options):
         """Keep finished parts of the work in the output folder, and report interruptions."""
         from mauvecl.runs.checkpoint import Checkpoint
 
-        how: dict[str, Any] = {"resume": self.resume, "restart": self.restart}
-        if self.keep_after is not None:
-            how["patience_s"] = self.keep_after
-        checkpoint = Checkpoint(self.folder, self.verb, self.study, held=True, **how)
+        checkpoint = Checkpoint(self.folder, self.verb, self.study, resume=self.resume, restart=self.restart, held=True)
         with report_interrupts(lambda: self._kept(checkpoint)), checkpoint:
             self.say(checkpoint.messages)
             yield checkpoint
@@ -232,11 +216,11 @@ class Session(Options):
         if self.pictures and available():
             style()
 
-    def metered(self, unit: str, work: str = "drawing") -> Meter:
-        """Return the progress in a unit, for a `with` block; a word names the work."""
+    def metered(self, unit: str) -> Meter:
+        """Return the progress in a unit, for a `with` block."""
         from mauvecl.cli.console import Meter
 
-        return Meter(quiet=self.quiet or self.as_json, unit=unit, work=work)
+        return Meter(quiet=self.quiet or self.as_json, unit=unit)
 
     def _kept(self, checkpoint: Checkpoint) -> str:
         parts_kept = checkpoint.kept
@@ -247,10 +231,10 @@ class Session(Options):
 
     def say(self, lines: Sequence[str]) -> None:
         """Print messages, unless standard output is reserved for JSON."""
-        from mauvecl.cli.console import show, with_flags
+        from mauvecl.cli.console import show
 
         if lines and not self.as_json:
-            show([with_flags(line) for line in lines])
+            show(lines)
 
     @cached_property
     def draws_pictures(self) -> bool:
@@ -317,11 +301,7 @@ class Session(Options):
         with report_interrupts(self._written):
             self._leave_all(answer)
         if self.as_json:
-            from mauvecl.cli.console import with_flags
-
-            content = answer.as_json()
-            remarks = {"assumed": answer.assumed, "messages": [with_flags(line) for line in content["messages"]]}
-            self.print_json(remarks | {key: value for key, value in content.items() if key != "messages"})
+            self.print_json({"assumed": answer.assumed} | answer.as_json())
             return
         from mauvecl.cli.console import show_view
 

@@ -249,12 +249,14 @@ def render(kernel_files: tuple[str, ...], variant: Variant) -> str:
     texts = [folder.joinpath(f"{name}.cl.mako").read_text(encoding="utf-8") for name in names]
     structs = layout.c_structs()
 
-    def make() -> str:
-        parts = (str(_parsed(text).render(**values)) for text in texts)
-        return "\n".join((f"/* mauvecl {VERSION} */", structs, *parts))
-
+    key = hashlib.sha256(repr((structs, values, texts)).encode()).hexdigest()[:32]
     # Rendering takes longer than loading a compiled kernel.
-    return kernel_cache().get_or_write(hashlib.sha256(repr((structs, values, texts)).encode()).hexdigest()[:32], make)
+    source = kernel_cache().read_text(key)
+    if source is None:
+        parts = (str(_parsed(text).render(**values)) for text in texts)
+        source = "\n".join((f"/* mauvecl {VERSION} */", structs, *parts))
+        kernel_cache().write_text(key, source)
+    return source
 
 
 @cache

@@ -13,15 +13,14 @@ writes the highest level of the x86-64 psABI that fits processor and library int
 PoCL 5 and later, and Debian's 3.1, name the processor after the library; their record is not changed.
 
 Kernel cache. PoCL aborts the process on a damaged cache entry and finds no device if its cache folder cannot be
-created. It is therefore given a working folder of this process alone. A store next to it keeps each program's files
-in an archive with checksums and restores only intact ones. If the store is damaged, full or read-only, kernels are
-built again.
+created. It is therefore given a working folder of this process alone. A folder per version of mauvecl keeps each
+program's files in an archive, whose checksums show damage. What is damaged or cannot be stored is built again.
 
 First builds. A driver's compiler may crash, hang or exhaust the memory, which would end the user's process without a
 message. The first build for a device, driver and version of mauvecl therefore runs in a child process with limits of
 time and memory, which draws a small scene and compares the counts with NumPy's. If it fails, the next lower level of
-the processor is tried. The outcome is saved with the compiled kernels, so that later processes read one small file,
-unless something else than the driver failed: a child that was killed, the linker, or memory.
+the processor is tried. The level that works is saved with the compiled kernels, so that later processes read one small
+file.
 """
 
 from __future__ import annotations
@@ -29,7 +28,6 @@ from __future__ import annotations
 import atexit
 import contextlib
 import ctypes
-import fcntl
 import hashlib
 import io
 import itertools
@@ -37,7 +35,6 @@ import json
 import os
 import platform
 import re
-import resource
 import secrets
 import shutil
 import signal
@@ -48,8 +45,7 @@ import threading
 import time
 import warnings
 import zlib
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -92,60 +88,75 @@ def driver_sources(system: str | None = None, machine: str | None = None) -> str
 
 #: Free space that PoCL needs to build the kernels of a session, bytes.
 MIN_FREE_BYTES = 64 * 2**20
-#: Largest size of the store in bytes; the least recently used programs are removed.
+#: Largest size of the stored archives in bytes; the oldest are removed.
 MAX_STORED = 128 * 2**20
-#: Name prefix of working folders, name of the lock in each, and prefix of folders that are being created.
-WORK, LOCK, MAKING = "mauvecl-work-", "lock", ".mauvecl-making-"
-#: Age after which an unlocked folder counts as abandoned; the locks of other hosts that share a home may be invisible.
-ABANDONED_S = 86400.0
+#: Name prefix of working folders, and the age after which a folder was left by a killed process: longer than any run.
+WORK, ABANDONED_S = "mauvecl-work-", 90 * 86400.0
 
 
 class KernelCache:
-    """Working folder of a process and the store that outlives it.
+    """Working folder of a process, and the archives that outlive it.
 
     Attributes
     ----------
+    store : Path
+        Folder with an archive of each program and of each text, by their keys; need not exist.
     work : Path
         PoCL's cache folder.
     pid : int
         Process that owns the working folder.
-    store : Path
-        Folder with an archive of each program and with texts, by their keys; need not exist.
     """
 
-    def __init__(self, base: Path | None, work: Path) -> None:
-        self.work = work
-        self.pid = os.getpid()
-        # The age of this file shows other hosts whether the folder is in use.
-        self._lock = work / LOCK
-        self.store = (base or work) / "store"
+    def __init__(self, store: Path, work: Path) -> None:
+        self.store, self.work, self.pid = store, work, os.getpid()
         self._folders: dict[str, str] = {}
-        self._published: dict[str, int] = {}
-        self._grown = False
+        self._stored: dict[str, int] = {}
+
+    def read(self, key: str) -> dict[str, bytes]:
+        """Return the contents of an archive by name; empty if it is missing or damaged."""
+        try:
+            with ZipFile(self.store / f"{key}.zip") as archive:
+                return {name: archive.read(name) for name in archive.namelist()}
+        except (OSError, ValueError, BadZipFile, NotImplementedError, RuntimeError, zlib.error):
+            return {}
+
+    def write(self, key: str, contents: Mapping[str, bytes]) -> None:
+        """Write an archive, of which readers find the old state or the new; failures to write are ignored."""
+        packed = io.BytesIO()
+        with ZipFile(packed, "w") as archive:
+            for name, content in contents.items():
+                archive.writestr(name, content)
+        new = self.store / f".{key}-{secrets.token_hex(8)}"
+        with contextlib.suppress(OSError):
+            self.store.mkdir(parents=True, exist_ok=True)
+            try:
+                new.write_bytes(packed.getvalue())
+                new.replace(self.store / f"{key}.zip")
+            finally:
+                new.unlink(missing_ok=True)
+
+    def read_text(self, key: str) -> str | None:
+        """Return a stored text, or None."""
+        text = self.read(key).get("text")
+        return None if text is None else text.decode()
+
+    def write_text(self, key: str, text: str) -> None:
+        """Store a text."""
+        self.write(key, {"text": text.encode()})
 
     def restore(self, key: str) -> bool:
         """Copy a program's files to the working folder if they are intact; return whether they are."""
         if key in self._folders:
             # The file of a loaded kernel must not be written again.
             return True
-        path = self.store / f"{key}.zip"
-        try:
-            with ZipFile(path) as archive:
-                contents = {name: archive.read(name) for name in archive.namelist()}
-            folder = "/".join(next(iter(contents)).split("/")[:2])
-        except FileNotFoundError:
-            return False
-        except (OSError, ValueError, BadZipFile, NotImplementedError, RuntimeError, StopIteration, zlib.error):
-            path.unlink(missing_ok=True)
-            return False
+        contents = self.read(key)
         for name, content in contents.items():
             target = self.work / name
             target.parent.mkdir(parents=True, exist_ok=True)
             target.write_bytes(content)
-        with contextlib.suppress(OSError):
-            os.utime(path)
-        self._folders[key], self._published[key] = folder, len(contents)
-        return True
+            self._folders[key] = "/".join(name.split("/")[:2])
+        self._stored[key] = len(contents)
+        return bool(contents)
 
     @contextlib.contextmanager
     def building(self, key: str) -> Iterator[None]:
@@ -154,167 +165,70 @@ class KernelCache:
         Earlier programs are stored then instead of at exit, so that concurrent processes need not build them. PoCL
         completes a kernel only at its first launch: it links the kernel outside the folder and moves the result there.
         """
-        with contextlib.suppress(OSError):
-            os.utime(self._lock)
-        before = set(self._programs())
+        before = set(self.work.glob("*/*/program.bc"))
         yield
-        new = [folder for folder in self._programs() if folder not in before]
+        new = [path.parent for path in self.work.glob("*/*/program.bc") if path not in before]
         if len(new) == 1:
-            self._folders[key] = new[0]
-        self._store_new()
+            self._folders[key] = new[0].relative_to(self.work).as_posix()
+        self.store_programs()
 
-    def _programs(self) -> Iterator[str]:
-        for path in self.work.glob("*/*/program.bc"):
-            yield path.parent.relative_to(self.work).as_posix()
-
-    def get_or_write(self, key: str, make: Callable[[], str]) -> str:
-        """Return a stored text, or make and store it."""
-        text = self.read_text(key)
-        if text is None:
-            text = make()
-            self.write_text(key, text)
-        return text
-
-    def read_text(self, key: str) -> str | None:
-        """Return a stored text, or None if it is missing or damaged."""
-        with contextlib.suppress(OSError, ValueError):
-            digest, text = (self.store / f"{key}.txt").read_text(encoding="utf-8").split("\n", 1)
-            if hashlib.sha256(text.encode()).hexdigest() == digest:
-                return text
-        return None
-
-    def write_text(self, key: str, text: str) -> None:
-        """Store a text with its digest; failures to write are ignored."""
-        with contextlib.suppress(OSError):
-            self._write(f"{key}.txt", f"{hashlib.sha256(text.encode()).hexdigest()}\n{text}".encode())
-
-    def _write(self, name: str, content: bytes) -> None:
-        """Write a file of the store; a reader finds the old one, none, or the new one."""
-        self._grown = True
-        self.store.mkdir(parents=True, exist_ok=True)
-        new = self.store / f".{name}-{secrets.token_hex(8)}"
-        try:
-            new.write_bytes(content)
-            new.replace(self.store / name)
-        finally:
-            new.unlink(missing_ok=True)
-
-    def forget(self, prefix: str) -> int:
-        """Remove stored texts whose keys begin with `prefix`, and return their number."""
-        texts = list(self.store.glob(f"{prefix}*.txt"))
-        for path in texts:
-            path.unlink(missing_ok=True)
-        return len(texts)
-
-    def publish(self) -> None:
-        """Store programs built since the last call, and limit the size of the store."""
-        self._store_new()
-        with contextlib.suppress(OSError):
-            # Listing the store takes 0.1 s at the end of each run.
-            if self._grown:
-                self._prune()
-                self._grown = False
-
-    def _store_new(self) -> None:
-        """Store programs built since the last call; failures to write are ignored."""
+    def store_programs(self) -> None:
+        """Store the programs that were built or completed since the last call."""
         for key, folder in self._folders.items():
-            with contextlib.suppress(OSError):
-                files = [
-                    path for path in (self.work / folder).rglob("*") if path.suffix in (".bc", ".so") and path.is_file()
-                ]
-                if len(files) != self._published.get(key):
-                    packed = io.BytesIO()
-                    with ZipFile(packed, "w") as archive:
-                        for path in files:
-                            archive.writestr(path.relative_to(self.work).as_posix(), path.read_bytes())
-                    self._write(f"{key}.zip", packed.getvalue())
-                    self._published[key] = len(files)
+            files = [path for path in (self.work / folder).rglob("*") if path.suffix in (".bc", ".so")]
+            if len(files) != self._stored.get(key):
+                self.write(key, {path.relative_to(self.work).as_posix(): path.read_bytes() for path in files})
+                self._stored[key] = len(files)
+                self._prune()
 
     def _prune(self) -> None:
         total = 0
-        for path in sorted(self.store.iterdir(), key=lambda p: p.stat().st_mtime, reverse=True):
-            total += path.stat().st_size
-            if total > MAX_STORED:
-                path.unlink()
+        with contextlib.suppress(OSError):
+            for path in sorted(self.store.iterdir(), key=lambda p: p.stat().st_mtime, reverse=True):
+                total += path.stat().st_size
+                if total > MAX_STORED:
+                    path.unlink()
 
     def close(self) -> None:
-        """Publish and remove the working folder, except in a forked child."""
-        if os.getpid() != self.pid:
-            return
-        self.publish()
-        shutil.rmtree(self.work, ignore_errors=True)
+        """Store programs and remove the working folder, except in a forked child."""
+        if os.getpid() == self.pid:
+            with contextlib.suppress(OSError):
+                self.store_programs()
+            shutil.rmtree(self.work, ignore_errors=True)
 
 
 @cache
 def kernel_cache() -> KernelCache:
     """Return the cache of this process.
 
-    It is in ``MAUVECL_CACHE_DIR`` or the user's cache folder, or in a temporary folder if that has too little space.
-    Raises OSError if none of them is usable.
+    It is in ``MAUVECL_CACHE_DIR`` or the user's cache folder; working folders are in the folder of temporary files if
+    that has too little space. Raises OSError if neither is usable.
     """
     import platformdirs
 
     wanted = os.environ.get("MAUVECL_CACHE_DIR") or platformdirs.user_cache_dir("mauvecl")
     base = Path(wanted) / f"kernels-{VERSION}"
-    for parent in (base, Path(tempfile.gettempdir()), Path("/dev/shm")):
-        work = _working_folder(parent)
-        if work is not None:
-            break
-    else:
+    work = _working_folder(base) or _working_folder(Path(tempfile.gettempdir()))
+    if work is None:
         raise OSError(f"no folder for compiled kernels can be written to with {MIN_FREE_BYTES >> 20} MiB to spare")
-    store = KernelCache(base if base.is_dir() and os.access(base, os.W_OK) else None, work)
+    store = KernelCache(base / "store", work)
     # PoCL's threads may still write when Python exits; a later process removes these files.
     atexit.register(store.close)
     return store
 
 
 def _working_folder(parent: Path) -> Path | None:
-    """Create a working folder under `parent`, or return None if that fails or the free space is too small.
-
-    A lock marks the folder as in use, since process numbers are not unique across hosts and containers.
-    """
+    """Create a working folder under `parent`, or return None if that fails or the free space is too small."""
     try:
         parent.mkdir(parents=True, exist_ok=True)
-        _sweep(parent)
+        for folder in parent.glob(f"{WORK}*"):
+            if time.time() - folder.stat().st_mtime > ABANDONED_S:
+                shutil.rmtree(folder, ignore_errors=True)
         if shutil.disk_usage(parent).free < MIN_FREE_BYTES:
             return None
-        # The folder has a temporary name until it is locked, so that no other process finds it without a lock.
-        making = Path(tempfile.mkdtemp(prefix=MAKING, dir=parent))
-        (making / "probe").write_bytes(b"\0" * 4096)
-        (making / "probe").unlink()
-        handle = os.open(making / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        with contextlib.suppress(OSError):
-            # On a file system without locks, age alone shows whether the folder is in use.
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        # The handle is never closed: the operating system releases the lock when the process ends.
-        return making.rename(parent / f"{WORK}{secrets.token_hex(8)}")
+        return Path(tempfile.mkdtemp(prefix=WORK, dir=parent))
     except OSError:
         return None
-
-
-def _sweep(parent: Path) -> None:
-    """Remove folders of killed processes."""
-    for folder in [*parent.glob(f"{WORK}*"), *parent.glob(f"{MAKING}*")]:
-        with contextlib.suppress(OSError):
-            lock = folder / LOCK
-            age = time.time() - (lock if lock.exists() else folder).stat().st_mtime
-            if age > ABANDONED_S and _is_free(lock):
-                shutil.rmtree(folder, ignore_errors=True)
-
-
-def _is_free(lock: Path) -> bool:
-    """Return whether no running process holds the lock, which need not exist."""
-    try:
-        handle = os.open(lock, os.O_RDWR | os.O_CLOEXEC)
-    except FileNotFoundError:
-        return True
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    finally:
-        os.close(handle)
-    return True
 
 
 #: Processor names, lowest first, and the instructions that each adds, as /proc/cpuinfo spells them. "sandybridge"
@@ -506,12 +420,6 @@ CLOCK = 10.0
 MEMORY = 4 * 2**30
 #: Variables that limit the number of threads of old and new versions of PoCL.
 THREADS = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")
-#: A failure may have a temporary cause and is discarded after a day.
-OUTCOME_LIFETIME_S = 86400.0
-#: Beginning of the outcomes' names in the cache, and the command that forgets them.
-OUTCOME_KEY, FORGET = "first-build-", "`mauvecl devices --forget`"
-#: Exit codes of the child: the driver failed, or something else.
-DRIVER_FAILED, OTHER_FAILED = 1, 3
 #: Code of the child, which searches the same import path as its parent.
 CHILD = (
     "import json, sys; request = json.loads(sys.argv[1]); sys.path[:] = request['path']; "
@@ -519,52 +427,9 @@ CHILD = (
 )
 #: CL_DEVICE_TYPE_CPU of the OpenCL specification.
 CPU = 2
-#: Signals that a process causes itself.
-CRASHES = (signal.SIGSEGV, signal.SIGBUS, signal.SIGILL, signal.SIGFPE, signal.SIGABRT)
-#: Messages with which compilers abort although the driver is not at fault, and what has failed.
-OTHER_CAUSES = {
-    "linker command failed": "the linker `ld` failed",
-    "Final linking": "the linker `ld` failed",
-    "bad_alloc": "ran out of memory",
-    "out of memory": "ran out of memory",
-    "MemoryError": "ran out of memory",
-    "No space left": "the disk is full",
-}
-
 #: Processor name chosen for each device of this process.
 settled: dict[int, str | None] = {}
 _one_at_a_time = threading.Lock()
-
-
-@dataclass(frozen=True)
-class Failure:
-    """Failed first build at a level."""
-
-    #: Reason, as the end of a sentence about the attempt.
-    why: str
-    #: Whether the driver is at fault, so that it would fail again.
-    by_driver: bool = True
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """Outcome of the first build for a device."""
-
-    #: Processor names in the order of trial and why each failed; the last reason is empty after a success.
-    tried: tuple[tuple[str | None, str], ...]
-    time_s: float
-    #: Whether only the driver is at fault for failures.
-    by_driver: bool = True
-
-    @property
-    def current(self) -> bool:
-        """True if the outcome is still valid."""
-        return not any(why for _, why in self.tried) or 0 <= time.time() - self.time_s < OUTCOME_LIFETIME_S
-
-
-def forget_outcomes() -> int:
-    """Forget the outcomes of all first builds, so that drivers that failed are tried again; return their number."""
-    return kernel_cache().forget(OUTCOME_KEY)
 
 
 def choose_processor_level(device: Any, others: Callable[[], Sequence[Any]]) -> str | None:
@@ -586,59 +451,43 @@ def choose_processor_level(device: Any, others: Callable[[], Sequence[Any]]) -> 
         If the driver works at no level.
     """
     place = int(device.int_ptr)
-    if place not in settled:
-        with _one_at_a_time:
-            if place not in settled:
-                outcome = _outcome(device, names(device), others)
-                name, reason = outcome.tried[-1]
-                if reason:
-                    raise DeviceError(_failure_message(device, outcome))
-                if name is not None:
-                    set_processor_name(device, name)
-                settled[place] = name
+    with _one_at_a_time:
+        if place not in settled:
+            name = _working_level(device, names(device), others)
+            if name is not None:
+                set_processor_name(device, name)
+            settled[place] = name
     return settled[place]
 
 
-def _outcome(device: Any, names: tuple[str | None, ...], others: Callable[[], Sequence[Any]]) -> Outcome:
-    """Read the outcome of the first build, or run the build."""
-    untried = Outcome(((names[0], ""),), time.time())
+def _working_level(device: Any, names: tuple[str | None, ...], others: Callable[[], Sequence[Any]]) -> str | None:
+    """Return the level that an earlier process has found, or try levels until a first build succeeds."""
     limit_s = _limit_s()
-    if limit_s == 0:
-        return untried
-    cache, key = kernel_cache(), _key(device, names)
-    known = _read_outcome(key)
-    if known is not None:
-        return known
     number = next((i for i, other in enumerate(others()) if other.int_ptr == device.int_ptr), None)
-    if number is None or not sys.executable:
-        return untried
-    with _locked():
-        # Another process may have tried in the meantime.
-        known = _read_outcome(key)
-        if known is not None:
-            return known
-        tried: list[tuple[str | None, str]] = []
-        by_driver = True
-        for place, name in enumerate(names):
-            try:
-                failure = _try(name, number, device, limit_s)
-            except InterruptedError:
-                return untried
-            tried.append((name, failure.why if failure else ""))
-            if failure is None:
-                break
-            by_driver &= failure.by_driver
-            if place + 1 < len(names):
-                level = f" at level {name}" if name else ""
+    if limit_s == 0 or number is None or not sys.executable:
+        return names[0]
+    cache, key = kernel_cache(), _key(device, names)
+    known = cache.read_text(key)
+    if known is not None:
+        return known or None
+    failed: list[str] = []
+    for name in names:
+        why = _try(name, number, device, limit_s)
+        if why is None:
+            cache.write_text(key, name or "")
+            if failed:
                 warnings.warn(
-                    f"The first build of kernels for {device.name.strip()}{level} {failure.why}. "
-                    f"The next lower level, {names[place + 1]}, is tried.",
+                    f"The first build of kernels for {device.name.strip()} failed ({'; '.join(failed)}). The next "
+                    f"lower level, {name}, is used.",
                     stacklevel=2,
                 )
-        outcome = Outcome(tuple(tried), time.time(), by_driver)
-        if by_driver:
-            cache.write_text(key, json.dumps(asdict(outcome)))
-    return outcome
+            return name
+        failed.append(f"{'it' if name is None else f'level {name}'} {why}")
+    raise DeviceError(
+        f"{device.platform.version.strip()}, driver {device.driver_version.strip()}, cannot build kernels for the "
+        f"processor {device.name.strip()} ({'; '.join(failed)}), expected enough memory, a linker that works, another "
+        f"device (`mauvecl devices` lists them) or another driver: {driver_sources()}; {LIMIT} sets the limit of time"
+    )
 
 
 def _limit_s() -> float:
@@ -650,40 +499,14 @@ def _limit_s() -> float:
 
 
 def _key(device: Any, names: tuple[str | None, ...]) -> str:
-    """Return the outcome's name in the cache, unique for version, driver, processor and installation."""
-    about = (VERSION, device.platform.version, device.name, device.version, device.driver_version, sys.prefix)
+    """Return the name of the level in the cache, unique for driver, processor and installation."""
+    about = (device.platform.version, device.name, device.version, device.driver_version, sys.prefix)
     said = "\0".join((*map(str, about), *map(str, names), *sorted(flags())))
-    return OUTCOME_KEY + hashlib.sha256(said.encode()).hexdigest()[:32]
+    return f"level-{hashlib.sha256(said.encode()).hexdigest()[:32]}"
 
 
-def _read_outcome(key: str) -> Outcome | None:
-    text = kernel_cache().read_text(key)
-    if text is None:
-        return None
-    content = json.loads(text)
-    outcome = Outcome(tuple((name, why) for name, why in content["tried"]), content["time_s"], content["by_driver"])
-    return outcome if outcome.current else None
-
-
-@contextlib.contextmanager
-def _locked() -> Iterator[None]:
-    """Hold a lock next to the cache, so that of processes started together only one builds."""
-    handle = None
-    with contextlib.suppress(OSError):
-        handle = os.open(kernel_cache().store.parent / "first-build.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        fcntl.flock(handle, fcntl.LOCK_EX)
-    try:
-        yield
-    finally:
-        if handle is not None:
-            os.close(handle)
-
-
-def _try(name: str | None, number: int, device: Any, limit_s: float) -> Failure | None:
-    """Build in a child process and return why it failed, or None after a success.
-
-    Raises InterruptedError if the child could not be started.
-    """
+def _try(name: str | None, number: int, device: Any, limit_s: float) -> str | None:
+    """Build in a child process; return why it failed, as the end of a sentence, or None after a success."""
     request = {
         "path": sys.path,
         "name": name,
@@ -693,7 +516,6 @@ def _try(name: str | None, number: int, device: Any, limit_s: float) -> Failure 
         "memory": MEMORY if int(device.type) & CPU else None,
     }
     threads = {variable: os.environ.get(variable, "2") for variable in THREADS}
-    before_s = _children_s()
     # Files instead of pipes, which a linker started by the child would keep open after the child's death.
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as log:
         try:
@@ -707,60 +529,31 @@ def _try(name: str | None, number: int, device: Any, limit_s: float) -> Failure 
                 start_new_session=True,
             )
         except OSError as error:
-            raise InterruptedError from error
+            return f"could not be started ({error.strerror})"
         try:
             code = child.wait(CLOCK * limit_s)
         except subprocess.TimeoutExpired:
-            return Failure(f"was not finished after {CLOCK * limit_s:g} s", by_driver=False)
+            return f"was not finished after {CLOCK * limit_s:g} s"
         finally:
             # The child and the compilers and linkers that it has started.
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(child.pid, signal.SIGKILL)
             child.wait()
-        return _failure(code, _start(out), _start(log), limit_s, _children_s() - before_s)
+        return _failure(code, _last_line(out) or _last_line(log) or "no message", limit_s)
 
 
-def _start(file: IO[bytes]) -> str:
+def _last_line(file: IO[bytes]) -> str:
     file.seek(0)
-    return file.read(2**16).decode(errors="replace")
+    lines = file.read(2**16).decode(errors="replace").split("\n")
+    return next((line.strip()[:200] for line in reversed(lines) if line.strip()), "")
 
 
-def _children_s() -> float:
-    """Return the processor time of this process's children that have ended, s."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
-
-
-def _failure(code: int, out: str, log: str, limit_s: float, used_s: float) -> Failure | None:
-    """Return the failure of a child by its exit code, output, messages and processor time; None after a success."""
+def _failure(code: int, message: str, limit_s: float) -> str | None:
+    """Describe the failure of a child by its exit code and its last line; None after a success."""
     if code == 0:
         return None
-    # A compiler that handles SIGXCPU is killed at the hard limit.
-    if -code == signal.SIGXCPU or (-code == signal.SIGKILL and used_s >= limit_s):
-        return Failure(f"was not finished after {limit_s:g} s of processor time")
-    cause = next((cause for words, cause in OTHER_CAUSES.items() if words in log), None)
-    if cause is not None and -code not in (signal.SIGSEGV, signal.SIGBUS, signal.SIGILL, signal.SIGFPE):
-        return Failure(f"failed ({cause})", by_driver=False)
+    if -code == signal.SIGXCPU:
+        return f"was not finished after {limit_s:g} s of processor time"
     if code < 0:
-        said = (signal.strsignal(-code) or f"signal {-code}").lower()
-        if -code in CRASHES:
-            return Failure(f"crashed ({said})")
-        return Failure(f"was stopped from outside ({said}), as systems do when memory is short", by_driver=False)
-    lines = out.splitlines()
-    return Failure(f"failed ({lines[-1] if lines else 'without a message'})", by_driver=code == DRIVER_FAILED)
-
-
-def _failure_message(device: Any, outcome: Outcome) -> str:
-    """Return a message that names the processor, the driver, the attempts and the remedies."""
-    tried = "; ".join(f"{'it' if name is None else f'level {name}'} {why}" for name, why in outcome.tried)
-    driver = f"{device.platform.version.strip()}, driver {device.driver_version.strip()}"
-    if not outcome.by_driver:
-        return (
-            f"the first build of kernels for {device.name.strip()} did not succeed ({tried}), expected enough memory "
-            f"and time ({LIMIT} sets the limit) and a linker that works; the next run tries again ({driver})"
-        )
-    return (
-        f"{driver}, cannot build kernels for the processor {device.name.strip()} ({tried}), expected another device "
-        f"(`mauvecl devices` lists them) or driver: {driver_sources()}; {LIMIT} sets the limit, and mauvecl tries "
-        f"again after a day or after {FORGET}"
-    )
+        return f"was ended by a signal ({(signal.strsignal(-code) or str(-code)).lower()}: {message})"
+    return f"failed ({message})"

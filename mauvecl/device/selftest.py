@@ -23,8 +23,8 @@ from mauvecl.detection.counts import Distribution
 from mauvecl.detection.requests import STATISTICS
 from mauvecl.detection.snr import Counts
 from mauvecl.device import drivers
-from mauvecl.device.build import SAME_BITS, DeviceRecord, choose_device, load_opencl, out_of_memory
-from mauvecl.device.drivers import BuildError, DeviceError, kernel_cache
+from mauvecl.device.build import SAME_BITS, DeviceRecord, choose_device
+from mauvecl.device.drivers import DeviceError, kernel_cache
 from mauvecl.device.engine import Engine, Stares, devices
 from mauvecl.flares.frames import Components
 from mauvecl.flares.stare import Stare
@@ -196,25 +196,15 @@ def list_devices(*, measure: bool = True) -> list[dict[str, Any]]:
 
 
 def child(request: dict[str, Any]) -> None:
-    """Build and run kernels within the limits; print the reason of a failure, and exit with a code that says whose."""
+    """Build and run kernels within the limits; print the reason of a failure and exit with code 1."""
     limit(request)
-    code = drivers.DRIVER_FAILED
     try:
         why = _build(request)
     except Exception as error:
         why = str(error).splitlines()[0] if str(error) else type(error).__name__
-        if not _is_drivers(error):
-            code = drivers.OTHER_FAILED
     if why:
         print(why)
-    sys.exit(code if why else 0)
-
-
-def _is_drivers(error: Exception) -> bool:
-    """Return whether the driver is at fault for an exception, and not memory, disk or another device."""
-    if isinstance(error, DeviceError):
-        return isinstance(error, BuildError) or error.kind == "processor"
-    return isinstance(error, load_opencl().Error) and not out_of_memory(error)
+    sys.exit(1 if why else 0)
 
 
 def limit(request: dict[str, Any]) -> None:

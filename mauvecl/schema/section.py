@@ -80,8 +80,9 @@ def _takes_truth(annotation: Any) -> bool:
 
 
 def input_error(where: str, model: type[BaseModel], error: ValidationError) -> InputError:
-    """Return the first fault as an InputError whose message begins with the place where it is."""
-    return _first_fault(model, error).within(where)
+    """Return the first fault as an InputError whose message begins with the place where it is, if one is given."""
+    fault = _first_fault(model, error)
+    return fault.within(where) if where else fault
 
 
 def _first_fault(model: type[BaseModel], error: ValidationError) -> InputError:

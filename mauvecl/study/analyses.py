@@ -241,9 +241,7 @@ class ChangeQuestion(Section):
     period_fap: Annotated[
         Annotated[float, Range(1e-3, 0.5)], Help("Probability of a peak of noise anywhere in a periodogram")
     ] = 0.01
-    trials: Annotated[int, Range(10, 10_000), Help("Simulated sinusoids in each cell of the map"), Flag("--trials")] = (
-        50
-    )
+    trials: Annotated[int, Range(10, 10_000), Help("Simulated sinusoids in each cell of the map")] = 50
 
     def light(self) -> Source | None:
         """Read the spectrum that the change adds; None without a file."""

@@ -40,7 +40,7 @@ from mauvecl.web.closed_forms import TITLES, ClosedForms
 from mauvecl.web.figures import INKS, PINS, Canvas
 from mauvecl.web.page import SEEN, TABS, State, reads_of
 from mauvecl.web.question import SIMULATIONS
-from mauvecl.web.uploads import UPLOADS, remove_abandoned
+from mauvecl.web.uploads import UPLOADS
 from mauvecl.web.visitor import UNUSED, Job, Visitor, limit_arenas, reading, release_memory, shown
 
 if TYPE_CHECKING:
@@ -297,7 +297,6 @@ def serve(address: str, port: int, *, show: bool = False, allow_origin: Sequence
     async def run() -> None:
         # Exit normally on SIGTERM, so that the folders of visitors are removed.
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
-        remove_abandoned()
         make(address, port, allow_origin)
         warm()
         if not local(address):

@@ -10,6 +10,7 @@ import hashlib
 import json
 import logging
 import math
+import tempfile
 import threading
 import time
 from collections import OrderedDict
@@ -34,8 +35,7 @@ from mauvecl.web.downloads import as_file, asked_study, commands_and_programs
 from mauvecl.web.fields import FIELDS, field_of, remedies, sentence
 from mauvecl.web.page import TABS, State, asking, card, known, reads_of, without_headline
 from mauvecl.web.question import DRAWING, SIMULATIONS, verbs_of
-from mauvecl.web.uploads import RESULTS, UPLOADS, visitor_folder
-from mauvecl.web.uploads import UPLOAD_SHELF as UPLOADED
+from mauvecl.web.uploads import RESULTS, UPLOAD_SHELF, UPLOADS
 
 if TYPE_CHECKING:
     from mauvecl.web.closed_forms import Answers
@@ -246,7 +246,7 @@ class Visitor(WebSocketHandler):
         self._closed: tuple[tuple[Any, ...], ClosedForms] | None = None
         self._answers: OrderedDict[tuple[str, tuple[Any, ...]], dict[str, Any]] = OrderedDict()
         self._files: OrderedDict[tuple[Any, ...], tuple[str, bytes]] = OrderedDict()
-        self._folder = visitor_folder()
+        self._folder = tempfile.TemporaryDirectory(prefix="mauvecl-page-")
 
     def check_origin(self, origin: str) -> bool:
         """Accept every origin, since `access.AccessMatcher` has checked it."""
@@ -264,7 +264,7 @@ class Visitor(WebSocketHandler):
             if job is not None:
                 job.cancel()
         self._folder.cleanup()
-        for shelf in (RESULTS, UPLOADED):
+        for shelf in (RESULTS, UPLOAD_SHELF):
             shelf.leave(self)
         Visitor.has_left = True
 
@@ -348,8 +348,7 @@ class Visitor(WebSocketHandler):
             given = self.given(state, tab)
             made = ClosedForms.of(question, Path(self._folder.name), headline=tab.headline, given=given)
             held = self._closed = key, made
-        # Closed forms compute and keep more when they are used.
-        self._shelve("_closed", held)
+        self._shelve("_closed")
         return held[1]
 
     def given(self, state: State, tab: Tab) -> dict[str, Any]:
@@ -358,12 +357,12 @@ class Visitor(WebSocketHandler):
         held = self._given
         if held is None or held[0] != key:
             held = self._given = key, tab.given(state.question(tab.reads))
-            self._shelve("_given", held)
+            self._shelve("_given")
         return held[1]
 
-    def _shelve(self, name: str, value: object) -> None:
+    def _shelve(self, name: str) -> None:
         """Count an attribute among the results of all visitors; it may be reset to None."""
-        RESULTS.keep(self, name, value, partial(setattr, self, name, None))
+        RESULTS.keep(self, name, partial(setattr, self, name, None))
 
     def answers(self, state: State) -> dict[str, Any]:
         """Return the simulated answers that hold for a question, by name."""
@@ -371,7 +370,7 @@ class Visitor(WebSocketHandler):
         for (simulation, key), answers in list(self._answers.items()):
             if key == self._key(state, reads_of(simulation)):
                 valid |= answers
-                RESULTS.used(self, (simulation, key))
+                RESULTS.keep(self, (simulation, key), partial(self._answers.pop, (simulation, key), None))
         return valid
 
     def _key(self, state: State, names: frozenset[str]) -> tuple[Any, ...]:
@@ -400,7 +399,7 @@ class Visitor(WebSocketHandler):
             name = field_of(error.key)
             if name is not None and "faults" in message:
                 # Values that cannot be together: one of their fields says so.
-                self.send(**message | {"faults": {name: sentence(error)}})
+                self.send(**message | {"faults": {name: str(error)}})
             else:
                 self.send(**message, refused=sentence(error))
         except DeviceError as error:
@@ -489,7 +488,7 @@ class Visitor(WebSocketHandler):
                 self.send(n=n, progress=job.share, message=job.words)
             self._answers[key] = done.result()
             self._answers.move_to_end(key)
-            RESULTS.keep(self, key, self._answers[key], partial(self._answers.pop, key, None))
+            RESULTS.keep(self, key, partial(self._answers.pop, key, None))
             while len(self._answers) > MOST_ANSWERS:
                 self._answers.popitem(last=False)
             self.send(n=n, ended=f"Done: {job.words}.", kind=kind)
@@ -537,7 +536,7 @@ class Visitor(WebSocketHandler):
         def came(future: Future[Any]) -> None:
             try:
                 self._uploads[field] = future.result()
-                UPLOADED.keep(self, field, self._uploads[field], partial(self._uploads.pop, field, None))
+                UPLOAD_SHELF.keep(self, field, partial(self._uploads.pop, field, None))
             except InputError as error:
                 proposed = [remedy for remedy in remedies(error, upload.options) if remedy[0] in names]
                 self.send(n=n, field=field, lacks=sentence(error, upload.options), remedies=proposed)
@@ -575,7 +574,7 @@ class Visitor(WebSocketHandler):
             else:
                 made = asked_study(name, state.question(reads).study(Path(self._folder.name)))
             self._files[which] = made
-            RESULTS.keep(self, which, made, partial(self._files.pop, which, None))
+            RESULTS.keep(self, which, partial(self._files.pop, which, None))
             while len(self._files) > MOST_KEPT:
                 self._files.popitem(last=False)
             return made

@@ -254,7 +254,8 @@ def test_plan_is_read_back_from_its_table_and_targets_are_not_an_answer(tmp_path
 SMALL_SHARDS = [
     sys.executable,
     "-c",
-    "import mauvecl.runs.checkpoint as s; s.SHARD_WORK = 2**27; from mauvecl.cli.app import main; main()",
+    "import mauvecl.runs.checkpoint as s; s.SHARD_WORK = 2**27; "
+    "s.Checkpoint.__init__.__kwdefaults__['patience_s'] = 0.0; from mauvecl.cli.app import main; main()",
 ]
 LONG = ("detect", "--star", "G2V", "-m", "7.4", "--statistic", "chi2", "-n", "100000", "--no-pictures", "-o", "out")
 #: Files of somebody else in the folder of a checkpoint.
@@ -264,7 +265,7 @@ FOREIGN = ("epoch-1.pt", "mine.npz", "deep/keep", ".unfinished-mine")
 @pytest.mark.long
 def test_interrupted_run_is_resumed_to_the_same_bits(tmp_path: Path) -> None:
     """Resume after Ctrl-C, SIGTERM and SIGKILL; only files that a run wrote are removed, at a restart or the end."""
-    command, shards, kept = [*SMALL_SHARDS, *LONG, "--resume", "--keep-after", "0"], tmp_path / "out" / "checkpoint", 0
+    command, shards, kept = [*SMALL_SHARDS, *LONG, "--resume"], tmp_path / "out" / "checkpoint", 0
     (shards / "deep").mkdir(parents=True)
     for name in FOREIGN:
         (shards / name).write_text("keep me")
@@ -290,7 +291,7 @@ def test_interrupted_run_is_resumed_to_the_same_bits(tmp_path: Path) -> None:
             assert "kept in 'out/checkpoint', and the same command with --resume continues from there" in errors
         assert counted() > kept
         kept = counted()
-    assert "--resume" in run(*LONG, folder=tmp_path, code=2).stderr
+    assert "resume=True" in run(*LONG, folder=tmp_path, code=2).stderr
     (shards / f".unfinished-{next(shards.glob('*-*-*-*.npz')).name}").write_text("killed while it was written")
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

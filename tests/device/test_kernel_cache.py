@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
 import shutil
-import signal
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -92,30 +89,25 @@ def store_of(cache: Path) -> Path:
 def test_damaged_program_is_not_restored(filled: tuple[Path, str], tmp_path: Path, kind: str) -> None:
     """Keep damaged files of every kind out of the folder that PoCL reads."""
     shutil.copytree(store_of(filled[0]), tmp_path / "store")
-    cache = drivers.KernelCache(tmp_path, tmp_path / "work")
-    programs = list(cache.store.glob("*.zip"))
-    assert len(programs) >= 2
-    for stored in programs:
+    cache = drivers.KernelCache(tmp_path / "store", tmp_path / "work")
+    archives = [path for path in cache.store.glob("*.zip") if path.stat().st_size > 1000]
+    assert len(archives) >= 2
+    for stored in archives:
         DAMAGE[kind](stored)
         assert not cache.restore(stored.stem)
         assert files_of(cache.work) == []
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("kind", "ending"), [("a flipped bit", ".zip"), ("a flipped bit", ".txt")])
-def test_damaged_store_is_rebuilt(filled: tuple[Path, str], tmp_path: Path, kind: str, ending: str) -> None:
+def test_damaged_store_is_rebuilt(filled: tuple[Path, str], tmp_path: Path) -> None:
     source, digest = filled
     cache = tmp_path / "cache"
     shutil.copytree(source, cache)
-    damaged = [path for path in files_of(cache) if path.suffix == ending]
-    assert damaged
-    for path in damaged:
-        DAMAGE[kind](path)
+    for path in files_of(cache):
+        DAMAGE["a flipped bit"](path)
     after = run(cache)
     assert after["digest"] == digest
-    if ending != ".txt":
-        # A text is a rendered source: rendering gives the same text again, and its program is found.
-        assert after["restored"].startswith("0 of")
+    assert after["restored"].startswith("0 of")
     healed = run(cache)
     restored, _, wanted = healed["restored"].partition(" of ")
     assert (healed["digest"], restored) == (digest, wanted)
@@ -123,7 +115,7 @@ def test_damaged_store_is_rebuilt(filled: tuple[Path, str], tmp_path: Path, kind
 
 def test_concurrent_processes_share_programs(tmp_path: Path) -> None:
     """Store a program at the next build, not only at the end of the process."""
-    one = drivers.KernelCache(tmp_path, tmp_path / "work-1")
+    one = drivers.KernelCache(tmp_path / "store", tmp_path / "work-1")
     for number in range(2):
         with one.building(f"key{number}"):
             (one.work / "AA" / f"program{number}").mkdir(parents=True)
@@ -131,17 +123,9 @@ def test_concurrent_processes_share_programs(tmp_path: Path) -> None:
         if number == 0:
             # The first launch completes the program.
             (one.work / "AA" / "program0" / "kernel.so").write_bytes(bytes(100))
-    other = drivers.KernelCache(tmp_path, tmp_path / "work-2")
+    other = drivers.KernelCache(tmp_path / "store", tmp_path / "work-2")
     assert other.restore("key0")
     assert [path.name for path in files_of(other.work)] == ["kernel.so", "program.bc"]
-
-
-def test_archive_without_files_is_rejected(tmp_path: Path) -> None:
-    cache = drivers.KernelCache(tmp_path, tmp_path / "work")
-    cache.store.mkdir()
-    ZipFile(cache.store / "key.zip", "w").close()
-    assert not cache.restore("key")
-    assert files_of(tmp_path) == []
 
 
 @pytest.mark.long
@@ -178,86 +162,14 @@ def test_unusable_cache_folder_is_replaced(filled: tuple[Path, str]) -> None:
     assert not found["work"].startswith("/dev/null")
 
 
-@pytest.mark.long
-def test_folder_of_killed_process_is_removed(filled: tuple[Path, str], tmp_path: Path) -> None:
-    shutil.copytree(filled[0], tmp_path, dirs_exist_ok=True)
-    code = "import time; from mauvecl import Engine; Engine(); print('up', flush=True); time.sleep(60)"
-    child = subprocess.Popen(
-        [sys.executable, "-c", code],
-        env=os.environ | {"MAUVECL_CACHE_DIR": str(tmp_path)},
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    assert child.stdout.readline() == "up\n"
-    left = list(tmp_path.glob("*/mauvecl-work-*"))
-    assert len(left) == 1
-    child.send_signal(signal.SIGKILL)
-    child.wait()
-    grow_old(left[0])
-    assert run(tmp_path)["digest"] == filled[1]
-    assert not left[0].exists()
-
-
-def grow_old(work: Path) -> None:
-    """Make a working folder look unused for longer than a day."""
-    then = time.time() - 25 * 3600
-    os.utime(work / "lock", (then, then))
-
-
-HOLDS = "from mauvecl.device import drivers; print(drivers.kernel_cache().work, flush=True); input()"
-SWEEPS = "import sys, pathlib; from mauvecl.device import drivers; drivers._sweep(pathlib.Path(sys.argv[1]))"
-#: Commands that run another one with its own process numbers and host name, as on another machine.
-ELSEWHERE = {
-    "another container": ["unshare", "--pid", "--fork", "--mount-proc"],
-    "another name": ["unshare", "--uts", "sh", "-c", 'hostname elsewhere && exec "$@"', "sh"],
-    "both": ["unshare", "--pid", "--fork", "--mount-proc", "--uts", "sh", "-c", 'hostname elsewhere && "$@"', "sh"],
-}
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("place", ELSEWHERE)
-@pytest.mark.parametrize("holder", ["here", "there"])
-def test_containers_with_shared_home_keep_each_others_folders(tmp_path: Path, place: str, holder: str) -> None:
-    """Keep a working folder while its process runs, and remove it afterwards, in any container."""
-    there = ELSEWHERE[place]
-    if subprocess.run([*there, "true"], capture_output=True, check=False).returncode:
-        pytest.skip("no namespaces can be made here")
-    one, other = (there, []) if holder == "there" else ([], there)
-    environment = os.environ | {"MAUVECL_CACHE_DIR": str(tmp_path)}
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-    child = subprocess.Popen([*one, sys.executable, "-c", HOLDS], env=environment, text=True, **pipes)  # type: ignore[call-overload]
-    work = Path(child.stdout.readline().strip())
-    grow_old(work)
-    sweep = [*other, sys.executable, "-c", SWEEPS, work.parent]
-    subprocess.run(sweep, env=environment, check=True)
-    assert work.is_dir(), "swept while it was in use"
-    (left,) = [int(p.name) for p in Path("/proc").glob("[0-9]*") if _holds(p, work / "lock")]
-    os.kill(left, signal.SIGKILL)
-    child.communicate()
-    subprocess.run(sweep, env=environment, check=True)
-    assert not work.exists()
-
-
-def _holds(process: Path, file: Path) -> bool:
-    try:
-        return any(handle.readlink() == file for handle in (process / "fd").iterdir())
-    except OSError:
-        return False
-
-
-@pytest.mark.parametrize("locked", [False, True])
-@pytest.mark.parametrize("hours", [0, 23, 25])
-def test_working_folder_is_removed_by_age_and_lock(tmp_path: Path, hours: int, locked: bool) -> None:
-    """Remove an unlocked folder after a day, since the locks of other hosts may be invisible."""
-    folder = tmp_path / "mauvecl-work-0123456789abcdef"
+@pytest.mark.parametrize("days", [0, 89, 91])
+def test_working_folder_of_killed_process_is_removed_after_90_days(tmp_path: Path, days: int) -> None:
+    folder = tmp_path / f"{drivers.WORK}01234567"
     folder.mkdir()
-    then = time.time() - hours * 3600
-    with (folder / "lock").open("w") as lock:
-        if locked:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-        os.utime(folder / "lock", (then, then))
-        drivers._sweep(tmp_path)
-    assert folder.exists() == (locked or hours < 24)
+    then = time.time() - days * 86400
+    os.utime(folder, (then, then))
+    assert drivers._working_folder(tmp_path) is not None
+    assert folder.exists() == (days < 90)
 
 
 @pytest.mark.long
@@ -274,20 +186,17 @@ assert first == digest(two) == digest(one)
 
 
 def test_store_is_limited_in_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Remove the least recently used programs."""
+    """Remove the oldest programs."""
     monkeypatch.setattr(drivers, "MAX_STORED", 25_000)
     for number in range(4):
-        cache = drivers.KernelCache(tmp_path, tmp_path / f"work{number}")
+        cache = drivers.KernelCache(tmp_path / "store", tmp_path / f"work{number}")
         with cache.building(f"key{number}"):
             folder = cache.work / "AA" / f"program{number}"
             folder.mkdir(parents=True)
             (folder / "program.bc").write_bytes(bytes(10_000))
-        cache.publish()
+        cache.store_programs()
         then = time.time() - 100 + number
         os.utime(cache.store / f"key{number}.zip", (then, then))
-    # Without new programs, the end of a run does not list the store.
-    monkeypatch.setattr(cache, "_prune", lambda: pytest.fail("the store was looked through"))
-    cache.publish()
     assert sorted(path.name for path in cache.store.iterdir()) == ["key2.zip", "key3.zip"]
     assert ZipFile(cache.store / "key3.zip").namelist() == ["AA/program3/program.bc"]
 

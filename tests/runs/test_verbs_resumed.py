@@ -36,7 +36,11 @@ def test_killed_run_is_resumed_to_the_same_bits(verb: str, study: str, tmp_path:
     """Kill a run twice: what it had finished is not written again, and the tables are those of an undisturbed run."""
     (tmp_path / "study.toml").write_text(study)
     words = [verb, "study.toml", "--no-pictures", "--quiet"]
-    again = [sys.executable, "-m", "mauvecl", *words, "--output", "out", "--keep-after", "0", "--resume"]
+    script = (
+        "from mauvecl.runs.checkpoint import Checkpoint; Checkpoint.__init__.__kwdefaults__['patience_s'] = 0.0; "
+        "from mauvecl.cli.app import main; main()"
+    )
+    again = [sys.executable, "-c", script, *words, "--output", "out", "--resume"]
     kept = tmp_path / "out" / "checkpoint"
 
     def finished() -> dict[str, int]:
@@ -54,8 +58,8 @@ def test_killed_run_is_resumed_to_the_same_bits(verb: str, study: str, tmp_path:
         assert before.items() <= now.items(), "what was finished is kept, and not written again"
         before = now
     refusal = run(*words, "--output", "out", folder=tmp_path, code=2).stderr
-    assert "--resume" in refusal
-    assert "--restart" in refusal
+    assert "resume=True" in refusal
+    assert "restart=True" in refusal
     done = subprocess.run(again, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert not kept.exists()

