@@ -364,7 +364,10 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "correlations over gaps": (
         "test_correlations_do_not_bridge_gaps",
-        ("pairs = numbers[lag:] - numbers[:-lag] == lag", "pairs = numbers[lag:] > numbers[:-lag]"),
+        (
+            "np.intersect1d(numbers, numbers - lag, return_indices=True)",
+            "0, np.arange(len(numbers) - lag), np.arange(lag, len(numbers))",
+        ),
     ),
     "losses that are never searched": (
         "test_losses_are_found_at_their_frames_and_a_flare_is_none",

@@ -263,21 +263,25 @@ def test_dips_at_random_are_no_flares() -> None:
 
 
 @pytest.mark.long
-def test_light_that_the_process_does_not_describe_has_no_verdicts() -> None:
-    """Observe the sawtooth of an RR Lyrae star in half-hour frames: the message says how large sudden dips are."""
-    rng, time = np.random.default_rng([504, 1]), np.arange(500) * 1800.0
-    phase = time / (0.567 * 86_400) % 1
-    flux = 1 + 0.3 * np.where(phase < 0.15, phase / 0.15, 1 - (phase - 0.15) / 0.85)
-    flux[300:303] += [0.5, 0.2, 0.1]
-    flux += 1e-3 * rng.standard_normal(time.size)
-    answer = analyse(Study(), frames=Frames.of(time, flux, np.full(time.size, 1e-3), exposure_s=1800.0))
+def test_light_that_the_process_does_not_describe_has_verdicts_for_evident_flares_only() -> None:
+    """Observe a sawtooth of six hours, as the pointing of K2 makes, in half-hour frames with two flares."""
+    rng, time = np.random.default_rng([504, 1]), np.arange(1500) * 1800.0
+    flux = 1 + 0.01 * np.sin(2 * np.pi * time / (7.3 * 86_400)) + 0.002 * (time / 21_600 % 1)
+    since = np.arange(12)
+    flux[500:512] += 0.1 * np.exp(-since / 2)
+    flux[900:912] += 0.006 * np.minimum((1 + since) / 2, 1) * np.exp(-since / 4)
+    flux += 3e-4 * rng.standard_normal(time.size)
+    answer = analyse(Study(), frames=Frames.of(time, flux, np.full(time.size, 3e-4), exposure_s=1800.0))
     analysis = answer.analysis
     assert not analysis.likeness.alike
-    assert len(answer.events)
-    assert "detected" not in set(answer.events["verdict"])
+    assert analysis.evident >= 3 * analysis.threshold
     (message,) = [one for one in answer.messages if "no verdicts" in one]
-    # Dips are searched above the threshold of candidates.
-    assert f"an S/N of up to {max(analysis.dip, analysis.candidates):.3g}:" in message
+    assert f"below an S/N of {analysis.evident:.3g} have" in message
+    flares = answer.events[answer.events["kind"] == "flare"]
+    assert set(flares["verdict"]) == {"detected", "undecided"}
+    for event in flares:
+        assert (event["verdict"] == "undecided") == (event["value"] < analysis.evident)
+    assert [int(one) for one in flares["tpeak"].to_value("s")[flares["verdict"] == "detected"] // 1800] == [500]
 
 
 @pytest.mark.long
