@@ -56,6 +56,7 @@ def test_bad_input_is_refused(path: Path, row: dict[str, Any], tmp_path: Path) -
     if path.stem in ("cli", "cli-limits"):
         # One sentence, in which parameters are named by their flags.
         assert (out, reported.count("\n"), reported[:9]) == ("", 1, "mauvecl: ")
+        assert "`" not in re.sub(r"`mauvecl [^`]*`", "", reported), reported
 
 
 def test_error_of_one_value_has_key_and_unit() -> None:

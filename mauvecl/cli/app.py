@@ -22,7 +22,7 @@ from typer.main import get_command
 
 from mauvecl.answers.verbs import VERBS
 from mauvecl.cli.commands import COMMANDS, add_plain_commands, export, verify
-from mauvecl.cli.console import EXIT_CODES, guarded
+from mauvecl.cli.console import EXIT_CODES, guarded, name_flags_of
 from mauvecl.cli.flags import DeviceFlag, JsonFlag, QuietFlag, option_of, within
 from mauvecl.host import VERSION
 from mauvecl.schema.parsing import count
@@ -348,6 +348,8 @@ app = typer.Typer(
     "Start with `mauvecl detect`, which answers the question of the MauveSim paper. The throughput is nominal, not a "
     f"flight calibration. {EXIT_CODES}",
 )
+
+name_flags_of(app)
 
 
 def _version(wanted: bool) -> None:

@@ -1,19 +1,21 @@
-"""Text on the terminal: tables, errors with their flags, and exit codes."""
+"""Text on the terminal: tables, errors with flags in place of keys, and exit codes."""
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import datetime
 import errno
 import os
 import platform
 import re
+import shlex
 import sys
 import tempfile
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 
@@ -93,7 +95,7 @@ def _run(app: typer.Typer) -> int:
     try:
         code = app(standalone_mode=False)
     except InputError as error:
-        return _say(with_flag(error), BAD_INPUT)
+        return _say(name_flag(error), BAD_INPUT)
     except MemoryError:
         return _say("the memory does not suffice for this question, expected a smaller one or more of it", BAD_INPUT)
     except OSError as error:
@@ -386,20 +388,84 @@ def _parts(columns: Sequence[str], cells: Sequence[Sequence[Any]], filled: list[
     return parts
 
 
-def with_flag(error: InputError) -> str:
-    """Return the error's message after the flag that gave its value, if one did: "flag: sentence"."""
+#: A remedy in a message: `extend`, `resume=True`, `wavelength_unit='Angstrom'`, `fap=0.001`.
+_REMEDY = re.compile(r"`(?P<name>[a-z][a-z0-9_.]*)(?:=(?P<value>[^`]+))?`")
+#: Parameters with flags of other names that are not keys of the study.
+_OTHERWISE = {"setting": "--set"}
+
+#: The command line whose flags messages name, alone in a list.
+_app: list[typer.Typer] = []
+
+
+def name_flags_of(app: typer.Typer) -> None:
+    """Set the command line whose flags messages name."""
+    _app[:] = [app]
+
+
+def _commands() -> Iterator[Any]:
+    """Yield the called command, then all others."""
+    from typer.main import get_command
+
+    called: Any = get_command(_app[0])
+    others = [called]
+    for word in sys.argv[1:]:
+        called = getattr(called, "commands", {}).get(word, called)
+    yield called
+    while others:
+        command = others.pop()
+        yield command
+        others += getattr(command, "commands", {}).values()
+
+
+def _flags(name: str, command: Any) -> list[str]:
+    """Return the flags that set a parameter or a key of the study, the long one first."""
     from mauvecl.study.study import keys_with_flags
 
-    key = re.sub(r"\.\d+(?=\.|$)", "", error.key or "")
-    of_keys = [flag.names for path, _, flag in keys_with_flags() if key and f".{path}".endswith(f".{key}")]
-    given = (
-        max(names, key=len)
-        for names in (*of_keys, ("--" + key.replace("_", "-"),))
-        if any(_gives(word, name) for word in sys.argv[1:] for name in names)
-    )
-    flag = next(given, None)
-    return str(error) if flag is None or flag in str(error) else f"{flag}: {error}"
+    # If a key has several flags, the last takes its value unchanged.
+    parameters = {key: flag.parameter for key, _, flag in keys_with_flags()}
+    wanted = {name} | {parameter for key, parameter in parameters.items() if f".{key}".endswith(f".{name}")}
+    for parameter in command.params:
+        if parameter.name in wanted:
+            return sorted((flag for flag in parameter.opts if flag.startswith("-")), key=len, reverse=True)
+    return []
 
 
-def _gives(word: str, flag: str) -> bool:
-    return word.partition("=")[0] == flag if flag.startswith("--") else word.startswith(flag)
+def with_flags(text: str) -> str:
+    """Return a message with flags instead of the remedies in backticks."""
+    return _REMEDY.sub(_as_flag, text) if "`" in text else text
+
+
+def _as_flag(match: re.Match[str]) -> str:
+    name = match["name"]
+    flag = _OTHERWISE.get(name) or next((flags[0] for command in _commands() if (flags := _flags(name, command))), None)
+    if flag is None:
+        return match[0]
+    if match["value"] is None:
+        return flag
+    try:
+        value = ast.literal_eval(match["value"])
+    except (ValueError, SyntaxError):
+        value = match["value"]
+    return flag if value is True else f"{flag} {shlex.quote(str(value))}"
+
+
+def name_flag(error: InputError) -> str:
+    """Return the error's message with a flag instead of its key, if that flag gave the value."""
+    text, key = with_flags(str(error)), error.key
+    if key is None:
+        return text
+    name = re.sub(r"\.\d+(?=\.|$)", "", key)
+    flags = [_OTHERWISE[name]] if name in _OTHERWISE else _flags(name, command := next(_commands()))
+    if not flags:
+        # "flare amplitude" is the amplitude of a flare.
+        flags = _flags(name.removeprefix("flare_"), command)
+    if not any(_gives(word, flags) for word in sys.argv[1:]):
+        return text
+    # The key as written, which may contain blanks, after its location.
+    section, _, own = re.escape(key).replace("_", "[_ ]").rpartition(r"\.")
+    shown = rf"(?:{section}\.)?{own}" if section else own
+    return re.sub(rf"^(?:[^:=]*: )?{shown} = ", lambda _: f"{flags[0]} ", text)
+
+
+def _gives(word: str, flags: list[str]) -> bool:
+    return any(word.partition("=")[0] == flag if flag.startswith("--") else word.startswith(flag) for flag in flags)

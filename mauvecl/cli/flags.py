@@ -218,7 +218,7 @@ def study_of(
                 changes.setdefault(flag.section, {})[flag.key] = flag.value(value)
     if given.get("nuisance"):
         changes.setdefault("nuisances", {}).update(nuisances_of(study, given["nuisance"]))
-    changed = study.with_changes(changes, stars_of(study, given, flags), "")
+    changed = study.with_changes(changes, stars_of(study, given, flags), "command line")
     return changed.with_settings(given["set"], "--set") if given["set"] else changed
 
 

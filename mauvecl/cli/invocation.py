@@ -231,10 +231,10 @@ class Session(Options):
 
     def say(self, lines: Sequence[str]) -> None:
         """Print messages, unless standard output is reserved for JSON."""
-        from mauvecl.cli.console import show
+        from mauvecl.cli.console import show, with_flags
 
         if lines and not self.as_json:
-            show(lines)
+            show([with_flags(line) for line in lines])
 
     @cached_property
     def draws_pictures(self) -> bool:
@@ -301,7 +301,11 @@ class Session(Options):
         with report_interrupts(self._written):
             self._leave_all(answer)
         if self.as_json:
-            self.print_json({"assumed": answer.assumed} | answer.as_json())
+            from mauvecl.cli.console import with_flags
+
+            content = answer.as_json()
+            remarks = {"assumed": answer.assumed, "messages": [with_flags(line) for line in content["messages"]]}
+            self.print_json(remarks | {key: value for key, value in content.items() if key != "messages"})
             return
         from mauvecl.cli.console import show_view
 

@@ -62,8 +62,8 @@ class InputError(ValueError):
     """Bad input from a user.
 
     The message is one sentence that names the input, its value and what is accepted. It names parameters of functions
-    and keys of studies, with remedies in backticks, as in ```extend``` or ```resume=True```; the command line prints
-    the flag before it and exits with code 2.
+    and keys of studies, with remedies in backticks, as in ```extend``` or ```resume=True```; the command line writes
+    flags in their place and exits with code 2.
 
     Parameters
     ----------

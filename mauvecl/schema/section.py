@@ -80,9 +80,8 @@ def _takes_truth(annotation: Any) -> bool:
 
 
 def input_error(where: str, model: type[BaseModel], error: ValidationError) -> InputError:
-    """Return the first fault as an InputError whose message begins with the place where it is, if one is given."""
-    fault = _first_fault(model, error)
-    return fault.within(where) if where else fault
+    """Return the first fault as an InputError whose message begins with the place where it is."""
+    return _first_fault(model, error).within(where)
 
 
 def _first_fault(model: type[BaseModel], error: ValidationError) -> InputError:

@@ -254,7 +254,7 @@ class Study(Section):
     @classmethod
     def build(cls, data: dict[str, Any], where: str) -> Self:
         """Validate nested data; raises InputError for the first invalid value."""
-        possible(data, where or "study")
+        possible(data, where)
         try:
             return cls.model_validate(data)
         except ValidationError as error:

@@ -247,7 +247,7 @@ def commands_and_programs(tab: Tab, question: Question, folder: Path) -> list[di
             # Relative to the study, instead of that on the server.
             study = study.with_value(place, Path(file.name))
         if rows := placed(study.calibrate.observations, lambda file: file.name):
-            study = study.with_changes({"calibrate": {"observations": rows}}, None, "")
+            study = study.with_changes({"calibrate": {"observations": rows}}, None, "page")
         entries.append({"question": name, "command": as_command(verb, study), "python": as_program(verb, study)})
     return entries
 

@@ -18,7 +18,7 @@ from mauvecl.host.stars.library import ModelStar, embedded, near_names, spectrum
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.fields import Flag, Range, Unit, Widget, as_typed, first, found, range_of, unit_of
 from mauvecl.schema.physical import LineFraction
-from mauvecl.study.study import study_keys
+from mauvecl.study.study import keys_with_flags, study_keys
 
 #: Texts of fields with an uploaded file: those that also accept a name or numbers, and all others.
 UPLOADED, UPLOADED_UNKNOWN, UPLOADED_FILE = "uploaded star", "uploaded spectrum", "uploaded file"
@@ -393,6 +393,12 @@ PRESETS: dict[str, dict[str, str]] = {
 NO_KEYS: Mapping[str, str] = MappingProxyType({})
 #: A remedy in a message, such as `magnitude=7.4`.
 _REMEDY = re.compile(r"`(?P<key>[a-z][\w.]*)(?:=(?P<quote>'?)(?P<value>[^`]*?)(?P=quote))?`")
+#: A value at the beginning of a message, such as fap = 0.001.
+_VALUE = re.compile(r"^(?:page: )?(?P<key>[a-z][\w.]*) = (?P<empty>''(?=,|$))?")
+#: A flag of the command line.
+_FLAG = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
+#: A key within a message: words of prose hold no underscore.
+_KEY = re.compile(r"(?<![\w.'])(?:[a-z]+\.)*[a-z0-9]+(?:_[a-z0-9]+)+(?![\w.]*')")
 
 
 @cache
@@ -404,15 +410,38 @@ def _fields() -> dict[str, str]:
     return names | {name: name for name in FIELDS} | {"tails": "realisations", "plan.targets": "targets"}
 
 
+@cache
+def _flags() -> dict[str, str]:
+    """Return the field of each flag whose key has one."""
+    names = {".".join(field.path): name for name, field in FIELDS.items() if field.path}
+    return {flag: names[key] for key, _, option in keys_with_flags() if key in names for flag in option.names}
+
+
 def field_of(key: str | None) -> str | None:
     """Return the name of the field that sets a key of the study, or None."""
     return _fields().get(key or "")
 
 
 def sentence(error: InputError, keys: Mapping[str, str] = NO_KEYS) -> str:
-    """Return the message of an error after the label of its field: "label: sentence"; `keys` maps keys to fields."""
-    name, text = field_of(keys.get(error.key or "", error.key)), str(error)
-    return text if name is None else f"{FIELDS[name].label}: {text}"
+    """Return the message of an error as the page shows it; `keys` maps other names of its keys to fields."""
+    text = _VALUE.sub(
+        lambda match: f"{_label(match['key'], keys)} {'is empty' if match['empty'] else '= '}", str(error)
+    )
+    return note(text.removeprefix("page: "), keys)
+
+
+def note(text: str, keys: Mapping[str, str] = NO_KEYS) -> str:
+    """Return a message with the labels of fields in place of keys and flags."""
+    text = _FLAG.sub(lambda match: f"“{FIELDS[_flags()[match[0]]].label}”" if match[0] in _flags() else match[0], text)
+    text = _REMEDY.sub(lambda match: _remedy(match, keys), text)
+    return _KEY.sub(lambda match: _label(match[0], keys), text)
+
+
+def _remedy(match: re.Match[str], keys: Mapping[str, str]) -> str:
+    label = _label(match["key"], keys)
+    if label == match["key"]:
+        return label
+    return f"{label} {match['value']}" if match["value"] else f"“{label}”"
 
 
 def remedies(error: InputError, keys: Mapping[str, str] = NO_KEYS) -> list[tuple[str, str]]:
@@ -420,3 +449,8 @@ def remedies(error: InputError, keys: Mapping[str, str] = NO_KEYS) -> list[tuple
     each = _REMEDY.finditer(str(error))
     named = ((field_of(keys.get(match["key"], match["key"])), match["value"]) for match in each)
     return [(name, value) for name, value in named if name is not None and value]
+
+
+def _label(key: str, keys: Mapping[str, str]) -> str:
+    name = field_of(keys.get(key, key))
+    return key if name is None else FIELDS[name].label

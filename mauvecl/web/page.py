@@ -20,7 +20,7 @@ from mauvecl.schema.errors import InputError, of_kind, shortened
 from mauvecl.study.plan import PlanTarget
 from mauvecl.web.closed_forms import TITLES, Answers, ClosedForms, chances, percent, short
 from mauvecl.web.exposure_tabs import Detection, Noise, Signal, Spectrum, Unknown
-from mauvecl.web.fields import FIELDS, UPLOADED, Choice, Field, targets
+from mauvecl.web.fields import FIELDS, UPLOADED, Choice, Field, note, sentence, targets
 from mauvecl.web.flare_tabs import Limit, Measurement
 from mauvecl.web.observation_tabs import Analyse, Calibrate, Change, Completeness, Periods, Plan, Visibility
 from mauvecl.web.question import OTHER, SIMULATIONS, Question
@@ -148,7 +148,7 @@ def _files(answers: Answers) -> list[str]:
 
 def _with_kinds(messages: list[str]) -> list[tuple[str, str]]:
     """Return messages with their kinds: severe ones begin in capitals."""
-    return [(m, "danger" if m.partition(":")[0].isupper() else "info") for m in messages]
+    return [(note(m), "danger" if m.partition(":")[0].isupper() else "info") for m in messages]
 
 
 def _messages(closed: ClosedForms, answers: Answers) -> list[str]:
@@ -207,7 +207,7 @@ class State:
                     )
                 self._values[name] = value
             except InputError as error:
-                self._invalid[name] = str(error)
+                self._invalid[name] = sentence(error)
 
     def _holds_file(self, name: str) -> bool:
         return name in UPLOADS and self.entered[name] == UPLOADS[name].entered
@@ -220,7 +220,7 @@ class State:
                 try:
                     self._check(name)
                 except InputError as error:
-                    faults[name] = str(error)
+                    faults[name] = sentence(error)
         return faults
 
     def values_of(self, names: Collection[str]) -> dict[str, Any]:
@@ -320,7 +320,7 @@ def _target(row: dict[str, Any]) -> dict[str, str]:
     try:
         star = PlanTarget.model_validate(row).target(simbad=False)
     except InputError as error:
-        return {"fault": str(error)}
+        return {"fault": sentence(error)}
     facts = {"spectral_type": star.spectral_type, "V": star.magnitude, "distance_pc": star.distance_pc}
     target = {
         key: "" if value is None else f"{value:g}" if isinstance(value, float) else value

@@ -80,7 +80,7 @@ class Question:
         uploaded = self.uploaded
         # An uploaded spectrum is not read from its file at every change.
         loader = Loader(None if uploaded is None else lambda star: star.applied(uploaded))
-        case = Case(Study.build(self._data(folder), ""), loader=loader)
+        case = Case(Study.build(self._data(folder), "page"), loader=loader)
         return case.at_observed_brightness() if self.as_bright_as_observed else case
 
     def _data(self, folder: Path | None) -> dict[str, Any]:
@@ -199,7 +199,7 @@ def _map_around(study: Study) -> Study:
 
 def _changed(study: Study, **sections: dict[str, Any]) -> Study:
     """Return a study with other values of keys, by section."""
-    return study.with_changes(sections, None, "")
+    return study.with_changes(sections, None, "page")
 
 
 def _tabulated(answers: dict[str, Any]) -> dict[str, Any]:

@@ -399,7 +399,7 @@ class Visitor(WebSocketHandler):
             name = field_of(error.key)
             if name is not None and "faults" in message:
                 # Values that cannot be together: one of their fields says so.
-                self.send(**message | {"faults": {name: str(error)}})
+                self.send(**message | {"faults": {name: sentence(error)}})
             else:
                 self.send(**message, refused=sentence(error))
         except DeviceError as error:
