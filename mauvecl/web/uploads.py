@@ -330,7 +330,7 @@ def reported_for(key: str, name: str) -> Iterator[None]:
 
 
 #: Closed forms, answers and files that the server keeps for all visitors together, and their uploads.
-MOST_RESULTS, MOST_UPLOADS = 24, 12
+MOST_RESULTS, MOST_UPLOADS = 24, 16
 
 
 class Shelf:

@@ -291,7 +291,7 @@ def test_interrupted_run_is_resumed_to_the_same_bits(tmp_path: Path) -> None:
             assert "kept in 'out/checkpoint', and the same command with --resume continues from there" in errors
         assert counted() > kept
         kept = counted()
-    assert "resume=True" in run(*LONG, folder=tmp_path, code=2).stderr
+    assert "--resume" in run(*LONG, folder=tmp_path, code=2).stderr
     (shards / f".unfinished-{next(shards.glob('*-*-*-*.npz')).name}").write_text("killed while it was written")
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -218,7 +218,7 @@ def test_existing_file_is_not_overwritten(name: str, tmp_path: Path) -> None:
     (tmp_path / name).write_text("mine")
     words = ("realise", "study.toml", "--output", name)
     for more in ([], ["--resume"]):
-        assert "restart=True" in run(*words, *more, folder=tmp_path, code=2).stderr
+        assert "--restart" in run(*words, *more, folder=tmp_path, code=2).stderr
     assert (tmp_path / name).read_text() == "mine"
     run(*words, "--restart", folder=tmp_path)
     assert (tmp_path / name).stat().st_size > 2 * 2 * 20 * 197
