@@ -35,7 +35,8 @@ from mauvecl.web.downloads import as_file, asked_study, commands_and_programs
 from mauvecl.web.fields import FIELDS, field_of, remedies, sentence
 from mauvecl.web.page import TABS, State, asking, card, known, reads_of, without_headline
 from mauvecl.web.question import DRAWING, SIMULATIONS, verbs_of
-from mauvecl.web.uploads import RESULTS, UPLOAD_SHELF, UPLOADS
+from mauvecl.web.uploads import RESULTS, UPLOADS
+from mauvecl.web.uploads import UPLOAD_SHELF as UPLOADED
 
 if TYPE_CHECKING:
     from mauvecl.web.closed_forms import Answers
@@ -264,7 +265,7 @@ class Visitor(WebSocketHandler):
             if job is not None:
                 job.cancel()
         self._folder.cleanup()
-        for shelf in (RESULTS, UPLOAD_SHELF):
+        for shelf in (RESULTS, UPLOADED):
             shelf.leave(self)
         Visitor.has_left = True
 
@@ -348,7 +349,8 @@ class Visitor(WebSocketHandler):
             given = self.given(state, tab)
             made = ClosedForms.of(question, Path(self._folder.name), headline=tab.headline, given=given)
             held = self._closed = key, made
-        self._shelve("_closed")
+        # Closed forms compute and keep more when they are used.
+        self._shelve("_closed", held)
         return held[1]
 
     def given(self, state: State, tab: Tab) -> dict[str, Any]:
@@ -357,12 +359,12 @@ class Visitor(WebSocketHandler):
         held = self._given
         if held is None or held[0] != key:
             held = self._given = key, tab.given(state.question(tab.reads))
-            self._shelve("_given")
+            self._shelve("_given", held)
         return held[1]
 
-    def _shelve(self, name: str) -> None:
+    def _shelve(self, name: str, value: object) -> None:
         """Count an attribute among the results of all visitors; it may be reset to None."""
-        RESULTS.keep(self, name, partial(setattr, self, name, None))
+        RESULTS.keep(self, name, value, partial(setattr, self, name, None))
 
     def answers(self, state: State) -> dict[str, Any]:
         """Return the simulated answers that hold for a question, by name."""
@@ -370,7 +372,7 @@ class Visitor(WebSocketHandler):
         for (simulation, key), answers in list(self._answers.items()):
             if key == self._key(state, reads_of(simulation)):
                 valid |= answers
-                RESULTS.keep(self, (simulation, key), partial(self._answers.pop, (simulation, key), None))
+                RESULTS.used(self, (simulation, key))
         return valid
 
     def _key(self, state: State, names: frozenset[str]) -> tuple[Any, ...]:
@@ -488,7 +490,7 @@ class Visitor(WebSocketHandler):
                 self.send(n=n, progress=job.share, message=job.words)
             self._answers[key] = done.result()
             self._answers.move_to_end(key)
-            RESULTS.keep(self, key, partial(self._answers.pop, key, None))
+            RESULTS.keep(self, key, self._answers[key], partial(self._answers.pop, key, None))
             while len(self._answers) > MOST_ANSWERS:
                 self._answers.popitem(last=False)
             self.send(n=n, ended=f"Done: {job.words}.", kind=kind)
@@ -536,7 +538,7 @@ class Visitor(WebSocketHandler):
         def came(future: Future[Any]) -> None:
             try:
                 self._uploads[field] = future.result()
-                UPLOAD_SHELF.keep(self, field, partial(self._uploads.pop, field, None))
+                UPLOADED.keep(self, field, self._uploads[field], partial(self._uploads.pop, field, None))
             except InputError as error:
                 proposed = [remedy for remedy in remedies(error, upload.options) if remedy[0] in names]
                 self.send(n=n, field=field, lacks=sentence(error, upload.options), remedies=proposed)
@@ -574,7 +576,7 @@ class Visitor(WebSocketHandler):
             else:
                 made = asked_study(name, state.question(reads).study(Path(self._folder.name)))
             self._files[which] = made
-            RESULTS.keep(self, which, partial(self._files.pop, which, None))
+            RESULTS.keep(self, which, made, partial(self._files.pop, which, None))
             while len(self._files) > MOST_KEPT:
                 self._files.popitem(last=False)
             return made

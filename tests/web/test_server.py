@@ -317,8 +317,10 @@ def test_answers_continue_while_others_compute_upload_and_leave(server: Server) 
 
 @pytest.mark.long
 def test_memory_of_uploads_and_answers_is_bounded(tmp_path: Path) -> None:
-    """Of more than 16 uploads the oldest are dropped; those of visitors who have left make room."""
+    """Of 256 MiB of uploads the oldest are dropped; those of visitors who have left make room."""
     served = Server(tmp_path / "log.txt")
+    documented = (Path(__file__).parents[2] / "docs" / "page.md").read_text()
+    assert documented.count("256 MiB of") == 2
 
     async def has_file(talk: Talk) -> bool:
         return "its file again" not in str((await talk.answer("?frames=uploaded+file", "analyse"))["faults"])
