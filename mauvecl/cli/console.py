@@ -48,8 +48,8 @@ DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.E
 
 #: What to do instead of giving a flag that has gone.
 GONE = {
-    "--forget": "leave it out: a driver that failed is tried again by every run",
-    "--keep-after": "leave it out: finished parts of a run are saved after 20 s",
+    "--forget": "leave it out, since a driver that failed is tried again by every run",
+    "--keep-after": "leave it out, since finished parts of a run are saved after 20 s",
     "--trials": "give --set change.trials=NUMBER",
 }
 #: Libraries that write to standard output for mauvecl.
@@ -114,7 +114,7 @@ def _failed(error: Exception) -> int:
         text = str(error.format_message())
         flag = getattr(error, "option_name", "")
         if flag in GONE:
-            text = f"the flag {flag} has gone, {GONE[flag]}"
+            text = f"the flag {flag} has gone: {GONE[flag]}"
         return _say(text.splitlines()[0] if text else "", BAD_INPUT) if text.strip() else BAD_INPUT
     if type(error).__name__ == "Abort" or isinstance(error.__cause__, KeyboardInterrupt):
         return _say("interrupted", INTERRUPTED)
