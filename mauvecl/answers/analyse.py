@@ -187,14 +187,13 @@ class EventRow:
         """Judgement of the event: a detected flare, a candidate, rejected as an event of another kind, or undecided.
 
         Where the throughput changes, only a spectrum that is clearly that of a flare makes an event a detection. Where
-        the fitted process does not describe the light, the false-alarm rate of an event is not known unless it is much
-        larger than all dips; where most frames are in events, no rate is.
+        the fitted process does not describe the light, or most frames are in events, its false-alarm rate is not known.
         """
         if self.analysis.crowded:
             return "undecided"
         if self.event.kind != "flare":
             return "rejected"
-        if not self.analysis.likeness.alike and self.event.value < self.analysis.evident:
+        if not self.analysis.likeness.alike:
             return "undecided"
         doubtful = self.spectrum is not None and self.spectrum.ambiguous and self.analysis.light_misleads
         return "detected" if self.significant and not doubtful and not self.unclear else "candidate"

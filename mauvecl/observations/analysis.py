@@ -159,8 +159,6 @@ def _power(part: SeriesSurvey, width: float) -> float:
 STAGES = (0.0, 0.45, 0.55, 0.65, 0.95, 1.0)
 #: False alarms per star-day above which events are candidates.
 CANDIDATES = 1.0
-#: Statistic in thresholds, or in largest dips, from which events are flares whatever the residuals are (assumed).
-EVIDENT = 3.0
 #: Share of the searched frames in events, their number, and length of the light curve in half-widths of the longest
 #: event, above which the events are no exception from the light of the star (assumed).
 MOST_IN_EVENTS, MOST_EVENTS, LONG = 0.5, 2, 100.0
@@ -235,11 +233,6 @@ class Analysis:
         many = len(self.events) > MOST_EVENTS and self.in_events > MOST_IN_EVENTS
         return many and self.survey.stare.duration_s > min(LONG * longest, LONG_S)
 
-    @property
-    def evident(self) -> float:
-        """Statistic from which events have verdicts where the process does not describe the light."""
-        return EVIDENT * max(self.threshold, self.dip)
-
     def false_alarms(self, event: ObservedEvent) -> tuple[float, float]:
         """Return the false alarms per star-day at an event's statistic: by the process, and with measured residuals."""
         return self.modelled.rate(event.value), self.measured.rate(event.value)
@@ -306,9 +299,9 @@ class Analysis:
         if not self.likeness.alike:
             lines.append(
                 f"Residuals of the quiescent light are correlated ({self.likeness.correlation:.2f} at a lag of "
-                f"{self.likeness.lag} frames), which the fitted process does not describe: events below an S/N "
-                f"of {self.evident:.3g} have no verdicts. That is {EVIDENT:g} times the threshold, or the largest "
-                "sudden dip, which is no flare."
+                f"{self.likeness.lag} frames), which the fitted process does not describe: there are no verdicts. "
+                f"Sudden dips, which are no flares, have an S/N of up to {max(self.dip, self.candidates):.3g}: rises "
+                "of that size are no evidence of flares."
             )
         elif self.dip == self.threshold:
             lines.append(
