@@ -282,45 +282,44 @@ def test_light_that_the_process_does_not_describe_has_no_verdicts() -> None:
 
 @pytest.mark.long
 def test_sudden_flares_of_a_few_frames_that_decay_exponentially_have_their_energies() -> None:
-    """Observe six flares on each of two rotators in frames of 10 minutes, with a step of the level in a gap.
+    """Observe six flares on a rotator in frames of 10 minutes, with a step of the level in a gap.
 
-    Of 12 intervals of 95 %, fewer than 9 hold the truth once in 4000.
+    Of 6 intervals of 95 %, fewer than 4 hold the truth once in 400 times.
     """
     frame_s, inside, noise, day = 600.0, 0, 6e-4, 86_400.0
-    for seed in (1, 2):
-        rng = np.random.default_rng([505, seed])
-        time = np.concatenate([np.arange(0, 25 * day, frame_s), np.arange(27.3 * day, 52 * day, frame_s)])
-        turn = 2 * np.pi * time / (3.1 * day)
-        flux = 1 + 0.02 * np.sin(turn) + 0.007 * np.sin(2 * turn + 2)
-        late = time > 26 * day
-        flux[late] *= 1.08
-        flares = []
-        for peak_d, amplitude, decay_s in (
-            (4.2, 0.03, 900), (8, 0.04, 400), (12, 0.01, 1500), (31, 0.05, 600), (38, 0.03, 600), (44, 0.008, 3000)
-        ):  # fmt: skip
-            peak = (peak_d + 0.1 * rng.uniform()) * day
-            left = [np.exp(-np.maximum(time + shift - peak, 0) / decay_s) for shift in (0, frame_s)]
-            flux += amplitude * decay_s * (left[0] - left[1]) / frame_s
-            flares.append((peak, amplitude * decay_s / (1.08 if peak_d > 26 else 1)))
-        flux += noise * rng.standard_normal(time.size)
-        frames = Frames.of(time, flux, np.full(time.size, noise), exposure_s=frame_s)
-        events = analyse(Study(), frames=frames).events
-        for peak, duration in flares:
-            near = np.abs(events["tpeak"].to_value("s") - peak) < 2 * frame_s
-            assert near.any()
-            low, high = (float(events[name].to_value("s")[near][0]) for name in ("ed_low_95", "ed_high_95"))
-            inside += low < duration < high
-    assert inside >= 9
+    rng = np.random.default_rng([505, 1])
+    time = np.concatenate([np.arange(0, 25 * day, frame_s), np.arange(27.3 * day, 52 * day, frame_s)])
+    turn = 2 * np.pi * time / (3.1 * day)
+    flux = 1 + 0.02 * np.sin(turn) + 0.007 * np.sin(2 * turn + 2)
+    late = time > 26 * day
+    flux[late] *= 1.08
+    flares = []
+    for peak_d, amplitude, decay_s in (
+        (4.2, 0.03, 900), (8, 0.04, 400), (12, 0.01, 1500), (31, 0.05, 600), (38, 0.03, 600), (44, 0.008, 3000)
+    ):  # fmt: skip
+        peak = (peak_d + 0.1 * rng.uniform()) * day
+        left = [np.exp(-np.maximum(time + shift - peak, 0) / decay_s) for shift in (0, frame_s)]
+        flux += amplitude * decay_s * (left[0] - left[1]) / frame_s
+        flares.append((peak, amplitude * decay_s / (1.08 if peak_d > 26 else 1)))
+    flux += noise * rng.standard_normal(time.size)
+    frames = Frames.of(time, flux, np.full(time.size, noise), exposure_s=frame_s)
+    events = analyse(Study(), frames=frames).events
+    for peak, duration in flares:
+        near = np.abs(events["tpeak"].to_value("s") - peak) < 2 * frame_s
+        assert near.any()
+        low, high = (float(events[name].to_value("s")[near][0]) for name in ("ed_low_95", "ed_high_95"))
+        inside += low < duration < high
+    assert inside >= 4
 
 
 @pytest.mark.long
 def test_visits_over_years_take_little_memory() -> None:
-    """Observe twelve visits of 20 minutes in six years in frames of 10 s, each with a flare.
+    """Observe six visits of 20 minutes in six years in frames of 10 s, each with a flare.
 
     Periodograms up to the frequency of frames took 10 GB.
     """
     rng, frame_s = np.random.default_rng([506, 1]), 10.0
-    starts = np.sort(rng.uniform(0, 6 * 365 * 86_400, 12) // frame_s * frame_s)
+    starts = np.sort(rng.uniform(0, 6 * 365 * 86_400, 6) // frame_s * frame_s)
     time = (starts[:, None] + frame_s * np.arange(120)).ravel()
     light = np.ones(time.size)
     for start in starts:
@@ -333,6 +332,6 @@ def test_visits_over_years_take_little_memory() -> None:
     finally:
         tracemalloc.stop()
     events = answer.events[answer.events["verdict"] == "detected"]
-    assert len(events) == 12
+    assert len(events) == 6
     for start, peak in zip(starts, events["tpeak"].to_value("s"), strict=True):
         assert abs(peak - start - 400.0) < 30
