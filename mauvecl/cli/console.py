@@ -269,6 +269,9 @@ class Meter:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._clear()
+
+    def _clear(self) -> None:
         if self._changes and self._shown > self._started:
             print(CLEARED, end="", file=sys.stderr, flush=True)
 
@@ -280,6 +283,7 @@ class Meter:
             return
         if done <= self._last:
             # Start of the next star's work.
+            self._clear()
             self._started = self._shown = now
         self._last, self._total = done, total
         if self._quiet or now - self._started < PATIENCE_S or now - self._shown < (0.2 if self._changes else 10.0):

@@ -90,7 +90,7 @@ def driver_sources(system: str | None = None, machine: str | None = None) -> str
 MIN_FREE_BYTES = 64 * 2**20
 #: Largest size of the stored archives in bytes; the oldest are removed.
 MAX_STORED = 128 * 2**20
-#: Name prefix of working folders, and the age after which a folder was left by a killed process: longer than any run.
+#: Name prefix of working folders, and the age after which a folder was left by a killed process (assumed).
 WORK, ABANDONED_S = "mauvecl-work-", 90 * 86400.0
 
 
@@ -222,8 +222,10 @@ def _working_folder(parent: Path) -> Path | None:
     try:
         parent.mkdir(parents=True, exist_ok=True)
         for folder in parent.glob(f"{WORK}*"):
-            if time.time() - folder.stat().st_mtime > ABANDONED_S:
-                shutil.rmtree(folder, ignore_errors=True)
+            # Other processes remove their folders at the same time.
+            with contextlib.suppress(OSError):
+                if time.time() - folder.stat().st_mtime > ABANDONED_S:
+                    shutil.rmtree(folder, ignore_errors=True)
         if shutil.disk_usage(parent).free < MIN_FREE_BYTES:
             return None
         return Path(tempfile.mkdtemp(prefix=WORK, dir=parent))

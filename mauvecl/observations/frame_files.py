@@ -73,7 +73,7 @@ KNOWN = {
 }  # fmt: skip
 #: Names of times where no column is called time and none is named after its dates, such as BJD.
 OTHER_TIMES = ("t", "date", "datetime", "timestamp", "date-obs", "date_obs", "utc", "ut")
-#: Names of the times at which frames start and end, where no column is called time or named after its dates.
+#: Names of the times at which frames start and end, where no other column is a time.
 EDGES = ("t0", "t1")
 #: Columns of bands and of stars, of which a light curve has one.
 GROUPS = ("band", "filter", "filt", "passband", "bandpass", "filtercode", "phot_filter", "source_id", "tic",
@@ -308,11 +308,10 @@ def _recognised(file: TableFile) -> FrameMapping:
             fault = f"{file.what}: {len(dated)} columns may be the time: {', '.join(map(shortened, dated))}"
             raise InputError(fault, "a mapping that names one", key="time")
         timed = [name for name in said if re.match(r"t(?:ime)?[\s_.]", name, re.IGNORECASE)]
+        columns["time"] = dated[0] if dated else first_of((*OTHER_TIMES, *timed), names, file.what)
+    if columns["time"] is None:
         edges = tuple(first_of((name,), names, file.what) for name in EDGES)
-        if dated:
-            columns["time"] = dated[0]
-        else:
-            columns["time"] = first_of((*OTHER_TIMES, *timed), names, file.what) if None in edges else edges
+        columns["time"] = None if None in edges else edges
     flux = divided_unit(columns["flux"] or "")[0]
     # Errors of another flux would be wrong ones.
     ends = ("_err", "_error", "err", "_e", "_unc", "_uncertainty", "_sigma", "_std")

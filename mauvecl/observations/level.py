@@ -342,7 +342,7 @@ def likeness(numbers: NDArray[np.int64], residual: Float) -> Likeness:
     found, errors = np.zeros((residual.shape[1], lags.size)), np.ones(lags.size)
     for k, lag in enumerate(lags):
         # Frames that are a lag apart, with any number of others between them.
-        _, first, second = np.intersect1d(numbers, numbers - lag, return_indices=True)
+        _, first, second = np.intersect1d(numbers, numbers - lag, assume_unique=True, return_indices=True)
         if first.size > 10:
             found[:, k] = (scaled[first] * scaled[second]).mean(axis=0)
             errors[k] = first.size**-0.5

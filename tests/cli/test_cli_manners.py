@@ -189,6 +189,19 @@ def test_meter_restarts_for_the_next_star(clock: Any, capsys: pytest.CaptureFixt
     ]
 
 
+def test_line_on_a_terminal_is_cleared_before_the_next_star(
+    clock: Any, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    with Meter() as meter:
+        meter(0, 1000)
+        clock.now += 10.0
+        meter(500, 1000)
+        meter(0, 2000)
+    cleared = "\r\x1b[K"
+    assert capsys.readouterr().err == f"{cleared}500 of 1000 realisations, 50 a second, 10 s left{cleared}"
+
+
 ROOT = Path(mauvecl.__file__).parent
 #: The command line itself, and the command that the page offers.
 OF_FLAGS = ("cli/", "web/downloads.py")

@@ -172,6 +172,12 @@ def test_working_folder_of_killed_process_is_removed_after_90_days(tmp_path: Pat
     assert folder.exists() == (days < 90)
 
 
+def test_folder_that_another_process_removes_does_no_harm(tmp_path: Path) -> None:
+    """A link to nothing is listed and has no age, as a folder that is removed meanwhile."""
+    (tmp_path / f"{drivers.WORK}01234567").symlink_to(tmp_path / "removed")
+    assert drivers._working_folder(tmp_path) is not None
+
+
 @pytest.mark.long
 def test_second_engine_does_not_rewrite_loaded_kernels(filled: tuple[Path, str]) -> None:
     """Keep the files of loaded kernels, since a process crashes if they are written again."""
