@@ -35,7 +35,7 @@ def main() -> None:
     parser.add_argument("--device")
     parser.add_argument("--output", type=Path, default=Path(__file__).parent / "results" / "joint_coverage.ecsv")
     options = parser.parse_args()
-    mauve, star, engine = Instrument.load("mauve"), Source.from_library("M3V").at_magnitude(9), Engine(options.device)
+    mauve, star, engine = Instrument.load("mauvesim"), Source.from_library("M3V").at_magnitude(9), Engine(options.device)
     quiet, stare = expect(star, mauve, exposure=5.0), Stare.of(300.0)
     model = FlareModel.of(star, mauve, quiet)
     free = Nuisances.of(quiet, {"dark": np.inf, "light": 0.02})

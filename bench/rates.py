@@ -72,7 +72,7 @@ def timed(work: Callable[[int], object]) -> Callable[[int], float]:
 def scenes(amplitudes: tuple[float, ...], exposure: float = 50.0) -> list[Expectation]:
     """Return the expectations of the paper's G2V star, quiescent and flaring."""
     star = Source.from_library("G2V").at_magnitude(7.4)
-    mauve, sky = Instrument.load("mauve"), Sky.of_brightness(22.1)
+    mauve, sky = Instrument.load("mauvesim"), Sky.of_brightness(22.1)
     sources = (star, *(star.flaring(a) for a in amplitudes))
     return [expect(s, mauve, exposure=exposure, sky=sky) for s in sources]
 

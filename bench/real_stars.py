@@ -356,7 +356,7 @@ def exposure_of(star: str, magnitude: float) -> Any:
     """Return mauvecl's expectation of one frame, from which only spectra of star and dark current are taken."""
     from mauvecl import Instrument, Source, expect
 
-    return expect(Source.from_library(star).at_magnitude(magnitude), Instrument.load("mauve"), exposure=5.0)
+    return expect(Source.from_library(star).at_magnitude(magnitude), Instrument.load("mauvesim"), exposure=5.0)
 
 
 def spectra(number: int, seed: int) -> Iterator[Trial]:

@@ -96,7 +96,7 @@ class Last:
 def payload(sums: int) -> Components:
     """Return the components of the paper's G2V star with flares of 7000 and 15 000 K and smooth weights."""
     star = Source.from_library("G2V").at_magnitude(7.4)
-    mauve, sky = Instrument.load("mauve"), Sky.of_brightness(22.1)
+    mauve, sky = Instrument.load("mauvesim"), Sky.of_brightness(22.1)
     sources = (star, star.flaring(1.0, temperature=7000.0), star.flaring(1.0, temperature=15_000.0))
     quiet, *flares = (expect(s, mauve, exposure=5.0, sky=sky) for s in sources)
     along = np.linspace(0.0, np.pi, quiet.wavelength_nm.size)

@@ -51,7 +51,7 @@ def stares(engine: Engine) -> Stares:
 
 @pytest.fixture(scope="session")
 def mauve() -> Instrument:
-    return Instrument.load("mauve")
+    return Instrument.load("mauvesim")
 
 
 @pytest.fixture

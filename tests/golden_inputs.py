@@ -33,7 +33,7 @@ def frames(path: Path, seed: int, star: str, magnitude: float, temperatures: tup
     rng, raw, sky = np.random.Generator(np.random.PCG64(seed)), [], Sky.of_brightness(22.1) if star else Sky.none()
     source = Source.from_library(star or "G2V").at_magnitude(magnitude)
     for celsius in temperatures:
-        true = Instrument.load("mauve").with_(**TRUE, temperature_c=celsius)
+        true = Instrument.load("mauvesim").with_(**TRUE, temperature_c=celsius)
         x = expect(source, true, exposure=5.0, sky=sky)
         light, shape = x.source_electrons + x.sky_electrons, (25, x.wavelength_nm.size)
         photons = x.gain_dn_per_electron * (light + np.sqrt(light) * rng.standard_normal(shape))

@@ -40,7 +40,7 @@ NEAR: Any = Study().with_settings(
 MG_II: Any = {"band_nm": (278.5, 281.5), "continuum_nm": ((275.5, 278.0), (282.0, 284.5))}
 
 
-def instrument(name: str = "mauve", *, part: bool = False, **changes: Any) -> Instrument:
+def instrument(name: str = "mauvesim", *, part: bool = False, **changes: Any) -> Instrument:
     """Return the payload, or only its 198 pixels around the peak of the throughput for the slow reference."""
     if part:
         changes = {"output_min_nm": 300.0, "output_max_nm": 360.0} | changes
@@ -72,7 +72,7 @@ def source(library: str = "M3V", magnitude: float = 9.0) -> Source:
 @cache
 def quiescent(library: str = "M3V", magnitude: float = 9.0, exposure: float = 50.0) -> Expectation:
     """Return the expectation of a star on the nominal payload."""
-    return expect(source(library, magnitude), "mauve", exposure=exposure)
+    return expect(source(library, magnitude), "mauvesim", exposure=exposure)
 
 
 def assert_covered(inside: Any, n: int, least: float, most: float, false: float = 1e-6) -> None:

@@ -202,7 +202,7 @@ def flares_in_time(folder: Path) -> Answer:
 @golden()
 def instruments(folder: Path) -> Answer:
     found: Answer = {}
-    for name in ("mauve", "mauve-electrons"):
+    for name in ("mauvesim", "mauve"):
         one = Instrument.load(name)
         found[name] = {
             "throughput": one.throughput(SEEN_NM), "efficiency": one.efficiency(SEEN_NM),
@@ -232,7 +232,7 @@ def expectations(folder: Path) -> Answer:
     """Return means, variances and S/N in both orders, with neighbours, in electrons, and near saturation."""
     cases = {
         "paper": star(), "physical": [expect(source(), instrument(), exposure=300.0, order="physical")],
-        "electrons": star("K5V", 8.0, amplitudes=(0.1,), payload=instrument("mauve-electrons")),
+        "electrons": star("K5V", 8.0, amplitudes=(0.1,), payload=instrument("mauve")),
         "neighbours": star(neighbours=NEAR), "bright": star("A0V", 1.0, exposure=5.0),
     }  # fmt: skip
     found: Answer = {}

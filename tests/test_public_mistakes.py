@@ -25,7 +25,7 @@ from mauvecl.device.drivers import DeviceError
 #: Values of required parameters that are text, by name of the parameter.
 WORDS = {
     "band": "Kepler", "kind": "band", "quantity": "magnitude", "statistic": "matched", "target": "290.0 -11.2",
-    "time": "2027-01-01", "shape": "fiducial", "instrument": "mauve", "path": "no such file", "file": "x.fits",
+    "time": "2027-01-01", "shape": "fiducial", "instrument": "mauvesim", "path": "no such file", "file": "x.fits",
 }  # fmt: skip
 
 #: What the package calls with arrays that it has made, which nothing checks again in a loop.
@@ -40,7 +40,7 @@ INNER = (
 def instances() -> dict[type, Any]:
     """Return an instance of each class that functions take or whose methods are called."""
     star = mauvecl.Source.from_library("G2V").at_magnitude(7.4)
-    part = mauvecl.Instrument.load("mauve").with_(output_min_nm=300.0, output_max_nm=306.0)
+    part = mauvecl.Instrument.load("mauvesim").with_(output_min_nm=300.0, output_max_nm=306.0)
     quiet, flare = (mauvecl.expect(one, part, exposure=5) for one in (star, star.flaring(0.5)))
     stare = {"output_min_nm": 300.0, "output_max_nm": 306.0}
     study = mauvecl.Study.build(

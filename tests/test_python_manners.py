@@ -68,7 +68,7 @@ ANSWERS: dict[str, Callable[[Engine, dict[str, object]], Any]] = {
 
 @cache
 def pair() -> tuple[Expectation, Expectation]:
-    payload = Instrument.load("mauve").with_(output_min_nm=300.0, output_max_nm=322.0)
+    payload = Instrument.load("mauvesim").with_(output_min_nm=300.0, output_max_nm=322.0)
     star = Source.from_library("G2V").at_magnitude(7.4)
     quiet, flare = (expect(s, payload, exposure=50) for s in (star, star.flaring(0.3)))
     return quiet, flare
@@ -87,7 +87,7 @@ def test_answers_compare_by_content_and_are_pickled(engine: Engine, name: str) -
 
 
 def things() -> dict[str, Callable[[float], Any]]:
-    mauve = Instrument.load("mauve")
+    mauve = Instrument.load("mauvesim")
     return {
         "Source": lambda v: Source.from_library("G2V").at_magnitude(v),
         "Instrument": lambda v: mauve.with_(temperature_c=v),
@@ -124,9 +124,9 @@ def test_whole_numbers_can_be_floats_and_tuples_single_values(engine: Engine) ->
 
 
 def test_names_are_accepted_for_stars_and_instruments() -> None:
-    usual = expect(Source.from_library("Vega"), Instrument.load("mauve"), exposure=5, sky=Sky.of_brightness(22.1))
-    assert expect("Vega", "mauve", exposure=5) == usual
-    assert expect("Vega", "mauve", exposure=5 * u.s, sky=22.1) == usual
+    usual = expect(Source.from_library("Vega"), Instrument.load("mauvesim"), exposure=5, sky=Sky.of_brightness(22.1))
+    assert expect("Vega", "mauvesim", exposure=5) == usual
+    assert expect("Vega", "mauvesim", exposure=5 * u.s, sky=22.1) == usual
 
 
 def test_tables_have_units() -> None:
@@ -134,7 +134,7 @@ def test_tables_have_units() -> None:
     for table, snr_of in ((quiet.table, quiet.snr()), (quiet.element_table, quiet.snr_per_element())):
         assert (table["wavelength"].unit, table["signal"].unit, table["noise"].unit) == (u.nm, u.DN, u.DN)
         np.testing.assert_allclose((table["signal"] / table["noise"]).value, snr_of)
-    mauve = Instrument.load("mauve").table
+    mauve = Instrument.load("mauvesim").table
     assert mauve["effective_area"].unit == u.cm**2
     np.testing.assert_allclose(mauve["effective_area"].value / mauve["throughput"], 122.0)
     star = Source.from_library("G2V").table

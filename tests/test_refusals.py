@@ -91,7 +91,7 @@ def test_each_kind_of_error_has_its_sentence() -> None:
         (lambda: Source.from_library("G2V").at_magnitude(99.0), "magnitude = 99.0, expected -30 to 40 mag"),
         (lambda: Study().with_settings(["run.fap=3"]), "settings: run.fap = 3, expected a number above 0 and below 1"),
         (
-            lambda: Instrument.load("mauve").with_(temprature_c=1),
+            lambda: Instrument.load("mauvesim").with_(temprature_c=1),
             "mauve: unknown key 'temprature_c', did you mean 'temperature_c'?",
         ),
         (lambda: Source.read("none.txt"), "spectrum file 'none.txt' does not exist, expected a file"),

@@ -196,7 +196,7 @@ DIMENSIONLESS = {
     "name", [n for n, f in mauvecl.Instrument.model_fields.items() if f.annotation in (float, int)]
 )
 def test_instruments_take_quantities(name: str) -> None:
-    mauve = mauvecl.Instrument.load("mauve")
+    mauve = mauvecl.Instrument.load("mauvesim")
     value = getattr(mauve, name)
     unit = metadata(mauvecl.Instrument.model_fields[name], "Unit")
     assert unit is not None or name in DIMENSIONLESS
@@ -225,7 +225,7 @@ def test_studies_take_quantities(quantity: str, value: Any, plain: float, key: C
 
 
 def test_quantities_give_the_same_results() -> None:
-    star, mauve = mauvecl.Source.from_library("G2V").at_magnitude(7.4 * u.mag), mauvecl.Instrument.load("mauve")
+    star, mauve = mauvecl.Source.from_library("G2V").at_magnitude(7.4 * u.mag), mauvecl.Instrument.load("mauvesim")
     assert star == mauvecl.Source.from_library("G2V").at_magnitude(7.4)
     assert star.flaring(24 * u.percent, 10 * u.kK) == star.flaring(0.24, 10_000)
     assert mauvecl.expect(star, mauve, exposure=1 * u.min) == mauvecl.expect(star, mauve, exposure=60)
@@ -280,7 +280,7 @@ def test_wrong_fields_of_records_raise(record: type[Record]) -> None:
 
 def test_attributes_cannot_be_set() -> None:
     study = mauvecl.Study()
-    for thing, name in ((study, "star"), (study.run, "fap"), (mauvecl.Instrument.load("mauve"), "light_loss")):
+    for thing, name in ((study, "star"), (study.run, "fap"), (mauvecl.Instrument.load("mauvesim"), "light_loss")):
         with pytest.raises(InputError) as error:
             setattr(thing, name, 1)
         assert error.value.key == name

@@ -156,7 +156,7 @@ def make(folder: Path) -> dict[str, Case]:
 
     (folder / "study.toml").write_text(STUDY)
     cases["study.toml"] = Case("study.toml", ((*EXPOSURE[:1], "study.toml", *EXPOSURE[1:]),))
-    (folder / "own.toml").write_text('extends = "mauve"\nname = "own"\n')
+    (folder / "own.toml").write_text('extends = "mauvesim"\nname = "own"\n')
     star = ("--star", "G2V", "--magnitude", "8")
     cases["own.toml"] = Case("own.toml", ((*EXPOSURE, *star, "--instrument", "own.toml"),))
     (folder / "neighbours.csv").write_text("name,separation,magnitude,type\na,10,9,G2V\nb,20,10,K3V\n")

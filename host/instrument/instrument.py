@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property, partial
@@ -16,7 +17,7 @@ from pydantic_core import PydanticCustomError
 from scipy.special import erf, ndtr
 
 from mauvecl.host.instrument.curves import MAX_PIXELS, Curve, PixelMap, ThroughputErrors
-from mauvecl.host.instrument.paths import instrument_path, shipped_names
+from mauvecl.host.instrument.paths import FORMERLY_MAUVE, instrument_path, shipped_names
 from mauvecl.host.tables.files import read_text, toml
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 
 #: Tags of sources: paper, datasheet, computation, assumption, user.
 TAGS = ("P", "D", "C", "A", "U")
+#: Version of instrument files; files without one are of version 1.
+FILE_VERSION = 2
 #: Largest number of files in a chain in which each extends the next.
 MAX_EXTENDED = 16
 
@@ -56,10 +59,19 @@ def read_values(
     content = toml(read_text(path, "instrument file"), f"instrument file {shortened(str(path))}")
     values: dict[str, Any] = {}
     sources: dict[str, str] = {}
+    version = content.pop("version", None)
+    if version not in (None, FILE_VERSION):
+        raise InputError.of("version", version, f"{FILE_VERSION}, or none in files of version 1", where=path.name)
     if "extends" in content:
-        values, sources = read_values(
-            instrument_path(content.pop("extends"), path.parent), files, (*seen, path.resolve())
-        )
+        extended = content.pop("extends")
+        if version is None and extended == "mauve":
+            extended = FORMERLY_MAUVE
+            warnings.warn(
+                f"{path.name} is read as in version 1, in which mauve was the payload of the paper, now mauvesim; with "
+                f"`version = {FILE_VERSION}` it extends the one that counts electrons.",
+                stacklevel=2,
+            )
+        values, sources = read_values(instrument_path(extended, path.parent), files, (*seen, path.resolve()))
     for name, entry in content.items():
         if name == "sources":
             raise InputError(
@@ -221,9 +233,10 @@ class Instrument(Section):
 
     @classmethod
     def load(cls, name: str | Path) -> Instrument:
-        """Read an embedded instrument ("mauve", "mauve-electrons") or a TOML file.
+        """Read an embedded instrument ("mauve", or "mauvesim" with the conventions of the paper) or a TOML file.
 
-        Paths of curves are relative to the file. With `extends = "mauve"` the file gives only the values that differ.
+        Paths of curves are relative to the file. With `version = 2` and `extends = "mauve"` the file gives only the
+        values that differ.
         """
         # Embedded files do not change during a run; a user's file may.
         return _embedded(name) if name in shipped_names() else _from_file(name)

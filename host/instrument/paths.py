@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import difflib
+import warnings
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
 
 from mauvecl.host.tables.files import is_file
 from mauvecl.schema.errors import InputError, shortened
+
+#: Former names of embedded instruments, with those of version 2 and later.
+FORMER_NAMES = {"mauve-electrons": "mauve"}
+#: What "mauve" meant before version 2.
+FORMERLY_MAUVE = "mauvesim"
 
 
 def shipped_names() -> tuple[str, ...]:
@@ -22,6 +28,9 @@ def instrument_path(name: str | Path, folder: Path) -> Path:
     if not isinstance(name, str | Path):
         raise InputError.of("instrument", name, "a name or the path of a TOML file")
     names = shipped_names()
+    if name in FORMER_NAMES:
+        warnings.warn(f"The instrument {name} is called {FORMER_NAMES[str(name)]} since version 2.", stacklevel=2)
+        name = FORMER_NAMES[str(name)]
     if name in names:
         return _local(resources.files(__package__).joinpath("instruments", f"{name}.toml"))
     path = folder / name

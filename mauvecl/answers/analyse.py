@@ -513,6 +513,19 @@ class AnalyseAnswer(Answer):
         return super().json_tables | {"measured": self.measured}
 
     @property
+    def headline(self) -> str:
+        """The number of detected flares, with the expected false alarms."""
+        verdicts = [row.verdict for row in self.rows]
+        number, others = verdicts.count("detected"), len(verdicts) - verdicts.count("detected")
+        flares = f"{number} flare{' is' if number == 1 else 's are'}" if number else "No flare is"
+        more = f", and {others} more event{'' if others == 1 else 's'} listed" if others else ""
+        expected = self.analysis.wanted * self.analysis.days
+        return (
+            f"{flares} detected in {self.analysis.days:.3g} star-days of {self.analysis.frames.name}, where noise "
+            f"alone gives {expected:.2g}{more}."
+        )
+
+    @property
     def views(self) -> list[View]:
         return [*self._event_views, *super().views]
 

@@ -19,11 +19,12 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, overload
 from mauvecl.host import VERSION
 from mauvecl.host.arrays import ContentEquality
 from mauvecl.host.exposure.star import Neighbour, rate_of
+from mauvecl.host.instrument.paths import shipped_names
 from mauvecl.host.tables.files import check_size, json_text, open_regular, read_text, write_whole, writing
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, Drawable, View, documents_of, percent, records, stacked, table_of
 from mauvecl.schema.errors import InputError
-from mauvecl.study.cases import assumption_line, cases, full_label, place_columns
+from mauvecl.study.cases import assumptions_of, cases, full_label, place_columns
 from mauvecl.study.study import read_embedded_study
 
 if TYPE_CHECKING:
@@ -47,6 +48,32 @@ class InCell:
     def title(self) -> str:
         """Star and swept values, for pictures."""
         return full_label(self.label, self.at)
+
+
+def chance_text(value: float) -> str:
+    """Format a probability, with bounds instead of 0 and 100 %."""
+    if value != value:
+        return "no number"
+    if value > 0.9999:
+        return "> 99.99 %"
+    if value < 0.0001:
+        return "< 0.01 %"
+    shown = 100 * value
+    return f"{shown:.2f} %" if shown < 1 or shown > 99 else f"{shown:.1f} %"
+
+
+def chance_range(low: float, high: float) -> str:
+    """Format an interval of probabilities."""
+    return " to ".join(dict.fromkeys([chance_text(low), chance_text(high)]))
+
+
+def name_of_instrument(study: Study) -> str:
+    """Return the instrument as sentences name it."""
+    return "Mauve" if study.observation.instrument in shipped_names() else Path(study.observation.instrument).stem
+
+
+#: End of a sentence on the ideal answer, which is a bound of the realistic one.
+IF_KNOWN = "if everything but the noise were known"
 
 
 @dataclass(eq=False)
@@ -163,9 +190,19 @@ class Answer(Drawable, ContentEquality, ABC):
         return (*place_columns(self.study.sweep, *(column.name for column in columns)), *columns)
 
     @property
+    def headline(self) -> str:
+        """The answer in one sentence, with its uncertainty; empty if there is none."""
+        return ""
+
+    @property
     def assumed(self) -> str:
         """Line with the study's assumptions about the parts that the answer uses."""
-        return assumption_line(self.study, self.uses)
+        return f"Assumed: {'; '.join(self.premises)}."
+
+    @property
+    def premises(self) -> list[str]:
+        """The study's assumptions about the parts that the answer uses, one clause each."""
+        return assumptions_of(self.study, self.uses)
 
     @property
     def uses(self) -> tuple[Use, ...]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from mauvecl.answers.answer import Answer, TableOf, ecsv_text
 from mauvecl.host.exposure.expectation import expect
 from mauvecl.host.instrument.curves import CALIBRATED, MODE, ThroughputErrors
-from mauvecl.host.instrument.instrument import Instrument
+from mauvecl.host.instrument.instrument import FILE_VERSION, Instrument
 from mauvecl.host.instrument.paths import shipped_names
 from mauvecl.observations.detector import (
     CalibrationFrames,
@@ -219,6 +219,14 @@ class CalibrateAnswer(Answer):
     def tables(self) -> dict[str, Table]:
         """Values, goodness of fit, throughput, dark current, photon transfer, and what the instrument file names."""
         return super().tables | self.instrument_tables
+
+    @property
+    def headline(self) -> str:
+        """The error of the throughput."""
+        return (
+            f"The throughput of {self.nominal.name} is fitted to {len(self.observations)} observations, with a "
+            f"standard error of {100 * float(np.median(self.throughput.error)):.2g} % in the median pixel."
+        )
 
     @property
     def views(self) -> list[View]:
@@ -445,7 +453,7 @@ class CalibrateAnswer(Answer):
 
         given = self.study.observation.instrument
         extends = given if given in shipped_names() else str(Path(given).resolve())
-        values: dict[str, Any] = {"extends": extends, "name": self.name, "notice": self.notice}
+        values: dict[str, Any] = {"version": FILE_VERSION, "extends": extends, "name": self.name, "notice": self.notice}
         values |= {key: {"value": value, "tag": "C", "source": self.source} for key, value in self.changes.items()}
         values |= {"throughput_factor": "throughput-factor.ecsv", "throughput_errors": "throughput-errors.ecsv",
                    "pixel_map": "pixel-map.ecsv"}  # fmt: skip

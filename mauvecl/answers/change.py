@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.answers.answer import Answer, InCell, TableOf, reported
+from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, name_of_instrument, reported
 from mauvecl.host.orbit.visibility import Visibility
 from mauvecl.observations.visits import (
     INDICES,
@@ -27,7 +27,7 @@ from mauvecl.observations.visits import (
     visit_times_d,
 )
 from mauvecl.schema.calls import validated
-from mauvecl.schema.columns import Column, View, number, percent
+from mauvecl.schema.columns import Column, View, formatted, number, percent
 from mauvecl.study.cases import Case, cases, collect_messages
 from mauvecl.study.plan import targets_of
 
@@ -54,6 +54,7 @@ class ChangeRow(InCell):
     error: float
     error_known: float
     smallest: Smallest  # in the unit of the change
+    ideal: float  # smallest difference of one visit if everything but the noise is known
     magnitude: float | None  # of the star
     saturated: tuple[int, int]  # pixels near saturation, and all that the change concerns
 
@@ -119,7 +120,7 @@ def _amount(value: float, unit: str) -> str:
         return ""
     if np.isinf(value):
         return "hidden"
-    return f"{100 * value:.3g} %" if not unit else f"{value:.3g} {unit}"
+    return f"{formatted(100 * value, '.3g')} %" if not unit else f"{value:.3g} {unit}"
 
 
 #: Columns of the table of changes.
@@ -127,13 +128,15 @@ COLUMNS = (
     Column("change", "change.name", "", "what changes", "change", kind=str),
     Column("unit", "change.unit", "", "unit of the change and its errors; empty if relative", kind=str),
     Column("error", "error", "", "standard error of one visit, unknowns marginalised; inf: hidden by them; nan: none",
-           "error of a visit", _amount, ("unit",)),
-    Column("error_known", "error_known", "", "the same with everything known", "all known", _amount, ("unit",)),
+           "error of a visit", _amount, ("unit",), detail=True),
+    Column("error_known", "error_known", "", "the same with everything known", "error, all known", _amount, ("unit",), detail=True),
     Column("smallest", "smallest.one", "", "smallest detected difference of one visit from the others",
            "smallest change", _amount, ("unit",)),
+    Column("smallest_ideal", "ideal", "", "the same if everything but the noise were known", "ideal", _amount,
+           ("unit",)),
     Column("smallest_scatter", "smallest.scatter", "", "smallest detected standard deviation between visits",
-           "smallest scatter", _amount, ("unit",)),
-    Column("meaning", "change.meaning", "", "what a change of one unit is", "of", kind=str),
+           "smallest scatter", _amount, ("unit",), detail=True),
+    Column("meaning", "change.meaning", "", "what a change of one unit is", "of", kind=str, detail=True),
     Column("note", "note", "", "what limits the row: saturated pixels or unknowns", "note", kind=str),
 )  # fmt: skip
 #: Columns of the table of indices.
@@ -143,12 +146,12 @@ INDEX_COLUMNS = (
            "flux", number(".3g")),
     Column("error", "error", "erg / (s cm2)", "standard deviation in one exposure with unknowns of finite spread; inf: "
            "a free unknown changes it", "error", lambda value: "free" if np.isinf(value) else number(".2g")(value)),
-    Column("error_known", "error_known", "erg / (s cm2)", "the same with everything known", "all known",
+    Column("error_known", "error_known", "erg / (s cm2)", "the same with everything known", "ideal",
            number(".2g")),
-    Column("snr", "snr", "", "index over its error with everything known", "S/N, all known", number(".3g")),
+    Column("snr", "snr", "", "index over its error with everything known", "ideal S/N", number(".3g"), detail=True),
     Column("equivalent_width", "value.equivalent_width_nm", "nm", "positive in emission", "EW (nm)", number(".3g")),
     Column("captured", "value.captured", "", "share of a line's flux that the index holds at this resolution",
-           "captured", percent(".0f")),
+           "captured", percent(".0f"), detail=True),
     Column("band_low", lambda row: row.value.index.band_nm[0], "nm", "lower end of the band"),
     Column("band_high", lambda row: row.value.index.band_nm[1], "nm", "upper end"),
     Column("published", "value.index.published", "", "usual definition at higher resolution, with its source",
@@ -165,7 +168,7 @@ PERIOD_COLUMNS = (
     Column("amplitude", lambda row: row.error * row.recovery.amplitudes[:, None], "", "semi-amplitude",
            "semi-amplitude", _amount, ("unit",)),
     Column("amplitude_errors", lambda row: row.recovery.amplitudes[:, None], "",
-           "the same in standard errors of a visit", "in errors", ".3g"),
+           "the same in standard errors of a visit", "in errors", ".3g", detail=True),
     Column("recovered", lambda row: row.shares("value"), "", "share of periods that are recovered", "recovered",
            percent(".0f")),
     Column("recovered_low", lambda row: row.shares("low"), "", "its 95 % interval, lower end"),
@@ -224,6 +227,25 @@ class ChangeAnswer(Answer):
     def many(self) -> int:
         """Number of stars at other magnitudes: all with a magnitude, in every cell of the sweep."""
         return len(self.along) // (MAGNITUDES.size * len(self.study.change.of))
+
+    @property
+    def headline(self) -> str:
+        """The smallest change of the first row that is not hidden."""
+        row = next((row for row in self.changes if np.isfinite(row.smallest.one)), self.changes[0])
+        name, unit, visits = row.change.name, row.change.unit, self.study.change.visits
+        where = (
+            f"{name} of {row.title} between {'two' if visits == 2 else visits} visits of "
+            f"{self.study.observation.exposure_s:g} s"
+        )
+        if not np.isfinite(row.smallest.one):
+            return (
+                f"{name_of_instrument(self.study)} would see no change in {where}: {row.note or 'there is no light'}."
+            )
+        ideal = "" if self.study.nuisances.none else f" ({_amount(row.ideal, unit)} {IF_KNOWN})"
+        return (
+            f"{name_of_instrument(self.study)} would see a change of {_amount(row.smallest.one, unit)}{ideal} in {where} with "
+            f"a chance of {100 * self.study.limit.power:g} %; one visit measures it to {_amount(row.error, unit)}."
+        )
 
     @property
     def views(self) -> list[View]:
@@ -312,8 +334,9 @@ def _changes(case: Case, file: Source | None) -> list[ChangeRow]:
         )
         error, known_error = (error_of_change(change.counts_dn, quiet, unknowns) for unknowns in (unknown, None))
         smallest = Smallest(change.size(error * unit.one), change.size(error * unit.scatter))
+        ideal = change.size(known_error * unit.one)
         lost, own = pixels_of(change.counts_dn, quiet), (change.size(error), change.size(known_error))
-        rows.append(ChangeRow(case.label, case.at, change, *own, smallest, case.star.magnitude, lost))
+        rows.append(ChangeRow(case.label, case.at, change, *own, smallest, ideal, case.star.magnitude, lost))
     return rows
 
 

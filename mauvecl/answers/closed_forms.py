@@ -23,13 +23,14 @@ from mauvecl.detection.names import MIN_IN_TAIL
 from mauvecl.detection.nuisances import Nuisances, join_names
 from mauvecl.detection.statistics import Matched, Setting
 from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, NUISANCES, PROCESSES, ThroughputMode, values_of
-from mauvecl.schema.columns import Column, First
+from mauvecl.schema.columns import Column, First, number
 from mauvecl.schema.errors import InputError, Message
 from mauvecl.study.cases import Case
-from mauvecl.study.nuisances import NuisanceChoice
+from mauvecl.study.nuisances import KNOWN, NuisanceChoice
 
 if TYPE_CHECKING:
     from mauvecl.detection.distributions import Form
+    from mauvecl.detection.statistics import Statistic
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.noise.disturbances import Prior
@@ -85,8 +86,7 @@ def cost_lines(costs: Sequence[Cost], nuisances: NuisanceChoice) -> list[str]:
     if not shown:
         return []
     faintest = min(shown, key=lambda cost: cost.known)
-    named = nuisances != NuisanceChoice()
-    which = spoken(nuisances) if named else f"the usual unknowns ({spoken(_or_documented(nuisances))})"
+    which = spoken(nuisances) if not nuisances.none else f"the usual unknowns ({spoken(_or_documented(nuisances))})"
     others = f", the faintest of {len(shown)}," if len(shown) > 1 else ""
     text = (
         f"What unknowns cost: {faintest.of}{others} has a matched S/N of {faintest.known:.3g} with everything known; "
@@ -98,7 +98,7 @@ def cost_lines(costs: Sequence[Cost], nuisances: NuisanceChoice) -> list[str]:
 
 def marginal_lines(nuisances: NuisanceChoice) -> list[str]:
     """Return a sentence on what statistics are marginalised over and which unknowns are drawn, or none."""
-    if nuisances == NuisanceChoice():
+    if nuisances.none:
         return []
     texts = [PROCESSES[row.process].drawn for row in DOCUMENTED_NUISANCES]
     drawn = f"; drawn: {'; '.join(texts)}" if nuisances.usual else ""
@@ -121,7 +121,39 @@ def _size(sd: float | str, unit: str) -> str:
 
 
 def _or_documented(nuisances: NuisanceChoice) -> NuisanceChoice:
-    return nuisances if nuisances != NuisanceChoice() else NuisanceChoice(usual=True)
+    return NuisanceChoice() if nuisances.none else nuisances
+
+
+#: Column of the answer with everything but the noise known, the bound of the realistic answer next to it.
+IDEAL = Column(
+    "ideal",
+    description="detection probability if everything but the noise were known, for Gaussian noise",
+    heading="ideal",
+    format=number(".4f"),
+)
+
+
+def ideal_chances(
+    case: Case, flares: Sequence[Expectation], statistics: Sequence[Statistic]
+) -> NDArray[np.float64] | None:
+    """Return the closed-form chances of flares if everything but the noise is known, or None if it is.
+
+    Returns
+    -------
+    ndarray or None, shape (n_flare, n_statistic)
+        NaN where the star or the flare saturates every pixel.
+    """
+    study = case.study
+    if study.nuisances.none:
+        return None
+    setting = case.with_sections(nuisances=KNOWN).setting(case.quiet, *flares)
+
+    def chance(statistic: Statistic, flare: Expectation) -> float:
+        if not setting.used.any() or flare.saturated[setting.used].all():
+            return float("nan")
+        return statistic.detection_forms(setting, flare, study.run.fap).probability
+
+    return np.array([[chance(statistic, flare) for statistic in statistics] for flare in flares])
 
 
 #: Kind of the message.
@@ -136,7 +168,7 @@ def chance_with_unknowns(prepared: Sequence[Case]) -> list[str]:
     The flare is the one whose chance is nearest to one half; others are detected, or missed, either way.
     """
     study = prepared[0].study
-    if study.nuisances != NuisanceChoice() or study.run.comparison().estimated:
+    if not study.nuisances.none or study.run.comparison().estimated:
         return []
     flares = [(case, flare) for case in prepared for flare in range(len(case.amplitudes))][:MAX_FLARES]
     chances = {item: chance for item in flares if (chance := _chance(*item)) is not None}
@@ -145,7 +177,7 @@ def chance_with_unknowns(prepared: Sequence[Case]) -> list[str]:
     case, flare = min(chances, key=lambda item: abs(chances[item] - 0.5))
     of = f"{case.label}, flare of {100 * case.amplitudes[flare]:g} %"
     try:
-        unknown = _chance(case.with_sections(nuisances=NuisanceChoice(usual=True)), flare)
+        unknown = _chance(case.with_sections(nuisances=NuisanceChoice()), flare)
     except InputError as error:
         # Too few pixels are left.
         return [Message(f"The usual unknowns cannot be taken into account for {of}: {error}.", BOTH_CHANCES)]
@@ -154,7 +186,7 @@ def chance_with_unknowns(prepared: Sequence[Case]) -> list[str]:
     text = (
         f"Everything but the noise is taken as known: {of} is then detected by the matched statistic with a chance of "
         f"{100 * chances[case, flare]:.1f} %, with the usual unknowns of {100 * unknown:.1f} % (closed forms; "
-        f"`nuisances.usual` draws them). These are {spoken(NuisanceChoice(usual=True))}."
+        f"`nuisances.usual` draws them). These are {spoken(NuisanceChoice())}."
     )
     return [Message(text, BOTH_CHANCES)]
 

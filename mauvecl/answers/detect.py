@@ -11,8 +11,28 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl.answers.answer import Answer, InCell, TableOf, realisations_of, reported, share_columns
-from mauvecl.answers.closed_forms import Cost, chance_with_unknowns, cost_lines, marginal_lines, spoken, unknown_cost
+from mauvecl.answers.answer import (
+    IF_KNOWN,
+    Answer,
+    InCell,
+    TableOf,
+    chance_range,
+    chance_text,
+    name_of_instrument,
+    realisations_of,
+    reported,
+    share_columns,
+)
+from mauvecl.answers.closed_forms import (
+    IDEAL,
+    Cost,
+    chance_with_unknowns,
+    cost_lines,
+    ideal_chances,
+    marginal_lines,
+    spoken,
+    unknown_cost,
+)
 from mauvecl.detection.detection import (
     AREA_COLUMNS,
     COLUMNS,
@@ -26,7 +46,7 @@ from mauvecl.detection.detection import (
     reconstruct,
 )
 from mauvecl.detection.distributions import QuadraticForm
-from mauvecl.detection.names import check_fap, countable
+from mauvecl.detection.names import RECOMMENDED, check_fap, countable
 from mauvecl.detection.statistics import Linear, Matched, Setting, read_weights
 from mauvecl.detection.tails import campaign, per_test
 from mauvecl.device.engine import Engine
@@ -39,6 +59,8 @@ from mauvecl.study.nuisances import NuisanceChoice
 from mauvecl.study.study import PAPER_STARS, Study
 
 if TYPE_CHECKING:
+    from astropy.table import QTable
+
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.study.questions import CampaignQuestion
 
@@ -52,6 +74,8 @@ class StarDetection(InCell):
 
     amplitudes: tuple[float, ...]
     detection: Detection
+    #: Closed-form chances if everything but the noise were known, shape (n_flare, n_statistic); None if it is known.
+    ideal: NDArray[np.float64] | None = None
 
     @property
     def shown(self) -> tuple[str, Detection, list[str]]:
@@ -64,7 +88,20 @@ def _detection_columns(answer: DetectAnswer) -> tuple[Column, ...]:
         lambda star: np.repeat(star.amplitudes, len(star.detection.statistics)),
         f"relative rise of the photons in the band {answer.study.flare.band}",
     )
-    return (*share_columns(answer.study, "detection.quiet.target_share"), amplitude, *COLUMNS[1:])
+    columns = [*share_columns(answer.study, "detection.quiet.target_share"), amplitude]
+    for column in COLUMNS[1:]:
+        columns += [column, IDEAL] if column.name == "high" and not answer.study.nuisances.none else [column]
+    return tuple(columns)
+
+
+def _rows_of(star: StarDetection, fap: float) -> QTable:
+    """Return the table of a star's detection with the ideal probabilities, if it has any."""
+    table = star.detection.table(fap)[[column.name for column in COLUMNS[1:]]]
+    if star.ideal is not None:
+        after = table.colnames.index("high") + 1
+        table.add_column(star.ideal.ravel(), name=IDEAL.name, index=after)
+        table[IDEAL.name].info.description = IDEAL.description
+    return table
 
 
 #: Columns of a statistic and of the flare that it looks at, before those of its curve or its extremes.
@@ -86,7 +123,7 @@ class DetectAnswer(Answer):
     #: One row per star, cell, flare and statistic.
     table = TableOf(
         "detection", _detection_columns, "stars", place=True, key="rows",
-        of=lambda answer, star: star.detection.table(answer.study.run.fap)[[column.name for column in COLUMNS[1:]]],
+        of=lambda answer, star: _rows_of(star, answer.study.run.fap),
     )  # fmt: skip
     #: One row per star, cell and statistic, and per flare for shaped statistics; see `Departure`. The table is empty if
     #: thresholds are not counted.
@@ -104,6 +141,27 @@ class DetectAnswer(Answer):
     #: so that each distribution has fewer than its 1000.
     tails = TableOf("tails", (*FLARE_COLUMNS, TEMPLATE_COLUMN), "_extremes", of=lambda _, row: row["tail"], place=True,
                     about=lambda answer: {"seed": answer.study.run.seed})  # fmt: skip
+
+    @property
+    def headline(self) -> str:
+        """The chance of the flare whose detection is least certain, by the recommended statistic if it is computed."""
+        statistics = self.stars[0].detection.statistics
+        statistic = RECOMMENDED if RECOMMENDED in statistics else statistics[0]
+        rows = self.table[self.table["statistic"] == statistic]
+        chances = np.asarray(rows["probability"])
+        if not np.isfinite(chances).any():
+            return f"{name_of_instrument(self.study)} would see none of these flares: every pixel saturates."
+        place = int(np.nanargmin(np.abs(chances - 0.5)))
+        row, star = rows[place], self.stars[place // len(self.stars[0].amplitudes)]
+        ideal = f"; {chance_text(row['ideal'])} {IF_KNOWN}" if "ideal" in rows.colnames else ""
+        least = f", the least certain of {len(rows)} flares" if len(rows) > 1 else ""
+        saturated, every = int(star.detection.quiet.saturated.sum()), star.detection.quiet.saturated.size
+        without = f", without the {saturated} of {every} pixels that saturate" if saturated else ""
+        return (
+            f"{name_of_instrument(self.study)} would see a flare of {100 * row['amplitude']:g} % on {star.title} in "
+            f"{star.detection.quiet.exposure_s:g} s with a chance of {chance_text(row['probability'])} "
+            f"({chance_range(row['low'], row['high'])}{ideal}){without}{least}."
+        )
 
     @property
     def views(self) -> list[View]:
@@ -195,7 +253,10 @@ def detect(
         own = [read_weights(name, path, case.quiet.wavelength_nm) for name, path in run.weights.items()]
         how = case.detect_options() | {"statistics": (*run.statistics, *own, *_other_templates(case))}
         detection = engine.detect(case.quiet, case.flares, seed=run.seed, **how)
-        return StarDetection(case.label, case.at, case.amplitudes, detection)
+        statistics = [detection.statistic(name) for name in detection.statistics]
+        return StarDetection(
+            case.label, case.at, case.amplitudes, detection, ideal_chances(case, case.flares, statistics)
+        )
 
     if isinstance(engine, Pool):
         engine.expect(len(prepared) * run.realisations)
@@ -347,11 +408,11 @@ def _paper(prepared: Sequence[Case]) -> list[str]:
 SHOWN: dict[str, NuisanceChoice] = {
     spoken(choice): choice
     for choice in (
-        NuisanceChoice(dark=0.1),
-        NuisanceChoice(light=0.01),
-        NuisanceChoice(dark="free", light="free"),
-        NuisanceChoice(sky=0.1),
-        NuisanceChoice(tilt=0.01),
+        NuisanceChoice(usual=False, dark=0.1),
+        NuisanceChoice(usual=False, light=0.01),
+        NuisanceChoice(usual=False, dark="free", light="free"),
+        NuisanceChoice(usual=False, sky=0.1),
+        NuisanceChoice(usual=False, tilt=0.01),
     )
 }
 

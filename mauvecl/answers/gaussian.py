@@ -175,6 +175,18 @@ class GaussianAnswer(Answer):
     thresholds = TableOf("thresholds", (), "detection.departures")
 
     @property
+    def headline(self) -> str:
+        """The largest errors of the formula."""
+        cells = self.cells
+        snr = float(np.abs(cells["snr_off_by"]).max())
+        ratios = np.asarray(cells["fap_ratio"])
+        worst = float(ratios[np.argmax(np.abs(np.log(np.maximum(ratios, SMALLEST_RATIO))))])
+        return (
+            f"The root-of-N formula is off by at most {snr:.2g} in S/N, and its false alarms are up to {worst:.3g} "
+            f"times as many as promised, in {len(cells)} case{'' if len(cells) == 1 else 's'}."
+        )
+
+    @property
     def messages(self) -> list[str]:
         return self.detection.messages
 
@@ -239,11 +251,12 @@ def gaussian(
     ----------
     study : Study
         Without a sweep: magnitudes from 4 to 12 and exposures of 5, 50 and 600 s, unless it states the magnitudes of
-        its stars, or another exposure than the default.
+        its stars, or another exposure than the default. Its usual unknowns are left out: the question is about the
+        noise.
     progress : callable, optional
         Called as ``progress(done, total)`` in stars, each of which is drawn for its S/N and then for its flares.
     """
-    engine = engine or Engine()
+    engine, study = engine or Engine(), study.ideal()
     stated = study.star != PAPER_STARS and all(star.magnitude is not None for star in study.star)
     if not study.sweep.axes and not stated:
         own = study.observation.exposure_s

@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.answers.answer import Answer, InCell, TableOf, share_columns
+from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, name_of_instrument, share_columns
 from mauvecl.detection.distributions import Interval
 from mauvecl.device.engine import Stares
 from mauvecl.flares.frames import STEADY, Components
@@ -172,7 +172,7 @@ def limit_columns(of: str) -> tuple[Column, ...]:
         columns += [
             Column(name, "value", unit, f"{of} at which the completeness is {power:g}", name.upper(), size).of(limit),
             Column(f"{name}_low", "low", unit, "its 95 % interval, lower end", INTERVAL, ends,
-                   (f"{name}_high",)).of(limit),
+                   (f"{name}_high",), detail=power != 0.5).of(limit),
             Column(f"{name}_high", "high", unit, "its 95 % interval, upper end").of(limit),
         ]  # fmt: skip
     return (
@@ -180,7 +180,16 @@ def limit_columns(of: str) -> tuple[Column, ...]:
                number(".4g", "all")),
         *columns,
         Column("never", "", "", "share of flares for which no template fits into what is observed", "no template fits",
-               percent(".3g")),
+               percent(".3g"), detail=True),
+    )  # fmt: skip
+
+
+def ideal_column(of: str) -> Column:
+    """Return the column of the ideal limit of a kind of size."""
+    return Column(
+        "e50_ideal", lambda row: row["e50"].value * row["share"], SIZE_UNITS[of],
+        "E50 if everything but the noise were known: E50 times the ratio of the S/N of a frame", "ideal E50",
+        percent(".4g") if of == "amplitude" else ".4g",
     )  # fmt: skip
 
 
@@ -205,16 +214,16 @@ SEARCH_COLUMNS = (
            ("threshold_high",)),
     Column("threshold_high", "threshold.high", "", "its 95 % interval, upper end"),
     Column("checked_at", "checked", "", "S/N at which drawn stares are held against normal noise",
-           "alarms a day above", ".2f"),
-    Column("alarms_sampled", "asked", "", "false alarms per star-day there, normal noise", "sampled", ".3g"),
-    Column("alarms_simulated", "simulated.value", "", "false alarms per star-day there, drawn stares", "drawn", ".3g"),
+           "alarms a day above", ".2f", detail=True),
+    Column("alarms_sampled", "asked", "", "false alarms per star-day there, normal noise", "sampled", ".3g", detail=True),
+    Column("alarms_simulated", "simulated.value", "", "false alarms per star-day there, drawn stares", "drawn", ".3g", detail=True),
     Column("alarms_low", "simulated.low", "", "lower end: 4 standard errors"),
     Column("alarms_high", "simulated.high", "", "upper end: 4 standard errors"),
     Column("alarmed", "", "", "drawn stares with a false alarm at the threshold"),
     Column("alarmed_expected", "expected", "", "how many should have one"),
     Column("in_a_row", "", "", "false alarms per star-day of the common rule, white noise"),
     Column("templates", "surveyed.survey.search.n_filters", "", "templates of the bank", "templates"),
-    Column("sums", "surveyed.survey.components.n_statistics", "", "weighted sums of a frame", "sums of a frame"),
+    Column("sums", "surveyed.survey.components.n_statistics", "", "weighted sums of a frame", "sums of a frame", detail=True),
     Column("spectral_loss", lambda row: float(row.surveyed.templates.loss.max()), "",
            "largest share of S/N lost because only these sums are searched"),
     Column("star_days", lambda row: row.surveyed.survey.stare.observed_s / DAY_S, "", "star-days of a stare"),
@@ -239,16 +248,20 @@ class StarCompleteness(InCell):
     in_a_row: float  # false alarms per star-day of the conventional rule in white noise
     injected: InjectedCompleteness
     fitted: FitAccuracy | None
+    # Size that is found if everything but the noise is known, over the size that is found: the inverse ratio of the S/N
+    # of a frame; NaN if everything is known.
+    ideal_share: float
 
     @property
     def limits(self) -> QTable:
         """Sizes of which 50 % and 90 % are found, for all half-widths together and for each."""
         rows = [
-            {"half_width": half_width, "never": self.injected.never(k)}
+            {"half_width": half_width, "never": self.injected.never(k), "share": self.ideal_share}
             | {name: self.injected.limit(power, k) for name, power in POWERS.items()}
             for k, half_width in ((None, np.nan), *enumerate(self.injected.half_widths_s))
         ]
-        return table_of(limit_columns(self.sizes.of), rows)
+        ideal = () if np.isnan(self.ideal_share) else (ideal_column(self.sizes.of),)
+        return table_of((*limit_columns(self.sizes.of), *ideal), rows)
 
     @property
     def cells(self) -> QTable:
@@ -318,12 +331,30 @@ class InjectAnswer(Answer):
     search = TableOf("search", lambda answer: (*_share(answer), *SEARCH_COLUMNS), "stars", place=True, about=_search_of)
 
     @property
+    def headline(self) -> str:
+        """The size of which half of the flares of the first star are found."""
+        star = self.stars[0]
+        unit, half = SIZE_UNITS[star.sizes.of], star.injected.limit(POWERS["e50"], None)
+        scale, unit = (100, "%") if star.sizes.of == "amplitude" else (1, unit)
+        of = star.sizes.of.replace("_", " ")
+        ideal = "" if np.isnan(star.ideal_share) else f"; {scale * half.value * star.ideal_share:.3g} {IF_KNOWN}"
+        least = f", the first of {len(self.stars)} cases" if len(self.stars) > 1 else ""
+        if not np.isfinite(half.value):
+            return f"Fewer than half of the injected flares on {star.title} are found at any {of}{least}."
+        return (
+            f"A search of {name_of_instrument(self.study)}'s frames of {star.title} would find half of the flares of "
+            f"{of} {scale * half.value:.3g} {unit} ({scale * half.low:.3g} to {scale * half.high:.3g}{ideal}), "
+            f"with {self.study.search.rate_text}{least}."
+        )
+
+    @property
     def views(self) -> list[View]:
         views = [InjectAnswer.search.view(self, f"The search: {self.study.search.rate_text} of frames")]
         for star in self.stars:
             unit = f" ({SIZE_UNITS[star.sizes.of]})" if SIZE_UNITS[star.sizes.of] else ""
             title = f"{star.title}: {star.sizes.of}{unit} of which a half (E50) and nine tenths (E90) are found"
-            views.append(View(title, limit_columns(star.sizes.of), star.limits))
+            ideal = () if np.isnan(star.ideal_share) else (ideal_column(star.sizes.of),)
+            views.append(View(title, (*limit_columns(star.sizes.of), *ideal), star.limits))
         return views
 
     @property
@@ -421,7 +452,19 @@ def _completeness(case: Case, engine: Stares | Pool, report: Callable[[float], N
             injections.half_widths_s, values, amplitudes, sizes.of_amplitude(critical, widths[:, None, None])
         ),
         FitAccuracy.of(parts) if refit.count else None,
+        _ideal_share(case, star),
     )
+
+
+def _ideal_share(case: Case, star: StarSurvey) -> float:
+    """Return the S/N of a frame over that with everything but the noise known, or NaN if it is known."""
+    if not case.study.nuisances.usual and not case.stare.jitters:
+        return float("nan")
+    frame = case.one_frame
+    own = frame.flare_electrons((case.study.flare.temperature_k,))[0] * star.quiet.gain_dn_per_electron
+    used = ~star.quiet.saturated
+    known = float(np.sqrt(np.sum(own[used] ** 2 / star.quiet.unsaturated_variance_dn2[used])))
+    return star.unit_snr / known if known > 0 else float("nan")
 
 
 def _threshold(case: Case, survey: Survey, engine: Stares | Pool) -> tuple[CountedRate | None, SampledRate, Interval]:

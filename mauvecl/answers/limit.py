@@ -9,17 +9,19 @@ from operator import attrgetter
 from threading import Lock
 from typing import TYPE_CHECKING, Any
 
-from mauvecl.answers.answer import Answer, TableOf, share_columns
+import numpy as np
+
+from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf, name_of_instrument, share_columns
 from mauvecl.answers.closed_forms import Cost, cost_lines, describe_shares, draw_columns, marginal_lines, unknown_cost
 from mauvecl.answers.limit_search import LimitSearch, MarginalLimitSearch, Point, Unknown, settle, single_flares
 from mauvecl.detection.distributions import Interval
-from mauvecl.detection.names import check_fap
+from mauvecl.detection.names import RECOMMENDED, check_fap
 from mauvecl.device.engine import Engine
 from mauvecl.noise.disturbances import Uniform
 from mauvecl.noise.unknowns import values_of
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import validated
-from mauvecl.schema.columns import INTERVAL, Column, View, interval, table_of
+from mauvecl.schema.columns import INTERVAL, Column, View, interval, number, table_of
 from mauvecl.schema.errors import InputError, Message, of_kind
 from mauvecl.study.cases import (
     SATURATED,
@@ -27,11 +29,13 @@ from mauvecl.study.cases import (
     amplitude_column,
     cases,
     collect_messages,
+    full_label,
     place_columns,
     star_column,
     star_label,
     worst_first,
 )
+from mauvecl.study.nuisances import KNOWN
 from mauvecl.study.questions import QUANTITIES, UNITS
 from mauvecl.study.sections import Unknowns
 from mauvecl.study.study import Study
@@ -157,6 +161,7 @@ class Limit:
     power: float
     value: Interval  # limit with its 95 % interval, including that of the threshold
     closed_form: float  # limit for Gaussian noise
+    ideal: float  # the same if everything but the noise were known; NaN if it is, or if there is none
     check: Point  # detection probability at the value, simulated again with another seed
     points: tuple[Point, ...]  # simulations of the search
     curve: tuple[tuple[float, float], ...]  # the closed form around the limit
@@ -178,8 +183,8 @@ class Limit:
         """Verdict of the second simulation on the limit.
 
         It is "confirms it" if its interval contains the power, "exceeds it" if exposures of whole frames have more
-        power, and "DIFFERS" if the interval misses the power by more than its width. It is empty in between, which
-        happens by chance for one limit in six.
+        power, "DIFFERS" if the interval misses the power by more than its width, and "misses it narrowly" in between,
+        which happens by chance for one limit in six.
         """
         p = self.check.probability
         if self.agrees:
@@ -187,11 +192,17 @@ class Limit:
         if self.of == "exposure" and p.low > self.power:
             return "exceeds it"
         away = max(p.low - self.power, self.power - p.high)
-        return "DIFFERS" if away > p.high - p.low else ""
+        return "DIFFERS" if away > p.high - p.low else "misses it narrowly"
 
 
+#: Words before a limit in a sentence, and how it is said, by quantity.
+SPOKEN: dict[str, tuple[str, Callable[[float], str]]] = {
+    "magnitude": ("down to a magnitude of", lambda value: f"{value:.2f}"),
+    "amplitude": ("from an amplitude of", lambda value: f"{100 * value:.3g} %"),
+    "exposure": ("in", lambda value: f"{value:g} s"),
+}
 #: Formats of limits by quantity.
-DIGITS = {"magnitude": ".3f", "amplitude": ".4g", "exposure": ".0f"}
+DIGITS = {"magnitude": ".2f", "amplitude": ".4g", "exposure": ".0f"}
 STATISTIC_COLUMN = Column("statistic", description="detection statistic", heading="statistic")
 CHECK = "detection probability there, with a fresh seed"
 
@@ -199,6 +210,8 @@ CHECK = "detection probability there, with a fresh seed"
 def _limit_columns(answer: LimitAnswer) -> tuple[Column, ...]:
     of, digits, unit = answer.study.limit.of, DIGITS[answer.study.limit.of], UNITS.get(answer.study.limit.of, "")
     unknown = _unknown_columns(digits) if answer.study.unknowns.draws else ()
+    known = "the same for Gaussian noise if everything but the noise were known"
+    ideal = () if answer.study.nuisances.none else (Column("ideal", "", unit, known, "ideal", number(digits)),)
     return (
         *answer.flare_columns,
         *share_columns(answer.study, "quiet.target_share"),
@@ -207,10 +220,11 @@ def _limit_columns(answer: LimitAnswer) -> tuple[Column, ...]:
         Column("low", "value.low", unit, "its 95 % interval, lower end, with the threshold's own", INTERVAL,
                interval(digits), ("high",)),
         Column("high", "value.high", unit, "its 95 % interval, upper end, with the threshold's own"),
-        Column("closed_form", "", unit, "the same for Gaussian noise", "closed form", digits),
-        Column("check", "check.probability.value", "", CHECK, "detected there, simulated again", ".4f"),
+        *ideal,
+        Column("closed_form", "", unit, "the same for Gaussian noise", "closed form", digits, detail=True),
+        Column("check", "check.probability.value", "", CHECK, "detected there, simulated again", ".4f", detail=True),
         Column("check_low", "check.probability.low", "", f"{CHECK}; 95 % interval, lower end", INTERVAL,
-               interval(".4f"), ("check_high",)),
+               interval(".4f"), ("check_high",), detail=True),
         Column("check_high", "check.probability.high", "", f"{CHECK}; 95 % interval, higher end"),
         *unknown,
     )  # fmt: skip
@@ -269,6 +283,22 @@ class LimitAnswer(Answer):
     def flare_columns(self) -> tuple[Column, ...]:
         """Columns of flare and statistic."""
         return (*(() if self.study.limit.of == "amplitude" else (amplitude_column(),)), STATISTIC_COLUMN)
+
+    @property
+    def headline(self) -> str:
+        """The limit of the first star and flare, by the recommended statistic if it is computed."""
+        asked = self.study.limit
+        limit = next((limit for limit in self.limits if limit.statistic == RECOMMENDED), self.limits[0])
+        before, number = SPOKEN[asked.of]
+        flare = "flares" if asked.of == "amplitude" else f"a flare of {100 * limit.amplitude:g} %"
+        within = "" if asked.of == "exposure" else f" in {self.study.observation.exposure_s:g} s"
+        ideal = "" if np.isnan(limit.ideal) else f"; {number(limit.ideal)} {IF_KNOWN}"
+        least = f", the first of {len(self.limits)} limits" if len(self.limits) > 1 else ""
+        return (
+            f"{name_of_instrument(self.study)} would see {flare} on {full_label(limit.star, limit.at)}{within} with a "
+            f"chance of {100 * asked.power:g} % {before} {number(limit.value.value)} "
+            f"({number(limit.value.low)} to {number(limit.value.high)}{ideal}){least}."
+        )
 
     @property
     def views(self) -> list[View]:
@@ -345,6 +375,7 @@ def solve(case: Case, statistic: str, engine: Engine | Pool, report: Callable[[i
         power=question.power,
         value=value,
         closed_form=theory,
+        ideal=_ideal(case, statistic, theory),
         check=check,
         points=simulated,
         curve=question.curve(value.value),
@@ -354,6 +385,16 @@ def solve(case: Case, statistic: str, engine: Engine | Pool, report: Callable[[i
         quiet=quiet,
         cost=unknown_cost(where, quiet, flare, study.nuisances, study.run.comparison()),
     )
+
+
+def _ideal(case: Case, statistic: str, near: float) -> float:
+    """Return the closed-form limit if everything but the noise is known; NaN if it is, or if there is no limit."""
+    if case.study.nuisances.none:
+        return float("nan")
+    try:
+        return LimitSearch(case.with_sections(nuisances=KNOWN), statistic).root(near=near)
+    except InputError:
+        return float("nan")
 
 
 @validated

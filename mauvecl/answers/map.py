@@ -9,18 +9,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.answers.answer import Answer, TableOf
+from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf, name_of_instrument
 from mauvecl.answers.closed_forms import (
+    IDEAL,
     average,
     cost_lines,
     describe_shares,
     drawn,
+    ideal_chances,
     marginal_lines,
     shares,
     unknown_cost,
 )
 from mauvecl.detection.distributions import Interval
-from mauvecl.detection.names import check_fap
+from mauvecl.detection.names import RECOMMENDED, check_fap
 from mauvecl.device.engine import Engine
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import validated
@@ -29,14 +31,13 @@ from mauvecl.schema.errors import Message, of_kind
 from mauvecl.study.cases import (
     SATURATED,
     Case,
-    assumption_line,
+    assumptions_of,
     cases,
     collect_messages,
     quantity_column,
     star_label,
     worst_first,
 )
-from mauvecl.study.nuisances import NuisanceChoice
 from mauvecl.study.questions import QUANTITIES
 from mauvecl.study.study import Study
 
@@ -57,6 +58,8 @@ COLUMNS = (
     Column("high", description="its 95 % interval, upper end, with the threshold's own"),
     Column("closed_form", description="the same for Gaussian noise"),
 )
+#: Arrays of the answer: chances, those with everything known, and both ends of the interval.
+NUMBERS = ("probability", "low", "high", "closed_form", "ideal")
 
 
 def _cell_columns(answer: MapAnswer) -> tuple[Column, ...]:
@@ -65,6 +68,7 @@ def _cell_columns(answer: MapAnswer) -> tuple[Column, ...]:
         quantity_column(x, lambda answer: np.array(answer.x)),
         quantity_column(y, lambda answer: np.array(answer.y)[:, None]),
         *COLUMNS,
+        *(() if answer.study.nuisances.none else (IDEAL,)),
     )
 
 
@@ -94,6 +98,7 @@ class MapAnswer(Answer):
     low: NDArray[np.float64]
     high: NDArray[np.float64]
     closed_form: NDArray[np.float64]  # probability for Gaussian noise
+    ideal: NDArray[np.float64]  # the same if everything but the noise were known; NaN if it is
     messages: list[str]
     # For maps averaged over unknowns, by statistic: the share of the variance of the mean probability that each unknown
     # explains, largest first.
@@ -102,6 +107,22 @@ class MapAnswer(Answer):
 
     #: One row per cell and statistic.
     table = TableOf("map", _cell_columns, lambda answer: answer, about=_run_of)
+
+    @property
+    def headline(self) -> str:
+        """The share of the map in which a flare is rather seen than not, by the recommended statistic if computed."""
+        statistic = RECOMMENDED if RECOMMENDED in self.statistics else self.statistics[0]
+        number = self.statistics.index(statistic)
+        cells = self.probability[number].size
+
+        def seen(chances: NDArray[np.float64]) -> int:
+            return int(np.count_nonzero(chances[number] >= 0.5))
+
+        ideal = "" if self.study.nuisances.none else f" ({seen(self.ideal)} {IF_KNOWN})"
+        return (
+            f"{name_of_instrument(self.study)} would see a flare on {self.star} with a chance of at least 50 % in "
+            f"{seen(self.probability)} of {cells} cells of the map{ideal}."
+        )
 
     @property
     def views(self) -> list[View]:
@@ -117,18 +138,24 @@ class MapAnswer(Answer):
             *(Column(f"x{k}", heading=_shown(x), format=lambda p: f"{100 * p:.0f}") for k, x in enumerate(self.x)),
         ]
         maps = []
-        for statistic, probability in zip(self.statistics, self.probability, strict=True):
-            rows = [
-                {"y": y} | {f"x{k}": p for k, p in enumerate(row)} for y, row in zip(self.y, probability, strict=True)
-            ]
-            title = f"{self.star}: detection probability in percent, {statistic}, fap {self.study.run.fap:g} per test"
-            maps.append(View(title, columns, table_of(columns, rows)))
+        kinds = {"": self.probability} | ({} if self.study.nuisances.none else {", ideal": self.ideal})
+        for number, statistic in enumerate(self.statistics):
+            for kind, chances in kinds.items():
+                rows = [
+                    {"y": y} | {f"x{k}": p for k, p in enumerate(row)}
+                    for y, row in zip(self.y, chances[number], strict=True)
+                ]
+                title = (
+                    f"{self.star}: detection probability in percent, {statistic}{kind}, fap {self.study.run.fap:g} "
+                    "per test"
+                )
+                maps.append(View(title, columns, table_of(columns, rows)))
         return [*lines, *maps]
 
     @property
-    def assumed(self) -> str:
-        """One line with the study's assumptions apart from the two quantities of the map."""
-        return assumption_line(self.study, self.uses, (self.study.map.x.quantity, self.study.map.y.quantity))
+    def premises(self) -> list[str]:
+        """The study's assumptions apart from the two quantities of the map."""
+        return assumptions_of(self.study, self.uses, (self.study.map.x.quantity, self.study.map.y.quantity))
 
     @property
     def inputs(self) -> list[Expectation]:
@@ -235,7 +262,7 @@ def _without_threshold(run: Run, values: Arrays) -> list[str]:
 
 def _wrong_sign(case: Case, lowered: set[Lowered], cells: int) -> list[str]:
     """Return a sentence for each weighted sum on the cells whose flare lowers it, if any."""
-    how = "marginalised over unknowns, " if case.study.nuisances != NuisanceChoice() else ""
+    how = "marginalised over unknowns, " if not case.study.nuisances.none else ""
     return [
         Message(
             f"WRONG SIGN: {how}{statistic} falls with the flare in {number} of {cells} cells, and only higher values "
@@ -264,7 +291,7 @@ class Cells:
     def map_of(self, case: Case) -> Arrays:
         """Compute the map on the instrument of a case."""
         shape = (len(case.study.run.statistics), len(self.y), len(self.x))
-        values = {name: np.full(shape, np.nan) for name in ("probability", "low", "high", "closed_form")}
+        values = {name: np.full(shape, np.nan) for name in NUMBERS}
 
         def filled(cells: list[tuple[int, int]]) -> tuple[Expectation, int, list[str]]:
             group = [_cell(case, self.x[i], self.y[j]) for i, j in cells]
@@ -284,7 +311,9 @@ class Cells:
 
 def _averaged(maps: list[Arrays]) -> Arrays:
     """Return the mean over draws of the unknown, with its interval; NaN if a draw has none."""
-    values = {name: np.mean([cells[name] for cells in maps], axis=0) for name in ("probability", "closed_form")}
+    values = {
+        name: np.mean([cells[name] for cells in maps], axis=0) for name in ("probability", "closed_form", "ideal")
+    }
     values |= {name: np.full_like(values["probability"], np.nan) for name in ("low", "high")}
     for at in zip(*np.nonzero(np.isfinite(values["probability"])), strict=True):
         p = average([Interval(*(float(cells[name][at]) for name in ("probability", "low", "high"))) for cells in maps])
@@ -317,12 +346,15 @@ def _fill(
     """Compute cells that share the quiescent star of a case, and return the weighted sums that their flares lower."""
     run, lowered = case.study.run, []
     result = engine.detect(case.quiet, flares, seed=run.seed, **case.detect_options())
+    ideal = ideal_chances(case, flares, [result.statistic(name) for name in run.statistics])
     for s, statistic in enumerate(run.statistics):
         probabilities = result.detection_probability(run.fap, statistic)
         for k, ((i, j), p) in enumerate(zip(cells, probabilities, strict=True)):
             at = (s, j, i)
             values["probability"][at], values["low"][at], values["high"][at] = p.value, p.low, p.high
             limit = result.closed_form(statistic, template=k).isf(run.fap)
+            if ideal is not None:
+                values["ideal"][at] = ideal[k, s]
             if k not in result.blinding:
                 values["closed_form"][at] = result.closed_form(statistic, k).sf(limit)
             if result.fall(statistic, k):

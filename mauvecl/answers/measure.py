@@ -13,7 +13,7 @@ import scipy
 from astropy.table import QTable
 from numpy.typing import NDArray
 
-from mauvecl.answers.answer import Answer, TableOf, reported
+from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf, name_of_instrument, reported
 from mauvecl.answers.measurements import (
     JOINT_COLUMNS,
     ExpectedMeasurement,
@@ -112,7 +112,7 @@ def _coverage_columns(level: float, suffix: str, whose: str, heading: str = "") 
     name = f"coverage_{100 * level:.0f}{suffix}"
     text = f"share of {100 * level:.0f} % intervals that hold the truth, {whose}"
     return [
-        Column(name, lambda row: row.coverages[name][0], "", text, heading, percent(".1f")),
+        Column(name, lambda row: row.coverages[name][0], "", text, heading, percent(".1f"), detail=bool(suffix)),
         Column(f"{name}_low", lambda row: row.coverages[name][1], "", f"{text}: 95 % interval, lower end"),
         Column(f"{name}_high", lambda row: row.coverages[name][2], "", f"{text}: 95 % interval, upper end"),
     ]
@@ -123,30 +123,30 @@ COLUMNS = (
     Column("quantity", "found.names", "", "what is measured", "quantity"),
     Column("unit", "found.units", "", "of truth, estimates and errors", "unit"),
     Column("truth", "", "", "true value; undefined where the flare has none", "truth", number(".4g")),
-    Column("error_known", "known.errors", "", "standard error in advance, everything known", "error, all known",
+    Column("error_known", "known.errors", "", "standard error in advance, everything known", "ideal error",
            number(".4g")),
     Column("error", "ahead.errors", "", "standard error in advance, unknowns marginalised over", "error",
            number(".4g")),
     Column("perfect", lambda row: row.perfect.estimates[0], "", "estimate from an exposure without noise",
-           "fit without noise", number(".4g")),
+           "fit without noise", number(".4g"), detail=True),
     Column("low_68", lambda row: row.perfect.low[0, 0], "",
            "lower end of the 68 % interval of that fit; infinite if there is none"),
     Column("high_68", lambda row: row.perfect.high[0, 0], "", "its upper end"),
     Column("low_95", lambda row: row.perfect.low[1, 0], "", "lower end of the 95 % interval of that fit", "95 % from",
-           number(".4g")),
-    Column("high_95", lambda row: row.perfect.high[1, 0], "", "its upper end", "to", number(".4g")),
+           number(".4g"), detail=True),
+    Column("high_95", lambda row: row.perfect.high[1, 0], "", "its upper end", "to", number(".4g"), detail=True),
     Column("median", lambda row: np.median(row.found.estimates, axis=0), "", "median of the estimates"),
     Column("bias", lambda row: np.median(row.found.estimates, axis=0) - row.truth, "",
-           "median of the estimates less the truth", "bias", number(".4g")),
+           "median of the estimates less the truth", "bias", number(".4g"), detail=True),
     Column("scatter", lambda row: _scatter(row.found.estimates), "", "half of the central 68.27 % of the estimates",
-           "scatter", number(".4g")),
+           "scatter", number(".4g"), detail=True),
     *_coverage_columns(LEVELS[0], "", "of all"),
     *_coverage_columns(LEVELS[1], "", "of all", "95 % covers"),
     *_coverage_columns(LEVELS[0], "_selected", "of detected flares"),
     *_coverage_columns(LEVELS[1], "_selected", "of detected flares", "if detected"),
-    Column("bias_selected", "", "", "median of the estimates of detected flares less the truth"),
+    Column("bias_selected", "", "", "median of the estimates of detected flares less the truth", detail=True),
     Column("one_sided", lambda row: row.found.one_sided[-1].mean(axis=0), "", "share of 95 % intervals with one end",
-           "one-sided", percent(".0f")),
+           "one-sided", percent(".0f"), detail=True),
 )  # fmt: skip
 #: Column of errors that all exposures share, after the standard errors of one exposure.
 THROUGHPUT_COLUMN = Column("error_throughput", "of_throughput", "",
@@ -156,12 +156,12 @@ THROUGHPUT_COLUMN = Column("error_throughput", "of_throughput", "",
 
 #: Columns of the table of fits.
 FIT_COLUMNS = (
-    Column("snr", lambda row: row.snr[0], "", "S/N of the flare in one exposure, everything known", "S/N, all known",
+    Column("snr", lambda row: row.snr[0], "", "S/N of the flare in one exposure, everything known", "ideal S/N",
            ".2f"),
     Column("snr_marginal", lambda row: row.snr[1], "", "the same, unknowns marginalised over", "S/N", ".2f"),
     Column("dof", "found.dof", "", "degrees of freedom of chi-squared"),
     Column("chi2", lambda row: float(np.mean(row.found.chi2)), "", "mean chi-squared of the fits", "chi-squared / dof",
-           lambda chi2, dof: f"{chi2:.1f} / {dof}", ("dof",)),
+           lambda chi2, dof: f"{chi2:.1f} / {dof}", ("dof",), detail=True),
     Column("chi2_perfect", lambda row: float(row.perfect.chi2[0]), "",
            "what the model cannot fit of an exposure without noise"),
     Column("rejected", "rejected.value", "", f"share of fits with a p-value below {REJECTED:g}", "p < 0.01",
@@ -173,7 +173,7 @@ FIT_COLUMNS = (
     Column("detected_low", "detected.low", "", "95 % interval, lower end"),
     Column("detected_high", "detected.high", "", "95 % interval, upper end"),
 )  # fmt: skip
-MODEL_COLUMN = Column("model", description="model that is fitted", heading="model")
+MODEL_COLUMN = Column("model", description="model that is fitted", heading="model", detail=True)
 
 
 def _quantity_columns(answer: MeasureAnswer) -> tuple[Column, ...]:
@@ -228,6 +228,19 @@ class MeasureAnswer(Answer):
     def binned(self) -> list[MeasuredStare]:
         """Stares in which some bin has the requested S/N."""
         return [stare for stare in self.stares if isinstance(stare.drawn, MeasuredBins)]
+
+    @property
+    def headline(self) -> str:
+        """The error of the first measured quantity of the first flare."""
+        flare = self.flares[0]
+        name, unit = flare.found.names[0], flare.found.units[0]
+        error, known = flare.ahead.errors[0], flare.known.errors[0]
+        ideal = "" if self.study.nuisances.none else f" ({known:.3g} {unit} {IF_KNOWN})"
+        return (
+            f"{name_of_instrument(self.study)} would measure the {name.replace('_', ' ')} of a flare of "
+            f"{100 * flare.amplitude:g} % on {flare.title} in {flare.quiet.exposure_s:g} s with a standard error of "
+            f"{error:.3g} {unit}{ideal}."
+        )
 
     @property
     def views(self) -> list[View]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.answers.answer import Answer, TableOf, reported, share_columns
+from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf, name_of_instrument, reported, share_columns
 from mauvecl.answers.plan_targets import (
     NOTHING,
     CompletenessOf,
@@ -67,23 +67,25 @@ def _interval(low: int | None, high: int | None) -> str:
 #: Columns of the table of targets, without false alarms, which precede the last.
 COLUMNS = (
     Column("target", "name", "", "name of the target", "target"),
-    Column("seen", "seen_h", "h", "time in which the target is seen", "seen (h)", ".0f"),
+    Column("seen", "seen_h", "h", "time in which the target is seen", "seen (h)", ".0f", detail=True),
     Column("hours", "", "h", "of it observed", "observed (h)", ".0f"),
     Column("E50", lambda row: row.energy_at(0.5), "erg",
            "bolometric energy from which on half of the flares are recovered", "E50 (erg)", energy),
     Column("E90", lambda row: row.energy_at(0.9), "erg",
-           "bolometric energy from which on 90 % of the flares are recovered", "E90 (erg)", energy),
+           "bolometric energy from which on 90 % of the flares are recovered", "E90 (erg)", energy, detail=True),
     Column("expected", lambda row: row.recovered.expected if row.recovered else np.nan, "",
            "flares recovered, by the rates as they are", "flares",
            lambda expected: two_digits(expected) if expected == expected else "not known"),
+    Column("ideal", "", "", "the same by the closed form if everything but the noise were known", "ideal",
+           lambda expected: two_digits(expected) if expected == expected else ""),
     Column("low", lambda row: row.recovered.low if row.recovered else None, "",
            "lower end of the 95 % interval: scatter of the rates and Poisson noise", "95 %", _interval,
            ("high",), int),
     Column("high", lambda row: row.recovered.high if row.recovered else None, "",
            "upper end of the 95 % interval", kind=int),
     Column("at_least_one", lambda row: row.recovered.at_least_one if row.recovered else np.nan, "",
-           "probability of recovering any", "P(>= 1)", number(".2f")),
-    Column("best_months", lambda row: " ".join(row.best_months), "", "those with most hours", "best months", months),
+           "probability of recovering any", "P(>= 1)", number(".2f"), detail=True),
+    Column("best_months", lambda row: " ".join(row.best_months), "", "those with most hours", "best months", months, detail=True),
 )  # fmt: skip
 #: Columns of errors by a calibrated throughput.
 THROUGHPUT_COLUMNS = (
@@ -166,6 +168,22 @@ class PlanAnswer(Answer):
     days = TableOf("days", (), "seen.by_day")
     #: All assumptions with their sources.
     assumptions = TableOf("assumptions", assumption_columns("assumption"), "_assumptions", study=False)
+
+    @property
+    def headline(self) -> str:
+        """The expected flares of the target with most of them."""
+        known = [target for target in self.planned if target.recovered is not None]
+        if not known:
+            return f"No flares are predicted for {self.planned[0].name}: its flare rates are not known."
+        best = max(known, key=lambda target: target.recovered.expected if target.recovered else 0.0)
+        assert best.recovered is not None
+        ideal = "" if np.isnan(best.ideal) else f"; {two_digits(best.ideal)} {IF_KNOWN}"
+        most = f", the most of {len(self.planned)} targets" if len(self.planned) > 1 else ""
+        return (
+            f"{name_of_instrument(self.study)} would recover {two_digits(best.recovered.expected)} flares of "
+            f"{best.name} in {best.hours:.0f} h (95 % of campaigns: {best.recovered.low} to {best.recovered.high}"
+            f"{ideal}){most}."
+        )
 
     @property
     def heading(self) -> str:
@@ -365,8 +383,11 @@ def plan(
         if rates is not None:
             days = observed * 3600 / DAY_S
             recovered = Yield.of_expected(0.0, 0.0) if its is None else Yield.of(rates, its, days)
+        ideal = float("nan")
+        if rates is not None and study.nuisances.usual and its not in (None, NOTHING):
+            ideal = recovered_per_day(rates, closed_form(target, known=True)) * observed * 3600 / DAY_S
         of_throughput = errors_of_throughput(target, rates)
-        return Planned(target, exposed, observed, its, rates, recovered, best, why, of_throughput)
+        return Planned(target, exposed, observed, its, rates, recovered, best, why, of_throughput, ideal)
 
     # With a pool, the noise of a target is drawn while the threshold of the next one is sampled.
     planned = tuple(reported(map_in_order(engine, planned_for, observations()), len(stars), progress))

@@ -22,6 +22,7 @@ from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool
 from mauvecl.schema.errors import InputError
 from mauvecl.search.completeness import PER_DECADE, Completeness, DurationLaw, Yield, frame_signal, recovered_per_day
+from mauvecl.search.templates import frame_nuisances
 from mauvecl.study.cases import Case
 from mauvecl.study.plan import PlanTarget
 from mauvecl.study.sections import SkyLight, Star
@@ -30,6 +31,7 @@ from mauvecl.study.stares import energy_scale
 
 if TYPE_CHECKING:
     from mauvecl.answers.visible import VisibleAnswer
+    from mauvecl.detection.nuisances import Nuisances
     from mauvecl.detection.snr import Arrays
     from mauvecl.device.engine import Stares
     from mauvecl.host.exposure.expectation import Expectation
@@ -112,11 +114,22 @@ class TargetObservation:
 
     @cached_property
     def signal_per_frame(self) -> float:
-        """S/N of a frame with a flare of amplitude 1; 0 if every pixel saturates."""
+        """S/N of a frame with a flare of amplitude 1; 0 if every pixel saturates.
+
+        What is unknown in each frame is marginalised over; slower changes are left to the level of the search.
+        """
+        return self._signal(frame_nuisances(self.quiet, self.case.stare))
+
+    @cached_property
+    def ideal_signal_per_frame(self) -> float:
+        """The same if everything but the noise is known."""
+        return self._signal(None)
+
+    def _signal(self, unknown: Nuisances | None) -> float:
         (flare,) = self.case.expect(self.case.flaring(SMALL))
         added = [process.variance_dn2(self.quiet) for process in self.case.study.processes.additive.values()]
         hits = np.sum(added, axis=0) if added else None
-        return frame_signal(self.quiet, flare, SMALL, added_variance_dn2=hits)
+        return frame_signal(self.quiet, flare, SMALL, added_variance_dn2=hits, unknown=unknown)
 
     @cached_property
     def scale(self) -> EnergyScale:
@@ -145,6 +158,9 @@ class Planned:
     best_months: tuple[str, ...]
     no_rates: str = ""  # reason for unknown rates
     of_throughput: tuple[float, float] | None = None  # relative errors of E50 and yield by a calibrated throughput
+    ideal: float = float(
+        "nan"
+    )  # recovered flares by the closed form if everything but the noise is known; NaN if it is
 
     @property
     def name(self) -> str:
@@ -164,11 +180,14 @@ class Planned:
         return not low <= self.energy_at(0.5) <= high
 
 
-def closed_form(observation: TargetObservation) -> Completeness:
-    """Return the completeness of a bank of matched filters in white noise; see `Completeness.of_search`."""
+def closed_form(observation: TargetObservation, *, known: bool = False) -> Completeness:
+    """Return the completeness of a bank of matched filters in white noise; see `Completeness.of_search`.
+
+    `known` takes everything but the noise as known.
+    """
     study = observation.case.study
     return Completeness.of_search(
-        observation.signal_per_frame,
+        observation.ideal_signal_per_frame if known else observation.signal_per_frame,
         observation.scale,
         window_s=observation.window_s,
         false_alarms_per_day=study.search.rate,

@@ -95,6 +95,16 @@ class ExposureAnswer(Answer):
     table = TableOf("exposure", EXPOSURE_COLUMNS, "exposures", title=_exposure_title)
 
     @property
+    def headline(self) -> str:
+        """The exposure of the first star."""
+        first = self.exposures[0]
+        least = f", the first of {len(self.exposures)} stars" if len(self.exposures) > 1 else ""
+        return (
+            f"{first.star} reaches an S/N of {first.wanted:g} per {first.per} at {first.wavelength_nm:g} nm in "
+            f"{first.exposure_s:g} s, {first.frames} frame{'' if first.frames == 1 else 's'}{least}."
+        )
+
+    @property
     def inputs(self) -> list[Expectation]:
         return list(self.expectations)
 
@@ -227,6 +237,19 @@ def _one(case: Case, snr: float, wavelength_nm: float, per: Per) -> tuple[Exposu
     return answer, x
 
 
+def _best(title: str, x: Expectation, number: int) -> str:
+    """Return the sentence on the best S/N of the first of several observations."""
+    each = x.snr_per_element()
+    at = float(x.wavelength_nm[x.element == int(np.argmax(each))].mean())
+    saturated = int(x.saturated.sum())
+    without = f"; {saturated} of {x.saturated.size} pixels saturate" if saturated else ""
+    least = f", the first of {number} cases" if number > 1 else ""
+    return (
+        f"{title} has an S/N of up to {each.max():.3g} per element of 10.5 nm in {x.exposure_s:g} s, at {at:.0f} nm"
+        f"{without}{least}."
+    )
+
+
 class Observation(NamedTuple):
     """A simulated observation."""
 
@@ -243,7 +266,7 @@ class Observation(NamedTuple):
 #: Columns of the summary of observations.
 SUMMARY_COLUMNS = (
     Column("observation", "title", description="star, and flare", heading="observation"),
-    Column("frames", "expectation.n_frames", description="frames of the exposure", heading="frames"),
+    Column("frames", "expectation.n_frames", description="frames of the exposure", heading="frames", detail=True),
     Column("peak_nm", lambda row: row.expectation.wavelength_nm[row.peak], "nm",
            "wavelength of the largest mean signal", "peak (nm)", ".1f"),
     Column("peak_dn", lambda row: row.expectation.signal_dn[row.peak], "DN", "largest mean signal of a pixel",
@@ -252,7 +275,7 @@ SUMMARY_COLUMNS = (
            "best S/N pixel", ".2f"),
     Column("snr_element", lambda row: row.expectation.snr_per_element().max(), "",
            "largest closed-form S/N of an element", "best S/N element", ".1f"),
-    Column("saturated_pixels", lambda row: row.expectation.saturated.sum(), "", "pixels that saturate", "saturated"),
+    Column("saturated_pixels", lambda row: row.expectation.saturated.sum(), "", "pixels that saturate", "saturated", detail=True),
 )  # fmt: skip
 
 
@@ -276,6 +299,11 @@ class SimulateAnswer(Answer):
     def uses(self) -> tuple[Use, ...]:
         """Parts of the study that this answer uses: flares only if observations have any."""
         return (*self.USES, "flare") if len(self.observations) > len(self.study.star) else self.USES
+
+    @property
+    def headline(self) -> str:
+        """The best S/N of the first observation."""
+        return _best(self.observations[0].title, self.observations[0].expectation, len(self.observations))
 
     @property
     def tables(self) -> dict[str, Table]:
@@ -305,6 +333,7 @@ def simulate(
     Parameters
     ----------
     study : Study
+        Its usual unknowns are left out: the question is about the noise.
     engine : Engine or Pool, optional
         Not used: the NumPy reference implementation draws.
     progress : callable, optional
@@ -315,6 +344,7 @@ def simulate(
         Whether the flares of the study are observed, too.
     """
     observations, everything = [], []
+    study = study.ideal()
     prepared = cases(study, swept=False)
     for case in reported(prepared, len(prepared), progress):
         xs = case.expectations if flaring else [case.quiet]
@@ -367,6 +397,11 @@ class SnrAnswer(Answer):
                            place=True, key="noise-budget", about=realisations_of)  # fmt: skip
 
     @property
+    def headline(self) -> str:
+        """The best S/N of the first star."""
+        return _best(self.stars[0].title, self.stars[0].result.expectation, len(self.stars))
+
+    @property
     def inputs(self) -> list[Expectation]:
         return [star.result.expectation for star in self.stars]
 
@@ -396,10 +431,13 @@ def snr(
 
     Parameters
     ----------
+    study : Study
+        Its usual unknowns are left out: the question is about the noise.
     progress : callable, optional
         Called as ``progress(done, total)`` in stars.
     """
     # Invalid input raises an error before anything is drawn.
+    study = study.ideal()
     prepared, run, asked = cases(study), study.run, study.signal.wavelength_nm
     quiet = [case.quiet for case in prepared]
     if asked is not None:

@@ -221,7 +221,7 @@ def _percent_with_error(value: float, error: float) -> str:
 #: Columns of the table of stares.
 COLUMNS = (
     Column("frames", "staring.stare.n_frames", "", "frames of the stare", "frames"),
-    Column("observed", "staring.stare.observed_s", "s", "time in them", "recorded (s)", "g"),
+    Column("observed", "staring.stare.observed_s", "s", "time in them", "recorded (s)", "g", detail=True),
     Column("intervals", lambda row: len(row.staring.stare.gtis), "",
            "good time intervals: runs of frames without a gap", "intervals"),
     Column("flux", lambda row: float(np.median(row.light.mean[:, 0])), "DN / s",
@@ -291,7 +291,7 @@ FOUND_COLUMNS = (
     Column("energy_bolometric", "bolometric_erg", "erg", "", "bolometric (erg)", number(".3g")),
     *_interval("energy_bolometric", "energy", "erg"),
     Column("value", "alarm.rho", "", "the search's statistic when it was found: S/N of the template that fits best",
-           "value", ".2f"),
+           "value", ".2f", detail=True),
     Column("event", "", "", "row of the star's flares that it is nearest to, from 1 on; 0: none near", "flare",
            lambda event: str(event) if event else "none", kind=int),
     Column("window", "alarm.block", "",
@@ -370,6 +370,19 @@ class StareAnswer(Answer):
     def placed(self, columns: Sequence[Column]) -> tuple[Column, ...]:
         """Return columns after those of the star and of all swept quantities; the amplitude is that of each flare."""
         return (*place_columns(self.study.sweep), *columns)
+
+    @property
+    def headline(self) -> str:
+        """The number of flares that the search of the first stare finds, or what is drawn."""
+        stare = self.stares[0]
+        frames, flares = stare.staring.stare.n_frames, len(stare.flares)
+        least = f" (the first of {len(self.stares)} stares)" if len(self.stares) > 1 else ""
+        drawn = f"{flares} flare{'' if flares == 1 else 's'} in {frames} frames of {stare.title}"
+        if not isinstance(stare.search, SearchResult):
+            return f"{drawn[0].upper()}{drawn[1:]} are drawn and not searched for{least}."
+        found = len({flare.event for flare in stare.found if flare.event})
+        others = sum(not flare.event for flare in stare.found)
+        return f"The search finds {found} of the {drawn}, and {others} that are none{least}."
 
     @property
     def views(self) -> list[View]:

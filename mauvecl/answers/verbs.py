@@ -363,6 +363,7 @@ VERBS: dict[str, Verb] = {
                 "flare.temperature_k",
                 "flare.band",
                 "flare.spectrum",
+                "nuisances.usual",
             ),
             counts="targets",
             observation=ORBIT,

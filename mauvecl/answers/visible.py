@@ -112,18 +112,18 @@ TARGET_COLUMN = Column("target", description="name of the target", heading="targ
 #: Columns of the table of targets; one for each limit in force follows `share`.
 COLUMNS = (
     TARGET_COLUMN,
-    Column("ra", "", "deg", "right ascension", "RA", ".3f"),
-    Column("dec", "", "deg", "declination", "dec", ".3f"),
+    Column("ra", "", "deg", "right ascension", "RA", ".3f", detail=True),
+    Column("dec", "", "deg", "declination", "dec", ".3f", detail=True),
     Column("hours", "", "h", "exposure in the whole time, with the duty cycle", "hours", ".0f"),
     Column("share", "", "", "of the time in which the target is seen", "share", percent(".1f")),
-    Column("windows", "", "", "stretches in which it is seen", "windows"),
+    Column("windows", "", "", "stretches in which it is seen", "windows", detail=True),
     Column("median_window", "", "min", "length of a stretch", "median", lambda minutes: f"{minutes:.0f} min"),
-    Column("longest_gap", "", "day", "longest time without one", "longest gap", lambda days: f"{days:.1f} d"),
+    Column("longest_gap", "", "day", "longest time without one", "longest gap", lambda days: f"{days:.1f} d", detail=True),
     Column("per_orbit", "", "min", "exposure in a mean orbit"),
     Column("in_shadow", "", "", "share of the windows in the Earth's shadow"),
     Column("best_month", "", "", "that with most exposure", "best month"),
     Column("least_elongation", "", "deg", "least angle from the Sun", "least elongation",
-           lambda degrees: f"{degrees:.0f} deg"),
+           lambda degrees: f"{degrees:.0f} deg", detail=True),
     Column("most_elongation", "", "deg", "largest angle from the Sun"),
     Column("brightest_sky", "", "mag / arcsec2", "zodiacal light at its brightest, V, where the table has it"),
     Column("faintest_sky", "", "mag / arcsec2", "zodiacal light at its faintest, V"),
@@ -191,6 +191,18 @@ class VisibleAnswer(Answer):
     #: Active limits with their values and the sources of their defaults.
     assumptions = TableOf("assumptions", assumption_columns("limit"), "visibility.limits.assumptions",
                           study=False)  # fmt: skip
+
+    @property
+    def headline(self) -> str:
+        """The hours in which the first target is seen."""
+        row = self._row(0)
+        least = f", the first of {len(self.targets)} targets" if len(self.targets) > 1 else ""
+        if not row["hours"]:
+            return f"{row['target']} is not seen in {self.times.days:g} days from {self.times.iso(0.0)[:10]}{least}."
+        return (
+            f"{row['target']} is seen for {row['hours']:.0f} h ({100 * row['share']:.1f} % of {self.times.days:g} days "
+            f"from {self.times.iso(0.0)[:10]}), most in {row['best_month']}{least}."
+        )
 
     @property
     def times(self) -> TimeGrid:

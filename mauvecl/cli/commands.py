@@ -19,6 +19,7 @@ from mauvecl.cli.flags import (
     DeviceFlag,
     JsonFlag,
     Options,
+    PaperFlag,
     QuietFlag,
     SetFlag,
     StudyFile,
@@ -60,12 +61,13 @@ class Command:
         flags = study_flags(*keys, defaults=verb.defaults or {})
         kinds = get_type_hints(self.run, localns={"Session": Any}, include_extras=True)
         _, *own = inspect.signature(self.run).parameters.values()
-        named = inspect.Parameter.KEYWORD_ONLY
+        named, observes = inspect.Parameter.KEYWORD_ONLY, verb.accepts("observation.instrument")
         options = self._options().items()
         parameters = [
             inspect.Parameter("study_file", named, default=None, annotation=StudyFile),
             *(inspect.Parameter(key, named, default=None, annotation=flag.kind) for key, flag in flags.items()),
             inspect.Parameter("set", named, default=None, annotation=SetFlag),
+            *([inspect.Parameter("paper", named, default=False, annotation=PaperFlag)] if observes else []),
             *(p.replace(kind=named, annotation=kinds[p.name]) for p in own if p.name != "given"),
             *(inspect.Parameter(key, named, default=usual, annotation=kind) for key, (kind, usual) in options),
         ]
@@ -90,7 +92,7 @@ class Command:
         from mauvecl.cli.invocation import Session, question_time, question_values
 
         verb, defaults = self.verb, self.verb.defaults or {}
-        given = {key: values.pop(key, None) for key in (*flags, "set")}
+        given = {key: values.pop(key, None) for key in (*flags, "set", "paper")}
         study_file = _placed(study_file, given)
         if study_file is None:
             for flag in flags.values():
@@ -110,7 +112,7 @@ class Command:
         """Return the options of the session, with their defaults."""
         output = output_flag(self.writes or f"the folder mauvecl-{self.verb.name}")
         workers = WORKERS if self.draws else RESUMING if self.resumes else ()
-        names = ("as_json", "quiet", *(["pictures"] if self.pictures else []), *workers)
+        names = ("as_json", "quiet", "wide", *(["pictures"] if self.pictures else []), *workers)
         kinds = get_type_hints(Options, include_extras=True)
         return {"output": (output, None)} | {name: (kinds[name], getattr(Options, name)) for name in names}
 
@@ -177,7 +179,7 @@ RowsFlag = Annotated[
 
 
 @command_of(
-    Verb("realise", "", ("flare", *DRAWS, "sweep", "bulk"), counts="spectra", defaults=FEWER),
+    Verb("realise", "", ("flare", *DRAWS, "nuisances.usual", "sweep", "bulk"), counts="spectra", defaults=FEWER),
     pictures=False,
     writes="mauvecl-frames.zarr; also NAME.fits, .h5, .hdf5",
 )

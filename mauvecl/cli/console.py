@@ -323,25 +323,47 @@ def show(lines: Sequence[str]) -> None:
         console.print(line)
 
 
-def show_view(view: View) -> None:
-    """Print a table of an answer, or the sentence in its place."""
+def show_view(view: View, *, wide: bool = True) -> bool:
+    """Print a table of an answer, or the sentence in its place.
+
+    Unless `wide`, a table that is too wide is printed without the columns of details.
+
+    Returns
+    -------
+    bool
+        Whether columns were left out.
+    """
     if view.table is None:
         show([view.title])
-    else:
-        show_table(view.title, *view.texts())
+        return False
+    headings, cells = without_empty(*view.texts())
+    details = {column.name for column in view.columns if column.detail and column.heading}
+    left_out = not wide and bool(details) and _width(headings, cells, range(len(headings))) > _room()
+    if left_out:
+        headings, cells = without_empty(*view.texts(details))
+    show_table(view.title, headings, cells, wide=wide)
+    return left_out
 
 
-def show_table(title: str, columns: Sequence[str], cells: Sequence[Sequence[Any]]) -> None:
-    """Print a table without its empty columns, in parts if the terminal is narrower; cells are text."""
+def _room() -> int:
+    """Return the width of the terminal, or 80 columns where there is none."""
     from rich.console import Console
 
-    columns, cells = without_empty(columns, cells)
+    return Console().width
+
+
+def show_table(title: str, columns: Sequence[str], cells: Sequence[Sequence[Any]], *, wide: bool = True) -> None:
+    """Print a table, in parts if the terminal is narrower; cells are text.
+
+    A `wide` table in a pipe is as wide as it needs to be.
+    """
+    from rich.console import Console
+
     filled = list(range(len(columns)))
     # Names may contain brackets and colons, which are not markup here.
     how: dict[str, Any] = {"highlight": False, "markup": False, "emoji": False}
     console = Console(**how)
-    if not console.is_terminal:
-        # A pipe has no width, so the table is as wide as needed.
+    if wide and not console.is_terminal:
         console = Console(**how, width=WIDEST)
     # rich would wrap a table's title at the table's width.
     console.print(title, soft_wrap=True)

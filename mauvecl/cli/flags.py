@@ -42,6 +42,14 @@ SetFlag = Annotated[
 ]
 
 
+PaperFlag = Annotated[
+    bool,
+    typer.Option(
+        "--paper", help="Ask with the conventions of the MauveSim paper: dark drawn in DN, all but the noise known."
+    ),
+]
+
+
 class StudyFlag(NamedTuple):
     """Flag of the command line, and the key of the study that it sets."""
 
@@ -164,6 +172,7 @@ class Options:
     output: Path | None = None  # where everything is written; its flag states the default of the command
     as_json: JsonFlag = False
     quiet: QuietFlag = False
+    wide: Annotated[bool, _option("--wide", text="Show all columns of tables, however wide they are.")] = False
     pictures: Annotated[bool, typer.Option("--pictures/--no-pictures", help="Draw pictures (needs mauvecl[plot]).")] = (
         True
     )
@@ -202,6 +211,8 @@ def study_of(
     from mauvecl.study.study import Study
 
     study = Study.read(file) if file is not None else default(given) if default else Study()
+    if given.get("paper"):
+        study = study.paper()
     changes: dict[str, dict[str, Any]] = {"sky": sky_of(given)}
     setting: dict[tuple[str, str], str] = {}
     for name, flag in flags.items():

@@ -297,21 +297,24 @@ class Session(Options):
 
     def answer(self, answer: Answer) -> None:
         """Print an answer and write its files."""
-        self.say([*answer.messages, answer.assumed])
         with report_interrupts(self._written):
             self._leave_all(answer)
         if self.as_json:
             from mauvecl.cli.console import with_flags
 
             content = answer.as_json()
-            remarks = {"assumed": answer.assumed, "messages": [with_flags(line) for line in content["messages"]]}
+            said = [with_flags(line) for line in content["messages"]]
+            remarks = {"headline": answer.headline, "assumed": answer.assumed, "messages": said}
             self.print_json(remarks | {key: value for key, value in content.items() if key != "messages"})
             return
         from mauvecl.cli.console import show_view
 
-        for view in answer.all_views:
-            show_view(view)
-        self.say(answer.remarks)
+        self.say([answer.headline])
+        left_out = [show_view(view, wide=self.wide) for view in answer.all_views]
+        self.say(["Assumed:", *(f"  {clause}" for clause in answer.premises)])
+        self.say([*answer.messages, *answer.remarks])
+        if any(left_out):
+            self.say(["Tables are shown without details: `--wide` shows all columns, and the files hold them."])
         self.finish()
 
     def _leave_all(self, answer: Answer) -> None:

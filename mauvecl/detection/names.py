@@ -10,6 +10,8 @@ from mauvecl.schema.errors import InputError
 #: All statistics in the order of tables and plots.
 STATISTIC_NAMES = ("chi2", "chi2_element", "chi2_pair", "matched", "uv_excess", "paper")
 #: Statistics computed by default.
+#: Recommended statistic, of which answers are given by default; it has the most power where its template is right.
+RECOMMENDED = "matched"
 DEFAULT_STATISTICS = ("chi2", "chi2_element", "matched")
 
 

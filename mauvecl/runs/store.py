@@ -31,7 +31,7 @@ from mauvecl.schema.columns import Column, percent
 from mauvecl.schema.errors import InputError, missing_package
 from mauvecl.study.cases import cases, full_label
 from mauvecl.study.cases import collect_messages as messages_of
-from mauvecl.study.study import Study
+from mauvecl.study.study import Study, read_version
 
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
@@ -277,7 +277,7 @@ class Store:
                 "restore the file of the correct one",
                 key="store",
             )
-        store = cls(path, Study.build(toml(text, path.name), path.name))
+        store = cls(path, Study.build(read_version(toml(text, path.name), path.name), path.name))
         store.read_digests()
         return store
 

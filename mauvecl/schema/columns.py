@@ -36,6 +36,7 @@ class Column:
     others: tuple[str, ...] = ()  # further columns whose values `format` takes after the column's own
     # Type of the values, where it does not follow from them: in a table without rows, or with missing values.
     kind: type | None = None
+    detail: bool = False  # whether people see the column only on request where the table is too wide
 
     def value(self, row: object) -> Any:
         """Return the value or values of a row."""

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import optimize, stats
 
 from mauvecl.detection.distributions import Interval, central_counts, clopper_pearson, smallest_integer
+from mauvecl.detection.nuisances import Nuisances
 from mauvecl.flares.energies import EnergyScale, PowerLaw, Rates
 from mauvecl.flares.settings import HALF_WIDTHS_S as BANK_S
 from mauvecl.flares.shapes import Shape, consecutive_integrals, shape_of
@@ -200,19 +201,28 @@ def _search_threshold(false_alarms_per_day: float, bank: Bank) -> float:
 
 
 def frame_signal(
-    quiet: Expectation, flare: Expectation, amplitude: float = 1.0, *, added_variance_dn2: Float | None = None
+    quiet: Expectation,
+    flare: Expectation,
+    amplitude: float = 1.0,
+    *,
+    added_variance_dn2: Float | None = None,
+    unknown: Nuisances | None = None,
 ) -> float:
     """Return the S/N of one frame with a flare of amplitude 1, with optimal weights.
 
     `amplitude` is that of the flare in `flare`, and `added_variance_dn2`, (n_pixel,), additional variance such as that
-    of particle hits. Pixels that saturate without a flare are excluded.
+    of particle hits. Pixels that saturate without a flare are excluded. `unknown` is marginalised over.
     """
     if quiet.n_frames != 1 or flare.n_frames != 1:
         raise InputError.of("n_frames", (quiet.n_frames, flare.n_frames), "one frame each")
     light = (flare.source_electrons - quiet.source_electrons) * quiet.gain_dn_per_electron / amplitude
     variance = quiet.unsaturated_variance_dn2 + (0.0 if added_variance_dn2 is None else added_variance_dn2)
-    used = ~quiet.saturated
-    return float(np.sqrt(np.sum(light[used] ** 2 / variance[used])))
+    light = np.where(quiet.saturated, 0.0, light)
+    power = float(light @ (light / variance))
+    if unknown is not None:
+        rows = unknown.rows(variance, np.where(quiet.saturated, 0.0, unknown.spectra))
+        power -= float(np.sum((rows @ light) ** 2))
+    return float(np.sqrt(max(power, 0.0)))
 
 
 @lru_cache(maxsize=32)

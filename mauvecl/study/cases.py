@@ -43,7 +43,12 @@ KNOWN_CHANGES = ("thermal", "variability", "throughput", "sky")
 
 
 def assumption_line(study: Study, uses: Collection[Use], varied: Collection[str] = ()) -> str:
-    """Return one line with the assumptions of a study about the parts that an answer uses.
+    """Return one line with the assumptions of a study; see `assumptions_of`."""
+    return f"Assumed: {'; '.join(assumptions_of(study, uses, varied))}."
+
+
+def assumptions_of(study: Study, uses: Collection[Use], varied: Collection[str] = ()) -> list[str]:
+    """Return the assumptions of a study about the parts that an answer uses, one clause each.
 
     Parameters
     ----------
@@ -65,7 +70,7 @@ def assumption_line(study: Study, uses: Collection[Use], varied: Collection[str]
     stated = {*uses, *(("unknowns",) if {*UNKNOWN_USES} & {*uses} else ())}
     unused = unused_unknowns(study, uses)
     ignored = [f"not used: {', '.join(unused)}"] if unused else []
-    return f"Assumed: {'; '.join([*(words[use]() for use in words if use in stated), *ignored])}."
+    return [*(words[use]() for use in words if use in stated), *ignored]
 
 
 def _instrument(study: Study, swept: set[str]) -> str:
@@ -122,7 +127,8 @@ def _unknowns(study: Study, uses: Collection[Use]) -> str:
         drawn += [name for name in KNOWN_CHANGES if getattr(s, name) is not None]
         drawn += [f"{course} of {', '.join(of)}" for course in COURSES if (of := getattr(s, course))]
         drawn += [f"{process.label} (assumed)" for name, process in STARE_PROCESSES.items() if getattr(s, name)]
-    usual = "drawn and marginalised" if {"nuisances", "stare"} & {*uses} else "drawn"
+    how = {"drawn": {"processes", "stare"}, "marginalised": {"nuisances", "stare"}}
+    usual = " and ".join(word for word, of in how.items() if of & {*uses})
     parts = [f"the usual unknowns {usual}"] if n.usual else []
     parts += [f"drawn: {', '.join(drawn)}"] if drawn else []
     named = [*n.spreads(), *n.own] if "nuisances" in uses else []
@@ -145,8 +151,7 @@ def unused_unknowns(study: Study, uses: Collection[Use]) -> list[str]:
     # Verbs of an orbit look at targets, not at the study's star.
     observes = "instrument" in uses and "orbit" not in uses
     near = [] if observes or all(star.neighbours is None for star in study.star) else ["star.neighbours"]
-    usual = ["nuisances.usual"] if n.usual and not {"processes", "stare"} & {*uses} else []
-    return [key for use, keys in given.items() if use not in uses for key in keys] + usual + near
+    return [key for use, keys in given.items() if use not in uses for key in keys] + near
 
 
 def star_label(star: Star, x: Expectation) -> str:

@@ -71,8 +71,8 @@ class OwnNuisance(Section):
 
 Usual = Annotated[
     bool,
-    Help("Draw the documented unknowns of this question, and marginalise over them"),
-    Flag("--with-unknowns"),
+    Help("Draw the usual unknowns and marginalise over them, or take everything but the noise as known"),
+    Flag("--with-unknowns/--ideal"),
 ]
 Own = Annotated[
     dict[str, OwnNuisance],
@@ -87,7 +87,7 @@ Own = Annotated[
     ),
 ]
 _keys: Any = (
-    {"usual": (Usual, False)}
+    {"usual": (Usual, True)}
     | {
         name: (Annotated[Spread | None, Help(f"Standard deviation of {row.label}, or free")], None)
         for name, row in NUISANCES.items()
@@ -99,8 +99,14 @@ _keys: Any = (
 class NuisanceChoice(create_model("_Amplitudes", __base__=Section, **_keys)):  # type: ignore[misc]
     """Prior standard deviations of the amplitudes that statistics are marginalised over, or "free" (projected out).
 
-    With `usual` the documented set is drawn and marginalised over; values given here replace those of the set.
+    With `usual`, the default, the documented set is drawn and marginalised over; values given here replace those of the
+    set.
     """
+
+    @property
+    def none(self) -> bool:
+        """True if everything but the noise is known."""
+        return self == KNOWN
 
     def marginalised(self, quiet: Expectation) -> Nuisances | None:
         """Return the nuisance parameters for the engine, or None if there are none."""
@@ -126,6 +132,10 @@ class NuisanceChoice(create_model("_Amplitudes", __base__=Section, **_keys)):  #
         update = {name: prior for name, prior in added.items() if getattr(named, name) is None}
         every: Processes = named.model_copy(update=update)
         return every
+
+
+#: Choice of unknowns with which everything but the noise is known.
+KNOWN = NuisanceChoice(usual=False)
 
 
 def usual_spreads(quiet: Expectation) -> dict[str, float]:

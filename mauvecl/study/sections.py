@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import Field, create_model, field_validator, model_validator
 
-from mauvecl.detection.names import DEFAULT_STATISTICS, STATISTIC_NAMES
+from mauvecl.detection.names import DEFAULT_STATISTICS, RECOMMENDED, STATISTIC_NAMES
 from mauvecl.host.exposure import DEFAULT_SKY
 from mauvecl.host.stars.library import ALIASES
 from mauvecl.noise.disturbances import Prior, PriorField
@@ -352,14 +352,16 @@ class Observation(Section):
     ] = 50.0
     instrument: Annotated[
         str,
-        Help("Instrument", choices="mauve (as in the paper), mauve-electrons (for planning), or your own TOML file"),
+        Help(
+            "Instrument", choices="mauve, mauvesim (with the conventions of the MauveSim paper), or your own TOML file"
+        ),
         Flag("--instrument"),
         Widget(
             label="Payload",
-            hint="mauve: as its paper has it, with dark counts that are Poisson in DN, the careful choice. "
-            "mauve-electrons: Poisson in electrons, as in physics; the documentation recommends it for planning.",
+            hint="mauve: dark counts are Poisson in electrons, as in physics. mauvesim: Poisson in DN, as in the "
+            "MauveSim paper, which makes the dark noise 1.3 times as large.",
             place=2,
-            choices=("mauve", "mauve-electrons"),
+            choices=("mauve", "mauvesim"),
         ),
     ] = "mauve"
     temperature_c: Annotated[
@@ -495,7 +497,13 @@ class Run(Section):
         Field(min_length=1),
         Help("Detection statistic", choices=f"{', '.join(STATISTIC_NAMES)}, or all"),
         Flag("--statistic", read=parsing.words),
-    ] = DEFAULT_STATISTICS
+        Flag(
+            "--all-statistics",
+            kind=bool,
+            read=lambda *_: DEFAULT_STATISTICS,
+            help=Help(f"Answer by {', '.join(DEFAULT_STATISTICS)} instead of {RECOMMENDED} alone"),
+        ),
+    ] = (RECOMMENDED,)
     fap: Annotated[
         Probability,
         Help("False-alarm probability per test"),

@@ -5,14 +5,17 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import tomllib
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from types import UnionType
-from typing import TYPE_CHECKING, Annotated, Any, Self, Union, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, Union, get_args, get_origin
 
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
+from mauvecl.detection.names import DEFAULT_STATISTICS
+from mauvecl.host.instrument.paths import FORMER_NAMES, FORMERLY_MAUVE
 from mauvecl.host.orbit.observing_limits import Limits
 from mauvecl.host.tables.ecsv import read_ecsv
 from mauvecl.host.tables.files import parsing, possible, read_bytes, read_text, toml, without_columns
@@ -20,7 +23,7 @@ from mauvecl.noise.processes import NONE, Processes
 from mauvecl.noise.unknowns import COURSES
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened
-from mauvecl.schema.fields import AnyUnit, Flag, found
+from mauvecl.schema.fields import AnyUnit, Flag, Help, found
 from mauvecl.schema.section import Section, fields_of, input_error
 from mauvecl.study.analyses import PATHS, CalibrateQuestion, ChangeQuestion, DataChoice, MeasureQuestion
 from mauvecl.study.flare_light import drop_default_spectrum
@@ -49,6 +52,29 @@ def read_embedded_study(path: Path) -> str:
     if not isinstance(study, str):
         raise InputError(f"{path.name} contains no study", "an answer's ECSV table", key="study")
     return study
+
+
+def read_version(data: dict[str, Any], where: str) -> dict[str, Any]:
+    """Return the data of a study file as those of the current version, and warn of what differs in an older file.
+
+    A file without a version is of version 1, in which by default everything but the noise was known and the instrument
+    "mauve" had the conventions of the paper.
+    """
+    if "version" in data or not all(isinstance(data.get(key, {}), dict) for key in ("observation", "nuisances", "run")):
+        return data
+    observation, nuisances, run = ({**data.get(key, {})} for key in ("observation", "nuisances", "run"))
+    named = observation.get("instrument", "mauve")
+    if isinstance(named, str):
+        observation["instrument"] = FORMERLY_MAUVE if named == "mauve" else FORMER_NAMES.get(named, named)
+    nuisances.setdefault("usual", False)
+    run.setdefault("statistics", [*DEFAULT_STATISTICS])
+    known = "the usual unknowns drawn" if nuisances["usual"] else "everything but the noise known"
+    warnings.warn(
+        f"{where} has no version and is read as in version 1, with the instrument now called "
+        f"{observation['instrument']} and {known}; `version = {VERSION}` asks with today's defaults.",
+        stacklevel=2,
+    )
+    return data | {"version": VERSION, "observation": observation, "nuisances": nuisances, "run": run}
 
 
 def with_paths(data: Any, kind: Any, change: Callable[[Path], Path]) -> Any:
@@ -173,6 +199,8 @@ def set_key(data: Any, path: list[str], value: Any, text: str) -> None:
     data[last] = value
 
 
+#: Version of study files.
+VERSION: Literal[2] = 2
 #: Sections that a study's text leaves out if they have their default values.
 OMITTED = (
     "bulk", "nuisances", "stare", "events", "search", "injections", "orbit", "plan", "measure", "data", "calibrate",
@@ -184,7 +212,7 @@ PAPER_STARS = (Star(library="K3V", magnitude=3.7), Star(library="G2V", magnitude
 
 @validated
 class Study(Section):
-    """Everything that an answer depends on; the default is the paper's question.
+    """Everything that an answer depends on; the default is the paper's question, asked with the usual unknowns.
 
     Examples
     --------
@@ -197,6 +225,9 @@ class Study(Section):
     True
     """
 
+    version: Annotated[Literal[2], Help("Version of the study's keys and defaults; none in files of version 1")] = (
+        VERSION
+    )
     star: Annotated[tuple[Star, ...], Field(min_length=1)] = PAPER_STARS
     flare: Flare = Flare()
     observation: Observation = Observation()
@@ -247,6 +278,7 @@ class Study(Section):
             )
         if path.suffix == ".ecsv":
             locate_files(data, path)
+        data = read_version(data, path.name)
         # Paths are relative to the study file.
         data = with_paths(data, cls, lambda file: path.parent / file)
         return cls.build(data, path.name)
@@ -259,6 +291,20 @@ class Study(Section):
             return cls.model_validate(data)
         except ValidationError as error:
             raise input_error(where, cls, error) from error
+
+    def ideal(self) -> Self:
+        """Return a copy without the usual unknowns."""
+        return self.model_copy(update={"nuisances": self.nuisances.model_copy(update={"usual": False})})
+
+    def paper(self) -> Self:
+        """Return a copy with the conventions of the MauveSim paper.
+
+        The dark charge is drawn in DN, everything but the noise is known, and sums of squares are statistics as well.
+        """
+        observation = self.observation.model_copy(update={"instrument": FORMERLY_MAUVE})
+        statistics = DEFAULT_STATISTICS if self.run.statistics == Run().statistics else self.run.statistics
+        run = self.run.model_copy(update={"statistics": statistics})
+        return self.ideal().model_copy(update={"observation": observation, "run": run})
 
     def with_changes(
         self, changes: dict[str, dict[str, Any]], stars: list[dict[str, Any]] | None, where: str = "changes"

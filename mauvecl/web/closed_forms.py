@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.answers.answer import chance_range, chance_text
 from mauvecl.answers.closed_forms import InterpolatedForm, cost_lines, marginal_lines, unknown_cost
 from mauvecl.answers.limit_search import LimitSearch
 from mauvecl.detection.distributions import Gaussian, Mixture
 from mauvecl.detection.requests import STATISTICS
 from mauvecl.schema.errors import InputError
 from mauvecl.study.cases import collect_messages
-from mauvecl.web.fields import FIELDS, UNKNOWN, Choice, star_words
+from mauvecl.web.fields import FIELDS, IDEAL, REALISTIC, UNKNOWN, Choice, star_words
 from mauvecl.web.question import OTHER
 
 if TYPE_CHECKING:
@@ -100,7 +101,7 @@ class ClosedForms:
         if question.items() <= self.question.values.items():
             return self
         study = self.study
-        sections: dict[str, Any] = {"nuisances": study.nuisances.model_copy(update={"usual": unknown == UNKNOWN[1]})}
+        sections: dict[str, Any] = {"nuisances": study.nuisances.model_copy(update={"usual": unknown == REALISTIC})}
         if question["instrument"] != self.question.instrument:
             sections["observation"] = study.observation.model_copy(update={"instrument": question["instrument"]})
         case = self.case.with_sections(**sections)
@@ -178,31 +179,13 @@ class ClosedForms:
         return pixel, element
 
 
-def percent(value: float) -> str:
-    """Format a probability, with bounds instead of 0 and 100 %."""
-    if value != value:
-        return "no number"
-    if value > 0.9999:
-        return "> 99.99 %"
-    if value < 0.0001:
-        return "< 0.01 %"
-    shown = 100 * value
-    return f"{shown:.2f} %" if shown < 1 or shown > 99 else f"{shown:.1f} %"
-
-
-def between(low: float, high: float) -> str:
-    """Format an interval of probabilities."""
-    ends = dict.fromkeys([percent(low), percent(high)])
-    return " to ".join(ends)
-
-
 def short(value: float) -> str:
     """Format a number with three significant digits and no power of ten."""
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
 
 
 #: Labels of the choices of the field "unknown".
-TITLES = dict(zip(UNKNOWN, ("everything known", "usual unknowns"), strict=True))
+TITLES = {REALISTIC: "realistic: with the usual unknowns", IDEAL: "ideal: everything but the noise known"}
 #: Sensible relative uncertainty of the nominal throughput (assumed; see the documentation's page on what is nominal).
 THROUGHPUT = 0.3
 
@@ -221,7 +204,7 @@ class Chance:
         return {
             "unknown": self.unknown,
             "title": TITLES[self.unknown],
-            "shown": percent(self.value),
+            "shown": chance_text(self.value),
             "value": None if self.value != self.value else self.value,
             "interval": self.how,
         }
@@ -250,7 +233,7 @@ def _simulated_chance(assumed: ClosedForms, answer: DetectAnswer | None) -> Chan
     (row,) = (row for row in answer.table if row["statistic"] == question.statistic)
     number = f"{question.realisations.number:,}"
     return Chance(
-        question.unknown, float(row["probability"]), f"{between(row['low'], row['high'])}, of {number} simulated"
+        question.unknown, float(row["probability"]), f"{chance_range(row['low'], row['high'])}, of {number} simulated"
     )
 
 
@@ -259,7 +242,7 @@ def _spread(closed: ClosedForms) -> str:
     if closed.study.nuisances.usual or closed.slow or closed.chance != closed.chance:
         return ""
     ends = [odds.probability for much in (-1, 1) for odds in closed.at(1 + much * THROUGHPUT, np.ones(1), sky=True)]
-    return f"; {between(min(ends), max(ends))} if the throughput is {100 * THROUGHPUT:g} % lower or higher"
+    return f"; {chance_range(min(ends), max(ends))} if the throughput is {100 * THROUGHPUT:g} % lower or higher"
 
 
 class Wording(NamedTuple):
@@ -290,20 +273,21 @@ def solved(closed: ClosedForms) -> str:
     """Return a sentence on the limit of the quantity that the question solves for, with and without unknowns."""
     q, asked = closed.question, closed.study.limit
     words = LIMITS[asked.of]
-    clauses, near = [], None
-    for unknown in UNKNOWN:
+    clauses, near = {}, None
+    # The ideal limit is found at once, and the realistic one near it.
+    for unknown in (IDEAL, REALISTIC):
         try:
             assumed = closed.assuming(unknown)
             near = None if assumed.slow else _limit(assumed, near)
-            clauses.append(words.slow if near is None else f"{words.before.format(band=q.band)} {words.value(near)}")
+            clauses[unknown] = words.slow if near is None else f"{words.before.format(band=q.band)} {words.value(near)}"
         except InputError:
-            clauses.append(words.none)
+            clauses[unknown] = words.none
     flares = "flares" if asked.of == "amplitude" else f"flares of {q.amplitude_percent:g} %"
     at = "" if asked.of == "magnitude" else f" at {q.band} = {q.magnitude:g}"
-    first, second = clauses
+    first = clauses[REALISTIC]
     # The size belongs to the flares, what is exposed to their detection.
     where = f" {first}{at} are detected" if asked.of == "amplitude" else f"{at} are detected {first}"
-    return f"{100 * asked.power:g} % of {flares}{where} with everything known, and {second} with the usual unknowns."
+    return f"{100 * asked.power:g} % of {flares}{where}, and {clauses[IDEAL]} if everything but the noise were known."
 
 
 def _limit(assumed: ClosedForms, limit: float | None) -> float:
@@ -327,7 +311,7 @@ def other_payloads(closed: ClosedForms) -> str:
             shown = []
             for unknown in UNKNOWN:
                 try:
-                    shown.append(percent(closed.assuming(unknown, instrument=name).chance))
+                    shown.append(chance_text(closed.assuming(unknown, instrument=name).chance))
                 except InputError:
                     shown.append("no number")
             clauses.append(f"Chances with {name}: {' and '.join(shown)}.")

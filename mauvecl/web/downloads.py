@@ -130,7 +130,8 @@ def _flag_words(name: str, value: Any, verb: Verb) -> list[str]:
     """Return the words of a key's flag, or none if the verb has no flag that takes such a value."""
     for flag in (flag for key, _, flag in keys_with_flags() if key == name and verb.accepts(name)):
         if isinstance(value, bool) and flag.read is None:
-            return [flag.names[0]] if value else []
+            on, _, off = flag.names[0].partition("/")
+            return [on] if value else [off] if off else []
         if flag.read is parsing.line_fluxes:
             return [word for line, share in value.items() for word in (flag.names[0], f"{line}={share!r}")]
         if flag.read is parsing.axis and "start" in value:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mauvecl.answers.answer import chance_text
 from mauvecl.answers.closed_forms import spoken, unknown_cost
 from mauvecl.answers.detect import UNKNOWN_COLUMNS as COLUMNS
 from mauvecl.answers.detect import power
@@ -32,7 +33,7 @@ from mauvecl.noise.unknowns import NUISANCES, Nuisance
 from mauvecl.schema.columns import View, stacked
 from mauvecl.study.cases import star_column, star_label
 from mauvecl.study.nuisances import NuisanceChoice
-from mauvecl.web.closed_forms import Answers, percent, short
+from mauvecl.web.closed_forms import Answers, short
 from mauvecl.web.figures import strips
 from mauvecl.web.tab import Tab
 
@@ -262,7 +263,7 @@ def distributions(closed: ClosedForms, answers: Answers) -> ChartData:
         (row,) = (row for row in answers["detection"].table if row["statistic"] == q.statistic)
         cut, chance = float(row["threshold"]), float(row["probability"])
     series["threshold"] = cut if cut == cut else None
-    share = f"{percent(chance)} of flares lie above the threshold of {cut:.4g}"
+    share = f"{chance_text(chance)} of flares lie above the threshold of {cut:.4g}"
     text = (
         f"Without a flare {q.statistic} lies at {closed.null.mean:.4g} ± {closed.null.std:.3g}, with it at "
         f"{closed.seen.mean:.4g} ± {closed.seen.std:.3g}; "
@@ -293,7 +294,7 @@ def trade(closed: ClosedForms, answers: Answers) -> ChartData:
     half = int(np.searchsorted(chances, 0.5))
     where = "half of them at " if half else "half of them still below "
     text = (
-        f"At a false-alarm probability of {q.fap:g} {percent(closed.chance)} are detected; {where}"
+        f"At a false-alarm probability of {q.fap:g} {chance_text(closed.chance)} are detected; {where}"
         f"{faps[min(half, faps.size - 1)]:.2g}."
     )
     return ChartData(text, series)
@@ -319,11 +320,11 @@ def costs(closed: ClosedForms) -> tuple[float, list[Row]]:
     """Return the flare's matched S/N with everything known, and with unknowns alone and together."""
     # Without a sky its brightness is no unknown. Those without a default prior are projected out.
     there = {name: row for name, row in NUISANCES.items() if np.any(row.spectrum(closed.quiet))}
-    alone = [NuisanceChoice.model_validate({name: _spread(row)}) for name, row in there.items()]
+    alone = [NuisanceChoice.model_validate({"usual": False, name: _spread(row)}) for name, row in there.items()]
     chosen = {spoken(choice).removeprefix("the "): choice for choice in alone}
-    chosen["all the usual together"] = NuisanceChoice(usual=True)
+    chosen["all the usual together"] = NuisanceChoice()
     if closed.study.nuisances.own:
-        chosen["your own spectrum"] = NuisanceChoice(own=closed.study.nuisances.own)
+        chosen["your own spectrum"] = NuisanceChoice(usual=False, own=closed.study.nuisances.own)
     rows, known_snr = list[Row](), 0.0
     for name, choice in chosen.items():
         cost = unknown_cost(name, closed.quiet, closed.flare, choice, closed.study.run.comparison())

@@ -14,6 +14,7 @@ from typing import Any, Literal, NamedTuple, get_args, get_origin
 from pydantic.fields import FieldInfo
 
 from mauvecl.detection.requests import STATISTICS
+from mauvecl.host.instrument.paths import FORMER_NAMES, FORMERLY_MAUVE
 from mauvecl.host.stars.library import ModelStar, embedded, near_names, spectrum_name
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.fields import Flag, Range, Unit, Widget, as_typed, first, found, range_of, unit_of
@@ -25,8 +26,13 @@ UPLOADED, UPLOADED_UNKNOWN, UPLOADED_FILE = "uploaded star", "uploaded spectrum"
 #: Numbers of realisations that a visitor can request, without and with importance sampling of the tail.
 REALISATIONS, SAMPLED = (10_000, 100_000, 1_000_000, 4_000_000), (100_000, 1_000_000)
 
-#: Choices of the unknowns.
-UNKNOWN = ("nothing", "the usual")
+#: Choices of what is unknown: the usual unknowns, and nothing but the noise.
+REALISTIC, IDEAL = UNKNOWN = ("realistic", "ideal")
+#: Values of fields in links of version 1, which name the choice of unknowns in other words, with those of today.
+FORMER_VALUES = {
+    "unknown": {"nothing": IDEAL, "the usual": REALISTIC},
+    "instrument": {"mauve": FORMERLY_MAUVE} | FORMER_NAMES,
+}
 SKIES = ("brightness", "target and time", "none")
 #: Largest number of characters of a field.
 MOST_CHARACTERS = 200
@@ -307,10 +313,10 @@ _OWN_FIELDS = {
         group="Detection", place=1, own_keys=("run.statistics",),
     ),
     "unknown": Field(
-        label="Unknown", first=UNKNOWN[0], read=Choice(UNKNOWN),
-        hint="What differs from exposure to exposure and is not known: the usual are detector temperature, light lost "
-        "and sky. They are drawn, and the statistic is made blind to them. The card shows both chances; this is for "
-        "the pictures, tables and simulations.", group="", place=3,
+        label="Answer", first=REALISTIC, read=Choice(UNKNOWN),
+        hint="Realistic: detector temperature, light lost and sky differ from exposure to exposure and are unknown; "
+        "they are drawn, and the statistic is made blind to them. Ideal: everything but the noise is known. The card "
+        "shows both chances; this is for the pictures, tables and simulations.", group="", place=3,
         own_keys=("nuisances.usual",),
     ),
     "own_unknown": Field(

@@ -18,7 +18,7 @@ from mauvecl.answers.measurements import expected_measurements, models_of
 from mauvecl.charts.chart import Axis, Band, Chart, ChartData, Contours, Custom, Dots, Line, Listed, Own, Rule
 from mauvecl.fits.flare_model import FlareModel
 from mauvecl.schema.columns import View, records
-from mauvecl.study.nuisances import NuisanceChoice
+from mauvecl.study.nuisances import KNOWN, NuisanceChoice
 from mauvecl.web.closed_forms import LIMITS, Answers, short
 from mauvecl.web.tab import Tab
 
@@ -293,9 +293,9 @@ class Limit(Tab):
 
 #: Unknowns of an observer, by name on the page, as the study's section of nuisances.
 ASSUMED = {
-    "everything known": NuisanceChoice(),
-    "usual unknowns": NuisanceChoice(usual=True),
-    "dark and star free": NuisanceChoice.model_validate({"dark": "free", "light": "free"}),
+    "everything known": KNOWN,
+    "usual unknowns": NuisanceChoice(),
+    "dark and star free": NuisanceChoice.model_validate({"usual": False, "dark": "free", "light": "free"}),
 }
 #: Names of the curves.
 NAMES = ("known", "usual", "free")

@@ -10,6 +10,7 @@ from bokeh.models import FixedTicker, HoverTool, LinearColorMapper
 from bokeh.models.annotations import ColorBar
 from numpy.typing import NDArray
 
+from mauvecl.answers.answer import chance_text
 from mauvecl.answers.plan import COLUMNS
 from mauvecl.charts.calibrations import (
     BIN,
@@ -40,7 +41,7 @@ from mauvecl.charts.light_curves import SCATTER, scatter_series
 from mauvecl.host.stars.source import Source
 from mauvecl.schema.columns import View
 from mauvecl.schema.errors import InputError
-from mauvecl.web.closed_forms import Answers, percent, short
+from mauvecl.web.closed_forms import Answers, short
 from mauvecl.web.sandboxed_reader import read_limited
 from mauvecl.web.tab import Tab, target_words
 from mauvecl.web.uploads import MOST_VALUES, VisitorFile, read_frames_of, reported_for
@@ -307,7 +308,7 @@ def shares(closed: ClosedForms, answers: Answers) -> ChartData:
             f"line {k}": (x, share),
         }
         seen = float(np.interp(np.log(closed.question.amplitude_percent), np.log(x), share))
-        parts.append(f"{percent(seen)} of those of half-width {short(width)} s")
+        parts.append(f"{chance_text(seen)} of those of half-width {short(width)} s")
     peak = f"{closed.question.amplitude_percent:g} %"
     return ChartData(f"Of flares that peak at {peak} the search finds {'; '.join(parts)}.", series)
 

@@ -10,6 +10,7 @@ from collections.abc import Collection, Mapping
 from typing import Any
 from urllib.parse import parse_qsl, urlencode
 
+from mauvecl.answers.answer import chance_text
 from mauvecl.answers.closed_forms import BOTH_CHANCES
 from mauvecl.answers.verbs import VERBS
 from mauvecl.detection.names import check_fap
@@ -18,9 +19,9 @@ from mauvecl.host.stars.library import resolve
 from mauvecl.host.tables.units import offline
 from mauvecl.schema.errors import InputError, of_kind, shortened
 from mauvecl.study.plan import PlanTarget
-from mauvecl.web.closed_forms import TITLES, Answers, ClosedForms, chances, percent, short
+from mauvecl.web.closed_forms import TITLES, Answers, ClosedForms, chances, short
 from mauvecl.web.exposure_tabs import Detection, Noise, Signal, Spectrum, Unknown
-from mauvecl.web.fields import FIELDS, UPLOADED, Choice, Field, note, sentence, targets
+from mauvecl.web.fields import FIELDS, FORMER_VALUES, UPLOADED, Choice, Field, note, sentence, targets
 from mauvecl.web.flare_tabs import Limit, Measurement
 from mauvecl.web.observation_tabs import Analyse, Calibrate, Change, Completeness, Periods, Plan, Visibility
 from mauvecl.web.question import OTHER, SIMULATIONS, Question
@@ -93,7 +94,7 @@ def card(closed: ClosedForms, answers: Answers) -> dict[str, Any]:
     if "detection" in answers:
         (row,) = (row for row in answers["detection"].table if row["statistic"] == q.statistic)
         cut = float(row["threshold"])
-        facts.append(("In closed form", percent(closed.chance)))
+        facts.append(("In closed form", chance_text(closed.chance)))
     facts += [
         ("Threshold", f"{cut:.4g}" if cut == cut else "none"),
         ("Expected with flare", f"{closed.odds.flaring.mean:.4g}"),
@@ -108,7 +109,7 @@ def card(closed: ClosedForms, answers: Answers) -> dict[str, Any]:
         "headline": True,
         "numbers": [chance.shown for chance in both],
         "chosen": q.unknown,
-        "shown": percent(chosen.value),
+        "shown": chance_text(chosen.value),
         "interval": f"{TITLES[q.unknown]}; {chosen.how}",
         "words": words,
         "facts": facts,
@@ -276,8 +277,14 @@ class State:
         strange = sorted({name for name, _ in pairs} - set(self._fields))
         if strange:
             self.stray = f"The link holds {shortened(', '.join(strange))}, which is no field here; it was left out."
+        given = {name: text for name, text in pairs if name in self._fields}
+        if given.get("unknown") in FORMER_VALUES["unknown"]:
+            self.stray += " The link is of version 1: its payload and unknowns have other names today."
+            given |= {
+                name: words.get(given[name], given[name]) for name, words in FORMER_VALUES.items() if name in given
+            }
         first = {name: field.first for name, field in self._fields.items()}
-        self.enter(first | {name: text for name, text in pairs if name in self._fields})
+        self.enter(first | given)
         for name in SEEN.keys() & self._invalid.keys():
             # The page has no field to correct them.
             self.stray += f" The link's {name}: {self._invalid[name]}; it was left out."

@@ -16,7 +16,7 @@ from mauvecl.schema.errors import InputError
 from mauvecl.study.analyses import SPECTRUM
 from mauvecl.study.cases import Case, Loader
 from mauvecl.study.study import Study
-from mauvecl.web.fields import FIELDS, WITH_FILE, Draws, Field
+from mauvecl.web.fields import FIELDS, REALISTIC, WITH_FILE, Draws, Field
 from mauvecl.web.uploads import content_folder
 
 if TYPE_CHECKING:
@@ -110,7 +110,7 @@ class Question:
             self._set(data, FIELDS["changes"], (*values["changes"], SPECTRUM))
         points = self.uploads.get("own_unknown", values["own_unknown"])
         own = {"own": {"points": points}} if points else {}
-        data["nuisances"] = {"usual": values["unknown"] == "the usual", "own": own}
+        data["nuisances"] = {"usual": values["unknown"] == REALISTIC, "own": own}
         draws: Draws = values["realisations"]
         data["run"] |= {
             "realisations": draws.number,

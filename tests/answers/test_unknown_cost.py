@@ -137,7 +137,7 @@ def usual_processes(temperature: float) -> Processes:
 @pytest.mark.long
 def test_priors_are_drawn_jointly_on_both_instruments() -> None:
     """Check that no usual setting needs noise to be drawn separately, which priors do not allow."""
-    payloads, temperatures = ("mauve", "mauve-electrons"), (-20.0, 0.0, 13.0, 21.0, 25.0)
+    payloads, temperatures = ("mauvesim", "mauve"), (-20.0, 0.0, 13.0, 21.0, 25.0)
     for payload, temperature, exposure in itertools.product(payloads, temperatures, (5.0, 50.0, 600.0)):
         mauve = instrument(payload, part=True, temperature_c=temperature, output_max_nm=310.0)
         for magnitude in (-1.0, 5.0, 20.0):
@@ -168,7 +168,7 @@ def test_false_alarms_with_drawn_unknowns_are_as_requested(engine: Engine) -> No
     failed = 0
     for number in range(SCENES):
         temperature, magnitude = rng.uniform(13, 21), rng.uniform(6, 10)
-        payload = instrument(str(rng.choice(["mauve", "mauve-electrons"])), part=True, temperature_c=temperature)
+        payload = instrument(str(rng.choice(["mauvesim", "mauve"])), part=True, temperature_c=temperature)
         star = Source.from_library(str(rng.choice(["G2V", "K3V", "M3V", "F5V"]))).at_magnitude(magnitude)
         sky = Sky.of_brightness(rng.uniform(19, 23))
         exposure = float(rng.choice([5.0, 50.0]))

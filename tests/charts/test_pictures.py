@@ -215,7 +215,7 @@ def test_report_has_every_table_remark_and_picture() -> None:
 def test_a_curve_is_listed_by_its_name(engine: Engine) -> None:
     star = Source.from_library("G2V").at_magnitude(7.4)
     quiet, flare = (
-        expect(one, "mauve", exposure=5, sky=22.1) for one in (star, star.flaring(amplitude=0.2, temperature=1e4))
+        expect(one, "mauvesim", exposure=5, sky=22.1) for one in (star, star.flaring(amplitude=0.2, temperature=1e4))
     )
     curve = engine.detect(quiet, flare, realisations=1000, seed=1).roc("matched")
     for name, start in (("", "area "), ("own words", "own words: area ")):

@@ -143,7 +143,7 @@ def test_extreme_numbers_in_settings_raise(key: str, value: str) -> None:
 
 def test_extreme_numbers_in_instruments_raise(tmp_path: Path) -> None:
     for value in NUMBERS:
-        (tmp_path / "mine.toml").write_text(f"extends = 'mauve'\nread_noise_dn = {value}\n")
+        (tmp_path / "mine.toml").write_text(f"extends = 'mauvesim'\nread_noise_dn = {value}\n")
         with pytest.raises(InputError) as error:
             Instrument.load(tmp_path / "mine.toml")
         assert "\n" not in str(error.value)
@@ -174,7 +174,7 @@ def test_deep_nesting_is_refused(text: str, tmp_path: Path) -> None:
 def test_long_chains_of_instruments_are_refused(tmp_path: Path) -> None:
     for i in range(100):
         (tmp_path / f"{i}.toml").write_text(f"extends = '{i + 1}.toml'\n")
-    (tmp_path / "100.toml").write_text("extends = 'mauve'\n")
+    (tmp_path / "100.toml").write_text("extends = 'mauvesim'\n")
     assert "chain" in refused(*OBSERVE, "--instrument", "0.toml", folder=tmp_path)
     run(*OBSERVE, "--instrument", "90.toml", folder=tmp_path)
 
@@ -190,8 +190,8 @@ def test_only_regular_files_are_read(tmp_path: Path) -> None:
     (tmp_path / "data" / "stars").mkdir(parents=True)
     (tmp_path / "data" / "stars" / "mine.ecsv").symlink_to("/dev/zero")
     for name in ("zero", "pipe"):
-        (tmp_path / f"{name}-curve.toml").write_text(f"extends = 'mauve'\nfibre_efficiency = '{name}.ecsv'\n")
-        (tmp_path / f"{name}-map.toml").write_text(f"extends = 'mauve'\npixel_map = '{name}.ecsv'\n")
+        (tmp_path / f"{name}-curve.toml").write_text(f"extends = 'mauvesim'\nfibre_efficiency = '{name}.ecsv'\n")
+        (tmp_path / f"{name}-map.toml").write_text(f"extends = 'mauvesim'\npixel_map = '{name}.ecsv'\n")
         for words in (
             ("simulate", f"{name}.toml"),
             ("simulate", f"{name}.ecsv"),

@@ -87,7 +87,7 @@ NUMBERS = st.one_of(
 TEXTS = st.one_of(
     st.text(max_size=30),
     st.sampled_from(["", ".", "..", "/", "[/red]", "[bold]x", "a\0b", "\udcff", "\n", "'", '"', "²", "~"]),
-    st.sampled_from(["x" * 5000, "y" * 300 + ".toml", "G2V", "mauve", "stack:5", "V", "chi2", "all", "none"]),
+    st.sampled_from(["x" * 5000, "y" * 300 + ".toml", "G2V", "mauvesim", "stack:5", "V", "chi2", "all", "none"]),
     st.sampled_from(["zero.txt", "fifo.txt", "/dev/zero", "good.txt"]),
 )
 QUOTED = TEXTS.map(lambda text: '"' + "".join(f"\\u{ord(c):04x}" if ord(c) < 0xD800 else "?" for c in text) + '"')
@@ -146,7 +146,7 @@ INSTRUMENT_KEYS = (
 @many(25)
 @given(key=st.sampled_from(INSTRUMENT_KEYS), value=VALUES)
 def test_instruments_never_crash(folder: Path, key: str, value: str) -> None:
-    (folder / "mine.toml").write_text(f"extends = 'mauve'\n{key} = {value}\n")
+    (folder / "mine.toml").write_text(f"extends = 'mauvesim'\n{key} = {value}\n")
     check(folder, *ASK, "--instrument", "mine.toml")
 
 

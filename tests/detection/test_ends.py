@@ -30,7 +30,7 @@ def study(number: int) -> tuple[list[Expectation], dict]:
     rng = np.random.default_rng([14, number])
     low = float(rng.uniform(205.0, 600.0))
     payload = instrument(
-        str(rng.choice(["mauve", "mauve-electrons"])),
+        str(rng.choice(["mauvesim", "mauve"])),
         temperature_c=float(rng.uniform(0.0, 22.0)),
         output_min_nm=low,
         output_max_nm=low + 25.0,

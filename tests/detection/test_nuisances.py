@@ -21,7 +21,7 @@ FREE = float("inf")
 @cache
 def pair(name: str = "G2V", magnitude: float = 7.4, amplitude: float = 0.02) -> tuple[Expectation, Expectation]:
     source = Source.from_library(name).at_magnitude(magnitude, "V", "vega")
-    mauve, sky = Instrument.load("mauve"), Sky.of_brightness(22.1)
+    mauve, sky = Instrument.load("mauvesim"), Sky.of_brightness(22.1)
     quiet, flare = (expect(one, mauve, exposure=50.0, sky=sky) for one in (source, source.flaring(amplitude)))
     return quiet, flare
 

@@ -20,7 +20,7 @@ def scene(number: int) -> tuple:
     """Draw a star, magnitude, exposure, temperature, sky, instrument and 12 nm of spectrum at random."""
     generator = np.random.default_rng([2026, number])
     first = generator.uniform(200.0, 330.0)
-    payload = Instrument.load(str(generator.choice(["mauve", "mauve-electrons"]))).with_(
+    payload = Instrument.load(str(generator.choice(["mauvesim", "mauve"]))).with_(
         temperature_c=float(generator.uniform(-10.0, 25.0)),
         output_min_nm=float(first),
         output_max_nm=float(first + 12.0),

@@ -32,7 +32,7 @@ from mauvecl import (
 )
 from mauvecl import fit_two_temperatures as fit_two
 
-MAUVE = Instrument.load("mauve")
+MAUVE = Instrument.load("mauvesim")
 FREE, SKY_SD, DARK_C = np.inf, 0.1, 0.5
 
 

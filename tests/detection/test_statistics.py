@@ -158,7 +158,7 @@ def test_every_pixel_is_a_centre_if_few_do_not_suffice() -> None:
     """Use a star without light or sky below 400 nm, where the inverse of the smoothed flux jumps."""
     nm = np.arange(170.0, 1150.0, 0.5)
     dark = Source.from_arrays(nm, np.where(nm > 400.0, 1e-11, 0.0)).at_magnitude(7.4)
-    quiet = expect(dark, Instrument.load("mauve"), exposure=50.0, sky=Sky.none())
+    quiet = expect(dark, Instrument.load("mauvesim"), exposure=50.0, sky=Sky.none())
     used = np.ones(quiet.wavelength_nm.size, bool)
     smoothing = chi2.Smoothing.of(quiet, used)
     assert len(smoothing.centres) == used.size

@@ -36,11 +36,11 @@ PRIORS = Processes(
 CASES = {
     "stack": {},
     "cold": {"temperature_c": -30.0, "exposure": 5.0},
-    "cold electrons": {"name": "mauve-electrons", "temperature_c": -20.0, "exposure": 10.0},
+    "cold electrons": {"name": "mauve", "temperature_c": -20.0, "exposure": 10.0},
     "frames": {"exposure": 15.0, "mode": "frames"},
     "at the rail": {"exposure": 10.0, "magnitude": -0.7},
-    "apart, quiet readout": {"read_noise_dn": 0.5, "name": "mauve-electrons", "exposure": 5.0, "magnitude": 14.0},
-    "apart, electrons, frames": {"recipe": "apart", "name": "mauve-electrons", "exposure": 10.0, "mode": "frames"},
+    "apart, quiet readout": {"read_noise_dn": 0.5, "name": "mauve", "exposure": 5.0, "magnitude": 14.0},
+    "apart, electrons, frames": {"recipe": "apart", "name": "mauve", "exposure": 10.0, "mode": "frames"},
     "noiseless": {"read_noise_dn": 0.0, "dark_scale_dn_per_s": 0.0, "magnitude": 30.0, "exposure": 5.0},
     "uneven": {"pixel_map": PixelMap.made_up(2048, seed=5, hot_share=0.05)},
     "uneven, apart": {"pixel_map": PixelMap.made_up(2048, seed=5), "recipe": "apart", "temperature_c": -9.0,
@@ -49,7 +49,7 @@ CASES = {
                                   "temperature_c": 9.0, "exposure": 5.0},
     "cosmic rays, frames": {"processes": Processes(cosmic_rays=RAYS), "mode": "frames", "exposure": 10.0},
     "priors": {"processes": PRIORS},
-    "priors, electrons, frames": {"processes": PRIORS, "name": "mauve-electrons", "mode": "frames", "exposure": 25.0},
+    "priors, electrons, frames": {"processes": PRIORS, "name": "mauve", "mode": "frames", "exposure": 25.0},
     "jitter, one frame, rays": {"processes": Processes(cosmic_rays=RAYS, jitter=Uniform(0.0, 0.05)), "exposure": 5.0},
 }  # fmt: skip
 #: Cases of raw spectra in `make test`: a joint draw, and separate draws frame by frame.
@@ -73,7 +73,7 @@ def case(name: str) -> tuple[list, dict]:
     options = dict(CASES[name])
     how = {key: options.pop(key) for key in ("mode", "recipe", "processes") if key in options}
     exposure, magnitude = options.pop("exposure", 50.0), options.pop("magnitude", 7.4)
-    payload = instrument(options.pop("name", "mauve"), part=True, **options)
+    payload = instrument(options.pop("name", "mauvesim"), part=True, **options)
     return star(magnitude=magnitude, amplitudes=(0.081, 0.24), exposure=exposure, payload=payload), how
 
 
@@ -180,7 +180,7 @@ def test_saturating_star_is_drawn_frame_by_frame(engine: Engine) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("payload", ["mauve", "mauve-electrons"])
+@pytest.mark.parametrize("payload", ["mauvesim", "mauve"])
 def test_moments_of_raw_spectra_follow_model(engine: Engine, payload: str) -> None:
     """Compare mean and variance of each pixel with the model: |z| < 6 in 1643 pixels fails once in 3e5 seeds."""
     (quiet,) = star(payload=instrument(payload))

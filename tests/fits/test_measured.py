@@ -28,7 +28,7 @@ from mauvecl import (
     measure_along,
 )
 
-MAUVE = Instrument.load("mauve")
+MAUVE = Instrument.load("mauvesim")
 STEADY = Cooling(9000.0, 9000.0, 1.0)
 SEEDS = 20
 

@@ -31,7 +31,7 @@ from mauvecl import (
     forecast,
 )
 
-MAUVE = Instrument.load("mauve")
+MAUVE = Instrument.load("mauvesim")
 #: Forecasts that an independent script computed for the project's specification.
 PUBLISHED = tomllib.loads((Path(__file__).parents[1] / "data" / "published-fits.toml").read_text(encoding="utf-8"))
 

@@ -15,7 +15,7 @@ from scipy.integrate import quad
 
 from mauvecl import SHAPES, Blackbody, Cooling, EnergyScale, Instrument, Sky, Source, Study, expect, stare
 
-MAUVE = Instrument.load("mauve")
+MAUVE = Instrument.load("mauvesim")
 STARS = ("A0V", "A7V", "F5V", "G2V", "K1V", "K5V", "M0V", "M3V", "M5V", "Sun")
 BANDS = ("Kepler", "TESS", "V", "B", "Gaia G", "Gaia BP", "GALEX NUV")
 #: Ranges of wavelength of the columns of a light curve.

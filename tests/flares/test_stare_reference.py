@@ -41,7 +41,7 @@ CASES: dict[str, tuple[dict[str, Any], dict[str, Any], int, int, int, dict[str, 
     "all that wobbles": ({}, WOBBLE, 3, 2, 0, {}),
     "jitter alone": ({}, {"jitters": {"light": 0.03}}, 2, 1, 0, {}),
     "unknown alone": ({}, {"offsets": {"temperature": 1.0}}, 5, 0, 0, {}),
-    "electrons": ({"name": "mauve-electrons"}, WOBBLE, 2, 1, 3, {}),
+    "electrons": ({"name": "mauve"}, WOBBLE, 2, 1, 3, {}),
     "cold, fourth cumulants": ({"temperature_c": -20.0, "output_max_nm": 303.0}, WOBBLE, 2, 1, 0, {}),
     "Poisson photons": ({"photon_noise": "poisson"}, WOBBLE, 3, 1, 0, {}),
     "neighbours": ({}, WOBBLE, 3, 2, 0, {}),
@@ -55,7 +55,7 @@ def case(name: str) -> tuple[Components, Stare, Any, Any, dict[str, Any]]:
     """Return components, stare, flares of each stare, amplitudes and further arguments."""
     payload, wobble, n_sums, n_flares, n_scenarios, more = CASES[name]
     options = {"output_min_nm": 300.0, "output_max_nm": 312.0} | payload
-    used = instrument(options.pop("name", "mauve"), **options)
+    used = instrument(options.pop("name", "mauvesim"), **options)
     near = NEAR if name == "neighbours" else None
     quiet, *flares = star(amplitudes=(0.5, 2.0)[:n_flares], exposure=5.0, payload=used, neighbours=near)
     wavelength = quiet.wavelength_nm - quiet.wavelength_nm.mean()

@@ -79,7 +79,7 @@ def test_archive_files_are_read(name: str, options: dict[str, Any], read: Any, v
     if v is not None:
         # Zero points of V differ by 0.03 mag; the M7 dwarf varies, and catalogues with it.
         assert star.magnitude("V") == pytest.approx(v, abs=0.15 if "extend" in options else 0.06)
-    messages = expect(star.at_magnitude(8.0), Instrument.load("mauve"), exposure=50.0).messages
+    messages = expect(star.at_magnitude(8.0), Instrument.load("mauvesim"), exposure=50.0).messages
     assert all(any(text in message for message in messages) for text in star.messages)
 
 
@@ -88,12 +88,12 @@ def test_short_spectra_need_an_extension(name: str, options: dict[str, Any], sen
     star = Source.read(HERE / name, **options)
     assert any(text.startswith("its own points cover") for text in star.messages)
     with refused(*sentence):
-        expect(replace(star, unscaled=""), Instrument.load("mauve"), exposure=5.0)
+        expect(replace(star, unscaled=""), Instrument.load("mauvesim"), exposure=5.0)
 
 
 def test_short_spectra_suffice_for_a_narrower_range() -> None:
     """Compare VB 8, which starts at 290 nm, with its extension by another star, for an instrument from 350 nm."""
-    red = Instrument.load("mauve").with_(output_min_nm=350.0)
+    red = Instrument.load("mauvesim").with_(output_min_nm=350.0)
     short, extended = (Source.read(HERE / "vb8_stiswfcnic_004.fits", extend=one) for one in (None, "M3V"))
     one, other = (expect(star, red, exposure=5.0) for star in (short, extended))
     np.testing.assert_array_equal(one.source_electrons, other.source_electrons)
@@ -144,7 +144,7 @@ def test_gaia_arrays_in_a_cell() -> None:
 
 
 def test_surface_or_relative_fluxes_need_a_magnitude() -> None:
-    mauve = Instrument.load("mauve")
+    mauve = Instrument.load("mauvesim")
     for name, options in (("ckp00_5750.fits[g45]", {}), ("h_stis_ngsl_hd095735_v2.txtA", ANGSTROM)):
         star = Source.read(HERE / name, **options)
         with refused("magnitude"):
@@ -156,7 +156,7 @@ def test_calspec_files_that_start_within_the_line_function_are_continued() -> No
     """Cut a whole file where three of CALSPEC's begin (180.02-180.10 nm) and P330E does (199.95 nm)."""
     star = Source.read(HERE / "18sco_stis_004.fits")
     assert star.name == "18SCO"
-    mauve = Instrument.load("mauve")
+    mauve = Instrument.load("mauvesim")
     whole = expect(star, mauve, exposure=50.0)
     for start in (180.02, 180.10, 199.95):
         kept = star.wavelength_nm >= start

@@ -128,7 +128,7 @@ def test_saturation_is_the_first_message(mauve: Instrument, quiet: Expectation) 
 
 
 def test_provenance_names_the_inputs(quiet: Expectation, sunlike: Source, mauve: Instrument) -> None:
-    assert (quiet.name, quiet.instrument) == (sunlike.name, "mauve")
+    assert (quiet.name, quiet.instrument) == (sunlike.name, "mauvesim")
     wanted = {"source digest": sunlike.digest, "instrument digest": mauve.digest, "order": "paper",
               "requested exposure": "50 s"}  # fmt: skip
     assert wanted.items() <= dict(quiet.provenance).items()

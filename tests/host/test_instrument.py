@@ -38,7 +38,7 @@ def test_pixels_cover_the_output_range(mauve: Instrument) -> None:
     np.testing.assert_allclose(np.diff(centres), 0.3043, rtol=1e-9)
 
 
-@pytest.mark.parametrize("name", ["mauve", "mauve-electrons"])
+@pytest.mark.parametrize("name", ["mauvesim", "mauve"])
 def test_every_value_has_a_source(name: str) -> None:
     instrument = Instrument.load(name)
     assert instrument.name == name
@@ -51,7 +51,7 @@ def test_every_value_has_a_source(name: str) -> None:
 
 
 def test_mauve_electrons_differs_only_in_counting(mauve: Instrument) -> None:
-    electrons = Instrument.load("mauve-electrons")
+    electrons = Instrument.load("mauve")
     assert (mauve.dark_unit, electrons.dark_unit) == ("DN", "electrons")
     assert electrons != mauve
     assert electrons.with_(dark_unit="DN", photon_noise="gaussian") == mauve
@@ -76,7 +76,7 @@ def test_user_file_extends_an_embedded_instrument(tmp_path: Path, mauve: Instrum
     (tmp_path / "grating.ecsv").write_text(CURVE)
     file = tmp_path / "mine.toml"
     file.write_text(
-        'extends = "mauve"\nname = "mine"\nlight_loss = 0.2\ngrating_efficiency = "grating.ecsv"\n'
+        'extends = "mauvesim"\nname = "mine"\nlight_loss = 0.2\ngrating_efficiency = "grating.ecsv"\n'
         'read_noise_dn = { value = 11, tag = "D", source = "lab" }\nwindow_efficiency = 0.9\n'
     )
     mine = Instrument.load(str(file))
@@ -140,7 +140,7 @@ def seen(payload: Instrument) -> Expectation:
 
 
 def test_each_column_changes_its_own_quantity() -> None:
-    mauve = Instrument.load("mauve")
+    mauve = Instrument.load("mauvesim")
     plain = seen(mauve)
     n = np.arange(2048)
     given = PixelMap(
@@ -166,7 +166,7 @@ def test_written_maps_are_read_back(tmp_path: Path) -> None:
     again = PixelMap.read(tmp_path / "map.ecsv")
     assert again.digest == made.digest
     assert again.source == "A: made up, seed 3"
-    (tmp_path / "own.toml").write_text('extends = "mauve"\nname = "own"\npixel_map = "map.ecsv"\n')
+    (tmp_path / "own.toml").write_text('extends = "mauvesim"\nname = "own"\npixel_map = "map.ecsv"\n')
     payload = Instrument.load(tmp_path / "own.toml")
     assert payload.pixel_map.digest == made.digest
     assert payload.sources["pixel_map"] == made.source

@@ -112,7 +112,7 @@ def seen(folder: Path, *rows: str, head: str = HEAD, share: float = 1.0) -> Expe
 
 
 def alone(star: Source = STAR) -> Expectation:
-    return expect(star, Instrument.load("mauve"), exposure=50.0)
+    return expect(star, Instrument.load("mauvesim"), exposure=50.0)
 
 
 def blend(share: float) -> Source:

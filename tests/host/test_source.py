@@ -110,7 +110,7 @@ GOOD = grid() * 1e-15
 def test_short_spectra_raise_for_the_nominal_range(kept: slice, refusal: tuple[str, ...]) -> None:
     """Refuse them, but accept them for an instrument whose pixels they cover."""
     star = Source.from_arrays(grid()[kept], GOOD[kept])
-    mauve = Instrument.load("mauve")
+    mauve = Instrument.load("mauvesim")
     with refused(*refusal):
         expect(star, mauve, exposure=5.0)
     narrow = mauve.with_(output_min_nm=250.0, output_max_nm=600.0)
@@ -133,7 +133,7 @@ def test_other_numbers_of_the_span() -> None:
     short = Source.from_arrays(finer, np.interp(finer, grid(), hot), name="short")
     assert any("starts at 180.1 nm and is continued to 180 nm" in text for text in short.messages)
     assert short.flux_flam[0] == pytest.approx(short.flux_flam[1:][np.abs(finer - finer[0]) <= 5.0].mean())
-    mauve = Instrument.load("mauve")
+    mauve = Instrument.load("mauvesim")
     one, other = (expect(star.at_magnitude(5.0), mauve, exposure=5.0) for star in (whole, short))
     np.testing.assert_allclose(one.source_electrons, other.source_electrons, rtol=2e-4)
     with refused("extend", "190"):
@@ -149,7 +149,7 @@ def test_other_numbers_of_the_span() -> None:
 def test_extension_by_another_star(sun: Source) -> None:
     """Cut the library's Sun at both ends and extend it by itself at another brightness."""
     kept = (sun.wavelength_nm > 250) & (sun.wavelength_nm < 650)
-    mauve = Instrument.load("mauve")
+    mauve = Instrument.load("mauvesim")
     short = (sun.wavelength_nm[kept], 1e-3 * sun.flux_flam[kept])
     with refused("extend", "200-700"):
         expect(Source.from_arrays(*short), mauve, exposure=5.0)
@@ -178,7 +178,7 @@ def test_measured_noise_is_kept_and_reported_once() -> None:
     nm, flux = noisy(0.0)
     star = Source.from_arrays(nm, flux, name="cool")
     np.testing.assert_array_equal(star.flux_flam, flux)
-    found = expect(star, Instrument.load("mauve"), exposure=50.0)
+    found = expect(star, Instrument.load("mauvesim"), exposure=50.0)
     reported = [message for message in found.messages if "negative flux" in message]
     assert len(reported) == 1
     assert f"{int((flux[(nm >= 180) & (nm <= 750)] < 0).sum())} of its 5700 points" in reported[0].replace(
@@ -195,7 +195,7 @@ def test_mean_too_far_below_zero_raises() -> None:
     """Refuse a level of -1e-13, ten errors of a point, which noise does not explain."""
     star = Source.from_arrays(*noisy(-1e-13), name="wrong")
     with refused("bin_nm", "3"):
-        expect(star.at_magnitude(2.0), Instrument.load("mauve"), exposure=50.0)
+        expect(star.at_magnitude(2.0), Instrument.load("mauvesim"), exposure=50.0)
 
 
 def test_stated_error_of_a_mean_equals_the_scatter_of_means() -> None:
@@ -204,7 +204,7 @@ def test_stated_error_of_a_mean_equals_the_scatter_of_means() -> None:
     The standard deviation of 100 draws is accurate to 7 %, and the mean of 20 stated errors to 5 %. The limits of 0.7
     and 1.3 lie beyond three standard deviations of their ratio: false failures for less than 3e-3 of seeds.
     """
-    mauve, nm = Instrument.load("mauve"), np.arange(170.0, 800.0, 0.5)
+    mauve, nm = Instrument.load("mauvesim"), np.arange(170.0, 800.0, 0.5)
     rng = np.random.default_rng(5)
 
     def star(level: float) -> Source:

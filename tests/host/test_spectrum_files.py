@@ -63,7 +63,7 @@ def test_relative_fluxes_of_lamost_need_a_magnitude(form: str, tmp_path: Path) -
     wanted = 1e15 * curve(10 * star.wavelength_nm[measured])
     np.testing.assert_allclose(star.flux_flam[measured], wanted, rtol=1e-3)
     assert any("cover 369.999-909.913 nm, 66% of 200-700 nm" in text for text in star.messages), star.messages
-    mauve = Instrument.load("mauve")
+    mauve = Instrument.load("mauvesim")
     with refused("magnitude", "LAMOST"):
         expect(star, mauve, exposure=5.0)
     assert expect(star.at_magnitude(8.0), mauve, exposure=5.0).signal_dn.max() > 0

@@ -89,7 +89,7 @@ def test_joint_draws_cannot_be_distinguished_from_exact_ones(name: str) -> None:
     assert exact.draws_to_tell(p, q) > 1e14
 
 
-@pytest.mark.parametrize("name", ["mauve", "mauve-electrons"])
+@pytest.mark.parametrize("name", ["mauvesim", "mauve"])
 def test_nominal_payload_is_drawn_jointly_at_all_settings(name: str) -> None:
     """Check nine temperatures and 1 to 100 frames, in the pixels with most and least light."""
     for temperature in (-40, -30, -20, -9, 0, 9, 15, 21, 25):

@@ -66,7 +66,7 @@ ENDS = [
         ("noise", {"temperature_c": -30.0}, {}),
         ("dark", {}, {"recipe": "apart"}),
         ("dark", {"temperature_c": -30.0}, {"recipe": "apart"}),
-        ("photon", {"name": "mauve-electrons"}, {"recipe": "apart"}),
+        ("photon", {"name": "mauve"}, {"recipe": "apart"}),
         ("cosmic_rays", {}, {"processes": Processes(cosmic_rays=CosmicRays(rate_per_cm2_s=500.0))}),
     ],
 )
@@ -76,7 +76,7 @@ def test_extreme_words_in_production_kernel_equal_reference(
     seed, index, frame, group = place_of(words, stream)
     np.testing.assert_array_equal([int(w[0]) for w in reference.words_at([index], frame, stream, group, seed)], words)
     options = dict(options)
-    payload = instrument(options.pop("name", "mauve"), part=True, output_max_nm=310.0, **options)
+    payload = instrument(options.pop("name", "mauvesim"), part=True, output_max_nm=310.0, **options)
     (x,) = star(payload=payload, exposure=5.0)
     scene = prepare([x], first_frame=frame, first_group=group, **how)
     raw = draw_one(engine, scene, index, seed)

@@ -141,7 +141,7 @@ def test_process_does_not_change_draws_of_others(engine: Engine) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("recipe", ["joint", "apart"])
-@pytest.mark.parametrize("name", ["mauve", "mauve-electrons"])
+@pytest.mark.parametrize("name", ["mauvesim", "mauve"])
 def test_components_have_correct_sum_and_moments(engine: Engine, name: str, recipe: str) -> None:
     """Check that components add up to the engine's count and have their own moments."""
     rays = recipe == "joint"
@@ -200,7 +200,7 @@ def test_draws_have_different_counters(monkeypatch: pytest.MonkeyPatch) -> None:
     cases = [
         ({"exposure": 20.0, "payload": payload}, {"mode": "frames", "processes": everything}),
         ({"exposure": 20.0, "payload": payload}, {"recipe": "apart"}),
-        ({"exposure": 10.0, "payload": instrument("mauve-electrons", output_max_nm=205.0)}, {"recipe": "apart"}),
+        ({"exposure": 10.0, "payload": instrument("mauve", output_max_nm=205.0)}, {"recipe": "apart"}),
     ]
     for observation, how in cases:
         scene = prepare(star(**observation), **how)

@@ -129,7 +129,7 @@ def test_mode_follows_least_light_of_prior() -> None:
 
 def test_payload_is_drawn_as_stack() -> None:
     """Draw stacks, since the read noise of 12 DN smooths all rounding."""
-    for name in ("mauve", "mauve-electrons"):
+    for name in ("mauvesim", "mauve"):
         for temperature in (-40.0, 21.0):
             for exposure in (10.0, 500.0):
                 payload = instrument(name, part=True, temperature_c=temperature)

@@ -31,7 +31,7 @@ def course(seconds: int) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def answer() -> Any:
-    star, mauve = Source.read(QUIET, wavelength_unit="Angstrom", extend="M3V"), Instrument.load("mauve")
+    star, mauve = Source.read(QUIET, wavelength_unit="Angstrom", extend="M3V"), Instrument.load("mauvesim")
     quiet = expect(star, mauve, exposure=FRAME_S)
     light = np.tile(quiet.light_dn, (N, 1))
     for seconds, path in FILES.items():

@@ -33,7 +33,7 @@ from mauvecl import (
     what_matters,
 )
 
-NOMINAL = Instrument.load("mauve")
+NOMINAL = Instrument.load("mauvesim")
 SKY = Sky.of_brightness(22.1)
 STARS = (("B3V", 4.5), ("A0V", 5.0), ("F0V", 4.0), ("G2V", 4.0), ("B0V", 5.0))
 #: Standard deviations beyond which a fitted value is wrong; a normal one is once in 16 000 times.
@@ -253,7 +253,7 @@ def grey(tmp_path: Path) -> str:
     errors = "# %ECSV 1.0\n# ---\n# datatype:\n# - {name: wavelength, unit: nm, datatype: float64}\n"
     errors += "# - {name: mode_1, datatype: float64}\nwavelength mode_1\n200 0.05\n700 0.05\n"
     (tmp_path / "errors.ecsv").write_text(errors)
-    (tmp_path / "grey.toml").write_text('extends = "mauve"\nname = "grey"\nthroughput_errors = "errors.ecsv"\n')
+    (tmp_path / "grey.toml").write_text('extends = "mauvesim"\nname = "grey"\nthroughput_errors = "errors.ecsv"\n')
     return str(tmp_path / "grey.toml")
 
 

@@ -14,7 +14,7 @@ from mauvecl import Engine, Expectation, Instrument, Nuisances, Sky, Source, Stu
 from mauvecl.observations.visits import line_index, recover_periods
 
 AU_MIC = Path(__file__).parents[1] / "data" / "flares" / "aumic_iue"
-MAUVE = Instrument.load("mauve")
+MAUVE = Instrument.load("mauvesim")
 STAR = Source.from_library("M3V").at_magnitude(9.0)
 #: Windows beside Mg II in which its index takes the continuum.
 CONTINUUM_NM = ((258.0, 270.0), (290.0, 302.0))

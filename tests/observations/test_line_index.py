@@ -132,7 +132,7 @@ def study(tmp_path: Path) -> Study:
 
 
 def electrons(source: Source) -> float:
-    return float(expect(source, Instrument.load("mauve"), exposure=50.0).source_electrons.sum())
+    return float(expect(source, Instrument.load("mauvesim"), exposure=50.0).source_electrons.sum())
 
 
 def test_analyse_lists_for_each_event_the_flares_that_raise_the_light_as_much(study: Study) -> None:

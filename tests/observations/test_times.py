@@ -97,7 +97,7 @@ def test_barycentric_times_stay_as_they_are() -> None:
 @pytest.mark.long
 def test_tables_of_an_analysis_state_epoch_scale_and_place(tmp_path: Path) -> None:
     hdu = fits.table_to_hdu(Table({"TIME": TIME, "FLUX": FLUX}))
-    hdu.header.update({"TIMEUNIT": "s", "MJDREF": 61_299.0, "TREFPOS": "TOPOCENTER", "INSTRUME": "mauve"})
+    hdu.header.update({"TIMEUNIT": "s", "MJDREF": 61_299.0, "TREFPOS": "TOPOCENTER", "INSTRUME": "mauvesim"})
     hdu.writeto(tmp_path / "a.fits")
     settings = {"data": {"file": str(tmp_path / "a.fits"), "barycentric": "AU Mic"}}
     answer = analyse(Study.build(settings, "test"))

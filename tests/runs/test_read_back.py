@@ -33,7 +33,7 @@ def test_stores_are_read_back_with_their_metadata(tmp_path: Path, engine: Engine
     np.testing.assert_allclose(frames.exposure_s, exposure)
     np.testing.assert_allclose(frames.time_s[:4], times)
     np.testing.assert_allclose(frames.temperature_c, 21.0)
-    assert (frames.instrument, frames.unit, frames.name) == ("mauve", "adu", "G2V V = 7.4")
+    assert (frames.instrument, frames.unit, frames.name) == ("mauvesim", "adu", "G2V V = 7.4")
     # The mean of the squared errors is the variance of the model: 40 rows of 197 pixels know it to a percent.
     np.testing.assert_allclose((frames.error**2).mean(), (x.variance_dn2 / x.n_frames * n).mean(), rtol=0.03)
     assert not frames.quality.any()

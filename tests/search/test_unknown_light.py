@@ -22,7 +22,7 @@ from mauvecl import (
     measure_along,
 )
 
-MAUVE = Instrument.load("mauve")
+MAUVE = Instrument.load("mauvesim")
 PEAK_S, HALF_WIDTH_S, AMPLITUDE, KELVIN = 100.0, 40.0, 1.5, 10_000.0
 START = {"peak_s": PEAK_S, "half_width_s": HALF_WIDTH_S, "cooling": False}
 

@@ -123,7 +123,7 @@ def test_energies_equal_those_of_the_light(name: str) -> None:
 def test_answers_take_any_spectrum(name: str) -> None:
     """The closed-form S/N equals that of the flare's counts, and stares have the light of the spectrum."""
     study = study_of(name, amplitudes=[0.05])
-    star, mauve = Source.from_library("M3V").at_magnitude(9), Instrument.load("mauve")
+    star, mauve = Source.from_library("M3V").at_magnitude(9), Instrument.load("mauvesim")
     wanted = [expect(s, mauve, exposure=50.0) for s in (star, star.flaring(0.05, spectrum=TEXTS[name][1]))]
     (found,) = expectations(study)
     assert snr_of(*found) == pytest.approx(snr_of(*wanted), rel=1e-9)

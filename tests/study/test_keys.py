@@ -72,8 +72,8 @@ CALLS: dict[str, Callable[[float], Any]] = {
     "balmer_jump": lambda v: BalmerFlare(1e4, v),
     "second_temperature": lambda v: TwoBlackbodies(1e4, v, 0.1),
     "second_area": lambda v: TwoBlackbodies(1e4, 2e4, v),
-    "exposure": lambda v: expect(star().at_magnitude(7.0), Instrument.load("mauve"), exposure=v),
-    "detector_temperature": lambda v: Instrument.load("mauve").with_(temperature_c=v),
+    "exposure": lambda v: expect(star().at_magnitude(7.0), Instrument.load("mauvesim"), exposure=v),
+    "detector_temperature": lambda v: Instrument.load("mauvesim").with_(temperature_c=v),
     "sky": Sky.of_brightness,
 }
 

@@ -30,7 +30,7 @@ def test_each_star_has_its_own_photosphere() -> None:
     for found, name, kelvin in zip(both, ("G2V", "M3V"), (5636.0, 3295.0), strict=True):
         star = Source.from_library(name).at_magnitude(8.0)
         flaring = star.flaring(0.1, geometry="replaces", photosphere_temperature=kelvin)
-        wanted = expect(flaring, Instrument.load("mauve").with_(**PART["changes"]), exposure=50)
+        wanted = expect(flaring, Instrument.load("mauvesim").with_(**PART["changes"]), exposure=50)
         np.testing.assert_allclose(found, wanted.source_electrons, rtol=1e-12)
     own = study({"library": "G2V", "effective_temperature_k": 5000.0}, geometry="replaces")
     one = study({"library": "G2V"}, geometry="replaces", photosphere_temperature_k=5000.0)

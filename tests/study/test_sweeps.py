@@ -85,7 +85,7 @@ def test_sweep_gives_the_expectations_of_each_value(quantity: str, engine: Engin
         given |= {part: value}
         light = LIGHT[quantity](value) if part == "spectrum" else Blackbody(10_000.0)
         quiet = Source.from_library(given["star"]).at_magnitude(given["magnitude"])
-        payload = Instrument.load("mauve")
+        payload = Instrument.load("mauvesim")
         if given["instrument"] is not None:
             payload = payload.with_(temperature_c=given["instrument"])
         how = {"exposure": given["exposure"], "sky": Sky.of_brightness(given["sky"])}
@@ -165,7 +165,7 @@ def test_formula_holds_for_the_payload_and_fails_at_saturation(engine: Engine) -
     assert faint["fap_ratio"] != 1.0
 
 
-@pytest.mark.parametrize("name", ["mauve", "mauve-electrons"])
+@pytest.mark.parametrize("name", ["mauvesim", "mauve"])
 @pytest.mark.parametrize("temperature", [21.0, -30.0])
 def test_pixels_beyond_five_sigma_are_counted(name: str, temperature: float, engine: Engine) -> None:
     """The saddle-point tail agrees with the exact sum over dark counts to 0.3 %; the distribution is skewed upward."""

@@ -41,7 +41,7 @@ def test_draws_follow_their_priors(averaged: Any) -> None:
             "light_loss": stats.truncnorm(-3, 3, loc=0.34, scale=0.1)}  # fmt: skip
     for name, prior in even.items():
         np.testing.assert_array_equal(np.sort(np.floor(24 * prior.cdf(column[name]))), np.arange(24))
-    one, nominal = draws.studies[7].observation.load_instrument(), Instrument.load("mauve")
+    one, nominal = draws.studies[7].observation.load_instrument(), Instrument.load("mauvesim")
     for name in ("temperature_c", "light_loss", "pointing_loss", "conversion_uv_per_electron", "read_noise_dn"):
         assert getattr(one, name) == column[name][7]
     assert one.collecting_area_cm2 == pytest.approx(column["qe_scale"][7] * nominal.collecting_area_cm2)

@@ -20,7 +20,7 @@ NUMBER = r"(-?[\d.]+(?:e[+-]\d+)?)"
 HOSTILE = "![x](http://127.0.0.1:1/x.png) <img src=http://127.0.0.1:1/y.png>"
 M_DWARF = {"star": "M3V", "magnitude": "9", "amplitude_percent": "2", "exposure_s": "50"}
 TEXTS = tomllib.loads((Path(__file__).parents[1] / "data" / "web" / "texts.toml").read_text(encoding="utf-8"))
-UNKNOWN = ("nothing", "the usual")
+UNKNOWN = ("realistic", "ideal")
 
 
 @pytest.fixture(scope="module")
@@ -173,9 +173,9 @@ def test_each_number_is_the_answer_to_its_own_question(server: Server) -> None:
                 if not more:
                     assert [one["shown"] for one in reported["numbers"]] == ["81.3 %", "2.5 %"]
             assert shown[0] == shown[1]
-        other = (await talk.answer(link(**M_DWARF, instrument="mauve-electrons")))["answer"]["numbers"]
+        other = (await talk.answer(link(**M_DWARF, instrument="mauve")))["answer"]["numbers"]
         payloads, _ = await talk.solved(link(**M_DWARF))
-        assert payloads == f"Chances with mauve-electrons: {' and '.join(one['shown'] for one in other)}."
+        assert payloads == f"Chances with mauve: {' and '.join(one['shown'] for one in other)}."
         known, usual = (await talk.answer(link(**M_DWARF, statistic="paper")))["answer"]["numbers"]
         assert known["value"] is not None
         assert usual["value"] is None
@@ -217,7 +217,7 @@ def test_limits_are_detected_with_the_wanted_probability(server: Server, of: str
 @pytest.mark.long
 def test_pictures_state_what_the_answer_is(server: Server) -> None:
     async def work(talk: Talk) -> None:
-        drawn = await talk.answer(link(unknown="nothing"))
+        drawn = await talk.answer(link(unknown="ideal"))
         # Squares of the excess per pixel add up to the square of the matched S/N.
         found = np.sqrt(np.sum(column(drawn, "excess", "pixel", "y").astype(float) ** 2))
         assert found == pytest.approx(float(dict(drawn["answer"]["facts"])["Expected with flare"]), rel=1e-3)

@@ -218,7 +218,7 @@ def test_downloads_equal_the_files_of_the_command_line(server: Server, tmp_path:
         Study.read(folder / "out" / "detection.ecsv")
 
 
-@pytest.mark.parametrize("unknown", long_but(["nothing", "the usual"], "nothing"))
+@pytest.mark.parametrize("unknown", long_but(["ideal", "realistic"], "ideal"))
 def test_one_simulation_gives_both_numbers(server: Server, unknown: str, tmp_path: Path) -> None:
     """Compare all bits with `detect` with and without the usual unknowns, asked by the printed command and study."""
     entered = {"star": "M3V", "magnitude": "9", "realisations": "10000", "fap": "0.05"}

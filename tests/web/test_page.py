@@ -182,13 +182,13 @@ def test_visitor_changes_values_and_reads_the_answer(browser: Browser, server: S
         assert places(page) == pytest.approx(before, abs=1), text
     enter(page, "Star", "G2V")
     # Values that cannot be together mark their field, and choices follow from others.
-    enter(page, "Unknown", "the usual")
+    enter(page, "Answer", "realistic")
     enter(page, "Detection statistic", "paper")
     assert page.get_by_label("Detection statistic", exact=True).get_attribute("aria-invalid") == "true"
     assert "cannot be marginalised" in page.locator("#words-of").inner_text()
     enter(page, "Detection statistic", "matched")
     assert "chance to detect" in shown(page)
-    enter(page, "Unknown", "nothing")
+    enter(page, "Answer", "ideal")
     enter(page, "Realisations", "1000000")
     enter(page, "False-alarm probability", "1e-6")
     field = page.get_by_label("Realisations", exact=True)
