@@ -129,7 +129,8 @@ COLUMNS = (
     Column("unit", "change.unit", "", "unit of the change and its errors; empty if relative", kind=str),
     Column("error", "error", "", "standard error of one visit, unknowns marginalised; inf: hidden by them; nan: none",
            "error of a visit", _amount, ("unit",), detail=True),
-    Column("error_known", "error_known", "", "the same with everything known", "error, all known", _amount, ("unit",), detail=True),
+    Column("error_known", "error_known", "", "the same with everything known", "error, all known", _amount,
+           ("unit",), detail=True),
     Column("smallest", "smallest.one", "", "smallest detected difference of one visit from the others",
            "smallest change", _amount, ("unit",)),
     Column("smallest_ideal", "ideal", "", "the same if everything but the noise were known", "ideal", _amount,
@@ -243,8 +244,9 @@ class ChangeAnswer(Answer):
             )
         ideal = "" if self.study.nuisances.none else f" ({_amount(row.ideal, unit)} {IF_KNOWN})"
         return (
-            f"{name_of_instrument(self.study)} would see a change of {_amount(row.smallest.one, unit)}{ideal} in {where} with "
-            f"a chance of {100 * self.study.limit.power:g} %; one visit measures it to {_amount(row.error, unit)}."
+            f"{name_of_instrument(self.study)} would see a change of {_amount(row.smallest.one, unit)}{ideal} in "
+            f"{where} with a chance of {100 * self.study.limit.power:g} %; one visit measures it to "
+            f"{_amount(row.error, unit)}."
         )
 
     @property

@@ -215,15 +215,18 @@ SEARCH_COLUMNS = (
     Column("threshold_high", "threshold.high", "", "its 95 % interval, upper end"),
     Column("checked_at", "checked", "", "S/N at which drawn stares are held against normal noise",
            "alarms a day above", ".2f", detail=True),
-    Column("alarms_sampled", "asked", "", "false alarms per star-day there, normal noise", "sampled", ".3g", detail=True),
-    Column("alarms_simulated", "simulated.value", "", "false alarms per star-day there, drawn stares", "drawn", ".3g", detail=True),
+    Column("alarms_sampled", "asked", "", "false alarms per star-day there, normal noise", "sampled", ".3g",
+           detail=True),
+    Column("alarms_simulated", "simulated.value", "", "false alarms per star-day there, drawn stares",
+           "drawn", ".3g", detail=True),
     Column("alarms_low", "simulated.low", "", "lower end: 4 standard errors"),
     Column("alarms_high", "simulated.high", "", "upper end: 4 standard errors"),
     Column("alarmed", "", "", "drawn stares with a false alarm at the threshold"),
     Column("alarmed_expected", "expected", "", "how many should have one"),
     Column("in_a_row", "", "", "false alarms per star-day of the common rule, white noise"),
     Column("templates", "surveyed.survey.search.n_filters", "", "templates of the bank", "templates"),
-    Column("sums", "surveyed.survey.components.n_statistics", "", "weighted sums of a frame", "sums of a frame", detail=True),
+    Column("sums", "surveyed.survey.components.n_statistics", "", "weighted sums of a frame",
+           "sums of a frame", detail=True),
     Column("spectral_loss", lambda row: float(row.surveyed.templates.loss.max()), "",
            "largest share of S/N lost because only these sums are searched"),
     Column("star_days", lambda row: row.surveyed.survey.stare.observed_s / DAY_S, "", "star-days of a stare"),
@@ -458,7 +461,7 @@ def _completeness(case: Case, engine: Stares | Pool, report: Callable[[float], N
 
 def _ideal_share(case: Case, star: StarSurvey) -> float:
     """Return the S/N of a frame over that with everything but the noise known, or NaN if it is known."""
-    if not case.study.nuisances.usual and not case.stare.jitters:
+    if not any(case.stare.jitters.values()):
         return float("nan")
     frame = case.one_frame
     own = frame.flare_electrons((case.study.flare.temperature_k,))[0] * star.quiet.gain_dn_per_electron

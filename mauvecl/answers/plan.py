@@ -85,7 +85,8 @@ COLUMNS = (
            "upper end of the 95 % interval", kind=int),
     Column("at_least_one", lambda row: row.recovered.at_least_one if row.recovered else np.nan, "",
            "probability of recovering any", "P(>= 1)", number(".2f"), detail=True),
-    Column("best_months", lambda row: " ".join(row.best_months), "", "those with most hours", "best months", months, detail=True),
+    Column("best_months", lambda row: " ".join(row.best_months), "", "those with most hours", "best months",
+           months, detail=True),
 )  # fmt: skip
 #: Columns of errors by a calibrated throughput.
 THROUGHPUT_COLUMNS = (
@@ -399,7 +400,8 @@ SUMMARY_TABLE = "plan.ecsv"
 LEGEND = (
     "E50 and E90: bolometric energies from which on half and 90 % of the flares are recovered. Flares: recovered "
     "in the hours observed, expected by the rates as they are; 95 % of campaigns recover the numbers next to them, by "
-    "Poisson's scatter and that of a star's rate; P(>= 1): probability of recovering any. False alarms: expected of "
+    "Poisson's scatter and that of a star's rate; ideal: by the closed form if everything but the noise were known; "
+    "P(>= 1): probability of recovering any. False alarms: expected of "
     f"noise. Numbers are those of {SUMMARY_TABLE}."
 )
 

@@ -275,7 +275,8 @@ SUMMARY_COLUMNS = (
            "best S/N pixel", ".2f"),
     Column("snr_element", lambda row: row.expectation.snr_per_element().max(), "",
            "largest closed-form S/N of an element", "best S/N element", ".1f"),
-    Column("saturated_pixels", lambda row: row.expectation.saturated.sum(), "", "pixels that saturate", "saturated", detail=True),
+    Column("saturated_pixels", lambda row: row.expectation.saturated.sum(), "", "pixels that saturate",
+           "saturated", detail=True),
 )  # fmt: skip
 
 

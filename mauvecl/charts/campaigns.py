@@ -80,7 +80,7 @@ PAGE, MARGIN = (8.27, 11.69), 0.6
 #: Approximate width of a letter divided by its size, for line breaks; line spacing divided by the size.
 LETTER, LINE = 0.53, 1.4
 #: Starts of the columns of the summary and of the assumptions, as fractions of the text width.
-SUMMARY_AT = (0.0, 0.16, 0.235, 0.34, 0.425, 0.51, 0.605, 0.685, 0.755, 0.86)
+SUMMARY_AT = (0.0, 0.15, 0.215, 0.31, 0.39, 0.47, 0.55, 0.615, 0.69, 0.755, 0.86)
 ASSUMED_AT = (0.0, 0.24, 0.5)
 #: Number of colours kept in the pictures of an HTML report.
 COLOURS_KEPT = 64

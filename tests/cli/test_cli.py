@@ -162,7 +162,7 @@ def test_wrong_template_loses_snr(engine: Engine) -> None:
         "flare.amplitudes=[0.01]",
         "run={realisations=50000, fap=0.01, statistics=['matched'], template_temperatures_k=[5000, 10000]}",
     ]
-    answer = detect(Study().with_settings(settings), engine)
+    answer = detect(Study().paper().with_settings(settings), engine)
     kept = [float(line.split(" keeps ")[1].split()[0]) for line in answer.messages if " keeps " in line]
     assert 50 < kept[0] < 95
     assert kept[1] == 100.0
@@ -185,9 +185,12 @@ def test_schema_describes_every_key(tmp_path: Path) -> None:
     assert len(keys) > 120
 
 
-def test_saturation_is_the_first_message(tmp_path: Path) -> None:
+def test_saturation_is_in_the_headline_and_the_first_message(tmp_path: Path) -> None:
     done = run("simulate", "--star", "B2IV", "-m", "0.5", "-t", "5", "--no-pictures", folder=tmp_path)
-    first = done.stdout.splitlines()[0]
+    headline, *others = done.stdout.splitlines()
+    assert re.search(r"; [1-9]\d* of 1643 pixels saturate\.$", headline)
+    # What was assumed is indented, and precedes the messages.
+    first = next(line for line in others[others.index("Assumed:") + 1 :] if not line.startswith("  "))
     assert first.startswith("SATURATED: ")
     assert " nm reach " in first
     assert "the longest safe frame is " in first
@@ -212,11 +215,11 @@ def test_flags_of_a_flare_set_its_spectrum(tmp_path: Path) -> None:
     assert light.line_fluxes == {"H beta": 1e-13}
 
 
-def test_assumptions_about_a_spectrum_come_first(tmp_path: Path) -> None:
+def test_assumptions_about_a_spectrum_are_the_first_message(tmp_path: Path) -> None:
     words = ("--wavelength-unit", "Angstrom", "-m", "8", "--exposure", "5", "--no-pictures", "-o", "out")
     done = run("simulate", "--star", DATA / "spectra" / "10lac_stis_001.txt", *words, folder=tmp_path).stdout
     shown = " ".join(done.split())
-    assert shown.index("ASSUMED: flux in erg") < shown.index("10lac_stis_001 V = 8")
+    assert shown.index("seed 1 ASSUMED: flux in erg")
     assert "ASSUMED: flux in erg" in (tmp_path / "out" / "run.json").read_text()
     # The study that was written reads the same star again; another star has none of its keys.
     again = Study.read(tmp_path / "out" / "study.toml")

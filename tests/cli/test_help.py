@@ -264,7 +264,7 @@ def tables(text: str) -> list[list[str]]:
 @pytest.mark.parametrize("width", [10, 40, 80, 132])
 def test_narrow_terminal_truncates_nothing(width: int, tmp_path: Path) -> None:
     words = ["detect", "--star", "G2V", "-m", "7.4", "-a", "0.01,0.02", "-n", "2000", "--fap", "0.1", "--no-pictures"]
-    words += ["--sweep", "exposure=5,50", "--quiet", "--output", str(tmp_path / "out")]
+    words += ["--sweep", "exposure=5,50", "--quiet", "--wide", "--output", str(tmp_path / "out")]
     wide = tables(run(*words, folder=tmp_path).stdout)
     env = {"COLUMNS": str(width), "FORCE_COLOR": "1"}
     shown = CliRunner().invoke(app, words, env=env).output

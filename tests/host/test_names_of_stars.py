@@ -108,7 +108,7 @@ def seen(folder: Path, *rows: str, head: str = HEAD, share: float = 1.0) -> Expe
     (folder / "near.csv").write_text("\n".join((head, *rows)) + "\n")
     star = {"library": "G2V", "magnitude": 7.4, "neighbours": str(folder / "near.csv"), "neighbour_share": share}
     study = {"star": [star], "observation": {"exposure_s": 50.0}}
-    return simulate(Study.build(study, "test")).inputs[0]
+    return simulate(Study.build(study, "test").paper()).inputs[0]
 
 
 def alone(star: Source = STAR) -> Expectation:

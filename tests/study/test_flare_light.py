@@ -55,7 +55,7 @@ def study_of(name: str, **flare: Any) -> Study:
             "flare": {"temperature_k": 9000.0, "amplitudes": [0.3], "spectrum": TEXTS[name][0], **flare},
         },
         "test",
-    )
+    ).paper()
 
 
 @TOGETHER

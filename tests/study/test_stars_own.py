@@ -15,7 +15,7 @@ PART = {"changes": {"output_min_nm": 300.0, "output_max_nm": 330.0}}
 
 def study(*stars: dict[str, Any], **flare: Any) -> Study:
     given = [{"magnitude": 8.0} | star for star in stars]
-    return Study.build({"star": given, "flare": {"amplitudes": [0.1]} | flare, "observation": PART}, "test")
+    return Study.build({"star": given, "flare": {"amplitudes": [0.1]} | flare, "observation": PART}, "test").paper()
 
 
 def light(asked: Study) -> list[np.ndarray]:
@@ -91,7 +91,7 @@ N = 4000
 def asked(name: str | None, prior: object = None) -> Study:
     processes = {} if name is None else {"processes": {name: prior}}
     star, stare = [{"library": "G2V", "magnitude": 6.0}], {"duration_s": 5.0}
-    return small(star=star, sky=BRIGHT, observation={"exposure_s": 5.0}, stare=stare, **processes)
+    return small(star=star, sky=BRIGHT, observation={"exposure_s": 5.0}, stare=stare, **processes).paper()
 
 
 def frames(study: Study, count: int, **how: Any) -> Any:

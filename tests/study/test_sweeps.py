@@ -35,7 +35,7 @@ def study(axes: list[dict[str, Any]], how: str = "product", **changes: Any) -> S
         "run": {"realisations": 20_000, "fap": 1e-2, "statistics": ["matched"], "seed": 5},
         "sweep": {"how": how, "axes": axes},
     }
-    return Study.build(data | changes, "test")
+    return Study.build(data | changes, "test").paper()
 
 
 MAGNITUDES = {"quantity": "magnitude", "values": [6.0, 9.0]}
