@@ -73,6 +73,7 @@ def same_snr(one: Any, other: Any) -> None:
 
 
 def small(**sections: Any) -> Study:
+    """Return a study of two stars with the paper's conventions, of few pixels."""
     changes = {"output_min_nm": 300.0, "output_max_nm": 360.0}
     data: dict[str, Any] = {
         "star": [{"library": "G2V", "magnitude": 7.4}, {"library": "K3V", "magnitude": 6.0}],
@@ -80,4 +81,6 @@ def small(**sections: Any) -> Study:
         "observation": {"changes": changes},
         "run": {"realisations": 10_000, "seed": 3, "fap": 0.01, "statistics": ["chi2", "matched"]},
     }
-    return Study.build(data | sections, "test")
+    observation = {"instrument": "mauvesim"} | sections.pop("observation", data["observation"])
+    known = {"usual": False} | sections.pop("nuisances", {})
+    return Study.build(data | sections | {"observation": observation, "nuisances": known}, "test")

@@ -218,10 +218,10 @@ def test_instruments_take_quantities(name: str) -> None:
     ],
 )
 def test_studies_take_quantities(quantity: str, value: Any, plain: float, key: Callable[[Any], float]) -> None:
-    assert key(mauvecl.Study().at(quantity, value)) == pytest.approx(plain)
+    assert key(mauvecl.Study().paper().at(quantity, value)) == pytest.approx(plain)
     for wrong in (3 * u.kg, np.nan, "x"):
         with refused("value" if wrong is np.nan else quantity):
-            mauvecl.Study().at(quantity, wrong)
+            mauvecl.Study().paper().at(quantity, wrong)
 
 
 def test_quantities_give_the_same_results() -> None:
@@ -279,7 +279,7 @@ def test_wrong_fields_of_records_raise(record: type[Record]) -> None:
 
 
 def test_attributes_cannot_be_set() -> None:
-    study = mauvecl.Study()
+    study = mauvecl.Study().paper()
     for thing, name in ((study, "star"), (study.run, "fap"), (mauvecl.Instrument.load("mauvesim"), "light_loss")):
         with pytest.raises(InputError) as error:
             setattr(thing, name, 1)

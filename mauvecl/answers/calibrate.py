@@ -435,7 +435,8 @@ class CalibrateAnswer(Answer):
         of_transfer = np.zeros((len(covariance), 2))
         of_transfer[:count, 1] = -1 / t.noise.gain
         of_transfer[place["conversion_uv_per_electron"], 1] = 1 / t.noise.gain
-        read = 0.0 if "read noise" in t.assumed else 0.5 / t.read_noise_dn**2
+        # A read noise at its bound of zero has no relative error.
+        read = 0.0 if "read noise" in t.assumed or not t.read_noise_dn else 0.5 / t.read_noise_dn**2
         of_transfer[place["read_noise_dn"], 0] = read
         covariance += of_transfer @ t.covariance @ of_transfer.T
         if "dark current" not in d.assumed:

@@ -27,7 +27,7 @@ from mauvecl.device.engine import Engine
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, View, table_of
-from mauvecl.schema.errors import Message, of_kind
+from mauvecl.schema.errors import InputError, Message, of_kind
 from mauvecl.study.cases import (
     SATURATED,
     Case,
@@ -195,6 +195,10 @@ def map(
     messages = [
         *_blinded(values),
         *_without_threshold(study.run, values),
+        *(
+            Message(f"NO ANSWER in {number} of {len(cells.x) * len(cells.y)} cells: {why}.", "no answer")
+            for why, number in cells.failed.items()
+        ),
         *_wrong_sign(case, cells.lowered, len(cells.x) * len(cells.y)),
         *worst_first([*collect_messages(cells.quiet, study.processes), *cells.saturated]),
         *marginal_lines(study.nuisances),
@@ -287,6 +291,7 @@ class Cells:
     quiet: list[Expectation] = field(default_factory=list)
     saturated: list[str] = field(default_factory=list)  # messages on flares that saturate
     lowered: set[Lowered] = field(default_factory=set)  # weighted sums that flares lower
+    failed: dict[str, int] = field(default_factory=dict)  # number of cells without an answer by the reason
 
     def map_of(self, case: Case) -> Arrays:
         """Compute the map on the instrument of a case."""
@@ -297,7 +302,13 @@ class Cells:
             group = [_cell(case, self.x[i], self.y[j]) for i, j in cells]
             quiet, flares = group[0].quiet, group[0].expect(*(cell.flaring(cell.amplitudes[0]) for cell in group))
             if not quiet.saturated.all():
-                self.lowered.update(_fill(values, cells, group[0], flares, self.engine))
+                try:
+                    self.lowered.update(_fill(values, cells, group[0], flares, self.engine))
+                except InputError as error:
+                    # Too few pixels may be left in some cells; the others have an answer.
+                    self.failed[str(error)] = self.failed.get(str(error), 0) + len(cells)
+                    if self.failed[str(error)] == len(self.x) * len(self.y):
+                        raise
             return quiet, len(cells), of_kind(collect_messages(flares), SATURATED)
 
         for quiet, count, texts in map_in_order(self.engine, filled, _groups(case.study.map, self.x, self.y)):

@@ -256,9 +256,12 @@ class LinearStatistic(Statistic):
         left = weights - (rows @ sought) @ rows
         power = float(left @ sought)
         if power <= 1e-10 * float(weights @ sought):
+            used, every = int(np.count_nonzero(setting.used)), setting.used.size
+            where = f" in the {used} of {every} pixels that are used" if used < every else ""
             raise InputError(
-                f"statistic {self.name!r} cannot be distinguished from {join_names(setting.nuisances.names)}",
-                "fewer unknowns or smaller standard deviations",
+                f"the flare that {self.name!r} looks for cannot be distinguished from "
+                f"{join_names(setting.nuisances.names)}{where}",
+                "fewer unknowns or smaller standard deviations, such as `nuisances.usual=false`",
                 key="statistic",
             )
         return np.asarray(left / np.sqrt(power) if self.normalised else left)

@@ -299,10 +299,11 @@ class Study(Section):
     def paper(self) -> Self:
         """Return a copy with the conventions of the MauveSim paper.
 
-        The dark charge is drawn in DN, everything but the noise is known, and sums of squares are statistics as well.
+        The dark charge is drawn in DN, everything but the noise is known, and sums of squares are statistics as well
+        unless the study states its statistics.
         """
         observation = self.observation.model_copy(update={"instrument": FORMERLY_MAUVE})
-        statistics = DEFAULT_STATISTICS if self.run.statistics == Run().statistics else self.run.statistics
+        statistics = self.run.statistics if "statistics" in self.run.model_fields_set else DEFAULT_STATISTICS
         run = self.run.model_copy(update={"statistics": statistics})
         return self.ideal().model_copy(update={"observation": observation, "run": run})
 

@@ -35,7 +35,7 @@ def study(**changes: Any) -> Study:
     }
     for section, values in changes.items():
         data[section] = (data.get(section, {}) | values) if isinstance(values, dict) else values
-    return Study.build(data, "test")
+    return Study.build(data, "test").paper()
 
 
 FEW = {"statistics": ("matched",), "realisations": 20_000}
@@ -155,8 +155,10 @@ def test_assumptions_move_the_limit_as_predicted(engine: Engine) -> None:
 @pytest.mark.long
 def test_progress_has_one_total_and_moves_with_each_simulation() -> None:
     """Three limits, of which several are computed at the same time: never back, and at the end all of it."""
-    study = Study().with_settings(
-        ["star=[{library='G2V'}]", "flare.amplitudes=[0.24]", "run.realisations=20000", "run.fap=0.01"]
+    study = (
+        Study()
+        .paper()
+        .with_settings(["star=[{library='G2V'}]", "flare.amplitudes=[0.24]", "run.realisations=20000", "run.fap=0.01"])
     )
     seen: list[tuple[int, int]] = []
     found = limiting_magnitude(study, Pool(LocalWorkers([None])), lambda done, total: seen.append((done, total)))
@@ -180,7 +182,7 @@ def mapped(x: dict, y: dict) -> Study:
             "map": {"x": x, "y": y},
         },
         "test",
-    )
+    ).paper()
 
 
 MAGNITUDE = {"quantity": "magnitude", "start": 6.0, "stop": 10.0, "steps": 5}
@@ -227,7 +229,9 @@ def test_probability_decreases_with_magnitude(engine: Engine) -> None:
 
 
 def sunlike(magnitude: float = 7.4, **observation: float) -> Study:
-    return Study.build({"star": [{"library": "G2V", "magnitude": magnitude}], "observation": observation}, "test")
+    return Study.build(
+        {"star": [{"library": "G2V", "magnitude": magnitude}], "observation": observation}, "test"
+    ).paper()
 
 
 def snr_at(x: Expectation, wavelength_nm: float, per: str) -> float:

@@ -23,7 +23,7 @@ def study_of(*settings: str, **flare: object) -> Study:
         "nuisances": {"dark": "free", "light": "free"},
         "measure": {"fits": 400},
     }
-    return Study.build(data, "test").with_settings(settings)
+    return Study.build(data, "test").paper().with_settings(settings)
 
 
 @pytest.fixture(scope="module")
@@ -186,8 +186,12 @@ MAGNITUDES = [4.0, 6.0, 8.0, 10.0, 12.0]
 
 
 def drawn_study(*settings: str, star: str = "M3V", magnitude: float = 7.0, fits: int = 400) -> Study:
-    return Study().with_settings(
-        [f"star=[{{library='{star}', magnitude={magnitude}}}]", f"measure.fits={fits}", "run.seed=42", *settings]
+    return (
+        Study()
+        .paper()
+        .with_settings(
+            [f"star=[{{library='{star}', magnitude={magnitude}}}]", f"measure.fits={fits}", "run.seed=42", *settings]
+        )
     )
 
 

@@ -51,7 +51,7 @@ def hot_star(magnitude: float, low_nm: float, **sections: Any) -> Study:
         "observation": {"exposure_s": 5.0, "changes": {"output_min_nm": low_nm, "output_max_nm": 340.0}},
         "run": {"realisations": 10_000, "seed": 3, "fap": 0.01, "statistics": ["matched"]},
     }
-    return Study.build(data | sections, "test")
+    return Study.build(data | sections, "test").paper()
 
 
 @pytest.mark.parametrize("name", SATURATED)
@@ -161,7 +161,7 @@ def test_maps_and_limits_report_a_wrong_sign_as_detect_does(engine: Engine, temp
 
 
 def test_rounding_that_invalidates_closed_forms_is_reported() -> None:
-    asked = Study().with_settings(["star=[{library='G2V', magnitude=12}]"])
+    asked = Study().paper().with_settings(["star=[{library='G2V', magnitude=12}]"])
     quiet = asked.with_settings(["observation.changes={read_noise_dn=0.1}", "observation.temperature_c=-40"])
     assert [bool(of_kind(simulate(one).messages, "rounding")) for one in (asked, quiet)] == [False, True]
 
@@ -172,7 +172,7 @@ def test_rounding_that_invalidates_closed_forms_is_reported() -> None:
 )
 def test_star_without_light_is_reported(magnitude: float, dark: bool) -> None:
     """Report a star that makes less than one electron in an exposure, since its S/N is 0."""
-    study = Study().with_settings([f"star=[{{library = 'G2V', magnitude = {magnitude}}}]"])
+    study = Study().paper().with_settings([f"star=[{{library = 'G2V', magnitude = {magnitude}}}]"])
     assert bool(of_kind(simulate(study).messages, "no light")) == dark
 
 

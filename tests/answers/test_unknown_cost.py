@@ -27,7 +27,9 @@ def study(**nuisances: Any) -> Study:
     """Return the G2V star of METHODS section 7 with its 2 % flare, Vega at V = 0."""
     star = {"library": "G2V", "magnitude": 7.4, "magnitude_system": "vega"}
     run = {"realisations": 10_000, "fap": 0.02, "statistics": ["matched"]}
-    return Study.build({"star": [star], "flare": {"amplitudes": [0.02]}, "run": run, "nuisances": nuisances}, "test")
+    return Study.build(
+        {"star": [star], "flare": {"amplitudes": [0.02]}, "run": run, "nuisances": nuisances}, "test"
+    ).paper()
 
 
 @pytest.mark.parametrize(
@@ -91,7 +93,21 @@ def test_own_unknowns_are_read_from_files_points_and_flags(tmp_path: Path, engin
     again = tmp_path / "elsewhere" / "again.toml"
     again.write_text(asked.toml())
     assert Study.read(again).nuisances == asked.nuisances
-    flags = ("--star", "G2V", "-m", "7.4", "-a", "0.02", "-n", "20000", "--fap", "0.01", "--statistic", "matched")
+    flags = (
+        "--star",
+        "G2V",
+        "-m",
+        "7.4",
+        "-a",
+        "0.02",
+        "-n",
+        "20000",
+        "--fap",
+        "0.01",
+        "--statistic",
+        "matched",
+        "--ideal",
+    )
     run("detect", *flags, "--nuisance", "dark=0.1", "--nuisance", "stray.txt=2", "--no-pictures", folder=tmp_path)
     of_flags = Study.read(tmp_path / "mauvecl-detect" / "detection.ecsv")
     kept = asked.nuisances.own["stray"].model_copy(update={"file": tmp_path / "stray.txt"})
@@ -196,7 +212,8 @@ def test_chance_with_unknowns_is_that_of_their_study() -> None:
     """The sentence of `detect` holds the closed forms of the table for both studies, of the most uncertain flare."""
     stars = [{"library": "M3V", "magnitude": 9.0}]
     run = {"realisations": 10_000, "fap": 0.02, "statistics": ["matched"]}
-    data = {"star": stars, "flare": {"amplitudes": [0.0001, 0.02, 3.0]}, "run": run}
+    data: dict[str, Any] = {"star": stars, "flare": {"amplitudes": [0.0001, 0.02, 3.0]}, "run": run}
+    data["observation"] = {"instrument": "mauvesim"}
     chances, sentences = [], []
     for usual in (False, True):
         answer = detect(Study.build(data | {"nuisances": {"usual": usual}}, "test"))

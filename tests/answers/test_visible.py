@@ -15,7 +15,9 @@ NAMES = ("eps Eri", "AU Mic", "EK Dra")
 @pytest.fixture(scope="module")
 def study() -> Study:
     targets = ", ".join(f"'{name}'" for name in NAMES)
-    return Study().with_settings([f"orbit.targets=[{targets}]", "orbit.start=2027-02-10T06:00", "orbit.days=40"])
+    return (
+        Study().paper().with_settings([f"orbit.targets=[{targets}]", "orbit.start=2027-02-10T06:00", "orbit.days=40"])
+    )
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +70,7 @@ def test_calendar_beyond_the_elements_has_days(found: Any) -> None:
 
 
 def test_calendar_near_the_epoch_has_windows() -> None:
-    near = Study().with_settings(["orbit.targets=['eps Eri']", "orbit.start=2026-09-20", "orbit.days=2"])
+    near = Study().paper().with_settings(["orbit.targets=['eps Eri']", "orbit.start=2026-09-20", "orbit.days=2"])
     answer = visible(near)
     events = icalendar.Calendar.from_ical(answer.documents["visible.ics"]()).walk("VEVENT")
     assert len(events) == answer.table["windows"][0] > 20
@@ -86,7 +88,7 @@ def test_pictures_are_drawn(found: Any, study: Study) -> None:
 
 def test_toml_dates_are_read() -> None:
     starts = ("orbit.start=2027-01-01", "orbit.start=2027-01-01T06:00:00", "orbit.start=2027-01-01T06:00:00+02:00")
-    found = [Study().with_settings([one]).orbit.times().iso(0.0) for one in starts]
+    found = [Study().paper().with_settings([one]).orbit.times().iso(0.0) for one in starts]
     assert found == ["2027-01-01T00:00:00", "2027-01-01T06:00:00", "2027-01-01T04:00:00"]
 
 
@@ -96,4 +98,4 @@ def test_study_contains_all_flags(study: Study) -> None:
     assert Study.build(tomllib.loads(changed.toml()), "text") == changed
     assert changed.orbit.limits.moon_deg is None
     assert 'moon_deg = "none"' in changed.toml()
-    assert "orbit" not in tomllib.loads(Study().toml())
+    assert "orbit" not in tomllib.loads(Study().paper().toml())

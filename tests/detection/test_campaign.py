@@ -98,7 +98,7 @@ def test_overlapping_stacks_allow_more_per_test(engine: Engine) -> None:
 
 
 def test_wanted_number_of_alarms_is_divided_among_the_tests(engine: Engine) -> None:
-    study = Study().with_settings(
+    study = Study().paper().with_settings(
         ["star=[{library='G2V', magnitude=7.4}]", "run={realisations=20000, fap=0.01, statistics=['matched']}",
          "campaign={frames=17280, step=1, fap=0.01, alarms=2}"]
     )  # fmt: skip

@@ -98,7 +98,7 @@ def study(magnitude: float, **sections: object) -> Study:
         "observation": {"changes": changes, "exposure_s": 5.0},
         "run": {"realisations": N, "seed": 3, "fap": 0.01, "statistics": ["matched"]},
     }
-    return Study.build(data | sections, "test")
+    return Study.build(data | sections, "test").paper()
 
 
 def at_the_rail() -> float:

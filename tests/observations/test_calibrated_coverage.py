@@ -56,7 +56,7 @@ def test_steps_of_the_throughput_are_followed() -> None:
 
 def with_(settings: list[str], instrument: Path | Instrument) -> Study:
     """Return a study with a fitted instrument's file, or with the values of a true one."""
-    study = Study().with_settings(settings)
+    study = Study().paper().with_settings(settings)
     if isinstance(instrument, Path):
         return study.with_settings([f"observation.instrument={instrument}"])
     return study.with_instrument({name: getattr(instrument, name) for name in CHANGED})

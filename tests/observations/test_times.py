@@ -18,8 +18,8 @@ from mauvecl.observations.reduction import barycentric
 RNG = np.random.default_rng(29)
 TIME = np.arange(200) * 30.0 + 15.0
 FLUX = RNG.normal(1000, 5, TIME.size)
-ORBIT = Study().orbit.orbit()
-(AU_MIC,) = visible(Study().with_settings(["orbit.targets=['311.2897 -31.3409']", "orbit.days=0.1"])).targets
+ORBIT = Study().paper().orbit.orbit()
+(AU_MIC,) = visible(Study().paper().with_settings(["orbit.targets=['311.2897 -31.3409']", "orbit.days=0.1"])).targets
 #: Days near the epoch of the embedded elements, and far from them.
 NEAR, FAR = "2026-09-16T03:00:00", "2027-03-01T00:00:00"
 

@@ -227,7 +227,7 @@ def test_eclipses_of_a_spotted_binary_are_no_flares() -> None:
     """
     time, flux, depth, peaks = spotted_binary(np.random.default_rng([502, 1]), 5.0, 120.0)
     frames = Frames.of(time, flux, np.full(time.size, 5e-4), exposure_s=120.0)
-    answer = analyse(Study(), frames=frames)
+    answer = analyse(Study().paper(), frames=frames)
     searched = np.array(answer.frames["reason"]) == ""
     assert searched[depth < 1e-9].mean() > 0.9
     events = answer.events[answer.events["verdict"] == "detected"]
@@ -254,7 +254,7 @@ def test_dips_at_random_are_no_flares() -> None:
     for middle in rng.uniform(0, time[-1], 38):
         flux *= 1 - rng.uniform(0.02, 0.3) * np.exp(-(((time - middle) / (rng.uniform(0.05, 0.3) * 86_400)) ** 4))
     flux += 1e-3 * rng.standard_normal(time.size)
-    answer = analyse(Study(), frames=Frames.of(time, flux, np.full(time.size, 1e-3), exposure_s=frame_s))
+    answer = analyse(Study().paper(), frames=Frames.of(time, flux, np.full(time.size, 1e-3), exposure_s=frame_s))
     assert "detected" not in set(answer.events["verdict"])
     messages = [one for one in answer.messages if "no verdicts" in one and "mapping" in one]
     assert len(messages) == int(answer.analysis.in_events > 0.5)
@@ -271,7 +271,7 @@ def test_light_that_the_process_does_not_describe_has_no_verdicts() -> None:
     flux[500:512] += 0.1 * np.exp(-since / 2)
     flux[900:912] += 0.006 * np.minimum((1 + since) / 2, 1) * np.exp(-since / 4)
     flux += 3e-4 * rng.standard_normal(time.size)
-    answer = analyse(Study(), frames=Frames.of(time, flux, np.full(time.size, 3e-4), exposure_s=1800.0))
+    answer = analyse(Study().paper(), frames=Frames.of(time, flux, np.full(time.size, 3e-4), exposure_s=1800.0))
     analysis = answer.analysis
     assert not analysis.likeness.alike
     assert set(answer.events["verdict"][answer.events["kind"] == "flare"]) == {"undecided"}
@@ -303,7 +303,7 @@ def test_sudden_flares_of_a_few_frames_that_decay_exponentially_have_their_energ
         flares.append((peak, amplitude * decay_s / (1.08 if peak_d > 26 else 1)))
     flux += noise * rng.standard_normal(time.size)
     frames = Frames.of(time, flux, np.full(time.size, noise), exposure_s=frame_s)
-    events = analyse(Study(), frames=frames).events
+    events = analyse(Study().paper(), frames=frames).events
     for peak, duration in flares:
         near = np.abs(events["tpeak"].to_value("s") - peak) < 2 * frame_s
         assert near.any()
@@ -327,7 +327,7 @@ def test_visits_over_years_take_little_memory() -> None:
     light += 0.05 * rng.standard_normal(time.size)
     tracemalloc.start()
     try:
-        answer = analyse(Study(), frames=Frames.of(time, light, np.full(time.size, 0.05), exposure_s=frame_s))
+        answer = analyse(Study().paper(), frames=Frames.of(time, light, np.full(time.size, 0.05), exposure_s=frame_s))
         assert tracemalloc.get_traced_memory()[1] < 2**30
     finally:
         tracemalloc.stop()

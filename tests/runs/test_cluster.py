@@ -56,7 +56,11 @@ def test_two_processes_give_the_answers_of_one(
     )
     bulk.realise(small().with_settings(["run.realisations=500"]), tmp_path / "s.zarr", Pool(workers))
     assert bulk.verify(tmp_path / "s.zarr", engine, redraw=True) == []
-    study = Study().with_settings(["star=[{library='M3V', magnitude=9}]", "flare.amplitudes=[0.5]", "measure.fits=40"])
+    study = (
+        Study()
+        .paper()
+        .with_settings(["star=[{library='M3V', magnitude=9}]", "flare.amplitudes=[0.5]", "measure.fits=40"])
+    )
     assert measure(study, Pool(workers)) == measure(study, engine)
 
 

@@ -91,7 +91,7 @@ N = 4000
 def asked(name: str | None, prior: object = None) -> Study:
     processes = {} if name is None else {"processes": {name: prior}}
     star, stare = [{"library": "G2V", "magnitude": 6.0}], {"duration_s": 5.0}
-    return small(star=star, sky=BRIGHT, observation={"exposure_s": 5.0}, stare=stare, **processes).paper()
+    return small(star=star, sky=BRIGHT, observation={"exposure_s": 5.0}, stare=stare, **processes)
 
 
 def frames(study: Study, count: int, **how: Any) -> Any:
