@@ -28,7 +28,7 @@ def study(realisations: int = 300, **sections: Any) -> Study:
     }
     for name, values in sections.items():
         data[name] = {**data.get(name, {}), **values}  # type: ignore[dict-item]
-    return Study.build(data, "test")
+    return Study.build(data, "test").paper()
 
 
 def expectations(asked: Study) -> list[Expectation]:

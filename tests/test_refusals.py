@@ -92,7 +92,7 @@ def test_each_kind_of_error_has_its_sentence() -> None:
         (lambda: Study().with_settings(["run.fap=3"]), "settings: run.fap = 3, expected a number above 0 and below 1"),
         (
             lambda: Instrument.load("mauvesim").with_(temprature_c=1),
-            "mauve: unknown key 'temprature_c', did you mean 'temperature_c'?",
+            "mauvesim: unknown key 'temprature_c', did you mean 'temperature_c'?",
         ),
         (lambda: Source.read("none.txt"), "spectrum file 'none.txt' does not exist, expected a file"),
     ):

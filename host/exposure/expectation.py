@@ -467,7 +467,7 @@ def expect(
     >>> quiet.n_frames, quiet.exposure_s
     (10, 50.0)
     >>> float(round(quiet.snr().max(), 2)), float(round(quiet.snr_per_element().max(), 1))
-    (8.21, 48.5)
+    (10.33, 61.0)
     """
     from mauvecl.host.stars.source import Source
 

@@ -23,13 +23,16 @@ from mauvecl.study.cases import Case
 STRAY = "200 1\n450 3\n700 1  # DN\n"
 
 
+#: Those of the paper.
+CONVENTIONS = {"observation": {"instrument": "mauvesim"}}
+
+
 def study(**nuisances: Any) -> Study:
     """Return the G2V star of METHODS section 7 with its 2 % flare, Vega at V = 0."""
     star = {"library": "G2V", "magnitude": 7.4, "magnitude_system": "vega"}
     run = {"realisations": 10_000, "fap": 0.02, "statistics": ["matched"]}
-    return Study.build(
-        {"star": [star], "flare": {"amplitudes": [0.02]}, "run": run, "nuisances": nuisances}, "test"
-    ).paper()
+    unknown = {"nuisances": {"usual": False} | nuisances}
+    return Study.build({"star": [star], "flare": {"amplitudes": [0.02]}, "run": run} | CONVENTIONS | unknown, "test")
 
 
 @pytest.mark.parametrize(
@@ -212,8 +215,7 @@ def test_chance_with_unknowns_is_that_of_their_study() -> None:
     """The sentence of `detect` holds the closed forms of the table for both studies, of the most uncertain flare."""
     stars = [{"library": "M3V", "magnitude": 9.0}]
     run = {"realisations": 10_000, "fap": 0.02, "statistics": ["matched"]}
-    data: dict[str, Any] = {"star": stars, "flare": {"amplitudes": [0.0001, 0.02, 3.0]}, "run": run}
-    data["observation"] = {"instrument": "mauvesim"}
+    data: dict[str, Any] = {"star": stars, "flare": {"amplitudes": [0.0001, 0.02, 3.0]}, "run": run} | CONVENTIONS
     chances, sentences = [], []
     for usual in (False, True):
         answer = detect(Study.build(data | {"nuisances": {"usual": usual}}, "test"))

@@ -14,7 +14,7 @@ from answers import VERBS, small
 
 import mauvecl
 from mauvecl import Engine, InputError, Stares, Study
-from mauvecl.answers.verbs import VERBS
+from mauvecl.answers.verbs import VERBS as REGISTRY
 
 ADDITIVE, NUISANCES, LEVELS = ["cosmic_rays"], ["dark", "light", "sky", "tilt"], ["light", "sky", "temperature"]
 STARE_CHANGES = {"jitters": LEVELS} | {course: ["star", *LEVELS] for course in ("offsets", "drifts", "cycles")}
@@ -91,7 +91,7 @@ def test_every_unknown_of_a_study_is_tested() -> None:
 )
 def test_no_unknown_is_ignored_silently(verb: str, name: str) -> None:
     unknown, base = UNKNOWNS[name], plain(verb)
-    if name == "nuisances.usual" and not VERBS[verb].accepts(name):
+    if name == "nuisances.usual" and not REGISTRY[verb].accepts(name):
         # A question about the noise or the sky alone, whose answer says that everything else is known.
         assert "the usual unknowns" not in answer(verb, unknown).assumed
         return

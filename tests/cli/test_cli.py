@@ -219,7 +219,7 @@ def test_assumptions_about_a_spectrum_are_the_first_message(tmp_path: Path) -> N
     words = ("--wavelength-unit", "Angstrom", "-m", "8", "--exposure", "5", "--no-pictures", "-o", "out")
     done = run("simulate", "--star", DATA / "spectra" / "10lac_stis_001.txt", *words, folder=tmp_path).stdout
     shown = " ".join(done.split())
-    assert shown.index("seed 1 ASSUMED: flux in erg")
+    assert "seed 1 10lac_stis_001: ASSUMED: flux in erg" in shown
     assert "ASSUMED: flux in erg" in (tmp_path / "out" / "run.json").read_text()
     # The study that was written reads the same star again; another star has none of its keys.
     again = Study.read(tmp_path / "out" / "study.toml")

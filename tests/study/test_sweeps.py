@@ -170,8 +170,8 @@ def test_formula_holds_for_the_payload_and_fails_at_saturation(engine: Engine) -
 def test_pixels_beyond_five_sigma_are_counted(name: str, temperature: float, engine: Engine) -> None:
     """The saddle-point tail agrees with the exact sum over dark counts to 0.3 %; the distribution is skewed upward."""
     part = {"output_min_nm": 340.0, "output_max_nm": 350.0, "temperature_c": temperature}
-    asked = study([{"quantity": "exposure", "values": [5.0]}], observation={"instrument": name, "changes": part})
-    (cell,) = gaussian(asked, engine).cells
+    asked = study([{"quantity": "exposure", "values": [5.0]}], observation={"changes": part})
+    (cell,) = gaussian(asked.with_settings([f"observation.instrument={name}"]), engine).cells
     (quiet,) = star(exposure=5.0, payload=instrument(name, **part))
     poisson = quiet.photon_noise == "poisson"
     found: dict[int, list[float]] = {1: [], -1: []}
