@@ -18,7 +18,8 @@ unexport PYTHONDONTWRITEBYTECODE
 	@touch $@
 
 demo: .venv/plot.stamp
-	$(BIN)/mauvecl detect --output demo
+	$(BIN)/mauvecl detect --paper --output demo/paper
+	$(BIN)/mauvecl detect --output demo/realistic
 
 # A file's tests stay in one process, which makes its fixtures and builds its kernels once. There are as many processes
 # as cores and more: threads of OpenBLAS would only wait for each other.

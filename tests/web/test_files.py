@@ -388,7 +388,8 @@ def test_neighbours_of_the_page_are_those_of_the_command_line(server: Server, tm
 
     async def work(talk: Talk) -> tuple[list[float], str]:
         asked = [link(**entered | more) for more in ({}, near, near | {"neighbour_share": "0"})]
-        found = [(await talk.chances(one))[0] for one in asked]
+        # The ideal chance falls with the noise of the neighbour's light.
+        found = [(await talk.chances(one))[1] for one in asked]
         return found, await taken(talk, link(**entered, **near, **FEW), "detection", tmp_path)
 
     (alone, blended, none_of_it), command = server.visited(work)
