@@ -1,4 +1,4 @@
 """Deterministic chain from a stellar spectrum to mean electrons per pixel, without OpenCL."""
 
 #: Version of the package; `tests/test_release.py` compares what repeats it.
-VERSION = "1.0.0"
+VERSION = "2.0.0"
