@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import json
 import os
+import re
 import shlex
 import shutil
 import sys
@@ -65,6 +66,10 @@ def test_verb_writes_its_files_and_states_its_assumptions(verb: str) -> None:
     assert all(path.name in done.stdout.splitlines()[-1] for path in written)
     assert all(path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n" for path in written if path.suffix == ".png")
     assert assumed(done.stdout) == TABLE[verb]["stated"].split("; ")
+    headline, *others = done.stdout.splitlines()
+    assert re.fullmatch(r"[A-Z0-9].* .*\.", headline), "the first line is the answer, in a sentence"
+    shown = others[: others.index("Assumed:")]
+    assert max(len(line.rstrip()) for line in shown if line.startswith("  ")) <= 80, "tables are narrow"
     assert "\x1b" not in done.stdout
     record = json.loads(written[-1].read_text())
     drawn = {"devices", "kernels"} if verb in DRAWING else set()

@@ -1,0 +1,166 @@
+"""The realistic answer is the default, the ideal one stands next to it, and files of version 1 are read as they were."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from commands import run
+from refusals import refused
+
+import mauvecl
+from mauvecl import Engine, Instrument, Study, detect, limit, plan
+from mauvecl.search.completeness import frame_signal
+
+SETTINGS = [
+    "star=[{library='M3V', magnitude=9}]", "flare.amplitudes=[0.02, 0.1]", "run.realisations=20000", "run.fap=0.01",
+    "map.x={quantity='magnitude', values=[8, 10]}", "map.y={quantity='amplitude', values=[0.02, 0.2]}",
+]  # fmt: skip
+ASKED = Study().with_settings(SETTINGS)
+
+
+def test_defaults_are_realistic() -> None:
+    study = Study()
+    assert (study.observation.instrument, study.nuisances.usual, study.run.statistics) == ("mauve", True, ("matched",))
+    mauve, mauvesim = Instrument.load("mauve"), Instrument.load("mauvesim")
+    assert (mauve.dark_unit, mauvesim.dark_unit) == ("electrons", "DN")
+    assert mauve == mauvesim.with_(dark_unit="electrons", photon_noise="poisson")
+
+
+def test_paper_and_ideal_change_the_conventions_alone() -> None:
+    for changed, instrument in ((ASKED.paper(), "mauvesim"), (ASKED.ideal(), "mauve")):
+        assert changed.observation.instrument == instrument
+        assert not changed.nuisances.usual
+        assert changed.star == ASKED.star
+        assert changed.flare == ASKED.flare
+    assert Study().paper().run.statistics == ("chi2", "chi2_element", "matched")
+    assert Study.build({"run": {"statistics": ["matched"]}}, "test").paper().run.statistics == ("matched",)
+
+
+def test_flags_ask_as_the_methods_do(tmp_path: Path) -> None:
+    words = ("exposure", "--snr", "10", "--at", "300", "--star", "G2V", "-m", "7.4", "--no-pictures", "-o")
+    for flag in ("paper", "ideal"):
+        few = ("detect", "--star", "G2V", "-m", "7", "-a", "0.1", "-n", "2000", "--fap", "0.1", "--no-pictures", "-o")
+        run(*few, flag, f"--{flag}", folder=tmp_path)
+        study = Study.read(tmp_path / flag / "study.toml")
+        assert study == getattr(study, flag)()
+    run(*words, "of-paper", "--paper", folder=tmp_path)
+    assert Study.read(tmp_path / "of-paper" / "study.toml").observation.instrument == "mauvesim"
+
+
+# The ideal answer
+
+
+def answered(verb: str, study: Study, engine: Engine) -> Any:
+    return getattr(mauvecl, verb)(study, engine)
+
+
+@pytest.mark.parametrize("verb", ["detect", "limit", "map"])
+def test_ideal_answer_is_that_of_the_ideal_study(verb: str, engine: Engine) -> None:
+    """Compare with the closed form of the study in which everything is known; the realistic answer is the worse."""
+    realistic, ideal = (answered(verb, study, engine).table for study in (ASKED, ASKED.ideal()))
+    assert "ideal" not in ideal.colnames
+    column = {"detect": "closed_form_probability"}.get(verb, "closed_form")
+    np.testing.assert_allclose(realistic["ideal"], ideal[column], rtol=1e-4)
+    # Where both are nearly sure to see the flare, neither is better.
+    assert (realistic["ideal"] >= realistic[column] - 1e-12).all()
+    assert (realistic["ideal"] > realistic[column] + 1e-3).any()
+
+
+def test_plan_by_the_closed_form_is_worse_than_the_ideal() -> None:
+    """The S/N of a frame is that of a matched filter, less what the jitters of light and sky take away."""
+    settings = ["plan.targets=[{name='eps Eri'}]", "orbit.days=5", "plan.completeness='closed form'"]
+    study = Study().with_settings(settings)
+    realistic, ideal = plan(study), plan(study.ideal())
+    assert realistic.table["ideal"][0] == pytest.approx(ideal.table["expected"][0], rel=1e-9)
+    assert realistic.table["expected"][0] < 0.95 * ideal.table["expected"][0]
+    assert np.isnan(ideal.table["ideal"]).all()
+    target = realistic.planned[0].observation
+    (flare,) = target.case.expect(target.case.flaring(1e-3))
+    quiet = target.quiet
+    light = (flare.source_electrons - quiet.source_electrons) * quiet.gain_dn_per_electron / 1e-3
+    added = sum(process.variance_dn2(quiet) for process in target.case.study.processes.additive.values())
+    variance = quiet.unsaturated_variance_dn2 + added
+    covariance = np.diag(variance)
+    for spectrum, sd in ((quiet.recorded_light_dn, 0.05 / np.sqrt(12)), (quiet.sky_dn, 0.0)):
+        covariance += sd**2 * np.outer(spectrum, spectrum)
+    used = ~quiet.saturated
+    exact = np.sqrt(light[used] @ np.linalg.solve(covariance[np.ix_(used, used)], light[used]))
+    assert target.signal_per_frame == pytest.approx(exact, rel=1e-6)
+    assert target.ideal_signal_per_frame == pytest.approx(frame_signal(quiet, flare, 1e-3, added_variance_dn2=added))
+
+
+# The first line
+
+
+def test_headline_has_the_numbers_of_the_table(engine: Engine) -> None:
+    answer = detect(ASKED, engine)
+    row = min(answer.table, key=lambda one: abs(one["probability"] - 0.5))
+    assert f"a flare of {100 * row['amplitude']:g} % on M3V V = 9 in 50 s" in answer.headline
+    shown = [float(text) for text in re.findall(r"([\d.]+) %", answer.headline)][1:5]
+    wanted = [100 * row[name] for name in ("probability", "low", "high", "ideal")]
+    assert shown == pytest.approx([min(value, 99.99) for value in wanted], abs=0.051)
+    assert answer.headline.endswith("the least certain of 2 flares.")
+    found = limit(ASKED, engine)
+    numbers = [f"{found.table[name].value[0]:.2f}" for name in ("magnitude", "low", "high", "ideal")]
+    assert re.findall(r"\d+\.\d\d", found.headline) == numbers
+    assert "if everything but the noise were known" not in limit(ASKED.ideal(), engine).headline
+
+
+def test_saturated_star_says_so_in_the_headline(engine: Engine) -> None:
+    bright = detect(ASKED.with_settings(["star.0.magnitude=1"]), engine)
+    saturated = int(bright.stars[0].detection.quiet.saturated.sum())
+    assert f"without the {saturated} of 1643 pixels that saturate" in bright.headline
+    assert saturated > 50
+
+
+# Files of version 1
+
+OLD = "[[star]]\nlibrary = 'G2V'\nmagnitude = 7.4\n[run]\nfap = 0.01\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "instrument"),
+    [("", "mauvesim"), ("[observation]\ninstrument = 'mauve'\n", "mauvesim"),
+     ("[observation]\ninstrument = 'mauve-electrons'\n", "mauve")],
+)  # fmt: skip
+def test_study_of_version_1_is_read_as_it_was(text: str, instrument: str, tmp_path: Path) -> None:
+    (tmp_path / "old.toml").write_text(OLD + text)
+    with pytest.warns(UserWarning, match=f"old.toml has no version .* now called {instrument} "):
+        study = Study.read(tmp_path / "old.toml")
+    assert study.observation.instrument == instrument
+    assert not study.nuisances.usual
+    assert study.run.statistics == ("chi2", "chi2_element", "matched")
+    (tmp_path / "usual.toml").write_text(OLD + "[nuisances]\nusual = true\n")
+    with pytest.warns(UserWarning, match="the usual unknowns drawn"):
+        assert Study.read(tmp_path / "usual.toml").nuisances.usual
+
+
+def test_study_of_version_2_needs_no_note(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
+    (tmp_path / "new.toml").write_text("version = 2\n" + OLD)
+    study = Study.read(tmp_path / "new.toml")
+    assert (study.observation.instrument, study.nuisances.usual) == ("mauve", True)
+    (tmp_path / "again.toml").write_text(study.toml())
+    assert Study.read(tmp_path / "again.toml") == study
+    assert study.toml().startswith("version = 2\n")
+    assert not recwarn.list
+    (tmp_path / "later.toml").write_text("version = 3\n" + OLD)
+    with refused("version", expected="2"):
+        Study.read(tmp_path / "later.toml")
+
+
+def test_instrument_files_of_version_1_are_read_as_they_were(tmp_path: Path) -> None:
+    (tmp_path / "old.toml").write_text("extends = 'mauve'\nname = 'old'\nlight_loss = 0.2\n")
+    (tmp_path / "new.toml").write_text("version = 2\nextends = 'mauve'\nname = 'new'\nlight_loss = 0.2\n")
+    with pytest.warns(UserWarning, match="old.toml is read as in version 1"):
+        old = Instrument.load(tmp_path / "old.toml")
+    assert old == Instrument.load("mauvesim").with_(light_loss=0.2)
+    assert Instrument.load(tmp_path / "new.toml") == Instrument.load("mauve").with_(light_loss=0.2)
+    with pytest.warns(UserWarning, match="is called mauve since version 2"):
+        assert Instrument.load("mauve-electrons") == Instrument.load("mauve")
+    (tmp_path / "later.toml").write_text("version = 3\nextends = 'mauve'\n")
+    with refused("version", expected="2"):
+        Instrument.load(tmp_path / "later.toml")
