@@ -30,6 +30,7 @@ from mauvecl.cli.flags import (
     study_flags,
     study_of,
 )
+from mauvecl.cli.help import HELP_ALL
 
 if TYPE_CHECKING:
     from mauvecl.cli.invocation import Session
@@ -68,11 +69,13 @@ class Command:
             inspect.Parameter("set", named, default=None, annotation=SetFlag),
             *(p.replace(kind=named, annotation=kinds[p.name]) for p in own if p.name != "given"),
             *(inspect.Parameter(key, named, default=usual, annotation=kind) for key, (kind, usual) in options),
+            inspect.Parameter("help_all", named, default=False, annotation=Annotated[bool, HELP_ALL]),
         ]
         taken = [as_text(parameter) for parameter in parameters]
         readers = {parameter.name: read for parameter, read in taken if read is not None}
 
         def command(study_file: Path | None = None, **values: Any) -> None:
+            del values["help_all"]
             for key, read in readers.items():
                 if values.get(key) is not None and not isinstance(values[key], int | float):
                     values[key] = read(values[key])
@@ -177,7 +180,15 @@ RowsFlag = Annotated[
 
 
 @command_of(
-    Verb("realise", "", ("flare", *DRAWS, "sweep", "bulk"), counts="spectra", defaults=FEWER),
+    Verb(
+        "realise",
+        "",
+        ("flare", *DRAWS, "sweep", "bulk"),
+        group="simulate",
+        common=("realisations", "seed", "frames", "components", "resume"),
+        counts="spectra",
+        defaults=FEWER,
+    ),
     pictures=False,
     writes="mauvecl-frames.zarr; also NAME.fits, .h5, .hdf5",
 )

@@ -80,6 +80,7 @@ def study_flags(*keys: str, defaults: Mapping[str, Any]) -> dict[str, StudyFlag]
                 *flag.names,
                 help=_help(path, field, flag, kind, defaults),
                 show_default=False,
+                rich_help_panel=section.partition(".")[0].capitalize(),
                 metavar={str: "TEXT", list[str]: "TEXT", Path: "FILE"}.get(kind),
             )
             flags[flag.parameter] = StudyFlag(flag.parameter, Annotated[kind | None, option], section, key, flag.read)

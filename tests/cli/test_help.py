@@ -24,6 +24,7 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 import mauvecl
+import mauvecl.answers.verbs
 from mauvecl import Study
 from mauvecl.cli.app import app
 
@@ -96,11 +97,45 @@ def test_help_has_examples_and_fits_80_columns(name: str, tmp_path: Path, monkey
         assert len(lines[i]) <= 80, lines[i]
 
 
-def test_list_of_verbs_is_not_truncated() -> None:
-    """Check that the first sentence of each verb fits into 80 columns."""
-    shown = CliRunner().invoke(app, ["--help"], env={"COLUMNS": "80"}).output
-    assert "Commands:" in shown
-    assert "..." not in shown.partition("Commands:")[2]
+def test_bare_command_lists_every_command_on_a_line_of_its_own() -> None:
+    """Check that the first sentence of each command fits into 80 columns, and that a bare `mauvecl` is no error."""
+    done = CliRunner().invoke(app, [], env={"COLUMNS": "80"})
+    assert (done.exit_code, done.stderr) == (0, "")
+    assert done.output == CliRunner().invoke(app, ["--help"], env={"COLUMNS": "80"}).output
+    lines = done.output.splitlines()
+    assert max(map(len, lines)) <= 80
+    for name, one in TOP.items():
+        sentence = one.help.partition("\n")[0]
+        assert [line.split() for line in lines if line.startswith(f"  {name} ")] == [[name, *sentence.split()]]
+
+
+@pytest.mark.parametrize("name", [name for name, one in VERBS.items() if "study_file" in {p.name for p in one.params}])
+def test_help_shows_the_common_flags_and_help_all_every_flag(name: str) -> None:
+    def listed(flag: str) -> list[str]:
+        shown = CliRunner().invoke(app, [name, flag], env={"COLUMNS": "80"})
+        assert shown.exit_code == 0
+        lines = shown.output.splitlines()
+        assert max(map(len, lines)) <= 80
+        return [found[1] for line in lines if (found := re.match(r"  (?:-\w, )?(--[\w-]+)", line))]
+
+    common, every = listed("--help"), listed("--help-all")
+    assert 4 <= len(common) - 2 <= 12
+    assert set(common) < set(every)
+    assert {*every} == {max(one.opts, key=len) for one in options(VERBS[name])} | {"--help"}
+    # Each name of the registry is a flag.
+    parameters = {one.name for one in VERBS[name].params}
+    assert name not in mauvecl.answers.verbs.VERBS or {*mauvecl.answers.verbs.VERBS[name].common} <= parameters
+
+
+def test_help_all_groups_flags_by_section() -> None:
+    shown = CliRunner().invoke(app, ["detect", "--help-all"], env={"COLUMNS": "80"}).output
+    found = re.findall(r"^(\S.*):$|^  (?:-\w, )?(--[\w-]+)", shown, re.MULTILINE)
+    heading, of = "", {}
+    for title, flag in found:
+        heading = title or heading
+        of[flag] = heading
+    assert (of["--star"], of["--sky"], of["--line"], of["--fap"]) == ("Star", "Sky", "Flare", "Run")
+    assert of["--json"] == of["--set"] == "Output and devices"
 
 
 #: Paths of the keys that each flag sets, by its parameter.
