@@ -29,6 +29,7 @@ from mauvecl.cli.flags import (
     output_flag,
     study_flags,
     study_of,
+    warn_of_percent,
 )
 from mauvecl.cli.help import HELP_ALL
 
@@ -71,11 +72,13 @@ class Command:
             *(inspect.Parameter(key, named, default=usual, annotation=kind) for key, (kind, usual) in options),
             inspect.Parameter("help_all", named, default=False, annotation=Annotated[bool, HELP_ALL]),
         ]
-        taken = [as_text(parameter) for parameter in parameters]
+        units = {key: flag.unit for key, flag in flags.items()}
+        taken = [as_text(parameter, units.get(parameter.name, "")) for parameter in parameters]
         readers = {parameter.name: read for parameter, read in taken if read is not None}
 
         def command(study_file: Path | None = None, **values: Any) -> None:
             del values["help_all"]
+            warn_of_percent(values.get("amplitude") or ())
             for key, read in readers.items():
                 if values.get(key) is not None and not isinstance(values[key], int | float):
                     values[key] = read(values[key])
@@ -90,7 +93,7 @@ class Command:
         self, study_file: Path | None, flags: dict[str, StudyFlag], values: dict[str, Any], *, tells_flags: bool
     ) -> None:
         """Run the command with the values of all its options."""
-        from mauvecl.cli.invocation import Session, question_time, question_values
+        from mauvecl.cli.invocation import Session, question_time, question_values, with_enough_tails
 
         verb, defaults = self.verb, self.verb.defaults or {}
         given = {key: values.pop(key, None) for key in (*flags, "set")}
@@ -103,10 +106,15 @@ class Command:
         if tells_flags:
             values["given"] = given
         study = study_of(study_file, given, flags, verb.default)
+        messages: list[str] = []
+        # A map would sample the tail of each cell, which takes longer than more realisations.
+        if study_file is None and verb.counts != "cells" and "tails" in flags and given["tails"] is None:
+            study, messages = with_enough_tails(study)
         question_values(study, detects={"fap", "realisations"} <= flags.keys())
         if self.draws:
             question_time(study, insist=how["insist"])
         with Session(verb.name, study, **how) as session:
+            session.say(messages)
             self.run(session, **values)
 
     def _options(self) -> dict[str, tuple[Any, Any]]:
