@@ -70,8 +70,10 @@ def without_unit(value: Any, unit: str) -> Any:
     return converted if getattr(converted, "ndim", 0) else float(converted)
 
 
-#: A number that is followed by a unit.
-_MEASURE = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)\s*([^\W\d_].{0,30}|[%°/].{0,9})", re.DOTALL)
+#: A number that is followed by a unit, which cannot begin like an exponent.
+_MEASURE = re.compile(
+    r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)(?![eE][+-]?\d)\s*([^\W\d_].{0,30}|[%°/].{0,9})", re.DOTALL
+)
 #: Units as people type them, which astropy does not know or takes for another.
 SPELLED = {
     "sec": "s", "hrs": "h", "C": "deg_C", "degC": "deg_C", "°C": "deg_C", "Rsun": "solRad", "Msun": "solMass",

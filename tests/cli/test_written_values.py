@@ -41,7 +41,8 @@ def test_units_are_converted_in_studies(section: str, key: str, text: str, value
 
 def test_lists_of_a_study_have_units() -> None:
     assert build("flare", amplitudes=["24 %", "3%", 0.5]).flare.amplitudes == pytest.approx((0.24, 0.03, 0.5))
-    assert build("stare", energies_erg=["1e33 erg", "1e26 J"]).stare.energies_erg == pytest.approx((1e33, 1e33))
+    energies = ["1e33 erg", "1e26J", "1e33", "+1.0E+33erg"]
+    assert build("stare", energies_erg=energies).stare.energies_erg == pytest.approx((1e33,) * 4)
     axis = {"quantity": "exposure", "values": ["1 min", 5, "2h"]}
     assert build("sweep", axes=[axis]).sweep.axes[0].points() == (60.0, 5.0, 7200.0)
 
