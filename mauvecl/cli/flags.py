@@ -237,8 +237,7 @@ def is_star(given: Path) -> bool:
     if not _is_there(text):
         # The first name decides; a wrong name among others has its own message.
         first = text.split(",")[0].strip()
-        star = resolve(first) if first else None
-        return star is not None and not (star.spectrum is None and star.known is None)
+        return bool(first) and resolve(first) is not None
     if given.suffix.lower() == ".ecsv":
         return not holds_study(given)
     return not given.is_file() or not _is_toml(given)
@@ -360,10 +359,10 @@ def _is_there(name: str) -> bool:
 def _is_file(name: str) -> bool:
     if _is_there(name):
         return True
-    from mauvecl.host.stars.library import ModelStar
+    from mauvecl.host.stars.library import resolve
 
     # "K2.5V" and "power law -1.5" look like file names but are stars.
-    if ModelStar.named(name) is not None:
+    if resolve(name) is not None:
         return False
     suffix = Path(name).suffix
     return bool(suffix) and not suffix[1:].isupper()
