@@ -32,6 +32,7 @@ from mauvecl.cli.flags import (
     warn_of_percent,
 )
 from mauvecl.cli.help import HELP_ALL
+from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from mauvecl.cli.invocation import Session
@@ -78,10 +79,17 @@ class Command:
 
         def command(study_file: Path | None = None, **values: Any) -> None:
             del values["help_all"]
-            warn_of_percent(values.get("amplitude") or ())
+            amplitudes = values.get("amplitude") or ()
+            errors: list[InputError] = []
             for key, read in readers.items():
                 if values.get(key) is not None and not isinstance(values[key], int | float):
-                    values[key] = read(values[key])
+                    try:
+                        values[key] = read(values[key])
+                    except InputError as error:
+                        errors.append(error)
+            if errors:
+                raise InputError.together(errors)
+            warn_of_percent(amplitudes)
             self._call(study_file, flags, values, tells_flags="given" in kinds)
 
         command.__name__ = verb.name
@@ -152,8 +160,6 @@ def command_of(
 
 def _placed(study_file: Path | None, given: dict[str, Any]) -> Path | None:
     """Give a file that is no study to the flag that takes such files, and return None in its place."""
-    from mauvecl.schema.errors import InputError
-
     others: dict[str, tuple[Callable[[Path], bool], str, Callable[[Path], Any]]] = {
         "targets": (lambda path: not holds_study(path), "tables of targets", lambda path: path),
         "data": (lambda path: path.suffix.lower() != ".toml", "observed frames", lambda path: path),
@@ -214,7 +220,6 @@ def realise(session: Session) -> None:
     from mauvecl.runs import bulk
     from mauvecl.runs.export import ENDINGS
     from mauvecl.runs.store import Store
-    from mauvecl.schema.errors import InputError
 
     place = session.output or Path("mauvecl-frames.zarr")
     one_file = place.suffix in ENDINGS
@@ -294,7 +299,6 @@ def verify(
     """
     from mauvecl.answers.answer import is_answer
     from mauvecl.cli.console import Meter
-    from mauvecl.schema.errors import InputError
 
     if is_answer(store):
         if repair or redraw or rows is not None:
@@ -372,8 +376,6 @@ def export(
 
 
 def _rows_of(text: str | None) -> tuple[int, int] | None:
-    from mauvecl.schema.errors import InputError
-
     if text is None:
         return None
     first, _, stop = text.partition(":")
@@ -437,7 +439,6 @@ def stare(
     """Draw stares on one device, which keeps their frames for a resume."""
     from mauvecl.answers.stare import stare as compute
     from mauvecl.device.engine import Stares
-    from mauvecl.schema.errors import InputError
 
     if given["energy"] and (given["amplitude"] or given["flares"]):
         raise InputError("only one of --energy, --amplitude and --flares may be given", key="energy")

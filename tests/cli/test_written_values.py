@@ -143,3 +143,25 @@ def test_counted_tails_are_refused_for_few_realisations(tmp_path: Path) -> None:
     for words in (("detect", "--tails", "counted"), ("map",)):
         code, _, reported = ended(*words, "-s", "M3V", "-m", "9", "-n", "1000", folder=tmp_path)
         assert (code, "100000 realisations" in reported) == (2, True)
+
+
+def test_several_wrong_values_are_reported_together(tmp_path: Path) -> None:
+    code, _, reported = ended("detect", "-s", "M3V", "-m", "x", "-t", "10 m", "-a", "4z", folder=tmp_path)
+    assert (code, reported.count("\n")) == (2, 1)
+    assert [part.split()[0] for part in reported.removeprefix("mauvecl: ").split("; ")] == [
+        "--magnitude", "--exposure", "--amplitude"
+    ]  # fmt: skip
+    code, _, reported = ended("detect", "-s", "M3V", "-m", "99", "-t", "30 h", "--fap", "2", folder=tmp_path)
+    assert (code, reported.count("\n")) == (2, 1)
+    parts = reported.removeprefix("mauvecl: ").split("; ")
+    assert [part.partition(",")[0] for part in parts] == ["--magnitude 99.0", "--exposure 108000.0", "--fap 2.0"]
+
+
+def test_errors_of_a_study_name_each_key_once() -> None:
+    stars = [{"library": "M3V", "magnitude": 99}, {"library": "G2V", "magnitude": "x"}]
+    with refused("star.0.magnitude", "star.1.magnitude = 'x'", "bulk.frames") as caught:
+        Study.build({"star": stars, "bulk": {"frames": "some"}}, "test")
+    assert len(caught.value.parts) == 3
+    assert str(caught.value).count("test: ") == 1
+    with refused("flare.amplitudes.0", "and 3 more values are wrong"):
+        Study.build({"flare": {"amplitudes": [-1.0] * 8}}, "test")
