@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Union, ge
 
 import typer
 
+from mauvecl.cli.completion import OF_KEYS, complete_study
 from mauvecl.schema.fields import Flag, Help, Unit, as_typed, first, is_measure, unit_of
 from mauvecl.schema.parsing import assignment, count, number, refusal, several
 from mauvecl.schema.physical import SkyBrightness
@@ -27,6 +28,7 @@ StudyFile = Annotated[
     typer.Argument(
         help="Study (TOML), the ECSV table of an answer, or a star as for --star; flags override it.",
         show_default=False,
+        autocompletion=complete_study,
     ),
 ]
 DeviceFlag = Annotated[
@@ -83,6 +85,7 @@ def study_flags(*keys: str, defaults: Mapping[str, Any]) -> dict[str, StudyFlag]
                 help=_help(path, field, flag, kind, defaults),
                 show_default=False,
                 rich_help_panel=section.partition(".")[0].capitalize(),
+                autocompletion=OF_KEYS.get(path),
                 metavar={str: "TEXT", list[str]: "TEXT", Path: "FILE"}.get(kind),
             )
             flags[flag.parameter] = StudyFlag(

@@ -176,13 +176,34 @@ def _at(value: Any, path: tuple[str, ...]) -> Any:
     return value
 
 
-def test_bash_completes_verbs_and_flags() -> None:
-    for typed, wanted in (("mauvecl det", "detect"), ("mauvecl detect --magn", "--magnitude")):
-        words = {"COMP_WORDS": typed, "COMP_CWORD": str(len(typed.split()) - 1), "_MAUVECL_COMPLETE": "complete_bash"}
-        # The program's name decides the variable; the console script has it.
-        script = str(Path(sys.executable).parent / "mauvecl")
-        done = subprocess.run([script], capture_output=True, text=True, env=os.environ | words)
-        assert wanted in done.stdout.split(), done
+@pytest.mark.parametrize(("typed", "wanted"), [
+    ("det", {"detect"}), ("detect --magn", {"--magnitude", "--magnitude-system"}), ("detect --star AUM", {"AUMic"}),
+    ("detect --star G2V,yz", {"G2V,yzCMi"}), ("limit K2.5", {"K2.5V"}),
+    ("detect -s my-", {"my-star.txt", "my-study.toml"}),
+    ("detect my-", {"my-star.txt", "my-study.toml"}),
+    ("snr --instrument m", {"mauve", "mauve-electrons", "my-study.toml"}),
+    # The shell completes these, where nothing is offered.
+    ("detect --flares my-", set()), ("detect --output my-", set()),
+])  # fmt: skip
+def test_bash_completes_names_and_files(typed: str, wanted: set[str], tmp_path: Path) -> None:
+    for name in ("my-star.txt", "my-study.toml"):
+        (tmp_path / name).touch()
+    words = f"mauvecl {typed}"
+    asked = {"COMP_WORDS": words, "COMP_CWORD": str(len(words.split()) - 1), "_MAUVECL_COMPLETE": "complete_bash"}
+    # The program's name decides the variable; the console script has it.
+    script = str(Path(sys.executable).parent / "mauvecl")
+    own = {"PYTHONPATH": str(Path(mauvecl.__file__).parents[1])}
+    done = subprocess.run([script], capture_output=True, text=True, env=os.environ | asked | own, cwd=tmp_path)
+    assert set(done.stdout.split()) == wanted, done
+
+
+def test_completed_names_are_accepted() -> None:
+    from mauvecl.cli.completion import complete_star
+    from mauvecl.host.stars.library import resolve
+
+    names = complete_star("")
+    assert {"AUMic", "YZCMi", "ADLeo", "G2V", "GJ581"} <= {*names}
+    assert [name for name in names if not Path(name).exists() and resolve(name) is None] == []
 
 
 def test_every_verb_with_flares_takes_the_flags_of_their_spectrum() -> None:
