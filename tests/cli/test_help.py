@@ -22,8 +22,7 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 import mauvecl
-import mauvecl.answers.verbs
-from mauvecl import Study
+from mauvecl import Source, Study
 from mauvecl.cli.app import app
 
 FILE = Path(__file__).parent.parent / "data" / "flags.json"
@@ -120,9 +119,6 @@ def test_help_shows_the_common_flags_and_help_all_every_flag(name: str) -> None:
     assert 4 <= len(common) - 2 <= 12
     assert set(common) < set(every)
     assert {*every} == {max(one.opts, key=len) for one in options(VERBS[name])} | {"--help"}
-    # Each name of the registry is a flag.
-    parameters = {one.name for one in VERBS[name].params}
-    assert name not in mauvecl.answers.verbs.VERBS or {*mauvecl.answers.verbs.VERBS[name].common} <= parameters
 
 
 def test_help_all_groups_flags_by_section() -> None:
@@ -176,11 +172,21 @@ def _at(value: Any, path: tuple[str, ...]) -> Any:
     return value
 
 
+def completed(typed: str, folder: Path) -> set[str]:
+    """Return what bash offers for the last word."""
+    words = f"mauvecl {typed}"
+    asked = {"COMP_WORDS": words, "COMP_CWORD": str(words.count(" ")), "_MAUVECL_COMPLETE": "complete_bash"}
+    # The program's name decides the variable; the console script has it.
+    script = str(Path(sys.executable).parent / "mauvecl")
+    own = {"PYTHONPATH": str(Path(mauvecl.__file__).parents[1])}
+    done = subprocess.run([script], capture_output=True, text=True, env=os.environ | asked | own, cwd=folder)
+    return set(done.stdout.split("\n")) - {""}
+
+
 @pytest.mark.parametrize(("typed", "wanted"), [
     ("det", {"detect"}), ("detect --magn", {"--magnitude", "--magnitude-system"}), ("detect --star AUM", {"AUMic"}),
     ("detect --star G2V,yz", {"G2V,yzCMi"}), ("limit K2.5", {"K2.5V"}),
-    ("detect -s my-", {"my-star.txt", "my-study.toml"}),
-    ("detect my-", {"my-star.txt", "my-study.toml"}),
+    ("detect -s my-", {"my-star.txt", "my-study.toml"}), ("detect my-", {"my-star.txt", "my-study.toml"}),
     ("snr --instrument m", {"mauve", "mauve-electrons", "my-study.toml"}),
     # The shell completes these, where nothing is offered.
     ("detect --flares my-", set()), ("detect --output my-", set()),
@@ -188,22 +194,15 @@ def _at(value: Any, path: tuple[str, ...]) -> Any:
 def test_bash_completes_names_and_files(typed: str, wanted: set[str], tmp_path: Path) -> None:
     for name in ("my-star.txt", "my-study.toml"):
         (tmp_path / name).touch()
-    words = f"mauvecl {typed}"
-    asked = {"COMP_WORDS": words, "COMP_CWORD": str(len(words.split()) - 1), "_MAUVECL_COMPLETE": "complete_bash"}
-    # The program's name decides the variable; the console script has it.
-    script = str(Path(sys.executable).parent / "mauvecl")
-    own = {"PYTHONPATH": str(Path(mauvecl.__file__).parents[1])}
-    done = subprocess.run([script], capture_output=True, text=True, env=os.environ | asked | own, cwd=tmp_path)
-    assert set(done.stdout.split()) == wanted, done
+    assert completed(typed, tmp_path) == wanted
 
 
-def test_completed_names_are_accepted() -> None:
-    from mauvecl.cli.completion import complete_star
-    from mauvecl.host.stars.library import resolve
-
-    names = complete_star("")
-    assert {"AUMic", "YZCMi", "ADLeo", "G2V", "GJ581"} <= {*names}
-    assert [name for name in names if not Path(name).exists() and resolve(name) is None] == []
+def test_completed_names_are_accepted(tmp_path: Path) -> None:
+    names = completed("detect --star ", tmp_path)
+    assert {"AUMic", "YZCMi", "ADLeo", "G2V", "GJ581"} <= names
+    for name in names:
+        assert " " not in name
+        Source.from_library(name)
 
 
 def test_every_verb_with_flares_takes_the_flags_of_their_spectrum() -> None:

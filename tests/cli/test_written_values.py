@@ -12,7 +12,6 @@ from commands import ended, run
 from refusals import refused
 
 from mauvecl import Study
-from mauvecl.web.fields import FIELDS
 
 FAST = ("exposure", "--snr", "10", "--at", "300", "--no-pictures")
 
@@ -78,16 +77,6 @@ def test_flags_refuse_wrong_units(words: tuple[str, ...], found: str, tmp_path: 
     code, out, reported = ended("detect", "-s", "M3V", *words, folder=tmp_path)
     assert (code, out, reported.count("\n")) == (2, "", 1)
     assert found in reported
-
-
-@pytest.mark.parametrize(("name", "text", "value"), [
-    ("exposure_s", "2 min", 120.0), ("magnitude", "8.5 mag", 8.5), ("amplitude_percent", "24%", 24.0),
-    ("amplitude_percent", "24", 24.0), ("flare_temperature_k", "9000 K", 9000.0), ("sky_brightness", "22", 22.0),
-])  # fmt: skip
-def test_fields_of_the_page_take_units(name: str, text: str, value: float) -> None:
-    assert FIELDS[name].read(text) == pytest.approx(value)
-    with refused("number", "expected"):
-        FIELDS[name].read("3 banana")
 
 
 def test_units_are_imported_only_with_a_unit() -> None:
