@@ -233,7 +233,13 @@ class Star(Section):
     def with_value(self, path: Sequence[str], value: Any) -> Self:
         """Return a copy with another value; another library star drops values that describe this one."""
         changed = super().with_value(path, value)
-        return changed.model_copy(update=dict.fromkeys(STAR_KEYS)) if path[0] == "library" else changed
+        if path[0] != "library":
+            return changed
+        listed = listed_values(str(value))
+        if self.magnitude not in (None, listed_values(self.library or "").get("magnitude")):
+            # A given magnitude is that of every star.
+            listed.pop("magnitude", None)
+        return changed.model_copy(update=dict.fromkeys(STAR_KEYS) | listed)
 
     def near(self) -> Neighbours | None:
         """Read the star's neighbours, or return None if it has none."""

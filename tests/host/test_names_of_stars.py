@@ -80,6 +80,16 @@ def test_given_values_win_over_those_of_the_list() -> None:
                exposure=50)  # fmt: skip
 
 
+def test_swept_stars_have_their_own_values_unless_others_are_given() -> None:
+    def values(name: str, **given: object) -> tuple[Any, Any]:
+        (star,) = Study.build({"star": [given]}, "test").at("star", name).star
+        return star.magnitude, star.distance_pc
+
+    assert values("YZ CMi", library="AU Mic") == (11.19, 5.957)
+    assert values("YZ CMi", library="M3V", magnitude=9) == (9.0, 5.957)
+    assert values("M3V", library="M1V", magnitude=9, distance_pc=3) == (9.0, None)
+
+
 @pytest.mark.parametrize(("text", "nearest"), [("M3.5V", "M3V"), ("dM4.5", "M4V"), ("G3V", "G2V")])
 def test_types_between_those_of_the_library_take_the_nearest_with_a_message(text: str, nearest: str) -> None:
     star = Source.from_library(text)
