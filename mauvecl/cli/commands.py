@@ -32,7 +32,7 @@ from mauvecl.cli.flags import (
     warn_of_percent,
 )
 from mauvecl.cli.help import HELP_ALL
-from mauvecl.schema.errors import InputError
+from mauvecl.schema.errors import InputError, together
 
 if TYPE_CHECKING:
     from mauvecl.cli.invocation import Session
@@ -88,7 +88,7 @@ class Command:
                     except InputError as error:
                         errors.append(error)
             if errors:
-                raise InputError.together(errors)
+                raise together(errors)
             warn_of_percent(amplitudes)
             self._call(study_file, flags, values, tells_flags="given" in kinds)
 

@@ -94,15 +94,6 @@ class InputError(ValueError):
         return reworded(self, f"{place}: {self}")
 
     @classmethod
-    def together(cls, errors: Sequence[InputError]) -> InputError:
-        """Return one error for several wrong values, or the only one of them."""
-        if len(errors) == 1:
-            return errors[0]
-        whole = reworded(errors[0], "; ".join(map(str, errors)))
-        whole.parts = tuple(errors)
-        return whole
-
-    @classmethod
     def of(cls, key: str, value: Any, expected: str, *, unit: str = "", where: str = "") -> InputError:
         """Return the error of one value: ``where: key = value unit, expected this``.
 
@@ -133,3 +124,12 @@ def reworded(error: InputError, sentence: str, key: str | None = None) -> InputE
     changed = InputError(sentence, key=key or error.key)
     changed.expected = error.expected
     return changed
+
+
+def together(errors: Sequence[InputError]) -> InputError:
+    """Return one error for several wrong values, or the only one of them."""
+    if len(errors) == 1:
+        return errors[0]
+    whole = reworded(errors[0], "; ".join(map(str, errors)))
+    whole.parts = tuple(errors)
+    return whole

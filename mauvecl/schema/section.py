@@ -20,7 +20,7 @@ from pydantic import (
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError, PydanticUndefined
 
-from mauvecl.schema.errors import InputError, shortened, shown
+from mauvecl.schema.errors import InputError, shortened, shown, together
 from mauvecl.schema.fields import Flag, Help, Range, Unit, as_typed, first, found, is_quantity, is_truth, numbers
 
 if TYPE_CHECKING:
@@ -95,7 +95,7 @@ def input_error(where: str, model: type[BaseModel], error: ValidationError) -> I
     first, *others = (_input_error_of(model, fault) for fault in [*faults.values()][:MOST_FAULTS])
     left = len(faults) - MOST_FAULTS
     more = [InputError(f"and {left} more values are wrong", key=first.key)] if left > 0 else []
-    return InputError.together([first.within(where), *others, *more])
+    return together([first.within(where), *others, *more])
 
 
 def _key_of(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str, ...]:
