@@ -93,7 +93,7 @@ def command_lines(command: Any, path: str) -> list[str]:
         for one in command.params:
             if one.param_type_name == "argument":
                 lines += [f".. option:: {one.name.upper()}", "", f"   {escaped(one.help)}", ""]
-            elif one.name != "help":
+            elif one.name not in ("help", "help_all"):
                 names = ", ".join([*one.opts, *one.secondary_opts])
                 lines += [f".. option:: {names}", "", f"   {escaped(one.help)}", ""]
     for name, inner in own.items():

@@ -20,14 +20,14 @@ class Done:
     stderr: str
 
 
-def run(*words: str | Path, folder: Path, code: int = 0) -> Done:
-    """Run a command in this process, which is faster than `started`."""
-    found, out, reported = ended(*words, folder=folder)
+def run(*words: str | Path, folder: Path, code: int = 0, columns: int = 200) -> Done:
+    """Run a command in this process, which is faster than `started`, in a terminal of some width."""
+    found, out, reported = ended(*words, folder=folder, columns=columns)
     assert found == code, out + reported
     return Done(out, reported)
 
 
-def ended(*words: str | Path, folder: Path) -> tuple[int, str, str]:
+def ended(*words: str | Path, folder: Path, columns: int = 200) -> tuple[int, str, str]:
     """Run a command in this process; return exit code, standard output and standard error."""
     out, reported = io.StringIO(), io.StringIO()
     code = 0
@@ -36,7 +36,7 @@ def ended(*words: str | Path, folder: Path) -> tuple[int, str, str]:
         contextlib.redirect_stdout(out),
         contextlib.redirect_stderr(reported),
         mock.patch.object(sys, "argv", ["mauvecl", *map(str, words)]),
-        mock.patch.dict(os.environ, {"COLUMNS": "200"}),
+        mock.patch.dict(os.environ, {"COLUMNS": str(columns)}),
     ):
         try:
             main()

@@ -439,7 +439,8 @@ def expect(
     Parameters
     ----------
     source : Source or str
-        A source, which emits no light beyond its wavelengths, or a name of the library.
+        A source, which emits no light beyond its wavelengths, or a name of the library. A well-known star,
+        such as AU Mic, has the V magnitude of the embedded list.
     instrument : Instrument, str or Path
         An instrument, or a name or file for `Instrument.load`.
     exposure : Quantity or float
@@ -469,9 +470,9 @@ def expect(
     >>> float(round(quiet.snr().max(), 2)), float(round(quiet.snr_per_element().max(), 1))
     (10.33, 61.0)
     """
-    from mauvecl.host.stars.source import Source
+    from mauvecl.host.stars.source import listed_star
 
-    source = Source.from_library(source) if isinstance(source, str) else source
+    source = listed_star(source) if isinstance(source, str) else source
     instrument = instrument if isinstance(instrument, Instrument) else Instrument.load(instrument)
     sky = sky if isinstance(sky, Sky) else Sky.of_brightness(DEFAULT_SKY if sky is None else sky)
     # The margin makes 0.1 + 0.2 s three frames of 0.1 s despite rounding.

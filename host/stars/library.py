@@ -425,9 +425,9 @@ def resolve(text: str, *, own: bool = True) -> NamedStar | None:
 
 
 def spectrum_name(text: str, key: str = "star", *, own: bool = True) -> str:
-    """Return the name of the spectrum of a star.
+    """Return the name of the spectrum of a star: its own, or that of the nearest type of the library.
 
-    Raises InputError if the star has no spectrum; the message proposes one and, for a well-known star, its magnitude.
+    Raises InputError for an unknown star; the message proposes similar names.
 
     Parameters
     ----------
@@ -439,21 +439,42 @@ def spectrum_name(text: str, key: str = "star", *, own: bool = True) -> str:
     star = resolve(text, own=own)
     if star is None:
         raise InputError(f"star {text.strip()!r} is unknown", f"a name such as {', '.join(near_names(text))}", key=key)
-    if star.spectrum is not None:
-        return star.spectrum
-    proposed = f"`{key}={star.nearest!r}`"
-    if star.known is None:
-        raise InputError(
-            f"spectral type {text.strip()!r} has no spectrum in the library",
-            f"the nearest, {proposed}, or a name such as {', '.join(near_names(text))}",
-            key=key,
-        )
-    raise InputError(
-        f"star {text.strip()!r} has no spectrum in the library",
-        f"that of the nearest type and its V: {proposed} with `magnitude={star.known.magnitude:g}` "
-        f"({star.name}: {star.known.about})",
-        key=key,
-    )
+    return star.nearest
+
+
+def listed_values(name: str) -> dict[str, float]:
+    """Return the V magnitude and the distance of a star of the list, as keys of a study.
+
+    They are empty for other names, and for a star whose spectrum has the level of the star.
+    """
+    star, entry = by_key().get(name_key(name)), embedded(name)
+    if star is None or (entry is not None and entry["level"] == "as seen"):
+        return {}
+    return {"magnitude": star.magnitude, "distance_pc": star.distance_pc}
+
+
+def listed_note(name: str, **used: float | None) -> str:
+    """Describe what the library and the list supply for a star; empty if it has a spectrum of its own.
+
+    Parameters
+    ----------
+    **used : float
+        The magnitude in V and the distance, in pc, that are used; those of the list are named with their source.
+    """
+    star = resolve(name)
+    if star is None:
+        return ""
+    texts = []
+    if star.spectrum is None:
+        wanted = star.name if star.known is None else star.known.spectral_type
+        exact = star.nearest == wanted
+        texts.append(f"spectrum of {f'type {wanted}' if exact else f'{star.nearest}, the nearest to type {wanted}'}")
+    elif star.known is not None:
+        texts.append(f"as {star.name}")
+    listed = {key: value for key, value in listed_values(name).items() if used.get(key) == value}
+    texts += [f"V = {value:g}" if key == "magnitude" else f"{value:g} pc" for key, value in listed.items()]
+    source = f", from {star.known.source.partition(',')[0]}" if star.known is not None and listed else ""
+    return ", ".join(texts) + source if listed or star.spectrum is None else ""
 
 
 def all_names() -> list[str]:

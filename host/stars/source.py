@@ -29,7 +29,17 @@ from mauvecl.host.stars.coverage import (
 )
 from mauvecl.host.stars.flare import Geometry, with_flare
 from mauvecl.host.stars.flare_spectra import Blackbody, FlareSpectrum
-from mauvecl.host.stars.library import ModelStar, embedded, find, spectrum, spectrum_table
+from mauvecl.host.stars.library import (
+    ModelStar,
+    embedded,
+    find,
+    listed_note,
+    listed_values,
+    resolve,
+    spectrum,
+    spectrum_name,
+    spectrum_table,
+)
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Drawable
 from mauvecl.schema.errors import InputError, missing_package
@@ -116,12 +126,14 @@ class Source(Drawable, ContentEquality):
         """Return an embedded spectrum, one of the user's own stars, a blackbody or a power law, by name in any case.
 
         "blackbody 9000 K" is a blackbody, and "power law -2" a flux proportional to a power of the wavelength.
-        `library_table` lists the names. For an unknown name the error suggests the nearest ones, and for a
-        well-known star without a spectrum that of its type.
+        `library_table` lists the names. Another spectral type, and a well-known star without a spectrum, have that of
+        the nearest type, with a message. For an unknown name the error suggests the nearest ones.
         """
-        from mauvecl.host.stars.library import spectrum_name
-
-        name = spectrum_name(name, "name")
+        given, name = name, spectrum_name(name, "name")
+        star = resolve(given)
+        if star is not None and star.spectrum is None:
+            nearest = cls.from_library(name)
+            return replace(nearest, name=star.name, messages=(listed_note(given), *nearest.messages))
         model = ModelStar.named(name)
         if model is not None:
             return cls(
@@ -484,3 +496,18 @@ class Source(Drawable, ContentEquality):
         flux = self.flux_flam[inside] * model.extinguish(self.wavelength_nm[inside] * u.nm, Ebv=ebv)
         history = (*self.history, f"reddened by E(B-V) = {ebv:g}, {law}, R_V = {rv:g}")
         return replace(self, wavelength_nm=self.wavelength_nm[inside], flux_flam=flux, history=history)
+
+
+def listed_star(name: str) -> Source:
+    """Return the star of a name; one of the embedded list at its V there, with a message."""
+    source = Source.from_library(name)
+    if not (values := listed_values(name)):
+        return source
+    return with_listed_note(source, name, **values).at_magnitude(values["magnitude"])
+
+
+def with_listed_note(source: Source, name: str, **used: float | None) -> Source:
+    """Return a source with a message on the values of the embedded list that are used; see `listed_note`."""
+    others = (text for text in source.messages if text != listed_note(name))
+    note = listed_note(name, **used)
+    return replace(source, messages=(*([note] if note else []), *others))

@@ -60,6 +60,8 @@ ORBIT = (
     "orbit.limits",
 )
 TARGETS = ("orbit.targets", "plan.targets")
+#: Flags that `--help` shows of every verb that has them; `--help-all` shows all.
+COMMON = ("star", "magnitude", "exposure", "amplitude", "paper", "output")
 
 
 @dataclass(frozen=True)
@@ -70,6 +72,9 @@ class Verb:
     help: str  # help text of the command, with examples
     # Keys and sections of the study whose flags the command takes, in addition to those of `observation`.
     takes: tuple[str, ...]
+    # Where `mauvecl` lists the command: under plan, simulate, analyse or tools.
+    group: str = "plan"
+    common: tuple[str, ...] = ()  # parameters of flags that `--help` shows in addition to `COMMON`
     counts: str = ""  # what the command line's progress bar counts; empty if a closed form answers at once
     observation: tuple[str, ...] = OBSERVATION  # keys of an observation, or their replacements
     without: str = ""  # key of the observation that the command does not take
@@ -131,6 +136,8 @@ VERBS: dict[str, Verb] = {
     Example: mauvecl simulate --star G2V --magnitude 7.4 --exposure 50 --amplitude 0.24
     """,
             ("flare", *SIGNAL, "run.seed"),
+            group="simulate",
+            common=("flare_temperature", "sky", "seed"),
             home="signal",
         ),
         Verb(
@@ -148,6 +155,8 @@ VERBS: dict[str, Verb] = {
     mauvecl snr --star G2V --sweep magnitude=4,6,8,10 --sweep exposure=5,50,600
     """,
             (*DRAWS, *SIGNAL, "signal.wavelength_nm", "sweep"),
+            group="simulate",
+            common=("realisations", "at", "signal", "sky", "sweep"),
             counts="realisations",
             defaults=FEWER,
             default=_budgets_or_star,
@@ -162,6 +171,7 @@ VERBS: dict[str, Verb] = {
     Example: mauvecl exposure --snr 10 --at 300 --star G2V --magnitude 7.4
     """,
             ("signal", *SIGNAL),
+            common=("snr", "at", "per", "sky"),
             without="observation.exposure_s",
             home="signal",
         ),
@@ -175,6 +185,7 @@ VERBS: dict[str, Verb] = {
     Example: mauvecl detect --star K5V --magnitude 6 --amplitude 0.05 --amplitude 0.1 --exposure 30
     """,
             ("flare", *DRAWS, *DETECTION, "campaign", *NUISANCES, "run.template_temperatures_k", "sweep"),
+            common=("flare_temperature", "realisations", "fap", "with_unknowns", "sweep"),
             counts="realisations",
         ),
         Verb(
@@ -188,6 +199,7 @@ VERBS: dict[str, Verb] = {
     Example: mauvecl limit --star G2V --amplitude 0.24 --exposure 50
     """,
             ("limit", "flare", *DRAWS, *DETECTION, *NUISANCES, *UNKNOWN, "sweep"),
+            common=("of", "power", "realisations", "fap", "with_unknowns"),
             counts="steps",
             tab=True,
         ),
@@ -201,6 +213,7 @@ VERBS: dict[str, Verb] = {
     Example: mauvecl map --star G2V --x magnitude:4:10:16 --y amplitude:0.01:1:16:log
     """,
             ("map", "flare", *DRAWS, *DETECTION, *NUISANCES, *UNKNOWN),
+            common=("x", "y", "realisations", "fap", "with_unknowns"),
             counts="cells",
             defaults=FEWER,
         ),
@@ -216,6 +229,8 @@ VERBS: dict[str, Verb] = {
     Example: mauvecl gaussian --star G2V --sweep magnitude=6,10 --sweep exposure=5,50
     """,
             (*DRAWS, *DETECTION, *SIGNAL, "sweep"),
+            group="simulate",
+            common=("realisations", "fap", "signal", "sweep"),
             counts="realisations",
             defaults=FEWER,
             default=_formula_grid,
@@ -234,6 +249,7 @@ VERBS: dict[str, Verb] = {
     mauvecl measure --star M3V --magnitude 9 --amplitude 2 --snr-per-bin 20 --joint-fit --duration 1800 --distance 5
     """,
             ("flare", "measure", *STARE, *NUISANCES, *SIZE, "run.fap", "run.seed", "sweep"),
+            common=("flare_temperature", "balmer_jump", "distance", "with_unknowns", "sweep"),
             counts="flares",
             tab=True,
         ),
@@ -248,6 +264,8 @@ VERBS: dict[str, Verb] = {
     mauvecl stare --star G2V --magnitude 7.4 --distance 14.1 --energy 1e33 --energy 1e34 --orbit-gap 2100
     """,
             ("flare", *STARE, *SIZE, "run.seed", "sweep"),
+            group="simulate",
+            common=("duration", "orbit_gap", "half_width", "energy", "distance", "with_unknowns"),
             counts="stares",
             without="observation.exposure_s",
         ),
@@ -277,6 +295,7 @@ VERBS: dict[str, Verb] = {
                 "run.seed",
                 "sweep",
             ),
+            common=("duration", "orbit_gap", "distance", "false_alarms", "alarms_per", "injections", "with_unknowns"),
             counts="injections",
             without="observation.exposure_s",
             defaults={"stare.duration_s": 86_400.0},
@@ -303,6 +322,8 @@ VERBS: dict[str, Verb] = {
                 "search.per",
                 "run.seed",
             ),
+            group="analyse",
+            common=("mapping", "quality_bits", "false_alarms", "alarms_per", "distance", "report"),
             counts="frames",
             without="observation.exposure_s",
             tab=True,
@@ -319,6 +340,7 @@ VERBS: dict[str, Verb] = {
     mauvecl change --star K5V -m 8 --exposure 300 --visits 40 --periods --look-at "eps Eri" --days 60
     """,
             ("change", "limit.power", "run.fap", "run.seed", *NUISANCES, *ORBIT, *TARGETS, "sweep"),
+            common=("change", "visits", "periods", "look_at", "days", "with_unknowns"),
             tab=True,
         ),
         Verb(
@@ -331,6 +353,8 @@ VERBS: dict[str, Verb] = {
     Example: mauvecl calibrate standards.toml
     """,
             ("observation.instrument", "sky", "calibrate"),
+            group="analyse",
+            common=("knots", "light_error", "spectrum_error"),
             observation=(),
             tab=True,
         ),
@@ -343,6 +367,7 @@ VERBS: dict[str, Verb] = {
     Example: mauvecl visible --look-at "eps Eri" --look-at "AU Mic" --start 2027-01-01 --days 365
     """,
             TARGETS,
+            common=("look_at", "targets", "start", "days", "simbad"),
             observation=ORBIT,
         ),
         Verb(
@@ -365,6 +390,7 @@ VERBS: dict[str, Verb] = {
                 "flare.spectrum",
                 "nuisances.usual",
             ),
+            common=("targets", "hours", "start", "days", "completeness", "report", "false_alarms"),
             counts="targets",
             observation=ORBIT,
             tab=True,

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import atexit
 import gc
-import inspect
 import json
 import os
-import re
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -17,13 +15,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer.core import TyperCommand, TyperGroup
+from typer.core import TyperGroup
 from typer.main import get_command
 
-from mauvecl.answers.verbs import VERBS
+from mauvecl.answers.verbs import COMMON, VERBS
 from mauvecl.cli.commands import COMMANDS, add_plain_commands, export, verify
 from mauvecl.cli.console import EXIT_CODES, guarded, name_flags_of
 from mauvecl.cli.flags import DeviceFlag, JsonFlag, QuietFlag, option_of, within
+from mauvecl.cli.help import CommandWithHelp, text_of, write_commands
 from mauvecl.host import VERSION
 from mauvecl.schema.parsing import count
 
@@ -267,23 +266,6 @@ def serve(
         ) from error
 
 
-def _help(text: str | None) -> str:
-    """Return a help text with examples on separate lines of at most 80 columns, which can be pasted."""
-    text = re.sub(r"(?m)^(Examples?:) (?=mauvecl )", r"\1\n\n", inspect.cleandoc(text or ""))
-    return re.sub(r"(?m)^mauvecl .*$", lambda match: "\b\n" + _broken(match[0]), text)
-
-
-def _broken(command: str) -> str:
-    """Divide a command longer than 72 characters into lines that end in a backslash before a flag."""
-    lines = [""]
-    for part in re.split(r" (?=-)", command):
-        if lines[-1] and len(lines[-1]) + len(part) > 72:
-            lines[-1] += " \\"
-            lines.append("   ")
-        lines[-1] += f" {part}" if lines[-1] else part
-    return "\n".join(lines)
-
-
 add_plain_commands()
 #: Functions of the commands without a study.
 OTHERS: dict[str, Callable[..., None]] = {
@@ -291,9 +273,9 @@ OTHERS: dict[str, Callable[..., None]] = {
 }
 #: Help text of every command, in the order of `--help`: verbs, raw spectra, mauvecl itself.
 HELP = {
-    **{name: _help(COMMANDS[name].help) for name in (*VERBS, "realise")},
-    **{name: _help(function.__doc__) for name, function in OTHERS.items()},
-    "library": _help(library.__doc__),
+    **{name: text_of(COMMANDS[name].help) for name in (*VERBS, "realise")},
+    **{name: text_of(function.__doc__) for name, function in OTHERS.items()},
+    "library": text_of(library.__doc__),
 }
 
 
@@ -303,11 +285,15 @@ def _command(name: str) -> Any:
     if name == "library":
         one = library_app
         for inner in one.registered_commands:
-            inner.help = _help(inner.callback and inner.callback.__doc__)
+            inner.help = text_of(inner.callback and inner.callback.__doc__)
     else:
         one = typer.Typer(add_completion=False, rich_markup_mode=None)
-        one.command(name, help=HELP[name])(COMMANDS[name].build() if name in COMMANDS else OTHERS[name])
-    return get_command(one)
+        function = COMMANDS[name].build() if name in COMMANDS else OTHERS[name]
+        one.command(name, help=HELP[name], cls=CommandWithHelp)(function)
+    command = get_command(one)
+    if name in COMMANDS:
+        command.common = frozenset((*COMMON, *COMMANDS[name].verb.common))  # type: ignore[attr-defined]
+    return command
 
 
 class _Commands(Mapping[str, Any]):
@@ -330,23 +316,27 @@ class _Group(TyperGroup):
         super().__init__(**how)
         self.commands = _Commands()  # type: ignore[assignment]
 
-    def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write the names and the first sentences of the help texts."""
-        TyperGroup(commands=[TyperCommand(name, help=text) for name, text in HELP.items()]).format_commands(
-            ctx, formatter
-        )
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write the commands in groups, and then the flags."""
+        groups = {name: COMMANDS[name].verb.group if name in COMMANDS else "tools" for name in HELP}
+        write_commands(formatter, HELP, groups)
+        with formatter.section("Options"):
+            formatter.write_dl([record for one in self.get_params(ctx) if (record := one.get_help_record(ctx))])
 
 
 app = typer.Typer(
     name="mauvecl",
     cls=_Group,
-    no_args_is_help=True,
+    invoke_without_command=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
     help="Would the Mauve satellite see this stellar flare, and how sure can one be?\n\n"
-    "Start with `mauvecl detect`, which answers the question of the MauveSim paper. The throughput is nominal, not a "
-    f"flight calibration. {EXIT_CODES}",
+    "mauvecl plans and simulates observations of stars and their flares, and analyses observed frames. The throughput "
+    "is nominal, not a flight calibration.\n\n"
+    "Start with the first of these; the second explains a command:\n\n"
+    "\b\nmauvecl detect --star M3V --magnitude 9\nmauvecl detect --help",
+    epilog=EXIT_CODES,
 )
 
 name_flags_of(app)
@@ -360,11 +350,13 @@ def _version(wanted: bool) -> None:
 
 @app.callback()
 def _options(
+    context: typer.Context,
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
-    pass
+    if context.invoked_subcommand is None:
+        print(context.get_help())
 
 
 def main() -> None:

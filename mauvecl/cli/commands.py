@@ -30,7 +30,10 @@ from mauvecl.cli.flags import (
     output_flag,
     study_flags,
     study_of,
+    warn_of_percent,
 )
+from mauvecl.cli.help import HELP_ALL
+from mauvecl.schema.errors import InputError, together
 
 if TYPE_CHECKING:
     from mauvecl.cli.invocation import Session
@@ -70,14 +73,25 @@ class Command:
             *([inspect.Parameter("paper", named, default=False, annotation=PaperFlag)] if observes else []),
             *(p.replace(kind=named, annotation=kinds[p.name]) for p in own if p.name != "given"),
             *(inspect.Parameter(key, named, default=usual, annotation=kind) for key, (kind, usual) in options),
+            inspect.Parameter("help_all", named, default=False, annotation=Annotated[bool, HELP_ALL]),
         ]
-        taken = [as_text(parameter) for parameter in parameters]
+        units = {key: flag.unit for key, flag in flags.items()}
+        taken = [as_text(parameter, units.get(parameter.name, "")) for parameter in parameters]
         readers = {parameter.name: read for parameter, read in taken if read is not None}
 
         def command(study_file: Path | None = None, **values: Any) -> None:
+            del values["help_all"]
+            amplitudes = values.get("amplitude") or ()
+            errors: list[InputError] = []
             for key, read in readers.items():
                 if values.get(key) is not None and not isinstance(values[key], int | float):
-                    values[key] = read(values[key])
+                    try:
+                        values[key] = read(values[key])
+                    except InputError as error:
+                        errors.append(error)
+            if errors:
+                raise together(errors)
+            warn_of_percent(amplitudes)
             self._call(study_file, flags, values, tells_flags="given" in kinds)
 
         command.__name__ = verb.name
@@ -89,7 +103,7 @@ class Command:
         self, study_file: Path | None, flags: dict[str, StudyFlag], values: dict[str, Any], *, tells_flags: bool
     ) -> None:
         """Run the command with the values of all its options."""
-        from mauvecl.cli.invocation import Session, question_time, question_values
+        from mauvecl.cli.invocation import Session, question_time, question_values, with_enough_tails
 
         verb, defaults = self.verb, self.verb.defaults or {}
         given = {key: values.pop(key, None) for key in (*flags, "set", "paper")}
@@ -102,10 +116,15 @@ class Command:
         if tells_flags:
             values["given"] = given
         study = study_of(study_file, given, flags, verb.default)
+        messages: list[str] = []
+        # A map would sample the tail of each cell, which takes longer than more realisations.
+        if study_file is None and verb.counts != "cells" and "tails" in flags and given["tails"] is None:
+            study, messages = with_enough_tails(study)
         question_values(study, detects={"fap", "realisations"} <= flags.keys())
         if self.draws:
             question_time(study, insist=how["insist"])
         with Session(verb.name, study, **how) as session:
+            session.say(messages)
             self.run(session, **values)
 
     def _options(self) -> dict[str, tuple[Any, Any]]:
@@ -143,8 +162,6 @@ def command_of(
 
 def _placed(study_file: Path | None, given: dict[str, Any]) -> Path | None:
     """Give a file that is no study to the flag that takes such files, and return None in its place."""
-    from mauvecl.schema.errors import InputError
-
     others: dict[str, tuple[Callable[[Path], bool], str, Callable[[Path], Any]]] = {
         "targets": (lambda path: not holds_study(path), "tables of targets", lambda path: path),
         "data": (lambda path: path.suffix.lower() != ".toml", "observed frames", lambda path: path),
@@ -179,7 +196,15 @@ RowsFlag = Annotated[
 
 
 @command_of(
-    Verb("realise", "", ("flare", *DRAWS, "nuisances.usual", "sweep", "bulk"), counts="spectra", defaults=FEWER),
+    Verb(
+        "realise",
+        "",
+        ("flare", *DRAWS, "nuisances.usual", "sweep", "bulk"),
+        group="simulate",
+        common=("realisations", "seed", "frames", "components", "resume"),
+        counts="spectra",
+        defaults=FEWER,
+    ),
     pictures=False,
     writes="mauvecl-frames.zarr; also NAME.fits, .h5, .hdf5",
 )
@@ -197,7 +222,6 @@ def realise(session: Session) -> None:
     from mauvecl.runs import bulk
     from mauvecl.runs.export import ENDINGS
     from mauvecl.runs.store import Store
-    from mauvecl.schema.errors import InputError
 
     place = session.output or Path("mauvecl-frames.zarr")
     one_file = place.suffix in ENDINGS
@@ -277,7 +301,6 @@ def verify(
     """
     from mauvecl.answers.answer import is_answer
     from mauvecl.cli.console import Meter
-    from mauvecl.schema.errors import InputError
 
     if is_answer(store):
         if repair or redraw or rows is not None:
@@ -355,8 +378,6 @@ def export(
 
 
 def _rows_of(text: str | None) -> tuple[int, int] | None:
-    from mauvecl.schema.errors import InputError
-
     if text is None:
         return None
     first, _, stop = text.partition(":")
@@ -420,7 +441,6 @@ def stare(
     """Draw stares on one device, which keeps their frames for a resume."""
     from mauvecl.answers.stare import stare as compute
     from mauvecl.device.engine import Stares
-    from mauvecl.schema.errors import InputError
 
     if given["energy"] and (given["amplitude"] or given["flares"]):
         raise InputError("only one of --energy, --amplitude and --flares may be given", key="energy")

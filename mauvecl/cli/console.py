@@ -477,6 +477,9 @@ def _as_flag(match: re.Match[str]) -> str:
 
 def name_flag(error: InputError) -> str:
     """Return the error's message with a flag instead of its key, if that flag gave the value."""
+    if error.parts:
+        # A flag that sets the same value of several stars is named once.
+        return "; ".join(dict.fromkeys(map(name_flag, error.parts)))
     text, key = with_flags(str(error)), error.key
     if key is None:
         return text

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import partial
@@ -13,8 +13,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Union, ge
 
 import typer
 
-from mauvecl.schema.fields import Flag, Help, Unit, as_typed, first
+from mauvecl.cli.completion import OF_KEYS, complete_study
+from mauvecl.schema.fields import Flag, Help, Unit, as_typed, first, is_measure, unit_of
 from mauvecl.schema.parsing import assignment, count, number, refusal, several
+from mauvecl.schema.physical import SkyBrightness
 
 if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
@@ -26,6 +28,7 @@ StudyFile = Annotated[
     typer.Argument(
         help="Study (TOML), the ECSV table of an answer, or a star as for --star; flags override it.",
         show_default=False,
+        autocompletion=complete_study,
     ),
 ]
 DeviceFlag = Annotated[
@@ -58,6 +61,7 @@ class StudyFlag(NamedTuple):
     section: str
     key: str
     read: Callable[[Any, str], Any] | None
+    unit: str  # of the key, in astropy's notation
 
     def value(self, given: Any) -> Any:
         """Convert the value of the flag to that of the key."""
@@ -83,14 +87,18 @@ def study_flags(*keys: str, defaults: Mapping[str, Any]) -> dict[str, StudyFlag]
         assert of_key, wanted
         for path, field, flag in of_key:
             section, _, key = path.rpartition(".")
-            kind = flag.kind or _kind(field.annotation)
+            kind, unit = flag.kind or _kind(field.annotation), (first(field, Unit) or Unit("")).name
             option = typer.Option(
                 *flag.names,
                 help=_help(path, field, flag, kind, defaults),
                 show_default=False,
+                rich_help_panel=section.partition(".")[0].capitalize(),
+                autocompletion=OF_KEYS.get(path),
                 metavar={str: "TEXT", list[str]: "TEXT", Path: "FILE"}.get(kind),
             )
-            flags[flag.parameter] = StudyFlag(flag.parameter, Annotated[kind | None, option], section, key, flag.read)
+            flags[flag.parameter] = StudyFlag(
+                flag.parameter, Annotated[kind | None, option], section, key, flag.read, unit
+            )
     return flags
 
 
@@ -229,7 +237,7 @@ def study_of(
                 changes.setdefault(flag.section, {})[flag.key] = flag.value(value)
     if given.get("nuisance"):
         changes.setdefault("nuisances", {}).update(nuisances_of(study, given["nuisance"]))
-    changed = study.with_changes(changes, stars_of(study, given, flags), "command line")
+    changed = study.with_changes(changes, stars_of(study, given, flags, own=file is not None), "command line")
     return changed.with_settings(given["set"], "--set") if given["set"] else changed
 
 
@@ -243,8 +251,7 @@ def is_star(given: Path) -> bool:
     if not _is_there(text):
         # The first name decides; a wrong name among others has its own message.
         first = text.split(",")[0].strip()
-        star = resolve(first) if first else None
-        return star is not None and not (star.spectrum is None and star.known is None)
+        return bool(first) and resolve(first) is not None
     if given.suffix.lower() == ".ecsv":
         return not holds_study(given)
     return not given.is_file() or not _is_toml(given)
@@ -284,7 +291,7 @@ def sky_of(given: dict[str, Any]) -> dict[str, Any]:
         sky["none"] = True
     elif text is not None:
         try:
-            sky["surface_brightness"] = float(text)
+            sky["surface_brightness"] = number(text, "--sky", unit_of(SkyBrightness))
         except ValueError as error:
             raise InputError(f"--sky {text!r}", "V mag/arcsec^2 or none", key="sky") from error
     return sky
@@ -306,8 +313,13 @@ def nuisances_of(study: Study, texts: list[str]) -> dict[str, Any]:
     return nuisances | ({"own": own} if own else {})
 
 
-def stars_of(study: Study, given: dict[str, Any], flags: Mapping[str, StudyFlag]) -> list[dict[str, Any]] | None:
-    """Return the data of the stars that flags name or change, or None."""
+def stars_of(
+    study: Study, given: dict[str, Any], flags: Mapping[str, StudyFlag], *, own: bool
+) -> list[dict[str, Any]] | None:
+    """Return the data of the stars that flags name or change, or None.
+
+    Raises InputError for a magnitude or another value of no star; `own` states that the user's study has stars.
+    """
     from mauvecl.schema.errors import InputError
     from mauvecl.study.sections import FILE_KEYS
 
@@ -322,6 +334,13 @@ def stars_of(study: Study, given: dict[str, Any], flags: Mapping[str, StudyFlag]
     same = {key: value for key, value in changed.items() if key not in FILE_KEYS}
     if not (names or magnitudes or same or of_files):
         return None
+    if not (names or own):
+        # Those of the default study are not meant.
+        described = next(name for name, flag in flags.items() if flag.section == "star" and given[name] is not None)
+        raise InputError(
+            f"--{described.replace('_', '-')} needs a star, such as --star M3V; `mauvecl library` lists them",
+            key="star",
+        )
     if names:
         # A name of an existing file is a file; other names are searched for in the library.
         each = [star for name in names for star in ([name] if _is_there(name) else map(str.strip, name.split(",")))]
@@ -354,17 +373,35 @@ def _is_there(name: str) -> bool:
 def _is_file(name: str) -> bool:
     if _is_there(name):
         return True
-    from mauvecl.host.stars.library import ModelStar
+    from mauvecl.host.stars.library import resolve
 
     # "K2.5V" and "power law -1.5" look like file names but are stars.
-    if ModelStar.named(name) is not None:
+    if resolve(name) is not None:
         return False
     suffix = Path(name).suffix
     return bool(suffix) and not suffix[1:].isupper()
 
 
-def as_text(parameter: inspect.Parameter) -> tuple[inspect.Parameter, Callable[[Any], Any] | None]:
-    """Return an option of which numbers are taken as text, so that messages have one style, and its reader if any."""
+def warn_of_percent(texts: Sequence[str]) -> None:
+    """Warn of amplitudes that look like a percentage without its sign."""
+    import warnings
+
+    for text in (word.strip() for texts_of_flag in texts for word in texts_of_flag.split(",")):
+        if not is_measure(text) and number(text, "--amplitude") >= 1:
+            warnings.warn(
+                f"--amplitude {text} is a rise of {100 * float(text):g} %; --amplitude {text}% is one of {text} %",
+                stacklevel=2,
+            )
+
+
+def as_text(parameter: inspect.Parameter, unit: str = "") -> tuple[inspect.Parameter, Callable[[Any], Any] | None]:
+    """Return an option of which numbers are taken as text, so that messages have one style, and its reader if any.
+
+    Parameters
+    ----------
+    unit : str
+        Unit to which numbers with another one are converted.
+    """
     if get_origin(parameter.annotation) is not Annotated:
         return parameter, None
     wanted, option, *_ = get_args(parameter.annotation)
@@ -378,7 +415,7 @@ def as_text(parameter: inspect.Parameter) -> tuple[inspect.Parameter, Callable[[
     option.metavar = ("NUMBER" if each is float else "INTEGER") + (",..." if many else "")
     named = (flag for flag in option.param_decls or () if flag.startswith("--"))
     flag = next(named, "--" + parameter.name.replace("_", "-"))
-    read = partial(within, read=number if each is float else count, low=low, high=high)
+    read = partial(within, read=partial(number, unit=unit) if each is float else count, low=low, high=high)
     texts: Any = list[str] if many else str
     default = None if parameter.default is None else f"{parameter.default:g}"
     taken = parameter.replace(annotation=Annotated[texts | None, option], default=default)

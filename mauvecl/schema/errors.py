@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 
@@ -80,11 +80,14 @@ class InputError(ValueError):
         The parameter, or the key of a study such as ``run.fap``; None for a fault that is not in one value.
     expected : str or None
         What is accepted.
+    parts : tuple of InputError
+        The errors of which this one consists, if several values are wrong; key and expected are those of the first.
     """
 
     def __init__(self, fault: str = "", expected: str | None = None, *, key: str | None = None) -> None:
         super().__init__(f"{fault}, expected {expected}" if expected else fault)
         self.key, self.expected = key, expected
+        self.parts: tuple[InputError, ...] = ()
 
     def within(self, place: str) -> InputError:
         """Return the same error with a place before its sentence, such as the name of a file."""
@@ -121,3 +124,12 @@ def reworded(error: InputError, sentence: str, key: str | None = None) -> InputE
     changed = InputError(sentence, key=key or error.key)
     changed.expected = error.expected
     return changed
+
+
+def together(errors: Sequence[InputError]) -> InputError:
+    """Return one error for several wrong values, or the only one of them."""
+    if len(errors) == 1:
+        return errors[0]
+    whole = reworded(errors[0], "; ".join(map(str, errors)))
+    whole.parts = tuple(errors)
+    return whole

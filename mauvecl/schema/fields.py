@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 import operator
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -69,6 +70,43 @@ def without_unit(value: Any, unit: str) -> Any:
     return converted if getattr(converted, "ndim", 0) else float(converted)
 
 
+#: A number that is followed by a unit, which cannot begin like an exponent.
+_MEASURE = re.compile(
+    r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)(?![eE][+-]?\d)\s*([^\W\d_].{0,30}|[%°/].{0,9})", re.DOTALL
+)
+#: Units as people type them, which astropy does not know or takes for another.
+SPELLED = {
+    "sec": "s", "hrs": "h", "C": "deg_C", "degC": "deg_C", "°C": "deg_C", "Rsun": "solRad", "Msun": "solMass",
+    "per cent": "%", "kelvin": "K", "ly": "lyr", "light years": "lyr",
+}  # fmt: skip
+
+
+def is_measure(text: str) -> bool:
+    """Return whether a text is a number that is followed by a unit, as far as its form tells."""
+    return _MEASURE.fullmatch(text) is not None
+
+
+def with_unit(text: str, unit: str) -> float | None:
+    """Read a number with its unit, such as "10 min" or "24%", and convert it; return None for any other text.
+
+    Raises ValueError if the unit is unknown or has no equivalent in `unit`.
+    """
+    found = _MEASURE.fullmatch(text)
+    if found is None:
+        return None
+    import astropy.units as u
+
+    word = re.sub(r"^(?:/|per (?!cent))", "1 / ", found[2].strip())
+    word = (SPELLED | {written: name for name, written in WRITTEN.items()}).get(word, word)
+    # Astropy has no plurals.
+    for spelling in (word, word[:-1])[: 2 if len(word) > 2 and word.endswith("s") else 1]:
+        try:
+            return float(without_unit(u.Quantity(float(found[1]), spelling), unit))
+        except (TypeError, ValueError, ArithmeticError):
+            continue
+    raise ValueError(text)
+
+
 def word_of(unit: str) -> str:
     """Return the words for a unit in a message."""
     return WORDS.get(unit, unit)
@@ -88,7 +126,7 @@ WRITTEN = {
 
 @dataclass(frozen=True)
 class Unit:
-    """Unit of a plain number or array, as astropy spells it; Quantities are converted to it."""
+    """Unit of a plain number or array, as astropy spells it; Quantities and text with a unit are converted to it."""
 
     name: str
 
@@ -104,9 +142,11 @@ class Unit:
         return _or_error(schema, word_of(self.name), unit=self.name)
 
     def plain(self, value: Any) -> Any:
-        """Convert a Quantity, or each of a list of them, to plain numbers; return other values unchanged."""
+        """Convert Quantities and texts with a unit, also in a list, to plain numbers; return other values unchanged."""
         if type(value) in (float, int):
             return value
+        if isinstance(value, str):
+            return value if (read := with_unit(value, self.name)) is None else read
         if isinstance(value, list | tuple):
             return [self.plain(item) for item in value]
         return without_unit(value, self.name) if is_quantity(value) else value
@@ -126,7 +166,10 @@ class Range:
 
         inner = handler(source)
         unit = (inner.get("metadata") or {}).get("unit", "")
-        schema = core_schema.no_info_after_validator_function(self._check, inner)
+        schema: CoreSchema = core_schema.no_info_after_validator_function(self._check, inner)
+        if not unit:
+            # A number without a unit may be written in per cent.
+            schema = core_schema.no_info_before_validator_function(Unit("").plain, schema)
         return _or_error(schema, self.words(unit, whole=int in (source, *get_args(source))), unit=unit)
 
     def __contains__(self, value: Any) -> bool:

@@ -7,6 +7,7 @@ from decimal import Decimal, InvalidOperation
 from typing import Any
 
 from mauvecl.schema.errors import InputError, shortened
+from mauvecl.schema.fields import Unit, is_measure, with_unit
 
 
 def refusal(name: str, text: str, expected: str, more: str = "") -> InputError:
@@ -15,12 +16,14 @@ def refusal(name: str, text: str, expected: str, more: str = "") -> InputError:
     return InputError(f"{name} {shortened(text)}{more}", expected, key=parameter)
 
 
-def number(text: str, name: str) -> float:
-    """Read a number."""
+def number(text: str, name: str, unit: str = "") -> float:
+    """Read a number in a unit, which may be followed by another one, as in "10 min" or "24%"."""
     try:
-        return float(text)
+        value = with_unit(text, unit)
+        return float(text) if value is None else value
     except ValueError as error:
-        raise refusal(name, text, "a number") from error
+        accepted = f" in {Unit(unit).written}, or in a unit of the same kind" if unit else ""
+        raise refusal(name, text, f"a number{accepted}") from error
 
 
 def count(text: str, name: str) -> int:
@@ -52,18 +55,23 @@ def axis(text: str, name: str) -> dict[str, Any]:
         quantity, _, values = text.partition("=")
         parts = [part.strip() for part in values.split(",")]
         try:
-            return {"quantity": quantity, "values": parts if quantity == "star" else [float(part) for part in parts]}
+            return {"quantity": quantity, "values": parts if quantity == "star" else list(map(_measure, parts))}
         except ValueError as error:
             raise refusal(name, text, f"numbers, such as {quantity}=5,50,600") from error
     parts = text.split(":")
     try:
         quantity, start, stop, steps, *rest = parts
-        spaced = {"quantity": quantity, "start": float(start), "stop": float(stop), "steps": int(steps)}
+        spaced = {"quantity": quantity, "start": _measure(start), "stop": _measure(stop), "steps": int(steps)}
     except ValueError as error:
         raise refusal(name, text, "quantity:start:stop:steps, the same with :log, or quantity=a,b,c") from error
     if rest not in ([], ["log"]):
         raise refusal(name, text, "log or nothing", f" ends in {':'.join(rest)!r}")
     return spaced | {"log": bool(rest)}
+
+
+def _measure(text: str) -> float | str:
+    """Read a number; return a text with a unit unchanged, since the axis converts it."""
+    return text if is_measure(text) else float(text)
 
 
 def axes(texts: Sequence[str], name: str) -> list[dict[str, Any]]:

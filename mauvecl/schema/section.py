@@ -20,7 +20,7 @@ from pydantic import (
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError, PydanticUndefined
 
-from mauvecl.schema.errors import InputError, shortened, shown
+from mauvecl.schema.errors import InputError, shortened, shown, together
 from mauvecl.schema.fields import Flag, Help, Range, Unit, as_typed, first, found, is_quantity, is_truth, numbers
 
 if TYPE_CHECKING:
@@ -79,13 +79,40 @@ def _takes_truth(annotation: Any) -> bool:
     return annotation in (bool, Any) or any(map(_takes_truth, get_args(annotation)))
 
 
+#: Largest number of wrong values that one message names.
+MOST_FAULTS = 5
+
+
 def input_error(where: str, model: type[BaseModel], error: ValidationError) -> InputError:
-    """Return the first fault as an InputError whose message begins with the place where it is."""
-    return _first_fault(model, error).within(where)
+    """Return the faults as one InputError whose message begins with the place where they are."""
+    faults: dict[tuple[str, ...], Any] = {}
+    for fault in error.errors():
+        # A key of several types has an error for each of them.
+        key = _key_of(model, fault["loc"])
+        # A list of which an entry is wrong counts as too short.
+        if not any(other[: len(key)] == key for other in faults):
+            faults[key] = fault
+    first, *others = (_input_error_of(model, fault) for fault in [*faults.values()][:MOST_FAULTS])
+    left = len(faults) - MOST_FAULTS
+    more = [InputError(f"and {left} more values are wrong", key=first.key)] if left > 0 else []
+    return together([first.within(where), *others, *more])
 
 
-def _first_fault(model: type[BaseModel], error: ValidationError) -> InputError:
-    first = error.errors()[0]
+def _key_of(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str, ...]:
+    """Return the part of an error's location that names a key, with the numbers of entries in lists."""
+    path: list[str] = []
+    inner: type[BaseModel] | None = model
+    for part in location:
+        if isinstance(part, str):
+            if inner is None:
+                break
+            field = inner.model_fields.get(part)
+            inner = None if field is None else model_in(field.annotation)
+        path.append(str(part))
+    return tuple(path)
+
+
+def _input_error_of(model: type[BaseModel], first: Any) -> InputError:
     path = [str(part) for part in first["loc"]]
     key, value, message = ".".join(path) or model.__name__.lower(), first.get("input"), first["msg"]
     match first["type"]:

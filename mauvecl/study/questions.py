@@ -183,6 +183,20 @@ class Axis(Section):
     steps: Annotated[Annotated[int, Range(2, 1000)] | None, Help("Number of evenly spaced values")] = None
     log: Annotated[bool, Help("Whether values are evenly spaced in the logarithm")] = False
 
+    @model_validator(mode="before")
+    @classmethod
+    def _without_units(cls, given: Any) -> Any:
+        """Convert values with a unit, such as "10 min", to the unit of the quantity."""
+        quantity = QUANTITIES.get(str(given.get("quantity"))) if isinstance(given, dict) else None
+        if quantity is None or quantity.is_name:
+            return given
+        keys = [key for key in ("values", "start", "stop") if key in given]
+        try:
+            return given | {key: Unit(quantity.unit).plain(given[key]) for key in keys}
+        except ValueError as error:
+            accepted = quantity.range.words(quantity.unit)
+            raise InputError(f"the axis {quantity.name!r} has the value {error}", accepted, key="values") from error
+
     @model_validator(mode="after")
     def _one_way(self) -> Self:
         spaced = (self.start, self.stop, self.steps)

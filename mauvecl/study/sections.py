@@ -10,7 +10,7 @@ from pydantic import Field, create_model, field_validator, model_validator
 
 from mauvecl.detection.names import DEFAULT_STATISTICS, RECOMMENDED, STATISTIC_NAMES
 from mauvecl.host.exposure import DEFAULT_SKY
-from mauvecl.host.stars.library import ALIASES
+from mauvecl.host.stars.library import ALIASES, listed_values
 from mauvecl.noise.disturbances import Prior, PriorField
 from mauvecl.noise.unknowns import INSTRUMENT_VALUES, values_of
 from mauvecl.schema import parsing
@@ -204,6 +204,17 @@ class Star(Section):
         ),
     ] = 1.0
 
+    @model_validator(mode="before")
+    @classmethod
+    def _as_listed(cls, given: Any) -> Any:
+        """Add the V magnitude and the distance of a star of the embedded list, unless others are given."""
+        if not isinstance(given, dict) or not isinstance(given.get("library"), str):
+            return given
+        listed = listed_values(given["library"])
+        if given.get("band", "V") != "V" or given.get("magnitude_system", "catalogue") != "catalogue":
+            listed.pop("magnitude", None)
+        return given | {key: value for key, value in listed.items() if given.get(key) is None}
+
     @model_validator(mode="after")
     def _one_spectrum(self) -> Self:
         if (self.library is None) == (self.file is None):
@@ -222,7 +233,13 @@ class Star(Section):
     def with_value(self, path: Sequence[str], value: Any) -> Self:
         """Return a copy with another value; another library star drops values that describe this one."""
         changed = super().with_value(path, value)
-        return changed.model_copy(update=dict.fromkeys(STAR_KEYS)) if path[0] == "library" else changed
+        if path[0] != "library":
+            return changed
+        listed = listed_values(str(value))
+        if self.magnitude not in (None, listed_values(self.library or "").get("magnitude")):
+            # A given magnitude is that of every star.
+            listed.pop("magnitude", None)
+        return changed.model_copy(update=dict.fromkeys(STAR_KEYS) | listed)
 
     def near(self) -> Neighbours | None:
         """Read the star's neighbours, or return None if it has none."""
@@ -236,10 +253,13 @@ class Star(Section):
     def source(self) -> Source:
         """Load the spectrum and scale it to the magnitude, if one is given."""
         from mauvecl.host.stars.library import spectrum_name
-        from mauvecl.host.stars.source import Source
+        from mauvecl.host.stars.source import Source, with_listed_note
 
         if self.library is not None:
-            source = Source.from_library(spectrum_name(self.library))
+            spectrum_name(self.library)
+            in_v = self.magnitude if (self.band, self.magnitude_system) == ("V", "catalogue") else None
+            source = Source.from_library(self.library)
+            source = with_listed_note(source, self.library, magnitude=in_v, distance_pc=self.distance_pc)
         else:
             source = Source.read(
                 self.file or "", wavelength_unit=self.wavelength_unit, flux_unit=self.flux_unit, extend=self.extend,

@@ -17,7 +17,19 @@ from mauvecl.detection.requests import STATISTICS
 from mauvecl.host.instrument.paths import FORMER_NAMES, FORMERLY_MAUVE
 from mauvecl.host.stars.library import ModelStar, embedded, near_names, spectrum_name
 from mauvecl.schema.errors import InputError, shortened
-from mauvecl.schema.fields import Flag, Range, Unit, Widget, as_typed, first, found, range_of, unit_of
+from mauvecl.schema.fields import (
+    Flag,
+    Range,
+    Unit,
+    Widget,
+    as_typed,
+    first,
+    found,
+    is_measure,
+    range_of,
+    unit_of,
+    with_unit,
+)
 from mauvecl.schema.physical import LineFraction
 from mauvecl.study.study import keys_with_flags, study_keys
 
@@ -44,11 +56,12 @@ MOST_TABLE = 3000
 
 @dataclass(frozen=True)
 class Number:
-    """Number in a range, written with a decimal point."""
+    """Number in a range, written with a decimal point, and with or without a unit."""
 
     range: Range
     whole: bool = False
     unit: str = ""
+    scale: float = 1.0  # factor from the value in the unit to that of the page
 
     def __call__(self, text: str) -> float | int:
         """Parse the number; an error states what is accepted."""
@@ -57,6 +70,11 @@ class Number:
         form = r"[+-]?\d+" if self.whole else r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,3})?"
         if not text.strip():
             raise InputError("nothing is entered", accepted, key="number")
+        if not self.whole and is_measure(text):
+            try:
+                text = repr(self.scale * float(with_unit(text, self.unit) or 0.0))
+            except ValueError:
+                raise InputError(f"{shortened(text)} has another unit", accepted, key="number") from None
         if re.fullmatch(form, text.strip(), flags=re.ASCII) is None:
             point = ", with a point for decimals" if "," in text else ""
             raise InputError(f"{shortened(text)} is not {kind}", f"{accepted}{point}", key="number")
@@ -286,7 +304,7 @@ def _reader(field: FieldInfo, widget: Widget, unit: str, *, optional: bool) -> C
         reach = replace(reach, high=widget.most)
     if widget.scale != 1.0:
         reach = replace(reach, low=widget.scale * reach.low, high=widget.scale * reach.high)
-    number = Number(reach, whole=field.annotation is int, unit=unit)
+    number = Number(reach, whole=field.annotation is int, unit=unit, scale=widget.scale)
     return or_nothing(number) if optional else number
 
 

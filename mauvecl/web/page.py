@@ -15,7 +15,7 @@ from mauvecl.answers.closed_forms import BOTH_CHANCES
 from mauvecl.answers.verbs import VERBS
 from mauvecl.detection.names import check_fap
 from mauvecl.host.exposure.sky import parse_position, parse_time
-from mauvecl.host.stars.library import resolve
+from mauvecl.host.stars.library import listed_note, resolve
 from mauvecl.host.tables.units import offline
 from mauvecl.schema.errors import InputError, of_kind, shortened
 from mauvecl.study.plan import PlanTarget
@@ -304,15 +304,11 @@ def _star(text: str) -> dict[str, Any]:
     star = None if text == UPLOADED else resolve(text, own=False)
     if star is None:
         return {"about": "", "given": {}, "offer": ""}
-    given: dict[str, str] = {}
-    about = "" if star.known is None else star.known.about
-    if star.known is not None:
-        given |= {"magnitude": f"{star.known.magnitude:g}", "band": "V", "target": star.name}
-    if star.spectrum is None:
-        given["star"] = star.nearest
-        at = "" if star.known is None else f" at V = {star.known.magnitude:g}"
-        return {"about": about, "given": given, "offer": f"Use {star.nearest}{at}"}
-    return {"about": about, "given": given, "offer": f"Use V = {star.known.magnitude:g}" if star.known else ""}
+    if star.known is None:
+        return {"about": listed_note(text) if star.spectrum is None else "", "given": {}, "offer": ""}
+    magnitude = f"{star.known.magnitude:g}"
+    given = {"magnitude": magnitude, "band": "V", "target": star.name}
+    return {"about": star.known.about, "given": given, "offer": f"Use V = {magnitude}"}
 
 
 def _rows(text: str) -> list[dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""The realistic answer is the default, the ideal one stands next to it, and files of version 1 are read as they were."""
+"""Realistic answers by default, ideal ones next to them, and files of version 1."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from astropy.table import Table
 from commands import run
 from refusals import refused
 
@@ -61,7 +62,7 @@ def answered(verb: str, study: Study, engine: Engine) -> Any:
 @pytest.mark.parametrize("verb", ["detect", "limit", "map"])
 def test_ideal_answer_is_that_of_the_ideal_study(verb: str, engine: Engine) -> None:
     """Compare with the closed form of the study in which everything is known; the realistic answer is the worse."""
-    realistic, ideal = (answered(verb, study, engine).table for study in (ASKED, ASKED.ideal()))
+    realistic, ideal = (Table(answered(verb, study, engine).table) for study in (ASKED, ASKED.ideal()))
     assert "ideal" not in ideal.colnames
     column = {"detect": "closed_form_probability"}.get(verb, "closed_form")
     np.testing.assert_allclose(realistic["ideal"], ideal[column], rtol=1e-4)

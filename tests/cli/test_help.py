@@ -15,16 +15,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from astropy.table import Table
 from commands import ended, run
-from refusals import refused
 from study_keys import fields, metadata
 from test_golden import GOLDEN, QUESTIONS
 from typer.main import get_command
 from typer.testing import CliRunner
 
 import mauvecl
-from mauvecl import Study
+from mauvecl import Source, Study
 from mauvecl.cli.app import app
 
 FILE = Path(__file__).parent.parent / "data" / "flags.json"
@@ -96,11 +94,42 @@ def test_help_has_examples_and_fits_80_columns(name: str, tmp_path: Path, monkey
         assert len(lines[i]) <= 80, lines[i]
 
 
-def test_list_of_verbs_is_not_truncated() -> None:
-    """Check that the first sentence of each verb fits into 80 columns."""
-    shown = CliRunner().invoke(app, ["--help"], env={"COLUMNS": "80"}).output
-    assert "Commands:" in shown
-    assert "..." not in shown.partition("Commands:")[2]
+def test_bare_command_lists_every_command_on_a_line_of_its_own() -> None:
+    """Check that the first sentence of each command fits into 80 columns, and that a bare `mauvecl` is no error."""
+    done = CliRunner().invoke(app, [], env={"COLUMNS": "80"})
+    assert (done.exit_code, done.stderr) == (0, "")
+    assert done.output == CliRunner().invoke(app, ["--help"], env={"COLUMNS": "80"}).output
+    lines = done.output.splitlines()
+    assert max(map(len, lines)) <= 80
+    for name, one in TOP.items():
+        sentence = one.help.partition("\n")[0]
+        assert [line.split() for line in lines if line.startswith(f"  {name} ")] == [[name, *sentence.split()]]
+
+
+@pytest.mark.parametrize("name", [name for name, one in VERBS.items() if "study_file" in {p.name for p in one.params}])
+def test_help_shows_the_common_flags_and_help_all_every_flag(name: str) -> None:
+    def listed(flag: str) -> list[str]:
+        shown = CliRunner().invoke(app, [name, flag], env={"COLUMNS": "80"})
+        assert shown.exit_code == 0
+        lines = shown.output.splitlines()
+        assert max(map(len, lines)) <= 80
+        return [found[1] for line in lines if (found := re.match(r"  (?:-\w, )?(--[\w-]+)", line))]
+
+    common, every = listed("--help"), listed("--help-all")
+    assert 4 <= len(common) - 2 <= 12
+    assert set(common) < set(every)
+    assert {*every} == {max(one.opts, key=len) for one in options(VERBS[name])} | {"--help"}
+
+
+def test_help_all_groups_flags_by_section() -> None:
+    shown = CliRunner().invoke(app, ["detect", "--help-all"], env={"COLUMNS": "80"}).output
+    found = re.findall(r"^(\S.*):$|^  (?:-\w, )?(--[\w-]+)", shown, re.MULTILINE)
+    heading, of = "", {}
+    for title, flag in found:
+        heading = title or heading
+        of[flag] = heading
+    assert (of["--star"], of["--sky"], of["--line"], of["--fap"]) == ("Star", "Sky", "Flare", "Run")
+    assert of["--json"] == of["--set"] == "Output and devices"
 
 
 #: Paths of the keys that each flag sets, by its parameter.
@@ -143,13 +172,37 @@ def _at(value: Any, path: tuple[str, ...]) -> Any:
     return value
 
 
-def test_bash_completes_verbs_and_flags() -> None:
-    for typed, wanted in (("mauvecl det", "detect"), ("mauvecl detect --magn", "--magnitude")):
-        words = {"COMP_WORDS": typed, "COMP_CWORD": str(len(typed.split()) - 1), "_MAUVECL_COMPLETE": "complete_bash"}
-        # The program's name decides the variable; the console script has it.
-        script = str(Path(sys.executable).parent / "mauvecl")
-        done = subprocess.run([script], capture_output=True, text=True, env=os.environ | words)
-        assert wanted in done.stdout.split(), done
+def completed(typed: str, folder: Path) -> set[str]:
+    """Return what bash offers for the last word."""
+    words = f"mauvecl {typed}"
+    asked = {"COMP_WORDS": words, "COMP_CWORD": str(words.count(" ")), "_MAUVECL_COMPLETE": "complete_bash"}
+    # The program's name decides the variable; the console script has it.
+    script = str(Path(sys.executable).parent / "mauvecl")
+    own = {"PYTHONPATH": str(Path(mauvecl.__file__).parents[1])}
+    done = subprocess.run([script], capture_output=True, text=True, env=os.environ | asked | own, cwd=folder)
+    return set(done.stdout.split("\n")) - {""}
+
+
+@pytest.mark.parametrize(("typed", "wanted"), [
+    ("det", {"detect"}), ("detect --magn", {"--magnitude", "--magnitude-system"}), ("detect --star AUM", {"AUMic"}),
+    ("detect --star G2V,yz", {"G2V,yzCMi"}), ("limit K2.5", {"K2.5V"}),
+    ("detect -s my-", {"my-star.txt", "my-study.toml"}), ("detect my-", {"my-star.txt", "my-study.toml"}),
+    ("snr --instrument m", {"mauve", "mauve-electrons", "my-study.toml"}),
+    # The shell completes these, where nothing is offered.
+    ("detect --flares my-", set()), ("detect --output my-", set()),
+])  # fmt: skip
+def test_bash_completes_names_and_files(typed: str, wanted: set[str], tmp_path: Path) -> None:
+    for name in ("my-star.txt", "my-study.toml"):
+        (tmp_path / name).touch()
+    assert completed(typed, tmp_path) == wanted
+
+
+def test_completed_names_are_accepted(tmp_path: Path) -> None:
+    names = completed("detect --star ", tmp_path)
+    assert {"AUMic", "YZCMi", "ADLeo", "G2V", "GJ581"} <= names
+    for name in names:
+        assert " " not in name
+        Source.from_library(name)
 
 
 def test_every_verb_with_flares_takes_the_flags_of_their_spectrum() -> None:
@@ -233,23 +286,15 @@ def test_given_star_becomes_the_star_of_the_study(tmp_path: Path) -> None:
     assert "star V = 8" in run("exposure", "study", "--no-pictures", folder=tmp_path).stdout
 
 
-@pytest.mark.parametrize("name", ["AD Leo", "ad leo", "Proxima", "Proxima Cen", "EV Lac", "YZ CMi", "AU Mic", "GJ 388",
-                                  "CN Leo", "TRAPPIST-1", "eps Eri", "Barnard's star"])  # fmt: skip
-def test_spectrum_and_magnitude_are_proposed_for_a_well_known_star(name: str, tmp_path: Path) -> None:
-    """The proposal is one that can be asked."""
-    reported = run("simulate", "--star", name, folder=tmp_path, code=2).stderr
-    assert repr(name) in reported
-    found = re.search(r"(--star \S+) with (--magnitude \S+) ", reported)
-    assert found, reported
-    run("simulate", *shlex.split(f"{found[1]} {found[2]}"), "--no-pictures", folder=tmp_path)
-
-
-def test_every_listed_star_is_proposed() -> None:
-    listed = Table.read(Path(mauvecl.__file__).parent / "host/stars/library/well_known.ecsv")["name"]
-    # The library has these, of which GX And as GJ 15 A, its M1V.
-    for name in {str(name) for name in listed} - {"Vega", "HD 40307", "GJ 581", "GX And"}:
-        with refused("star", name):
-            Study.build({"star": [{"library": name}]}, "test").star[0].source()
+@pytest.mark.parametrize("name", ["ad leo", "Proxima", "YZ CMi", "GJ 388", "Barnard's star"])
+def test_well_known_star_is_accepted_with_a_note(name: str, tmp_path: Path) -> None:
+    shown = run("simulate", "--star", name, "--no-pictures", folder=tmp_path).stdout
+    (star,) = Study.read(tmp_path / "mauvecl-simulate" / "study.toml").star
+    assert re.search(rf"spectrum of .*V = {star.magnitude:g}, {star.distance_pc:g} pc, from \w+", shown)
+    # The star may also be named in place of the study, with another magnitude.
+    shown = run("simulate", name, "-m", "9", "--no-pictures", folder=tmp_path).stdout
+    assert f"{name} V = 9" in shown
+    assert f"V = {star.magnitude:g}" not in shown
 
 
 # Terminals

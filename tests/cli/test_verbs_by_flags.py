@@ -42,7 +42,7 @@ def answered(verb: str) -> tuple[Path, Done]:
     folder = Path(mkdtemp(prefix=f"mauvecl-{verb}-"))
     atexit.register(shutil.rmtree, folder)
     write_inputs(folder, " ".join(words(verb)))
-    return folder, run(*words(verb), "--output", "out", folder=folder)
+    return folder, run(*words(verb), "--output", "out", folder=folder, columns=80)
 
 
 @pytest.fixture
@@ -67,7 +67,7 @@ def test_verb_writes_its_files_and_states_its_assumptions(verb: str) -> None:
     assert all(path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n" for path in written if path.suffix == ".png")
     assert assumed(done.stdout) == TABLE[verb]["stated"].split("; ")
     headline, *others = done.stdout.splitlines()
-    assert re.fullmatch(r"[A-Z0-9].* .*\.", headline), "the first line is the answer, in a sentence"
+    assert re.fullmatch(r"[A-Za-z0-9].* .*\.", headline), "the first line is the answer, in a sentence"
     shown = others[: others.index("Assumed:")]
     assert max(len(line.rstrip()) for line in shown if line.startswith("  ")) <= 80, "tables are narrow"
     assert "\x1b" not in done.stdout

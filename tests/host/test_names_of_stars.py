@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
 from astropy.table import Table
+from refusals import refused
 from synphot import SourceSpectrum
 from synphot.models import BlackBodyNorm1D
 from synphot.units import FLAM
@@ -48,6 +49,52 @@ def test_names_of_spectra_are_resolved(text: str, name: str) -> None:
 def test_names_of_targets_are_resolved(texts: tuple[str, ...], name: str, magnitude: float) -> None:
     for text in texts:
         assert (target(text).name, target(text).magnitude) == (name, magnitude)
+
+
+def test_every_listed_star_has_a_spectrum_at_its_magnitude() -> None:
+    for row in KNOWN:
+        x = expect(str(row["name"]), "mauve", exposure=50)
+        (star,) = Study.build({"star": [{"library": str(row["name"])}]}, "test").star
+        assert star.source().magnitude("V") == pytest.approx(row["V"], abs=0.01), row["name"]
+        np.testing.assert_allclose(x.source_electrons, simulate_one(star.source()), rtol=1e-9)
+        if row["name"] != "Vega":
+            assert (star.magnitude, star.distance_pc) == (row["V"], row["distance"])
+            assert f"V = {row['V']:g}, {row['distance']:g} pc, from " in " ".join(x.messages)
+
+
+def simulate_one(star: Source) -> Any:
+    return expect(star, "mauve", exposure=50).source_electrons
+
+
+def test_given_values_win_over_those_of_the_list() -> None:
+    def notes(**given: object) -> tuple[Any, str]:
+        (star,) = Study.build({"star": [{"library": "AU Mic"} | given]}, "test").star
+        return (star.magnitude, star.distance_pc), star.source().messages[0]
+
+    assert notes() == ((8.81, 9.91), "spectrum of type M1V, V = 8.81, 9.91 pc, from Hipparcos")
+    assert notes(magnitude=9) == ((9.0, 9.91), "spectrum of type M1V, 9.91 pc, from Hipparcos")
+    assert notes(magnitude=9, distance_pc=10) == ((9.0, 10.0), "spectrum of type M1V")
+    # The list has no magnitude in another band.
+    with refused("magnitude", expected="a magnitude"):
+        expect(Study.build({"star": [{"library": "AU Mic", "band": "TESS"}]}, "test").star[0].source(), "mauve",
+               exposure=50)  # fmt: skip
+
+
+def test_swept_stars_have_their_own_values_unless_others_are_given() -> None:
+    def values(name: str, **given: object) -> tuple[Any, Any]:
+        (star,) = Study.build({"star": [given]}, "test").at("star", name).star
+        return star.magnitude, star.distance_pc
+
+    assert values("YZ CMi", library="AU Mic") == (11.19, 5.957)
+    assert values("YZ CMi", library="M3V", magnitude=9) == (9.0, 5.957)
+    assert values("M3V", library="M1V", magnitude=9, distance_pc=3) == (9.0, None)
+
+
+@pytest.mark.parametrize(("text", "nearest"), [("M3.5V", "M3V"), ("dM4.5", "M4V"), ("G3V", "G2V")])
+def test_types_between_those_of_the_library_take_the_nearest_with_a_message(text: str, nearest: str) -> None:
+    star = Source.from_library(text)
+    np.testing.assert_array_equal(star.flux_flam, Source.from_library(nearest).flux_flam)
+    assert star.messages[0].startswith(f"spectrum of {Source.from_library(nearest).name}, the nearest to type ")
 
 
 def test_every_listed_name_is_found() -> None:

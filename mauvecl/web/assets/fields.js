@@ -223,7 +223,7 @@ export class Fields {
     button.hidden = !offer || !Object.keys(other).length
     button.textContent = offer
     button.onclick = () => enter(given, false)
-    const fills = this.fresh === this.entered.star && !("star" in given)
+    const fills = this.fresh === this.entered.star
     this.fresh = ""
     if (fills && Object.keys(other).length) enter(given, true)
   }

@@ -1,0 +1,156 @@
+"""Values as people write them: with units, in per cent, without a star, and with few realisations."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from astropy.table import Table
+from commands import ended, run
+from refusals import refused
+
+from mauvecl import Study
+
+FAST = ("exposure", "--snr", "10", "--at", "300", "--no-pictures")
+
+
+def build(section: str, **values: object) -> Study:
+    return Study.build({"star": [{"library": "G2V"} | values]} if section == "star" else {section: values}, "test")
+
+
+@pytest.mark.parametrize(("section", "key", "text", "value"), [
+    ("observation", "exposure_s", "10 min", 600.0), ("observation", "exposure_s", "10min", 600.0),
+    ("observation", "exposure_s", "2h", 7200.0), ("observation", "exposure_s", "3 hours", 10_800.0),
+    ("observation", "exposure_s", "0.5 d", 43_200.0), ("observation", "exposure_s", "90 sec", 90.0),
+    ("observation", "temperature_c", "290 K", 16.85), ("observation", "temperature_c", "-10 °C", -10.0),
+    ("observation", "temperature_c", "20 deg C", 20.0), ("flare", "temperature_k", "9000 K", 9000.0),
+    ("flare", "temperature_k", "1e4 kelvin", 1e4), ("star", "magnitude", "7mag", 7.0),
+    ("star", "distance_pc", "5 pc", 5.0), ("star", "distance_pc", "10 light years", 3.06601),
+    ("star", "radius_rsun", "0.5 Rsun", 0.5), ("star", "radius_rsun", "695700 km", 1.0),
+    ("sky", "surface_brightness", "22 mag/arcsec^2", 22.0), ("run", "fap", "0.1 %", 1e-3),
+    ("signal", "wavelength_nm", "2800 Angstrom", 280.0),
+])  # fmt: skip
+def test_units_are_converted_in_studies(section: str, key: str, text: str, value: float) -> None:
+    study = build(section, **{key: text})
+    part = study.star[0] if section == "star" else getattr(study, section)
+    assert getattr(part, key) == pytest.approx(value, rel=1e-5)
+
+
+def test_lists_of_a_study_have_units() -> None:
+    assert build("flare", amplitudes=["24 %", "3%", 0.5]).flare.amplitudes == pytest.approx((0.24, 0.03, 0.5))
+    energies = ["1e33 erg", "1e26J", "1e33", "+1.0E+33erg"]
+    assert build("stare", energies_erg=energies).stare.energies_erg == pytest.approx((1e33,) * 4)
+    axis = {"quantity": "exposure", "values": ["1 min", 5, "2h"]}
+    assert build("sweep", axes=[axis]).sweep.axes[0].points() == (60.0, 5.0, 7200.0)
+
+
+@pytest.mark.parametrize(("section", "key", "text", "accepted"), [
+    ("observation", "exposure_s", "10 m", "seconds"), ("observation", "exposure_s", "2 banana", "seconds"),
+    ("star.0", "magnitude", "7 K", "mag"), ("flare", "temperature_k", "20 pc", "K"),
+    ("star.0", "distance_pc", "5 %", "pc"), ("observation", "temperature_c", "20 s", "deg C"),
+    ("observation", "exposure_s", "25 h", "86400"), ("run", "fap", "120 %", "below 1"),
+])  # fmt: skip
+def test_wrong_units_are_refused(section: str, key: str, text: object, accepted: str) -> None:
+    with refused(f"{section}.{key}", repr(text), expected=accepted):
+        build(section.removesuffix(".0"), **{key: text})
+
+
+def test_flags_take_units(tmp_path: Path) -> None:
+    words = ("-s", "M3V", "-m", "9 mag", "-t", "10min", "-a", "24%,2 %", "--flare-temperature", "9000 K")
+    run("simulate", *words, "--sky", "22 mag/arcsec2", "--no-pictures", folder=tmp_path)
+    study = Study.read(tmp_path / "mauvecl-simulate" / "study.toml")
+    assert (study.star[0].magnitude, study.observation.exposure_s, study.flare.temperature_k) == (9.0, 600.0, 9000.0)
+    assert (study.flare.amplitudes, study.sky.surface_brightness) == (pytest.approx((0.24, 0.02)), 22.0)
+
+
+@pytest.mark.parametrize(("words", "found"), [
+    (("-t", "10 m"), "--exposure '10 m', expected a number in s"), (("-m", "7 K"), "--magnitude '7 K', expected a num"),
+    (("-a", "5%,24s"), "--amplitude '24s', expected a number"),
+    (("--sky", "3 K"), "--sky '3 K', expected V mag/arcsec"),
+    (("-t", "30 h"), "--exposure 108000.0, expected seconds above 0 and up to 86400"),
+    (("-n", "3 %"), "--realisations '3 %', expected a whole number"),
+    (("--sweep", "exposure=1 min,2 pc"), "the axis 'exposure' has the value 2 pc, expected seconds"),
+])  # fmt: skip
+def test_flags_refuse_wrong_units(words: tuple[str, ...], found: str, tmp_path: Path) -> None:
+    code, out, reported = ended("detect", "-s", "M3V", *words, folder=tmp_path)
+    assert (code, out, reported.count("\n")) == (2, "", 1)
+    assert found in reported
+
+
+def test_units_are_imported_only_with_a_unit() -> None:
+    """Reading plain numbers must not take the time that importing astropy takes."""
+    code = "import sys; from mauvecl.schema.parsing import number; number({!r}, '--exposure', 's'); "
+    code += "print('astropy' in sys.modules)"
+    for text, imported in (("600", "False"), ("10 min", "True")):
+        done = subprocess.run([sys.executable, "-c", code.format(text)], capture_output=True, text=True, check=True)
+        assert done.stdout.strip() == imported
+
+
+def test_amplitudes_like_percentages_have_a_note(tmp_path: Path) -> None:
+    words = ("simulate", "-s", "M3V", "-m", "9", "--no-pictures", "-a")
+    noted = run(*words, "24", folder=tmp_path).stderr
+    assert "--amplitude 24 is a rise of 2400 %" in noted
+    assert "--amplitude 24% is one of 24 %" in noted
+    assert Study.read(tmp_path / "mauvecl-simulate" / "study.toml").flare.amplitudes == (24.0,)
+    for text in ("0.24", "2400%"):
+        assert "is a rise" not in run(*words, text, folder=tmp_path).stderr
+
+
+@pytest.mark.parametrize(("verb", "flag"), [
+    ("detect", "-m"), ("limit", "--magnitude"), ("gaussian", "-m"), ("snr", "-m"), ("inject", "--distance"),
+    ("realise", "-m"), ("analyse", "--distance"), ("stare", "--neighbour-share"),
+])  # fmt: skip
+def test_values_of_no_star_ask_for_a_star(verb: str, flag: str, tmp_path: Path) -> None:
+    code, out, reported = ended(verb, flag, "1", folder=tmp_path)
+    assert (code, out, reported.count("\n")) == (2, "", 1)
+    assert "--star M3V" in reported
+    assert "mauvecl library" in reported
+
+
+def test_a_study_has_its_star(tmp_path: Path) -> None:
+    run(*FAST, "-s", "K5V", "-m", "8", folder=tmp_path)
+    run(*FAST, "mauvecl-exposure/study.toml", "-m", "9", "-o", "again", folder=tmp_path)
+    (star,) = Study.read(tmp_path / "again" / "study.toml").star
+    assert (star.library, star.magnitude) == ("K5V", 9.0)
+
+
+@pytest.mark.long
+def test_few_realisations_sample_the_tails(tmp_path: Path) -> None:
+    words = ("detect", "-s", "M3V", "-m", "9", "-a", "3%", "-n", "1000", "--statistic", "matched", "--no-pictures")
+    shown = run(*words, folder=tmp_path).stdout
+    assert "1000 realisations are too few" in shown
+    assert "importance sampling" in shown
+    assert Study.read(tmp_path / "mauvecl-detect" / "study.toml").run.tails == "sampled"
+    # The threshold is that of many realisations: 3.09 standard deviations of a normal.
+    table = Table.read(tmp_path / "mauvecl-detect" / "detection.ecsv")
+    assert table["threshold"][0] == pytest.approx(3.09, abs=0.03)
+
+
+def test_counted_tails_are_refused_for_few_realisations(tmp_path: Path) -> None:
+    for words in (("detect", "--tails", "counted"), ("map",)):
+        code, _, reported = ended(*words, "-s", "M3V", "-m", "9", "-n", "1000", folder=tmp_path)
+        assert (code, "100000 realisations" in reported) == (2, True)
+
+
+def test_several_wrong_values_are_reported_together(tmp_path: Path) -> None:
+    code, _, reported = ended("detect", "-s", "M3V", "-m", "x", "-t", "10 m", "-a", "4z", folder=tmp_path)
+    assert (code, reported.count("\n")) == (2, 1)
+    assert [part.split()[0] for part in reported.removeprefix("mauvecl: ").split("; ")] == [
+        "--magnitude", "--exposure", "--amplitude"
+    ]  # fmt: skip
+    code, _, reported = ended("detect", "-s", "M3V", "-m", "99", "-t", "30 h", "--fap", "2", folder=tmp_path)
+    assert (code, reported.count("\n")) == (2, 1)
+    parts = reported.removeprefix("mauvecl: ").split("; ")
+    assert [part.partition(",")[0] for part in parts] == ["--magnitude 99.0", "--exposure 108000.0", "--fap 2.0"]
+
+
+def test_errors_of_a_study_name_each_key_once() -> None:
+    stars = [{"library": "M3V", "magnitude": 99}, {"library": "G2V", "magnitude": "x"}]
+    with refused("star.0.magnitude", "star.1.magnitude = 'x'", "bulk.frames") as caught:
+        Study.build({"star": stars, "bulk": {"frames": "some"}}, "test")
+    assert len(caught.value.parts) == 3
+    assert str(caught.value).count("test: ") == 1
+    with refused("flare.amplitudes.0", "and 3 more values are wrong"):
+        Study.build({"flare": {"amplitudes": [-1.0] * 8}}, "test")
