@@ -14,7 +14,6 @@ from answers import VERBS, small
 
 import mauvecl
 from mauvecl import Engine, InputError, Stares, Study
-from mauvecl.answers.verbs import VERBS as REGISTRY
 
 ADDITIVE, NUISANCES, LEVELS = ["cosmic_rays"], ["dark", "light", "sky", "tilt"], ["light", "sky", "temperature"]
 STARE_CHANGES = {"jitters": LEVELS} | {course: ["star", *LEVELS] for course in ("offsets", "drifts", "cycles")}
@@ -30,6 +29,8 @@ UNKNOWNS: dict[str, dict[str, Any]] = {
     **{f"stare.{at}.{name}": {"stare": {at: {name: 0.01}}} for at, rows in STARE_CHANGES.items() for name in rows},
     **TABLES["unknowns"],
 }
+#: Verbs that leave the usual unknowns out, since they ask about the noise, the sky's geometry or observed frames.
+WITHOUT_USUAL = {"simulate", "snr", "exposure", "gaussian", "visible", "analyse"}
 #: Verbs that take another engine, or none.
 ENGINES: dict[str, Any] = {"stare": Stares, "inject": Stares, "plan": Stares, "simulate": None, "visible": None}
 
@@ -91,7 +92,7 @@ def test_every_unknown_of_a_study_is_tested() -> None:
 )
 def test_no_unknown_is_ignored_silently(verb: str, name: str) -> None:
     unknown, base = UNKNOWNS[name], plain(verb)
-    if name == "nuisances.usual" and not REGISTRY[verb].accepts(name):
+    if name == "nuisances.usual" and verb in WITHOUT_USUAL:
         # A question about the noise or the sky alone, whose answer says that everything else is known.
         assert "the usual unknowns" not in answer(verb, unknown).assumed
         return
