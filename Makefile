@@ -37,6 +37,7 @@ lint: .venv/test.stamp .venv/lint.stamp
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports --no-cache
 	$(BIN)/mypy
+	$(BIN)/zizmor --offline --quiet .github
 	@if command -v npm >/dev/null && $(MAKE) --silent $(PAGE)/.stamp; then $(MAKE) --no-print-directory page; \
 	else echo "the page's script is not checked: that needs npm (Debian, Ubuntu: apt-get install npm) and its packages"; fi
 
