@@ -99,4 +99,4 @@ mutants: .venv/test.stamp
 	$(BIN)/python tools/mutation_check.py
 
 clean:
-	rm -rf .venv tools/page/node_modules demo build dist docs/_build docs/_generated docs/jupyter_execute *.egg-info
+	rm -rf .venv tools/page/node_modules demo build dist docs/_build docs/_generated docs/commands docs/jupyter_execute *.egg-info
