@@ -5,6 +5,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import jupyter_client
 from astropy.table import Table
 from pydantic import BaseModel
 from typer.main import get_command
@@ -34,6 +35,16 @@ nb_execution_mode = "force"
 nb_execution_timeout = 900
 nb_execution_show_tb = True
 nb_merge_streams = True
+
+
+class SocketFiles(jupyter_client.AsyncKernelManager):
+    """Kernels that other users of the machine cannot listen to, as the kernels warn of TCP."""
+
+    transport = "ipc"
+
+
+# nbclient imports its default class from here when it starts a kernel.
+jupyter_client.AsyncKernelManager = SocketFiles
 html_theme = "pydata_sphinx_theme"
 # Every page on the left of every page.
 html_sidebars = {"**": ["globaltoc.html"]}
