@@ -37,14 +37,14 @@ nb_execution_show_tb = True
 nb_merge_streams = True
 
 
-class SocketFiles(jupyter_client.AsyncKernelManager):
-    """Kernels that other users of the machine cannot listen to, as the kernels warn of TCP."""
+class EncryptedKernels(jupyter_client.AsyncKernelManager):
+    """Kernels that talk through encrypted sockets; they print a warning of others."""
 
-    transport = "ipc"
+    transport_encryption = "auto"
 
 
 # nbclient imports its default class from here when it starts a kernel.
-jupyter_client.AsyncKernelManager = SocketFiles
+jupyter_client.AsyncKernelManager = EncryptedKernels
 html_theme = "pydata_sphinx_theme"
 # Every page on the left of every page.
 html_sidebars = {"**": ["globaltoc.html"]}
