@@ -20,7 +20,7 @@ from mauvecl.observations.detection import detect_events
 from mauvecl.observations.event_fits import Mixture
 from mauvecl.observations.event_windows import Family, Likelihood, families
 from mauvecl.observations.level import process_level
-from mauvecl.observations.process import HARMONICS, SIZES, Covariance, Process, ProcessTerm, Steps
+from mauvecl.observations.process import Covariance, Process, ProcessTerm, Steps
 from mauvecl.observations.search import Detection, SeriesSurvey
 
 GENERAL = Family.general()
@@ -229,17 +229,18 @@ def test_coefficients_are_those_of_celerite2() -> None:
     """All bits, for parameters within and beyond the bounds of fits."""
     rng = np.random.default_rng(9)
     for _ in range(200):
-        drawn = {kind: rng.uniform(-6.0, 6.0, size) for kind, size in SIZES.items()}
+        sizes: dict[Any, int] = {"correlated": 2, "smooth": 2, "rotation": 5, "sharp rotation": 4}
+        drawn = {kind: rng.uniform(-6.0, 6.0, size) for kind, size in sizes.items()}
         drawn["sharp rotation"][2:] = rng.uniform(-0.5, 5.0), rng.uniform(-3.0, 0.0)
         sigma, scale, *others = np.exp(drawn["rotation"])
         size, period, quality, ratio = np.exp(drawn["sharp rotation"])
-        number = np.arange(1, HARMONICS + 1)
-        sizes = ratio ** (number - 1.0) * (size / np.linalg.norm(ratio ** (number - 1.0)))
+        number = np.arange(1, 7)
+        sigmas = ratio ** (number - 1.0) * (size / np.linalg.norm(ratio ** (number - 1.0)))
         expected = terms.TermSum(
             terms.RealTerm(a=np.exp(drawn["correlated"][0]) ** 2, c=1.0 / np.exp(drawn["correlated"][1])),
             terms.SHOTerm(sigma=np.exp(drawn["smooth"][0]), rho=np.exp(drawn["smooth"][1]), Q=2**-0.5),
             terms.RotationTerm(sigma=sigma, period=scale, **dict(zip(("Q0", "dQ", "f"), others, strict=True))),
-            *(terms.SHOTerm(sigma=s, rho=period / k, Q=k * quality) for k, s in zip(number, sizes, strict=True)),
+            *(terms.SHOTerm(sigma=s, rho=period / k, Q=k * quality) for k, s in zip(number, sigmas, strict=True)),
         )
         found = Process(tuple(ProcessTerm(kind, tuple(values)) for kind, values in drawn.items()), 1.0).kernel()
         for one, other in zip(found.get_coefficients(), expected.get_coefficients(), strict=True):
