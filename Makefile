@@ -38,6 +38,7 @@ lint: .venv/test.stamp .venv/lint.stamp
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports --no-cache
 	$(BIN)/mypy
+	$(BIN)/zizmor --offline --quiet .github
 	@if command -v npm >/dev/null && $(MAKE) --silent $(PAGE)/.stamp; then $(MAKE) --no-print-directory page; \
 	else echo "the page's script is not checked: that needs npm (Debian, Ubuntu: apt-get install npm) and its packages"; fi
 
@@ -99,4 +100,4 @@ mutants: .venv/test.stamp
 	$(BIN)/python tools/mutation_check.py
 
 clean:
-	rm -rf .venv tools/page/node_modules demo build dist docs/_build docs/_generated docs/jupyter_execute *.egg-info
+	rm -rf .venv tools/page/node_modules demo build dist docs/_build docs/_generated docs/commands docs/jupyter_execute *.egg-info

@@ -1,9 +1,11 @@
 """Sphinx configuration."""
 
 import os
+import shutil
 from pathlib import Path
 from typing import Any
 
+import jupyter_client
 from astropy.table import Table
 from pydantic import BaseModel
 from typer.main import get_command
@@ -33,6 +35,16 @@ nb_execution_mode = "force"
 nb_execution_timeout = 900
 nb_execution_show_tb = True
 nb_merge_streams = True
+
+
+class EncryptedKernels(jupyter_client.AsyncKernelManager):
+    """Kernels that talk through encrypted sockets; they print a warning of others."""
+
+    transport_encryption = "auto"
+
+
+# nbclient imports its default class from here when it starts a kernel.
+jupyter_client.AsyncKernelManager = EncryptedKernels
 html_theme = "pydata_sphinx_theme"
 # Every page on the left of every page.
 html_sidebars = {"**": ["globaltoc.html"]}
@@ -83,9 +95,9 @@ def write_keys(section: type[BaseModel], name: str, columns: tuple[str, ...]) ->
     (Path(__file__).parent / "_generated" / f"{name}.rst").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def command_lines(command: Any, path: str) -> list[str]:
+def command_lines(command: Any, path: str, rule: str = "=") -> list[str]:
     """Return the help of a command and of those below it, with an index entry for each flag."""
-    lines = [path, "-" * len(path), ""]
+    lines = [path, rule * len(path), ""]
     if own := getattr(command, "commands", {}):
         lines += [escaped(paragraph(command.help)), ""]
     else:
@@ -97,7 +109,7 @@ def command_lines(command: Any, path: str) -> list[str]:
                 names = ", ".join([*one.opts, *one.secondary_opts])
                 lines += [f".. option:: {names}", "", f"   {escaped(one.help)}", ""]
     for name, inner in own.items():
-        lines += command_lines(inner, f"{path} {name}")
+        lines += command_lines(inner, f"{path} {name}", "-")
     return lines
 
 
@@ -129,9 +141,14 @@ def escaped(text: str | None) -> str:
 
 
 def write_commands() -> None:
-    """Write the reference of all commands as sections that a page includes."""
-    lines = [line for name, one in get_command(app).commands.items() for line in command_lines(one, f"mauvecl {name}")]  # type: ignore[attr-defined]
-    (Path(__file__).parent / "_generated" / "commands.rst").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    """Write a page for each command, and a list of them that a page includes."""
+    folder, listed = Path(__file__).parent / "commands", list[str]()
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    for name, one in get_command(app).commands.items():  # type: ignore[attr-defined]
+        (folder / f"{name}.rst").write_text("\n".join(command_lines(one, f"mauvecl {name}")) + "\n", encoding="utf-8")
+        listed.append(f"- :doc:`{name} </commands/{name}>`: {escaped(paragraph(one.help))}\n")
+    (folder.parent / "_generated" / "commands.rst").write_text("".join(listed), encoding="utf-8")
 
 
 bench_tables()

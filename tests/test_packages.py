@@ -36,8 +36,8 @@ FILES = (
     "environment.yml",
     "pyproject.toml",
 )
-MADE = ("__pycache__", "_build", "_generated", "jupyter_execute", ".ipynb_checkpoints", "*_cache", ".hypothesis",
-        "node_modules")  # fmt: skip
+MADE = ("__pycache__", "_build", "_generated", "commands", "jupyter_execute", ".ipynb_checkpoints", "*_cache",
+        ".hypothesis", "node_modules")  # fmt: skip
 VERSION = mauvecl.__version__
 WHEEL = f"mauvecl-{VERSION}-py3-none-any.whl"
 SDIST = f"mauvecl-{VERSION}.tar.gz"

@@ -1,4 +1,4 @@
-"""What is around the package: one version and date, licences of what is embedded, and reviewers' checklists."""
+"""What is around the package: one version and date, licences of what is embedded, and the paper."""
 
 from __future__ import annotations
 
@@ -78,25 +78,6 @@ def test_all_data_have_a_licence() -> None:
         packages = [name for name in NOTICES if name in meta["origin"]]
         assert packages, file
         assert all((LIBRARY / "licenses" / f"{name}.txt").exists() for name in packages)
-
-
-#: `file` "text of a line in it".
-EVIDENCE = re.compile(r'`([\w./-]+)` "([^"]+)"')
-
-
-def test_answers_are_where_the_checklist_says() -> None:
-    answers = EVIDENCE.findall((ROOT / "docs" / "review.md").read_text(encoding="utf-8"))
-    assert len(answers) > 35
-    missing = [(file, text) for file, text in answers if text not in (ROOT / file).read_text(encoding="utf-8")]
-    assert not missing
-
-
-def test_files_that_the_checklist_names_exist() -> None:
-    """Those that are named without a line as well."""
-    text = (ROOT / "docs" / "review.md").read_text(encoding="utf-8")
-    named = set(re.findall(r"`((?:[\w.-]+/)+[\w.-]+|[A-Z]\w+(?:\.\w+)?)`", text))
-    assert len(named) > 25
-    assert not [file for file in named if not (ROOT / file).is_file()]
 
 
 def test_references_of_the_paper_are_cited_and_identified() -> None:

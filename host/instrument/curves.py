@@ -302,7 +302,7 @@ class ThroughputErrors(ContentEquality):
         if modes.ndim != 2 or modes.shape[1] != nm.size or not np.isfinite(modes).all():
             raise InputError.of("modes", modes.shape, f"finite values of the shape (n_mode, {nm.size})")
         set_read_only(self, wavelength_nm=nm, modes=modes)
-        others = self.values
+        others: object = self.values
         if not isinstance(others, Mapping) or not set(others) <= set(CALIBRATED):
             raise InputError.of("values", others, f"some of {', '.join(CALIBRATED)}")
         for name, changes in others.items():

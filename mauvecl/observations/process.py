@@ -8,6 +8,7 @@ information criterion (Schwarz 1978, doi 10.1214/aos/1176344136).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -90,6 +91,8 @@ SCALES = (1.5, 3.0)
 SMOOTH_QUALITY = 2**-0.5
 #: Largest number of iterations of a fit, and the change of log likelihood at which it has converged.
 ITERATIONS, CONVERGED = 80, 1e-3
+#: Step of a parameter for the derivatives of a fit.
+DIFFERENCE = 1e-8
 #: Largest number of fits one after the other, and the change of log likelihood below which the last one is the best.
 STARTS, SAME = 4, 0.5
 #: Number of parameters of each kind of term.
@@ -139,24 +142,42 @@ class ProcessTerm:
         turns = {"correlated": 0.5 / np.pi, "smooth": 1, "rotation": 2, "sharp rotation": HARMONICS}[self.kind]
         return self.scale_s / (2 * np.pi * turns)
 
-    def kernel(self) -> Any:
-        """Return the term of celerite2."""
-        terms = _terms()
-        values = np.exp(self.parameters)
+    def coefficients(self) -> tuple[list[tuple[float, float]], list[tuple[float, float, float, float]]]:
+        """Return celerite's coefficients, those of celerite2's terms to the last bit in a fraction of their time.
+
+        Returns
+        -------
+        decays : list of tuple
+            a and c of exponentials.
+        oscillators : list of tuple
+            a, b, c and d of underdamped oscillators.
+        """
+        values = np.exp(self.parameters).tolist()
         if self.kind == "correlated":
-            return terms.RealTerm(a=values[0] ** 2, c=1.0 / values[1])
+            return [(values[0] ** 2, 1.0 / values[1])], []
         if self.kind == "smooth":
-            return terms.SHOTerm(sigma=values[0], rho=values[1], Q=SMOOTH_QUALITY)
+            return [], [_oscillator(values[0] ** 2, 2 * np.pi / values[1], SMOOTH_QUALITY)]
         if self.kind == "rotation":
             sigma, period, quality, difference, share = values
-            return terms.RotationTerm(sigma=sigma, period=period, Q0=quality, dQ=difference, f=share)
+            first, second = 0.5 + quality + difference, 0.5 + quality
+            size = sigma**2 / (1 + share)
+            return [], [
+                _oscillator(size, 4 * np.pi * first / (period * math.sqrt(4 * first**2 - 1)), first),
+                _oscillator(share * size, 8 * np.pi * second / (period * math.sqrt(4 * second**2 - 1)), second),
+            ]
         sigma, period, quality, ratio = values
-        number = np.arange(1, HARMONICS + 1)
-        sizes = ratio ** (number - 1.0)
+        sizes = ratio ** np.arange(float(HARMONICS))
         sizes *= sigma / np.linalg.norm(sizes)
-        return terms.TermSum(
-            *(terms.SHOTerm(sigma=size, rho=period / k, Q=k * quality) for k, size in zip(number, sizes, strict=True))
-        )
+        return [], [
+            _oscillator(size**2, 2 * np.pi / (period / k), k * quality) for k, size in enumerate(sizes.tolist(), 1)
+        ]
+
+
+def _oscillator(variance: float, frequency: float, quality: float) -> tuple[float, float, float, float]:
+    """Return the coefficients of a stochastically driven oscillator of a quality above 1/2."""
+    ratio = math.sqrt(max(4.0 * quality**2 - 1.0, 1e-5))
+    a, c = variance / (frequency * quality) * frequency * quality, 0.5 * frequency / quality
+    return a, a / ratio, c, c * ratio
 
 
 def _terms() -> Any:
@@ -189,11 +210,14 @@ class Process:
 
     def kernel(self) -> Any:
         """Return the sum of the terms as a term of celerite2; one of zero variance if there are none."""
-        kernels = [term.kernel() for term in self.terms] or [_terms().RealTerm(a=0.0, c=1.0)]
-        total = kernels[0]
-        for one in kernels[1:]:
-            total = total + one
-        return total
+        return _terms().OriginalCeleriteTerm(self)
+
+    def get_all_coefficients(self) -> tuple[Float, ...]:
+        """Return the coefficients of the terms, as celerite2 asks for them."""
+        parts = [term.coefficients() for term in self.terms] or [([(0.0, 1.0)], [])]
+        decays = np.array([one for part, _ in parts for one in part]).reshape(-1, 2)
+        oscillators = np.array([one for _, part in parts for one in part]).reshape(-1, 4)
+        return tuple(np.ascontiguousarray(one) for one in (*decays.T, *oscillators.T))
 
     @property
     def shortest_s(self) -> float:
@@ -353,7 +377,9 @@ class LevelFit:
 
 def level_fit(covariance: Covariance, values: Float) -> LevelFit:
     """Return the mean of values, and their likelihood with the mean integrated over a flat prior."""
-    both = covariance.whitened(np.column_stack([values, np.ones(values.size)]))
+    both = np.ones((values.size, 2))
+    both[:, 0] = values
+    both = covariance.whitened(both)
     information = float(both[:, 1] @ both[:, 1])
     mean = float(both[:, 0] @ both[:, 1]) / information
     left = both[:, 0] - mean * both[:, 1]
@@ -550,9 +576,9 @@ def _fitted(data: Binned, terms: tuple[ProcessTerm, ...], log_excess: float) -> 
     low, high = np.array(bounds).T
 
     def made(x: Float) -> Process:
-        parts, first = [], 1
+        parts, first, values = [], 1, x.tolist()
         for kind in kinds:
-            parts.append(ProcessTerm(kind, tuple(float(v) for v in x[first : first + SIZES[kind]])))
+            parts.append(ProcessTerm(kind, tuple(values[first : first + SIZES[kind]])))
             first += SIZES[kind]
         return Process(tuple(parts), float(np.exp(x[0])))
 
@@ -565,13 +591,25 @@ def _fitted(data: Binned, terms: tuple[ProcessTerm, ...], log_excess: float) -> 
         value = 0.5 * ((x[0] - expected) / NOISE_PRIOR) ** 2 - level_fit(covariance, data.values).log_likelihood
         return value if np.isfinite(value) else 1e25
 
+    def slopes(x: Float) -> tuple[float, Float]:
+        """Return the cost and its derivatives by forward differences, or backward ones at an upper bound.
+
+        These are those of scipy, which takes as long for its checks as a cost takes.
+        """
+        value, gradient = cost(x), np.empty(x.size)
+        for k, at in enumerate(x.tolist()):
+            there = np.array(x)
+            there[k] = at + DIFFERENCE if at + DIFFERENCE <= high[k] else at - DIFFERENCE
+            gradient[k] = (cost(there) - value) / (there[k] - at)
+        return value, gradient
+
     x, value = np.clip(start, low, high), np.inf
     tolerance = CONVERGED / max(abs(cost(x)), 1.0)
     # The estimate of the curvature may mislead a fit, which another one from its end on shows.
     for _ in range(STARTS):
         found = minimize(
-            cost, x, method="L-BFGS-B", bounds=bounds, options={"maxiter": ITERATIONS, "ftol": tolerance}
-        )  # fmt: skip
+            slopes, x, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": ITERATIONS, "ftol": tolerance}
+        )
         x, before, value = found.x, value, float(found.fun)
         if before - value < SAME:
             break

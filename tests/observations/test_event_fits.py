@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from celerite2 import terms
 from numpy.typing import NDArray
 from scenes import flare
 from scipy import stats
@@ -222,6 +223,28 @@ def test_level_norms_and_covariances_are_those_of_the_matrices(term: ProcessTerm
     padded = np.pad(columns, [(30, time.size - 70), (0, 0)])
     exact = np.einsum("ik,ik->k", padded, np.linalg.solve(between + np.diag(noise), padded))
     np.testing.assert_allclose(model.covariance(time, noise).squared_norms(columns, 30, time.size), exact, rtol=1e-9)
+
+
+def test_coefficients_are_those_of_celerite2() -> None:
+    """All bits, for parameters within and beyond the bounds of fits."""
+    rng = np.random.default_rng(9)
+    for _ in range(200):
+        sizes: dict[Any, int] = {"correlated": 2, "smooth": 2, "rotation": 5, "sharp rotation": 4}
+        drawn = {kind: rng.uniform(-6.0, 6.0, size) for kind, size in sizes.items()}
+        drawn["sharp rotation"][2:] = rng.uniform(-0.5, 5.0), rng.uniform(-3.0, 0.0)
+        sigma, scale, *others = np.exp(drawn["rotation"])
+        size, period, quality, ratio = np.exp(drawn["sharp rotation"])
+        number = np.arange(1, 7)
+        sigmas = ratio ** (number - 1.0) * (size / np.linalg.norm(ratio ** (number - 1.0)))
+        expected = terms.TermSum(
+            terms.RealTerm(a=np.exp(drawn["correlated"][0]) ** 2, c=1.0 / np.exp(drawn["correlated"][1])),
+            terms.SHOTerm(sigma=np.exp(drawn["smooth"][0]), rho=np.exp(drawn["smooth"][1]), Q=2**-0.5),
+            terms.RotationTerm(sigma=sigma, period=scale, **dict(zip(("Q0", "dQ", "f"), others, strict=True))),
+            *(terms.SHOTerm(sigma=s, rho=period / k, Q=k * quality) for k, s in zip(number, sigmas, strict=True)),
+        )
+        found = Process(tuple(ProcessTerm(kind, tuple(values)) for kind, values in drawn.items()), 1.0).kernel()
+        for one, other in zip(found.get_coefficients(), expected.get_coefficients(), strict=True):
+            np.testing.assert_array_equal(one, other)
 
 
 def few_frames() -> Frames:

@@ -112,8 +112,8 @@ def test_losses_are_found_at_their_frames_and_a_flare_is_none() -> None:
 )
 def test_losses_in_most_frames_are_no_flares_between_them(losses: tuple[tuple[float, ...], ...]) -> None:
     """Observe a star that is out of the fibre for half of the time or more, and returns to its light."""
-    rng, frame_s, noise = np.random.default_rng([504, 1]), 5.0, 1e-4
-    time = np.arange(1260) * frame_s
+    rng, frame_s, noise = np.random.default_rng([504, 1]), 10.0, 1e-4
+    time = np.arange(630) * frame_s
     loss = np.zeros(time.size)
     for start, length, size, out, back in losses:
         gone = 1 - np.exp(-np.clip(time - start, 0, length) / out)

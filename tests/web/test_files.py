@@ -172,7 +172,7 @@ def test_downloads_equal_the_files_of_the_command_line(server: Server, tmp_path:
     """With a study that is taken from the page, of an uploaded star and an uploaded unknown: all bytes."""
     entered = {"realisations": "10000", "fap": "0.05", "statistic": "chi2", "magnitude": "7", "targets": "eps Eri"}
     # A short campaign and few periods, whose numbers take seconds.
-    entered |= {"days": "20", "shortest_d": "5", "longest_d": "10", "visits": "5"}
+    entered |= {"days": "10", "shortest_d": "3", "longest_d": "5", "visits": "5"}
     asked = link(**entered, star="uploaded star", own_unknown="uploaded spectrum")
     words = server.words()
 
