@@ -59,7 +59,7 @@ def assumptions_of(study: Study, uses: Collection[Use], varied: Collection[str] 
     """
     swept = {axis.quantity for axis in study.sweep.axes} | set(varied)
     words: dict[str, Callable[[], str]] = {
-        "instrument": lambda: _instrument(study, swept),
+        "instrument": lambda: _instrument(study, swept, along_orbit="orbit" in uses and study.plan.along_orbit),
         "sky": lambda: _sky(study, swept),
         "flare": lambda: _flare(study, swept),
         "orbit": lambda: _orbit(study),
@@ -73,13 +73,15 @@ def assumptions_of(study: Study, uses: Collection[Use], varied: Collection[str] 
     return [*(words[use]() for use in words if use in stated), *ignored]
 
 
-def _instrument(study: Study, swept: set[str]) -> str:
+def _instrument(study: Study, swept: set[str], *, along_orbit: bool) -> str:
     o = study.observation
     text = f"instrument {o.instrument}"
     if o.changes:
         text += f" with another {', '.join(o.changes)}"
     if "detector_temperature" in swept:
         return f"{text}, detector temperature as swept"
+    if along_orbit and o.temperature_c is None:
+        return f"{text}, detector temperature along the orbit"
     return f"{text}, detector at {study.observation.load_instrument().temperature_c:g} deg C"
 
 

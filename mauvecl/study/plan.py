@@ -258,7 +258,7 @@ class PlanQuestion(Section):
         Literal["injections", "closed form"],
         Help("Completeness", choices="injections (into simulated noise) or 'closed form' (at once)"),
         Flag("--completeness"),
-    ] = "injections"
+    ] = "closed form"
     along_orbit: Annotated[
         bool, Help("Whether frames have the detector temperature and particle flux along the orbit")
     ] = True

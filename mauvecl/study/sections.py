@@ -301,7 +301,7 @@ class Flare(Section):
             hint="By how much the flare at its peak brightens the star in the band of the Kepler satellite. In the "
             "ultraviolet the rise is many times as large.",
             name="amplitude_percent",
-            first="4.5",
+            first="2",
             unit="%",
             scale=100.0,
             slider=Slider(0.01, 1000, 10**0.1, log=True),

@@ -60,21 +60,23 @@ def read_version(data: dict[str, Any], where: str) -> dict[str, Any]:
     A file without a version is of version 1, in which by default everything but the noise was known and the instrument
     "mauve" had the conventions of the paper.
     """
-    if "version" in data or not all(isinstance(data.get(key, {}), dict) for key in ("observation", "nuisances", "run")):
+    of_defaults = ("observation", "nuisances", "run", "plan")
+    if "version" in data or not all(isinstance(data.get(key, {}), dict) for key in of_defaults):
         return data
-    observation, nuisances, run = ({**data.get(key, {})} for key in ("observation", "nuisances", "run"))
+    observation, nuisances, run, plan = ({**data.get(key, {})} for key in of_defaults)
     named = observation.get("instrument", "mauve")
     if isinstance(named, str):
         observation["instrument"] = FORMERLY_MAUVE if named == "mauve" else FORMER_NAMES.get(named, named)
     nuisances.setdefault("usual", False)
     run.setdefault("statistics", [*DEFAULT_STATISTICS])
+    plan.setdefault("completeness", "injections")
     known = "the usual unknowns drawn" if nuisances["usual"] else "everything but the noise known"
     warnings.warn(
         f"{where} has no version and is read as in version 1, with the instrument now called "
         f"{observation['instrument']} and {known}; `version = {VERSION}` asks with today's defaults.",
         stacklevel=2,
     )
-    return data | {"version": VERSION, "observation": observation, "nuisances": nuisances, "run": run}
+    return data | {"version": VERSION} | dict(zip(of_defaults, (observation, nuisances, run, plan), strict=True))
 
 
 def with_paths(data: Any, kind: Any, change: Callable[[Path], Path]) -> Any:

@@ -331,7 +331,7 @@ _OWN_FIELDS = {
         group="Detection", place=1, own_keys=("run.statistics",),
     ),
     "unknown": Field(
-        label="Answer", first=REALISTIC, read=Choice(UNKNOWN),
+        label="Kind of answer", first=REALISTIC, read=Choice(UNKNOWN),
         hint="Realistic: detector temperature, light lost and sky differ from exposure to exposure and are unknown; "
         "they are drawn, and the statistic is made blind to them. Ideal: everything but the noise is known. The card "
         "shows both chances; this is for the pictures, tables and simulations.", group="", place=3,
@@ -406,7 +406,7 @@ ASKED_UNDER = {
 }
 #: Questions to begin with; the amplitudes of the first two are the paper's smallest, the others are examples (assumed).
 PRESETS: dict[str, dict[str, str]] = {
-    "Edge of detection": {},
+    "Edge of detection": {"magnitude": "7.7"},
     "Paper: G2V, V = 7.4": {"magnitude": "7.4", "amplitude_percent": "0.76"},
     "Paper: K3V, V = 3.7": {"star": "K3V", "magnitude": "3.7", "amplitude_percent": "0.76"},
     "M dwarf": {"star": "GJ 581", "magnitude": "10.6", "amplitude_percent": "10"},

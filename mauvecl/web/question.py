@@ -140,6 +140,9 @@ class Question:
                 write_spectrum(upload, folder, SPECTRA[name]) if page_field.kind == "file" else upload.written(folder)
             )
             value = str(written) if isinstance(written, Path) else written
+        if name == "temperature_c" and value == page_field.read(page_field.first):
+            # The instrument's own, or along the orbit that of a plan.
+            return
         if value is not None:
             self._set(data, page_field, value)
 
@@ -265,7 +268,7 @@ _OWN_SIMULATIONS = {
     "measure": Simulation({"measure": "measure"}, _fits),
     "completeness": Simulation({"completeness": "inject"}, partial(_changed, injections=INJECTED, search={"nulls": 0})),
     "visible": Simulation({"visible": "visible"}, completed=_tabulated, needs="targets"),
-    "plan": Simulation({"plan": "plan"}, partial(_changed, plan={"completeness": "closed form"}), needs="targets"),
+    "plan": Simulation({"plan": "plan"}, needs="targets"),
     "analyse": Simulation({"analyse": "analyse"}, needs="frames"),
     "calibrate": Simulation({"calibrate": "calibrate"}, needs="observations"),
     "periods": Simulation({"periods": "change"}, partial(_changed, change={"periods": True}), needs="targets"),

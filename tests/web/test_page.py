@@ -131,7 +131,7 @@ def test_visitor_changes_values_and_reads_the_answer(browser: Browser, server: S
     # A 2 % flare on a G2V star of V = 7.4 in 50 s.
     enter(page, "Magnitude", "7.4")
     reported = shown(page)
-    assert reported.startswith("> 99.99 %")
+    assert reported.startswith("78.0 %")
     assert "a 2 % flare (10000 K) on a G2V star of V = 7.4, in 50 s (10 frames)" in reported
     for found in ("#f-star", "#f-magnitude", "#f-amplitude_percent", "#f-exposure_s", "#chance", "#facts", "#simulate",
                   "#plot-excess", "#plot-distributions"):  # fmt: skip
@@ -181,13 +181,13 @@ def test_visitor_changes_values_and_reads_the_answer(browser: Browser, server: S
         assert places(page) == pytest.approx(before, abs=1), text
     enter(page, "Star", "G2V")
     # Values that cannot be together mark their field, and choices follow from others.
-    enter(page, "Answer", "realistic")
+    enter(page, "Kind of answer", "realistic")
     enter(page, "Detection statistic", "paper")
     assert page.get_by_label("Detection statistic", exact=True).get_attribute("aria-invalid") == "true"
     assert "cannot be marginalised" in page.locator("#words-of").inner_text()
     enter(page, "Detection statistic", "matched")
     assert "chance to detect" in shown(page)
-    enter(page, "Answer", "ideal")
+    enter(page, "Kind of answer", "ideal")
     enter(page, "Realisations", "1000000")
     enter(page, "False-alarm probability", "1e-6")
     field = page.get_by_label("Realisations", exact=True)
@@ -1053,14 +1053,14 @@ def which_flares_on_an_m_dwarf(visitor: Mouse) -> None:
     visitor.type(page.get_by_label("Star", exact=True), "AU Mic")
     told = sentence(page, "at V = 8.81")
     assert told.startswith("90 % of flares of at least ")
-    assert "with the usual unknowns" in told
+    assert "if everything but the noise were known" in told
     assert visitor.clicks == 1
 
 
 def limiting_magnitude(visitor: Mouse) -> None:
     page = visitor.page
     visitor.choose(page.get_by_label("Solve for", exact=True), "magnitude")
-    assert "with everything known" in sentence(page, "to V = 8.14")
+    assert "to V = 8.40 if everything but the noise were known" in sentence(page, "to V = 7.26")
     assert visitor.clicks == 2
 
 

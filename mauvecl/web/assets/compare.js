@@ -18,7 +18,7 @@ const KEY = "mauvecl-compare"
 const ROWS = [
   ["Star", e => e.star], ["Magnitude", e => `${e.band} = ${e.magnitude}`], ["Flare", e => `${e.amplitude_percent} %`],
   ["Flare's spectrum", e => spectrum(e)], ["Exposure", e => `${e.exposure_s} s`],
-  ["Statistic", e => e.statistic], ["False-alarm probability", e => e.fap], ["Unknown", e => e.unknown],
+  ["Statistic", e => e.statistic], ["False-alarm probability", e => e.fap], ["Kind of answer", e => e.unknown],
 ]
 
 /** The flare's light in a few words; scenarios that were kept before may lack fields.
