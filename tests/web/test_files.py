@@ -383,7 +383,7 @@ def test_own_added_spectrum_answers_as_its_file(server: Server, tmp_path: Path) 
 def test_neighbours_of_the_page_are_those_of_the_command_line(server: Server, tmp_path: Path) -> None:
     """A Gaia table whose first row is the star itself dilutes the page's chance as it does that of `detect`."""
     table = 'designation,ra,dec,phot_g_mean_mag,bp_rp\n"Gaia DR3 1",150.0,60.0,9,2.1\n"Gaia DR3 2",150.0,60.003,8,0.8\n'
-    entered = {"star": "M3V", "magnitude": "9", "amplitude_percent": "2"}
+    entered = {"star": "M3V", "magnitude": "9", "amplitude_percent": "1"}
     near = {"neighbours": table, "neighbours_of": "Gaia DR3 1"}
 
     async def work(talk: Talk) -> tuple[list[float], str]:

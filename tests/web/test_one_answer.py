@@ -29,7 +29,7 @@ DETECTIONS = [
     ("K3V", "9", "3", "50", "dark sky"),
 ]  # fmt: skip
 FAP, N = "0.1", "2000"
-TARGETS, HOURS = ("eps Eri", "AU Mic", "GJ 205", "YZ CMi"), "100"
+TARGETS, HOURS = ("eps Eri", "GJ 205", "YZ CMi", "AD Leo"), "100"
 
 
 def on_the_command_line(folder: Path, *words: str) -> dict[str, Any]:
@@ -81,6 +81,4 @@ def test_plans_are_the_same_everywhere(server: Server, tmp_path: Path) -> None:
     for k, row in enumerate(answer["rows"]):
         for column in ("expected", "ideal", "E50"):
             numbers = [float(getattr(table[column], "value", table[column])[k]) for table in (page, python.table)]
-            # A target without flare rates has no number of flares.
-            ours = float("nan") if row[column] is None else row[column]
-            assert [ours] * 2 == pytest.approx(numbers, rel=1e-9, nan_ok=True), (row["target"], column)
+            assert [row[column]] * 2 == pytest.approx(numbers, rel=1e-9), (row["target"], column)
