@@ -155,11 +155,17 @@ class DetectAnswer(Answer):
         row, star = rows[place], self.stars[place // len(self.stars[0].amplitudes)]
         ideal = f"; {chance_text(row['ideal'])} {IF_KNOWN}" if "ideal" in rows.colnames else ""
         least = f", the least certain of {len(rows)} flares" if len(rows) > 1 else ""
-        saturated, every = int(star.detection.quiet.saturated.sum()), star.detection.quiet.saturated.size
-        without = f", without the {saturated} of {every} pixels that saturate" if saturated else ""
+        quiet = star.detection.quiet
+        saturated = int(quiet.saturated.sum())
+        without = (
+            f", without the {saturated} of {quiet.saturated.size} pixels that saturate in a frame of more than "
+            f"{quiet.longest_safe_frame_s:.3g} s"
+            if saturated
+            else ""
+        )
         return (
             f"{name_of_instrument(self.study)} would see a flare of {100 * row['amplitude']:g} % on {star.title} in "
-            f"{star.detection.quiet.exposure_s:g} s with a chance of {chance_text(row['probability'])} "
+            f"{quiet.exposure_s:g} s with a chance of {chance_text(row['probability'])} "
             f"({chance_range(row['low'], row['high'])}{ideal}){without}{least}."
         )
 

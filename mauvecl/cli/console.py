@@ -443,8 +443,8 @@ def _commands() -> Iterator[Any]:
         others += getattr(command, "commands", {}).values()
 
 
-def _flags(name: str, command: Any) -> list[str]:
-    """Return the flags that set a parameter or a key of the study, the long one first."""
+def _flags(name: str, command: Any, *, off: bool = False) -> list[str]:
+    """Return the flags that set a parameter or a key of the study, or turn it off, the long one first."""
     from mauvecl.study.study import keys_with_flags
 
     # If a key has several flags, the last takes its value unchanged.
@@ -452,7 +452,8 @@ def _flags(name: str, command: Any) -> list[str]:
     wanted = {name} | {parameter for key, parameter in parameters.items() if f".{key}".endswith(f".{name}")}
     for parameter in command.params:
         if parameter.name in wanted:
-            return sorted((flag for flag in parameter.opts if flag.startswith("-")), key=len, reverse=True)
+            flags = parameter.secondary_opts if off else parameter.opts
+            return sorted((flag for flag in flags if flag.startswith("-")), key=len, reverse=True)
     return []
 
 
@@ -462,11 +463,12 @@ def with_flags(text: str) -> str:
 
 
 def _as_flag(match: re.Match[str]) -> str:
-    name = match["name"]
-    flag = _OTHERWISE.get(name) or next((flags[0] for command in _commands() if (flags := _flags(name, command))), None)
+    name, off = match["name"], match["value"] in ("false", "False")
+    found = (flags[0] for command in _commands() if (flags := _flags(name, command, off=off)))
+    flag = _OTHERWISE.get(name) or next(found, None)
     if flag is None:
         return match[0]
-    if match["value"] is None:
+    if match["value"] is None or off:
         return flag
     try:
         value = ast.literal_eval(match["value"])

@@ -129,7 +129,7 @@ class Statistic(ABC):
             why = "with estimated variances" if self.marginal else "which compares with one noisy exposure"
             raise InputError(
                 f"statistic {self.name!r} {why} cannot be marginalised over {join_names(setting.nuisances.names)}",
-                "no unknowns, or another statistic by the model's variances",
+                "no unknowns, as `nuisances.usual=false` has it, or another statistic by the model's variances",
                 key="statistic",
             )
 

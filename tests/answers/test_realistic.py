@@ -113,7 +113,10 @@ def test_headline_has_the_numbers_of_the_table(engine: Engine) -> None:
 def test_saturated_star_says_so_in_the_headline(engine: Engine) -> None:
     bright = detect(ASKED.with_settings(["star.0.magnitude=1"]), engine)
     saturated = int(bright.stars[0].detection.quiet.saturated.sum())
-    assert f"without the {saturated} of 1643 pixels that saturate" in bright.headline
+    assert f"without the {saturated} of 1643 pixels that saturate in a frame of more than " in bright.headline
+    safe_s = float(re.findall(r"more than ([\d.]+) s", bright.headline)[0])
+    at_end = ASKED.with_settings(["star.0.magnitude=1", f"observation.changes={{frame_s={0.99 * safe_s}}}"])
+    assert "saturate" not in detect(at_end, engine).headline
     assert saturated > 50
 
 
