@@ -34,6 +34,27 @@ SWAPPED = (
 SHAPE = "    g1, g2, g3 = c.shape()\n    sd ="
 
 MUTATIONS: dict[str, Mutation] = {
+    # Realistic and ideal answers, and files of version 1.
+    "old studies read with today's unknowns": (
+        "test_study_of_version_1_is_read_as_it_was[-mauvesim]",
+        ('nuisances.setdefault("usual", False)', 'nuisances.setdefault("usual", True)'),
+    ),
+    "an ideal answer with the unknowns": (
+        "test_ideal_answer_is_that_of_the_ideal_study[detect]",
+        ("setting = case.with_sections(nuisances=KNOWN).setting(", "setting = case.setting("),
+    ),
+    "an ideal limit with the unknowns": (
+        "test_ideal_answer_is_that_of_the_ideal_study[limit]",
+        ("LimitSearch(case.with_sections(nuisances=KNOWN), statistic)", "LimitSearch(case, statistic)"),
+    ),
+    "jitters that cost a plan nothing": (
+        "test_plan_by_the_closed_form_is_worse_than_the_ideal",
+        ("power -= float(np.sum((rows @ light) ** 2))", "power -= 0.0"),
+    ),
+    "paper's conventions without its instrument": (
+        "test_paper_and_ideal_change_the_conventions_alone",
+        ('update={"instrument": FORMERLY_MAUVE})', "update={})"),
+    ),
     # Draws, statistics, stores and runs.
     "one unknown's row dropped": (
         "test_closed_forms_integrate_over_drawn_unknowns[half a degree]",
