@@ -202,7 +202,7 @@ def test_interrupted_cluster_ends_its_workers(stop: signal.Signals, tmp_path: Pa
         "import mauvecl.runs.checkpoint as s; s.SHARD_WORK = 2**27; "
         "s.Checkpoint.__init__.__kwdefaults__['patience_s'] = 0.0; from mauvecl.cli.app import main; main()"
     )
-    flags = "--statistic chi2 -n 80000 --no-pictures --fap 0.01"
+    flags = "--statistic chi2 -n 80000 --no-pictures --fap 0.01 --ideal"
     words = ["detect", "--star", "G2V", "--star", "K3V", "-m", "7.4,3.7", *flags.split()]
     command = [sys.executable, "-c", script, *words, "--output", "out"]
     process = subprocess.Popen(
