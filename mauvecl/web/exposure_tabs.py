@@ -68,7 +68,7 @@ class Noise(Tab):
         """Return the closed-form table of `mauvecl snr`."""
         study = closed.study
         parts = [({"star": star_label(study.star[0], closed.quiet)}, closed.quiet.noise_budget())]
-        return stacked([star_column()], parts, realisations=study.run.realisations, study=study.text())
+        return stacked([star_column()], parts, realisations=study.run.realisations, study=study.ideal().text())
 
 
 @Chart(
