@@ -97,7 +97,7 @@ def test_flares_are_measured_along_a_stare(engine: Engine, tmp_path: Path) -> No
         "measure.joint_fit=true",
         "stare.duration_s=400",
         "stare.number=3",
-        "nuisances={}",
+        "nuisances={usual=false}",
     )
     study = study_of(*settings, temperature_k=14_000.0)
     study = Study.build(study.model_dump() | {"events": events}, "test")
@@ -140,7 +140,7 @@ def test_flares_are_measured_along_a_stare(engine: Engine, tmp_path: Path) -> No
 def test_two_temperatures_are_fitted_where_the_flare_has_two(engine: Engine, tmp_path: Path) -> None:
     """Check that the hotter blackbody is always the second, and that pictures have a column per model."""
     spectrum = {"second_temperature_k": 8000.0, "second_area": 20.0}
-    settings = "measure.fits=20", "flare.amplitudes=[3.0]", "nuisances={}"
+    settings = "measure.fits=20", "flare.amplitudes=[3.0]", "nuisances={usual=false}"
     answer = measure(study_of(*settings, temperature_k=30_000.0, spectrum=spectrum), engine)
     assert [one.model for one in answer.flares] == ["blackbody", "two-temperatures"]
     rows = {row["quantity"]: row for row in answer.flares[1].rows()}
@@ -164,7 +164,7 @@ def test_two_temperatures_are_fitted_where_the_flare_has_two(engine: Engine, tmp
 
 def test_lines_and_absolute_fluxes_are_measured(engine: Engine) -> None:
     spectrum = {"balmer_jump": 2.0, "lines": {"H alpha": 0.05}, "line_fluxes": {"Mg II": 2e-11}}
-    answer = measure(study_of("measure.fits=50", "nuisances={}", spectrum=spectrum), engine)
+    answer = measure(study_of("measure.fits=50", "nuisances={usual=false}", spectrum=spectrum), engine)
     assert [one.model for one in answer.flares] == ["blackbody", "balmer", "lines"]
     rows = {row["quantity"]: row for row in answer.flares[-1].rows()}
     assert rows["line Mg II"]["truth"] == 2e-11

@@ -80,8 +80,8 @@ def test_every_answer_reports_the_cost_of_unknowns(engine: Engine) -> None:
         for sentence in of_kind(plain.messages, "cost of unknowns"):
             assert all(name in sentence for name in ("the usual unknowns", "dark", "light", "sky"))
         assert any("marginalised over the dark level (+-0.1 deg C)" in m for m in other.messages)
-        assert "[nuisances]" in other.table.meta["study"]
-        assert "[nuisances]" not in plain.table.meta["study"]
+        assert "dark = 0.1" in other.table.meta["study"]
+        assert "dark = " not in plain.table.meta["study"]
     # What is marginalised detects less.
     assert limiting_magnitude(marginal, engine).limits[0].closed_form < limiting_magnitude(small).limits[0].closed_form
 

@@ -102,7 +102,7 @@ def test_files_json_and_terminal_agree(name: str, tmp_path: Path) -> None:
         names = list(found[key][0])
         assert names == table.colnames
         assert [list(row.values()) for row in found[key]] == rows_of(table, names), key
-    shown = run(*words, "shown", folder=tmp_path).stdout
+    shown = run(*words, "shown", "--wide", folder=tmp_path).stdout
     for view in answer.views:
         assert view.title in shown
         if view.table is not None:
