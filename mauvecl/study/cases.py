@@ -486,9 +486,24 @@ def collect_messages(expectations: list[Expectation], processes: Processes | Non
 
     All answers report the saturation of stars and flares through this function.
     """
-    texts = [message for x in expectations for message in (*_without_light(x), *x.messages, *_coarse(x))]
+    stars = {star for x in expectations if x.saturated.any() for star, flaring in [_star_of(x)] if not flaring}
+
+    def said(x: Expectation) -> tuple[str, ...]:
+        # A flare saturates the pixels that its star saturates without it, which is one fact.
+        star, flaring = _star_of(x)
+        repeated = of_kind(x.messages, SATURATED) if flaring and star in stars else []
+        return tuple(message for message in x.messages if message not in repeated)
+
+    texts = [message for x in expectations for message in (*_without_light(x), *said(x), *_coarse(x))]
     outside = off_centre(expectations, processes) if processes else []
     return worst_first([*(Message(f"OUTSIDE THE PRIOR: {text}.", "outside the prior") for text in outside), *texts])
+
+
+def _star_of(x: Expectation) -> tuple[tuple[object, ...], bool]:
+    """Return what tells an expectation's star and exposure from others, and whether it has a flare."""
+    steps = x.provenance.get("source history", "").split("; ")
+    quiet = tuple(step for step in steps if not step.startswith("flare"))
+    return (x.name, quiet, x.frame_s, x.n_frames), len(quiet) < len(steps)
 
 
 def off_centre(expectations: list[Expectation], processes: Processes) -> list[str]:

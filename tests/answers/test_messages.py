@@ -182,3 +182,15 @@ def test_json_has_no_nan(tmp_path: Path) -> None:
     rows = json.loads(run(*words, folder=tmp_path).stdout, parse_constant=pytest.fail)["rows"]
     assert {row["scatter"] for row in rows} == {None}
     assert all(np.isfinite(row["bias"]) for row in rows)
+
+
+def test_saturation_of_a_star_and_its_flare_is_one_message() -> None:
+    """A flare that alone saturates has its own, also next to a brighter star of the same name that does, too."""
+    star = "star=[{library='Vega', magnitude=0.03}]"
+    few = ["run.realisations=2000", "run.fap=0.1", "flare.amplitudes=[0.02]", star]
+    both = detect(Study().paper().with_settings(few))
+    assert len(of_kind(both.messages, "saturated")) == 1
+    axes = "sweep.axes=[{quantity='magnitude', values=[0.03, 1.5]}]"
+    swept = detect(Study().paper().with_settings([*few, "flare.amplitudes=[0.5]", axes]))
+    assert [one.detection.quiet.saturated.any() for one in swept.stars] == [True, False]
+    assert len(of_kind(swept.messages, "saturated")) == 2
