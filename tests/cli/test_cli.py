@@ -24,25 +24,28 @@ DATA = Path(__file__).parents[1] / "data"
 
 @pytest.fixture(scope="module")
 def answered(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """Answer the default question with fewer realisations; return the folder and the output."""
+    """Answer the question of the paper with fewer realisations; return the folder and the output."""
     folder = tmp_path_factory.mktemp("detect")
-    return folder, started("detect", "-n", "100000", "--no-pictures", folder=folder).stdout
+    return folder, started("detect", "--paper", "-n", "100000", "--no-pictures", folder=folder).stdout
 
 
 @pytest.mark.long
 def test_detect_answers_the_question_of_the_paper(answered: tuple[Path, str]) -> None:
     folder, text = answered
     lines = text.splitlines()
-    assert "not a flight calibration" in lines[0]
-    assert lines[1] == "Magnitudes in V are as in catalogues: Vega has 0.03."
-    assert "false-alarm probability of 0.001 per test, 50 s (10 frames), 100,000 realisations" in lines[4]
-    # One line says that everything is taken as known, the chance if it is not, and what the usual unknowns are.
-    assert lines[2].startswith(
+    assert lines[0].startswith("Mauve would see a flare of 0.76 % on G2V V = 7.4 in 50 s with a chance of 5")
+    assert lines[0].endswith(", the least certain of 8 flares.")
+    assert "false-alarm probability of 0.001 per test, 50 s (10 frames), 100,000 realisations" in lines[1]
+    notes = lines[lines.index("  seed 1") + 1 :]
+    assert "not a flight calibration" in notes[0]
+    assert notes[1] == "Magnitudes in V are as in catalogues: Vega has 0.03."
+    # One note says that everything is taken as known, the chance if it is not, and what the usual unknowns are.
+    assert notes[2].startswith(
         "Everything but the noise is taken as known: G2V V = 7.4, flare of 0.76 % is then detected"
     )
     chance = "a chance of 57.0 %, with the usual unknowns of 2.7 % (closed forms; --with-unknowns draws them)."
-    assert chance in lines[2]
-    assert lines[2].endswith("These are the dark level (free), the light level (free) and the sky level (+-10 %).")
+    assert chance in notes[2]
+    assert notes[2].endswith("These are the dark level (free), the light level (free) and the sky level (+-10 %).")
     assert sum("unknowns" in line for line in lines) == 1
     table = QTable.read(folder / "mauvecl-detect" / "detection.ecsv")
     assert len(table) == 2 * 4 * 3
@@ -69,7 +72,7 @@ def test_detect_answers_the_question_of_the_paper(answered: tuple[Path, str]) ->
 def test_detect_takes_all_statistics(tmp_path: Path) -> None:
     """Ask for six statistics with noisy references and estimated variances, and read the written study."""
     words = ("detect", "--star", "G2V", "-m", "7.4", "-a", "0.1", "-n", "20000", "--fap", "0.01", "--no-pictures")
-    shown = run(*words, "--statistic", "all", "--reference", "stack:3", "--variances", "estimated", folder=tmp_path)
+    shown = run(*words, "--statistic", "all", "--reference", "stack:3", "--variances", "estimated", "--ideal", folder=tmp_path)
     asked = Study.read(tmp_path / "mauvecl-detect" / "study.toml").run
     assert (asked.reference, asked.variances) == ("stack:3", "estimated")
     assert {"chi2", "chi2_element", "chi2_pair", "uv_excess", "matched", "paper"} == set(asked.statistics)
