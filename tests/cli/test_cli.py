@@ -72,7 +72,9 @@ def test_detect_answers_the_question_of_the_paper(answered: tuple[Path, str]) ->
 def test_detect_takes_all_statistics(tmp_path: Path) -> None:
     """Ask for six statistics with noisy references and estimated variances, and read the written study."""
     words = ("detect", "--star", "G2V", "-m", "7.4", "-a", "0.1", "-n", "20000", "--fap", "0.01", "--no-pictures")
-    shown = run(*words, "--statistic", "all", "--reference", "stack:3", "--variances", "estimated", "--ideal", folder=tmp_path)
+    shown = run(
+        *words, "--statistic", "all", "--reference", "stack:3", "--variances", "estimated", "--ideal", folder=tmp_path
+    )
     asked = Study.read(tmp_path / "mauvecl-detect" / "study.toml").run
     assert (asked.reference, asked.variances) == ("stack:3", "estimated")
     assert {"chi2", "chi2_element", "chi2_pair", "uv_excess", "matched", "paper"} == set(asked.statistics)

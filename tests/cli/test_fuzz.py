@@ -230,7 +230,7 @@ def test_flare_tables_never_crash(
     file = folder / f"flares{ending}"
     file.write_bytes(spoilt(_flares()[kind], place, splice, cut, pack))
     # Fewer realisations than the threshold needs: everything is read, and then refused.
-    check(folder, "detect", "--star", "G2V", "-m", "8", "-n", "100", "--flares", str(file))
+    check(folder, "detect", "--star", "G2V", "-m", "8", "-n", "100", "--tails", "counted", "--flares", str(file))
 
 
 @many(25)
@@ -238,7 +238,20 @@ def test_flare_tables_never_crash(
 def test_weights_never_crash(folder: Path, lines: list[str], junk: bytes) -> None:
     (folder / "weights.txt").write_bytes("\n".join(["190 0.5", *lines, "700 1"]).encode() + junk)
     # Fewer realisations than the threshold needs: everything is read, and then refused.
-    check(folder, "detect", "--star", "G2V", "-m", "8", "-n", "100", "--set", "run.weights.mine='weights.txt'")
+    check(
+        folder,
+        "detect",
+        "--star",
+        "G2V",
+        "-m",
+        "8",
+        "-n",
+        "100",
+        "--tails",
+        "counted",
+        "--set",
+        "run.weights.mine='weights.txt'",
+    )
 
 
 @many(20)

@@ -680,7 +680,10 @@ def test_uploaded_standards_are_fitted_as_on_the_command_line(server: Server, tm
     for name, content in contents.items():
         (here / ("nights" if name == "b3v.fits" else "") / name).write_bytes(content)
     page = Table.read(table.decode(), format="ascii.ecsv")
-    for folder, words in ((here, "calibrate standards.toml --instrument mauve"), (tmp_path / "again", "calibrate study.toml")):
+    for folder, words in (
+        (here, "calibrate standards.toml --instrument mauve"),
+        (tmp_path / "again", "calibrate study.toml"),
+    ):
         found = answered(folder, words)["calibrate"]
         assert found.colnames == page.colnames
         for name in page.colnames:
