@@ -21,7 +21,7 @@ def study(**sections: Any) -> Study:
     merged = {
         name: {**base.get(name, {}), **value} if isinstance(value, dict) else value for name, value in sections.items()
     }
-    return Study.build(base | merged, "test")
+    return Study.build(base | merged, "test").paper()
 
 
 def random_stare(rng: np.random.Generator) -> tuple[dict[str, Any], dict[str, Any]]:
