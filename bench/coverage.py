@@ -33,7 +33,8 @@ def main() -> None:
     parser.add_argument("--device")
     parser.add_argument("--output", type=Path, default=Path(__file__).parent / "results" / "coverage.ecsv")
     options = parser.parse_args()
-    mauve, star, engine = Instrument.load("mauvesim"), Source.from_library("M3V").at_magnitude(9), Engine(options.device)
+    mauve, star = Instrument.load("mauvesim"), Source.from_library("M3V").at_magnitude(9)
+    engine = Engine(options.device)
     quiet, rng = expect(star, mauve, exposure=50.0), np.random.default_rng(28)
     free = Nuisances.of(quiet, {"dark": np.inf, "star": np.inf, "sky": 0.1}, own={"star": quiet.net_source_dn})
     rows = []

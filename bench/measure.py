@@ -66,7 +66,8 @@ def main() -> None:
     parser.add_argument("--device")
     parser.add_argument("--output", type=Path, default=Path(__file__).parent / "results" / "measure.ecsv")
     options = parser.parse_args()
-    mauve, star, engine = Instrument.load("mauvesim"), Source.from_library("M3V").at_magnitude(9), Engine(options.device)
+    mauve, star = Instrument.load("mauvesim"), Source.from_library("M3V").at_magnitude(9)
+    engine = Engine(options.device)
     quiet = expect(star, mauve, exposure=50.0)
     rows, growth = [], 0.0
     for name, true_jump, jump in (
