@@ -42,7 +42,7 @@ STEPS = 9, 5
 #: Labelled contours, with the part of the line at which the label stands.
 LABELLED = {0.1: 0.25, 0.5: 0.5, 0.9: 0.75}
 #: Initial number of points of a curve, number of times that steps are halved, and change above which they are halved.
-FIRST, HALVINGS, CHANGE = 9, 5, 0.25
+FIRST, HALVINGS, CHANGE = 9, 5, 0.1
 
 
 #: Fields on which a map does not depend; an upload is identified by its content.
