@@ -111,7 +111,7 @@ def test_flags_override_the_study_file(tmp_path: Path) -> None:
     assert any("15 s" in message for message in answer["messages"])
     text = (elsewhere / "mauvecl-detect" / "study.toml").read_text()
     assert "none = true" in text
-    assert "target" not in text
+    assert "290.68" not in text
     assert "seed = 7" in text
     settings = ("star.0.magnitude=5", "observation.exposure_s = 10", "sky={surface_brightness=21}")
     sets = [word for setting in settings for word in ("--set", setting)]
