@@ -377,7 +377,8 @@ def _faults_of_description(store: Store, repair: bool) -> Iterator[Fault]:
         try:
             data = read_bytes(there, "description")
             if name.endswith("zarr.json"):
-                existing, made = (without_version(json.loads(text)) for text in (data, content))
+                old = store.of_version_1
+                existing, made = (without_version(json.loads(text), of_version_1=old) for text in (data, content))
                 same, seen = existing in (made, without_later_attributes(made)), "foreign"
             else:
                 same, seen = data == content, "damaged"

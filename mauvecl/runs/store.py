@@ -61,10 +61,17 @@ def without_later_attributes(described: dict[str, Any]) -> dict[str, Any]:
     return described | {"attributes": {k: v for k, v in attributes.items() if k not in LATER_ATTRIBUTES}}
 
 
-def without_version(described: dict[str, Any]) -> dict[str, Any]:
-    """Return the description of a group without the version that wrote it, which may be any."""
-    attributes = described.get("attributes", {})
-    return described | {"attributes": {k: v for k, v in attributes.items() if k != "mauvecl"}}
+#: Attributes in which stores of version 1 state the study and the instrument by other defaults and names.
+OTHERWISE_IN_VERSION_1 = ("study", "study_sha256", "instrument", "provenance")
+
+
+def without_version(described: dict[str, Any], *, of_version_1: bool = False) -> dict[str, Any]:
+    """Return the description of a group without the version that wrote it, and what version 1 states otherwise."""
+    attributes, left_out = (
+        described.get("attributes", {}),
+        ("mauvecl", *(OTHERWISE_IN_VERSION_1 if of_version_1 else ())),
+    )
+    return described | {"attributes": {k: v for k, v in attributes.items() if k not in left_out}}
 
 
 def describe(study: Study, scenes: Sequence[StoredScene], folder: Path) -> None:
@@ -242,6 +249,7 @@ class Store:
     path: Path
     study: Study
     digests: dict[str, str] = field(default_factory=dict)  # of written chunks, by path
+    of_version_1: bool = False
     _listing: threading.Lock = field(default_factory=threading.Lock)
 
     def __post_init__(self) -> None:
@@ -277,7 +285,8 @@ class Store:
                 "restore the file of the correct one",
                 key="store",
             )
-        store = cls(path, Study.build(read_version(toml(text, path.name), path.name), path.name))
+        data = toml(text, path.name)
+        store = cls(path, Study.build(read_version(data, path.name), path.name), of_version_1="version" not in data)
         store.read_digests()
         return store
 

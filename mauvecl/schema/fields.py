@@ -169,7 +169,9 @@ class Range:
         schema: CoreSchema = core_schema.no_info_after_validator_function(self._check, inner)
         if not unit:
             # A number without a unit may be written in per cent.
-            schema = core_schema.no_info_before_validator_function(Unit("").plain, schema)
+            schema = core_schema.no_info_before_validator_function(
+                lambda value: Unit("").plain(value) if isinstance(value, str) else value, schema
+            )
         return _or_error(schema, self.words(unit, whole=int in (source, *get_args(source))), unit=unit)
 
     def __contains__(self, value: Any) -> bool:
