@@ -368,7 +368,7 @@ def stores(folder: Path) -> Answer:
 @golden(ITERATIVE)
 def answers_in_python(folder: Path) -> Answer:
     """Return answers that are not verbs of the command line."""
-    asked = Study().with_settings(
+    asked = Study().paper().with_settings(
         ['star=[{library="M3V", magnitude=9}]', "flare.amplitudes=[0.01]", "run.realisations=10000", "run.fap=0.01",
          'run.statistics=["matched"]']
     )  # fmt: skip
