@@ -23,14 +23,20 @@ def shipped_names() -> tuple[str, ...]:
     return tuple(sorted(file.name.removesuffix(".toml") for file in files if file.name.endswith(".toml")))
 
 
+def current_name(name: str) -> str:
+    """Return today's name of an embedded instrument, and warn if version 2 renamed it; return other names unchanged."""
+    if name not in FORMER_NAMES:
+        return name
+    warnings.warn(f"The instrument {name} is called {FORMER_NAMES[name]} since version 2.", stacklevel=2)
+    return FORMER_NAMES[name]
+
+
 def instrument_path(name: str | Path, folder: Path) -> Path:
     """Return the path of an embedded instrument or of a user's file, relative to `folder`."""
     if not isinstance(name, str | Path):
         raise InputError.of("instrument", name, "a name or the path of a TOML file")
     names = shipped_names()
-    if name in FORMER_NAMES:
-        warnings.warn(f"The instrument {name} is called {FORMER_NAMES[str(name)]} since version 2.", stacklevel=2)
-        name = FORMER_NAMES[str(name)]
+    name = current_name(name) if isinstance(name, str) else name
     if name in names:
         return _local(resources.files(__package__).joinpath("instruments", f"{name}.toml"))
     path = folder / name

@@ -72,6 +72,11 @@ def name_of_instrument(study: Study) -> str:
     return "Mauve" if study.observation.instrument in shipped_names() else Path(study.observation.instrument).stem
 
 
+def first_of(number: int, name: str) -> str:
+    """Return the end of a sentence on the first of several things, as in ", the first of 3 limits", or nothing."""
+    return f", the first of {number} {name}" if number > 1 else ""
+
+
 #: End of a sentence on the ideal answer, which is a bound of the realistic one.
 IF_KNOWN = "if everything but the noise were known"
 

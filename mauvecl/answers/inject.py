@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, name_of_instrument, share_columns
+from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, first_of, name_of_instrument, share_columns
 from mauvecl.detection.distributions import Interval
 from mauvecl.device.engine import Stares
 from mauvecl.flares.frames import STEADY, Components
@@ -22,7 +22,7 @@ from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import INTERVAL, Column, View, interval, number, percent, table_of
 from mauvecl.schema.errors import InputError, Message
 from mauvecl.schema.physical import DAY_S
-from mauvecl.search.completeness import InjectedCompleteness
+from mauvecl.search.completeness import SMALL, InjectedCompleteness, frame_signal
 from mauvecl.search.false_alarms import CountedRate, SampledRate, consecutive_alarm_rate, sampled_rate
 from mauvecl.search.flare_fits import SingleFlareFit
 from mauvecl.search.injections import FitAccuracy, Injections, Refit
@@ -341,7 +341,7 @@ class InjectAnswer(Answer):
         scale, unit = (100, "%") if star.sizes.of == "amplitude" else (1, unit)
         of = star.sizes.of.replace("_", " ")
         ideal = "" if np.isnan(star.ideal_share) else f"; {scale * half.value * star.ideal_share:.3g} {IF_KNOWN}"
-        least = f", the first of {len(self.stars)} cases" if len(self.stars) > 1 else ""
+        least = first_of(len(self.stars), "cases")
         if not np.isfinite(half.value):
             return f"Fewer than half of the injected flares on {star.title} are found at any {of}{least}."
         return (
@@ -464,9 +464,8 @@ def _ideal_share(case: Case, star: StarSurvey) -> float:
     if not any(case.stare.jitters.values()):
         return float("nan")
     frame = case.one_frame
-    own = frame.flare_electrons((case.study.flare.temperature_k,))[0] * star.quiet.gain_dn_per_electron
-    used = ~star.quiet.saturated
-    known = float(np.sqrt(np.sum(own[used] ** 2 / star.quiet.unsaturated_variance_dn2[used])))
+    (flare,) = frame.expect(frame.flaring(SMALL))
+    known = frame_signal(star.quiet, flare, SMALL)
     return star.unit_snr / known if known > 0 else float("nan")
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf, name_of_instrument, share_columns
+from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf, first_of, name_of_instrument, share_columns
 from mauvecl.answers.closed_forms import Cost, cost_lines, describe_shares, draw_columns, marginal_lines, unknown_cost
 from mauvecl.answers.limit_search import LimitSearch, MarginalLimitSearch, Point, Unknown, settle, single_flares
 from mauvecl.detection.distributions import Interval
@@ -293,7 +293,7 @@ class LimitAnswer(Answer):
         flare = "flares" if asked.of == "amplitude" else f"a flare of {100 * limit.amplitude:g} %"
         within = "" if asked.of == "exposure" else f" in {self.study.observation.exposure_s:g} s"
         ideal = "" if np.isnan(limit.ideal) else f"; {number(limit.ideal)} {IF_KNOWN}"
-        least = f", the first of {len(self.limits)} limits" if len(self.limits) > 1 else ""
+        least = first_of(len(self.limits), "limits")
         return (
             f"{name_of_instrument(self.study)} would see {flare} on {full_label(limit.star, limit.at)}{within} with a "
             f"chance of {100 * asked.power:g} % {before} {number(limit.value.value)} "

@@ -293,7 +293,8 @@ class PlanAnswer(Answer):
         study = self.study
         if study.plan.completeness == "closed form" and (study.stare.has_unknowns or study.nuisances.usual):
             text = (
-                "FALSE ALARMS may be more than stated: the closed form takes the stare for known, and it has unknowns; "
+                "FALSE ALARMS may be more than stated: the closed form marginalises over what is unknown in each "
+                "frame, and takes slower changes for known; "
                 "plan.completeness = 'injections' allows for them."
             )
             lines.append(Message(text, "false alarms"))

@@ -21,7 +21,15 @@ from mauvecl.host.stars.library import nearest_spectrum
 from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool
 from mauvecl.schema.errors import InputError
-from mauvecl.search.completeness import PER_DECADE, Completeness, DurationLaw, Yield, frame_signal, recovered_per_day
+from mauvecl.search.completeness import (
+    PER_DECADE,
+    SMALL,
+    Completeness,
+    DurationLaw,
+    Yield,
+    frame_signal,
+    recovered_per_day,
+)
 from mauvecl.search.templates import frame_nuisances
 from mauvecl.study.cases import Case
 from mauvecl.study.plan import PlanTarget
@@ -81,10 +89,6 @@ class OrbitConditions:
         orbit = self.temperature_c[first : first + int(np.ceil(orbit_s / step))] - mean
         swing = tuple((float((n + 0.5) * step), float(value)) for n, value in enumerate(orbit))
         return Conditions(mean, swing, float(self.hits_per_cm2_s[seen].mean()))
-
-
-#: Amplitude of the flare from which the signal per amplitude follows; its own photon noise is neglected.
-SMALL = 0.01
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
-from mauvecl.answers.answer import Answer, InCell, TableOf, realisations_of, reported
+from mauvecl.answers.answer import Answer, InCell, TableOf, first_of, realisations_of, reported
 from mauvecl.detection.snr import COLUMNS
 from mauvecl.device.engine import Engine
 from mauvecl.host.exposure.expectation import BUDGET_COLUMNS
@@ -98,7 +98,7 @@ class ExposureAnswer(Answer):
     def headline(self) -> str:
         """The exposure of the first star."""
         first = self.exposures[0]
-        least = f", the first of {len(self.exposures)} stars" if len(self.exposures) > 1 else ""
+        least = first_of(len(self.exposures), "stars")
         return (
             f"{first.star} reaches an S/N of {first.wanted:g} per {first.per} at {first.wavelength_nm:g} nm in "
             f"{first.exposure_s:g} s, {first.frames} frame{'' if first.frames == 1 else 's'}{least}."
@@ -243,7 +243,7 @@ def _best(title: str, x: Expectation, number: int) -> str:
     at = float(x.wavelength_nm[x.element == int(np.argmax(each))].mean())
     saturated = int(x.saturated.sum())
     without = f"; {saturated} of {x.saturated.size} pixels saturate" if saturated else ""
-    least = f", the first of {number} cases" if number > 1 else ""
+    least = first_of(number, "cases")
     return (
         f"{title} has an S/N of up to {each.max():.3g} per element of 10.5 nm in {x.exposure_s:g} s, at {at:.0f} nm"
         f"{without}{least}."

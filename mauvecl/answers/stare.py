@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from mauvecl.answers.answer import Answer, InCell, TableOf, reported
+from mauvecl.answers.answer import Answer, InCell, TableOf, first_of, reported
 from mauvecl.answers.inject import survey_star
 from mauvecl.device.engine import Stares
 from mauvecl.flares.energies import Kind
@@ -376,13 +376,14 @@ class StareAnswer(Answer):
         """The number of flares that the search of the first stare finds, or what is drawn."""
         stare = self.stares[0]
         frames, flares = stare.staring.stare.n_frames, len(stare.flares)
-        least = f" (the first of {len(self.stares)} stares)" if len(self.stares) > 1 else ""
-        drawn = f"{flares} flare{'' if flares == 1 else 's'} in {frames} frames of {stare.title}"
+        least = first_of(len(self.stares), "stares")
+        drawn = f"flare{'' if flares == 1 else 's'} in {frames} frames of {stare.title}"
         if not isinstance(stare.search, SearchResult):
-            return f"{drawn[0].upper()}{drawn[1:]} are drawn and not searched for{least}."
+            return f"The stare has {flares} {drawn}, which are not searched for{least}."
         found = len({flare.event for flare in stare.found if flare.event})
-        others = sum(not flare.event for flare in stare.found)
-        return f"The search finds {found} of the {drawn}, and {others} that are none{least}."
+        false = sum(not flare.event for flare in stare.found)
+        alarms = f"{false or 'no'} false alarm{'' if false == 1 else 's'}"
+        return f"The search finds {found} of {flares} {drawn} and raises {alarms}{least}."
 
     @property
     def views(self) -> list[View]:

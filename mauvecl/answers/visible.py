@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.answers.answer import Answer, TableOf
+from mauvecl.answers.answer import Answer, TableOf, first_of
 from mauvecl.host import VERSION
 from mauvecl.host.orbit.geometry import Bodies, TimeGrid
 from mauvecl.host.orbit.orbit import Target
@@ -197,7 +197,7 @@ class VisibleAnswer(Answer):
     def headline(self) -> str:
         """The hours in which the first target is seen."""
         row = self._row(0)
-        least = f", the first of {len(self.targets)} targets" if len(self.targets) > 1 else ""
+        least = first_of(len(self.targets), "targets")
         if not row["hours"]:
             return f"{row['target']} is not seen in {self.times.days:g} days from {self.times.iso(0.0)[:10]}{least}."
         return (

@@ -200,6 +200,10 @@ def _search_threshold(false_alarms_per_day: float, bank: Bank) -> float:
     return float(optimize.brentq(over, *THRESHOLDS, xtol=1e-9))
 
 
+#: Amplitude of the flare from which the signal per amplitude follows; its own photon noise is neglected.
+SMALL = 0.01
+
+
 def frame_signal(
     quiet: Expectation,
     flare: Expectation,

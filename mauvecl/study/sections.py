@@ -10,6 +10,7 @@ from pydantic import Field, create_model, field_validator, model_validator
 
 from mauvecl.detection.names import DEFAULT_STATISTICS, RECOMMENDED, STATISTIC_NAMES
 from mauvecl.host.exposure import DEFAULT_SKY
+from mauvecl.host.instrument.paths import current_name
 from mauvecl.host.stars.library import ALIASES, listed_values
 from mauvecl.noise.disturbances import Prior, PriorField
 from mauvecl.noise.unknowns import INSTRUMENT_VALUES, values_of
@@ -418,6 +419,11 @@ class Observation(Section):
     changes: Annotated[dict[str, float | int | str], Help("Changed values of the instrument, by name")] = Field(
         default_factory=dict
     )
+
+    @field_validator("instrument")
+    @classmethod
+    def _current_name(cls, given: str) -> str:
+        return current_name(given)
 
     def load_instrument(self) -> Instrument:
         """Load the instrument and apply `changes` and the detector temperature."""
