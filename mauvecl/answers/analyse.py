@@ -285,9 +285,9 @@ EVENTS = (
     Column("ed_low_95", lambda row: row.fitted_s[3], "s", "lower end of its 95 % interval"),
     Column("ed_high_95", lambda row: row.fitted_s[4], "s", "upper end"),
     Column("ed_rec", "event.energy.summed_s", "s", "equivalent duration in the frames of the event: sum of the flux "
-           "above the level, relative to the level at the peak", "ED in frames (s)", number(".4g")),
+           "above the level, relative to the level at the peak", "ED in frames (s)", number(".4g"), detail=True),
     Column("ed_rec_err", "event.energy.summed_error_s", "s", "its standard error, with that of the level", "error (s)",
-           number(".2g")),
+           number(".2g"), detail=True),
     Column("ed_rec_limit", "event.is_limit", "", "whether it is a lower limit, because a gap or an end cuts the flare",
            kind=bool),
     Column("ed_fit", lambda row: row.fitted_s[0], "s", "the same as ed, by its older name"),
@@ -295,7 +295,7 @@ EVENTS = (
     Column("ed_fit_high", lambda row: row.fitted_s[2], "s", "the same as ed_high"),
     Column("shape", "event.energy.shape", "", "shape of the flares that fits best", kind=str),
     Column("half_width", lambda row: row.event.energy.flares[0].half_width_s, "s",
-           "t_1/2 of the largest flare fitted to it; nan: none", "half-width (s)", number(".3g")),
+           "t_1/2 of the largest flare fitted to it; nan: none", "half-width (s)", number(".3g"), detail=True),
     Column("components", lambda row: len(row.event.energy.flares), "", "flares fitted together", kind=int),
     Column("value", "event.value", "", "statistic of the search: S/N of the best template", "S/N", number(".4g")),
     Column("rate_normal", lambda row: row.rates[0], "1 / d", "false alarms per star-day above this statistic in "
@@ -521,8 +521,8 @@ class AnalyseAnswer(Answer):
         more = f", and {others} more event{'' if others == 1 else 's'} listed" if others else ""
         expected = self.analysis.wanted * self.analysis.days
         return (
-            f"{flares} detected in {self.analysis.days:.3g} star-days of {self.analysis.frames.name}, where noise "
-            f"alone gives {expected:.2g}{more}."
+            f"{flares} detected in {self.analysis.days:.3g} star-days of {self.analysis.frames.name}, where "
+            f"{expected:.2g} are expected from noise alone{more}."
         )
 
     @property
