@@ -611,6 +611,8 @@ def _elements(instrument: Instrument) -> tuple[NDArray[np.int32], Float]:
 
 #: Fraction of exposures with a clipped frame from which a message reports it.
 REPORTED_CLIPPING = 1e-4
+#: Largest number of runs of saturated pixels that a message names one by one.
+MOST_RUNS = 3
 
 
 def _saturation(x: Expectation) -> tuple[str, ...]:
@@ -619,29 +621,26 @@ def _saturation(x: Expectation) -> tuple[str, ...]:
     touched = float(-np.expm1(x.n_frames * np.sum(np.log1p(-np.minimum(cut, 1 - 1e-16)))))
     if not x.saturated.any() and touched < REPORTED_CLIPPING:
         return ()
-    brightest = int(np.argmax(x.mean_raw_dn))
     safe = x.longest_safe_frame_s
     # Rounded down, so that the reported length is safe.
     safe_s = np.floor(safe * 1000) / 1000
     flares = [text for text in x.provenance.get("source history", "").split("; ") if text.startswith("flare")]
     name = f"{x.name} with a {flares[-1].removesuffix(', added')}" if flares else x.name
-    advice = (
-        f"the longest safe frame is {safe_s:g} s (brightest pixel at {x.wavelength_nm[brightest]:.1f} nm, dark and "
-        "bias included)"
-    )
-    often = (
-        f"frames are cut off there: {cut.sum():.3g} pixels of a frame on average, at least one in "
-        f"{100 * touched:.3g} % of exposures (closed form)"
-    )
     if not x.saturated.any():
-        text = f"SATURATED at times: pixels of {name} come near {x.ceiling_dn:.0f} DN, and {often}."
+        text = (
+            f"SATURATED at times: pixels of {name} come near {x.ceiling_dn:.0f} DN, and reach it in "
+            f"{100 * touched:.3g} % of exposures; in frames of up to {safe_s:g} s none does on average."
+        )
         return (Message(text, "saturated"),)
     # First and last wavelength of each run of saturated pixels.
     steps = np.flatnonzero(np.diff(np.concatenate([[0], x.saturated.astype(np.int8), [0]])))
     runs = [f"{x.wavelength_nm[a]:.1f}-{x.wavelength_nm[b - 1]:.1f}" for a, b in steps.reshape(-1, 2)]
+    where = ", ".join(runs)
+    if len(runs) > MOST_RUNS:
+        where = f"{len(runs)} intervals between {runs[0].partition('-')[0]} and {runs[-1].partition('-')[2]}"
     text = (
-        f"SATURATED: {int(x.saturated.sum())} of {x.saturated.size} pixels at {', '.join(runs)} nm reach "
-        f"{x.ceiling_dn:.0f} DN in a {x.frame_s:g} s frame of {name}; {advice}; {often}."
+        f"SATURATED: {int(x.saturated.sum())} of {x.saturated.size} pixels of {name} at {where} nm reach "
+        f"{x.ceiling_dn:.0f} DN in a {x.frame_s:g} s frame; the longest safe frame is {safe_s:g} s."
     )
     return (Message(text, "saturated"),)
 
