@@ -20,6 +20,7 @@ from mauvecl.host.exposure.response import Order, electrons_per_second, negative
 from mauvecl.host.exposure.sky import Sky
 from mauvecl.host.exposure.star import Neighbours
 from mauvecl.host.instrument.instrument import Instrument, LineSpread
+from mauvecl.host.instrument.paths import DEFAULT_INSTRUMENT
 from mauvecl.host.spectra.units import SPAN_NM
 from mauvecl.host.stars.coverage import check_covers, continued
 from mauvecl.schema.calls import validated
@@ -426,7 +427,7 @@ def _ratio(signal: Float, variance: Float) -> Float:
 @validated
 def expect(
     source: Source | str,
-    instrument: Instrument | str | Path,
+    instrument: Instrument | str | Path = DEFAULT_INSTRUMENT,
     *,
     exposure: Exposure,
     sky: Sky | SkyBrightness | None = None,
@@ -441,8 +442,8 @@ def expect(
     source : Source or str
         A source, which emits no light beyond its wavelengths, or a name of the library. A well-known star,
         such as AU Mic, has the V magnitude of the embedded list.
-    instrument : Instrument, str or Path
-        An instrument, or a name or file for `Instrument.load`.
+    instrument : Instrument, str or Path, optional
+        An instrument, or a name or file for `Instrument.load`; "mauve" by default.
     exposure : Quantity or float
         Exposure time, up to one day; plain numbers are seconds. It is rounded up to whole frames, with a message.
     sky : Sky, Quantity or float, optional

@@ -11,6 +11,8 @@ from pathlib import Path
 from mauvecl.host.tables.files import is_file
 from mauvecl.schema.errors import InputError, shortened
 
+#: Instrument where none is named.
+DEFAULT_INSTRUMENT = "mauve"
 #: Former names of embedded instruments, with those of version 2 and later.
 FORMER_NAMES = {"mauve-electrons": "mauve"}
 #: What "mauve" meant before version 2.

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mauvecl.answers.answer import Answer, TableOf
+from mauvecl.answers.verbs import by_keywords
 from mauvecl.fits.flare_model import FlareModel
 from mauvecl.fits.spectrum import Measurement
 from mauvecl.host.orbit.orbit import Orbit, Target
@@ -24,7 +25,6 @@ from mauvecl.observations.frame_model import FrameModel
 from mauvecl.observations.frames import Frames, Reason
 from mauvecl.observations.reduction import barycentric
 from mauvecl.observations.visits import flux_per_dn
-from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, View, interval, number, percent
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import DAY_S
@@ -568,7 +568,7 @@ def _orbit(study: Study, frames: Frames) -> Orbit | None:
     return study.orbit.orbit() if is_mauve or study.orbit.tle is not None else None
 
 
-@validated
+@by_keywords
 def analyse(
     study: Study,
     engine: Engine | Pool | None = None,
@@ -580,7 +580,7 @@ def analyse(
 
     Parameters
     ----------
-    study : Study
+    study : Study, optional
         Its sections `data` and `search`: `data.file` is read, `search.false_alarms` are allowed for a detection. With
         `data.barycentric` times become those at the Solar System's barycentre, by the satellite's orbit.
         Fainter events are candidates, down to one false alarm per star-day.

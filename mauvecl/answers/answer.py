@@ -12,6 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass
 from functools import cached_property
+from html import escape
 from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, overload
@@ -246,10 +247,15 @@ class Answer(Drawable, ContentEquality, ABC):
         return []
 
     def _line(self) -> str:
-        return f"to {self.study!r}"
+        return repr(self.headline) if self.headline else f"to {self.study!r}"
+
+    def __str__(self) -> str:
+        """Return what the command prints, without details."""
+        parts = [self.headline, *map(str, self.all_views), "Assumed:", *(f"  {clause}" for clause in self.premises)]
+        return "\n".join(part for part in (*parts, *self.messages, *self.remarks) if part)
 
     def _repr_html_(self) -> str:
-        return str(next(iter(self.tables.values()))._repr_html_())
+        return f"<p>{escape(self.headline)}</p>{next(iter(self.tables.values()))._repr_html_()}"
 
     def as_json(self) -> dict[str, Any]:
         """Return the content that `--json` prints."""

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer, TableOf, ecsv_text
+from mauvecl.answers.verbs import by_keywords
 from mauvecl.host.exposure.expectation import expect
 from mauvecl.host.instrument.curves import CALIBRATED, MODE, ThroughputErrors
 from mauvecl.host.instrument.instrument import FILE_VERSION, Instrument
@@ -33,7 +34,6 @@ from mauvecl.observations.detector import (
 from mauvecl.observations.frame_files import read_frames
 from mauvecl.observations.frames import Frames
 from mauvecl.observations.throughput import ERROR_KNOTS, ThroughputFit, fit_throughput
-from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, View, number, percent, table_of
 from mauvecl.schema.errors import InputError
 
@@ -475,7 +475,7 @@ class CalibrateAnswer(Answer):
         return out.getvalue()
 
 
-@validated
+@by_keywords
 def calibrate(
     study: Study,
     engine: Engine | Pool | None = None,
@@ -488,7 +488,7 @@ def calibrate(
 
     Parameters
     ----------
-    study : Study
+    study : Study, optional
         Its ``calibrate`` lists the observations, and its observation names the instrument from which the fit starts.
     engine, progress : optional
         Not used: nothing is drawn on a device.

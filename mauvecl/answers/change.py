@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, name_of_instrument, reported
+from mauvecl.answers.verbs import by_keywords
 from mauvecl.host.orbit.visibility import Visibility
 from mauvecl.observations.visits import (
     INDICES,
@@ -26,7 +27,6 @@ from mauvecl.observations.visits import (
     smallest_change,
     visit_times_d,
 )
-from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, View, formatted, number, percent
 from mauvecl.study.cases import Case, cases, collect_messages
 from mauvecl.study.plan import targets_of
@@ -277,7 +277,7 @@ class ChangeAnswer(Answer):
         return self.expectations
 
 
-@validated
+@by_keywords
 def change(
     study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
 ) -> ChangeAnswer:
@@ -285,7 +285,7 @@ def change(
 
     Parameters
     ----------
-    study : Study
+    study : Study, optional
         Its ``change`` gives the changes and the number of visits, ``run.fap`` and ``limit.power`` the probabilities,
         and ``nuisances`` the unknowns of each visit.
     engine : Engine or Pool, optional

@@ -33,6 +33,7 @@ from mauvecl.answers.closed_forms import (
     spoken,
     unknown_cost,
 )
+from mauvecl.answers.verbs import by_keywords
 from mauvecl.detection.detection import (
     AREA_COLUMNS,
     COLUMNS,
@@ -51,7 +52,6 @@ from mauvecl.detection.statistics import Linear, Matched, Setting, read_weights
 from mauvecl.detection.tails import campaign, per_test
 from mauvecl.device.engine import Engine
 from mauvecl.runs.pool import Pool, map_in_order
-from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, View, percent
 from mauvecl.schema.errors import InputError
 from mauvecl.study.cases import Case, amplitude_column, cases, collect_messages, star_column
@@ -235,7 +235,7 @@ class DetectAnswer(Answer):
         return {"paper": self.paper} | super().as_json()
 
 
-@validated
+@by_keywords
 def detect(
     study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
 ) -> DetectAnswer:
@@ -243,8 +243,21 @@ def detect(
 
     Parameters
     ----------
+    study : Study, optional
+        The paper's stars and flares by default.
+    engine : Engine or Pool, optional
+        By default that of the default device.
     progress : callable, optional
         Called as ``progress(done, total)`` in stars.
+    **keywords
+        Flags of the command, as in ``star="M4V"``, ``magnitude=11``: they change the study, or the default.
+
+    Examples
+    --------
+    >>> from mauvecl import detect
+    >>> answer = detect(star="G2V", magnitude=7.4, amplitude=0.24, exposure=50, realisations=100_000)
+    >>> answer.headline.partition(" with ")[0]
+    'Mauve would see a flare of 24 % on G2V V = 7.4 in 50 s'
     """
     # Invalid input raises an error before anything is drawn.
     run = study.run
@@ -393,9 +406,9 @@ def _wanted(asked: CampaignQuestion, tests: int, stack: int, seed: int) -> list[
 
 
 def _paper(prepared: Sequence[Case]) -> list[str]:
-    """Return the paper's G2V values with their reconstruction, if its star is among the cases."""
+    """Return the paper's G2V values with their reconstruction, if its star is observed with its conventions."""
     case = next((case for case in prepared if case.star == PAPER_STARS[1] and not case.at), None)
-    if case is None or case.study.observation.exposure_s != 50.0:
+    if case is None or case.study.observation.exposure_s != 50.0 or case.study != case.study.paper():
         return []
     lines = []
     for amplitude, flare in zip(case.amplitudes, case.flares, strict=True):

@@ -17,10 +17,10 @@ from scipy import special
 from mauvecl.answers.answer import Answer, TableOf, realisations_of
 from mauvecl.answers.detect import DetectAnswer, detect
 from mauvecl.answers.signal import SnrAnswer, snr
+from mauvecl.answers.verbs import by_keywords
 from mauvecl.detection.snr import steps_of
 from mauvecl.device.engine import Engine
 from mauvecl.noise.drawing import Cumulants
-from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, number, table_of
 from mauvecl.study.questions import formula_grid
 from mauvecl.study.sections import Observation
@@ -241,7 +241,7 @@ def _of_thresholds(tested: QTable, flares: QTable) -> dict[str, float | str]:
     }
 
 
-@validated
+@by_keywords
 def gaussian(
     study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
 ) -> GaussianAnswer:
@@ -249,7 +249,7 @@ def gaussian(
 
     Parameters
     ----------
-    study : Study
+    study : Study, optional
         Without a sweep: magnitudes from 4 to 12 and exposures of 5, 50 and 600 s, unless it states the magnitudes of
         its stars, or another exposure than the default. Its usual unknowns are left out: the question is about the
         noise.

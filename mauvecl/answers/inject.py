@@ -12,13 +12,13 @@ import scipy
 from numpy.typing import NDArray
 
 from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, first_of, name_of_instrument, share_columns
+from mauvecl.answers.verbs import by_keywords
 from mauvecl.detection.distributions import Interval
 from mauvecl.device.engine import Stares
 from mauvecl.flares.frames import STEADY, Components
 from mauvecl.flares.shapes import shape_of
 from mauvecl.flares.stare_scene import Arrays
 from mauvecl.runs.pool import Pool, map_in_order
-from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import INTERVAL, Column, View, interval, number, percent, table_of
 from mauvecl.schema.errors import InputError, Message
 from mauvecl.schema.physical import DAY_S
@@ -365,7 +365,7 @@ class InjectAnswer(Answer):
         return [star.surveyed.quiet for star in self.stars]
 
 
-@validated
+@by_keywords
 def inject(
     study: Study, engine: Stares | Pool | None = None, progress: Callable[[int, int], None] | None = None
 ) -> InjectAnswer:
@@ -373,7 +373,7 @@ def inject(
 
     Parameters
     ----------
-    study : Study
+    study : Study, optional
     engine : Stares or Pool, optional
         Simulator; by default that of the default device.
     progress : callable, optional

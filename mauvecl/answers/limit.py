@@ -14,6 +14,7 @@ import numpy as np
 from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf, first_of, name_of_instrument, share_columns
 from mauvecl.answers.closed_forms import Cost, cost_lines, describe_shares, draw_columns, marginal_lines, unknown_cost
 from mauvecl.answers.limit_search import LimitSearch, MarginalLimitSearch, Point, Unknown, settle, single_flares
+from mauvecl.answers.verbs import by_keywords
 from mauvecl.detection.distributions import Interval
 from mauvecl.detection.names import RECOMMENDED, check_fap
 from mauvecl.device.engine import Engine
@@ -397,7 +398,7 @@ def _ideal(case: Case, statistic: str, near: float) -> float:
         return float("nan")
 
 
-@validated
+@by_keywords
 def limit(
     study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
 ) -> LimitAnswer:
@@ -407,7 +408,7 @@ def limit(
 
     Parameters
     ----------
-    study : Study
+    study : Study, optional
         Its ``limit`` defines the quantity (magnitude, amplitude or exposure) and the power.
     progress : callable, optional
         Called as ``progress(done, total)`` in steps, `STEPS` for each limit.

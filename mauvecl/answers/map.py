@@ -21,11 +21,11 @@ from mauvecl.answers.closed_forms import (
     shares,
     unknown_cost,
 )
+from mauvecl.answers.verbs import by_keywords
 from mauvecl.detection.distributions import Interval
 from mauvecl.detection.names import RECOMMENDED, check_fap
 from mauvecl.device.engine import Engine
 from mauvecl.runs.pool import Pool, map_in_order
-from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, View, table_of
 from mauvecl.schema.errors import InputError, Message, of_kind
 from mauvecl.study.cases import (
@@ -163,7 +163,7 @@ class MapAnswer(Answer):
         return [] if self.quiet is None else [self.quiet]
 
 
-@validated
+@by_keywords
 def map(
     study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
 ) -> MapAnswer:
@@ -171,7 +171,7 @@ def map(
 
     Parameters
     ----------
-    study : Study
+    study : Study, optional
         Its ``map`` defines the axes; other quantities have the study's values.
     progress : callable, optional
         Called as ``progress(done, total)`` in cells.

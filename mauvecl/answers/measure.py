@@ -23,6 +23,7 @@ from mauvecl.answers.measurements import (
     matched_filter,
     measured_stare,
 )
+from mauvecl.answers.verbs import by_keywords
 from mauvecl.detection.distributions import Interval, clopper_pearson
 from mauvecl.detection.nuisances import join_names
 from mauvecl.device.engine import Engine
@@ -32,7 +33,6 @@ from mauvecl.fits.time_course import MeasuredBins
 from mauvecl.noise.scene import FactorDistributions
 from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool, map_in_order
-from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, View, number, percent, table_of
 from mauvecl.schema.errors import InputError
 from mauvecl.study.cases import Case, amplitude_column, cases, collect_messages
@@ -260,7 +260,7 @@ class MeasureAnswer(Answer):
         return list({id(flare.quiet): flare.quiet for flare in self.flares}.values())
 
 
-@validated
+@by_keywords
 def measure(
     study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
 ) -> MeasureAnswer:
@@ -268,7 +268,7 @@ def measure(
 
     Parameters
     ----------
-    study : Study
+    study : Study, optional
     engine : Engine or Pool, optional
         Simulator of the exposures; by default that of the default device. The checkpoint of a pool keeps finished fits.
     progress : callable, optional

@@ -25,11 +25,11 @@ from mauvecl.answers.plan_targets import (
     rates_of,
     star_of,
 )
+from mauvecl.answers.verbs import by_keywords
 from mauvecl.answers.visible import VisibleAnswer, assumption_columns, visible
 from mauvecl.device.engine import Stares
 from mauvecl.host.orbit.visibility import PARTICLES_SOURCE, THERMAL_SOURCE
 from mauvecl.runs.pool import map_in_order
-from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, number, percent, records
 from mauvecl.schema.errors import InputError, Message, of_kind, printable
 from mauvecl.schema.physical import DAY_S
@@ -315,7 +315,7 @@ def _measured(target: Planned) -> str:
     )
 
 
-@validated
+@by_keywords
 def plan(
     study: Study,
     engine: Stares | Pool | None = None,
@@ -327,7 +327,7 @@ def plan(
 
     Parameters
     ----------
-    study : Study
+    study : Study, optional
         Its ``plan`` defines the targets, its ``orbit`` time and position.
     engine : Stares or Pool, optional
         Simulator of injections; by default that of the default device. The checkpoint of a pool keeps finished targets.

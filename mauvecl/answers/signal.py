@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 
 from mauvecl.answers.answer import Answer, InCell, TableOf, first_of, realisations_of, reported
+from mauvecl.answers.verbs import by_keywords
 from mauvecl.detection.snr import COLUMNS
 from mauvecl.device.engine import Engine
 from mauvecl.host.exposure.expectation import BUDGET_COLUMNS
@@ -125,7 +126,7 @@ def place_of(x: Expectation, wavelength_nm: float, per: Per) -> int:
     return int(x.element[pixel]) if per == "element" else pixel
 
 
-@validated
+@by_keywords
 def exposure(
     study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
 ) -> ExposureAnswer:
@@ -136,7 +137,7 @@ def exposure(
 
     Parameters
     ----------
-    study : Study
+    study : Study, optional
         Its ``signal`` gives S/N and wavelength; its exposure is not used.
     engine : Engine or Pool, optional
         Not used: nothing is drawn.
@@ -320,7 +321,7 @@ class SimulateAnswer(Answer):
         return list(self.pictures.values())[number](path, ax=ax)
 
 
-@validated
+@by_keywords
 def simulate(
     study: Study,
     engine: Engine | Pool | None = None,
@@ -333,7 +334,7 @@ def simulate(
 
     Parameters
     ----------
-    study : Study
+    study : Study, optional
         Its usual unknowns are left out: the question is about the noise.
     engine : Engine or Pool, optional
         Not used: the NumPy reference implementation draws.
@@ -424,7 +425,7 @@ class SnrAnswer(Answer):
         ]
 
 
-@validated
+@by_keywords
 def snr(
     study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
 ) -> SnrAnswer:
@@ -432,7 +433,7 @@ def snr(
 
     Parameters
     ----------
-    study : Study
+    study : Study, optional
         Its usual unknowns are left out: the question is about the noise.
     progress : callable, optional
         Called as ``progress(done, total)`` in stars.

@@ -21,6 +21,7 @@ from scipy.interpolate import CubicSpline
 
 from mauvecl.answers.answer import Answer, InCell, TableOf, first_of, reported
 from mauvecl.answers.inject import survey_star
+from mauvecl.answers.verbs import by_keywords
 from mauvecl.device.engine import Stares
 from mauvecl.flares.energies import Kind
 from mauvecl.flares.frames import Draw, LightCurves, StareExpectation, draw_light_curves
@@ -29,7 +30,6 @@ from mauvecl.host import VERSION
 from mauvecl.host.exposure.sky import parse_position, parse_time
 from mauvecl.host.tables.units import offline
 from mauvecl.runs.checkpoint import Checkpoint, kept
-from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, View, number, percent, table_of
 from mauvecl.schema.errors import InputError, Message
 from mauvecl.schema.physical import DAY_S
@@ -433,7 +433,7 @@ class StareAnswer(Answer):
         )
 
 
-@validated
+@by_keywords
 def stare(
     study: Study,
     engine: Stares | None = None,
@@ -445,7 +445,7 @@ def stare(
 
     Parameters
     ----------
-    study : Study
+    study : Study, optional
         Its section `stare`, `events`, star, flare, sky, observation; `run.seed` and `stare.number` select the stare.
     engine : Stares, optional
         Simulator; by default that of the default device.

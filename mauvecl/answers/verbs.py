@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import inspect
+import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
+from difflib import get_close_matches
+from functools import wraps
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+
+from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Mapping
 
+    from mauvecl.study.keywords import Keyword
     from mauvecl.study.study import Study
 
     #: Function of a command's flags that returns the study where no file is given.
@@ -94,8 +102,48 @@ class Verb:
 
     def accepts(self, key: str) -> bool:
         """Return whether the command has the flags of a key or section of the study."""
-        taken = (key for key in (*self.observation, *self.takes) if key != self.without)
-        return key != self.without and any(key == prefix or key.startswith(f"{prefix}.") for prefix in taken)
+        return key != self.without and any(key == prefix or key.startswith(f"{prefix}.") for prefix in self.keys)
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Keys and sections of the study that the verb takes, in the order of `--help-all`."""
+        return tuple(key for key in (*self.observation, *self.takes) if key != self.without)
+
+    def study_of(
+        self, given: dict[str, Any], keywords: Mapping[str, Keyword], study: Study | None, where: str
+    ) -> tuple[Study, list[str]]:
+        """Return the study that keywords ask for, with messages on what they do not state.
+
+        Parameters
+        ----------
+        given : dict
+            Value of each keyword, or None; also ``paper``, and ``set``, texts of any keys.
+        keywords : mapping
+            Keywords of the verb.
+        study : Study or None
+            Study that keywords change; without one, the verb's default.
+        where : str
+            Origin of the keywords, for messages.
+        """
+        from mauvecl.study.keywords import changes_of, stars_of
+        from mauvecl.study.study import Study
+
+        own = study is not None
+        if study is None:
+            for name, keyword in keywords.items():
+                if given[name] is None:
+                    given[name] = (self.defaults or {}).get(f"{keyword.section}.{keyword.key}")
+            study = self.default(given) if self.default else Study()
+        if given.get("paper"):
+            study = study.paper()
+        stars = stars_of(study.star, given, keywords, own=own)
+        study = study.with_changes(changes_of(given, keywords, study.nuisances), stars, where)
+        if given.get("set"):
+            study = study.with_settings(given["set"], "--set")
+        # A map would sample the tail of each cell, which takes longer than more realisations.
+        if own or self.counts == "cells" or given.get("tails", study) is not None:
+            return study, []
+        return study.with_enough_tails()
 
     @property
     def ask(self) -> Callable[..., Any]:
@@ -397,3 +445,61 @@ VERBS: dict[str, Verb] = {
         ),
     )
 }
+
+
+Answered = TypeVar("Answered", covariant=True)
+
+
+class Question(Protocol[Answered]):
+    """Function of a verb, which takes a study or the keywords of one."""
+
+    def __call__(
+        self,
+        study: Study | None = None,
+        engine: Any = None,
+        progress: Callable[[int, int], None] | None = None,
+        **keywords: Any,
+    ) -> Answered: ...
+
+
+def by_keywords(function: Callable[..., Answered]) -> Question[Answered]:
+    """Let the function of a verb take keywords, named as the flags of its command, and validate its arguments.
+
+    Keywords change the study if there is one, and otherwise the verb's default. ``ideal=True`` asks with everything
+    known but the noise, and ``paper=True`` with the conventions of the MauveSim paper.
+    """
+    from mauvecl.schema.calls import validated
+
+    checked = validated(function)
+    checks = vars(checked)["__validated__"]
+
+    @wraps(checked)
+    def ask(study: Any = None, *arguments: Any, **keywords: Any) -> Any:
+        own = {key: keywords.pop(key) for key in tuple(keywords) if key in checks}
+        if study is None or keywords:
+            study = _study_of(VERBS[function.__name__], study and checks["study"](study), keywords)
+        return checked(study, *arguments, **own)
+
+    study, *others = inspect.signature(function).parameters.values()
+    keywords = inspect.Parameter("keywords", inspect.Parameter.VAR_KEYWORD, annotation=Any)
+    vars(ask)["__signature__"] = inspect.Signature([study.replace(default=None), *others, keywords])
+    return ask
+
+
+def _study_of(verb: Verb, study: Study | None, given: dict[str, Any]) -> Study:
+    """Return the study that keywords of Python ask for."""
+    from mauvecl.study.keywords import Keyword
+    from mauvecl.study.study import keys_of
+
+    keywords = {flag.parameter: Keyword.of(*entry) for entry in keys_of(verb.keys) for flag in entry[2:]}
+    known = [*keywords, "paper", "ideal"]
+    for name in given.keys() - known:
+        close = get_close_matches(name, known, n=3) or known
+        raise InputError(f"{verb.name}() has no keyword {name!r}", f"a flag of the command, such as {', '.join(close)}")
+    if given.pop("ideal", False):
+        given["with_unknowns"] = False
+    values = {name: keyword.listed(given.get(name)) for name, keyword in keywords.items()}
+    asked, messages = verb.study_of(values | {"paper": given.get("paper", False)}, keywords, study, f"{verb.name}()")
+    for message in messages:
+        warnings.warn(message, stacklevel=3)
+    return asked

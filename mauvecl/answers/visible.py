@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer, TableOf, first_of
+from mauvecl.answers.verbs import by_keywords
 from mauvecl.host import VERSION
 from mauvecl.host.orbit.geometry import Bodies, TimeGrid
 from mauvecl.host.orbit.orbit import Target
 from mauvecl.host.orbit.visibility import Visibility, Windows, elongation_deg, zodiacal_light
-from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, View, percent, table_of
 from mauvecl.schema.physical import DAY_S
 from mauvecl.study.plan import targets_of
@@ -374,7 +374,7 @@ class VisibleAnswer(Answer):
         return f"the limit of {alone[0].replace('_', ' ')}{value} alone leaves nothing"
 
 
-@validated
+@by_keywords
 def visible(
     study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
 ) -> VisibleAnswer:
@@ -382,7 +382,7 @@ def visible(
 
     Parameters
     ----------
-    study : Study
+    study : Study, optional
         Its ``orbit`` defines position, time and limits.
     engine : Engine or Pool, optional
         Not used: nothing is drawn.

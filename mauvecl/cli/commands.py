@@ -23,13 +23,11 @@ from mauvecl.cli.flags import (
     QuietFlag,
     SetFlag,
     StudyFile,
-    StudyFlag,
     as_text,
     holds_study,
     is_star,
     output_flag,
     study_flags,
-    study_of,
     warn_of_percent,
 )
 from mauvecl.cli.help import HELP_ALL
@@ -39,6 +37,7 @@ if TYPE_CHECKING:
     from mauvecl.cli.invocation import Session
     from mauvecl.runs.store import Store
     from mauvecl.schema.columns import Column
+    from mauvecl.study.keywords import Keyword
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,8 +59,7 @@ class Command:
     def build(self) -> Callable[..., None]:
         """Return the function that typer calls."""
         verb = self.verb
-        keys = (key for key in (*verb.observation, *verb.takes) if key != verb.without)
-        flags = study_flags(*keys, defaults=verb.defaults or {})
+        flags = study_flags(*verb.keys, defaults=verb.defaults or {})
         kinds = get_type_hints(self.run, localns={"Session": Any}, include_extras=True)
         _, *own = inspect.signature(self.run).parameters.values()
         named, observes = inspect.Parameter.KEYWORD_ONLY, verb.accepts("observation.instrument")
@@ -100,26 +98,20 @@ class Command:
         return command
 
     def _call(
-        self, study_file: Path | None, flags: dict[str, StudyFlag], values: dict[str, Any], *, tells_flags: bool
+        self, study_file: Path | None, flags: dict[str, Keyword], values: dict[str, Any], *, tells_flags: bool
     ) -> None:
         """Run the command with the values of all its options."""
-        from mauvecl.cli.invocation import Session, question_time, question_values, with_enough_tails
+        from mauvecl.cli.invocation import Session, question_time, question_values
+        from mauvecl.study.study import Study
 
-        verb, defaults = self.verb, self.verb.defaults or {}
+        verb = self.verb
         given = {key: values.pop(key, None) for key in (*flags, "set", "paper")}
         study_file = _placed(study_file, given)
-        if study_file is None:
-            for flag in flags.values():
-                if given[flag.name] is None:
-                    given[flag.name] = defaults.get(f"{flag.section}.{flag.key}")
         how = {key: values.pop(key, usual) for key, (_, usual) in self._options().items()}
         if tells_flags:
             values["given"] = given
-        study = study_of(study_file, given, flags, verb.default)
-        messages: list[str] = []
-        # A map would sample the tail of each cell, which takes longer than more realisations.
-        if study_file is None and verb.counts != "cells" and "tails" in flags and given["tails"] is None:
-            study, messages = with_enough_tails(study)
+        own = None if study_file is None else Study.read(study_file)
+        study, messages = verb.study_of(given, flags, own, "command line")
         question_values(study, detects={"fap", "realisations"} <= flags.keys())
         if self.draws:
             question_time(study, insist=how["insist"])

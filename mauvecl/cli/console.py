@@ -337,10 +337,9 @@ def show_view(view: View, *, wide: bool = True) -> bool:
         show([view.title])
         return False
     headings, cells = without_empty(*view.texts())
-    details = {column.name for column in view.columns if column.detail and column.heading}
-    left_out = not wide and bool(details) and _width(headings, cells, range(len(headings))) > _room()
+    left_out = not wide and bool(view.details) and _width(headings, cells, range(len(headings))) > _room()
     if left_out:
-        headings, cells = without_empty(*view.texts(details))
+        headings, cells = without_empty(*view.texts(view.details))
     show_table(view.title, headings, cells, wide=wide)
     return left_out
 
@@ -445,10 +444,10 @@ def _commands() -> Iterator[Any]:
 
 def _flags(name: str, command: Any, *, off: bool = False) -> list[str]:
     """Return the flags that set a parameter or a key of the study, or turn it off, the long one first."""
-    from mauvecl.study.study import keys_with_flags
+    from mauvecl.study.study import keys_of
 
     # If a key has several flags, the last takes its value unchanged.
-    parameters = {key: flag.parameter for key, _, flag in keys_with_flags()}
+    parameters = {key: flag.parameter for key, _, flag in keys_of()}
     wanted = {name} | {parameter for key, parameter in parameters.items() if f".{key}".endswith(f".{name}")}
     for parameter in command.params:
         if parameter.name in wanted:

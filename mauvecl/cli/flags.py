@@ -3,25 +3,24 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from types import NoneType, UnionType
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
+from types import NoneType
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin
 
 import typer
 
 from mauvecl.cli.completion import OF_KEYS, complete_study
-from mauvecl.schema.fields import Flag, Help, Unit, as_typed, first, is_measure, unit_of
-from mauvecl.schema.parsing import assignment, count, number, refusal, several
-from mauvecl.schema.physical import SkyBrightness
+from mauvecl.schema.fields import Flag, Help, Unit, as_typed, first, is_measure
+from mauvecl.schema.parsing import count, number, refusal, several
 
 if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
 
-    from mauvecl.study.study import Study
+    from mauvecl.study.keywords import Keyword
 
 StudyFile = Annotated[
     Path | None,
@@ -53,23 +52,8 @@ PaperFlag = Annotated[
 ]
 
 
-class StudyFlag(NamedTuple):
-    """Flag of the command line, and the key of the study that it sets."""
-
-    name: str  # name of the parameter
-    kind: Any
-    section: str
-    key: str
-    read: Callable[[Any, str], Any] | None
-    unit: str  # of the key, in astropy's notation
-
-    def value(self, given: Any) -> Any:
-        """Convert the value of the flag to that of the key."""
-        return self.read(given, "--" + self.name.replace("_", "-")) if self.read else given
-
-
-def study_flags(*keys: str, defaults: Mapping[str, Any]) -> dict[str, StudyFlag]:
-    """Return the flags of keys and of whole sections, by the names of their parameters.
+def study_flags(*keys: str, defaults: Mapping[str, Any]) -> dict[str, Keyword]:
+    """Return keywords whose types have the options of the command line, by the names of their parameters.
 
     Parameters
     ----------
@@ -79,26 +63,21 @@ def study_flags(*keys: str, defaults: Mapping[str, Any]) -> dict[str, StudyFlag]
         Defaults of a verb that differ from the study's, by key.
     """
     # `mauvecl --help` shows no flags, and starts twice as fast without importing the study.
-    from mauvecl.study.study import keys_with_flags
+    from mauvecl.study.keywords import Keyword
+    from mauvecl.study.study import keys_of
 
-    flags: dict[str, StudyFlag] = {}
-    for wanted in keys:
-        of_key = [entry for entry in keys_with_flags() if entry[0] == wanted or entry[0].startswith(f"{wanted}.")]
-        assert of_key, wanted
-        for path, field, flag in of_key:
-            section, _, key = path.rpartition(".")
-            kind, unit = flag.kind or _kind(field.annotation), (first(field, Unit) or Unit("")).name
-            option = typer.Option(
-                *flag.names,
-                help=_help(path, field, flag, kind, defaults),
-                show_default=False,
-                rich_help_panel=section.partition(".")[0].capitalize(),
-                autocompletion=OF_KEYS.get(path),
-                metavar={str: "TEXT", list[str]: "TEXT", Path: "FILE"}.get(kind),
-            )
-            flags[flag.parameter] = StudyFlag(
-                flag.parameter, Annotated[kind | None, option], section, key, flag.read, unit
-            )
+    flags: dict[str, Keyword] = {}
+    for path, field, flag in keys_of(keys):
+        keyword = Keyword.of(path, field, flag)
+        option = typer.Option(
+            *flag.names,
+            help=_help(path, field, flag, keyword.kind, defaults),
+            show_default=False,
+            rich_help_panel=path.partition(".")[0].capitalize(),
+            autocompletion=OF_KEYS.get(path),
+            metavar={str: "TEXT", list[str]: "TEXT", Path: "FILE"}.get(keyword.kind),
+        )
+        flags[keyword.name] = keyword._replace(kind=Annotated[keyword.kind | None, option])
     return flags
 
 
@@ -106,30 +85,6 @@ def option_of(key: str) -> Any:
     """Return the option of a key's flag, for a verb without a study."""
     (flag,) = study_flags(key, defaults={}).values()
     return get_args(flag.kind)[1]
-
-
-def _kind(annotation: Any) -> Any:
-    """Return the type of a flag's value: a plain type, or a list for a field of several values."""
-    kinds = list(_plain(annotation))
-    if len(kinds) > 1 and str in kinds:
-        # A number or a word.
-        return str
-    return kinds[0]
-
-
-def _plain(annotation: Any) -> Iterator[Any]:
-    origin, parts = get_origin(annotation), get_args(annotation)
-    if origin is Annotated:
-        yield from _plain(parts[0])
-    elif origin in (Union, UnionType):
-        for part in parts:
-            yield from _plain(part)
-    elif origin is Literal:
-        yield str
-    elif origin is tuple:
-        yield list[_kind(parts[0])]  # type: ignore[misc]
-    elif annotation is not NoneType:
-        yield annotation
 
 
 def _help(path: str, field: FieldInfo, flag: Flag, kind: Any, defaults: Mapping[str, Any]) -> str:
@@ -208,47 +163,15 @@ RESUMING = ("resume", "restart")
 WORKERS = ("device", "cluster", *RESUMING, "insist")
 
 
-def study_of(
-    file: Path | None,
-    given: dict[str, Any],
-    flags: Mapping[str, StudyFlag],
-    default: Callable[[dict[str, Any]], Study] | None,
-) -> Study:
-    """Return a study file, or the default, changed by flags and then by ``--set``."""
-    from mauvecl.schema.errors import InputError
-    from mauvecl.study.study import Study
-
-    study = Study.read(file) if file is not None else default(given) if default else Study()
-    if given.get("paper"):
-        study = study.paper()
-    changes: dict[str, dict[str, Any]] = {"sky": sky_of(given)}
-    setting: dict[tuple[str, str], str] = {}
-    for name, flag in flags.items():
-        if flag.section not in ("star", "sky") and name != "nuisance":
-            value = given[name]
-            if value is not None:
-                other = setting.setdefault((flag.section, flag.key), name)
-                if other != name:
-                    raise InputError(
-                        f"--{other} and --{name} are both given",
-                        f"one of them: both set {flag.section}.{flag.key}",
-                        key=other,
-                    )
-                changes.setdefault(flag.section, {})[flag.key] = flag.value(value)
-    if given.get("nuisance"):
-        changes.setdefault("nuisances", {}).update(nuisances_of(study, given["nuisance"]))
-    changed = study.with_changes(changes, stars_of(study, given, flags, own=file is not None), "command line")
-    return changed.with_settings(given["set"], "--set") if given["set"] else changed
-
-
 def is_star(given: Path) -> bool:
     """Return whether the argument of the study is a star: a name of the library or a spectrum file."""
     from mauvecl.host.stars.library import resolve
+    from mauvecl.study.keywords import is_there
 
     text = str(given)
     if given.suffix.lower() == ".toml" or given.is_dir():
         return False
-    if not _is_there(text):
+    if not is_there(text):
         # The first name decides; a wrong name among others has its own message.
         first = text.split(",")[0].strip()
         return bool(first) and resolve(first) is not None
@@ -278,108 +201,6 @@ def holds_study(file: Path) -> bool:
     from mauvecl.host.tables.ecsv import read_ecsv
 
     return "study" in read_ecsv(file, "table", "a table of targets, or of an answer").meta
-
-
-def sky_of(given: dict[str, Any]) -> dict[str, Any]:
-    from mauvecl.schema.errors import InputError
-
-    if "time" not in given:
-        return {}
-    sky: dict[str, Any] = {"target": given["target"], "time": given["time"]}
-    text = given["sky"]
-    if text is not None and text.strip().lower() == "none":
-        sky["none"] = True
-    elif text is not None:
-        try:
-            sky["surface_brightness"] = number(text, "--sky", unit_of(SkyBrightness))
-        except ValueError as error:
-            raise InputError(f"--sky {text!r}", "V mag/arcsec^2 or none", key="sky") from error
-    return sky
-
-
-def nuisances_of(study: Study, texts: list[str]) -> dict[str, Any]:
-    """Read nuisance parameters such as dark=0.1, or with the name of a file, stray.txt=free."""
-    from mauvecl.noise.unknowns import NUISANCES
-
-    nuisances: dict[str, Any] = {}
-    own = {name: choice.model_dump(exclude_none=True) for name, choice in study.nuisances.own.items()}
-    for text in texts:
-        expected = f"NAME=SD, with a name of {', '.join(NUISANCES)} or a file's, and a standard deviation or free"
-        name, sd = assignment(text, "--nuisance", expected)
-        if name in NUISANCES:
-            nuisances[name] = sd
-        else:
-            own[Path(name).stem] = {"file": Path(name), "sd": sd}
-    return nuisances | ({"own": own} if own else {})
-
-
-def stars_of(
-    study: Study, given: dict[str, Any], flags: Mapping[str, StudyFlag], *, own: bool
-) -> list[dict[str, Any]] | None:
-    """Return the data of the stars that flags name or change, or None.
-
-    Raises InputError for a magnitude or another value of no star; `own` states that the user's study has stars.
-    """
-    from mauvecl.schema.errors import InputError
-    from mauvecl.study.sections import FILE_KEYS
-
-    if "star" not in given:
-        return None
-    names, magnitudes = given["star"], given["magnitude"]
-    of_stars = {flag.key: given[name] for name, flag in flags.items() if flag.section == "star"}
-    changed = {
-        key: value for key, value in of_stars.items() if value is not None and key not in ("library", "magnitude")
-    }
-    of_files = {key: value for key, value in changed.items() if key in FILE_KEYS}
-    same = {key: value for key, value in changed.items() if key not in FILE_KEYS}
-    if not (names or magnitudes or same or of_files):
-        return None
-    if not (names or own):
-        # Those of the default study are not meant.
-        described = next(name for name, flag in flags.items() if flag.section == "star" and given[name] is not None)
-        raise InputError(
-            f"--{described.replace('_', '-')} needs a star, such as --star M3V; `mauvecl library` lists them",
-            key="star",
-        )
-    if names:
-        # A name of an existing file is a file; other names are searched for in the library.
-        each = [star for name in names for star in ([name] if _is_there(name) else map(str.strip, name.split(",")))]
-        stars: list[dict[str, Any]] = [{"file": name} if _is_file(name) else {"library": name} for name in each]
-    else:
-        stars = [entry.model_dump(exclude_none=True) for entry in study.star]
-    if magnitudes:
-        if len(magnitudes) not in (1, len(stars)):
-            of = "one star" if len(stars) == 1 else f"{len(stars)} stars"
-            raise InputError(f"{len(magnitudes)} magnitudes for {of}", "one for all or one each", key="magnitude")
-        for entry, value in zip(stars, magnitudes * (len(stars) if len(magnitudes) == 1 else 1), strict=True):
-            entry["magnitude"] = value
-    if of_files and not any("file" in entry for entry in stars):
-        named = " and ".join("--" + key.replace("_", "-") for key in of_files)
-        raise InputError(f"{named} needs a spectrum file among the stars: --star FILE", key=next(iter(of_files)))
-    return [entry | same | (of_files if "file" in entry else {}) for entry in stars]
-
-
-def _is_there(name: str) -> bool:
-    """Return whether a file has that name, which may contain commas."""
-    from mauvecl.host.tables.files import without_columns
-
-    try:
-        return bool(name) and without_columns(name)[0].exists()
-    except (OSError, ValueError):
-        # Impossible file names raise an error.
-        return True
-
-
-def _is_file(name: str) -> bool:
-    if _is_there(name):
-        return True
-    from mauvecl.host.stars.library import resolve
-
-    # "K2.5V" and "power law -1.5" look like file names but are stars.
-    if resolve(name) is not None:
-        return False
-    suffix = Path(name).suffix
-    return bool(suffix) and not suffix[1:].isupper()
 
 
 def warn_of_percent(texts: Sequence[str]) -> None:

@@ -65,20 +65,6 @@ def question_values(study: Study, *, detects: bool) -> None:
     check_fap(run.fap, run.realisations, run.tails)
 
 
-def with_enough_tails(study: Study) -> tuple[Study, list[str]]:
-    """Return a study that samples the tails which its realisations are too few to count, with a message."""
-    from mauvecl.detection.names import countable
-
-    run = study.run
-    if not 0 < run.fap < 1 or countable(run.fap, run.realisations):
-        return study, []
-    message = (
-        f"{run.realisations} realisations are too few to count thresholds with a false-alarm probability of "
-        f"{run.fap:g}, so importance sampling finds them (`tails='sampled'`)."
-    )
-    return study.with_settings(["run.tails=sampled"]), [message]
-
-
 def _check_file(file: Path) -> None:
     from mauvecl.host.tables.files import read_bytes, without_columns
 

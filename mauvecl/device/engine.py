@@ -65,7 +65,7 @@ from mauvecl.noise.scene import BATCH, prepare
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import OneOrMore
-from mauvecl.schema.physical import FirstRealisation, Realisations, Seed
+from mauvecl.schema.physical import DEFAULT_SEED, FirstRealisation, Realisations, Seed
 
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
@@ -129,6 +129,9 @@ class Stares:
         self.open_device = device if isinstance(device, Device) else Device(device, width=width)
         self._tiles = tiles or Tiles(self.open_device, progress=progress, largest=tile)
 
+    def __repr__(self) -> str:
+        return f"<Stares on {self.open_device.record.label}>"
+
     def frames(
         self,
         components: Components,
@@ -137,7 +140,7 @@ class Stares:
         *,
         first: StareNumber = 0,
         count: Realisations = 1,
-        seed: Seed,
+        seed: Seed = DEFAULT_SEED,
         method: Method = "pixels",
         amplitudes: NDArray[Any] | None = None,
         processes: Processes = NONE,
@@ -306,6 +309,9 @@ class Engine:
         self.open_device = Device(device, width=width)
         self._tiles = Tiles(self.open_device, progress=progress, largest=tile)
 
+    def __repr__(self) -> str:
+        return f"<Engine on {self.device_name}>"
+
     @property
     def device(self) -> DeviceRecord:
         """Record of the device, for run records."""
@@ -332,7 +338,7 @@ class Engine:
         *,
         start: FirstRealisation = 0,
         count: Realisations,
-        seed: Seed,
+        seed: Seed = DEFAULT_SEED,
         out: NDArray[Any] | None = None,
         **drawing: Unpack[DrawingOptions],
     ) -> NDArray[Any]:
@@ -363,7 +369,7 @@ class Engine:
         *,
         start: FirstRealisation = 0,
         count: Realisations,
-        seed: Seed,
+        seed: Seed = DEFAULT_SEED,
         out: NDArray[Any] | None = None,
         **drawing: Unpack[DrawingOptions],
     ) -> tuple[NDArray[Any], NDArray[np.uint32]]:
@@ -409,7 +415,7 @@ class Engine:
         expectation: Expectation,
         *,
         realisations: Realisations,
-        seed: Seed,
+        seed: Seed = DEFAULT_SEED,
         start: FirstRealisation = 0,
         **drawing: Unpack[DrawingOptions],
     ) -> SnrResult:
@@ -477,7 +483,7 @@ class Engine:
         flares: Sequence[Expectation] | Expectation,
         *,
         realisations: Realisations,
-        seed: Seed,
+        seed: Seed = DEFAULT_SEED,
         statistics: Annotated[Sequence[str | Linear], OneOrMore((str, Linear))] = DEFAULT_STATISTICS,
         start: FirstRealisation = 0,
         comparison: Comparison = NOISE_FREE,
@@ -546,7 +552,7 @@ class Engine:
         *,
         start: FirstRealisation = 0,
         count: Realisations,
-        seed: Seed,
+        seed: Seed = DEFAULT_SEED,
         statistics: Annotated[Sequence[str | Linear], OneOrMore((str, Linear))] = DEFAULT_STATISTICS,
         comparison: Comparison = NOISE_FREE,
         nuisances: Nuisances | Mapping[str, float] | None = None,

@@ -101,6 +101,14 @@ class Measurement:
     #: Factor on all light, shape (n,); 1 if it is known.
     factor: Float
 
+    def __repr__(self) -> str:
+        if not len(self.estimates):
+            return "<Measurement of no frames>"
+        first = zip(self.names, self.estimates[0], self.errors[0], self.units, strict=True)
+        values = ", ".join(f"{name} = {value:.4g} +- {error:.2g} {unit}".rstrip() for name, value, error, unit in first)
+        others = f"; the first of {len(self.estimates)} frames" if len(self.estimates) > 1 else ""
+        return f"<Measurement: {values}{others}>"
+
     @property
     def errors(self) -> Float:
         """Standard errors from the Fisher information, shape (n, n_derived)."""

@@ -23,7 +23,7 @@ from mauvecl.host.stars.flare_spectra import BALMER_EDGE_NM, EmissionLine
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.fields import Range, Unit
-from mauvecl.schema.physical import Positive, Probability, Seed, Wavelength
+from mauvecl.schema.physical import DEFAULT_SEED, Positive, Probability, Seed, Wavelength
 
 if TYPE_CHECKING:
     from mauvecl.detection.nuisances import Nuisances
@@ -81,7 +81,7 @@ def recover_periods(
     *,
     fap: Probability = 0.01,
     trials: Annotated[int, Range(1)] = 100,
-    seed: Seed = 1,
+    seed: Seed = DEFAULT_SEED,
     shortest_d: Annotated[Positive | None, Unit("d")] = None,
     longest_d: Annotated[Positive | None, Unit("d")] = None,
 ) -> Recovery:

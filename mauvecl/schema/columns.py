@@ -73,6 +73,20 @@ class View:
         rows = table if isinstance(table, Sequence) else records(table)
         return [column.heading for column in shown], [[column.text(record) for column in shown] for record in rows]
 
+    @property
+    def details(self) -> set[str]:
+        """Names of printed columns that narrow tables leave out."""
+        return {column.name for column in self.columns if column.detail and column.heading}
+
+    def __str__(self) -> str:
+        if self.table is None:
+            return self.title
+        headings, cells = without_empty(*self.texts(self.details))
+        widths = [max(map(len, column)) for column in zip(headings, *cells, strict=True)]
+        rows = [headings, ["-" * width for width in widths], *cells]
+        lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
+        return "\n".join([self.title, *(f"  {line}" for line in lines)])
+
 
 def without_empty(headings: Sequence[str], cells: Sequence[Sequence[str]]) -> tuple[list[str], list[list[str]]]:
     """Return headings and cells without columns whose cells are all empty."""

@@ -50,6 +50,8 @@ Duration = Annotated[float, Unit("s"), Range(0, open_low=True)]
 Energy = Annotated[float, Unit("erg"), Range(0, open_low=True)]
 #: Seed of a random generator with 64 bits.
 Seed = Annotated[int, Range(0, 2**64 - 1)]
+#: Seed where none is given.
+DEFAULT_SEED = 1
 #: Number of realisations, and that of the first of them.
 Realisations = Annotated[int, Range(1)]
 FirstRealisation = Annotated[int, Range(0, 2**63 - 1)]

@@ -10,7 +10,7 @@ from pydantic import Field, create_model, field_validator, model_validator
 
 from mauvecl.detection.names import DEFAULT_STATISTICS, RECOMMENDED, STATISTIC_NAMES
 from mauvecl.host.exposure import DEFAULT_SKY
-from mauvecl.host.instrument.paths import current_name
+from mauvecl.host.instrument.paths import DEFAULT_INSTRUMENT, current_name
 from mauvecl.host.stars.library import ALIASES, listed_values
 from mauvecl.noise.disturbances import Prior, PriorField
 from mauvecl.noise.unknowns import INSTRUMENT_VALUES, values_of
@@ -18,6 +18,7 @@ from mauvecl.schema import parsing
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help, Quantity, Range, Slider, Widget
 from mauvecl.schema.physical import (
+    DEFAULT_SEED,
     Amplitude,
     BinWidth,
     DetectorTemperature,
@@ -384,7 +385,7 @@ class Observation(Section):
             place=2,
             choices=("mauve", "mauvesim"),
         ),
-    ] = "mauve"
+    ] = DEFAULT_INSTRUMENT
     temperature_c: Annotated[
         DetectorTemperature | None,
         Help("Detector temperature", default="the instrument's"),
@@ -517,7 +518,7 @@ class Run(Section):
         Help("Seed"),
         Flag("--seed"),
         Widget(label="Seed", hint="The same seed gives the same noise, to the bit.", group="Detection", place=3),
-    ] = 1
+    ] = DEFAULT_SEED
     statistics: Annotated[
         tuple[str, ...],
         Field(min_length=1),

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, Union, get_args
 
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
-from mauvecl.detection.names import DEFAULT_STATISTICS
+from mauvecl.detection.names import DEFAULT_STATISTICS, countable
 from mauvecl.host.instrument.paths import FORMER_NAMES, FORMERLY_MAUVE
 from mauvecl.host.orbit.observing_limits import Limits
 from mauvecl.host.tables.ecsv import read_ecsv
@@ -337,6 +337,17 @@ class Study(Section):
             set_key(data, path.split("."), parse_toml_value(value), text)
         return self.build(data, where)
 
+    def with_enough_tails(self) -> tuple[Self, list[str]]:
+        """Return a copy that samples the tails which its realisations are too few to count, with a message."""
+        run = self.run
+        if not 0 < run.fap < 1 or countable(run.fap, run.realisations):
+            return self, []
+        message = (
+            f"{run.realisations} realisations are too few to count thresholds with a false-alarm probability of "
+            f"{run.fap:g}, so importance sampling finds them (`tails='sampled'`)."
+        )
+        return self.with_settings(["run.tails=sampled"]), [message]
+
     def toml(self) -> str:
         """Return the study as TOML, without sections that have their default values."""
         import tomli_w
@@ -442,6 +453,12 @@ def study_keys() -> Mapping[str, FieldInfo]:
 
 
 @cache
-def keys_with_flags() -> tuple[tuple[str, FieldInfo, Flag], ...]:
-    """Return key, field and metadata of every flag of a study."""
-    return tuple((key, field, flag) for key, field in study_keys().items() for flag in found(field, Flag))
+def keys_of(wanted: tuple[str, ...] = ("",)) -> tuple[tuple[str, FieldInfo, Flag], ...]:
+    """Return key, field and metadata of the flags of keys and whole sections in their order, by default of all."""
+    fields = [
+        (key, field)
+        for name in wanted
+        for key, field in study_keys().items()
+        if not name or key == name or key.startswith(f"{name}.")
+    ]
+    return tuple((key, field, flag) for key, field in fields for flag in found(field, Flag))

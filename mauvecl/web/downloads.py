@@ -21,7 +21,7 @@ from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, found
 from mauvecl.study.analyses import PATHS
 from mauvecl.study.sections import Star
-from mauvecl.study.study import Study, keys_with_flags
+from mauvecl.study.study import Study, keys_of
 from mauvecl.web.page import TABS
 from mauvecl.web.question import asked
 from mauvecl.web.uploads import placed
@@ -115,7 +115,7 @@ def as_command(verb: str, study: Study) -> str:
 
 def keys_used(verb: Verb, study: Study, base: Study) -> Iterator[tuple[str, Any]]:
     """Yield the keys that a verb uses of a study, with their plain values, if they are `differing` from a base."""
-    flagged = {key for key, *_ in keys_with_flags()}
+    flagged = {key for key, *_ in keys_of()}
     observes = verb.accepts("star.library")
     for name, value in differing(study, base):
         if name in ("star", "sky"):
@@ -128,7 +128,7 @@ def keys_used(verb: Verb, study: Study, base: Study) -> Iterator[tuple[str, Any]
 
 def _flag_words(name: str, value: Any, verb: Verb) -> list[str]:
     """Return the words of a key's flag, or none if the verb has no flag that takes such a value."""
-    for flag in (flag for key, _, flag in keys_with_flags() if key == name and verb.accepts(name)):
+    for flag in (flag for key, _, flag in keys_of() if key == name and verb.accepts(name)):
         if isinstance(value, bool) and flag.read is None:
             on, _, off = flag.names[0].partition("/")
             return [on] if value else [off] if off else []

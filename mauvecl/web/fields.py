@@ -31,7 +31,7 @@ from mauvecl.schema.fields import (
     with_unit,
 )
 from mauvecl.schema.physical import LineFraction
-from mauvecl.study.study import keys_with_flags, study_keys
+from mauvecl.study.study import keys_of, study_keys
 
 #: Texts of fields with an uploaded file: those that also accept a name or numbers, and all others.
 UPLOADED, UPLOADED_UNKNOWN, UPLOADED_FILE = "uploaded star", "uploaded spectrum", "uploaded file"
@@ -438,7 +438,7 @@ def _fields() -> dict[str, str]:
 def _flags() -> dict[str, str]:
     """Return the field of each flag whose key has one."""
     names = {".".join(field.path): name for name, field in FIELDS.items() if field.path}
-    return {flag: names[key] for key, _, option in keys_with_flags() if key in names for flag in option.names}
+    return {flag: names[key] for key, _, option in keys_of() if key in names for flag in option.names}
 
 
 def field_of(key: str | None) -> str | None:

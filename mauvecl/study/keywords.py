@@ -1,0 +1,200 @@
+"""Keywords of studies: the names under which Python and the command line give keys, and the values that they set."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
+
+from mauvecl.host.stars.library import resolve
+from mauvecl.host.tables.files import without_columns
+from mauvecl.noise.unknowns import NUISANCES
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.fields import Flag, Unit, first, unit_of
+from mauvecl.schema.parsing import assignment, number
+from mauvecl.schema.physical import SkyBrightness
+from mauvecl.study.sections import FILE_KEYS
+
+if TYPE_CHECKING:
+    from pydantic.fields import FieldInfo
+
+    from mauvecl.study.nuisances import NuisanceChoice
+    from mauvecl.study.sections import Star
+
+
+class Keyword(NamedTuple):
+    """Keyword of a verb's function, or flag of its command, and the key of the study that it sets."""
+
+    name: str
+    kind: Any  # type of the value on the command line
+    section: str
+    key: str
+    read: Callable[[Any, str], Any] | None  # converts the texts of a flag, which it receives with the flag's name
+    unit: str  # of the key, in astropy's notation
+
+    @classmethod
+    def of(cls, path: str, field: FieldInfo, flag: Flag) -> Keyword:
+        """Return the keyword of a key of the study."""
+        section, _, key = path.rpartition(".")
+        unit = (first(field, Unit) or Unit("")).name
+        return cls(flag.parameter, flag.kind or plain_kind(field.annotation), section, key, flag.read, unit)
+
+    def value(self, given: Any) -> Any:
+        """Convert a value to that of the key; what Python gives as other than text needs no parsing."""
+        parts = [given] if _is_single(given) else given
+        if self.read is None or not all(isinstance(part, str | bool | Path) for part in parts):
+            return given
+        return self.read(given, f"{self.name} =")
+
+    def listed(self, given: Any) -> Any:
+        """Return a list for a single value of a keyword of several values."""
+        several = get_origin(self.kind) is list
+        return [given] if several and given is not None and _is_single(given) else given
+
+
+def _is_single(value: Any) -> bool:
+    """Return whether a value is neither a sequence nor an array."""
+    return isinstance(value, str | Path) or getattr(value, "ndim", 1) == 0 or not hasattr(value, "__len__")
+
+
+def plain_kind(annotation: Any) -> Any:
+    """Return the type of a keyword's value: a plain type, or a list for a field of several values."""
+    kinds = list(_plain(annotation))
+    if len(kinds) > 1 and str in kinds:
+        # A number or a word.
+        return str
+    return kinds[0]
+
+
+def _plain(annotation: Any) -> Iterator[Any]:
+    origin, parts = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        yield from _plain(parts[0])
+    elif origin in (Union, UnionType):
+        for part in parts:
+            yield from _plain(part)
+    elif origin is Literal:
+        yield str
+    elif origin is tuple:
+        yield list[plain_kind(parts[0])]  # type: ignore[misc]
+    elif annotation is not NoneType:
+        yield annotation
+
+
+def changes_of(
+    given: Mapping[str, Any], keywords: Mapping[str, Keyword], nuisances: NuisanceChoice
+) -> dict[str, dict[str, Any]]:
+    """Return the values that keywords set, by sections of the study; stars have their own function."""
+    changes: dict[str, dict[str, Any]] = {"sky": sky_of(given)}
+    setting: dict[tuple[str, str], str] = {}
+    for name, keyword in keywords.items():
+        if keyword.section not in ("star", "sky") and name != "nuisance":
+            value = given[name]
+            if value is not None:
+                other = setting.setdefault((keyword.section, keyword.key), name)
+                if other != name:
+                    raise InputError(
+                        f"`{other}` and `{name}` are both given",
+                        f"one of them: both set {keyword.section}.{keyword.key}",
+                        key=other,
+                    )
+                changes.setdefault(keyword.section, {})[keyword.key] = keyword.value(value)
+    if given.get("nuisance"):
+        changes.setdefault("nuisances", {}).update(nuisances_of(nuisances, given["nuisance"]))
+    return changes
+
+
+def sky_of(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the data of the sky, of which a brightness may be text."""
+    if "time" not in given:
+        return {}
+    sky: dict[str, Any] = {"target": given["target"], "time": given["time"]}
+    value = given["sky"]
+    if isinstance(value, str) and value.strip().lower() == "none":
+        sky["none"] = True
+    elif isinstance(value, str):
+        try:
+            sky["surface_brightness"] = number(value, "sky =", unit_of(SkyBrightness))
+        except ValueError as error:
+            raise InputError(f"sky = {value!r}", "V mag/arcsec^2 or none", key="sky") from error
+    else:
+        sky["surface_brightness"] = value
+    return sky
+
+
+def nuisances_of(nuisances: NuisanceChoice, given: Sequence[str] | Mapping[str, Any]) -> dict[str, Any]:
+    """Return nuisance parameters, read from texts such as dark=0.1, or with the name of a file, stray.txt=free."""
+    changed: dict[str, Any] = {}
+    own = {name: choice.model_dump(exclude_none=True) for name, choice in nuisances.own.items()}
+    expected = f"NAME=SD, with a name of {', '.join(NUISANCES)} or a file's, and a standard deviation or free"
+    pairs = (
+        given.items() if isinstance(given, Mapping) else [assignment(text, "nuisance =", expected) for text in given]
+    )
+    for name, sd in pairs:
+        if name in NUISANCES:
+            changed[name] = sd
+        else:
+            own[Path(name).stem] = {"file": Path(name), "sd": sd}
+    return changed | ({"own": own} if own else {})
+
+
+def stars_of(
+    stars: Sequence[Star], given: Mapping[str, Any], keywords: Mapping[str, Keyword], *, own: bool
+) -> list[dict[str, Any]] | None:
+    """Return the data of the stars that keywords name or change, or None.
+
+    Raises InputError for a magnitude or another value of no star; `own` states that the user's study has `stars`.
+    """
+    if "star" not in given:
+        return None
+    names, magnitudes = given["star"], given["magnitude"]
+    of_stars = {keyword.key: given[name] for name, keyword in keywords.items() if keyword.section == "star"}
+    changed = {
+        key: value for key, value in of_stars.items() if value is not None and key not in ("library", "magnitude")
+    }
+    of_files = {key: value for key, value in changed.items() if key in FILE_KEYS}
+    same = {key: value for key, value in changed.items() if key not in FILE_KEYS}
+    if not (names or magnitudes or same or of_files):
+        return None
+    if not (names or own):
+        # Those of the default study are not meant.
+        described = next(name for name, each in keywords.items() if each.section == "star" and given[name] is not None)
+        raise InputError(f"`{described}` needs a star, such as `star='M3V'`; `mauvecl library` lists them", key="star")
+    if names:
+        # A name of an existing file is a file; other names are searched for in the library.
+        each = [star for name in names for star in ([name] if is_there(name) else map(str.strip, name.split(",")))]
+        data: list[dict[str, Any]] = [{"file": name} if _is_file(name) else {"library": name} for name in each]
+    else:
+        data = [entry.model_dump(exclude_none=True) for entry in stars]
+    if magnitudes:
+        if len(magnitudes) not in (1, len(data)):
+            of = "one star" if len(data) == 1 else f"{len(data)} stars"
+            raise InputError(f"{len(magnitudes)} magnitudes for {of}", "one for all or one each", key="magnitude")
+        for entry, value in zip(data, magnitudes * (len(data) if len(magnitudes) == 1 else 1), strict=True):
+            entry["magnitude"] = value
+    if of_files and not any("file" in entry for entry in data):
+        named = " and ".join(f"`{key}`" for key in of_files)
+        raise InputError(
+            f"{named} needs a spectrum file among the stars: `star='my-star.txt'`", key=next(iter(of_files))
+        )
+    return [entry | same | (of_files if "file" in entry else {}) for entry in data]
+
+
+def is_there(name: str) -> bool:
+    """Return whether a file has that name, which may contain commas."""
+    try:
+        return bool(name) and without_columns(name)[0].exists()
+    except (OSError, ValueError):
+        # Impossible file names raise an error.
+        return True
+
+
+def _is_file(name: str) -> bool:
+    if is_there(name):
+        return True
+    # "K2.5V" and "power law -1.5" look like file names but are stars.
+    if resolve(name) is not None:
+        return False
+    suffix = Path(name).suffix
+    return bool(suffix) and not suffix[1:].isupper()

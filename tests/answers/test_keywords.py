@@ -1,0 +1,132 @@
+"""Verbs asked by keywords in Python, which are the flags of the command line, and what their answers print."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+from typing import Any
+
+import astropy.units as u
+import numpy as np
+import pytest
+from commands import run
+
+import mauvecl
+from mauvecl import Engine, Expectation, FlareModel, InputError, Instrument, Source, Study, expect, fit
+
+# Keywords, and the flags that ask the same.
+ASKED: dict[str, tuple[str, dict[str, Any], str]] = {
+    "one star": ("simulate", {"star": "M4V", "magnitude": 11, "amplitude": 0.05}, "--star M4V -m 11 -a 0.05"),
+    "several": (
+        "simulate", {"star": ["G2V", "K3V"], "magnitude": [7.4, 3.7], "seed": 3},
+        "--star G2V -m 7.4 --star K3V -m 3.7 --seed 3",
+    ),
+    "units": (
+        "simulate",
+        {"star": "AU Mic", "amplitude": 24 * u.percent, "exposure": 2 * u.min, "flare_temperature": 9 * u.kK},
+        "'AU Mic' -a 24% -t 120 --flare-temperature 9000",
+    ),
+    "text": (
+        "simulate", {"star": "AU Mic", "amplitude": "24%", "exposure": "2 min"}, "'AU Mic' -a 0.24 -t 120"
+    ),
+    "arrays": ("simulate", {"star": "G2V", "magnitude": np.array([7.4]), "amplitude": np.array([0.1, 0.2])},
+               "--star G2V -m 7.4 -a 0.1,0.2"),
+    "sky": ("simulate", {"star": "G2V", "magnitude": 7, "sky": "none"}, "--star G2V -m 7 --sky none"),
+    "brightness": ("simulate", {"star": "G2V", "magnitude": 7, "sky": 21.5}, "--star G2V -m 7 --sky 21.5"),
+    "paper": ("simulate", {"star": "G2V", "magnitude": 7, "paper": True}, "--star G2V -m 7 --paper"),
+    "ideal": ("detect", {"star": "G2V", "magnitude": 7, "amplitude": 0.1, "ideal": True, "fap": 0.1,
+                         "realisations": 2000}, "--star G2V -m 7 -a 0.1 --ideal --fap 0.1 -n 2000"),
+    "all statistics": ("detect", {"star": "G2V", "magnitude": 7, "amplitude": 0.1, "all_statistics": True, "fap": 0.1,
+                                  "realisations": 2000, "ideal": True},
+                       "--star G2V -m 7 -a 0.1 --ideal --fap 0.1 -n 2000 --all-statistics"),
+    "nuisances": ("detect", {"star": "G2V", "magnitude": 7, "amplitude": 0.1, "nuisance": {"dark": 0.1}, "fap": 0.1,
+                             "realisations": 2000},
+                  "--star G2V -m 7 -a 0.1 --nuisance dark=0.1 --fap 0.1 -n 2000"),
+    "default of the verb": ("snr", {"star": "G2V", "magnitude": 7, "realisations": 1000}, "--star G2V -m 7 -n 1000"),
+    "sweep": ("snr", {"star": "G2V", "sweep": "magnitude=6,7", "realisations": 1000},
+              "--star G2V --sweep magnitude=6,7 -n 1000"),
+    "own section": ("exposure", {"star": "G2V", "magnitude": 7, "snr": 10, "at": 300 * u.nm},
+                    "--star G2V -m 7 --snr 10 --at 300"),
+    "targets": ("visible", {"look_at": ["eps Eri"], "start": "2027-01-01", "days": 2},
+                "--look-at 'eps Eri' --start 2027-01-01 --days 2"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ASKED)
+def test_keywords_ask_what_flags_ask(name: str, tmp_path: Path) -> None:
+    """Python and the command line have the same study, and the same answer to the last digit."""
+    verb, keywords, flags = ASKED[name]
+    run(verb, *shlex.split(flags), "--no-pictures", "-o", "answer", folder=tmp_path)
+    answer = getattr(mauvecl, verb)(**keywords)
+    assert answer.study.toml() == (tmp_path / "answer" / "study.toml").read_text()
+    assert answer.tables.keys() <= {path.stem for path in (tmp_path / "answer").glob("*.ecsv")}
+
+
+def test_keywords_change_a_study() -> None:
+    study = Study().with_settings(["star=[{library='G2V', magnitude=7}, {library='K3V', magnitude=4}]"])
+    changed = mauvecl.simulate(study, exposure=600, magnitude=6).study
+    settings = ["observation.exposure_s=600", "star.0.magnitude=6", "star.1.magnitude=6"]
+    assert changed.toml() == study.ideal().with_settings(settings).toml()
+    assert mauvecl.simulate(study).study == study.ideal()
+
+
+def test_too_few_realisations_are_warned_of() -> None:
+    with pytest.warns(UserWarning, match="2000 realisations are too few"):
+        answer = mauvecl.detect(star="G2V", magnitude=7, amplitude=0.1, realisations=2000, ideal=True)
+    assert answer.study.run.tails == "sampled"
+
+
+@pytest.mark.parametrize(("named", "keywords"), [
+    ("'magnitud'", {"star": "G2V", "magnitud": 7}),
+    ("needs a star", {"magnitude": 7}),
+    ("2 magnitudes for one star", {"star": "G2V", "magnitude": [7, 8]}),
+    ("'Nowhere'", {"star": "Nowhere"}),
+    ("exposure_s", {"star": "G2V", "exposure": 3 * u.nm}),
+    ("'bright'", {"star": "G2V", "magnitude": 7, "sky": "bright"}),
+    ("amplitudes", {"star": "G2V", "magnitude": 7, "amplitude": [-1]}),
+    ("expected a Study", {"study": "G2V", "amplitude": 0.1}),
+])  # fmt: skip
+def test_wrong_keywords_are_refused(named: str, keywords: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match=re.escape(named)):
+        mauvecl.simulate(**keywords)
+
+
+@pytest.fixture
+def quiet() -> Expectation:
+    return expect("AU Mic", exposure=50)
+
+
+def test_expectations_and_draws_have_the_defaults_of_the_command_line(quiet: Expectation, engine: Engine) -> None:
+    assert quiet == expect("AU Mic", "mauve", exposure=50)
+    drawn = engine.realise(quiet, count=2)
+    np.testing.assert_array_equal(drawn, engine.realise(quiet, count=2, seed=Study().run.seed))
+
+
+def test_printed_answers_hold_the_sentence_and_the_table(engine: Engine) -> None:
+    answer = mauvecl.detect(engine=engine, star="M4V", magnitude=11, amplitude=0.05, fap=0.1, realisations=5000)
+    assert answer.headline.startswith("Mauve would see a flare of 5 % on M4V V = 11 in 50 s with a chance of ")
+    assert repr(answer) == f"<DetectAnswer {answer.headline!r}>"
+    first, *others = str(answer).splitlines()
+    assert first == answer.headline
+    assert max(map(len, others[:4])) <= 100
+    (row,) = (line.split() for line in others if line.startswith("  M4V"))
+    assert row[:6] == ["M4V", "V", "=", "11", "5", "%"]
+    assert f"{answer.table['probability'][0]:.4f}" in row
+    assert others[others.index("Assumed:") + 1] == "  instrument mauve, detector at 21 deg C"
+    assert list(answer.messages) == others[-len(answer.messages) :]
+    # A table of one detection shows its probability where astropy prints the first and last columns.
+    assert "probability" in str(answer.stars[0].detection.table(fap=0.1)).splitlines()[0]
+
+
+def test_engine_and_measurement_have_short_reprs(quiet: Expectation, engine: Engine) -> None:
+    assert repr(engine) == f"<Engine on {engine.device_name}>"
+    assert repr(mauvecl.Stares(engine.open_device)) == f"<Stares on {engine.device_name}>"
+    star = Source.from_library("AU Mic").at_magnitude(8.81)
+    model = FlareModel.of(star, Instrument.load("mauve"), quiet)
+    measured = fit(engine.realise(expect(star.flaring(1.0), exposure=50), count=3), quiet, model)
+    text = repr(measured)
+    assert text.startswith(f"<Measurement: {measured.names[0]} = ")
+    assert text.endswith("; the first of 3 frames>")
+    value, error = measured.estimates[0, 0], measured.errors[0, 0]
+    assert f"{value:.4g} +- {error:.2g} {measured.units[0]}" in text
