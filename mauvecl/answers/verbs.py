@@ -6,12 +6,9 @@ import inspect
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from difflib import get_close_matches
 from functools import wraps
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
-
-from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -486,20 +483,13 @@ def by_keywords(function: Callable[..., Answered]) -> Question[Answered]:
     return ask
 
 
-def _study_of(verb: Verb, study: Study | None, given: dict[str, Any]) -> Study:
+def _study_of(verb: Verb, study: Study | None, given: Mapping[str, Any]) -> Study:
     """Return the study that keywords of Python ask for."""
-    from mauvecl.study.keywords import Keyword
+    from mauvecl.study.keywords import keywords_of, values_of
     from mauvecl.study.study import keys_of
 
-    keywords = {flag.parameter: Keyword.of(*entry) for entry in keys_of(verb.keys) for flag in entry[2:]}
-    known = [*keywords, "paper", "ideal"]
-    for name in given.keys() - known:
-        close = get_close_matches(name, known, n=3) or known
-        raise InputError(f"{verb.name}() has no keyword {name!r}", f"a flag of the command, such as {', '.join(close)}")
-    if given.pop("ideal", False):
-        given["with_unknowns"] = False
-    values = {name: keyword.listed(given.get(name)) for name, keyword in keywords.items()}
-    asked, messages = verb.study_of(values | {"paper": given.get("paper", False)}, keywords, study, f"{verb.name}()")
+    keywords, where = keywords_of(keys_of(verb.keys)), f"{verb.name}()"
+    asked, messages = verb.study_of(values_of(given, keywords, where), keywords, study, where)
     for message in messages:
         warnings.warn(message, stacklevel=3)
     return asked

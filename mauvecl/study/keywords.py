@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
@@ -51,6 +53,28 @@ class Keyword(NamedTuple):
         """Return a list for a single value of a keyword of several values."""
         several = get_origin(self.kind) is list
         return [given] if several and given is not None and _is_single(given) else given
+
+
+def keywords_of(fields: Iterable[tuple[str, FieldInfo, Flag]]) -> dict[str, Keyword]:
+    """Return the keywords of keys, fields and flags by name, without names of several keys."""
+    keywords = [Keyword.of(*entry) for entry in fields]
+    count = Counter(keyword.name for keyword in keywords)
+    return {keyword.name: keyword for keyword in keywords if count[keyword.name] == 1}
+
+
+def values_of(given: Mapping[str, Any], keywords: Mapping[str, Keyword], where: str) -> dict[str, Any]:
+    """Return the value of each keyword, None where it is not given, and of ``paper``.
+
+    Raises InputError for a keyword of another name; ``ideal`` is another form of ``with_unknowns``.
+    """
+    known = [*keywords, "paper", "ideal"]
+    for name in given.keys() - known:
+        close = get_close_matches(name, known, n=3) or known
+        raise InputError(f"{where} has no keyword {name!r}", f"a flag of the command, such as {', '.join(close)}")
+    values = {name: keyword.listed(given.get(name)) for name, keyword in keywords.items()}
+    if given.get("ideal"):
+        values["with_unknowns"] = False
+    return values | {"paper": given.get("paper")}
 
 
 def _is_single(value: Any) -> bool:

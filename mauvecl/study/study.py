@@ -27,6 +27,7 @@ from mauvecl.schema.fields import AnyUnit, Flag, Help, found
 from mauvecl.schema.section import Section, fields_of, input_error
 from mauvecl.study.analyses import PATHS, CalibrateQuestion, ChangeQuestion, DataChoice, MeasureQuestion
 from mauvecl.study.flare_light import drop_default_spectrum
+from mauvecl.study.keywords import changes_of, keywords_of, stars_of, values_of
 from mauvecl.study.nuisances import NuisanceChoice
 from mauvecl.study.plan import OrbitQuestion, PlanQuestion
 from mauvecl.study.questions import (
@@ -293,6 +294,23 @@ class Study(Section):
             return cls.model_validate(data)
         except ValidationError as error:
             raise input_error(where, cls, error) from error
+
+    @classmethod
+    def of(cls, **keywords: Any) -> Self:
+        """Build a study from keywords that are named as the flags of the command line.
+
+        Examples
+        --------
+        >>> import astropy.units as u
+        >>> from mauvecl import Study
+        >>> Study.of(star="M4V", magnitude=11, amplitude=0.05, exposure=2 * u.min)
+        <Study of M4V V = 11; flares of 5 %; 120 s on mauve>
+        """
+        named, where = keywords_of(keys_of()), "Study.of()"
+        given = values_of(keywords, named, where)
+        study = cls().paper() if given["paper"] else cls()
+        changes = changes_of(given, named, study.nuisances)
+        return study.with_changes(changes, stars_of(study.star, given, named, own=False), where)
 
     def ideal(self) -> Self:
         """Return a copy without the usual unknowns."""

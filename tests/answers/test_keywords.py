@@ -71,6 +71,19 @@ def test_keywords_change_a_study() -> None:
     assert mauvecl.simulate(study).study == study.ideal()
 
 
+def test_studies_are_built_from_the_same_keywords() -> None:
+    asked = {"star": "G2V", "magnitude": 7, "exposure": 60, "distance": 5, "duration": 3600, "look_at": "eps Eri"}
+    study = Study.of(**asked, paper=True, ideal=True)
+    settings = [
+        "star=[{library='G2V', magnitude=7, distance_pc=5}]", "observation.exposure_s=60", "stare.duration_s=3600",
+        "orbit.targets=['eps Eri']",
+    ]  # fmt: skip
+    assert study.toml() == Study().paper().with_settings(settings).toml()
+    # A name of two keys is refused, not given to one of them.
+    with pytest.raises(InputError, match="no keyword 'shape'"):
+        Study.of(shape="davenport")
+
+
 def test_too_few_realisations_are_warned_of() -> None:
     with pytest.warns(UserWarning, match="2000 realisations are too few"):
         answer = mauvecl.detect(star="G2V", magnitude=7, amplitude=0.1, realisations=2000, ideal=True)
