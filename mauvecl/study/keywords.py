@@ -30,6 +30,7 @@ class Keyword(NamedTuple):
 
     name: str
     kind: Any  # type of the value on the command line
+    many: bool  # whether it has several values
     section: str
     key: str
     read: Callable[[Any, str], Any] | None  # converts the texts of a flag, which it receives with the flag's name
@@ -39,20 +40,21 @@ class Keyword(NamedTuple):
     def of(cls, path: str, field: FieldInfo, flag: Flag) -> Keyword:
         """Return the keyword of a key of the study."""
         section, _, key = path.rpartition(".")
-        unit = (first(field, Unit) or Unit("")).name
-        return cls(flag.parameter, flag.kind or plain_kind(field.annotation), section, key, flag.read, unit)
+        kind, unit = flag.kind or plain_kind(field.annotation), (first(field, Unit) or Unit("")).name
+        return cls(flag.parameter, kind, get_origin(kind) is list, section, key, flag.read, unit)
 
     def value(self, given: Any) -> Any:
         """Convert a value to that of the key; what Python gives as other than text needs no parsing."""
-        parts = [given] if _is_single(given) else given
+        parts = given if self.many else [given]
         if self.read is None or not all(isinstance(part, str | bool | Path) for part in parts):
             return given
         return self.read(given, f"{self.name} =")
 
     def listed(self, given: Any) -> Any:
         """Return a list for a single value of a keyword of several values."""
-        several = get_origin(self.kind) is list
-        return [given] if several and given is not None and _is_single(given) else given
+        if not self.many or given is None or isinstance(given, Mapping):
+            return given
+        return [given] if _is_single(given) else list(given)
 
 
 def keywords_of(fields: Iterable[tuple[str, FieldInfo, Flag]]) -> dict[str, Keyword]:

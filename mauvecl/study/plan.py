@@ -158,6 +158,11 @@ class PlanTarget(Section):
 
     unused: Annotated[tuple[str, ...], Help("Columns of its table that are not read")] = ()
 
+    @model_validator(mode="before")
+    @classmethod
+    def _by_name(cls, data: Any) -> Any:
+        return {"name": data} if isinstance(data, str) else data
+
     @model_validator(mode="after")
     def _one_distribution(self) -> Self:
         for names in (("mass_msun", "age_myr"), ("alpha", "rate_per_day", "at_erg")):

@@ -19,7 +19,7 @@ from mauvecl import Engine, Expectation, FlareModel, InputError, Instrument, Sou
 ASKED: dict[str, tuple[str, dict[str, Any], str]] = {
     "one star": ("simulate", {"star": "M4V", "magnitude": 11, "amplitude": 0.05}, "--star M4V -m 11 -a 0.05"),
     "several": (
-        "simulate", {"star": ["G2V", "K3V"], "magnitude": [7.4, 3.7], "seed": 3},
+        "simulate", {"star": ("G2V", "K3V"), "magnitude": np.array([7.4, 3.7]), "seed": 3},
         "--star G2V -m 7.4 --star K3V -m 3.7 --seed 3",
     ),
     "units": (
@@ -30,7 +30,7 @@ ASKED: dict[str, tuple[str, dict[str, Any], str]] = {
     "text": (
         "simulate", {"star": "AU Mic", "amplitude": "24%", "exposure": "2 min"}, "'AU Mic' -a 0.24 -t 120"
     ),
-    "arrays": ("simulate", {"star": "G2V", "magnitude": np.array([7.4]), "amplitude": np.array([0.1, 0.2])},
+    "arrays": ("simulate", {"star": "G2V", "magnitude": np.array([7.4]), "amplitude": [10, 20] * u.percent},
                "--star G2V -m 7.4 -a 0.1,0.2"),
     "sky": ("simulate", {"star": "G2V", "magnitude": 7, "sky": "none"}, "--star G2V -m 7 --sky none"),
     "brightness": ("simulate", {"star": "G2V", "magnitude": 7, "sky": 21.5}, "--star G2V -m 7 --sky 21.5"),
@@ -79,6 +79,8 @@ def test_studies_are_built_from_the_same_keywords() -> None:
         "orbit.targets=['eps Eri']",
     ]  # fmt: skip
     assert study.toml() == Study().paper().with_settings(settings).toml()
+    by_name = Study.of(targets=["AU Mic", {"name": "eps Eri", "age_myr": 400, "mass_msun": 0.8}]).plan.targets
+    assert [target.name for target in by_name] == ["AU Mic", "eps Eri"]
     # A name of two keys is refused, not given to one of them.
     with pytest.raises(InputError, match="no keyword 'shape'"):
         Study.of(shape="davenport")
