@@ -136,7 +136,7 @@ class Verb:
         stars = stars_of(study.star, given, keywords, own=own)
         study = study.with_changes(changes_of(given, keywords, study.nuisances), stars, where)
         if given.get("set"):
-            study = study.with_settings(given["set"], "--set")
+            study = study.with_settings(given["set"], where)
         # A map would sample the tail of each cell, which takes longer than more realisations.
         if own or self.counts == "cells" or given.get("tails", study) is not None:
             return study, []

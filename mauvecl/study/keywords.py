@@ -44,9 +44,9 @@ class Keyword(NamedTuple):
         return cls(flag.parameter, kind, get_origin(kind) is list, section, key, flag.read, unit)
 
     def value(self, given: Any) -> Any:
-        """Convert a value to that of the key; what Python gives as other than text needs no parsing."""
+        """Convert a value to that of the key, unless it has parts of its own, as in Python."""
         parts = given if self.many else [given]
-        if self.read is None or not all(isinstance(part, str | bool | Path) for part in parts):
+        if self.read is None or not all(isinstance(part, str | int | float | Path) for part in parts):
             return given
         return self.read(given, f"{self.name} =")
 
