@@ -616,15 +616,27 @@ REPORTED_CLIPPING = 1e-4
 MOST_RUNS = 3
 
 
+def entirely_saturated(x: Expectation, key: str) -> InputError:
+    """Return the error of an exposure of which every pixel saturates."""
+    return InputError(
+        f"every pixel of {x.name} is saturated in a frame of {x.frame_s:g} s",
+        f"a fainter star, or frames of at most {_safe_frame_s(x):g} s",
+        key=key,
+    )
+
+
+def _safe_frame_s(x: Expectation) -> float:
+    """Return the longest frame without a saturated pixel, rounded down so that it is safe."""
+    return float(np.floor(x.longest_safe_frame_s * 1000) / 1000)
+
+
 def _saturation(x: Expectation) -> tuple[str, ...]:
     """Return the message on saturation, if any."""
     cut = x.cut_share
     touched = float(-np.expm1(x.n_frames * np.sum(np.log1p(-np.minimum(cut, 1 - 1e-16)))))
     if not x.saturated.any() and touched < REPORTED_CLIPPING:
         return ()
-    safe = x.longest_safe_frame_s
-    # Rounded down, so that the reported length is safe.
-    safe_s = np.floor(safe * 1000) / 1000
+    safe_s = _safe_frame_s(x)
     flares = [text for text in x.provenance.get("source history", "").split("; ") if text.startswith("flare")]
     name = f"{x.name} with a {flares[-1].removesuffix(', added')}" if flares else x.name
     if not x.saturated.any():

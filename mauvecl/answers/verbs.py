@@ -137,10 +137,10 @@ class Verb:
         study = study.with_changes(changes_of(given, keywords, study.nuisances), stars, where)
         if given.get("set"):
             study = study.with_settings(given["set"], where)
-        # A map would sample the tail of each cell, which takes longer than more realisations.
-        if own or self.counts == "cells" or given.get("tails", study) is not None:
+        if own or given.get("tails", study) is not None:
             return study, []
-        return study.with_enough_tails()
+        # A map would sample the tail of each cell, which takes longer than more realisations.
+        return study.with_enough_tails(sampled=self.counts != "cells")
 
     @property
     def ask(self) -> Callable[..., Any]:

@@ -61,6 +61,11 @@ def countable(fap: float, realisations: int) -> bool:
     return fap * realisations >= MIN_IN_TAIL * (1 - 1e-9)
 
 
+def least_countable(fap: float) -> int:
+    """Return the smallest number of realisations that is `countable`."""
+    return math.ceil(MIN_IN_TAIL / fap)
+
+
 def check_fap(fap: float, realisations: int, tails: Tails = "counted") -> None:
     """Raise InputError if `fap` is not a probability, or is too small for counted tails."""
     if not 0.0 < fap < 1.0:
@@ -70,6 +75,6 @@ def check_fap(fap: float, realisations: int, tails: Tails = "counted") -> None:
     if tails == "counted" and not countable(fap, realisations):
         raise InputError(
             f"fap = {fap:g} leaves {fap * realisations:.3g} of {realisations} realisations beyond the threshold",
-            f"at least {MIN_IN_TAIL}: ask for {math.ceil(MIN_IN_TAIL / fap)} realisations, or for `tails='sampled'`",
+            f"at least {MIN_IN_TAIL}: ask for {least_countable(fap)} realisations, or for `tails='sampled'`",
             key="fap",
         )

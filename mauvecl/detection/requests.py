@@ -29,7 +29,7 @@ from mauvecl.detection.statistics import (
     Statistic,
     UvExcess,
 )
-from mauvecl.host.exposure.expectation import Expectation
+from mauvecl.host.exposure.expectation import Expectation, entirely_saturated
 from mauvecl.noise.drawing import AUTOMATIC, Drawing, DrawingOptions
 from mauvecl.noise.layout import FIXED_STATISTICS
 from mauvecl.noise.processes import NOISE_FREE, Comparison
@@ -103,7 +103,7 @@ class Hypotheses:
         if shaped is not None and not self.flares:
             raise InputError("no flare given", f"at least one for the statistic {shaped!r}", key="flares")
         if not self.scene.used.any():
-            raise InputError(f"every pixel of {self.quiet.name} is saturated", "a fainter star", key="quiet")
+            raise entirely_saturated(self.quiet, "quiet")
         for statistic in self._chosen.values():
             statistic.check(self.setting)
         for k, flare in enumerate(self.flares if "matched" in self._chosen else ()):

@@ -98,24 +98,25 @@ def line_fluxes(texts: Sequence[str], name: str) -> dict[str, float]:
 
 def gaps(texts: Sequence[str], name: str) -> list[tuple[float, float]]:
     """Read ranges of time such as 1000:2000."""
-    return [_pair(text, name, "two times in s, such as 1000:2000") for text in texts]
+    return [_pair(text, name, "two times in s, such as 1000:2000", "s") for text in texts]
 
 
 def wavelengths(texts: Sequence[str], name: str) -> list[tuple[float, float]]:
     """Read ranges of wavelengths such as 322:368."""
-    return [_pair(text, name, "two wavelengths in nm, such as 322:368") for text in texts]
+    return [_pair(text, name, "two wavelengths in nm, such as 322:368", "nm") for text in texts]
 
 
 def declinations(text: str, name: str) -> tuple[float, float] | str:
     """Read a range of declinations such as -46.4:31.8, or none."""
     if text.strip().lower() == "none":
         return "none"
-    return _pair(text, name, "low:high in degrees, or none")
+    return _pair(text, name, "low:high in degrees, or none", "deg")
 
 
-def _pair(text: str, name: str, expected: str) -> tuple[float, float]:
+def _pair(text: str, name: str, expected: str, unit: str) -> tuple[float, float]:
+    """Read two numbers, each of which may have a unit of its own."""
     try:
-        low, high = (float(part) for part in text.split(":"))
+        low, high = (number(part, name, unit) for part in text.split(":"))
     except ValueError as error:
         raise refusal(name, text, expected) from error
     return low, high

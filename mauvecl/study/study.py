@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, Union, get_args
 
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
-from mauvecl.detection.names import DEFAULT_STATISTICS, countable
+from mauvecl.detection.names import DEFAULT_STATISTICS, countable, least_countable
 from mauvecl.host.instrument.paths import FORMER_NAMES, FORMERLY_MAUVE
 from mauvecl.host.orbit.observing_limits import Limits
 from mauvecl.host.tables.ecsv import read_ecsv
@@ -209,6 +209,8 @@ OMITTED = (
     "bulk", "nuisances", "stare", "events", "search", "injections", "orbit", "plan", "measure", "data", "calibrate",
     "change",
 )  # fmt: skip
+#: Largest number of realisations to which too few are raised.
+MOST_RAISED = 1_000_000
 #: The paper's two stars.
 PAPER_STARS = (Star(library="K3V", magnitude=3.7), Star(library="G2V", magnitude=7.4))
 
@@ -355,16 +357,29 @@ class Study(Section):
             set_key(data, path.split("."), parse_toml_value(value), text)
         return self.build(data, where)
 
-    def with_enough_tails(self) -> tuple[Self, list[str]]:
-        """Return a copy that samples the tails which its realisations are too few to count, with a message."""
+    def with_enough_tails(self, *, sampled: bool = True) -> tuple[Self, list[str]]:
+        """Return a copy whose tails hold enough realisations, with a message if it differs.
+
+        Parameters
+        ----------
+        sampled : bool
+            Whether importance sampling finds thresholds that cannot be counted; if not, more realisations are drawn.
+        """
         run = self.run
         if not 0 < run.fap < 1 or countable(run.fap, run.realisations):
             return self, []
-        message = (
+        least = least_countable(run.fap)
+        if not sampled and least > MOST_RAISED:
+            return self, []
+        few = (
             f"{run.realisations} realisations are too few to count thresholds with a false-alarm probability of "
-            f"{run.fap:g}, so importance sampling finds them (`tails='sampled'`)."
+            f"{run.fap:g}, so "
         )
-        return self.with_settings(["run.tails=sampled"]), [message]
+        if sampled:
+            return self.with_settings(["run.tails=sampled"]), [
+                f"{few}importance sampling finds them (`tails='sampled'`)."
+            ]
+        return self.with_settings([f"run.realisations={least}"]), [f"{few}{least} are drawn."]
 
     def toml(self) -> str:
         """Return the study as TOML, without sections that have their default values."""

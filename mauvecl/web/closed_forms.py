@@ -17,6 +17,7 @@ from mauvecl.answers.closed_forms import InterpolatedForm, cost_lines, marginal_
 from mauvecl.answers.limit_search import LimitSearch
 from mauvecl.detection.distributions import Gaussian, Mixture
 from mauvecl.detection.requests import STATISTICS
+from mauvecl.host.exposure.expectation import entirely_saturated
 from mauvecl.schema.errors import InputError
 from mauvecl.study.cases import collect_messages
 from mauvecl.web.fields import FIELDS, IDEAL, REALISTIC, UNKNOWN, Choice, star_words
@@ -69,8 +70,7 @@ class ClosedForms:
         """Closed form of the requested statistic, for Gaussian noise."""
         statistic, setting = STATISTICS[self.question.statistic], self.case.setting(self.quiet, self.flare)
         if not setting.used.any():
-            name = self.quiet.name
-            raise InputError(f"every pixel of {name} is saturated", "a fainter star", key="magnitude")
+            raise entirely_saturated(self.quiet, "magnitude")
         statistic.check(setting)
         return statistic.detection_forms(setting, self.flare, self.question.fap)
 

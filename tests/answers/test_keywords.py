@@ -81,6 +81,10 @@ def test_studies_are_built_from_the_same_keywords() -> None:
     assert study.toml() == Study().paper().with_settings(settings).toml()
     by_name = Study.of(targets=["AU Mic", {"name": "eps Eri", "age_myr": 400, "mass_msun": 0.8}]).plan.targets
     assert [target.name for target in by_name] == ["AU Mic", "eps Eri"]
+    pairs = Study.of(gap="10 min:0.5 h", skip=["322:3680 Angstrom"], declination="-30 deg:1800 arcmin")
+    assert pairs.stare.gaps == ((600.0, 1800.0),)
+    assert pairs.measure.skipped_nm == ((322.0, 368.0),)
+    assert pairs.orbit.limits.declination_deg == (-30.0, 30.0)
     # A name of two keys is refused, not given to one of them.
     with pytest.raises(InputError, match="no keyword 'shape'"):
         Study.of(shape="davenport")
@@ -90,6 +94,15 @@ def test_too_few_realisations_are_warned_of() -> None:
     with pytest.warns(UserWarning, match="2000 realisations are too few"):
         answer = mauvecl.detect(star="G2V", magnitude=7, amplitude=0.1, realisations=2000, ideal=True)
     assert answer.study.run.tails == "sampled"
+
+
+def test_maps_draw_more_instead() -> None:
+    axes = {"x": "magnitude=6,8", "y": {"quantity": "amplitude", "values": [0.1, 1]}}
+    with pytest.warns(UserWarning, match="10 realisations are too few .* so 1000 are drawn"):
+        answer = mauvecl.map(star="G2V", **axes, realisations=10, fap=0.1, ideal=True)
+    assert answer.study.run.realisations == 1000
+    with pytest.raises(InputError, match="ask for 100000000 realisations"):
+        mauvecl.map(star="G2V", **axes, realisations=10, fap=1e-6, ideal=True)
 
 
 @pytest.mark.parametrize(("named", "keywords"), [

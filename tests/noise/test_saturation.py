@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scenes import instrument, star
 
-from mauvecl import Engine, Expectation, Normal, Processes
+from mauvecl import Engine, Expectation, InputError, Normal, Processes
 from mauvecl.noise import reference
 from mauvecl.noise.scene import prepare
 
@@ -129,3 +129,12 @@ def test_saturated_pixels_and_exposures_are_reported() -> None:
     assert "the longest safe frame is " in often
     assert rarely.startswith("SATURATED at times: pixels of G2V ")
     assert not never.startswith("SATURATED")
+
+
+def test_star_that_saturates_every_pixel_is_refused_with_a_safe_frame() -> None:
+    payload = instrument(part=True, output_min_nm=290.0, output_max_nm=350.0)
+    quiet, *_ = star(magnitude=-6.0, payload=payload)
+    with pytest.raises(InputError, match="frames of at most") as caught:
+        Engine().detect(quiet, [quiet], realisations=1000)
+    safe = float(str(caught.value).split("at most ")[1].split()[0])
+    assert safe <= quiet.longest_safe_frame_s < safe + 0.0011
