@@ -25,7 +25,7 @@ from mauvecl.observations.frame_model import FrameModel
 from mauvecl.observations.frames import Frames, Reason
 from mauvecl.observations.reduction import barycentric
 from mauvecl.observations.visits import flux_per_dn
-from mauvecl.schema.columns import Column, View, interval, number, percent
+from mauvecl.schema.columns import Column, View, formatted, interval, number, percent
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import DAY_S
 from mauvecl.study.cases import cases
@@ -261,7 +261,7 @@ def _rate(value: float) -> str:
 #: Columns of the table of events; names as in AltaiPony's flare tables where it has the quantity.
 EVENTS = (
     Column("date", description="of the brightest frame, in the time scale of the file", heading="brightest at",
-           format=lambda text: text[:22], kind=str),
+           format=lambda text: text[:19], kind=str),
     Column("tstart", lambda row: row.time_d(row.event.first), "d", "middle of the first frame, from time zero"),
     Column("tpeak", lambda row: row.time_d(row.event.brightest), "d", "middle of the brightest frame"),
     Column("tstop", lambda row: row.time_d(row.event.last), "d", "middle of the last frame"),
@@ -273,7 +273,7 @@ EVENTS = (
     Column("total_n_valid_data_points", lambda row: row.analysis.survey.stare.n_frames, "", "searched frames",
            kind=int),
     Column("dur", "duration_d", "d", "from the start of the first frame to the end of the last", "duration (min)",
-           lambda days: f"{1440 * days:.3g}"),
+           lambda days: formatted(1440 * days, ".3g")),
     Column("ampl_rec", "event.amplitude", "", "largest flux above the level, relative to the level", "peak",
            percent(".3g")),
     Column("ed", lambda row: row.fitted_s[0], "s", "recommended equivalent duration, of the whole flare: the light "

@@ -120,13 +120,14 @@ def _coverage_columns(level: float, suffix: str, whose: str, heading: str = "") 
 
 #: Columns of the measured quantities of a `MeasuredFlare`.
 COLUMNS = (
-    Column("quantity", "found.names", "", "what is measured", "quantity"),
-    Column("unit", "found.units", "", "of truth, estimates and errors", "unit"),
+    Column("quantity", "found.names", "", "what is measured", "quantity",
+           lambda name, unit: f"{name} ({unit})" if unit else name, ("unit",)),
+    Column("unit", "found.units", "", "of truth, estimates and errors"),
     Column("truth", "", "", "true value; undefined where the flare has none", "truth", number(".4g")),
-    Column("error_known", "known.errors", "", "standard error in advance, everything known", "ideal error",
-           number(".4g")),
+    Column("error_known", "known.errors", "", "standard error in advance, everything known", "ideal",
+           number(".3g")),
     Column("error", "ahead.errors", "", "standard error in advance, unknowns marginalised over", "error",
-           number(".4g")),
+           number(".3g")),
     Column("perfect", lambda row: row.perfect.estimates[0], "", "estimate from an exposure without noise",
            "fit without noise", number(".4g"), detail=True),
     Column("low_68", lambda row: row.perfect.low[0, 0], "",
@@ -141,7 +142,7 @@ COLUMNS = (
     Column("scatter", lambda row: _scatter(row.found.estimates), "", "half of the central 68.27 % of the estimates",
            "scatter", number(".4g"), detail=True),
     *_coverage_columns(LEVELS[0], "", "of all"),
-    *_coverage_columns(LEVELS[1], "", "of all", "95 % covers"),
+    *_coverage_columns(LEVELS[1], "", "of all", "in 95 %"),
     *_coverage_columns(LEVELS[0], "_selected", "of detected flares"),
     *_coverage_columns(LEVELS[1], "_selected", "of detected flares", "if detected"),
     Column("bias_selected", "", "", "median of the estimates of detected flares less the truth", detail=True),

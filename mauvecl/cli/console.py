@@ -340,8 +340,21 @@ def show_view(view: View, *, wide: bool = True) -> bool:
     left_out = not wide and bool(view.details) and _width(headings, cells, range(len(headings))) > _room()
     if left_out:
         headings, cells = without_empty(*view.texts(view.details))
-    show_table(view.title, headings, cells, wide=wide)
+    title = view.title
+    if not wide and len(cells) > 1 and _width(headings, cells, range(len(headings))) > _room():
+        shared, headings, cells = _without_shared(headings, cells)
+        title = "; ".join([title, *shared])
+    show_table(title, headings, cells, wide=wide)
     return left_out
+
+
+def _without_shared(
+    headings: Sequence[str], cells: Sequence[Sequence[str]]
+) -> tuple[list[str], list[str], list[list[str]]]:
+    """Return the values of the first columns that all rows share, and the other headings and cells."""
+    first = next((k for k, column in enumerate(zip(*cells, strict=True)) if len(set(column)) > 1), 0)
+    shared = [f"{heading} {text}" for heading, text in zip(headings[:first], cells[0], strict=False)]
+    return shared, list(headings[first:]), [list(row[first:]) for row in cells]
 
 
 def _room() -> int:

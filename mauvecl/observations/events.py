@@ -278,7 +278,7 @@ class ObservedEvent:
     # first, last: first and last frame of the event, inclusive.
     first: int
     last: int
-    brightest: int  # frame of the largest flux
+    brightest: int  # frame of the largest flux, or of the largest weighted sum of spectra
     half_width_s: float  # half-width of the best template
     amplitude: float  # largest flux above the level, relative to the level
     missing: int  # number of frames missing inside the event
@@ -310,8 +310,12 @@ def measure_events(
     """
     steps = steps or Steps()
     level = survey.flux_level(~taken)
+    # In the sum over wavelength of spectra, dark current and losses of light may exceed a flare; weights leave them out.
+    bright = survey.along(len(survey.bank.directions) // 2, ~taken) if survey.weighted else survey.flux - level
     kinds: Sequence[Kind] = causes or ["flare"] * len(found)
-    measured = map_in_threads(lambda k: measure_event(survey, taken, level, found[k], kinds[k]), range(len(found)))
+    measured = map_in_threads(
+        lambda k: measure_event(survey, taken, level, bright, found[k], kinds[k]), range(len(found))
+    )
     events = list(steps.each(measured, len(found)))
     for k, event in enumerate(events):
         ends = (event.first - 1, event.last + 1)
@@ -323,7 +327,7 @@ def measure_events(
 
 
 def measure_event(
-    survey: SeriesSurvey, taken: Bool, level: Float, found: Detection, cause: Kind = "flare"
+    survey: SeriesSurvey, taken: Bool, level: Float, bright: Float, found: Detection, cause: Kind = "flare"
 ) -> ObservedEvent:
     """Measure a detected event.
 
@@ -333,6 +337,8 @@ def measure_event(
         Frames of all events.
     level : ndarray, shape (n_frame,)
         Quiescent level of the flux, in units of the survey's scale.
+    bright : ndarray, shape (n_frame,)
+        Light above the level, by which the brightest frame is chosen.
     found : Detection
     cause : str
         Follows from the spectrum of the event.
@@ -341,7 +347,7 @@ def measure_event(
     rows = slice(first, last + 1)
     energy = measure_energy(survey, taken, level, found)
     flux, numbers = (survey.flux[rows] - level[rows]) * survey.scale, survey.stare.numbers
-    brightest = first + int(np.argmax(flux))
+    brightest = first + int(np.argmax(bright[rows]))
     around = numbers[max(brightest - 1, 0) : brightest + 2]
     missing_s = (int(np.diff(around).max()) - 1) * survey.stare.frame_s
     ends = (first == 0, last == survey.stare.n_frames - 1)
