@@ -12,7 +12,7 @@ from urllib.parse import parse_qsl, urlencode
 
 from mauvecl.answers.answer import chance_text
 from mauvecl.answers.closed_forms import BOTH_CHANCES
-from mauvecl.answers.verbs import VERBS
+from mauvecl.answers.verbs import GROUPS, VERBS
 from mauvecl.detection.names import check_fap
 from mauvecl.host.exposure.sky import parse_position, parse_time
 from mauvecl.host.stars.library import listed_note, resolve
@@ -28,7 +28,7 @@ from mauvecl.web.question import OTHER, SIMULATIONS, Question
 from mauvecl.web.tab import Compare, Tab
 from mauvecl.web.uploads import UPLOADS
 
-#: Tabs with pictures, in the order of the page.
+#: Tabs with pictures, in the order of their group.
 DRAWN: dict[str, Tab] = {
     tab.name: tab
     for tab in (
@@ -56,11 +56,16 @@ def _tab_of(verb: str) -> Tab:
     return made
 
 
-#: All tabs by name, in the order of the page.
+#: All tabs by name, in the order of the page: group by group.
 TABS: dict[str, Tab] = {
-    **DRAWN,
-    **{name: _tab_of(name) for name, verb in VERBS.items() if verb.tab and name not in DRAWN},
-    Compare.name: Compare(),
+    tab.name: tab
+    for group in GROUPS
+    for tab in (
+        *DRAWN.values(),
+        *(_tab_of(name) for name, verb in VERBS.items() if verb.tab and name not in DRAWN),
+        Compare(),
+    )
+    if tab.group == group
 }
 
 

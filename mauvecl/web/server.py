@@ -31,6 +31,7 @@ from tornado.iostream import IOStream
 from tornado.routing import Matcher, Rule
 from tornado.web import Application, RequestHandler
 
+from mauvecl.answers.verbs import GROUPS
 from mauvecl.host import VERSION
 from mauvecl.host.exposure.star import KNOWN
 from mauvecl.host.stars.library import all_names, library_names, well_known_stars
@@ -382,7 +383,7 @@ def front() -> bytes:
     template = lookup.get_template("page.html.mako")
     text = template.render(
         fields=fields, uploads=UPLOADS, names=[star.name for star in well_known_stars()],
-        library=library_names(), tabs=TABS, version=VERSION,
+        library=library_names(), tabs=TABS, groups=GROUPS, version=VERSION,
         bibtex=BIBTEX.format(version=VERSION), titles=TITLES, digest=_digest(),
         words=json.dumps(_words()).replace("<", "\\u003c"),
     )  # fmt: skip

@@ -44,6 +44,8 @@ class Tab(ABC):
     view: ClassVar[int] = 0  # number of that table among the answer's `views`
     #: Questions of "Share, export, cite": names of simulations or verbs; by default its own simulations.
     questions: ClassVar[tuple[str, ...]] = ()
+    #: Key of `GROUPS` under whose heading it stands; by default that of the verb that answers its first question.
+    group: ClassVar[str]
     #: Whether the chance of detection stands above it, whose fields it then shows.
     headline: ClassVar[bool] = True
     #: Fields that it reads although its verbs do not take their keys, and those that it does not read.
@@ -60,6 +62,8 @@ class Tab(ABC):
             cls._follow_verb()
         if "questions" not in vars(cls):
             cls.questions = tuple(cls.simulations) or ("detection",)
+        if "group" not in vars(cls):
+            cls.group = VERBS[verbs_of(cls.questions[0])[0]].group
 
     @classmethod
     def _follow_verb(cls) -> None:
@@ -130,5 +134,5 @@ class Tab(ABC):
 class Compare(Tab):
     """Pinned scenarios and the history of runs."""
 
-    name, title = "compare", "Compare"
+    name, title, group = "compare", "Compare", "tools"
     about = "Scenarios that you have pinned, side by side, and what you have simulated; this browser tab keeps them."

@@ -787,12 +787,17 @@ def test_visitor_with_a_phone(browser: Browser, server: Server) -> None:
 
 
 def test_visitor_with_a_keyboard(page: Page) -> None:
-    """Tabs turn round, a slider and a help text stand where they belong, and a plan is pinned and found again.
+    """Tabs stand in groups and turn round, a slider and a help text stand where they belong, and a plan is pinned and found again.
 
     Newcomers with keys alone do the rest, and see at every stop where they are.
     """
+    headings = page.locator("[role=tablist] > div > span").all_inner_texts()
+    assert headings == ["Plan observations", "Simulate observations", "Analyse observations", "Tools"]
+    for name, number in (("detection", 0), ("visibility", 0), ("snr", 1), ("calibrate", 2), ("compare", 3)):
+        described = page.locator(f"#tab-{name}").get_attribute("aria-describedby")
+        assert page.locator(f"#{described}").inner_text() == headings[number], name
     page.locator("#tab-detection").focus()
-    for key, name in (("ArrowRight", "spectrum"), ("ArrowLeft", "detection"), ("ArrowLeft", "compare")):
+    for key, name in (("ArrowRight", "limit"), ("ArrowLeft", "detection"), ("ArrowLeft", "compare")):
         page.keyboard.press(key)
         assert page.evaluate("document.activeElement.id") == f"tab-{name}"
     page.keyboard.press("Home")

@@ -232,13 +232,21 @@ ${control(name)}
 </div>
 % endfor
 <div class="tabs">
+<% first = next(iter(tabs)) %>
 <div role="tablist" aria-label="Pictures of the answer">
-% for k, tab in enumerate(tabs.values()):
-<button type="button" role="tab" id="tab-${tab.name}" aria-controls="panel-${tab.name}" aria-selected="${"true" if k == 0 else "false"}" tabindex="${0 if k == 0 else -1}" data-title="${tab.title}">${tab.title}</button>
+% for group, heading in groups.items():
+<div role="none">
+<span id="group-${group}" aria-hidden="true">${heading}</span>
+% for tab in tabs.values():
+% if tab.group == group:
+<button type="button" role="tab" id="tab-${tab.name}" aria-controls="panel-${tab.name}" aria-describedby="group-${group}" aria-selected="${"true" if tab.name == first else "false"}" tabindex="${0 if tab.name == first else -1}" data-title="${tab.title}">${tab.title}</button>
+% endif
 % endfor
 </div>
-% for k, tab in enumerate(tabs.values()):
-<div role="tabpanel" id="panel-${tab.name}" aria-labelledby="tab-${tab.name}"${"" if k == 0 else " hidden"}>
+% endfor
+</div>
+% for tab in tabs.values():
+<div role="tabpanel" id="panel-${tab.name}" aria-labelledby="tab-${tab.name}"${"" if tab.name == first else " hidden"}>
 <p class="about">${tab.about}</p>
 <% has_form = any(names[0] in tab.reads for names in fields.FORMS.values()) %>
 % if has_form:
