@@ -85,13 +85,30 @@ NOMINAL = "The throughput is nominal"
 TOLD = ("detection", "measure")
 
 
-def card(closed: ClosedForms, answers: Answers) -> dict[str, Any]:
+def card(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
     """Return the contents of the card.
 
-    It holds ``numbers``, one for each choice of what is unknown; ``chosen``, ``shown`` and ``interval`` of the
-    question's choice, and ``words``; ``facts``, pairs of names and values; ``notes``, pairs of sentences and kinds;
-    ``simulated``, names of what is simulated; ``files``, tabs and names of downloads.
+    It holds ``headline``, the sentence of the tab's simulated answer or nothing, and ``words``, the question;
+    ``chance`` says whether there are ``numbers``, one for each choice of what is unknown; ``chosen``, ``shown`` and
+    ``interval`` are of the question's choice; ``facts``, pairs of names and values; ``notes``, pairs of sentences and
+    kinds; ``simulated``, names of what is simulated; ``files``, tabs and names of downloads.
     """
+    return {
+        "headline": _headline(tab, answers),
+        "chance": tab.chance,
+        **(_with_chance(closed, answers) if tab.chance else _without_chance(tab, closed, answers)),
+        "simulated": sorted(name for name in answers if name not in ("snr", "draw", "seen", OTHER)),
+        "files": _files(answers),
+    }
+
+
+def _headline(tab: Tab, answers: Answers) -> str:
+    """Return the first sentence of the command line's output for the tab's simulated answer; empty without one."""
+    names = (tab.answer, *tab.questions, *tab.simulations)
+    return next((str(answers[name].headline) for name in names if name in answers), "")
+
+
+def _with_chance(closed: ClosedForms, answers: Answers) -> dict[str, Any]:
     q, x = closed.question, closed.quiet
     cut, both = closed.odds.threshold, chances(closed, answers)
     (chosen,) = (chance for chance in both if chance.unknown == q.unknown)
@@ -111,7 +128,6 @@ def card(closed: ClosedForms, answers: Answers) -> dict[str, Any]:
         f"per test, with the payload {q.instrument}"
     )
     return {
-        "headline": True,
         "numbers": [chance.shown for chance in both],
         "chosen": q.unknown,
         "shown": chance_text(chosen.value),
@@ -119,16 +135,12 @@ def card(closed: ClosedForms, answers: Answers) -> dict[str, Any]:
         "words": words,
         "facts": facts,
         "notes": _with_kinds(_messages(closed, answers)),
-        "simulated": _simulated_sentences(answers),
-        "files": _files(answers),
     }
 
 
-def without_headline(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
-    """Return the `card` of a tab that asks for no chance of detection."""
+def _without_chance(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
     messages = list(answers[tab.answer].messages) if tab.answer in answers else []
     return {
-        "headline": False,
         "numbers": [],
         "chosen": "",
         "shown": tab.title,
@@ -136,13 +148,7 @@ def without_headline(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[st
         "words": tab.words(closed.question),
         "facts": [],
         "notes": _with_kinds([m for m in dict.fromkeys(messages) if not m.startswith(NOMINAL)]),
-        "simulated": _simulated_sentences(answers),
-        "files": _files(answers),
     }
-
-
-def _simulated_sentences(answers: Answers) -> list[str]:
-    return sorted(name for name in answers if name not in ("snr", "draw", "seen", OTHER))
 
 
 def _files(answers: Answers) -> list[str]:

@@ -420,7 +420,7 @@ def _words() -> dict[str, Any]:
                     for p in tab.pictures
                 ],
                 "reads": sorted(tab.reads),
-                "headline": tab.headline,
+                "chance": tab.chance,
             }
             for tab in TABS.values()
         },

@@ -47,7 +47,7 @@ class Tab(ABC):
     #: Key of `GROUPS` under whose heading it stands; by default that of the verb that answers its first question.
     group: ClassVar[str]
     #: Whether the chance of detection stands above it, whose fields it then shows.
-    headline: ClassVar[bool] = True
+    chance: ClassVar[bool] = True
     #: Fields that it reads although its verbs do not take their keys, and those that it does not read.
     also: ClassVar[tuple[str, ...]] = ()
     never: ClassVar[tuple[str, ...]] = ()
@@ -77,9 +77,9 @@ class Tab(ABC):
 
     @cached_property
     def reads(self) -> frozenset[str]:
-        """Fields on which the tab depends, with those of its headline: the chance, and the limit in a sentence."""
-        headline = ("detection", "limit") if self.headline else ()
-        return self.reads_of(*self.questions, *self.simulations, *headline)
+        """Fields on which the tab depends, with those of the card: the chance, and the limit in a sentence."""
+        above = ("detection", "limit") if self.chance else ()
+        return self.reads_of(*self.questions, *self.simulations, *above)
 
     def reads_of(self, *questions: str) -> frozenset[str]:
         """Return the fields on which simulations or verbs depend, by the keys that the flags of their verbs set."""
@@ -97,7 +97,7 @@ class Tab(ABC):
         return {}
 
     def words(self, question: Question) -> str:
-        """Return the question of a tab without a headline, in words."""
+        """Return the question of a tab without the chance, in words."""
         star = "your own star" if question.uploaded is not None else star_words(question.star)
         return f"{star} of {question.band} = {question.magnitude:g}"
 

@@ -114,8 +114,8 @@ def test_hidden_fields_change_nothing_and_others_do(server: Server) -> None:
                 if old == new:
                     old, new = [await once(talk.answer, one, tab) for one in asked]
                     # Limits stand in a sentence of their own; the number of draws and their seed are the button's.
-                    headline = words["tabs"][tab]["headline"] and name in ("of", "power", "realisations", "seed")
-                    assert headline or {**old, "n": 0} != {**new, "n": 0}, f"{tab} shows {name}, which changes nothing"
+                    above = words["tabs"][tab]["chance"] and name in ("of", "power", "realisations", "seed")
+                    assert above or {**old, "n": 0} != {**new, "n": 0}, f"{tab} shows {name}, which changes nothing"
 
     server.visited(work)
 

@@ -26,7 +26,7 @@ pytestmark = pytest.mark.long
 
 
 def shown(page: Page) -> str:
-    """Return the answer in the words of the card."""
+    """Return the answer in the words of the card: a sentence, and both chances."""
     settled(page)
     return "\n".join(page.locator("#card :is(.message, .words)").all_inner_texts())
 
@@ -131,7 +131,7 @@ def test_visitor_changes_values_and_reads_the_answer(browser: Browser, server: S
     # A 2 % flare on a G2V star of V = 7.4 in 50 s.
     enter(page, "Magnitude", "7.4")
     reported = shown(page)
-    assert reported.startswith("78.0 %")
+    assert page.locator("#chance").inner_text() == "78.0 %"
     assert "a 2 % flare (10000 K) on a G2V star of V = 7.4, in 50 s (10 frames)" in reported
     for found in ("#f-star", "#f-magnitude", "#f-amplitude_percent", "#f-exposure_s", "#chance", "#facts", "#simulate",
                   "#plot-excess", "#plot-distributions"):  # fmt: skip
@@ -478,7 +478,10 @@ def test_visitor_simulates_shares_and_compares(browser: Browser, page: Page, ser
     assert "of 10,000 simulated" in reported
     rows = QTable.read(io.BytesIO(download(page, "detection (ecsv)")), format="ascii.ecsv")
     (row,) = (row for row in rows if row["statistic"] == "matched")
-    assert reported.startswith(f"{100 * row['probability']:.1f} %")
+    assert reported.startswith("Mauve would see a flare of 1.5 % on G2V V = 8.5 in 50 s with a chance of "), (
+        "the answer"
+    )
+    assert reported.count(f"{100 * row['probability']:.1f} %") >= 2, "in the sentence and in the number"
     # The link is opened again.
     until(page, lambda: "simulated=detection" in page.url)
     second = fresh(browser, page.url)
@@ -787,7 +790,7 @@ def test_visitor_with_a_phone(browser: Browser, server: Server) -> None:
 
 
 def test_visitor_with_a_keyboard(page: Page) -> None:
-    """Tabs stand in groups and turn round, a slider and a help text stand where they belong, and a plan is pinned and found again.
+    """Tabs stand in groups and turn round, slider and help stand where they belong, a plan is pinned and found again.
 
     Newcomers with keys alone do the rest, and see at every stop where they are.
     """
@@ -820,7 +823,7 @@ def test_visitor_with_a_keyboard(page: Page) -> None:
     # The plan survives a change of the star of other tabs, is pinned, and is found again.
     tab(page, "Plan")
     page.wait_for_url("**tab=plan**")
-    assert not page.locator("#card").is_visible(), "no headline of another star"
+    assert not page.locator("#numbers").is_visible(), "no chance of another star"
     assert not page.get_by_label("Magnitude", exact=True).is_visible()
     page.locator("#panel-plan .rows", has_text="best months").wait_for()
     page.get_by_label("Target of target 1").click()
@@ -835,6 +838,7 @@ def test_visitor_with_a_keyboard(page: Page) -> None:
     until(page, lambda: all(name in table.inner_text() for name in ("AU Mic", "eps Eri", "YZ CMi", "false alarms")))
     page.locator("#figure-recovered .legend", has_text="YZ CMi").wait_for()
     planned = table.inner_text()
+    assert page.locator("#words-of").inner_text().startswith("Mauve would recover ")
     page.get_by_role("button", name="Pin", exact=True).click()
     tab(page, "Detection")
     enter(page, "Magnitude", "6")

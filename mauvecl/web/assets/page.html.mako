@@ -182,6 +182,7 @@ ${control(name)}
 <section id="answer" aria-labelledby="answer-head" tabindex="-1">
 <h2 id="answer-head" class="quiet">Answer</h2>
 <div id="card" class="card" aria-busy="true">
+<p class="words" id="words-of" aria-live="polite">the answer is on its way</p>
 <div class="message" aria-live="polite" aria-atomic="true">
 <p class="chance" id="no-answer" hidden>No answer.</p>
 <div id="numbers" role="group" aria-label="Chance to detect the flare">
@@ -196,7 +197,6 @@ ${control(name)}
 </div>
 <div class="rest">
 <div class="below">
-<p class="words" id="words-of">the answer is on its way</p>
 <div class="solve">
 % for name in fields.SOLVED:
 ${control(name)}

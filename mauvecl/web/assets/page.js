@@ -86,11 +86,11 @@ class Page {
     this.front()
   }
 
-  // The tab in front shows the fields on which it depends; the card is that of the detection.
+  // The tab in front shows the fields on which it depends.
   front() {
-    const {reads, headline} = this.tab
+    const {reads, chance} = this.tab
     this.fields.front(reads)
-    byId("card").hidden = !headline
+    this.card.front(chance)
     for (const form of every("[data-form]")) {
       form.hidden = !reads.includes(form.dataset.form)
       if (!form.hidden) byId(`panel-${this.routing.seen.tab}`).querySelector(".about").after(form)
@@ -150,7 +150,6 @@ class Page {
     this.discardAnswer()
     document.title = "No answer: mauvecl"
     this.fields.tell(faults)
-    if (refused && !this.tab.headline) this.card.notices([[refused, "danger"]])
     this.card.none(refused ?? Object.entries(faults).map(([name, why]) => this.fields.said(name, why)).join("; "))
   }
 
@@ -167,7 +166,7 @@ class Page {
       this.compare.ran({...this.scenario(), at: new Date().toLocaleTimeString()})
     }
     clearTimeout(this.later)
-    if (answer.headline) this.later = setTimeout(() => this.solve(), SOLVE_MS)
+    if (answer.chance) this.later = setTimeout(() => this.solve(), SOLVE_MS)
     this.simulations.next(answer.simulated)
   }
 
@@ -291,8 +290,8 @@ class Page {
     const facts = [...this.answer.facts]
     for (const one of this.answer.numbers) facts.push([one.title, one.shown])
     const entered = {...this.fields.entered}
-    // Where there is no headline, the table is what is compared.
-    const rows = this.tab.headline ? undefined : this.rows
+    // Where there is no chance, the table is what is compared.
+    const rows = this.tab.chance ? undefined : this.rows
     return {link: this.routing.link, entered, files: this.uploads.of(entered), shown, interval, facts, words: said, rows}
   }
 
