@@ -81,6 +81,9 @@ def reads_of(simulation: str) -> frozenset[str]:
 
 #: Part of the message about the throughput, which the page shows once.
 NOMINAL = "The throughput is nominal"
+#: Kinds of messages that change the answer, which are shown in red.
+CHANGING = {"saturated", "no answer", "no limit", "no threshold", "no light", "wrong sign", "not marginalised",
+            "outside the prior"}  # fmt: skip
 #: Answers whose messages are shown, since they include those of the others.
 TOLD = ("detection", "measure")
 
@@ -159,8 +162,8 @@ def _files(answers: Answers) -> list[str]:
 
 
 def _with_kinds(messages: list[str]) -> list[tuple[str, str]]:
-    """Return messages with their kinds: severe ones begin in capitals."""
-    return [(note(m), "danger" if m.partition(":")[0].isupper() else "info") for m in messages]
+    """Return messages, and whether each is a danger to the answer or mere information."""
+    return [(note(m), "danger" if getattr(m, "kind", "") in CHANGING else "info") for m in messages]
 
 
 def _messages(closed: ClosedForms, answers: Answers) -> list[str]:

@@ -304,7 +304,10 @@ def test_own_star_and_unknown_are_in_the_study_that_the_command_names(server: Se
         await talk.upload(rows_of(np.arange(170, 1001), np.full(831, 1e-12)))
         await talk.upload(b"# nm DN\n200 1\n450 3.5\n700 1\n", "own_unknown", "stray.txt")
         asked = link(star="uploaded star", own_unknown="uploaded spectrum")
-        assert "your own star" in (await talk.answer(asked))["answer"]["words"]
+        reported = (await talk.answer(asked))["answer"]
+        assert "your own star" in reported["words"]
+        assert any("ASSUMED" in text for text, _ in reported["notes"])
+        assert {kind for _, kind in reported["notes"]} == {"info"}, "red is what changes the answer"
         for tab, shown in SHOWN.items():
             for one in (await talk.exported(asked, tab)).values() if "star" in shown else ():
                 assert re.fullmatch(r"mauvecl \w+ study\.toml", one["command"])

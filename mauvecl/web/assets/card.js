@@ -128,7 +128,7 @@ export class Card {
       away.setAttribute("aria-label", `Put away: ${text.slice(0, 60)}`)
       away.onclick = () => { this.dismissed.add(text); made.remove() }
       const said = element("span", text)
-      if (kind === "danger") said.setAttribute("role", "alert")
+      if (kind !== "info") said.setAttribute("role", "alert")
       made.append(said, away)
       return made
     }

@@ -45,7 +45,7 @@ class Page {
     }, (field, file) => this.uploads.choose(field, file))
     this.routing = new Routing(words, this.fields.entered, () => this.moved(), () => { this.front(); this.ask() })
     this.live = new Live(version => this.back(version), code => this.lost(code))
-    const refused = (/** @type {string} */ why) => this.card.notices([[why, "danger"]])
+    const refused = (/** @type {string} */ why) => this.card.notices([[why, "notice"]])
     this.simulations = new Simulations(this.live, this.routing, this.card, {
       question: kind => this.asked(words.asks[kind]), ready: () => this.answer !== null, offer: () => this.offer(),
       lacks: kind => lacks(kind, this.fields.entered, words.needs) ? "a field that it needs is empty" : "",
@@ -212,7 +212,7 @@ class Page {
     if (question !== this.question) return
     // Without an answer the notes of the last one keep their room, unseen: nothing jumps while a number is typed.
     /** @type {[string, string][]} */
-    const stray = message.stray ? [[message.stray, "stray"]] : []
+    const stray = message.stray ? [[message.stray, "notice"]] : []
     if (message.answer || message.stray) this.card.notices([...stray, ...(message.answer?.notes ?? [])])
     if (message.answer) this.tell(message.answer)
     else this.none(message.faults, message.refused)
