@@ -68,6 +68,8 @@ def test_plans_are_the_same_everywhere(server: Server, tmp_path: Path) -> None:
     async def of_the_page(talk: Talk) -> tuple[str, bytes]:
         assert (await talk.simulate("plan", asked)).startswith("Done")
         headline = (await talk.answer(asked, "plan"))["answer"]["headline"]
+        command = (await talk.exported(f"{asked}&temperature_c=21", "plan"))["plan"]["command"]
+        assert "--temperature 21" in command, "what is entered is no default"
         return headline, (await talk.file(link=asked, tab="plan", name="plan", ending="ecsv"))[1]
 
     headline, table = server.visited(of_the_page)

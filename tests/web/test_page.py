@@ -128,6 +128,9 @@ def test_visitor_changes_values_and_reads_the_answer(browser: Browser, server: S
     assert page.get_by_text("not a flight calibration").count() == 1, "stated once"
     assert page.get_by_label("Exposure, slider").get_attribute("aria-valuetext") == "50 s"
     assert page.get_by_label("Magnitude, slider").get_attribute("aria-valuetext") == "V = 8.5"
+    temperature = page.get_by_label("Detector temperature", exact=True)
+    assert temperature.input_value() == ""
+    assert temperature.get_attribute("placeholder") == "21, or along the orbit in plans"
     # A 2 % flare on a G2V star of V = 7.4 in 50 s.
     enter(page, "Magnitude", "7.4")
     reported = shown(page)

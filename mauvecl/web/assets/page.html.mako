@@ -50,7 +50,7 @@ ${control(option)}
 <p class="known"><span id="k-star"></span> <button type="button" class="plain" id="o-star" hidden></button></p>
 ${upload("star", "Use your own spectrum", "Your own spectrum", "text, ECSV, VOTable or FITS; or drop it here")}
 % elif name == "own_unknown":
-<input id="f-own_unknown" name="own_unknown" type="text" autocomplete="off" spellcheck="false" placeholder="200 1, 450 3, 700 1" aria-describedby="w-own_unknown">
+<input id="f-own_unknown" name="own_unknown" type="text" autocomplete="off" spellcheck="false" placeholder="${field.placeholder}" aria-describedby="w-own_unknown">
 ${upload("own_unknown", "Use a file of nm and DN", "File of the unknown spectrum", "")}
 % elif field.kind == "file":
 <input id="f-${name}" name="${name}" type="text" aria-label="${field.label}" hidden>
@@ -63,7 +63,7 @@ ${upload(name, "Use a file", field.label, "text, ECSV, VOTable or FITS; or drop 
 <button type="button" class="plain" id="targets-clear" hidden>Remove all</button>
 <p class="wrong" id="w-targets" hidden></p><span class="hint">Type names or paste a list or table; what is known of a star stands in grey and can be overwritten.</span></div>
 % elif field.kind == "table":
-<textarea id="f-${name}" name="${name}" rows="3" spellcheck="false" placeholder="name,separation,magnitude,spectral_type" aria-describedby="w-${name}"></textarea>
+<textarea id="f-${name}" name="${name}" rows="3" spellcheck="false" placeholder="${field.placeholder}" aria-describedby="w-${name}"></textarea>
 <div class="file"><button type="button" class="plain" data-open-text="${name}">Open a CSV table</button><input type="file" data-text="${name}" accept=".csv,.txt" aria-label="CSV table: ${field.label}" tabindex="-1" hidden></div>
 % elif field.kind == "upload":
 <input id="f-${name}" name="${name}" type="hidden" value="">
@@ -82,7 +82,7 @@ ${upload(name, "Use a file", field.label, "text, ECSV, VOTable or FITS; or drop 
 <p class="known" id="n-realisations"></p>
 % endif
 % else:
-<div class="number"><input id="f-${name}" name="${name}" type="text" value="${field.first}" autocomplete="off" spellcheck="false"
+<div class="number"><input id="f-${name}" name="${name}" type="text" value="${field.first}" placeholder="${field.placeholder}" autocomplete="off" spellcheck="false"
  ${"inputmode=decimal" if hasattr(field.read, "range") else "list=names" if name == "target" else "list=library" if field.kind == "library" else f"list=s-{name}" if field.suggestions else ""} aria-describedby="w-${name}">
 % if name == "magnitude":
 <label class="aside" for="f-band">in</label>
