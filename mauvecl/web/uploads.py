@@ -307,6 +307,12 @@ UPLOADS: Mapping[str, Upload] = {
 }
 
 
+#: Assets that visitors may try in place of a file of their own, by field, with what they are.
+EXAMPLES: Mapping[str, tuple[str, str]] = {
+    "frames": ("kepler-example.fits", "12 days of KIC 10002792, a flare star, by Kepler (NASA, in the public domain)"),
+}
+
+
 def read_frames_of(
     file: VisitorFile, mapping: VisitorFile | None, key: str, *, quality_bits: str | None = None
 ) -> Frames:

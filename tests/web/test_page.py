@@ -877,6 +877,17 @@ def test_visitor_pastes_and_opens_targets(page: Page, tmp_path: Path) -> None:
     assert page.get_by_role("button", name="Find when").is_disabled()
 
 
+def test_visitor_tries_an_example(page: Page) -> None:
+    """One click reads a light curve of Kepler and answers it, whatever was entered on another file."""
+    tab(page, "Analyse")
+    page.get_by_label("Quality bits", exact=True).fill("all")
+    page.get_by_role("button", name="Try an example file").click()
+    page.get_by_text("Done: ").wait_for()
+    until(page, lambda: "flares are detected in 9.97 star-days of KIC 10002792" in shown(page))
+    assert page.get_by_label("Quality bits", exact=True).input_value() == ""
+    assert "detected" in page.locator("#panel-analyse .rows").inner_text()
+
+
 @pytest.mark.parametrize("theme", ["light", "dark", "forced"])
 def test_visitor_with_a_screen_reader_or_other_colours_and_sizes(browser: Browser, server: Server, theme: str) -> None:
     """axe-core finds no violation of any impact on any tab, dialog or error.

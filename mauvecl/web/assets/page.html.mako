@@ -70,6 +70,10 @@ ${upload(name, "Use a file", field.label, "text, ECSV, VOTable or FITS; or drop 
 <div class="file"><button type="button" data-choose="${name}" aria-describedby="w-${name}">Choose a file</button>
 <input type="file" data-upload="${name}" aria-label="${field.label}" tabindex="-1" hidden><span class="hint">or drop it here, at most ${uploads[name].most // 2**20} MiB</span>
 <span data-uploaded="${name}"></span> <span data-remedies="${name}"></span> <button type="button" class="plain" data-remove="${name}" hidden>Remove</button></div>
+% if name in examples:
+<% asset, about = examples[name] %>
+<div class="file"><button type="button" data-example="${name}" data-asset="${asset}">Try an example file</button><span class="hint">${about}</span></div>
+% endif
 % elif field.kind == "day":
 <input id="f-${name}" name="${name}" type="date" value="${field.first}" aria-describedby="w-${name}">
 % elif hasattr(field.read, "options"):

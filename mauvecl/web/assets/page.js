@@ -33,16 +33,22 @@ class Page {
     /** @type {Answer | null} */
     this.answer = null
     this.asking = this.dirty = false
+    // The simulation that answers an example, once its file is read.
+    this.tried = ""
     /** Table of the tab in front.
      * @type {string[][]} */
     this.rows = []
     this.card = new Card()
     this.fields = new Fields(words, (name, last, other) => {
       // A changed question cancels the wait for a file.
+      if (other) this.tried = ""
       if (other) this.uploads.forget([name])
       if (other) this.uploads.changed(name, last)
       this.changed(last, other)
-    }, (field, file) => this.uploads.choose(field, file))
+    }, (field, file) => {
+      this.tried = ""
+      this.uploads.choose(field, file)
+    })
     this.routing = new Routing(words, this.fields.entered, () => this.moved(), () => { this.front(); this.ask() })
     this.live = new Live(version => this.back(version), code => this.lost(code))
     const refused = (/** @type {string} */ why) => this.card.notices([[why, "notice"]])
@@ -167,7 +173,10 @@ class Page {
     }
     clearTimeout(this.later)
     if (answer.chance) this.later = setTimeout(() => this.solve(), SOLVE_MS)
-    this.simulations.next(answer.simulated)
+    if (this.tried && !lacks(this.tried, this.fields.entered, words.needs)) {
+      this.simulations.press(this.tried)
+      this.tried = ""
+    } else this.simulations.next(answer.simulated)
   }
 
   ask() {
@@ -304,6 +313,17 @@ class Page {
     return {sentences: [...sentences.filter(Boolean), `mauvecl ${words.version}`], pins: this.compare.key("light")}
   }
 
+  /** Read an example in place of a visitor's file, without what was entered on an earlier one, and answer it.
+   * @param {HTMLElement} button */
+  async example(button) {
+    const {example, asset} = button.dataset
+    const file = new File([await (await fetch(`assets/${asset}`)).blob()], asset)
+    const form = every("[data-field]", button.closest(".form")).map(box => box.dataset.field)
+    this.enter(Object.fromEntries(form.map(name => [name, words.fields[name]])))
+    this.tried = Object.keys(words.needs).find(kind => words.needs[kind] === example) ?? ""
+    this.uploads.choose(example, file)
+  }
+
   // The connection
 
   /** @param {string} version */
@@ -351,6 +371,7 @@ class Page {
       if (given) this.enter({...words.fields, ...given})
       byId("preset").value = ""
     }
+    for (const button of every("[data-example]")) button.onclick = () => this.example(button)
     byId("go-on").onclick = () => this.live.connect()
     byId("theme").onclick = () => {
       /** @type {Record<string, string | null>} */
