@@ -41,7 +41,7 @@ from mauvecl.web.closed_forms import TITLES, ClosedForms
 from mauvecl.web.figures import INKS, PINS, Canvas
 from mauvecl.web.page import SEEN, TABS, State, reads_of
 from mauvecl.web.question import SIMULATIONS
-from mauvecl.web.uploads import EXAMPLES, UPLOADS
+from mauvecl.web.uploads import EXAMPLES, MAPPED, TIME_UNITS, UPLOADS
 from mauvecl.web.visitor import UNUSED, Job, Visitor, limit_arenas, reading, release_memory, shown
 
 if TYPE_CHECKING:
@@ -384,7 +384,7 @@ def front() -> bytes:
     template = lookup.get_template("page.html.mako")
     text = template.render(
         fields=fields, uploads=UPLOADS, examples=EXAMPLES, names=[star.name for star in well_known_stars()],
-        library=library_names(), tabs=TABS, groups=GROUPS, version=VERSION,
+        mapped=MAPPED, time_units=TIME_UNITS, library=library_names(), tabs=TABS, groups=GROUPS, version=VERSION,
         bibtex=BIBTEX.format(version=VERSION), titles=TITLES, digest=_digest(),
         words=json.dumps(_words()).replace("<", "\\u003c"),
     )  # fmt: skip

@@ -35,6 +35,7 @@ from mauvecl.web.downloads import as_file, asked_study, commands_and_programs
 from mauvecl.web.fields import FIELDS, field_of, remedies, sentence
 from mauvecl.web.page import TABS, State, asking, card, known, reads_of
 from mauvecl.web.question import DRAWING, SIMULATIONS, verbs_of
+from mauvecl.web.sandboxed_reader import read_columns_limited
 from mauvecl.web.uploads import RESULTS, UPLOADS
 from mauvecl.web.uploads import UPLOAD_SHELF as UPLOADED
 
@@ -551,6 +552,16 @@ class Visitor(WebSocketHandler):
                 self.send(n=n, field=field, entered=upload.entered)
 
         self._when_done(reading(lambda: upload.read(name, content, state.values_of(names))), came)
+
+    def _ask_columns(self, asked: dict[str, Any]) -> None:
+        """Send the names of the columns of the visitor's frames; none if they are no table."""
+        self._give(self._columns(asked["n"]), n=asked["n"], columns=[])
+
+    async def _columns(self, n: int) -> None:
+        file, names = self._uploads.get("frames"), ()
+        if file is not None:
+            names = await asyncio.wrap_future(reading(partial(read_columns_limited, file.name, file.content)))
+        self.send(n=n, columns=names)
 
     def _ask_file(self, asked: dict[str, Any]) -> None:
         n = asked["n"]

@@ -594,6 +594,9 @@ def test_unusable_frames_end_in_a_sentence(server: Server, number: int) -> None:
         assert words in reported["faults"]["frames"]
         assert "mauvecl-page" not in reported["faults"]["frames"]
         assert "\n" not in reported["faults"]["frames"]
+        columns = (await talk.ask("columns", "columns"))["columns"]
+        named = [] if frames.startswith(b"\x89") else frames.partition(b"\n")[0].decode().split(",")
+        assert columns == named, "for menus"
 
     server.visited(work)
 

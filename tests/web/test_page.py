@@ -16,7 +16,7 @@ import pytest
 from astropy.table import QTable
 
 from mauvecl import __version__
-from tests.web.test_files import standards, zipped
+from tests.web.test_files import light_curve, standards, zipped
 from tests.web.visits import PATIENCE, Server, enter, fresh, settled, until
 
 if TYPE_CHECKING:
@@ -886,6 +886,27 @@ def test_visitor_tries_an_example(page: Page) -> None:
     until(page, lambda: "flares are detected in 9.97 star-days of KIC 10002792" in shown(page))
     assert page.get_by_label("Quality bits", exact=True).input_value() == ""
     assert "detected" in page.locator("#panel-analyse .rows").inner_text()
+
+
+def test_visitor_chooses_columns_from_menus(page: Page) -> None:
+    """Those of a file that is not understood; what is chosen is a mapping, which the command line reads as well."""
+    tab(page, "Analyse")
+    file = {"name": "mine.csv", "mimeType": "text/csv", "buffer": light_curve(flags=True)}
+    page.locator("[data-upload=frames]").set_input_files(file)
+    menus = page.get_by_role("group", name="Which column is what?")
+    menus.get_by_label("Time", exact=True).select_option("minute")
+    flux = menus.get_by_label("Flux", exact=True)
+    assert flux.locator("option").all_inner_texts() == ["choose", "minute", "rate", "sd", "flag"]
+    flux.select_option("rate")
+    until(page, lambda: "200 frames of" in page.locator("#text-frames").inner_text())
+    menus.get_by_label("Unit of time").select_option("min")
+    menus.get_by_label("Error", exact=True).select_option("sd")
+    assert menus.is_visible(), "what was chosen can be chosen otherwise"
+    simulate(page, "Analyse")
+    until(page, lambda: "1 flare is detected" in shown(page))
+    with zipfile.ZipFile(io.BytesIO(taken(page))) as archive:
+        mapping = archive.read("columns.toml").decode()
+    assert mapping == 'time = "minute"\ntime_unit = "min"\nflux = "rate"\nerror = "sd"\n'
 
 
 @pytest.mark.parametrize("theme", ["light", "dark", "forced"])

@@ -233,6 +233,23 @@ ${control(name)}
 % for name in names:
 ${control(name)}
 % endfor
+% if form == "frames":
+<fieldset id="columns" hidden><legend>Which column is what?</legend>
+<div class="row">
+% for key, label in mapped.items():
+<span class="row"><label for="m-${key}">${label}</label>
+<select id="m-${key}" name="${key}" data-columns${" required" if loop.index < 2 else ""}><option value="">${"choose" if loop.index < 2 else "none"}</option></select>
+% if key == "time":
+<select name="time_unit" aria-label="Unit of time"><option value="">in the file's unit</option>
+% for unit in time_units:
+<option>${unit}</option>
+% endfor
+</select>
+% endif
+</span>
+% endfor
+</div></fieldset>
+% endif
 </div>
 % endfor
 <div class="tabs">

@@ -2,6 +2,7 @@
 // The page sends the entered text to the server, and only shows the answer to it.
 
 import {Card} from "./card.js"
+import {Columns} from "./columns.js"
 import {Compare} from "./compare.js"
 import {byId, every} from "./dom.js"
 import {Export, give} from "./export.js"
@@ -61,6 +62,7 @@ class Page {
       changed: last => this.changed(last, true), none: () => this.none(this.uploads.lacks), again: () => this.ask(),
       link: () => this.routing.link,
     })
+    this.columns = new Columns(this.live, this.uploads)
     this.export = new Export(this.live, this.routing, () => this.offer(), refused)
     this.pictures = new Pictures(words, given => this.enter(given), give, () => this.about())
     this.pins = new Map()
@@ -212,6 +214,7 @@ class Page {
   show(message) {
     const question = this.question
     this.fields.tell(message.faults)
+    this.columns.tell(message.faults)
     this.fields.facts(message.known, (given, fills) => {
       // What is filled in belongs to the same step of the history as the star.
       if (fills) this.routing.editing = true

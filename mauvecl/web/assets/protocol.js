@@ -23,7 +23,7 @@
  * A message of the server: which entries it has depends on what was asked.
  * @typedef {{n: number, faults: Faults, stray: string, answer: Answer, refused: string, tab: string,
  *   pictures: Record<string, Drawn>, rows: string[][], draws: boolean, ended: string, kind: string, progress: number,
- *   message: string, lacks: string, remedies: [string, string][], entered: string, file: string, taken: any[], solved?: string, payloads?: string,
+ *   message: string, columns: string[], lacks: string, remedies: [string, string][], entered: string, file: string, taken: any[], solved?: string, payloads?: string,
  *   pins: Record<string, Columns>, hello: string,
  *   known: {star: {about: string, given: Entered, offer: string}, targets: any[]}}} Message
  *
