@@ -95,7 +95,7 @@ def possible_question(
         if quick and state.entered["own_unknown"]:
             continue
         try:
-            return state, ClosedForms.of(state.question(tab.reads), folder, headline=tab.headline)
+            return state, ClosedForms.of(state.question(tab.reads), folder, chance=tab.chance)
         except InputError:
             continue
 

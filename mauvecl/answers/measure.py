@@ -34,7 +34,7 @@ from mauvecl.noise.scene import FactorDistributions
 from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.columns import Column, View, number, percent, table_of
-from mauvecl.schema.errors import InputError
+from mauvecl.schema.errors import InputError, Message
 from mauvecl.study.cases import Case, amplitude_column, cases, collect_messages
 from mauvecl.study.questions import check_sweep
 from mauvecl.study.study import Study
@@ -358,10 +358,11 @@ def _not_marginalised(case: Case) -> list[str]:
     names = [name for name in (drawn.spreads if drawn else ()) if unknown is None or name not in unknown.names]
     if not names:
         return []
-    return [
+    text = (
         f"NOT MARGINALISED: {join_names(names)}. Exposures are drawn with other levels than fits expect, so that "
         f"intervals miss the truth; `nuisances.{names[0]}` marginalises over one."
-    ]
+    )
+    return [Message(text, "not marginalised")]
 
 
 def _faint(flares: Sequence[MeasuredFlare]) -> list[str]:

@@ -19,6 +19,14 @@ if TYPE_CHECKING:
     #: Function of a command's flags that returns the study where no file is given.
     DefaultStudy = Callable[[dict[str, Any]], Study]
 
+#: Headings of the command line's list of commands and of the page's tabs, by the group of a verb.
+GROUPS = {
+    "plan": "Plan observations",
+    "simulate": "Simulate observations",
+    "analyse": "Analyse observations",
+    "tools": "Tools",
+}
+
 #: Default of verbs that need fewer realisations than a detection.
 FEWER = {"run.realisations": 100_000}
 
@@ -77,7 +85,7 @@ class Verb:
     help: str  # help text of the command, with examples
     # Keys and sections of the study whose flags the command takes, in addition to those of `observation`.
     takes: tuple[str, ...]
-    # Where `mauvecl` lists the command: under plan, simulate, analyse or tools.
+    # Key of `GROUPS`: where `mauvecl` lists the command, and the page its tabs.
     group: str = "plan"
     common: tuple[str, ...] = ()  # parameters of flags that `--help` shows in addition to `COMMON`
     counts: str = ""  # what the command line's progress bar counts; empty if a closed form answers at once

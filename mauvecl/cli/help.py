@@ -10,13 +10,8 @@ from typing import Any
 import typer
 from typer.core import TyperCommand
 
-#: Headings of the list of commands, by the group of a verb.
-GROUPS = {
-    "plan": "Plan observations",
-    "simulate": "Simulate observations",
-    "analyse": "Analyse observations",
-    "tools": "Tools",
-}
+from mauvecl.answers.verbs import GROUPS
+
 #: Heading of the flags that set no key of a study.
 OTHERS = "Output and devices"
 #: Key of a context that shows all flags.

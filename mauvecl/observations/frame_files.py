@@ -229,6 +229,20 @@ def reduce_frames(
         return ReducedFrames(curves, sums.pixels)
 
 
+@dataclass(frozen=True)
+class ColumnNames:
+    """Names of the columns of a file of frames, some of which a mapping names."""
+
+    names: tuple[str, ...]
+
+    @classmethod
+    def read(cls, path: str | Path) -> ColumnNames:
+        """Read the names of a table in a file."""
+        place, words = without_columns(path)
+        with _parsing(path), _opened(place, f"file {place.name!r}", words[0] if words else None) as file:
+            return cls(tuple(file.names))
+
+
 def _parsing(path: str | Path) -> AbstractContextManager[None]:
     """Return a context in which exceptions of other libraries become errors of a file."""
     return parsing(f"file {shortened(Path(path).name)}", FORMATS)

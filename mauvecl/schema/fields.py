@@ -395,6 +395,7 @@ class Widget:
     kind: str = ""
     slider: Slider | None = None
     suggestions: tuple[str, ...] = ()  # texts that the page offers for a field of text
+    placeholder: str = ""  # what an empty field stands for, or an example; a slider stands at the number it begins with
 
 
 def found(kind: Any, of: type[Metadata]) -> list[Metadata]:

@@ -179,6 +179,7 @@ class Star(Section):
             "columns of a Gaia query. The light of those within 47 arcsec enters.",
             group="Neighbours",
             kind="table",
+            placeholder="name,separation,magnitude,spectral_type",
         ),
     ] = None
     neighbours_of: Annotated[
@@ -394,7 +395,7 @@ class Observation(Section):
             label="Detector temperature",
             hint="The dark current doubles every few degrees.",
             group="Detector",
-            first="21",
+            placeholder="21, or along the orbit in plans",
             slider=Slider(-10, 40, 1),
         ),
         Quantity("detector_temperature", "temperature of the detector", "detector temperature (deg C)"),

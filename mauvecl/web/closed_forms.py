@@ -1,4 +1,4 @@
-"""Closed forms of a question, which answer at once, and the headline that they give."""
+"""Closed forms of a question, which answer at once, and the chance that they give."""
 
 from __future__ import annotations
 
@@ -49,11 +49,11 @@ class ClosedForms:
 
     @classmethod
     def of(
-        cls, question: Question, folder: Path, *, headline: bool = True, given: Mapping[str, Any] | None = None
+        cls, question: Question, folder: Path, *, chance: bool = True, given: Mapping[str, Any] | None = None
     ) -> ClosedForms:
         """Answer a question; `folder` holds the visitor's files for the study, and `given` their contents.
 
-        Without the headline a star may be too bright for the chance of detection. Raises InputError for incompatible
+        Without the chance a star may be too bright for the chance of detection. Raises InputError for incompatible
         values.
         """
         case = question.case(folder)
@@ -61,7 +61,7 @@ class ClosedForms:
             values = {**question.values, "amplitude_percent": 100 * case.amplitudes[0]}
             question = replace(question, values=values)
         closed = cls(question, case, given or {})
-        if headline:
+        if chance:
             _ = closed.odds
         return closed
 

@@ -341,6 +341,7 @@ _OWN_FIELDS = {
         label="Own unknown spectrum", first="", read=points,
         hint="Something else of known shape and unknown strength, such as stray light: pairs of nm and DN, as in "
         "200 1, 450 3, 700 1, or a file of two columns.", group="Unknown", place=1, own_keys=("nuisances.own",),
+        placeholder="200 1, 450 3, 700 1",
     ),
     "targets": Field(
         label="Targets", first="", read=targets,

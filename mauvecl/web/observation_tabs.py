@@ -232,7 +232,7 @@ class Analyse(Tab):
         "Flares in your own light curve or spectra: the noise is checked first, and every event has its false-alarm "
         "rate in the noise as measured. The star's fields are for spectra of Mauve."
     )
-    headline = False
+    chance = False
     pictures = (light_curve, dynamic_spectrum, scatter)
     files = dict.fromkeys(("events", "measured", "frames", "noise", "limits", "completeness"), "analyse")
     documents = {"analyse.html": "analyse"}  # noqa: RUF012
@@ -322,7 +322,7 @@ class Completeness(Tab):
         "one orbit finds at the chosen rate of false alarms, with losses while the star drifts out of the fibre."
     )
     pictures = (shares,)
-    headline = False
+    chance = False
     # The picture reads off the share of flares of this size.
     also = ("amplitude_percent",)
     simulations = {"completeness": "Inject flares"}  # noqa: RUF012
@@ -375,7 +375,7 @@ class Calibrate(Tab):
         "The instrument from frames of standard stars and of no light: throughput with its errors, dark current, gain "
         "and line width, next to the nominal values."
     )
-    headline = False
+    chance = False
     pictures = (throughput, residuals, photon_transfer)
     files = dict.fromkeys(("calibrate", "fits", "throughput", "dark"), "calibrate")
     documents = {"instrument.zip": "calibrate"}  # noqa: RUF012
@@ -443,7 +443,7 @@ class Change(Tab):
         ),
         _against_magnitude("fluxes", "Smallest change of the flux of lines", "erg/s/cm²", {"erg / (s cm2)": 1.0}),
     )
-    headline = False
+    chance = False
     # Visits are evenly spaced, without an orbit, and the seed is that of periods.
     never = ("targets", "start", "days", "shortest_d", "longest_d", "seed")
     files = {"change": "change", "indices": "change"}  # noqa: RUF012
@@ -493,7 +493,7 @@ class Periods(Tab):
         "Lomb-Scargle periodogram with a false-alarm probability of 1 %."
     )
     pictures = (recovered_periods,)
-    headline = False
+    chance = False
     simulations = {"periods": "Map periods"}  # noqa: RUF012
     answer, view = "periods", 2
     # The power is that of differences.
@@ -565,7 +565,7 @@ class Plan(Tab):
         "What a campaign would find: hours, energies recovered, flares expected. Spectrum and flare rates are those of "
         "each target's type; completeness is in closed form, and assumptions have a table."
     )
-    headline = False
+    chance = False
     # The page has no star-time of a campaign's false alarms: one a month. Flares of all sizes are expected.
     never = ("false_alarms", "as_observed")
     pictures = (recovered, expected)
@@ -614,7 +614,7 @@ class Visibility(Tab):
 
     verb, name, title = "visible", "visibility", "Visibility"
     about = "When the satellite can look at targets: clear of Earth, Sun, Moon and radiation."
-    headline = False
+    chance = False
     pictures = (hours,)
     answer = "visible"
     simulations = {"visible": "Find when"}  # noqa: RUF012

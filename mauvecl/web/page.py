@@ -12,7 +12,7 @@ from urllib.parse import parse_qsl, urlencode
 
 from mauvecl.answers.answer import chance_text
 from mauvecl.answers.closed_forms import BOTH_CHANCES
-from mauvecl.answers.verbs import VERBS
+from mauvecl.answers.verbs import GROUPS, VERBS
 from mauvecl.detection.names import check_fap
 from mauvecl.host.exposure.sky import parse_position, parse_time
 from mauvecl.host.stars.library import listed_note, resolve
@@ -28,7 +28,7 @@ from mauvecl.web.question import OTHER, SIMULATIONS, Question
 from mauvecl.web.tab import Compare, Tab
 from mauvecl.web.uploads import UPLOADS
 
-#: Tabs with pictures, in the order of the page.
+#: Tabs with pictures, in the order of their group.
 DRAWN: dict[str, Tab] = {
     tab.name: tab
     for tab in (
@@ -56,11 +56,16 @@ def _tab_of(verb: str) -> Tab:
     return made
 
 
-#: All tabs by name, in the order of the page.
+#: All tabs by name, in the order of the page: group by group.
 TABS: dict[str, Tab] = {
-    **DRAWN,
-    **{name: _tab_of(name) for name, verb in VERBS.items() if verb.tab and name not in DRAWN},
-    Compare.name: Compare(),
+    tab.name: tab
+    for group in GROUPS
+    for tab in (
+        *DRAWN.values(),
+        *(_tab_of(name) for name, verb in VERBS.items() if verb.tab and name not in DRAWN),
+        Compare(),
+    )
+    if tab.group == group
 }
 
 
@@ -76,17 +81,37 @@ def reads_of(simulation: str) -> frozenset[str]:
 
 #: Part of the message about the throughput, which the page shows once.
 NOMINAL = "The throughput is nominal"
+#: Kinds of messages that change the answer, which are shown in red.
+CHANGING = {"saturated", "no answer", "no limit", "no threshold", "no light", "wrong sign", "not marginalised",
+            "outside the prior"}  # fmt: skip
 #: Answers whose messages are shown, since they include those of the others.
 TOLD = ("detection", "measure")
 
 
-def card(closed: ClosedForms, answers: Answers) -> dict[str, Any]:
+def card(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
     """Return the contents of the card.
 
-    It holds ``numbers``, one for each choice of what is unknown; ``chosen``, ``shown`` and ``interval`` of the
-    question's choice, and ``words``; ``facts``, pairs of names and values; ``notes``, pairs of sentences and kinds;
-    ``simulated``, names of what is simulated; ``files``, tabs and names of downloads.
+    It holds ``headline``, the sentence of the tab's simulated answer or nothing, and ``words``, the question;
+    ``chance`` says whether there are ``numbers``, one for each choice of what is unknown; ``chosen``, ``shown`` and
+    ``interval`` are of the question's choice; ``facts``, pairs of names and values; ``notes``, pairs of sentences and
+    kinds; ``simulated``, names of what is simulated; ``files``, tabs and names of downloads.
     """
+    return {
+        "headline": _headline(tab, answers),
+        "chance": tab.chance,
+        **(_with_chance(closed, answers) if tab.chance else _without_chance(tab, closed, answers)),
+        "simulated": sorted(name for name in answers if name not in ("snr", "draw", "seen", OTHER)),
+        "files": _files(answers),
+    }
+
+
+def _headline(tab: Tab, answers: Answers) -> str:
+    """Return the first sentence of the command line's output for the tab's simulated answer; empty without one."""
+    names = (tab.answer, *tab.questions, *tab.simulations)
+    return next((str(answers[name].headline) for name in names if name in answers), "")
+
+
+def _with_chance(closed: ClosedForms, answers: Answers) -> dict[str, Any]:
     q, x = closed.question, closed.quiet
     cut, both = closed.odds.threshold, chances(closed, answers)
     (chosen,) = (chance for chance in both if chance.unknown == q.unknown)
@@ -106,7 +131,6 @@ def card(closed: ClosedForms, answers: Answers) -> dict[str, Any]:
         f"per test, with the payload {q.instrument}"
     )
     return {
-        "headline": True,
         "numbers": [chance.shown for chance in both],
         "chosen": q.unknown,
         "shown": chance_text(chosen.value),
@@ -114,16 +138,12 @@ def card(closed: ClosedForms, answers: Answers) -> dict[str, Any]:
         "words": words,
         "facts": facts,
         "notes": _with_kinds(_messages(closed, answers)),
-        "simulated": _simulated_sentences(answers),
-        "files": _files(answers),
     }
 
 
-def without_headline(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
-    """Return the `card` of a tab that asks for no chance of detection."""
+def _without_chance(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
     messages = list(answers[tab.answer].messages) if tab.answer in answers else []
     return {
-        "headline": False,
         "numbers": [],
         "chosen": "",
         "shown": tab.title,
@@ -131,13 +151,7 @@ def without_headline(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[st
         "words": tab.words(closed.question),
         "facts": [],
         "notes": _with_kinds([m for m in dict.fromkeys(messages) if not m.startswith(NOMINAL)]),
-        "simulated": _simulated_sentences(answers),
-        "files": _files(answers),
     }
-
-
-def _simulated_sentences(answers: Answers) -> list[str]:
-    return sorted(name for name in answers if name not in ("snr", "draw", "seen", OTHER))
 
 
 def _files(answers: Answers) -> list[str]:
@@ -148,8 +162,8 @@ def _files(answers: Answers) -> list[str]:
 
 
 def _with_kinds(messages: list[str]) -> list[tuple[str, str]]:
-    """Return messages with their kinds: severe ones begin in capitals."""
-    return [(note(m), "danger" if m.partition(":")[0].isupper() else "info") for m in messages]
+    """Return messages, and whether each is a danger to the answer or mere information."""
+    return [(note(m), "danger" if getattr(m, "kind", "") in CHANGING else "info") for m in messages]
 
 
 def _messages(closed: ClosedForms, answers: Answers) -> list[str]:

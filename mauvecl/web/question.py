@@ -140,9 +140,6 @@ class Question:
                 write_spectrum(upload, folder, SPECTRA[name]) if page_field.kind == "file" else upload.written(folder)
             )
             value = str(written) if isinstance(written, Path) else written
-        if name == "temperature_c" and value == page_field.read(page_field.first):
-            # The instrument's own, or along the orbit that of a plan.
-            return
         if value is not None:
             self._set(data, page_field, value)
 

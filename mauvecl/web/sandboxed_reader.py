@@ -40,6 +40,7 @@ READERS = {
     "flare": ("mauvecl.host.stars.flare_spectra", "ObservedFlare.read"),
     "plain": ("mauvecl.host.spectra.formats", "read_spectrum"),
     "frames": ("mauvecl.observations.frame_files", "read_frames"),
+    "columns": ("mauvecl.observations.frame_files", "ColumnNames.read"),
 }
 #: Expected content of an upload, by the function that reads it.
 EXPECTED = {
@@ -47,7 +48,7 @@ EXPECTED = {
         ("spectrum", "flare", "plain"),
         ("a spectrum of some thousand points", "a spectrum as text, ECSV, VOTable or FITS"),
     ),
-    "frames": ("fewer frames", "frames as FITS, ECSV or CSV"),
+    **dict.fromkeys(("frames", "columns"), ("fewer frames", "frames as FITS, ECSV or CSV")),
 }
 Spectrum = TypeVar("Spectrum", Source, ObservedFlare, ReadSpectrum)
 #: Reader of each kind of spectrum.
@@ -72,6 +73,12 @@ def read_frames_limited(
     `files` holds contents by name: the file of frames first, then the mapping and files that they need.
     """
     return Frames(**_read("frames", files, {"mapping": mapping, "quality_bits": quality_bits}))
+
+
+def read_columns_limited(name: str, content: bytes) -> tuple[str, ...]:
+    """Read the names of the columns of a file of frames, in a process with limited memory and time."""
+    names: tuple[str, ...] = _read("columns", {name: content}, {})["names"]
+    return names
 
 
 def _read(reader: str, files: Mapping[str, bytes], options: Mapping[str, Any]) -> dict[str, Any]:

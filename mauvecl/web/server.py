@@ -31,6 +31,7 @@ from tornado.iostream import IOStream
 from tornado.routing import Matcher, Rule
 from tornado.web import Application, RequestHandler
 
+from mauvecl.answers.verbs import GROUPS
 from mauvecl.host import VERSION
 from mauvecl.host.exposure.star import KNOWN
 from mauvecl.host.stars.library import all_names, library_names, well_known_stars
@@ -40,7 +41,7 @@ from mauvecl.web.closed_forms import TITLES, ClosedForms
 from mauvecl.web.figures import INKS, PINS, Canvas
 from mauvecl.web.page import SEEN, TABS, State, reads_of
 from mauvecl.web.question import SIMULATIONS
-from mauvecl.web.uploads import UPLOADS
+from mauvecl.web.uploads import EXAMPLES, MAPPED, TIME_UNITS, UPLOADS
 from mauvecl.web.visitor import UNUSED, Job, Visitor, limit_arenas, reading, release_memory, shown
 
 if TYPE_CHECKING:
@@ -336,6 +337,7 @@ KINDS = {
     "svg": "image/svg+xml",
     "json": "application/json",
     "html": "text/html; charset=utf-8",
+    "fits": "application/fits",
 }
 #: Citation, as in the project's file CITATION.cff, which has neither the paper's volume and pages nor an address of
 #: the project.
@@ -381,8 +383,8 @@ def front() -> bytes:
     lookup = TemplateLookup([str(_FOLDER)], default_filters=["h"], strict_undefined=True)
     template = lookup.get_template("page.html.mako")
     text = template.render(
-        fields=fields, uploads=UPLOADS, names=[star.name for star in well_known_stars()],
-        library=library_names(), tabs=TABS, version=VERSION,
+        fields=fields, uploads=UPLOADS, examples=EXAMPLES, names=[star.name for star in well_known_stars()],
+        mapped=MAPPED, time_units=TIME_UNITS, library=library_names(), tabs=TABS, groups=GROUPS, version=VERSION,
         bibtex=BIBTEX.format(version=VERSION), titles=TITLES, digest=_digest(),
         words=json.dumps(_words()).replace("<", "\\u003c"),
     )  # fmt: skip
@@ -419,7 +421,7 @@ def _words() -> dict[str, Any]:
                     for p in tab.pictures
                 ],
                 "reads": sorted(tab.reads),
-                "headline": tab.headline,
+                "chance": tab.chance,
             }
             for tab in TABS.values()
         },

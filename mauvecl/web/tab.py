@@ -44,8 +44,10 @@ class Tab(ABC):
     view: ClassVar[int] = 0  # number of that table among the answer's `views`
     #: Questions of "Share, export, cite": names of simulations or verbs; by default its own simulations.
     questions: ClassVar[tuple[str, ...]] = ()
+    #: Key of `GROUPS` under whose heading it stands; by default that of the verb that answers its first question.
+    group: ClassVar[str]
     #: Whether the chance of detection stands above it, whose fields it then shows.
-    headline: ClassVar[bool] = True
+    chance: ClassVar[bool] = True
     #: Fields that it reads although its verbs do not take their keys, and those that it does not read.
     also: ClassVar[tuple[str, ...]] = ()
     never: ClassVar[tuple[str, ...]] = ()
@@ -60,6 +62,8 @@ class Tab(ABC):
             cls._follow_verb()
         if "questions" not in vars(cls):
             cls.questions = tuple(cls.simulations) or ("detection",)
+        if "group" not in vars(cls):
+            cls.group = VERBS[verbs_of(cls.questions[0])[0]].group
 
     @classmethod
     def _follow_verb(cls) -> None:
@@ -73,9 +77,9 @@ class Tab(ABC):
 
     @cached_property
     def reads(self) -> frozenset[str]:
-        """Fields on which the tab depends, with those of its headline: the chance, and the limit in a sentence."""
-        headline = ("detection", "limit") if self.headline else ()
-        return self.reads_of(*self.questions, *self.simulations, *headline)
+        """Fields on which the tab depends, with those of the card: the chance, and the limit in a sentence."""
+        above = ("detection", "limit") if self.chance else ()
+        return self.reads_of(*self.questions, *self.simulations, *above)
 
     def reads_of(self, *questions: str) -> frozenset[str]:
         """Return the fields on which simulations or verbs depend, by the keys that the flags of their verbs set."""
@@ -93,7 +97,7 @@ class Tab(ABC):
         return {}
 
     def words(self, question: Question) -> str:
-        """Return the question of a tab without a headline, in words."""
+        """Return the question of a tab without the chance, in words."""
         star = "your own star" if question.uploaded is not None else star_words(question.star)
         return f"{star} of {question.band} = {question.magnitude:g}"
 
@@ -130,5 +134,5 @@ class Tab(ABC):
 class Compare(Tab):
     """Pinned scenarios and the history of runs."""
 
-    name, title = "compare", "Compare"
+    name, title, group = "compare", "Compare", "tools"
     about = "Scenarios that you have pinned, side by side, and what you have simulated; this browser tab keeps them."

@@ -307,6 +307,16 @@ UPLOADS: Mapping[str, Upload] = {
 }
 
 
+#: Keys of a mapping of frames that are chosen from menus of their columns, with labels; the first two are required.
+MAPPED = {"time": "Time", "flux": "Flux", "error": "Error", "quality": "Quality", "temperature": "Temperature"}
+#: Units and dates of times, chosen from a menu next to them.
+TIME_UNITS = ("s", "min", "h", "d", "jd", "mjd", "bjd", "btjd", "bkjd")
+#: Assets that visitors may try in place of a file of their own, by field, with what they are.
+EXAMPLES: Mapping[str, tuple[str, str]] = {
+    "frames": ("kepler-example.fits", "12 days of KIC 10002792, a flare star, by Kepler (NASA, in the public domain)"),
+}
+
+
 def read_frames_of(
     file: VisitorFile, mapping: VisitorFile | None, key: str, *, quality_bits: str | None = None
 ) -> Frames:

@@ -33,8 +33,9 @@ from mauvecl.schema.errors import InputError, shortened
 from mauvecl.web.closed_forms import ClosedForms, other_payloads, solved
 from mauvecl.web.downloads import as_file, asked_study, commands_and_programs
 from mauvecl.web.fields import FIELDS, field_of, remedies, sentence
-from mauvecl.web.page import TABS, State, asking, card, known, reads_of, without_headline
+from mauvecl.web.page import TABS, State, asking, card, known, reads_of
 from mauvecl.web.question import DRAWING, SIMULATIONS, verbs_of
+from mauvecl.web.sandboxed_reader import read_columns_limited
 from mauvecl.web.uploads import RESULTS, UPLOADS
 from mauvecl.web.uploads import UPLOAD_SHELF as UPLOADED
 
@@ -333,8 +334,7 @@ class Visitor(WebSocketHandler):
         async def answer() -> None:
             closed = await self._in_thread(partial(self.closed, state, tab))
             answers = self.answers(state)
-            made = partial(card, closed, answers) if tab.headline else partial(without_headline, tab, closed, answers)
-            self.send(**message, answer=await self._in_thread(made))
+            self.send(**message, answer=await self._in_thread(partial(card, tab, closed, answers)))
             if self._next is None:
                 self.send(n=n, **await self._in_thread(partial(shown, tab.name, closed, answers)))
 
@@ -342,12 +342,12 @@ class Visitor(WebSocketHandler):
 
     def closed(self, state: State, tab: Tab) -> ClosedForms:
         """Return the closed forms of the part of a question that a tab reads; the last ones are cached."""
-        key = self._key(state, tab.reads), tab.headline
+        key = self._key(state, tab.reads), tab.chance
         held = self._closed
         if held is None or held[0] != key:
             question = state.question(tab.reads)
             given = self.given(state, tab)
-            made = ClosedForms.of(question, Path(self._folder.name), headline=tab.headline, given=given)
+            made = ClosedForms.of(question, Path(self._folder.name), chance=tab.chance, given=given)
             held = self._closed = key, made
         # Closed forms compute and keep more when they are used.
         self._shelve("_closed", held)
@@ -447,7 +447,7 @@ class Visitor(WebSocketHandler):
     def _ask_draw(self, asked: dict[str, Any]) -> None:
         """Draw one exposure with the flare."""
         state, tab = self.state(asked["link"]), tab_of(str(asked.get("tab")))
-        if self._closed is None or self._closed[0] != (self._key(state, tab.reads), tab.headline):
+        if self._closed is None or self._closed[0] != (self._key(state, tab.reads), tab.chance):
             return
         closed = self._closed[1]
         if self._drawing is not None:
@@ -475,7 +475,7 @@ class Visitor(WebSocketHandler):
         key = kind, self._key(state, reads_of(kind))
         question, tab = state.question(reads_of(kind)), asking(kind)
         given = await self._in_thread(partial(self.given, state, tab))
-        made = partial(ClosedForms.of, question, Path(self._folder.name), headline=tab.headline, given=given)
+        made = partial(ClosedForms.of, question, Path(self._folder.name), chance=tab.chance, given=given)
         closed = await self._in_thread(made)
         if self.job is not None:
             raise InputError("a simulation is running already: wait until it ends", key="simulate")
@@ -552,6 +552,16 @@ class Visitor(WebSocketHandler):
                 self.send(n=n, field=field, entered=upload.entered)
 
         self._when_done(reading(lambda: upload.read(name, content, state.values_of(names))), came)
+
+    def _ask_columns(self, asked: dict[str, Any]) -> None:
+        """Send the names of the columns of the visitor's frames; none if they are no table."""
+        self._give(self._columns(asked["n"]), n=asked["n"], columns=[])
+
+    async def _columns(self, n: int) -> None:
+        file, names = self._uploads.get("frames"), ()
+        if file is not None:
+            names = await asyncio.wrap_future(reading(partial(read_columns_limited, file.name, file.content)))
+        self.send(n=n, columns=names)
 
     def _ask_file(self, asked: dict[str, Any]) -> None:
         n = asked["n"]

@@ -171,7 +171,10 @@ def test_each_number_is_the_answer_to_its_own_question(server: Server) -> None:
                 assert "payload mauve" in reported["words"]
                 if not more:
                     assert [one["shown"] for one in reported["numbers"]] == ["4.9 %", "97.5 %"]
+                    assert {kind for _, kind in reported["notes"]} == {"info"}
             assert shown[0] == shown[1]
+        notes = (await talk.answer(link(magnitude="-1")))["answer"]["notes"]
+        assert {text.partition(":")[0] for text, kind in notes if kind == "danger"} == {"SATURATED"}
         other = (await talk.answer(link(**M_DWARF, instrument="mauvesim")))["answer"]["numbers"]
         payloads, _ = await talk.solved(link(**M_DWARF))
         assert payloads == f"Chances with mauvesim: {' and '.join(one['shown'] for one in other)}."

@@ -114,8 +114,8 @@ def test_hidden_fields_change_nothing_and_others_do(server: Server) -> None:
                 if old == new:
                     old, new = [await once(talk.answer, one, tab) for one in asked]
                     # Limits stand in a sentence of their own; the number of draws and their seed are the button's.
-                    headline = words["tabs"][tab]["headline"] and name in ("of", "power", "realisations", "seed")
-                    assert headline or {**old, "n": 0} != {**new, "n": 0}, f"{tab} shows {name}, which changes nothing"
+                    above = words["tabs"][tab]["chance"] and name in ("of", "power", "realisations", "seed")
+                    assert above or {**old, "n": 0} != {**new, "n": 0}, f"{tab} shows {name}, which changes nothing"
 
     server.visited(work)
 
@@ -304,7 +304,10 @@ def test_own_star_and_unknown_are_in_the_study_that_the_command_names(server: Se
         await talk.upload(rows_of(np.arange(170, 1001), np.full(831, 1e-12)))
         await talk.upload(b"# nm DN\n200 1\n450 3.5\n700 1\n", "own_unknown", "stray.txt")
         asked = link(star="uploaded star", own_unknown="uploaded spectrum")
-        assert "your own star" in (await talk.answer(asked))["answer"]["words"]
+        reported = (await talk.answer(asked))["answer"]
+        assert "your own star" in reported["words"]
+        assert any("ASSUMED" in text for text, _ in reported["notes"])
+        assert {kind for _, kind in reported["notes"]} == {"info"}, "red is what changes the answer"
         for tab, shown in SHOWN.items():
             for one in (await talk.exported(asked, tab)).values() if "star" in shown else ():
                 assert re.fullmatch(r"mauvecl \w+ study\.toml", one["command"])
@@ -591,6 +594,9 @@ def test_unusable_frames_end_in_a_sentence(server: Server, number: int) -> None:
         assert words in reported["faults"]["frames"]
         assert "mauvecl-page" not in reported["faults"]["frames"]
         assert "\n" not in reported["faults"]["frames"]
+        columns = (await talk.ask("columns", "columns"))["columns"]
+        named = [] if frames.startswith(b"\x89") else frames.partition(b"\n")[0].decode().split(",")
+        assert columns == named, "for menus"
 
     server.visited(work)
 

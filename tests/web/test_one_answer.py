@@ -62,14 +62,18 @@ def test_chances_are_the_same_everywhere(server: Server, tmp_path: Path) -> None
 
 
 def test_plans_are_the_same_everywhere(server: Server, tmp_path: Path) -> None:
-    """Flares, their ideal number and the energy that half of them have, of four targets: twelve numbers."""
+    """Headline, flares, their ideal number and the energy that half of them have, of four targets: twelve numbers."""
     asked = link(targets="\n".join(TARGETS), hours=HOURS, start="2027-01-01", days="30")
 
-    async def of_the_page(talk: Talk) -> bytes:
+    async def of_the_page(talk: Talk) -> tuple[str, bytes]:
         assert (await talk.simulate("plan", asked)).startswith("Done")
-        return (await talk.file(link=asked, tab="plan", name="plan", ending="ecsv"))[1]
+        headline = (await talk.answer(asked, "plan"))["answer"]["headline"]
+        command = (await talk.exported(f"{asked}&temperature_c=21", "plan"))["plan"]["command"]
+        assert "--temperature 21" in command, "what is entered is no default"
+        return headline, (await talk.file(link=asked, tab="plan", name="plan", ending="ecsv"))[1]
 
-    page = QTable.read(io.BytesIO(server.visited(of_the_page)), format="ascii.ecsv")
+    headline, table = server.visited(of_the_page)
+    page = QTable.read(io.BytesIO(table), format="ascii.ecsv")
     (tmp_path / "targets.csv").write_text("\n".join(["name", *TARGETS]) + "\n")
     words = ("plan", "targets.csv", "--hours", HOURS, "--start", "2027-01-01", "--days", "30")
     answer = on_the_command_line(tmp_path, *words)
@@ -77,6 +81,7 @@ def test_plans_are_the_same_everywhere(server: Server, tmp_path: Path) -> None:
         f"plan.targets=[{', '.join(f'{{name={name!r}}}' for name in TARGETS)}]", f"plan.hours={HOURS}",
         "orbit.start=2027-01-01", "orbit.days=30",
     ]))  # fmt: skip
+    assert answer["headline"] == headline, "in the same words"
     assert "detector temperature along the orbit" in answer["assumed"]
     for k, row in enumerate(answer["rows"]):
         for column in ("expected", "ideal", "E50"):

@@ -16,7 +16,7 @@ import pytest
 from astropy.table import QTable
 
 from mauvecl import __version__
-from tests.web.test_files import standards, zipped
+from tests.web.test_files import light_curve, standards, zipped
 from tests.web.visits import PATIENCE, Server, enter, fresh, settled, until
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.long
 
 
 def shown(page: Page) -> str:
-    """Return the answer in the words of the card."""
+    """Return the answer in the words of the card: a sentence, and both chances."""
     settled(page)
     return "\n".join(page.locator("#card :is(.message, .words)").all_inner_texts())
 
@@ -128,10 +128,13 @@ def test_visitor_changes_values_and_reads_the_answer(browser: Browser, server: S
     assert page.get_by_text("not a flight calibration").count() == 1, "stated once"
     assert page.get_by_label("Exposure, slider").get_attribute("aria-valuetext") == "50 s"
     assert page.get_by_label("Magnitude, slider").get_attribute("aria-valuetext") == "V = 8.5"
+    temperature = page.get_by_label("Detector temperature", exact=True)
+    assert temperature.input_value() == ""
+    assert temperature.get_attribute("placeholder") == "21, or along the orbit in plans"
     # A 2 % flare on a G2V star of V = 7.4 in 50 s.
     enter(page, "Magnitude", "7.4")
     reported = shown(page)
-    assert reported.startswith("78.0 %")
+    assert page.locator("#chance").inner_text() == "78.0 %"
     assert "a 2 % flare (10000 K) on a G2V star of V = 7.4, in 50 s (10 frames)" in reported
     for found in ("#f-star", "#f-magnitude", "#f-amplitude_percent", "#f-exposure_s", "#chance", "#facts", "#simulate",
                   "#plot-excess", "#plot-distributions"):  # fmt: skip
@@ -478,7 +481,10 @@ def test_visitor_simulates_shares_and_compares(browser: Browser, page: Page, ser
     assert "of 10,000 simulated" in reported
     rows = QTable.read(io.BytesIO(download(page, "detection (ecsv)")), format="ascii.ecsv")
     (row,) = (row for row in rows if row["statistic"] == "matched")
-    assert reported.startswith(f"{100 * row['probability']:.1f} %")
+    assert reported.startswith("Mauve would see a flare of 1.5 % on G2V V = 8.5 in 50 s with a chance of "), (
+        "the answer"
+    )
+    assert reported.count(f"{100 * row['probability']:.1f} %") >= 2, "in the sentence and in the number"
     # The link is opened again.
     until(page, lambda: "simulated=detection" in page.url)
     second = fresh(browser, page.url)
@@ -787,12 +793,17 @@ def test_visitor_with_a_phone(browser: Browser, server: Server) -> None:
 
 
 def test_visitor_with_a_keyboard(page: Page) -> None:
-    """Tabs turn round, a slider and a help text stand where they belong, and a plan is pinned and found again.
+    """Tabs stand in groups and turn round, slider and help stand where they belong, a plan is pinned and found again.
 
     Newcomers with keys alone do the rest, and see at every stop where they are.
     """
+    headings = page.locator("[role=tablist] > div > span").all_inner_texts()
+    assert headings == ["Plan observations", "Simulate observations", "Analyse observations", "Tools"]
+    for name, number in (("detection", 0), ("visibility", 0), ("snr", 1), ("calibrate", 2), ("compare", 3)):
+        described = page.locator(f"#tab-{name}").get_attribute("aria-describedby")
+        assert page.locator(f"#{described}").inner_text() == headings[number], name
     page.locator("#tab-detection").focus()
-    for key, name in (("ArrowRight", "spectrum"), ("ArrowLeft", "detection"), ("ArrowLeft", "compare")):
+    for key, name in (("ArrowRight", "limit"), ("ArrowLeft", "detection"), ("ArrowLeft", "compare")):
         page.keyboard.press(key)
         assert page.evaluate("document.activeElement.id") == f"tab-{name}"
     page.keyboard.press("Home")
@@ -815,7 +826,7 @@ def test_visitor_with_a_keyboard(page: Page) -> None:
     # The plan survives a change of the star of other tabs, is pinned, and is found again.
     tab(page, "Plan")
     page.wait_for_url("**tab=plan**")
-    assert not page.locator("#card").is_visible(), "no headline of another star"
+    assert not page.locator("#numbers").is_visible(), "no chance of another star"
     assert not page.get_by_label("Magnitude", exact=True).is_visible()
     page.locator("#panel-plan .rows", has_text="best months").wait_for()
     page.get_by_label("Target of target 1").click()
@@ -830,6 +841,7 @@ def test_visitor_with_a_keyboard(page: Page) -> None:
     until(page, lambda: all(name in table.inner_text() for name in ("AU Mic", "eps Eri", "YZ CMi", "false alarms")))
     page.locator("#figure-recovered .legend", has_text="YZ CMi").wait_for()
     planned = table.inner_text()
+    assert page.locator("#words-of").inner_text().startswith("Mauve would recover ")
     page.get_by_role("button", name="Pin", exact=True).click()
     tab(page, "Detection")
     enter(page, "Magnitude", "6")
@@ -863,6 +875,38 @@ def test_visitor_pastes_and_opens_targets(page: Page, tmp_path: Path) -> None:
     assert page.get_by_label("Target of target 1").input_value() == "AU Mic"
     page.get_by_role("button", name="Remove all").click()
     assert page.get_by_role("button", name="Find when").is_disabled()
+
+
+def test_visitor_tries_an_example(page: Page) -> None:
+    """One click reads a light curve of Kepler and answers it, whatever was entered on another file."""
+    tab(page, "Analyse")
+    page.get_by_label("Quality bits", exact=True).fill("all")
+    page.get_by_role("button", name="Try an example file").click()
+    page.get_by_text("Done: ").wait_for()
+    until(page, lambda: "flares are detected in 9.97 star-days of KIC 10002792" in shown(page))
+    assert page.get_by_label("Quality bits", exact=True).input_value() == ""
+    assert "detected" in page.locator("#panel-analyse .rows").inner_text()
+
+
+def test_visitor_chooses_columns_from_menus(page: Page) -> None:
+    """Those of a file that is not understood; what is chosen is a mapping, which the command line reads as well."""
+    tab(page, "Analyse")
+    file = {"name": "mine.csv", "mimeType": "text/csv", "buffer": light_curve(flags=True)}
+    page.locator("[data-upload=frames]").set_input_files(file)
+    menus = page.get_by_role("group", name="Which column is what?")
+    menus.get_by_label("Time", exact=True).select_option("minute")
+    flux = menus.get_by_label("Flux", exact=True)
+    assert flux.locator("option").all_inner_texts() == ["choose", "minute", "rate", "sd", "flag"]
+    flux.select_option("rate")
+    until(page, lambda: "200 frames of" in page.locator("#text-frames").inner_text())
+    menus.get_by_label("Unit of time").select_option("min")
+    menus.get_by_label("Error", exact=True).select_option("sd")
+    assert menus.is_visible(), "what was chosen can be chosen otherwise"
+    simulate(page, "Analyse")
+    until(page, lambda: "1 flare is detected" in shown(page))
+    with zipfile.ZipFile(io.BytesIO(taken(page))) as archive:
+        mapping = archive.read("columns.toml").decode()
+    assert mapping == 'time = "minute"\ntime_unit = "min"\nflux = "rate"\nerror = "sd"\n'
 
 
 @pytest.mark.parametrize("theme", ["light", "dark", "forced"])

@@ -8,7 +8,8 @@ import {byId, element, every, tableOf} from "./dom.js"
 export class Card {
   constructor() {
     this.box = byId("card")
-    this.parts = [...every(".message, .below", this.box), byId("facts")]
+    this.said = byId("words-of")
+    this.parts = [this.said, ...every(".message, .below", this.box), byId("facts")]
     /** @type {Set<string>} */
     this.dismissed = new Set()
     this.unfolded = false
@@ -23,6 +24,13 @@ export class Card {
   fade() {
     this.busy(true)
     for (const part of [...this.parts, ...every(".pictures, .rows")]) part.classList.add("dim")
+  }
+
+  /** Another tab is in front; what is said is not its answer.
+   * @param {boolean} chance whether the chance stands below the sentence */
+  front(chance) {
+    this.said.classList.add("dim")
+    for (const part of every(".message, .rest", this.box)) part.hidden = !chance
   }
 
   /** The pictures of a tab are those of the answer; other tabs may still hold an earlier one's.
@@ -48,15 +56,19 @@ export class Card {
     if (payloads !== undefined) byId("payloads").textContent = payloads
   }
 
-  /** Show the answer, where the tab in front has one that the card shows.
+  /** Show the answer in a sentence, before it is simulated the question.
    * @param {Answer} answer */
   tell(answer) {
-    if (!answer.headline) {
-      // The notes that an earlier refusal hid are shown again.
-      this.box.classList.remove("none")
-      this.busy(false)
-      return
-    }
+    this.said.textContent = answer.headline || answer.words
+    this.said.classList.remove("dim")
+    // The notes that an earlier refusal hid are shown again.
+    this.box.classList.remove("none")
+    if (answer.chance) this.chance(answer)
+    this.busy(false)
+  }
+
+  /** @param {Answer} answer */
+  chance(answer) {
     this.empty(false)
     for (const part of this.parts) part.classList.remove("dim")
     for (const {unknown, shown, interval} of answer.numbers) {
@@ -65,16 +77,14 @@ export class Card {
       number.querySelector(".interval").textContent = interval
       number.setAttribute("aria-pressed", String(unknown === answer.chosen))
     }
-    byId("words-of").textContent = answer.words
     byId("facts").replaceChildren(...answer.facts.flatMap(([name, value]) => [element("dt", name), element("dd", value)]))
-    this.busy(false)
   }
 
   /** @param {string} why */
   none(why) {
     this.empty(true)
     for (const part of this.parts) part.classList.remove("dim")
-    byId("words-of").textContent = why
+    this.said.textContent = why
     this.solved("", "")
     this.ended("")
     this.busy(false)
@@ -118,7 +128,7 @@ export class Card {
       away.setAttribute("aria-label", `Put away: ${text.slice(0, 60)}`)
       away.onclick = () => { this.dismissed.add(text); made.remove() }
       const said = element("span", text)
-      if (kind === "danger") said.setAttribute("role", "alert")
+      if (kind !== "info") said.setAttribute("role", "alert")
       made.append(said, away)
       return made
     }

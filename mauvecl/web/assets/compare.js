@@ -7,7 +7,7 @@ import {dashed} from "./legend.js"
 /** @typedef {import("./protocol.js").Entered} Entered */
 /**
  * A question with its answer: its slot is how pictures draw it, and at is when it was simulated. The answer of a tab
- * without a headline is its table, in rows.
+ * without a chance is its table, in rows.
  * @typedef {{link: string, entered: Entered, files: string, shown: string, interval: string, words: string,
  *   facts: [string, string][], rows?: string[][], slot?: number, at?: string}} Scenario
  */

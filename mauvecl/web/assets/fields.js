@@ -96,7 +96,7 @@ export class Fields {
     slider.addEventListener("change", () => move(true))
     field.addEventListener("keydown", (/** @type {KeyboardEvent} */ event) => {
       const step = STEPS[event.key]
-      const value = Number(field.value)
+      const value = this.number(name)
       if (!step || !(Math.abs(value) >= 0)) return
       event.preventDefault()
       field.value = scale.value(scale.place(value) + step)
@@ -159,19 +159,26 @@ export class Fields {
     if (this.entered.realisations !== this.raised) this.wish = this.entered.realisations
   }
 
+  /** The number in a field; of an empty one, that with which its placeholder begins.
+   * @param {string} name */
+  number(name) {
+    const {value, placeholder} = byId(`f-${name}`)
+    return value.trim() ? Number(value) : Number.parseFloat(placeholder)
+  }
+
   /** Elements that accompany a field: its slider, and fields that apply only with one text of it.
    * @param {string} name */
   aside(name) {
     const [slider] = every(`[data-slider="${name}"]`)
     if (slider) {
-      const value = Number(this.entered[name])
-      if (this.entered[name].trim() && Number.isFinite(value)) {
+      const value = this.number(name)
+      if (Number.isFinite(value)) {
         const place = this.scales[name].place(value)
         if (slider.value !== String(place)) slider.value = String(place)
       }
       const [unit] = every(`[data-field="${name}"] .unit`)
       const spoken = name === "magnitude" ? `${this.entered.band} = ${this.entered[name]}` : `${this.entered[name]} ${unit?.textContent ?? ""}`
-      slider.setAttribute("aria-valuetext", spoken.trim())
+      slider.setAttribute("aria-valuetext", this.entered[name] ? spoken.trim() : byId(`f-${name}`).placeholder)
     }
     if (Object.values(this.words.under).some(([other]) => other === name)) this.hide()
   }

@@ -50,7 +50,7 @@ ${control(option)}
 <p class="known"><span id="k-star"></span> <button type="button" class="plain" id="o-star" hidden></button></p>
 ${upload("star", "Use your own spectrum", "Your own spectrum", "text, ECSV, VOTable or FITS; or drop it here")}
 % elif name == "own_unknown":
-<input id="f-own_unknown" name="own_unknown" type="text" autocomplete="off" spellcheck="false" placeholder="200 1, 450 3, 700 1" aria-describedby="w-own_unknown">
+<input id="f-own_unknown" name="own_unknown" type="text" autocomplete="off" spellcheck="false" placeholder="${field.placeholder}" aria-describedby="w-own_unknown">
 ${upload("own_unknown", "Use a file of nm and DN", "File of the unknown spectrum", "")}
 % elif field.kind == "file":
 <input id="f-${name}" name="${name}" type="text" aria-label="${field.label}" hidden>
@@ -63,13 +63,17 @@ ${upload(name, "Use a file", field.label, "text, ECSV, VOTable or FITS; or drop 
 <button type="button" class="plain" id="targets-clear" hidden>Remove all</button>
 <p class="wrong" id="w-targets" hidden></p><span class="hint">Type names or paste a list or table; what is known of a star stands in grey and can be overwritten.</span></div>
 % elif field.kind == "table":
-<textarea id="f-${name}" name="${name}" rows="3" spellcheck="false" placeholder="name,separation,magnitude,spectral_type" aria-describedby="w-${name}"></textarea>
+<textarea id="f-${name}" name="${name}" rows="3" spellcheck="false" placeholder="${field.placeholder}" aria-describedby="w-${name}"></textarea>
 <div class="file"><button type="button" class="plain" data-open-text="${name}">Open a CSV table</button><input type="file" data-text="${name}" accept=".csv,.txt" aria-label="CSV table: ${field.label}" tabindex="-1" hidden></div>
 % elif field.kind == "upload":
 <input id="f-${name}" name="${name}" type="hidden" value="">
 <div class="file"><button type="button" data-choose="${name}" aria-describedby="w-${name}">Choose a file</button>
 <input type="file" data-upload="${name}" aria-label="${field.label}" tabindex="-1" hidden><span class="hint">or drop it here, at most ${uploads[name].most // 2**20} MiB</span>
 <span data-uploaded="${name}"></span> <span data-remedies="${name}"></span> <button type="button" class="plain" data-remove="${name}" hidden>Remove</button></div>
+% if name in examples:
+<% asset, about = examples[name] %>
+<div class="file"><button type="button" data-example="${name}" data-asset="${asset}">Try an example file</button><span class="hint">${about}</span></div>
+% endif
 % elif field.kind == "day":
 <input id="f-${name}" name="${name}" type="date" value="${field.first}" aria-describedby="w-${name}">
 % elif hasattr(field.read, "options"):
@@ -82,7 +86,7 @@ ${upload(name, "Use a file", field.label, "text, ECSV, VOTable or FITS; or drop 
 <p class="known" id="n-realisations"></p>
 % endif
 % else:
-<div class="number"><input id="f-${name}" name="${name}" type="text" value="${field.first}" autocomplete="off" spellcheck="false"
+<div class="number"><input id="f-${name}" name="${name}" type="text" value="${field.first}" placeholder="${field.placeholder}" autocomplete="off" spellcheck="false"
  ${"inputmode=decimal" if hasattr(field.read, "range") else "list=names" if name == "target" else "list=library" if field.kind == "library" else f"list=s-{name}" if field.suggestions else ""} aria-describedby="w-${name}">
 % if name == "magnitude":
 <label class="aside" for="f-band">in</label>
@@ -182,6 +186,7 @@ ${control(name)}
 <section id="answer" aria-labelledby="answer-head" tabindex="-1">
 <h2 id="answer-head" class="quiet">Answer</h2>
 <div id="card" class="card" aria-busy="true">
+<p class="words" id="words-of" aria-live="polite">the answer is on its way</p>
 <div class="message" aria-live="polite" aria-atomic="true">
 <p class="chance" id="no-answer" hidden>No answer.</p>
 <div id="numbers" role="group" aria-label="Chance to detect the flare">
@@ -196,7 +201,6 @@ ${control(name)}
 </div>
 <div class="rest">
 <div class="below">
-<p class="words" id="words-of">the answer is on its way</p>
 <div class="solve">
 % for name in fields.SOLVED:
 ${control(name)}
@@ -229,16 +233,41 @@ ${control(name)}
 % for name in names:
 ${control(name)}
 % endfor
+% if form == "frames":
+<fieldset id="columns" hidden><legend>Which column is what?</legend>
+<div class="row">
+% for key, label in mapped.items():
+<span class="row"><label for="m-${key}">${label}</label>
+<select id="m-${key}" name="${key}" data-columns${" required" if loop.index < 2 else ""}><option value="">${"choose" if loop.index < 2 else "none"}</option></select>
+% if key == "time":
+<select name="time_unit" aria-label="Unit of time"><option value="">in the file's unit</option>
+% for unit in time_units:
+<option>${unit}</option>
+% endfor
+</select>
+% endif
+</span>
+% endfor
+</div></fieldset>
+% endif
 </div>
 % endfor
 <div class="tabs">
+<% first = next(iter(tabs)) %>
 <div role="tablist" aria-label="Pictures of the answer">
-% for k, tab in enumerate(tabs.values()):
-<button type="button" role="tab" id="tab-${tab.name}" aria-controls="panel-${tab.name}" aria-selected="${"true" if k == 0 else "false"}" tabindex="${0 if k == 0 else -1}" data-title="${tab.title}">${tab.title}</button>
+% for group, heading in groups.items():
+<div role="none">
+<span id="group-${group}" aria-hidden="true">${heading}</span>
+% for tab in tabs.values():
+% if tab.group == group:
+<button type="button" role="tab" id="tab-${tab.name}" aria-controls="panel-${tab.name}" aria-describedby="group-${group}" aria-selected="${"true" if tab.name == first else "false"}" tabindex="${0 if tab.name == first else -1}" data-title="${tab.title}">${tab.title}</button>
+% endif
 % endfor
 </div>
-% for k, tab in enumerate(tabs.values()):
-<div role="tabpanel" id="panel-${tab.name}" aria-labelledby="tab-${tab.name}"${"" if k == 0 else " hidden"}>
+% endfor
+</div>
+% for tab in tabs.values():
+<div role="tabpanel" id="panel-${tab.name}" aria-labelledby="tab-${tab.name}"${"" if tab.name == first else " hidden"}>
 <p class="about">${tab.about}</p>
 <% has_form = any(names[0] in tab.reads for names in fields.FORMS.values()) %>
 % if has_form:

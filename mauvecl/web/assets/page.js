@@ -2,6 +2,7 @@
 // The page sends the entered text to the server, and only shows the answer to it.
 
 import {Card} from "./card.js"
+import {Columns} from "./columns.js"
 import {Compare} from "./compare.js"
 import {byId, every} from "./dom.js"
 import {Export, give} from "./export.js"
@@ -33,19 +34,25 @@ class Page {
     /** @type {Answer | null} */
     this.answer = null
     this.asking = this.dirty = false
+    // The simulation that answers an example, once its file is read.
+    this.tried = ""
     /** Table of the tab in front.
      * @type {string[][]} */
     this.rows = []
     this.card = new Card()
     this.fields = new Fields(words, (name, last, other) => {
       // A changed question cancels the wait for a file.
+      if (other) this.tried = ""
       if (other) this.uploads.forget([name])
       if (other) this.uploads.changed(name, last)
       this.changed(last, other)
-    }, (field, file) => this.uploads.choose(field, file))
+    }, (field, file) => {
+      this.tried = ""
+      this.uploads.choose(field, file)
+    })
     this.routing = new Routing(words, this.fields.entered, () => this.moved(), () => { this.front(); this.ask() })
     this.live = new Live(version => this.back(version), code => this.lost(code))
-    const refused = (/** @type {string} */ why) => this.card.notices([[why, "danger"]])
+    const refused = (/** @type {string} */ why) => this.card.notices([[why, "notice"]])
     this.simulations = new Simulations(this.live, this.routing, this.card, {
       question: kind => this.asked(words.asks[kind]), ready: () => this.answer !== null, offer: () => this.offer(),
       lacks: kind => lacks(kind, this.fields.entered, words.needs) ? "a field that it needs is empty" : "",
@@ -55,6 +62,7 @@ class Page {
       changed: last => this.changed(last, true), none: () => this.none(this.uploads.lacks), again: () => this.ask(),
       link: () => this.routing.link,
     })
+    this.columns = new Columns(this.live, this.uploads)
     this.export = new Export(this.live, this.routing, () => this.offer(), refused)
     this.pictures = new Pictures(words, given => this.enter(given), give, () => this.about())
     this.pins = new Map()
@@ -86,11 +94,11 @@ class Page {
     this.front()
   }
 
-  // The tab in front shows the fields on which it depends; the card is that of the detection.
+  // The tab in front shows the fields on which it depends.
   front() {
-    const {reads, headline} = this.tab
+    const {reads, chance} = this.tab
     this.fields.front(reads)
-    byId("card").hidden = !headline
+    this.card.front(chance)
     for (const form of every("[data-form]")) {
       form.hidden = !reads.includes(form.dataset.form)
       if (!form.hidden) byId(`panel-${this.routing.seen.tab}`).querySelector(".about").after(form)
@@ -150,7 +158,6 @@ class Page {
     this.discardAnswer()
     document.title = "No answer: mauvecl"
     this.fields.tell(faults)
-    if (refused && !this.tab.headline) this.card.notices([[refused, "danger"]])
     this.card.none(refused ?? Object.entries(faults).map(([name, why]) => this.fields.said(name, why)).join("; "))
   }
 
@@ -167,8 +174,11 @@ class Page {
       this.compare.ran({...this.scenario(), at: new Date().toLocaleTimeString()})
     }
     clearTimeout(this.later)
-    if (answer.headline) this.later = setTimeout(() => this.solve(), SOLVE_MS)
-    this.simulations.next(answer.simulated)
+    if (answer.chance) this.later = setTimeout(() => this.solve(), SOLVE_MS)
+    if (this.tried && !lacks(this.tried, this.fields.entered, words.needs)) {
+      this.simulations.press(this.tried)
+      this.tried = ""
+    } else this.simulations.next(answer.simulated)
   }
 
   ask() {
@@ -204,6 +214,7 @@ class Page {
   show(message) {
     const question = this.question
     this.fields.tell(message.faults)
+    this.columns.tell(message.faults)
     this.fields.facts(message.known, (given, fills) => {
       // What is filled in belongs to the same step of the history as the star.
       if (fills) this.routing.editing = true
@@ -213,7 +224,7 @@ class Page {
     if (question !== this.question) return
     // Without an answer the notes of the last one keep their room, unseen: nothing jumps while a number is typed.
     /** @type {[string, string][]} */
-    const stray = message.stray ? [[message.stray, "stray"]] : []
+    const stray = message.stray ? [[message.stray, "notice"]] : []
     if (message.answer || message.stray) this.card.notices([...stray, ...(message.answer?.notes ?? [])])
     if (message.answer) this.tell(message.answer)
     else this.none(message.faults, message.refused)
@@ -291,8 +302,8 @@ class Page {
     const facts = [...this.answer.facts]
     for (const one of this.answer.numbers) facts.push([one.title, one.shown])
     const entered = {...this.fields.entered}
-    // Where there is no headline, the table is what is compared.
-    const rows = this.tab.headline ? undefined : this.rows
+    // Where there is no chance, the table is what is compared.
+    const rows = this.tab.chance ? undefined : this.rows
     return {link: this.routing.link, entered, files: this.uploads.of(entered), shown, interval, facts, words: said, rows}
   }
 
@@ -303,6 +314,17 @@ class Page {
     const entered = others.map(([name, text]) => `${this.fields.label(name)}: ${text}`).join("; ")
     const sentences = [this.answer && `${this.answer.shown} ${this.answer.words}.`, entered && `Entered: ${entered}.`]
     return {sentences: [...sentences.filter(Boolean), `mauvecl ${words.version}`], pins: this.compare.key("light")}
+  }
+
+  /** Read an example in place of a visitor's file, without what was entered on an earlier one, and answer it.
+   * @param {HTMLElement} button */
+  async example(button) {
+    const {example, asset} = button.dataset
+    const file = new File([await (await fetch(`assets/${asset}`)).blob()], asset)
+    const form = every("[data-field]", button.closest(".form")).map(box => box.dataset.field)
+    this.enter(Object.fromEntries(form.map(name => [name, words.fields[name]])))
+    this.tried = Object.keys(words.needs).find(kind => words.needs[kind] === example) ?? ""
+    this.uploads.choose(example, file)
   }
 
   // The connection
@@ -352,6 +374,7 @@ class Page {
       if (given) this.enter({...words.fields, ...given})
       byId("preset").value = ""
     }
+    for (const button of every("[data-example]")) button.onclick = () => this.example(button)
     byId("go-on").onclick = () => this.live.connect()
     byId("theme").onclick = () => {
       /** @type {Record<string, string | null>} */

@@ -18,12 +18,12 @@
  * The answer to a question, as the card shows it; notes are sentences with their kind.
  * @typedef {{numbers: {unknown: string, title: string, shown: string, interval: string}[], chosen: string,
  *   shown: string, interval: string, words: string, facts: [string, string][], notes: [string, string][],
- *   simulated: string[], files: string[], headline: boolean}} Answer
+ *   simulated: string[], files: string[], headline: string, chance: boolean}} Answer
  *
  * A message of the server: which entries it has depends on what was asked.
  * @typedef {{n: number, faults: Faults, stray: string, answer: Answer, refused: string, tab: string,
  *   pictures: Record<string, Drawn>, rows: string[][], draws: boolean, ended: string, kind: string, progress: number,
- *   message: string, lacks: string, remedies: [string, string][], entered: string, file: string, taken: any[], solved?: string, payloads?: string,
+ *   message: string, columns: string[], lacks: string, remedies: [string, string][], entered: string, file: string, taken: any[], solved?: string, payloads?: string,
  *   pins: Record<string, Columns>, hello: string,
  *   known: {star: {about: string, given: Entered, offer: string}, targets: any[]}}} Message
  *
@@ -36,7 +36,7 @@
  *   uploads: Record<string, {entered: string, options: string[], most: number}>, withFile: Record<string, string[]>, needs: Record<string, string>,
  *   columns: string[], under: Record<string, [string, string]>, presets: Record<string, Entered>,
  *   sliders: Record<string, {low: number, high: number, step: number, log: boolean}>,
- *   tabs: Record<string, {pictures: PictureWords[], reads: string[], headline: boolean}>,
+ *   tabs: Record<string, {pictures: PictureWords[], reads: string[], chance: boolean}>,
  *   pins: Record<string, [string, string][]>, unused: number}} Words
  */
 
