@@ -310,7 +310,7 @@ def measure_events(
     """
     steps = steps or Steps()
     level = survey.flux_level(~taken)
-    # In the sum over wavelength of spectra, dark current and losses of light may exceed a flare; weights leave them out.
+    # In the sum over wavelength of spectra, dark current and losses of light may exceed a flare; the weights do not.
     bright = survey.along(len(survey.bank.directions) // 2, ~taken) if survey.weighted else survey.flux - level
     kinds: Sequence[Kind] = causes or ["flare"] * len(found)
     measured = map_in_threads(

@@ -412,3 +412,16 @@ def test_study_keeps_the_light_and_flares_like_its_changes_are_candidates() -> N
     found, messages = verdicts(0.3, frame={"light": 1e-6})
     assert found == {900.0: "rejected", 1800.0: "candidate", 2900.0: "detected"}
     assert any('search.frame.light = "free"' in line for line in messages)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [1, 2])
+def test_flare_in_a_stare_with_a_drifting_detector_is_where_it_was_put(seed: int, tmp_path: Path) -> None:
+    """The dark current of unknown temperature exceeds the star in the sum over wavelength, and the flare as well."""
+    drawn = stare(star="AD Leo", amplitude=0.9, duration=3600, seed=seed)
+    light = drawn.stares[0].light
+    assert np.ptp(light.flux.sum(axis=1)) > 2 * light.mean.sum()
+    drawn.write(tmp_path)
+    found = analyse(frames=read_frames(tmp_path / "light-curve-1.fits")).events
+    (flare,) = found[found["kind"] == "flare"]
+    assert flare["tpeak"].to_value("s") == pytest.approx(drawn.events["peak_time"][0].to_value("s"), abs=10)
