@@ -282,7 +282,7 @@ def _panels(figure: Any, answer: PlanAnswer, k: int) -> None:
     top, bottom = figure.subplots(2, 1)
     figure.subplots_adjust(**PANELS)
     days = np.arange(len(seen.days))
-    top.fill_between(days, seen.visibility.by_day(k), step="mid", color=COLOURS[1], linewidth=0)
+    top.fill_between(days, seen.visibility.by_day(k), step="mid", color=COLOURS[3], linewidth=0)
     top.set(ylabel="hours a day", xlim=(0, max(len(days) - 1, 1)), ylim=(0, None))
     firsts = [i for i, day in enumerate(seen.days) if day.endswith("-01")]
     step = max(1, len(firsts) // 12)

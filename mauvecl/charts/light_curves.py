@@ -300,7 +300,7 @@ def observed_light_curve(answer: AnalyseAnswer) -> Picture:
         Dots("", "text", size=2.5, alpha=0.7, at=(time[used], analysis.flux[used])),
         Line("", "sky", width=1.1, at=(time, level)),
         Band("", "sky", alpha=0.3, at=(time, level - off, level + off)),
-        Dots("", COLOURS[1], size=8, marker="x", at=(time[left_out], analysis.flux[left_out])),
+        Dots("", COLOURS[3], size=8, marker="x", at=(time[left_out], analysis.flux[left_out])),
     ]
     x = Axis(f"time (min) from {analysis.frames.date(float(analysis.frames.time_s[0]))[:19]}")
     label = f"flux ({analysis.frames.unit})" if analysis.frames.unit else "flux"

@@ -16,8 +16,9 @@ from mauvecl.host.tables.files import write_whole
 from mauvecl.schema.errors import InputError
 
 P = ParamSpec("P")
-#: Colours of Okabe & Ito, which colour-blind readers can distinguish (jfly.uni-koeln.de/color).
-COLOURS = ("#0072B2", "#56B4E9", "#009E73", "#E69F00", "#D55E00", "#CC79A7", "#000000")
+#: Colours of Okabe & Ito, which colour-blind readers can distinguish (jfly.uni-koeln.de/color); neighbours differ in
+#: lightness as well.
+COLOURS = ("#0072B2", "#E69F00", "#009E73", "#56B4E9", "#D55E00", "#CC79A7", "#000000")
 NULL = "#777777"
 #: Colours of files by their names in charts; `web.figures.INKS` has those of the page's themes.
 INK = {
@@ -36,6 +37,7 @@ MAX_COLUMNS = 3
 COLUMN = 3.5
 #: No-break space.
 UNBROKEN = "\N{NO-BREAK SPACE}"
+MINUS = "\N{MINUS SIGN}"
 #: Size of the labels of ticks that are names.
 SMALL = 8
 #: Largest fraction of a figure's width for titles and legends.
@@ -47,6 +49,7 @@ STYLE = {
     "axes.spines.right": False,
     "axes.titlesize": 9,
     "axes.titlelocation": "left",
+    "axes.formatter.use_mathtext": True,
     "legend.frameon": False,
     "legend.fontsize": 8,
     "figure.constrained_layout.use": True,
@@ -122,8 +125,9 @@ def _headline(figure: Any, text: str) -> None:
 
 
 def _legend_below(figure: Any, handles: dict[str, Any]) -> None:
-    """Add a legend below all panels, in as many columns as fit."""
-    for columns in range(len(handles), 0, -1):
+    """Add a legend below all panels, in as few rows as fit, which have about equally many entries."""
+    for rows in range(1, len(handles) + 1):
+        columns = -(-len(handles) // rows)
         legend = figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)
         if columns == 1 or legend.get_window_extent(_renderer(figure)).width <= INSIDE * figure.bbox.width:
             return
@@ -140,9 +144,18 @@ def _plain_numbers(axis: Any) -> None:
         low, high = sorted(side.get_view_interval())
         decades = float(np.log10(high / low))
         side.set_major_locator(LogLocator(subs=(1.0,) if decades > 2 else (1.0, 2.0, 5.0)))
-        if decades < 4 and high < 1e6:
-            side.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        if decades < 4:
+            side.set_major_formatter(FuncFormatter(lambda value, _: written(value)))
         side.set_minor_formatter(NullFormatter())
+
+
+def written(value: float) -> str:
+    """Return a number as people write it: 0.1, 500, or 2 times a power of ten."""
+    digits, _, power = f"{value:.5e}".partition("e")
+    if value == 0 or -4 <= int(power) < 5:
+        return f"{value:g}".replace("-", MINUS)
+    digits = f"{float(digits):g}"
+    return rf"$10^{{{int(power)}}}$" if digits == "1" else rf"${digits}\times10^{{{int(power)}}}$"
 
 
 def _renderer(figure: Any) -> Any:

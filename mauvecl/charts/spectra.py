@@ -84,7 +84,7 @@ def convolved(source: Source, instrument: Instrument) -> Panel:
     # Division by a flat spectrum removes the efficiencies and leaves the effect of the line spread function.
     flat = electrons_per_second(instrument, nm, np.ones_like(source.flux_flam))
     seen = electrons_per_second(instrument, nm, source.flux_flam) / flat
-    given = Line("as given", COLOURS[1], width=1.1, at=(nm, source.flux_flam))
+    given = Line("as given", COLOURS[3], width=1.1, at=(nm, source.flux_flam))
     through = Line("through Mauve's line function", "sky", at=(instrument.wavelength_nm, seen))
     return Panel(WAVELENGTH, Axis(FLUX.label, limits=(0, 1.1 * float(seen.max()))), [given, through], source.name)
 
