@@ -158,6 +158,13 @@ def written(value: float) -> str:
     return rf"$10^{{{int(power)}}}$" if digits == "1" else rf"${digits}\times10^{{{int(power)}}}$"
 
 
+def in_figure(unit: str) -> str:
+    """Return a unit, as astropy spells it, as the label of an axis has it."""
+    from astropy.units import Unit
+
+    return str(Unit(unit).to_string("latex_inline"))
+
+
 def _renderer(figure: Any) -> Any:
     """Return the renderer that measures text."""
     from matplotlib.backends.backend_agg import RendererAgg

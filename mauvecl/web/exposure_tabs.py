@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 def budget(closed: ClosedForms, answers: Answers) -> ChartData:
     """Return the noise of a pixel by origin."""
     series = budget_series(closed.quiet)
-    power = {part: float(np.nansum(series[part.key][1] ** 2)) for part in BUDGET.series[:-1] if part.key in series}
+    power = {part: float(np.nansum(series[part.key][1] ** 2)) for part in BUDGET.series[1:] if part.key in series}
     most = max(power, key=lambda name: power[name])
     share = 100 * power[most] / (sum(power.values()) or 1.0)
     return ChartData(f"Most of the noise's power comes from {most.called}: {share:.0f} % over all pixels.", series)
