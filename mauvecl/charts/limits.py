@@ -25,7 +25,19 @@ from mauvecl.charts.chart import (
     Strips,
     picture_of,
 )
-from mauvecl.charts.matplotlib import COLOURS, COLUMN, MAX_COLUMNS, UNBROKEN, in_figure, styled_picture, written
+from mauvecl.charts.matplotlib import (
+    COLOURS,
+    COLUMN,
+    EMPTY,
+    MAX_COLUMNS,
+    UNBROKEN,
+    contour_entries,
+    draw_contours,
+    in_figure,
+    strokes_of,
+    styled_picture,
+    written,
+)
 from mauvecl.detection.requests import statistic_label
 from mauvecl.fits.flare_model import FlareModel, usable_variance
 from mauvecl.schema.columns import First, note_of
@@ -43,8 +55,6 @@ if TYPE_CHECKING:
     from mauvecl.study.study import Study
 
 
-#: Styles of contours, by ascending probability.
-STROKES = ("dotted", "dashed", "-", "dashdot")
 MARKS = "osD^vPX"
 
 
@@ -65,21 +75,19 @@ def detection_map(answer: MapAnswer) -> Picture:
         np.arange(len(values)) if named[which] else np.array(values, float)
         for which, values in (("x", answer.x), ("y", answer.y))
     )
-    # Lines are close where a map is steep, so line styles distinguish them instead of labels.
-    levels = dict(zip(sorted(question.contours), cycle(STROKES), strict=False)) if min(x.size, y.size) > 1 else {}
+    strokes = strokes_of(question.contours) if min(x.size, y.size) > 1 else {}
 
     def finish(axis: Any, probability: Any) -> None:
-        if levels:
-            axis.contour(x, y, probability, levels=list(levels), colors="white", linewidths=2.4)
-            strokes = list(levels.values())
-            axis.contour(x, y, probability, levels=list(levels), colors="black", linewidths=1.2, linestyles=strokes)
+        axis.set_facecolor(EMPTY)
+        if strokes:
+            draw_contours(axis, (x, y, probability), strokes)
 
     x_axis, y_axis = (
         quantity_axis(study, sweep.quantity, log=sweep.log and not named[which],
                       ticks=(place, getattr(answer, which)) if named[which] else None)
         for which, sweep, place in (("x", question.x, x), ("y", question.y, y))
     )  # fmt: skip
-    lines = [Line(f"detected in {100 * level:g} %", "text", dash=dash, at=([], [])) for level, dash in levels.items()]
+    lines = contour_entries(strokes, "detected")
     row = [
         Panel(x_axis, y_axis, [Mesh("detection probability", at=(x, y, p)), *lines], statistic_label(statistic),
               partial(finish, probability=p))
@@ -89,7 +97,7 @@ def detection_map(answer: MapAnswer) -> Picture:
     exposure = "" if "exposure" in names else f", {study.observation.exposure_s:g} s"
     flare = "" if "amplitude" in names else f", flare of {100 * study.flare.amplitudes[0]:g} %"
     title = f"{answer.star}{exposure}{flare}, false-alarm probability {study.run.fap:g} per test; nominal throughput"
-    return Picture([row], (COLUMN * len(row) + 0.5, 3.4), title, below=bool(levels), share_y=True)
+    return Picture([row], (COLUMN * len(row) + 0.5, 3.4), title, below=bool(strokes), share_y=True)
 
 
 @picture_of("LimitAnswer", "limit")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache, wraps
 from itertools import cycle
 from pathlib import Path
@@ -20,6 +20,8 @@ P = ParamSpec("P")
 #: lightness as well.
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#56B4E9", "#D55E00", "#CC79A7", "#000000")
 NULL = "#777777"
+#: Colour of a mesh's cells without a value, which no palette has.
+EMPTY = "#bbbbbb"
 #: Colours of files by their names in charts; `web.figures.INKS` has those of the page's themes.
 INK = {
     "star": "#0072B2", "flare": "#D55E00", "sky": "#009E73", "drawn": NULL, "dark": "#CC79A7", "read": "#E69F00",
@@ -52,6 +54,7 @@ STYLE = {
     "axes.formatter.use_mathtext": True,
     "legend.frameon": False,
     "legend.fontsize": 8,
+    "legend.markerscale": 1.6,
     "figure.constrained_layout.use": True,
     "savefig.dpi": 160,
     "pdf.fonttype": 42,
@@ -134,16 +137,19 @@ def _legend_below(figure: Any, handles: dict[str, Any]) -> None:
         legend.remove()
 
 
-def _plain_numbers(axis: Any) -> None:
+def _plain_numbers(axis: Any, panel: Panel) -> None:
     """Label logarithmic ticks as plain numbers (0.1, 20, 500), with intermediate ticks only over few decades."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-    for side in (axis.xaxis, axis.yaxis):
+    for side, of in ((axis.xaxis, panel.x), (axis.yaxis, panel.y)):
         if side.get_scale() != "log":
             continue
         low, high = sorted(side.get_view_interval())
         decades = float(np.log10(high / low))
-        side.set_major_locator(LogLocator(subs=(1.0,) if decades > 2 else (1.0, 2.0, 5.0)))
+        if of.ticks is None:
+            # Powers of ten are too wide to stand side by side with others.
+            most = 1 if side is axis.xaxis and (low < 1e-4 or high > 1e5) else 2
+            side.set_major_locator(LogLocator(subs=(1.0,) if decades > most else (1.0, 2.0, 5.0)))
         if decades < 4:
             side.set_major_formatter(FuncFormatter(lambda value, _: written(value)))
         side.set_minor_formatter(NullFormatter())
@@ -156,6 +162,22 @@ def written(value: float) -> str:
         return f"{value:g}".replace("-", MINUS)
     digits = f"{float(digits):g}"
     return rf"$10^{{{int(power)}}}$" if digits == "1" else rf"${digits}\times10^{{{int(power)}}}$"
+
+
+def strokes_of(levels: Iterable[float]) -> dict[float, str]:
+    """Return the line style of each contour; lines are close where a map is steep, so that labels would not fit."""
+    return dict(zip(sorted(levels), cycle(("dotted", "dashed", "-", "dashdot")), strict=False))
+
+
+def contour_entries(strokes: Mapping[float, str], found: str) -> list[Line]:
+    """Return the entries of the legend for contours of a probability."""
+    return [Line(f"{found} in {100 * level:g} %", "text", dash=dash, at=([], [])) for level, dash in strokes.items()]
+
+
+def draw_contours(axis: Any, at: tuple[Any, Any, Any], strokes: Mapping[float, str]) -> None:
+    """Draw contours of a map, with a bright edge that sets them off."""
+    axis.contour(*at, levels=list(strokes), colors="white", linewidths=2.4)
+    axis.contour(*at, levels=list(strokes), colors="black", linewidths=1.2, linestyles=list(strokes.values()))
 
 
 def in_figure(unit: str) -> str:
@@ -237,7 +259,7 @@ def _finish(axis: Any, panel: Panel) -> None:
             getattr(axis, f"set_{name}lim")(*limits)
         if of.ticks is not None:
             getattr(axis, f"set_{name}ticks")(*of.ticks, **({"fontsize": SMALL} if len(of.ticks) > 1 else {}))
-    _plain_numbers(axis)
+    _plain_numbers(axis, panel)
     if panel.finish is not None:
         panel.finish(axis)
 
