@@ -72,7 +72,7 @@ def _rows(answer: VisibleAnswer, hours: Any) -> Picture:
 
 
 def _month(day: str) -> str:
-    return f"{months_of_years.month_abbr[int(day[5:7])]} {day[2:4]}"
+    return f"{months_of_years.month_abbr[int(day[5:7])]} {day[:4]}"
 
 
 #: A4, and its margin, inches.
@@ -112,10 +112,10 @@ def _overview(answer: PlanAnswer) -> Picture:
     logs = np.log10([energy for pair in ends for energy in pair if np.isfinite(energy)])
     decades = (10 ** np.floor(logs.min()), 10 ** np.ceil(logs.max())) if logs.size else None
     names = range(len(planned)), [f"{target.name} ({target.hours:.0f} h)" for target in planned]
-    y, above = Axis(limits=(len(planned) - 0.5, -0.5), ticks=names), "expected (dot); 95 % of campaigns"
+    y, above = Axis(limits=(len(planned) - 0.5, -0.5), ticks=names), "mean (dot), and 95 % of campaigns"
     row = [
         Panel(Axis("flares recovered", log=True, limits=(0.05, None)), y, left, above),
-        Panel(Axis("bolometric energy (erg)", log=True, limits=decades), y, right, "E50 (dot) to E90"),
+        Panel(Axis("bolometric energy (erg)", log=True, limits=decades), y, right, "recovered in 50 % (dot) to 90 %"),
     ]
     return Picture([row], (7.4, 0.24 * len(planned) + 1.5), share_y=True)
 
