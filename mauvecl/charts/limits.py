@@ -85,7 +85,7 @@ def detection_map(answer: MapAnswer) -> Picture:
     x_axis, y_axis = (
         quantity_axis(study, sweep.quantity, log=sweep.log and not named[which],
                       ticks=(place, getattr(answer, which)) if named[which] else None)
-        for which, sweep, place in (("x", question.x, x), ("y", question.y, y))
+        for which, sweep, place in (("x", question.axes[0], x), ("y", question.axes[1], y))
     )  # fmt: skip
     lines = contour_entries(strokes, "detected")
     row = [
@@ -93,7 +93,7 @@ def detection_map(answer: MapAnswer) -> Picture:
               partial(finish, probability=p))
         for statistic, p in zip(answer.statistics, answer.probability, strict=True)
     ]  # fmt: skip
-    names = {question.x.quantity, question.y.quantity}
+    names = {axis.quantity for axis in question.axes}
     exposure = "" if "exposure" in names else f", {study.observation.exposure_s:g} s"
     flare = "" if "amplitude" in names else f", flare of {100 * study.flare.amplitudes[0]:g} %"
     title = f"{answer.star}{exposure}{flare}, false-alarm probability {study.run.fap:g} per test; nominal throughput"
