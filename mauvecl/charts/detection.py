@@ -275,7 +275,9 @@ def unknowns(answer: UnknownAnswer) -> Picture:
         smallest = [Dots("", "text", size=12, at=([0], [answer.smallest(star, None)]))]
         for k, (colour, (unknown, cost)) in enumerate(zip(cycle(COLOURS), costs.items(), strict=False), 1):
             series += [
-                Line(unknown, colour, at=(relative, power(cost.marginal * relative / amplitude, fap))),
+                Line(
+                    unknown.replace("+-", "±"), colour, at=(relative, power(cost.marginal * relative / amplitude, fap))
+                ),
                 Line("", colour, dash="dashed", at=(relative, power(cost.plain * relative / amplitude, fap))),
             ]
             smallest.append(Dots("", colour, size=12, at=([k], [answer.smallest(star, unknown)])))

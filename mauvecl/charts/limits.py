@@ -89,15 +89,16 @@ def detection_map(answer: MapAnswer) -> Picture:
     )  # fmt: skip
     lines = contour_entries(strokes, "detected")
     row = [
-        Panel(x_axis, y_axis, [Mesh("detection probability", at=(x, y, p)), *lines], statistic_label(statistic),
-              partial(finish, probability=p))
+        Panel(x_axis, y_axis, [Mesh("detection probability", at=(x, y, p)), *lines],
+              statistic_label(statistic).partition(" (")[0], partial(finish, probability=p))
         for statistic, p in zip(answer.statistics, answer.probability, strict=True)
     ]  # fmt: skip
     names = {axis.quantity for axis in question.axes}
     exposure = "" if "exposure" in names else f", {study.observation.exposure_s:g} s"
     flare = "" if "amplitude" in names else f", flare of {100 * study.flare.amplitudes[0]:g} %"
     title = f"{answer.star}{exposure}{flare}, false-alarm probability {study.run.fap:g} per test; nominal throughput"
-    return Picture([row], (COLUMN * len(row) + 0.5, 3.4), title, below=bool(strokes), share_y=True)
+    empty = "grey: no answer" if np.isnan(answer.probability).any() else ""
+    return Picture([row], (COLUMN * len(row) + 0.5, 3.4), title, (empty,), below=bool(strokes), share_y=True)
 
 
 @picture_of("LimitAnswer", "limit")

@@ -106,7 +106,7 @@ def efficiencies(instrument: Instrument) -> Picture:
 def throughput(instrument: Instrument) -> Picture:
     """Plot the quantum efficiency and the end-to-end throughput, which includes it, as the paper's figure."""
     w, errors = np.linspace(*RANGE_NM, 501), instrument.throughput_errors
-    origin, label = ("nominal, not a flight calibration", "sensible uncertainty")
+    origin, label = ("nominal, not a flight calibration", "assumed uncertainty")
     share = np.where(w < 250, 0.5, 0.3)
     low, high, spread = 1 - share, 1 + share, 100 * instrument.throughput(w)
     if errors is not None:
@@ -115,7 +115,7 @@ def throughput(instrument: Instrument) -> Picture:
     quantum = Line("", "star", at=(w, 100 * instrument.quantum_efficiency(w)))
     band, line = Band(label, alpha=0.25, at=(w, low * spread, high * spread)), Line("", "flare", at=(w, spread))
     above = Panel(WAVELENGTH, Axis("quantum efficiency (%)"), [quantum], f"{instrument.name}: {origin}")
-    below = Panel(WAVELENGTH, Axis("throughput with it (%)"), [line, band])
+    below = Panel(WAVELENGTH, Axis("end-to-end throughput (%)"), [line, band])
     return Picture([[above], [below]], (3.6, 4.0), share_x=True)
 
 
