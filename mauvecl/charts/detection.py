@@ -125,10 +125,14 @@ def _scaled(axis: Any, linear: bool, ends: tuple[float, float]) -> None:
         axis.set_xscale("log")
         low, high = np.log10(ends)
         axis.set_xlim(*10 ** np.array([low - MARGIN * (high - low), high + MARGIN * (high - low)]))
-        digits: tuple[float, ...] = (1,)
-        if high - low <= 2:
-            # Below two decades, powers of ten alone are too sparse.
-            digits = (1, 2, 5) if high - low > 0.8 else (1, 1.2, 1.4, 1.7, 2, 2.5, 3, 4, 5, 6, 8)
+        # Over few decades, powers of ten alone are too sparse.
+        digits = next(
+            digits
+            for most, digits in (
+                (0.4, (1, 1.2, 1.4, 1.7, 2, 2.5, 3, 4, 5, 6, 8)), (0.8, (1, 2, 3, 5)), (2.0, (1, 2, 5)), (np.inf, (1,)),
+            )
+            if high - low <= most
+        )  # fmt: skip
         major = [digit * decade for decade in decades for digit in digits]
         minor = [digit * decade for decade in decades for digit in range(1, 10)]
     low, high = axis.get_xlim()
