@@ -164,7 +164,8 @@ def with_error(value: float, error: float) -> str:
     if not (math.isfinite(error) and error > 0):
         return f"{value:.3g}"
     digits = max(1 - math.floor(math.log10(error)), 0)
-    return f"{value:.{digits}f} ± {error:.{digits}f}"
+    # The sum makes -0 a 0.
+    return f"{round(value, digits) + 0.0:.{digits}f} ± {error:.{digits}f}"
 
 
 def short(value: float | str) -> str:
