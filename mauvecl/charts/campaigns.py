@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 #: Largest number of targets with a calendar each; more targets are rows of one picture.
 MOST_CALENDARS = 6
+#: Largest number of months whose names fit side by side.
+MOST_MONTHS = 8
 
 
 @picture_of("VisibleAnswer", "visible")
@@ -65,7 +67,7 @@ def _rows(answer: VisibleAnswer, hours: Any) -> Picture:
     step = max(1, n // 60)
     names = np.arange(0, n, step), [target.name for target in answer.targets[::step]]
     firsts = [i for i, day in enumerate(answer.days) if day.endswith("-01")]
-    firsts = firsts[:: max(1, len(firsts) // 13)]
+    firsts = firsts[:: -(-len(firsts) // MOST_MONTHS) or 1]
     x = Axis(ticks=(firsts, [_month(answer.days[i]) for i in firsts]))
     panel = Panel(x, Axis(limits=(n - 0.5, -0.5), ticks=names), [mesh])
     return Picture([[panel]], (7.4, min(0.16 * n + 1.4, 20.0)))

@@ -206,7 +206,7 @@ COMPONENTS = {
     "source": "star",
     "sky": "zodiacal light",
     "photon_noise": "photon noise",
-    "dark": "dark",
+    "dark": "dark current",
     "bias": "bias",
     "read_noise": "read noise",
 }
