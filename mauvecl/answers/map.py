@@ -21,7 +21,7 @@ from mauvecl.answers.closed_forms import (
     shares,
     unknown_cost,
 )
-from mauvecl.answers.limit_search import LimitSearch
+from mauvecl.answers.limit_search import SEARCH, LimitSearch
 from mauvecl.detection.distributions import Interval
 from mauvecl.detection.names import RECOMMENDED, check_fap
 from mauvecl.device.engine import Engine
@@ -51,8 +51,8 @@ if TYPE_CHECKING:
 OF_FLARE = tuple(name for name, quantity in QUANTITIES.items() if quantity.path[0] == "flare")
 
 
-#: Magnitudes of a map of which the closed form tells none.
-USUAL = (4.0, 10.0)
+#: Magnitude from which that of saturation is computed.
+MIDDLE = 10.0
 #: Steps of the magnitudes of a map, and their largest number.
 STEPS, MOST_MAGNITUDES = (0.1, 0.2, 0.25, 0.5, 1.0), 16
 #: Columns of the table of cells, after those of the two axes.
@@ -237,32 +237,38 @@ def magnitudes_of(case: Case) -> Axis:
     question, statistics = case.study.map, case.study.run.statistics
     statistic = RECOMMENDED if RECOMMENDED in statistics else statistics[0]
     values, powers = question.y.points(), (*question.contours, 0.5)
-    ends, saturating = list[float](), list[float]()
+    ends, saturating, (faint, _) = list[float](), list[float](), SEARCH["magnitude"]
+    assert faint is not None
     for value in values if isinstance(values[0], str) else (values[0], values[-1]):
         for power in (min(powers), max(powers)):
             limit = LimitQuestion(of="magnitude", power=power)
             one = replace(case, study=case.study.model_copy(update={"limit": limit}))
             search = LimitSearch(one.with_value(question.y.quantity, value), statistic)
+            saturating.append(_saturating(search.scaled(MIDDLE)[0], MIDDLE))
             try:
                 ends.append(search.root())
             except InputError:
-                # The flare is detected at no magnitude, or at all.
-                continue
-            saturating.append(_saturating(search.scaled(ends[-1])[0], ends[-1]))
-    brightest, faintest = (max(min(ends), *saturating), max(ends)) if ends else USUAL
+                # The flare is detected on the faintest star, or not even on one that saturates.
+                ends.append(faint if search.theory(faint) >= power else saturating[-1])
     for step in STEPS:
-        low, high = np.floor(brightest / step), np.ceil(faintest / step)
+        low = max(np.floor(min(ends) / step), np.ceil(max(saturating) / step))
+        high = np.ceil(max(ends) / step)
         if high - low < MOST_MAGNITUDES:
             break
     high = max(high, low + 1)
-    return Axis(quantity="magnitude", start=float(low * step), stop=float(high * step), steps=int(high - low) + 1)
+    start, stop = (round(float(end * step), 2) for end in (low, high))
+    return Axis(quantity="magnitude", start=start, stop=stop, steps=int(high - low) + 1)
 
 
 def _saturating(quiet: Expectation, magnitude: float) -> float:
     """Return the magnitude at which a star's brightest pixel saturates, given its expectation at a magnitude."""
     star = quiet.gain_dn_per_electron * quiet.source_electrons
     room = quiet.ceiling_dn - (quiet.mean_raw_dn - star)
-    return magnitude + 2.5 * float(np.log10(np.max(star / room)))
+    # Pixels that their dark current alone saturates have no room, whatever the magnitude.
+    free = room > 0
+    if not free.any():
+        return magnitude
+    return magnitude + 2.5 * float(np.log10(np.max(star[free] / room[free])))
 
 
 def _cost(case: Case, x: Values, y: Values) -> list[str]:
