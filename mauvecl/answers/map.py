@@ -21,6 +21,7 @@ from mauvecl.answers.closed_forms import (
     shares,
     unknown_cost,
 )
+from mauvecl.answers.limit_search import SEARCH, LimitSearch
 from mauvecl.answers.verbs import by_keywords
 from mauvecl.detection.distributions import Interval
 from mauvecl.detection.names import RECOMMENDED, check_fap
@@ -38,7 +39,7 @@ from mauvecl.study.cases import (
     star_label,
     worst_first,
 )
-from mauvecl.study.questions import QUANTITIES
+from mauvecl.study.questions import QUANTITIES, Axis, LimitQuestion
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
@@ -50,6 +51,10 @@ if TYPE_CHECKING:
 OF_FLARE = tuple(name for name, quantity in QUANTITIES.items() if quantity.path[0] == "flare")
 
 
+#: Magnitude from which that of saturation is computed.
+MIDDLE = 10.0
+#: Steps of the magnitudes of a map, and their largest number.
+STEPS, MOST_MAGNITUDES = (0.1, 0.2, 0.25, 0.5, 1.0), 16
 #: Columns of the table of cells, after those of the two axes.
 COLUMNS = (
     Column("statistic", lambda answer: np.array(answer.statistics)[:, None, None], description="detection statistic"),
@@ -63,7 +68,7 @@ NUMBERS = ("probability", "low", "high", "closed_form", "ideal")
 
 
 def _cell_columns(answer: MapAnswer) -> tuple[Column, ...]:
-    x, y = (axis.quantity for axis in (answer.study.map.x, answer.study.map.y))
+    x, y = (axis.quantity for axis in answer.study.map.axes)
     return (
         quantity_column(x, lambda answer: np.array(answer.x)),
         quantity_column(y, lambda answer: np.array(answer.y)[:, None]),
@@ -132,7 +137,7 @@ class MapAnswer(Answer):
             View(f"{statistic}, averaged over {draws}: its scatter is from {describe_shares(parts)}.")
             for statistic, parts in self.shares.items()
         ]
-        axes = f"{self.study.map.y.quantity}, {self.study.map.x.quantity}"
+        axes = ", ".join(axis.quantity for axis in self.study.map.axes[::-1])
         columns = [
             Column("y", heading=axes, format=_shown),
             *(Column(f"x{k}", heading=_shown(x), format=lambda p: f"{100 * p:.0f}") for k, x in enumerate(self.x)),
@@ -155,7 +160,7 @@ class MapAnswer(Answer):
     @property
     def premises(self) -> list[str]:
         """The study's assumptions apart from the two quantities of the map."""
-        return assumptions_of(self.study, self.uses, (self.study.map.x.quantity, self.study.map.y.quantity))
+        return assumptions_of(self.study, self.uses, tuple(axis.quantity for axis in self.study.map.axes))
 
     @property
     def inputs(self) -> list[Expectation]:
@@ -172,16 +177,22 @@ def map(
     Parameters
     ----------
     study : Study, optional
-        Its ``map`` defines the axes; other quantities have the study's values.
+        Its ``map`` defines the axes; other quantities have the study's values. Without a horizontal axis, it has the
+        magnitudes over which the flares of the vertical one are lost.
     progress : callable, optional
         Called as ``progress(done, total)`` in cells.
     """
     check_fap(study.run.fap, study.run.realisations, study.run.tails)
     study = study.model_copy(update={"star": study.star[:1]}).at("amplitude", study.flare.amplitudes[0])
     (case,) = cases(study, swept=False)
+    if study.map.x is None:
+        question = study.map.model_copy(update={"x": magnitudes_of(case)})
+        study = study.model_copy(update={"map": question})
+        case = replace(case, study=case.study.model_copy(update={"map": question}))
     unknown = drawn(case.study) if study.unknowns.draws else None
     draws = [case] if unknown is None else [replace(case, study=draw) for draw in unknown.studies]
-    cells = Cells(study.map.x.points(), study.map.y.points(), engine or Engine(), len(draws), progress)
+    x, y = study.map.axes
+    cells = Cells(x.points(), y.points(), engine or Engine(), len(draws), progress)
     maps = [cells.map_of(draw) for draw in draws]
     values, parts = maps[0], {}
     if unknown is not None:
@@ -189,7 +200,7 @@ def map(
         for s, statistic in enumerate(study.run.statistics):
             means = [float(np.nanmean(drawn_map["probability"][s])) for drawn_map in maps]
             parts[statistic] = shares(unknown, np.array(means))
-    quiet, star, names = cells.quiet[0], study.star[0], {study.map.x.quantity, study.map.y.quantity}
+    quiet, star, names = cells.quiet[0], study.star[0], {x.quantity, y.quantity}
     if "magnitude" in names:
         star = star.model_copy(update={"magnitude": None})
     messages = [
@@ -217,12 +228,55 @@ def map(
     )
 
 
+def magnitudes_of(case: Case) -> Axis:
+    """Return the magnitudes over which a star's flares are lost, by the closed form.
+
+    They reach from where the least visible flare of the vertical axis is detected, or the star's brightest pixel
+    saturates, to where the most visible one hardly is.
+    """
+    question, statistics = case.study.map, case.study.run.statistics
+    statistic = RECOMMENDED if RECOMMENDED in statistics else statistics[0]
+    values, powers = question.y.points(), (*question.contours, 0.5)
+    ends, saturating, (faint, _) = list[float](), list[float](), SEARCH["magnitude"]
+    assert faint is not None
+    for value in values if isinstance(values[0], str) else (values[0], values[-1]):
+        for power in (min(powers), max(powers)):
+            limit = LimitQuestion(of="magnitude", power=power)
+            one = replace(case, study=case.study.model_copy(update={"limit": limit}))
+            search = LimitSearch(one.with_value(question.y.quantity, value), statistic)
+            saturating.append(_saturating(search.scaled(MIDDLE)[0], MIDDLE))
+            try:
+                ends.append(search.root())
+            except InputError:
+                # The flare is detected on the faintest star, or not even on one that saturates.
+                ends.append(faint if search.theory(faint) >= power else saturating[-1])
+    for step in STEPS:
+        low = max(np.floor(min(ends) / step), np.ceil(max(saturating) / step))
+        high = np.ceil(max(ends) / step)
+        if high - low < MOST_MAGNITUDES:
+            break
+    high = max(high, low + 1)
+    start, stop = (round(float(end * step), 2) for end in (low, high))
+    return Axis(quantity="magnitude", start=start, stop=stop, steps=int(high - low) + 1)
+
+
+def _saturating(quiet: Expectation, magnitude: float) -> float:
+    """Return the magnitude at which a star's brightest pixel saturates, given its expectation at a magnitude."""
+    star = quiet.gain_dn_per_electron * quiet.source_electrons
+    room = quiet.ceiling_dn - (quiet.mean_raw_dn - star)
+    # Pixels that their dark current alone saturates have no room, whatever the magnitude.
+    free = room > 0
+    if not free.any():
+        return magnitude
+    return magnitude + 2.5 * float(np.log10(np.max(star[free] / room[free])))
+
+
 def _cost(case: Case, x: Values, y: Values) -> list[str]:
     """Return the sentence on the cost of unknowns in the middle of the map."""
     middle, study = (x[len(x) // 2], y[len(y) // 2]), case.study
     there = _cell(case, *middle)
     (flare,) = there.flares
-    names = (axis.quantity.replace("_", " ") for axis in (study.map.x, study.map.y))
+    names = (axis.quantity.replace("_", " ") for axis in study.map.axes)
     at = " and ".join(f"{name} {_shown(value)}" for name, value in zip(names, middle, strict=True))
     cost = unknown_cost(f"the cell of {at}", there.quiet, flare, study.nuisances, study.run.comparison())
     return cost_lines([cost], study.nuisances)
@@ -334,7 +388,7 @@ def _averaged(maps: list[Arrays]) -> Arrays:
 
 def _groups(question: MapQuestion, x: Values, y: Values) -> list[list[tuple[int, int]]]:
     """Return the cells (i, j) in groups that share a quiescent star."""
-    flare_x, flare_y = (axis.quantity in OF_FLARE for axis in (question.x, question.y))
+    flare_x, flare_y = (axis.quantity in OF_FLARE for axis in question.axes)
     every = [[(i, j) for i in range(len(x))] for j in range(len(y))]
     if flare_x and flare_y:
         return [[cell for row in every for cell in row]]
@@ -347,8 +401,8 @@ def _groups(question: MapQuestion, x: Values, y: Values) -> list[list[tuple[int,
 
 def _cell(case: Case, x: float | str, y: float | str) -> Case:
     """Return the case of a cell."""
-    question = case.study.map
-    return case.with_value(question.x.quantity, x).with_value(question.y.quantity, y)
+    across, along = case.study.map.axes
+    return case.with_value(across.quantity, x).with_value(along.quantity, y)
 
 
 def _fill(

@@ -8,7 +8,6 @@ QUALITY, CADENCENO.
 from __future__ import annotations
 
 import io
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -30,7 +29,7 @@ from mauvecl.host import VERSION
 from mauvecl.host.exposure.sky import parse_position, parse_time
 from mauvecl.host.tables.units import offline
 from mauvecl.runs.checkpoint import Checkpoint, kept
-from mauvecl.schema.columns import Column, View, number, percent, table_of
+from mauvecl.schema.columns import Column, View, number, percent, table_of, with_error
 from mauvecl.schema.errors import InputError, Message
 from mauvecl.schema.physical import DAY_S
 from mauvecl.search.alarms import Alarm, alarms
@@ -203,18 +202,8 @@ MOST_ROWS = 100_000
 MOST_SHOWN = 2_000_000
 
 
-def _with_error(value: float, error: float) -> str:
-    """Format a value to its error's two leading digits: 9979 ± 120, not 1e+02."""
-    if value != value:
-        return ""
-    if not (math.isfinite(error) and error > 0):
-        return f"{value:.3g}"
-    digits = max(1 - math.floor(math.log10(error)), 0)
-    return f"{value:.{digits}f} ± {error:.{digits}f}"
-
-
 def _percent_with_error(value: float, error: float) -> str:
-    text = _with_error(100 * value, 100 * error)
+    text = with_error(100 * value, 100 * error)
     return f"{text} %" if text else ""
 
 
@@ -283,9 +272,9 @@ def _interval(name: str, key: str, unit: str) -> list[Column]:
 FOUND_COLUMNS = (
     *_fitted("peak_time", "peak_s", "s", "from the start of the stare", "peak at (s)", number(".6g", "not measured")),
     *_fitted("amplitude", "amplitude", "", "in the flare's band", "amplitude", _percent_with_error, "amplitude_error"),
-    *_fitted("half_width", "half_width_s", "s", "t_1/2 of the search's shape", "half-width (s)", _with_error,
+    *_fitted("half_width", "half_width_s", "s", "t_1/2 of the search's shape", "half-width (s)", with_error,
              "half_width_error"),
-    *_fitted("temperature", "temperature_k", "K", "blackbody temperature", "temperature (K)", _with_error,
+    *_fitted("temperature", "temperature_k", "K", "blackbody temperature", "temperature (K)", with_error,
              "temperature_error"),
     *_fitted("equivalent_duration", "equivalent_duration_s", "s", "in the flare's band"),
     Column("energy_bolometric", "bolometric_erg", "erg", "", "bolometric (erg)", number(".3g")),

@@ -23,8 +23,8 @@ from mauvecl.charts.chart import (
     Targets,
     picture_of,
 )
-from mauvecl.charts.matplotlib import styled_picture
-from mauvecl.schema.columns import First
+from mauvecl.charts.matplotlib import in_figure, styled_picture
+from mauvecl.schema.columns import First, with_error
 
 if TYPE_CHECKING:
     from mauvecl.answers.calibrate import CalibrateAnswer
@@ -35,7 +35,7 @@ BIN, GROUPS = 16, 60
 THROUGHPUT = Chart(
     "throughput", "Throughput: fitted and nominal", WAVELENGTH, Axis("electrons per photon (%)"),
     (
-        Band("95 %", "star", "band", alpha=0.35),
+        Band("95 % interval", "star", "band", alpha=0.35),
         Line("fitted", "star", width=2, tips=("nm", "fitted (%)")),
         Line("nominal", dash="dashed"),
     ),
@@ -80,12 +80,14 @@ def residual_series(answer: CalibrateAnswer) -> list[tuple[str, Any, Any]]:
 @styled_picture
 def calibration_residuals(answer: CalibrateAnswer) -> Picture:
     """Plot the residuals of each star, averaged over some pixels, in their standard deviations."""
-    y, two = Axis(f"residual of {BIN} pixels (sigma)"), Strips(along="y", alpha=0.2, at=([-2], [2]))
+    two = Strips(along="y", alpha=0.2, at=([-2], [2]))
     rows = [
-        [Panel(WAVELENGTH, y if k == len(answer.stars) // 2 else Axis(), [two, Dots("", "star", at=(nm, row))], name)]
-        for k, (name, nm, row) in enumerate(residual_series(answer))
+        [Panel(WAVELENGTH, Axis("residual (sigma)"), [two, Dots("", "star", at=(nm, row))], name)]
+        for name, nm, row in residual_series(answer)
     ]
-    title = f"Observed less fitted spectra; grey: 2 sigma; p = {answer.throughput.p_value:.2g}"
+    title = (
+        f"Observed less fitted spectra, means of {BIN} pixels; grey: 2 sigma; p-value {answer.throughput.p_value:.2g}"
+    )
     return Picture(rows, (5.2, 1.0 + 1.1 * len(rows)), title, share_x=True, share_y=True)
 
 
@@ -108,8 +110,8 @@ def photon_transfer(answer: CalibrateAnswer) -> Picture:
     off = Dots("", "star", size=6, at=(model, 100 * (measured / model - 1), 100 * error / model))
     below = Panel(TRANSFER.x, Axis("difference (%)"), [Rule(along="y", dash="-", at=0), off])
     title = (
-        f"Photon transfer: gain {t.noise.gain:.4g} +- {t.gain_error:.1g} DN per electron, read noise "
-        f"{t.read_noise_dn:.3g} +- {t.read_noise_error:.1g} DN; dark counts in {t.dark_unit}"
+        f"Photon transfer: gain {with_error(t.noise.gain, t.gain_error)} DN per electron, read noise "
+        f"{with_error(t.read_noise_dn, t.read_noise_error)} DN; dark counts in {t.dark_unit}"
     )
     return Picture([[TRANSFER.panel(series)], [below]], (4.6, 4.6), title, share_x=True)
 
@@ -127,18 +129,18 @@ def dark_current(answer: CalibrateAnswer) -> Picture:
     mean = [
         *(
             Dots(
-                "",
+                "" if number else "means of frames",
                 "star",
                 at=(observation.temperature_c, (observation.raw_dn - d.bias_dn).mean(axis=1) / observation.exposure_s),
             )
-            for observation in dark
+            for number, observation in enumerate(dark)
         ),
         Line("fitted", "flare", at=(kelvin, d.level_dn_per_s.mean() * d.growth(kelvin))),
         Line("nominal", dash="dashed", at=(kelvin, usual)),
     ]
-    left = Panel(WAVELENGTH, Axis("dark current (DN/s)"), [pixels], f"pixels at {d.reference_c:.1f} C")
-    right = Panel(Axis("detector temperature (C)"), Axis("mean dark current (DN/s)"), mean)
-    title = f"Dark current: slope {d.slope_per_c:.4g} +- {d.slope_error:.1g} per deg C"
+    left = Panel(WAVELENGTH, Axis("dark current (DN/s)"), [pixels], f"pixels at {d.reference_c:.1f} °C")
+    right = Panel(Axis("detector temperature (°C)"), Axis("mean dark current (DN/s)"), mean)
+    title = f"Dark current: slope {with_error(d.slope_per_c, d.slope_error)} per °C"
     return Picture([[left, right]], (7.2, 2.9), title)
 
 
@@ -150,12 +152,17 @@ AROUND_NM = 15.0
 
 def along_magnitude(answer: ChangeAnswer, names: Sequence[str], scale: float) -> list[tuple[str, Any, Any]]:
     """Return name, magnitudes and smallest changes of the first star, times a factor, where they are known."""
-    lines = []
+    lines = list[tuple[str, Any, Any]]()
     for name in names:
         own = [row for row in answer.along if row.change.name == name]
         x, y = np.array([(row.magnitude, row.smallest.one) for row in own[: len(own) // answer.many]]).T
-        lines.append((name, x[np.isfinite(y)], scale * y[np.isfinite(y)]))
+        lines.append((shown_name(name), x[np.isfinite(y)], scale * y[np.isfinite(y)]))
     return lines
+
+
+def shown_name(change: str) -> str:
+    """Return the name of a change with its unit if it is a wavelength or a band, and with its capital letter."""
+    return f"{change} nm" if change[0].isdigit() else change.replace("balmer", "Balmer")
 
 
 @picture_of("ChangeAnswer", "change", when=lambda answer: bool(answer.along))
@@ -167,9 +174,13 @@ def change_against_magnitude(answer: ChangeAnswer) -> Picture:
     for unit in dict.fromkeys(row.change.unit for row in answer.along):
         names = list(dict.fromkeys(row.change.name for row in answer.along if row.change.unit == unit))
         lines = [line for line in along_magnitude(answer, names, 1 if unit else 100) if line[1].size]
-        here = [] if star.magnitude is None else [Rule(dash="dotted", at=star.magnitude)]
+        here = [] if star.magnitude is None else [Rule("this star", dash="dotted", at=star.magnitude)]
         # Without a pixel that does not saturate there is nothing to show.
-        y = Axis(f"smallest change ({unit or '%'})", log=bool(lines))
+        values, limits = [value for _, _, column in lines for value in column], None
+        if lines:
+            # A decade at least, since errors beyond a few per cent do not matter, and room for the legend.
+            limits = min(*values, max(values) / 5) / 1.2, 2 * max(*values, 5 * min(values))
+        y = Axis(f"smallest change ({in_figure(unit) if unit else '%'})", log=bool(lines), limits=limits)
         row.append(Panel(Axis(f"magnitude ({star.band})"), y, [Targets(at=lines), *here]))
     visits, exposure = answer.study.change.visits, answer.study.observation.exposure_s
     title = f"{title}: smallest change between {visits} visits of {exposure:g} s"
@@ -185,8 +196,9 @@ def recovered_periods(answer: ChangeAnswer) -> Picture:
         r, scale = row_of_change.recovery, row_of_change.error * (1 if row_of_change.change.unit else 100)
         shares = 100 * row_of_change.shares("value")
         mesh = Mesh("recovered (%)", high=100, at=(r.periods_d, scale * r.amplitudes, shares))
-        y = Axis(f"semi-amplitude ({row_of_change.change.unit or '%'})", log=True)
-        row.append(Panel(Axis("period (d)", log=True), y, [mesh], row_of_change.change.name))
+        unit = row_of_change.change.unit
+        y = Axis(f"semi-amplitude ({in_figure(unit) if unit else '%'})", log=True)
+        row.append(Panel(Axis("period (d)", log=True), y, [mesh], shown_name(row_of_change.change.name)))
     time = first[0].recovery.time_d
     title = f"{first[0].title}: periods that {time.size} visits within {np.ptp(time):.0f} days recover"
     return Picture([row], (1.0 + 2.9 * len(row), 3.2), title, (first.note,))
@@ -202,9 +214,10 @@ def line_indices(answer: ChangeAnswer) -> Picture:
             continue
         index, nm = index_row.value.index, index_row.wavelength_nm
         near = (nm > index.continuum_nm[0][0] - AROUND_NM) & (nm < index.continuum_nm[-1][1] + AROUND_NM)
-        line = Line("", "star", at=(nm[near], index_row.flux[near]))
+        line = Line("mean spectrum", "star", at=(nm[near], index_row.flux[near]))
         band, continua = np.array([index.band_nm]).T, np.array(index.continuum_nm).T
-        series = [line, Strips("", "read", at=band), Strips(alpha=0.2, at=continua)]
-        row.append(Panel(Axis("nm"), Axis("erg / (s cm² nm)"), series, index.name))
-    title = f"{title}: bands (orange) and continua (grey) of the line indices, mean spectrum"
-    return Picture([row], (1.0 + 2.3 * len(row), 2.8), title)
+        series = [line, Strips("band", "read", at=band), Strips("continuum", alpha=0.2, at=continua)]
+        y = Axis(f"flux ({in_figure('erg / (s cm2 nm)')})")
+        row.append(Panel(Axis("wavelength (nm)"), y, series, index.name))
+    title = f"{title}: bands and continua of the line indices in the mean spectrum"
+    return Picture([row], (1.0 + 2.3 * len(row), 3.1), title, below=True)

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 #: Largest number of targets with a calendar each; more targets are rows of one picture.
 MOST_CALENDARS = 6
+#: Largest number of months whose names fit side by side.
+MOST_MONTHS = 8
 
 
 @picture_of("VisibleAnswer", "visible")
@@ -65,14 +67,14 @@ def _rows(answer: VisibleAnswer, hours: Any) -> Picture:
     step = max(1, n // 60)
     names = np.arange(0, n, step), [target.name for target in answer.targets[::step]]
     firsts = [i for i, day in enumerate(answer.days) if day.endswith("-01")]
-    firsts = firsts[:: max(1, len(firsts) // 13)]
+    firsts = firsts[:: -(-len(firsts) // MOST_MONTHS) or 1]
     x = Axis(ticks=(firsts, [_month(answer.days[i]) for i in firsts]))
     panel = Panel(x, Axis(limits=(n - 0.5, -0.5), ticks=names), [mesh])
     return Picture([[panel]], (7.4, min(0.16 * n + 1.4, 20.0)))
 
 
 def _month(day: str) -> str:
-    return f"{months_of_years.month_abbr[int(day[5:7])]} {day[2:4]}"
+    return f"{months_of_years.month_abbr[int(day[5:7])]} {day[:4]}"
 
 
 #: A4, and its margin, inches.
@@ -112,10 +114,10 @@ def _overview(answer: PlanAnswer) -> Picture:
     logs = np.log10([energy for pair in ends for energy in pair if np.isfinite(energy)])
     decades = (10 ** np.floor(logs.min()), 10 ** np.ceil(logs.max())) if logs.size else None
     names = range(len(planned)), [f"{target.name} ({target.hours:.0f} h)" for target in planned]
-    y, above = Axis(limits=(len(planned) - 0.5, -0.5), ticks=names), "expected (dot); 95 % of campaigns"
+    y, above = Axis(limits=(len(planned) - 0.5, -0.5), ticks=names), "mean (dot), and 95 % of campaigns"
     row = [
         Panel(Axis("flares recovered", log=True, limits=(0.05, None)), y, left, above),
-        Panel(Axis("bolometric energy (erg)", log=True, limits=decades), y, right, "E50 (dot) to E90"),
+        Panel(Axis("bolometric energy (erg)", log=True, limits=decades), y, right, "recovered in 50 % (dot) to 90 %"),
     ]
     return Picture([row], (7.4, 0.24 * len(planned) + 1.5), share_y=True)
 
@@ -282,7 +284,7 @@ def _panels(figure: Any, answer: PlanAnswer, k: int) -> None:
     top, bottom = figure.subplots(2, 1)
     figure.subplots_adjust(**PANELS)
     days = np.arange(len(seen.days))
-    top.fill_between(days, seen.visibility.by_day(k), step="mid", color=COLOURS[1], linewidth=0)
+    top.fill_between(days, seen.visibility.by_day(k), step="mid", color=COLOURS[3], linewidth=0)
     top.set(ylabel="hours a day", xlim=(0, max(len(days) - 1, 1)), ylim=(0, None))
     firsts = [i for i, day in enumerate(seen.days) if day.endswith("-01")]
     step = max(1, len(firsts) // 12)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.charts.chart import WAVELENGTH, Axis, Band, Dots, Line, Panel, Picture, Rule, Series, picture_of
-from mauvecl.charts.matplotlib import COLOURS, COLUMN, MAX_COLUMNS, UNBROKEN, styled_picture
+from mauvecl.charts.matplotlib import COLOURS, COLUMN, MAX_COLUMNS, UNBROKEN, styled_picture, written
 from mauvecl.detection.names import NoThresholdError
 from mauvecl.detection.requests import statistic_label
 from mauvecl.detection.statistics import LinearStatistic
@@ -33,6 +33,10 @@ Shown = tuple[str, "Detection", Sequence[str]]
 ELEMENT = "per 10.5 nm element"
 #: Largest number of stars in a picture.
 MOST_STARS = 6
+#: Share of the axis of a statistic that stays empty on either side.
+MARGIN = 0.04
+#: Length of the axis of a weighted sum, in the inverse hyperbolic sine, above which few of its ticks have a number.
+WIDE = 5.0
 
 
 def _few(answer: DetectAnswer) -> First[Shown]:
@@ -57,8 +61,8 @@ def detection(stars: Sequence[Shown], fap: float = 1e-3) -> Picture:
         rows += [panels[k : k + columns] for k in range(0, len(panels), columns)]
     exposures = " and ".join(sorted({f"{outcome.quiet.exposure_s:g}{UNBROKEN}s" for _, outcome, _ in stars}))
     title = (
-        f"Detection statistics without a flare and with one, {exposures}, {first.realisations:,} realisations each; "
-        "nominal throughput"
+        f"Detection statistics without and with a flare, {exposures}, {first.realisations:,} realisations each; "
+        f"thresholds at a false-alarm probability of {fap:g} per test; nominal throughput"
     )
     size, notes = (COLUMN * columns, 2.6 * len(rows) + 0.4), (note_of(stars), _flare_note(stars))
     return Picture(rows, size, title, notes, below=True)
@@ -81,42 +85,60 @@ def _distributions(title: str, outcome: Detection, flares: Sequence[str], statis
     linear, chosen = isinstance(kind, LinearStatistic), _drawn_flares(flares)
     shapes: list[tuple[int | None, str, str]] = [(None, "drawn", "no flare")]
     shapes += [(k, colour, flares[k]) for k, colour in zip(chosen, cycle(COLOURS), strict=False)]
-    series: list[Series] = []
+    series, ends = list[Series](), list[float]()
     for flare, colour, name in shapes:
         edges, counts = outcome.histogram(statistic, flare, bins=120)
         middle, height = (edges[1:] + edges[:-1]) / 2, counts / counts.max()
+        ends += [edges[0], edges[-1]]
         series += [
             Band("", colour, alpha=0.3, step=True, at=(middle, 0 * height, height)),
             Line(name, colour, step=True, at=(middle, height)),
         ]
     # Statistics that are scaled by the flare have a threshold per flare.
-    own = chosen if kind.shaped and not linear else [0]
+    own, cuts = chosen if kind.shaped and not linear else [0], list[float]()
     for k, colour in zip(own, cycle(COLOURS if len(own) > 1 else ["text"]), strict=False):
         try:
             cut = outcome.threshold(fap, statistic, template=k).value
         except NoThresholdError:
             continue
-        series.append(Rule(f"threshold, fap {fap:g} per test", colour, listed=len(own) == 1, at=cut))
-    y = Axis(f"{title}\nrealisations, each peak = 1", limits=(0, None))
-    return Panel(Axis(statistic_label(statistic)), y, series, finish=partial(_scaled, linear=linear))
+        cuts.append(cut)
+        series.append(Rule("threshold", colour, listed=len(own) == 1, at=cut))
+    above = f"{title}: a threshold per flare" if len(own) > 1 else title
+    if len(own) == len(cuts) == 1:
+        above = f"{title}: threshold {written(float(f'{cuts[0]:.3g}'))}"
+    finish = partial(_scaled, linear=linear, ends=(min(ends + cuts), max(ends + cuts)))
+    y = Axis("realisations / peak", limits=(0, 1.05))
+    return Panel(Axis(statistic_label(statistic)), y, series, above, finish=finish)
 
 
-def _scaled(axis: Any, linear: bool) -> None:
-    """Scale the axis of a statistic, whose means differ by decades."""
+def _scaled(axis: Any, linear: bool, ends: tuple[float, float]) -> None:
+    """Scale the axis of a statistic, whose means differ by decades, and show the values between two ends."""
+    decades = [10.0**power for power in range(10)]
     if linear:
-        axis.set_xscale("function", functions=(lambda x: np.arcsinh(x / 2), lambda y: 2 * np.sinh(y)))
-        low, high = axis.get_xlim()
-        ticks: list[float] = [t for t in (-4, 0, 4, 10, 30, 100, 1000, 10000) if low <= t <= high]
-        axis.set_xticks(ticks, [str(t) for t in ticks])
-        return
-    axis.set_xscale("log")
+        axis.set_xscale("asinh", linear_width=2)
+        low, high = np.arcsinh(np.array(ends) / 2)
+        axis.set_xlim(*2 * np.sinh([low - MARGIN * (high - low), high + MARGIN * (high - low)]))
+        shown = [*range(-10, 8, 2)] if high - low < WIDE else [-10, -4, 0, 4]
+        major = [*shown, *(digit * decade for decade in decades[1:] for digit in ((1, 3) if decade < 100 else (1,)))]
+        minor = [*range(-10, 10), *(digit * decade for decade in decades[1:] for digit in range(1, 10))]
+    else:
+        axis.set_xscale("log")
+        low, high = np.log10(ends)
+        axis.set_xlim(*10 ** np.array([low - MARGIN * (high - low), high + MARGIN * (high - low)]))
+        # Over few decades, powers of ten alone are too sparse.
+        digits = next(
+            digits
+            for most, digits in (
+                (0.4, (1, 1.2, 1.4, 1.7, 2, 2.5, 3, 4, 5, 6, 8)), (0.8, (1, 2, 3, 5)), (2.0, (1, 2, 5)), (np.inf, (1,)),
+            )
+            if high - low <= most
+        )  # fmt: skip
+        major = [digit * decade for decade in decades for digit in digits]
+        minor = [digit * decade for decade in decades for digit in range(1, 10)]
     low, high = axis.get_xlim()
-    digits: tuple[float, ...] = (1,)
-    if high / low <= 100:
-        # Below two decades, powers of ten alone are too sparse.
-        digits = (1, 2, 5) if high / low > 3 else (1, 1.2, 1.4, 1.6, 1.8, 2, 2.5, 3, 4, 5, 6, 8)
-    ticks = [t for t in (d * 10.0**e for e in range(9) for d in digits) if low <= t <= high]
-    axis.set_xticks(ticks, [f"{t:g}" if t < 1e5 else f"$10^{{{np.log10(t):.0f}}}$" for t in ticks])
+    axis.set_xticks([tick for tick in major if low <= tick <= high])
+    axis.set_xticks([tick for tick in minor if low <= tick <= high], minor=True)
+    axis.xaxis.set_major_formatter(lambda value, _: written(value))
     axis.tick_params(axis="x", which="minor", labelbottom=False)
 
 
@@ -184,7 +206,7 @@ COMPONENTS = {
     "source": "star",
     "sky": "zodiacal light",
     "photon_noise": "photon noise",
-    "dark": "dark",
+    "dark": "dark current",
     "bias": "bias",
     "read_noise": "read noise",
 }
@@ -257,7 +279,9 @@ def unknowns(answer: UnknownAnswer) -> Picture:
         smallest = [Dots("", "text", size=12, at=([0], [answer.smallest(star, None)]))]
         for k, (colour, (unknown, cost)) in enumerate(zip(cycle(COLOURS), costs.items(), strict=False), 1):
             series += [
-                Line(unknown, colour, at=(relative, power(cost.marginal * relative / amplitude, fap))),
+                Line(
+                    unknown.replace("+-", "±"), colour, at=(relative, power(cost.marginal * relative / amplitude, fap))
+                ),
                 Line("", colour, dash="dashed", at=(relative, power(cost.plain * relative / amplitude, fap))),
             ]
             smallest.append(Dots("", colour, size=12, at=([k], [answer.smallest(star, unknown)])))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
 from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +26,16 @@ from mauvecl.charts.chart import (
     Strips,
     picture_of,
 )
-from mauvecl.charts.matplotlib import COLOURS, INK, MAX_COLUMNS, styled_picture
+from mauvecl.charts.matplotlib import (
+    COLOURS,
+    EMPTY,
+    INK,
+    MAX_COLUMNS,
+    contour_entries,
+    draw_contours,
+    strokes_of,
+    styled_picture,
+)
 from mauvecl.schema.columns import First, part_note
 
 if TYPE_CHECKING:
@@ -46,7 +57,7 @@ SIZES = {
 MOST_CURVES = 6
 #: Largest number of maps in a picture.
 MOST_MAPS = 6
-CONTOURS = (0.1, 0.5, 0.9)
+CONTOURS = strokes_of((0.1, 0.5, 0.9))
 HALF_WIDTH = Axis("half-width (s)", log=True)
 
 
@@ -72,13 +83,11 @@ def maps(answer: InjectAnswer) -> Picture:
             # A single half-width defines no cell width.
             return Panel(Axis("completeness"), size, [Line("", "star", at=(f.completeness[0], y))], star.title)
 
-        def finish(axis: Any) -> None:
-            lines = axis.contour(x, y, z, levels=CONTOURS, colors="white", linewidths=1)
-            axis.clabel(lines, fmt=lambda level: f"{100 * level:g} %", fontsize=7)
+        mesh = Mesh("completeness", at=(_edges(x), _edges(y), z))
+        finish = partial(draw_contours, at=(x, y, z), strokes=CONTOURS)
+        return Panel(HALF_WIDTH, size, [mesh, *contour_entries(CONTOURS, "found")], star.title, finish)
 
-        return Panel(HALF_WIDTH, size, [Mesh("completeness", at=(_edges(x), _edges(y), z))], star.title, finish)
-
-    return _stars(answer, panel)
+    return _stars(answer, panel, below=True)
 
 
 @picture_of("InjectAnswer", "curves")
@@ -95,12 +104,13 @@ def curves(answer: InjectAnswer) -> Picture:
                 Band("", colour, alpha=0.25, at=(f.sizes, f.completeness_low[k], f.completeness_high[k])),
                 Line(name, colour, at=(f.sizes, f.completeness[k])),
             ]
-        series.append(Rule(colour="text", along="y", at=(0.5, 0.9)))
+        series.append(Rule("50 % and 90 %", "text", along="y", at=(0.5, 0.9)))
         y = Axis("completeness", limits=(-0.02, 1.02))
         return Panel(Axis(SIZES[star.sizes.of], log=True), y, series, star.title)
 
     widths = len(answer.stars[0].injected.half_widths_s)
-    return _stars(answer, panel, part_note(min(MOST_CURVES, widths), widths, "half-widths"), below=True)
+    notes = "shaded: 95 % intervals", part_note(min(MOST_CURVES, widths), widths, "half-widths")
+    return _stars(answer, panel, *notes, below=True)
 
 
 @picture_of("InjectAnswer", "energies", when=lambda answer: all(star.fitted for star in answer.stars))
@@ -112,11 +122,15 @@ def energies(answer: InjectAnswer) -> Picture:
         x, y, meshes = np.array(star.injected.half_widths_s), star.injected.sizes, list[Series]()
         if x.size > 1:
             at = _edges(x), _edges(y), np.log10(star.fitted.energy_ratio.T)
-            label = "recovered over injected energy, median (dex)"
+            label = "recovered / injected energy (dex)"
             meshes.append(Mesh(label, low=-0.3, high=0.3, palette="RdBu_r", at=at))
-        return Panel(HALF_WIDTH, Axis(SIZES[star.sizes.of], log=True), meshes, star.title)
+        return Panel(HALF_WIDTH, Axis(SIZES[star.sizes.of], log=True), meshes, star.title, _empty_in_grey)
 
-    return _stars(answer, panel)
+    return _stars(answer, panel, "medians; grey: none found")
+
+
+def _empty_in_grey(axis: Any) -> None:
+    axis.set_facecolor(EMPTY)
 
 
 def _edges(middles: Any) -> Any:
@@ -135,36 +149,37 @@ IN_SECONDS_S, IN_MINUTES_S = 600.0, 4 * 3600.0
 @picture_of("StareAnswer", "light-curve", each=lambda answer: [(star,) for star in answer.stares])
 @styled_picture
 def light_curves(star: StarStare) -> Picture:
-    """Plot light curves in all bands, relative to the quiescent star.
-
-    Dotted lines are injected flares, triangles detections. Shaded frames lose light in pointing drifts.
-    """
+    """Plot light curves in all bands, relative to the quiescent star, with injected and found flares."""
     stare, light, rows = star.staring.stare, star.light, list[list[Panel]]()
     scale, unit = time_unit(stare.duration_s)
     level, gaps = np.median(light.mean, axis=0), _runs(stare.numbers)
     lost = stare.numbers[:0] if star.pointing_loss is None else stare.numbers[star.pointing_loss > 0]
     ends = [(lost[part[0]] * stare.frame_s, (lost[part[-1]] + 1) * stare.frame_s) for part in _runs(lost) if part.size]
     always = [
-        Strips(alpha=0.2, at=np.reshape(ends, (-1, 2)).T / scale),
-        Rule(dash="dotted", at=[flare.event.peak_s / scale for flare in star.flares]),
+        Strips("light lost in pointing drifts", alpha=0.2, at=np.reshape(ends, (-1, 2)).T / scale),
+        Rule("injected flare", dash="dotted", at=[flare.event.peak_s / scale for flare in star.flares]),
     ]
     peaks = [float(flare.alarm.recovered.peak_s[0]) / scale for flare in star.found if flare.alarm.measured]
 
     def finish(axis: Any) -> None:
-        axis.plot(peaks, [1.0] * len(peaks), "v", color=COLOURS[4], markersize=4, transform=axis.get_xaxis_transform())
+        label = {"label": "found flare"} if peaks else {}
+        axis.plot(peaks, [1.03] * len(peaks), "v", color=INK["flare"], transform=axis.get_xaxis_transform(),
+                  markersize=4, clip_on=False, **label)  # fmt: skip
 
     for k, band in enumerate(light.bands):
         series = list[Series](always)
-        for part in gaps:
+        for number, part in enumerate(gaps):
             step = -(-part.size // max(1, MOST_POINTS * part.size // stare.n_frames))
             columns = (stare.middle_s / scale, light.flux[:, k] / level[k], light.mean[:, k] / level[k])
             time, flux, mean = (_binned(values[part], step) for values in columns)
-            colour = "text" if k == 0 else COLOURS[(k - 1) % len(COLOURS)]
-            series += [Dots("", colour, size=1.7, alpha=0.6, at=(time, flux)), Line("", width=1.1, at=(time, mean))]
-        x, y = Axis(f"time from the start of the stare ({unit})"), Axis("relative light")
+            series += [
+                Dots("simulated frames", "star", size=2, alpha=0.6, listed=not number, at=(time, flux)),
+                Line("star and flares alone", "text", width=1.1, listed=not number, at=(time, mean)),
+            ]
+        x, y = Axis(f"time from the start of the stare ({unit})"), Axis("flux / quiescent")
         rows.append([Panel(x, y, series, band, finish)])
     title = f"{star.title}: one simulated stare; nominal throughput"
-    return Picture(rows, (7.2, 1.5 * len(rows) + 0.7), title, share_x=True)
+    return Picture(rows, (7.2, 1.5 * len(rows) + 0.9), title, below=True, share_x=True)
 
 
 @styled_picture
@@ -190,7 +205,7 @@ def compare_light_curves(answers: Sequence[tuple[str, StareAnswer]], band: int =
             ]
             above = f"{title}\n" if row is rows[0] else ""
             heading = f"{above}{star.title}, {light.bands[band]}"
-            row.append(Panel(Axis(f"time ({unit})"), Axis("relative light"), series, heading))
+            row.append(Panel(Axis(f"time ({unit})"), Axis("flux / quiescent"), series, heading))
     size = 3.7 * len(answers), 1.5 * len(rows) + 0.8
     return Picture(rows, size, share_x=True, share_y="row")
 
@@ -232,7 +247,7 @@ def spectra_panel(
     mesh = Mesh(label, low=-reach, high=reach, palette="RdBu_r", at=(time, nm, image.T))
 
     def finish(axis: Any) -> None:
-        axis.set_facecolor("#dddddd")
+        _empty_in_grey(axis)
         for ends, colour in marks:
             axis.plot(ends, [1.02, 1.02], transform=axis.get_xaxis_transform(), color=INK[colour], linewidth=3,
                       clip_on=False, solid_capstyle="butt")  # fmt: skip
@@ -265,15 +280,23 @@ def _binned(values: Float, step: int) -> Float:
     return np.asarray(np.add.reduceat(values, edges) / np.diff(np.append(edges, values.size)))
 
 
-#: Title of the light curve, which explains its colours.
-KINDS = "events above {:.2f} (blue), candidates (grey), look-alikes (red)"
+#: Title of the light curve.
+KINDS = "observed light curve; threshold of events {:.2f}"
+#: Names of events by their colours.
+EVENTS = {"star": "event", "drawn": "candidate", "flare": "look-alike"}
+INKS = {"star": "blue", "drawn": "grey", "flare": "red"}
 #: Flux in standard deviations above which the light curve has a second panel near the level.
 BRIGHT = 30.0
 
 
-def _minutes(analysis: Analysis, time_s: Any) -> Any:
-    """Return times in minutes from the first frame."""
-    return (time_s - analysis.frames.time_s[0]) / 60.0
+def _since(analysis: Analysis, time_s: Any) -> Any:
+    """Return times from the first frame, in the unit of the analysis's pictures."""
+    return (time_s - analysis.frames.time_s[0]) / _unit(analysis)[0]
+
+
+def _unit(analysis: Analysis) -> tuple[float, str]:
+    """Return the unit of time of an analysis's pictures, and its length, s."""
+    return time_unit(float(np.ptp(analysis.frames.time_s)))
 
 
 @picture_of("AnalyseAnswer", "light-curve")
@@ -281,36 +304,44 @@ def _minutes(analysis: Analysis, time_s: Any) -> Any:
 def observed_light_curve(answer: AnalyseAnswer) -> Picture:
     """Plot the observed light curve with its level and the level's band of 95 %, events, and frames not searched.
 
-    If there are bright events, a second panel shows the part near the level.
+    If there are bright events, a second panel shows the flux less the level.
     """
-    analysis = answer.analysis
-    time, used = _minutes(analysis, analysis.frames.time_s), analysis.level.used
-    level, error = analysis.level.level, analysis.level.error
-    left_out, off = ~used & np.isfinite(analysis.flux), 2 * analysis.level.level_error
-    series: list[Series] = [
-        Strips(
-            "",
-            _colour(analysis, event),
-            alpha=0.2,
-            at=[[_minutes(analysis, analysis.survey.time_s[k])] for k in (event.first, event.last)],
-        )
-        for event in analysis.events
-    ]
-    series += [
-        Dots("", "text", size=2.5, alpha=0.7, at=(time[used], analysis.flux[used])),
-        Line("", "sky", width=1.1, at=(time, level)),
-        Band("", "sky", alpha=0.3, at=(time, level - off, level + off)),
-        Dots("", COLOURS[1], size=8, marker="x", at=(time[left_out], analysis.flux[left_out])),
-    ]
-    x = Axis(f"time (min) from {analysis.frames.date(float(analysis.frames.time_s[0]))[:19]}")
+    analysis, unit = answer.analysis, _unit(answer.analysis)[1]
+    time, used = _since(analysis, analysis.frames.time_s), analysis.level.used
+    level, error, off = analysis.level.level, analysis.level.error, 2 * analysis.level.level_error
+    left_out, strips = ~used & np.isfinite(analysis.flux), list[Series]()
+    for colour, name in EVENTS.items():
+        ends = [
+            [_since(analysis, analysis.survey.time_s[k]) for k in (event.first, event.last)]
+            for event in analysis.events if _colour(analysis, event) == colour
+        ]  # fmt: skip
+        if ends:
+            strips.append(Strips(name, colour, alpha=0.2, at=np.transpose(ends)))
+
+    def series(flux: Any, middle: Any, reach: Any) -> list[Series]:
+        parts: list[Series] = [
+            *strips,
+            Dots("frames", "text", size=2.5, alpha=0.7, at=(time[used], flux[used])),
+            Band("95 % of the level", "sky", alpha=0.3, at=(time, middle - reach, middle + reach)),
+            Line("level without flares", "sky", width=1.6, at=(time, middle)),
+        ]
+        if left_out.any():
+            parts.append(Dots("not searched", COLOURS[3], size=8, marker="x", at=(time[left_out], flux[left_out])))
+        return parts
+
+    x = Axis(f"time ({unit}) from {analysis.frames.date(float(analysis.frames.time_s[0]))[:19]}")
     label = f"flux ({analysis.frames.unit})" if analysis.frames.unit else "flux"
     around = float(np.min((analysis.flux - error)[used])), float(np.max((analysis.flux + error)[used]))
-    ranges: list[Any] = [around]
-    if (((analysis.flux - level) / error)[used] > BRIGHT).any():
-        ranges = [None, (float(np.min((level - 6 * error)[used])), float(np.max((level + BRIGHT / 2 * error)[used])))]
-    rows = [[Panel(x, Axis(label, limits=limits), series)] for limits in ranges]
+    # Frames that are left out may be far off.
+    reach = around[1] - around[0]
+    beside = [flux for flux in analysis.flux[left_out] if around[0] - reach < flux < around[1] + reach]
+    around = min(*around, *beside) - 0.05 * reach, max(*around, *beside) + 0.05 * reach
+    rows, excess = [[Panel(x, Axis(label, limits=around), series(analysis.flux, level, off))]], (analysis.flux - level)
+    if (excess / error)[used].max() > BRIGHT:
+        y = Axis("(flux \N{MINUS SIGN} level) / noise", limits=(-6, BRIGHT / 2))
+        rows.append([Panel(x, y, series(excess / error, 0 * level, off / error))])
     title = f"{analysis.frames.name}: {KINDS.format(analysis.threshold)}"
-    return Picture(rows, (7.2, 1.1 + 1.8 * len(rows)), title, share_x=True)
+    return Picture(rows, (7.2, 1.4 + 1.8 * len(rows)), title, below=True, share_x=True)
 
 
 def _colour(analysis: Analysis, event: ObservedEvent) -> str:
@@ -335,7 +366,10 @@ def observed_dynamic_spectrum(answer: AnalyseAnswer) -> Picture:
             (np.array([first, last + stare.frame_s]) / time_unit(stare.duration_s)[0], _colour(analysis, event))
         )
     panel, _ = spectra_panel(stare, spectra.series.excess, sd, noise.wavelength_nm, marks)
-    return Picture([[panel]], (7.2, 3.6), f"{analysis.frames.name}: {KINDS.format(analysis.threshold)}")
+    shown = {_colour(analysis, event) for event in analysis.events}
+    marked = ", ".join(f"{EVENTS[colour]}s ({INKS[colour]})" for colour in EVENTS if colour in shown)
+    title = f"{analysis.frames.name}; marked above: {marked}" if marked else analysis.frames.name
+    return Picture([[panel]], (7.2, 3.6), title)
 
 
 @picture_of("AnalyseAnswer", "noise-per-pixel", when=lambda answer: answer.analysis.spectra is not None)
@@ -346,14 +380,15 @@ def observed_pixel_noise(answer: AnalyseAnswer) -> Picture:
     assert spectra is not None
     noise = spectra.series.noise
     series: list[Series] = [
-        Band("", alpha=0.4, at=(noise.wavelength_nm, noise.low / noise.stated, noise.high / noise.stated))
+        Band("95 % of normal noise", at=(noise.wavelength_nm, noise.low / noise.stated, noise.high / noise.stated))
     ]
-    for which, colour in ((~noise.departs, "star"), (noise.departs, "flare")):
+    for name, which, colour in (("measured", ~noise.departs, "star"), ("measured, departs", noise.departs, "flare")):
         at = noise.wavelength_nm[which], (noise.measured / noise.stated)[which]
-        series.append(Dots("", colour, size=2.5, at=at))
-    panel = Panel(Axis("wavelength (nm)"), Axis("measured over stated noise"), series)
-    title = f"{answer.analysis.frames.name}: quiescent frames; grey: 95 % of normal noise; red: departs"
-    return Picture([[panel]], (4.6, 3.2), title)
+        if which.any():
+            series.append(Dots(name, colour, size=4, at=at))
+    panel = Panel(Axis("wavelength (nm)"), Axis("measured / stated noise"), series)
+    title = f"{answer.analysis.frames.name}: noise of quiescent frames"
+    return Picture([[panel]], (4.6, 3.5), title, below=True)
 
 
 @picture_of("AnalyseAnswer", "residuals")
@@ -362,25 +397,31 @@ def observed_residuals(answer: AnalyseAnswer) -> Picture:
     """Plot the residuals of the fitted process against time, their autocorrelation, and their quantiles."""
     analysis = answer.analysis
     residual, likeness = analysis.residual[:, 0], analysis.likeness
-    time = _minutes(analysis, analysis.survey.time_s)[analysis.quiet]
+    time, unit = _since(analysis, analysis.survey.time_s)[analysis.quiet], _unit(analysis)[1]
+    size = 1.7 if time.size > 1000 else 4
+
+    def whole(axis: Any) -> None:
+        axis.xaxis.get_major_locator().set_params(integer=True)
+
     lags = np.arange(1, likeness.correlations.size + 1)
     normal = ndtri((np.arange(residual.size) + 0.5) / residual.size)
-    course = [Dots("", "text", size=1.7, alpha=0.7, at=(time, residual))]
+    course = [Dots("", "text", size=size, alpha=0.7, at=(time, residual))]
     correlation = [
         Strips(along="y", alpha=0.4, at=([-2 * likeness.errors[0]], [2 * likeness.errors[0]])),
         Line("", "star", marker="o", at=(lags, likeness.correlations)),
     ]
     quantiles = [
         Line(at=(normal[[0, -1]], normal[[0, -1]])),
-        Dots("", "star", size=1.7, at=(normal, np.sort(residual))),
+        Dots("", "star", size=size, at=(normal, np.sort(residual))),
     ]
     row = [
-        Panel(Axis("time (min)"), Axis("residual (standard deviations)"), course),
-        Panel(Axis("lag (frames)"), Axis("autocorrelation"), correlation),
+        Panel(Axis(f"time ({unit})"), Axis("residual (standard deviations)"), course),
+        Panel(Axis("lag (frames)"), Axis("autocorrelation"), correlation, finish=whole),
         Panel(Axis("normal quantile"), Axis("quantile of the residuals"), quantiles),
     ]
     title = (
-        f"{analysis.frames.name}: residuals of {analysis.level.process.name}; grey: 95 % of independent, normal noise"
+        f"{analysis.frames.name}: residuals of the fitted process, {analysis.level.process.name}; grey: 95 % of "
+        "independent, normal noise"
     )
     return Picture([row], (9.6, 2.9), title, widths=(2, 1, 1))
 
@@ -391,7 +432,7 @@ SCATTER = Chart(
     (
         Band("95 % of independent frames", name="range", alpha=0.4),
         Line("independent frames", name="white"),
-        Dots("as measured", "star", "measured", size=8, tips=("frames", "scatter")),
+        Dots("measured", "star", size=8, tips=("frames", "scatter")),
     ),
 )  # fmt: skip
 
@@ -410,4 +451,5 @@ def scatter_series(answer: AnalyseAnswer) -> dict[str, Any]:
 def observed_noise(answer: AnalyseAnswer) -> Picture:
     """Plot the scatter of means of quiescent frames against their number, and that of independent frames."""
     panel, title = SCATTER.panel(scatter_series(answer)), f"{answer.analysis.frames.name}: quiescent frames"
+    panel = replace(panel, x=replace(panel.x, ticks=([row.frames for row in answer.analysis.scatter],)))
     return Picture([[panel]], (4.6, 3.2), title)

@@ -14,7 +14,6 @@ import numpy as np
 from mauvecl.charts.chart import (
     WAVELENGTH,
     Axis,
-    Band,
     Chart,
     Dots,
     Line,
@@ -26,7 +25,19 @@ from mauvecl.charts.chart import (
     Strips,
     picture_of,
 )
-from mauvecl.charts.matplotlib import COLOURS, COLUMN, UNBROKEN, styled_picture
+from mauvecl.charts.matplotlib import (
+    COLOURS,
+    COLUMN,
+    EMPTY,
+    MAX_COLUMNS,
+    UNBROKEN,
+    contour_entries,
+    draw_contours,
+    in_figure,
+    strokes_of,
+    styled_picture,
+    written,
+)
 from mauvecl.detection.requests import statistic_label
 from mauvecl.fits.flare_model import FlareModel, usable_variance
 from mauvecl.schema.columns import First, note_of
@@ -41,11 +52,17 @@ if TYPE_CHECKING:
     from mauvecl.answers.measurements import JointFit, MeasuredStare
     from mauvecl.answers.signal import ExposureAnswer, SnrAnswer
     from mauvecl.host.exposure.expectation import Expectation
+    from mauvecl.study.study import Study
 
 
-#: Styles of contours, by ascending probability.
-STROKES = ("dotted", "dashed", "-", "dashdot")
 MARKS = "osD^vPX"
+
+
+def quantity_axis(study: Study, name: str, **how: Any) -> Axis:
+    """Return the axis of a quantity, with the band of magnitudes if all stars have the same."""
+    bands = {star.band for star in study.star}
+    band = f" ({bands.pop()})" if name == "magnitude" and len(bands) == 1 else ""
+    return Axis(QUANTITIES[name].label + band, **how)
 
 
 @picture_of("MapAnswer", "map")
@@ -58,31 +75,30 @@ def detection_map(answer: MapAnswer) -> Picture:
         np.arange(len(values)) if named[which] else np.array(values, float)
         for which, values in (("x", answer.x), ("y", answer.y))
     )
-    # Lines are close where a map is steep, so line styles distinguish them instead of labels.
-    levels = dict(zip(sorted(question.contours), cycle(STROKES), strict=False)) if min(x.size, y.size) > 1 else {}
+    strokes = strokes_of(question.contours) if min(x.size, y.size) > 1 else {}
 
     def finish(axis: Any, probability: Any) -> None:
-        if levels:
-            axis.contour(x, y, probability, levels=list(levels), colors="white", linewidths=2.4)
-            strokes = list(levels.values())
-            axis.contour(x, y, probability, levels=list(levels), colors="black", linewidths=1.2, linestyles=strokes)
+        axis.set_facecolor(EMPTY)
+        if strokes:
+            draw_contours(axis, (x, y, probability), strokes)
 
     x_axis, y_axis = (
-        Axis(QUANTITIES[sweep.quantity].label, log=sweep.log and not named[which],
-             ticks=(place, getattr(answer, which)) if named[which] else None)
-        for which, sweep, place in (("x", question.x, x), ("y", question.y, y))
+        quantity_axis(study, sweep.quantity, log=sweep.log and not named[which],
+                      ticks=(place, getattr(answer, which)) if named[which] else None)
+        for which, sweep, place in (("x", question.axes[0], x), ("y", question.axes[1], y))
     )  # fmt: skip
-    lines = [Line(f"detected in {100 * level:g} %", "text", dash=dash, at=([], [])) for level, dash in levels.items()]
+    lines = contour_entries(strokes, "detected")
     row = [
-        Panel(x_axis, y_axis, [Mesh("detection probability", at=(x, y, p)), *lines], statistic_label(statistic),
-              partial(finish, probability=p))
+        Panel(x_axis, y_axis, [Mesh("detection probability", at=(x, y, p)), *lines],
+              statistic_label(statistic).partition(" (")[0], partial(finish, probability=p))
         for statistic, p in zip(answer.statistics, answer.probability, strict=True)
     ]  # fmt: skip
-    names = {question.x.quantity, question.y.quantity}
+    names = {axis.quantity for axis in question.axes}
     exposure = "" if "exposure" in names else f", {study.observation.exposure_s:g} s"
     flare = "" if "amplitude" in names else f", flare of {100 * study.flare.amplitudes[0]:g} %"
     title = f"{answer.star}{exposure}{flare}, false-alarm probability {study.run.fap:g} per test; nominal throughput"
-    return Picture([row], (COLUMN * len(row) + 0.5, 3.4), title, below=bool(levels), share_y=True)
+    empty = "grey: no answer" if np.isnan(answer.probability).any() else ""
+    return Picture([row], (COLUMN * len(row) + 0.5, 3.4), title, (empty,), below=bool(strokes), share_y=True)
 
 
 @picture_of("LimitAnswer", "limit")
@@ -90,13 +106,15 @@ def detection_map(answer: MapAnswer) -> Picture:
 def limits(answer: LimitAnswer) -> Picture:
     """Plot the detection probability at every simulated value, and the limits."""
     of, power = answer.study.limit.of, answer.study.limit.power
-    series: list[Series] = []
+    series, several = list[Series](), len({limit.statistic for limit in answer.limits}) > 1
     for k, limit in enumerate(answer.limits):
         colour, marker = COLOURS[k % len(COLOURS)], MARKS[k // len(COLOURS) % len(MARKS)]
         points = sorted((*limit.points, limit.check), key=lambda p: p.value)
         p, low, high = np.array([(q.value, q.low, q.high) for q in (point.probability for point in points)]).T
-        flare = "" if np.isnan(limit.amplitude) else f", {100 * limit.amplitude:g} %"
-        text = f"{limit.star}{flare}, {limit.statistic}: {limit.value.value:.4g}"
+        flare = "" if np.isnan(limit.amplitude) else f", flare {100 * limit.amplitude:g} %"
+        statistic = f", {limit.statistic}" if several else ""
+        value = f"{limit.value.value:.2f}" if of == "magnitude" else written(float(f"{limit.value.value:.3g}"))
+        text = f"{limit.star}{flare}{statistic}: {value}{QUANTITIES[of].suffix}"
         at = [point.value for point in points], p, (p - low, high - p)
         series += [
             Dots(text, colour, marker=marker, size=6, at=at),
@@ -106,25 +124,27 @@ def limits(answer: LimitAnswer) -> Picture:
     series.append(Rule(colour="text", along="y", at=power))
     exposure = "" if of == "exposure" else f", {answer.study.observation.exposure_s:g}{UNBROKEN}s"
     title = (
-        f"Limits at a power of {power:g}{exposure}, false-alarm probability {answer.study.run.fap:g} per test; "
-        "points: simulated, 95 %; lines: Gaussian noise; nominal throughput"
+        f"Limits at a detection probability of {power:g}{exposure}, false-alarm probability "
+        f"{answer.study.run.fap:g} per test; points: simulated, 95 %; lines: Gaussian noise; nominal throughput"
     )
-    x, y = Axis(QUANTITIES[of].label, log=of != "magnitude"), Axis("detection probability", limits=(-0.02, 1.02))
+    x, y = quantity_axis(answer.study, of, log=of != "magnitude"), Axis("detection probability", limits=(-0.02, 1.02))
     return Picture([[Panel(x, y, series)]], (COLUMN, 3.0 + 0.17 * len(answer.limits)), title, below=True)
 
 
+#: Panels of noise budgets in a picture.
+MOST_BUDGETS = 12
 #: Noise by origin, as on the page and in files.
 BUDGET = Chart(
     "budget", "Noise of a pixel by origin", WAVELENGTH, Axis("noise (DN rms per pixel)", log=True),
     (
+        # A broad pale line below the others does not hide the largest of them.
+        Line("all together", "total", "total", width=6, alpha=0.25, tips=("wavelength (nm)", "all together (DN)")),
         Line("photons of the star", "star", "source_photon", width=2, tips=("photons of the star (DN)",)),
         Line("photons of neighbours", "flare", "neighbour_photon", "if any", width=2,
              tips=("photons of neighbours (DN)",)),
         Line("photons of the sky", "sky", "zodiacal_photon", width=2, tips=("photons of the sky (DN)",)),
-        Line("dark current", "dark", "dark", width=2, tips=("dark current (DN)",)),
-        Line("read noise", "read", "read", width=2, tips=("read noise (DN)",)),
-        # The largest part stays visible behind the sum.
-        Line("all together", "total", "total", width=2, dash="dashed", tips=("wavelength (nm)", "all together (DN)")),
+        Line("dark current", "dark", "dark", width=2, dash="dashed", tips=("dark current (DN)",)),
+        Line("read noise", "read", "read", width=2, dash="dotted", tips=("read noise (DN)",)),
     ),
     logs=("Y",), pins="source_photon",
 )  # fmt: skip
@@ -147,17 +167,22 @@ def noise_budgets(answer: SnrAnswer, path: str | Path | None = None) -> Any:
 
 @styled_picture
 def noise_budget(observed: Sequence[tuple[str, Expectation]], *, each: int = 1) -> Picture:
-    """Plot pixel noise by origin against wavelength for titled expectations, in `each` columns."""
+    """Plot pixel noise by origin against wavelength for titled expectations, `each` of every star side by side."""
 
     def finish(axis: Any) -> None:
         # Zodiacal light can be far below everything else.
         axis.set_ylim(bottom=max(axis.get_ylim()[0], axis.get_ylim()[1] * 1e-4))
 
-    stars = len(observed) // each
-    panels = [replace(BUDGET.panel(budget_series(x), title), finish=finish) for title, x in observed]
-    rows, size = [panels[k::stars] for k in range(stars)], (COLUMN * min(each, 6), 2.3 * stars + 0.7)
+    shown = First(observed, MOST_BUDGETS, "observations")
+    panels = [replace(BUDGET.panel(budget_series(x), title), finish=finish) for title, x in shown]
+    # A column for each cell, unless these are too many.
+    across = len(observed) // each if each <= MAX_COLUMNS and len(shown) == len(observed) else 0
+    rows = [panels[k::across] for k in range(across)] or [
+        panels[k : k + MAX_COLUMNS] for k in range(0, len(panels), MAX_COLUMNS)
+    ]
+    size = COLUMN * max(len(row) for row in rows), 2.3 * len(rows) + 0.7
     title = "Noise budgets; nominal throughput, not a flight calibration"
-    return Picture(rows, size, title, below=True, share_x=True, share_y="col")
+    return Picture(rows, size, title, (shown.note,), below=True, share_x=True, share_y="col" if across else True)
 
 
 @picture_of("SnrAnswer", "snr-sweep", when=lambda answer: answer.study.sweep.axes)
@@ -178,14 +203,13 @@ def snr_sweep(answer: SnrAnswer) -> Picture:
         series: list[Series] = []
         for (name, points), colour in zip(lines.items(), cycle(COLOURS), strict=False):
             x, expected, low, high = zip(*points, strict=True)
-            series += [
-                Band("", colour, alpha=0.25, at=(x, low, high)), Line(name, colour, marker="o", at=(x, expected)),
-            ]  # fmt: skip
-        x_axis = Axis(QUANTITIES[first].label, log=first == "exposure")
+            lengths = np.maximum(np.subtract(expected, low), 0), np.maximum(np.subtract(high, expected), 0)
+            series += [Line(name, colour, at=(x, expected)), Dots("", colour, size=7, at=(x, expected, lengths))]
+        x_axis = quantity_axis(answer.study, first, log=first == "exposure")
         y_axis = Axis("S/N per 10.5 nm element", log=True, limits=(0.1, None))
         row.append(Panel(x_axis, y_axis, series, f"{wavelength:g} nm"))
     size = (COLUMN if len(row) == 1 else 2.6 * len(row), 3.2)
-    title = "S/N: closed form, and 95 % of realisations; nominal throughput"
+    title = "S/N in closed form; bars: 95 % of realisations; nominal throughput"
     return Picture([row], size, title, below=True, share_y=True)
 
 
@@ -203,8 +227,8 @@ def gaussian(answer: GaussianAnswer) -> Picture:
 
         def finish(axis: Any) -> None:
             low, high = axis.get_xlim()
-            axis.set_xlim(min(low, predicted - least), max(high, predicted + least))
-            axis.xaxis.set_major_locator(MaxNLocator(3, prune="both"))
+            axis.set_xlim(min(low, predicted - 1.2 * least), max(high, predicted + 1.2 * least))
+            axis.xaxis.set_major_locator(MaxNLocator(3, steps=(1, 2, 5, 10)))
             axis.grid(axis="y", linewidth=0.3)
 
         y = Axis(limits=(len(rows) - 0.5, -0.5), ticks=(rows, labels))
@@ -216,12 +240,12 @@ def gaussian(answer: GaussianAnswer) -> Picture:
     dots = {name: Dots("", "star", size=7, at=(np.asarray(cells[name]), rows))
             for name in ("snr_off_by", "five_sigma_above", "fap_ratio")}  # fmt: skip
     row = [
-        panel("mean S/N\nless formula", 0.0, 0.1, dots["snr_off_by"]),
-        panel("share of 1-sigma\nintervals right", 0.6827, 0.03, coverage),
-        panel("pixels 5 sigma above,\nover normal", 1.0, 0.5, dots["five_sigma_above"]),
-        panel("false alarms\nover promised", 1.0, 0.2, dots["fap_ratio"]),
+        panel("S/N: simulated\nless predicted", 0.0, 0.1, dots["snr_off_by"]),
+        panel("coverage of\n1-sigma intervals", 0.6827, 0.03, coverage),
+        panel("5-sigma pixels\nover predicted", 1.0, 0.5, dots["five_sigma_above"]),
+        panel("false alarms\nover predicted", 1.0, 0.2, dots["fap_ratio"]),
     ]
-    title = "The root-of-N formula and the simulation; grey: as promised; nominal throughput"
+    title = "Simulation and root-of-N formula; vertical lines: as the formula predicts; nominal throughput"
     return Picture([row], (2 * COLUMN, 0.22 * len(cells) + 1.5), title, share_y=True)
 
 
@@ -233,23 +257,30 @@ def exposures(answer: ExposureAnswer) -> Picture:
     for e, colour in zip(answer.exposures, cycle(COLOURS), strict=False):
         x = np.geomspace(e.exposure_s / e.frames, 4 * e.exposure_s, 50)
         series += [
-            Line(f"{e.star}: {e.exposure_s:g} s", colour, at=(x, e.snr * np.sqrt(x / e.exposure_s))),
+            Line(
+                f"{e.star}: {written(float(f'{e.exposure_s:.4g}'))} s",
+                colour,
+                at=(x, e.snr * np.sqrt(x / e.exposure_s)),
+            ),
             Dots("", colour, size=8, at=([e.exposure_s], [e.snr])),
         ]
-    series.append(Rule(along="y", at=first.wanted))
-    panel = Panel(Axis("exposure (s)", log=True), Axis(f"S/N per {first.per}", log=True), series)
-    title = f"S/N at {first.wavelength_nm:g} nm; dashed: the one wanted; nominal throughput"
-    return Picture([[panel]], (COLUMN, 2.9 + 0.17 * len(answer.exposures)), title, below=True)
+    series.append(Rule(f"wanted S/N of {first.wanted:g}", along="y", at=first.wanted))
+    per = "10.5 nm element" if first.per == "element" else first.per
+    panel = Panel(Axis("exposure (s)", log=True), Axis(f"S/N per {per}", log=True), series)
+    title = f"S/N at {first.wavelength_nm:g} nm against exposure; nominal throughput"
+    return Picture([[panel]], (COLUMN, 3.0 + 0.17 * len(answer.exposures)), title, below=True)
 
 
-#: Increases of chi-squared that enclose 68.27 and 95 % in two dimensions.
-RISES = (2.30, 5.99)
+#: Increases of chi-squared that enclose 68 and 95 % in two dimensions.
+RISES = {"68 %": 2.30, "95 %": 5.99}
 #: Factors on the amplitude over which errors are plotted.
 FACTORS = np.geomspace(0.1, 10.0, 25)
 #: Half-widths before and after the peak of a flare that are plotted.
 BEFORE, AFTER = 3.0, 15.0
 #: Largest number of flares in a picture.
 MOST_FLARES = 4
+#: Number of fits from which histograms of pulls have narrow bins.
+MANY_FITS = 1000
 
 
 def _few(answer: MeasureAnswer) -> tuple[Any, ...]:
@@ -268,13 +299,15 @@ def fits(flares: Sequence[MeasuredFlare]) -> Picture:
         variance, used = usable_variance(quiet, mean, flare.skipped_nm)
         sums = [quiet.per_element(np.where(used, values, 0.0)) for values in (flare.frame - unknown, mean, variance)]
         # Resolution elements of which some pixels are not used are not shown.
-        whole = quiet.per_element(used.astype(np.float64)) == quiet.per_element(np.ones(used.size))
+        pixels = quiet.per_element(np.ones(used.size))
+        whole = quiet.per_element(used.astype(np.float64)) == pixels
         data, fit, variance = (np.where(whole, values, np.nan) for values in sums)
         nm, noise = quiet.element_wavelength_nm, np.sqrt(variance)
         x = Axis("wavelength (nm)")
-        dots = Dots("exposure less star and unknowns", size=4, at=(nm, data, noise))
-        line = Line(f"fit: {kelvin}", "star", at=(nm, fit))
-        above.append(Panel(x, Axis("DN per resolution element"), [dots, line], flare.name))
+        # Elements differ in their number of pixels, means hardly.
+        dots = Dots("exposure less star and fitted unknowns", size=4, at=(nm, data / pixels, noise / pixels))
+        line = Line(f"fit: {kelvin}", "star", at=(nm, fit / pixels))
+        above.append(Panel(x, Axis("mean of an element (DN per pixel)"), [dots, line], flare.name))
         residuals = Dots("", "star", size=4, at=(nm, (data - fit) / noise))
         below.append(Panel(x, Axis("residual / noise"), [residuals, Rule(along="y", dash="-", at=0.0)]))
     size = 3.6 * len(flares), 4.6
@@ -283,7 +316,8 @@ def fits(flares: Sequence[MeasuredFlare]) -> Picture:
 
 def _each(flares: Sequence[MeasuredFlare], panel: Callable[[MeasuredFlare], Panel]) -> Picture:
     """Return a picture with a panel per flare."""
-    return Picture([[panel(flare) for flare in flares]], (3.4 * len(flares), 3.1), notes=(note_of(flares),))
+    row = [panel(flare) for flare in flares]
+    return Picture([row], (3.4 * len(flares), 3.6), notes=(note_of(flares),), below=True)
 
 
 def _single(answer: MeasureAnswer) -> tuple[Any, ...]:
@@ -298,14 +332,14 @@ def contours(flares: Sequence[MeasuredFlare]) -> Picture:
 
     def panel(flare: MeasuredFlare) -> Panel:
         series: list[Series] = []
-        for rise, dash in zip(RISES, ("-", "dashed"), strict=True):
+        for (share, rise), dash in zip(RISES.items(), ("-", "dashed"), strict=True):
             kelvin, low, high = flare.region(rise)
             around = np.concatenate([kelvin, kelvin[::-1], kelvin[:1]]), np.concatenate([low, high[::-1], low[:1]])
-            series.append(Line("", "star", dash=dash, at=around))
-        series.append(Dots("", "flare", marker="+", size=10, at=flare.perfect.estimates[0, :2]))
+            series.append(Line(f"{share} of estimates", "star", dash=dash, at=around))
+        series.append(Dots("estimate without noise", "flare", marker="+", size=14, at=flare.perfect.estimates[0, :2]))
         if np.isfinite(flare.truth[:2]).all():
-            series.append(Dots("", "text", marker="x", size=10, at=flare.truth[:2]))
-        return Panel(Axis("temperature (K)"), Axis("amplitude"), series, flare.name)
+            series.append(Dots("simulated flare", "text", marker="x", size=8, at=flare.truth[:2]))
+        return Panel(Axis("flare temperature (K)"), Axis("flare amplitude"), series, flare.name)
 
     return _each(flares, panel)
 
@@ -314,7 +348,9 @@ def contours(flares: Sequence[MeasuredFlare]) -> Picture:
 @styled_picture
 def pulls(flares: Sequence[MeasuredFlare]) -> Picture:
     """Plot the pulls of estimates, (estimate - truth) / standard error, and the standard normal."""
-    x, edges = np.linspace(-5.0, 5.0, 201), np.linspace(-5.0, 5.0, 41)
+    # Few fits need wide bins.
+    most = max(len(flare.found.estimates) for flare in flares)
+    x, edges = np.linspace(-5.0, 5.0, 201), np.linspace(-5.0, 5.0, 41 if most >= MANY_FITS else 21)
 
     def panel(flare: MeasuredFlare) -> Panel:
         series: list[Series] = []
@@ -325,8 +361,10 @@ def pulls(flares: Sequence[MeasuredFlare]) -> Picture:
             density, _ = np.histogram(np.clip(pull[np.isfinite(pull)], -5, 5), edges, density=True)
             series.append(Line(flare.found.names[q], colour, step=True, at=((edges[1:] + edges[:-1]) / 2, density)))
         normal = np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi)
-        series.append(Line("normal", dash="dashed", at=(x, normal)))
-        return Panel(Axis("(estimate - truth) / error"), Axis("density"), series, flare.name)
+        series.append(Line("standard normal", "text", dash="dashed", at=(x, normal)))
+        return Panel(
+            Axis("(estimate \N{MINUS SIGN} truth) / standard error"), Axis("probability density"), series, flare.name
+        )
 
     return _each(flares, panel)
 
@@ -339,11 +377,15 @@ def errors(flares: Sequence[MeasuredFlare]) -> Picture:
     def panel(flare: MeasuredFlare) -> Panel:
         amplitudes, series = FACTORS * flare.perfect.estimates[0, 1], list[Series]()
         for unknown, dash in {None: "dashed", flare.unknown: "-"}.items():
-            ahead, whose = flare.forecasts(FACTORS, unknown), "all known" if unknown is None else "unknowns free"
+            ahead, whose = (
+                flare.forecasts(FACTORS, unknown),
+                "everything else known" if unknown is None else "with unknowns",
+            )
             for colour, q in zip(COLOURS, range(2), strict=False):
                 relative = [f.errors[q] / f.values[q] for f in ahead]
                 series.append(Line(f"{flare.fitted.names[q]}, {whose}", colour, dash=dash, at=(amplitudes, relative)))
-        return Panel(Axis("amplitude", log=True), Axis("relative error", log=True), series, flare.name)
+        x, y = Axis("flare amplitude", log=True), Axis("relative standard error", log=True)
+        return Panel(x, y, series, flare.name)
 
     return _each(flares, panel)
 
@@ -363,21 +405,24 @@ def temperatures(star: MeasuredStare) -> Picture:
     size = "area" if "area" in measurement.names else "amplitude"
     light = "luminosity bolometric" if "area" in measurement.names else "flux bolometric"
     middle, reach = (drawn.start_s + drawn.end_s) / 2, (drawn.end_s - drawn.start_s) / 2
-    for name, colour in zip(("temperature", size, light), COLOURS, strict=False):
+    for name in ("temperature", size, light):
         q = measurement.column(name)
         estimate, low, high = measurement.estimates[:, q], measurement.low[-1, :, q], measurement.high[-1, :, q]
         ends = np.where(np.isfinite([low, high]), np.abs([estimate - low, high - estimate]), 0.0)
         limits, true = ~np.isfinite(high), perfect.found.estimates[:, q]
         series = [
-            Dots("", colour, size=4, at=(middle, estimate, ends, reach)),
-            Dots("", colour, size=10, marker="^", at=(middle[limits], low[limits])),
-            Line("", step=True, at=(middle, true)),
+            Dots("fit, 95 %", "star", size=4, at=(middle, estimate, ends, reach)),
+            Line("fit to the same frames without noise", step=True, at=(middle, true)),
         ]
+        if limits.any():
+            series.append(Dots("lower limit", "star", size=10, marker="^", at=(middle[limits], low[limits])))
         positive = [value for value in (*estimate, *true) if value > 0]
-        label = f"{name} ({measurement.units[q]})" if measurement.units[q] else name
+        of = " ".join(name.split(" ")[::-1])
+        label = f"{of} ({in_figure(measurement.units[q])})" if measurement.units[q] else of
         y = Axis(label, log=True, limits=(0.5 * min(positive), 2 * max(positive)))
         rows.append([Panel(Axis("time from the start of the stare (s)"), y, series)])
-    return Picture(rows, (7.2, 6.4), f"{star.title}: one simulated stare; nominal throughput", share_x=True)
+    title = f"{star.title}: one simulated stare; nominal throughput"
+    return Picture(rows, (7.2, 6.7), title, below=True, share_x=True)
 
 
 @picture_of("MeasureAnswer", "joint", each=lambda answer: [(star, star.joint) for star in answer.stares if star.joint])
@@ -389,15 +434,19 @@ def joint(star: MeasuredStare, fit: JointFit) -> Picture:
     near = (since > -BEFORE) & (since < AFTER)
     x, time = Axis("time from the start of the stare (s)"), stare.middle_s[near]
     light: list[Series] = [
-        Dots("frames less star, sky and dark", size=4, at=(time, drawn[near])),
+        Dots("frames less star, sky, dark and unknowns", size=4, at=(time, drawn[near])),
         Line("joint fit", "star", at=(time, mean[near])),
     ]
     off = Dots("", "star", size=4, at=(time, (drawn - mean)[near]))
+    courses = fit.true.kelvin[near], fit.fitted.kelvin[near]
     kelvin: list[Series] = [
-        Line("simulated flare", dash="dashed", at=(time, fit.true.kelvin[near])),
-        Line("joint fit", "star", at=(time, fit.fitted.kelvin[near])),
+        Line("joint fit", "star", at=(time, courses[1])),
+        Line("simulated flare", "text", dash="dashed", at=(time, courses[0])),
     ]
-    axes = {"DN per frame": light, "residual (DN)": [off, Rule(along="y", dash="-", at=0.0)], "temperature (K)": kelvin}
-    rows = [[Panel(x, Axis(label), series)] for label, series in axes.items()]
+    rows = [
+        [Panel(x, Axis("light (DN per frame)"), light)],
+        [Panel(x, Axis("residual (DN)"), [off, Rule(along="y", dash="-", at=0.0)])],
+        [Panel(x, Axis("temperature (K)", limits=(0.8 * np.min(courses), 1.2 * np.max(courses))), kelvin)],
+    ]
     title = f"{star.title}: one simulated stare; nominal throughput"
-    return Picture(rows, (7.2, 6.4), title, share_x=True, heights=(2, 1, 1.5))
+    return Picture(rows, (7.2, 6.7), title, below=True, share_x=True, heights=(2, 1, 1.5))

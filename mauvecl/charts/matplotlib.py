@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache, wraps
 from itertools import cycle
 from pathlib import Path
@@ -16,9 +16,12 @@ from mauvecl.host.tables.files import write_whole
 from mauvecl.schema.errors import InputError
 
 P = ParamSpec("P")
-#: Colours of Okabe & Ito, which colour-blind readers can distinguish (jfly.uni-koeln.de/color).
-COLOURS = ("#0072B2", "#56B4E9", "#009E73", "#E69F00", "#D55E00", "#CC79A7", "#000000")
+#: Colours of Okabe & Ito, which colour-blind readers can distinguish (jfly.uni-koeln.de/color); neighbours differ in
+#: lightness as well.
+COLOURS = ("#0072B2", "#E69F00", "#009E73", "#56B4E9", "#D55E00", "#CC79A7", "#000000")
 NULL = "#777777"
+#: Colour of a mesh's cells without a value, which no palette has.
+EMPTY = "#bbbbbb"
 #: Colours of files by their names in charts; `web.figures.INKS` has those of the page's themes.
 INK = {
     "star": "#0072B2", "flare": "#D55E00", "sky": "#009E73", "drawn": NULL, "dark": "#CC79A7", "read": "#E69F00",
@@ -36,6 +39,7 @@ MAX_COLUMNS = 3
 COLUMN = 3.5
 #: No-break space.
 UNBROKEN = "\N{NO-BREAK SPACE}"
+MINUS = "\N{MINUS SIGN}"
 #: Size of the labels of ticks that are names.
 SMALL = 8
 #: Largest fraction of a figure's width for titles and legends.
@@ -47,8 +51,10 @@ STYLE = {
     "axes.spines.right": False,
     "axes.titlesize": 9,
     "axes.titlelocation": "left",
+    "axes.formatter.use_mathtext": True,
     "legend.frameon": False,
     "legend.fontsize": 8,
+    "legend.markerscale": 1.6,
     "figure.constrained_layout.use": True,
     "savefig.dpi": 160,
     "pdf.fonttype": 42,
@@ -122,27 +128,63 @@ def _headline(figure: Any, text: str) -> None:
 
 
 def _legend_below(figure: Any, handles: dict[str, Any]) -> None:
-    """Add a legend below all panels, in as many columns as fit."""
-    for columns in range(len(handles), 0, -1):
+    """Add a legend below all panels, in as few rows as fit, which have about equally many entries."""
+    for rows in range(1, len(handles) + 1):
+        columns = -(-len(handles) // rows)
         legend = figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)
         if columns == 1 or legend.get_window_extent(_renderer(figure)).width <= INSIDE * figure.bbox.width:
             return
         legend.remove()
 
 
-def _plain_numbers(axis: Any) -> None:
+def _plain_numbers(axis: Any, panel: Panel) -> None:
     """Label logarithmic ticks as plain numbers (0.1, 20, 500), with intermediate ticks only over few decades."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-    for side in (axis.xaxis, axis.yaxis):
+    for side, of in ((axis.xaxis, panel.x), (axis.yaxis, panel.y)):
         if side.get_scale() != "log":
             continue
         low, high = sorted(side.get_view_interval())
         decades = float(np.log10(high / low))
-        side.set_major_locator(LogLocator(subs=(1.0,) if decades > 2 else (1.0, 2.0, 5.0)))
-        if decades < 4 and high < 1e6:
-            side.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        if of.ticks is None:
+            # Powers of ten are too wide to stand side by side with others.
+            most = 1 if side is axis.xaxis and (low < 1e-4 or high > 1e5) else 2
+            side.set_major_locator(LogLocator(subs=(1.0,) if decades > most else (1.0, 2.0, 5.0)))
+        if decades < 4:
+            side.set_major_formatter(FuncFormatter(lambda value, _: written(value)))
         side.set_minor_formatter(NullFormatter())
+
+
+def written(value: float) -> str:
+    """Return a number as people write it: 0.1, 500, or 2 times a power of ten."""
+    digits, _, power = f"{value:.5e}".partition("e")
+    if value == 0 or -4 <= int(power) < 5:
+        return f"{value:g}".replace("-", MINUS)
+    digits = f"{float(digits):g}"
+    return rf"$10^{{{int(power)}}}$" if digits == "1" else rf"${digits}\times10^{{{int(power)}}}$"
+
+
+def strokes_of(levels: Iterable[float]) -> dict[float, str]:
+    """Return the line style of each contour; lines are close where a map is steep, so that labels would not fit."""
+    return dict(zip(sorted(levels), cycle(("dotted", "dashed", "-", "dashdot")), strict=False))
+
+
+def contour_entries(strokes: Mapping[float, str], found: str) -> list[Line]:
+    """Return the entries of the legend for contours of a probability."""
+    return [Line(f"{found} in {100 * level:g} %", "text", dash=dash, at=([], [])) for level, dash in strokes.items()]
+
+
+def draw_contours(axis: Any, at: tuple[Any, Any, Any], strokes: Mapping[float, str]) -> None:
+    """Draw contours of a map, with a bright edge that sets them off."""
+    axis.contour(*at, levels=list(strokes), colors="white", linewidths=2.4)
+    axis.contour(*at, levels=list(strokes), colors="black", linewidths=1.2, linestyles=list(strokes.values()))
+
+
+def in_figure(unit: str) -> str:
+    """Return a unit, as astropy spells it, as the label of an axis has it."""
+    from astropy.units import Unit
+
+    return str(Unit(unit).to_string("latex_inline"))
 
 
 def _renderer(figure: Any) -> Any:
@@ -217,7 +259,7 @@ def _finish(axis: Any, panel: Panel) -> None:
             getattr(axis, f"set_{name}lim")(*limits)
         if of.ticks is not None:
             getattr(axis, f"set_{name}ticks")(*of.ticks, **({"fontsize": SMALL} if len(of.ticks) > 1 else {}))
-    _plain_numbers(axis)
+    _plain_numbers(axis, panel)
     if panel.finish is not None:
         panel.finish(axis)
 

@@ -84,7 +84,7 @@ def convolved(source: Source, instrument: Instrument) -> Panel:
     # Division by a flat spectrum removes the efficiencies and leaves the effect of the line spread function.
     flat = electrons_per_second(instrument, nm, np.ones_like(source.flux_flam))
     seen = electrons_per_second(instrument, nm, source.flux_flam) / flat
-    given = Line("as given", COLOURS[1], width=1.1, at=(nm, source.flux_flam))
+    given = Line("as given", COLOURS[3], width=1.1, at=(nm, source.flux_flam))
     through = Line("through Mauve's line function", "sky", at=(instrument.wavelength_nm, seen))
     return Panel(WAVELENGTH, Axis(FLUX.label, limits=(0, 1.1 * float(seen.max()))), [given, through], source.name)
 
@@ -106,7 +106,7 @@ def efficiencies(instrument: Instrument) -> Picture:
 def throughput(instrument: Instrument) -> Picture:
     """Plot the quantum efficiency and the end-to-end throughput, which includes it, as the paper's figure."""
     w, errors = np.linspace(*RANGE_NM, 501), instrument.throughput_errors
-    origin, label = ("nominal, not a flight calibration", "sensible uncertainty")
+    origin, label = ("nominal, not a flight calibration", "assumed uncertainty")
     share = np.where(w < 250, 0.5, 0.3)
     low, high, spread = 1 - share, 1 + share, 100 * instrument.throughput(w)
     if errors is not None:
@@ -115,7 +115,7 @@ def throughput(instrument: Instrument) -> Picture:
     quantum = Line("", "star", at=(w, 100 * instrument.quantum_efficiency(w)))
     band, line = Band(label, alpha=0.25, at=(w, low * spread, high * spread)), Line("", "flare", at=(w, spread))
     above = Panel(WAVELENGTH, Axis("quantum efficiency (%)"), [quantum], f"{instrument.name}: {origin}")
-    below = Panel(WAVELENGTH, Axis("throughput with it (%)"), [line, band])
+    below = Panel(WAVELENGTH, Axis("end-to-end throughput (%)"), [line, band])
     return Picture([[above], [below]], (3.6, 4.0), share_x=True)
 
 

@@ -481,7 +481,8 @@ class CoolingCourse(NamedTuple):
     """A flare in the quantities of a fit, and frame by frame, added up over the pixels that are used."""
 
     values: Float  # shape (n_derived,)
-    drawn_dn: Float  # of the frames less their known mean without a flare, shape (n_frame,)
+    # Of the frames less their known mean without a flare and the levels of what is unknown, shape (n_frame,).
+    drawn_dn: Float
     mean_dn: Float  # of the flare
     kelvin: Float
 
@@ -587,12 +588,29 @@ def cooling_course(
     values = {quantity.name: quantity.value(theta, data) for quantity in _quantities(data, stare, cooling=True)}
     rise, log_k = data.strengths(theta)
     used = (data.reduction.variance > 0).astype(np.float64)
-    return CoolingCourse(
-        np.array([values[name] for name in measurement.names]),
-        less_known(frames, quiet, known_strengths(stare, quiet), used[None])[:, 0],
-        rise * (model.hot_spline(log_k) @ used),
-        np.exp(log_k),
+    drawn_dn = less_known(frames, quiet, known_strengths(stare, quiet), used[None])[:, 0]
+    mean_dn = rise * (model.hot_spline(log_k) @ used)
+    drawn_dn = drawn_dn - _summed_levels(drawn_dn - mean_dn, mean_dn, quiet, stare, used)
+    return CoolingCourse(np.array([values[name] for name in measurement.names]), drawn_dn, mean_dn, np.exp(log_k))
+
+
+def _summed_levels(residual_dn: Float, flare_dn: Float, quiet: Expectation, stare: Stare, used: Float) -> Float:
+    """Return what the unknown changes of a stare add to the sum over pixels, as its residuals tell."""
+    if not stare.unknowns:
+        return np.zeros_like(residual_dn)
+    strengths = known_strengths(stare, quiet)
+    components = Components(quiet, np.zeros((0, used.size)), used[None])
+    changes, noise = components.directions(strengths), np.sqrt(components.covariance(strengths)[:, 0, 0])
+    levels = np.array(
+        [
+            unknown.sd * unknown.curve * (changes[unknown.of][:, 0] + (flare_dn if unknown.of == "light" else 0.0))
+            for unknown in stare.unknowns
+        ]
     )
+    # Each level has its prior as another measurement.
+    rows = np.vstack([(levels / noise).T, np.eye(len(levels))])
+    best, *_ = np.linalg.lstsq(rows, np.concatenate([residual_dn / noise, np.zeros(len(levels))]))
+    return np.asarray(best @ levels)
 
 
 def cooling_event(measurement: Measurement, shape: Shape) -> Event:

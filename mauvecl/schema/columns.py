@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -168,6 +169,17 @@ def interval(spec: str, factor: float = 1.0) -> Callable[[float, float], str]:
     return lambda low, high: (
         f"[{formatted(factor * low, spec)}, {formatted(factor * high, spec)}]" if low == low else ""
     )
+
+
+def with_error(value: float, error: float) -> str:
+    """Format a value to its error's two leading digits: 9979 ± 120, not 1e+02."""
+    if value != value:
+        return ""
+    if not (math.isfinite(error) and error > 0):
+        return f"{value:.3g}"
+    digits = max(1 - math.floor(math.log10(error)), 0)
+    # The sum makes -0 a 0.
+    return f"{round(value, digits) + 0.0:.{digits}f} ± {error:.{digits}f}"
 
 
 def short(value: float | str) -> str:

@@ -243,10 +243,14 @@ class MapQuestion(Section):
     """Axes and contour levels of a map of the detection probability."""
 
     x: Annotated[
-        Axis,
-        Help("Horizontal axis of the map", "such as magnitude:4:10:16, or exposure=5,50,600"),
+        Axis | None,
+        Help(
+            "Horizontal axis of the map",
+            "such as magnitude:4:10:16, or exposure=5,50,600",
+            default="the magnitudes over which the flares are lost",
+        ),
         Flag("--x", kind=str, read=parsing.axis),
-    ] = Axis(quantity="magnitude", start=4.0, stop=10.0, steps=16)
+    ] = None
     y: Annotated[
         Axis,
         Help("Vertical axis of the map", "such as amplitude:0.01:1:16:log"),
@@ -256,11 +260,17 @@ class MapQuestion(Section):
 
     @model_validator(mode="after")
     def _different_axes(self) -> Self:
-        if self.x.quantity == self.y.quantity:
+        if self.y.quantity == ("magnitude" if self.x is None else self.x.quantity):
             raise InputError(
-                f"the axes of the map must be two different quantities, but both are {self.x.quantity!r}", key="y"
+                f"the axes of the map must be two different quantities, but both are {self.y.quantity!r}", key="y"
             )
         return self
+
+    @property
+    def axes(self) -> tuple[Axis, Axis]:
+        """The horizontal and the vertical axis of a map that has been computed."""
+        assert self.x is not None
+        return self.x, self.y
 
 
 class Sweep(Section):

@@ -30,7 +30,7 @@ from mauvecl.charts.detection import roc_columns
 from mauvecl.charts.limits import BUDGET, budget_series
 from mauvecl.detection.requests import statistic_label
 from mauvecl.noise.unknowns import NUISANCES, Nuisance
-from mauvecl.schema.columns import View, stacked
+from mauvecl.schema.columns import View, stacked, with_error
 from mauvecl.study.cases import star_column, star_label
 from mauvecl.study.nuisances import NuisanceChoice
 from mauvecl.web.closed_forms import Answers, short
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 def budget(closed: ClosedForms, answers: Answers) -> ChartData:
     """Return the noise of a pixel by origin."""
     series = budget_series(closed.quiet)
-    power = {part: float(np.nansum(series[part.key][1] ** 2)) for part in BUDGET.series[:-1] if part.key in series}
+    power = {part: float(np.nansum(series[part.key][1] ** 2)) for part in BUDGET.series[1:] if part.key in series}
     most = max(power, key=lambda name: power[name])
     share = 100 * power[most] / (sum(power.values()) or 1.0)
     return ChartData(f"Most of the noise's power comes from {most.called}: {share:.0f} % over all pixels.", series)
@@ -265,8 +265,8 @@ def distributions(closed: ClosedForms, answers: Answers) -> ChartData:
     series["threshold"] = cut if cut == cut else None
     share = f"{chance_text(chance)} of flares lie above the threshold of {cut:.4g}"
     text = (
-        f"Without a flare {q.statistic} lies at {closed.null.mean:.4g} ± {closed.null.std:.3g}, with it at "
-        f"{closed.seen.mean:.4g} ± {closed.seen.std:.3g}; "
+        f"Without a flare {q.statistic} lies at {with_error(closed.null.mean, closed.null.std)}, with it at "
+        f"{with_error(closed.seen.mean, closed.seen.std)}; "
         f"{share if cut == cut else 'no threshold has this false-alarm probability'}."
     )
     return ChartData(text, series, {"x axis": {"axis_label": statistic_label(q.statistic)}})

@@ -193,7 +193,10 @@ class Canvas:
     def _drawn(self, series: Series, source: ColumnDataSource) -> Any:
         """Return the renderer of a series."""
         plot, colour, columns = self.plot, self.ink.get(series.colour, series.colour), series.columns
-        line: dict[str, Any] = {"line_color": colour, "line_width": series.width, "line_dash": series.dash or "solid"}
+        line: dict[str, Any] = {
+            "line_color": colour, "line_width": series.width, "line_dash": series.dash or "solid",
+            "line_alpha": series.alpha,
+        }  # fmt: skip
         match series:
             case Band():
                 return plot.varea(*columns, source=source, fill_color=colour, fill_alpha=series.alpha)

@@ -18,6 +18,7 @@ from mauvecl.charts.calibrations import (
     TRANSFER,
     along_magnitude,
     residual_series,
+    shown_name,
     throughput_series,
     transfer_series,
 )
@@ -39,7 +40,7 @@ from mauvecl.charts.chart import (
 )
 from mauvecl.charts.light_curves import SCATTER, scatter_series
 from mauvecl.host.stars.source import Source
-from mauvecl.schema.columns import View
+from mauvecl.schema.columns import View, with_error
 from mauvecl.schema.errors import InputError
 from mauvecl.web.closed_forms import Answers, short
 from mauvecl.web.sandboxed_reader import read_limited
@@ -361,7 +362,7 @@ def residuals(closed: ClosedForms, answer: CalibrateAnswer) -> ChartData:
 def photon_transfer(closed: ClosedForms, answer: CalibrateAnswer) -> ChartData:
     """Return the measured over the fitted variance."""
     t = answer.transfer
-    text = f"Gain {t.noise.gain:.4g} +- {t.gain_error:.1g} DN per electron, read noise {t.read_noise_dn:.3g} DN."
+    text = f"Gain {with_error(t.noise.gain, t.gain_error)} DN per electron, read noise {t.read_noise_dn:.3g} DN."
     if "gain" in t.assumed:
         text = "The frames do not determine the gain: it is nominal."
     return ChartData(text, transfer_series(answer)[0])
@@ -419,7 +420,7 @@ def _against_magnitude(name: str, title: str, label: str, units: Mapping[str, fl
             change, scale = row.change.name, units[row.change.unit]
             lines += along_magnitude(answer, [change], scale)
             hidden = np.isinf(row.smallest.one)
-            words.append(f"{change} {'hidden' if hidden else f'{scale * row.smallest.one:.3g}'}")
+            words.append(f"{shown_name(change)} {'hidden' if hidden else f'{scale * row.smallest.one:.3g}'}")
             own += [] if hidden else [scale * row.smallest.one]
         text = (
             f"Smallest changes between {answer.study.change.visits} visits, in {label}: "
@@ -474,7 +475,7 @@ def recovered_periods(closed: ClosedForms, answer: ChangeAnswer) -> ChartData:
     wide, high = (np.sqrt(points[1] / points[0]) for points in (r.periods_d, r.amplitudes))
     share = row.shares("value").ravel()
     errors = "; ".join(
-        f"{row.change.name} {(row.error if row.change.unit else 100 * row.error):.3g} {row.change.unit or '%'}"
+        f"{shown_name(row.change.name)} {row.error * (1 if row.change.unit else 100):.3g} {row.change.unit or '%'}"
         for row in answer.periods
     )
     text = (

@@ -122,7 +122,7 @@ def _with_chance(closed: ClosedForms, answers: Answers) -> dict[str, Any]:
         facts.append(("In closed form", chance_text(closed.chance)))
     facts += [
         ("Threshold", f"{cut:.4g}" if cut == cut else "none"),
-        ("Expected with flare", f"{closed.odds.flaring.mean:.4g}"),
+        ("Expected with flare", f"{round(closed.odds.flaring.mean, 6) + 0.0:.4g}"),
         ("Best S/N per pixel", short(x.snr().max())),
         ("Best S/N per element", short(x.snr_per_element().max())),
     ]

@@ -189,6 +189,29 @@ MAGNITUDE = {"quantity": "magnitude", "start": 6.0, "stop": 10.0, "steps": 5}
 AMPLITUDE = {"quantity": "amplitude", "start": 0.02, "stop": 0.5, "steps": 4, "log": True}
 
 
+@pytest.mark.parametrize("star", ["M3V", "B2IV"])
+def test_map_without_magnitudes_has_those_over_which_flares_are_lost(star: str, engine: Engine) -> None:
+    """The study of the answer has the axis, so that it gives the same map again."""
+    y = 'map.y={quantity="amplitude", values=[0.02, 0.5]}'
+    asked = Study().paper().with_settings([f'star=[{{library="{star}"}}]', y, "run.realisations=10000", "run.fap=0.01"])
+    found = detection_map(asked, engine)
+    chances = found.closed_form[found.statistics.index("matched")]
+    assert chances[0, 0] > 0.9
+    assert chances[1, -1] < 0.1 < chances[1, -2]
+    assert found.x == found.study.map.axes[0].points()
+    assert not found.quiet.saturated.any()
+
+
+def test_map_of_a_star_whose_flares_are_seen_to_where_it_saturates_begins_there(engine: Engine) -> None:
+    y = 'map.y={quantity="amplitude", values=[1e-6, 0.5]}'
+    asked = Study().paper().with_settings(['star=[{library="G2V"}]', y, "run.realisations=10000", "run.fap=0.01"])
+    found = detection_map(asked, engine)
+    brighter, *_ = expectations(asked.at("magnitude", found.x[0] - 1))
+    assert brighter.saturated.any()
+    assert not found.quiet.saturated.any()
+    assert not np.isnan(found.probability).any()
+
+
 def alone(asked: Study, engine: Engine, x: float | str, y: float | str) -> list[float]:
     one = asked.at(asked.map.x.quantity, x).at(asked.map.y.quantity, y)
     quiet, flare = expectations(one)

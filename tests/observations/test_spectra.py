@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import astropy.units as u
@@ -12,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from mauvecl import SHAPES, Frames, Study, analyse
+from mauvecl import SHAPES, Frames, Study, analyse, read_frames, stare
 from mauvecl.answers.analyse import frame_model
 from mauvecl.observations.detection import detect_events
 from mauvecl.observations.event_spectra import drifts, event_spectrum, measure_flare
