@@ -408,6 +408,11 @@ class Binned:
         spread = 1.4826 * float(np.median(np.abs(steps))) / np.sqrt(2.0)
         return spread if spread > 0 else float(np.std(self.values))
 
+    @cached_property
+    def period_s(self) -> float | None:
+        """Period of the highest peak of the periodogram, or None if it is noise."""
+        return _period(self, self.values, LONGEST)
+
     @classmethod
     def of(cls, time_s: Float, values: Float, variance: Float, step_s: float, largest: int = MAX_FITTED) -> Binned:
         """Average consecutive values so that at most `largest` remain; bins hold half of their frames at least."""
@@ -504,7 +509,7 @@ def _starts(data: Binned, best: Process) -> Iterator[tuple[ProcessTerm, ...]]:
         return
     smooth = ProcessTerm("smooth", (np.log(spread), np.log(0.2 * data.span_s)))
     yield (smooth,)
-    if (period := _period(data, data.values, LONGEST)) is None:
+    if (period := data.period_s) is None:
         return
     for factor in (1.0, 2.0):
         yield (_rotation(spread, factor * period),)
