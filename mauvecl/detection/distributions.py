@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -311,26 +311,32 @@ class QuadraticForm:
     weight: NDArray[np.float64]  # positive, shape (n,)
     shift: NDArray[np.float64]  # means in standard deviations, shape (n,)
 
-    @property
+    @cached_property
     def mean(self) -> float:
         return float(np.sum(self.weight * (1.0 + self.shift**2)))
 
-    @property
+    @cached_property
     def std(self) -> float:
         return float(np.sqrt(np.sum(self.weight**2 * (2.0 + 4.0 * self.shift**2))))
 
-    @property
+    @cached_property
     def third(self) -> float:
         """Third central moment."""
         return 8.0 * float(np.sum(self.weight**3 * (1.0 + 3.0 * self.shift**2)))
 
-    @property
+    @cached_property
     def effective_terms(self) -> float:
         """Number of equal terms with the same relative scatter: (sum of weights)^2 / sum of squared weights."""
         return float(self.weight.sum() ** 2 / np.sum(self.weight**2))
 
-    def sf(self, value: float) -> float:
+    def sf(self, value: float, *, relative: bool = True) -> float:
         """Return the probability of exceeding `value`.
+
+        Parameters
+        ----------
+        value : float
+        relative : bool
+            If False, an error of 1e-15 is enough, however small the probability.
 
         Notes
         -----
@@ -342,18 +348,21 @@ class QuadraticForm:
         """
         if value <= 0.0:
             return 1.0
-        if self._is_chi_squared():
+        if self._equal:
             if not self.shift.any():
                 return float(special.chdtrc(self.weight.size, value))
             # scipy.stats takes a second to import, and most studies do not need it.
             from scipy.stats import ncx2
 
             return float(ncx2.sf(value, self.weight.size, np.sum(self.shift**2)))
-        if self.effective_terms >= MANY and abs(value - self.mean) <= NEAR * self.std:
-            u, size, phase = self._near
-            above = 0.5 + float(np.sum(size * np.sin(phase - u * value))) / np.pi
-            if above >= RARE:
-                return min(above, 1.0)
+        if self.effective_terms >= MANY:
+            if abs(value - self.mean) <= NEAR * self.std:
+                u, size, phase = self._near
+                above = 0.5 + float(np.sum(size * np.sin(phase - u * value))) / np.pi
+            else:
+                above = float(value < self.mean)
+            if above >= RARE or not relative:
+                return min(max(above, 0.0), 1.0)
         upper = value > self.mean
         tail = float(np.exp(self._squares.tail(value / self._squares.unit, upper=upper)[0]))
         return tail if upper else 1.0 - tail
@@ -388,7 +397,7 @@ class QuadraticForm:
 
     def isf(self, probability: float) -> float:
         """Return the value that is exceeded with a probability in (0, 1)."""
-        if self._is_chi_squared() and not self.shift.any():
+        if self._equal and not self.shift.any():
             return float(special.chdtri(self.weight.size, probability))
         if self.effective_terms >= MANY and RARE < probability < 1.0 - RARE:
             from scipy.optimize import brentq
@@ -399,7 +408,9 @@ class QuadraticForm:
         wanted = probability if upper else 1.0 - probability
         return self._squares.unit * self._squares.quantile(wanted, upper=upper)
 
-    def _is_chi_squared(self) -> bool:
+    @cached_property
+    def _equal(self) -> bool:
+        """Whether all weights are 1, as of a chi-squared variable."""
         return bool(np.all(self.weight == 1.0))
 
 
@@ -445,12 +456,19 @@ class Mixture:
     def sf(self, value: float) -> float:
         """Return the probability of exceeding `value`."""
         normal = self._normal
-        if normal is None:
-            each = np.array([part.sf(value) for part in self.parts])
-        else:
+        if normal is not None:
             mean, std = normal
-            each = special.ndtr((mean - value) / std)
-        return min(float(self.weights @ each), 1.0)
+            return min(float(self.weights @ special.ndtr((mean - value) / std)), 1.0)
+        # Parts that hardly contribute need no relative precision.
+        for relative in (False, True):
+            each = [
+                part.sf(value, relative=relative) if isinstance(part, QuadraticForm) else part.sf(value)
+                for part in self.parts
+            ]
+            above = float(self.weights @ each)
+            if above >= RARE:
+                break
+        return min(above, 1.0)
 
     @cached_property
     def _normal(self) -> NDArray[np.float64] | None:
@@ -463,12 +481,20 @@ class Mixture:
         """Return the value that is exceeded with a probability in (0, 1)."""
         from scipy.optimize import brentq
 
-        low, high = self.mean - self.std, self.mean + self.std
-        while self.sf(low) < probability:
-            low -= self.std
-        while self.sf(high) > probability:
-            high += self.std
-        return float(brentq(lambda x: np.log(self.sf(x) / probability), low, high, xtol=1e-9 * self.std))
+        @cache
+        def off(value: float) -> float:
+            return float(np.log(max(self.sf(value), 1e-300) / probability))
+
+        # From the quantile of a normal distribution with the same skewness (Cornish & Fisher 1938), outwards.
+        z = -float(special.ndtri(probability))
+        low = high = self.mean + self.std * z + (z**2 - 1.0) * self.third / (6.0 * self.std**2)
+        step = 0.01 * self.std
+        while off(low) < 0:
+            low, high, step = low - step, low, 4 * step
+        step = 0.01 * self.std
+        while off(high) > 0:
+            low, high, step = high, high + step, 4 * step
+        return float(brentq(off, low, high, xtol=1e-9 * self.std)) if low < high else low
 
 
 #: Closed form of a statistic's distribution.

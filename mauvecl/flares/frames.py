@@ -148,8 +148,14 @@ class Components:
         return sums[0], sums[1:]
 
     @cached_property
-    def _sums(self) -> dict[int, tuple[Float, Float]]:
-        return {order: self.sum_cumulants(order) for order in (1, 2, 3, 4)}
+    def _known(self) -> dict[int, tuple[Float, Float]]:
+        return {}
+
+    def _sums(self, order: int) -> tuple[Float, Float]:
+        """Return `sum_cumulants`, computed once: those of high orders take long, and fits do not need them."""
+        if order not in self._known:
+            self._known[order] = self.sum_cumulants(order)
+        return self._known[order]
 
     def coefficients(self, stare: Stare, flare: Float | None = None) -> Float:
         """Return the known coefficients of star, sky, dark, neighbours and flares, shape (n_frame, 4 + n_flare).
@@ -172,7 +178,7 @@ class Components:
         """Return the mean statistics, (..., n_statistic), for coefficients of shape (..., 4 + n_flare)."""
         reference = np.zeros(len(STEADY) + self.n_flares)
         reference[: len(STEADY)] = 1.0
-        return np.asarray((coefficients - reference) @ self._sums[1][1])
+        return np.asarray((coefficients - reference) @ self._sums(1)[1])
 
     def covariance(self, coefficients: Float) -> Float:
         """Return the covariances of the statistics of frames, shape (..., n_statistic, n_statistic)."""
@@ -195,7 +201,7 @@ class Components:
         return covariance
 
     def _of(self, order: int, coefficients: Float) -> Float:
-        constant, each = self._sums[order]
+        constant, each = self._sums(order)
         return np.asarray(constant + np.tensordot(coefficients, each, 1))
 
     def directions(self, coefficients: Float) -> dict[str, Float]:
@@ -203,7 +209,7 @@ class Components:
 
         They are with respect to relative changes of the star, of all light and of the sky, and to the temperature.
         """
-        mean = self._sums[1][1]
+        mean = self._sums(1)[1]
         light = np.delete(coefficients, 2, axis=-1) @ np.delete(mean, 2, axis=0)
         slope = self.quiet.conditions["dark_slope_per_c"]
         return {

@@ -264,10 +264,14 @@ def alternate(
     taken : ndarray of bool, shape (n_frame,)
         Frames of events above `PROVISIONAL`.
     """
-    taken = guessed
+    taken, rounds = guessed, dict[tuple[bytes, SeriesSurvey | None], tuple[SeriesSurvey, Bool]]()
     for _ in range(ROUNDS):
-        fitted = fit_processes(survey, taken, before, steps)
-        _, now = detect_events(fitted, PROVISIONAL, steps)
+        # Rounds may come back to the same frames.
+        key = taken.tobytes(), before
+        if key not in rounds:
+            fitted = fit_processes(survey, taken, before, steps)
+            rounds[key] = fitted, detect_events(fitted, PROVISIONAL, steps)[1]
+        fitted, now = rounds[key]
         changed = float((now ^ taken).mean())
         taken = now
         if changed <= SETTLED:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -127,9 +129,15 @@ def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, taken: Bool, steps
     down = replace(survey.inverted(), bank=bank_of(survey.stare, survey.bank.directions, Loss()))
     # Losses in independent noise are the first guess: a process that is fitted to losses would hide them.
     guessed = detect_events(down, PROVISIONAL, steps)[1]
+
+    @cache
+    def usual() -> float:
+        """Return the criterion of flares without losses."""
+        return criterion(fitted, light_of_events(fitted, taken), taken)
+
     # Those of a star that varies are most of its frames; eclipses repeat.
     if active and guessed.mean() >= MOST_LOST:
-        lost = _eclipses(survey, criterion(fitted, light_of_events(fitted, taken), taken))
+        lost = _eclipses(survey, usual)
         if lost.any():
             none[dark] = lost
             return none
@@ -140,22 +148,20 @@ def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, taken: Bool, steps
     if 0 < losses.mean() < (MOST_LOST_CONSTANT if constant else MOST_LOST):
         # Beside flares in even more frames, the star would be more than its noise.
         simpler = constant and losses.mean() < taken.mean() and process.excess > MOST_EXCESS
-        if simpler or criterion(other, light_of_events(other, losses), losses, shapeless=True) < criterion(
-            fitted, light_of_events(fitted, taken), taken
-        ):
+        if simpler or criterion(other, light_of_events(other, losses), losses, shapeless=True) < usual():
             none[dark] = losses
     return none
 
 
-def _eclipses(survey: SeriesSurvey, usual: float) -> Bool:
+def _eclipses(survey: SeriesSurvey, usual: Callable[[], float]) -> Bool:
     """Return the frames in periodic losses, if these lower the criterion, shape (n_frame,).
 
     Parameters
     ----------
     survey : SeriesSurvey
         Without processes.
-    usual : float
-        Criterion without losses.
+    usual : callable
+        Returns the criterion without losses, which takes long.
     """
     guessed = guess_eclipses(survey)
     none = np.zeros_like(guessed)
@@ -169,7 +175,7 @@ def _eclipses(survey: SeriesSurvey, usual: float) -> Bool:
     process, size = fit_process(data), float(np.log(guessed.size))
     dim_light = replace(data, variance=data.variance * process.excess**2)
     cost = EPHEMERIS * size + criterion_of_process(process, dim_light, size)
-    if criterion(fitted, light_of_events(fitted, taken), taken) + cost >= usual:
+    if criterion(fitted, light_of_events(fitted, taken), taken) + cost >= usual():
         return none
     quiet = ~guessed
     quiet[quiet] = ~taken

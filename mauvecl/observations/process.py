@@ -288,9 +288,8 @@ class Covariance:
         self._rates, diagonal, self._u, v = kernel.get_celerite_matrices(
             self._time, np.ascontiguousarray(variance, np.float64)
         )
-        self._d, self._w = driver.factor(
-            self._time, self._rates, diagonal, self._u, v, np.array(diagonal), np.array(v, copy=True)
-        )
+        # In place, as celerite2 does it.
+        self._d, self._w = driver.factor(self._time, self._rates, diagonal, self._u, v, diagonal, v)
         if not (self._d > 0).all():
             raise np.linalg.LinAlgError("the covariance is not positive definite")
         self._forms: dict[tuple[int, int], Float] = {}
@@ -409,6 +408,11 @@ class Binned:
         spread = 1.4826 * float(np.median(np.abs(steps))) / np.sqrt(2.0)
         return spread if spread > 0 else float(np.std(self.values))
 
+    @cached_property
+    def period_s(self) -> float | None:
+        """Period of the highest peak of the periodogram, or None if it is noise."""
+        return _period(self, self.values, LONGEST)
+
     @classmethod
     def of(cls, time_s: Float, values: Float, variance: Float, step_s: float, largest: int = MAX_FITTED) -> Binned:
         """Average consecutive values so that at most `largest` remain; bins hold half of their frames at least."""
@@ -505,7 +509,7 @@ def _starts(data: Binned, best: Process) -> Iterator[tuple[ProcessTerm, ...]]:
         return
     smooth = ProcessTerm("smooth", (np.log(spread), np.log(0.2 * data.span_s)))
     yield (smooth,)
-    if (period := _period(data, data.values, LONGEST)) is None:
+    if (period := data.period_s) is None:
         return
     for factor in (1.0, 2.0):
         yield (_rotation(spread, factor * period),)
@@ -591,20 +595,26 @@ def _fitted(data: Binned, terms: tuple[ProcessTerm, ...], log_excess: float) -> 
         value = 0.5 * ((x[0] - expected) / NOISE_PRIOR) ** 2 - level_fit(covariance, data.values).log_likelihood
         return value if np.isfinite(value) else 1e25
 
+    known: dict[bytes, tuple[float, Float]] = {}
+
     def slopes(x: Float) -> tuple[float, Float]:
         """Return the cost and its derivatives by forward differences, or backward ones at an upper bound.
 
         These are those of scipy, which takes as long for its checks as a cost takes.
         """
+        # Fits begin where others end.
+        if x.tobytes() in known:
+            return known[x.tobytes()]
         value, gradient = cost(x), np.empty(x.size)
         for k, at in enumerate(x.tolist()):
             there = np.array(x)
             there[k] = at + DIFFERENCE if at + DIFFERENCE <= high[k] else at - DIFFERENCE
             gradient[k] = (cost(there) - value) / (there[k] - at)
+        known[x.tobytes()] = value, gradient
         return value, gradient
 
     x, value = np.clip(start, low, high), np.inf
-    tolerance = CONVERGED / max(abs(cost(x)), 1.0)
+    tolerance = CONVERGED / max(abs(slopes(x)[0]), 1.0)
     # The estimate of the curvature may mislead a fit, which another one from its end on shows.
     for _ in range(STARTS):
         found = minimize(

@@ -124,6 +124,18 @@ def test_mixture_follows_simulation() -> None:
         assert abs(np.mean(x > cut) - p) < 4.5 * np.sqrt(p * (1 - p) / n) + 1e-5
 
 
+def test_mixture_of_parts_far_apart_is_the_sum_of_their_chances() -> None:
+    """In the middle of one part, far above another, and above both, where chances are below those of rounding."""
+    parts = tuple(QuadraticForm(np.linspace(0.9, 1.1, 300) * size, np.full(300, 0.1)) for size in (1.0, 1.3, 9.0))
+    shares = np.array([0.6, 0.3999, 1e-4])
+    found = Mixture(parts, shares)
+    for value in (200.0, 310.0, 420.0, 900.0, 2700.0, 4000.0, 6000.0):
+        chance = float(shares @ [part.sf(value) for part in parts])
+        assert found.sf(value) == pytest.approx(chance, rel=1e-5, abs=0)
+        if 1e-12 < chance < 1 - 1e-9:
+            assert found.sf(found.isf(chance)) == pytest.approx(chance, rel=1e-6)
+
+
 def whole(quiet: Expectation, flare: Expectation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the rows, factors of squares and variances of modes of the paper's sum over every pixel."""
     n = quiet.wavelength_nm.size

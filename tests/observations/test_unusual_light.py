@@ -327,7 +327,7 @@ def test_visits_over_years_take_little_memory() -> None:
     light += 0.05 * rng.standard_normal(time.size)
     tracemalloc.start()
     try:
-        answer = analyse(Study().paper(), frames=Frames.of(time, light, np.full(time.size, 0.05), exposure_s=frame_s))
+        answer = analysed(Frames.of(time, light, np.full(time.size, 0.05), exposure_s=frame_s))
         assert tracemalloc.get_traced_memory()[1] < 2**30
     finally:
         tracemalloc.stop()
