@@ -5,7 +5,7 @@ BIN := .venv/bin
 # Compiled files are kept whatever the shell says: the tests start Python some hundred times.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo check quick test test-long test-all lowest lint page docs dist try-wheel coverage mutants clean
+.PHONY: demo check quick test test-long lowest lint page docs dist try-wheel coverage mutants clean
 
 .venv/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "mauvecl needs Python 3.11 or newer, found " + sys.version.split()[0])'
@@ -25,17 +25,13 @@ demo: .venv/plot.stamp
 # as cores and more: threads of OpenBLAS would only wait for each other.
 PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder
 
-# What must hold of every change, in minutes.
+# What must hold of every change, in minutes; with TESTS=all those that take long as well, as .ci/run has it.
 test: .venv/test.stamp
-	$(PYTEST) -n 3 -m 'not long'
+	$(PYTEST) -n 3 $(if $(filter all,$(TESTS)),,-m "not long")
 
 # Coverage studies, attacks, executed documentation and whatever else takes long.
 test-long: .venv/test.stamp
 	$(PYTEST) -n 3 -m long
-
-# Both at once, which collects tests, makes fixtures and waits for the last process once.
-test-all: .venv/test.stamp
-	$(PYTEST) -n 3
 
 lint: .venv/test.stamp .venv/lint.stamp
 	$(BIN)/ruff check .
