@@ -213,6 +213,21 @@ class Nuisances(ContentEquality):
         """Mean change of the exposure by the priors' means, DN, shape (n_pixel,)."""
         return np.asarray(self.mean @ self.spectra)
 
+    def fitted_dn(self, counts: Float, variance: Float, flare_dn: Float) -> Float:
+        """Return the light of the unknowns, shape (n_pixel,), fitted together with a flare to counts less the star's.
+
+        Parameters
+        ----------
+        counts, variance, flare_dn : ndarray, shape (n_pixel,)
+            The variance is infinite for pixels that are left out.
+        """
+        spectra = np.vstack([self.spectra, flare_dn])
+        # The amplitude of the flare has a flat prior.
+        information = (spectra / variance) @ spectra.T + np.diag([*self.sd**-2.0, 0.0])
+        scale = np.sqrt(np.diag(information))
+        scaled, *_ = np.linalg.lstsq(information / np.outer(scale, scale), (spectra / variance) @ counts / scale)
+        return np.asarray((scaled / scale)[:-1] @ self.spectra)
+
     def finite(self, spectra: Float) -> Float:
         """Return the spectra with finite priors times their standard deviations, shape (k_finite, n)."""
         has_prior = np.isfinite(self.sd)

@@ -216,8 +216,13 @@ def excess(closed: ClosedForms, answers: Answers) -> ChartData:
         "noise": ([190.0, 710.0], [-1.96] * 2, [1.96] * 2),
         "saturated": strips(x.wavelength_nm, saturated),
     }
+    drawn = ""
     if "draw" in answers:
-        raw = np.where(x.saturated, 0.0, answers["draw"] - x.recorded_dn)
+        raw = np.where(saturated, 0.0, answers["draw"] - x.recorded_dn)
+        if unknown := closed.case.unknowns(x):
+            variance, flare_dn = np.where(saturated, np.inf, x.variance_dn2), closed.flare.recorded_dn - x.recorded_dn
+            raw = np.where(saturated, 0.0, raw - unknown.fitted_dn(raw, variance, flare_dn))
+            drawn = " The drawn exposure is shown less the levels of what is unknown, fitted to it."
         noise = np.sqrt(x.per_element(np.where(x.saturated, 0.0, x.variance_dn2)))
         shown = np.divide(x.per_element(raw), noise, out=np.full(noise.size, np.nan), where=noise > 0)
         series["drawn"] = x.element_wavelength_nm, shown
@@ -226,7 +231,7 @@ def excess(closed: ClosedForms, answers: Answers) -> ChartData:
         f"The flare stands out most at {x.element_wavelength_nm[best]:.0f} nm, by {element[best]:.3g} sigma of an "
         f"element's noise; {np.count_nonzero(element > 1.96)} of {element.size} elements rise above 95 % of the noise."
     )
-    return ChartData(text + (f" {lost} pixels saturate." if lost else ""), series)
+    return ChartData(text + drawn + (f" {lost} pixels saturate." if lost else ""), series)
 
 
 @Chart(

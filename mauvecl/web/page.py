@@ -127,8 +127,8 @@ def _with_chance(closed: ClosedForms, answers: Answers) -> dict[str, Any]:
         ("Best S/N per element", short(x.snr_per_element().max())),
     ]
     words = (
-        f"chance to detect {closed.words}, by the statistic {q.statistic} at a false-alarm probability of {q.fap:g} "
-        f"per test, with the payload {q.instrument}"
+        f"Chance to detect {closed.words}, by the statistic {q.statistic} at a false-alarm probability of {q.fap:g} "
+        f"per test, with the payload {q.instrument}."
     )
     return {
         "numbers": [chance.shown for chance in both],

@@ -31,9 +31,10 @@ def test_each_verb_has_one_name_and_one_signature(name: str) -> None:
     verb = getattr(mauvecl, name)
     assert verb.__name__ == name
     assert name in mauvecl.__all__
-    study, engine, progress, *own = inspect.signature(verb).parameters.values()
+    study, engine, progress, *own, keywords = inspect.signature(verb).parameters.values()
     assert [one.name for one in (study, engine, progress)] == ["study", "engine", "progress"]
-    assert (study.default, engine.default, progress.default) == (inspect.Parameter.empty, None, None)
+    assert (study.default, engine.default, progress.default) == (None, None, None)
+    assert keywords.kind is keywords.VAR_KEYWORD
     assert all(one.kind is one.KEYWORD_ONLY and one.default is not one.empty for one in own)
 
 

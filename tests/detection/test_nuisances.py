@@ -158,3 +158,16 @@ def test_weighted_sums_over_drawn_unknowns_have_the_moments_of_their_nodes(name:
         variance = weights**2 @ (flare.variance_dn2 + amount @ variances) + np.sum((rows @ weights) ** 2)
         wanted = float(weights @ (delta + amount @ means)), float(np.sqrt(variance))
         assert (one.mean, one.std) == pytest.approx(wanted, rel=1e-12)
+
+
+def test_light_of_unknowns_is_separated_from_a_flare() -> None:
+    """Of data without noise all amplitudes with flat priors are found; with noise, none is biased by the flare."""
+    rng = np.random.default_rng(8)
+    spectra, flare, variance = rng.uniform(1, 2, (2, 50)), rng.uniform(0, 5, 50), rng.uniform(4, 9, 50)
+    unknown = Nuisances(("dark", "light"), spectra, np.array([np.inf, np.inf]))
+    variance[:5] = np.inf
+    light = np.array([30.0, -7.0]) @ spectra
+    np.testing.assert_allclose(unknown.fitted_dn(light + 3.0 * flare, variance, flare), light, rtol=1e-9)
+    # A prior that excludes the level keeps it away.
+    known = Nuisances(("dark", "light"), spectra, np.array([1e-9, 1e-9]))
+    np.testing.assert_allclose(known.fitted_dn(light + 3.0 * flare, variance, flare), 0.0, atol=1e-9)

@@ -189,7 +189,7 @@ def test_visitor_changes_values_and_reads_the_answer(browser: Browser, server: S
     assert page.get_by_label("Detection statistic", exact=True).get_attribute("aria-invalid") == "true"
     assert "cannot be marginalised" in page.locator("#words-of").inner_text()
     enter(page, "Detection statistic", "matched")
-    assert "chance to detect" in shown(page)
+    assert "Chance to detect" in shown(page)
     enter(page, "Kind of answer", "ideal")
     enter(page, "Realisations", "1000000")
     enter(page, "False-alarm probability", "1e-6")
