@@ -129,7 +129,7 @@ def test_few_realisations_sample_the_tails(tmp_path: Path) -> None:
 
 
 def test_counted_tails_are_refused_for_few_realisations(tmp_path: Path) -> None:
-    for words in (("detect", "--tails", "counted"), ("map",)):
+    for words in (("detect", "--tails", "counted"), ("map", "--tails", "counted")):
         code, _, reported = ended(*words, "-s", "M3V", "-m", "9", "-n", "1000", folder=tmp_path)
         assert (code, "100000 realisations" in reported) == (2, True)
 
