@@ -5,14 +5,11 @@ from mauvecl.answers.calibrate import calibrate as calibrate
 from mauvecl.answers.change import change as change
 from mauvecl.answers.detect import detect as detect
 from mauvecl.answers.gaussian import gaussian as gaussian
-from mauvecl.answers.gaussian import gaussian_report as gaussian_report
 from mauvecl.answers.inject import inject as inject
 from mauvecl.answers.limit import limit as limit
-from mauvecl.answers.limit import limiting_magnitude as limiting_magnitude
 from mauvecl.answers.limit import shortest_exposure as shortest_exposure
 from mauvecl.answers.limit import smallest_amplitude as smallest_amplitude
 from mauvecl.answers.limit import what_matters as what_matters
-from mauvecl.answers.map import detection_map as detection_map
 from mauvecl.answers.map import map as map
 from mauvecl.answers.measure import measure as measure
 from mauvecl.answers.plan import plan as plan

@@ -27,7 +27,6 @@ FILE = Path(__file__).parent / "data" / "public_interface.txt"
 #: What is listed, with the least number of lines; fewer would mean that the listing lost sight of something.
 LEAST = {"command": 500, "study": 150, "instrument": 30, "mapping": 10, "column": 300, "python": 300}
 #: Older names of functions.
-OLDER = {"detection_map": "map", "gaussian_report": "gaussian", "limiting_magnitude": "limit"}
 #: Classes that functions make, or that files fill: their constructors are not public.
 MADE = {"Detection", "Expectation", "Frames", "Instrument", "Source", "Study"}
 
@@ -99,7 +98,6 @@ def python() -> Iterator[str]:
             yield from call(name, value)
         else:
             yield f"python {name}"
-    yield from (f"python {older}, now {now}" for older, now in OLDER.items() if {older, now} <= set(mauvecl.__all__))
 
 
 def public_interface() -> list[str]:

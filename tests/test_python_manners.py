@@ -25,13 +25,19 @@ from mauvecl import (
     Source,
     Study,
     detect,
-    detection_map,
     expect,
     exposure_for,
-    gaussian_report,
-    limiting_magnitude,
     simulate,
     snr,
+)
+from mauvecl import (
+    gaussian as gaussian_report,
+)
+from mauvecl import (
+    limit as limiting_magnitude,
+)
+from mauvecl import (
+    map as detection_map,
 )
 
 

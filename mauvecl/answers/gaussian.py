@@ -271,7 +271,3 @@ def gaussian(
         return report
 
     return GaussianAnswer(study, snr(study, engine, progress_of(0)), detect(study, engine, progress_of(1)))
-
-
-#: Former name.
-gaussian_report = gaussian

@@ -455,10 +455,6 @@ def limit(
     return result
 
 
-#: Former name.
-limiting_magnitude = limit
-
-
 @validated
 def smallest_amplitude(study: Study, engine: Engine | Pool | None = None) -> LimitAnswer:
     """Compute the smallest flare that is detected; see `limit`."""

@@ -425,7 +425,3 @@ def _fill(
             if result.fall(statistic, k):
                 lowered.append((statistic, i, j))
     return lowered
-
-
-#: The older name, which does not hide Python's own `map`.
-detection_map = map

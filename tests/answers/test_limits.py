@@ -15,12 +15,16 @@ from mauvecl import (
     LocalWorkers,
     Pool,
     Study,
-    detection_map,
     exposure_for,
-    limiting_magnitude,
     shortest_exposure,
     smallest_amplitude,
     what_matters,
+)
+from mauvecl import (
+    limit as limiting_magnitude,
+)
+from mauvecl import (
+    map as detection_map,
 )
 
 STATISTICS = ("chi2", "chi2_element", "matched", "uv_excess")

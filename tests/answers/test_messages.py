@@ -14,7 +14,8 @@ from commands import ended, run
 from marks import long_but
 
 import mauvecl
-from mauvecl import Engine, InputError, Stares, Study, detect, detection_map, limit, simulate
+from mauvecl import Engine, InputError, Stares, Study, detect, limit, simulate
+from mauvecl import map as detection_map
 
 G2V = {"star": [{"library": "G2V", "magnitude": 7.4}]}
 TABLES: dict[str, dict[str, Any]] = tomllib.loads(

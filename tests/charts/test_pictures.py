@@ -30,16 +30,22 @@ from mauvecl import (
     Study,
     analyse,
     detect,
-    detection_map,
     expect,
     exposure_for,
-    gaussian_report,
     inject,
-    limiting_magnitude,
     measure,
     simulate,
     snr,
     visible,
+)
+from mauvecl import (
+    gaussian as gaussian_report,
+)
+from mauvecl import (
+    limit as limiting_magnitude,
+)
+from mauvecl import (
+    map as detection_map,
 )
 
 #: Width of one column of a journal, inches.

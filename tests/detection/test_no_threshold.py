@@ -10,7 +10,8 @@ import pytest
 from answers import expectations, of_kind
 from scenes import instrument, star
 
-from mauvecl import Engine, Expectation, InputError, Study, detect, detection_map
+from mauvecl import Engine, Expectation, InputError, Study, detect
+from mauvecl import map as detection_map
 
 N = 20_000
 PAYLOAD = instrument(part=True, output_min_nm=300.0, output_max_nm=310.0)

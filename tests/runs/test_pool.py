@@ -38,9 +38,13 @@ from mauvecl import (
     Study,
     Uniform,
     detect,
-    detection_map,
-    limiting_magnitude,
     snr,
+)
+from mauvecl import (
+    limit as limiting_magnitude,
+)
+from mauvecl import (
+    map as detection_map,
 )
 from mauvecl.detection import requests
 from mauvecl.device.drivers import DeviceError

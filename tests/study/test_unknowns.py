@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from mauvecl import Engine, Instrument, Study, detect, detection_map, limit
+from mauvecl import Engine, Instrument, Study, detect, limit
+from mauvecl import map as detection_map
 
 ALL = ("temperature_c", "light_loss", "pointing_loss", "qe_scale", "conversion_uv_per_electron", "read_noise_dn")
 
