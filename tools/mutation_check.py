@@ -55,6 +55,21 @@ MUTATIONS: dict[str, Mutation] = {
         "test_paper_and_ideal_change_the_conventions_alone",
         ('update={"instrument": FORMERLY_MAUVE})', "update={})"),
     ),
+    "an ideal answer of Python with the unknowns": (
+        "test_keywords_ask_what_flags_ask[ideal]",
+        ('        values["with_unknowns"] = False', "        pass"),
+    ),
+    "pairs of values without their units": (
+        "test_studies_are_built_from_the_same_keywords",
+        (
+            '(number(part, name, unit) for part in text.split(":"))',
+            '(number(part, name, "s") for part in text.split(":"))',
+        ),
+    ),
+    "unknowns fitted with the wrong sign": (
+        "test_light_of_unknowns_is_separated_from_a_flare",
+        ("(scaled / scale)[:-1] @ self.spectra", "-(scaled / scale)[:-1] @ self.spectra"),
+    ),
     # Draws, statistics, stores and runs.
     "one unknown's row dropped": (
         "test_closed_forms_integrate_over_drawn_unknowns[half a degree]",
