@@ -338,7 +338,7 @@ def measure_event(
     level : ndarray, shape (n_frame,)
         Quiescent level of the flux, in units of the survey's scale.
     bright : ndarray, shape (n_frame,)
-        Light above the level, by which the brightest frame is chosen.
+        Light above the level, by which the brightest frame of a flare is chosen.
     found : Detection
     cause : str
         Follows from the spectrum of the event.
@@ -347,7 +347,8 @@ def measure_event(
     rows = slice(first, last + 1)
     energy = measure_energy(survey, taken, level, found)
     flux, numbers = (survey.flux[rows] - level[rows]) * survey.scale, survey.stare.numbers
-    brightest = first + int(np.argmax(bright[rows]))
+    # Weights for flares do not show what else brightens the star.
+    brightest = first + int(np.argmax(bright[rows] if cause == "flare" else flux))
     around = numbers[max(brightest - 1, 0) : brightest + 2]
     missing_s = (int(np.diff(around).max()) - 1) * survey.stare.frame_s
     ends = (first == 0, last == survey.stare.n_frames - 1)
