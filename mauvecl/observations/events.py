@@ -278,7 +278,7 @@ class ObservedEvent:
     # first, last: first and last frame of the event, inclusive.
     first: int
     last: int
-    brightest: int  # frame of the largest flux, or of the largest weighted sum of spectra
+    brightest: int  # frame of the largest flux; in spectra, next to the peak of the best template
     half_width_s: float  # half-width of the best template
     amplitude: float  # largest flux above the level, relative to the level
     missing: int  # number of frames missing inside the event
@@ -310,12 +310,8 @@ def measure_events(
     """
     steps = steps or Steps()
     level = survey.flux_level(~taken)
-    # In the sum over wavelength of spectra, dark current and losses of light may exceed a flare; the weights do not.
-    bright = survey.along(len(survey.bank.directions) // 2, ~taken) if survey.weighted else survey.flux - level
     kinds: Sequence[Kind] = causes or ["flare"] * len(found)
-    measured = map_in_threads(
-        lambda k: measure_event(survey, taken, level, bright, found[k], kinds[k]), range(len(found))
-    )
+    measured = map_in_threads(lambda k: measure_event(survey, taken, level, found[k], kinds[k]), range(len(found)))
     events = list(steps.each(measured, len(found)))
     for k, event in enumerate(events):
         ends = (event.first - 1, event.last + 1)
@@ -326,8 +322,18 @@ def measure_events(
     return events
 
 
+def _near_peak(survey: SeriesSurvey, found: Detection) -> Bool:
+    """Return which frames of an event may be its brightest, of its frames.
+
+    In the sum over wavelength of spectra a drift of the dark current may exceed a flare, but not within its half-width.
+    """
+    start_s, frame_s = survey.stare.start_s[found.first : found.last + 1], survey.stare.frame_s
+    near = np.abs(start_s + frame_s / 2 - found.peak_s) <= found.half_width_s + frame_s
+    return near if survey.weighted and near.any() else np.ones(near.size, np.bool_)
+
+
 def measure_event(
-    survey: SeriesSurvey, taken: Bool, level: Float, bright: Float, found: Detection, cause: Kind = "flare"
+    survey: SeriesSurvey, taken: Bool, level: Float, found: Detection, cause: Kind = "flare"
 ) -> ObservedEvent:
     """Measure a detected event.
 
@@ -337,8 +343,6 @@ def measure_event(
         Frames of all events.
     level : ndarray, shape (n_frame,)
         Quiescent level of the flux, in units of the survey's scale.
-    bright : ndarray, shape (n_frame,)
-        Light above the level, by which the brightest frame of a flare is chosen.
     found : Detection
     cause : str
         Follows from the spectrum of the event.
@@ -347,8 +351,7 @@ def measure_event(
     rows = slice(first, last + 1)
     energy = measure_energy(survey, taken, level, found)
     flux, numbers = (survey.flux[rows] - level[rows]) * survey.scale, survey.stare.numbers
-    # Weights for flares do not show what else brightens the star.
-    brightest = first + int(np.argmax(bright[rows] if cause == "flare" else flux))
+    brightest = first + int(np.argmax(np.where(_near_peak(survey, found), flux, -np.inf)))
     around = numbers[max(brightest - 1, 0) : brightest + 2]
     missing_s = (int(np.diff(around).max()) - 1) * survey.stare.frame_s
     ends = (first == 0, last == survey.stare.n_frames - 1)

@@ -141,6 +141,9 @@ class Unit:
         schema = core_schema.no_info_before_validator_function(self.plain, handler(source))
         return _or_error(schema, word_of(self.name), unit=self.name)
 
+    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> Any:
+        return _or_text(handler(schema))
+
     def plain(self, value: Any) -> Any:
         """Convert Quantities and texts with a unit, also in a list, to plain numbers; return other values unchanged."""
         if type(value) in (float, int):
@@ -189,7 +192,7 @@ class Range:
             "exclusiveMinimum" if self.open_low else "minimum": self.low,
             "exclusiveMaximum" if self.open_high else "maximum": self.high,
         }
-        return handler(schema) | {name: end for name, end in ends.items() if math.isfinite(end)}
+        return _or_text(handler(schema)) | {name: end for name, end in ends.items() if math.isfinite(end)}
 
     def words(self, unit: str = "", *, whole: bool = False) -> str:
         """Describe the accepted values, for error messages."""
@@ -303,6 +306,15 @@ class OrNone:
 
     def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> Any:
         return {"anyOf": [handler(schema), {"const": "none"}]}
+
+
+def _or_text(schema: dict[str, Any]) -> dict[str, Any]:
+    """Return a JSON schema whose numbers, also in arrays and alternatives, may be text with a unit or in per cent."""
+    if schema.get("type") == "number":
+        return schema | {"type": ["number", "string"]}
+    items = {"items": _or_text(schema["items"])} if isinstance(schema.get("items"), dict) else {}
+    several = {"anyOf": [_or_text(each) for each in schema["anyOf"]]} if "anyOf" in schema else {}
+    return schema | items | several
 
 
 def _or_error(schema: CoreSchema, words: str, **metadata: str) -> CoreSchema:

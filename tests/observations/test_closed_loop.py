@@ -76,9 +76,7 @@ def test_intervals_of_the_fitted_equivalent_duration_cover(threshold: float) -> 
         level = survey.flux_level(~taken)
         for truth, at in zip(amplitude * width * SHAPE.equivalent_duration, peak, strict=True):
             near = (one for one in found if abs(one.peak_s - at) < 2000)
-            energy = events.measure_event(
-                survey, taken, level, survey.flux - level, max(near, key=lambda one: one.value)
-            ).energy
+            energy = events.measure_event(survey, taken, level, max(near, key=lambda one: one.value)).energy
             inside += [low <= truth <= high for low, high in zip(energy.low_s, energy.high_s, strict=True)]
             end = (energy.high_s if truth > energy.fitted_s else energy.low_s)[1]
             pulls.append(stats.norm.isf(0.025) * (truth - energy.fitted_s) / (end - energy.fitted_s))

@@ -176,7 +176,7 @@ def test_work_of_an_event_does_not_grow_with_the_light_curve(model: Process, mon
         one = event_of(survey)
         taken = np.zeros(n, np.bool_)
         taken[one.first : one.last + 1] = True
-        measured.append(events.measure_event(survey, taken, np.full(n, LEVEL / SD), survey.flux, one).energy)
+        measured.append(events.measure_event(survey, taken, np.full(n, LEVEL / SD), one).energy)
         work.append(sizes.taken())
     assert work[0]
     assert work[0] == work[1]
