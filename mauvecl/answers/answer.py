@@ -255,7 +255,7 @@ class Answer(Drawable, ContentEquality, ABC):
         return "\n".join(part for part in (*parts, *self.messages, *self.remarks) if part)
 
     def _repr_html_(self) -> str:
-        return f"<p>{escape(self.headline)}</p>{next(iter(self.tables.values()))._repr_html_()}"
+        return f"<p>{escape(self.headline)}</p>{''.join(view._repr_html_() for view in self.all_views)}"
 
     def as_json(self) -> dict[str, Any]:
         """Return the content that `--json` prints."""

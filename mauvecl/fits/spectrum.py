@@ -68,6 +68,12 @@ NEIGHBOURS = 4
 NEAR_GROUP = 1.1
 
 
+def _values(measured: Measurement | Forecast, values: Float, errors: Float) -> str:
+    """Return quantities with errors and units as text."""
+    each = zip(measured.names, values, errors, measured.units, strict=True)
+    return ", ".join(f"{name} = {value:.4g} +- {error:.2g} {unit}".rstrip() for name, value, error, unit in each)
+
+
 @dataclass(frozen=True, eq=False)
 class Measurement:
     """Fitted flares of n frames; quantities are those of the model, in its order."""
@@ -104,10 +110,8 @@ class Measurement:
     def __repr__(self) -> str:
         if not len(self.estimates):
             return "<Measurement of no frames>"
-        first = zip(self.names, self.estimates[0], self.errors[0], self.units, strict=True)
-        values = ", ".join(f"{name} = {value:.4g} +- {error:.2g} {unit}".rstrip() for name, value, error, unit in first)
         others = f"; the first of {len(self.estimates)} frames" if len(self.estimates) > 1 else ""
-        return f"<Measurement: {values}{others}>"
+        return f"<Measurement: {_values(self, self.estimates[0], self.errors[0])}{others}>"
 
     @property
     def errors(self) -> Float:
@@ -429,6 +433,9 @@ class Forecast:
     covariance: Float
     #: S/N of the flare.
     snr: float
+
+    def __repr__(self) -> str:
+        return f"<Forecast: {_values(self, self.values, self.errors)}>"
 
     @property
     def correlation(self) -> Float:

@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from html import escape
 from importlib import import_module
 from itertools import islice
 from operator import attrgetter, itemgetter
@@ -78,6 +79,15 @@ class View:
     def details(self) -> set[str]:
         """Names of printed columns that narrow tables leave out."""
         return {column.name for column in self.columns if column.detail and column.heading}
+
+    def _repr_html_(self) -> str:
+        title = f"<p>{escape(self.title)}</p>"
+        if self.table is None:
+            return title
+        headings, cells = without_empty(*self.texts(self.details))
+        rows = ["".join(f"<td>{escape(cell)}</td>" for cell in row) for row in cells]
+        head = "".join(f"<th>{escape(heading)}</th>" for heading in headings)
+        return f"{title}<table><tr>{head}</tr>{''.join(f'<tr>{row}</tr>' for row in rows)}</table>"
 
     def __str__(self) -> str:
         if self.table is None:

@@ -143,6 +143,9 @@ def test_printed_answers_hold_the_sentence_and_the_table(engine: Engine) -> None
     assert f"{answer.table['probability'][0]:.4f}" in row
     assert others[others.index("Assumed:") + 1] == "  instrument mauve, detector at 21 deg C"
     assert list(answer.messages) == others[-len(answer.messages) :]
+    html = answer._repr_html_()
+    assert html.startswith("<p>Mauve would see a flare of 5 % on M4V V = 11")
+    assert f"<td>{answer.table['probability'][0]:.4f}</td>" in html
     # A table of one detection shows its probability where astropy prints the first and last columns.
     assert "probability" in str(answer.stars[0].detection.table(fap=0.1)).splitlines()[0]
 
@@ -153,6 +156,8 @@ def test_engine_and_measurement_have_short_reprs(quiet: Expectation, engine: Eng
     star = Source.from_library("AU Mic").at_magnitude(8.81)
     model = FlareModel.of(star, Instrument.load("mauve"), quiet)
     measured = fit(engine.realise(expect(star.flaring(1.0), exposure=50), count=3), quiet, model)
+    ahead = mauvecl.forecast(quiet, model, 10_000, [1.0])
+    assert repr(ahead).startswith(f"<Forecast: {ahead.names[0]} = {ahead.values[0]:.4g} +- {ahead.errors[0]:.2g} K, ")
     text = repr(measured)
     assert text.startswith(f"<Measurement: {measured.names[0]} = ")
     assert text.endswith("; the first of 3 frames>")
