@@ -38,7 +38,7 @@ from mauvecl.fits.profile import (
     with_bounds,
 )
 from mauvecl.schema.calls import validated
-from mauvecl.schema.columns import Column, table_of
+from mauvecl.schema.columns import Column, formatted, table_of
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import Probability, Temperature, Wavelength
 
@@ -71,7 +71,10 @@ NEAR_GROUP = 1.1
 def _values(measured: Measurement | Forecast, values: Float, errors: Float) -> str:
     """Return quantities with errors and units as text."""
     each = zip(measured.names, values, errors, measured.units, strict=True)
-    return ", ".join(f"{name} = {value:.4g} +- {error:.2g} {unit}".rstrip() for name, value, error, unit in each)
+    return ", ".join(
+        f"{name} = {formatted(value, '.4g')} +- {formatted(error, '.2g')} {unit}".rstrip()
+        for name, value, error, unit in each
+    )
 
 
 @dataclass(frozen=True, eq=False)
