@@ -221,6 +221,8 @@ class Nuisances(ContentEquality):
         counts, variance, flare_dn : ndarray, shape (n_pixel,)
             The variance is infinite for pixels that are left out.
         """
+        for key, values in (("counts", counts), ("variance", variance), ("flare_dn", flare_dn)):
+            self._check_pixels(key, values)
         spectra = np.vstack([self.spectra, flare_dn])
         # The amplitude of the flare has a flat prior.
         information = (spectra / variance) @ spectra.T + np.diag([*self.sd**-2.0, 0.0])
