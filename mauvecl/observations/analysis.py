@@ -164,6 +164,10 @@ CANDIDATES = 1.0
 MOST_IN_EVENTS, MOST_EVENTS, LONG = 0.5, 2, 100.0
 
 
+#: Range of the sum over wavelength of spectra, relative to its level, above which this is not the star's (assumed).
+DRIFTS = 1.0
+
+
 @dataclass(frozen=True, eq=False)
 class SpectralAnalysis:
     """Results that the analysis of spectra adds to that of a light curve."""
@@ -251,6 +255,16 @@ class Analysis:
         return event_colour(frames.flux, frames.error, inside, quiet)
 
     @property
+    def _drift(self) -> float:
+        """Range of nine tenths of the frames outside of flares, relative to the level."""
+        outside = np.ones(self.survey.stare.n_frames, np.bool_)
+        for one in self.events:
+            if one.kind == "flare":
+                outside[one.first : one.last + 1] = False
+        low, high = np.quantile(self.survey.flux[outside], [0.05, 0.95]) if outside.any() else (0.0, 0.0)
+        return float(high - low) / self.unit
+
+    @property
     def messages(self) -> list[str]:
         """Statements about the data that a reader must know, the most important first."""
         lines = list(self.frames.remarks)
@@ -295,6 +309,12 @@ class Analysis:
             lines.append(
                 "The quiescent light is not constant: its fitted level has a standard deviation of "
                 f"{100 * spread:.2g} %, by {self.level.process.describe(self.unit)}."
+            )
+        if self.spectra is not None and self._drift > DRIFTS:
+            lines.append(
+                "The sum over wavelength drifts by more than its level, as by the dark current of a detector whose "
+                "temperature changes: peaks and equivalent durations are relative to that level, and are not those of "
+                "the star; temperatures and energies are measured in the spectra."
             )
         if not self.likeness.alike:
             lines.append(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
@@ -58,18 +57,18 @@ class Keyword(NamedTuple):
 
 
 def keywords_of(fields: Iterable[tuple[str, FieldInfo, Flag]]) -> dict[str, Keyword]:
-    """Return the keywords of keys, fields and flags by name, without names of several keys."""
-    keywords = [Keyword.of(*entry) for entry in fields]
-    count = Counter(keyword.name for keyword in keywords)
-    return {keyword.name: keyword for keyword in keywords if count[keyword.name] == 1}
+    """Return the keywords of keys, fields and flags by name; of several keys with one name the last has it."""
+    return {flag.parameter: Keyword.of(path, field, flag) for path, field, flag in fields}
 
 
 def values_of(given: Mapping[str, Any], keywords: Mapping[str, Keyword], where: str) -> dict[str, Any]:
     """Return the value of each keyword, None where it is not given, and of ``paper``.
 
-    Raises InputError for a keyword of another name; ``ideal`` is another form of ``with_unknowns``.
+    Raises InputError for a keyword of another name; ``ideal`` is another form of ``with_unknowns``, and ``paper`` needs
+    an instrument.
     """
-    known = [*keywords, "paper", "ideal"]
+    others = {"paper": "instrument", "ideal": "with_unknowns"}
+    known = [*keywords, *(name for name, needed in others.items() if needed in keywords)]
     for name in given.keys() - known:
         close = get_close_matches(name, known, n=3) or known
         raise InputError(f"{where} has no keyword {name!r}", f"a flag of the command, such as {', '.join(close)}")

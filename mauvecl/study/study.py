@@ -6,8 +6,10 @@ import contextlib
 import hashlib
 import tomllib
 import warnings
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
+from itertools import chain
 from pathlib import Path
 from types import UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, Union, get_args, get_origin
@@ -308,7 +310,9 @@ class Study(Section):
         >>> Study.of(star="M4V", magnitude=11, amplitude=0.05, exposure=2 * u.min)
         <Study of M4V V = 11; flares of 5 %; 120 s on mauve>
         """
-        named, where = keywords_of(keys_of()), "Study.of()"
+        count, where = Counter(flag.parameter for *_, flag in keys_of()), "Study.of()"
+        # A name of several keys belongs to none of them.
+        named = keywords_of(entry for entry in keys_of() if count[entry[2].parameter] == 1)
         given = values_of(keywords, named, where)
         study = cls().paper() if given["paper"] else cls()
         changes = changes_of(given, named, study.nuisances)
@@ -488,10 +492,7 @@ def study_keys() -> Mapping[str, FieldInfo]:
 @cache
 def keys_of(wanted: tuple[str, ...] = ("",)) -> tuple[tuple[str, FieldInfo, Flag], ...]:
     """Return key, field and metadata of the flags of keys and whole sections in their order, by default of all."""
-    fields = [
-        (key, field)
-        for name in wanted
-        for key, field in study_keys().items()
-        if not name or key == name or key.startswith(f"{name}.")
-    ]
-    return tuple((key, field, flag) for key, field in fields for flag in found(field, Flag))
+    flags = [(key, field, flag) for key, field in study_keys().items() for flag in found(field, Flag)]
+    each = [[entry for entry in flags if f"{entry[0]}.".startswith(f"{name}." if name else "")] for name in wanted]
+    assert all(each), wanted
+    return tuple(chain.from_iterable(each))

@@ -37,6 +37,10 @@ ASKED: dict[str, tuple[str, dict[str, Any], str]] = {
     "paper": ("simulate", {"star": "G2V", "magnitude": 7, "paper": True}, "--star G2V -m 7 --paper"),
     "ideal": ("detect", {"star": "G2V", "magnitude": 7, "amplitude": 0.1, "ideal": True, "fap": 0.1,
                          "realisations": 2000}, "--star G2V -m 7 -a 0.1 --ideal --fap 0.1 -n 2000"),
+    "two sections with one flag": (
+        "measure", {"star": "M3V", "magnitude": 9, "amplitude": 0.5, "fits": 20, "ideal": True},
+        "--star M3V -m 9 -a 0.5 --fits 20 --ideal",
+    ),
     "all statistics": ("detect", {"star": "G2V", "magnitude": 7, "amplitude": 0.1, "all_statistics": True, "fap": 0.1,
                                   "realisations": 2000, "ideal": True},
                        "--star G2V -m 7 -a 0.1 --ideal --fap 0.1 -n 2000 --all-statistics"),
@@ -107,6 +111,7 @@ def test_maps_draw_more_instead() -> None:
 
 @pytest.mark.parametrize(("named", "keywords"), [
     ("'magnitud'", {"star": "G2V", "magnitud": 7}),
+    ("no keyword 'ideal'", {"star": "G2V", "magnitude": 7, "ideal": True}),
     ("needs a star", {"magnitude": 7}),
     ("2 magnitudes for one star", {"star": "G2V", "magnitude": [7, 8]}),
     ("'Nowhere'", {"star": "Nowhere"}),
