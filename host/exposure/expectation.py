@@ -481,28 +481,51 @@ def expect(
     if n_frames > MAX_FRAMES:
         raise InputError.of("exposure", exposure, f"at most {MAX_FRAMES} frames of {instrument.frame_s:g} s", unit="s")
     source = _usable(source, instrument)
-
-    def per_frame(light: Source) -> Float:
-        rate = electrons_per_second(instrument, light.wavelength_nm, light.flux_flam, order)
-        return rate * instrument.frame_s * instrument.per_pixel("response", 1.0)
-
     zodiacal = sky.spectrum(instrument.field_of_view_arcsec2)
+    near = None
     provenance = _provenance(source, instrument, sky, zodiacal) | {
         "order": order,
         "signal": signal,
         "requested exposure": f"{exposure:g} s",
         "exposure": f"{n_frames} x {instrument.frame_s:g} s",
     }
-    n_pixel = instrument.wavelength_nm.size
-    element, element_wavelength = _elements(instrument)
-    electrons = per_frame(source)
-    near = np.zeros(n_pixel)
     if neighbours is not None:
-        near = _faint_enough(instrument.frame_s * neighbours.electrons_per_second(instrument, order), "a neighbour")
-    plain = Expectation(
+        near = instrument.frame_s * neighbours.electrons_per_second(instrument, order)
+        provenance |= neighbours.provenance(instrument)
+    electrons = _electrons_per_frame(source, instrument, order)
+    sky_electrons = None if zodiacal is None else _electrons_per_frame(zodiacal, instrument, order)
+    plain = _expected(instrument, n_frames, electrons, sky_electrons, near, source.name, signal, provenance)
+    messages = [*_saturation(plain), *(f"{source.name}: {text}." for text in source.messages)]
+    if neighbours is not None:
+        messages += neighbours.messages(source.name, instrument)
+    drawn = np.sqrt(plain.variance_dn2) / (n_frames * plain.gain_dn_per_electron)
+    messages += negative_means_message(source, instrument, electrons, drawn, order)
+    return replace(plain, messages=(*messages, *_remarks(plain, exposure, source, instrument)))
+
+
+def _electrons_per_frame(light: Source, instrument: Instrument, order: Order) -> Float:
+    """Return the mean electrons of a frame, shape (n_pixel,); negative where the fluxes are."""
+    rate = electrons_per_second(instrument, light.wavelength_nm, light.flux_flam, order)
+    return rate * instrument.frame_s * instrument.per_pixel("response", 1.0)
+
+
+def _expected(
+    instrument: Instrument, n_frames: int, source: Float, sky: Float | None, near: Float | None,
+    name: str, signal: Signal, provenance: Mapping[str, str],
+) -> Expectation:  # fmt: skip
+    """Return the expectation of some frames.
+
+    Parameters
+    ----------
+    source, sky, near : ndarray, shape (n_pixel,)
+        Mean electrons of a frame from the source, the sky and neighbours; those below zero count as zero.
+    """
+    element, element_wavelength = _elements(instrument)
+    nothing = np.zeros(instrument.wavelength_nm.size)
+    return Expectation(
         wavelength_nm=instrument.wavelength_nm,
-        source_electrons=_faint_enough(np.maximum(electrons, 0.0), source.name),
-        sky_electrons=np.zeros(n_pixel) if zodiacal is None else np.maximum(per_frame(zodiacal), 0.0),
+        source_electrons=_faint_enough(np.maximum(source, 0.0), name),
+        sky_electrons=nothing if sky is None else np.maximum(sky, 0.0),
         dark_dn=instrument.per_pixel("dark", instrument.dark_dn_per_s * instrument.frame_s),
         dark_unit=instrument.dark_unit,
         bias_dn=instrument.per_pixel("bias_dn", instrument.bias_dn),
@@ -516,21 +539,15 @@ def expect(
         signal=signal,
         adc_max_dn=instrument.adc_max_dn,
         saturation_dn=instrument.saturation_dn,
-        neighbour_electrons=near,
+        neighbour_electrons=nothing if near is None else _faint_enough(near, "a neighbour"),
         conditions={
-            name: getattr(instrument, name)
-            for name in ("temperature_c", "dark_slope_per_c", "light_loss", "pointing_loss")
+            key: getattr(instrument, key)
+            for key in ("temperature_c", "dark_slope_per_c", "light_loss", "pointing_loss")
         },
-        name=source.name,
+        name=name,
         instrument=instrument.name,
-        provenance=provenance | ({} if neighbours is None else neighbours.provenance(instrument)),
+        provenance=provenance,
     )
-    messages = [*_saturation(plain), *(f"{source.name}: {text}." for text in source.messages)]
-    if neighbours is not None:
-        messages += neighbours.messages(source.name, instrument)
-    drawn = np.sqrt(plain.variance_dn2) / (n_frames * plain.gain_dn_per_electron)
-    messages += negative_means_message(source, instrument, electrons, drawn, order)
-    return replace(plain, messages=(*messages, *_remarks(plain, exposure, source, instrument)))
 
 
 def _provenance(source: Source, instrument: Instrument, sky: Sky, zodiacal: Source | None) -> dict[str, str]:

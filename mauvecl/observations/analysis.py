@@ -267,7 +267,17 @@ class Analysis:
     @property
     def messages(self) -> list[str]:
         """Statements about the data that a reader must know, the most important first."""
-        lines = list(self.frames.remarks)
+        return [
+            *self.frames.remarks,
+            *self._frame_messages(),
+            *([] if self.spectra is None else _spectral_messages(self.spectra)),
+            *self._level_messages(),
+            *self._verdict_messages(),
+        ]
+
+    def _frame_messages(self) -> list[str]:
+        """Return messages on what is searched and on the noise of frames."""
+        lines = []
         if self.crowded:
             lines.append(
                 f"Events take {100 * self.in_events:.2g} % of the searched frames, so that what the star does without "
@@ -290,7 +300,11 @@ class Analysis:
         if self.level.excess > 1.2:
             lines.append(f"The scatter of quiescent frames is {self.level.excess:.2f} times the stated errors; the "
                          "measured scatter is used.")  # fmt: skip
-        lines += [] if self.spectra is None else _spectral_messages(self.spectra)
+        return lines
+
+    def _level_messages(self) -> list[str]:
+        """Return messages on changes of the light that are no flares."""
+        lines = []
         if self.light_misleads:
             lines.append(
                 "The throughput changes, as by pointing losses; short changes may resemble flares: "
@@ -316,6 +330,11 @@ class Analysis:
                 "temperature changes: peaks and equivalent durations are relative to that level, and are not those of "
                 "the star; temperatures and energies are measured in the spectra."
             )
+        return lines
+
+    def _verdict_messages(self) -> list[str]:
+        """Return messages on why events have no verdict or another threshold than the wanted one."""
+        lines = []
         if not self.likeness.alike:
             lines.append(
                 f"Residuals of the quiescent light are correlated ({self.likeness.correlation:.2f} at a lag of "

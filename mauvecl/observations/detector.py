@@ -351,9 +351,9 @@ def fit_dark(dark: Sequence[CalibrationFrames], nominal: Instrument, noise: Nois
         Its variances are the weights.
     """
     raw = np.concatenate([one.raw_dn for one in dark])
+    n_pixel = raw.shape[1]
     temperature = np.concatenate([one.temperature_c for one in dark])
     exposure = np.concatenate([np.full(one.n_frames, one.exposure_s) for one in dark])
-    n_pixel = raw.shape[1]
     reference, spread = float(temperature.mean()), float(np.ptp(temperature))
     offset = temperature - reference
     fits_slope, by_pixel = spread >= SLOPE_RANGE_C, float(exposure.max() / exposure.min()) >= EXPOSURE_RATIO
@@ -372,24 +372,17 @@ def fit_dark(dark: Sequence[CalibrationFrames], nominal: Instrument, noise: Nois
 
     # With the slope known, each pixel is linear in its level and bias.
     seconds = exposure * np.exp(slope * offset)
-    weight = 1.0 / typical
     columns = np.column_stack([np.ones_like(seconds), seconds, seconds * offset])
-    own_bias = np.zeros_like(bias) if by_pixel else bias
-    used = np.array([0, 1] if by_pixel else [1])
-    hat, own = _solved(columns[:, used], weight, raw - own_bias)
-    level = own[-1]
-    bias = own[0] if by_pixel else bias
-    # Variances of the pixels differ from the typical ones of the weights.
+    values, used = (raw, [0, 1]) if by_pixel else (raw - bias, [1])
+    found, errors = _fit_pixels(columns[:, used], 1.0 / typical, values, noise)
+    level = found[-1]
+    bias = found[0] if by_pixel else bias
     covariance = np.zeros((n_pixel, 2, 2))
-    covariance[np.ix_(np.arange(n_pixel), used, used)] = noise.read_variance * hat @ hat.T + noise.dark_factor * level[
-        :, None, None
-    ] * ((hat * seconds) @ hat.T)
+    covariance[np.ix_(np.arange(n_pixel), used, used)] = errors
     pixel_slope, pixel_error = np.full((2, n_pixel), np.nan)
     if fits_slope:
-        hat, own = _solved(columns[:, [*used, 2]], weight, raw - own_bias)
-        pixel_slope = slope + own[-1] / level
-        variance = noise.read_variance * hat[-1] @ hat[-1] + noise.dark_factor * level * ((hat[-1] * seconds) @ hat[-1])
-        pixel_error = np.sqrt(variance) / np.abs(level)
+        found, errors = _fit_pixels(columns[:, [*used, 2]], 1.0 / typical, values, noise, (seconds, level))
+        pixel_slope, pixel_error = slope + found[-1] / level, np.sqrt(errors[:, -1, -1]) / np.abs(level)
     scatter = float(np.sum(((pixel_slope - slope) / pixel_error) ** 2))
     mean = seconds[:, None] * level
     chi2 = float(np.sum((raw - bias - mean) ** 2 / noise.variance(0.0, mean)))
@@ -450,8 +443,32 @@ def _mean_dark(
     return whole(found.x), covariance
 
 
-def _solved(columns: Float, weight: Float, values: Float) -> tuple[Float, Float]:
-    """Return the weights of a least-squares fit, shape (n_column, n_frame), and its solution for each pixel."""
+def _fit_pixels(
+    columns: Float, weight: Float, values: Float, noise: NoiseModel, dark: tuple[Float, Float] | None = None
+) -> tuple[Float, Float]:
+    """Fit a linear model to each pixel by weighted least squares.
+
+    Parameters
+    ----------
+    columns : ndarray, shape (n_frame, n_column)
+        Signals of units of the fitted values, of which the last is the level unless `dark` is given.
+    weight : ndarray, shape (n_frame,)
+        Of a typical pixel.
+    values : ndarray, shape (n_frame, n_pixel)
+    noise : NoiseModel
+        Variance of the pixels, which differs from the typical one of the weights.
+    dark : tuple of ndarray, optional
+        Exposure times, shape (n_frame,), and levels, shape (n_pixel,), of the dark current.
+
+    Returns
+    -------
+    ndarray, shape (n_column, n_pixel)
+    ndarray, shape (n_pixel, n_column, n_column)
+        Covariance.
+    """
     weighted = columns * weight[:, None]
     hat = np.linalg.solve(weighted.T @ columns, weighted.T)
-    return np.asarray(hat), np.asarray(hat @ values)
+    found = np.asarray(hat @ values)
+    seconds, level = (columns[:, -1], found[-1]) if dark is None else dark
+    photons = noise.dark_factor * level[:, None, None] * ((hat * seconds) @ hat.T)
+    return found, noise.read_variance * hat @ hat.T + photons
