@@ -10,6 +10,7 @@ from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf, name_of_instrument, reported, share_columns
 from mauvecl.answers.plan_targets import (
@@ -33,7 +34,7 @@ from mauvecl.runs.pool import map_in_order
 from mauvecl.schema.columns import Column, number, percent, records
 from mauvecl.schema.errors import InputError, Message, of_kind, printable
 from mauvecl.schema.physical import DAY_S
-from mauvecl.search.completeness import Yield, recovered_per_day
+from mauvecl.search.completeness import Completeness, Yield, recovered_per_day
 from mauvecl.study.cases import SATURATED, Case, collect_messages
 from mauvecl.study.study import Study
 
@@ -362,9 +363,8 @@ def plan(
     if progress is not None:
         progress(0, len(stars))
     seen = visible(study)
-    names, hours = seen.visibility.by_month()
+    months = seen.visibility.by_month()
     along = OrbitConditions.along(seen.visibility.track) if study.plan.along_orbit else None
-
     base = Case(study)
 
     def observations() -> Iterator[tuple[int, TargetObservation]]:
@@ -373,27 +373,48 @@ def plan(
 
     def planned_for(item: tuple[int, TargetObservation]) -> Planned:
         k, target = item
-        exposed = float(seen.visibility.hours[k])
-        observed = exposed if study.plan.hours is None else min(exposed, study.plan.hours)
-        order = np.argsort(-hours[:, k], kind="stable")[: study.plan.best_months]
-        best = tuple(names[i] for i in sorted(order) if hours[i, k] > 0)
         its = None
         if target.window_s > 0:
             its = completeness(target) if target.signal_per_frame > 0 else NOTHING
-        rates, why = rates_of(study.plan.targets[k], target)
-        recovered = None
-        if rates is not None:
-            days = observed * 3600 / DAY_S
-            recovered = Yield.of_expected(0.0, 0.0) if its is None else Yield.of(rates, its, days)
-        ideal = float("nan")
-        if rates is not None and study.nuisances.usual and its not in (None, NOTHING):
-            ideal = recovered_per_day(rates, closed_form(target, known=True)) * observed * 3600 / DAY_S
-        of_throughput = errors_of_throughput(target, rates)
-        return Planned(target, exposed, observed, its, rates, recovered, best, why, of_throughput, ideal)
+        best = _best_months(months, k, study.plan.best_months)
+        return _planned(study, k, target, its, float(seen.visibility.hours[k]), best)
 
     # With a pool, the noise of a target is drawn while the threshold of the next one is sampled.
     planned = tuple(reported(map_in_order(engine, planned_for, observations()), len(stars), progress))
     return PlanAnswer(study, seen, planned)
+
+
+def _best_months(months: tuple[list[str], NDArray[np.float64]], k: int, most: int) -> tuple[str, ...]:
+    """Return the months, in order, in which target number `k` is seen for the most hours."""
+    names, hours = months
+    order = np.argsort(-hours[:, k], kind="stable")[:most]
+    return tuple(names[i] for i in sorted(order) if hours[i, k] > 0)
+
+
+def _planned(
+    study: Study, k: int, target: TargetObservation, its: Completeness | None, exposed: float, best: tuple[str, ...]
+) -> Planned:
+    """Return the plan of target number `k`.
+
+    Parameters
+    ----------
+    its : Completeness or None
+        Recovered fraction of its flares; None if no frames follow each other.
+    exposed : float
+        Hours in which it is seen.
+    best : tuple of str
+        Months in which it is seen best.
+    """
+    observed = exposed if study.plan.hours is None else min(exposed, study.plan.hours)
+    days = observed * 3600 / DAY_S
+    rates, why = rates_of(study.plan.targets[k], target)
+    recovered, ideal = None, float("nan")
+    if rates is not None:
+        recovered = Yield.of_expected(0.0, 0.0) if its is None else Yield.of(rates, its, days)
+        if study.nuisances.usual and its not in (None, NOTHING):
+            ideal = recovered_per_day(rates, closed_form(target, known=True)) * days
+    return Planned(target, exposed, observed, its, rates, recovered, best, why, errors_of_throughput(target, rates),
+                   ideal)  # fmt: skip
 
 
 SUMMARY_TABLE = "plan.ecsv"

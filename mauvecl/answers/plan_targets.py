@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -162,9 +163,8 @@ class Planned:
     best_months: tuple[str, ...]
     no_rates: str = ""  # reason for unknown rates
     of_throughput: tuple[float, float] | None = None  # relative errors of E50 and yield by a calibrated throughput
-    ideal: float = float(
-        "nan"
-    )  # recovered flares by the closed form if everything but the noise is known; NaN if it is
+    # Recovered flares by the closed form if everything but the noise is known; NaN if it is.
+    ideal: float = math.nan
 
     @property
     def name(self) -> str:

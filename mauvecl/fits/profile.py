@@ -396,12 +396,7 @@ class _Thresholds:
         distances = np.concatenate([-distances, distances])
         out = np.repeat(distances, len(noise))
         draws = np.column_stack([np.ones(out.size), out, np.tile(noise, (distances.size, 1))])
-        # Temperatures around the end, evenly spaced nodes of the model.
-        last = profile.nodes.size - 1
-        step = (profile.nodes[-1] - profile.nodes[0]) / last
-        stride = np.clip(2 * REACH * error / step / (TRIED - 1), 1, last // (TRIED - 1)).astype(np.intp)
-        first = np.rint((x - profile.nodes[0]) / step).astype(np.intp) - stride * (TRIED // 2)
-        tried = np.clip(first, 0, last - stride * (TRIED - 1))[:, None] + stride[:, None] * np.arange(TRIED)
+        tried = _nodes_around(profile.nodes, x, error)
         root = np.empty((rows.size, out.size))
         for start in range(0, rows.size, ENDS_AT_ONCE):
             some = slice(start, start + ENDS_AT_ONCE)
@@ -410,18 +405,42 @@ class _Thresholds:
             away = own @ self._held[node].transpose(0, 2, 1)
             away[:, 0] -= value[some, None] * self._scale[node]
             root[some] = np.sqrt(_likelihood_ratio(light, draws @ away))
-        # Shares of fits with a smaller ratio, smoothed alike for the simulated fits and where the quantity is straight.
-        weights = np.exp(-(out**2) / 2)
-        level = weights @ scipy.special.ndtr((z - np.abs(out)) / SMOOTH)
-        end = np.full(rows.size, z)
-        for _ in range(NEWTON):
-            below = (end[:, None] - root) / SMOOTH
-            density = np.exp(-(below**2) / 2) @ weights / (SMOOTH * np.sqrt(2 * np.pi))
-            missing = level - scipy.special.ndtr(below) @ weights
-            # Without a ratio nearby the threshold moves by the longest step.
-            far = SMOOTH * np.sign(missing)
-            end += np.clip(np.divide(missing, density, out=far, where=density > 1e-9), -SMOOTH, SMOOTH)
-        return np.asarray(end**2)
+        return _as_probable(root, out, z) ** 2
+
+
+def _nodes_around(nodes: Float, x: Float, error: Float) -> NDArray[np.intp]:
+    """Return the numbers of evenly spaced nodes around log temperatures with some errors, shape (n, TRIED)."""
+    last = nodes.size - 1
+    step = (nodes[-1] - nodes[0]) / last
+    stride = np.clip(2 * REACH * error / step / (TRIED - 1), 1, last // (TRIED - 1)).astype(np.intp)
+    first = np.rint((x - nodes[0]) / step).astype(np.intp) - stride * (TRIED // 2)
+    return np.asarray(np.clip(first, 0, last - stride * (TRIED - 1))[:, None] + stride[:, None] * np.arange(TRIED))
+
+
+def _as_probable(root: Float, out: Float, z: float) -> Float:
+    """Return the values, (n,), below which roots of ratios are as probable as |distance| is below `z`.
+
+    Shares of fits with a smaller ratio are smoothed alike for the simulated fits and where the quantity is straight.
+
+    Parameters
+    ----------
+    root : ndarray, shape (n, n_fit)
+        Roots of the likelihood ratios of simulated fits.
+    out : ndarray, shape (n_fit,)
+        Their distances along the gradient of the quantity, in standard errors.
+    z : float
+    """
+    weights = np.exp(-(out**2) / 2)
+    level = weights @ scipy.special.ndtr((z - np.abs(out)) / SMOOTH)
+    end = np.full(len(root), z)
+    for _ in range(NEWTON):
+        below = (end[:, None] - root) / SMOOTH
+        density = np.exp(-(below**2) / 2) @ weights / (SMOOTH * np.sqrt(2 * np.pi))
+        missing = level - scipy.special.ndtr(below) @ weights
+        # Without a ratio nearby the value moves by the longest step.
+        far = SMOOTH * np.sign(missing)
+        end += np.clip(np.divide(missing, density, out=far, where=density > 1e-9), -SMOOTH, SMOOTH)
+    return end
 
 
 def _parabola(samples: Float, middle: NDArray[np.intp]) -> tuple[Float, Float, Float]:
