@@ -8,6 +8,7 @@ import re
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
@@ -378,17 +379,24 @@ def rows_of(hdu: Any, telescope: str, asked: bool) -> tuple[Any, tuple[str, ...]
     return flux, tuple(text_at(header, f"BANDID{k + 1}") for k in range(len(flux))), ()
 
 
+def _number_at(headers: Sequence[Any], *keys: str) -> float | None:
+    """Return the first number that headers have under one of some keys."""
+    for key in keys:
+        for one in headers:
+            value = one.get(key)
+            if isinstance(value, int | float) and not isinstance(value, bool):
+                return float(value)
+    return None
+
+
+#: Types of axes that are wavelengths, or frequencies and energies that become them, and beginnings of others.
+AXIS_TYPES = ("", "WAVE", "AWAV", "FREQ", "ENER", "LINEAR", "LAMBDA", "WAVELENGTH", "LOGLAM", "LOG", "LOG10")
+AXIS_BEGINNINGS = ("WAVELEN", "LAM", "ANGSTROM", "ALOG")
+
+
 def axis_of(header: Any, primary: Any, n: int) -> tuple[Any, str | None, str, tuple[str, ...]]:
     """Return the values of an image's first axis, their unit, their kind (WAVE, AWAV, ...) and notes."""
-
-    def number(*keys: str) -> float | None:
-        for key in keys:
-            for one in (header, primary):
-                value = one.get(key)
-                if isinstance(value, int | float) and not isinstance(value, bool):
-                    return float(value)
-        return None
-
+    number = partial(_number_at, (header, primary))
     first, slope = number("COEFF0"), number("COEFF1")
     if first is not None and slope is not None and 1.0 < first < 6.0:
         return 10.0 ** (first + slope * np.arange(n)), "Angstrom", "", ("wavelengths from COEFF0 and COEFF1",)
@@ -406,10 +414,8 @@ def axis_of(header: Any, primary: Any, n: int) -> tuple[Any, str | None, str, tu
     unit = unit_at(WAVE_UNITS, header, primary) or _iraf_unit(header) or None
     value = start + step * pixel
     name, _, algorithm = kind.partition("-")
-    if algorithm.strip("-") not in ("", "LOG", "LAMBDA", "LINEAR", "WAV") or (
-        name not in ("", "WAVE", "AWAV", "FREQ", "ENER", "LINEAR", "LAMBDA", "WAVELENGTH", "LOGLAM", "LOG", "LOG10")
-        and not name.startswith(("WAVELEN", "LAM", "ANGSTROM", "ALOG"))
-    ):
+    is_known = name in AXIS_TYPES or name.startswith(AXIS_BEGINNINGS)
+    if algorithm.strip("-") not in ("", "LOG", "LAMBDA", "LINEAR", "WAV") or not is_known:
         raise InputError.of("CTYPE1", kind, "linear or logarithmic wavelengths")
     flag = number("DC-FLAG")
     if unit is not None and re.match(r"\s*log|\s*dex", unit, re.IGNORECASE):

@@ -354,18 +354,19 @@ def _derived(
     light.append(("bolometric", every))
     for where, flux in light:
         derived.append(Derived(f"flux {where}", "erg / (cm2 s)", f"flux at the telescope, {where}", summed(flux)))
-    if distance_pc is not None:
-        far = distance_pc * PARSEC_CM
-        area = single(0, np.pi * far**2 * scale)
-        derived.append(Derived("area", "cm2", "projected area of the blackbody", area))
-        if radius_rsun is not None:
-            share = area / (np.pi * (radius_rsun * SUN_CM) ** 2)
-            derived.append(Derived("filling factor", "", "share of the star's disc that the blackbody covers", share))
-        for where, flux in light:
-            total = summed(flux) * 4 * np.pi * far**2
-            derived.append(Derived(f"luminosity {where}", "erg / s", f"luminosity, {where}", total))
-            energy = total * exposure_s
-            derived.append(Derived(f"energy {where}", "erg", f"energy within the exposure, {where}", energy))
+    if distance_pc is None:
+        return tuple(derived)
+    far = distance_pc * PARSEC_CM
+    area = single(0, np.pi * far**2 * scale)
+    derived.append(Derived("area", "cm2", "projected area of the blackbody", area))
+    if radius_rsun is not None:
+        share = area / (np.pi * (radius_rsun * SUN_CM) ** 2)
+        derived.append(Derived("filling factor", "", "share of the star's disc that the blackbody covers", share))
+    for where, flux in light:
+        total = summed(flux) * 4 * np.pi * far**2
+        derived.append(Derived(f"luminosity {where}", "erg / s", f"luminosity, {where}", total))
+        energy = total * exposure_s
+        derived.append(Derived(f"energy {where}", "erg", f"energy within the exposure, {where}", energy))
     return tuple(derived)
 
 

@@ -378,7 +378,7 @@ def fit_dark(dark: Sequence[CalibrationFrames], nominal: Instrument, noise: Nois
     level = found[-1]
     bias = found[0] if by_pixel else bias
     covariance = np.zeros((n_pixel, 2, 2))
-    covariance[np.ix_(np.arange(n_pixel), used, used)] = errors
+    covariance[:, -len(used) :, -len(used) :] = errors
     pixel_slope, pixel_error = np.full((2, n_pixel), np.nan)
     if fits_slope:
         found, errors = _fit_pixels(columns[:, [*used, 2]], 1.0 / typical, values, noise, (seconds, level))

@@ -531,31 +531,12 @@ def _frames_in(
         exposure_s = converted(found.exposure, mapping.exposure_unit, "s", "exposure_unit").numbers().reshape(n)
     elif (one_s := mapping.exposure_s or _brite_exposure_s(file)) is not None:
         exposure_s = np.full(n, one_s)
-    unit, flux, error, more = _light(found, mapping)
-    remarks += (*more, *(f"{what}: {text}" for text in file.remarks))
-    wavelength = None if found.wavelength is None else _vacuum_nm(found.wavelength, mapping.wavelength_unit, file)
-    if len(flux.shape) == 2 and flux.shape[1] == 1 and wavelength is None:
-        flux, error = _single(flux), None if error is None else _single(error)
     bits = QualityBits.of(file.header, mapping.quality_bits, what)
-    light, sd, flags, more = read(flux, error, _masked(found.quality, bits))
-    remarks += more
-    light, said = _without_marks(without_indefinite(light))
-    sd = None if sd is None else without_indefinite(sd)
-    remarks += tuple(f"{what}: {text}" for text in said)
-    unused = [name for name in file.columns if FLAGS & {*words_of(name)}]
-    if found.quality is None and unused:
-        remarks += (f"{what}: no flags are used; a mapping with quality names one of {', '.join(unused)}",)
-    if len(light.shape) == 1:
-        light, sd, unit, said = _of_level(light, sd, unit)
-        remarks += tuple(f"{what}: {text}" for text in said)
-    if sd is not None and not np.isfinite(sd).any():
-        # lightkurve writes a column of NaN for errors that it does not know.
-        sd = None
-        remarks += (f"{what} has a column of errors without a number: it is left out",)
-    if found.quality is not None and len(found.quality.shape) == 1:
-        flags = decimal_flags(found.quality.numbers())
+    wavelength = None if found.wavelength is None else _vacuum_nm(found.wavelength, mapping.wavelength_unit, file)
+    light, sd, flags, unit, more = _read_light(file, found, mapping, bits, read)
     if len(light.shape) == 1:
         wavelength = None
+    remarks += more
     kept = np.isfinite(time)
     remarks += _left_out(what, kept)
     temperature = _temperature_c(file, found, mapping, n)
@@ -583,6 +564,35 @@ def _frames_in(
     if made.quality is not None:
         remarks += bits.remarks(made.quality, made.name)
     return made.with_remarks(remarks)
+
+
+def _read_light(
+    file: TableFile, found: Quantities, mapping: FrameMapping, bits: QualityBits, read: Callable[..., Light]
+) -> tuple[Float, Float | None, Float | None, str, tuple[str, ...]]:
+    """Return light, errors, flags, the unit of the light, and remarks; `read` returns the first three."""
+    what = file.what
+    unit, flux, error, remarks = _light(found, mapping)
+    remarks += tuple(f"{what}: {text}" for text in file.remarks)
+    if len(flux.shape) == 2 and flux.shape[1] == 1 and found.wavelength is None:
+        flux, error = _single(flux), None if error is None else _single(error)
+    light, sd, flags, more = read(flux, error, _masked(found.quality, bits))
+    remarks += more
+    light, said = _without_marks(without_indefinite(light))
+    sd = None if sd is None else without_indefinite(sd)
+    remarks += tuple(f"{what}: {text}" for text in said)
+    unused = [name for name in file.columns if FLAGS & {*words_of(name)}]
+    if found.quality is None and unused:
+        remarks += (f"{what}: no flags are used; a mapping with quality names one of {', '.join(unused)}",)
+    if len(light.shape) == 1:
+        light, sd, unit, said = _of_level(light, sd, unit)
+        remarks += tuple(f"{what}: {text}" for text in said)
+    if sd is not None and not np.isfinite(sd).any():
+        # lightkurve writes a column of NaN for errors that it does not know.
+        sd = None
+        remarks += (f"{what} has a column of errors without a number: it is left out",)
+    if found.quality is not None and len(found.quality.shape) == 1:
+        flags = decimal_flags(found.quality.numbers())
+    return light, sd, flags, unit, remarks
 
 
 def _check_one_source(file: TableFile) -> None:
@@ -627,14 +637,7 @@ def _times(
         unit = u.Unit(said.unit)
         offset = stated.offset_in(unit, file.what)
         scale, position = scale or said.scale or stated.default_scale, position or said.position
-        if epoch is None:
-            both = said.epoch_mjd is not None and stated.epoch_mjd is not None
-            if both and abs((said.epoch_mjd or 0.0) - (stated.epoch_mjd or 0.0)) > 1e-5:
-                raise InputError(
-                    f"{file.what}: {time[0].name!r} counts from MJD {said.epoch_mjd:g} by its unit or name and from "
-                    f"{stated.epoch_mjd:g} by its header", "one epoch, or a mapping with epoch", key="epoch",
-                )  # fmt: skip
-            epoch = said.epoch_mjd if stated.epoch_mjd is None else stated.epoch_mjd
+        epoch = _epoch_mjd(said, stated, time[0].name, file.what) if epoch is None else epoch
     is_cheops = str(file.header.get("EXTNAME", "")).upper().startswith(CHEOPS)
     if is_cheops and position == "BARYCENTER" and not mapping.scale:
         scale = "tt"
@@ -650,6 +653,19 @@ def _times(
         epoch = None
     dates = replace(stated, epoch_mjd=None if epoch is None else epoch + first_d, scale=scale, position=position, at=at)
     return (seconds if epoch is not None else seconds + first_d * DAY_S), exposure, dates, tuple(remarks)
+
+
+def _epoch_mjd(said: TimeUnit, stated: TimeSystem, name: str, what: str) -> float | None:
+    """Return the MJD from which times count, as their unit or name says or else the header; these must agree."""
+    if said.epoch_mjd is None or stated.epoch_mjd is None:
+        return said.epoch_mjd if stated.epoch_mjd is None else stated.epoch_mjd
+    if abs(said.epoch_mjd - stated.epoch_mjd) > 1e-5:
+        fault = (
+            f"{what}: {name!r} counts from MJD {said.epoch_mjd:g} by its unit or name and from {stated.epoch_mjd:g} by "
+            "its header"
+        )
+        raise InputError(fault, "one epoch, or a mapping with epoch", key="epoch")
+    return stated.epoch_mjd
 
 
 def _time_unit(

@@ -296,10 +296,7 @@ def survey_light_curve(
     used = reasons == 0
     steps_of_level = np.ones(flux.size)
     if counts is None and np.ptp(frames.time_s) > LONG_S:
-        relative = relative_level(frames.time_s[used], frames.numbers[used], flux[used], frames.cadence_s)
-        steps_of_level = relative[
-            np.clip(np.searchsorted(np.flatnonzero(used), np.arange(flux.size)), 0, used.sum() - 1)
-        ]
+        steps_of_level = _steps_of_level(frames, flux, used)
         flux, error = flux / steps_of_level, None if error is None else error / steps_of_level
     # A frame of no count at the least has the Poisson noise of one.
     least = 0.0 if counts is None else float(np.sqrt(max(np.median(flux[used]) * counts, 1.0))) / counts
@@ -338,6 +335,13 @@ def survey_light_curve(
     draws = steps.part(0.9, 1.0)
     light = quiescent_light(frames, flux, error, survey, used, used & ~guessed, reasons, seed, draws)
     return survey, light.times(steps_of_level), frames
+
+
+def _steps_of_level(frames: Frames, flux: Float, used: Bool) -> Float:
+    """Return the relative level after each sudden change, for all frames; those not used have that of the next used."""
+    relative = relative_level(frames.time_s[used], frames.numbers[used], flux[used], frames.cadence_s)
+    places = np.searchsorted(np.flatnonzero(used), np.arange(flux.size))
+    return relative[np.clip(places, 0, used.sum() - 1)]
 
 
 def searched_among(survey: SeriesSurvey, frames: Frames) -> NDArray[np.intp]:

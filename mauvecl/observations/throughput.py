@@ -392,8 +392,8 @@ def fit_throughput(
         trial = _iterated(model, ONE_STAR_ERROR)
         error = trial.linear.error_of(trial.linear.prior == ONE_STAR_ERROR, trial.smoothing)
         best = _iterated(model, error)
-    pixels = best.pixels(model)
-    if (np.abs(best.found[n : n + m]) > LIMITS[:m]).any():
+    pixels, shape = best.pixels(model), best.found[n : n + m]
+    if (np.abs(shape) > LIMITS[:m]).any():
         raise InputError(
             "the spectra of the stars do not match a wavelength scale and line width near the nominal ones",
             f"shifts up to {LIMITS[0]:g} nm and widths within {100 * LIMITS[2]:g} %",
@@ -410,19 +410,23 @@ def fit_throughput(
         curve += error**2 * _linear_basis(nm) @ _linear_basis(nm).T
     # Counts determine the product of gain and throughput.
     curve += transfer.relative_gain_error**2
-    log_factor, shape = model.basis @ best.found[:n] + pixels.log_factor, best.found[n : n + m]
-    errors = np.sqrt(np.diag(covariance))[n : n + m]
-    scale = [1.0, 1.0, nominal.gaussian_fwhm_nm, nominal.gaussian_fwhm_nm]
-    values = [Value(scale[k] * float(shape[k] + (k == 2)), scale[k] * float(errors[k])) for k in range(m)]
+    log_factor = model.basis @ best.found[:n] + pixels.log_factor
     light = model.light_dn(log_factor, shape)
     sd = np.sqrt(model.variance_dn2(light) + np.diagonal(model.dark_covariance, axis1=1, axis2=2).T)
     residual = np.where(model.usable, (model.observed_dn - light) / sd, np.nan)
     assumed = [*(() if m else ("wavelength zero point",)), *(() if m == 4 else ("line width",)),
                *(() if several else ("errors of the star's spectrum",))]  # fmt: skip
-    padded: list[Value | None] = [*values, *[None] * (4 - m)]
-    shift, stretch, width, change = padded
+    errors = np.sqrt(np.diag(covariance))[n : n + m]
+    shift, stretch, width, change = _shape_values(shape, errors, nominal.gaussian_fwhm_nm)
     return ThroughputFit(nm, log_factor, joint, shift, stretch, width, change, residual, pixels.chi2, pixels.dof,
                          best.smoothing, error, pixels.structure, tuple(assumed))  # fmt: skip
+
+
+def _shape_values(shape: Float, errors: Float, fwhm_nm: float) -> list[Value | None]:
+    """Return shift, stretch, width and change of the width of the wavelengths, None for those that are not fitted."""
+    scale = [1.0, 1.0, fwhm_nm, fwhm_nm]
+    values = [Value(scale[k] * float(shape[k] + (k == 2)), scale[k] * float(errors[k])) for k in range(shape.size)]
+    return [*values, *[None] * (4 - shape.size)]
 
 
 @dataclass(frozen=True, eq=False)
