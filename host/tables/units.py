@@ -102,6 +102,16 @@ def unit_of(text: str) -> u.UnitBase | u.function.FunctionUnitBase:
     return _linear_unit(name, text, expected)
 
 
+def _scale_and_name(name: str) -> tuple[float, str]:
+    """Return the factor before or after the name of a unit, and the name."""
+    if match := SCALE.match(name):
+        scale = float((match[3] or f"1e{match[1] or match[2]}").lower().replace("d", "e"))
+        return scale, re.sub(r"^\s*[*.x]?\s*", "", name[match.end() :])
+    if match := re.search(rf"\s*[(\[]?\s*[*x]\s*({SCALE.pattern})[)\]]?$", name):
+        return float(match[4] or f"1e{match[2] or match[3]}"), name[: match.start()]
+    return 1.0, name
+
+
 def _linear_unit(name: str, text: str, expected: str) -> u.UnitBase:
     import astropy.units as u
 
@@ -115,13 +125,7 @@ def _linear_unit(name: str, text: str, expected: str) -> u.UnitBase:
         fault = f"unit = {shortened(text.strip())}: its factor may be 1e{power} or {other}"
         usual = f"a unit such as '1e{-abs(power)} erg / (s cm2 Angstrom)': `flux_unit` names it"
         raise InputError(fault, usual, key="unit")
-    scale = 1.0
-    if match := SCALE.match(name):
-        scale = float((match[3] or f"1e{match[1] or match[2]}").lower().replace("d", "e"))
-        name = re.sub(r"^\s*[*.x]?\s*", "", name[match.end() :])
-    elif match := re.search(rf"\s*[(\[]?\s*[*x]\s*({SCALE.pattern})[)\]]?$", name):
-        scale = float(match[4] or f"1e{match[2] or match[3]}")
-        name = name[: match.start()]
+    scale, name = _scale_and_name(name)
     name = balanced(name.rstrip(". "))
     if name not in ("MJy", "MJY"):
         name = _DENSITIES.get(name.lower(), name)

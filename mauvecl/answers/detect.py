@@ -263,9 +263,7 @@ def detect(
     run = study.run
     check_fap(run.fap, run.realisations, run.tails)
     prepared = cases(study)
-    expectations = [x for case in prepared for x in case.expectations]
     campaigns = [text for case in prepared for text in _campaign(case)]
-
     engine = engine or Engine()
 
     def detected(case: Case) -> StarDetection:
@@ -286,12 +284,23 @@ def detect(
             # Meanwhile, the devices count the next star.
             paper = _paper(prepared)
         stars.append(star)
+    answer = DetectAnswer(study, stars, paper=paper)
     costs = [text for case, star in zip(prepared, stars, strict=True) for text in _template_costs(case, star)]
-    answer = DetectAnswer(study, stars)
-    blinding = [message.about(star.title) for star in stars for message in star.detection.messages]
-    blinding += [message.about(star.title) for star in stars for message in star.detection.without_threshold(run.fap)]
-    blinding += [message.about(star.title) for star in stars for message in star.detection.lowered]
-    messages: list[str] = [*blinding, *collect_messages(expectations, study.processes)]
+    last = [*_few_terms(stars), *marginal_lines(study.nuisances)]
+    # One sentence on unknowns: their effect on the chance, or on the S/N where they are taken into account.
+    last += chance_with_unknowns(prepared) or _cost_of_unknowns(prepared)
+    answer.messages = list(dict.fromkeys([*_messages(answer, prepared), *campaigns, *costs, *last]))
+    return answer
+
+
+def _messages(answer: DetectAnswer, prepared: Sequence[Case]) -> list[str]:
+    """Return messages on lost pixels, on thresholds, and of the expectations."""
+    run, detections = answer.study.run, [(star.title, star.detection) for star in answer.stars]
+    blinding = [message.about(title) for title, one in detections for message in one.messages]
+    blinding += [message.about(title) for title, one in detections for message in one.without_threshold(run.fap)]
+    blinding += [message.about(title) for title, one in detections for message in one.lowered]
+    expectations = [x for case in prepared for x in case.expectations]
+    messages: list[str] = [*blinding, *collect_messages(expectations, answer.study.processes)]
     errors = answer.table["fap_error"][np.isfinite(answer.table["fap_error"])]
     if not countable(run.fap, run.realisations) and errors.size:
         messages.append(
@@ -299,12 +308,7 @@ def detect(
             f"{100 * errors.max():.1f} % of it: {run.realisations} realisations leave fewer than "
             "100 beyond them."
         )
-    last = [*_few_terms(stars), *marginal_lines(study.nuisances)]
-    # One sentence on unknowns: their effect on the chance, or on the S/N where they are taken into account.
-    last += chance_with_unknowns(prepared) or _cost_of_unknowns(prepared)
-    answer.messages = list(dict.fromkeys([*messages, *campaigns, *costs, *last]))
-    answer.paper = paper
-    return answer
+    return messages
 
 
 def _cost_of_unknowns(prepared: Sequence[Case]) -> list[str]:

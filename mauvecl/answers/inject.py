@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any
@@ -423,14 +423,7 @@ def _completeness(case: Case, engine: Stares | Pool, report: Callable[[float], N
     widths = np.array(injections.half_widths_s)
     amplitudes = np.asarray(sizes.amplitude(values[None], widths[:, None]))
     refit = Refit(star.fit, amplitudes, case.study.flare.temperature_k, -(-asked.fitted // positions))
-
-    def at_one_peak(position: int) -> Arrays:
-        return _reduced(engine, injections.request(position, refit if refit.count else None))
-
-    parts: list[Arrays] = []
-    for part in map_in_order(engine, at_one_peak, range(positions)):
-        parts.append(part)
-        report(len(parts) / positions)
+    parts = list(_at_each_peak(injections, refit, positions, engine, report))
     critical = np.stack([part["critical"].T for part in parts], axis=1)
     # The comparison with drawn stares has most power where a few in ten have an alarm.
     checked, likely, error = tail.likely
@@ -457,6 +450,19 @@ def _completeness(case: Case, engine: Stares | Pool, report: Callable[[float], N
         FitAccuracy.of(parts) if refit.count else None,
         _ideal_share(case, star),
     )
+
+
+def _at_each_peak(
+    injections: Injections, refit: Refit, positions: int, engine: Stares | Pool, report: Callable[[float], None]
+) -> Iterator[Arrays]:
+    """Yield what injections at each peak time give; `report` receives the share that is done."""
+
+    def at_one_peak(position: int) -> Arrays:
+        return _reduced(engine, injections.request(position, refit if refit.count else None))
+
+    for done, part in enumerate(map_in_order(engine, at_one_peak, range(positions)), 1):
+        report(done / positions)
+        yield part
 
 
 def _ideal_share(case: Case, star: StarSurvey) -> float:

@@ -203,29 +203,34 @@ def map(
     quiet, star, names = cells.quiet[0], study.star[0], {x.quantity, y.quantity}
     if "magnitude" in names:
         star = star.model_copy(update={"magnitude": None})
-    messages = [
-        *_blinded(values),
-        *_without_threshold(study.run, values),
-        *(
-            Message(f"NO ANSWER in {number} of {len(cells.x) * len(cells.y)} cells: {why}.", "no answer")
-            for why, number in cells.failed.items()
-        ),
-        *_wrong_sign(case, cells.lowered, len(cells.x) * len(cells.y)),
-        *worst_first([*collect_messages(cells.quiet, study.processes), *cells.saturated]),
-        *marginal_lines(study.nuisances),
-        *_cost(case, cells.x, cells.y),
-    ]
     return MapAnswer(
         study=study,
         star="stars of the axis" if "star" in names else star_label(star, quiet),
         x=cells.x,
         y=cells.y,
         statistics=study.run.statistics,
-        messages=messages,
+        messages=_messages(case, cells, values),
         shares=parts,
         quiet=quiet,
         **values,
     )
+
+
+def _messages(case: Case, cells: Cells, values: Arrays) -> list[str]:
+    """Return messages on the cells of a map, the most important first."""
+    study, number_of_cells = case.study, len(cells.x) * len(cells.y)
+    return [
+        *_blinded(values),
+        *_without_threshold(study.run, values),
+        *(
+            Message(f"NO ANSWER in {number} of {number_of_cells} cells: {why}.", "no answer")
+            for why, number in cells.failed.items()
+        ),
+        *_wrong_sign(case, cells.lowered, number_of_cells),
+        *worst_first([*collect_messages(cells.quiet, study.processes), *cells.saturated]),
+        *marginal_lines(study.nuisances),
+        *_cost(case, cells.x, cells.y),
+    ]
 
 
 def magnitudes_of(case: Case) -> Axis:

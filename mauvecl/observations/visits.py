@@ -112,14 +112,7 @@ def recover_periods(
     base = float(np.ptp(time))
     if not base > 0:
         raise InputError.of("time_d", "visits at one time", "visits at different times")
-    low, high = 1 / (longest_d or max(periods_d)), 1 / (shortest_d or min(periods_d))
-    step = 1 / (OVERSAMPLING * base)
-    # Half a resolution beyond the ends, so that periods at the ends can be recovered.
-    count = int(np.ceil((high - low) / step)) + OVERSAMPLING + 1
-    if count > MAX_FREQUENCIES:
-        expected = f"at most {MAX_FREQUENCIES}: longer periods or a shorter campaign"
-        raise InputError.of("periods", f"{count} frequencies", expected)
-    frequency = max(low - 0.5 / base, step) + step * np.arange(count)
+    frequency = _frequencies(base, 1 / (longest_d or max(periods_d)), 1 / (shortest_d or min(periods_d)))
     generator = np.random.default_rng(seed)
 
     def peak(values: Float) -> tuple[float, float]:
@@ -141,6 +134,17 @@ def recover_periods(
             row.append(clopper_pearson(found, trials))
         recovered.append(row)
     return Recovery(time, threshold, np.asarray(periods_d), np.asarray(amplitudes), recovered)
+
+
+def _frequencies(base: float, low: float, high: float) -> Float:
+    """Return the frequencies of a periodogram of visits over a time base, from low to high ones, shape (n,)."""
+    step = 1 / (OVERSAMPLING * base)
+    # Half a resolution beyond the ends, so that periods at the ends can be recovered.
+    count = int(np.ceil((high - low) / step)) + OVERSAMPLING + 1
+    if count > MAX_FREQUENCIES:
+        expected = f"at most {MAX_FREQUENCIES}: longer periods or a shorter campaign"
+        raise InputError.of("periods", f"{count} frequencies", expected)
+    return np.asarray(max(low - 0.5 / base, step) + step * np.arange(count))
 
 
 #: Share of the information on a change that must be left by what is unknown; less is rounding.
