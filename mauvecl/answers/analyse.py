@@ -219,7 +219,14 @@ class EventRow:
         energy = self.event.energy
         if self.event.kind != "flare":
             return (float("nan"),) * 5
-        return (energy.fitted_s, energy.low_s[0], energy.high_s[0], energy.low_s[1], energy.high_s[1])
+        # The level at the peak is that of the sum over wavelength.
+        times = energy.level * self.analysis.level_ratio if self.analysis.dark_misleads else 1.0
+        (low, low_95), (high, high_95) = energy.low_s, energy.high_s
+        return times * energy.fitted_s, times * low, times * high, times * low_95, times * high_95
+
+    def in_white_light(self, value: float) -> float:
+        """Return a value that follows from the sum over wavelength; NaN if the dark current changes this."""
+        return float("nan") if self.analysis.dark_misleads else value
 
     @cached_property
     def colour(self) -> tuple[float, float, float]:
@@ -274,8 +281,8 @@ EVENTS = (
            kind=int),
     Column("dur", "duration_d", "d", "from the start of the first frame to the end of the last", "duration (min)",
            lambda days: formatted(1440 * days, ".3g")),
-    Column("ampl_rec", "event.amplitude", "", "largest flux above the level, relative to the level", "peak",
-           percent(".3g")),
+    Column("ampl_rec", lambda row: row.in_white_light(row.event.amplitude), "", "largest flux above the level, "
+           "relative to the level; nan: the dark current changes the level", "peak", percent(".3g")),
     Column("ed", lambda row: row.fitted_s[0], "s", "recommended equivalent duration, of the whole flare: the light "
            "that is observed, and the shape where it is not; proportional to the energy; nan: no flare", "ED (s)",
            number(".4g")),
@@ -284,10 +291,11 @@ EVENTS = (
     Column("ed_high", lambda row: row.fitted_s[2], "s", "upper end"),
     Column("ed_low_95", lambda row: row.fitted_s[3], "s", "lower end of its 95 % interval"),
     Column("ed_high_95", lambda row: row.fitted_s[4], "s", "upper end"),
-    Column("ed_rec", "event.energy.summed_s", "s", "equivalent duration in the frames of the event: sum of the flux "
-           "above the level, relative to the level at the peak", "ED in frames (s)", number(".4g"), detail=True),
-    Column("ed_rec_err", "event.energy.summed_error_s", "s", "its standard error, with that of the level", "error (s)",
-           number(".2g"), detail=True),
+    Column("ed_rec", lambda row: row.in_white_light(row.event.energy.summed_s), "s", "equivalent duration in the "
+           "frames of the event: sum of the flux above the level, relative to the level at the peak; nan: the dark "
+           "current changes the level", "ED in frames (s)", number(".4g"), detail=True),
+    Column("ed_rec_err", lambda row: row.in_white_light(row.event.energy.summed_error_s), "s", "its standard error, "
+           "with that of the level", "error (s)", number(".2g"), detail=True),
     Column("ed_rec_limit", "event.is_limit", "", "whether it is a lower limit, because a gap or an end cuts the flare",
            kind=bool),
     Column("ed_fit", lambda row: row.fitted_s[0], "s", "the same as ed, by its older name"),
@@ -382,15 +390,17 @@ THROUGHPUT = (
 #: Columns of the completeness, one row per half-width and equivalent duration.
 COMPLETENESS = (
     Column("half_width", lambda row: row.completeness.half_widths_s[:, None], "s", "t_1/2 of the injected flares"),
-    Column("equivalent_duration", "completeness.equivalent_durations_s", "s", "of the injected flares"),
+    Column("equivalent_duration", lambda row: row.level_ratio * row.completeness.equivalent_durations_s, "s",
+           "of the injected flares"),
     Column("injected", "completeness.injected", "", "number of injections"),
     Column("detected", "completeness.detected", "", "number that the search detects"),
 )  # fmt: skip
 #: Columns of the limits, one row per half-width.
 LIMITS = (
     Column("half_width", "completeness.half_widths_s", "s", "t_1/2 of the flares", "half-width (s)", number(".3g")),
-    Column("limit", lambda row: np.array([row.completeness.limit(k) for k in range(len(row.completeness.detected))]),
-           "s", "equivalent duration of flares that are detected with a probability of 90 %; nan: above the largest "
+    Column("limit", lambda row: row.level_ratio * np.array([row.completeness.limit(k) for k in
+                                                            range(len(row.completeness.detected))]), "s",
+           "equivalent duration of flares that are detected with a probability of 90 %; nan: above the largest "
            "injected", "ED detected at 90 % (s)", number(".4g", "not reached")),
 )  # fmt: skip
 #: Columns of the models of the quiescent light, one row per combination of terms.
@@ -428,6 +438,10 @@ def _has_spectra(answer: AnalyseAnswer) -> bool:
     return answer.analysis.spectra is not None
 
 
+def _has_level(answer: AnalyseAnswer) -> bool:
+    return bool(np.isfinite(answer.analysis.level_ratio))
+
+
 def _noise_of_pixels(answer: AnalyseAnswer) -> list[object]:
     spectra = answer.analysis.spectra
     return [] if spectra is None else [spectra.series.noise]
@@ -458,10 +472,10 @@ class AnalyseAnswer(Answer):
     #: One row per frame: flux, level, noise, and why it is not searched.
     frames = TableOf("frames", FRAMES, "analysis", about=_frames_of, study=False, cached=False)
     #: One row per half-width and size of injected flares.
-    completeness = TableOf("completeness", COMPLETENESS, "analysis", study=False,
+    completeness = TableOf("completeness", COMPLETENESS, "analysis", when=_has_level, study=False,
                            about=lambda answer: {"threshold": answer.analysis.threshold})  # fmt: skip
     #: One row per half-width: the smallest flare that the search detects with a probability of 90 %.
-    limits = TableOf("limits", LIMITS, "analysis", key="limits", study=False,
+    limits = TableOf("limits", LIMITS, "analysis", key="limits", when=_has_level, study=False,
                      title="Smallest flares that would have been detected, by injecting into these frames")  # fmt: skip
     #: One row per number of frames: scatter of their means.
     noise = TableOf("noise", NOISE, "analysis.scatter", key="noise", study=False,
@@ -650,6 +664,6 @@ def frame_model(study: Study, frames: Frames) -> FrameModel | str:
             distance_pc=star.distance_pc if named else None, radius_rsun=star.radius_rsun if named else None,
             order=study.observation.order,
         )  # fmt: skip
-        return FrameModel.of(frames, quiet, flare, flux_per_dn(quiet, case.instrument))
+        return FrameModel.of(frames, quiet, flare, flux_per_dn(quiet, case.instrument), named)
     except InputError as error:
         return f"Spectra are searched as their sum over wavelength: {error}."

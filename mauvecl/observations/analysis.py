@@ -15,7 +15,14 @@ from mauvecl.fits.spectrum import Measurement
 from mauvecl.flares.settings import RANK, Per, per_day
 from mauvecl.flares.shapes import shape_of
 from mauvecl.observations.detection import LONG_S, detect_events, most_events
-from mauvecl.observations.event_spectra import Colour, EventSpectrum, event_colour, event_spectrum, measure_flare
+from mauvecl.observations.event_spectra import (
+    CAUSES,
+    Colour,
+    EventSpectrum,
+    event_colour,
+    event_spectrum,
+    measure_flare,
+)
 from mauvecl.observations.events import ObservedEvent, measure_events
 from mauvecl.observations.false_alarms import CHANCE_DIP, SimulatedRate, innovations, largest_dip, simulated_rates
 from mauvecl.observations.frame_model import FrameModel
@@ -164,8 +171,9 @@ CANDIDATES = 1.0
 MOST_IN_EVENTS, MOST_EVENTS, LONG = 0.5, 2, 100.0
 
 
-#: Range of the sum over wavelength of spectra, relative to its level, above which this is not the star's (assumed).
-DRIFTS = 1.0
+#: Range of the dark current in the sum over wavelength of spectra, relative to the level, above which this is not the
+#: star's (assumed).
+DARK_SHARE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,14 +263,16 @@ class Analysis:
         return event_colour(frames.flux, frames.error, inside, quiet)
 
     @property
-    def _drift(self) -> float:
-        """Range of nine tenths of the frames outside of flares, relative to the level."""
-        outside = np.ones(self.survey.stare.n_frames, np.bool_)
-        for one in self.events:
-            if one.kind == "flare":
-                outside[one.first : one.last + 1] = False
-        low, high = np.quantile(self.survey.flux[outside], [0.05, 0.95]) if outside.any() else (0.0, 0.0)
-        return float(high - low) / self.unit
+    def dark_misleads(self) -> bool:
+        """True if the sum over wavelength changes with the dark current, so that its level is not the star's."""
+        return self.spectra is not None and self.spectra.series.dark_drift > DARK_SHARE
+
+    @property
+    def level_ratio(self) -> float:
+        """Level over the light of the star: 1, unless the dark current changes it; NaN if the star is not known."""
+        if self.spectra is None or not self.dark_misleads:
+            return 1.0
+        return 1.0 / self.spectra.series.star_level
 
     @property
     def messages(self) -> list[str]:
@@ -317,19 +327,21 @@ class Analysis:
                 f"The level changes {often} suddenly for a day or more, by {100 * largest:+.2g} % at the most: light "
                 "is relative to the level after each change, and the table of frames has that level."
             )
-        if self.level.process.terms:
+        if self.level.process.terms and not self.dark_misleads:
             # A light curve that shows few periods of a process has another standard deviation than the process.
             spread = self.level.level[self.level.used].std() / self.survey.level
             lines.append(
                 "The quiescent light is not constant: its fitted level has a standard deviation of "
                 f"{100 * spread:.2g} %, by {self.level.process.describe(self.unit)}."
             )
-        if self.spectra is not None and self._drift > DRIFTS:
+        if self.spectra is not None and self.dark_misleads:
+            series = self.spectra.series
             lines.append(
-                "The sum over wavelength drifts by more than its level, as by the dark current of a detector whose "
-                "temperature changes: peaks and equivalent durations are relative to that level, and are not those of "
-                "the star; temperatures and energies are measured in the spectra."
-            )
+                f"The dark current changes the sum over wavelength by {series.dark_drift:.2g} times its level, as in a "
+                "detector whose temperature changes: peaks are not stated, and equivalent durations "
+                + ("are relative to the light of the star by the shape of its spectrum." if series.model.star_is_known
+                   else "only where the star is named, whose spectrum distinguishes its light from the dark current.")
+            )  # fmt: skip
         return lines
 
     def _verdict_messages(self) -> list[str]:
@@ -459,7 +471,7 @@ def _spectral_messages(spectra: SpectralAnalysis) -> list[str]:
     for name, sd in spectra.series.jitters.items():
         if np.isfinite(sd):
             size = f"{sd:.2g} deg C" if name == "dark" else f"{100 * sd:.2g} %"
-            lines.append(f"The {name} of single frames changes: {size}, which the search marginalises over.")
+            lines.append(f"The {CAUSES[name]} of single frames changes: {size}, which the search marginalises over.")
         elif name == "light":
             left = f"{100 * spectra.series.kept:.2g} %"
             lines.append(
@@ -467,5 +479,5 @@ def _spectral_messages(spectra: SpectralAnalysis) -> list[str]:
                 f"{left} of their S/N; search.frame.light states its standard deviation instead (1e-6: steady)."
             )
         else:
-            lines.append(f"The search leaves out all changes of the {name} of single frames.")
+            lines.append(f"The search leaves out all changes of the {CAUSES[name]} of single frames.")
     return lines

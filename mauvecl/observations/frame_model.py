@@ -44,9 +44,12 @@ class FrameModel:
     # Shape (n_value,); values of the frames per DN of an exposure; for flux densities, those of a flat spectrum.
     per_dn: Float
     raw: bool  # true if the frames include bias and dark current
+    star_is_known: bool = False  # true if `quiet` is of the observed star, not of another in its place
 
     @classmethod
-    def of(cls, frames: Frames, quiet: Expectation, flare: FlareModel, flux_per_dn: Float) -> Self:
+    def of(
+        cls, frames: Frames, quiet: Expectation, flare: FlareModel, flux_per_dn: Float, star_is_known: bool = False
+    ) -> Self:
         """Match frames with the pixels or resolution elements of an instrument.
 
         Raises InputError if wavelengths differ from the instrument's, or the unit is neither counts nor a flux density.
@@ -82,11 +85,11 @@ class FrameModel:
         if flux is not None:
             # A flux density is that of a flat spectrum with as many DN in all pixels of the value.
             per_flux = np.divide(1.0, flux_per_dn, out=np.zeros_like(flux_per_dn), where=flux_per_dn > 0)
-            return cls(quiet, flare, bins, flux / (bins @ per_flux), False)
+            return cls(quiet, flare, bins, flux / (bins @ per_flux), False, star_is_known)
         ones = np.ones(len(bins))
         if unit not in {_plain(each) for each in COUNT_UNITS}:
-            return cls(quiet, flare, bins, ones / exposure, False)
-        raw = cls(quiet, flare, bins, ones, True)
+            return cls(quiet, flare, bins, ones / exposure, False, star_is_known)
+        raw = cls(quiet, flare, bins, ones, True, star_is_known)
         # Light is added to bias and dark current: where a pixel has far less than these, they were subtracted.
         included = np.nanmedian(frames.flux, axis=0) >= LEAST_OF_OFFSET * raw.offset
         return raw if included.all() else replace(raw, raw=False)
@@ -120,6 +123,12 @@ class FrameModel:
         spectra = {"light": light, "dark": self.bins @ spectrum_of("dark", self.quiet) * self.per_dn}
         sky = self.bins @ spectrum_of("sky", self.quiet) * self.per_dn
         return spectra | ({"sky": sky} if sky.any() else {})
+
+    @property
+    def star(self) -> Float:
+        """Expected light of the star in a frame, shape (n_value,)."""
+        dn = self.quiet.n_frames * self.quiet.source_electrons * self.quiet.gain_dn_per_electron
+        return np.asarray(self.bins @ dn * self.per_dn)
 
     def variance(self, light: Float) -> Float:
         """Return the instrument's variance of a frame with this light, shape (n_value,)."""

@@ -46,6 +46,12 @@ DEPARTS = 4.0
 ROUNDS, SETTLED_EVENTS = 3, 0.01
 #: Number of frames in means that show slow changes.
 SLOW_FRAMES = 12
+#: Range of nine tenths of the slow changes of the dark current above which the search leaves it out, because flares
+#: would be measured with a part of it: in standard errors of a frame, and relative to the range of means of frames that
+#: change independently (assumed).
+DARK_DRIFTS, BEYOND_JITTER = 5.0, 2.0
+#: Range of nine tenths of normal values, in standard deviations.
+NINE_TENTHS = float(scipy.stats.norm.ppf(0.95) - scipy.stats.norm.ppf(0.05))
 #: Frames of one block of computations, which bounds the memory.
 BLOCK = 1024
 
@@ -100,6 +106,23 @@ class SpectralSeries:
     jitters: Mapping[str, float]
     changes: list[LightChange]  # sudden changes of the light that all pixels share
     kept: float  # S/N of flares over that with a steady level of the frames
+    # Range of nine tenths of the slow changes of the dark current, relative to the light in the sum over wavelength; 0
+    # if they are small for the noise.
+    dark_drift: float
+
+    @property
+    def star_level(self) -> float:
+        """Light of the star in the sum over wavelength, relative to `light`, by the shape of its spectrum.
+
+        It excludes dark current and sky that the light includes; NaN if the star is not known.
+        """
+        if not self.model.star_is_known:
+            return float("nan")
+        star = self.model.star
+        others = [spectrum for name, spectrum in self.model.unknowns(self.light).items() if name != "light"]
+        columns = np.array([star, *others]).T / self.noise.used[:, None]
+        amplitude = np.linalg.lstsq(columns, self.light / self.noise.used, rcond=None)[0][0]
+        return float(amplitude * star.sum() / abs(self.light.sum()))
 
 
 def relative_error(differences: int) -> float:
@@ -309,7 +332,8 @@ def _weighted_sums(
     compared = np.flatnonzero(reasons == 0)
     others = np.vstack([flares, *(spectrum for name, spectrum in unknown.items() if name != "light")])
     changes = light_changes(excess, compared, frames.numbers, light, others, noise.used)
-    known = {"light": np.inf} | _dark_jitter(excess, pairs, noise.used, shared) | dict(jitters or {})
+    dark, drift = _dark_changes(excess, pairs, quiet, noise.used, shared)
+    known = {"light": np.inf} | dark | dict(jitters or {})
     names = tuple(name for name in known if name in unknown)
     nuisances = Nuisances(names, np.array([unknown[name] for name in names]).reshape(len(names), light.size),
                           np.array([known[name] for name in names]))  # fmt: skip
@@ -326,7 +350,8 @@ def _weighted_sums(
         templates, sums = templates.mixed(mixing), sums @ mixing.T
     turn = _slow_axes(sums, quiet)
     templates, sums = templates.mixed(turn), sums @ turn.T
-    return SpectralSeries(excess, light, noise, model, known, changes, kept), templates, sums
+    drift *= abs(float(unknown["dark"].sum() / light.sum()))
+    return SpectralSeries(excess, light, noise, model, known, changes, kept, drift), templates, sums
 
 
 def _slow_axes(sums: Float, quiet: Bool) -> Float:
@@ -342,17 +367,42 @@ def _slow_axes(sums: Float, quiet: Bool) -> Float:
     return np.asarray(np.linalg.eigh(np.cov(means.T).reshape(sums.shape[1], -1))[1].T[::-1])
 
 
-def _dark_jitter(excess: Float, pairs: NDArray[np.intp], sd: Float, shared: Float) -> dict[str, float]:
-    """Measure the scatter of the dark current from frame to frame beyond that of noise; empty if insignificant.
+def _dark_changes(
+    excess: Float, pairs: NDArray[np.intp], quiet: Bool, sd: Float, shared: Float
+) -> tuple[dict[str, float], float]:
+    """Measure changes of the dark current, which is fitted together with the light.
 
-    It is fitted together with the light, in the order of the rows of `shared`: light, dark.
+    Parameters
+    ----------
+    pairs : ndarray of int
+        Quiescent frames whose successor is quiescent.
+    quiet : ndarray of bool, shape (n_frame,)
+    sd : ndarray, shape (n_pixel,)
+    shared : ndarray, shape (2, n_pixel)
+        Spectra of light and dark current.
+
+    Returns
+    -------
+    dict of str to float
+        Standard deviation of the dark current from frame to frame beyond that of noise; infinite if it drifts, and none
+        if it does not change significantly.
+    float
+        Range of nine tenths of slow changes if it drifts, or else 0.
     """
     white = shared / sd
     covariance = np.linalg.inv(white @ white.T)
-    amplitude = excess @ (covariance[1] @ white / sd)
-    beyond = float(np.mean((amplitude[pairs + 1] - amplitude[pairs]) ** 2)) / 2 - covariance[1, 1]
-    significant = beyond > DEPARTS * 2 * relative_error(pairs.size) * covariance[1, 1]
-    return {"dark": float(np.sqrt(beyond))} if significant else {}
+    amplitude, error = excess @ (covariance[1] @ white / sd), float(np.sqrt(covariance[1, 1]))
+    variance = float(np.mean((amplitude[pairs + 1] - amplitude[pairs]) ** 2)) / 2
+    beyond = variance - error**2
+    significant = beyond > DEPARTS * 2 * relative_error(pairs.size) * error**2
+    jitter = {"dark": float(np.sqrt(beyond))} if significant else {}
+    n = int(quiet.sum()) // SLOW_FRAMES
+    if n < 2:
+        return jitter, 0.0
+    means = amplitude[quiet][: n * SLOW_FRAMES].reshape(n, SLOW_FRAMES).mean(axis=1)
+    drift = float(np.ptp(np.quantile(means, [0.05, 0.95])))
+    independent = NINE_TENTHS * float(np.sqrt(variance / SLOW_FRAMES))
+    return ({"dark": np.inf}, drift) if drift > max(DARK_DRIFTS * error, BEYOND_JITTER * independent) else (jitter, 0.0)
 
 
 def _whitening(sums: Float, pairs: NDArray[np.intp]) -> Float | None:

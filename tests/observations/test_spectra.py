@@ -417,13 +417,30 @@ def test_study_keeps_the_light_and_flares_like_its_changes_are_candidates() -> N
 
 @pytest.mark.long
 @pytest.mark.parametrize("seed", [1, 2])
-def test_flare_in_a_stare_with_a_drifting_detector_is_where_it_was_put(seed: int, tmp_path: Path) -> None:
-    """The dark current of unknown temperature exceeds the star in the sum over wavelength, and the flare as well."""
+def test_flare_in_a_stare_with_a_drifting_detector_has_its_time_and_duration(seed: int, tmp_path: Path) -> None:
+    """The dark current of unknown temperature exceeds the star in the sum over wavelength, and the flare as well.
+
+    Equivalent durations are relative to the light of a star that is named, and otherwise not stated. A right interval
+    fails with a probability of 5 % for each seed; the seeds are fixed.
+    """
     drawn = stare(star="AD Leo", amplitude=0.9, duration=3600, seed=seed)
     light = drawn.stares[0].light
     assert np.ptp(light.flux[:, 0]) > 2 * light.mean[:, 0].mean()
     drawn.write(tmp_path)
-    answer = analyse(frames=read_frames(tmp_path / "light-curve-1.fits"))
-    assert any("are not those of the star" in line for line in answer.messages)
-    (flare,) = answer.events[answer.events["kind"] == "flare"]
-    assert flare["tpeak"].to_value("s") == pytest.approx(drawn.events["peak_time"][0].to_value("s"), abs=10)
+    frames = read_frames(tmp_path / "light-curve-1.fits")
+    for star in ({"star": "AD Leo"}, {}):
+        answer = analyse(frames=frames, **star)
+        assert any("dark current changes the sum over wavelength" in line for line in answer.messages)
+        (flare,) = answer.events[answer.events["kind"] == "flare"]
+        assert flare["tpeak"].to_value("s") == pytest.approx(drawn.events["peak_time"][0].to_value("s"), abs=10)
+        assert np.isnan(flare["ampl_rec"])
+        if not star:
+            assert np.isnan(flare["ed"])
+            assert "limits" not in answer.tables
+            continue
+        model = frame_model(Study.of(**star), frames)
+        all_light = float(model.flares((1e4,)).sum() / model.star.sum())
+        truth_s = all_light * drawn.events["equivalent_duration"][0].to_value("s")
+        assert flare["ed_low_95"].to_value("s") < truth_s < flare["ed_high_95"].to_value("s")
+        assert flare["ed_high_95"] < 1.3 * flare["ed_low_95"]
+        assert {"limits", "completeness"} <= set(answer.tables)
