@@ -64,6 +64,11 @@ def star(
     return [expect(s, payload, exposure=exposure, sky=Sky.of_brightness(22.1), neighbours=neighbours) for s in sources]
 
 
+def paper(*settings: str) -> Study:
+    """Return a study of the paper's conventions with some settings."""
+    return Study().paper().with_settings(settings)
+
+
 @cache
 def source(library: str = "M3V", magnitude: float = 9.0) -> Source:
     return Source.from_library(library).at_magnitude(magnitude)

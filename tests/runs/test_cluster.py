@@ -23,9 +23,9 @@ import psutil
 import pytest
 from answers import N, same, same_snr, small
 from commands import run
-from scenes import flaring_stares, instrument, star
+from scenes import flaring_stares, instrument, paper, star
 
-from mauvecl import DaskWorkers, Engine, Expectation, Pool, Stares, Study, bulk, measure
+from mauvecl import DaskWorkers, Engine, Expectation, Pool, Stares, bulk, measure
 from mauvecl.device.drivers import DeviceError
 from mauvecl.runs.pool import Stopped, map_in_order
 
@@ -56,11 +56,7 @@ def test_two_processes_give_the_answers_of_one(
     )
     bulk.realise(small().with_settings(["run.realisations=500"]), tmp_path / "s.zarr", Pool(workers))
     assert bulk.verify(tmp_path / "s.zarr", engine, redraw=True) == []
-    study = (
-        Study()
-        .paper()
-        .with_settings(["star=[{library='M3V', magnitude=9}]", "flare.amplitudes=[0.5]", "measure.fits=40"])
-    )
+    study = paper("star=[{library='M3V', magnitude=9}]", "flare.amplitudes=[0.5]", "measure.fits=40")
     assert measure(study, Pool(workers)) == measure(study, engine)
 
 
