@@ -391,11 +391,11 @@ MUTATIONS: dict[str, Mutation] = {
         (" & (np.abs(sigmas[after]) < NEAR)", ""),
     ),
     "means that scatter like frames": (
-        "test_correlated_frames_are_red_and_gaps_are_not_bridged",
+        "test_tables_of_default_questions_are_unchanged[analyse-rotating]",
         ("scipy.stats.chi2.ppf(p, dof) / dof / size", "scipy.stats.chi2.ppf(p, dof) / dof"),
     ),
     "means over gaps": (
-        "test_correlated_frames_are_red_and_gaps_are_not_bridged",
+        "test_tables_of_default_questions_are_unchanged[analyse-rotating]",
         ("(place % size == 0) & (place + size <= length)", "place % size == 0"),
     ),
     "correlations over gaps": (

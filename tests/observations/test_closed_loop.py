@@ -16,7 +16,7 @@ from mauvecl import SHAPES, Frames
 from mauvecl.observations import events
 from mauvecl.observations.detection import detect_events
 from mauvecl.observations.false_alarms import simulated_rates
-from mauvecl.observations.level import binned_scatter, likeness, quiet_variance
+from mauvecl.observations.level import likeness, quiet_variance
 from mauvecl.observations.light_curve import survey_light_curve
 
 SHAPE = SHAPES["davenport2014"]
@@ -92,27 +92,6 @@ def test_noise_at_the_level_is_that_of_its_counts() -> None:
     variance, slope = quiet_variance(flux, np.sqrt(flux + 25), np.full(FRAMES, level), quiet)
     assert slope == pytest.approx(1.0, rel=1e-9)
     np.testing.assert_allclose(variance, level + 25, rtol=1e-9)
-
-
-@pytest.mark.long
-def test_independent_frames_are_called_red_as_often_as_stated() -> None:
-    """2.5 % of light curves at each number of frames; each range fails by chance once in ten thousand times."""
-    rng = np.random.default_rng(295)
-    numbers, count = np.arange(2000), 400
-    red = np.array([[one.red for one in binned_scatter(numbers, rng.normal(0, 1, 2000))] for _ in range(count)])
-    low, high = stats.binom.ppf([0.00005, 0.99995], count, 0.025)
-    assert red.shape == (count, 8)
-    assert ((red.sum(axis=0) >= low) & (red.sum(axis=0) <= high)).all()
-
-
-def test_correlated_frames_are_red_and_gaps_are_not_bridged() -> None:
-    rng = np.random.default_rng(296)
-    slow = np.convolve(rng.normal(0, 1, 20_000), np.ones(10) / np.sqrt(10), "same")
-    found = binned_scatter(np.arange(slow.size), slow)
-    assert all(one.red for one in found if one.frames >= 2)
-    # With a gap after every second frame there are no means of four.
-    pairs = np.arange(20_000) + np.arange(20_000) // 2 * 5
-    assert [one.frames for one in binned_scatter(pairs, slow)] == [1, 2]
 
 
 def test_correlations_do_not_bridge_gaps() -> None:
