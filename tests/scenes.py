@@ -1,7 +1,5 @@
 """Expectations for the engine's tests: real stars on the nominal payload, or on a part of its pixels."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 from typing import Any

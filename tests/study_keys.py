@@ -1,7 +1,5 @@
 """Keys of studies and instruments with what their annotations say, by their public fields alone."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any, get_args
 

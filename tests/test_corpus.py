@@ -3,8 +3,6 @@
 The entries are in data/corpus, whose README says what they may hold; those of stored files are beside the files.
 """
 
-from __future__ import annotations
-
 import re
 import warnings
 from collections.abc import Callable

@@ -4,8 +4,6 @@ A refactoring must not change an answer. Where a change is intended, `python tes
 named tables again, and the commit says why they differ.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re

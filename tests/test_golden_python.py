@@ -5,8 +5,6 @@ intended, `python tests/test_golden_python.py NAME ...` writes the named answers
 differ.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import sys

@@ -5,8 +5,6 @@ itself has to refuse them. Parameters and their types are derived from the annot
 annotation does not state, are listed.
 """
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Mapping, Sequence
 from functools import cache

@@ -1,7 +1,5 @@
 """Verbs asked by keywords in Python, which are the flags of the command line, and what their answers print."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from pathlib import Path

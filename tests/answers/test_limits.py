@@ -1,7 +1,5 @@
 """Limits, maps and exposures have the requested power or S/N, by theory and by simulation, and are monotone."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What `measure` states: simulated fits, detected flares, models that are too simple, and unknowns that are drawn."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """What answers say: saturation, priors beside the expectation, flares that lower a statistic, stars without light."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from pathlib import Path

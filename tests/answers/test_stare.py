@@ -1,7 +1,5 @@
 """One simulated stare: its light, its files, and refusals."""
 
-from __future__ import annotations
-
 import io
 import re
 import shutil

@@ -1,7 +1,5 @@
 """What unknowns cost in detections, limits and maps, and false alarms where they are drawn."""
 
-from __future__ import annotations
-
 import itertools
 import re
 import tomllib

@@ -1,7 +1,5 @@
 """Verbs: one name and signature in Python and on the command line, and one definition of a table's columns."""
 
-from __future__ import annotations
-
 import inspect
 import io
 import json

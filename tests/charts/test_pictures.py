@@ -1,7 +1,5 @@
 """Pictures through public functions: parts are told, texts are apart, files equal figures, backends are not loaded."""
 
-from __future__ import annotations
-
 import io
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Campaigns: bounds, independence, overlap, and false-alarm probabilities of single tests, as a detection says them."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

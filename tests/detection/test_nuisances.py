@@ -1,7 +1,5 @@
 """Statistics marginalised over what is unknown or drawn: METHODS section 7, and simulation by NumPy code alone."""
 
-from __future__ import annotations
-
 from functools import cache
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Marginalised statistics on the device, compared with closed forms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scenes import star

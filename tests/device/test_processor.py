@@ -1,7 +1,5 @@
 """Processor names that fit both the processor and the library that PoCL loads."""
 
-from __future__ import annotations
-
 import ctypes
 import importlib.util
 import shutil

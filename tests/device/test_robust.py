@@ -1,7 +1,5 @@
 """Missing devices and tools, little memory and invalid numbers: clear errors or unchanged results."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import shutil

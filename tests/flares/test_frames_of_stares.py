@@ -1,7 +1,5 @@
 """Frames and gaps of stares, curves over frames, unknowns, and stares along the orbit."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Work in threads yields results in order, few ahead of their use, and ends with its caller."""
 
-from __future__ import annotations
-
 import os
 import threading
 import time

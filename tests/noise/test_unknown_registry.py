@@ -1,7 +1,5 @@
 """Registry of unknowns, whose rows are keys, streams and defaults, and distributions of their factors."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Coverage of calibrated instruments: the throughput's band, and answers with a fitted instrument."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 from typing import Any

@@ -3,8 +3,6 @@
 Draws are NumPy's, so that the simulation shares no code with the engine.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path

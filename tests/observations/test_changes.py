@@ -1,7 +1,5 @@
 """Changes between visits against closed forms, drawn exposures, a direct integration and another periodogram."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

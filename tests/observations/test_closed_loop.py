@@ -1,7 +1,5 @@
 """Simulated light curves with a known truth: false alarms as promised, intervals that cover, limits that hold."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Families of shapes and the process of a light curve: their matrices, and work that does not grow with its length."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 from types import SimpleNamespace

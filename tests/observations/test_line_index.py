@@ -1,7 +1,5 @@
 """Spectra of frames: line indices, the colour of events, and flares of neighbours that look like one."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import astropy.units as u

@@ -1,7 +1,5 @@
 """Light curves of stars that rotate, of red noise, few counts and short windows: false alarms and energies."""
 
-from __future__ import annotations
-
 import re
 from functools import cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Times: FITS keywords, dates, and the Solar System's barycentre against an independent route."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Dask workers in separate processes give the same bits, whichever of them end."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """Shards of a request add up to the answer of the engine, in any order and whatever was interrupted."""
 
-from __future__ import annotations
-
 import hashlib
 import itertools
 import json

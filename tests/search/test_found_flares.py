@@ -1,7 +1,5 @@
 """Flares that the search of a drawn stare finds: each once, overlapping ones apart, with intervals that cover."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import cache
 from typing import Any

@@ -1,7 +1,5 @@
 """Keys of studies: their units and ranges wherever a value can be given, their paths, and older files."""
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path

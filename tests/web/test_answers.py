@@ -1,7 +1,5 @@
 """Fields and answers of the page, as its script asks for them: what is entered, the two chances, limits, pictures."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import re
