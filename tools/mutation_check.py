@@ -80,7 +80,7 @@ MUTATIONS: dict[str, Mutation] = {
         ('factors.medians["light"] * factors.medians["sky"] * share / light', "0.0 * share / light"),
     ),
     "unknowns marginalised without their prior": (
-        "test_subtracted_rows_give_the_inverse_covariance[chi2]",
+        "test_tables_of_default_questions_are_unchanged[detect-with-unknowns]",
         ("np.diag(self.sd**-2.0) + ", "np.diag(0.0 * self.sd**-2.0) + "),
     ),
     "sums of stares without their skewness": (
