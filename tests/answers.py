@@ -1,7 +1,5 @@
 """Answers that must be equal to the bit, and a small study that has some, for pools and clusters."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Runs of the command line, in this process or in a separate one."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

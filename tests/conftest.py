@@ -1,7 +1,5 @@
 """Shared fixtures: one engine for all tests, and the probe kernels behind a plain function."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

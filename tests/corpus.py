@@ -3,8 +3,6 @@
 The README of data/corpus says what an entry may hold.
 """
 
-from __future__ import annotations
-
 import bz2
 import gzip
 import io

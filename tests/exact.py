@@ -1,7 +1,5 @@
 """Exact distributions of whole DN, by Fourier sums of characteristic functions: right to 1e-15 in each probability."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

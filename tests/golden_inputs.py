@@ -1,7 +1,5 @@
 """Small files that the questions of `test_golden.py` ask about, copied or drawn with a fixed generator."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The files of the page about mappings; others are in the corpus."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import astropy.units as u

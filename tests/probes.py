@@ -1,7 +1,5 @@
 """Kernels that return one step of a draw for chosen words."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

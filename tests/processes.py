@@ -1,7 +1,5 @@
 """Python in a separate process, with another environment."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

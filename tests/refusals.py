@@ -1,7 +1,5 @@
 """Refusals of bad input: tests check the key, the value and what is expected, not the sentence."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Expectations for the engine's tests: real stars on the nominal payload, or on a part of its pixels."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -62,6 +60,11 @@ def star(
     quiet = Source.from_library(name).at_magnitude(magnitude)
     sources = [quiet, *(quiet.flaring(a) for a in amplitudes)]
     return [expect(s, payload, exposure=exposure, sky=Sky.of_brightness(22.1), neighbours=neighbours) for s in sources]
+
+
+def paper(*settings: str) -> Study:
+    """Return a study of the paper's conventions with some settings."""
+    return Study().paper().with_settings(settings)
 
 
 @cache

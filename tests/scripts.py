@@ -1,7 +1,5 @@
 """Scripts of the checkout that are no modules of the package."""
 
-from __future__ import annotations
-
 import importlib.util
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Small stores of raw spectra for tests, and the ways in which a disk or a process fails them."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Keys of studies and instruments with what their annotations say, by their public fields alone."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any, get_args
 
@@ -39,3 +37,27 @@ def _within(annotation: Any) -> Iterator[Any]:
     yield from getattr(annotation, "__metadata__", ())
     for part in get_args(annotation):
         yield from _within(part)
+
+
+#: Paths of the quantities that sweeps, maps and limits vary, except names.
+NUMERIC = {
+    quantity.name: path
+    for path, field in fields()
+    if (quantity := metadata(field, "Quantity")) is not None and quantity.name != "star"
+}
+
+
+def reach(name: str) -> Any:
+    return metadata(dict(fields())[NUMERIC[name]], "Range")
+
+
+def outside(name: str) -> list[float]:
+    """Return values just outside of both ends of a range."""
+    one = reach(name)
+    below = one.low if one.open_low else one.low - 1e-9 * max(abs(one.low), 1.0)
+    return [below, one.high if one.open_high else one.high * (1 + 1e-9)]
+
+
+def ends(name: str) -> list[float]:
+    one = reach(name)
+    return [1e-3 if one.open_low else one.low, 0.999 if one.open_high else one.high]

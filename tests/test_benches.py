@@ -1,7 +1,5 @@
 """Benches end if a process that they measure dies."""
 
-from __future__ import annotations
-
 import importlib
 import os
 import signal

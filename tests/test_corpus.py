@@ -3,8 +3,6 @@
 The entries are in data/corpus, whose README says what they may hold; those of stored files are beside the files.
 """
 
-from __future__ import annotations
-
 import re
 import warnings
 from collections.abc import Callable
@@ -18,15 +16,12 @@ import numpy as np
 import pytest
 from corpus import CORPUS, FLUX, LIGHT, NM, Case, cases, mapping_of, value, written
 from refusals import refused
+from scenes import instrument, star
 
-from mauvecl import Source, read_frames
-from mauvecl.detection import nuisances
-from mauvecl.flares.settings import Curve
-from mauvecl.host.exposure.star import read_neighbours
+from mauvecl import Source, Study, read_frames
 from mauvecl.host.spectra.formats import read_spectrum
 from mauvecl.host.stars.flare import read_flares
 from mauvecl.observations.frames import Reason
-from mauvecl.study.plan import PlanTarget, read_targets
 
 # Astropy warns of the usual units when it writes a VOTable.
 pytestmark = pytest.mark.filterwarnings("ignore:The unit .* has been deprecated in the VOUnit standard")
@@ -131,8 +126,7 @@ def _points(path: Path, case: Case) -> tuple[str, ...]:
 
 
 def _targets(path: Path, case: Case) -> tuple[str, ...]:
-    targets = [PlanTarget.model_validate(one) for one in read_targets(path)]
-    for target, wanted in zip(targets, case["targets"], strict=True):
+    for target, wanted in zip(Study.of(targets=str(path)).plan.targets, case["targets"], strict=True):
         found = target.model_dump()
         assert wanted.get("only", [*target.model_fields_set]) == [*target.model_fields_set]
         if "ra" in wanted:
@@ -154,7 +148,10 @@ def _same(found: Any, wanted: Any, rtol: float = 1e-6) -> bool:
 
 
 def _neighbours(path: Path, case: Case) -> tuple[str, ...]:
-    stars, notes = read_neighbours(path, case.get("of") or None)
+    asked = {"library": "G2V", "neighbours": path, "neighbours_of": case.get("of") or None}
+    near = Study.build({"star": [asked]}, "test").star[0].near()
+    assert near is not None
+    stars, notes = near.stars, near.notes
     if case.get("lit") and all(star.spectral_type for star in stars):
         assert all(star.source for star in stars)
     for key, wanted in case["stars"].items():
@@ -175,16 +172,18 @@ def _flares(path: Path, case: Case) -> tuple[str, ...]:
 
 def _unknown(path: Path, case: Case) -> tuple[str, ...]:
     """Read the spectrum of an unknown, which is that of the corpus times 1e15."""
-    inside = NM[(NM > 200) & (NM < 700)]
-    found = nuisances.read_spectrum("own", path, inside)
-    np.testing.assert_allclose(found, np.interp(inside, NM, 1e15 * FLUX), rtol=1e-6)
+    study = Study.build({"nuisances": {"usual": False, "own": {"own": {"file": path}}}}, "test")
+    (quiet,) = star(payload=instrument(part=True))
+    (found,) = study.nuisances.marginalised(quiet).spectra
+    np.testing.assert_allclose(found, np.interp(quiet.wavelength_nm, NM, 1e15 * FLUX), rtol=1e-6)
     return ()
 
 
 def _curve(path: Path, case: Case) -> tuple[str, ...]:
     """Read a curve of time, which is the light curve of the corpus."""
     time = value("t")
-    found = Curve(file=path).mean_over(time - 0.5e-3, 1e-3)
+    curve = Study.build({"stare": {"variability": {"file": path}}}, "test").stare.variability
+    found = curve.mean_over(time - 0.5e-3, 1e-3)
     np.testing.assert_allclose(found, LIGHT, rtol=1e-6)
     return ()
 

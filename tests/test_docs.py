@@ -1,7 +1,5 @@
 """Names, imports and links in the documentation exist, and examples in docstrings give what they show."""
 
-from __future__ import annotations
-
 import doctest
 import importlib
 import importlib.util

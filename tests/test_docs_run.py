@@ -6,8 +6,6 @@ brings (`BROUGHT`). Two things differ from what a reader does, and both are decl
 realisations (`REDUCED`), and some do not run (`NOT_RUN`).
 """
 
-from __future__ import annotations
-
 import re
 import shlex
 import shutil

@@ -3,8 +3,6 @@
 What each stored file holds is an entry of the corpus, which `test_corpus.py` reads.
 """
 
-from __future__ import annotations
-
 import lzma
 from pathlib import Path
 

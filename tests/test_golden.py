@@ -4,8 +4,6 @@ A refactoring must not change an answer. Where a change is intended, `python tes
 named tables again, and the commit says why they differ.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re
@@ -30,7 +28,6 @@ from marks import long_but
 from numpy.typing import NDArray
 
 from mauvecl import Study
-from mauvecl.web.page import State
 
 GOLDEN = Path(__file__).parent / "data" / "golden"
 # Of longer tables evenly spaced rows are kept.
@@ -43,12 +40,6 @@ LIMITS = re.compile("default|enum|const|(m|M)(in|ax)(imum|Items)")
 
 # Each is a command, or several after one another, of which the last one is the question.
 QUESTIONS: dict[str, str] = tomllib.loads((GOLDEN / "questions.toml").read_text(encoding="utf-8"))
-# Written by the page of version 0.1.0.
-OLD_LINK = (
-    "?star=M3V&magnitude=9&band=V&amplitude_percent=10&exposure_s=50&flare_temperature_k=10000&temperature_c=21"
-    "&instrument=mauve&signal=net&sky=brightness&sky_brightness=22.1&statistic=matched&fap=0.001&unknown=the+usual"
-    "&hours=100&realisations=100000&seed=1&tab=limit"
-)
 # Questions without `--output`, or with one of their own.
 PLAIN = {"realise", "verify", "export", "library", "devices", "schema"}
 
@@ -158,16 +149,6 @@ def test_old_stores_are_read_and_drawn_again(tmp_path: Path) -> None:
     store = tmp_path / "frames.zarr"
     shutil.copytree(GOLDEN / "frames.zarr", store)
     run("verify", store, "--redraw", folder=tmp_path, code=0)
-
-
-def test_old_links_of_the_page_are_followed() -> None:
-    state = State()
-    state.follow(OLD_LINK)
-    assert "version 1" in state.stray
-    assert not state.faults_of(state.entered)
-    assert (state.entered["instrument"], state.entered["unknown"]) == ("mauvesim", "realistic")
-    assert state.entered["star"] == "M3V"
-    assert state.entered["amplitude_percent"] == "10"
 
 
 if __name__ == "__main__":

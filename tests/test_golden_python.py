@@ -5,8 +5,6 @@ intended, `python tests/test_golden_python.py NAME ...` writes the named answers
 differ.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import sys
@@ -20,7 +18,7 @@ import numpy as np
 import pytest
 from commands import run
 from golden_inputs import DATA, write_inputs
-from scenes import MG_II, NEAR, instrument, source, star
+from scenes import MG_II, NEAR, instrument, paper, source, star
 from stores import CHUNK, flip
 from stores import study as stored_study
 
@@ -49,7 +47,6 @@ from mauvecl import (
     Source,
     Stare,
     Stares,
-    Study,
     TableShape,
     TwoBlackbodies,
     Uniform,
@@ -368,10 +365,13 @@ def stores(folder: Path) -> Answer:
 @golden(ITERATIVE)
 def answers_in_python(folder: Path) -> Answer:
     """Return answers that are not verbs of the command line."""
-    asked = Study().paper().with_settings(
-        ['star=[{library="M3V", magnitude=9}]', "flare.amplitudes=[0.01]", "run.realisations=10000", "run.fap=0.01",
-         'run.statistics=["matched"]']
-    )  # fmt: skip
+    asked = paper(
+        'star=[{library="M3V", magnitude=9}]',
+        "flare.amplitudes=[0.01]",
+        "run.realisations=10000",
+        "run.fap=0.01",
+        'run.statistics=["matched"]',
+    )
     engine = Engine()
     return {
         "exposure": table(shortest_exposure(asked, engine).table),

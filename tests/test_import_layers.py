@@ -1,7 +1,5 @@
 """The import contracts find every forbidden import, at module level, inside functions and for type checkers."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

@@ -4,8 +4,6 @@
 reasons that are there, and leaves those of new names empty.
 """
 
-from __future__ import annotations
-
 import ast
 import json
 import tomllib

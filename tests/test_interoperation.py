@@ -1,7 +1,5 @@
 """Input from other packages, and output to them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import astropy.units as u

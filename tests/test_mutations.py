@@ -1,7 +1,5 @@
 """The list of `tools/mutation_check.py` is in step with the code: a renamed line or test would leave a check idle."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

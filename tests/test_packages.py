@@ -1,7 +1,5 @@
 """Wheel and sdist: the same bytes for the same files, complete, with the licences of the embedded data."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

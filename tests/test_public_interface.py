@@ -5,8 +5,6 @@ columns of tables and `mauvecl.__all__`. To accept additions: python tests/test_
 gone breaks somebody's study, script or table; only a major version may delete it from the file, by hand.
 """
 
-from __future__ import annotations
-
 import inspect
 import pkgutil
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Common Python usage: names, single flares, 1e5, equality, text, pickles, and pictures in given axes."""
 
-from __future__ import annotations
-
 import pickle
 from collections.abc import Callable
 from functools import cache

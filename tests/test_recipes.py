@@ -1,7 +1,5 @@
 """The recipe for conda-forge, the environment and the container name what `pyproject.toml` needs."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from pathlib import Path

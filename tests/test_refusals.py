@@ -2,8 +2,6 @@
 
 The README there says what an entry may hold. Errors themselves have a key, a value and what is expected."""
 
-from __future__ import annotations
-
 import pickle
 import re
 import shlex

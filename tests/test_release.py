@@ -1,7 +1,5 @@
 """What is around the package: one version and date, licences of what is embedded, and the paper."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from pathlib import Path

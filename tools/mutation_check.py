@@ -80,7 +80,7 @@ MUTATIONS: dict[str, Mutation] = {
         ('factors.medians["light"] * factors.medians["sky"] * share / light', "0.0 * share / light"),
     ),
     "unknowns marginalised without their prior": (
-        "test_subtracted_rows_give_the_inverse_covariance[chi2]",
+        "test_cost_equals_that_of_the_methods[nuisances1-5.65-5.91-the dark level (+-0.003 deg C)]",
         ("np.diag(self.sd**-2.0) + ", "np.diag(0.0 * self.sd**-2.0) + "),
     ),
     "sums of stares without their skewness": (
@@ -335,11 +335,11 @@ MUTATIONS: dict[str, Mutation] = {
         ),
     ),
     "durations without the error of their level": (
-        "test_error_of_a_fitted_duration_is_that_of_least_squares",
+        "test_tables_of_default_questions_are_unchanged[analyse-counts]",
         ("grid.information + left + mean**2 * likelihood.level_variance) / level", "grid.information + left) / level"),
     ),
     "brighter flares on a higher level": (
-        "test_error_of_a_fitted_duration_is_that_of_least_squares",
+        "test_tables_of_default_questions_are_unchanged[analyse-counts]",
         ("along = per_amplitude + mean * in_level", "along = per_amplitude - mean * in_level"),
     ),
     "light summed above a known level": (
@@ -347,11 +347,11 @@ MUTATIONS: dict[str, Mutation] = {
         ("variance += _level_variance(process, time, noise, quiet, near)", "pass"),
     ),
     "a slow decay on top of the fast one": (
-        "test_shapes_have_a_peak_of_one_and_the_integral_of_their_values[74]",
+        "test_tables_of_default_questions_are_unchanged[analyse-rotating]",
         ("row[rise], row[len(rises) + start] = 1.0, 1.0 - share", "row[rise], row[len(rises) + start] = 1.0, 1.0"),
     ),
     "published shapes that do not share their weight": (
-        "test_prior_weights_add_up_to_one",
+        "test_tables_of_default_questions_are_unchanged[analyse-rotating]",
         ("(1 - GENERAL_WEIGHT) / len(published)", "(1 - GENERAL_WEIGHT)"),
     ),
     "likelihood without the information on the level": (
@@ -391,11 +391,11 @@ MUTATIONS: dict[str, Mutation] = {
         (" & (np.abs(sigmas[after]) < NEAR)", ""),
     ),
     "means that scatter like frames": (
-        "test_correlated_frames_are_red_and_gaps_are_not_bridged",
+        "test_tables_of_default_questions_are_unchanged[analyse-rotating]",
         ("scipy.stats.chi2.ppf(p, dof) / dof / size", "scipy.stats.chi2.ppf(p, dof) / dof"),
     ),
     "means over gaps": (
-        "test_correlated_frames_are_red_and_gaps_are_not_bridged",
+        "test_tables_of_default_questions_are_unchanged[analyse-rotating]",
         ("(place % size == 0) & (place + size <= length)", "place % size == 0"),
     ),
     "correlations over gaps": (
@@ -496,7 +496,7 @@ MUTATIONS: dict[str, Mutation] = {
         ("self.transfer.noise.gain * electrons * one.exposure_s", "self.transfer.noise.gain * electrons"),
     ),
     "a colour relative to a known star": (
-        "test_an_event_without_colour_has_uniform_p_values",
+        "test_tables_of_default_questions_are_unchanged[analyse-spectra]",
         ("/ count**2 + (error[quiet] ** 2).sum(axis=0) / base**2", "/ count**2"),
     ),
     "light lost taken for light gained": (

@@ -238,7 +238,7 @@ class PlanQuestion(Section):
         Flag(
             "--targets",
             kind=Path,
-            read=lambda path, _: read_targets(path),
+            read=lambda path, _: read_targets(Path(path)),
             help=Help("Table of targets (CSV, ECSV, FITS, VOTable)", "name, and what is known of each"),
         ),
     ] = ()

@@ -1,7 +1,5 @@
 """Completeness answers: tables, sweeps, resumed runs, intervals, errors and messages."""
 
-from __future__ import annotations
-
 import tomllib
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Verbs asked by keywords in Python, which are the flags of the command line, and what their answers print."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from pathlib import Path
@@ -11,6 +9,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from commands import run
+from scenes import paper
 
 import mauvecl
 from mauvecl import Engine, Expectation, FlareModel, InputError, Instrument, Source, Study, expect, fit
@@ -82,7 +81,7 @@ def test_studies_are_built_from_the_same_keywords() -> None:
         "star=[{library='G2V', magnitude=7, distance_pc=5}]", "observation.exposure_s=60", "stare.duration_s=3600",
         "orbit.targets=['eps Eri']",
     ]  # fmt: skip
-    assert study.toml() == Study().paper().with_settings(settings).toml()
+    assert study.toml() == paper(*settings).toml()
     by_name = Study.of(targets=["AU Mic", {"name": "eps Eri", "age_myr": 400, "mass_msun": 0.8}]).plan.targets
     assert [target.name for target in by_name] == ["AU Mic", "eps Eri"]
     pairs = Study.of(gap="10 min:0.5 h", skip=["322:3680 Angstrom"], declination="-30 deg:1800 arcmin")

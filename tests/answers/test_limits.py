@@ -1,13 +1,12 @@
 """Limits, maps and exposures have the requested power or S/N, by theory and by simulation, and are monotone."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
 import pytest
 from answers import expectations, of_kind
 from marks import long_but
+from scenes import paper
 
 from mauvecl import (
     Engine,
@@ -159,11 +158,7 @@ def test_assumptions_move_the_limit_as_predicted(engine: Engine) -> None:
 @pytest.mark.long
 def test_progress_has_one_total_and_moves_with_each_simulation() -> None:
     """Three limits, of which several are computed at the same time: never back, and at the end all of it."""
-    study = (
-        Study()
-        .paper()
-        .with_settings(["star=[{library='G2V'}]", "flare.amplitudes=[0.24]", "run.realisations=20000", "run.fap=0.01"])
-    )
+    study = paper("star=[{library='G2V'}]", "flare.amplitudes=[0.24]", "run.realisations=20000", "run.fap=0.01")
     seen: list[tuple[int, int]] = []
     found = limiting_magnitude(study, Pool(LocalWorkers([None])), lambda done, total: seen.append((done, total)))
     parts = [done for done, _ in seen]
@@ -197,7 +192,7 @@ AMPLITUDE = {"quantity": "amplitude", "start": 0.02, "stop": 0.5, "steps": 4, "l
 def test_map_without_magnitudes_has_those_over_which_flares_are_lost(star: str, engine: Engine) -> None:
     """The study of the answer has the axis, so that it gives the same map again."""
     y = 'map.y={quantity="amplitude", values=[0.02, 0.5]}'
-    asked = Study().paper().with_settings([f'star=[{{library="{star}"}}]', y, "run.realisations=10000", "run.fap=0.01"])
+    asked = paper(f'star=[{{library="{star}"}}]', y, "run.realisations=10000", "run.fap=0.01")
     found = detection_map(asked, engine)
     chances = found.closed_form[found.statistics.index("matched")]
     assert chances[0, 0] > 0.9
@@ -208,7 +203,7 @@ def test_map_without_magnitudes_has_those_over_which_flares_are_lost(star: str, 
 
 def test_map_of_a_star_whose_flares_are_seen_to_where_it_saturates_begins_there(engine: Engine) -> None:
     y = 'map.y={quantity="amplitude", values=[1e-6, 0.5]}'
-    asked = Study().paper().with_settings(['star=[{library="G2V"}]', y, "run.realisations=10000", "run.fap=0.01"])
+    asked = paper('star=[{library="G2V"}]', y, "run.realisations=10000", "run.fap=0.01")
     found = detection_map(asked, engine)
     brighter, *_ = expectations(asked.at("magnitude", found.x[0] - 1))
     assert brighter.saturated.any()

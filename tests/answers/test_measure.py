@@ -1,7 +1,5 @@
 """What `measure` states: simulated fits, detected flares, models that are too simple, and unknowns that are drawn."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +8,7 @@ import numpy as np
 import pytest
 from astropy.table import QTable
 from commands import run
-from scenes import assert_covered
+from scenes import assert_covered, paper
 from scipy import stats
 
 from mauvecl import Engine, Pool, Study, measure
@@ -186,12 +184,8 @@ MAGNITUDES = [4.0, 6.0, 8.0, 10.0, 12.0]
 
 
 def drawn_study(*settings: str, star: str = "M3V", magnitude: float = 7.0, fits: int = 400) -> Study:
-    return (
-        Study()
-        .paper()
-        .with_settings(
-            [f"star=[{{library='{star}', magnitude={magnitude}}}]", f"measure.fits={fits}", "run.seed=42", *settings]
-        )
+    return paper(
+        f"star=[{{library='{star}', magnitude={magnitude}}}]", f"measure.fits={fits}", "run.seed=42", *settings
     )
 
 

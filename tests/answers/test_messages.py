@@ -1,7 +1,5 @@
 """What answers say: saturation, priors beside the expectation, flares that lower a statistic, stars without light."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from pathlib import Path
@@ -12,6 +10,7 @@ import pytest
 from answers import expectations, of_kind, small
 from commands import ended, run
 from marks import long_but
+from scenes import paper
 
 import mauvecl
 from mauvecl import Engine, InputError, Stares, Study, detect, limit, simulate
@@ -162,7 +161,7 @@ def test_maps_and_limits_report_a_wrong_sign_as_detect_does(engine: Engine, temp
 
 
 def test_rounding_that_invalidates_closed_forms_is_reported() -> None:
-    asked = Study().paper().with_settings(["star=[{library='G2V', magnitude=12}]"])
+    asked = paper("star=[{library='G2V', magnitude=12}]")
     quiet = asked.with_settings(["observation.changes={read_noise_dn=0.1}", "observation.temperature_c=-40"])
     assert [bool(of_kind(simulate(one).messages, "rounding")) for one in (asked, quiet)] == [False, True]
 
@@ -173,7 +172,7 @@ def test_rounding_that_invalidates_closed_forms_is_reported() -> None:
 )
 def test_star_without_light_is_reported(magnitude: float, dark: bool) -> None:
     """Report a star that makes less than one electron in an exposure, since its S/N is 0."""
-    study = Study().paper().with_settings([f"star=[{{library = 'G2V', magnitude = {magnitude}}}]"])
+    study = paper(f"star=[{{library = 'G2V', magnitude = {magnitude}}}]")
     assert bool(of_kind(simulate(study).messages, "no light")) == dark
 
 
@@ -189,9 +188,9 @@ def test_saturation_of_a_star_and_its_flare_is_one_message() -> None:
     """A flare that alone saturates has its own, also next to a brighter star of the same name that does, too."""
     star = "star=[{library='Vega', magnitude=0.03}]"
     few = ["run.realisations=2000", "run.fap=0.1", "flare.amplitudes=[0.02]", star]
-    both = detect(Study().paper().with_settings(few))
+    both = detect(paper(*few))
     assert len(of_kind(both.messages, "saturated")) == 1
     axes = "sweep.axes=[{quantity='magnitude', values=[0.03, 1.5]}]"
-    swept = detect(Study().paper().with_settings([*few, "flare.amplitudes=[0.5]", axes]))
+    swept = detect(paper(*few, "flare.amplitudes=[0.5]", axes))
     assert [one.detection.quiet.saturated.any() for one in swept.stars] == [True, False]
     assert len(of_kind(swept.messages, "saturated")) == 2

@@ -10,6 +10,7 @@ import pytest
 from answers import of_kind
 from astropy.table import QTable, Table
 from commands import run
+from scenes import paper
 from scipy import stats
 
 from mauvecl import Study, plan, stare
@@ -196,10 +197,10 @@ def test_plan_takes_completeness_as_argument(study: Study) -> None:
 def test_conditions_equal_those_of_stares_along_the_orbit() -> None:
     """Compare the temperature while a target is seen with frames of the same orbit; it and hits change the noise."""
     base = ["plan.targets=[{name='GJ 205'}]", "orbit.days=1", "orbit.start=2026-10-01"]
-    study = Study().paper().with_settings([*base, "plan.completeness='closed form'"])
+    study = paper(*base, "plan.completeness='closed form'")
     seen = plan(study).stars[0]
     along = ["stare.along_orbit=true", "stare.duration_s=86400", "stare.search=false", "orbit.targets=['GJ 205']"]
-    frames = stare(Study().paper().with_settings([*base[1:], *along])).stares[0].staring.stare
+    frames = stare(paper(*base[1:], *along)).stares[0].staring.stare
     # The plan begins in balance, the stare with its past.
     assert seen["temperature"].value == pytest.approx(frames.temperature_c.mean(), abs=0.2)
     still = plan(study.with_settings(["plan.along_orbit=false", "observation.temperature_c=21"]))
@@ -234,7 +235,7 @@ def test_shares_equal_those_computed_by_hand() -> None:
     critical = np.array([[1.0, 2.0, 3.0, 4.0], [10.0, 20.0, 0.0, 30.0]])
     widths = np.array([10.0, 1000.0])
     fixed = ["plan.at_erg=1", "plan.exponent=0", "plan.scatter_dex=0"]
-    law, short = (Study().paper().with_settings([*fixed, f"plan.half_width_s={w}"]).plan.law() for w in (100, 1))
+    law, short = (paper(*fixed, f"plan.half_width_s={w}").plan.law() for w in (100, 1))
     found = found_by_energy(critical, widths, np.array([0.5, 2.5, 15.0, 99.0]), law)
     # An alarm without a flare is none of it: three injections are left of the second half-width.
     assert found == pytest.approx([0.0, 0.25, (1 + 1 / 3) / 2, 1.0])
@@ -248,10 +249,13 @@ def test_injections_agree_with_the_closed_form() -> None:
     A bank of several temperatures has a higher threshold than one sum; 200 injections leave some per cent.
     """
     # Five half-widths and one sum of each frame in place of nine and three: as good a search, in less time.
-    study = Study().paper().with_settings(
-        ["plan.targets=[{name='GJ 205'}]", "orbit.days=20", "plan.injections=200", "search.sums=1",
-         "search.half_widths_s=[25, 50, 100, 200, 400]"]
-    )  # fmt: skip
+    study = paper(
+        "plan.targets=[{name='GJ 205'}]",
+        "orbit.days=20",
+        "plan.injections=200",
+        "search.sums=1",
+        "search.half_widths_s=[25, 50, 100, 200, 400]",
+    )
     drawn, form = (plan(study.with_settings([f"plan.completeness='{how}'"])) for how in ("injections", "closed form"))
     assert drawn.table["E50"][0].value == pytest.approx(form.table["E50"][0].value, rel=0.15)
     assert drawn.table["expected"][0] == pytest.approx(form.table["expected"][0], rel=0.15)
@@ -260,9 +264,7 @@ def test_injections_agree_with_the_closed_form() -> None:
 
 def test_plan_reports_saturation() -> None:
     settings = ["plan.targets=[{name = 'Vega'}]", "orbit.days=31", "plan.hours=100"]
-    assert of_kind(
-        plan(Study().paper().with_settings([*settings, "plan.completeness='closed form'"])).messages, "saturated"
-    )
+    assert of_kind(plan(paper(*settings, "plan.completeness='closed form'")).messages, "saturated")
 
 
 def test_columns_of_simbad_and_gaia_are_read(tmp_path: Path) -> None:

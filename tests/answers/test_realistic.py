@@ -1,7 +1,5 @@
 """Realistic answers by default, ideal ones next to them, and files of version 1."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """One simulated stare: its light, its files, and refusals."""
 
-from __future__ import annotations
-
 import io
 import re
 import shutil
@@ -13,25 +11,20 @@ import numpy as np
 import pytest
 from answers import expectations, of_kind
 from astropy.io import fits
+from scenes import paper
 
 from mauvecl import Engine, Study, stare
 
 #: A G2V star for five minutes with a gap and a flare.
-SHORT = (
-    Study()
-    .paper()
-    .with_settings(
-        [
-            'star=[{library="G2V", magnitude=7.4}]',
-            "flare.amplitudes=[0.5]",
-            "stare.duration_s=300",
-            "stare.gaps=[[100, 150]]",
-            "stare.half_width_s=20",
-            "stare.search=false",
-            "stare.thermal.amplitude=2.0",
-            "stare.thermal.period_s=600",
-        ]
-    )
+SHORT = paper(
+    'star=[{library="G2V", magnitude=7.4}]',
+    "flare.amplitudes=[0.5]",
+    "stare.duration_s=300",
+    "stare.gaps=[[100, 150]]",
+    "stare.half_width_s=20",
+    "stare.search=false",
+    "stare.thermal.amplitude=2.0",
+    "stare.thermal.period_s=600",
 )
 
 
@@ -99,11 +92,7 @@ def test_fits_file_has_the_columns_of_lightkurve(found):
 @pytest.mark.long
 def test_search_finds_only_the_injected_flares(stares):
     """Search flares of S/N 8, 32, 96 and 3, of which the last may be missed, at one false alarm per star-month."""
-    study = (
-        Study()
-        .paper()
-        .with_settings(['star=[{library="G2V", magnitude=7.4, distance_pc=37}]', "stare.gaps=[[2500, 3000]]"])
-    )
+    study = paper('star=[{library="G2V", magnitude=7.4, distance_pc=37}]', "stare.gaps=[[2500, 3000]]")
     answer = stare(study, stares)
     one, found = answer.stares[0], answer.found
     assert found["event"].tolist()[:3] == [4, 3, 2]

@@ -1,7 +1,5 @@
 """What unknowns cost in detections, limits and maps, and false alarms where they are drawn."""
 
-from __future__ import annotations
-
 import itertools
 import re
 import tomllib
@@ -41,6 +39,7 @@ def study(**nuisances: Any) -> Study:
     ("nuisances", "plain", "marginal", "said"),
     [
         ({"dark": 0.1}, 0.23, 3.06, "the dark level (+-0.1 deg C)"),
+        ({"dark": 0.003}, 5.65, 5.91, "the dark level (+-0.003 deg C)"),
         ({"light": 0.01}, 4.12, 5.67, "the light level (+-1 %)"),
         ({"dark": "free", "light": "free"}, 0.0, 3.05, "the dark level (free) and the light level (free)"),
     ],

@@ -1,7 +1,5 @@
 """Every unknown at every verb: it changes the answer, is refused, or the answer names it as not used."""
 
-from __future__ import annotations
-
 import tomllib
 from dataclasses import replace
 from functools import cache

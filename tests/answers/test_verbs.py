@@ -1,7 +1,5 @@
 """Verbs: one name and signature in Python and on the command line, and one definition of a table's columns."""
 
-from __future__ import annotations
-
 import inspect
 import io
 import json
@@ -14,6 +12,7 @@ from answers import FEW, QUICK, VERBS
 from astropy.table import QTable, Table
 from commands import run
 from marks import long_but
+from scenes import paper
 
 import mauvecl
 from mauvecl import Engine, Study
@@ -58,9 +57,7 @@ def test_progress_ends_at_its_total(name: str, engine: Engine) -> None:
     """Pass all arguments by position, since all verbs have the same."""
     seen: list[tuple[int, int]] = []
     drawing = None if name == "plan" else engine
-    getattr(mauvecl, name)(
-        Study().paper().with_settings(FEW + QUICK[name]), drawing, lambda *reported: seen.append(reported)
-    )
+    getattr(mauvecl, name)(paper(*FEW + QUICK[name]), drawing, lambda *reported: seen.append(reported))
     done, total = zip(*seen, strict=True)
     assert list(done) == sorted(done)
     assert done[-1] == total[-1] > 0
@@ -83,7 +80,7 @@ def rows_of(table: Table, names: list[str]) -> list[list[object]]:
 @pytest.mark.parametrize("name", long_but(QUICK | SLOW, "exposure", "detect"))
 def test_files_json_and_terminal_agree(name: str, tmp_path: Path) -> None:
     """Check names, units, descriptions and values of each table, and every text that the terminal shows."""
-    answer = getattr(mauvecl, name)(Study().paper().with_settings([*FEW, *(QUICK | SLOW)[name]]))
+    answer = getattr(mauvecl, name)(paper(*FEW, *(QUICK | SLOW)[name]))
     answer.write(tmp_path / "files")
     for file, table in answer.tables.items():
         path = tmp_path / "files" / f"{file}.ecsv"

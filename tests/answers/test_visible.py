@@ -6,6 +6,7 @@ from typing import Any
 import icalendar
 import numpy as np
 import pytest
+from scenes import paper
 
 from mauvecl import Study, visible
 
@@ -15,9 +16,7 @@ NAMES = ("eps Eri", "AU Mic", "EK Dra")
 @pytest.fixture(scope="module")
 def study() -> Study:
     targets = ", ".join(f"'{name}'" for name in NAMES)
-    return (
-        Study().paper().with_settings([f"orbit.targets=[{targets}]", "orbit.start=2027-02-10T06:00", "orbit.days=40"])
-    )
+    return paper(f"orbit.targets=[{targets}]", "orbit.start=2027-02-10T06:00", "orbit.days=40")
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +69,7 @@ def test_calendar_beyond_the_elements_has_days(found: Any) -> None:
 
 
 def test_calendar_near_the_epoch_has_windows() -> None:
-    near = Study().paper().with_settings(["orbit.targets=['eps Eri']", "orbit.start=2026-09-20", "orbit.days=2"])
+    near = paper("orbit.targets=['eps Eri']", "orbit.start=2026-09-20", "orbit.days=2")
     answer = visible(near)
     events = icalendar.Calendar.from_ical(answer.documents["visible.ics"]()).walk("VEVENT")
     assert len(events) == answer.table["windows"][0] > 20
@@ -88,7 +87,7 @@ def test_pictures_are_drawn(found: Any, study: Study) -> None:
 
 def test_toml_dates_are_read() -> None:
     starts = ("orbit.start=2027-01-01", "orbit.start=2027-01-01T06:00:00", "orbit.start=2027-01-01T06:00:00+02:00")
-    found = [Study().paper().with_settings([one]).orbit.times().iso(0.0) for one in starts]
+    found = [paper(one).orbit.times().iso(0.0) for one in starts]
     assert found == ["2027-01-01T00:00:00", "2027-01-01T06:00:00", "2027-01-01T04:00:00"]
 
 

@@ -1,7 +1,5 @@
 """Pictures through public functions: parts are told, texts are apart, files equal figures, backends are not loaded."""
 
-from __future__ import annotations
-
 import io
 import os
 import subprocess
@@ -13,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from scenes import paper
 
 pytest.importorskip("matplotlib")
 
@@ -109,7 +108,7 @@ SHORT = ("detect, one statistic", "limit of exposure", "map", "snr", "exposure")
 @pytest.mark.parametrize("case", long_but(CASES, *SHORT))
 def test_texts_are_inside_figure_and_do_not_overlap(case: str, engine: Engine) -> None:
     ask, settings, column = CASES[case]
-    answer = ask(Study().paper().with_settings(list(settings)), engine)
+    answer = ask(paper(*settings), engine)
     assert answer.pictures
     exposures = {f"{x.exposure_s:g}" for x in answer.inputs}
     for place, (name, figure, renderer) in enumerate(drawn(answer)):
@@ -148,7 +147,7 @@ def test_texts_are_inside_figure_and_do_not_overlap(case: str, engine: Engine) -
 
 def test_detected_flare_is_visible(engine: Engine) -> None:
     """Check that the 5 % flare, hidden in pixel noise, reaches four sigma of an element in the lower panel."""
-    answer = detect(Study().paper().with_settings([*FEW, ONE, "flare.amplitudes=[0.05]", ONLY]), engine)
+    answer = detect(paper(*FEW, ONE, "flare.amplitudes=[0.05]", ONLY), engine)
     figure = answer.pictures["spectra"]()
     (line,) = [line for line in figure.axes[1].lines if len(line.get_ydata()) > 2]
     assert 3.0 < max(line.get_ydata()) < 6.0
@@ -180,22 +179,20 @@ PARTS: dict[str, tuple[Any, tuple[str, ...], str, set[str]]] = {
 @pytest.mark.parametrize("case", long_but(PARTS, "detect"))
 def test_pictures_of_a_part_say_so(case: str, engine: Engine) -> None:
     ask, settings, note, whole = PARTS[case]
-    for name, draw in ask(Study().paper().with_settings(list(settings)), engine).pictures.items():
+    for name, draw in ask(paper(*settings), engine).pictures.items():
         title = draw()._suptitle
         written = title.get_text().replace("\n", " ") if title else ""
         assert (note in written) == (name not in whole), (name, written)
 
 
 def test_pictures_without_a_part_say_nothing(engine: Engine) -> None:
-    for draw in detect(
-        Study().paper().with_settings([*FEW, stars(6), "flare.amplitudes=[0.5]"]), engine
-    ).pictures.values():
+    for draw in detect(paper(*FEW, stars(6), "flare.amplitudes=[0.5]"), engine).pictures.values():
         assert " shown" not in draw()._suptitle.get_text()
 
 
 def test_saved_picture_equals_savefig(engine: Engine, tmp_path: Path) -> None:
     """Compare all bytes with those of savefig, which draws the picture twice."""
-    for name, draw in detect(Study().paper().with_settings(list(FEW)), engine).pictures.items():
+    for name, draw in detect(paper(*FEW), engine).pictures.items():
         twice = io.BytesIO()
         draw().savefig(twice, format="png", dpi=160)
         assert draw(tmp_path / f"{name}.png").read_bytes() == twice.getvalue()

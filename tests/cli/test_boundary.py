@@ -1,7 +1,5 @@
 """Every failure of the command line ends with one sentence and the exit code of its kind, without a traceback."""
 
-from __future__ import annotations
-
 import gzip
 import os
 import re

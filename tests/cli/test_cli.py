@@ -1,7 +1,5 @@
 """The command line as a user meets it: the paper's question, studies, reruns and interruption."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
@@ -16,6 +14,7 @@ import pytest
 from astropy.io import fits
 from astropy.table import QTable
 from commands import ended, run, started
+from scenes import paper
 
 from mauvecl import Engine, Study, detect, simulate
 
@@ -167,7 +166,7 @@ def test_wrong_template_loses_snr(engine: Engine) -> None:
         "flare.amplitudes=[0.01]",
         "run={realisations=50000, fap=0.01, statistics=['matched'], template_temperatures_k=[5000, 10000]}",
     ]
-    answer = detect(Study().paper().with_settings(settings), engine)
+    answer = detect(paper(*settings), engine)
     kept = [float(line.split(" keeps ")[1].split()[0]) for line in answer.messages if " keeps " in line]
     assert 50 < kept[0] < 95
     assert kept[1] == 100.0

@@ -1,7 +1,5 @@
 """Processes of the command line: what they print and load, their progress, names of flags, and interruption."""
 
-from __future__ import annotations
-
 import ast
 import json
 import os

@@ -1,7 +1,5 @@
 """What all verbs have in common: flags, help with examples, completion, values, stars, and narrow terminals."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

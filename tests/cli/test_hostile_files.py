@@ -1,7 +1,5 @@
 """Files without an end or of absurd size, and what is no file: refused in one sentence, in little time and memory."""
 
-from __future__ import annotations
-
 import os
 import shlex
 import tomllib

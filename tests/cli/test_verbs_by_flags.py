@@ -1,7 +1,5 @@
 """Every verb that answers a study: its files, what it prints, its record, and what becomes of it on a full disk."""
 
-from __future__ import annotations
-
 import atexit
 import json
 import os

@@ -1,7 +1,5 @@
 """Values as people write them: with units, in per cent, without a star, and with few realisations."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,11 +1,10 @@
 """Campaigns: bounds, independence, overlap, and false-alarm probabilities of single tests, as a detection says them."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np
 import pytest
+from scenes import paper
 from scipy import stats
 
 from mauvecl import Engine, Study, detect
@@ -98,10 +97,11 @@ def test_overlapping_stacks_allow_more_per_test(engine: Engine) -> None:
 
 
 def test_wanted_number_of_alarms_is_divided_among_the_tests(engine: Engine) -> None:
-    study = Study().paper().with_settings(
-        ["star=[{library='G2V', magnitude=7.4}]", "run={realisations=20000, fap=0.01, statistics=['matched']}",
-         "campaign={frames=17280, step=1, fap=0.01, alarms=2}"]
-    )  # fmt: skip
+    study = paper(
+        "star=[{library='G2V', magnitude=7.4}]",
+        "run={realisations=20000, fap=0.01, statistics=['matched']}",
+        "campaign={frames=17280, step=1, fap=0.01, alarms=2}",
+    )
     sentences = [text for text in detect(study, engine).messages if "campaign" in text]
     assert "173 false alarms are expected" in sentences[0]
     assert "`fap=5.79e-07`" in sentences[1]

@@ -1,7 +1,5 @@
 """Departures of the simulation from the closed form: each cause is predicted where it dominates."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

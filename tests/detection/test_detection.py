@@ -1,7 +1,5 @@
 """Detection: calibrated nulls, probabilities against closed forms, inversions, and refusals."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -5,8 +5,6 @@ priors, cosmic rays, noisy references, estimated variances, own weights, near-sa
 chance: both sides see the same draws.
 """
 
-from __future__ import annotations
-
 from itertools import count
 from typing import Any
 

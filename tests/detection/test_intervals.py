@@ -1,7 +1,5 @@
 """Intervals of probabilities have their coverage, by plain normals, and their ends, by scipy."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from marks import long_but

@@ -1,7 +1,5 @@
 """Nulls in which a single value is more probable than the false-alarm probability: no threshold has it."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """False alarms in random scenes are as frequent as the threshold promises."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from answers import STATISTICS, twice

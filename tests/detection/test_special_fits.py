@@ -4,8 +4,6 @@ Draws of the first are normal, with seeds fixed beforehand. They multiply star, 
 kernels do.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from typing import Any
 

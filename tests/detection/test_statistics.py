@@ -1,7 +1,5 @@
 """Closed forms against scipy's exact distributions and plain simulation, and the paper's smoothing."""
 
-from __future__ import annotations
-
 import itertools
 import time
 

@@ -1,7 +1,5 @@
 """Rare false alarms by importance sampling, compared with brute force and closed forms."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

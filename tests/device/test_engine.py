@@ -1,7 +1,5 @@
 """Comparison of the engine with the NumPy reference, with its own splits, and with closed-form moments."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """First builds with failing compilers: the user's process continues or ends with a one-sentence error."""
 
-from __future__ import annotations
-
 import os
 import stat
 import time

@@ -1,7 +1,5 @@
 """Cache of compiled kernels: damage causes a new build, but never a failure or a different result."""
 
-from __future__ import annotations
-
 import errno
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Every kernel under Oclgrind, which simulates a device and detects races and invalid memory accesses."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The self-test passes on correct kernels and fails on wrong ones, for the strict and the weaker promise."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import replace

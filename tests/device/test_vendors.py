@@ -1,7 +1,5 @@
 """Drivers: Intel's wheel is found and hides no other; without drivers, an error names their sources."""
 
-from __future__ import annotations
-
 import os
 import platform
 import subprocess

@@ -1,7 +1,5 @@
 """Hundreds of flares: bounded memory for each, and equal results however they are divided."""
 
-from __future__ import annotations
-
 import tracemalloc
 
 import numpy as np

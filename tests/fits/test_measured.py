@@ -1,7 +1,5 @@
 """Flares measured against time: a flare that cools, a steady one, known changes of conditions, refusals."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache, partial
 from typing import Any

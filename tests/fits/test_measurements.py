@@ -3,8 +3,6 @@
 Draws are normal with the variance of the flaring exposure, by seeds fixed beforehand.
 """
 
-from __future__ import annotations
-
 import tomllib
 from functools import cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Drawn stares: pixels against an independent recipe and the engine's exposures, cumulants against pixels."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

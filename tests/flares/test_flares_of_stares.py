@@ -1,7 +1,5 @@
 """Flares of a study's stare: the light of each frame, and the stated energies, are those of the flares' spectra."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import astropy.units as u

@@ -1,13 +1,11 @@
 """Frames and gaps of stares, curves over frames, unknowns, and stares along the orbit."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
 import pytest
 from astropy.time import Time
-from scenes import instrument, star
+from scenes import instrument, paper, star
 from scipy.integrate import quad
 
 from mauvecl import Sinusoid, Stare, Study, stare, visible
@@ -77,7 +75,7 @@ START, HOURS = "2026-09-20T03:00:00", 8.0
 def asked(start: str = START, hours: float = HOURS, *settings: str) -> Any:
     orbit = ["orbit.targets=['eps Eri']", f"orbit.start='{start}'", f"orbit.days={hours / 24}", "orbit.step_s=5"]
     frames = ["stare.along_orbit=true", f"stare.duration_s={hours * 3600}", "stare.search=false"]
-    return Study().paper().with_settings([*orbit, *frames, *settings])
+    return paper(*orbit, *frames, *settings)
 
 
 def frames_of(*given: Any) -> Stare:
@@ -123,5 +121,5 @@ def test_source_of_the_orbit_is_stated() -> None:
     assert any("assumptions" in line for line in stare(asked()).messages)
     (line,) = (one for one in stare(asked("2027-01-10", HOURS)).messages if "mean Sun-synchronous" in one)
     assert line
-    plain = stare(Study().paper().with_settings(["stare.search=false"]))
+    plain = stare(paper("stare.search=false"))
     assert not any("orbit" in one for one in plain.messages)

@@ -1,7 +1,5 @@
 """Rates of flares and the closed form of completeness, as plans state them: published values, tables and bands."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

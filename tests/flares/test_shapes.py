@@ -1,7 +1,5 @@
 """Shapes of flares in time and their energies: published values, integrals against quadrature, frames."""
 
-from __future__ import annotations
-
 import itertools
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Stares of the device, compared bit by bit with the NumPy reference and with their own splits."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, ClassVar
 

@@ -1,7 +1,5 @@
 """Unmodified files of the archives are read as by hand; those that are refused are in the corpus."""
 
-from __future__ import annotations
-
 import csv
 from dataclasses import replace
 from pathlib import Path

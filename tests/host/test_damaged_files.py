@@ -1,7 +1,5 @@
 """Files that are packed, cut, damaged, too large or no files at all; suggestions of messages can be typed."""
 
-from __future__ import annotations
-
 import bz2
 import gzip
 import lzma

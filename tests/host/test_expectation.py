@@ -1,7 +1,5 @@
 """Expectations of the host, and the closed forms of their noise."""
 
-from __future__ import annotations
-
 import pickle
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Spectra of flares: light, totals, and observed spectra."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

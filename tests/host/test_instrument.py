@@ -1,7 +1,5 @@
 """Values of the payload, pixels that differ, and the content of users' instrument files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Headers of library spectra state assumptions and sources."""
 
-from __future__ import annotations
-
 import re
 from itertools import pairwise
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Names of stars, wherever a star can be given, stars that are formulas, and neighbours in the fibre."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The orbit and what is seen from it, compared with SGP4's verification, astropy's frames and plain geometry."""
 
-from __future__ import annotations
-
 import sys
 import threading
 import types

@@ -1,7 +1,5 @@
 """The user's own stars: kept from files, and fetched from a local server in place of the archives."""
 
-from __future__ import annotations
-
 import contextlib
 import http.server
 import io

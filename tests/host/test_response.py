@@ -1,7 +1,5 @@
 """The response of the detector to light, compared with quadrature."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

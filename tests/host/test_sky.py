@@ -1,7 +1,5 @@
 """Zodiacal light: cells of the table, the helio-ecliptic position, and refusals."""
 
-from __future__ import annotations
-
 import re
 import socket
 from datetime import datetime

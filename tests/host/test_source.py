@@ -1,7 +1,5 @@
 """Sources: the embedded library, users' files, magnitudes, flares, dust, and refusals."""
 
-from __future__ import annotations
-
 import re
 import warnings
 from typing import Any

@@ -3,8 +3,6 @@
 A file is read right or refused in one sentence.
 """
 
-from __future__ import annotations
-
 import re
 import warnings
 from pathlib import Path

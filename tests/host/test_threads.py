@@ -1,16 +1,16 @@
 """Work in threads yields results in order, few ahead of their use, and ends with its caller."""
 
-from __future__ import annotations
-
 import os
 import threading
 import time
 
 import pytest
 
-from mauvecl.host.threads import MOST_THREADS, map_in_threads
+from mauvecl.host.threads import map_in_threads
 
 Work = list[int]
+#: At most as many, however many cores there are.
+THREADS = 4
 
 
 @pytest.fixture(autouse=True)
@@ -28,8 +28,8 @@ def test_results_are_in_the_order_of_the_items(number: int | None) -> None:
 
 
 def test_items_are_worked_on_at_the_same_time() -> None:
-    together = threading.Barrier(MOST_THREADS)
-    assert all(map_in_threads(lambda _: together.wait(10) >= 0, range(MOST_THREADS)))
+    together = threading.Barrier(THREADS)
+    assert all(map_in_threads(lambda _: together.wait(10) >= 0, range(THREADS)))
 
 
 def test_few_results_wait_and_none_are_made_after_the_caller_stops() -> None:
@@ -38,7 +38,7 @@ def test_few_results_wait_and_none_are_made_after_the_caller_stops() -> None:
     for _ in range(5):
         next(results)
     time.sleep(0.05)
-    assert len(begun) <= 5 + MOST_THREADS
+    assert len(begun) <= 5 + THREADS
     results.close()
     number = len(begun)
     time.sleep(0.05)
@@ -55,4 +55,4 @@ def test_an_error_reaches_the_caller_and_ends_the_work() -> None:
     results = map_in_threads(work, range(100))
     with pytest.raises(ZeroDivisionError):
         list(results)
-    assert len(begun) <= 4 + 2 * MOST_THREADS
+    assert len(begun) <= 4 + 2 * THREADS

@@ -1,7 +1,5 @@
 """The probe kernels in every form that a device may be given."""
 
-from __future__ import annotations
-
 import pytest
 from probes import Probes
 

@@ -1,7 +1,5 @@
 """The joint draw of Gaussian and Poisson noise against their exact convolution, wherever its condition allows it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import exact

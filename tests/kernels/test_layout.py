@@ -1,7 +1,5 @@
 """The device reads the memory layout that Python defines."""
 
-from __future__ import annotations
-
 import numpy as np
 from probes import Probes
 

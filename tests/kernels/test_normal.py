@@ -1,7 +1,5 @@
 """Box-Muller: accuracy against float64, extreme words, and the bits of the reference."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 
 import numpy as np

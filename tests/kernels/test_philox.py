@@ -1,7 +1,5 @@
 """Philox4x32-10 against known answers and independent code."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import randomgen

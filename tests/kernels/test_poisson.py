@@ -1,7 +1,5 @@
 """Poisson draws by alias table: exact probabilities, Pearson tests, extreme words."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import exact

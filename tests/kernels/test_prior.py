@@ -1,7 +1,5 @@
 """Compare the device's map from words to factors, integrated exactly, with the distribution of the prior."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,5 @@
 """Additive processes: every row of the registry, and a second process registered for a test."""
 
-from __future__ import annotations
-
 import json
 import os
 import sys

@@ -1,7 +1,5 @@
 """Independence of draws, for every method and every mixture of methods in a group."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Extreme words and counters in the production kernels."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Pointing drifts: distributions of waits, durations and depths, correlation in time, and means of frames."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from marks import long_but

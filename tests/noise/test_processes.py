@@ -1,7 +1,5 @@
 """Optional processes: each has its distribution and its own stream, and changes nothing else."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

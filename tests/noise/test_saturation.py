@@ -1,7 +1,5 @@
 """Draws and closed forms near and beyond saturation."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Stacks against their frames; frames are drawn singly where rounding does not act as noise."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import exact

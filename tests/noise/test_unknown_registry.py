@@ -1,16 +1,13 @@
-"""Registry of unknowns, whose rows are keys, streams and defaults, and distributions of their factors."""
-
-from __future__ import annotations
+"""Registry of unknowns, whose rows are keys, streams and defaults, and changes of what is recorded."""
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 from scenes import instrument, star
 
-from mauvecl import Normal, Processes, Stare, Study, Uniform
+from mauvecl import Processes, Stare, Study
 from mauvecl.noise import layout, unknowns
-from mauvecl.noise.scene import FactorDistributions, changes_of, prepare
+from mauvecl.noise.scene import changes_of
 
 ROWS = [
     *unknowns.PROCESSES.values(),
@@ -49,53 +46,6 @@ def test_streams_of_processes_are_those_of_the_rows() -> None:
 def test_stares_take_every_change_of_the_registry(row: object) -> None:
     stare = Stare.of(6000.0, **{row.course: {row.name: 0.01}})  # type: ignore[attr-defined]
     assert any(stare.jitters.values()) or stare.unknowns
-
-
-def drawn(**priors: Normal | Uniform) -> tuple[FactorDistributions, float]:
-    """Return the distributions for a few pixels, and the slope of the dark with temperature."""
-    quiet, *_ = star(payload=instrument(part=True))
-    found = FactorDistributions.of(prepare([quiet], processes=Processes(**priors)))
-    return found, quiet.conditions["dark_slope_per_c"]
-
-
-def test_moments_equal_those_of_priors() -> None:
-    """Compare the exponential of a normal temperature, a uniform loss and the mean jitter of ten frames, to float32."""
-    found, slope = drawn(detector_temperature=Normal(21.0, 0.5, 17.0, 25.0))
-    dark, s2 = found.spreads["dark"], (slope * 0.5) ** 2
-    assert dark.mean == pytest.approx(np.exp(s2 / 2), rel=2e-6)
-    assert dark.sd == pytest.approx(np.exp(s2 / 2) * np.sqrt(np.expm1(s2)), rel=2e-4)
-    assert not dark.normal
-    found, _ = drawn(qe_scale=Uniform(0.7, 1.1))
-    light = found.spreads["light"]
-    assert light.mean == pytest.approx(0.9, rel=1e-5)
-    assert light.sd == pytest.approx(0.4 / np.sqrt(12), rel=1e-3)
-    assert not light.normal
-    found, _ = drawn(jitter=Uniform(0.0, 0.05), qe_scale=Normal(1.0, 0.01, 0.9, 1.1))
-    light = found.spreads["light"]
-    assert light.mean == pytest.approx(0.975, rel=1e-5)
-    assert light.sd == pytest.approx(np.hypot(0.05 / np.sqrt(120), 0.975 * 0.01), rel=1e-3)
-    assert light.normal
-
-
-@pytest.mark.parametrize("weighted", [True, False])
-def test_nodes_sum_to_one_and_have_mean_of_factors(weighted: bool) -> None:
-    """Check the sum of probabilities and the means of factors."""
-    quiet, *_ = star("K3V", 3.7, payload=instrument(part=True))
-    how = Processes(
-        jitter=Uniform(0.0, 0.05),
-        detector_temperature=Uniform(20.0, 23.0),
-        light_loss=Uniform(0.2, 0.5),
-        sky_level=Normal(1.0, 0.1, 0.5, 1.5),
-    )
-    found = FactorDistributions.of(prepare([quiet], processes=how))
-    nodes, rows = found.nodes(quiet, weighted=weighted)
-    share = np.array([node.probability for node in nodes])
-    assert share.sum() == pytest.approx(1.0, abs=1e-12)
-    for name in ("light", "dark", "sky"):
-        assert share @ [getattr(node, name) for node in nodes] == pytest.approx(found.spreads[name].mean, rel=1e-4)
-    # The sky alone is faint enough to be an amplitude.
-    assert rows.shape == (1, quiet.wavelength_nm.size)
-    assert rows[0] == pytest.approx(found.spreads["sky"].sd * quiet.sky_dn)
 
 
 @pytest.mark.parametrize("magnitude", [-2.0, -1.2, -1.0, 2.0])

@@ -5,8 +5,6 @@ The published spectra at 912 and 1497 s, less the quiescent one, rise and decay 
 9500 K in the optical, 13 800-14 500 K between 270 and 417 nm at 912 s.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Coverage of calibrated instruments: the throughput's band, and answers with a fitted instrument."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -11,6 +9,7 @@ import pytest
 import scipy
 from astropy.table import QTable
 from numpy.typing import NDArray
+from scenes import paper
 
 from mauvecl import Expectation, FlareModel, Instrument, Sky, Source, Study, expect, fit, measure, plan
 from tests.observations.test_calibration import NOMINAL, STARS, answer_of, curve, truth
@@ -56,7 +55,7 @@ def test_steps_of_the_throughput_are_followed() -> None:
 
 def with_(settings: list[str], instrument: Path | Instrument) -> Study:
     """Return a study with a fitted instrument's file, or with the values of a true one."""
-    study = Study().paper().with_settings(settings)
+    study = paper(*settings)
     if isinstance(instrument, Path):
         return study.with_settings([f"observation.instrument={instrument}"])
     return study.with_instrument({name: getattr(instrument, name) for name in CHANGED})

@@ -3,8 +3,6 @@
 Draws are NumPy's, so that the simulation shares no code with the engine.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -15,6 +13,7 @@ import pytest
 from astropy.table import Table
 from commands import run
 from refusals import refused
+from scenes import paper
 from scenes import source as star
 
 from mauvecl import (
@@ -87,7 +86,7 @@ def frames_of(
 def study_of(stars: tuple[tuple[str, float], ...], dark: bool = True) -> Study:
     rows = [f'{{frames="x", library="{name}", magnitude={magnitude}}}' for name, magnitude in stars]
     rows += ['{frames="y"}'] if dark else []
-    return Study().paper().with_settings([f"calibrate.observations=[{', '.join(rows)}]"])
+    return paper(f"calibrate.observations=[{', '.join(rows)}]")
 
 
 def answer_of(stars: tuple[tuple[str, float], ...], instrument: Instrument, seed: int, dark: bool = True) -> Any:
@@ -278,10 +277,10 @@ def grey(tmp_path: Path) -> str:
 def test_plans_state_the_error_of_the_throughput(grey: str) -> None:
     """E50 follows the S/N, which grows with the light by less than its share and more than its root."""
     settings = ["plan.targets=[{name='eps Eri'}]", "orbit.days=5", "plan.completeness='closed form'"]
-    table = plan(Study().paper().with_settings([*settings, f"observation.instrument={grey}"])).table
+    table = plan(paper(*settings, f"observation.instrument={grey}")).table
     assert 0.02 < table["E50_error"][0] < 0.06
     assert 0 < table["expected_error"][0] < 0.2
-    assert "E50_error" not in plan(Study().paper().with_settings(settings)).table.colnames
+    assert "E50_error" not in plan(paper(*settings)).table.colnames
 
 
 def test_dark_frames_of_two_exposure_times_determine_the_bias_of_pixels() -> None:
@@ -292,13 +291,7 @@ def test_dark_frames_of_two_exposure_times_determine_the_bias_of_pixels() -> Non
     true = truth(pixel_map=PixelMap(bias_dn=bias))
     frames = [frames_of(true, None, [15.0, 19.0], 30, rng, exposure_s) for exposure_s in (1.0, 5.0)]
     frames.insert(0, frames_of(true, star("A0V", 5.0), [16.0], 40, rng))
-    study = (
-        Study()
-        .paper()
-        .with_settings(
-            ["calibrate.observations=[{frames='x', library='A0V', magnitude=5.0}, {frames='y'}, {frames='z'}]"]
-        )
-    )
+    study = paper("calibrate.observations=[{frames='x', library='A0V', magnitude=5.0}, {frames='y'}, {frames='z'}]")
     found = calibrate(study, frames=tuple(frames))
     table = found.dark_table
     far = (table["bias"].value - bias[NOMINAL.read_pixels]) / table["bias_error"].value
@@ -327,7 +320,7 @@ def test_answers_through_a_calibrated_instrument_state_its_modes(answer: Any, tm
     """The error of the light of a star is that of the fitted covariance, and the nominal unknowns are gone."""
     answer.write(tmp_path)
     settings = ["star=[{library='G2V', magnitude=7.4}]", "flare.amplitudes=[0.24]", "run.statistics=['matched']"]
-    study = Study().paper().with_settings([*settings, f"observation.instrument={tmp_path / 'instrument.toml'}"])
+    study = paper(*settings, f"observation.instrument={tmp_path / 'instrument.toml'}")
     named = set(what_matters(study)["assumption"])
     assert "calibration, mode 1" in named
     assert "light loss" not in named
@@ -336,7 +329,7 @@ def test_answers_through_a_calibrated_instrument_state_its_modes(answer: Any, tm
 def test_measurements_state_the_error_of_the_throughput(grey: str) -> None:
     """Light alike at all wavelengths moves fluxes by 5 %, and no temperature."""
     settings = ["star=[{library='M3V', magnitude=9}]", "flare.amplitudes=[0.5]", f"observation.instrument={grey}"]
-    table = measure(Study().paper().with_settings([*settings, "run.realisations=10"])).table
+    table = measure(paper(*settings, "run.realisations=10")).table
     found = {row["quantity"]: row["error_throughput"] / row["perfect"] for row in table}
     assert found["flux 200-700 nm"] == pytest.approx(np.expm1(0.05), rel=0.01)
     assert found["temperature"] < 1e-3

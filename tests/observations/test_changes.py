@@ -1,16 +1,14 @@
 """Changes between visits against closed forms, drawn exposures, a direct integration and another periodogram."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import scipy
-from scenes import MG_II
+from scenes import MG_II, paper
 
-from mauvecl import Engine, Expectation, Instrument, Nuisances, Sky, Source, Study, change, expect
+from mauvecl import Engine, Expectation, Instrument, Nuisances, Sky, Source, change, expect
 from mauvecl.observations.visits import line_index, recover_periods
 
 AU_MIC = Path(__file__).parents[1] / "data" / "flares" / "aumic_iue"
@@ -21,7 +19,7 @@ CONTINUUM_NM = ((258.0, 270.0), (290.0, 302.0))
 
 
 def asked(*settings: str, star: str = "library='M3V', magnitude=9") -> Any:
-    return change(Study().paper().with_settings([f"star=[{{{star}}}]", *settings]))
+    return change(paper(f"star=[{{{star}}}]", *settings))
 
 
 def written(source: Source, path: Path) -> str:
@@ -253,7 +251,7 @@ def test_changes_below_an_edge_end_there(name: str, edge: float, quiet: Expectat
 )  # fmt: skip
 def test_rows_with_saturated_pixels_are_marked(magnitude: float, none: set[str], marked: set[str]) -> None:
     """Check that rows without a pixel have no number, and that indices with a saturated pixel have none."""
-    answer = change(Study().paper().with_settings([f"star=[{{library='G2V', magnitude={magnitude}}}]"]))
+    answer = change(paper(f"star=[{{library='G2V', magnitude={magnitude}}}]"))
     for row in answer.changes:
         name = row.change.name
         assert np.isnan(row.error) == (name in none)
@@ -268,11 +266,7 @@ def test_rows_with_saturated_pixels_are_marked(magnitude: float, none: set[str],
 def test_a_colour_of_magnitudes_is_not_linear() -> None:
     """Check that the faintest star's smallest colour is a few magnitudes, and that of a bright one proportional."""
     faint, bright = (
-        change(
-            Study()
-            .paper()
-            .with_settings([f"star=[{{library='M3V', magnitude={v}}}]", "change.of=['colour', '150-450']"])
-        )
+        change(paper(f"star=[{{library='M3V', magnitude={v}}}]", "change.of=['colour', '150-450']"))
         for v in (16.0, 6.0)
     )
     for answer in (faint, bright):

@@ -1,8 +1,5 @@
 """Simulated light curves with a known truth: false alarms as promised, intervals that cover, limits that hold."""
 
-from __future__ import annotations
-
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -16,12 +13,9 @@ from scipy import stats
 from mauvecl import SHAPES, Frames
 from mauvecl.observations import events
 from mauvecl.observations.detection import detect_events
-from mauvecl.observations.event_fits import _ranges, _single
-from mauvecl.observations.event_windows import Family, FittedFlare, Window
 from mauvecl.observations.false_alarms import simulated_rates
-from mauvecl.observations.level import binned_scatter, likeness, quiet_variance
+from mauvecl.observations.level import likeness, quiet_variance
 from mauvecl.observations.light_curve import survey_light_curve
-from mauvecl.observations.search import Detection, SeriesSurvey
 
 SHAPE = SHAPES["davenport2014"]
 FRAMES, CADENCE_S, LEVEL, SD = 600, 60.0, 1000.0, 5.0
@@ -96,27 +90,6 @@ def test_noise_at_the_level_is_that_of_its_counts() -> None:
     variance, slope = quiet_variance(flux, np.sqrt(flux + 25), np.full(FRAMES, level), quiet)
     assert slope == pytest.approx(1.0, rel=1e-9)
     np.testing.assert_allclose(variance, level + 25, rtol=1e-9)
-
-
-@pytest.mark.long
-def test_independent_frames_are_called_red_as_often_as_stated() -> None:
-    """2.5 % of light curves at each number of frames; each range fails by chance once in ten thousand times."""
-    rng = np.random.default_rng(295)
-    numbers, count = np.arange(2000), 400
-    red = np.array([[one.red for one in binned_scatter(numbers, rng.normal(0, 1, 2000))] for _ in range(count)])
-    low, high = stats.binom.ppf([0.00005, 0.99995], count, 0.025)
-    assert red.shape == (count, 8)
-    assert ((red.sum(axis=0) >= low) & (red.sum(axis=0) <= high)).all()
-
-
-def test_correlated_frames_are_red_and_gaps_are_not_bridged() -> None:
-    rng = np.random.default_rng(296)
-    slow = np.convolve(rng.normal(0, 1, 20_000), np.ones(10) / np.sqrt(10), "same")
-    found = binned_scatter(np.arange(slow.size), slow)
-    assert all(one.red for one in found if one.frames >= 2)
-    # With a gap after every second frame there are no means of four.
-    pairs = np.arange(20_000) + np.arange(20_000) // 2 * 5
-    assert [one.frames for one in binned_scatter(pairs, slow)] == [1, 2]
 
 
 def test_correlations_do_not_bridge_gaps() -> None:
@@ -197,29 +170,3 @@ def test_error_of_a_summed_duration_includes_that_of_its_level() -> None:
     quiet = FRAMES - inside
     expected = sd / 100.0 * CADENCE_S * np.sqrt(inside + (inside + frames) ** 2 / quiet)
     assert energy.summed_error_s == pytest.approx(expected, rel=0.15)
-
-
-def faint_star() -> tuple[SeriesSurvey, NDArray[np.bool_], Detection]:
-    """Return a star whose level is known to 0.3 % alone, the frames of a flare of an amplitude of 4, and the flare."""
-    flux = 100.0 * (1 + 4.0 * flare(15_000, 300.0)) + np.random.default_rng(299).normal(0.0, SD, FRAMES)
-    frames = Frames.of(TIME, flux, np.full(FRAMES, SD))
-    survey = SeriesSurvey.of(frames, flux, np.full(FRAMES, SD**2), np.ones(FRAMES, np.bool_), 100.0, 0.0, SHAPE)
-    taken = (np.arange(FRAMES) >= 240) & (np.arange(FRAMES) < 340)
-    return survey, taken, Detection(100.0, 300.0, 15_030.0, 0, 80.0, 240, 339)
-
-
-def test_error_of_a_fitted_duration_is_that_of_least_squares() -> None:
-    """Compare the part of the posterior at the best peak and half-width with the fit of amplitude and level there."""
-    survey, taken, one = faint_star()
-    window = Window.of(survey, taken, one)
-    start = FittedFlare(one.peak_s, 4.0, one.half_width_s, 4.0 * one.half_width_s * SHAPE.equivalent_duration)
-    (fit,) = _single(window, replace(Family.of(SHAPE, 1.0), epsilon=(0.0,)), SHAPE, start, _ranges(window))
-    (best,), part = fit.flares, int(np.argmax(fit.mixture.log_weight))
-    peak, half_width = np.array([best.peak_s]), np.array([best.half_width_s])
-    columns = np.column_stack([window.model(SHAPE, peak, half_width)[0] / window.scale, np.ones(window.values.size)])
-    covariance = np.linalg.inv(columns.T / window.noise @ columns)
-    light, level = covariance @ (columns.T / window.noise @ window.values)
-    duration = light / level * best.half_width_s * SHAPE.equivalent_duration
-    along = duration * np.array([1 / light, -1 / level])
-    assert fit.mixture.mean[part] == pytest.approx(duration, rel=1e-6)
-    assert fit.mixture.sd[part] == pytest.approx(np.sqrt(along @ covariance @ along), rel=1e-6)

@@ -1,7 +1,5 @@
 """Families of shapes and the process of a light curve: their matrices, and work that does not grow with its length."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 from types import SimpleNamespace
@@ -18,74 +16,9 @@ from mauvecl import SHAPES, Frames, Study, analyse
 from mauvecl.observations import event_windows, events
 from mauvecl.observations.detection import detect_events
 from mauvecl.observations.event_fits import Mixture
-from mauvecl.observations.event_windows import Family, Likelihood, families
 from mauvecl.observations.level import process_level
 from mauvecl.observations.process import Covariance, Process, ProcessTerm, Steps
 from mauvecl.observations.search import Detection, SeriesSurvey
-
-GENERAL = Family.general()
-
-
-def test_prior_weights_add_up_to_one() -> None:
-    for searched in SHAPES.values():
-        every = families(searched)
-        assert sum(one.prior for one in every) == pytest.approx(1.0)
-        assert searched.name in [one.name for one in every]
-
-
-def test_shares_of_the_slow_decay_have_equal_weights() -> None:
-    """No slow decay is one of five shares, though it has one rate where the others have 24."""
-    share, prior = GENERAL.weights[:, 6:].sum(axis=1).round(9), np.exp(GENERAL.log_prior)
-    weights = [prior[share == each].sum() for each in np.unique(share)]
-    assert weights == pytest.approx([0.2] * 5)
-
-
-def test_slow_decays_are_exponentials_of_all_rates() -> None:
-    tau = np.concatenate([[0.0], np.geomspace(1e-3, 150, 500)])
-    (fast,) = (each for each in GENERAL.parts[4:6] if isinstance(each, event_windows.Exponential))
-    pairs = [(share, rate) for share in event_windows.SLOW_SHARES for rate in event_windows.SLOW_RATES]
-    for k, (share, rate) in enumerate(pairs, 1):
-        slow = np.exp(-rate * tau) / rate
-        np.testing.assert_allclose(GENERAL.shape(k).after(tau), (1 - share) * fast.after(tau) + share * slow, atol=5e-5)
-
-
-@pytest.mark.parametrize("k", range(0, len(GENERAL.weights), 37))
-def test_shapes_have_a_peak_of_one_and_the_integral_of_their_values(k: int) -> None:
-    shape = GENERAL.shape(k)
-    # Values are differences of the integrals from both ends, which agree.
-    tau = np.concatenate([-np.geomspace(1e-6, 12, 4000)[::-1], np.geomspace(1e-6, 150, 8000)])
-    up, down = np.diff(shape.before(tau)), -np.diff(shape.after(tau))
-    np.testing.assert_allclose(up, down, rtol=1e-5, atol=1e-13)
-    at = up / np.diff(tau)
-    assert at.max() == pytest.approx(1.0, abs=2e-3)
-    assert np.argmax(at) == pytest.approx(np.searchsorted(tau, 0.0), abs=600)
-    # Slow decays are interpolated to 1e-5 of the peak.
-    assert (at >= -1e-5).all()
-    assert np.sum(np.diff(tau) * at) == pytest.approx(shape.equivalent_duration, rel=1e-4)
-    assert GENERAL.durations[k] == pytest.approx(shape.equivalent_duration, rel=1e-12)
-
-
-def test_fits_of_all_shapes_are_those_of_each() -> None:
-    rng = np.random.default_rng(3)
-    n, n_node = 12, 5
-    parts = rng.random((len(GENERAL.parts), n_node, n))
-    root = rng.standard_normal((n, n))
-    likelihood = Likelihood(SimpleNamespace(), root @ root.T, 0.0, np.zeros(n), 0.0, np.zeros(n), 0.0)  # type: ignore[arg-type]
-    values = 5 + rng.standard_normal(n)
-    slope, information = likelihood.matched(parts, GENERAL.weights, values)
-    for k in range(0, len(GENERAL.weights), 29):
-        for node in range(n_node):
-            model = GENERAL.weights[k] @ parts[:, node]
-            assert information[k, node] == pytest.approx(model @ likelihood.inverse @ model, rel=1e-10)
-            assert slope[k, node] == pytest.approx(model @ likelihood.inverse @ values, rel=1e-8, abs=1e-8)
-
-
-def test_parts_without_light_have_no_product_with_values() -> None:
-    n = 12
-    likelihood = Likelihood(SimpleNamespace(), np.eye(n), 0.0, np.zeros(n), 0.0, np.zeros(n), 0.0)  # type: ignore[arg-type]
-    slope, information = likelihood.matched(np.zeros((len(GENERAL.parts), 5, n)), GENERAL.weights, np.ones(n))
-    assert (slope == 0).all()
-    assert (information > 0).all()
 
 
 @pytest.mark.parametrize("mean", [-40.0, -5.0, 0.0, 3.0, 1e4])
@@ -94,18 +27,6 @@ def test_quantiles_are_those_of_a_truncated_normal_distribution(mean: float) -> 
     expected = stats.truncnorm(-mean / 2, np.inf, mean, 2.0)
     for probability in (0.025, 0.16, 0.5, 0.84, 0.975):
         assert mixture.quantile(probability) == pytest.approx(float(expected.ppf(probability)), rel=1e-5)
-
-
-def test_quantiles_of_a_mixture_are_those_of_its_draws() -> None:
-    """The allowed errors are five standard errors of the draws."""
-    log_weight, mean, sd = np.log([1.0, 2.0, 3.0]), np.array([-1.0, 2.0, 6.0]), np.array([1.0, 3.0, 0.5])
-    rng = np.random.default_rng(5)
-    which = rng.choice(3, 400_000, p=np.exp(log_weight) / 6)
-    drawn = mean[which] + sd[which] * rng.standard_normal(which.size)
-    drawn = drawn[drawn > 0]
-    for probability in (0.025, 0.16, 0.5, 0.84, 0.975):
-        below = np.mean(drawn < Mixture(log_weight + 3.0, mean, sd).quantile(probability))
-        assert abs(below - probability) < 5 * np.sqrt(probability * (1 - probability) / drawn.size)
 
 
 @pytest.mark.parametrize("middle", [-3.0, 0.1, 5.0, 300.0])

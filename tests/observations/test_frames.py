@@ -1,7 +1,5 @@
 """Frames from arrays, from containers of other packages and from the layouts of the documentation."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """GJ 65 as GALEX saw it in the near ultraviolet: a whole archive file, with a bad bin, a spike and two known flares."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

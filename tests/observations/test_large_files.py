@@ -1,7 +1,5 @@
 """Files larger than memory are read in pieces, in a process whose address space is limited."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Steps of the level that last, as where observations are joined: they are fitted, and flares beside them are found."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """Sudden changes of the light that all pixels share, in spectra with a known truth."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,17 +1,13 @@
 """Spectra of frames: line indices, the colour of events, and flares of neighbours that look like one."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import astropy.units as u
 import numpy as np
 import pytest
 from scenes import MG_II, analysed
-from scipy import stats
 
 from mauvecl import Frames, Instrument, Source, Study, analyse, expect
-from mauvecl.observations.event_spectra import event_colour
 from mauvecl.observations.visits import line_index
 
 AU_MIC = Path(__file__).parents[1] / "data" / "flares" / "aumic_iue"
@@ -30,31 +26,6 @@ def test_straight_continuum_is_removed_exactly(slope: float) -> None:
     assert found.flux == pytest.approx(2.0, abs=2e-6)
     assert found.equivalent_width_nm == pytest.approx(0.4, abs=1e-5)
     assert np.isnan(found.error)
-
-
-def test_error_is_that_of_linear_propagation() -> None:
-    """The derivative by each pixel is measured; the index is linear, so that differences of any size are exact."""
-    error = 0.1 + 0.02 * np.sin(NM)
-    flux = 5.0 + LINE
-    one = np.array([mg_ii(NM, flux + np.eye(NM.size)[k], error)[0] for k in range(NM.size)])
-    start, stated = mg_ii(NM, flux, error)
-    assert stated == pytest.approx(np.sqrt((((one - start) * error) ** 2).sum()), rel=1e-9)
-
-
-@pytest.mark.long
-def test_flux_equals_that_of_specutils() -> None:
-    specutils = pytest.importorskip("specutils")
-    from specutils.analysis import line_flux
-
-    # Limits of the band on the edges of pixels, which both packages count alike.
-    low, high = 278.45, 281.55
-    inside = ((NM > 275.5) & (NM < 278)) | ((NM > 282) & (NM < 284.5))
-    flux = 3.0 + 0.1 * (NM - 280) + LINE
-    net = flux - np.polyval(np.polyfit(NM[inside], flux[inside], 1), NM)
-    spectrum = specutils.Spectrum(spectral_axis=NM * u.nm, flux=net * u.one)
-    there = line_flux(spectrum, specutils.SpectralRegion(278.5 * u.nm, 281.5 * u.nm)).to_value(u.nm)
-    found = line_index(NM, flux, band_nm=(low, high), continuum_nm=[(275.5, 278), (282, 284.5)])
-    assert found.flux == pytest.approx(there, rel=1e-5)
 
 
 def test_batch_of_spectra_equals_single_spectra() -> None:
@@ -83,24 +54,6 @@ def test_mg_ii_of_au_mic_lies_in_the_published_range() -> None:
 PIXELS, FRAMES = 40, 300
 STAR = np.linspace(100.0, 900.0, PIXELS)
 BLUE = np.linspace(300.0, 50.0, PIXELS)
-
-
-def test_an_event_without_colour_has_uniform_p_values() -> None:
-    """Kolmogorov's test over 300 events of one star; fails by chance once in ten thousand times."""
-    rng = np.random.default_rng(298)
-    event = np.zeros(120, np.bool_)
-    event[50:60] = True
-    values, ratios = [], []
-    for _ in range(300):
-        mean = STAR * np.where(event, 1.2, 1.0)[:, None]
-        error = np.full(mean.shape, 10.0)
-        found = event_colour(rng.normal(mean, error), error, event, ~event)
-        values.append(found.p_value)
-        ratios.append((found.blue_over_red - 1) / found.blue_over_red_error)
-    # The star's own error makes the spectra slightly more different: by 0.2^2 of its variance.
-    assert stats.kstest(values, "uniform").pvalue > 1e-4
-    assert abs(np.mean(ratios)) < 0.3
-    assert 0.85 < np.std(ratios) < 1.15
 
 
 def test_the_answer_tells_a_flare_from_a_change_of_throughput() -> None:

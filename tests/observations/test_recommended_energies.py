@@ -1,7 +1,5 @@
 """Recommended energies of flares in short windows: their intervals hold the truth as often as stated."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Times: FITS keywords, dates, and the Solar System's barycentre against an independent route."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +9,7 @@ import pytest
 from astropy.io import fits
 from astropy.table import Table
 from astropy.time import Time
+from scenes import paper
 
 from mauvecl import Frames, Study, analyse, read_frames, visible
 from mauvecl.observations.reduction import barycentric
@@ -19,7 +18,7 @@ RNG = np.random.default_rng(29)
 TIME = np.arange(200) * 30.0 + 15.0
 FLUX = RNG.normal(1000, 5, TIME.size)
 ORBIT = Study().paper().orbit.orbit()
-(AU_MIC,) = visible(Study().paper().with_settings(["orbit.targets=['311.2897 -31.3409']", "orbit.days=0.1"])).targets
+(AU_MIC,) = visible(paper("orbit.targets=['311.2897 -31.3409']", "orbit.days=0.1")).targets
 #: Days near the epoch of the embedded elements, and far from them.
 NEAR, FAR = "2026-09-16T03:00:00", "2027-03-01T00:00:00"
 

@@ -5,8 +5,6 @@
 writes them into the package, where the self-test reads them.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """NumPy reference implementation of the stare kernels, with the same counters, arithmetic and order of summation."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterable
 

@@ -1,7 +1,5 @@
 """Stores of raw spectra: content, verification, and recovery."""
 
-from __future__ import annotations
-
 import fcntl
 import json
 import os

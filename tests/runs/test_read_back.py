@@ -1,7 +1,5 @@
 """Stores, FITS and HDF5 files are read back as frames with their metadata, and refuse what they cannot use."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

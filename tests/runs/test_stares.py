@@ -1,7 +1,5 @@
 """Shards of stares join to the same bits, whoever draws them and whatever is kept."""
 
-from __future__ import annotations
-
 import pickle
 from dataclasses import dataclass, replace
 from pathlib import Path

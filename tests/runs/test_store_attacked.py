@@ -1,7 +1,5 @@
 """Stores under attack: wrong studies, other people's files, two processes, absurd sizes."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Verbs that are killed and resumed give the same tables, and compute nothing twice."""
 
-from __future__ import annotations
-
 import json
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """Flares that the search of a drawn stare finds: each once, overlapping ones apart, with intervals that cover."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import cache
 from typing import Any
@@ -9,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from astropy.table import QTable, Row
+from scenes import paper
 from scipy.stats import binom, chi2
 
 from mauvecl import Event, Study, stare
@@ -42,14 +41,14 @@ def found(events: list[Event], seed: int, settings: tuple[str, ...] = FAINT) -> 
         f"shape='{one.form.name}'}}"
         for one in events
     ]
-    return stare(Study().paper().with_settings([*settings, f"run.seed={seed}", f"events=[{', '.join(given)}]"])).found
+    return stare(paper(*settings, f"run.seed={seed}", f"events=[{', '.join(given)}]")).found
 
 
 @cache
 def snr_per_amplitude() -> float:
     """Return the S/N of a flare of half-width 1 s and amplitude 1 against the noise of the quiescent star."""
     event = "events=[{peak_s=1000.0, half_width_s=100.0, amplitude=1e-4}]"
-    (row,) = stare(Study().paper().with_settings([*FAINT, "stare.search=false", event])).events
+    (row,) = stare(paper(*FAINT, "stare.search=false", event)).events
     return float(row["snr"] / 1e-4 / np.sqrt(100.0))
 
 

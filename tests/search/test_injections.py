@@ -1,7 +1,5 @@
 """Searches of whole stares: false alarms are as often as asked for, and injections are found as drawn flares are."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

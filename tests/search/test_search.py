@@ -1,7 +1,5 @@
 """Searches of sums of frames: values of filters, losses of a bank, and rates of false alarms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from refusals import refused

@@ -1,7 +1,5 @@
 """Fits along stares whose light, star, sky and temperature change by unknown amounts, drawn by NumPy."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

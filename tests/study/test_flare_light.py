@@ -1,7 +1,5 @@
 """Flare spectra in studies, flags and answers."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Keys of studies: their units and ranges wherever a value can be given, their paths, and older files."""
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -11,10 +9,9 @@ import astropy.units as u
 import numpy as np
 import pytest
 from refusals import refused
-from study_keys import fields, metadata
+from study_keys import NUMERIC, ends, fields, metadata, outside, reach
 
 from mauvecl import BalmerFlare, InputError, Instrument, Sky, Source, Study, TwoBlackbodies, detect, expect
-from mauvecl.web.page import State
 
 FIELDS = dict(fields())
 
@@ -43,22 +40,6 @@ def test_values_in_range_are_plain_numbers(key: str, value: Any, plain: Any) -> 
 
 # Ranges of quantities
 
-#: Paths of the quantities that sweeps, maps and limits vary, except names.
-NUMERIC = {
-    quantity.name: path
-    for path, field in FIELDS.items()
-    if (quantity := metadata(field, "Quantity")) is not None and quantity.name != "star"
-}
-#: Names in the page's links.
-PAGE = {
-    "magnitude": "magnitude",
-    "amplitude": "amplitude_percent",
-    "exposure": "exposure_s",
-    "flare_temperature": "flare_temperature_k",
-    "detector_temperature": "temperature_c",
-    "sky": "sky_brightness",
-}
-
 
 def star() -> Source:
     return Source.from_library("G2V")
@@ -76,22 +57,6 @@ CALLS: dict[str, Callable[[float], Any]] = {
     "detector_temperature": lambda v: Instrument.load("mauvesim").with_(temperature_c=v),
     "sky": Sky.of_brightness,
 }
-
-
-def reach(name: str) -> Any:
-    return metadata(FIELDS[NUMERIC[name]], "Range")
-
-
-def outside(name: str) -> list[float]:
-    """Return values just outside of both ends of a range."""
-    one = reach(name)
-    below = one.low if one.open_low else one.low - 1e-9 * max(abs(one.low), 1.0)
-    return [below, one.high if one.open_high else one.high * (1 + 1e-9)]
-
-
-def ends(name: str) -> list[float]:
-    one = reach(name)
-    return [1e-3 if one.open_low else one.low, 0.999 if one.open_high else one.high]
 
 
 def refuses(call: Callable[[], Any]) -> bool:
@@ -131,17 +96,6 @@ def test_keys_sweeps_and_maps_have_the_range(name: str) -> None:
 def test_python_arguments_have_the_range(name: str) -> None:
     assert all(refuses(lambda: CALLS[name](value)) for value in outside(name))  # noqa: B023
     assert not any(refuses(lambda: CALLS[name](value)) for value in ends(name))  # noqa: B023
-
-
-@pytest.mark.parametrize("name", PAGE)
-def test_page_has_the_range(name: str) -> None:
-    scale = 100 if name == "amplitude" else 1
-    for values, faulty in ((outside(name), True), (ends(name), False)):
-        for value in values:
-            state = State()
-            state.follow(f"?{PAGE[name]}={scale * value!r}")
-            faults = state.faults_of(state.entered)
-            assert (PAGE[name] in faults) == faulty, (value, faults)
 
 
 def test_keys_of_one_kind_share_a_range() -> None:

@@ -1,7 +1,5 @@
 """Photosphere and magnitude of each star of a study, and processes in its stares."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

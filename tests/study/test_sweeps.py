@@ -1,7 +1,5 @@
 """Sweeps over products and lists in detection, limits and S/N, and comparison with the Gaussian formula."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

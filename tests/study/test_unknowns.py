@@ -1,7 +1,5 @@
 """Averages over unknown instrument values, and their importance."""
 
-from __future__ import annotations
-
 from itertools import permutations
 from typing import Any
 

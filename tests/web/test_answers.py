@@ -1,7 +1,5 @@
 """Fields and answers of the page, as its script asks for them: what is entered, the two chances, limits, pictures."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import re
@@ -13,6 +11,7 @@ import numpy as np
 import pytest
 from marks import long_but
 from scipy.interpolate import RegularGridInterpolator
+from study_keys import ends, outside
 
 from tests.web.visits import Server, Talk, column, link
 
@@ -20,6 +19,21 @@ NUMBER = r"(-?[\d.]+(?:e[+-]\d+)?)"
 HOSTILE = "![x](http://127.0.0.1:1/x.png) <img src=http://127.0.0.1:1/y.png>"
 M_DWARF = {"star": "M3V", "magnitude": "9", "amplitude_percent": "2", "exposure_s": "50"}
 TEXTS = tomllib.loads((Path(__file__).parents[1] / "data" / "web" / "texts.toml").read_text(encoding="utf-8"))
+#: Quantities of studies by their fields.
+QUANTITIES = {
+    "magnitude": "magnitude",
+    "amplitude": "amplitude_percent",
+    "exposure": "exposure_s",
+    "flare_temperature": "flare_temperature_k",
+    "detector_temperature": "temperature_c",
+    "sky": "sky_brightness",
+}
+#: Written by the page of version 0.1.0.
+OLD_LINK = (
+    "?star=M3V&magnitude=9&band=V&amplitude_percent=10&exposure_s=50&flare_temperature_k=10000&temperature_c=21"
+    "&instrument=mauve&signal=net&sky=brightness&sky_brightness=22.1&statistic=matched&fap=0.001&unknown=the+usual"
+    "&hours=100&realisations=100000&seed=1&tab=limit"
+)
 UNKNOWN = ("realistic", "ideal")
 
 
@@ -82,6 +96,18 @@ def test_invalid_numbers_are_faults_and_ranges_include_their_ends(server: Server
     server.visited(work)
 
 
+def test_ranges_are_those_of_studies(server: Server) -> None:
+    async def work(talk: Talk) -> None:
+        for name, field in QUANTITIES.items():
+            scale = 100 if name == "amplitude" else 1
+            for values, faulty in ((outside(name), True), (ends(name), False)):
+                for value in values:
+                    faults = await talk.faults(link(**{field: repr(scale * value)}))
+                    assert ("out of range" in faults.get(field, "")) == faulty, (value, faults)
+
+    server.visited(work)
+
+
 def test_texts_are_refused_at_their_field_or_accepted(server: Server) -> None:
     async def work(talk: Talk) -> None:
         for row in TEXTS["refused"]:
@@ -107,6 +133,13 @@ def test_links_are_read_with_care(server: Server, words: dict[str, Any]) -> None
         reported = await talk.answer("?star=" + "G" * 10_000)
         assert "more than 8192" in reported["stray"]
         assert "answer" in reported
+        reported = await talk.answer(OLD_LINK)
+        assert "version 1" in reported["stray"]
+        assert reported["faults"] == {}
+        assert "a 10 % flare (10000 K) on an M3V star" in reported["answer"]["words"]
+        assert "with the payload mauvesim" in reported["answer"]["words"]
+        command = (await talk.exported(OLD_LINK))["detection"]["command"]
+        assert "--ideal" not in command
         for text in (HOSTILE, "1 & 2=3", "\ud83d\ude00".encode("utf-16", "surrogatepass").decode("utf-16")):
             assert f"'{text[:8]}" in (await talk.faults(link(star=text)))["star"]
         assert "magnitude" in (await talk.faults("?magnitude=")), "an emptied field is not filled"

@@ -1,7 +1,5 @@
 """The same questions asked on the command line, in Python and on the page have the same answers, to the digits."""
 
-from __future__ import annotations
-
 import io
 import json
 from pathlib import Path

@@ -1019,36 +1019,11 @@ def test_visitor_loses_the_server_and_finds_it_again(browser: Browser, server: S
 MOST_STOPS = 150
 
 
-class Mouse:
-    """Visitor with a mouse, who clicks into fields, on buttons, and twice at a list: to open it and to choose."""
+class Keys:
+    """Visitor with the keyboard alone, who sees at each stop where he is; a choice counts as two clicks."""
 
     def __init__(self, page: Page) -> None:
         self.page, self.clicks = page, 0
-
-    def press(self, control: Locator) -> None:
-        """Press a button or go into a field."""
-        control.click()
-        self.clicks += 1
-
-    def choose(self, control: Locator, option: str) -> None:
-        """Choose from a list."""
-        control.select_option(option)
-        self.clicks += 2
-
-    def turn(self, name: str) -> None:
-        """Open a tab."""
-        self.press(self.page.get_by_role("tab", name=name, exact=True))
-
-    def type(self, control: Locator, *lines: str) -> None:
-        """Go into a field and type, each line with Enter."""
-        self.press(control)
-        for line in lines:
-            self.page.keyboard.type(line)
-            self.page.keyboard.press("Enter")
-
-
-class Keys(Mouse):
-    """Visitor with the keyboard alone, who sees at each stop where he is."""
 
     def reach(self, control: Locator) -> None:
         """Go from stop to stop until this one."""
@@ -1083,6 +1058,13 @@ class Keys(Mouse):
         assert self.page.locator("[role=tab][aria-selected=true]").inner_text().strip() == name
         self.clicks += 1
 
+    def type(self, control: Locator, *lines: str) -> None:
+        """Go into a field and type, each line with Enter."""
+        self.press(control)
+        for line in lines:
+            self.page.keyboard.type(line)
+            self.page.keyboard.press("Enter")
+
 
 def sentence(page: Page, part: str) -> str:
     """Return the limit in a sentence, once it has these words."""
@@ -1092,7 +1074,7 @@ def sentence(page: Page, part: str) -> str:
     return solved.inner_text()
 
 
-def which_flares_on_an_m_dwarf(visitor: Mouse) -> None:
+def which_flares_on_an_m_dwarf(visitor: Keys) -> None:
     page = visitor.page
     visitor.type(page.get_by_label("Star", exact=True), "AU Mic")
     told = sentence(page, "at V = 8.81")
@@ -1101,14 +1083,14 @@ def which_flares_on_an_m_dwarf(visitor: Mouse) -> None:
     assert visitor.clicks == 1
 
 
-def limiting_magnitude(visitor: Mouse) -> None:
+def limiting_magnitude(visitor: Keys) -> None:
     page = visitor.page
     visitor.choose(page.get_by_label("Solve for", exact=True), "magnitude")
     assert "to V = 8.40 if everything but the noise were known" in sentence(page, "to V = 7.26")
     assert visitor.clicks == 2
 
 
-def own_spectrum_in_angstrom(visitor: Mouse) -> None:
+def own_spectrum_in_angstrom(visitor: Keys) -> None:
     """Upload the same spectrum in nm and in Angstrom, which give the same answer."""
     page = visitor.page
     nm = np.linspace(170.0, 1000.0, 400)
@@ -1128,7 +1110,7 @@ def own_spectrum_in_angstrom(visitor: Mouse) -> None:
     assert visitor.clicks == 2, "one for each file"
 
 
-def plan_of_three_targets(visitor: Mouse) -> None:
+def plan_of_three_targets(visitor: Keys) -> None:
     page = visitor.page
     visitor.turn("Plan")
     visitor.type(page.get_by_label("Target of target 1"), "AU Mic", "eps Eri", "YZ CMi")
@@ -1140,7 +1122,7 @@ def plan_of_three_targets(visitor: Mouse) -> None:
     assert visitor.clicks == 3
 
 
-def share_download_cite(visitor: Mouse) -> None:
+def share_download_cite(visitor: Keys) -> None:
     page = visitor.page
     with page.expect_download() as coming:
         visitor.press(page.locator("#figure-excess").get_by_role("button", name="PNG"))
@@ -1159,12 +1141,10 @@ TASKS = (which_flares_on_an_m_dwarf, limiting_magnitude, plan_of_three_targets, 
          own_spectrum_in_angstrom)  # fmt: skip
 
 
-@pytest.mark.parametrize("visitor", [Mouse, Keys])
-def test_newcomers_do_five_tasks(browser: Browser, server: Server, visitor: type[Mouse]) -> None:
-    """Visitors with a phone plan with the mouse; here the plan is one of the keyboard's tasks alone."""
+def test_newcomers_do_five_tasks(browser: Browser, server: Server) -> None:
     page = fresh(browser, server.address, permissions=["clipboard-read", "clipboard-write"])
-    for task in TASKS if visitor is Keys else [one for one in TASKS if one is not plan_of_three_targets]:
+    for task in TASKS:
         page.goto(server.address)
         settled(page)
-        task(visitor(page))
+        task(Keys(page))
     page.context.close()

@@ -1,7 +1,5 @@
 """The server: who is let in, what it makes of nonsense, what it computes for whom, and what it leaves behind."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import re
