@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -137,6 +138,12 @@ def test_study_of_version_1_is_read_as_it_was(text: str, instrument: str, tmp_pa
     assert study.observation.instrument == instrument
     assert not study.nuisances.usual
     assert study.run.statistics == ("chi2", "chi2_element", "matched")
+    new = tomllib.loads(study.toml())
+    assert new.keys() - tomllib.loads(Study().toml()).keys() == {"nuisances"}, "no section that says nothing"
+    assert new["nuisances"] == {"usual": False, "own": {}}
+    (tmp_path / "plan.toml").write_text(OLD + "[plan]\nhours = 10\n")
+    with pytest.warns(UserWarning, match="no version"):
+        assert Study.read(tmp_path / "plan.toml").plan.completeness == "injections"
     (tmp_path / "usual.toml").write_text(OLD + "[nuisances]\nusual = true\n")
     with pytest.warns(UserWarning, match="the usual unknowns drawn"):
         assert Study.read(tmp_path / "usual.toml").nuisances.usual
