@@ -109,6 +109,21 @@ FLARE_COLUMNS = (Column("statistic", description="detection statistic"), amplitu
 TEMPLATE_COLUMN = Column("template", description="amplitude of the flare that the statistic looks for")
 
 
+def chance_of_flare(study: Study, star: str, amplitude: float, quiet: Expectation, chance: str) -> str:
+    """Return the sentence on the chance that a flare is seen, without what follows it."""
+    saturated = int(quiet.saturated.sum())
+    without = (
+        f", without the {saturated} of {quiet.saturated.size} pixels that saturate in a frame of more than "
+        f"{quiet.longest_safe_frame_s:.3g} s"
+        if saturated
+        else ""
+    )
+    return (
+        f"{name_of_instrument(study)} would see a flare of {100 * amplitude:g} % on {star} in {quiet.exposure_s:g} s "
+        f"with a chance of {chance}{without}"
+    )
+
+
 @dataclass(eq=False)
 class DetectAnswer(Answer):
     """Answer of `detect`."""
@@ -155,19 +170,9 @@ class DetectAnswer(Answer):
         row, star = rows[place], self.stars[place // len(self.stars[0].amplitudes)]
         ideal = f"; {chance_text(row['ideal'])} {IF_KNOWN}" if "ideal" in rows.colnames else ""
         least = f", the least certain of {len(rows)} flares" if len(rows) > 1 else ""
-        quiet = star.detection.quiet
-        saturated = int(quiet.saturated.sum())
-        without = (
-            f", without the {saturated} of {quiet.saturated.size} pixels that saturate in a frame of more than "
-            f"{quiet.longest_safe_frame_s:.3g} s"
-            if saturated
-            else ""
-        )
-        return (
-            f"{name_of_instrument(self.study)} would see a flare of {100 * row['amplitude']:g} % on {star.title} in "
-            f"{quiet.exposure_s:g} s with a chance of {chance_text(row['probability'])} "
-            f"({chance_range(row['low'], row['high'])}{ideal}){without}{least}."
-        )
+        chance = f"{chance_text(row['probability'])} ({chance_range(row['low'], row['high'])}{ideal})"
+        seen = chance_of_flare(self.study, star.title, row["amplitude"], star.detection.quiet, chance)
+        return f"{seen}{least}."
 
     @property
     def views(self) -> list[View]:
