@@ -874,6 +874,16 @@ def test_visitor_pastes_and_opens_targets(page: Page, tmp_path: Path) -> None:
     until(page, lambda: page.get_by_label("age_myr of target 1").input_value() == "600")
     assert page.get_by_label("Target of target 1").input_value() == "one, two"
     until(page, lambda: page.get_by_role("button", name="Find when").is_enabled())
+    # Names of columns as on the command line.
+    file.write_text("source_id,main_id,RAJ2000,DEJ2000,Vmag,SpType,Plx\n12,HD 1,10.5,-3,8,K5V,100\n")
+    page.locator("#targets-file").set_input_files(file)
+    until(page, lambda: page.get_by_label("Target of target 1").input_value() == "12")
+    cells = [page.get_by_label(f"{name} of target 1").input_value() for name in ("V", "Type")]
+    assert cells == ["8", "K5V"]
+    until(page, lambda: page.get_by_role("button", name="Find when").is_enabled())
+    file.write_text("name\none\nAU Mic\n")
+    page.locator("#targets-file").set_input_files(file)
+    until(page, lambda: page.get_by_label("Target of target 2").input_value() == "AU Mic")
     page.get_by_role("button", name="Remove target 1", exact=True).click()
     assert page.get_by_label("Target of target 1").input_value() == "AU Mic"
     page.get_by_role("button", name="Remove all").click()
