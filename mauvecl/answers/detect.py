@@ -16,8 +16,6 @@ from mauvecl.answers.answer import (
     Answer,
     InCell,
     TableOf,
-    chance_range,
-    chance_text,
     name_of_instrument,
     realisations_of,
     reported,
@@ -52,7 +50,7 @@ from mauvecl.detection.statistics import Linear, Matched, Setting, read_weights
 from mauvecl.detection.tails import campaign, per_test
 from mauvecl.device.engine import Engine
 from mauvecl.runs.pool import Pool, map_in_order
-from mauvecl.schema.columns import Column, View, percent
+from mauvecl.schema.columns import Column, View, chance_range, chance_text, percent
 from mauvecl.schema.errors import InputError
 from mauvecl.study.cases import Case, amplitude_column, cases, collect_messages, star_column
 from mauvecl.study.nuisances import NuisanceChoice
@@ -177,7 +175,8 @@ class DetectAnswer(Answer):
     @property
     def views(self) -> list[View]:
         run, quiet = self.study.run, [star.detection.quiet for star in self.stars]
-        exposures = " and ".join(dict.fromkeys(f"{x.exposure_s:g} s ({x.n_frames} frames)" for x in quiet))
+        frames = {x.exposure_s: "1 frame" if x.n_frames == 1 else f"{x.n_frames} frames" for x in quiet}
+        exposures = " and ".join(f"{exposure_s:g} s ({text})" for exposure_s, text in frames.items())
         title = (
             f"Detection at a false-alarm probability of {run.fap:g} per test, {exposures}, {run.realisations:,} "
             "realisations"

@@ -303,14 +303,15 @@ class Analysis:
                 f"The level changes {often} suddenly for a day or more, by {100 * largest:+.2g} % at the most: light "
                 "is relative to the level after each change, and the table of frames has that level."
             )
-        if self.level.process.terms:
+        drifts = self.spectra is not None and self._drift > DRIFTS
+        if self.level.process.terms and not drifts:
             # A light curve that shows few periods of a process has another standard deviation than the process.
             spread = self.level.level[self.level.used].std() / self.survey.level
             lines.append(
                 "The quiescent light is not constant: its fitted level has a standard deviation of "
                 f"{100 * spread:.2g} %, by {self.level.process.describe(self.unit)}."
             )
-        if self.spectra is not None and self._drift > DRIFTS:
+        if drifts:
             lines.append(
                 "The sum over wavelength drifts by more than its level, as by the dark current of a detector whose "
                 "temperature changes: peaks and equivalent durations are relative to that level, and are not those of "

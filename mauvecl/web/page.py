@@ -10,7 +10,7 @@ from collections.abc import Collection, Mapping
 from typing import Any
 from urllib.parse import parse_qsl, urlencode
 
-from mauvecl.answers.answer import IF_KNOWN, chance_text
+from mauvecl.answers.answer import IF_KNOWN
 from mauvecl.answers.closed_forms import BOTH_CHANCES
 from mauvecl.answers.detect import chance_of_flare
 from mauvecl.answers.verbs import GROUPS, VERBS
@@ -18,6 +18,7 @@ from mauvecl.detection.names import check_fap
 from mauvecl.host.exposure.sky import parse_position, parse_time
 from mauvecl.host.stars.library import listed_note, resolve
 from mauvecl.host.tables.units import offline
+from mauvecl.schema.columns import chance_text
 from mauvecl.schema.errors import InputError, of_kind, shortened
 from mauvecl.study.plan import PlanTarget
 from mauvecl.web.closed_forms import TITLES, Answers, Chance, ClosedForms, chances, short

@@ -92,7 +92,7 @@ def test_amplitudes_like_percentages_have_a_note(tmp_path: Path) -> None:
     words = ("simulate", "-s", "M3V", "-m", "9", "--no-pictures", "-a")
     noted = run(*words, "24", folder=tmp_path).stderr
     assert "--amplitude 24 is a rise of 2400 %" in noted
-    assert "--amplitude 24% is one of 24 %" in noted
+    assert "--amplitude 24% is one of 24 %\n" in noted
     assert Study.read(tmp_path / "mauvecl-simulate" / "study.toml").flare.amplitudes == (24.0,)
     for text in ("0.24", "2400%"):
         assert "is a rise" not in run(*words, text, folder=tmp_path).stderr
