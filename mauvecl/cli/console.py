@@ -351,8 +351,10 @@ def show_view(view: View, *, wide: bool = True) -> bool:
         headings, cells = without_empty(*view.texts(view.details))
     title = view.title
     if not wide and cells and _width(headings, cells, range(len(headings))) > _room():
-        shared, headings, cells = _without_shared(headings, cells)
-        title = "; ".join([title, *shared])
+        shared, others, values = _without_shared(headings, cells)
+        # The parts of a single row begin with its label.
+        if len(cells) > 1 or _width(others, values, range(len(others))) <= _room():
+            title, headings, cells = "; ".join([title, *shared]), others, values
     show_table(title, headings, cells, wide=wide)
     return left_out
 

@@ -120,8 +120,8 @@ def test_a_study_has_its_star(tmp_path: Path) -> None:
 def test_few_realisations_sample_the_tails(tmp_path: Path) -> None:
     words = ("detect", "-s", "M3V", "-m", "9", "-a", "3%", "-n", "1000", "--statistic", "matched", "--no-pictures")
     shown = run(*words, folder=tmp_path).stdout
-    assert "1000 realisations are too few" in shown
-    assert "importance sampling" in shown
+    assert shown.startswith("Mauve would see")
+    assert shown.count("importance sampling") == 1
     assert Study.read(tmp_path / "mauvecl-detect" / "study.toml").run.tails == "sampled"
     # The threshold is that of many realisations: 3.09 standard deviations of a normal.
     table = Table.read(tmp_path / "mauvecl-detect" / "detection.ecsv")
