@@ -364,7 +364,7 @@ def _without_shared(
 ) -> tuple[list[str], list[str], list[list[str]]]:
     """Return the values of the first columns that all rows share, and the other headings and cells.
 
-    The first column of a single row is taken as shared.
+    Of a single row the first column alone counts as shared.
     """
     differing = (k for k, column in enumerate(zip(*cells, strict=True)) if len(set(column)) > 1)
     first = 1 if len(cells) == 1 else next(differing, 0)
