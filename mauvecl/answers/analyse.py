@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from operator import itemgetter
 from typing import TYPE_CHECKING
@@ -280,7 +280,7 @@ EVENTS = (
     Column("total_n_valid_data_points", lambda row: row.analysis.survey.stare.n_frames, "", "searched frames",
            kind=int),
     Column("dur", "duration_d", "d", "from the start of the first frame to the end of the last", "duration (min)",
-           lambda days: formatted(1440 * days, ".3g")),
+           lambda days: formatted(1440 * days, ".3g"), detail=True),
     Column("ampl_rec", lambda row: row.in_white_light(row.event.amplitude), "", "largest flux above the level, "
            "relative to the level; nan: the dark current changes the level", "peak", percent(".3g")),
     Column("ed", lambda row: row.fitted_s[0], "s", "recommended equivalent duration, of the whole flare: the light "
@@ -311,30 +311,31 @@ EVENTS = (
     Column("rate_measured", lambda row: row.rates[1], "1 / d", "the same with residuals resampled from quiescent "
            "frames"),
     Column("probability", "probability", "", "probability of such an event from noise anywhere in these frames, by "
-           "the larger rate", "from noise", _rate),
+           "the larger rate", "from noise", _rate, detail=True),
     Column("significant", "significant", "", "whether the rate is at most the wanted one", kind=bool),
     Column("verdict", "verdict", "", "detected: a flare with at most the wanted rate; candidate: a flare with a larger "
            "one, one like the changes of throughput in these frames, or one whose frames are together not brighter "
            "than the level; rejected: it resembles a flare, but its spectrum or shape is of another kind; undecided: "
            "the false-alarm rate is not known", "verdict", kind=str),
     Column("blue_over_red", lambda row: row.colour[0], "", "rise relative to the star in the blue half of the pixels "
-           "over that in the red half: 1 for a change of throughput; nan: no spectra", "blue/red", number(".3g")),
+           "over that in the red half: 1 for a change of throughput; nan: no spectra", "blue/red", number(".3g"),
+           detail=True),
     Column("blue_over_red_error", lambda row: row.colour[1], "", "its standard error"),
     Column("p_no_colour", lambda row: row.colour[2], "", "probability of a spectrum at least as different from the "
            "star's if the event has no colour, as a change of throughput"),
     Column("temperature", lambda row: row.quantity("temperature")[0], "K", "temperature of a blackbody fitted to the "
-           "summed spectra of the event; nan: not measured", "temperature (K)", number(".4g")),
+           "summed spectra of the event; nan: not measured", "temperature (K)", number(".4g"), detail=True),
     Column("temperature_low", lambda row: row.quantity("temperature")[1], "K", "lower end of its 68 % interval"),
     Column("temperature_high", lambda row: row.quantity("temperature")[2], "K", "upper end"),
     Column("energy", lambda row: row.quantity(ENERGY)[0], "erg", "bolometric energy in the frames of the event",
-           "energy (erg)", number(".3g")),
+           "energy (erg)", number(".3g"), detail=True),
     Column("energy_low", lambda row: row.quantity(ENERGY)[1], "erg", "lower end of its 68 % interval"),
     Column("energy_high", lambda row: row.quantity(ENERGY)[2], "erg", "upper end"),
     Column("unmeasured", "unmeasured", "", "why temperature or energy are not measured", kind=str),
     Column("snr_flare", lambda row: float("nan") if row.spectrum is None else row.spectrum.snr, "", "S/N of a flare in "
            "the event's spectrum if star, dark current and sky changed by any amount"),
     Column("kind", "event.kind", "", "flare, or what resembles one: step of the level, edge of a dip, change of "
-           "throughput, dark current or sky, cosmic ray", "kind", kind=str),
+           "throughput, dark current or sky, cosmic ray", "kind", kind=str, detail=True),
     Column("note", "note", "", "what is special", kind=str),
 )  # fmt: skip
 #: Columns of the table of frames, one row for all frames of an analysis.
@@ -664,6 +665,11 @@ def frame_model(study: Study, frames: Frames) -> FrameModel | str:
             distance_pc=star.distance_pc if named else None, radius_rsun=star.radius_rsun if named else None,
             order=study.observation.order,
         )  # fmt: skip
+        if not named:
+            # An amplitude is relative to the star.
+            flare = replace(
+                flare, derived=tuple(quantity for quantity in flare.derived if quantity.name != "amplitude")
+            )
         return FrameModel.of(frames, quiet, flare, flux_per_dn(quiet, case.instrument), named)
     except InputError as error:
         return f"Spectra are searched as their sum over wavelength: {error}."

@@ -51,23 +51,6 @@ class InCell:
         return full_label(self.label, self.at)
 
 
-def chance_text(value: float) -> str:
-    """Format a probability, with bounds instead of 0 and 100 %."""
-    if value != value:
-        return "no number"
-    if value > 0.9999:
-        return "> 99.99 %"
-    if value < 0.0001:
-        return "< 0.01 %"
-    shown = 100 * value
-    return f"{shown:.2f} %" if shown < 1 or shown > 99 else f"{shown:.1f} %"
-
-
-def chance_range(low: float, high: float) -> str:
-    """Format an interval of probabilities."""
-    return " to ".join(dict.fromkeys([chance_text(low), chance_text(high)]))
-
-
 def name_of_instrument(study: Study) -> str:
     """Return the instrument as sentences name it."""
     return "Mauve" if study.observation.instrument in shipped_names() else Path(study.observation.instrument).stem

@@ -23,7 +23,7 @@ from mauvecl.detection.names import MIN_IN_TAIL
 from mauvecl.detection.nuisances import Nuisances, join_names
 from mauvecl.detection.statistics import Matched, Setting
 from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, NUISANCES, PROCESSES, ThroughputMode, values_of
-from mauvecl.schema.columns import Column, First, number
+from mauvecl.schema.columns import Column, First, chance_text, number
 from mauvecl.schema.errors import InputError, Message
 from mauvecl.study.cases import Case
 from mauvecl.study.nuisances import KNOWN, NuisanceChoice
@@ -185,7 +185,7 @@ def chance_with_unknowns(prepared: Sequence[Case]) -> list[str]:
         return []
     text = (
         f"Everything but the noise is taken as known: {of} is then detected by the matched statistic with a chance of "
-        f"{100 * chances[case, flare]:.1f} %, with the usual unknowns of {100 * unknown:.1f} % (closed forms; "
+        f"{chance_text(chances[case, flare])}, with the usual unknowns of {chance_text(unknown)} (closed forms; "
         f"`nuisances.usual` draws them). These are {spoken(NuisanceChoice())}."
     )
     return [Message(text, BOTH_CHANCES)]

@@ -16,8 +16,6 @@ from mauvecl.answers.answer import (
     Answer,
     InCell,
     TableOf,
-    chance_range,
-    chance_text,
     name_of_instrument,
     realisations_of,
     reported,
@@ -52,7 +50,7 @@ from mauvecl.detection.statistics import Linear, Matched, Setting, read_weights
 from mauvecl.detection.tails import campaign, per_test
 from mauvecl.device.engine import Engine
 from mauvecl.runs.pool import Pool, map_in_order
-from mauvecl.schema.columns import Column, View, percent
+from mauvecl.schema.columns import Column, View, chance_range, chance_text, percent
 from mauvecl.schema.errors import InputError
 from mauvecl.study.cases import Case, amplitude_column, cases, collect_messages, star_column
 from mauvecl.study.nuisances import NuisanceChoice
@@ -109,6 +107,21 @@ FLARE_COLUMNS = (Column("statistic", description="detection statistic"), amplitu
 TEMPLATE_COLUMN = Column("template", description="amplitude of the flare that the statistic looks for")
 
 
+def chance_of_flare(study: Study, star: str, amplitude: float, quiet: Expectation, chance: str) -> str:
+    """Return the sentence on the chance that a flare is seen, without what follows it."""
+    saturated = int(quiet.saturated.sum())
+    without = (
+        f", without the {saturated} of {quiet.saturated.size} pixels that saturate in a frame of more than "
+        f"{quiet.longest_safe_frame_s:.3g} s"
+        if saturated
+        else ""
+    )
+    return (
+        f"{name_of_instrument(study)} would see a flare of {100 * amplitude:g} % on {star} in {quiet.exposure_s:g} s "
+        f"with a chance of {chance}{without}"
+    )
+
+
 @dataclass(eq=False)
 class DetectAnswer(Answer):
     """Answer of `detect`."""
@@ -155,24 +168,15 @@ class DetectAnswer(Answer):
         row, star = rows[place], self.stars[place // len(self.stars[0].amplitudes)]
         ideal = f"; {chance_text(row['ideal'])} {IF_KNOWN}" if "ideal" in rows.colnames else ""
         least = f", the least certain of {len(rows)} flares" if len(rows) > 1 else ""
-        quiet = star.detection.quiet
-        saturated = int(quiet.saturated.sum())
-        without = (
-            f", without the {saturated} of {quiet.saturated.size} pixels that saturate in a frame of more than "
-            f"{quiet.longest_safe_frame_s:.3g} s"
-            if saturated
-            else ""
-        )
-        return (
-            f"{name_of_instrument(self.study)} would see a flare of {100 * row['amplitude']:g} % on {star.title} in "
-            f"{quiet.exposure_s:g} s with a chance of {chance_text(row['probability'])} "
-            f"({chance_range(row['low'], row['high'])}{ideal}){without}{least}."
-        )
+        chance = f"{chance_text(row['probability'])} ({chance_range(row['low'], row['high'])}{ideal})"
+        seen = chance_of_flare(self.study, star.title, row["amplitude"], star.detection.quiet, chance)
+        return f"{seen}{least}."
 
     @property
     def views(self) -> list[View]:
         run, quiet = self.study.run, [star.detection.quiet for star in self.stars]
-        exposures = " and ".join(dict.fromkeys(f"{x.exposure_s:g} s ({x.n_frames} frames)" for x in quiet))
+        frames = {x.exposure_s: "1 frame" if x.n_frames == 1 else f"{x.n_frames} frames" for x in quiet}
+        exposures = " and ".join(f"{exposure_s:g} s ({text})" for exposure_s, text in frames.items())
         title = (
             f"Detection at a false-alarm probability of {run.fap:g} per test, {exposures}, {run.realisations:,} "
             "realisations"

@@ -49,24 +49,25 @@ ELEMENT_COLUMNS = (
 )
 #: Columns of the largest error of each prediction.
 WORST_COLUMNS = (
-    Column("best_snr", description="largest S/N per element by the formula", heading="best S/N", format=".2f"),
+    Column("best_snr", description="largest S/N per element by the formula", heading="best S/N", format=".2f",
+           detail=True),
     Column("snr_off_by",
            description="largest significant (4 standard errors) difference of the mean S/N from it; 0 if none",
            heading="S/N off by", format="+.3f"),
-    Column("at_nm", description="where", heading="at nm", format=number(".0f")),
+    Column("at_nm", description="where", heading="at nm", format=number(".0f"), detail=True),
     Column("coverage_low", description="smallest share of 1-sigma intervals that hold the truth, of all elements",
            heading="1-sigma intervals", format=lambda low, high: f"{100 * low:.2f}-{100 * high:.2f} %",
-           others=("coverage_high",)),
+           others=("coverage_high",), detail=True),
     Column("coverage_high", description="largest"),
     Column("five_sigma_above", description="how often a pixel lies 5 sigma above its mean, over the normal 2.9e-7; "
            "the most", heading="5 sigma above, below", format=lambda above, below: f"{above:.2f}, {below:.2f}",
-           others=("five_sigma_below",)),
+           others=("five_sigma_below",), detail=True),
     Column("five_sigma_below",
            description="how often a pixel lies 5 sigma below its mean, over the normal 2.9e-7; the least"),
     Column("fap_ratio", description="most wrong false-alarm probability over the promised one; 1 if none differs",
            heading="false alarms", format=".3f"),
-    Column("statistic", description="detection statistic", heading="statistic"),
-    Column("why", description="main cause of a difference from the closed form", heading="why"),
+    Column("statistic", description="detection statistic", heading="statistic", detail=True),
+    Column("why", description="main cause of a difference from the closed form", heading="why", detail=True),
     Column("probability_off_by",
            description="largest significant difference of a detection probability from the closed form",
            heading="detection off by", format="+.4f"),
@@ -182,8 +183,9 @@ class GaussianAnswer(Answer):
         ratios = np.asarray(cells["fap_ratio"])
         worst = float(ratios[np.argmax(np.abs(np.log(np.maximum(ratios, SMALLEST_RATIO))))])
         return (
-            f"The root-of-N formula is off by at most {snr:.2g} in S/N, and its false alarms are up to {worst:.3g} "
-            f"times as many as promised, in {len(cells)} case{'' if len(cells) == 1 else 's'}."
+            f"The root-of-N formula is {f'off by at most {snr:.2g}' if snr else 'right'} in S/N, and its false alarms "
+            f"are {'as many' if worst == 1.0 else f'up to {worst:.3g} times as many'} as promised, in {len(cells)} "
+            f"case{'' if len(cells) == 1 else 's'}."
         )
 
     @property

@@ -32,7 +32,7 @@ from mauvecl.device.engine import Stares
 from mauvecl.host.orbit.visibility import PARTICLES_SOURCE, THERMAL_SOURCE
 from mauvecl.runs.pool import map_in_order
 from mauvecl.schema.columns import Column, number, percent, records
-from mauvecl.schema.errors import InputError, Message, of_kind, printable
+from mauvecl.schema.errors import InputError, Message, of_kind, printable, together
 from mauvecl.schema.physical import DAY_S
 from mauvecl.search.completeness import Completeness, Yield, recovered_per_day
 from mauvecl.study.cases import SATURATED, Case, collect_messages
@@ -41,6 +41,7 @@ from mauvecl.study.study import Study
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.runs.pool import Pool
+    from mauvecl.study.sections import Star
 
 
 def two_digits(value: float) -> str:
@@ -139,7 +140,7 @@ ENERGY_COLUMNS = (
 
 def _target_columns(answer: PlanAnswer) -> tuple[Column, ...]:
     alarms = Column("false_alarms", lambda row: answer.study.search.rate * row.hours / 24, "", "expected of noise",
-                    "false alarms", two_digits)  # fmt: skip
+                    "false alarms", two_digits, detail=True)  # fmt: skip
     share = share_columns(answer.study, "observation.quiet.target_share")
     calibrated = any(target.of_throughput is not None for target in answer.planned)
     return (*COLUMNS[:-1], alarms, *share, *(THROUGHPUT_COLUMNS if calibrated else ()), COLUMNS[-1])
@@ -282,21 +283,23 @@ class PlanAnswer(Answer):
                 f"Flare rates of {', '.join(typical)} are those typical of their types at 1000 Myr: mass_msun and "
                 "age_myr, or their own rates, are more accurate."
             )
+        beyond = []
         for target in self.planned:
             if target.no_rates:
                 lines.append(f"{target.no_rates[0].upper()}{target.no_rates[1:]}; its expected flares are not given.")
             if target.rates is not None and target.completeness is not None and target.extrapolated:
                 low, high = target.rates.measured_erg
-                lines.append(
-                    f"E50 of {target.name}, {target.energy_at(0.5):.2g} erg, lies outside the {low:.2g} to {high:.2g} "
-                    "erg for which its flare rates are published: they are extrapolated."
+                beyond.append(
+                    f"{target.name} ({target.energy_at(0.5):.2g} erg, published for {low:.2g} to {high:.2g} erg)"
                 )
+        if beyond:
+            lines.append(f"Flare rates are extrapolated to E50 of {', '.join(beyond)}.")
         study = self.study
         if study.plan.completeness == "closed form" and (study.stare.has_unknowns or study.nuisances.usual):
             text = (
                 "FALSE ALARMS may be more than stated: the closed form marginalises over what is unknown in each "
                 "frame, and takes slower changes for known; "
-                "plan.completeness = 'injections' allows for them."
+                "`plan.completeness='injections'` allows for them."
             )
             lines.append(Message(text, "false alarms"))
         if study.plan.along_orbit and study.processes.particle_processes:
@@ -359,7 +362,15 @@ def plan(
             "'injections'",
             key=f"processes.{name}",
         )
-    stars = [star_of(text, study.orbit.simbad) for text in study.plan.targets]
+    stars: list[Star] = []
+    errors: list[InputError] = []
+    for text in study.plan.targets:
+        try:
+            stars.append(star_of(text, study.orbit.simbad))
+        except InputError as error:
+            errors.append(error)
+    if errors:
+        raise together(errors)
     if progress is not None:
         progress(0, len(stars))
     seen = visible(study)

@@ -212,7 +212,7 @@ COLUMNS = (
     Column("frames", "staring.stare.n_frames", "", "frames of the stare", "frames"),
     Column("observed", "staring.stare.observed_s", "s", "time in them", "recorded (s)", "g", detail=True),
     Column("intervals", lambda row: len(row.staring.stare.gtis), "",
-           "good time intervals: runs of frames without a gap", "intervals"),
+           "good time intervals: runs of frames without a gap", "intervals", detail=True),
     Column("flux", lambda row: float(np.median(row.light.mean[:, 0])), "DN / s",
            "median net light of a frame, sky included, without bias and dark", "light (DN/s)", ".4g"),
     Column("frame_noise", lambda row: float(np.median(row.light.sd[:, 0] / row.light.mean[:, 0])), "",
@@ -237,7 +237,8 @@ POINTING_COLUMN = Column(
 #: Columns of the table of flares, for `StareFlare`.
 EVENT_COLUMNS = (
     Column("peak_time", "event.peak_s", "s", "from the start of the stare; tau = 0 of the shape", "peak at (s)", ".6g"),
-    Column("half_width", "event.half_width_s", "s", "t_1/2 of the shape's publication", "half-width (s)", "g"),
+    Column("half_width", "event.half_width_s", "s", "t_1/2 of the shape's publication", "half-width (s)", "g",
+           detail=True),
     Column("amplitude", "event.amplitude", "", "the shape's own, in the flare's band"),
     Column("peak", "event.peak", "", "highest relative rise of the photons in the flare's band", "peak",
            percent(".3g")),
@@ -250,11 +251,14 @@ EVENT_COLUMNS = (
 )  # fmt: skip
 
 
-def _fitted(name: str, key: str, unit: str, text: str, heading: str = "", form: Any = "", *more: str) -> list[Column]:
+def _fitted(
+    name: str, key: str, unit: str, text: str, heading: str = "", form: Any = "", *more: str, detail: bool = False
+) -> list[Column]:
     """Return the columns of a fitted quantity: value, standard error, and ends of its 68 % interval."""
     error = key.replace("_s", "_error_s").replace("_k", "_error_k") if key[-2:] in ("_s", "_k") else f"{key}_error"
     return [
-        Column(name, lambda row: float(getattr(row.alarm.recovered, key)[0]), unit, text, heading, form, more),
+        Column(name, lambda row: float(getattr(row.alarm.recovered, key)[0]), unit, text, heading, form, more,
+               detail=detail),
         Column(f"{name}_error", lambda row: float(getattr(row.alarm.recovered, error)[0]), unit,
                f"{text}; standard error by curvature"),
         *_interval(name, key, unit),
@@ -273,7 +277,7 @@ FOUND_COLUMNS = (
     *_fitted("peak_time", "peak_s", "s", "from the start of the stare", "peak at (s)", number(".6g", "not measured")),
     *_fitted("amplitude", "amplitude", "", "in the flare's band", "amplitude", _percent_with_error, "amplitude_error"),
     *_fitted("half_width", "half_width_s", "s", "t_1/2 of the search's shape", "half-width (s)", with_error,
-             "half_width_error"),
+             "half_width_error", detail=True),
     *_fitted("temperature", "temperature_k", "K", "blackbody temperature", "temperature (K)", with_error,
              "temperature_error"),
     *_fitted("equivalent_duration", "equivalent_duration_s", "s", "in the flare's band"),
@@ -381,7 +385,7 @@ class StareAnswer(Answer):
             if isinstance(stare.search, SearchResult):
                 above = f"{stare.search.threshold:.2f}, {self.study.search.rate_text}"
                 table = table_of(FOUND_COLUMNS, stare.found)
-                views.append(View(f"Found at {stare.title} above {above}", FOUND_COLUMNS, table))
+                views.append(View(f"Found at {stare.title} above an S/N of {above}", FOUND_COLUMNS, table))
         return views
 
     def light_curve(self, number: int = 0) -> QTable:

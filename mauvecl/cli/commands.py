@@ -22,11 +22,11 @@ from mauvecl.cli.flags import (
     PaperFlag,
     QuietFlag,
     SetFlag,
-    StudyFile,
     as_text,
     holds_study,
     is_star,
     output_flag,
+    study_argument,
     study_flags,
     warn_of_percent,
 )
@@ -65,7 +65,7 @@ class Command:
         named, observes = inspect.Parameter.KEYWORD_ONLY, verb.accepts("observation.instrument")
         options = self._options().items()
         parameters = [
-            inspect.Parameter("study_file", named, default=None, annotation=StudyFile),
+            inspect.Parameter("study_file", named, default=None, annotation=study_argument(flags)),
             *(inspect.Parameter(key, named, default=None, annotation=flag.kind) for key, flag in flags.items()),
             inspect.Parameter("set", named, default=None, annotation=SetFlag),
             *([inspect.Parameter("paper", named, default=False, annotation=PaperFlag)] if observes else []),
@@ -115,8 +115,7 @@ class Command:
         question_values(study, detects={"fap", "realisations"} <= flags.keys())
         if self.draws:
             question_time(study, insist=how["insist"])
-        with Session(verb.name, study, **how) as session:
-            session.say(messages)
+        with Session(verb.name, study, notes=messages, **how) as session:
             self.run(session, **values)
 
     def _options(self) -> dict[str, tuple[Any, Any]]:
@@ -158,6 +157,7 @@ def _placed(study_file: Path | None, given: dict[str, Any]) -> Path | None:
         "targets": (lambda path: not holds_study(path), "tables of targets", lambda path: path),
         "data": (lambda path: path.suffix.lower() != ".toml", "observed frames", lambda path: path),
         "star": (is_star, "stars", lambda path: [str(path)]),
+        "look_at": (is_star, "targets", lambda path: [str(path)]),
     }
     for key, (applies, plural, value) in others.items():
         if key in given and study_file is not None and applies(study_file):

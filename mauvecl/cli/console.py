@@ -12,6 +12,7 @@ import re
 import shlex
 import sys
 import tempfile
+import textwrap
 import time
 import traceback
 import warnings
@@ -166,8 +167,8 @@ def _say(text: str, code: int, *, whole: bool = False) -> int:
 
 
 def _warn(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
-    """Print a warning of a library on one line."""
-    _say(f"note: {message} ({category.__name__})", 0)
+    """Print a warning on one line, with its kind unless it is one of mauvecl's own."""
+    _say(f"note: {message}" + ("" if category is UserWarning else f" ({category.__name__})"), 0)
 
 
 def _print_anything() -> None:
@@ -315,12 +316,20 @@ class Meter:
 
 
 def show(lines: Sequence[str]) -> None:
-    """Print plain lines on standard output."""
+    """Print plain lines on standard output, broken between words on a terminal."""
     from rich.console import Console
 
     console = Console(highlight=False, soft_wrap=True, markup=False, emoji=False)
     for line in lines:
-        console.print(line)
+        console.print(_broken(line, console.width) if console.is_terminal else line)
+
+
+def _broken(line: str, width: int) -> str:
+    """Break a line between words, and indent what follows where it is indented; longer words remain whole."""
+    indent = " " * (len(line) - len(line.lstrip()))
+    return textwrap.fill(
+        line, max(width, len(indent) + 1), subsequent_indent=2 * indent, break_long_words=False, break_on_hyphens=False
+    )
 
 
 def show_view(view: View, *, wide: bool = True) -> bool:
@@ -341,9 +350,11 @@ def show_view(view: View, *, wide: bool = True) -> bool:
     if left_out:
         headings, cells = without_empty(*view.texts(view.details))
     title = view.title
-    if not wide and len(cells) > 1 and _width(headings, cells, range(len(headings))) > _room():
-        shared, headings, cells = _without_shared(headings, cells)
-        title = "; ".join([title, *shared])
+    if not wide and cells and _width(headings, cells, range(len(headings))) > _room():
+        shared, others, values = _without_shared(headings, cells)
+        # The parts of a single row begin with its label.
+        if len(cells) > 1 or _width(others, values, range(len(others))) <= _room():
+            title, headings, cells = "; ".join([title, *shared]), others, values
     show_table(title, headings, cells, wide=wide)
     return left_out
 
@@ -351,8 +362,12 @@ def show_view(view: View, *, wide: bool = True) -> bool:
 def _without_shared(
     headings: Sequence[str], cells: Sequence[Sequence[str]]
 ) -> tuple[list[str], list[str], list[list[str]]]:
-    """Return the values of the first columns that all rows share, and the other headings and cells."""
-    first = next((k for k, column in enumerate(zip(*cells, strict=True)) if len(set(column)) > 1), 0)
+    """Return the values of the first columns that all rows share, and the other headings and cells.
+
+    Of a single row the first column alone counts as shared.
+    """
+    differing = (k for k, column in enumerate(zip(*cells, strict=True)) if len(set(column)) > 1)
+    first = 1 if len(cells) == 1 else next(differing, 0)
     shared = [f"{heading} {text}" for heading, text in zip(headings[:first], cells[0], strict=False)]
     return shared, list(headings[first:]), [list(row[first:]) for row in cells]
 
@@ -377,8 +392,7 @@ def show_table(title: str, columns: Sequence[str], cells: Sequence[Sequence[Any]
     console = Console(**how)
     if wide and not console.is_terminal:
         console = Console(**how, width=WIDEST)
-    # rich would wrap a table's title at the table's width.
-    console.print(title, soft_wrap=True)
+    show([title])
     for part in _parts(columns, cells, filled, console.width):
         # A column that exceeds the terminal is printed completely.
         Console(**how, width=max(console.width, _width(columns, cells, part))).print(_table(columns, cells, part))

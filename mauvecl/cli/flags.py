@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import partial
@@ -22,14 +22,18 @@ if TYPE_CHECKING:
 
     from mauvecl.study.keywords import Keyword
 
-StudyFile = Annotated[
-    Path | None,
-    typer.Argument(
-        help="Study (TOML), the ECSV table of an answer, or a star as for --star; flags override it.",
-        show_default=False,
-        autocompletion=complete_study,
-    ),
-]
+#: What the argument of the study may be instead, by the flag of a command that takes it.
+PLACES = {"targets": "a table of targets", "data": "a file of frames", "star": "a star as for --star"}
+
+
+def study_argument(flags: Collection[str]) -> Any:
+    """Return the annotation of the argument that is a study, or in its place what a flag takes."""
+    other = next((f", or {what}" for flag, what in PLACES.items() if flag in flags), "")
+    described = f"Study (TOML), the ECSV table of an answer{other}; flags override it."
+    argument = typer.Argument(help=described, show_default=False, autocompletion=complete_study)
+    return Annotated[Path | None, argument]
+
+
 DeviceFlag = Annotated[
     str | None,
     typer.Option(metavar="TEXT", help="OpenCL device: number or part of its name [PoCL].", show_default=False),

@@ -37,6 +37,10 @@ MOST_SPECTRA = 1e16
 MOST_REALISATIONS = 2**63 - 1
 
 
+#: Words of the messages that thresholds are not counted.
+SAMPLED = "importance sampling"
+
+
 def question_values(study: Study, *, detects: bool) -> None:
     """Raise InputError for values that a later step would reject.
 
@@ -134,6 +138,7 @@ class Session(Options):
 
     verb: str
     study: Study
+    notes: Sequence[str] = ()  # what the flags did not state, which is printed with the messages of the answer
     files: list[Path] = field(default_factory=list)
     started: float = field(default_factory=time.perf_counter)
     opened: Device | None = None  # device on which something was drawn without a pool, for the run record
@@ -303,7 +308,7 @@ class Session(Options):
             from mauvecl.cli.console import with_flags
 
             content = answer.as_json()
-            said = [with_flags(line) for line in content["messages"]]
+            said = [with_flags(line) for line in (*self._notes_on(answer), *content["messages"])]
             remarks = {"headline": answer.headline, "assumed": answer.assumed, "messages": said}
             self.print_json(remarks | {key: value for key, value in content.items() if key != "messages"})
             return
@@ -312,10 +317,15 @@ class Session(Options):
         self.say([answer.headline])
         left_out = [show_view(view, wide=self.wide) for view in answer.all_views]
         self.say(["Assumed:", *(f"  {clause}" for clause in answer.premises)])
-        self.say([*answer.messages, *answer.remarks])
+        self.say([*self._notes_on(answer), *answer.messages, *answer.remarks])
         if any(left_out):
             self.say(["Tables are shown without details: `--wide` shows all columns, and the files hold them."])
         self.finish()
+
+    def _notes_on(self, answer: Answer) -> list[str]:
+        """Return the notes of the session, without those on importance sampling where the answer has its own."""
+        told = any(SAMPLED in message for message in answer.messages)
+        return [note for note in self.notes if not (told and SAMPLED in note)]
 
     def _leave_all(self, answer: Answer) -> None:
         """Write tables, documents and pictures of an answer, then the run record."""

@@ -181,6 +181,23 @@ def interval(spec: str, factor: float = 1.0) -> Callable[[float, float], str]:
     )
 
 
+def chance_text(value: float) -> str:
+    """Format a probability, with bounds instead of 0 and 100 %."""
+    if value != value:
+        return "no number"
+    if value > 0.9999:
+        return "> 99.99 %"
+    if value < 0.0001:
+        return "< 0.01 %"
+    shown = 100 * value
+    return f"{shown:.2f} %" if shown < 1 or shown > 99 else f"{shown:.1f} %"
+
+
+def chance_range(low: float, high: float) -> str:
+    """Format an interval of probabilities."""
+    return " to ".join(dict.fromkeys([chance_text(low), chance_text(high)]))
+
+
 def with_error(value: float, error: float) -> str:
     """Format a value to its error's two leading digits: 9979 ± 120, not 1e+02."""
     if value != value:

@@ -501,7 +501,7 @@ def collect_messages(expectations: list[Expectation], processes: Processes | Non
 
 def _star_of(x: Expectation) -> tuple[tuple[object, ...], bool]:
     """Return what tells an expectation's star and exposure from others, and whether it has a flare."""
-    steps = x.provenance.get("source history", "").split("; ")
+    steps = [step for step in x.provenance.get("source history", "").split("; ") if step]
     quiet = tuple(step for step in steps if not step.startswith("flare"))
     return (x.name, quiet, x.frame_s, x.n_frames), len(quiet) < len(steps)
 

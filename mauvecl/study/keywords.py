@@ -70,7 +70,8 @@ def values_of(given: Mapping[str, Any], keywords: Mapping[str, Keyword], where: 
     others = {"paper": "instrument", "ideal": "with_unknowns"}
     known = [*keywords, *(name for name, needed in others.items() if needed in keywords)]
     for name in given.keys() - known:
-        close = get_close_matches(name, known, n=3) or known
+        keys = [keyword for keyword, of in keywords.items() if of.key == name]
+        close = keys or get_close_matches(name, known, n=3) or known
         raise InputError(f"{where} has no keyword {name!r}", f"a flag of the command, such as {', '.join(close)}")
     values = {name: keyword.listed(given.get(name)) for name, keyword in keywords.items()}
     if given.get("ideal"):

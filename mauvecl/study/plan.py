@@ -302,10 +302,11 @@ def targets_of(orbit: OrbitQuestion, plan: PlanQuestion) -> list[Target]:
     return targets
 
 
-def read_targets(path: Path) -> list[dict[str, Any]]:
+def read_targets(path: str | Path) -> list[dict[str, Any]]:
     """Read targets from a table of any format; see `targets_in`. Paths in it are relative to its folder."""
     from mauvecl.host.tables.opening import read_table
 
+    path = Path(path)
     named = f"table of targets {shortened(path.name)}"
     return targets_in(read_table(path, "table of targets"), named, path.parent)
 

@@ -72,7 +72,8 @@ def read_version(data: dict[str, Any], where: str) -> dict[str, Any]:
         observation["instrument"] = FORMERLY_MAUVE if named == "mauve" else FORMER_NAMES.get(named, named)
     nuisances.setdefault("usual", False)
     run.setdefault("statistics", [*DEFAULT_STATISTICS])
-    plan.setdefault("completeness", "injections")
+    if "plan" in data:
+        plan.setdefault("completeness", "injections")
     known = "the usual unknowns drawn" if nuisances["usual"] else "everything but the noise known"
     warnings.warn(
         f"{where} has no version and is read as in version 1, with the instrument now called "

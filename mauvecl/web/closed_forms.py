@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.answers.answer import chance_range, chance_text
 from mauvecl.answers.closed_forms import InterpolatedForm, cost_lines, marginal_lines, unknown_cost
 from mauvecl.answers.limit_search import LimitSearch
 from mauvecl.detection.distributions import Gaussian, Mixture
 from mauvecl.detection.requests import STATISTICS
 from mauvecl.host.exposure.expectation import entirely_saturated
+from mauvecl.schema.columns import chance_range, chance_text
 from mauvecl.schema.errors import InputError
 from mauvecl.study.cases import collect_messages
 from mauvecl.web.fields import FIELDS, IDEAL, REALISTIC, UNKNOWN, Choice, star_words

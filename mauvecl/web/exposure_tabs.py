@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.answers.answer import chance_text
 from mauvecl.answers.closed_forms import spoken, unknown_cost
 from mauvecl.answers.detect import UNKNOWN_COLUMNS as COLUMNS
 from mauvecl.answers.detect import power
@@ -30,7 +29,7 @@ from mauvecl.charts.detection import roc_columns
 from mauvecl.charts.limits import BUDGET, budget_series
 from mauvecl.detection.requests import statistic_label
 from mauvecl.noise.unknowns import NUISANCES, Nuisance
-from mauvecl.schema.columns import View, stacked, with_error
+from mauvecl.schema.columns import View, chance_text, stacked, with_error
 from mauvecl.study.cases import star_column, star_label
 from mauvecl.study.nuisances import NuisanceChoice
 from mauvecl.web.closed_forms import Answers, short

@@ -153,12 +153,13 @@ def draws(text: str) -> Draws:
 
 
 def star_name(text: str) -> str:
-    """Return the library's name of a star from any of its names, except stars stored on the server."""
+    """Return the name of a star as it is entered; raises InputError for unknown ones and those stored on the server."""
     if text == UPLOADED:
         return UPLOADED
     if not text.strip():
         raise InputError("no star is chosen: give a name of the library, or upload a spectrum", key="star")
-    return spectrum_name(text, own=False)
+    spectrum_name(text, own=False)
+    return text.strip()
 
 
 def day(text: str) -> str:
@@ -237,6 +238,7 @@ def neighbours(text: str) -> str | None:
 
 def star_words(name: str) -> str:
     """Describe a star of the library by its type and the star of its spectrum."""
+    name = spectrum_name(name, own=False)
     entry = embedded(name)
     model = ModelStar.named(name)
     if model is not None:

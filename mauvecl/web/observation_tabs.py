@@ -10,7 +10,6 @@ from bokeh.models import FixedTicker, HoverTool, LinearColorMapper
 from bokeh.models.annotations import ColorBar
 from numpy.typing import NDArray
 
-from mauvecl.answers.answer import chance_text
 from mauvecl.answers.plan import COLUMNS
 from mauvecl.charts.calibrations import (
     BIN,
@@ -40,7 +39,7 @@ from mauvecl.charts.chart import (
 )
 from mauvecl.charts.light_curves import SCATTER, scatter_series
 from mauvecl.host.stars.source import Source
-from mauvecl.schema.columns import View, with_error
+from mauvecl.schema.columns import View, chance_text, with_error
 from mauvecl.schema.errors import InputError
 from mauvecl.web.closed_forms import Answers, short
 from mauvecl.web.sandboxed_reader import read_limited

@@ -10,18 +10,20 @@ from collections.abc import Collection, Mapping
 from typing import Any
 from urllib.parse import parse_qsl, urlencode
 
-from mauvecl.answers.answer import chance_text
+from mauvecl.answers.answer import IF_KNOWN
 from mauvecl.answers.closed_forms import BOTH_CHANCES
+from mauvecl.answers.detect import chance_of_flare
 from mauvecl.answers.verbs import GROUPS, VERBS
 from mauvecl.detection.names import check_fap
 from mauvecl.host.exposure.sky import parse_position, parse_time
 from mauvecl.host.stars.library import listed_note, resolve
 from mauvecl.host.tables.units import offline
+from mauvecl.schema.columns import chance_text
 from mauvecl.schema.errors import InputError, of_kind, shortened
 from mauvecl.study.plan import PlanTarget
-from mauvecl.web.closed_forms import TITLES, Answers, ClosedForms, chances, short
+from mauvecl.web.closed_forms import TITLES, Answers, Chance, ClosedForms, chances, short
 from mauvecl.web.exposure_tabs import Detection, Noise, Signal, Spectrum, Unknown
-from mauvecl.web.fields import FIELDS, FORMER_VALUES, UPLOADED, Choice, Field, note, sentence, targets
+from mauvecl.web.fields import FIELDS, FORMER_VALUES, IDEAL, REALISTIC, UPLOADED, Choice, Field, note, sentence, targets
 from mauvecl.web.flare_tabs import Limit, Measurement
 from mauvecl.web.observation_tabs import Analyse, Calibrate, Change, Completeness, Periods, Plan, Visibility
 from mauvecl.web.question import OTHER, SIMULATIONS, Question
@@ -91,15 +93,15 @@ TOLD = ("detection", "measure")
 def card(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
     """Return the contents of the card.
 
-    It holds ``headline``, the sentence of the tab's simulated answer or nothing, and ``words``, the question;
+    It holds ``headline``, the sentence of the tab's simulated answer, or before that on the chance if there is one,
+    and ``words``, the question;
     ``chance`` says whether there are ``numbers``, one for each choice of what is unknown; ``chosen``, ``shown`` and
     ``interval`` are of the question's choice; ``facts``, pairs of names and values; ``notes``, pairs of sentences and
     kinds; ``simulated``, names of what is simulated; ``files``, tabs and names of downloads.
     """
     return {
-        "headline": _headline(tab, answers),
         "chance": tab.chance,
-        **(_with_chance(closed, answers) if tab.chance else _without_chance(tab, closed, answers)),
+        **(_with_chance(tab, closed, answers) if tab.chance else _without_chance(tab, closed, answers)),
         "simulated": sorted(name for name in answers if name not in ("snr", "draw", "seen", OTHER)),
         "files": _files(answers),
     }
@@ -111,7 +113,18 @@ def _headline(tab: Tab, answers: Answers) -> str:
     return next((str(answers[name].headline) for name in names if name in answers), "")
 
 
-def _with_chance(closed: ClosedForms, answers: Answers) -> dict[str, Any]:
+def _estimate(closed: ClosedForms, both: list[Chance]) -> str:
+    """Return the sentence with which `mauvecl detect` begins, by the closed form; empty where it has no number."""
+    shown = {chance.unknown: chance_text(chance.value) for chance in both if chance.value == chance.value}
+    if (chance := shown.get(closed.question.unknown)) is None:
+        return ""
+    if closed.question.unknown == REALISTIC and IDEAL in shown:
+        chance += f" ({shown[IDEAL]} {IF_KNOWN})"
+    seen = chance_of_flare(closed.study, closed.case.label, closed.case.amplitudes[0], closed.quiet, chance)
+    return f"{seen}, by the estimate before a simulation."
+
+
+def _with_chance(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
     q, x = closed.question, closed.quiet
     cut, both = closed.odds.threshold, chances(closed, answers)
     (chosen,) = (chance for chance in both if chance.unknown == q.unknown)
@@ -131,6 +144,7 @@ def _with_chance(closed: ClosedForms, answers: Answers) -> dict[str, Any]:
         f"per test, with the payload {q.instrument}."
     )
     return {
+        "headline": _headline(tab, answers) or _estimate(closed, both),
         "numbers": [chance.shown for chance in both],
         "chosen": q.unknown,
         "shown": chance_text(chosen.value),
@@ -144,6 +158,7 @@ def _with_chance(closed: ClosedForms, answers: Answers) -> dict[str, Any]:
 def _without_chance(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
     messages = list(answers[tab.answer].messages) if tab.answer in answers else []
     return {
+        "headline": _headline(tab, answers),
         "numbers": [],
         "chosen": "",
         "shown": tab.title,

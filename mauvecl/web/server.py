@@ -36,6 +36,7 @@ from mauvecl.host import VERSION
 from mauvecl.host.exposure.star import KNOWN
 from mauvecl.host.stars.library import all_names, library_names, well_known_stars
 from mauvecl.schema.errors import InputError, shortened
+from mauvecl.study.plan import TARGET_COLUMNS
 from mauvecl.web import fields
 from mauvecl.web.closed_forms import TITLES, ClosedForms
 from mauvecl.web.figures import INKS, PINS, Canvas
@@ -391,6 +392,10 @@ def front() -> bytes:
     return str(text).encode()
 
 
+#: Columns of the page's table of targets that have other names in tables, with the keys of targets.
+HEADINGS = {"name": "name", "spectral_type": "spectral_type", "V": "magnitude", "coordinates": "coordinates"}
+
+
 def _words() -> dict[str, Any]:
     """Return the settings of the page's script."""
     return {
@@ -403,6 +408,9 @@ def _words() -> dict[str, Any]:
         },
         "stars": all_names(),
         "example": "AU Mic\nYZ CMi\neps Eri",
+        "headings": {
+            column: [name.lower() for name in (key, *TARGET_COLUMNS[key])] for column, key in HEADINGS.items()
+        },
         "asks": {name: sorted(reads_of(name)) for name in SIMULATIONS},
         "uploads": {
             name: {"entered": upload.entered, "options": list(upload.options.values()), "most": upload.most}

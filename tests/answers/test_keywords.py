@@ -9,6 +9,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from commands import run
+from refusals import refused
 from scenes import paper
 
 import mauvecl
@@ -169,3 +170,8 @@ def test_engine_and_measurement_have_short_reprs(quiet: Expectation, engine: Eng
         assert written is not None
         np.testing.assert_allclose([float(number) for number in written.groups()], [values[0], errors[0]], rtol=0.05)
     assert repr(measured).endswith("; the first of 3 frames>")
+
+
+def test_keys_of_studies_name_the_keyword() -> None:
+    with refused(None, expected="such as data"):
+        mauvecl.analyse(file="light-curve.fits")

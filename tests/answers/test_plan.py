@@ -222,6 +222,7 @@ def test_targets_and_rates_are_read_from_tables(tmp_path: Path) -> None:
     sets = ("--set", "plan.completeness='closed form'", "--days", "2", "--no-pictures", "-o", "out")
     run("plan", "targets.csv", "--paper", *sets, folder=tmp_path)
     made = Study.read(tmp_path / "out" / "plan.ecsv")
+    assert Study.of(targets=str(tmp_path / "targets.csv")).plan.targets == made.plan.targets
     assert made.plan.targets[0].rates_file == tmp_path / "ffd.csv"
     again = Study().paper().with_changes({"plan": QUICK | {"targets": TARGETS[1:2]}, "orbit": {"days": 2.0}}, None)
     ours, theirs = QTable.read(tmp_path / "out" / "stars.ecsv"), plan(again).stars
@@ -280,8 +281,8 @@ def test_columns_of_simbad_and_gaia_are_read(tmp_path: Path) -> None:
     (star,) = QTable.read(tmp_path / "mauvecl-plan" / "stars.ecsv")
     assert (star["spectrum"], star["distance"].value) == ("M1V", 10.0)
     (tmp_path / "gaia.csv").write_text(
-        "source_id,ra,dec,parallax,phot_g_mean_mag\n12,311.29,-31.34,100.0,7.9\n", encoding="utf-8"
+        "source_id,ra,dec,parallax,phot_g_mean_mag\n12,311.29,-31.34,100.0,7.9\n13,10.5,-3,90,8\n", encoding="utf-8"
     )
     reported = run("plan", "gaia.csv", *quick, folder=tmp_path, code=2).stderr
-    assert "no spectral_type and no magnitude" in reported
+    assert all(f"target '{name}' has no spectral_type and no magnitude" in reported for name in (12, 13))
     assert "phot_g_mean_mag is a magnitude in G, not in V" in reported

@@ -1,6 +1,7 @@
 """Realistic answers by default, ideal ones next to them, and files of version 1."""
 
 import re
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -135,6 +136,12 @@ def test_study_of_version_1_is_read_as_it_was(text: str, instrument: str, tmp_pa
     assert study.observation.instrument == instrument
     assert not study.nuisances.usual
     assert study.run.statistics == ("chi2", "chi2_element", "matched")
+    new = tomllib.loads(study.toml())
+    assert new.keys() - tomllib.loads(Study().toml()).keys() == {"nuisances"}, "no section that says nothing"
+    assert new["nuisances"] == {"usual": False, "own": {}}
+    (tmp_path / "plan.toml").write_text(OLD + "[plan]\nhours = 10\n")
+    with pytest.warns(UserWarning, match="no version"):
+        assert Study.read(tmp_path / "plan.toml").plan.completeness == "injections"
     (tmp_path / "usual.toml").write_text(OLD + "[nuisances]\nusual = true\n")
     with pytest.warns(UserWarning, match="the usual unknowns drawn"):
         assert Study.read(tmp_path / "usual.toml").nuisances.usual

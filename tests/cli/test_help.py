@@ -310,10 +310,10 @@ def tables(text: str) -> list[list[str]]:
 def test_narrow_terminal_truncates_nothing(width: int, tmp_path: Path) -> None:
     words = ["detect", "--star", "G2V", "-m", "7.4", "-a", "0.01,0.02", "-n", "2000", "--fap", "0.1", "--no-pictures"]
     words += ["--sweep", "exposure=5,50", "--quiet", "--wide", "--output", str(tmp_path / "out")]
-    wide = tables(run(*words, folder=tmp_path).stdout)
+    wide = tables(run(*words, folder=tmp_path).stdout.partition("Assumed:")[0])
     env = {"COLUMNS": str(width), "FORCE_COLOR": "1"}
     shown = CliRunner().invoke(app, words, env=env).output
-    narrow = tables(shown)
+    narrow = tables(shown.partition("Assumed:")[0])
     assert "…" not in shown
     assert {cell for row in wide for cell in row} <= {cell for row in narrow for cell in row}
     # What a row is begins each of its parts, and a value keeps its interval.
@@ -323,8 +323,8 @@ def test_narrow_terminal_truncates_nothing(width: int, tmp_path: Path) -> None:
             if interval.startswith("["):
                 assert any((value, interval) in pairwise(one) for one in narrow)
     if width >= 80:
-        inside = [line for line in re.sub(r"\x1b\[[0-9;]*m", "", shown).splitlines() if line.startswith("  ")]
-        assert max(map(len, inside)) <= width
+        lines = re.sub(r"\x1b\[[0-9;]*m", "", shown).splitlines()
+        assert max(map(len, lines)) <= width
 
 
 @pytest.mark.parametrize(("changes", "shown"), [("{}", False), ("{bias_dn=5.0, dark_scale_dn_per_s=0.01}", True)])
@@ -333,6 +333,26 @@ def test_empty_columns_are_omitted(changes: str, shown: bool, tmp_path: Path) ->
     words = "gaussian --star G2V -m 9 --exposure 5 -n 2000 --fap 0.1 --statistic chi2 --no-pictures --set"
     done = run(*words.split(), f"observation.changes={changes}", folder=tmp_path)
     assert any("why" in row for row in tables(done.stdout)) == shown
+
+
+#: Questions whose tables are wide.
+WIDE = [
+    ["simulate", "--star", "AU Mic", "-a", "5%"],
+    ["limit", "--star", "AU Mic", "--of", "amplitude", "--fap", "0.1", "-n", "2000"],
+    ["gaussian", "--star", "G2V", "-m", "9", "--sweep", "exposure=5,50", "--fap", "0.1", "-n", "2000"],
+    ["stare", "--star", "M3V", "-m", "9", "-a", "0.5", "--duration", "900", "--distance", "5"],
+    ["plan", "--set", "plan.targets=[{name='eps Eri'}, {name='EK Dra'}]", "--days", "3"],
+]
+
+
+def test_tables_have_one_part_in_80_columns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for words in WIDE:
+        done = CliRunner().invoke(app, [*words, "--no-pictures"], env={"COLUMNS": "80", "FORCE_COLOR": "1"})
+        shown = re.sub(r"\x1b\[[0-9;]*m", "", done.output)
+        assert "─" in shown, shown
+        # A part without a title begins with its headings.
+        assert not re.search(r"\n *\n *\n +\w", shown), shown
 
 
 @pytest.mark.long

@@ -90,7 +90,7 @@ def test_amplitudes_like_percentages_have_a_note(tmp_path: Path) -> None:
     words = ("simulate", "-s", "M3V", "-m", "9", "--no-pictures", "-a")
     noted = run(*words, "24", folder=tmp_path).stderr
     assert "--amplitude 24 is a rise of 2400 %" in noted
-    assert "--amplitude 24% is one of 24 %" in noted
+    assert "--amplitude 24% is one of 24 %\n" in noted
     assert Study.read(tmp_path / "mauvecl-simulate" / "study.toml").flare.amplitudes == (24.0,)
     for text in ("0.24", "2400%"):
         assert "is a rise" not in run(*words, text, folder=tmp_path).stderr
@@ -118,8 +118,8 @@ def test_a_study_has_its_star(tmp_path: Path) -> None:
 def test_few_realisations_sample_the_tails(tmp_path: Path) -> None:
     words = ("detect", "-s", "M3V", "-m", "9", "-a", "3%", "-n", "1000", "--statistic", "matched", "--no-pictures")
     shown = run(*words, folder=tmp_path).stdout
-    assert "1000 realisations are too few" in shown
-    assert "importance sampling" in shown
+    assert shown.startswith("Mauve would see")
+    assert shown.count("importance sampling") == 1
     assert Study.read(tmp_path / "mauvecl-detect" / "study.toml").run.tails == "sampled"
     # The threshold is that of many realisations: 3.09 standard deviations of a normal.
     table = Table.read(tmp_path / "mauvecl-detect" / "detection.ecsv")

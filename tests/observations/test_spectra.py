@@ -373,10 +373,14 @@ def test_answer_states_measurements_or_why_there_are_none() -> None:
     assert event["unmeasured"] == ""
     assert {"area", "energy bolometric"} <= {str(name) for name in answer.measured["quantity"]}
     assert set(answer.tables) >= {"measured", "noise-per-pixel"}
+    # The printed table of events fits into 80 columns, with the lines of a terminal.
+    assert max(map(len, str(answer.views[0]).splitlines()[1:])) <= 73
     unnamed = analyse(Study(search=OFTEN), frames=frames)
     event = unnamed.events[k]
     assert np.isnan(event["energy"])
     assert "distance" in event["unmeasured"]
+    assert "amplitude" not in unnamed.measured["quantity"], "of which star"
+    assert "amplitude" in answer.measured["quantity"]
     # The flux of a flare does not depend on the star.
     assert event["temperature"].value == pytest.approx(answer.events["temperature"][k].value, rel=1e-3)
 

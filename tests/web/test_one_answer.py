@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -35,19 +36,27 @@ def on_the_command_line(folder: Path, *words: str) -> dict[str, Any]:
 
 
 def test_chances_are_the_same_everywhere(server: Server, tmp_path: Path) -> None:
-    """Both chances of ten flares, which are twenty numbers, by the closed form that all three give."""
+    """Both chances of ten flares, which are twenty numbers, by the closed form that all three give.
 
-    async def of_the_page(talk: Talk) -> list[list[float]]:
+    The page says them before a simulation in the words of the command line.
+    """
+
+    async def of_the_page(talk: Talk) -> list[tuple[list[float], str, str]]:
         found = []
         for star, magnitude, percent, exposure, more in DETECTIONS:
             entered = {"star": star, "magnitude": magnitude, "amplitude_percent": percent, "exposure_s": exposure}
-            found.append(await talk.chances(link(**entered | {"fap": FAP} | MORE[more][0])))
+            answer = (await talk.answer(link(**entered | {"fap": FAP} | MORE[more][0])))["answer"]
+            found.append(([one["value"] for one in answer["numbers"]], answer["headline"], answer["shown"]))
         return found
 
-    for (star, magnitude, percent, exposure, more), page in zip(DETECTIONS, server.visited(of_the_page), strict=True):
+    answers = zip(DETECTIONS, server.visited(of_the_page), strict=True)
+    for (star, magnitude, percent, exposure, more), (page, sentence, shown) in answers:
         _, flags, settings = MORE[more]
         words = ["detect", "--star", star, "-m", magnitude, "-a", f"{percent}%", "-t", exposure, "-n", N, "--fap", FAP]
-        (row,) = on_the_command_line(tmp_path, *words, *flags)["rows"]
+        answer = on_the_command_line(tmp_path, *words, *flags)
+        (row,) = answer["rows"]
+        said = re.sub(r"(?<=a chance of ).* % \(.*; ", f"{shown} (", answer["headline"])
+        assert sentence == f"{said[:-1]}, by the estimate before a simulation.", "in the same words"
         python = Study().with_settings([
             f"star=[{{library='{star}', magnitude={magnitude}}}]", f"flare.amplitudes=[{float(percent) / 100}]",
             f"observation.exposure_s={exposure}", f"run.realisations={N}", f"run.fap={FAP}", *settings,

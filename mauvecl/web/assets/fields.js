@@ -32,7 +32,7 @@ export class Fields {
     // The star whose values are filled in once the server knows them.
     this.fresh = ""
     this.stars = new Stars(byId("f-star"), byId("stars"), words.stars, () => this.take("star", true))
-    this.targets = new Targets(words.example)
+    this.targets = new Targets(words.example, words.headings)
     /** @type {Record<string, Scale>} */
     this.scales = {}
     for (const name of Object.keys(words.fields)) this.wire(name)

@@ -32,7 +32,7 @@
  *
  * Texts and limits that the page is served with.
  * @typedef {{version: string, fields: Entered, seen: {tab: string, simulated: string}, stars: string[],
- *   example: string, asks: Record<string, string[]>,
+ *   example: string, headings: Record<string, string[]>, asks: Record<string, string[]>,
  *   uploads: Record<string, {entered: string, options: string[], most: number}>, withFile: Record<string, string[]>, needs: Record<string, string>,
  *   columns: string[], under: Record<string, [string, string]>, presets: Record<string, Entered>,
  *   sliders: Record<string, {low: number, high: number, step: number, log: boolean}>,

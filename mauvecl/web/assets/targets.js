@@ -10,8 +10,6 @@ import {byId, element, every} from "./dom.js"
 const COLUMNS = {
   name: "Target", spectral_type: "Type", V: "V", distance_pc: "Distance (pc)", coordinates: "Coordinates (deg)",
 }
-/** Other names that tables have for columns. */
-const ALIASES = /** @type {Record<string, string>} */ ({target: "name", star: "name", magnitude: "V", v: "V", vmag: "V"})
 
 /** The cells of a line; quotes hold separators.
  * @param {string} line
@@ -29,14 +27,19 @@ function cells(line, separator) {
 
 /** The rows of a pasted or stored text: names, or a table whose first line names its columns.
  * @param {string} text
+ * @param {Record<string, string[]>} headings names that tables have for columns, in lower case, the preferred first
  * @returns {Row[]} */
-export function rowsOf(text) {
+function rowsOf(text, headings) {
   const lines = text.split(/\r?\n/).map(line => line.trim()).filter(line => line && !line.startsWith("#"))
   if (!lines.length) return []
   const separator = text.startsWith("# %ECSV") ? " " : ["\t", ";", ","].find(mark => lines[0].includes(mark)) ?? ","
-  const head = cells(lines[0], separator).map(name => ALIASES[name.toLowerCase()] ?? name)
-  if (head.some(name => name.toLowerCase() === "name")) {
-    const keys = head.map(name => name.toLowerCase() === "name" ? "name" : name)
+  const keys = cells(lines[0], separator)
+  const lower = keys.map(name => name.toLowerCase())
+  for (const [key, names] of Object.entries(headings)) {
+    const first = names.find(name => lower.includes(name))
+    if (first) keys[lower.indexOf(first)] = key
+  }
+  if (keys.includes("name")) {
     return lines.slice(1).map(line => {
       const values = cells(line, separator)
       return Object.fromEntries(keys.map((key, k) => [key, values[k] ?? ""]))
@@ -72,8 +75,11 @@ export function textOf(rows) {
 }
 
 export class Targets {
-  /** @param {string} example what the button for an example enters */
-  constructor(example) {
+  /**
+   * @param {string} example what the button for an example enters
+   * @param {Record<string, string[]>} headings see `rowsOf` */
+  constructor(example, headings) {
+    this.headings = headings
     this.field = byId("f-targets")
     this.body = byId("targets").tBodies[0]
     this.head = byId("targets").tHead
@@ -87,16 +93,16 @@ export class Targets {
     file.onchange = async () => {
       const [one] = file.files
       file.value = ""
-      if (one) this.enter(rowsOf(await one.text()))
+      if (one) this.enter(rowsOf(await one.text(), this.headings))
     }
-    byId("targets-example").onclick = () => this.enter(rowsOf(example))
+    byId("targets-example").onclick = () => this.enter(rowsOf(example, this.headings))
     byId("targets-clear").onclick = () => { this.enter([]); this.focus(0) }
     this.read()
   }
 
   // The text behind the table was changed by a link or an example.
   read() {
-    if (this.field.value !== textOf(this.rows)) this.rows = rowsOf(this.field.value)
+    if (this.field.value !== textOf(this.rows)) this.rows = rowsOf(this.field.value, this.headings)
     this.draw()
   }
 
@@ -190,7 +196,7 @@ export class Targets {
     const text = event.clipboardData?.getData("text") ?? ""
     if (!/[\n\t]|,(?!\s*[+-]?\d)/.test(text.trim())) return
     event.preventDefault()
-    const rows = rowsOf(text)
+    const rows = rowsOf(text, this.headings)
     this.enter([...this.rows.slice(0, k), ...rows, ...this.rows.slice(k)])
     this.focus(k + rows.length)
   }
