@@ -147,8 +147,8 @@ class Verb:
             study = study.with_settings(given["set"], where)
         if own or given.get("tails", study) is not None:
             return study, []
-        # A map would sample the tail of each cell, which takes longer than more realisations.
-        return study.with_enough_tails(sampled=self.counts != "cells")
+        # Maps and limits would sample a tail in each cell or step, which takes longer than more realisations.
+        return study.with_enough_tails(sampled=self.counts != "cells", raised=self.counts in ("cells", "steps"))
 
     @property
     def ask(self) -> Callable[..., Any]:

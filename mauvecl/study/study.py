@@ -362,29 +362,29 @@ class Study(Section):
             set_key(data, path.split("."), parse_toml_value(value), text)
         return self.build(data, where)
 
-    def with_enough_tails(self, *, sampled: bool = True) -> tuple[Self, list[str]]:
-        """Return a copy whose tails hold enough realisations, with a message if it differs.
+    def with_enough_tails(self, *, sampled: bool = True, raised: bool = False) -> tuple[Self, list[str]]:
+        """Return a copy whose thresholds can be found, with a message if it differs.
 
         Parameters
         ----------
         sampled : bool
-            Whether importance sampling finds thresholds that cannot be counted; if not, more realisations are drawn.
+            Whether importance sampling may find thresholds that cannot be counted.
+        raised : bool
+            Whether more realisations are drawn instead, up to `MOST_RAISED`.
         """
         run = self.run
         if not 0 < run.fap < 1 or countable(run.fap, run.realisations):
             return self, []
         least = least_countable(run.fap)
-        if not sampled and least > MOST_RAISED:
-            return self, []
         few = (
             f"{run.realisations} realisations are too few to count thresholds with a false-alarm probability of "
             f"{run.fap:g}, so "
         )
-        if sampled:
-            return self.with_settings(["run.tails=sampled"]), [
-                f"{few}importance sampling finds them (`tails='sampled'`)."
-            ]
-        return self.with_settings([f"run.realisations={least}"]), [f"{few}{least} are drawn."]
+        if raised and least <= MOST_RAISED:
+            return self.with_settings([f"run.realisations={least}"]), [f"{few}{least} are drawn."]
+        if not sampled:
+            return self, []
+        return self.with_settings(["run.tails=sampled"]), [f"{few}importance sampling finds them (`tails='sampled'`)."]
 
     def toml(self) -> str:
         """Return the study as TOML, without sections that have their default values."""

@@ -105,6 +105,9 @@ def test_maps_draw_more_instead() -> None:
     with pytest.warns(UserWarning, match="10 realisations are too few .* so 1000 are drawn"):
         answer = mauvecl.map(star="G2V", **axes, realisations=10, fap=0.1, ideal=True)
     assert answer.study.run.realisations == 1000
+    with pytest.warns(UserWarning, match="10 realisations are too few .* so 1000 are drawn"):
+        limit = mauvecl.limit(star="G2V", amplitude=0.1, realisations=10, fap=0.1, ideal=True)
+    assert limit.study.run.realisations == 1000
     with pytest.raises(InputError, match="ask for 100000000 realisations"):
         mauvecl.map(star="G2V", **axes, realisations=10, fap=1e-6, ideal=True)
 
