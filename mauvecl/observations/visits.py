@@ -42,6 +42,10 @@ MIN_VISITS = 5
 MAX_FREQUENCIES = 200_000
 #: Simulated periodograms beyond the threshold.
 IN_TAIL = 20
+#: Largest number of series that are drawn together, and of values of their periodograms in memory.
+TOGETHER, BLOCK = 2048, 2**21
+#: Length of a wave of unit amplitude below which it is zero at all visits but for rounding.
+ROUNDING = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,8 +108,6 @@ def recover_periods(
     shortest_d, longest_d : float, optional
         Range of the periodogram; by default that of the periods.
     """
-    from astropy.timeseries import LombScargle
-
     time = np.sort(np.asarray(time_d, np.float64))
     if time.size < MIN_VISITS:
         raise InputError.of("visits", time.size, f"at least {MIN_VISITS}")
@@ -119,28 +121,69 @@ def recover_periods(
     if count > MAX_FREQUENCIES:
         expected = f"at most {MAX_FREQUENCIES}: longer periods or a shorter campaign"
         raise InputError.of("periods", f"{count} frequencies", expected)
-    frequency = max(low - 0.5 / base, step) + step * np.arange(count)
+    frequency = max(low - 0.5 / base, step) + step * np.arange(count, dtype=np.float64)
     generator = np.random.default_rng(seed)
 
-    def peak(values: Float) -> tuple[float, float]:
-        power = LombScargle(time, values).power(frequency, method="fast", assume_regular_frequency=True)
-        best = int(np.argmax(power))
-        return float(power[best]), float(frequency[best])
+    def peaks(amplitude: float, period: float, phases: Float) -> tuple[Float, Float]:
+        """Draw a sinusoid with noise for each phase, and return the highest peaks and their frequencies."""
+        found = []
+        for some in np.array_split(phases, -(-phases.size // TOGETHER)):
+            values = amplitude * np.sin(2 * np.pi * time / period + some[:, None])
+            values += generator.standard_normal(values.shape)
+            found.append(highest_peaks(time, values, frequency))
+        power, at = zip(*found, strict=True)
+        return np.concatenate(power), np.concatenate(at)
 
-    noise = np.sort([peak(generator.standard_normal(time.size))[0] for _ in range(int(np.ceil(IN_TAIL / fap)))])
+    noise = np.sort(peaks(0.0, 1.0, np.zeros(int(np.ceil(IN_TAIL / fap))))[0])
     threshold = float(noise[-IN_TAIL])
     recovered = []
     for amplitude in amplitudes:
         row = []
         for period in periods_d:
-            found = 0
-            for phase in generator.uniform(0, 2 * np.pi, trials):
-                values = amplitude * np.sin(2 * np.pi * time / period + phase) + generator.standard_normal(time.size)
-                power, at = peak(values)
-                found += power > threshold and abs(at - 1 / period) < 0.5 / base
+            power, at = peaks(amplitude, period, generator.uniform(0, 2 * np.pi, trials))
+            found = int(((power > threshold) & (np.abs(at - 1 / period) < 0.5 / base)).sum())
             row.append(clopper_pearson(found, trials))
         recovered.append(row)
     return Recovery(time, threshold, np.asarray(periods_d), np.asarray(amplitudes), recovered)
+
+
+def highest_peaks(time_d: Float, values: Float, frequency: Float) -> tuple[Float, Float]:
+    """Return the highest peaks of the periodograms of several series at the same times, and their frequencies.
+
+    The normalised power of a frequency is the share of the squares about the mean that a sinusoid with a free mean
+    explains (Zechmeister & Kuerster 2009, doi 10.1051/0004-6361:200811296). For one series it is that of astropy's
+    `LombScargle`, which prepares each series anew.
+
+    Parameters
+    ----------
+    time_d : ndarray, shape (n_visit,)
+    values : ndarray, shape (n_series, n_visit)
+    frequency : ndarray, shape (n_frequency,)
+        Per day.
+
+    Returns
+    -------
+    power, frequency : ndarray, shape (n_series,)
+    """
+    left = values - values.mean(axis=1, keepdims=True)
+    every, best, at = np.arange(len(left)), np.full(len(left), -np.inf), np.zeros(len(left))
+    for some in np.array_split(frequency, -(-frequency.size * max(left.shape) // BLOCK)):
+        turn = 2 * np.pi * some[:, None] * (time_d - time_d[0])
+        cosine, sine = (wave - wave.mean(axis=1, keepdims=True) for wave in (np.cos(turn), np.sin(turn)))
+        cosine = _unit_rows(cosine)
+        sine = _unit_rows(sine - np.sum(sine * cosine, axis=1, keepdims=True) * cosine)
+        power = (left @ cosine.T) ** 2 + (left @ sine.T) ** 2
+        which = power.argmax(axis=1)
+        highest = power[every, which]
+        at = np.where(highest > best, some[which], at)
+        best = np.maximum(highest, best)
+    return best / np.sum(left**2, axis=1), at
+
+
+def _unit_rows(rows: Float) -> Float:
+    """Scale rows to unit length; those of rounding errors become zero."""
+    length = np.sqrt(np.sum(rows**2, axis=1, keepdims=True))
+    return np.asarray(np.divide(rows, length, out=np.zeros_like(rows), where=length > ROUNDING))
 
 
 #: Share of the information on a change that must be left by what is unknown; less is rounding.
