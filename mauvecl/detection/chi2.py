@@ -133,10 +133,12 @@ def _span(vectors: Float, ratio: Float) -> tuple[Float, Float]:
     are equal within groups. Groups are `GROUP_WIDTH` wide, and the coupling of the span to the rest changes eigenvalues
     by the square of this width.
     """
-    order = np.argsort(ratio)
-    group = np.floor(np.log(ratio[order] / ratio[order[0]]) / GROUP_WIDTH)
+    group = np.floor(np.log(ratio / ratio.min()) / GROUP_WIDTH)
     parts, rest = [], []
-    for members in np.split(order, np.flatnonzero(np.diff(group)) + 1):
+    for number in range(int(group.max()) + 1):
+        members = np.flatnonzero(group == number)
+        if not members.size:
+            continue
         basis, sizes, _ = np.linalg.svd(vectors[:, members].T, full_matrices=False)
         basis = basis[:, sizes > 1e-13 * sizes[0]] if sizes[0] > 0 else basis[:, :0]
         part = np.zeros((ratio.size, basis.shape[1]))
