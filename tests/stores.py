@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mauvecl import Engine, Expectation, Study, simulate
+from mauvecl import Engine, Expectation, Study
+from mauvecl.study.cases import Case
 
 CHUNK, LAST = "star-1/quiescent/c/1/0", "star-1/flare-1/c/4/0"
 
@@ -31,7 +32,7 @@ def study(realisations: int = 300, **sections: Any) -> Study:
 
 def expectations(asked: Study) -> list[Expectation]:
     """Return the expectations of a study's quiescent star and its flare."""
-    return simulate(asked, flaring=True).inputs
+    return Case(asked).expectations
 
 
 @contextmanager

@@ -165,13 +165,22 @@ class Limit:
     ideal: float  # the same if everything but the noise were known; NaN if it is, or if there is none
     check: Point  # detection probability at the value, simulated again with another seed
     points: tuple[Point, ...]  # simulations of the search
-    curve: tuple[tuple[float, float], ...]  # the closed form around the limit
+    question: LimitSearch = field(compare=False, repr=False)  # the closed form
     at: Mapping[str, float | str] = field(default_factory=dict)  # sweep values
     unknown: Unknown | None = None  # for limits averaged over unknown instrument values
     messages: tuple[str, ...] = ()  # saturation at the limit, without and with the flare
     cost: Cost | None = None  # loss of S/N to unknowns at the limit
     # The star at the limit, without the flare.
     quiet: Expectation | None = field(default=None, compare=False, repr=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # The loader of a case cannot be pickled.
+        return vars(self) | {"curve": self.curve, "question": None}
+
+    @cached_property
+    def curve(self) -> tuple[tuple[float, float], ...]:
+        """The closed form around the limit."""
+        return self.question.curve(self.value.value)
 
     @property
     def agrees(self) -> bool:
@@ -379,7 +388,7 @@ def solve(case: Case, statistic: str, engine: Engine | Pool, report: Callable[[i
         ideal=_ideal(case, statistic, theory),
         check=check,
         points=simulated,
-        curve=question.curve(value.value),
+        question=kind(case, statistic),
         at=case.at,
         unknown=question.unknown(theory) if isinstance(question, MarginalLimitSearch) else None,
         messages=tuple(of_kind(collect_messages([quiet, flare]), SATURATED)),

@@ -75,14 +75,21 @@ class Chi2(QuadraticStatistic):
         pixels = np.packbits(counts).tobytes().hex()
         spectra, rows = setting.cached(f"projection of {self.name} on {pixels}", projection)
         drawn = (nuisances.finite(spectra) if scatter is None else scatter) / scale
-        basis, rest = _span(np.vstack([spectra / scale, drawn, delta / scale]), true / model)
-        # Covariance and quadratic form within the span.
-        noise = basis.T @ ((true / model)[:, None] * basis) + (drawn @ basis).T @ (drawn @ basis)
-        taken, root = rows @ basis, np.linalg.cholesky(noise)
+        ratio, moved = true / model, delta / scale
+        groups, rest = _span(np.vstack([spectra / scale, drawn, moved]), ratio)
+        # Components, covariance and quadratic form within the span; a group's basis is zero at other pixels.
+        every = np.vstack([rows, drawn, moved])
+        inside = np.hstack([every[:, members] @ basis for members, basis in groups])
+        taken, scattered, moved = np.split(inside, (len(rows), len(rows) + len(drawn)))
+        noise, end = scattered.T @ scattered, 0
+        for members, basis in groups:
+            start, end = end, end + basis.shape[1]
+            noise[start:end, start:end] += basis.T @ (ratio[members, None] * basis)
+        root = np.linalg.cholesky(noise)
         weight, vectors = np.linalg.eigh(root.T @ root - (taken @ root).T @ (taken @ root))
         # Projected-out directions have no weight.
         large = weight > 1e-9 * weight[-1]
-        shift = vectors.T @ solve_triangular(root, basis.T @ (delta / scale), lower=True)
+        shift = vectors.T @ solve_triangular(root, moved[0], lower=True)
         weights, shifts = np.append(weight[large], rest), np.append(shift[large], np.zeros(rest.size))
         return QuadraticForm(weights, shifts)
 
@@ -125,27 +132,26 @@ class Chi2(QuadraticStatistic):
         return self._grouped(setting, setting.nuisances.spectra * setting.used)
 
 
-def _span(vectors: Float, ratio: Float) -> tuple[Float, Float]:
-    """Return an orthonormal basis of vectors' parts in groups of pixels, (n, m), and the weights outside its span.
+def _span(vectors: Float, ratio: Float) -> tuple[list[tuple[NDArray[np.intp], Float]], Float]:
+    """Return an orthonormal basis of vectors' parts in groups of pixels, and the weights outside its span.
 
     The vectors, (k, n), are in standard deviations of each value, and `ratio` holds true variances divided by the
-    model's. The weights, (n - m,), are the mean of the group, which preserves the sum. The result is exact if ratios
-    are equal within groups. Groups are `GROUP_WIDTH` wide, and the coupling of the span to the rest changes eigenvalues
-    by the square of this width.
+    model's. The basis, of m vectors in all, is the members of each group and the vectors there, (n_member, m_group).
+    The weights, (n - m,), are the mean of the group, which preserves the sum. The result is exact if ratios are equal
+    within groups. Groups are `GROUP_WIDTH` wide, and the coupling of the span to the rest changes eigenvalues by the
+    square of this width.
     """
-    order = np.argsort(ratio)
-    group = np.floor(np.log(ratio[order] / ratio[order[0]]) / GROUP_WIDTH)
-    parts, rest = [], []
-    for members in np.split(order, np.flatnonzero(np.diff(group)) + 1):
+    group = np.floor(np.log(ratio / ratio.min()) / GROUP_WIDTH)
+    order = np.argsort(group, kind="stable")
+    groups, rest = [], []
+    for members in np.split(order, np.flatnonzero(np.diff(group[order])) + 1):
         basis, sizes, _ = np.linalg.svd(vectors[:, members].T, full_matrices=False)
         basis = basis[:, sizes > 1e-13 * sizes[0]] if sizes[0] > 0 else basis[:, :0]
-        part = np.zeros((ratio.size, basis.shape[1]))
-        part[members] = basis
-        parts.append(part)
+        groups.append((members, basis))
         left = members.size - basis.shape[1]
         total = float(ratio[members].sum() - ratio[members] @ np.sum(basis**2, axis=1))
         rest.append(np.full(left, total / max(left, 1)))
-    return np.hstack(parts), np.concatenate(rest)
+    return groups, np.concatenate(rest)
 
 
 class Chi2Element(Chi2):

@@ -376,11 +376,11 @@ class QuadraticForm:
         """Frequencies, and modulus and phase of the characteristic function, for values near the mean."""
         spacing = 2.0 * np.pi / ((40.0 + NEAR) * self.std)
         weight, count, pull = self.weight, np.ones(self.weight.size), self.shift**2 * self.weight
-        values, member = np.unique(weight, return_inverse=True)
-        if values.size < weight.size / 2:
-            # Most weights of marginalised statistics are equal.
-            weight, count = values, np.bincount(member).astype(np.float64)
-            pull = np.bincount(member, pull).astype(np.float64)
+        first = np.flatnonzero(np.append(True, weight[1:] != weight[:-1]))
+        if first.size < weight.size / 2:
+            # Most weights of marginalised statistics are equal, and stand together.
+            count = np.diff(first, append=weight.size).astype(np.float64)
+            weight, pull = weight[first], np.add.reduceat(pull, first)
         parts = []
         k = 0.5 + np.arange(256)
         while True:

@@ -184,10 +184,13 @@ class KernelCache:
     def _prune(self) -> None:
         total = 0
         with contextlib.suppress(OSError):
-            for path in sorted(self.store.iterdir(), key=lambda p: p.stat().st_mtime, reverse=True):
-                total += path.stat().st_size
+            # A full store has a thousand archives, and is pruned twice for each program.
+            with os.scandir(self.store) as entries:
+                stored = sorted(((entry.stat(), entry.path) for entry in entries), key=lambda pair: -pair[0].st_mtime)
+            for about, path in stored:
+                total += about.st_size
                 if total > MAX_STORED:
-                    path.unlink()
+                    os.unlink(path)
 
     def close(self) -> None:
         """Store programs and remove the working folder, except in a forked child."""

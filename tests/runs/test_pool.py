@@ -391,7 +391,8 @@ def test_short_runs_leave_no_files(tmp_path: Path, engine: Engine) -> None:
 def test_jumps_of_the_clock_have_no_effect(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the wall time jump and run backwards while a command reports its progress."""
     leaps, real = itertools.cycle([1e9, -1e9, 0.0, 5e9]), time.time
-    words = ("detect", "-n", "30000", "--fap", "0.1", "--statistic", "chi2", "--no-pictures")
+    question = "-s G2V -m 7.4 -a 0.24 -n 30000 --fap 0.1 --statistic chi2 --no-pictures"
+    words = ("detect", *question.split())
     monkeypatch.setitem(shards.Checkpoint.__init__.__kwdefaults__, "patience_s", 0.0)
     run(*words, "--output", "usual", folder=tmp_path)
     monkeypatch.setattr(time, "time", lambda: real() + next(leaps))
