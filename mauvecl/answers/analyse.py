@@ -186,8 +186,9 @@ class EventRow:
     def verdict(self) -> str:
         """Judgement of the event: a detected flare, a candidate, rejected as an event of another kind, or undecided.
 
-        Where the throughput changes, only a spectrum that is clearly that of a flare makes an event a detection. Where
-        the fitted process does not describe the light, or most frames are in events, its false-alarm rate is not known.
+        Where the throughput changes, only a spectrum that is clearly that of a flare makes an event a detection, and a
+        light curve must show its peak. Where the fitted process does not describe the light, or most frames are in
+        events, its false-alarm rate is not known.
         """
         if self.analysis.crowded:
             return "undecided"
@@ -195,7 +196,11 @@ class EventRow:
             return "rejected"
         if not self.analysis.likeness.alike:
             return "undecided"
-        doubtful = self.spectrum is not None and self.spectrum.ambiguous and self.analysis.light_misleads
+        if self.spectrum is None:
+            # The light of many instruments is wrong for hours after a gap, and decays.
+            doubtful = not self.event.energy.peak_observed
+        else:
+            doubtful = self.spectrum.ambiguous and self.analysis.light_misleads
         return "detected" if self.significant and not doubtful and not self.unclear else "candidate"
 
     @property
@@ -255,7 +260,7 @@ class EventRow:
         if event.kind == "flare" and self.unclear:
             notes.append("its frames are together fainter than the level by more than its error")
         if event.kind == "flare" and not event.energy.peak_observed:
-            notes.append("no frame shows its peak")
+            notes.append("no frame shows its peak: light that settles after a gap looks alike")
         elif event.kind == "flare" and event.gap_at_peak:
             notes.append("frames next to its brightest one are missing: they may have held its peak")
         return "; ".join(notes)
@@ -314,9 +319,9 @@ EVENTS = (
            "the larger rate", "from noise", _rate, detail=True),
     Column("significant", "significant", "", "whether the rate is at most the wanted one", kind=bool),
     Column("verdict", "verdict", "", "detected: a flare with at most the wanted rate; candidate: a flare with a larger "
-           "one, one like the changes of throughput in these frames, or one whose frames are together not brighter "
-           "than the level; rejected: it resembles a flare, but its spectrum or shape is of another kind; undecided: "
-           "the false-alarm rate is not known", "verdict", kind=str),
+           "one, one like the changes of throughput in these frames, one in a light curve that does not show its peak, "
+           "or one whose frames are together not brighter than the level; rejected: it resembles a flare, but its "
+           "spectrum or shape is of another kind; undecided: the false-alarm rate is not known", "verdict", kind=str),
     Column("blue_over_red", lambda row: row.colour[0], "", "rise relative to the star in the blue half of the pixels "
            "over that in the red half: 1 for a change of throughput; nan: no spectra", "blue/red", number(".3g"),
            detail=True),

@@ -21,6 +21,7 @@ from mauvecl.observations.search import bank_of, stare_of
 Float = NDArray[np.float64]
 DAVENPORT = SHAPES["davenport2014"]
 CASES = Path(__file__).parent.parent / "data" / "cases"
+LIGHT_CURVES = CASES.parent / "light_curves"
 #: Rotation and correlated noise, in standard deviations of a frame.
 ROTATOR = Process(
     (
@@ -372,6 +373,17 @@ def test_files_that_once_failed_have_an_answer() -> None:
         key=lambda one: -one.value,
     )
     assert np.isfinite([event.energy.fitted_s, *event.energy.low_s, *event.energy.high_s]).all()
+
+
+@pytest.mark.long
+def test_light_that_settles_after_a_safe_mode_is_no_detected_flare() -> None:
+    """Kepler was in safe mode on 2 and 3 July 2009, and its light decayed for days, as here by 4 %."""
+    events = analysed(read_frames(LIGHT_CURVES / "kplr010002792-2009259160929_llc.fits.xz")).events
+    settles = np.array([date.startswith(("2009-07-04", "2009-07-05")) for date in events["date"]])
+    assert settles.any()
+    assert not (settles & (events["verdict"] == "detected")).any()
+    # Flares of the star whose peaks are seen are.
+    assert np.count_nonzero(events["verdict"] == "detected") > 30
 
 
 @pytest.mark.long
