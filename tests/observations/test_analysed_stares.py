@@ -48,27 +48,32 @@ def test_flare_of_a_stare_with_unknowns_and_rays_is_found_and_measured(stares: S
 @pytest.mark.long
 @pytest.mark.parametrize("pointing", [{}, {"pointing": {"rate_per_h": 3.0}}], ids=["steady", "pointing losses"])
 def test_completeness_equals_that_of_inject(pointing: dict[str, Any], stares: Stares, tmp_path: Path) -> None:
-    """Size of half of the flares detected, over the threshold; 12 % is 3 standard errors of 40 injections a size."""
-    sections = SECTIONS | {"stare": SECTIONS["stare"] | pointing}
-    quiet = Study(**sections | {"flare": {"amplitudes": [1e-6]}})
-    drawn = stare(quiet, stares)
-    drawn.write(tmp_path)
-    answer = analyse(quiet, frames=read_frames(tmp_path / NAME))
-    completeness, spectra = answer.analysis.completeness, answer.analysis.spectra
-    assert spectra is not None
+    """Size of half of the flares detected, over the threshold: the mean of three stares.
+
+    Over 11 stares the ratio has a mean of 0.94, since analyses detect flares that are somewhat smaller, and a standard
+    deviation of 0.05: 12 % are two standard errors of three stares below that mean, and six above. The seeds are fixed.
+    """
+    ratios = []
+    for seed in (1, 2, 3):
+        sections = SECTIONS | {"stare": SECTIONS["stare"] | pointing, "run": {"seed": seed}}
+        quiet = Study(**sections | {"flare": {"amplitudes": [1e-6]}})
+        drawn = stare(quiet, stares)
+        drawn.write(tmp_path / str(seed))
+        answer = analyse(quiet, frames=read_frames(tmp_path / str(seed) / NAME))
+        completeness, spectra = answer.analysis.completeness, answer.analysis.spectra
+        assert spectra is not None
+        series = spectra.series
+        # Sizes of inject are relative to the star in the flare's band, those of analyse to all light of the frames.
+        relative = float(series.model.flares((10_000.0,))[0].sum() / series.light.sum())
+        ratios.append(completeness.limit(1, 0.5) / answer.analysis.threshold / relative)
     width = float(completeness.half_widths_s[1])
     injections = {"of": "duration", "half_width_low_s": width, "half_width_high_s": width, "widths": 1, "sizes": 12,
-                  "count": 200, "positions": 20, "fitted": 0}  # fmt: skip
-    # The level of each frame is free in analyses; inject assumes that by itself only of stares with pointing losses.
-    free = {"search": SECTIONS["search"] | {"frame": {"light": "free"}}}
+                  "count": 200, "positions": 200, "fitted": 0}  # fmt: skip
+    # Analyses leave out the level of each frame, and a dark current that drifts; inject assumes neither by itself.
+    free = {"search": SECTIONS["search"] | {"frame": dict.fromkeys(series.left_out, "free")}}
     expected = inject(Study(**sections | free, injections=injections), stares)
-    # Sizes of inject are relative to the star in the flare's band, those of analyse to all light of the frames.
-    series = spectra.series
-    relative = float(series.model.flares((10_000.0,))[0].sum() / series.light.sum())
-    there = float(expected.tables["limits"]["e50"][0].value) * relative
-    threshold = float(expected.tables["search"]["threshold"][0])
-    ratio = completeness.limit(1, 0.5) / answer.analysis.threshold / (there / threshold)
-    assert ratio == pytest.approx(1.0, abs=0.12)
+    there = float(expected.tables["limits"]["e50"][0].value) / float(expected.tables["search"]["threshold"][0])
+    assert np.mean(ratios) / there == pytest.approx(1.0, abs=0.12)
 
 
 @pytest.mark.long
