@@ -19,7 +19,7 @@ from mauvecl.host.stars.flare import check_scales
 from mauvecl.host.stars.source import Source
 from mauvecl.observations.analysis import Analysis, analyse_frames
 from mauvecl.observations.event_spectra import EventSpectrum
-from mauvecl.observations.events import ObservedEvent
+from mauvecl.observations.events import GAP_FRAMES, ObservedEvent
 from mauvecl.observations.frame_files import read_frames
 from mauvecl.observations.frame_model import FrameModel
 from mauvecl.observations.frames import Frames, Reason
@@ -186,9 +186,9 @@ class EventRow:
     def verdict(self) -> str:
         """Judgement of the event: a detected flare, a candidate, rejected as an event of another kind, or undecided.
 
-        Where the throughput changes, only a spectrum that is clearly that of a flare makes an event a detection, and a
-        light curve must show its peak. Where the fitted process does not describe the light, or most frames are in
-        events, its false-alarm rate is not known.
+        Where the throughput changes, only a spectrum that is clearly that of a flare makes an event a detection, and in
+        a light curve its peak must not be in a gap. Where the fitted process does not describe the light, or most
+        frames are in events, its false-alarm rate is not known.
         """
         if self.analysis.crowded:
             return "undecided"
@@ -198,10 +198,20 @@ class EventRow:
             return "undecided"
         if self.spectrum is None:
             # The light of many instruments is wrong for hours after a gap, and decays.
-            doubtful = not self.event.energy.peak_observed
+            doubtful = self.peak_in_gap
         else:
             doubtful = self.spectrum.ambiguous and self.analysis.light_misleads
         return "detected" if self.significant and not doubtful and not self.unclear else "candidate"
+
+    @property
+    def peak_in_gap(self) -> bool:
+        """True if the peak of the largest fitted flare is in a gap, or before or after all frames."""
+        if self.event.energy.peak_observed:
+            return False
+        stare = self.analysis.survey.stare
+        after = int(np.searchsorted(stare.start_s, self.event.energy.flares[0].peak_s))
+        around = stare.numbers[max(after - 1, 0) : after + 1]
+        return around.size < 2 or int(np.ptp(around)) > GAP_FRAMES
 
     @property
     def unclear(self) -> bool:
@@ -260,7 +270,8 @@ class EventRow:
         if event.kind == "flare" and self.unclear:
             notes.append("its frames are together fainter than the level by more than its error")
         if event.kind == "flare" and not event.energy.peak_observed:
-            notes.append("no frame shows its peak: light that settles after a gap looks alike")
+            looks = ": light that settles after a gap looks alike" if self.peak_in_gap else ""
+            notes.append(f"no frame shows its peak{looks}")
         elif event.kind == "flare" and event.gap_at_peak:
             notes.append("frames next to its brightest one are missing: they may have held its peak")
         return "; ".join(notes)
@@ -319,7 +330,7 @@ EVENTS = (
            "the larger rate", "from noise", _rate, detail=True),
     Column("significant", "significant", "", "whether the rate is at most the wanted one", kind=bool),
     Column("verdict", "verdict", "", "detected: a flare with at most the wanted rate; candidate: a flare with a larger "
-           "one, one like the changes of throughput in these frames, one in a light curve that does not show its peak, "
+           "one, one like the changes of throughput in these frames, one of a light curve whose peak is in a gap, "
            "or one whose frames are together not brighter than the level; rejected: it resembles a flare, but its "
            "spectrum or shape is of another kind; undecided: the false-alarm rate is not known", "verdict", kind=str),
     Column("blue_over_red", lambda row: row.colour[0], "", "rise relative to the star in the blue half of the pixels "
