@@ -686,6 +686,7 @@ def frame_model(study: Study, frames: Frames) -> FrameModel | str:
             flare = replace(
                 flare, derived=tuple(quantity for quantity in flare.derived if quantity.name != "amplitude")
             )
-        return FrameModel.of(frames, quiet, flare, flux_per_dn(quiet, case.instrument), named)
+        model = FrameModel.of(frames, quiet, flare, flux_per_dn(quiet, case.instrument))
+        return replace(model, star_is_known=named)
     except InputError as error:
         return f"Spectra are searched as their sum over wavelength: {error}."

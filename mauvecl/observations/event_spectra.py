@@ -14,7 +14,7 @@ from mauvecl.fits.spectrum import Measurement, fit
 from mauvecl.noise.unknowns import NUISANCES, Amplitude
 from mauvecl.observations.frame_model import CLEARLY, chi2_of_one
 from mauvecl.observations.search import MIN_BASELINE, Detection, SeriesSurvey
-from mauvecl.observations.spectra import SpectralSeries
+from mauvecl.observations.spectra import SpectralSeries, fit_changes
 from mauvecl.schema.errors import InputError
 from mauvecl.search.templates import TEMPERATURES_K
 
@@ -202,9 +202,8 @@ def drifts(survey: SeriesSurvey, series: SpectralSeries, taken: NDArray[np.bool_
     """
     unknown = series.model.unknowns(series.light)
     names = ("light", "dark")
-    white = np.array([unknown[name] for name in names]) / series.noise.used
-    covariance = np.linalg.inv(white @ white.T)
-    amplitudes = series.excess @ (covariance @ white / series.noise.used).T
+    spectra = np.array([unknown[name] for name in names])
+    amplitudes, covariance = fit_changes(series.excess, spectra, series.noise.used)
     found = dict.fromkeys(names, np.inf)
     size, means, counts = n_frames, list[Float](), np.zeros(0, np.intp)
     while size > 0 and len(means) < MIN_PARTS:

@@ -47,9 +47,7 @@ class FrameModel:
     star_is_known: bool = False  # true if `quiet` is of the observed star, not of another in its place
 
     @classmethod
-    def of(
-        cls, frames: Frames, quiet: Expectation, flare: FlareModel, flux_per_dn: Float, star_is_known: bool = False
-    ) -> Self:
+    def of(cls, frames: Frames, quiet: Expectation, flare: FlareModel, flux_per_dn: Float) -> Self:
         """Match frames with the pixels or resolution elements of an instrument.
 
         Raises InputError if wavelengths differ from the instrument's, or the unit is neither counts nor a flux density.
@@ -85,11 +83,11 @@ class FrameModel:
         if flux is not None:
             # A flux density is that of a flat spectrum with as many DN in all pixels of the value.
             per_flux = np.divide(1.0, flux_per_dn, out=np.zeros_like(flux_per_dn), where=flux_per_dn > 0)
-            return cls(quiet, flare, bins, flux / (bins @ per_flux), False, star_is_known)
+            return cls(quiet, flare, bins, flux / (bins @ per_flux), False)
         ones = np.ones(len(bins))
         if unit not in {_plain(each) for each in COUNT_UNITS}:
-            return cls(quiet, flare, bins, ones / exposure, False, star_is_known)
-        raw = cls(quiet, flare, bins, ones, True, star_is_known)
+            return cls(quiet, flare, bins, ones / exposure, False)
+        raw = cls(quiet, flare, bins, ones, True)
         # Light is added to bias and dark current: where a pixel has far less than these, they were subtracted.
         included = np.nanmedian(frames.flux, axis=0) >= LEAST_OF_OFFSET * raw.offset
         return raw if included.all() else replace(raw, raw=False)

@@ -364,12 +364,36 @@ def _slow_axes(sums: Float, quiet: Bool) -> Float:
 
     The noise, of unit covariance, stays so.
     """
-    values = sums[quiet]
-    n = len(values) // SLOW_FRAMES
-    if n < 2 * sums.shape[1]:
+    means = _slow_means(sums[quiet])
+    if len(means) < 2 * sums.shape[1]:
         return np.eye(sums.shape[1])
-    means = values[: n * SLOW_FRAMES].reshape(n, SLOW_FRAMES, -1).mean(axis=1)
     return np.asarray(np.linalg.eigh(np.cov(means.T).reshape(sums.shape[1], -1))[1].T[::-1])
+
+
+def _slow_means(values: Float) -> Float:
+    """Return the means of each `SLOW_FRAMES` values along the first axis."""
+    n = len(values) // SLOW_FRAMES
+    return np.asarray(values[: n * SLOW_FRAMES].reshape(n, SLOW_FRAMES, *values.shape[1:]).mean(axis=1))
+
+
+def fit_changes(excess: Float, spectra: Float, sd: Float) -> tuple[Float, Float]:
+    """Fit the amplitudes of spectra together to each frame.
+
+    Parameters
+    ----------
+    excess : ndarray, shape (n_frame, n_pixel)
+    spectra : ndarray, shape (k, n_pixel)
+    sd : ndarray, shape (n_pixel,)
+        Noise of a frame.
+
+    Returns
+    -------
+    amplitudes : ndarray, shape (n_frame, k)
+    covariance : ndarray, shape (k, k)
+    """
+    white = spectra / sd
+    covariance: Float = np.asarray(np.linalg.inv(white @ white.T), np.float64)
+    return excess @ (covariance @ white / sd).T, covariance
 
 
 def _dark_changes(
@@ -394,17 +418,15 @@ def _dark_changes(
     float
         Range of nine tenths of slow changes if it drifts, or else 0.
     """
-    white = shared / sd
-    covariance = np.linalg.inv(white @ white.T)
-    amplitude, error = excess @ (covariance[1] @ white / sd), float(np.sqrt(covariance[1, 1]))
+    amplitudes, covariance = fit_changes(excess, shared, sd)
+    amplitude, error = amplitudes[:, 1], float(np.sqrt(covariance[1, 1]))
     variance = float(np.mean((amplitude[pairs + 1] - amplitude[pairs]) ** 2)) / 2
     beyond = variance - error**2
     significant = beyond > DEPARTS * 2 * relative_error(pairs.size) * error**2
     jitter = {"dark": float(np.sqrt(beyond))} if significant else {}
-    n = int(quiet.sum()) // SLOW_FRAMES
-    if n < 2:
+    means = _slow_means(amplitude[quiet])
+    if len(means) < 2:
         return jitter, 0.0
-    means = amplitude[quiet][: n * SLOW_FRAMES].reshape(n, SLOW_FRAMES).mean(axis=1)
     drift = float(np.ptp(np.quantile(means, [0.05, 0.95])))
     independent = NINE_TENTHS * float(np.sqrt(variance / SLOW_FRAMES))
     return ({"dark": np.inf}, drift) if drift > max(DARK_DRIFTS * error, BEYOND_JITTER * independent) else (jitter, 0.0)
