@@ -51,7 +51,7 @@ from mauvecl.detection.tails import campaign, per_test
 from mauvecl.device.engine import Engine
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.columns import Column, View, chance_range, chance_text, percent
-from mauvecl.schema.errors import InputError
+from mauvecl.schema.errors import InputError, Message
 from mauvecl.study.cases import Case, amplitude_column, cases, collect_messages, star_column
 from mauvecl.study.nuisances import NuisanceChoice
 from mauvecl.study.study import PAPER_STARS, Study
@@ -307,11 +307,11 @@ def _messages(answer: DetectAnswer, prepared: Sequence[Case]) -> list[str]:
     messages: list[str] = [*blinding, *collect_messages(expectations, answer.study.processes)]
     errors = answer.table["fap_error"][np.isfinite(answer.table["fap_error"])]
     if not countable(run.fap, run.realisations) and errors.size:
-        messages.append(
+        text = (
             f"Thresholds at a false-alarm probability of {run.fap:g} come from importance sampling, right to "
-            f"{100 * errors.max():.1f} % of it: {run.realisations} realisations leave fewer than "
-            "100 beyond them."
+            f"{100 * errors.max():.1f} % of it: {run.realisations} realisations leave fewer than 100 beyond them."
         )
+        messages.append(Message(text, "sampled"))
     return messages
 
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from mauvecl.cli.console import writes_to
 from mauvecl.cli.flags import Options
-from mauvecl.schema.errors import InputError
+from mauvecl.schema.errors import InputError, of_kind
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -35,10 +35,6 @@ if TYPE_CHECKING:
 MOST_SPECTRA = 1e16
 #: The engine's index of realisations has 63 bits: `Engine._check`.
 MOST_REALISATIONS = 2**63 - 1
-
-
-#: Words of the messages that thresholds are not counted.
-SAMPLED = "importance sampling"
 
 
 def question_values(study: Study, *, detects: bool) -> None:
@@ -323,9 +319,9 @@ class Session(Options):
         self.finish()
 
     def _notes_on(self, answer: Answer) -> list[str]:
-        """Return the notes of the session, without those on importance sampling where the answer has its own."""
-        told = any(SAMPLED in message for message in answer.messages)
-        return [note for note in self.notes if not (told and SAMPLED in note)]
+        """Return the notes of the session, without that on sampled thresholds where the answer has its own."""
+        told = of_kind(self.notes, "sampled") if of_kind(answer.messages, "sampled") else []
+        return [note for note in self.notes if note not in told]
 
     def _leave_all(self, answer: Answer) -> None:
         """Write tables, documents and pictures of an answer, then the run record."""

@@ -24,7 +24,7 @@ from mauvecl.host.tables.files import parsing, possible, read_bytes, read_text, 
 from mauvecl.noise.processes import NONE, Processes
 from mauvecl.noise.unknowns import COURSES
 from mauvecl.schema.calls import validated
-from mauvecl.schema.errors import InputError, shortened
+from mauvecl.schema.errors import InputError, Message, shortened
 from mauvecl.schema.fields import AnyUnit, Flag, Help, found
 from mauvecl.schema.section import Section, fields_of, input_error
 from mauvecl.study.analyses import PATHS, CalibrateQuestion, ChangeQuestion, DataChoice, MeasureQuestion
@@ -384,7 +384,8 @@ class Study(Section):
             return self.with_settings([f"run.realisations={least}"]), [f"{few}{least} are drawn."]
         if not sampled:
             return self, []
-        return self.with_settings(["run.tails=sampled"]), [f"{few}importance sampling finds them (`tails='sampled'`)."]
+        said = Message(f"{few}importance sampling finds them (`tails='sampled'`).", "sampled")
+        return self.with_settings(["run.tails=sampled"]), [said]
 
     def toml(self) -> str:
         """Return the study as TOML, without sections that have their default values."""
