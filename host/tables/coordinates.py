@@ -83,18 +83,10 @@ def position(text: str) -> tuple[float, float]:
 
 
 def angle(text: str, unit: str = "", *, right_ascension: bool, pair: int = 3) -> float:
-    """Return an angle in degrees.
+    """Return an angle in degrees; raises ValueError if the text is no angle, and InputError if it is out of range.
 
-    Parameters
-    ----------
-    unit : str
-        Unit of plain numbers, as astropy names it; degrees if it is empty.
-    right_ascension : bool
-        Whether numbers with colons, and three plain numbers, are hours.
-    pair : int
-        Number of words of the other coordinate: three plain numbers are a right ascension only next to three.
-
-    Raises ValueError if the text is no angle, InputError if it is out of range.
+    Plain numbers are in a unit that astropy names, by default degrees. Numbers with colons are hours for a right
+    ascension, as are three plain numbers next to a coordinate of three words, `pair`.
     """
     from astropy.coordinates import Angle
 

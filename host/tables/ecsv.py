@@ -33,15 +33,7 @@ def read_ecsv(path: str | Path, what: str, expected: str = "an ECSV table") -> T
 
 
 def parse_ecsv(text: str, what: str, expected: str = "an ECSV table") -> Table:
-    """Parse ECSV text.
-
-    Parameters
-    ----------
-    what : str
-        Description of the origin for messages, including its name.
-    expected : str
-        Expected content, for messages.
-    """
+    """Parse ECSV text; `what` says where it is from and `expected` what it should be, for messages."""
     # These imports are slow and only needed here.
     from astropy.table import Table
 

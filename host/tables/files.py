@@ -35,16 +35,10 @@ def writing(what: str, path: Path, expected: str, *, key: str) -> Iterator[None]
 
 
 def write_whole(path: Path, *parts: bytes | memoryview, shared: bool = False) -> None:
-    """Write a file atomically: under a temporary name, flushed to the disk, then renamed.
+    """Write the parts of a file atomically: under a temporary name, flushed to the disk, then renamed.
 
-    Parameters
-    ----------
-    parts : bytes or memoryview
-        Content of the file.
-    shared : bool
-        Whether other processes may write the file at the same time; the last one wins.
-
-    Raises InputError if the file cannot be written; an existing file is then kept.
+    Other processes may write a `shared` file at the same time; the last one wins. Raises InputError if the file cannot
+    be written; an existing file is then kept.
     """
     tail = f".{os.getpid()}-{secrets.token_hex(4)}" if shared else ""
     unfinished = path.with_name(f"{UNFINISHED}{path.name}{tail}")
@@ -101,12 +95,7 @@ LONGEST_LINE = 2**17
 
 
 def open_regular(path: Path, what: str) -> io.BufferedReader:
-    """Open a regular file for reading.
-
-    Parameters
-    ----------
-    what : str
-        Expected kind of file, for messages: "spectrum file", "study".
+    """Open a regular file for reading; `what` is its kind, for messages: "spectrum file", "study".
 
     Raises InputError if the file does not exist, is not a regular file, or cannot be opened.
     """
@@ -153,12 +142,7 @@ def read_bytes(path: Path, what: str) -> bytes:
 def check_size(path: Path, what: str, most: int | None = None) -> int:
     """Return the size of a regular file in bytes, without reading it.
 
-    Parameters
-    ----------
-    most : int, optional
-        Largest size, bytes; by default MAUVECL_LARGEST_FILE_MIB.
-
-    Raises InputError if the file is larger, or as `open_regular`.
+    Raises InputError if it exceeds `most` bytes, by default MAUVECL_LARGEST_FILE_MIB, or as `open_regular`.
     """
     with open_regular(path, what) as file:
         size = os.fstat(file.fileno()).st_size
@@ -214,12 +198,7 @@ def packed(start: bytes) -> bool:
 def unpacked(content: bytes, what: str) -> bytes:
     """Unpack content that is compressed by gzip, bzip2 or xz; return other content unchanged.
 
-    Parameters
-    ----------
-    what : str
-        Description of the content for messages, including its name.
-
-    Raises InputError if it unpacks to more than the limit or is damaged.
+    Raises InputError if it unpacks to more than the limit or is damaged; `what` names it in messages.
     """
     if content[:2] == b"\x1f\x8b":
         return _unpack(content, lambda: zlib.decompressobj(wbits=31), "gzip", what)
@@ -280,14 +259,8 @@ def parsing(what: str, expected: str) -> Iterator[None]:
     """Convert any exception of a parser of foreign content to InputError with a one-sentence message.
 
     Parsers of TOML, YAML, FITS and tables raise many kinds of exceptions on damaged content: their own, those of Python
-    (RecursionError, OverflowError) and of NumPy (MemoryError for sizes that a header claims).
-
-    Parameters
-    ----------
-    what : str
-        Description of the content, including its name.
-    expected : str
-        Expected content.
+    (RecursionError, OverflowError) and of NumPy (MemoryError for sizes that a header claims). `what` describes the
+    content and includes its name.
     """
     try:
         yield

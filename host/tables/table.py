@@ -208,16 +208,8 @@ def _plain(text: Any) -> str:
 def converted(values: Values, given: str | None, unit: str, key: str) -> Values:
     """Return values in a unit.
 
-    Parameters
-    ----------
-    given : str or None
-        Unit in the mapping, which takes precedence over the file.
-    unit : str
-        Unit of the result.
-    key : str
-        Key of the mapping that states it.
-
-    Raises InputError if neither file nor mapping states a unit, or for one of another kind.
+    The unit that a mapping gives takes precedence over that of the file; `key` is that of the mapping. Raises
+    InputError if neither states a unit, or for one of another kind.
     """
     import astropy.units as u
 
@@ -374,13 +366,7 @@ class MemoryTable(TableFile):
 class Rows:
     """Cells of a small table by the names of its columns, in any case.
 
-    Parameters
-    ----------
-    table : Table
-    named : str
-        The table, for messages.
-    key : str
-        Key of errors; by default that of the column.
+    For messages, `named` is the table, and `key` the key of errors, by default the column.
     """
 
     def __init__(self, table: Table, named: str, key: str | None = None) -> None:
@@ -432,12 +418,7 @@ class Rows:
     def number(self, name: str | None, row: int, unit: str = "", *, above: float = -np.inf) -> float | None:
         """Return the number of a cell in a unit, None for a missing one; raise InputError for anything else.
 
-        Parameters
-        ----------
-        unit : str
-            Unit of the result, which the column is in if it states none.
-        above : float
-            Exclusive lower bound.
+        A column that states no unit is in this one. The number must lie above the exclusive lower bound `above`.
         """
         text = self.text(name, row)
         if name is None or not text:

@@ -50,21 +50,12 @@ INJECTION_KEY = 0x696E6A65
 
 @dataclass(frozen=True, eq=False)
 class Completeness:
-    """Share of injected flares that the search detects.
+    """Share of injected flares that the search detects."""
 
-    Attributes
-    ----------
-    half_widths_s : ndarray, shape (n_width,)
-    equivalent_durations_s : ndarray, shape (n_width, n_size)
-    detected : ndarray of int, shape (n_width, n_size)
-    injected : int
-        Number of injections per cell.
-    """
-
-    half_widths_s: Float
-    equivalent_durations_s: Float
-    detected: NDArray[np.int64]
-    injected: int
+    half_widths_s: Float  # shape (n_width,)
+    equivalent_durations_s: Float  # shape (n_width, n_size)
+    detected: NDArray[np.int64]  # shape (n_width, n_size)
+    injected: int  # number of injections per cell
 
     def interval(self, width: int, size: int) -> Interval:
         """Return the completeness of a cell with its 95 % interval."""
@@ -92,17 +83,8 @@ def inject(
 ) -> Completeness:  # fmt: skip
     """Inject flares of several half-widths and sizes at random times, and count those that the search detects.
 
-    Parameters
-    ----------
-    survey : SeriesSurvey
-    free : ndarray of bool, shape (n_frame,)
-        Frames that belong to no event; flares are injected into these, and the others are left out of the search.
-    threshold : float
-    seed : int
-    temperature_k : float
-        Temperature of the flares; light curves have no colour.
-    steps : Steps, optional
-        Reports each half-width.
+    Flares are injected into `free` frames, which belong to no event, and the others are left out of the search. Light
+    curves have no colour, and flares in them no temperature. `steps` reports each half-width.
     """
     steps = steps or Steps()
     every = np.flatnonzero(free)

@@ -35,14 +35,9 @@ class CalibrationFrames:
 
     @classmethod
     def of(cls, frames: Frames, nominal: Instrument, star: Source | None, temperature_c: float | None = None) -> Self:
-        """Select the good frames of spectra that a detector recorded.
+        """Select the good frames of spectra that a detector recorded: raw DN of each pixel that the instrument reads.
 
-        Parameters
-        ----------
-        frames : Frames
-            Raw DN of each pixel that the instrument reads.
-        temperature_c : float, optional
-            Of the detector, where the frames do not state it.
+        `temperature_c` is that of the detector where the frames do not state it.
         """
         nm = frames.wavelength_nm
         if nm is None or nm.shape != nominal.wavelength_nm.shape:
@@ -175,15 +170,8 @@ class PhotonTransfer:
 def measured_variance(raw_dn: Float, light_dn: Float, dark_dn: Float, usable: NDArray[np.bool_]) -> MeasuredVariance:
     """Measure the variance of frames from differences of consecutive ones, without drifts.
 
-    From each difference the best multiples of light and dark are subtracted, since jitter of the pointing and of the
-    temperature change all pixels together.
-
-    Parameters
-    ----------
-    raw_dn : ndarray, shape (n_frame, n_pixel)
-    light_dn, dark_dn : ndarray, shape (n_pixel,)
-        Mean of a frame.
-    usable : ndarray of bool, shape (n_pixel,)
+    From each difference the best multiples of light and dark, the means of a frame, are subtracted, since jitter of the
+    pointing and of the temperature change all pixels together.
     """
     # A pixel that never changes is dead.
     usable = usable & np.any(raw_dn != raw_dn[0], axis=0)
@@ -205,14 +193,8 @@ def fit_photon_transfer(
 ) -> PhotonTransfer:
     """Fit gain, read noise and the unit of dark counts to measured variances, by iterated weighted least squares.
 
-    Parameters
-    ----------
-    measured : sequence of MeasuredVariance
-        At least one.
-    nominal : Instrument
-        Instrument whose values are kept where the data determine none.
-    dark_error_dn : float
-        Standard error of the dark of a mean frame, which moves the read noise.
+    The nominal values are kept where the data determine none. The standard error of the dark of a mean frame,
+    `dark_error_dn`, moves the read noise.
     """
     variance, light, dark = (
         np.concatenate([getattr(one, key) for one in measured]) for key in ("variance", "light_dn", "dark_dn")
@@ -341,14 +323,7 @@ def fit_dark(dark: Sequence[CalibrationFrames], nominal: Instrument, noise: Nois
 
     The slope is assumed if the temperatures span less than `SLOPE_RANGE_C`. Each pixel's bias is fitted if exposure
     times differ by `EXPOSURE_RATIO`, and one for all pixels if the temperatures span `BIAS_RANGE_C`; otherwise it is
-    the instrument's.
-
-    Parameters
-    ----------
-    dark : sequence of CalibrationFrames
-        At least one.
-    noise : NoiseModel
-        Its variances are the weights.
+    the instrument's. The variances of `noise` are the weights.
     """
     raw = np.concatenate([one.raw_dn for one in dark])
     n_pixel = raw.shape[1]
@@ -411,21 +386,9 @@ def fit_dark(dark: Sequence[CalibrationFrames], nominal: Instrument, noise: Nois
 def _mean_dark(
     series: Float, exposure: Float, offset: Float, variance: Float, start: Float, free: NDArray[np.bool_]
 ) -> tuple[Float, Float]:
-    """Fit bias, dark level and slope of the mean pixel.
+    """Fit bias, dark level and slope of the mean pixel, and return them, shape (3,), with their covariance.
 
-    Parameters
-    ----------
-    series, exposure, offset, variance : ndarray, shape (n_frame,)
-        Mean of the pixels, exposure time, temperature above the reference, and variance of the mean.
-    start, free : ndarray, shape (3,)
-        Bias, level and slope, and whether each is fitted.
-
-    Returns
-    -------
-    ndarray, shape (3,)
-        Fitted values, those of `start` where they are not free.
-    ndarray, shape (3, 3)
-        Covariance, zero where they are not free.
+    Offsets are temperatures above the reference. Values that are not free are those of `start`, with no variance.
     """
 
     def whole(values: Float) -> Float:
@@ -448,23 +411,9 @@ def _fit_pixels(
 ) -> tuple[Float, Float]:
     """Fit a linear model to each pixel by weighted least squares.
 
-    Parameters
-    ----------
-    columns : ndarray, shape (n_frame, n_column)
-        Signals of units of the fitted values, of which the last is the level unless `dark` is given.
-    weight : ndarray, shape (n_frame,)
-        Of a typical pixel.
-    values : ndarray, shape (n_frame, n_pixel)
-    noise : NoiseModel
-        Variance of the pixels, which differs from the typical one of the weights.
-    dark : tuple of ndarray, optional
-        Exposure times, shape (n_frame,), and levels, shape (n_pixel,), of the dark current.
-
-    Returns
-    -------
-    ndarray, shape (n_column, n_pixel)
-    ndarray, shape (n_pixel, n_column, n_column)
-        Covariance.
+    The last column is the signal of the level unless `dark` has exposure times and levels of the dark current. Weights
+    are those of a typical pixel, from whose variance that of the pixels differs. Returned are the values, shape
+    (n_column, n_pixel), and their covariance, shape (n_pixel, n_column, n_column).
     """
     weighted = columns * weight[:, None]
     hat = np.linalg.solve(weighted.T @ columns, weighted.T)

@@ -36,14 +36,9 @@ class Colour:
 
 
 def event_colour(spectra: Float, error: Float, event: NDArray[np.bool_], quiet: NDArray[np.bool_]) -> Colour:
-    """Compare the mean spectrum of an event with that of the quiescent star.
+    """Compare the mean spectrum of the frames of an event with that of the quiescent star near it.
 
-    Parameters
-    ----------
-    spectra, error : ndarray, shape (n_frame, n_pixel)
-        Pixels in order of wavelength; those that are not finite in a frame are left out.
-    event, quiet : ndarray of bool, shape (n_frame,)
-        Frames of the event, and of the quiescent star near it.
+    Pixels are in order of wavelength; those that are not finite in a frame are left out.
     """
     fine = np.isfinite(spectra).all(axis=0) & np.isfinite(error).all(axis=0) & (error > 0).all(axis=0)
     spectra, error = spectra[:, fine], error[:, fine]
@@ -115,13 +110,7 @@ class EventSpectrum:
 def event_spectrum(
     survey: SeriesSurvey, series: SpectralSeries, taken: NDArray[np.bool_], one: Detection
 ) -> EventSpectrum:
-    """Compare the spectrum of an event with those of flares and of changes that resemble them.
-
-    Parameters
-    ----------
-    taken : ndarray of bool, shape (n_frame,)
-        Frames of all events.
-    """
+    """Compare the spectrum of an event with those of flares and of changes that resemble them."""
     spectrum, variance = _weighted(survey, series, taken, one)
     flares = series.model.flares(TEMPERATURES_K)
     unknown = series.model.unknowns(series.light)
@@ -191,14 +180,10 @@ def _weighted(
 def drifts(survey: SeriesSurvey, series: SpectralSeries, taken: NDArray[np.bool_], n_frames: int) -> dict[str, float]:
     """Return the differences of star, dark current and sky between parts of the frames and their surroundings.
 
-    They follow from means of `n_frames` quiescent frames, compared with the means before and after: the scatter in
-    excess of noise, and the part that noise may hide. If there are fewer than `MIN_PARTS` such means, shorter ones are
-    taken, and changes are assumed to grow in proportion to time. The sky changes by its documented prior.
-
-    Returns
-    -------
-    dict of str to float
-        Standard deviation by name.
+    They are standard deviations, by name, and follow from means of `n_frames` quiescent frames, compared with the means
+    before and after: the scatter in excess of noise, and the part that noise may hide. If there are fewer than
+    `MIN_PARTS` such means, shorter ones are taken, and changes are assumed to grow in proportion to time. The sky
+    changes by its documented prior.
     """
     unknown = series.model.unknowns(series.light)
     names = ("light", "dark")

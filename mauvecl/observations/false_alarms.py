@@ -103,16 +103,8 @@ def simulated_rates(
 
     Both have the covariance of the process, and levels are fitted and subtracted as in the search. The noise of the
     first is normal, or Poisson noise for counts. That of the second are blocks of the standardised residuals of
-    quiescent frames, drawn with replacement (Kuensch 1989, doi 10.1214/aos/1176347265).
-
-    Parameters
-    ----------
-    quiet : ndarray of bool, shape (n_frame,)
-        Searched frames that belong to no event.
-    rate : float
-        Smallest rate of interest, per star-day: enough light curves are drawn for `MIN_ALARMS`, up to a limit.
-    steps : Steps, optional
-        Reports each batch of light curves.
+    quiescent frames, drawn with replacement (Kuensch 1989, doi 10.1214/aos/1176347265). Enough light curves are drawn
+    for `MIN_ALARMS` at the smallest rate of interest, per star-day, up to a limit; `steps` reports each batch.
     """
     steps = steps or Steps()
     residual = innovations(survey, quiet)

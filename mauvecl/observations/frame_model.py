@@ -50,12 +50,8 @@ class FrameModel:
     def of(cls, frames: Frames, quiet: Expectation, flare: FlareModel, flux_per_dn: Float) -> Self:
         """Match frames with the pixels or resolution elements of an instrument.
 
-        Raises InputError if wavelengths differ from the instrument's, or the unit is neither counts nor a flux density.
-
-        Parameters
-        ----------
-        flux_per_dn : ndarray, shape (n_pixel,)
-            Flux density, erg s-1 cm-2 nm-1, for one DN of the exposure in each pixel of the instrument.
+        `flux_per_dn` is the flux density, erg s-1 cm-2 nm-1, for one DN of the exposure in each of its pixels. Raises
+        InputError if wavelengths differ from the instrument's, or the unit is neither counts nor a flux density.
         """
         unit = _plain(frames.unit)
         counts = unit in {_plain(each) for each in (*COUNT_UNITS, *RATE_UNITS)}
@@ -137,10 +133,7 @@ class FrameModel:
     def exposure(self, light: Float, variance: Float, n_frames: int) -> Expectation:
         """Return the expectation of some frames, with one pixel for each value, as measured.
 
-        Parameters
-        ----------
-        light, variance : ndarray, shape (n_value,)
-            Light of a quiescent frame and its variance, in the frames' unit.
+        Light of a quiescent frame and its variance are in the frames' unit.
         """
         gain = self.gain / self.per_dn
         electrons = np.maximum(light / self.per_dn, 0.0) / gain / self.quiet.n_frames
@@ -234,23 +227,10 @@ def light_changes(
 ) -> list[LightChange]:  # fmt: skip
     """Find sudden changes of the light that all pixels share, in order of time.
 
-    The light is fitted to each frame, and its means before and after each frame are compared. A change counts if the
-    spectrum of the difference is clearly that of the star rather than one of `others`.
-
-    Parameters
-    ----------
-    excess : ndarray, shape (n_frame, n_pixel)
-        Spectra less that of the quiescent star.
-    frames : ndarray of int
-        Frames that are compared, ascending.
-    numbers : ndarray of int, shape (n_frame,)
-        Numbers of all frames on the regular grid.
-    light : ndarray, shape (n_pixel,)
-        Spectrum of the quiescent star.
-    others : ndarray, shape (k, n_pixel)
-        Spectra of flares, dark current and sky.
-    sd : ndarray, shape (n_pixel,)
-        Noise of a frame.
+    The light is fitted to each of some frames, ascending, and its means before and after each frame are compared. A
+    change counts if the spectrum of the difference is clearly that of the star rather than one of `others`: flares,
+    dark current and sky. `excess` is the spectra of all frames less that of the quiescent star, `light`; `numbers` are
+    those of all frames on the regular grid, and `sd` is the noise of a frame.
     """
     weights = light / sd**2 / float(((light / sd) ** 2).sum())
     amplitude, at = excess[frames] @ weights, numbers[frames]

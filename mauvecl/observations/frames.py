@@ -50,14 +50,7 @@ class QualityBits:
 
     @classmethod
     def of(cls, header: Mapping[str, Any], chosen: str | int | None, what: str) -> QualityBits:
-        """Return the bits that are chosen for a file, or the defaults of its mission.
-
-        Parameters
-        ----------
-        chosen : str or int, optional
-            A sum of bits; "all" or "none"; or names and numbers, such as "Desat, 128". By default lightkurve's default
-            for Kepler and K2, the same without ImpulsiveOutlier for TESS, and all bits for other files.
-        """
+        """Return the bits that are chosen for a file, or its mission's defaults; see `FrameMapping.quality_bits`."""
         said = {str(header.get(key, "") or "").strip().upper() for key in ("TELESCOP", "MISSION")}
         mission = "Kepler" if said & {"KEPLER", "K2"} else "TESS" if "TESS" in said else ""
         if chosen is None or str(chosen).strip().lower() == "default":

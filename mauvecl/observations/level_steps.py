@@ -36,14 +36,7 @@ def relative_level(time_s: Float, numbers: NDArray[np.int64], flux: Float, frame
 
     Sudden changes that last are fitted together with the process of the light. They are steps if each is larger than
     its error allows, with and without the frames in which a flare may have begun there, and if together they lower the
-    Bayesian information criterion.
-
-    Parameters
-    ----------
-    time_s, numbers, flux : ndarray, shape (n_frame,)
-        Times, numbers on the regular grid, and flux of the frames without a fault.
-    frame_s : float
-        Time from frame to frame on the grid.
+    Bayesian information criterion. The frames are those without a fault, `frame_s` apart on the grid of their numbers.
     """
     constant = np.ones(flux.size)
     values = flux / Binned(time_s, flux, constant, frame_s).noise

@@ -95,20 +95,7 @@ def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, taken: Bool, steps
 
     Without losses, a star does not flare in many of its frames, keeps its noise, and varies slowly. Where that does not
     hold, the light curve is searched upside down for losses, and the smaller Bayesian information criterion decides.
-
-    Parameters
-    ----------
-    survey : SeriesSurvey
-        Without processes.
-    fitted : SeriesSurvey
-    taken : ndarray of bool, shape (n_frame,)
-        Process and events of `fit_quiet_light`.
-    steps : Steps, optional
-        Reports each fit and each search.
-
-    Returns
-    -------
-    ndarray of bool, shape (n_frame,)
+    `survey` has no processes; `fitted` and `taken` are the process and the events of `fit_quiet_light`.
     """
     none, process = np.zeros_like(taken), fitted.flux_process
     rotates = any(term.rotates for term in process.terms)
@@ -156,12 +143,7 @@ def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, taken: Bool, steps
 def _eclipses(survey: SeriesSurvey, usual: Callable[[], float]) -> Bool:
     """Return the frames in periodic losses, if these lower the criterion, shape (n_frame,).
 
-    Parameters
-    ----------
-    survey : SeriesSurvey
-        Without processes.
-    usual : callable
-        Returns the criterion without losses, which takes long.
+    The survey has no processes; `usual` returns the criterion without losses, which takes long.
     """
     guessed = guess_eclipses(survey)
     none = np.zeros_like(guessed)
@@ -268,19 +250,8 @@ def survey_light_curve(
 ) -> tuple[SeriesSurvey, QuiescentLevel, Frames]:
     """Fit the quiescent light of a light curve, and prepare its search.
 
-    Parameters
-    ----------
-    seed : int
-        Seed of the standard error of the level.
-    steps : Steps, optional
-        Reports fits, searches and draws.
-
-    Returns
-    -------
-    survey : SeriesSurvey
-    level : QuiescentLevel
-    frames : Frames
-        With a remark, and without errors, if they hold few counts.
+    Frames of few counts are returned with a remark and without errors. The seed is that of the standard error of the
+    level; `steps` reports fits, searches and draws.
     """
     steps = steps or Steps()
     fits = steps.part(0.0, 0.9)
@@ -383,13 +354,9 @@ def _noise(
 
 
 def level_of(frames: Frames, flux: Float, used: Bool, survey: SeriesSurvey, quiet: Bool) -> Float:
-    """Return the quiescent level of all frames, shape (n_frame,); between searched frames it is interpolated.
+    """Return the quiescent level of all frames, shape (n_frame,); between searched frames, `used`, it is interpolated.
 
-    Parameters
-    ----------
-    used : ndarray of bool, shape (n_frame,)
-        Frames of the survey.
-    quiet : ndarray of bool, shape (n_used,)
+    `quiet` are those of the searched frames that belong to no event.
     """
     return np.interp(frames.time_s, frames.time_s[used], survey.flux_level(quiet) * survey.scale)
 

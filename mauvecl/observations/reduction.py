@@ -153,14 +153,9 @@ class WeightedSums:
 def weighted_sums(
     flux: Values, error: Values | None, quality: Values | None, weights: Float | None = None
 ) -> WeightedSums:
-    """Reduce spectra to weighted sums, reading them twice in pieces.
+    """Reduce spectra to weighted sums, by default the sum over all pixels, reading them twice in pieces.
 
-    Parameters
-    ----------
-    flux, error, quality : Values
-        Flux of shape (n_frame, n_pixel); quality of this shape or (n_frame,), zero where nothing is wrong.
-    weights : ndarray, shape (n_weight, n_pixel), optional
-        By default the sum over all pixels.
+    Quality has the shape of the flux or of its frames, and is zero where nothing is wrong.
     """
     n, n_pixel = flux.shape
     given = np.ones((1, n_pixel)) if weights is None else np.atleast_2d(np.asarray(weights, np.float64))

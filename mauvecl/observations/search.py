@@ -39,23 +39,13 @@ WHITE = Process((), 1.0)
 
 @dataclass(frozen=True)
 class Detection:
-    """Event above the threshold of the search, before it is measured.
+    """Event above the threshold of the search, before it is measured."""
 
-    Attributes
-    ----------
-    value, half_width_s, peak_s, direction : float, float, float, int
-        Statistic, half-width, time of the peak in the stare, and row of the bank's directions, of the best template.
-    amplitude : float
-        Of the template, in the unit of the sums along the direction.
-    first, last : int
-        First and last frame of the event.
-    """
-
-    value: float
+    value: float  # statistic of the best template
     half_width_s: float
-    peak_s: float
-    direction: int
-    amplitude: float
+    peak_s: float  # in the stare
+    direction: int  # row of the bank's directions
+    amplitude: float  # of the template, in the unit of the sums along the direction
     first: int
     last: int
 
@@ -88,17 +78,7 @@ class SeriesSurvey:
         cls, frames: Frames, flux: Float, variance: Float, used: Bool, level: float, photon: float, shape: Shape,
         counts: float = 0.0,
     ) -> SeriesSurvey:  # fmt: skip
-        """Prepare the frames of a light curve that can be searched, without a process.
-
-        Parameters
-        ----------
-        flux, variance : ndarray, shape (n_frame,)
-            The light curve and the variance of the noise at its level.
-        used : ndarray of bool, shape (n_frame,)
-            Frames that are searched.
-        level, photon, counts : float
-            See the attributes.
-        """
+        """Prepare the frames of a light curve that can be searched, `used`, without a process; see the attributes."""
         stare = stare_of(frames, used)
         scale = float(np.sqrt(np.median(variance[used])))
         typical = abs(level)

@@ -206,16 +206,8 @@ def _replace_rays(
 def measure_noise(excess: Float, pairs: NDArray[np.intp], stated: Float, shared: Float, nm: Float) -> PixelNoise:
     """Measure the noise of each pixel from differences of neighbouring quiescent frames.
 
-    Parameters
-    ----------
-    excess : ndarray, shape (n_frame, n_pixel)
-    pairs : ndarray of int
-        Quiescent frames whose successor is the next one, and quiescent.
-    stated : ndarray, shape (n_pixel,)
-        Standard deviation of a frame that is expected.
-    shared : ndarray, shape (k, n_pixel)
-        Spectra of changes that all pixels share; their amplitudes are fitted in each frame.
-    nm : ndarray, shape (n_pixel,)
+    The frames of `pairs` and their successors are quiescent and next to each other. The noise of a frame is expected to
+    be as `stated`. Amplitudes of changes that all pixels share, with the spectra `shared`, are fitted to each frame.
     """
     basis = np.linalg.svd(shared / stated, full_matrices=False)[2]
     total = np.zeros(stated.size)
@@ -241,11 +233,11 @@ def survey_spectra(
     """Prepare the search of spectra that is weighted for flares.
 
     Slow changes of the dark current and of what else the weights let through are processes of the weighted sums; the
-    level of the light in each frame is free, so that pointing losses take no part.
+    level of the light in each frame is free, so that pointing losses take no part. The level that is returned is that
+    of the sum over wavelength, with flags of single frames that only the weighted sums show.
 
     Parameters
     ----------
-    shape : Shape
     rank : int
         Largest number of sums of a frame.
     seed : int
@@ -255,13 +247,6 @@ def survey_spectra(
         state it, that of the light is infinite and that of the dark current as measured.
     steps : Steps, optional
         Reports fits, searches and draws.
-
-    Returns
-    -------
-    survey : SeriesSurvey
-    series : SpectralSeries
-    level : QuiescentLevel
-        Of the sum over wavelength, with flags of single frames that only the weighted sums show.
     """
     steps = steps or Steps()
     fits = steps.part(0.0, 0.9)
@@ -314,12 +299,8 @@ def _weighted_sums(
 ) -> tuple[SpectralSeries, Templates, Float]:
     """Return the spectra less that of the quiescent star, the weights for flares, and the weighted sums of each frame.
 
-    Sums have unit covariance from frame to frame, and are independent of each other over longer times as well.
-
-    Parameters
-    ----------
-    quiet : ndarray of bool, shape (n_frame,)
-        Frames that belong to no event.
+    Sums have unit covariance from frame to frame, and are independent of each other over longer times as well. Frames
+    that belong to no event are `quiet`.
     """
     frames, model = cleaned.frames, cleaned.model
     light = frames.flux[quiet].mean(axis=0)
@@ -377,19 +358,9 @@ def _slow_means(values: Float) -> Float:
 
 
 def fit_changes(excess: Float, spectra: Float, sd: Float) -> tuple[Float, Float]:
-    """Fit the amplitudes of spectra together to each frame.
+    """Fit the amplitudes of spectra together to each frame; return them, shape (n_frame, k), and their covariance.
 
-    Parameters
-    ----------
-    excess : ndarray, shape (n_frame, n_pixel)
-    spectra : ndarray, shape (k, n_pixel)
-    sd : ndarray, shape (n_pixel,)
-        Noise of a frame.
-
-    Returns
-    -------
-    amplitudes : ndarray, shape (n_frame, k)
-    covariance : ndarray, shape (k, k)
+    The noise of a frame is `sd`.
     """
     white = spectra / sd
     covariance: Float = np.asarray(np.linalg.inv(white @ white.T), np.float64)
@@ -399,16 +370,7 @@ def fit_changes(excess: Float, spectra: Float, sd: Float) -> tuple[Float, Float]
 def _dark_changes(
     excess: Float, pairs: NDArray[np.intp], quiet: Bool, sd: Float, shared: Float
 ) -> tuple[dict[str, float], float]:
-    """Measure changes of the dark current, which is fitted together with the light.
-
-    Parameters
-    ----------
-    pairs : ndarray of int
-        Quiescent frames whose successor is quiescent.
-    quiet : ndarray of bool, shape (n_frame,)
-    sd : ndarray, shape (n_pixel,)
-    shared : ndarray, shape (2, n_pixel)
-        Spectra of light and dark current.
+    """Measure changes of the dark current, which is fitted together with the light; both spectra are `shared`.
 
     Returns
     -------
