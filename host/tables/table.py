@@ -14,8 +14,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.tables.coordinates import ANGLES, angle, angle_unit, angle_unit_in_name
-from mauvecl.host.tables.names import divided_unit, first_of, is_missing, key_of, matched
+from mauvecl.host.tables.names import (
+    ANGLES,
+    angle,
+    angle_unit,
+    angle_unit_in_name,
+    divided_unit,
+    first_of,
+    is_missing,
+    key_of,
+    matched,
+)
 from mauvecl.host.tables.units import time_unit, unit_of
 from mauvecl.schema.errors import InputError, printable, shortened
 

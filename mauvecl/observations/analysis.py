@@ -15,23 +15,31 @@ from mauvecl.fits.spectrum import Measurement
 from mauvecl.flares.settings import RANK, Per, per_day
 from mauvecl.flares.shapes import shape_of
 from mauvecl.observations.detection import LONG_S, detect_events, most_events
-from mauvecl.observations.event_spectra import (
-    CAUSES,
-    Colour,
-    EventSpectrum,
-    event_colour,
-    event_spectrum,
-    measure_flare,
-)
 from mauvecl.observations.events import ObservedEvent, measure_events
-from mauvecl.observations.false_alarms import CHANCE_DIP, SimulatedRate, innovations, largest_dip, simulated_rates
-from mauvecl.observations.frame_model import FrameModel
+from mauvecl.observations.frame_model import CleanedSpectra, FrameModel, clean_spectra
 from mauvecl.observations.frames import Frames, Reason
 from mauvecl.observations.level import Likeness, QuiescentLevel, Scatter, binned_scatter, likeness
 from mauvecl.observations.light_curve import survey_light_curve
 from mauvecl.observations.process import Steps
-from mauvecl.observations.search import NO_COLOUR_K, SeriesSurvey
-from mauvecl.observations.spectra import CleanedSpectra, SpectralSeries, clean_spectra, survey_spectra
+from mauvecl.observations.search import (
+    CHANCE_DIP,
+    NO_COLOUR_K,
+    SeriesSurvey,
+    SimulatedRate,
+    innovations,
+    largest_dip,
+    simulated_rates,
+)
+from mauvecl.observations.spectra import (
+    CAUSES,
+    Colour,
+    EventSpectrum,
+    SpectralSeries,
+    event_colour,
+    event_spectrum,
+    measure_flare,
+    survey_spectra,
+)
 from mauvecl.schema.physical import DAY_S
 
 Float = NDArray[np.float64]

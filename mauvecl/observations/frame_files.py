@@ -44,8 +44,18 @@ from mauvecl.host.tables.units import (
 )
 from mauvecl.observations.frames import ALL_BITS, MAX_FRAMES, Frames, QualityBits, decimal_flags
 from mauvecl.observations.mapping import FrameMapping
-from mauvecl.observations.reduction import Light, PixelStatistics, weighted_sums, whole_or_reduced
-from mauvecl.observations.stored_frames import FolderFile, StoredFile, is_store, open_hdf5, open_store, stored_in_fits
+from mauvecl.observations.stored_frames import (
+    FolderFile,
+    Light,
+    PixelStatistics,
+    StoredFile,
+    is_store,
+    open_hdf5,
+    open_store,
+    stored_in_fits,
+    weighted_sums,
+    whole_or_reduced,
+)
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.physical import DAY_S

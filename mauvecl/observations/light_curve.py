@@ -31,10 +31,10 @@ from mauvecl.observations.level import (
     guess_flares,
     level_error,
     quiet_variance,
+    relative_level,
     single_frames,
     spikes,
 )
-from mauvecl.observations.level_steps import relative_level
 from mauvecl.observations.process import Binned, Steps, criterion_of_process, fit_process
 from mauvecl.observations.search import SeriesSurvey, bank_of
 from mauvecl.schema.errors import InputError

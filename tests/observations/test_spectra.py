@@ -16,9 +16,9 @@ from scipy import stats
 from mauvecl import SHAPES, Frames, Study, analyse, read_frames, stare
 from mauvecl.answers.analyse import frame_model
 from mauvecl.observations.detection import detect_events
-from mauvecl.observations.event_spectra import drifts, event_spectrum, measure_flare
-from mauvecl.observations.false_alarms import simulated_rates
-from mauvecl.observations.spectra import clean_spectra, survey_spectra
+from mauvecl.observations.frame_model import clean_spectra
+from mauvecl.observations.search import simulated_rates
+from mauvecl.observations.spectra import drifts, event_spectrum, measure_flare, survey_spectra
 
 Float = NDArray[np.float64]
 SHAPE = SHAPES["davenport2014"]
