@@ -101,6 +101,12 @@ def counts_per_unit(frames: Frames) -> float | None:
     return None
 
 
+def noise_of_steps(numbers: NDArray[np.int64], flux: Float) -> float:
+    """Return the robust standard deviation of a frame from steps between neighbours; zero without any."""
+    steps = np.diff(flux)[np.diff(numbers) == 1]
+    return PER_MAD * float(np.median(np.abs(steps))) / float(np.sqrt(2.0)) if steps.size else 0.0
+
+
 def guess_flares(numbers: NDArray[np.int64], flux: Float, least: float = 0.0) -> Bool:
     """Return a first guess of the frames in flares, which rise faster than the star otherwise does, shape (n_frame,).
 
@@ -114,8 +120,7 @@ def guess_flares(numbers: NDArray[np.int64], flux: Float, least: float = 0.0) ->
     """
     inside = np.zeros(flux.size, np.bool_)
     rises: list[tuple[float, int, int]] = []
-    steps = np.diff(flux)[np.diff(numbers) == 1]
-    noise = max(PER_MAD * float(np.median(np.abs(steps))) / np.sqrt(2.0) if steps.size else 0.0, least)
+    noise = max(noise_of_steps(numbers, flux), least)
     for lag in JUMP_FRAMES:
         if flux.size <= lag:
             continue
@@ -276,8 +281,7 @@ def spikes(numbers: NDArray[np.int64], flux: Float, error: Float | None, fine: B
     found = np.zeros(flux.size, np.bool_)
     at = np.flatnonzero(fine)
     around = scipy.ndimage.median_filter(flux[at], size=AROUND, mode="nearest")
-    steps = np.diff(flux[at])[np.diff(numbers[at]) == 1]
-    scatter = PER_MAD * float(np.median(np.abs(steps))) / np.sqrt(2.0) if steps.size else 0.0
+    scatter = noise_of_steps(numbers[at], flux[at])
     sd = np.full(at.size, scatter) if error is None else np.maximum(error[at], scatter)
     sigmas = np.divide(flux[at] - around, sd, out=np.zeros(at.size), where=sd > 0)
     found[at] = single_frames(numbers[at], sigmas, np.ones(at.size, np.bool_))

@@ -30,6 +30,7 @@ from mauvecl.observations.level import (
     counts_per_unit,
     guess_flares,
     level_error,
+    noise_of_steps,
     quiet_variance,
     relative_level,
     single_frames,
@@ -348,8 +349,7 @@ def _noise(
         return np.maximum(level, 1e-3 * float(np.median(level[quiet])) + 1e-300) / counts, 1.0 / counts
     if error is not None:
         return quiet_variance(flux, error, level, quiet)
-    steps = np.diff(flux[quiet])[np.diff(frames.numbers[quiet]) == 1]
-    spread = PER_MAD * float(np.median(np.abs(steps))) / np.sqrt(2.0) if steps.size else 0.0
+    spread = noise_of_steps(frames.numbers[quiet], flux[quiet])
     return np.full(flux.size, (spread if spread > 0 else float(np.std(flux[quiet]))) ** 2), 0.0
 
 

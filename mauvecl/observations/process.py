@@ -343,11 +343,11 @@ class Covariance:
 
 @dataclass(frozen=True, eq=False)
 class LevelFit:
-    """Mean and log likelihood of values under a covariance."""
+    """Constant level of values under a covariance."""
 
     mean: float  # generalised least squares
-    mean_variance: float
     log_likelihood: float
+    left: Float  # shape (n,); innovations of the values less their mean
 
 
 def level_fit(covariance: Covariance, values: Float) -> LevelFit:
@@ -359,7 +359,7 @@ def level_fit(covariance: Covariance, values: Float) -> LevelFit:
     mean = float(both[:, 0] @ both[:, 1]) / information
     left = both[:, 0] - mean * both[:, 1]
     log_likelihood = -0.5 * (float(left @ left) + covariance.log_determinant + np.log(information))
-    return LevelFit(mean, 1.0 / information, log_likelihood)
+    return LevelFit(mean, log_likelihood, left)
 
 
 @dataclass(frozen=True, eq=False)

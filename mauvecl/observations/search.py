@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mauvecl.flares.stare import Stare, select_frames
 from mauvecl.observations.level import process_level
-from mauvecl.observations.process import Process, Steps
+from mauvecl.observations.process import Process, Steps, level_fit
 from mauvecl.observations.process_search import ProcessSearch
 from mauvecl.schema.physical import DAY_S
 from mauvecl.search.templates import Bank, Baseline, Templates
@@ -311,10 +311,8 @@ def innovations(survey: SeriesSurvey, quiet: Bool) -> Float:
     """
     columns = []
     for process, column in zip(survey.processes, survey.sums.T, strict=True):
-        one = process.covariance(survey.stare.start_s[quiet], survey.variance[quiet] * process.excess**2)
-        both = one.whitened(np.column_stack([column[quiet], np.ones(int(quiet.sum()))]))
-        mean = float(both[:, 0] @ both[:, 1] / (both[:, 1] @ both[:, 1]))
-        columns.append(both[:, 0] - mean * both[:, 1])
+        covariance = process.covariance(survey.stare.start_s[quiet], survey.variance[quiet] * process.excess**2)
+        columns.append(level_fit(covariance, column[quiet]).left)
     return np.column_stack(columns)
 
 

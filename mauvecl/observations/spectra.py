@@ -98,11 +98,6 @@ class SpectralSeries:
     dark_drift: float
 
     @property
-    def left_out(self) -> list[str]:
-        """Names of the unknowns whose changes from frame to frame the search leaves out."""
-        return [name for name, sd in self.jitters.items() if np.isinf(sd)]
-
-    @property
     def star_level(self) -> float:
         """Light of the star in the sum over wavelength, relative to `light`, by the shape of its spectrum.
 
