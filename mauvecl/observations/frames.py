@@ -203,6 +203,16 @@ def _cadence_of(name: str, time: Float) -> float:
     return cadence
 
 
+def _exposures(name: str, given: ArrayLike | None, n: int, cadence: float) -> Float:
+    """Return the exposure time of each frame, by default the cadence; raise InputError for an impossible one."""
+    if given is not None and np.shape(given) not in ((), (1,), (n,)):
+        raise _bad(name, "exposure", np.shape(given), f"one exposure time, or one for each of {n} frames")
+    exposure = np.array(np.broadcast_to(np.asarray(cadence if given is None else given, np.float64), (n,)))
+    if not (np.isfinite(exposure) & (exposure > 0)).all():
+        raise _bad(name, "exposure", f"{exposure[np.argmin(exposure)]:g} s", "exposure times above 0")
+    return exposure
+
+
 @validated
 @dataclass(frozen=True, eq=False)
 class Frames:
@@ -300,18 +310,11 @@ class Frames:
         if sd is not None and sd.shape != light.shape:
             raise _bad(name, "error", sd.shape, f"the shape of the flux, {light.shape}")
         flags = _whole_flags(name, quality, n)
-        if exposure_s is not None and np.shape(exposure_s) not in ((), (1,), (n,)):
-            raise _bad(name, "exposure", np.shape(exposure_s), f"one exposure time, or one for each of {n} frames")
-        exposure = None if exposure_s is None else np.array(np.broadcast_to(np.asarray(exposure_s, np.float64), (n,)))
         order = np.argsort(time, kind="stable")
         remarks: tuple[str, ...] = ()
         if (np.diff(time) < 0).any():
             remarks = (f"the times of {name} are not ascending; its frames were sorted by time",)
-        cadence = _cadence_of(name, time[order])
-        if exposure is None:
-            exposure = np.full(n, cadence)
-        if not (np.isfinite(exposure) & (exposure > 0)).all():
-            raise _bad(name, "exposure", f"{exposure[np.argmin(exposure)]:g} s", "exposure times above 0")
+        exposure = _exposures(name, exposure_s, n, _cadence_of(name, time[order]))
         if how.get("temperature_c") is not None:
             temperature = np.asarray(how["temperature_c"], np.float64)
             if temperature.shape != (n,):

@@ -110,13 +110,8 @@ def noise_of_steps(numbers: NDArray[np.int64], flux: Float) -> float:
 def guess_flares(numbers: NDArray[np.int64], flux: Float, least: float = 0.0) -> Bool:
     """Return a first guess of the frames in flares, which rise faster than the star otherwise does, shape (n_frame,).
 
-    Parameters
-    ----------
-    numbers : ndarray, shape (n_frame,)
-        Numbers of the frames on their regular grid.
-    flux : ndarray, shape (n_frame,)
-    least : float
-        Least standard deviation of a frame; most of few counts are equal.
+    `numbers` are those of the frames on their regular grid; `least` is the least standard deviation of a frame, since
+    most of few counts are equal.
     """
     inside = np.zeros(flux.size, np.bool_)
     rises: list[tuple[float, int, int]] = []
@@ -171,24 +166,14 @@ def quiet_variance(flux: Float, error: Float | None, level: Float, quiet: Bool) 
 
 
 def process_level(process: Process, time_s: Float, values: Float, variance: Float, quiet: Bool) -> Float:
-    """Return the mean of a process at all times given the quiescent values, shape (n,) or (n, k) as `values`.
-
-    Parameters
-    ----------
-    variance : ndarray, shape (n,)
-        Variance of the noise of each value, without the excess of the process.
-    quiet : ndarray of bool, shape (n,)
-    """
+    """Return the mean of a process at all times given the quiescent values, shape (n,) or (n, k) as `values`."""
     return LevelGiven(process, time_s, variance, quiet).of(values)
 
 
 class LevelGiven:
     """Means of a process at all times given quiescent values: one factorisation for all values at the same times.
 
-    Parameters
-    ----------
-    process, time_s, variance, quiet
-        As for `process_level`.
+    The variance is that of the noise of each value, without the excess of the process.
     """
 
     def __init__(self, process: Process, time_s: Float, variance: Float, quiet: Bool) -> None:
@@ -247,15 +232,7 @@ def single_frames(numbers: NDArray[np.int64], sigmas: Float, fine: Bool) -> Bool
     """Return single frames far above the level whose neighbours on both sides are not.
 
     A flare decays over several frames; one that is shorter than a frame cannot be distinguished from a cosmic ray.
-
-    Parameters
-    ----------
-    numbers : ndarray, shape (n_frame,)
-        Numbers of the frames on their regular grid.
-    sigmas : ndarray, shape (n_frame,)
-        Distance of the frames from the level, in standard deviations.
-    fine : ndarray of bool, shape (n_frame,)
-        Frames without another fault.
+    `sigmas` is the distance from the level, in standard deviations, and frames without another fault are `fine`.
     """
     at = np.flatnonzero(fine)
     single = np.zeros(sigmas.size, np.bool_)
@@ -269,14 +246,9 @@ def single_frames(numbers: NDArray[np.int64], sigmas: Float, fine: Bool) -> Bool
 
 
 def spikes(numbers: NDArray[np.int64], flux: Float, error: Float | None, fine: Bool) -> Bool:
-    """Return single frames far above the frames around them, of a star whose level is not known yet, shape (n_frame,).
+    """Return single frames far above the frames around them, of a star whose level is not known yet.
 
-    Parameters
-    ----------
-    error : ndarray, shape (n_frame,), or None
-        Stated errors.
-    fine : ndarray of bool, shape (n_frame,)
-        Frames without another fault.
+    Frames without another fault are `fine`.
     """
     found = np.zeros(flux.size, np.bool_)
     at = np.flatnonzero(fine)
@@ -328,14 +300,7 @@ class Likeness:
 
 
 def likeness(numbers: NDArray[np.int64], residual: Float) -> Likeness:
-    """Return the autocorrelation of residuals.
-
-    Parameters
-    ----------
-    numbers : ndarray, shape (n_frame,)
-        Numbers of the frames on their regular grid.
-    residual : ndarray, shape (n_frame, n_sum)
-    """
+    """Return the autocorrelation of residuals, shape (n_frame, n_sum), at lags of the frames' numbers."""
     # Single extreme values would hide correlations, or feign them.
     scaled = np.clip(residual, -4.0, 4.0)
     scaled = (scaled - scaled.mean(axis=0)) / np.maximum(scaled.std(axis=0), 1e-300)
@@ -372,12 +337,7 @@ class Scatter:
 def binned_scatter(numbers: NDArray[np.int64], residual: Float) -> list[Scatter]:
     """Measure the scatter of means of consecutive frames without gaps.
 
-    Parameters
-    ----------
-    numbers : ndarray, shape (n_frame,)
-        Numbers of the frames on their regular grid.
-    residual : ndarray, shape (n_frame,)
-        Flux of quiescent frames less their level, in units of the noise of one frame.
+    Residuals are in units of the noise of a frame.
     """
     found = []
     # Place of each frame among consecutive ones, and their number.

@@ -261,10 +261,7 @@ def survey_light_curve(
         remark = "the frames hold few counts: their noise is Poisson noise of the level, and stated errors are not used"
         frames = replace(frames, error=None).with_remarks((remark,))
     flux, error = frames.white_light
-    reasons = frames.faults.copy()
-    check_usable(frames, reasons)
-    if counts is None:
-        reasons[spikes(frames.numbers, flux, error, reasons == 0)] |= Reason.SPIKE
+    reasons = _faults(frames, counts)
     used = reasons == 0
     steps_of_level = np.ones(flux.size)
     if counts is None and np.ptp(frames.time_s) > LONG_S:
@@ -278,9 +275,7 @@ def survey_light_curve(
         used = reasons == 0
         if survey is None:
             guessed[used] = guess_flares(frames.numbers[used], flux[used], least)
-            level = np.full(flux.size, _mean(flux[used & ~guessed], least))
-            if not level.any():
-                raise InputError(f"{frames.name}: the level of its light is zero", "the light of a star", key="flux")
+            level = np.full(flux.size, _mean(frames.name, flux[used & ~guessed], least))
         quiet = used & ~guessed
         variance, photon = _noise(frames, flux, error, level, quiet, counts)
         typical = float(np.median(level[quiet]))
@@ -309,6 +304,16 @@ def survey_light_curve(
     return survey, light.times(steps_of_level), frames
 
 
+def _faults(frames: Frames, counts: float | None) -> NDArray[np.int64]:
+    """Return why frames are not searched, before their level is known; raise InputError if too few are left."""
+    flux, error = frames.white_light
+    reasons = frames.faults.copy()
+    check_usable(frames, reasons)
+    if counts is None:
+        reasons[spikes(frames.numbers, flux, error, reasons == 0)] |= Reason.SPIKE
+    return reasons
+
+
 def _steps_of_level(frames: Frames, flux: Float, used: Bool) -> Float:
     """Return the relative level after each sudden change, for all frames; those not used have that of the next used."""
     relative = relative_level(frames.time_s[used], frames.numbers[used], flux[used], frames.cadence_s)
@@ -333,12 +338,14 @@ def check_usable(frames: Frames, reasons: NDArray[np.int64]) -> None:
         raise InputError(f"{frames.name}: the flux of most frames is the same", "a light curve with noise", key="flux")
 
 
-def _mean(flux: Float, least: float) -> float:
-    """Return the mean without outliers; a median of whole numbers would be one of them."""
+def _mean(name: str, flux: Float, least: float) -> float:
+    """Return the mean without outliers, which must not be zero; a median of whole numbers would be one of them."""
     middle = float(np.median(flux))
     spread = max(PER_MAD * float(np.median(np.abs(flux - middle))), least)
     near = np.abs(flux - middle) <= max(FAR * spread, 1e-12 * abs(middle))
-    return float(flux[near].mean())
+    if (mean := float(flux[near].mean())) == 0.0:
+        raise InputError(f"{name}: the level of its light is zero", "the light of a star", key="flux")
+    return mean
 
 
 def _noise(

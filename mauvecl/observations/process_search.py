@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.threads import map_in_threads
-from mauvecl.search.search import LargestValue
 from mauvecl.search.templates import LEAST_SHARE, Bank, Template
 
 if TYPE_CHECKING:
@@ -247,29 +246,15 @@ class ProcessSearch:
         rho[:, ~tried] = -np.inf
         return row, rho
 
-    def largest(self, sums: NDArray[Any]) -> LargestValue:
-        """Return the largest value of each light curve and its template."""
+    def largest(self, sums: NDArray[Any]) -> Float:
+        """Return the largest value of each light curve, shape (n_stare,)."""
         size = max(1, BATCH // (self.n_grid * sums.shape[2]))
-        parts = [self._largest(sums[k : k + size]) for k in range(0, len(sums), size)]
-        return LargestValue(
-            *(np.concatenate([getattr(p, name) for p in parts]) for name in LargestValue.__annotations__)
-        )
-
-    def _largest(self, sums: NDArray[Any]) -> LargestValue:
-        n = len(sums)
-        best, every = np.full(n, -np.inf), np.arange(n)
-        peak, width, amplitude = np.zeros((3, n))
-        temperature = np.zeros(n, np.int64)
-        for row, rho in self.values(sums):
-            flat = rho.reshape(n, -1)
-            which = flat.argmax(axis=1)
-            value = flat[every, which]
-            better = value > best
-            direction, onset = np.divmod(which[better], rho.shape[2])
-            best[better], width[better], temperature[better] = value[better], row.template.half_width_s, direction
-            peak[better] = self.peak_s(row, onset)
-            amplitude[better] = value[better] / row.per_amplitude[direction, onset]
-        return LargestValue(best, peak, width, temperature, amplitude)
+        best = np.full(len(sums), -np.inf)
+        for first in range(0, len(sums), size):
+            part = slice(first, first + size)
+            for _, rho in self.values(sums[part]):
+                best[part] = np.maximum(best[part], rho.max(axis=(1, 2)))
+        return best
 
     def peak_s(self, row: FilterRow, onset: NDArray[np.int64]) -> Float:
         """Return the times of the peaks of templates, from the start of the stare's numbering."""

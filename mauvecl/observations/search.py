@@ -277,7 +277,7 @@ def simulated_rates(
                 drawn = rng.poisson(counts, (size, n))[:, :, None] / survey.counts / survey.scale
             else:
                 drawn = np.stack([one.coloured(white[:, :, k].T).T for k, one in enumerate(covariances)], axis=2)
-            found.append(part.search.largest(drawn).maximum)
+            found.append(part.search.largest(drawn))
     modelled, measured = (np.sort(np.concatenate(values)) for values in largest)
     return SimulatedRate(modelled, days, bool(survey.counts)), SimulatedRate(measured, days, True)
 

@@ -36,6 +36,7 @@ from mauvecl.search.templates import TEMPERATURES_K, Templates
 
 if TYPE_CHECKING:
     from mauvecl.flares.shapes import Shape
+    from mauvecl.observations.frames import Frames
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -165,8 +166,7 @@ def survey_spectra(
     steps = steps or Steps()
     fits = steps.part(0.0, 0.9)
     frames = cleaned.frames
-    flux, error = frames.white_light
-    assert error is not None
+    flux, _ = frames.white_light
     reasons = frames.faults | np.where(cleaned.saturated, Reason.SATURATED, 0)
     check_usable(frames, reasons)
     used = reasons == 0
@@ -174,20 +174,8 @@ def survey_spectra(
     events[used] = guess_flares(frames.numbers[used], flux[used])
     for _ in range(ROUNDS):
         series, templates, sums = _weighted_sums(cleaned, reasons, used & ~events, rank, jitters)
-        directions = templates.directions[list(templates.chosen)]
-        stare = stare_of(frames, used)
-        scale = float(np.median(error[used]))
-        # The noise follows that of the whole light in time.
-        variance = (error[used] / scale) ** 2
-        light = series.light
-        lit = np.maximum(light, 0.0)
-        # Frames without light, such as dark frames, have no photon noise to weight by.
-        photon = float(np.average(series.model.gain, weights=lit if lit.any() else None))
-        survey = SeriesSurvey(
-            stare, bank_of(stare, directions, shape), templates, sums[used], variance, (WHITE,) * sums.shape[1],
-            flux[used] / scale, variance, WHITE, scale, abs(float(np.median(flux[used & ~events]))), photon,
-            frames.time_s[used], weighted=True,
-        )  # fmt: skip
+        typical = abs(float(np.median(flux[used & ~events])))
+        survey = _survey(frames, series, templates, sums, used, shape, typical)
         survey, taken = fit_quiet_light(survey, events[used], None, fits)
         now = np.zeros(flux.size, np.bool_)
         now[used] = taken
@@ -206,6 +194,26 @@ def survey_spectra(
     draws = steps.part(0.9, 1.0)
     level = quiescent_light(frames, flux, frames.error, survey, used, used & ~events, reasons, seed, draws)
     return survey, series, level
+
+
+def _survey(
+    frames: Frames, series: SpectralSeries, templates: Templates, sums: Float, used: Bool, shape: Shape, level: float
+) -> SeriesSurvey:
+    """Return the survey of the weighted sums of the frames that are searched, without processes."""
+    flux, error = frames.white_light
+    assert error is not None
+    stare = stare_of(frames, used)
+    scale = float(np.median(error[used]))
+    # The noise follows that of the whole light in time.
+    variance = (error[used] / scale) ** 2
+    lit = np.maximum(series.light, 0.0)
+    # Frames without light, such as dark frames, have no photon noise to weight by.
+    photon = float(np.average(series.model.gain, weights=lit if lit.any() else None))
+    bank = bank_of(stare, templates.directions[list(templates.chosen)], shape)
+    return SeriesSurvey(
+        stare, bank, templates, sums[used], variance, (WHITE,) * sums.shape[1], flux[used] / scale, variance, WHITE,
+        scale, level, photon, frames.time_s[used], weighted=True,
+    )  # fmt: skip
 
 
 def _weighted_sums(
