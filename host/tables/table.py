@@ -8,7 +8,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -380,11 +380,10 @@ class Rows:
 
     def __init__(self, table: Table, named: str, key: str | None = None) -> None:
         self.table, self.named, self.key, self.n = _with_coordinates(table), named, key, len(table)
-        self._texts: dict[str, list[str]] = {}
-        self._values: dict[str, list[float] | None] = {}
-        self._units: dict[str, str] = {}
-        self._factors: dict[tuple[str, str], float] = {}
         self._ignored: list[str] = []
+        # Columns are read, and their units parsed, once.
+        self.texts, self._numbers = cache(self._texts), cache(self._numbers_of)
+        self._angles, self._factor = cache(self._unit_of_angles), cache(self._ratio)
 
     @cached_property
     def names(self) -> list[str]:
@@ -399,25 +398,24 @@ class Rows:
         """Return the text of a cell; empty for a missing one."""
         return "" if name is None else self.texts(name)[row]
 
-    def texts(self, name: str) -> list[str]:
-        """Return the texts of a column."""
-        if name not in self._texts:
-            values = np.ma.asarray(getattr(self.table[name], "value", self.table[name]))
-            cells = [
-                "" if cell is None or cell is np.ma.masked else
-                (cell.decode("utf-8", "replace") if isinstance(cell, bytes) else str(cell)).strip()
-                for cell in (values.tolist() if values.dtype.kind in "SUO" else values)
-            ]  # fmt: skip
-            self._texts[name] = ["" if is_missing(text) else text for text in cells]
-        return self._texts[name]
+    def _cells(self, name: str) -> Any:
+        return np.ma.asarray(getattr(self.table[name], "value", self.table[name]))
 
-    def _numbers(self, name: str) -> list[float] | None:
+    def _texts(self, name: str) -> list[str]:
+        """Return the texts of a column."""
+        values = self._cells(name)
+        cells = [
+            "" if cell is None or cell is np.ma.masked else
+            (cell.decode("utf-8", "replace") if isinstance(cell, bytes) else str(cell)).strip()
+            for cell in (values.tolist() if values.dtype.kind in "SUO" else values)
+        ]  # fmt: skip
+        return ["" if is_missing(text) else text for text in cells]
+
+    def _numbers_of(self, name: str) -> list[float] | None:
         """Return the numbers of a column as the table holds them, or None if it holds texts."""
-        if name not in self._values:
-            values = np.ma.asarray(getattr(self.table[name], "value", self.table[name]))
-            numeric = values.dtype.kind in "iuf" and values.ndim == 1
-            self._values[name] = np.ma.filled(values.astype(np.float64), np.nan).tolist() if numeric else None
-        return self._values[name]
+        values = self._cells(name)
+        numeric = values.dtype.kind in "iuf" and values.ndim == 1
+        return np.ma.filled(values.astype(np.float64), np.nan).tolist() if numeric else None
 
     def unit(self, name: str) -> str:
         """Return the unit of a column as the table states it, or in its name, as in ``distance (pc)``; or nothing."""
@@ -457,18 +455,16 @@ class Rows:
             expected = getattr(error, "expected", None) or "degrees, or sexagesimal text such as 10h30m00s or 10:30:00"
             raise self.error(f"row {row + 1} has {name} = {shortened(text)}", expected, name) from error
 
-    def _angles(self, name: str) -> str:
+    def _unit_of_angles(self, name: str) -> str:
         """Return the unit of a column of angles; raise InputError for another, or for coordinates in FK4."""
-        if name not in self._units:
-            if old := next(filter(_OLD_SYSTEM.search, self._system(name)), None):
-                expected = "right ascension and declination in ICRS or FK5 of J2000"
-                raise self.error(f"its coordinates are in {old}", expected, name)
-            stated = getattr(self.table[name], "unit", None)
-            unit = angle_unit_in_name(name) if stated is None else angle_unit(str(stated))
-            if unit is None:
-                raise self.error(f"{name} has the unit {shortened(str(stated))}", "an angle", name)
-            self._units[name] = unit
-        return self._units[name]
+        if old := next(filter(_OLD_SYSTEM.search, self._system(name)), None):
+            expected = "right ascension and declination in ICRS or FK5 of J2000"
+            raise self.error(f"its coordinates are in {old}", expected, name)
+        stated = getattr(self.table[name], "unit", None)
+        unit = angle_unit_in_name(name) if stated is None else angle_unit(str(stated))
+        if unit is None:
+            raise self.error(f"{name} has the unit {shortened(str(stated))}", "an angle", name)
+        return unit
 
     def _system(self, name: str) -> list[str]:
         """Return what keywords, columns, comments and a name say of the system of the coordinates."""
@@ -490,13 +486,8 @@ class Rows:
         """Return the error of a column or cell."""
         return InputError(f"{self.named}: {fault}", expected, key=self.key or name)
 
-    def _factor(self, name: str, unit: str) -> float:
-        """Return the factor from the unit of a column to another."""
-        if (name, unit) not in self._factors:
-            self._factors[name, unit] = self._ratio(name, unit)
-        return self._factors[name, unit]
-
     def _ratio(self, name: str, unit: str) -> float:
+        """Return the factor from the unit of a column to another."""
         import astropy.units as u
 
         stated = self.unit(name)

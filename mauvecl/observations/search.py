@@ -126,17 +126,16 @@ class SeriesSurvey:
     def backwards(self) -> SeriesSurvey:
         """Return the survey in the other direction of time."""
         start = self.stare.start_s
-        names = ("sums", "variance", "flux", "flux_variance", "time_s")
-        return replace(
-            self, stare=replace(self.stare, start_s=start[-1] + start[0] - start[::-1]),
-            **{name: getattr(self, name)[::-1] for name in names},
-        )  # fmt: skip
+        stare = replace(self.stare, start_s=start[-1] + start[0] - start[::-1])
+        return self._with_frames(stare, slice(None, None, -1))
 
     def frames(self, kept: Bool) -> SeriesSurvey:
         """Return the survey of some of the frames."""
-        part = select_frames(self.stare, kept)
+        return self._with_frames(select_frames(self.stare, kept), kept)
+
+    def _with_frames(self, stare: Stare, chosen: Bool | slice) -> SeriesSurvey:
         names = ("sums", "variance", "flux", "flux_variance", "time_s")
-        return replace(self, stare=part, **{name: getattr(self, name)[kept] for name in names})
+        return replace(self, stare=stare, **{name: getattr(self, name)[chosen] for name in names})
 
 
 def stare_of(frames: Frames, used: Bool) -> Stare:

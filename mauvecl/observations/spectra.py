@@ -443,10 +443,8 @@ def event_spectrum(
 def _fitted(cause: Cause, spectrum: Float, variance: Float, flares: Float, unknown: dict[str, Float]) -> Float:
     """Return the best fit of a single cause, shape (n_pixel,)."""
     rows = flares if cause == "flare" else np.array([row for name, row in unknown.items() if CAUSES[name] == cause])
-    amplitudes = (rows @ (spectrum / variance)) / np.einsum("kp,kp->k", rows, rows / variance)
-    chi2 = (((spectrum - amplitudes[:, None] * rows) ** 2) / variance).sum(axis=1)
-    k = int(np.argmin(chi2))
-    return np.asarray(amplitudes[k] * rows[k])
+    row = rows[int(np.argmin(chi2_of_one(spectrum, variance, rows)))]
+    return np.asarray((row @ (spectrum / variance)) / (row @ (row / variance)) * row)
 
 
 def _window(
