@@ -399,6 +399,15 @@ def _temperature_c(file: TableFile, found: Quantities, mapping: FrameMapping, n:
     return np.full(n, float(nominal)) if isinstance(nominal, int | float) else None
 
 
+def _exposure_s(file: TableFile, found: Quantities, mapping: FrameMapping, between_edges: Float | None) -> Float | None:
+    """Return the exposure time of each frame by a column, the mapping, the header or the edges of frames, or None."""
+    n = found.time[0].n_rows
+    if found.exposure is not None:
+        return converted(found.exposure, mapping.exposure_unit, "s", "exposure_unit").numbers().reshape(n)
+    one = mapping.exposure_s or _brite_exposure_s(file)
+    return between_edges if one is None else np.full(n, one)
+
+
 def _brite_exposure_s(file: TableFile) -> float | None:
     """Return the exposure time in the header of BRITE's light curves, in milliseconds for each image of a stack."""
     try:
@@ -448,11 +457,8 @@ def _frames_in(
     what = file.what
     found = Quantities.of(file, mapping)
     n = _number_of_rows(file, found)
-    time, exposure_s, dates, remarks = times_of(found.time, file, mapping)
-    if found.exposure is not None:
-        exposure_s = converted(found.exposure, mapping.exposure_unit, "s", "exposure_unit").numbers().reshape(n)
-    elif (one_s := mapping.exposure_s or _brite_exposure_s(file)) is not None:
-        exposure_s = np.full(n, one_s)
+    time, between_edges_s, dates, remarks = times_of(found.time, file, mapping)
+    exposure_s = _exposure_s(file, found, mapping, between_edges_s)
     bits = QualityBits.of(file.header, mapping.quality_bits, what)
     wavelength = None if found.wavelength is None else _vacuum_nm(found.wavelength, mapping.wavelength_unit, file)
     light, sd, flags, unit, more = _read_light(file, found, mapping, bits, read)

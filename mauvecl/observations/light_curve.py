@@ -256,17 +256,12 @@ def survey_light_curve(
     """
     steps = steps or Steps()
     fits = steps.part(0.0, 0.9)
-    counts = counts_per_unit(frames)
-    if counts is not None:
-        remark = "the frames hold few counts: their noise is Poisson noise of the level, and stated errors are not used"
-        frames = replace(frames, error=None).with_remarks((remark,))
+    frames, counts = _counted(frames)
     flux, error = frames.white_light
     reasons = _faults(frames, counts)
     used = reasons == 0
-    steps_of_level = np.ones(flux.size)
-    if counts is None and np.ptp(frames.time_s) > LONG_S:
-        steps_of_level = _steps_of_level(frames, flux, used)
-        flux, error = flux / steps_of_level, None if error is None else error / steps_of_level
+    steps_of_level = _steps_of_level(frames, flux, used, counts)
+    flux, error = flux / steps_of_level, None if error is None else error / steps_of_level
     # A frame of no count at the least has the Poisson noise of one.
     least = 0.0 if counts is None else float(np.sqrt(max(np.median(flux[used]) * counts, 1.0))) / counts
     guessed = np.zeros(flux.size, np.bool_)
@@ -299,9 +294,17 @@ def survey_light_curve(
     reasons = np.where(below, reasons | Reason.BELOW, reasons)
     used = reasons == 0
     survey = survey.frames(used[searched_among(survey, frames)])
-    draws = steps.part(0.9, 1.0)
-    light = quiescent_light(frames, flux, error, survey, used, used & ~guessed, reasons, seed, draws)
+    last = steps.part(0.9, 1.0)
+    light = quiescent_light(frames, flux, error, survey, used, used & ~guessed, reasons, seed, last)
     return survey, light.times(steps_of_level), frames
+
+
+def _counted(frames: Frames) -> tuple[Frames, float | None]:
+    """Return the counts in a unit of the flux of frames of few counts, and these without errors; or frames and None."""
+    if (counts := counts_per_unit(frames)) is None:
+        return frames, None
+    remark = "the frames hold few counts: their noise is Poisson noise of the level, and stated errors are not used"
+    return replace(frames, error=None).with_remarks((remark,)), counts
 
 
 def _faults(frames: Frames, counts: float | None) -> NDArray[np.int64]:
@@ -314,8 +317,10 @@ def _faults(frames: Frames, counts: float | None) -> NDArray[np.int64]:
     return reasons
 
 
-def _steps_of_level(frames: Frames, flux: Float, used: Bool) -> Float:
+def _steps_of_level(frames: Frames, flux: Float, used: Bool, counts: float | None) -> Float:
     """Return the relative level after each sudden change, for all frames; those not used have that of the next used."""
+    if counts is not None or np.ptp(frames.time_s) <= LONG_S:
+        return np.ones(flux.size)
     relative = relative_level(frames.time_s[used], frames.numbers[used], flux[used], frames.cadence_s)
     places = np.searchsorted(np.flatnonzero(used), np.arange(flux.size))
     return relative[np.clip(places, 0, used.sum() - 1)]

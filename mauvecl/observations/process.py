@@ -560,20 +560,10 @@ def _fitted(data: Binned, terms: tuple[ProcessTerm, ...], log_excess: float) -> 
     known: dict[bytes, tuple[float, Float]] = {}
 
     def slopes(x: Float) -> tuple[float, Float]:
-        """Return the cost and its derivatives by forward differences, or backward ones at an upper bound.
-
-        These are those of scipy, which takes as long for its checks as a cost takes.
-        """
         # Fits begin where others end.
-        if x.tobytes() in known:
-            return known[x.tobytes()]
-        value, gradient = cost(x), np.empty(x.size)
-        for k, at in enumerate(x.tolist()):
-            there = np.array(x)
-            there[k] = at + DIFFERENCE if at + DIFFERENCE <= high[k] else at - DIFFERENCE
-            gradient[k] = (cost(there) - value) / (there[k] - at)
-        known[x.tobytes()] = value, gradient
-        return value, gradient
+        if x.tobytes() not in known:
+            known[x.tobytes()] = _with_slopes(cost, x, high)
+        return known[x.tobytes()]
 
     x, value = np.clip(start, low, high), np.inf
     tolerance = CONVERGED / max(abs(slopes(x)[0]), 1.0)
@@ -586,3 +576,16 @@ def _fitted(data: Binned, terms: tuple[ProcessTerm, ...], log_excess: float) -> 
         if before - value < SAME:
             break
     return made(x), 2 * value + start.size * float(np.log(data.values.size))
+
+
+def _with_slopes(cost: Callable[[Float], float], x: Float, high: Float) -> tuple[float, Float]:
+    """Return a cost and its derivatives by forward differences, or backward ones at an upper bound.
+
+    These are those of scipy, which takes as long for its checks as a cost takes.
+    """
+    value, gradient = cost(x), np.empty(x.size)
+    for k, at in enumerate(x.tolist()):
+        there = np.array(x)
+        there[k] = at + DIFFERENCE if at + DIFFERENCE <= high[k] else at - DIFFERENCE
+        gradient[k] = (cost(there) - value) / (there[k] - at)
+    return value, gradient
