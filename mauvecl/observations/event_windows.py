@@ -100,6 +100,11 @@ def _exponentials(rates: Float) -> tuple[list[Decay], Float]:
     return [_exponential(float(rate)) for rate in np.exp(points)], np.asarray(weights)
 
 
+def _gaussian_rise(width: float) -> Rise:
+    """Return the first half of a Gaussian; the width is from half maximum to maximum, in half-widths."""
+    return Rise(lambda tau: _gaussian_tail(-tau, width))
+
+
 def _gaussian_tail(tau: Float, width: float) -> Float:
     """Return the integral of a Gaussian from tau to the end, for a half-width at half maximum of `width`."""
     root = float(np.sqrt(np.log(2)))
@@ -147,8 +152,7 @@ class Family:
     @cache
     def general(cls) -> Family:
         """Return the general family, the same object in all calls: rises and decays in all combinations."""
-        gaussians = [Rise(lambda tau, width=width: _gaussian_tail(-tau, width)) for width in GAUSSIAN_RISES]
-        rises = [Rise(SHAPES["davenport2014"].before), *gaussians]
+        rises = [Rise(SHAPES["davenport2014"].before), *map(_gaussian_rise, GAUSSIAN_RISES)]
         fast = [_exponential(Davenport2014.DECAY[0][1]), Decay(lambda tau: _gaussian_tail(tau, GAUSSIAN_DECAY))]
         slow, interpolated = _exponentials(SLOW_RATES)
         choices = [(0.0, 0), *((share, rate) for share in SLOW_SHARES for rate in range(SLOW_RATES.size))]
