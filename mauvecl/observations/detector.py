@@ -137,7 +137,6 @@ class PhotonTransfer:
     covariance: Float
     read_noise_error: float  # standard error, DN, with that of the dark counts
     dark_unit: Literal["DN", "electrons"]
-    dark_unit_chi2: float  # chi-squared with dark counts in DN, less that with electrons
     chi2: float
     dof: int
     # mean_dn, variance, model: shape (n_value,); all means of light, measured and fitted variances.
@@ -216,12 +215,12 @@ def fit_photon_transfer(
     if not gain > MIN_SNR * errors[1]:
         before, unknown = NoiseModel.nominal(nominal), ("gain", "read noise", "unit of the dark counts")
         model, assumed_error = before.variance(light, dark), np.diag([0.0, (ASSUMED_GAIN_ERROR * before.gain) ** 2])
-        return PhotonTransfer(before, assumed_error, 0.0, nominal.dark_unit, better, np.nan, 0, light, variance, model,
+        return PhotonTransfer(before, assumed_error, 0.0, nominal.dark_unit, np.nan, 0, light, variance, model,
                               unknown)  # fmt: skip
     read = max(float(read), ROUNDING)
     noise = NoiseModel(read, float(gain) if unit == "electrons" else 1.0, float(gain))
     read_error = np.hypot(errors[0], noise.dark_factor * dark_error_dn) / (2 * np.sqrt(max(read - ROUNDING, errors[0])))
-    return PhotonTransfer(noise, covariance, float(read_error), unit, float(better), float(chi2),
+    return PhotonTransfer(noise, covariance, float(read_error), unit, float(chi2),
                           variance.size - 2, light, variance, model, tuple(assumed))  # fmt: skip
 
 

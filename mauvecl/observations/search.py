@@ -299,8 +299,7 @@ def largest_dip(survey: SeriesSurvey, quiet: Bool, least: float) -> float:
 
 def _mean_counts(survey: SeriesSurvey, quiet: Bool) -> Float:
     """Return the mean counts of each frame, shape (n_frame,)."""
-    level = process_level(survey.processes[0], survey.stare.start_s, survey.sums[:, 0], survey.variance, quiet)
-    return np.maximum(level * survey.scale * survey.counts, 0.0)
+    return np.maximum(survey.levels(quiet)[:, 0] * survey.scale * survey.counts, 0.0)
 
 
 def innovations(survey: SeriesSurvey, quiet: Bool) -> Float:
