@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.observations.frames import Frames, Reason
+from mauvecl.observations.frames import Frames
 from mauvecl.observations.process import MAX_TRIED, Binned, Process, Steps, criterion_of_process, fit_process
 from mauvecl.schema.physical import DAY_S
 
@@ -73,12 +73,6 @@ class QuiescentLevel:
     def used(self) -> Bool:
         """Frames that are searched."""
         return np.asarray(self.reasons == 0)
-
-    def without(self, single: Bool) -> QuiescentLevel:
-        """Return the level without some single bright frames."""
-        return replace(
-            self, quiet=self.quiet & ~single, reasons=np.where(single, self.reasons | Reason.SPIKE, self.reasons)
-        )
 
 
 def counts_per_unit(frames: Frames) -> float | None:

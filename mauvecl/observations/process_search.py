@@ -200,11 +200,6 @@ class ProcessSearch:
             self._solve(one, one.unsolved)
         return [one.row() for one in self.filters]
 
-    @property
-    def n_filters(self) -> int:
-        """Number of searched templates: half-widths, phases, onsets and directions."""
-        return int(sum(np.count_nonzero(row.per_amplitude) for row in self.rows))
-
     def scores(self, sums: NDArray[Any]) -> Float:
         """Return C^-1 (sums - level) on the grid of frames with gaps, shape (n_stare, n_sum, n_grid).
 
