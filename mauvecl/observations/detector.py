@@ -335,11 +335,8 @@ def fit_dark(dark: Sequence[CalibrationFrames], nominal: Instrument, noise: Nois
     bias = nominal.per_pixel("bias_dn", nominal.bias_dn)
 
     # The mean pixel gives what all pixels share: bias, slope, and their errors.
-    series = raw.mean(axis=1)
-    start = np.array([bias.mean(), (series - bias.mean()).mean() / exposure.mean(), nominal.dark_slope_per_c])
-    typical = noise.variance(0.0, start[1] * exposure * np.exp(start[2] * offset))
     free = np.array([fits_bias, True, fits_slope])
-    common, shared = _mean_dark(series, exposure, offset, typical / n_pixel, start, free)
+    common, shared, typical = _mean_dark(raw, exposure, offset, free, nominal, noise)
     slope = float(common[2])
     if fits_bias and not by_pixel:
         bias = np.full(n_pixel, common[0])
@@ -361,14 +358,12 @@ def fit_dark(dark: Sequence[CalibrationFrames], nominal: Instrument, noise: Nois
     mean = seconds[:, None] * level
     chi2 = float(np.sum((raw - bias - mean) ** 2 / noise.variance(0.0, mean)))
     dof = raw.size - len(used) * n_pixel - int(fits_slope) - int(fits_bias and not by_pixel)
-    assumed = [*(() if fits_slope else ("dark slope",)), *(() if fits_bias else ("bias",))]
-    bias_error = np.sqrt(covariance[:, 0, 0]) if by_pixel else np.full(n_pixel, np.sqrt(shared[0, 0]))
     return DarkFit(
         reference_c=reference,
         level_dn_per_s=level,
         level_error=np.sqrt(covariance[:, 1, 1]),
         bias_dn=bias,
-        bias_error=bias_error,
+        bias_error=np.sqrt(covariance[:, 0, 0]) if by_pixel else np.full(n_pixel, np.sqrt(shared[0, 0])),
         covariance=covariance,
         shared=shared,
         slope_per_c=slope,
@@ -378,17 +373,22 @@ def fit_dark(dark: Sequence[CalibrationFrames], nominal: Instrument, noise: Nois
         chi2=chi2,
         dof=dof,
         slopes_p_value=float(scipy.stats.chi2.sf(scatter, n_pixel - 1)),
-        assumed=tuple(assumed),
+        assumed=(*(() if fits_slope else ("dark slope",)), *(() if fits_bias else ("bias",))),
     )
 
 
 def _mean_dark(
-    series: Float, exposure: Float, offset: Float, variance: Float, start: Float, free: NDArray[np.bool_]
-) -> tuple[Float, Float]:
-    """Fit bias, dark level and slope of the mean pixel, and return them, shape (3,), with their covariance.
+    raw: Float, exposure: Float, offset: Float, free: NDArray[np.bool_], nominal: Instrument, noise: NoiseModel
+) -> tuple[Float, Float, Float]:
+    """Fit bias, dark level and slope of the mean pixel; return them, their covariance, and the variance of a pixel.
 
-    Offsets are temperatures above the reference. Values that are not free are those of `start`, with no variance.
+    Offsets are temperatures above the reference. The variance, shape (n_frame,), is that of a typical pixel. Values
+    that are not free are nominal, with no variance.
     """
+    series, bias = raw.mean(axis=1), nominal.per_pixel("bias_dn", nominal.bias_dn).mean()
+    start = np.array([bias, (series - bias).mean() / exposure.mean(), nominal.dark_slope_per_c])
+    typical = noise.variance(0.0, start[1] * exposure * np.exp(start[2] * offset))
+    variance = typical / raw.shape[1]
 
     def whole(values: Float) -> Float:
         every = start.copy()
@@ -402,7 +402,7 @@ def _mean_dark(
     found = scipy.optimize.least_squares(left, start[free], x_scale=np.maximum(np.abs(start[free]), 1e-3), xtol=1e-14)
     covariance, jacobian = np.zeros((3, 3)), np.asarray(found.jac)
     covariance[np.ix_(free, free)] = np.linalg.inv(jacobian.T @ jacobian)
-    return whole(found.x), covariance
+    return whole(found.x), covariance, typical
 
 
 def _fit_pixels(
