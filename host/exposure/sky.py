@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.stars.library import by_key, name_key, near_names
-from mauvecl.host.tables.coordinates import EXPECTED
-from mauvecl.host.tables.coordinates import position as coordinates
+from mauvecl.host.tables.names import EXPECTED_POSITION
+from mauvecl.host.tables.names import position as coordinates
 from mauvecl.host.tables.units import offline
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
@@ -101,7 +101,7 @@ def parse_position(target: SkyCoord | str) -> SkyCoord:
     from astropy.coordinates import SkyCoord
     from astropy.coordinates.baseframe import BaseCoordinateFrame
 
-    expected = EXPECTED
+    expected = EXPECTED_POSITION
     if isinstance(target, str):
         star = by_key().get(name_key(target))
         if star is not None:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.host.arrays import ContentEquality, set_read_only
-from mauvecl.host.tables.ecsv import read_numbers
+from mauvecl.host.tables.files import read_numbers
 from mauvecl.host.tables.units import unit_of
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError

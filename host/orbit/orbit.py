@@ -30,10 +30,8 @@ from mauvecl.host.orbit.geometry import (
     utc_text,
 )
 from mauvecl.host.stars.library import by_key, name_key, near_names, well_known_text
-from mauvecl.host.tables.coordinates import EXPECTED
-from mauvecl.host.tables.ecsv import parse_ecsv
-from mauvecl.host.tables.files import read_text
-from mauvecl.host.tables.names import is_missing_position
+from mauvecl.host.tables.files import parse_ecsv, read_text
+from mauvecl.host.tables.names import EXPECTED_POSITION, is_missing_position
 from mauvecl.host.tables.units import offline
 from mauvecl.schema.errors import InputError, printable, shortened
 from mauvecl.schema.physical import DAY_S
@@ -407,7 +405,7 @@ class Target:
             Whether to query SIMBAD for a name that is not embedded (needs `mauvecl[names]` and a network).
         """
         if is_missing_position(text):
-            raise InputError(f"target {shortened(text)} is a pair of missing values", EXPECTED, key="target")
+            raise InputError(f"target {shortened(text)} is a pair of missing values", EXPECTED_POSITION, key="target")
         star = by_key().get(name_key(text))
         if star is not None:
             return cls(name or star.name, star.ra_deg, star.dec_deg, f"embedded list ({star.source})",

@@ -16,7 +16,7 @@ from mauvecl.host.orbit import geometry
 from mauvecl.host.orbit.geometry import Bodies, Flags, TimeGrid, Vectors, unit
 from mauvecl.host.orbit.observing_limits import Limits
 from mauvecl.host.orbit.orbit import Orbit, Track
-from mauvecl.host.tables.ecsv import parse_ecsv
+from mauvecl.host.tables.files import parse_ecsv
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import DetectorTemperature, Duration, NotNegative, Share

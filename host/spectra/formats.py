@@ -460,7 +460,7 @@ def _stem(name: str) -> str:
 def _tables(
     content: Content, name: str, origin: str, asked: Sequence[str], units: tuple[bool, bool], check: bool
 ) -> list[SpectrumTable]:
-    from mauvecl.host.tables.ecsv import parse_ecsv
+    from mauvecl.host.tables.files import parse_ecsv
     from mauvecl.host.tables.opening import check_form, votables
     from mauvecl.host.tables.table import MemoryTable
     from mauvecl.host.tables.text_tables import is_described, text_of, text_table

@@ -19,7 +19,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mauvecl.host.tables.ecsv import Numbers, parse_numbers, read_ecsv
+from mauvecl.host.tables.files import Numbers, parse_numbers, read_ecsv
 from mauvecl.schema.columns import Column
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.fields import Range, checked, number

@@ -97,12 +97,7 @@ def reading(what: str) -> Iterator[None]:
 def open_fits(file: IO[bytes], what: str = "", *, check: bool = True) -> fits.HDUList:
     """Open a FITS file after a check of its sizes and checksums; its data are read on access.
 
-    Parameters
-    ----------
-    what : str
-        The file, for messages.
-    check : bool
-        Whether to verify checksums, for which the whole file is read.
+    To `check` the checksums the whole file is read. `what` is the file, for messages.
     """
     from astropy.io import fits
 
@@ -478,14 +473,8 @@ SCALES = ("UTC", "TAI", "TT", "TDB", "TCG", "TCB", "UT1")
 class FitsTables(TableFile):
     """An open FITS file.
 
-    Parameters
-    ----------
-    what : str
-        The file, for messages.
-    hdu : str or int, optional
-        Name or number of the extension whose columns are searched first; by default the first table.
-    wanted : tuple of tuple of str
-        Groups of names; without `hdu`, the first table with a column of each group is used.
+    The columns of the extension `hdu`, a name or number, are searched first; by default those of the first table with a
+    column of each of the `wanted` groups of names, or else of the first table.
     """
 
     def __init__(

@@ -15,8 +15,8 @@ from typing import IO, TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from mauvecl.host.tables.ecsv import MOST_HEADER
 from mauvecl.host.tables.files import (
+    MOST_HEADER,
     check_size,
     limit_bytes,
     lines_in,

@@ -8,14 +8,23 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.tables.coordinates import ANGLES, angle, angle_unit, angle_unit_in_name
-from mauvecl.host.tables.names import divided_unit, first_of, is_missing, key_of, matched
+from mauvecl.host.tables.names import (
+    ANGLES,
+    angle,
+    angle_unit,
+    angle_unit_in_name,
+    divided_unit,
+    first_of,
+    is_missing,
+    key_of,
+    matched,
+)
 from mauvecl.host.tables.units import time_unit, unit_of
 from mauvecl.schema.errors import InputError, printable, shortened
 
@@ -208,16 +217,8 @@ def _plain(text: Any) -> str:
 def converted(values: Values, given: str | None, unit: str, key: str) -> Values:
     """Return values in a unit.
 
-    Parameters
-    ----------
-    given : str or None
-        Unit in the mapping, which takes precedence over the file.
-    unit : str
-        Unit of the result.
-    key : str
-        Key of the mapping that states it.
-
-    Raises InputError if neither file nor mapping states a unit, or for one of another kind.
+    The unit that a mapping gives takes precedence over that of the file; `key` is that of the mapping. Raises
+    InputError if neither states a unit, or for one of another kind.
     """
     import astropy.units as u
 
@@ -374,22 +375,15 @@ class MemoryTable(TableFile):
 class Rows:
     """Cells of a small table by the names of its columns, in any case.
 
-    Parameters
-    ----------
-    table : Table
-    named : str
-        The table, for messages.
-    key : str
-        Key of errors; by default that of the column.
+    For messages, `named` is the table, and `key` the key of errors, by default the column.
     """
 
     def __init__(self, table: Table, named: str, key: str | None = None) -> None:
         self.table, self.named, self.key, self.n = _with_coordinates(table), named, key, len(table)
-        self._texts: dict[str, list[str]] = {}
-        self._values: dict[str, list[float] | None] = {}
-        self._units: dict[str, str] = {}
-        self._factors: dict[tuple[str, str], float] = {}
         self._ignored: list[str] = []
+        # Columns are read, and their units parsed, once.
+        self.texts, self._numbers = cache(self._texts), cache(self._numbers_of)
+        self._angles, self._factor = cache(self._unit_of_angles), cache(self._ratio)
 
     @cached_property
     def names(self) -> list[str]:
@@ -404,25 +398,24 @@ class Rows:
         """Return the text of a cell; empty for a missing one."""
         return "" if name is None else self.texts(name)[row]
 
-    def texts(self, name: str) -> list[str]:
-        """Return the texts of a column."""
-        if name not in self._texts:
-            values = np.ma.asarray(getattr(self.table[name], "value", self.table[name]))
-            cells = [
-                "" if cell is None or cell is np.ma.masked else
-                (cell.decode("utf-8", "replace") if isinstance(cell, bytes) else str(cell)).strip()
-                for cell in (values.tolist() if values.dtype.kind in "SUO" else values)
-            ]  # fmt: skip
-            self._texts[name] = ["" if is_missing(text) else text for text in cells]
-        return self._texts[name]
+    def _cells(self, name: str) -> Any:
+        return np.ma.asarray(getattr(self.table[name], "value", self.table[name]))
 
-    def _numbers(self, name: str) -> list[float] | None:
+    def _texts(self, name: str) -> list[str]:
+        """Return the texts of a column."""
+        values = self._cells(name)
+        cells = [
+            "" if cell is None or cell is np.ma.masked else
+            (cell.decode("utf-8", "replace") if isinstance(cell, bytes) else str(cell)).strip()
+            for cell in (values.tolist() if values.dtype.kind in "SUO" else values)
+        ]  # fmt: skip
+        return ["" if is_missing(text) else text for text in cells]
+
+    def _numbers_of(self, name: str) -> list[float] | None:
         """Return the numbers of a column as the table holds them, or None if it holds texts."""
-        if name not in self._values:
-            values = np.ma.asarray(getattr(self.table[name], "value", self.table[name]))
-            numeric = values.dtype.kind in "iuf" and values.ndim == 1
-            self._values[name] = np.ma.filled(values.astype(np.float64), np.nan).tolist() if numeric else None
-        return self._values[name]
+        values = self._cells(name)
+        numeric = values.dtype.kind in "iuf" and values.ndim == 1
+        return np.ma.filled(values.astype(np.float64), np.nan).tolist() if numeric else None
 
     def unit(self, name: str) -> str:
         """Return the unit of a column as the table states it, or in its name, as in ``distance (pc)``; or nothing."""
@@ -432,12 +425,7 @@ class Rows:
     def number(self, name: str | None, row: int, unit: str = "", *, above: float = -np.inf) -> float | None:
         """Return the number of a cell in a unit, None for a missing one; raise InputError for anything else.
 
-        Parameters
-        ----------
-        unit : str
-            Unit of the result, which the column is in if it states none.
-        above : float
-            Exclusive lower bound.
+        A column that states no unit is in this one. The number must lie above the exclusive lower bound `above`.
         """
         text = self.text(name, row)
         if name is None or not text:
@@ -467,18 +455,16 @@ class Rows:
             expected = getattr(error, "expected", None) or "degrees, or sexagesimal text such as 10h30m00s or 10:30:00"
             raise self.error(f"row {row + 1} has {name} = {shortened(text)}", expected, name) from error
 
-    def _angles(self, name: str) -> str:
+    def _unit_of_angles(self, name: str) -> str:
         """Return the unit of a column of angles; raise InputError for another, or for coordinates in FK4."""
-        if name not in self._units:
-            if old := next(filter(_OLD_SYSTEM.search, self._system(name)), None):
-                expected = "right ascension and declination in ICRS or FK5 of J2000"
-                raise self.error(f"its coordinates are in {old}", expected, name)
-            stated = getattr(self.table[name], "unit", None)
-            unit = angle_unit_in_name(name) if stated is None else angle_unit(str(stated))
-            if unit is None:
-                raise self.error(f"{name} has the unit {shortened(str(stated))}", "an angle", name)
-            self._units[name] = unit
-        return self._units[name]
+        if old := next(filter(_OLD_SYSTEM.search, self._system(name)), None):
+            expected = "right ascension and declination in ICRS or FK5 of J2000"
+            raise self.error(f"its coordinates are in {old}", expected, name)
+        stated = getattr(self.table[name], "unit", None)
+        unit = angle_unit_in_name(name) if stated is None else angle_unit(str(stated))
+        if unit is None:
+            raise self.error(f"{name} has the unit {shortened(str(stated))}", "an angle", name)
+        return unit
 
     def _system(self, name: str) -> list[str]:
         """Return what keywords, columns, comments and a name say of the system of the coordinates."""
@@ -500,13 +486,8 @@ class Rows:
         """Return the error of a column or cell."""
         return InputError(f"{self.named}: {fault}", expected, key=self.key or name)
 
-    def _factor(self, name: str, unit: str) -> float:
-        """Return the factor from the unit of a column to another."""
-        if (name, unit) not in self._factors:
-            self._factors[name, unit] = self._ratio(name, unit)
-        return self._factors[name, unit]
-
     def _ratio(self, name: str, unit: str) -> float:
+        """Return the factor from the unit of a column to another."""
         import astropy.units as u
 
         stated = self.unit(name)

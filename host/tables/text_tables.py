@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.tables.ecsv import check_cells, parse_ecsv
-from mauvecl.host.tables.files import parsing, read_text
+from mauvecl.host.tables.files import check_cells, parse_ecsv, parsing, read_text
 from mauvecl.host.tables.names import in_brackets, is_missing
 from mauvecl.host.tables.table import REMARKS, Values, is_known, number_in, plain_numbers, unit_in, unquoted
 from mauvecl.host.tables.units import is_dated, is_stated, time_unit, unit_of
@@ -63,12 +62,8 @@ def read_columns(what: str, kind: str, path: Path, unit: str = "") -> NDArray[np
 def columns(what: str, text: str, expected: str, unit: str = "") -> NDArray[np.float64]:
     """Parse rows of two numbers in any form of text, shape (n, 2).
 
-    Parameters
-    ----------
-    what, expected : str
-        The text and its two columns, for messages.
-    unit : str
-        Unit of the first column of the result; the text is in it unless its header states another one.
+    The first column of the result is in `unit`, as is that of the text unless its header states another one. `what` and
+    `expected` are the text and its two columns, for messages.
     """
     with parsing(what, expected):
         try:
@@ -120,10 +115,7 @@ def text_of(content: bytes) -> str:
 class NumberLines:
     """Header and rows of a text with numbers; the columns of the rows are parsed when they are read.
 
-    Parameters
-    ----------
-    expected : str
-        What a row should have, for messages.
+    `expected` is what a row should have, for messages.
     """
 
     def __init__(self, text: str, expected: str) -> None:
@@ -267,16 +259,10 @@ class TextRows:
 
     The first line names the columns, unless it has numbers and dates only; then the last comment above it may do so,
     and otherwise columns are called col1, col2 and so on. Lines above the names without a mark are a title. Units, and
-    dashes, may stand below the names.
+    dashes, may stand below the names. If nothing else shows how, cells are divided at `commas`.
 
-    Parameters
-    ----------
-    commas : bool
-        Whether cells are divided at commas if nothing else shows how.
-    like : Layout, optional
-        Layout of the rows of the same table above this text, which then has rows only.
-    first : int
-        Number of these rows, which messages count.
+    A text that continues a table has rows only: its layout is `like` that of the `first` rows above it, which messages
+    count.
     """
 
     def __init__(self, text: str, what: str, commas: bool, like: Layout | None = None, first: int = 0) -> None:
@@ -560,7 +546,7 @@ def _are_units(cells: list[str], below: list[str]) -> bool:
 
 
 def _is_unit(text: str) -> bool:
-    from mauvecl.host.tables.coordinates import angle_unit
+    from mauvecl.host.tables.names import angle_unit
 
     plain = in_brackets(text)
     return is_stated(text) and (time_unit(plain) is not None or angle_unit(plain) is not None or is_known(text))

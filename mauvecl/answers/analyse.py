@@ -18,12 +18,11 @@ from mauvecl.host.orbit.orbit import Orbit, Target
 from mauvecl.host.stars.flare import check_scales
 from mauvecl.host.stars.source import Source
 from mauvecl.observations.analysis import Analysis, analyse_frames
-from mauvecl.observations.event_spectra import EventSpectrum
 from mauvecl.observations.events import GAP_FRAMES, ObservedEvent
 from mauvecl.observations.frame_files import read_frames
 from mauvecl.observations.frame_model import FrameModel
-from mauvecl.observations.frames import Frames, Reason
-from mauvecl.observations.reduction import barycentric
+from mauvecl.observations.frames import Frames, Reason, barycentric
+from mauvecl.observations.spectra import EventSpectrum
 from mauvecl.observations.visits import flux_per_dn
 from mauvecl.schema.columns import Column, View, formatted, interval, number, percent
 from mauvecl.schema.errors import InputError

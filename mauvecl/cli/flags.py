@@ -202,7 +202,7 @@ def holds_study(file: Path) -> bool:
     suffix = file.suffix.lower()
     if suffix != ".ecsv" or not file.is_file():
         return suffix not in (".csv", ".vot", ".votable", ".xml", ".fits", ".fit")
-    from mauvecl.host.tables.ecsv import read_ecsv
+    from mauvecl.host.tables.files import read_ecsv
 
     return "study" in read_ecsv(file, "table", "a table of targets, or of an answer").meta
 

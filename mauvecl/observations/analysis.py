@@ -15,23 +15,31 @@ from mauvecl.fits.spectrum import Measurement
 from mauvecl.flares.settings import RANK, Per, per_day
 from mauvecl.flares.shapes import shape_of
 from mauvecl.observations.detection import LONG_S, detect_events, most_events
-from mauvecl.observations.event_spectra import (
-    CAUSES,
-    Colour,
-    EventSpectrum,
-    event_colour,
-    event_spectrum,
-    measure_flare,
-)
 from mauvecl.observations.events import ObservedEvent, measure_events
-from mauvecl.observations.false_alarms import CHANCE_DIP, SimulatedRate, innovations, largest_dip, simulated_rates
-from mauvecl.observations.frame_model import FrameModel
+from mauvecl.observations.frame_model import CleanedSpectra, FrameModel, clean_spectra
 from mauvecl.observations.frames import Frames, Reason
 from mauvecl.observations.level import Likeness, QuiescentLevel, Scatter, binned_scatter, likeness
 from mauvecl.observations.light_curve import survey_light_curve
 from mauvecl.observations.process import Steps
-from mauvecl.observations.search import NO_COLOUR_K, SeriesSurvey
-from mauvecl.observations.spectra import CleanedSpectra, SpectralSeries, clean_spectra, survey_spectra
+from mauvecl.observations.search import (
+    CHANCE_DIP,
+    NO_COLOUR_K,
+    SeriesSurvey,
+    SimulatedRate,
+    innovations,
+    largest_dip,
+    simulated_rates,
+)
+from mauvecl.observations.spectra import (
+    CAUSES,
+    Colour,
+    EventSpectrum,
+    SpectralSeries,
+    event_colour,
+    event_spectrum,
+    measure_flare,
+    survey_spectra,
+)
 from mauvecl.schema.physical import DAY_S
 
 Float = NDArray[np.float64]
@@ -50,21 +58,12 @@ INJECTION_KEY = 0x696E6A65
 
 @dataclass(frozen=True, eq=False)
 class Completeness:
-    """Share of injected flares that the search detects.
+    """Share of injected flares that the search detects."""
 
-    Attributes
-    ----------
-    half_widths_s : ndarray, shape (n_width,)
-    equivalent_durations_s : ndarray, shape (n_width, n_size)
-    detected : ndarray of int, shape (n_width, n_size)
-    injected : int
-        Number of injections per cell.
-    """
-
-    half_widths_s: Float
-    equivalent_durations_s: Float
-    detected: NDArray[np.int64]
-    injected: int
+    half_widths_s: Float  # shape (n_width,)
+    equivalent_durations_s: Float  # shape (n_width, n_size)
+    detected: NDArray[np.int64]  # shape (n_width, n_size)
+    injected: int  # number of injections per cell
 
     def interval(self, width: int, size: int) -> Interval:
         """Return the completeness of a cell with its 95 % interval."""
@@ -92,17 +91,8 @@ def inject(
 ) -> Completeness:  # fmt: skip
     """Inject flares of several half-widths and sizes at random times, and count those that the search detects.
 
-    Parameters
-    ----------
-    survey : SeriesSurvey
-    free : ndarray of bool, shape (n_frame,)
-        Frames that belong to no event; flares are injected into these, and the others are left out of the search.
-    threshold : float
-    seed : int
-    temperature_k : float
-        Temperature of the flares; light curves have no colour.
-    steps : Steps, optional
-        Reports each half-width.
+    Flares are injected into `free` frames, which belong to no event, and the others are left out of the search. Light
+    curves have no colour, and flares in them no temperature. `steps` reports each half-width.
     """
     steps = steps or Steps()
     every = np.flatnonzero(free)
@@ -133,24 +123,31 @@ def inject(
             shapes = np.array([bank.shape.mean_over(edges, peak, float(width)) for peak in peaks])
             # The photon noise of the flare itself is added to that of the frames.
             drawn = rng.standard_normal((*shapes.shape, direction.size)) @ own_noise.T
-            added = np.concatenate([
-                part.sums[None], shapes[:, :, None] * direction,
-                np.sqrt(np.maximum(shapes, 0.0))[:, :, None] * drawn,
-            ])  # fmt: skip
-            best = np.full((SIZES, count), -np.inf)
-            # The statistics are linear in the sums, so that one search serves all sizes.
-            for row, rho in part.search.values(added):
-                at = part.search.peak_s(row, np.arange(row.peaks.size))
-                tried = (row.per_amplitude > 0).any(axis=0)
-                for k, peak in enumerate(peaks):
-                    near = np.abs(at - peak) <= 2 * (width + frame_s) + row.template.half_width_s
-                    near &= tried
-                    if near.any():
-                        quiet, flare, own = (rho[n][:, near] for n in (0, 1 + k, 1 + count + k))
-                        size = amplitudes[:, None, None]
-                        best[:, k] = np.maximum(best[:, k], (quiet + size * flare + np.sqrt(size) * own).max((1, 2)))
+            drawn *= np.sqrt(np.maximum(shapes, 0.0))[:, :, None]
+            best = _largest_near(part, peaks, float(width), amplitudes, shapes[:, :, None] * direction, drawn)
             detected[w] += (best >= threshold).sum(axis=1)
     return Completeness(widths, durations, detected, TIMES)
+
+
+def _largest_near(
+    part: SeriesSurvey, peaks: Float, width: float, amplitudes: Float, flares: Float, noise: Float
+) -> Float:
+    """Return the largest statistic near each flare that is added with its noise, shape (n_amplitude, n_flare).
+
+    Flares and their noise have the shape (n_flare, n_frame, n_sum), for unit amplitude. Statistics are linear in the
+    sums, so that one search serves all amplitudes.
+    """
+    count, size = peaks.size, amplitudes[:, None, None]
+    best = np.full((amplitudes.size, count), -np.inf)
+    for row, rho in part.search.values(np.concatenate([part.sums[None], flares, noise])):
+        at = part.search.peak_s(row, np.arange(row.peaks.size))
+        tried = (row.per_amplitude > 0).any(axis=0)
+        for k, peak in enumerate(peaks):
+            near = tried & (np.abs(at - peak) <= 2 * (width + part.stare.frame_s) + row.template.half_width_s)
+            if near.any():
+                quiet, flare, own = (rho[n][:, near] for n in (0, 1 + k, 1 + count + k))
+                best[:, k] = np.maximum(best[:, k], (quiet + size * flare + np.sqrt(size) * own).max((1, 2)))
+    return best
 
 
 def _power(part: SeriesSurvey, width: float) -> float:
@@ -382,64 +379,46 @@ def analyse_frames(
 ) -> Analysis:
     """Find the flares in observed frames.
 
-    Parameters
-    ----------
-    false_alarms : float
-        Wanted false alarms in a star-time of frames.
-    per : {"day", "month", "year"}
-    shape : str
-        Shape of the templates; see `SHAPES`.
-    seed : int
-        Seed of the resampled noise and of injections.
-    model : FrameModel, optional
-        What the pixels of spectra record; without it, spectra are searched as their sum over wavelength.
-    rank : int
-        Largest number of weighted sums of a spectrum.
-    jitters : mapping of str to float, optional
-        Standard deviations of light, dark current and sky from frame to frame, infinite for those that the search
-        leaves out. Where they do not state it, that of the light is infinite and that of the dark current as measured.
-    temperature_k : float
-        Temperature of injected flares in spectra.
-    report : callable, optional
-        Called with the share of the work that is done, which rises to 1; may raise to stop the work.
+    The `model` is that of the pixels of spectra, which are searched as their sum over wavelength without it; `rank`
+    is the largest number of weighted sums of a spectrum. Standard deviations of light, dark current and sky from
+    frame to frame, `jitters`, are infinite for those that the search leaves out; where they do not state it, that
+    of the light is infinite and that of the dark current as measured. The temperature is that of injected flares in
+    spectra. `report` is called with the share of the work that is done, which rises to 1, and may raise to stop the
+    work.
     """
     steps = Steps(report)
     level_steps, rate_steps, search_steps, event_steps, injection_steps = (
         steps.part(first, last) for first, last in pairwise(STAGES)
     )
     wanted = per_day(false_alarms, per)
-    cleaned = None if model is None else clean_spectra(frames, model)
-    frames = frames if cleaned is None else cleaned.frames
-    series = None
-    if cleaned is None:
+    if model is None:
         survey, level, frames = survey_light_curve(frames, shape_of(shape), seed, level_steps)
     else:
+        cleaned = clean_spectra(frames, model)
+        frames = cleaned.frames
         survey, series, level = survey_spectra(cleaned, shape_of(shape), rank, seed, jitters, level_steps)
     flux, error = frames.white_light
-    frequent = max(wanted, CANDIDATES)
-    modelled, measured = simulated_rates(survey, level.quiet[level.used], wanted, seed, rate_steps)
-    threshold, candidates = (max(one.threshold(rate) for one in (modelled, measured)) for rate in (wanted, frequent))
+    rates = simulated_rates(survey, level.quiet[level.used], wanted, seed, rate_steps)
+    threshold, candidates = (max(one.threshold(each) for one in rates) for each in (wanted, max(wanted, CANDIDATES)))
     dip = largest_dip(survey, level.quiet[level.used], candidates)
-    days = survey.stare.observed_s / DAY_S
-    if -np.expm1(-max(one.rate(dip) for one in (modelled, measured)) * days) < CHANCE_DIP:
+    if -np.expm1(-max(one.rate(dip) for one in rates) * survey.stare.observed_s / DAY_S) < CHANCE_DIP:
         threshold = max(threshold, dip)
     detected, taken = detect_events(survey, candidates, search_steps)
-    seen = None if series is None else [event_spectrum(survey, series, taken, one) for one in detected]
-    causes = None if seen is None else [one.cause for one in seen]
-    events = measure_events(survey, taken, detected, causes, event_steps)
+    seen = [] if model is None else [event_spectrum(survey, series, taken, one) for one in detected]
+    events = measure_events(survey, taken, detected, [one.cause for one in seen], event_steps)
     spectra = None
-    if cleaned is not None and series is not None and seen is not None:
-        measured_flares = [
+    if model is not None:
+        flares = [
             measure_flare(survey, series, taken, one) if event.kind == "flare" else f"its kind is {event.kind}"
             for event, one in zip(events, detected, strict=True)
         ]
-        spectra = SpectralAnalysis(cleaned, series, seen, measured_flares)
+        spectra = SpectralAnalysis(cleaned, series, seen, flares)
     quiet = ~taken
     residual = innovations(survey, quiet)
     middle = survey.bank.directions[len(survey.bank.directions) // 2]
     numbers = survey.stare.numbers[quiet]
     return Analysis(
-        frames, flux, error, level, survey, wanted, modelled, measured, threshold, candidates, dip, events,
+        frames, flux, error, level, survey, wanted, *rates, threshold, candidates, dip, events,
         inject(survey, ~taken, threshold, seed, temperature_k, injection_steps),
         binned_scatter(numbers, residual @ middle), residual, quiet, likeness(numbers, residual), spectra,
     )  # fmt: skip

@@ -63,16 +63,9 @@ STILL_BRIGHT, END_FRAMES = 1.0, 4
 def fit_processes(
     survey: SeriesSurvey, taken: Bool, start: SeriesSurvey | None = None, steps: Steps | None = None
 ) -> SeriesSurvey:
-    """Return a survey with the processes that fit its sums and its flux outside some frames.
+    """Return a survey with the processes that fit its sums and its flux outside the frames of events, `taken`.
 
-    Parameters
-    ----------
-    taken : ndarray of bool, shape (n_frame,)
-        Frames of events.
-    start : SeriesSurvey, optional
-        Survey of nearly the same frames, with processes; their terms are kept.
-    steps : Steps, optional
-        Reports each fit.
+    `start` is a survey of nearly the same frames with processes, whose terms are kept. `steps` reports each fit.
     """
     quiet = ~taken
     time, step = survey.stare.start_s[quiet], survey.stare.frame_s
@@ -98,12 +91,7 @@ def fit_quiet_light(
 
     A bright, slow flare resembles a process that is seen once. Where that is the result, the one with the events in
     independent noise is compared, and the smaller Bayesian information criterion decides, with the flares among the
-    parameters.
-
-    Parameters
-    ----------
-    survey, guessed, before, steps
-        As for `alternate`.
+    parameters. The arguments are those of `alternate`.
     """
     fitted, taken = alternate(survey, guessed, before, steps)
     if not _seen_once(fitted):
@@ -153,23 +141,11 @@ def criterion(
     *,
     shapeless: bool = False,
 ) -> float:
-    """Return the Bayesian information criterion of a process and of flares.
+    """Return the Bayesian information criterion of the processes of a survey and of the flares of `light_of_events`.
 
-    A process of minutes that is hardly seen to repeat costs `SEEN_ONCE`: stars and instruments repeat what they do.
-
-    Parameters
-    ----------
-    survey : SeriesSurvey
-        With processes.
-    fits : sequence of EventLight
-        Of `light_of_events`.
-    taken : ndarray of bool, shape (n_frame,)
-        Frames of events.
-    further : sequence of EventLight, optional
-        Other flares, from which the light of an event may depart.
-    shapeless : bool
-        If True, or in independent noise, the light of an event may have any smooth shape, or depart from that of its
-        flares by a process.
+    A process of minutes that is hardly seen to repeat costs `SEEN_ONCE`: stars and instruments repeat what they do. If
+    `shapeless`, or in independent noise, the light of an event may have any smooth shape, or depart from that of its
+    flares, or of `further` ones, by a process.
     """
     size = float(np.log(survey.stare.n_frames))
     every = np.ones(survey.stare.n_frames, np.bool_)
@@ -209,13 +185,8 @@ def _criterion_of(survey: SeriesSurvey, fits: Sequence[EventLight], kept: Bool, 
 def _criterion_alone(survey: SeriesSurvey, event: Detection, size: float, *alternatives: Sequence[EventLight]) -> float:
     """Return the criterion of the frames of an event in a light curve, whose light has a process of its own.
 
-    Parameters
-    ----------
-    survey, event
-    size : float
-        Cost of a parameter.
-    *alternatives
-        Flares to which the process is added. The smallest criterion counts, which may be that without flares.
+    The process is added to each of the alternatives, which are flares, or to no flare: the smallest criterion counts. A
+    parameter costs `size`.
     """
     rows = slice(event.first, event.last + 1)
     added = [(1, *_added(survey, [], 0.0))]
@@ -244,25 +215,11 @@ def _seen_once(survey: SeriesSurvey) -> bool:
 def alternate(
     survey: SeriesSurvey, guessed: Bool, before: SeriesSurvey | None = None, steps: Steps | None = None
 ) -> tuple[SeriesSurvey, Bool]:
-    """Fit process and events in alternation.
+    """Fit process and events in alternation; return the survey with processes, and the frames above `PROVISIONAL`.
 
-    Parameters
-    ----------
-    survey : SeriesSurvey
-        Without processes.
-    guessed : ndarray of bool, shape (n_frame,)
-        First guess of the frames of events.
-    before : SeriesSurvey, optional
-        Survey of nearly the same frames, with processes; their terms are kept as long as the events hardly change.
-    steps : Steps, optional
-        Reports each fit and each search.
-
-    Returns
-    -------
-    survey : SeriesSurvey
-        With processes.
-    taken : ndarray of bool, shape (n_frame,)
-        Frames of events above `PROVISIONAL`.
+    The survey has no processes, and the frames of events are first guessed. `before` is a survey of nearly the same
+    frames with processes, whose terms are kept as long as the events hardly change. `steps` reports each fit and each
+    search.
     """
     taken, rounds = guessed, dict[tuple[bytes, SeriesSurvey | None], tuple[SeriesSurvey, Bool]]()
     for _ in range(ROUNDS):
@@ -282,13 +239,7 @@ def alternate(
 
 
 def detect_events(survey: SeriesSurvey, threshold: float, steps: Steps | None = None) -> tuple[list[Detection], Bool]:
-    """Detect events above a threshold, the largest first, and return them in order of time with their frames.
-
-    Parameters
-    ----------
-    steps : Steps, optional
-        Reports each search.
-    """
+    """Detect events above a threshold, the largest first, and return them in order of time with their frames."""
     # Where the star is constant, or seen for a short time, events may take any number of frames.
     varies_for_days = survey.stare.duration_s > LONG_S and any(process.terms for process in survey.processes)
     for faint in FAINT if varies_for_days else FAINT[:1]:

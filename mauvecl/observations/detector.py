@@ -35,14 +35,9 @@ class CalibrationFrames:
 
     @classmethod
     def of(cls, frames: Frames, nominal: Instrument, star: Source | None, temperature_c: float | None = None) -> Self:
-        """Select the good frames of spectra that a detector recorded.
+        """Select the good frames of spectra that a detector recorded: raw DN of each pixel that the instrument reads.
 
-        Parameters
-        ----------
-        frames : Frames
-            Raw DN of each pixel that the instrument reads.
-        temperature_c : float, optional
-            Of the detector, where the frames do not state it.
+        `temperature_c` is that of the detector where the frames do not state it.
         """
         nm = frames.wavelength_nm
         if nm is None or nm.shape != nominal.wavelength_nm.shape:
@@ -142,7 +137,6 @@ class PhotonTransfer:
     covariance: Float
     read_noise_error: float  # standard error, DN, with that of the dark counts
     dark_unit: Literal["DN", "electrons"]
-    dark_unit_chi2: float  # chi-squared with dark counts in DN, less that with electrons
     chi2: float
     dof: int
     # mean_dn, variance, model: shape (n_value,); all means of light, measured and fitted variances.
@@ -175,15 +169,8 @@ class PhotonTransfer:
 def measured_variance(raw_dn: Float, light_dn: Float, dark_dn: Float, usable: NDArray[np.bool_]) -> MeasuredVariance:
     """Measure the variance of frames from differences of consecutive ones, without drifts.
 
-    From each difference the best multiples of light and dark are subtracted, since jitter of the pointing and of the
-    temperature change all pixels together.
-
-    Parameters
-    ----------
-    raw_dn : ndarray, shape (n_frame, n_pixel)
-    light_dn, dark_dn : ndarray, shape (n_pixel,)
-        Mean of a frame.
-    usable : ndarray of bool, shape (n_pixel,)
+    From each difference the best multiples of light and dark, the means of a frame, are subtracted, since jitter of the
+    pointing and of the temperature change all pixels together.
     """
     # A pixel that never changes is dead.
     usable = usable & np.any(raw_dn != raw_dn[0], axis=0)
@@ -205,14 +192,8 @@ def fit_photon_transfer(
 ) -> PhotonTransfer:
     """Fit gain, read noise and the unit of dark counts to measured variances, by iterated weighted least squares.
 
-    Parameters
-    ----------
-    measured : sequence of MeasuredVariance
-        At least one.
-    nominal : Instrument
-        Instrument whose values are kept where the data determine none.
-    dark_error_dn : float
-        Standard error of the dark of a mean frame, which moves the read noise.
+    The nominal values are kept where the data determine none. The standard error of the dark of a mean frame,
+    `dark_error_dn`, moves the read noise.
     """
     variance, light, dark = (
         np.concatenate([getattr(one, key) for one in measured]) for key in ("variance", "light_dn", "dark_dn")
@@ -234,12 +215,12 @@ def fit_photon_transfer(
     if not gain > MIN_SNR * errors[1]:
         before, unknown = NoiseModel.nominal(nominal), ("gain", "read noise", "unit of the dark counts")
         model, assumed_error = before.variance(light, dark), np.diag([0.0, (ASSUMED_GAIN_ERROR * before.gain) ** 2])
-        return PhotonTransfer(before, assumed_error, 0.0, nominal.dark_unit, better, np.nan, 0, light, variance, model,
+        return PhotonTransfer(before, assumed_error, 0.0, nominal.dark_unit, np.nan, 0, light, variance, model,
                               unknown)  # fmt: skip
     read = max(float(read), ROUNDING)
     noise = NoiseModel(read, float(gain) if unit == "electrons" else 1.0, float(gain))
     read_error = np.hypot(errors[0], noise.dark_factor * dark_error_dn) / (2 * np.sqrt(max(read - ROUNDING, errors[0])))
-    return PhotonTransfer(noise, covariance, float(read_error), unit, float(better), float(chi2),
+    return PhotonTransfer(noise, covariance, float(read_error), unit, float(chi2),
                           variance.size - 2, light, variance, model, tuple(assumed))  # fmt: skip
 
 
@@ -341,14 +322,7 @@ def fit_dark(dark: Sequence[CalibrationFrames], nominal: Instrument, noise: Nois
 
     The slope is assumed if the temperatures span less than `SLOPE_RANGE_C`. Each pixel's bias is fitted if exposure
     times differ by `EXPOSURE_RATIO`, and one for all pixels if the temperatures span `BIAS_RANGE_C`; otherwise it is
-    the instrument's.
-
-    Parameters
-    ----------
-    dark : sequence of CalibrationFrames
-        At least one.
-    noise : NoiseModel
-        Its variances are the weights.
+    the instrument's. The variances of `noise` are the weights.
     """
     raw = np.concatenate([one.raw_dn for one in dark])
     n_pixel = raw.shape[1]
@@ -361,11 +335,8 @@ def fit_dark(dark: Sequence[CalibrationFrames], nominal: Instrument, noise: Nois
     bias = nominal.per_pixel("bias_dn", nominal.bias_dn)
 
     # The mean pixel gives what all pixels share: bias, slope, and their errors.
-    series = raw.mean(axis=1)
-    start = np.array([bias.mean(), (series - bias.mean()).mean() / exposure.mean(), nominal.dark_slope_per_c])
-    typical = noise.variance(0.0, start[1] * exposure * np.exp(start[2] * offset))
     free = np.array([fits_bias, True, fits_slope])
-    common, shared = _mean_dark(series, exposure, offset, typical / n_pixel, start, free)
+    common, shared, typical = _mean_dark(raw, exposure, offset, free, nominal, noise)
     slope = float(common[2])
     if fits_bias and not by_pixel:
         bias = np.full(n_pixel, common[0])
@@ -387,14 +358,12 @@ def fit_dark(dark: Sequence[CalibrationFrames], nominal: Instrument, noise: Nois
     mean = seconds[:, None] * level
     chi2 = float(np.sum((raw - bias - mean) ** 2 / noise.variance(0.0, mean)))
     dof = raw.size - len(used) * n_pixel - int(fits_slope) - int(fits_bias and not by_pixel)
-    assumed = [*(() if fits_slope else ("dark slope",)), *(() if fits_bias else ("bias",))]
-    bias_error = np.sqrt(covariance[:, 0, 0]) if by_pixel else np.full(n_pixel, np.sqrt(shared[0, 0]))
     return DarkFit(
         reference_c=reference,
         level_dn_per_s=level,
         level_error=np.sqrt(covariance[:, 1, 1]),
         bias_dn=bias,
-        bias_error=bias_error,
+        bias_error=np.sqrt(covariance[:, 0, 0]) if by_pixel else np.full(n_pixel, np.sqrt(shared[0, 0])),
         covariance=covariance,
         shared=shared,
         slope_per_c=slope,
@@ -404,29 +373,22 @@ def fit_dark(dark: Sequence[CalibrationFrames], nominal: Instrument, noise: Nois
         chi2=chi2,
         dof=dof,
         slopes_p_value=float(scipy.stats.chi2.sf(scatter, n_pixel - 1)),
-        assumed=tuple(assumed),
+        assumed=(*(() if fits_slope else ("dark slope",)), *(() if fits_bias else ("bias",))),
     )
 
 
 def _mean_dark(
-    series: Float, exposure: Float, offset: Float, variance: Float, start: Float, free: NDArray[np.bool_]
-) -> tuple[Float, Float]:
-    """Fit bias, dark level and slope of the mean pixel.
+    raw: Float, exposure: Float, offset: Float, free: NDArray[np.bool_], nominal: Instrument, noise: NoiseModel
+) -> tuple[Float, Float, Float]:
+    """Fit bias, dark level and slope of the mean pixel; return them, their covariance, and the variance of a pixel.
 
-    Parameters
-    ----------
-    series, exposure, offset, variance : ndarray, shape (n_frame,)
-        Mean of the pixels, exposure time, temperature above the reference, and variance of the mean.
-    start, free : ndarray, shape (3,)
-        Bias, level and slope, and whether each is fitted.
-
-    Returns
-    -------
-    ndarray, shape (3,)
-        Fitted values, those of `start` where they are not free.
-    ndarray, shape (3, 3)
-        Covariance, zero where they are not free.
+    Offsets are temperatures above the reference. The variance, shape (n_frame,), is that of a typical pixel. Values
+    that are not free are nominal, with no variance.
     """
+    series, bias = raw.mean(axis=1), nominal.per_pixel("bias_dn", nominal.bias_dn).mean()
+    start = np.array([bias, (series - bias).mean() / exposure.mean(), nominal.dark_slope_per_c])
+    typical = noise.variance(0.0, start[1] * exposure * np.exp(start[2] * offset))
+    variance = typical / raw.shape[1]
 
     def whole(values: Float) -> Float:
         every = start.copy()
@@ -440,7 +402,7 @@ def _mean_dark(
     found = scipy.optimize.least_squares(left, start[free], x_scale=np.maximum(np.abs(start[free]), 1e-3), xtol=1e-14)
     covariance, jacobian = np.zeros((3, 3)), np.asarray(found.jac)
     covariance[np.ix_(free, free)] = np.linalg.inv(jacobian.T @ jacobian)
-    return whole(found.x), covariance
+    return whole(found.x), covariance, typical
 
 
 def _fit_pixels(
@@ -448,23 +410,9 @@ def _fit_pixels(
 ) -> tuple[Float, Float]:
     """Fit a linear model to each pixel by weighted least squares.
 
-    Parameters
-    ----------
-    columns : ndarray, shape (n_frame, n_column)
-        Signals of units of the fitted values, of which the last is the level unless `dark` is given.
-    weight : ndarray, shape (n_frame,)
-        Of a typical pixel.
-    values : ndarray, shape (n_frame, n_pixel)
-    noise : NoiseModel
-        Variance of the pixels, which differs from the typical one of the weights.
-    dark : tuple of ndarray, optional
-        Exposure times, shape (n_frame,), and levels, shape (n_pixel,), of the dark current.
-
-    Returns
-    -------
-    ndarray, shape (n_column, n_pixel)
-    ndarray, shape (n_pixel, n_column, n_column)
-        Covariance.
+    The last column is the signal of the level unless `dark` has exposure times and levels of the dark current. Weights
+    are those of a typical pixel, from whose variance that of the pixels differs. Returned are the values, shape
+    (n_column, n_pixel), and their covariance, shape (n_pixel, n_column, n_column).
     """
     weighted = columns * weight[:, None]
     hat = np.linalg.solve(weighted.T @ columns, weighted.T)

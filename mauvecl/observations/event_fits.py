@@ -145,16 +145,7 @@ def fit_event(window: Window, searched: Shape) -> list[Fit]:
 
 
 def flares_of(survey: SeriesSurvey, taken: Bool, one: Detection) -> tuple[list[FittedFlare], float, float]:
-    """Return the flares of the shape of the bank that fit an event best.
-
-    Returns
-    -------
-    flares : list of FittedFlare
-    scale : float
-        Light of unit amplitude in the sum along the direction of the event.
-    photon : float
-        Rise of the variance of that sum with the amplitude.
-    """
+    """Return the flares of the bank's shape that fit an event best, and scale and photon noise of its `Window`."""
     window = Window.of(survey, taken, one)
     shape = survey.bank.shape
     return _further(window, shape, [_first_fit(window, Family.of(shape, 1.0)).best[1]]), window.scale, window.photon
@@ -197,13 +188,9 @@ class Grid:
     def of(cls, likelihood: Likelihood, family: Family, box: Float, outer: Float, before: Grid | None = None) -> Grid:
         """Compute the posterior on a grid that is refined or widened until it covers all that is not negligible.
 
-        Parameters
-        ----------
-        box, outer : ndarray, shape (2, 2)
-            First and largest range of the peak and of the logarithm of the half-width.
-        before : Grid, optional
-            Grid of the same window and family. Its means are reused where the range is the same, because they take
-            most of the time.
+        `box` and `outer` are the first and the largest range of the peak and of the logarithm of the half-width.
+        `before` is a grid of the same window and family: its means are reused where the range is the same, as they take
+        most of the time.
         """
         window = likelihood.window
         n_node = NODES if len(family.weights) == 1 else NODES_OF_MANY
@@ -386,14 +373,8 @@ def _single(
 ) -> list[Fit]:
     """Fit a single flare with each departure of a family from its shapes.
 
-    Parameters
-    ----------
-    shape, flare
-        A first fit, from which the departures follow.
-    box : ndarray, shape (2, 2)
-        Range of the peak and of the logarithm of the half-width from which the grid begins.
-    last : Grid, optional
-        Grid of the first fit, if that was a fit of the same family.
+    The departures follow from a first fit, `shape` and `flare`. The grid begins from the range `box`, and `last` is the
+    grid of the first fit, if that was a fit of the same family.
     """
     outer = _ranges(window)
     box = np.column_stack([np.maximum(box[:, 0], outer[:, 0]), np.minimum(box[:, 1], outer[:, 1])])

@@ -16,8 +16,7 @@ shape where it is not observed.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from itertools import pairwise, product
@@ -53,12 +52,15 @@ GENERAL = "general"
 GENERAL_WEIGHT = 0.5
 
 
-class Rise(ABC):
+@dataclass(frozen=True)
+class Rise:
     """Rise of a flare that ends at the peak."""
 
-    @abstractmethod
+    integral: Callable[[Float], Float]  # of the rise up to a time before the peak
+
     def before(self, tau: ArrayLike) -> Float:
         """Return the integral up to tau."""
+        return self.integral(np.minimum(tau, 0.0))
 
     def after(self, tau: ArrayLike) -> Float:
         """Return the integral from tau to the peak."""
@@ -66,58 +68,28 @@ class Rise(ABC):
         return self.before(0.0) - self.before(t) if (t < 0).any() else np.zeros(t.shape)
 
 
-class Decay(ABC):
+@dataclass(frozen=True)
+class Decay:
     """Decay of a flare that begins at the peak."""
+
+    integral: Callable[[Float], Float]  # of the decay from a time after the peak on
 
     def before(self, tau: ArrayLike) -> Float:
         """Return the integral from the peak to tau."""
         t = np.asarray(tau, np.float64)
         return self.after(0.0) - self.after(t) if (t > 0).any() else np.zeros(t.shape)
 
-    @abstractmethod
     def after(self, tau: ArrayLike) -> Float:
         """Return the integral from tau to the end."""
+        return self.integral(np.maximum(tau, 0.0))
 
 
-@dataclass(frozen=True)
-class PublishedRise(Rise):
-    """The rise of Davenport et al. (2014)."""
-
-    def before(self, tau: ArrayLike) -> Float:
-        return SHAPES["davenport2014"].before(np.minimum(tau, 0.0))
+def _exponential(rate: float) -> Decay:
+    """Return an exponential decay with a rate per half-width."""
+    return Decay(lambda tau: np.asarray(np.exp(-rate * tau) / rate))
 
 
-@dataclass(frozen=True)
-class GaussianRise(Rise):
-    """First half of a Gaussian; `width` is from half maximum to maximum, in half-widths."""
-
-    width: float
-
-    def before(self, tau: ArrayLike) -> Float:
-        return _gaussian_tail(-np.minimum(tau, 0.0), self.width)
-
-
-@dataclass(frozen=True)
-class GaussianDecay(Decay):
-    """Second half of a Gaussian; `width` is from maximum to half maximum, in half-widths."""
-
-    width: float
-
-    def after(self, tau: ArrayLike) -> Float:
-        return _gaussian_tail(np.maximum(tau, 0.0), self.width)
-
-
-@dataclass(frozen=True)
-class Exponential(Decay):
-    """Exponential decay; `rate` per half-width."""
-
-    rate: float
-
-    def after(self, tau: ArrayLike) -> Float:
-        return np.asarray(np.exp(-self.rate * np.maximum(tau, 0.0)) / self.rate)
-
-
-def _exponentials(rates: Float) -> tuple[list[Exponential], Float]:
+def _exponentials(rates: Float) -> tuple[list[Decay], Float]:
     """Return exponentials of few rates, and their weights in those of many, shape (n_rate, n_few).
 
     An exponential is a smooth function of the logarithm of its rate: it is interpolated between Chebyshev points.
@@ -125,13 +97,18 @@ def _exponentials(rates: Float) -> tuple[list[Exponential], Float]:
     middle, half = np.log(rates[[0, -1]].prod()) / 2, np.log(rates[-1] / rates[0]) / 2
     points = middle + half * np.cos(np.pi * np.arange(EXPONENTIALS) / (EXPONENTIALS - 1))
     weights = scipy.interpolate.BarycentricInterpolator(points, np.eye(EXPONENTIALS))(np.log(rates))
-    return [Exponential(float(rate)) for rate in np.exp(points)], np.asarray(weights)
+    return [_exponential(float(rate)) for rate in np.exp(points)], np.asarray(weights)
 
 
-def _gaussian_tail(tau: ArrayLike, width: float) -> Float:
+def _gaussian_rise(width: float) -> Rise:
+    """Return the first half of a Gaussian; the width is from half maximum to maximum, in half-widths."""
+    return Rise(lambda tau: _gaussian_tail(-tau, width))
+
+
+def _gaussian_tail(tau: Float, width: float) -> Float:
     """Return the integral of a Gaussian from tau to the end, for a half-width at half maximum of `width`."""
     root = float(np.sqrt(np.log(2)))
-    return np.asarray(np.sqrt(np.pi) / 2 * width / root * scipy.special.erfc(np.asarray(tau) * root / width))
+    return np.asarray(np.sqrt(np.pi) / 2 * width / root * scipy.special.erfc(tau * root / width))
 
 
 @dataclass(frozen=True)
@@ -175,8 +152,8 @@ class Family:
     @cache
     def general(cls) -> Family:
         """Return the general family, the same object in all calls: rises and decays in all combinations."""
-        rises: list[Integrable] = [PublishedRise(), *(GaussianRise(width) for width in GAUSSIAN_RISES)]
-        fast: list[Integrable] = [Exponential(Davenport2014.DECAY[0][1]), GaussianDecay(GAUSSIAN_DECAY)]
+        rises = [Rise(SHAPES["davenport2014"].before), *map(_gaussian_rise, GAUSSIAN_RISES)]
+        fast = [_exponential(Davenport2014.DECAY[0][1]), Decay(lambda tau: _gaussian_tail(tau, GAUSSIAN_DECAY))]
         slow, interpolated = _exponentials(SLOW_RATES)
         choices = [(0.0, 0), *((share, rate) for share in SLOW_SHARES for rate in range(SLOW_RATES.size))]
         # Each share has the same weight: without a slow decay, its rate does not matter.

@@ -83,13 +83,7 @@ def _p_value(chi2: float, dof: int) -> float:
 
 
 def measure_energy(survey: SeriesSurvey, taken: Bool, flux_level: Float, one: Detection) -> Energy:
-    """Measure the equivalent duration of an event.
-
-    Parameters
-    ----------
-    survey, taken, flux_level, one
-        As for `measure_event`.
-    """
+    """Measure the equivalent duration of an event; the arguments are those of `measure_event`."""
     peak = int(np.clip(np.searchsorted(survey.stare.middle_s, one.peak_s), 0, survey.stare.n_frames - 1))
     level = float(flux_level[peak]) * survey.scale / survey.level
     window = replace(Window.of(survey, taken, one), quiet_level=level if level > 0 else 1.0)
@@ -144,11 +138,7 @@ def _tempered(window: Window, best: Fit, mixtures: Sequence[Mixture]) -> list[Mi
 def _dips(window: Window, fits: Sequence[Fit], summed: float, error: float) -> bool:
     """Return whether the frames of an event lack the light of the best fit.
 
-    Parameters
-    ----------
-    fits : sequence of Fit
-    summed, error : float
-        Light of the frames above the level, amplitude x s.
+    `summed` is the light of the frames above the level, amplitude x s, and `error` its standard error.
     """
     best = max(fits, key=lambda fit: fit.mixture.log_total)
     plain, model = _without_departures(window, best)
@@ -335,17 +325,9 @@ def _near_peak(survey: SeriesSurvey, found: Detection) -> Bool:
 def measure_event(
     survey: SeriesSurvey, taken: Bool, level: Float, found: Detection, cause: Kind = "flare"
 ) -> ObservedEvent:
-    """Measure a detected event.
+    """Measure a detected event, whose cause follows from its spectrum.
 
-    Parameters
-    ----------
-    taken : ndarray of bool, shape (n_frame,)
-        Frames of all events.
-    level : ndarray, shape (n_frame,)
-        Quiescent level of the flux, in units of the survey's scale.
-    found : Detection
-    cause : str
-        Follows from the spectrum of the event.
+    `taken` are the frames of all events, and `level` is the quiescent level of the flux in units of the survey's scale.
     """
     first, last = found.first, found.last
     rows = slice(first, last + 1)

@@ -17,7 +17,7 @@ from mauvecl.host.spectra.columns import words_of
 from mauvecl.host.spectra.units import medium_of, unit_and_medium, vacuum_wavelengths
 from mauvecl.host.tables.files import limit_bytes, parsing, without_columns
 from mauvecl.host.tables.fits_tables import FitsTables
-from mauvecl.host.tables.names import divided_unit, first_of, is_magnitude, is_missing, key_of
+from mauvecl.host.tables.names import is_magnitude, is_missing, key_of
 from mauvecl.host.tables.opening import open_table
 from mauvecl.host.tables.table import (
     MemoryTable,
@@ -30,25 +30,24 @@ from mauvecl.host.tables.table import (
     without_indefinite,
 )
 from mauvecl.host.tables.units import (
-    EPOCHS_MJD,
-    MISSIONS,
-    TimeSystem,
-    TimeUnit,
     is_dated,
-    mjd_of,
-    position_of,
-    scale_of,
-    seconds_from_first,
-    time_in_name,
-    time_unit,
 )
 from mauvecl.observations.frames import ALL_BITS, MAX_FRAMES, Frames, QualityBits, decimal_flags
-from mauvecl.observations.mapping import FrameMapping
-from mauvecl.observations.reduction import Light, PixelStatistics, weighted_sums, whole_or_reduced
-from mauvecl.observations.stored_frames import FolderFile, StoredFile, is_store, open_hdf5, open_store, stored_in_fits
+from mauvecl.observations.mapping import FrameMapping, recognised, times_of, wanted_columns
+from mauvecl.observations.stored_frames import (
+    FolderFile,
+    Light,
+    PixelStatistics,
+    StoredFile,
+    is_store,
+    open_hdf5,
+    open_store,
+    stored_in_fits,
+    weighted_sums,
+    whole_or_reduced,
+)
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened
-from mauvecl.schema.physical import DAY_S
 
 
 def _keys(values: Values) -> NDArray[Any]:
@@ -60,48 +59,15 @@ def _keys(values: Values) -> NDArray[Any]:
 Float = NDArray[np.float64]
 
 FORMATS = "FITS, HDF5, ECSV, CSV, a Zarr store or a folder of spectra"
-#: Names of columns that need no mapping, in order of preference, in any case: those of mauvecl, of the pipelines of
-#: Kepler, K2 and TESS, of lightkurve and AltaiPony, and of K2SFF, QLP, eleanor, TASOC and gPhoton.
-KNOWN = {
-    "time": ("time",),
-    "flux": ("flux_bgsub", "flux", "pdcsap_flux", "sap_flux", "kspsap_flux", "det_flux", "corr_flux", "corrected_flux",
-             "fcor", "flux_corr", "detrended_flux", "rate", "rel_flux", "relative_flux", "normalized_flux",
-             "norm_flux", "flux_norm", "flux_normalized", "rel_flux_t1", "ujy", "count_rate", "countrate", "cps",
-             "counts", "cal_aper_flux", "whitelight_flux"),
-    "quality": ("quality", "sap_quality"),
-    "temperature": ("temperature",),
-}  # fmt: skip
-#: Names of times where no column is called time and none is named after its dates, such as BJD.
-OTHER_TIMES = ("t", "date", "datetime", "timestamp", "date-obs", "date_obs", "utc", "ut")
-#: Names of the times at which frames start and end, where no other column is a time.
-EDGES = ("t0", "t1")
 #: Columns of bands and of stars, of which a light curve has one.
 GROUPS = ("band", "filter", "filt", "passband", "bandpass", "filtercode", "phot_filter", "source_id", "tic",
           "tic_id", "ticid", "kic", "kepid", "epic", "object", "target", "star", "f")  # fmt: skip
 #: Words in the names of flags, which exclude frames only if they are called quality or a mapping names them.
 FLAGS = {"flag", "flags", "rejected", "quality", "qual", "dq", "status", "event", "mask"}
-#: Part of a frame that times refer to.
-PARTS = {"start": 0.0, "middle": 0.5, "end": 1.0}
-#: Dates of observed light, MJD, from 1845 to 2269.
-DATES_MJD = (-5000.0, 150_000.0)
 #: Units in which light is given as a deviation from its level, as TASOC does.
 PARTS_OF_LEVEL = {"%": 1e-2, "percent": 1e-2, "ppt": 1e-3, "ppm": 1e-6, "ppb": 1e-9}
-#: Columns of files that state no unit of their times, these times, and what they are: Gaia DR3's epoch photometry, BJD
-#: in TCB less 2455197.5 (documentation of vari_epoch_photometry), and GALEX, Unix time less 315964800 s (user guide of
-#: gPhoton), of which the columns are those of gPhoton's light curves.
-TIMES_OF_COLUMNS = (
-    ({"transit_id", "rejected_by_photometry"}, TimeUnit("d", 55_197.0, "tcb", "BARYCENTER"),
-     "days from 2010-01-01 in TCB, as in Gaia DR3's epoch photometry"),
-    ({"t0", "t1", "cps", "cps_err"}, TimeUnit("s", EPOCHS_MJD["gps"], "utc"),
-     "seconds from 1980-01-06 in UTC, as in GALEX light curves of gPhoton"),
-)  # fmt: skip
-#: Extension of the light curves of CHEOPS. UTC in its header is that of the start and the end of a visit;
-#: BJD_TIME is in TT: pycheops 1.1.14, documentation of `Dataset`.
-CHEOPS = "SCI_COR_LIGHTCURVE"
 #: Standard errors by which a level is above zero.
 SURE = 5.0
-#: What a cell of times may be.
-DATE = "a number or a date such as 2026-03-01T12:00:00"
 
 
 @validated
@@ -175,7 +141,7 @@ def frames_of(container: Any, mapping: FrameMapping | None = None, *, time: Any 
         mapping = FrameMapping(time="time", flux="flux", wavelength="wavelength",
                                error="flux_err" if "flux_err" in columns else None)  # fmt: skip
     file = MemoryTable(container, type(container).__name__)
-    return _frames_in(file, mapping or _recognised(file), str(container.meta.get("LABEL", "frames")))
+    return _frames_in(file, mapping or recognised(file), str(container.meta.get("LABEL", "frames")))
 
 
 def _standard_deviation(uncertainty: Any) -> Float:
@@ -279,7 +245,7 @@ def _open_frames(
             yield FolderFile(path, mapping, what, lambda one: open_one(one, f"file {one.name!r}")), mapping
         return
     with _opened(path, what, name, mapping, check, large=True) as file:
-        yield file, mapping or (file.mapping if isinstance(file, StoredFile) else _recognised(file))
+        yield file, mapping or (file.mapping if isinstance(file, StoredFile) else recognised(file))
 
 
 def _opened(
@@ -294,56 +260,12 @@ def _opened(
     """Open a file with frames; only `large` ones may exceed MAUVECL_LARGEST_FILE_MIB."""
 
     def of_fits(hdus: Any) -> TableFile:
-        return stored_in_fits(FitsTables(hdus, what), name) or FitsTables(hdus, what, name, _wanted(mapping))
+        return stored_in_fits(FitsTables(hdus, what), name) or FitsTables(hdus, what, name, wanted_columns(mapping))
 
     return open_table(
         path, what, expected=FORMATS, check=check, large=large, of_fits=of_fits,
         of_hdf5=lambda file: open_hdf5(file, name, what),
     )  # fmt: skip
-
-
-def _wanted(mapping: FrameMapping | None) -> tuple[tuple[str, ...], ...]:
-    """Return groups of names, of each of which the chosen table has one."""
-    return (KNOWN["time"], KNOWN["flux"]) if mapping is None else tuple((name,) for name in mapping.times)
-
-
-def _recognised(file: TableFile) -> FrameMapping:
-    """Return the mapping of a file whose columns have known names."""
-    # Of FITS files also images, but no columns of other extensions.
-    names = [*file.columns, *(name for name in file.names if "/" not in name and name not in file.columns)]
-    columns: dict[str, Any] = {key: first_of(known, names, file.what) for key, known in KNOWN.items()}
-    if columns["time"] is None:
-        said = {name: found for name in names if (found := time_in_name(name)) is not None}
-        dated = [name for name, one in said.items() if one.epoch_mjd is not None]
-        for place in ("BARYCENTER", "HELIOCENTER"):
-            # Dates at the barycentre are those of the light; those at the Sun are seconds from them.
-            dated = [name for name in dated if said[name].position == place] or dated
-        if len(dated) > 1:
-            fault = f"{file.what}: {len(dated)} columns may be the time: {', '.join(map(shortened, dated))}"
-            raise InputError(fault, "a mapping that names one", key="time")
-        timed = [name for name in said if re.match(r"t(?:ime)?[\s_.]", name, re.IGNORECASE)]
-        columns["time"] = dated[0] if dated else first_of((*OTHER_TIMES, *timed), names, file.what)
-    if columns["time"] is None:
-        edges = tuple(first_of((name,), names, file.what) for name in EDGES)
-        columns["time"] = None if None in edges else edges
-    flux = divided_unit(columns["flux"] or "")[0]
-    # Errors of another flux would be wrong ones.
-    ends = ("_err", "_error", "err", "_e", "_unc", "_uncertainty", "_sigma", "_std")
-    errors = [f"{flux}{end}" for end in ends] + [f"{start}{flux}" for start in ("e_", "err_", "sigma_", "sig_", "d")]
-    errors += [flux.lower().replace("flux_", "flux_err_")] if "flux_" in flux.lower() else []
-    columns["error"] = first_of((*errors, "error", "err", "uncertainty", "unc", "sigma"), names, file.what)
-    if columns["flux"] is None and (magnitudes := [name for name in names if is_magnitude(name)]):
-        fault = f"{file.what} has magnitudes ({', '.join(map(shortened, magnitudes))}) and no column of linear light"
-        raise InputError(fault, "light in a linear unit, in a column named flux or that a mapping names", key="flux")
-    if columns["time"] is None or columns["flux"] is None:
-        raise InputError(
-            f"{file.what} has the columns {shortened(', '.join(file.names), 300)}",
-            "columns named time and flux, or a mapping that names them",
-            key="mapping",
-        )
-    if "SPECTRUM" in file.names and "WAVELENGTH/WAVELENGTH" in file.names:
-        columns |= {"flux": "SPECTRUM", "error": "SPECTRUM_ERR", "wavelength": "WAVELENGTH/WAVELENGTH"}
-    return FrameMapping(**{key: value for key, value in columns.items() if value is not None})
 
 
 @dataclass(frozen=True, eq=False)
@@ -477,6 +399,15 @@ def _temperature_c(file: TableFile, found: Quantities, mapping: FrameMapping, n:
     return np.full(n, float(nominal)) if isinstance(nominal, int | float) else None
 
 
+def _exposure_s(file: TableFile, found: Quantities, mapping: FrameMapping, between_edges: Float | None) -> Float | None:
+    """Return the exposure time of each frame by a column, the mapping, the header or the edges of frames, or None."""
+    n = found.time[0].n_rows
+    if found.exposure is not None:
+        return converted(found.exposure, mapping.exposure_unit, "s", "exposure_unit").numbers().reshape(n)
+    one = mapping.exposure_s or _brite_exposure_s(file)
+    return between_edges if one is None else np.full(n, one)
+
+
 def _brite_exposure_s(file: TableFile) -> float | None:
     """Return the exposure time in the header of BRITE's light curves, in milliseconds for each image of a stack."""
     try:
@@ -526,11 +457,8 @@ def _frames_in(
     what = file.what
     found = Quantities.of(file, mapping)
     n = _number_of_rows(file, found)
-    time, exposure_s, dates, remarks = _times(found.time, file, mapping)
-    if found.exposure is not None:
-        exposure_s = converted(found.exposure, mapping.exposure_unit, "s", "exposure_unit").numbers().reshape(n)
-    elif (one_s := mapping.exposure_s or _brite_exposure_s(file)) is not None:
-        exposure_s = np.full(n, one_s)
+    time, between_edges_s, dates, remarks = times_of(found.time, file, mapping)
+    exposure_s = _exposure_s(file, found, mapping, between_edges_s)
     bits = QualityBits.of(file.header, mapping.quality_bits, what)
     wavelength = None if found.wavelength is None else _vacuum_nm(found.wavelength, mapping.wavelength_unit, file)
     light, sd, flags, unit, more = _read_light(file, found, mapping, bits, read)
@@ -614,95 +542,6 @@ def _masked(quality: Values | None, bits: QualityBits) -> Values | None:
     if quality is None or bits.mask == ALL_BITS:
         return quality
     return quality.mapped(lambda flags: np.where(np.isfinite(flags), bits.mask & flags.astype(np.int64), flags), "")
-
-
-def _times(
-    time: tuple[Values, ...], file: TableFile, mapping: FrameMapping
-) -> tuple[Float, Float | None, TimeSystem, tuple[str, ...]]:
-    """Return times in seconds from the first, exposure times of frames with a start and an end, and their dates."""
-    import astropy.units as u
-
-    stated = TimeSystem.of(file.header, file.what)
-    scale, position = scale_of(mapping.scale) or stated.scale, position_of(mapping.position) or stated.position
-    epoch, remarks = mapping.epoch_mjd, []
-    texts = [one.texts() for one in time]
-    if all(text is not None and any(is_dated(cell) for cell in text) for text in texts):
-        scale, unit, epoch, offset = scale or stated.default_scale or "utc", u.d, 0.0, 0.0
-        edges = [mjd_of(text or [], scale, one.name, file.what) for text, one in zip(texts, time, strict=True)]
-        if not (mapping.scale or stated.scale or stated.default_scale):
-            remarks.append(f"the dates of {file.what} state no time scale and are assumed to be in UTC")
-    else:
-        edges = [one.numbers(DATE).ravel() for one in time]
-        said, remarks = _time_unit(time, edges[0], file, mapping, stated)
-        unit = u.Unit(said.unit)
-        offset = stated.offset_in(unit, file.what)
-        scale, position = scale or said.scale or stated.default_scale, position or said.position
-        epoch = _epoch_mjd(said, stated, time[0].name, file.what) if epoch is None else epoch
-    is_cheops = str(file.header.get("EXTNAME", "")).upper().startswith(CHEOPS)
-    if is_cheops and position == "BARYCENTER" and not mapping.scale:
-        scale = "tt"
-        remarks.append(
-            f"{time[0].name} of {file.what} is in TT, as in all files of CHEOPS; UTC is the scale of its other dates"
-        )
-    exposure = None if len(edges) == 1 else np.asarray(((edges[1] - edges[0]) * unit).to_value(u.s))
-    seconds, first_d = seconds_from_first(np.mean(edges, axis=0) + offset, unit)
-    at = 0.5 if len(edges) == 2 else PARTS.get(mapping.time_at or "", stated.at)
-    if epoch is not None and mapping.epoch is None and not DATES_MJD[0] < epoch + first_d < DATES_MJD[1]:
-        span = " and ".join(f"{float(edge):g}" for edge in (np.nanmin(edges[0]), np.nanmax(edges[0])))
-        remarks.append(f"the times of {file.what} have no date, although their unit, name or header says so: {span}")
-        epoch = None
-    dates = replace(stated, epoch_mjd=None if epoch is None else epoch + first_d, scale=scale, position=position, at=at)
-    return (seconds if epoch is not None else seconds + first_d * DAY_S), exposure, dates, tuple(remarks)
-
-
-def _epoch_mjd(said: TimeUnit, stated: TimeSystem, name: str, what: str) -> float | None:
-    """Return the MJD from which times count, as their unit or name says or else the header; these must agree."""
-    if said.epoch_mjd is None or stated.epoch_mjd is None:
-        return said.epoch_mjd if stated.epoch_mjd is None else stated.epoch_mjd
-    if abs(said.epoch_mjd - stated.epoch_mjd) > 1e-5:
-        fault = (
-            f"{what}: {name!r} counts from MJD {said.epoch_mjd:g} by its unit or name and from {stated.epoch_mjd:g} by "
-            "its header"
-        )
-        raise InputError(fault, "one epoch, or a mapping with epoch", key="epoch")
-    return stated.epoch_mjd
-
-
-def _time_unit(
-    time: tuple[Values, ...], values: Float, file: TableFile, mapping: FrameMapping, stated: TimeSystem
-) -> tuple[TimeUnit, list[str]]:
-    """Return the unit of times and what it says of their zero: of the mapping, the column, its name, the header."""
-    if len({one.unit or unit_in_name(one.name) for one in time}) > 1 and not mapping.time_unit:
-        names = " and ".join(repr(one.name) for one in time)
-        raise InputError(f"{file.what}: {names} have different units", "one unit", key="time")
-    text = mapping.time_unit or time[0].unit or unit_in_name(time[0].name)
-    named = time_in_name(time[0].name)
-    said = named if not text else time_unit(text)
-    if said is None:
-        text = text or stated.unit
-        said = time_unit(text) if text else None
-        if said is None and text:
-            # Checks the unit; times keep theirs, so that long times lose no digits.
-            converted(replace(time[0], unit=text), None, "s", "time_unit")
-            said = TimeUnit(str(unit_in(text)))
-    if said is None:
-        held = {*map(key_of, file.columns)}
-        for columns, times, text in TIMES_OF_COLUMNS:
-            if columns <= held:
-                return times, [f"ASSUMED: the times of {file.what} are {text}; it states no unit"]
-        words = {str(file.header.get(key, "") or "").strip().upper() for key in ("MISSION", "TELESCOP")}
-        mission = next((one for one in MISSIONS if one in words), None)
-        finite = values[np.isfinite(values)]
-        if mission is None or not (finite.size and 0 < float(np.median(finite)) < 20_000):
-            converted(time[0], None, "s", "time_unit")
-        name = MISSIONS[mission or "TESS"].upper()
-        said = time_unit(name) or TimeUnit("d")
-        return said, [
-            f"ASSUMED: the times of {file.what} are {name}, days, as in files of {mission}; it states no unit"
-        ]
-    if said.epoch_mjd is None and named is not None and named.unit == said.unit:
-        said = named
-    return said, []
 
 
 def _light(found: Quantities, mapping: FrameMapping) -> tuple[str, Values, Values | None, tuple[str, ...]]:

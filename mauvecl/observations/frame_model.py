@@ -1,4 +1,4 @@
-"""Model of the pixels of quiescent frames, and changes of the light that all pixels share."""
+"""Pixels of spectra: their model in quiescent frames, single bad values, and changes of the light that all share."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from mauvecl.observations.frames import Frames
 
 Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
 
 #: Units of frames of the instrument: counts of an exposure, with bias and dark current or without, and rates without
 #: these, as `stare` writes them.
@@ -50,12 +51,8 @@ class FrameModel:
     def of(cls, frames: Frames, quiet: Expectation, flare: FlareModel, flux_per_dn: Float) -> Self:
         """Match frames with the pixels or resolution elements of an instrument.
 
-        Raises InputError if wavelengths differ from the instrument's, or the unit is neither counts nor a flux density.
-
-        Parameters
-        ----------
-        flux_per_dn : ndarray, shape (n_pixel,)
-            Flux density, erg s-1 cm-2 nm-1, for one DN of the exposure in each pixel of the instrument.
+        `flux_per_dn` is the flux density, erg s-1 cm-2 nm-1, for one DN of the exposure in each of its pixels. Raises
+        InputError if wavelengths differ from the instrument's, or the unit is neither counts nor a flux density.
         """
         unit = _plain(frames.unit)
         counts = unit in {_plain(each) for each in (*COUNT_UNITS, *RATE_UNITS)}
@@ -137,10 +134,7 @@ class FrameModel:
     def exposure(self, light: Float, variance: Float, n_frames: int) -> Expectation:
         """Return the expectation of some frames, with one pixel for each value, as measured.
 
-        Parameters
-        ----------
-        light, variance : ndarray, shape (n_value,)
-            Light of a quiescent frame and its variance, in the frames' unit.
+        Light of a quiescent frame and its variance are in the frames' unit.
         """
         gain = self.gain / self.per_dn
         electrons = np.maximum(light / self.per_dn, 0.0) / gain / self.quiet.n_frames
@@ -234,23 +228,10 @@ def light_changes(
 ) -> list[LightChange]:  # fmt: skip
     """Find sudden changes of the light that all pixels share, in order of time.
 
-    The light is fitted to each frame, and its means before and after each frame are compared. A change counts if the
-    spectrum of the difference is clearly that of the star rather than one of `others`.
-
-    Parameters
-    ----------
-    excess : ndarray, shape (n_frame, n_pixel)
-        Spectra less that of the quiescent star.
-    frames : ndarray of int
-        Frames that are compared, ascending.
-    numbers : ndarray of int, shape (n_frame,)
-        Numbers of all frames on the regular grid.
-    light : ndarray, shape (n_pixel,)
-        Spectrum of the quiescent star.
-    others : ndarray, shape (k, n_pixel)
-        Spectra of flares, dark current and sky.
-    sd : ndarray, shape (n_pixel,)
-        Noise of a frame.
+    The light is fitted to each of some frames, ascending, and its means before and after each frame are compared. A
+    change counts if the spectrum of the difference is clearly that of the star rather than one of `others`: flares,
+    dark current and sky. `excess` is the spectra of all frames less that of the quiescent star, `light`; `numbers` are
+    those of all frames on the regular grid, and `sd` is the noise of a frame.
     """
     weights = light / sd**2 / float(((light / sd) ** 2).sum())
     amplitude, at = excess[frames] @ weights, numbers[frames]
@@ -279,3 +260,94 @@ def light_changes(
         for other, wide in zip(significance, widths, strict=True):
             other[max(0, place - width - wide + 1) : place + width + wide] = 0.0
     return sorted(found, key=lambda one: one.frame)
+
+
+#: Expected number of values of normal noise in all frames that are mistaken for cosmic rays.
+CHANCE_RAYS = 0.01
+#: Flares that explain the light of many pixels at once, K; their residual in one pixel of one frame is a cosmic ray.
+RAY_FLARES_K = (6_000.0, 12_000.0, 30_000.0)
+#: Largest number of rounds of replacing bad values by the fit to the others, which end where the values change by less
+#: than this share of a standard deviation.
+RAY_ROUNDS, SETTLED = 50, 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class CleanedSpectra:
+    """Frames whose single bad values are replaced."""
+
+    frames: Frames  # without bias and dark current, in the pixels that are used
+    model: FrameModel  # of these pixels
+    rays: NDArray[np.int64]  # shape (n_frame,); number of values of each frame that are replaced
+    # Shape (n_pixel,); standard deviation of a quiescent frame, as the file states it or else by the noise model of the
+    # instrument.
+    stated: Float
+    stated_by: str
+    saturated: Bool  # shape (n_frame,)
+
+
+def clean_spectra(frames: Frames, model: FrameModel) -> CleanedSpectra:
+    """Replace single bad values of spectra by a fit to the other pixels of their frame.
+
+    Flares, and changes of the star, the dark current and the sky, change many pixels. A single pixel that deviates in
+    one frame was hit by a particle or read incorrectly. Pixels that are not finite in a frame without a fault are
+    left out of all frames.
+    """
+    usable = frames.faults == 0
+    fine = np.isfinite(frames.flux[usable]).all(axis=0) & (model.bins.sum(axis=1) > 0)
+    if not fine.any() or not usable.any():
+        raise InputError.of("flux", "no pixel that is finite in every frame", "pixels with light in every frame",
+                            where=frames.name)  # fmt: skip
+    model = model.part(fine)
+    assert frames.wavelength_nm is not None
+    flux = frames.flux[:, fine]
+    saturated = usable & (flux >= model.ceiling).any(axis=1)
+    flux = flux - model.offset
+    good = usable & ~saturated
+    if not good.any():
+        raise InputError.of("flux", "saturated pixels in every frame", "frames below saturation", where=frames.name)
+    light = np.median(flux[good], axis=0)
+    error = None if frames.error is None else frames.error[:, fine]
+    stated = np.sqrt(model.variance(light)) if error is None else np.median(error[good], axis=0)
+    rays = np.zeros(frames.n_frames, np.int64)
+    rays[good] = _replace_rays(flux, np.flatnonzero(good), light, stated, model, frames.numbers)
+    made = replace(
+        frames, flux=flux, error=np.broadcast_to(stated, flux.shape) if error is None else error,
+        wavelength_nm=frames.wavelength_nm[fine],
+    )  # fmt: skip
+    return CleanedSpectra(made, model, rays, stated, "instrument" if error is None else "file", saturated)
+
+
+def _replace_rays(
+    flux: Float, at: NDArray[np.intp], light: Float, stated: Float, model: FrameModel, numbers: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Replace bad values in some frames of `flux`, in place, and return their number in each of these frames."""
+    excess = flux[at] - light
+    # Measured robustly, so that a wrong statement makes no rays.
+    scatter = PER_MAD * np.median(np.abs(np.diff(excess, axis=0)), axis=0) / np.sqrt(2.0)
+    sd = np.maximum(stated, scatter)
+    spectra = np.vstack([*model.unknowns(light).values(), model.flares(RAY_FLARES_K)])
+    basis = np.linalg.svd(spectra / np.linalg.norm(spectra, axis=1, keepdims=True) / sd, full_matrices=False)[2]
+    limit = float(scipy.stats.norm.isf(CHANCE_RAYS / 2 / excess.size))
+    bad = np.zeros(excess.shape, np.bool_)
+    rows = np.arange(at.size)
+    for _ in range(RAY_ROUNDS):
+        fit = (excess[rows] / sd) @ basis.T @ basis * sd
+        left = np.abs(excess[rows] - fit) / np.sqrt(sd**2 + model.gain * np.maximum(fit, 0.0))
+        left[bad[rows]] = 0.0
+        # The farthest alone: a large one moves the fit away from the others.
+        worst = left.argmax(axis=1)
+        far = left[np.arange(rows.size), worst] > limit
+        bad[rows[far], worst[far]] = True
+        moved = np.where(bad[rows], fit - excess[rows], 0.0)
+        excess[rows] += moved
+        rows = rows[far | (np.abs(moved) > SETTLED * sd).any(axis=1)]
+        if not rows.size:
+            break
+    # An excess in the same pixel of a neighbouring frame as well is not a ray, but light that the fit does not include.
+    adjacent = np.diff(numbers[at]) == 1
+    both = bad[1:] & bad[:-1] & adjacent[:, None]
+    bad[1:] &= ~both
+    bad[:-1] &= ~both
+    where = np.nonzero(bad)
+    flux[at[where[0]], where[1]] = (excess + light)[where]
+    return np.asarray(bad.sum(axis=1), np.int64)

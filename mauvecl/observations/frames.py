@@ -1,21 +1,27 @@
-"""Observed frames: times, fluxes, errors and quality flags."""
+"""Observed frames: times, fluxes, errors and quality flags, and their times at the barycentre."""
 
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from enum import IntFlag
 from functools import cached_property
-from typing import Annotated, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mauvecl.host.orbit.orbit import Orbit, Target
+from mauvecl.host.tables.units import SCALES, offline
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Unit
 from mauvecl.schema.physical import DAY_S, Moment
+
+if TYPE_CHECKING:
+    from astropy.time import Time
 
 #: Bits of SAP_QUALITY by number: Kepler Archive Manual (KDMC-10008-006, table 2-3), K2 Archive Manual.
 KEPLER = {
@@ -50,14 +56,7 @@ class QualityBits:
 
     @classmethod
     def of(cls, header: Mapping[str, Any], chosen: str | int | None, what: str) -> QualityBits:
-        """Return the bits that are chosen for a file, or the defaults of its mission.
-
-        Parameters
-        ----------
-        chosen : str or int, optional
-            A sum of bits; "all" or "none"; or names and numbers, such as "Desat, 128". By default lightkurve's default
-            for Kepler and K2, the same without ImpulsiveOutlier for TESS, and all bits for other files.
-        """
+        """Return the bits that are chosen for a file, or its mission's defaults; see `FrameMapping.quality_bits`."""
         said = {str(header.get(key, "") or "").strip().upper() for key in ("TELESCOP", "MISSION")}
         mission = "Kepler" if said & {"KEPLER", "K2"} else "TESS" if "TESS" in said else ""
         if chosen is None or str(chosen).strip().lower() == "default":
@@ -204,6 +203,16 @@ def _cadence_of(name: str, time: Float) -> float:
     return cadence
 
 
+def _exposures(name: str, given: ArrayLike | None, n: int, cadence: float) -> Float:
+    """Return the exposure time of each frame, by default the cadence; raise InputError for an impossible one."""
+    if given is not None and np.shape(given) not in ((), (1,), (n,)):
+        raise _bad(name, "exposure", np.shape(given), f"one exposure time, or one for each of {n} frames")
+    exposure = np.array(np.broadcast_to(np.asarray(cadence if given is None else given, np.float64), (n,)))
+    if not (np.isfinite(exposure) & (exposure > 0)).all():
+        raise _bad(name, "exposure", f"{exposure[np.argmin(exposure)]:g} s", "exposure times above 0")
+    return exposure
+
+
 @validated
 @dataclass(frozen=True, eq=False)
 class Frames:
@@ -301,18 +310,11 @@ class Frames:
         if sd is not None and sd.shape != light.shape:
             raise _bad(name, "error", sd.shape, f"the shape of the flux, {light.shape}")
         flags = _whole_flags(name, quality, n)
-        if exposure_s is not None and np.shape(exposure_s) not in ((), (1,), (n,)):
-            raise _bad(name, "exposure", np.shape(exposure_s), f"one exposure time, or one for each of {n} frames")
-        exposure = None if exposure_s is None else np.array(np.broadcast_to(np.asarray(exposure_s, np.float64), (n,)))
         order = np.argsort(time, kind="stable")
         remarks: tuple[str, ...] = ()
         if (np.diff(time) < 0).any():
             remarks = (f"the times of {name} are not ascending; its frames were sorted by time",)
-        cadence = _cadence_of(name, time[order])
-        if exposure is None:
-            exposure = np.full(n, cadence)
-        if not (np.isfinite(exposure) & (exposure > 0)).all():
-            raise _bad(name, "exposure", f"{exposure[np.argmin(exposure)]:g} s", "exposure times above 0")
+        exposure = _exposures(name, exposure_s, n, _cadence_of(name, time[order]))
         if how.get("temperature_c") is not None:
             temperature = np.asarray(how["temperature_c"], np.float64)
             if temperature.shape != (n,):
@@ -445,3 +447,91 @@ def dead_pixel_remarks(number: int, name: str) -> tuple[str, ...]:
 
 def _bad(name: str, key: str, value: Any, expected: str) -> InputError:
     return InputError.of(key, value, expected, where=name)
+
+
+#: Speed of light, km/s (exact).
+LIGHT_KM_S = 299_792.458
+#: Times that are converted at once.
+PIECE = 50_000
+
+
+def barycentric(frames: Frames, target: Target, orbit: Orbit | None = None) -> Frames:
+    """Return frames whose times are those at the Solar System's barycentre, in TDB.
+
+    The light travel time is astropy's, for a plane wave from the target (no parallax) and its built-in ephemeris,
+    which is good to some microseconds. A remark states how well the satellite's position is known.
+
+    Parameters
+    ----------
+    frames : Frames
+        Dated, at ``GEOCENTER`` or ``TOPOCENTER``; barycentric ones are returned as they are, with a remark.
+    target : Target
+    orbit : Orbit, optional
+        Orbit of the satellite, for ``TOPOCENTER``.
+    """
+    import astropy.units as u
+    from astropy.time import Time
+
+    name = frames.name
+    if frames.reference_mjd is None:
+        raise InputError(f"{name}: its times have no date", "a mapping with epoch", key="epoch")
+    if frames.position == "BARYCENTER":
+        return frames.with_remarks((f"the times of {name} are barycentric already",))
+    if frames.scale not in SCALES.values():
+        known = ", ".join(sorted(set(SCALES.values())))
+        raise InputError.of("scale", frames.scale, f"a mapping with scale, one of {known}", where=name)
+    if frames.position not in ("GEOCENTER", "TOPOCENTER"):
+        raise InputError.of("position", frames.position, "a mapping with position, TOPOCENTER or GEOCENTER", where=name)
+    if frames.position == "TOPOCENTER" and orbit is None:
+        raise InputError(f"{name}: the orbit of {frames.instrument or 'its satellite'} is not known",
+                         "two-line elements in `orbit.tle`", key="orbit.tle")  # fmt: skip
+    with offline():
+        when = Time(frames.reference_mjd, frames.time_s / DAY_S, format="mjd", scale=frames.scale)
+        parts = [when[k : k + PIECE] for k in range(0, frames.n_frames, PIECE)]
+        place = None if frames.position == "GEOCENTER" else orbit
+        late = np.concatenate([_light_travel_s(part, target, place) for part in parts])
+        first = when[0].tdb + late[0] * u.s
+        seconds = (when.tdb - first).to_value(u.s) + late
+        reference = float(first.mjd)
+    remark = f"times are at the Solar System's barycentre (TDB) for {target.name} ({target.source})"
+    if place is not None:
+        remark += f", {_accuracy(place, when)}"
+    made = replace(
+        frames, time_s=seconds, reference_mjd=reference, scale="tdb", position="BARYCENTER",
+        direction_deg=(target.ra_deg, target.dec_deg),
+    )  # fmt: skip
+    return made.with_remarks((remark,))
+
+
+def _light_travel_s(when: Time, target: Target, orbit: Orbit | None) -> Float:
+    """Return the delay of light from the observer to the barycentre, s, shape (n,); call inside `offline`."""
+    import astropy.units as u
+    from astropy.coordinates import ITRS, TEME, CartesianRepresentation, EarthLocation, SkyCoord
+    from astropy.utils import iers
+
+    # Old tables of the Earth's rotation do no harm: it is used twice, in opposite directions.
+    with (
+        iers.conf.set_temp("iers_degraded_accuracy", "ignore"),
+        iers.conf.set_temp("auto_max_age", None),
+        warnings.catch_warnings(),
+    ):
+        warnings.filterwarnings("ignore", message=".*polar motions.*")
+        utc = when.utc
+        if orbit is None:
+            observer = EarthLocation.from_geocentric(0.0, 0.0, 0.0, unit=u.m)
+        else:
+            days = np.abs(utc.jd - orbit.elements.epoch_jd).max()
+            position, _ = orbit.states(utc.jd1, utc.jd2, orbit.resolved_at(float(days)))
+            earth_fixed = TEME(CartesianRepresentation(position.T * u.km), obstime=utc).transform_to(ITRS(obstime=utc))
+            observer = EarthLocation(*earth_fixed.cartesian.xyz)
+        star = SkyCoord(target.ra_deg, target.dec_deg, unit="deg")
+        return np.asarray(utc.light_travel_time(star, "barycentric", location=observer).to_value(u.s))
+
+
+def _accuracy(orbit: Orbit, when: Time) -> str:
+    """Return the accuracy of the satellite's position, as a part of a sentence."""
+    days = float(np.abs(when.utc.jd - orbit.elements.epoch_jd).max())
+    if orbit.resolved_at(days) == "mean":
+        return f"good to {1e3 * orbit.elements.axis_km / LIGHT_KM_S:.0f} ms: the place in the orbit is not known"
+    off = 1e3 * orbit.along_track_km(days) / LIGHT_KM_S
+    return f"good to {off:.2g} ms along the track of {orbit.elements.source}"

@@ -30,11 +30,12 @@ from mauvecl.observations.level import (
     counts_per_unit,
     guess_flares,
     level_error,
+    noise_of_steps,
     quiet_variance,
+    relative_level,
     single_frames,
     spikes,
 )
-from mauvecl.observations.level_steps import relative_level
 from mauvecl.observations.process import Binned, Steps, criterion_of_process, fit_process
 from mauvecl.observations.search import SeriesSurvey, bank_of
 from mauvecl.schema.errors import InputError
@@ -95,20 +96,7 @@ def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, taken: Bool, steps
 
     Without losses, a star does not flare in many of its frames, keeps its noise, and varies slowly. Where that does not
     hold, the light curve is searched upside down for losses, and the smaller Bayesian information criterion decides.
-
-    Parameters
-    ----------
-    survey : SeriesSurvey
-        Without processes.
-    fitted : SeriesSurvey
-    taken : ndarray of bool, shape (n_frame,)
-        Process and events of `fit_quiet_light`.
-    steps : Steps, optional
-        Reports each fit and each search.
-
-    Returns
-    -------
-    ndarray of bool, shape (n_frame,)
+    `survey` has no processes; `fitted` and `taken` are the process and the events of `fit_quiet_light`.
     """
     none, process = np.zeros_like(taken), fitted.flux_process
     rotates = any(term.rotates for term in process.terms)
@@ -156,12 +144,7 @@ def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, taken: Bool, steps
 def _eclipses(survey: SeriesSurvey, usual: Callable[[], float]) -> Bool:
     """Return the frames in periodic losses, if these lower the criterion, shape (n_frame,).
 
-    Parameters
-    ----------
-    survey : SeriesSurvey
-        Without processes.
-    usual : callable
-        Returns the criterion without losses, which takes long.
+    The survey has no processes; `usual` returns the criterion without losses, which takes long.
     """
     guessed = guess_eclipses(survey)
     none = np.zeros_like(guessed)
@@ -268,36 +251,17 @@ def survey_light_curve(
 ) -> tuple[SeriesSurvey, QuiescentLevel, Frames]:
     """Fit the quiescent light of a light curve, and prepare its search.
 
-    Parameters
-    ----------
-    seed : int
-        Seed of the standard error of the level.
-    steps : Steps, optional
-        Reports fits, searches and draws.
-
-    Returns
-    -------
-    survey : SeriesSurvey
-    level : QuiescentLevel
-    frames : Frames
-        With a remark, and without errors, if they hold few counts.
+    Frames of few counts are returned with a remark and without errors. The seed is that of the standard error of the
+    level; `steps` reports fits, searches and draws.
     """
     steps = steps or Steps()
     fits = steps.part(0.0, 0.9)
-    counts = counts_per_unit(frames)
-    if counts is not None:
-        remark = "the frames hold few counts: their noise is Poisson noise of the level, and stated errors are not used"
-        frames = replace(frames, error=None).with_remarks((remark,))
+    frames, counts = _counted(frames)
     flux, error = frames.white_light
-    reasons = frames.faults.copy()
-    check_usable(frames, reasons)
-    if counts is None:
-        reasons[spikes(frames.numbers, flux, error, reasons == 0)] |= Reason.SPIKE
+    reasons = _faults(frames, counts)
     used = reasons == 0
-    steps_of_level = np.ones(flux.size)
-    if counts is None and np.ptp(frames.time_s) > LONG_S:
-        steps_of_level = _steps_of_level(frames, flux, used)
-        flux, error = flux / steps_of_level, None if error is None else error / steps_of_level
+    steps_of_level = _steps_of_level(frames, flux, used, counts)
+    flux, error = flux / steps_of_level, None if error is None else error / steps_of_level
     # A frame of no count at the least has the Poisson noise of one.
     least = 0.0 if counts is None else float(np.sqrt(max(np.median(flux[used]) * counts, 1.0))) / counts
     guessed = np.zeros(flux.size, np.bool_)
@@ -306,9 +270,7 @@ def survey_light_curve(
         used = reasons == 0
         if survey is None:
             guessed[used] = guess_flares(frames.numbers[used], flux[used], least)
-            level = np.full(flux.size, _mean(flux[used & ~guessed], least))
-            if not level.any():
-                raise InputError(f"{frames.name}: the level of its light is zero", "the light of a star", key="flux")
+            level = np.full(flux.size, _mean(frames.name, flux[used & ~guessed], least))
         quiet = used & ~guessed
         variance, photon = _noise(frames, flux, error, level, quiet, counts)
         typical = float(np.median(level[quiet]))
@@ -332,13 +294,33 @@ def survey_light_curve(
     reasons = np.where(below, reasons | Reason.BELOW, reasons)
     used = reasons == 0
     survey = survey.frames(used[searched_among(survey, frames)])
-    draws = steps.part(0.9, 1.0)
-    light = quiescent_light(frames, flux, error, survey, used, used & ~guessed, reasons, seed, draws)
+    last = steps.part(0.9, 1.0)
+    light = quiescent_light(frames, flux, error, survey, used, used & ~guessed, reasons, seed, last)
     return survey, light.times(steps_of_level), frames
 
 
-def _steps_of_level(frames: Frames, flux: Float, used: Bool) -> Float:
+def _counted(frames: Frames) -> tuple[Frames, float | None]:
+    """Return the counts in a unit of the flux of frames of few counts, and these without errors; or frames and None."""
+    if (counts := counts_per_unit(frames)) is None:
+        return frames, None
+    remark = "the frames hold few counts: their noise is Poisson noise of the level, and stated errors are not used"
+    return replace(frames, error=None).with_remarks((remark,)), counts
+
+
+def _faults(frames: Frames, counts: float | None) -> NDArray[np.int64]:
+    """Return why frames are not searched, before their level is known; raise InputError if too few are left."""
+    flux, error = frames.white_light
+    reasons = frames.faults.copy()
+    check_usable(frames, reasons)
+    if counts is None:
+        reasons[spikes(frames.numbers, flux, error, reasons == 0)] |= Reason.SPIKE
+    return reasons
+
+
+def _steps_of_level(frames: Frames, flux: Float, used: Bool, counts: float | None) -> Float:
     """Return the relative level after each sudden change, for all frames; those not used have that of the next used."""
+    if counts is not None or np.ptp(frames.time_s) <= LONG_S:
+        return np.ones(flux.size)
     relative = relative_level(frames.time_s[used], frames.numbers[used], flux[used], frames.cadence_s)
     places = np.searchsorted(np.flatnonzero(used), np.arange(flux.size))
     return relative[np.clip(places, 0, used.sum() - 1)]
@@ -361,12 +343,14 @@ def check_usable(frames: Frames, reasons: NDArray[np.int64]) -> None:
         raise InputError(f"{frames.name}: the flux of most frames is the same", "a light curve with noise", key="flux")
 
 
-def _mean(flux: Float, least: float) -> float:
-    """Return the mean without outliers; a median of whole numbers would be one of them."""
+def _mean(name: str, flux: Float, least: float) -> float:
+    """Return the mean without outliers, which must not be zero; a median of whole numbers would be one of them."""
     middle = float(np.median(flux))
     spread = max(PER_MAD * float(np.median(np.abs(flux - middle))), least)
     near = np.abs(flux - middle) <= max(FAR * spread, 1e-12 * abs(middle))
-    return float(flux[near].mean())
+    if (mean := float(flux[near].mean())) == 0.0:
+        raise InputError(f"{name}: the level of its light is zero", "the light of a star", key="flux")
+    return mean
 
 
 def _noise(
@@ -377,19 +361,14 @@ def _noise(
         return np.maximum(level, 1e-3 * float(np.median(level[quiet])) + 1e-300) / counts, 1.0 / counts
     if error is not None:
         return quiet_variance(flux, error, level, quiet)
-    steps = np.diff(flux[quiet])[np.diff(frames.numbers[quiet]) == 1]
-    spread = PER_MAD * float(np.median(np.abs(steps))) / np.sqrt(2.0) if steps.size else 0.0
+    spread = noise_of_steps(frames.numbers[quiet], flux[quiet])
     return np.full(flux.size, (spread if spread > 0 else float(np.std(flux[quiet]))) ** 2), 0.0
 
 
 def level_of(frames: Frames, flux: Float, used: Bool, survey: SeriesSurvey, quiet: Bool) -> Float:
-    """Return the quiescent level of all frames, shape (n_frame,); between searched frames it is interpolated.
+    """Return the quiescent level of all frames, shape (n_frame,); between searched frames, `used`, it is interpolated.
 
-    Parameters
-    ----------
-    used : ndarray of bool, shape (n_frame,)
-        Frames of the survey.
-    quiet : ndarray of bool, shape (n_used,)
+    `quiet` are those of the searched frames that belong to no event.
     """
     return np.interp(frames.time_s, frames.time_s[used], survey.flux_level(quiet) * survey.scale)
 

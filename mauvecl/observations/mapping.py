@@ -1,17 +1,45 @@
-"""Mapping from the columns of a file to frames, as a short TOML file that a user writes."""
+"""What the columns of a file are, by a mapping in a short TOML file or by their names, and what their times mean."""
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import model_validator
 
 from mauvecl.host.tables.files import read_text, toml
-from mauvecl.host.tables.units import EPOCHS_MJD, SCALES, offline, scale_of
+from mauvecl.host.tables.names import divided_unit, first_of, is_magnitude, key_of
+from mauvecl.host.tables.table import (
+    TableFile,
+    Values,
+    converted,
+    unit_in,
+    unit_in_name,
+)
+from mauvecl.host.tables.units import (
+    EPOCHS_MJD,
+    MISSIONS,
+    SCALES,
+    TimeSystem,
+    TimeUnit,
+    is_dated,
+    mjd_of,
+    offline,
+    position_of,
+    scale_of,
+    seconds_from_first,
+    time_in_name,
+    time_unit,
+)
 from mauvecl.schema.errors import InputError, shortened
-from mauvecl.schema.physical import Exposure
+from mauvecl.schema.physical import DAY_S, Exposure
 from mauvecl.schema.section import Record
+
+Float = NDArray[np.float64]
 
 
 class FrameMapping(Record):
@@ -133,3 +161,171 @@ class FrameMapping(Record):
             except InputError as error:
                 expected = f"one of {', '.join(EPOCHS_MJD)}, or a date such as 2026-03-01T12:00:00"
                 raise InputError.of("epoch", self.epoch, expected) from error
+
+
+#: Names of columns that need no mapping, in order of preference, in any case: those of mauvecl, of the pipelines of
+#: Kepler, K2 and TESS, of lightkurve and AltaiPony, and of K2SFF, QLP, eleanor, TASOC and gPhoton.
+KNOWN = {
+    "time": ("time",),
+    "flux": ("flux_bgsub", "flux", "pdcsap_flux", "sap_flux", "kspsap_flux", "det_flux", "corr_flux", "corrected_flux",
+             "fcor", "flux_corr", "detrended_flux", "rate", "rel_flux", "relative_flux", "normalized_flux",
+             "norm_flux", "flux_norm", "flux_normalized", "rel_flux_t1", "ujy", "count_rate", "countrate", "cps",
+             "counts", "cal_aper_flux", "whitelight_flux"),
+    "quality": ("quality", "sap_quality"),
+    "temperature": ("temperature",),
+}  # fmt: skip
+#: Names of times where no column is called time and none is named after its dates, such as BJD.
+OTHER_TIMES = ("t", "date", "datetime", "timestamp", "date-obs", "date_obs", "utc", "ut")
+#: Names of the times at which frames start and end, where no other column is a time.
+EDGES = ("t0", "t1")
+#: Part of a frame that times refer to.
+PARTS = {"start": 0.0, "middle": 0.5, "end": 1.0}
+#: Dates of observed light, MJD, from 1845 to 2269.
+DATES_MJD = (-5000.0, 150_000.0)
+#: Columns of files that state no unit of their times, these times, and what they are: Gaia DR3's epoch photometry, BJD
+#: in TCB less 2455197.5 (documentation of vari_epoch_photometry), and GALEX, Unix time less 315964800 s (user guide of
+#: gPhoton), of which the columns are those of gPhoton's light curves.
+TIMES_OF_COLUMNS = (
+    ({"transit_id", "rejected_by_photometry"}, TimeUnit("d", 55_197.0, "tcb", "BARYCENTER"),
+     "days from 2010-01-01 in TCB, as in Gaia DR3's epoch photometry"),
+    ({"t0", "t1", "cps", "cps_err"}, TimeUnit("s", EPOCHS_MJD["gps"], "utc"),
+     "seconds from 1980-01-06 in UTC, as in GALEX light curves of gPhoton"),
+)  # fmt: skip
+#: Extension of the light curves of CHEOPS. UTC in its header is that of the start and the end of a visit;
+#: BJD_TIME is in TT: pycheops 1.1.14, documentation of `Dataset`.
+CHEOPS = "SCI_COR_LIGHTCURVE"
+#: What a cell of times may be.
+DATE = "a number or a date such as 2026-03-01T12:00:00"
+
+
+def wanted_columns(mapping: FrameMapping | None) -> tuple[tuple[str, ...], ...]:
+    """Return groups of names, of each of which the chosen table has one."""
+    return (KNOWN["time"], KNOWN["flux"]) if mapping is None else tuple((name,) for name in mapping.times)
+
+
+def recognised(file: TableFile) -> FrameMapping:
+    """Return the mapping of a file whose columns have known names."""
+    # Of FITS files also images, but no columns of other extensions.
+    names = [*file.columns, *(name for name in file.names if "/" not in name and name not in file.columns)]
+    columns: dict[str, Any] = {key: first_of(known, names, file.what) for key, known in KNOWN.items()}
+    if columns["time"] is None:
+        said = {name: found for name in names if (found := time_in_name(name)) is not None}
+        dated = [name for name, one in said.items() if one.epoch_mjd is not None]
+        for place in ("BARYCENTER", "HELIOCENTER"):
+            # Dates at the barycentre are those of the light; those at the Sun are seconds from them.
+            dated = [name for name in dated if said[name].position == place] or dated
+        if len(dated) > 1:
+            fault = f"{file.what}: {len(dated)} columns may be the time: {', '.join(map(shortened, dated))}"
+            raise InputError(fault, "a mapping that names one", key="time")
+        timed = [name for name in said if re.match(r"t(?:ime)?[\s_.]", name, re.IGNORECASE)]
+        columns["time"] = dated[0] if dated else first_of((*OTHER_TIMES, *timed), names, file.what)
+    if columns["time"] is None:
+        edges = tuple(first_of((name,), names, file.what) for name in EDGES)
+        columns["time"] = None if None in edges else edges
+    flux = divided_unit(columns["flux"] or "")[0]
+    # Errors of another flux would be wrong ones.
+    ends = ("_err", "_error", "err", "_e", "_unc", "_uncertainty", "_sigma", "_std")
+    errors = [f"{flux}{end}" for end in ends] + [f"{start}{flux}" for start in ("e_", "err_", "sigma_", "sig_", "d")]
+    errors += [flux.lower().replace("flux_", "flux_err_")] if "flux_" in flux.lower() else []
+    columns["error"] = first_of((*errors, "error", "err", "uncertainty", "unc", "sigma"), names, file.what)
+    if columns["flux"] is None and (magnitudes := [name for name in names if is_magnitude(name)]):
+        fault = f"{file.what} has magnitudes ({', '.join(map(shortened, magnitudes))}) and no column of linear light"
+        raise InputError(fault, "light in a linear unit, in a column named flux or that a mapping names", key="flux")
+    if columns["time"] is None or columns["flux"] is None:
+        raise InputError(
+            f"{file.what} has the columns {shortened(', '.join(file.names), 300)}",
+            "columns named time and flux, or a mapping that names them",
+            key="mapping",
+        )
+    if "SPECTRUM" in file.names and "WAVELENGTH/WAVELENGTH" in file.names:
+        columns |= {"flux": "SPECTRUM", "error": "SPECTRUM_ERR", "wavelength": "WAVELENGTH/WAVELENGTH"}
+    return FrameMapping(**{key: value for key, value in columns.items() if value is not None})
+
+
+def times_of(
+    time: tuple[Values, ...], file: TableFile, mapping: FrameMapping
+) -> tuple[Float, Float | None, TimeSystem, tuple[str, ...]]:
+    """Return times in seconds from the first, exposure times of frames with a start and an end, and their dates."""
+    import astropy.units as u
+
+    stated = TimeSystem.of(file.header, file.what)
+    scale, position = scale_of(mapping.scale) or stated.scale, position_of(mapping.position) or stated.position
+    epoch, remarks = mapping.epoch_mjd, []
+    texts = [one.texts() for one in time]
+    if all(text is not None and any(is_dated(cell) for cell in text) for text in texts):
+        scale, unit, epoch, offset = scale or stated.default_scale or "utc", u.d, 0.0, 0.0
+        edges = [mjd_of(text or [], scale, one.name, file.what) for text, one in zip(texts, time, strict=True)]
+        if not (mapping.scale or stated.scale or stated.default_scale):
+            remarks.append(f"the dates of {file.what} state no time scale and are assumed to be in UTC")
+    else:
+        edges = [one.numbers(DATE).ravel() for one in time]
+        said, remarks = _time_unit(time, edges[0], file, mapping, stated)
+        unit = u.Unit(said.unit)
+        offset = stated.offset_in(unit, file.what)
+        scale, position = scale or said.scale or stated.default_scale, position or said.position
+        epoch = _epoch_mjd(said, stated, time[0].name, file.what) if epoch is None else epoch
+    is_cheops = str(file.header.get("EXTNAME", "")).upper().startswith(CHEOPS)
+    if is_cheops and position == "BARYCENTER" and not mapping.scale:
+        scale = "tt"
+        remarks.append(
+            f"{time[0].name} of {file.what} is in TT, as in all files of CHEOPS; UTC is the scale of its other dates"
+        )
+    exposure = None if len(edges) == 1 else np.asarray(((edges[1] - edges[0]) * unit).to_value(u.s))
+    seconds, first_d = seconds_from_first(np.mean(edges, axis=0) + offset, unit)
+    at = 0.5 if len(edges) == 2 else PARTS.get(mapping.time_at or "", stated.at)
+    if epoch is not None and mapping.epoch is None and not DATES_MJD[0] < epoch + first_d < DATES_MJD[1]:
+        span = " and ".join(f"{float(edge):g}" for edge in (np.nanmin(edges[0]), np.nanmax(edges[0])))
+        remarks.append(f"the times of {file.what} have no date, although their unit, name or header says so: {span}")
+        epoch = None
+    dates = replace(stated, epoch_mjd=None if epoch is None else epoch + first_d, scale=scale, position=position, at=at)
+    return (seconds if epoch is not None else seconds + first_d * DAY_S), exposure, dates, tuple(remarks)
+
+
+def _epoch_mjd(said: TimeUnit, stated: TimeSystem, name: str, what: str) -> float | None:
+    """Return the MJD from which times count, as their unit or name says or else the header; these must agree."""
+    if said.epoch_mjd is None or stated.epoch_mjd is None:
+        return said.epoch_mjd if stated.epoch_mjd is None else stated.epoch_mjd
+    if abs(said.epoch_mjd - stated.epoch_mjd) > 1e-5:
+        fault = (
+            f"{what}: {name!r} counts from MJD {said.epoch_mjd:g} by its unit or name and from {stated.epoch_mjd:g} by "
+            "its header"
+        )
+        raise InputError(fault, "one epoch, or a mapping with epoch", key="epoch")
+    return stated.epoch_mjd
+
+
+def _time_unit(
+    time: tuple[Values, ...], values: Float, file: TableFile, mapping: FrameMapping, stated: TimeSystem
+) -> tuple[TimeUnit, list[str]]:
+    """Return the unit of times and what it says of their zero: of the mapping, the column, its name, the header."""
+    if len({one.unit or unit_in_name(one.name) for one in time}) > 1 and not mapping.time_unit:
+        names = " and ".join(repr(one.name) for one in time)
+        raise InputError(f"{file.what}: {names} have different units", "one unit", key="time")
+    text = mapping.time_unit or time[0].unit or unit_in_name(time[0].name)
+    named = time_in_name(time[0].name)
+    said = named if not text else time_unit(text)
+    if said is None:
+        text = text or stated.unit
+        said = time_unit(text) if text else None
+        if said is None and text:
+            # Checks the unit; times keep theirs, so that long times lose no digits.
+            converted(replace(time[0], unit=text), None, "s", "time_unit")
+            said = TimeUnit(str(unit_in(text)))
+    if said is None:
+        held = {*map(key_of, file.columns)}
+        for columns, times, text in TIMES_OF_COLUMNS:
+            if columns <= held:
+                return times, [f"ASSUMED: the times of {file.what} are {text}; it states no unit"]
+        words = {str(file.header.get(key, "") or "").strip().upper() for key in ("MISSION", "TELESCOP")}
+        mission = next((one for one in MISSIONS if one in words), None)
+        finite = values[np.isfinite(values)]
+        if mission is None or not (finite.size and 0 < float(np.median(finite)) < 20_000):
+            converted(time[0], None, "s", "time_unit")
+        name = MISSIONS[mission or "TESS"].upper()
+        said = time_unit(name) or TimeUnit("d")
+        return said, [
+            f"ASSUMED: the times of {file.what} are {name}, days, as in files of {mission}; it states no unit"
+        ]
+    if said.epoch_mjd is None and named is not None and named.unit == said.unit:
+        said = named
+    return said, []

@@ -28,12 +28,7 @@ EACH = 0.07
 class Steps:
     """Part of an analysis, which reports the share of the whole that is done.
 
-    Parameters
-    ----------
-    report : callable, optional
-        Called with shares of the whole, which rise; may raise to stop the work.
-    first, last : float
-        Shares of the whole at the begin and the end of the part.
+    `report` is called with shares of the whole, which rise from `first` to `last`; it may raise to stop the work.
     """
 
     def __init__(self, report: Callable[[float], None] | None = None, first: float = 0.0, last: float = 1.0) -> None:
@@ -143,14 +138,9 @@ class ProcessTerm:
         return self.scale_s / (2 * np.pi * turns)
 
     def coefficients(self) -> tuple[list[tuple[float, float]], list[tuple[float, float, float, float]]]:
-        """Return celerite's coefficients, those of celerite2's terms to the last bit in a fraction of their time.
+        """Return a and c of each exponential, and a, b, c and d of each underdamped oscillator, as celerite names them.
 
-        Returns
-        -------
-        decays : list of tuple
-            a and c of exponentials.
-        oscillators : list of tuple
-            a, b, c and d of underdamped oscillators.
+        They are those of celerite2's terms to the last bit, in a fraction of their time.
         """
         values = np.exp(self.parameters).tolist()
         if self.kind == "correlated":
@@ -268,16 +258,9 @@ def _time(seconds: float) -> str:
 
 
 class Covariance:
-    """Covariance of values of a process with independent noise, factorised as L D L^T.
+    """Covariance of values of a process at ascending times with independent noise, factorised as L D L^T.
 
-    Parameters
-    ----------
-    kernel
-        Term of celerite2.
-    time_s : ndarray, shape (n,)
-        Ascending.
-    variance : ndarray, shape (n,)
-        Variance of the noise of each value.
+    The kernel is a term of celerite2, and the variance that of the noise of each value.
     """
 
     def __init__(self, kernel: Any, time_s: Float, variance: Float) -> None:
@@ -323,17 +306,10 @@ class Covariance:
     def squared_norms(self, columns: Float, first: int, after: int) -> Float:
         """Return v^T C^-1 v of each column, shape (n_column,).
 
-        Innovations after the last value follow from the state of the recursion there, so that their sum of squares is a
-        quadratic form of as many variables as the process has, the same for all columns.
-
-        Parameters
-        ----------
-        columns : ndarray, shape (n, n_column)
-            Values from a time on, with zeros at all times before and after; they are overwritten.
-        first : int
-            Number of this time.
-        after : int
-            Number of times after the values from which innovations are neglected.
+        Columns, which are overwritten, have values from time number `first` on, and zeros before and after. Innovations
+        after the last value follow from the state of the recursion there, so that their sum of squares is a quadratic
+        form of as many variables as the process has, the same for all columns; those more than `after` times later are
+        neglected.
         """
         last = first + len(columns)
         rows = slice(first, last)
@@ -367,11 +343,11 @@ class Covariance:
 
 @dataclass(frozen=True, eq=False)
 class LevelFit:
-    """Mean and log likelihood of values under a covariance."""
+    """Constant level of values under a covariance."""
 
     mean: float  # generalised least squares
-    mean_variance: float
     log_likelihood: float
+    left: Float  # shape (n,); innovations of the values less their mean
 
 
 def level_fit(covariance: Covariance, values: Float) -> LevelFit:
@@ -383,7 +359,7 @@ def level_fit(covariance: Covariance, values: Float) -> LevelFit:
     mean = float(both[:, 0] @ both[:, 1]) / information
     left = both[:, 0] - mean * both[:, 1]
     log_likelihood = -0.5 * (float(left @ left) + covariance.log_determinant + np.log(information))
-    return LevelFit(mean, 1.0 / information, log_likelihood)
+    return LevelFit(mean, log_likelihood, left)
 
 
 @dataclass(frozen=True, eq=False)
@@ -431,13 +407,9 @@ class Binned:
 
 
 def criterion_of_process(process: Process, data: Binned, size: float) -> float:
-    """Return the Bayesian information criterion of a process for values with the variance of their noise.
+    """Return the Bayesian information criterion of a process for values whose noise has the stated variance.
 
-    Parameters
-    ----------
-    process, data
-    size : float
-        Cost of a parameter.
+    A parameter costs `size`.
     """
     covariance = process.covariance(data.time_s, data.variance)
     return process.n_parameters * size - 2 * level_fit(covariance, data.values).log_likelihood
@@ -446,13 +418,8 @@ def criterion_of_process(process: Process, data: Binned, size: float) -> float:
 def fit_process(data: Binned, start: Process | None = None, steps: Steps | None = None) -> Process:
     """Fit a process to a light curve without flares.
 
-    Parameters
-    ----------
-    data : Binned
-    start : Process, optional
-        Process of nearly the same data: its terms are kept, and their parameters are the starting point.
-    steps : Steps, optional
-        Reports each combination of terms.
+    `start` is a process of nearly the same data, of which the terms are kept. `steps` reports each combination of
+    terms.
     """
     steps = steps or Steps()
     noise = max(data.noise / float(np.sqrt(np.median(data.variance))), 1e-6)
@@ -528,13 +495,8 @@ def _rotation(size: float, period: float) -> ProcessTerm:
 def _period(data: Binned, values: Float, share: float) -> float | None:
     """Return the period of the highest peak of a Lomb-Scargle periodogram in seconds, or None if it is noise.
 
-    Parameters
-    ----------
-    data : Binned
-    values : ndarray, shape (n_value,)
-        Values of the data, or what is left of them.
-    share : float
-        Longest period as a share of the length of the light curve.
+    The values are those of the data, or what is left of them; `share` is the longest period over the length of the
+    data.
     """
     from astropy.timeseries import LombScargle
 
@@ -598,20 +560,10 @@ def _fitted(data: Binned, terms: tuple[ProcessTerm, ...], log_excess: float) -> 
     known: dict[bytes, tuple[float, Float]] = {}
 
     def slopes(x: Float) -> tuple[float, Float]:
-        """Return the cost and its derivatives by forward differences, or backward ones at an upper bound.
-
-        These are those of scipy, which takes as long for its checks as a cost takes.
-        """
         # Fits begin where others end.
-        if x.tobytes() in known:
-            return known[x.tobytes()]
-        value, gradient = cost(x), np.empty(x.size)
-        for k, at in enumerate(x.tolist()):
-            there = np.array(x)
-            there[k] = at + DIFFERENCE if at + DIFFERENCE <= high[k] else at - DIFFERENCE
-            gradient[k] = (cost(there) - value) / (there[k] - at)
-        known[x.tobytes()] = value, gradient
-        return value, gradient
+        if x.tobytes() not in known:
+            known[x.tobytes()] = _with_slopes(cost, x, high)
+        return known[x.tobytes()]
 
     x, value = np.clip(start, low, high), np.inf
     tolerance = CONVERGED / max(abs(slopes(x)[0]), 1.0)
@@ -624,3 +576,16 @@ def _fitted(data: Binned, terms: tuple[ProcessTerm, ...], log_excess: float) -> 
         if before - value < SAME:
             break
     return made(x), 2 * value + start.size * float(np.log(data.values.size))
+
+
+def _with_slopes(cost: Callable[[Float], float], x: Float, high: Float) -> tuple[float, Float]:
+    """Return a cost and its derivatives by forward differences, or backward ones at an upper bound.
+
+    These are those of scipy, which takes as long for its checks as a cost takes.
+    """
+    value, gradient = cost(x), np.empty(x.size)
+    for k, at in enumerate(x.tolist()):
+        there = np.array(x)
+        there[k] = at + DIFFERENCE if at + DIFFERENCE <= high[k] else at - DIFFERENCE
+        gradient[k] = (cost(there) - value) / (there[k] - at)
+    return value, gradient

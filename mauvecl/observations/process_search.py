@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.threads import map_in_threads
-from mauvecl.search.search import LargestValue
 from mauvecl.search.templates import LEAST_SHARE, Bank, Template
 
 if TYPE_CHECKING:
@@ -153,19 +152,10 @@ class FrameGrid:
 class ProcessSearch:
     """Search of light curves for flares.
 
-    Parameters
-    ----------
-    bank : Bank
-        Its baseline is not used: the level is that of the processes.
-    stare : Stare
-        Only the times of its frames are used.
-    processes : sequence of Process
-        One for each sum of a frame; the sums are independent of each other.
-    variance : ndarray, shape (n_frame,)
-        Variance of the noise of each frame's sums.
-    before : ProcessSearch, optional
-        Search of the same frames and further ones, with the same bank, processes and variances. Denominators are solved
-        anew only where the further frames contribute to them.
+    Of the stare only the times of the frames are used, and of the bank no baseline: the level is that of the processes.
+    There is one for each sum of a frame, and the sums are independent of each other. The variance is that of the noise
+    of each frame's sums. `before` is a search of the same frames and further ones, with the same bank, processes and
+    variances: denominators are solved anew only where the further frames contribute to them.
     """
 
     def __init__(
@@ -210,17 +200,10 @@ class ProcessSearch:
             self._solve(one, one.unsolved)
         return [one.row() for one in self.filters]
 
-    @property
-    def n_filters(self) -> int:
-        """Number of searched templates: half-widths, phases, onsets and directions."""
-        return int(sum(np.count_nonzero(row.per_amplitude) for row in self.rows))
-
     def scores(self, sums: NDArray[Any]) -> Float:
         """Return C^-1 (sums - level) on the grid of frames with gaps, shape (n_stare, n_sum, n_grid).
 
-        Parameters
-        ----------
-        sums : ndarray, shape (n_stare, n_frame, n_sum)
+        The shape of sums is (n_stare, n_frame, n_sum), here and below.
         """
         scores = np.zeros((len(sums), sums.shape[2], self.n_grid))
         for k, (covariance, level) in enumerate(zip(self.covariances, self._levels, strict=True)):
@@ -232,12 +215,8 @@ class ProcessSearch:
     def values(self, sums: NDArray[Any], above: float | None = None) -> Iterator[tuple[FilterRow, Float]]:
         """Yield each row with rho, shape (n_stare, n_direction, n_onset); minus infinity if not searched.
 
-        Parameters
-        ----------
-        sums : ndarray, shape (n_stare, n_frame, n_sum)
-        above : float, optional
-            Positive threshold. Onsets next to gaps, at which rho of the first light curve cannot exceed it, are not
-            searched.
+        Onsets next to gaps, at which rho of the first light curve cannot exceed a positive threshold `above`, are not
+        searched.
         """
         rows = self.rows if above is None else [None] * len(self.filters)
         scores = Correlations(self.scores(sums), [(one.shape.size, one.first) for one in self.filters])
@@ -262,34 +241,15 @@ class ProcessSearch:
         rho[:, ~tried] = -np.inf
         return row, rho
 
-    def largest(self, sums: NDArray[Any]) -> LargestValue:
-        """Return the largest value of each light curve and its template.
-
-        Parameters
-        ----------
-        sums : ndarray, shape (n_stare, n_frame, n_sum)
-        """
+    def largest(self, sums: NDArray[Any]) -> Float:
+        """Return the largest value of each light curve, shape (n_stare,)."""
         size = max(1, BATCH // (self.n_grid * sums.shape[2]))
-        parts = [self._largest(sums[k : k + size]) for k in range(0, len(sums), size)]
-        return LargestValue(
-            *(np.concatenate([getattr(p, name) for p in parts]) for name in LargestValue.__annotations__)
-        )
-
-    def _largest(self, sums: NDArray[Any]) -> LargestValue:
-        n = len(sums)
-        best, every = np.full(n, -np.inf), np.arange(n)
-        peak, width, amplitude = np.zeros((3, n))
-        temperature = np.zeros(n, np.int64)
-        for row, rho in self.values(sums):
-            flat = rho.reshape(n, -1)
-            which = flat.argmax(axis=1)
-            value = flat[every, which]
-            better = value > best
-            direction, onset = np.divmod(which[better], rho.shape[2])
-            best[better], width[better], temperature[better] = value[better], row.template.half_width_s, direction
-            peak[better] = self.peak_s(row, onset)
-            amplitude[better] = value[better] / row.per_amplitude[direction, onset]
-        return LargestValue(best, peak, width, temperature, amplitude)
+        best = np.full(len(sums), -np.inf)
+        for first in range(0, len(sums), size):
+            part = slice(first, first + size)
+            for _, rho in self.values(sums[part]):
+                best[part] = np.maximum(best[part], rho.max(axis=(1, 2)))
+        return best
 
     def peak_s(self, row: FilterRow, onset: NDArray[np.int64]) -> Float:
         """Return the times of the peaks of templates, from the start of the stare's numbering."""
@@ -409,12 +369,7 @@ def _threads(n_values: int) -> int | None:
 class Correlations:
     """Correlations of light curves with many kernels, of which those of alike lengths share the transforms of the data.
 
-    Parameters
-    ----------
-    values : ndarray, shape (..., n)
-        Values outside are zero.
-    kernels : sequence of tuple of int
-        Length and first frame of each kernel.
+    Values beyond the ends of the last axis are zero. A kernel is announced by its length and first frame.
     """
 
     def __init__(self, values: Float, kernels: Sequence[tuple[int, int]]) -> None:

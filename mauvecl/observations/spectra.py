@@ -1,4 +1,4 @@
-"""Spectra of observed frames: single bad pixels, noise of each pixel as measured, and sums weighted for flares.
+"""Spectra of observed frames: noise of each pixel as measured, sums weighted for flares, and spectra of events.
 
 The weights are those of the marginalised matched filter (METHODS section 7) for flares of 6000 to 30 000 K, with the
 noise of each pixel. The level of each frame is free: pointing losses change it, and a faint star does not show them.
@@ -8,20 +8,29 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
 from mauvecl.detection.nuisances import Nuisances
+from mauvecl.fits.spectrum import Measurement, fit
+from mauvecl.noise.unknowns import NUISANCES, Amplitude
 from mauvecl.observations.detection import fit_quiet_light
-from mauvecl.observations.frame_model import FrameModel, LightChange, light_changes
+from mauvecl.observations.frame_model import (
+    CLEARLY,
+    CleanedSpectra,
+    FrameModel,
+    LightChange,
+    chi2_of_one,
+    light_changes,
+)
 from mauvecl.observations.frames import Reason
-from mauvecl.observations.level import PER_MAD, QuiescentLevel, guess_flares, single_frames
+from mauvecl.observations.level import QuiescentLevel, guess_flares, single_frames
 from mauvecl.observations.light_curve import check_usable, quiescent_light, searched_among
 from mauvecl.observations.process import Steps
-from mauvecl.observations.search import WHITE, SeriesSurvey, bank_of, stare_of
+from mauvecl.observations.search import MIN_BASELINE, WHITE, Detection, SeriesSurvey, bank_of, stare_of
 from mauvecl.schema.errors import InputError
 from mauvecl.search.templates import TEMPERATURES_K, Templates
 
@@ -32,13 +41,6 @@ if TYPE_CHECKING:
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
-#: Expected number of values of normal noise in all frames that are mistaken for cosmic rays.
-CHANCE_RAYS = 0.01
-#: Flares that explain the light of many pixels at once, K; their residual in one pixel of one frame is a cosmic ray.
-RAY_FLARES_K = (6_000.0, 12_000.0, 30_000.0)
-#: Largest number of rounds of replacing bad values by the fit to the others, which end where the values change by less
-#: than this share of a standard deviation.
-RAY_ROUNDS, SETTLED = 50, 0.05
 #: Differences, in standard errors, above which measured noise replaces stated noise.
 DEPARTS = 4.0
 #: Largest number of times that weights and events are found in alternation, and the share of the frames in events that
@@ -54,20 +56,6 @@ DARK_DRIFTS, BEYOND_JITTER = 5.0, 2.0
 NINE_TENTHS = float(scipy.stats.norm.ppf(0.95) - scipy.stats.norm.ppf(0.05))
 #: Frames of one block of computations, which bounds the memory.
 BLOCK = 1024
-
-
-@dataclass(frozen=True, eq=False)
-class CleanedSpectra:
-    """Frames whose single bad values are replaced."""
-
-    frames: Frames  # without bias and dark current, in the pixels that are used
-    model: FrameModel  # of these pixels
-    rays: NDArray[np.int64]  # shape (n_frame,); number of values of each frame that are replaced
-    # Shape (n_pixel,); standard deviation of a quiescent frame, as the file states it or else by the noise model of the
-    # instrument.
-    stated: Float
-    stated_by: str
-    saturated: Bool  # shape (n_frame,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,11 +99,6 @@ class SpectralSeries:
     dark_drift: float
 
     @property
-    def left_out(self) -> list[str]:
-        """Names of the unknowns whose changes from frame to frame the search leaves out."""
-        return [name for name, sd in self.jitters.items() if np.isinf(sd)]
-
-    @property
     def star_level(self) -> float:
         """Light of the star in the sum over wavelength, relative to `light`, by the shape of its spectrum.
 
@@ -135,87 +118,11 @@ def relative_error(differences: int) -> float:
     return 0.5 * float(np.sqrt(3.0 / max(differences, 1)))
 
 
-def clean_spectra(frames: Frames, model: FrameModel) -> CleanedSpectra:
-    """Replace single bad values of spectra by a fit to the other pixels of their frame.
-
-    Flares, and changes of the star, the dark current and the sky, change many pixels. A single pixel that deviates in
-    one frame was hit by a particle or read incorrectly. Pixels that are not finite in a frame without a fault are
-    left out of all frames.
-    """
-    usable = frames.faults == 0
-    fine = np.isfinite(frames.flux[usable]).all(axis=0) & (model.bins.sum(axis=1) > 0)
-    if not fine.any() or not usable.any():
-        raise InputError.of("flux", "no pixel that is finite in every frame", "pixels with light in every frame",
-                            where=frames.name)  # fmt: skip
-    model = model.part(fine)
-    assert frames.wavelength_nm is not None
-    flux = frames.flux[:, fine]
-    saturated = usable & (flux >= model.ceiling).any(axis=1)
-    flux = flux - model.offset
-    good = usable & ~saturated
-    if not good.any():
-        raise InputError.of("flux", "saturated pixels in every frame", "frames below saturation", where=frames.name)
-    light = np.median(flux[good], axis=0)
-    error = None if frames.error is None else frames.error[:, fine]
-    stated = np.sqrt(model.variance(light)) if error is None else np.median(error[good], axis=0)
-    rays = np.zeros(frames.n_frames, np.int64)
-    rays[good] = _replace_rays(flux, np.flatnonzero(good), light, stated, model, frames.numbers)
-    made = replace(
-        frames, flux=flux, error=np.broadcast_to(stated, flux.shape) if error is None else error,
-        wavelength_nm=frames.wavelength_nm[fine],
-    )  # fmt: skip
-    return CleanedSpectra(made, model, rays, stated, "instrument" if error is None else "file", saturated)
-
-
-def _replace_rays(
-    flux: Float, at: NDArray[np.intp], light: Float, stated: Float, model: FrameModel, numbers: NDArray[np.int64]
-) -> NDArray[np.int64]:
-    """Replace bad values in some frames of `flux`, in place, and return their number in each of these frames."""
-    excess = flux[at] - light
-    # Measured robustly, so that a wrong statement makes no rays.
-    scatter = PER_MAD * np.median(np.abs(np.diff(excess, axis=0)), axis=0) / np.sqrt(2.0)
-    sd = np.maximum(stated, scatter)
-    spectra = np.vstack([*model.unknowns(light).values(), model.flares(RAY_FLARES_K)])
-    basis = np.linalg.svd(spectra / np.linalg.norm(spectra, axis=1, keepdims=True) / sd, full_matrices=False)[2]
-    limit = float(scipy.stats.norm.isf(CHANCE_RAYS / 2 / excess.size))
-    bad = np.zeros(excess.shape, np.bool_)
-    rows = np.arange(at.size)
-    for _ in range(RAY_ROUNDS):
-        fit = (excess[rows] / sd) @ basis.T @ basis * sd
-        left = np.abs(excess[rows] - fit) / np.sqrt(sd**2 + model.gain * np.maximum(fit, 0.0))
-        left[bad[rows]] = 0.0
-        # The farthest alone: a large one moves the fit away from the others.
-        worst = left.argmax(axis=1)
-        far = left[np.arange(rows.size), worst] > limit
-        bad[rows[far], worst[far]] = True
-        moved = np.where(bad[rows], fit - excess[rows], 0.0)
-        excess[rows] += moved
-        rows = rows[far | (np.abs(moved) > SETTLED * sd).any(axis=1)]
-        if not rows.size:
-            break
-    # An excess in the same pixel of a neighbouring frame as well is not a ray, but light that the fit does not include.
-    adjacent = np.diff(numbers[at]) == 1
-    both = bad[1:] & bad[:-1] & adjacent[:, None]
-    bad[1:] &= ~both
-    bad[:-1] &= ~both
-    where = np.nonzero(bad)
-    flux[at[where[0]], where[1]] = (excess + light)[where]
-    return np.asarray(bad.sum(axis=1), np.int64)
-
-
 def measure_noise(excess: Float, pairs: NDArray[np.intp], stated: Float, shared: Float, nm: Float) -> PixelNoise:
     """Measure the noise of each pixel from differences of neighbouring quiescent frames.
 
-    Parameters
-    ----------
-    excess : ndarray, shape (n_frame, n_pixel)
-    pairs : ndarray of int
-        Quiescent frames whose successor is the next one, and quiescent.
-    stated : ndarray, shape (n_pixel,)
-        Standard deviation of a frame that is expected.
-    shared : ndarray, shape (k, n_pixel)
-        Spectra of changes that all pixels share; their amplitudes are fitted in each frame.
-    nm : ndarray, shape (n_pixel,)
+    The frames of `pairs` and their successors are quiescent and next to each other. The noise of a frame is expected to
+    be as `stated`. Amplitudes of changes that all pixels share, with the spectra `shared`, are fitted to each frame.
     """
     basis = np.linalg.svd(shared / stated, full_matrices=False)[2]
     total = np.zeros(stated.size)
@@ -241,11 +148,11 @@ def survey_spectra(
     """Prepare the search of spectra that is weighted for flares.
 
     Slow changes of the dark current and of what else the weights let through are processes of the weighted sums; the
-    level of the light in each frame is free, so that pointing losses take no part.
+    level of the light in each frame is free, so that pointing losses take no part. The level that is returned is that
+    of the sum over wavelength, with flags of single frames that only the weighted sums show.
 
     Parameters
     ----------
-    shape : Shape
     rank : int
         Largest number of sums of a frame.
     seed : int
@@ -255,19 +162,11 @@ def survey_spectra(
         state it, that of the light is infinite and that of the dark current as measured.
     steps : Steps, optional
         Reports fits, searches and draws.
-
-    Returns
-    -------
-    survey : SeriesSurvey
-    series : SpectralSeries
-    level : QuiescentLevel
-        Of the sum over wavelength, with flags of single frames that only the weighted sums show.
     """
     steps = steps or Steps()
     fits = steps.part(0.0, 0.9)
     frames = cleaned.frames
-    flux, error = frames.white_light
-    assert error is not None
+    flux, _ = frames.white_light
     reasons = frames.faults | np.where(cleaned.saturated, Reason.SATURATED, 0)
     check_usable(frames, reasons)
     used = reasons == 0
@@ -275,20 +174,8 @@ def survey_spectra(
     events[used] = guess_flares(frames.numbers[used], flux[used])
     for _ in range(ROUNDS):
         series, templates, sums = _weighted_sums(cleaned, reasons, used & ~events, rank, jitters)
-        directions = templates.directions[list(templates.chosen)]
-        stare = stare_of(frames, used)
-        scale = float(np.median(error[used]))
-        # The noise follows that of the whole light in time.
-        variance = (error[used] / scale) ** 2
-        light = series.light
-        lit = np.maximum(light, 0.0)
-        # Frames without light, such as dark frames, have no photon noise to weight by.
-        photon = float(np.average(series.model.gain, weights=lit if lit.any() else None))
-        survey = SeriesSurvey(
-            stare, bank_of(stare, directions, shape), templates, sums[used], variance, (WHITE,) * sums.shape[1],
-            flux[used] / scale, variance, WHITE, scale, abs(float(np.median(flux[used & ~events]))), photon,
-            frames.time_s[used], weighted=True,
-        )  # fmt: skip
+        typical = abs(float(np.median(flux[used & ~events])))
+        survey = _survey(frames, series, templates, sums, used, shape, typical)
         survey, taken = fit_quiet_light(survey, events[used], None, fits)
         now = np.zeros(flux.size, np.bool_)
         now[used] = taken
@@ -309,17 +196,33 @@ def survey_spectra(
     return survey, series, level
 
 
+def _survey(
+    frames: Frames, series: SpectralSeries, templates: Templates, sums: Float, used: Bool, shape: Shape, level: float
+) -> SeriesSurvey:
+    """Return the survey of the weighted sums of the frames that are searched, without processes."""
+    flux, error = frames.white_light
+    assert error is not None
+    stare = stare_of(frames, used)
+    scale = float(np.median(error[used]))
+    # The noise follows that of the whole light in time.
+    variance = (error[used] / scale) ** 2
+    lit = np.maximum(series.light, 0.0)
+    # Frames without light, such as dark frames, have no photon noise to weight by.
+    photon = float(np.average(series.model.gain, weights=lit if lit.any() else None))
+    bank = bank_of(stare, templates.directions[list(templates.chosen)], shape)
+    return SeriesSurvey(
+        stare, bank, templates, sums[used], variance, (WHITE,) * sums.shape[1], flux[used] / scale, variance, WHITE,
+        scale, level, photon, frames.time_s[used], weighted=True,
+    )  # fmt: skip
+
+
 def _weighted_sums(
     cleaned: CleanedSpectra, reasons: NDArray[np.int64], quiet: Bool, rank: int, jitters: Mapping[str, float] | None
 ) -> tuple[SpectralSeries, Templates, Float]:
     """Return the spectra less that of the quiescent star, the weights for flares, and the weighted sums of each frame.
 
-    Sums have unit covariance from frame to frame, and are independent of each other over longer times as well.
-
-    Parameters
-    ----------
-    quiet : ndarray of bool, shape (n_frame,)
-        Frames that belong to no event.
+    Sums have unit covariance from frame to frame, and are independent of each other over longer times as well. Frames
+    that belong to no event are `quiet`.
     """
     frames, model = cleaned.frames, cleaned.model
     light = frames.flux[quiet].mean(axis=0)
@@ -377,19 +280,9 @@ def _slow_means(values: Float) -> Float:
 
 
 def fit_changes(excess: Float, spectra: Float, sd: Float) -> tuple[Float, Float]:
-    """Fit the amplitudes of spectra together to each frame.
+    """Fit the amplitudes of spectra together to each frame; return them, shape (n_frame, k), and their covariance.
 
-    Parameters
-    ----------
-    excess : ndarray, shape (n_frame, n_pixel)
-    spectra : ndarray, shape (k, n_pixel)
-    sd : ndarray, shape (n_pixel,)
-        Noise of a frame.
-
-    Returns
-    -------
-    amplitudes : ndarray, shape (n_frame, k)
-    covariance : ndarray, shape (k, k)
+    The noise of a frame is `sd`.
     """
     white = spectra / sd
     covariance: Float = np.asarray(np.linalg.inv(white @ white.T), np.float64)
@@ -399,16 +292,7 @@ def fit_changes(excess: Float, spectra: Float, sd: Float) -> tuple[Float, Float]
 def _dark_changes(
     excess: Float, pairs: NDArray[np.intp], quiet: Bool, sd: Float, shared: Float
 ) -> tuple[dict[str, float], float]:
-    """Measure changes of the dark current, which is fitted together with the light.
-
-    Parameters
-    ----------
-    pairs : ndarray of int
-        Quiescent frames whose successor is quiescent.
-    quiet : ndarray of bool, shape (n_frame,)
-    sd : ndarray, shape (n_pixel,)
-    shared : ndarray, shape (2, n_pixel)
-        Spectra of light and dark current.
+    """Measure changes of the dark current, which is fitted together with the light; both spectra are `shared`.
 
     Returns
     -------
@@ -439,3 +323,221 @@ def _whitening(sums: Float, pairs: NDArray[np.intp]) -> Float | None:
     error = 2 * relative_error(pairs.size)
     departs = np.abs(covariance - np.eye(len(covariance))) > DEPARTS * error
     return np.linalg.inv(np.linalg.cholesky(covariance)) if departs.any() else None
+
+
+@dataclass(frozen=True)
+class Colour:
+    """Spectrum of an event against the spectrum of the quiescent star."""
+
+    # chi2, dof: chi-squared of the event's spectrum as a multiple of the quiescent one.
+    chi2: float
+    dof: int
+    # Probability of a chi-squared at least as large for an event without colour, such as a step of the throughput.
+    p_value: float
+    # Rise relative to the quiescent star in the blue half of the pixels over that in the red half: 1 without colour.
+    blue_over_red: float
+    blue_over_red_error: float
+
+
+def event_colour(spectra: Float, error: Float, event: NDArray[np.bool_], quiet: NDArray[np.bool_]) -> Colour:
+    """Compare the mean spectrum of the frames of an event with that of the quiescent star near it.
+
+    Pixels are in order of wavelength; those that are not finite in a frame are left out.
+    """
+    fine = np.isfinite(spectra).all(axis=0) & np.isfinite(error).all(axis=0) & (error > 0).all(axis=0)
+    spectra, error = spectra[:, fine], error[:, fine]
+    star = spectra[quiet].mean(axis=0)
+    excess = spectra[event].mean(axis=0) - star
+    count, base = np.count_nonzero(event), np.count_nonzero(quiet)
+    variance = (error[event] ** 2).sum(axis=0) / count**2 + (error[quiet] ** 2).sum(axis=0) / base**2
+    scale = _multiple(excess, star, variance)
+    chi2 = float(((excess - scale[0] * star) ** 2 / variance).sum())
+    dof = int(fine.sum()) - 1
+    half = fine.sum() // 2
+    blue, red = (_multiple(excess[part], star[part], variance[part]) for part in (slice(None, half), slice(half, None)))
+    ratio = blue[0] / red[0]
+    relative = np.hypot(blue[1] / blue[0], red[1] / red[0])
+    return Colour(chi2, dof, float(scipy.stats.chi2.sf(chi2, dof)), float(ratio), float(abs(ratio) * relative))
+
+
+def _multiple(excess: Float, star: Float, variance: Float) -> tuple[float, float]:
+    """Return the best multiple of the star in a spectrum, and its standard error."""
+    information = float((star**2 / variance).sum())
+    return float((excess * star / variance).sum()) / information, information**-0.5
+
+
+Cause = Literal["flare", "throughput", "dark current", "sky", "cosmic ray"]
+#: Words for the unknowns of frames that may cause an event.
+CAUSES: dict[str, Cause] = {"light": "throughput", "dark": "dark current", "sky": "sky"}
+#: S/N of a flare, next to unknown changes of star, dark current and sky, from which an event is a flare.
+FLARE_SNR = 4.0
+#: Share of an event's chi-squared in a single pixel from which it is that of a cosmic ray.
+RAY_SHARE = 0.5
+#: Smallest number of means of quiescent frames from which drifts are measured.
+MIN_PARTS = 8
+#: Share of the frames of such a part that must be quiescent.
+QUIET_SHARE = 0.5
+#: Probability of a worse fit below which no spectrum that is known explains an event.
+NO_FIT = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class EventSpectrum:
+    """Spectrum of an event and its fits."""
+
+    cause: Cause  # explanation of the spectrum: a flare, or a change that resembles one
+    snr: float  # S/N of a flare whose amplitude is fitted together with changes of star, dark current and sky
+    # Chi-squared of single causes, each with its best amplitude, and flares with their best temperature.
+    chi2: dict[Cause, float]
+    dof: int
+    p_value: float  # probability of a chi-squared at least as large as the smallest, if its cause is right
+
+    @property
+    def ambiguous(self) -> bool:
+        """True if a flare explains the spectrum best, but hardly better than a change of the instrument does."""
+        others = min(value for cause, value in self.chi2.items() if cause != "flare")
+        return self.cause == "flare" and others < self.chi2["flare"] + CLEARLY
+
+    @property
+    def reason(self) -> str:
+        """Reason why the event is not a flare, or is doubtful; empty for a clear flare."""
+        if self.cause == "cosmic ray":
+            return "its light is in a single pixel, as that of a cosmic ray"
+        if self.cause != "flare":
+            gain = self.chi2["flare"] - self.chi2[self.cause]
+            return f"its spectrum is that of a change of the {self.cause}: chi-squared is {gain:.3g} below a flare's"
+        if self.ambiguous:
+            return "its spectrum does not distinguish it from a change of the instrument"
+        return "no flare of one temperature fits its spectrum" if self.p_value < NO_FIT else ""
+
+
+def event_spectrum(
+    survey: SeriesSurvey, series: SpectralSeries, taken: NDArray[np.bool_], one: Detection
+) -> EventSpectrum:
+    """Compare the spectrum of an event with those of flares and of changes that resemble them."""
+    spectrum, variance = _weighted(survey, series, taken, one)
+    flares = series.model.flares(TEMPERATURES_K)
+    unknown = series.model.unknowns(series.light)
+    whole = float((spectrum**2 / variance).sum())
+    # Light is added, never taken away.
+    rises = flares @ (spectrum / variance) > 0
+    chi2: dict[Cause, float] = {"flare": float(np.where(rises, chi2_of_one(spectrum, variance, flares), whole).min())}
+    chi2 |= {CAUSES[name]: float(chi2_of_one(spectrum, variance, row[None])[0]) for name, row in unknown.items()}
+    together = Nuisances(tuple(unknown), np.array(list(unknown.values())), np.full(len(unknown), np.inf))
+    rows = together.rows(variance, together.spectra)
+    optimal = flares / variance - (flares @ rows.T) @ rows
+    values = (optimal @ spectrum) / np.sqrt(np.einsum("kp,kp->k", optimal, flares))
+    snr = float(values.max())
+    cause: Cause = min(chi2, key=lambda name: chi2[name])
+    dof = spectrum.size - 1
+    least = chi2[cause]
+    left = spectrum - _fitted(cause, spectrum, variance, flares, unknown)
+    p_value = float(scipy.stats.chi2.sf(least, dof))
+    if p_value < NO_FIT and (left**2 / variance).max() > RAY_SHARE * least:
+        cause = "cosmic ray"
+    elif cause != "flare" and (chi2["flare"] - least < CLEARLY or snr >= FLARE_SNR):
+        cause = "flare"
+    return EventSpectrum(cause, snr, chi2, dof, p_value)
+
+
+def _fitted(cause: Cause, spectrum: Float, variance: Float, flares: Float, unknown: dict[str, Float]) -> Float:
+    """Return the best fit of a single cause, shape (n_pixel,)."""
+    rows = flares if cause == "flare" else np.array([row for name, row in unknown.items() if CAUSES[name] == cause])
+    row = rows[int(np.argmin(chi2_of_one(spectrum, variance, rows)))]
+    return np.asarray((row @ (spectrum / variance)) / (row @ (row / variance)) * row)
+
+
+def _window(
+    survey: SeriesSurvey, taken: NDArray[np.bool_], one: Detection
+) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Return the frames of an event and of its surroundings without other events, and which belong to the event."""
+    lead, tail = survey.bank.window(one.half_width_s)
+    numbers = survey.stare.numbers
+    inside = np.zeros(numbers.size, np.bool_)
+    inside[one.first : one.last + 1] = True
+    near = (numbers >= numbers[one.first] - lead) & (numbers <= numbers[one.last] + tail)
+    at = np.flatnonzero(near & (inside | ~taken))
+    return at, inside[at]
+
+
+def _weighted(
+    survey: SeriesSurvey, series: SpectralSeries, taken: NDArray[np.bool_], one: Detection
+) -> tuple[Float, Float]:
+    """Return the spectrum of an event, of the size of its peak, and its variance.
+
+    The template of the search is fitted to each pixel, with a straight line.
+    """
+    at, _ = _window(survey, taken, one)
+    start = survey.stare.start_s[at]
+    edges = np.column_stack([start, start + survey.stare.frame_s])
+    shape = survey.bank.shape.mean_over(edges, one.peak_s, one.half_width_s)
+    middle = (start - start.mean()) / max(float(np.ptp(start)), 1.0)
+    weights = np.linalg.pinv(np.column_stack([shape, np.ones(at.size), middle]))[0]
+    spectrum = weights @ series.excess[at]
+    quiet = (weights**2).sum() * series.noise.used**2
+    photons = series.model.gain * np.maximum(spectrum, 0.0) * float((weights**2) @ np.maximum(shape, 0.0))
+    return np.asarray(spectrum), np.asarray(quiet + photons)
+
+
+def drifts(survey: SeriesSurvey, series: SpectralSeries, taken: NDArray[np.bool_], n_frames: int) -> dict[str, float]:
+    """Return the differences of star, dark current and sky between parts of the frames and their surroundings.
+
+    They are standard deviations, by name, and follow from means of `n_frames` quiescent frames, compared with the means
+    before and after: the scatter in excess of noise, and the part that noise may hide. If there are fewer than
+    `MIN_PARTS` such means, shorter ones are taken, and changes are assumed to grow in proportion to time. The sky
+    changes by its documented prior.
+    """
+    unknown = series.model.unknowns(series.light)
+    names = ("light", "dark")
+    spectra = np.array([unknown[name] for name in names])
+    amplitudes, covariance = fit_changes(series.excess, spectra, series.noise.used)
+    found = dict.fromkeys(names, np.inf)
+    size, means, counts = n_frames, list[Float](), np.zeros(0, np.intp)
+    while size > 0 and len(means) < MIN_PARTS:
+        part = survey.stare.numbers // size
+        counts = np.bincount(part[~taken], minlength=int(part[-1]) + 1)
+        # A part without the frames of a short event still shows the drift.
+        enough = np.flatnonzero(counts > QUIET_SHARE * size)
+        means, counts = [amplitudes[(part == k) & ~taken].mean(axis=0) for k in enough], counts[enough]
+        size = size if len(means) >= MIN_PARTS else size // 2
+    if len(means) >= MIN_PARTS:
+        bends = np.diff(np.array(means), 2, axis=0) / 2
+        for k, name in enumerate(names):
+            share = 1.0 / counts
+            # A mean less that of its neighbours has 3/2 of the variance of a mean, where all are of as many frames.
+            expected = float(covariance[k, k]) * float((share[:-2] / 4 + share[1:-1] + share[2:] / 4).mean())
+            beyond = max(float(np.mean(bends[:, k] ** 2)) - expected, 0.0)
+            found[name] = n_frames / size * float(np.sqrt(beyond + 2 * expected * np.sqrt(2 / len(bends))))
+    if "sky" in unknown and isinstance(NUISANCES["sky"].prior, Amplitude):
+        found["sky"] = NUISANCES["sky"].prior.sd
+    return found
+
+
+def measure_flare(
+    survey: SeriesSurvey, series: SpectralSeries, taken: NDArray[np.bool_], one: Detection
+) -> Measurement | str:
+    """Fit a flare to the sum of the spectra of an event, or return the reason why none is.
+
+    The level of each pixel is the mean of the surroundings of the event. Star, dark current and sky may differ from
+    these during the event, by as much as between other parts of the frames that are as long; see `drifts`.
+    """
+    at, inside = _window(survey, taken, one)
+    n, base = int(inside.sum()), int((~inside).sum())
+    if base < MIN_BASELINE:
+        return f"{base} frames around it show the quiescent star, {MIN_BASELINE} are needed"
+    excess = series.excess[at]
+    summed = excess[inside].sum(axis=0) - n * excess[~inside].mean(axis=0)
+    model = series.model
+    # The level is that of a finite number of frames.
+    variance = series.noise.used**2 * (1 + n / base)
+    exposure = model.exposure(series.light, variance, n)
+    unknown = {name: row * n / model.per_dn for name, row in model.unknowns(series.light).items()}
+    sd = drifts(survey, series, taken, n)
+    spectra, errors = np.array(list(unknown.values())), np.array([sd[name] for name in unknown])
+    # What changes the light of the star changes that of the flare alike.
+    of_flare = np.array([np.full(summed.size, float(name == "light")) for name in unknown])
+    nuisances = Nuisances(tuple(unknown), spectra, errors, of_flare)
+    try:
+        return fit((summed / model.per_dn + exposure.recorded_dn)[None], exposure, model.flares_of(n), nuisances)
+    except InputError as error:
+        return str(error)

@@ -157,14 +157,7 @@ class _Linearised:
         return float(left @ left), float(np.any(self.design != 0, axis=1).sum() - np.sum(covariance * self.normal))
 
     def scaled(self, found: Float, covariance: Float, smoothing: float, basis: Float) -> Float:
-        """Return the covariance with the smoothing's bias as large as that of the fitted curve, on average over pixels.
-
-        Parameters
-        ----------
-        found, covariance : ndarray
-            From `solved`.
-        basis : ndarray, shape (n_pixel, n_coefficient)
-        """
+        """Return the covariance with a smoothing bias as large as that of the fitted curve, on average over pixels."""
         n = len(self.penalty)
         pull = np.zeros_like(covariance)
         pull[:, :n] = smoothing * covariance[:, :n] @ self.penalty
@@ -371,11 +364,8 @@ def fit_throughput(
 
     Parameters
     ----------
-    stars : sequence of CalibrationFrames
-        At least one, each with its spectrum.
     knots : int
         Number of intervals of the spline.
-    order : {"paper", "physical"}
     light_error : float
         Relative standard deviation of the light of an observation, by pointing.
     spectrum_error : float, optional

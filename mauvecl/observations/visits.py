@@ -205,12 +205,8 @@ def pixels_of(counts_dn: Float, quiet: Expectation) -> tuple[int, int]:
 def error_of_change(counts_dn: Float, quiet: Expectation, unknown: Nuisances | None) -> float:
     """Return the standard error of the amplitude of a change in one exposure, from pixels that do not saturate.
 
-    It is infinite if the unknowns hide the change, and NaN if no pixel is left.
-
-    Parameters
-    ----------
-    counts_dn : ndarray, shape (n_pixel,)
-        DN of the exposure for an amplitude of one.
+    `counts_dn` is the DN of the exposure for an amplitude of one. The error is infinite if the unknowns hide the
+    change, and NaN if no pixel is left.
     """
     variance, used = variance_of(quiet)
     lost, concerned = pixels_of(counts_dn, quiet)
@@ -225,13 +221,9 @@ def error_of_change(counts_dn: Float, quiet: Expectation, unknown: Nuisances | N
 
 
 def error_of_index(weights: Float, quiet: Expectation, unknown: Nuisances | None) -> float:
-    """Return the standard deviation of a weighted sum of an exposure.
+    """Return the standard deviation of a weighted sum of the pixels of an exposure.
 
     It is infinite if a free unknown changes the sum, and NaN if a pixel with a weight is near saturation.
-
-    Parameters
-    ----------
-    weights : ndarray, shape (n_pixel,)
     """
     if (weights[~variance_of(quiet)[1]] != 0.0).any():
         return float("nan")
@@ -425,21 +417,10 @@ class Change:
         file: Source | None,
         band: str,
     ) -> Self:
-        """Return a change by name.
+        """Return a change by name: lines, ``balmer jump``, ``colour``, a band as in ``200-320``, or ``spectrum``.
 
-        Parameters
-        ----------
-        name : str
-            A line or group of lines, ``balmer jump``, ``colour``, a band as in ``200-320``, or ``spectrum``.
-        star : Source
-            At its brightness.
-        quiet : Expectation
-            One exposure.
-        order : {"paper", "physical"}
-        file : Source, optional
-            Light that the change ``spectrum`` adds.
-        band : str
-            In which the light of that spectrum is measured.
+        The star is at its brightness, and the expectation that of one exposure. ``spectrum`` adds the light of `file`,
+        which is measured in `band`.
         """
         nm, unit = GRID_NM, ""
         own = np.interp(nm, star.wavelength_nm, star.flux_flam, left=0.0, right=0.0)

@@ -19,8 +19,7 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 from mauvecl.detection.names import DEFAULT_STATISTICS, countable, least_countable
 from mauvecl.host.instrument.paths import FORMER_NAMES, FORMERLY_MAUVE
 from mauvecl.host.orbit.observing_limits import Limits
-from mauvecl.host.tables.ecsv import read_ecsv
-from mauvecl.host.tables.files import parsing, possible, read_bytes, read_text, toml, without_columns
+from mauvecl.host.tables.files import parsing, possible, read_bytes, read_ecsv, read_text, toml, without_columns
 from mauvecl.noise.processes import NONE, Processes
 from mauvecl.noise.unknowns import COURSES
 from mauvecl.schema.calls import validated

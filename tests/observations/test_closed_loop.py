@@ -13,9 +13,9 @@ from scipy import stats
 from mauvecl import SHAPES, Frames
 from mauvecl.observations import events
 from mauvecl.observations.detection import detect_events
-from mauvecl.observations.false_alarms import simulated_rates
 from mauvecl.observations.level import likeness, quiet_variance
 from mauvecl.observations.light_curve import survey_light_curve
+from mauvecl.observations.search import simulated_rates
 
 SHAPE = SHAPES["davenport2014"]
 FRAMES, CADENCE_S, LEVEL, SD = 600, 60.0, 1000.0, 5.0

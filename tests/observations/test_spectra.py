@@ -16,9 +16,9 @@ from scipy import stats
 from mauvecl import SHAPES, Frames, Study, analyse, read_frames, stare
 from mauvecl.answers.analyse import frame_model
 from mauvecl.observations.detection import detect_events
-from mauvecl.observations.event_spectra import drifts, event_spectrum, measure_flare
-from mauvecl.observations.false_alarms import simulated_rates
-from mauvecl.observations.spectra import clean_spectra, survey_spectra
+from mauvecl.observations.frame_model import clean_spectra
+from mauvecl.observations.search import simulated_rates
+from mauvecl.observations.spectra import drifts, event_spectrum, measure_flare, survey_spectra
 
 Float = NDArray[np.float64]
 SHAPE = SHAPES["davenport2014"]
@@ -174,7 +174,7 @@ def test_statistics_do_not_depend_on_changes_of_the_light_however_small(loss: fl
         flux = frames.flux - lost * np.outer(at, light())
         _, survey, series = prepared(element_frames(flux, frames.error))
         assert series.jitters == {"light": np.inf}
-        maxima.append(survey.search.largest(survey.sums[None]).maximum[0])
+        maxima.append(survey.search.largest(survey.sums[None])[0])
     assert maxima[1] == pytest.approx(maxima[0], abs=0.01 + 2 * loss)
 
 
@@ -304,8 +304,9 @@ def test_detection_rate_follows_the_signal_to_noise() -> None:
     for _ in range(number):
         peak = rng.uniform(900, 2700)
         _, survey, _ = prepared(drawn(rng, flare(peak, row.template.half_width_s, size)))
-        best = survey.search.largest(survey.sums[None])
-        seen += best.maximum[0] >= above and abs(best.peak_s[0] - peak) < 120
+        best, rho = max(survey.search.values(survey.sums[None]), key=lambda pair: pair[1].max())
+        at = survey.search.peak_s(best, rho[0].max(axis=0).argmax(keepdims=True))[0]
+        seen += rho.max() >= above and abs(at - peak) < 120
     expected = stats.norm.sf(-0.5)
     low, high = stats.binom.ppf([0.0005, 0.9995], number, [expected - 0.03, expected + 0.12])
     assert low <= seen <= high

@@ -12,7 +12,7 @@ from astropy.time import Time
 from scenes import paper
 
 from mauvecl import Frames, Study, analyse, read_frames, visible
-from mauvecl.observations.reduction import barycentric
+from mauvecl.observations.frames import barycentric
 
 RNG = np.random.default_rng(29)
 TIME = np.arange(200) * 30.0 + 15.0
