@@ -96,7 +96,12 @@ def _exponentials(rates: Float) -> tuple[list[Decay], Float]:
     """
     middle, half = np.log(rates[[0, -1]].prod()) / 2, np.log(rates[-1] / rates[0]) / 2
     points = middle + half * np.cos(np.pi * np.arange(EXPONENTIALS) / (EXPONENTIALS - 1))
-    weights = scipy.interpolate.BarycentricInterpolator(points, np.eye(EXPONENTIALS))(np.log(rates))
+    # The barycentric weights of Chebyshev points are known (Berrut & Trefethen 2004, doi:10.1137/S0036144502417715,
+    # equation 5.4); scipy would compute them with the points in a random order, which changes the last bits.
+    barycentric = (-1.0) ** np.arange(EXPONENTIALS)
+    barycentric[[0, -1]] /= 2
+    interpolate = scipy.interpolate.BarycentricInterpolator(points, np.eye(EXPONENTIALS), wi=barycentric)
+    weights = interpolate(np.log(rates))
     return [_exponential(float(rate)) for rate in np.exp(points)], np.asarray(weights)
 
 

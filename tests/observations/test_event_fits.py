@@ -84,6 +84,15 @@ class Sizes:
         return found
 
 
+def test_general_family_has_the_same_bits_in_each_process() -> None:
+    def weights() -> bytes:
+        event_windows.Family.general.cache_clear()
+        return event_windows.Family.general().weights.tobytes()
+
+    # Weights that depend on ten points in a random order repeat once in thousands of times.
+    assert weights() == weights() == weights()
+
+
 @pytest.mark.parametrize("model", [SMOOTH, WHITE], ids=["smooth", "white"])
 def test_work_of_an_event_does_not_grow_with_the_light_curve(model: Process, monkeypatch: pytest.MonkeyPatch) -> None:
     sizes = Sizes(monkeypatch)
