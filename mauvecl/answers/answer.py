@@ -8,7 +8,6 @@ import hashlib
 import io
 import json
 import platform
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass
 from functools import cached_property
@@ -31,6 +30,7 @@ from mauvecl.study.study import read_embedded_study
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
+    from mauvecl.answers.verbs import Progress
     from mauvecl.device.build import Device, DeviceRecord
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.runs.pool import Pool
@@ -81,7 +81,8 @@ class TableOf:
     place: bool = False  # whether columns of the star and of swept quantities precede those that are given
     title: str | Callable[[Any], str] = ""  # of the printed view; without one there is none
     key: str = ""  # in JSON
-    when: Callable[[Any], object] = lambda answer: True  # whether the answer has the table
+    # Whether the answer has the table: an attribute, or a function of the answer; every answer has it by default.
+    when: str | Callable[[Any], object] = lambda answer: True
     about: Callable[[Any], Mapping[str, object]] = lambda answer: {}  # metadata, which precede the study
     study: bool = True  # whether the metadata include the study
     cached: bool = True  # whether the answer keeps the table, which may be large
@@ -105,7 +106,7 @@ class TableOf:
         return table
 
     def _made(self, answer: Answer) -> Any:
-        rows: Any = self.rows(answer) if callable(self.rows) else attrgetter(self.rows)(answer)
+        rows: Any = _of_answer(self.rows, answer)
         if hasattr(rows, "colnames"):
             return rows
         if isinstance(rows, Mapping) or not isinstance(rows, Iterable):
@@ -128,7 +129,12 @@ class TableOf:
         return View(title, self.columns_of(answer), getattr(answer, self.name) if table is None else table)
 
 
-class Answer(Drawable, ContentEquality, ABC):
+def _of_answer(get: str | Callable[[Any], Any], answer: Answer) -> Any:
+    """Return an attribute of an answer by its path, or the value of a function of the answer."""
+    return get(answer) if callable(get) else attrgetter(get)(answer)
+
+
+class Answer(Drawable, ContentEquality):
     """Answer of a verb to a study: tables, printed views, messages, pictures and files.
 
     Subclasses declare tables with `TableOf`, in the order of the files; the first is the answer itself.
@@ -149,14 +155,17 @@ class Answer(Drawable, ContentEquality, ABC):
         def messages(self) -> Sequence[str]:
             """Messages for users, the most severe first."""
 
-    @property
-    @abstractmethod
-    def inputs(self) -> list[Expectation]:
-        """Expectations on which the answer is based, for the run record."""
+        @property
+        def inputs(self) -> Sequence[Expectation]:
+            """Expectations on which the answer is based, for the run record; none if nothing is exposed."""
+    else:
+        inputs = ()
 
     def _declared(self) -> list[TableOf]:
         """Return the declarations of the tables that the answer has."""
-        return [table for table in vars(type(self)).values() if isinstance(table, TableOf) and table.when(self)]
+        return [
+            table for table in vars(type(self)).values() if isinstance(table, TableOf) and _of_answer(table.when, self)
+        ]
 
     @property
     def tables(self) -> dict[str, Table]:
@@ -578,7 +587,7 @@ def realisations_of(answer: Answer) -> dict[str, object]:
 Item = TypeVar("Item")
 
 
-def reported(items: Iterable[Item], total: int, progress: Callable[[int, int], None] | None) -> Iterator[Item]:
+def reported(items: Iterable[Item], total: int, progress: Progress) -> Iterator[Item]:
     """Yield items, and call ``progress(done, total)`` after the work on each.
 
     If that raises, a generator of items is closed at once, while the workers that it uses are still open.

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer, TableOf, ecsv_text
-from mauvecl.answers.verbs import by_keywords
+from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.host.exposure.expectation import expect
 from mauvecl.host.instrument.curves import CALIBRATED, MODE, ThroughputErrors
 from mauvecl.host.instrument.instrument import FILE_VERSION, Instrument
@@ -479,7 +479,7 @@ class CalibrateAnswer(Answer):
 def calibrate(
     study: Study,
     engine: Engine | Pool | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress = None,
     *,
     frames: tuple[Frames, ...] | None = None,
     stars: tuple[Source | None, ...] | None = None,

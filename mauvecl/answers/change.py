@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, name_of_instrument, reported
-from mauvecl.answers.verbs import by_keywords
+from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.host.orbit.visibility import Visibility
 from mauvecl.observations.visits import (
     INDICES,
@@ -201,7 +200,7 @@ class ChangeAnswer(Answer):
     indices: list[IndexRow]
     along: list[ChangeRow]  # changes of stars at other magnitudes
     periods: list[PeriodRow]  # empty unless the study asks for them
-    expectations: list[Expectation]
+    inputs: list[Expectation]
 
     #: One row per star, cell and change.
     table = TableOf("change", COLUMNS, "changes", place=True, title=_title, key="rows", about=_probabilities)
@@ -212,10 +211,10 @@ class ChangeAnswer(Answer):
     )  # fmt: skip
     #: One row per star, cell, change and magnitude.
     magnitude_table = TableOf("magnitudes", MAGNITUDE_COLUMNS, "along", place=True, study=False,
-                              when=lambda answer: answer.along)  # fmt: skip
+                              when="along")  # fmt: skip
     #: One row per star, cell, change, amplitude and period.
     period_table = TableOf(
-        "periods", PERIOD_COLUMNS, "periods", place=True, study=False, when=lambda answer: answer.periods,
+        "periods", PERIOD_COLUMNS, "periods", place=True, study=False, when="periods",
         about=lambda answer: {"fap": answer.study.change.period_fap},
     )  # fmt: skip
 
@@ -260,7 +259,7 @@ class ChangeAnswer(Answer):
 
     @property
     def messages(self) -> list[str]:
-        lines = collect_messages(self.expectations)
+        lines = collect_messages(self.inputs)
         hidden = dict.fromkeys(f"{row.title}: {row.change.name}" for row in self.changes if row.hidden)
         lines += [f"HIDDEN by what is unknown: {text}." for text in hidden]
         left = [name for name in INDICES if name not in {row.value.index.name for row in self.indices}]
@@ -272,15 +271,9 @@ class ChangeAnswer(Answer):
         )
         return lines
 
-    @property
-    def inputs(self) -> list[Expectation]:
-        return self.expectations
-
 
 @by_keywords
-def change(
-    study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
-) -> ChangeAnswer:
+def change(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> ChangeAnswer:
     """Compute the smallest changes of a study's stars between visits that are detected.
 
     Parameters

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
@@ -31,7 +31,7 @@ from mauvecl.answers.closed_forms import (
     spoken,
     unknown_cost,
 )
-from mauvecl.answers.verbs import by_keywords
+from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection.detection import (
     AREA_COLUMNS,
     COLUMNS,
@@ -74,11 +74,6 @@ class StarDetection(InCell):
     detection: Detection
     #: Closed-form chances if everything but the noise were known, shape (n_flare, n_statistic); None if it is known.
     ideal: NDArray[np.float64] | None = None
-
-    @property
-    def shown(self) -> tuple[str, Detection, list[str]]:
-        """Title, detection and names of the flares, for pictures."""
-        return self.title, self.detection, [f"flare {100 * amplitude:g} %" for amplitude in self.amplitudes]
 
 
 def _detection_columns(answer: DetectAnswer) -> tuple[Column, ...]:
@@ -240,9 +235,7 @@ class DetectAnswer(Answer):
 
 
 @by_keywords
-def detect(
-    study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
-) -> DetectAnswer:
+def detect(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> DetectAnswer:
     """Simulate the detection of every flare of a study, for every star and sweep value.
 
     Parameters
@@ -317,15 +310,13 @@ def _messages(answer: DetectAnswer, prepared: Sequence[Case]) -> list[str]:
 
 def _cost_of_unknowns(prepared: Sequence[Case]) -> list[str]:
     """Return the sentence on the S/N that the faintest flare loses to unknowns."""
-    study = prepared[0].study
+    choice, comparison = prepared[0].study.nuisances, prepared[0].study.run.comparison()
     costs = [
-        unknown_cost(
-            f"{case.label}, flare of {100 * a:g} %", case.quiet, flare, study.nuisances, study.run.comparison()
-        )
+        unknown_cost(f"{case.label}, flare of {100 * amplitude:g} %", case.quiet, flare, choice, comparison)
         for case in prepared
-        for a, flare in zip(case.amplitudes, case.flares, strict=True)
+        for amplitude, flare in zip(case.amplitudes, case.flares, strict=True)
     ]
-    return cost_lines(costs, study.nuisances)
+    return cost_lines(costs, choice)
 
 
 def _few_terms(stars: Sequence[StarDetection]) -> list[str]:
@@ -348,11 +339,11 @@ def _few_terms(stars: Sequence[StarDetection]) -> list[str]:
 
 def _other_templates(case: Case) -> list[Linear]:
     """Return matched statistics that search for flares of other temperatures than the study's."""
-    filters, quiet = [], case.quiet
-    for temperature in case.study.run.template_temperatures_k:
-        (shape,) = case.expect(case.with_value("flare_temperature", temperature).flaring(case.amplitudes[0]))
-        setting = Setting(quiet, ~quiet.saturated, case.study.run.comparison())
-        filters.append(Linear(f"matched {temperature:g} K", Matched().weights_per_dn(setting, shape)))
+    filters, run = [], case.study.run
+    setting = Setting(case.quiet, ~case.quiet.saturated, run.comparison())
+    for kelvin in run.template_temperatures_k:
+        (shape,) = case.expect(case.with_value("flare_temperature", kelvin).flaring(case.amplitudes[0]))
+        filters.append(Linear(f"matched {kelvin:g} K", Matched().weights_per_dn(setting, shape)))
     return filters
 
 
@@ -469,7 +460,7 @@ class UnknownAnswer(Answer):
 
     study: Study
     costs: dict[tuple[str, float], dict[str, Cost]]  # by (star, amplitude), then by unknown
-    quiets: tuple[Expectation, ...] = ()  # the stars without a flare
+    inputs: list[Expectation]  # the stars without a flare
 
     #: One row per star, flare and unknown.
     table = TableOf(
@@ -479,19 +470,16 @@ class UnknownAnswer(Answer):
                               "study": answer.study.toml()},
     )  # fmt: skip
 
+    def of_star(self, star: str) -> tuple[float, dict[str, Cost]]:
+        """Return the amplitude of the first flare of a star, and its costs by unknown."""
+        return next((amplitude, costs) for (name, amplitude), costs in self.costs.items() if name == star)
+
     def smallest(self, star: str, unknown: str | None) -> float:
         """Return the flare amplitude detected with the study's power at its false-alarm probability, marginalised.
 
-        Parameters
-        ----------
-        unknown : str or None
-            None for everything known.
-
-        Notes
-        -----
-        S/N grows with the amplitude; the flare's own photon noise is left out.
+        `unknown` is None for everything known. S/N grows with the amplitude; the flare's own photon noise is left out.
         """
-        (amplitude, costs), *_ = ((a, c) for (name, a), c in self.costs.items() if name == star)
+        amplitude, costs = self.of_star(star)
         cost = next(iter(costs.values())) if unknown is None else costs[unknown]
         snr = cost.known if unknown is None else cost.marginal
         needed = special.ndtri(self.study.limit.power) - special.ndtri(self.study.run.fap)
@@ -507,26 +495,21 @@ class UnknownAnswer(Answer):
 
     @property
     def messages(self) -> list[str]:
-        return collect_messages(list(self.quiets))
-
-    @property
-    def inputs(self) -> list[Expectation]:
-        return list(self.quiets)
+        return collect_messages(self.inputs)
 
 
 def unknown_table(study: Study) -> UnknownAnswer:
     """Compute the S/N of a study's flares under each of the unknowns of `SHOWN`."""
-    costs: dict[tuple[str, float], dict[str, Cost]] = {}
-    quiets = []
-    comparison = study.run.comparison()
-    for case in cases(study, swept=False):
-        quiets.append(case.quiet)
-        for amplitude, flare in zip(case.amplitudes, case.flares, strict=True):
-            costs[case.label, amplitude] = {
-                unknown: unknown_cost(case.label, case.quiet, flare, choice, comparison)
-                for unknown, choice in SHOWN.items()
-            }
-    return UnknownAnswer(study, costs, tuple(quiets))
+    prepared, comparison = cases(study, swept=False), study.run.comparison()
+    costs = {
+        (case.label, amplitude): {
+            unknown: unknown_cost(case.label, case.quiet, flare, choice, comparison)
+            for unknown, choice in SHOWN.items()
+        }
+        for case in prepared
+        for amplitude, flare in zip(case.amplitudes, case.flares, strict=True)
+    }
+    return UnknownAnswer(study, costs, [case.quiet for case in prepared])
 
 
 def power(snr: float | NDArray[np.float64], fap: float) -> NDArray[np.float64]:

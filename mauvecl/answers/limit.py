@@ -14,7 +14,7 @@ import numpy as np
 from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf, first_of, name_of_instrument, share_columns
 from mauvecl.answers.closed_forms import Cost, cost_lines, describe_shares, draw_columns, marginal_lines, unknown_cost
 from mauvecl.answers.limit_search import LimitSearch, MarginalLimitSearch, Point, Unknown, settle, single_flares
-from mauvecl.answers.verbs import by_keywords
+from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection.distributions import Interval
 from mauvecl.detection.names import RECOMMENDED, check_fap
 from mauvecl.device.engine import Engine
@@ -281,7 +281,7 @@ class LimitAnswer(Answer):
     #: One row per star, flare and statistic.
     table = TableOf("limit", _limit_columns, "limits", place=True, key="rows", about=_run_of)
     #: One row per limit and draw of the unknown: its values and the closed-form limit.
-    draws = TableOf("unknowns", _draw_columns, "limits", place=True, when=lambda answer: answer.study.unknowns.draws)
+    draws = TableOf("unknowns", _draw_columns, "limits", place=True, when="study.unknowns.draws")
     _assumptions = TableOf("assumptions", lambda answer: assumption_columns(answer.study.limit.of), "assumptions",
                            key="assumptions", when=lambda answer: answer.assumptions is not None)  # fmt: skip
 
@@ -408,9 +408,7 @@ def _ideal(case: Case, statistic: str, near: float) -> float:
 
 
 @by_keywords
-def limit(
-    study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
-) -> LimitAnswer:
+def limit(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> LimitAnswer:
     """Compute the limits of a study's stars and flares, by every statistic.
 
     Raises InputError as for `solve` if all limits fail; otherwise see `LimitAnswer.failed`.

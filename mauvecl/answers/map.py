@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -22,7 +21,7 @@ from mauvecl.answers.closed_forms import (
     unknown_cost,
 )
 from mauvecl.answers.limit_search import SEARCH, LimitSearch
-from mauvecl.answers.verbs import by_keywords
+from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection.distributions import Interval
 from mauvecl.detection.names import RECOMMENDED, check_fap
 from mauvecl.device.engine import Engine
@@ -108,7 +107,7 @@ class MapAnswer(Answer):
     # For maps averaged over unknowns, by statistic: the share of the variance of the mean probability that each unknown
     # explains, largest first.
     shares: dict[str, dict[str, float]] = field(default_factory=dict)
-    quiet: Expectation | None = None  # the star of the first cell
+    inputs: tuple[Expectation, ...] = ()  # the star without a flare in the first cell
 
     #: One row per cell and statistic.
     table = TableOf("map", _cell_columns, lambda answer: answer, about=_run_of)
@@ -162,16 +161,9 @@ class MapAnswer(Answer):
         """The study's assumptions apart from the two quantities of the map."""
         return assumptions_of(self.study, self.uses, tuple(axis.quantity for axis in self.study.map.axes))
 
-    @property
-    def inputs(self) -> list[Expectation]:
-        """The star without a flare in the first cell."""
-        return [] if self.quiet is None else [self.quiet]
-
 
 @by_keywords
-def map(
-    study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
-) -> MapAnswer:
+def map(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> MapAnswer:
     """Compute the detection probability of the study's first star and flare over two quantities.
 
     Parameters
@@ -211,7 +203,7 @@ def map(
         statistics=study.run.statistics,
         messages=_messages(case, cells, values),
         shares=parts,
-        quiet=quiet,
+        inputs=(quiet,),
         **values,
     )
 
@@ -345,7 +337,7 @@ class Cells:
     y: Values
     engine: Engine | Pool
     n_maps: int
-    progress: Callable[[int, int], None] | None
+    progress: Progress
     done: int = 0  # cells of all maps
     quiet: list[Expectation] = field(default_factory=list)
     saturated: list[str] = field(default_factory=list)  # messages on flares that saturate

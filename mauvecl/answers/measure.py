@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from operator import attrgetter
@@ -23,7 +23,7 @@ from mauvecl.answers.measurements import (
     matched_filter,
     measured_stare,
 )
-from mauvecl.answers.verbs import by_keywords
+from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection.distributions import Interval, clopper_pearson
 from mauvecl.detection.nuisances import join_names
 from mauvecl.device.engine import Engine
@@ -214,11 +214,11 @@ class MeasureAnswer(Answer):
     temperatures = TableOf(
         "temperatures", (MODEL_COLUMN,), lambda answer: answer.binned or QTable(), place=True, key="temperatures",
         of=lambda _, stare: table_of(_bin_columns(stare), [stare]),
-        when=lambda answer: answer.study.measure.snr_per_bin is not None,
+        when="study.measure.snr_per_bin",
     )  # fmt: skip
     #: Joint fits of shape and spectrum; one row per star, cell and quantity.
     joint = TableOf("joint", JOINT_COLUMNS, "stares", place=True, key="joint",
-                    when=lambda answer: answer.study.measure.joint_fit)  # fmt: skip
+                    when="study.measure.joint_fit")  # fmt: skip
 
     @property
     def uses(self) -> tuple[Use, ...]:
@@ -262,9 +262,7 @@ class MeasureAnswer(Answer):
 
 
 @by_keywords
-def measure(
-    study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
-) -> MeasureAnswer:
+def measure(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> MeasureAnswer:
     """Forecast and simulate the measurement of a study's flares in one exposure.
 
     Parameters

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import calendar
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
@@ -26,7 +26,7 @@ from mauvecl.answers.plan_targets import (
     rates_of,
     star_of,
 )
-from mauvecl.answers.verbs import by_keywords
+from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.answers.visible import VisibleAnswer, assumption_columns, visible
 from mauvecl.device.engine import Stares
 from mauvecl.host.orbit.visibility import PARTICLES_SOURCE, THERMAL_SOURCE
@@ -323,7 +323,7 @@ def _measured(target: Planned) -> str:
 def plan(
     study: Study,
     engine: Stares | Pool | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress = None,
     *,
     completeness: CompletenessOf | None = None,
 ) -> PlanAnswer:

@@ -20,7 +20,7 @@ from scipy.interpolate import CubicSpline
 
 from mauvecl.answers.answer import Answer, InCell, TableOf, first_of, reported
 from mauvecl.answers.inject import survey_star
-from mauvecl.answers.verbs import by_keywords
+from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.device.engine import Stares
 from mauvecl.flares.energies import Kind
 from mauvecl.flares.frames import Draw, LightCurves, StareExpectation, draw_light_curves
@@ -357,7 +357,7 @@ class StareAnswer(Answer):
     #: Values are NaN where the fit does not measure the flare: `note` says why.
     found = TableOf(
         "found", FOUND_COLUMNS, lambda answer: chain.from_iterable(stare.found for stare in answer.stares), place=True,
-        key="found", when=lambda answer: answer.study.stare.search, about=_seed, study=False,
+        key="found", when="study.stare.search", about=_seed, study=False,
     )  # fmt: skip
 
     def placed(self, columns: Sequence[Column]) -> tuple[Column, ...]:
@@ -430,7 +430,7 @@ class StareAnswer(Answer):
 def stare(
     study: Study,
     engine: Stares | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress = None,
     *,
     checkpoint: Checkpoint | None = None,
 ) -> StareAnswer:

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     #: Function of a command's flags that returns the study where no file is given.
     DefaultStudy = Callable[[dict[str, Any]], Study]
 
+#: Function that is called as ``progress(done, total)``; it may raise to stop the work.
+Progress = Callable[[int, int], None] | None
+
 #: Headings of the command line's list of commands and of the page's tabs, by the group of a verb.
 GROUPS = {
     "plan": "Plan observations",
@@ -462,7 +465,7 @@ class Question(Protocol[Answered]):
         self,
         study: Study | None = None,
         engine: Any = None,
-        progress: Callable[[int, int], None] | None = None,
+        progress: Progress = None,
         **keywords: Any,
     ) -> Answered: ...
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer, TableOf, first_of
-from mauvecl.answers.verbs import by_keywords
+from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.host import VERSION
 from mauvecl.host.orbit.geometry import Bodies, TimeGrid
 from mauvecl.host.orbit.orbit import Target
@@ -26,7 +26,6 @@ from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
     from mauvecl.device.engine import Engine
-    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.runs.pool import Pool
 
 
@@ -186,7 +185,7 @@ class VisibleAnswer(Answer):
     #: One row per target and day.
     by_day = TableOf("days", DAY_COLUMNS, "_day_rows")
     #: One row per window.
-    window_table = TableOf("windows", WINDOW_COLUMNS, "_window_rows", when=lambda answer: answer.writes_windows,
+    window_table = TableOf("windows", WINDOW_COLUMNS, "_window_rows", when="writes_windows",
                            about=lambda answer: {"study": answer.study.text(), "step_s": answer.times.step_s},
                            study=False)  # fmt: skip
     #: Active limits with their values and the sources of their defaults.
@@ -343,11 +342,6 @@ class VisibleAnswer(Answer):
         return entries
 
     @property
-    def inputs(self) -> list[Expectation]:
-        """No expectations, since nothing is exposed."""
-        return []
-
-    @property
     def messages(self) -> list[str]:
         """Messages on the orbit, assumptions, effects that are not modelled, and targets that are never visible."""
         never = [target.name for target, part in zip(self.targets, self.visibility.share, strict=True) if part == 0]
@@ -375,9 +369,7 @@ class VisibleAnswer(Answer):
 
 
 @by_keywords
-def visible(
-    study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
-) -> VisibleAnswer:
+def visible(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> VisibleAnswer:
     """Compute when a study's targets are visible.
 
     Parameters
