@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mauvecl.answers.answer import Answer, TableOf
+from mauvecl.answers.answer import Answer, TableOf, metadata_of
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.fits.flare_model import FlareModel
 from mauvecl.fits.spectrum import Measurement
@@ -419,10 +419,6 @@ NOISE = (
 )  # fmt: skip
 
 
-def _star_of(answer: AnalyseAnswer) -> dict[str, object]:
-    return {"star": answer.analysis.frames.name, "unit": answer.analysis.frames.unit}
-
-
 @dataclass(frozen=True, eq=False)
 class AnalyseAnswer(Answer):
     """Answer of `analyse`."""
@@ -434,39 +430,39 @@ class AnalyseAnswer(Answer):
     white: str = ""  # why spectra are searched as their sum over wavelength; empty if they are not
 
     #: One row per event, in order of time.
-    events = TableOf("events", EVENTS, "rows", key="events", study=False, about=lambda answer: {
-        "study": answer.study.text(), **answer.analysis.frames.time_keywords, **_star_of(answer),
-        "threshold": answer.analysis.threshold})  # fmt: skip
+    events = TableOf("events", EVENTS, "rows", key="events", about=lambda answer: {
+        **metadata_of(answer, "study"), **answer.analysis.frames.time_keywords, "star": answer.analysis.frames.name,
+        **metadata_of(answer, "analysis.frames.unit", "analysis.threshold")})  # fmt: skip
     #: One row per frame: flux, level, noise, and why it is not searched.
-    frames = TableOf("frames", FRAMES, "analysis", study=False, cached=False,
-                     about=lambda answer: _star_of(answer) | answer.analysis.frames.time_keywords)  # fmt: skip
+    frames = TableOf("frames", FRAMES, "analysis", cached=False, about=lambda answer: {
+        "star": answer.analysis.frames.name, "unit": answer.analysis.frames.unit,
+        **answer.analysis.frames.time_keywords})  # fmt: skip
     #: One row per half-width and size of injected flares.
-    completeness = TableOf("completeness", COMPLETENESS, "analysis", when="_has_level", study=False,
-                           about=lambda answer: {"threshold": answer.analysis.threshold})  # fmt: skip
+    completeness = TableOf("completeness", COMPLETENESS, "analysis", when="_has_level",
+                           about=("analysis.threshold",))  # fmt: skip
     #: One row per half-width: the smallest flare that the search detects with a probability of 90 %.
-    limits = TableOf("limits", LIMITS, "analysis", key="limits", when="_has_level", study=False,
+    limits = TableOf("limits", LIMITS, "analysis", key="limits", when="_has_level", about=(),
                      title="Smallest flares that would have been detected, by injecting into these frames")  # fmt: skip
     #: One row per number of frames: scatter of their means.
-    noise = TableOf("noise", NOISE, "analysis.scatter", key="noise", study=False,
+    noise = TableOf("noise", NOISE, "analysis.scatter", key="noise", about=(),
                     title="Noise of quiescent frames, less the fitted process")  # fmt: skip
     #: One row per combination of terms that was tried for the quiescent light, with its criterion.
     process = TableOf(
-        "process", PROCESS, lambda answer: sorted(answer.analysis.level.process.bic, key=itemgetter(1)), study=False,
+        "process", PROCESS, lambda answer: sorted(answer.analysis.level.process.bic, key=itemgetter(1)), about=(),
         title="What was tried for the quiescent light",
     )  # fmt: skip
     #: One row per event and measured quantity, with intervals.
     measured = TableOf(
         "measured", MEASURED, lambda answer: [row for row in answer.rows if not isinstance(row.measured, str)],
-        when="_spectra", study=False,
+        when="_spectra", about=(),
     )  # fmt: skip
     #: One row per pixel of spectra: noise as stated and as measured.
     pixels = TableOf("noise-per-pixel", PIXELS, lambda answer: [spectra.series.noise for spectra in answer._spectra],
-                     when="_spectra", study=False,
-                     about=lambda answer: {"unit": answer.analysis.frames.unit})  # fmt: skip
+                     when="_spectra", about=("analysis.frames.unit",))  # fmt: skip
     #: One row per sudden change of the light that all pixels of spectra share.
     throughput = TableOf("throughput", THROUGHPUT, lambda answer: [
         (spectra.cleaned.frames, change) for spectra in answer._spectra for change in spectra.series.changes
-    ], when="_spectra", study=False)  # fmt: skip
+    ], when="_spectra", about=())  # fmt: skip
     #: One row per event and star in the fibre: the flare of that star which would look like the event.
     neighbour_flares = TableOf("neighbour-flares", COLUMNS, "_flares_of_stars",
                                when="study.has_neighbours")  # fmt: skip

@@ -83,8 +83,8 @@ class TableOf:
     key: str = ""  # in JSON
     # Whether the answer has the table: an attribute, or a function of the answer; every answer has it by default.
     when: str | Callable[[Any], object] = lambda answer: True
-    about: Callable[[Any], Mapping[str, object]] = lambda answer: {}  # metadata, which precede the study
-    study: bool = True  # whether the metadata include the study
+    # Metadata: paths of attributes of the answer, whose last names are the keys, or a function of the answer.
+    about: Sequence[str] | Callable[[Any], Mapping[str, object]] = ("study",)
     cached: bool = True  # whether the answer keeps the table, which may be large
 
     def __set_name__(self, owner: type, name: str) -> None:
@@ -111,7 +111,7 @@ class TableOf:
             return rows
         if isinstance(rows, Mapping) or not isinstance(rows, Iterable):
             rows = [rows]
-        about = {**self.about(answer), **({"study": answer.study.text()} if self.study else {})}
+        about = self.about(answer) if callable(self.about) else metadata_of(answer, *self.about)
         if self.of is None:
             return table_of(self.columns_of(answer), rows, **about)
         parts = [(row, self.of(answer, row)) for row in rows]
@@ -132,6 +132,12 @@ class TableOf:
 def _of_answer(get: str | Callable[[Any], Any], answer: Answer) -> Any:
     """Return an attribute of an answer by its path, or the value of a function of the answer."""
     return get(answer) if callable(get) else attrgetter(get)(answer)
+
+
+def metadata_of(answer: Answer, *paths: str) -> dict[str, object]:
+    """Return attributes of an answer by the last names of their paths; "study" is the text of the study."""
+    values = {path.rpartition(".")[2]: attrgetter(path)(answer) for path in paths}
+    return values | ({"study": answer.study.text()} if "study" in values else {})
 
 
 class Answer(Drawable, ContentEquality):
@@ -577,11 +583,6 @@ def share_columns(study: Study, get: str) -> tuple[Column, ...]:
     """Return the column of the dilution, or nothing for studies without neighbours; `get` names it in a row."""
     text = "share of the star in the electrons of all stars in the fibre, without a flare (dilution)"
     return (Column("target_share", get, "", text, "star's share", percent(".3g")),) if study.has_neighbours else ()
-
-
-def realisations_of(answer: Answer) -> dict[str, object]:
-    """Return the number of a study's realisations, for the metadata of tables."""
-    return {"realisations": answer.study.run.realisations}
 
 
 Item = TypeVar("Item")

@@ -130,10 +130,6 @@ TRANSFER_COLUMNS = (
 )
 
 
-def _reference(answer: CalibrateAnswer) -> dict[str, object]:
-    return {"reference_c": answer.dark.reference_c}
-
-
 def _title(answer: CalibrateAnswer) -> str:
     stars = f"{len(answer.stars)} standard star{'s' if len(answer.stars) > 1 else ''}"
     return f"{answer.nominal.name} fitted to {stars}; dark current at {answer.dark.reference_c:.1f} C"
@@ -154,16 +150,16 @@ class CalibrateAnswer(Answer):
     throughput: ThroughputFit
 
     #: One row per value of the instrument.
-    values_table = TableOf("calibrate", COLUMNS, "values", title=_title, key="rows", about=lambda answer: {
-        **_reference(answer), "dark_unit": answer.transfer.dark_unit})  # fmt: skip
+    values_table = TableOf("calibrate", COLUMNS, "values", title=_title, key="rows",
+                           about=("dark.reference_c", "transfer.dark_unit", "study"))  # fmt: skip
     #: One row per fit: its goodness.
-    fits = TableOf("fits", FIT_COLUMNS, "_fits", title="Goodness of fit", key="fits", study=False)
+    fits = TableOf("fits", FIT_COLUMNS, "_fits", title="Goodness of fit", key="fits", about=())
     #: One row per pixel: fitted and nominal throughput.
     throughput_table = TableOf("throughput", THROUGHPUT_COLUMNS, lambda answer: answer)
     #: One row per pixel: dark current and bias.
-    dark_table = TableOf("dark", DARK_COLUMNS, lambda answer: answer, about=_reference, study=False)
+    dark_table = TableOf("dark", DARK_COLUMNS, lambda answer: answer, about=("dark.reference_c",))
     #: One row per observation and usable pixel: the variance of frames.
-    transfer_table = TableOf("photon-transfer", TRANSFER_COLUMNS, lambda answer: answer, study=False)
+    transfer_table = TableOf("photon-transfer", TRANSFER_COLUMNS, lambda answer: answer, about=())
 
     @property
     def stars(self) -> list[CalibrationFrames]:

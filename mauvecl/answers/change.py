@@ -184,11 +184,6 @@ def _title(answer: ChangeAnswer) -> str:
     )
 
 
-def _probabilities(answer: ChangeAnswer) -> dict[str, object]:
-    study = answer.study
-    return {"visits": study.change.visits, "fap": study.run.fap, "power": study.limit.power}
-
-
 @dataclass(frozen=True, eq=False)
 class ChangeAnswer(Answer):
     """Answer of `change`."""
@@ -203,18 +198,19 @@ class ChangeAnswer(Answer):
     inputs: list[Expectation]
 
     #: One row per star, cell and change.
-    table = TableOf("change", COLUMNS, "changes", place=True, title=_title, key="rows", about=_probabilities)
+    table = TableOf("change", COLUMNS, "changes", place=True, title=_title, key="rows",
+                    about=("study.change.visits", "study.run.fap", "study.limit.power", "study"))  # fmt: skip
     #: One row per star, cell and line index.
     index_table = TableOf(
-        "indices", INDEX_COLUMNS, "indices", place=True, key="indices", study=False,
+        "indices", INDEX_COLUMNS, "indices", place=True, key="indices", about=(),
         title=lambda answer: f"Line indices in {answer.study.observation.exposure_s:g} s",
     )  # fmt: skip
     #: One row per star, cell, change and magnitude.
-    magnitude_table = TableOf("magnitudes", MAGNITUDE_COLUMNS, "along", place=True, study=False,
+    magnitude_table = TableOf("magnitudes", MAGNITUDE_COLUMNS, "along", place=True, about=(),
                               when="along")  # fmt: skip
     #: One row per star, cell, change, amplitude and period.
     period_table = TableOf(
-        "periods", PERIOD_COLUMNS, "periods", place=True, study=False, when="periods",
+        "periods", PERIOD_COLUMNS, "periods", place=True, when="periods",
         about=lambda answer: {"fap": answer.study.change.period_fap},
     )  # fmt: skip
 

@@ -16,8 +16,8 @@ from mauvecl.answers.answer import (
     Answer,
     InCell,
     TableOf,
+    metadata_of,
     name_of_instrument,
-    realisations_of,
     reported,
     share_columns,
 )
@@ -143,12 +143,12 @@ class DetectAnswer(Answer):
     #: each curve has fewer than its 200.
     roc = TableOf(
         "roc", (*FLARE_COLUMNS, *ROC_COLUMNS, *(column.of(itemgetter("roc")) for column in AREA_COLUMNS)), "_curves",
-        place=True, about=realisations_of,
+        place=True, about=("study.run.realisations", "study"),
     )  # fmt: skip
     #: The extremes of every null (amplitude 0) and flare, with their realisations. Many flares share `MOST_ROWS` rows,
     #: so that each distribution has fewer than its 1000.
     tails = TableOf("tails", (*FLARE_COLUMNS, TEMPLATE_COLUMN), "_extremes", of=lambda _, row: row["tail"], place=True,
-                    about=lambda answer: {"seed": answer.study.run.seed})  # fmt: skip
+                    about=("study.run.seed", "study"))  # fmt: skip
 
     @property
     def headline(self) -> str:
@@ -464,10 +464,9 @@ class UnknownAnswer(Answer):
 
     #: One row per star, flare and unknown.
     table = TableOf(
-        "unknowns", UNKNOWN_COLUMNS, "_rows", study=False,
+        "unknowns", UNKNOWN_COLUMNS, "_rows",
         title="What unknowns cost: S/N of the matched statistic, by closed forms",
-        about=lambda answer: {"fap": answer.study.run.fap, "power": answer.study.limit.power,
-                              "study": answer.study.toml()},
+        about=lambda answer: metadata_of(answer, "study.run.fap", "study.limit.power") | {"study": answer.study.toml()},
     )  # fmt: skip
 
     def of_star(self, star: str) -> tuple[float, dict[str, Cost]]:

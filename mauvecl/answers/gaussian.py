@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl.answers.answer import Answer, TableOf, realisations_of
+from mauvecl.answers.answer import Answer, TableOf
 from mauvecl.answers.detect import DetectAnswer, detect
 from mauvecl.answers.signal import SnrAnswer, snr
 from mauvecl.answers.verbs import Progress, by_keywords
@@ -150,14 +150,14 @@ class GaussianAnswer(Answer):
 
     #: Largest error of each prediction, one row per star and cell.
     cells = TableOf(
-        "gaussian", WORST_COLUMNS, "_largest_errors", place=True, about=lambda answer: {"fap": answer.study.run.fap},
+        "gaussian", WORST_COLUMNS, "_largest_errors", place=True, about=("study.run.fap", "study"),
         title=lambda answer: f"The root-of-N formula and {answer.study.run.realisations:,} realisations; promised: no "
         "difference in S/N, 68.3 % of 1-sigma intervals, as many 5-sigma pixels and false alarms "
         f"({answer.study.run.fap:g}) as normal noise has",
     )  # fmt: skip
     #: Predictions and simulation, one row per star, cell and resolution element.
     elements = TableOf("elements", (), "signal.stars", of=lambda _, star: _promises(star.result),
-                       place=True, about=realisations_of)  # fmt: skip
+                       place=True, about=("study.run.realisations", "study"))  # fmt: skip
     #: One row per star, cell and statistic: false-alarm probabilities at the formula's thresholds, with reasons.
     thresholds = TableOf("thresholds", (), "detection.departures")
 

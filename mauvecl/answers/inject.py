@@ -317,11 +317,12 @@ def _share(answer: InjectAnswer) -> tuple[Column, ...]:
     return share_columns(answer.study, "surveyed.quiet.target_share")
 
 
-def _search_of(answer: InjectAnswer) -> dict[str, object]:
+def _search(answer: InjectAnswer) -> dict[str, object]:
     choice, flare = answer.study.search, answer.study.flare
     return {
         "false_alarms": f"{choice.false_alarms:g} per star-{choice.per}",
         "flare": f"{flare.light().describe()}, {choice.shape}, amplitudes in {flare.band}",
+        "study": answer.study.text(),
     }
 
 
@@ -336,11 +337,11 @@ class InjectAnswer(Answer):
     messages: list[str] = field(default_factory=list)
 
     #: Sizes E50 and E90: per star and cell of the sweep, one row for all half-widths and one for each.
-    table = TableOf("limits", _share, "stars", of=lambda _, star: star.limits, place=True, about=_search_of)
+    table = TableOf("limits", _share, "stars", of=lambda _, star: star.limits, place=True, about=_search)
     #: One row per star, cell of the sweep, half-width and size.
-    completeness = TableOf("completeness", _share, "stars", of=lambda _, star: star.cells, place=True, about=_search_of)
+    completeness = TableOf("completeness", _share, "stars", of=lambda _, star: star.cells, place=True, about=_search)
     #: One row per star and cell of the sweep: thresholds, false alarms.
-    search = TableOf("search", lambda answer: (*_share(answer), *SEARCH_COLUMNS), "stars", place=True, about=_search_of)
+    search = TableOf("search", lambda answer: (*_share(answer), *SEARCH_COLUMNS), "stars", place=True, about=_search)
 
     @property
     def headline(self) -> str:

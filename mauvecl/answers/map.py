@@ -76,11 +76,6 @@ def _cell_columns(answer: MapAnswer) -> tuple[Column, ...]:
     )
 
 
-def _run_of(answer: MapAnswer) -> dict[str, object]:
-    run = answer.study.run
-    return {"star": answer.star, "fap": run.fap, "realisations": run.realisations}
-
-
 @dataclass(frozen=True, eq=False)
 class MapAnswer(Answer):
     """Answer of `map`, for the study's first star.
@@ -110,7 +105,8 @@ class MapAnswer(Answer):
     inputs: tuple[Expectation, ...] = ()  # the star without a flare in the first cell
 
     #: One row per cell and statistic.
-    table = TableOf("map", _cell_columns, lambda answer: answer, about=_run_of)
+    table = TableOf("map", _cell_columns, lambda answer: answer,
+                    about=("star", "study.run.fap", "study.run.realisations", "study"))  # fmt: skip
 
     @property
     def headline(self) -> str:

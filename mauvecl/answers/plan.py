@@ -146,11 +146,6 @@ def _target_columns(answer: PlanAnswer) -> tuple[Column, ...]:
     return (*COLUMNS[:-1], alarms, *share, *(THROUGHPUT_COLUMNS if calibrated else ()), COLUMNS[-1])
 
 
-def _time_of(answer: PlanAnswer) -> dict[str, object]:
-    times = answer.seen.times
-    return {"start": times.iso(0.0), "days": times.days, "false_alarms_per_day": answer.study.search.rate}
-
-
 @dataclass(frozen=True, eq=False)
 class PlanAnswer(Answer):
     """Answer of `plan`."""
@@ -162,7 +157,9 @@ class PlanAnswer(Answer):
     planned: tuple[Planned, ...]
 
     #: One row per target.
-    table = TableOf("plan", _target_columns, "planned", title=lambda answer: answer.heading, about=_time_of)
+    table = TableOf("plan", _target_columns, "planned", title=lambda answer: answer.heading, about=lambda answer: {
+        "start": answer.seen.times.iso(0.0), "days": answer.seen.times.days,
+        "false_alarms_per_day": answer.study.search.rate, "study": answer.study.text()})  # fmt: skip
     #: Inputs, one row per target.
     stars = TableOf("stars", STAR_COLUMNS, "planned")
     #: Recovered fraction and rate by energy, one row per target and energy where either changes.
@@ -170,7 +167,7 @@ class PlanAnswer(Answer):
     months = TableOf("months", (), "seen.months")
     days = TableOf("days", (), "seen.by_day")
     #: All assumptions with their sources.
-    assumptions = TableOf("assumptions", assumption_columns("assumption"), "_assumptions", study=False)
+    assumptions = TableOf("assumptions", assumption_columns("assumption"), "_assumptions", about=())
 
     @property
     def headline(self) -> str:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
-from mauvecl.answers.answer import Answer, InCell, TableOf, first_of, realisations_of, reported
+from mauvecl.answers.answer import Answer, InCell, TableOf, first_of, reported
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection.snr import COLUMNS
 from mauvecl.device.engine import Engine
@@ -271,7 +271,7 @@ class SimulateAnswer(Answer):
 
     #: Peak, best closed-form S/N and saturated pixels of each observation.
     summary = TableOf("", SUMMARY_COLUMNS, "observations", title="One observation each (closed-form S/N)",
-                      key="observations", study=False)  # fmt: skip
+                      key="observations", about=())  # fmt: skip
 
     @property
     def uses(self) -> tuple[Use, ...]:
@@ -355,6 +355,10 @@ class StarSnr(InCell):
         return [wavelength for wavelength in SHOWN_NM if first <= wavelength <= last]
 
 
+#: Metadata of tables of realisations.
+REALISATIONS = ("study.run.realisations", "study")
+
+
 @dataclass(eq=False)
 class SnrAnswer(Answer):
     """Answer of `snr`."""
@@ -367,12 +371,12 @@ class SnrAnswer(Answer):
 
     #: S/N per resolution element of 10.5 nm, one row per star, cell and element.
     element = TableOf("snr-element", (), "stars", of=lambda _, star: star.result.element, place=True,
-                      key="snr-element", about=realisations_of)  # fmt: skip
+                      key="snr-element", about=REALISATIONS)  # fmt: skip
     #: S/N per pixel, one row per star, cell and pixel.
-    pixel = TableOf("snr-pixel", (), "stars", of=lambda _, star: star.result.pixel, place=True, about=realisations_of)
+    pixel = TableOf("snr-pixel", (), "stars", of=lambda _, star: star.result.pixel, place=True, about=REALISATIONS)
     #: Noise by origin, DN rms per pixel, one row per star, cell and pixel.
     noise_budget = TableOf("noise-budget", (), "stars", of=lambda _, star: star.result.expectation.noise_budget(),
-                           place=True, key="noise-budget", about=realisations_of)  # fmt: skip
+                           place=True, key="noise-budget", about=REALISATIONS)  # fmt: skip
 
     @property
     def headline(self) -> str:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from mauvecl.answers.answer import Answer, InCell, TableOf, first_of, reported
+from mauvecl.answers.answer import Answer, InCell, TableOf, first_of, metadata_of, reported
 from mauvecl.answers.inject import survey_star
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.device.engine import Stares
@@ -330,8 +330,8 @@ def _stare_columns(answer: StareAnswer) -> tuple[Column, ...]:
     return (*COLUMNS, *searched, SATURATED_COLUMN, *drifting)
 
 
-def _seed(answer: StareAnswer) -> dict[str, object]:
-    return {"study": answer.study.text(), "seed": answer.study.run.seed}
+#: Metadata of the tables.
+SEED = ("study", "study.run.seed")
 
 
 @dataclass(eq=False)
@@ -345,19 +345,19 @@ class StareAnswer(Answer):
     messages: list[str] = field(default_factory=list)
 
     #: One row per star and cell: frames, gaps, light and noise of a frame, flares.
-    table = TableOf("stare", _stare_columns, "stares", place=True, title="One stare each", key="stares", about=_seed,
-                    study=False)  # fmt: skip
+    table = TableOf("stare", _stare_columns, "stares", place=True, title="One stare each", key="stares",
+                    about=SEED)  # fmt: skip
     #: One row per flare: peak, half-width, amplitude, temperature, energies, and the S/N of its matched filter.
     events = TableOf(
         "events", EVENT_COLUMNS, lambda answer: chain.from_iterable(stare.flares for stare in answer.stares),
         place=True, title="Flares in them; S/N of one who knows all but whether the flare is there", key="events",
-        about=_seed, study=False,
+        about=SEED,
     )  # fmt: skip
     #: One row per flare that the search found: fitted values with errors, and the number of the flare in the stare.
     #: Values are NaN where the fit does not measure the flare: `note` says why.
     found = TableOf(
         "found", FOUND_COLUMNS, lambda answer: chain.from_iterable(stare.found for stare in answer.stares), place=True,
-        key="found", when="study.stare.search", about=_seed, study=False,
+        key="found", when="study.stare.search", about=SEED,
     )  # fmt: skip
 
     def placed(self, columns: Sequence[Column]) -> tuple[Column, ...]:
@@ -393,7 +393,7 @@ class StareAnswer(Answer):
         star = self.stares[number]
         columns = [*FRAME_COLUMNS, *(() if star.pointing_loss is None else (LOSS_COLUMN,))]
         columns += [_light_column(kind, band, k) for k, band in enumerate(star.light.bands) for kind in LIGHT]
-        return table_of(columns, [star], star=star.label, **_seed(self), **star.at)
+        return table_of(columns, [star], star=star.label, **metadata_of(self, *SEED), **star.at)
 
     @property
     def tables(self) -> dict[str, Table]:

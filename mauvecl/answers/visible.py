@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.answers.answer import Answer, TableOf, first_of
+from mauvecl.answers.answer import Answer, TableOf, first_of, metadata_of
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.host import VERSION
 from mauvecl.host.orbit.geometry import Bodies, TimeGrid
@@ -174,7 +174,7 @@ class VisibleAnswer(Answer):
     table = TableOf(
         "visible", _target_columns, lambda answer: [answer._row(k) for k in range(len(answer.targets))],
         title=lambda answer: f"Seen in {answer.times.days:g} days from {answer.times.iso(0.0)} UTC",
-        about=lambda answer: {"start": answer.times.iso(0.0), "days": answer.times.days},
+        about=lambda answer: {"start": answer.times.iso(0.0), **metadata_of(answer, "times.days", "study")},
     )  # fmt: skip
     #: One row per month, one column of hours per target.
     months = TableOf(
@@ -186,11 +186,9 @@ class VisibleAnswer(Answer):
     by_day = TableOf("days", DAY_COLUMNS, "_day_rows")
     #: One row per window.
     window_table = TableOf("windows", WINDOW_COLUMNS, "_window_rows", when="writes_windows",
-                           about=lambda answer: {"study": answer.study.text(), "step_s": answer.times.step_s},
-                           study=False)  # fmt: skip
+                           about=("study", "times.step_s"))  # fmt: skip
     #: Active limits with their values and the sources of their defaults.
-    assumptions = TableOf("assumptions", assumption_columns("limit"), "visibility.limits.assumptions",
-                          study=False)  # fmt: skip
+    assumptions = TableOf("assumptions", assumption_columns("limit"), "visibility.limits.assumptions", about=())
 
     @property
     def headline(self) -> str:
