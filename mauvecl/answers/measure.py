@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from itertools import chain
 from operator import attrgetter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy
@@ -64,8 +65,7 @@ class MeasuredFlare(ExpectedMeasurement):
 
     def fitted_dn(self) -> tuple[Float, Float]:
         """Return the mean of the fitted flare in the first exposure, and the best values of unknowns, DN."""
-        measurement = self.found
-        mean = self.fitted.counts(np.exp(measurement.log_k[0]), measurement.factor[0] * measurement.amplitudes[0])
+        mean = self.fitted.counts(np.exp(self.found.log_k[0]), self.found.factor[0] * self.found.amplitudes[0])
         if self.unknown is None:
             return mean, np.zeros_like(mean)
         unknown, expected = self.unknown.around(mean), self.unknown.mean_dn
@@ -283,9 +283,8 @@ def measure(study: Study, engine: Engine | Pool | None = None, progress: Progres
     expectations = [x for case in prepared for x in case.expectations]
     engine = engine or Engine()
     asked = [(case, *flare, engine) for case in prepared for flare in zip(case.amplitudes, case.flares, strict=True)]
-    flares: list[MeasuredFlare] = []
-    for some in reported(map_in_order(engine, lambda row: _measured(*row), asked), len(asked), progress):
-        flares += some
+    measured = reported(map_in_order(engine, lambda row: _measured(*row), asked), len(asked), progress)
+    flares = list(chain.from_iterable(measured))
     stares = [measured_stare(case, engine) for case in prepared if study.measure.along_stare]
     messages = collect_messages(expectations)
     messages += [stare.drawn for stare in stares if isinstance(stare.drawn, str)]
@@ -310,8 +309,7 @@ def _measured(case: Case, amplitude: float, flare: Expectation, engine: Engine |
             arrays |= {f"{k} {key}": value for key, value in measurement.arrays().items()}
         return arrays
 
-    checkpoint = engine.checkpoint if isinstance(engine, Pool) else None
-    parts: list[Arrays] = []
+    checkpoint, parts = engine.checkpoint if isinstance(engine, Pool) else None, list[Arrays]()
     for start in range(0, study.measure.fits, BATCH):
         count = min(BATCH, study.measure.fits - start)
         # The number changes with the arrays that a fit keeps.
@@ -321,12 +319,9 @@ def _measured(case: Case, amplitude: float, flare: Expectation, engine: Engine |
     measured = []
     for k, forecast in enumerate(expected):
         own = [{key.removeprefix(f"{k} "): x for key, x in part.items() if key.startswith(f"{k} ")} for part in parts]
-        model = forecast.fitted
-        of_batch = partial(
-            Measurement.of_arrays, levels=LEVELS, names=model.names, units=model.units, bounds=model.bounds
-        )
-        measurement = Measurement.joined(list(map(of_batch, own)))
-        measured.append(MeasuredFlare(**vars(forecast), found=measurement, selected=selected, frame=parts[0]["first"]))
+        about: dict[str, Any] = {name: getattr(forecast.fitted, name) for name in ("names", "units", "bounds")}
+        found = Measurement.joined([Measurement.of_arrays(arrays, levels=LEVELS, **about) for arrays in own])
+        measured.append(MeasuredFlare(**vars(forecast), found=found, selected=selected, frame=parts[0]["first"]))
     return measured
 
 
