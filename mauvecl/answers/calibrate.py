@@ -130,11 +130,6 @@ TRANSFER_COLUMNS = (
 )
 
 
-def _title(answer: CalibrateAnswer) -> str:
-    stars = f"{len(answer.stars)} standard star{'s' if len(answer.stars) > 1 else ''}"
-    return f"{answer.nominal.name} fitted to {stars}; dark current at {answer.dark.reference_c:.1f} C"
-
-
 @dataclass(frozen=True, eq=False)
 class CalibrateAnswer(Answer):
     """Answer of `calibrate`."""
@@ -150,8 +145,11 @@ class CalibrateAnswer(Answer):
     throughput: ThroughputFit
 
     #: One row per value of the instrument.
-    values_table = TableOf("calibrate", COLUMNS, "values", title=_title, key="rows",
-                           about=("dark.reference_c", "transfer.dark_unit", "study"))  # fmt: skip
+    values_table = TableOf(
+        "calibrate", COLUMNS, "values", key="rows", about=("dark.reference_c", "transfer.dark_unit", "study"),
+        title=lambda answer: f"{answer.nominal.name} fitted to {len(answer.stars)} standard star"
+        f"{'s' if len(answer.stars) > 1 else ''}; dark current at {answer.dark.reference_c:.1f} C",
+    )  # fmt: skip
     #: One row per fit: its goodness.
     fits = TableOf("fits", FIT_COLUMNS, "_fits", title="Goodness of fit", key="fits", about=())
     #: One row per pixel: fitted and nominal throughput.
@@ -234,7 +232,7 @@ class CalibrateAnswer(Answer):
 
     @property
     def messages(self) -> list[str]:
-        lines = [*self._throughput_messages]
+        lines = self._throughput_messages
         if self.study.calibrate.light_error == 0:
             lines.append("Losses by pointing are taken to be alike in all observations (calibrate.light_error).")
         for row in self.fits:
@@ -284,9 +282,8 @@ class CalibrateAnswer(Answer):
     @property
     def inputs(self) -> list[Expectation]:
         exposure, sky = self.nominal.frame_s, self.study.sky.sky()
-        return [
-            expect(lit.star, self.nominal, exposure=exposure, sky=sky) for lit in self.stars if lit.star is not None
-        ]
+        stars = [observation.star for observation in self.stars]
+        return [expect(star, self.nominal, exposure=exposure, sky=sky) for star in stars if star is not None]
 
     @property
     def source(self) -> str:

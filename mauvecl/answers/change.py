@@ -66,12 +66,8 @@ class ChangeRow(InCell):
     def note(self) -> str:
         """What limits the row, in a few words."""
         lost, every = self.saturated
-        notes = [_lost_pixels(lost, every)] if lost else []
-        if not every:
-            notes.append("no light")
-        if self.hidden:
-            notes.append("hidden by what is unknown")
-        return "; ".join(notes)
+        hidden = "hidden by what is unknown" if self.hidden else ""
+        return "; ".join(filter(None, [_lost_pixels(lost, every), "" if every else "no light", hidden]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,8 +84,7 @@ class IndexRow(InCell):
     @property
     def note(self) -> str:
         """Why the index has no value; empty if it has one."""
-        lost, every = self.saturated
-        return _lost_pixels(lost, every) if lost else ""
+        return _lost_pixels(*self.saturated)
 
     @property
     def snr(self) -> float:
@@ -111,6 +106,9 @@ class PeriodRow(InCell):
 
 
 def _lost_pixels(lost: int, every: int) -> str:
+    """Return how many pixels saturate, or nothing if none do."""
+    if not lost:
+        return ""
     return "every pixel saturates" if lost == every else f"{lost} of {every} pixels saturate"
 
 
@@ -176,14 +174,6 @@ PERIOD_COLUMNS = (
 )  # fmt: skip
 
 
-def _title(answer: ChangeAnswer) -> str:
-    study, visits = answer.study, answer.study.change.visits
-    return (
-        f"Smallest changes between {'two' if visits == 2 else visits} visits of {study.observation.exposure_s:g} s, at "
-        f"a false-alarm probability of {study.run.fap:g} and a power of {study.limit.power:g}"
-    )
-
-
 @dataclass(frozen=True, eq=False)
 class ChangeAnswer(Answer):
     """Answer of `change`."""
@@ -198,8 +188,12 @@ class ChangeAnswer(Answer):
     inputs: list[Expectation]
 
     #: One row per star, cell and change.
-    table = TableOf("change", COLUMNS, "changes", place=True, title=_title, key="rows",
-                    about=("study.change.visits", "study.run.fap", "study.limit.power", "study"))  # fmt: skip
+    table = TableOf(
+        "change", COLUMNS, "changes", place=True, key="rows",
+        title=lambda answer: f"Smallest changes between {answer.visits}, at a false-alarm probability of "
+        f"{answer.study.run.fap:g} and a power of {answer.study.limit.power:g}",
+        about=("study.change.visits", "study.run.fap", "study.limit.power", "study"),
+    )  # fmt: skip
     #: One row per star, cell and line index.
     index_table = TableOf(
         "indices", INDEX_COLUMNS, "indices", place=True, key="indices", about=(),
@@ -225,23 +219,23 @@ class ChangeAnswer(Answer):
         return len(self.along) // (MAGNITUDES.size * len(self.study.change.of))
 
     @property
+    def visits(self) -> str:
+        """Number and exposure of the visits, as sentences say them."""
+        visits = self.study.change.visits
+        return f"{'two' if visits == 2 else visits} visits of {self.study.observation.exposure_s:g} s"
+
+    @property
     def headline(self) -> str:
         """The smallest change of the first row that is not hidden."""
         row = next((row for row in self.changes if np.isfinite(row.smallest.one)), self.changes[0])
-        name, unit, visits = row.change.name, row.change.unit, self.study.change.visits
-        where = (
-            f"{name} of {row.title} between {'two' if visits == 2 else visits} visits of "
-            f"{self.study.observation.exposure_s:g} s"
-        )
+        unit, instrument = row.change.unit, name_of_instrument(self.study)
+        where = f"{row.change.name} of {row.title} between {self.visits}"
         if not np.isfinite(row.smallest.one):
-            return (
-                f"{name_of_instrument(self.study)} would see no change in {where}: {row.note or 'there is no light'}."
-            )
+            return f"{instrument} would see no change in {where}: {row.note or 'there is no light'}."
         ideal = "" if self.study.nuisances.none else f" ({_amount(row.ideal, unit)} {IF_KNOWN})"
         return (
-            f"{name_of_instrument(self.study)} would see a change of {_amount(row.smallest.one, unit)}{ideal} in "
-            f"{where} with a chance of {100 * self.study.limit.power:g} %; one visit measures it to "
-            f"{_amount(row.error, unit)}."
+            f"{instrument} would see a change of {_amount(row.smallest.one, unit)}{ideal} in {where} with a chance of "
+            f"{100 * self.study.limit.power:g} %; one visit measures it to {_amount(row.error, unit)}."
         )
 
     @property
@@ -320,9 +314,8 @@ def _changes(case: Case, file: Source | None) -> list[ChangeRow]:
     unit = smallest_change(1.0, study.change.visits, study.run.fap, study.limit.power)
     rows = []
     for name in study.change.of:
-        change = Change.named(
-            name, case.source, quiet, case.instrument, study.observation.order, file, study.change.band
-        )
+        order, band = study.observation.order, study.change.band
+        change = Change.named(name, case.source, quiet, case.instrument, order, file, band)
         error, known_error = (error_of_change(change.counts_dn, quiet, unknowns) for unknowns in (unknown, None))
         smallest = Smallest(change.size(error * unit.one), change.size(error * unit.scatter))
         ideal = change.size(known_error * unit.one)

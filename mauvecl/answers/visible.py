@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,15 +29,14 @@ if TYPE_CHECKING:
     from mauvecl.runs.pool import Pool
 
 
-@dataclass(frozen=True)
-class Entry:
+class Entry(NamedTuple):
     """Appointment in a calendar."""
 
     #: UTC, ISO 8601 to the second; dates without time make an entry of whole days, including the last.
     start: str
     stop: str
     title: str
-    text: str = ""
+    text: str
 
 
 def calendar_bytes(entries: Iterable[Entry], name: str) -> bytes:
@@ -50,19 +49,19 @@ def calendar_bytes(entries: Iterable[Entry], name: str) -> bytes:
     ]
     for entry in entries:
         stop = entry.stop
-        if _is_day(stop):
+        if len(stop) == len("2027-01-31"):
             # An event ends at the beginning of the next day.
             stop = (datetime.date.fromisoformat(stop) + datetime.timedelta(days=1)).isoformat()
-        unique = hashlib.sha256("\0".join((entry.start, entry.stop, entry.title)).encode()).hexdigest()[:24]
+        unique = hashlib.sha256("\0".join(entry[:3]).encode()).hexdigest()[:24]
         lines += [
             "BEGIN:VEVENT",
             f"UID:{unique}@mauvecl",
             # A fixed time, so that equal plans give equal files.
-            f"DTSTAMP:{_moment(entry.start).removeprefix(':').removeprefix(';VALUE=DATE:')[:8]}T000000Z",
+            f"DTSTAMP:{entry.start[:10].replace('-', '')}T000000Z",
             f"DTSTART{_moment(entry.start)}",
             f"DTEND{_moment(stop)}",
             f"SUMMARY:{_text(entry.title)}",
-            *([f"DESCRIPTION:{_text(entry.text)}"] if entry.text else []),
+            f"DESCRIPTION:{_text(entry.text)}",
             "TRANSP:TRANSPARENT",
             "END:VEVENT",
         ]
@@ -70,13 +69,9 @@ def calendar_bytes(entries: Iterable[Entry], name: str) -> bytes:
     return "".join(f"{_folded(line)}\r\n" for line in lines).encode()
 
 
-def _is_day(text: str) -> bool:
-    return len(text) == 10
-
-
 def _moment(text: str) -> str:
     plain = text.replace("-", "").replace(":", "")
-    return f";VALUE=DATE:{plain}" if _is_day(text) else f":{plain}Z"
+    return f":{plain}Z" if "T" in plain else f";VALUE=DATE:{plain}"
 
 
 def _text(value: str) -> str:
@@ -87,14 +82,12 @@ def _text(value: str) -> str:
 
 def _folded(line: str) -> str:
     """Fold a line to at most 75 bytes; continuation lines begin with a space."""
-    parts: list[str] = []
-    part = ""
+    parts = [""]
     for character in line:
-        if len((part + character).encode()) > (75 if not parts else 74):
-            parts.append(part)
-            part = ""
-        part += character
-    return "\r\n ".join([*parts, part])
+        if len((parts[-1] + character).encode()) > (75 if len(parts) == 1 else 74):
+            parts.append("")
+        parts[-1] += character
+    return "\r\n ".join(parts)
 
 
 Float = NDArray[np.float64]
@@ -239,7 +232,7 @@ class VisibleAnswer(Answer):
         names, by_month = seen.by_month()
         hours, away = by_month[:, k], self.elongation_deg(k)
         light = self.zodiacal[k][np.isfinite(self.zodiacal[k])]
-        length = windows.length_s
+        length, end_s = windows.length_s, self.times.n * self.times.step_s
         return {
             "target": target.name,
             "ra": target.ra_deg,
@@ -249,7 +242,7 @@ class VisibleAnswer(Answer):
             **{f"leaves_{name}": shares[k] for name, shares in seen.kept_by.items()},
             "windows": length.size,
             "median_window": float(np.median(length / 60)) if length.size else 0.0,
-            "longest_gap": self._longest_gap_d(k),
+            "longest_gap": float(np.max(np.append(windows.start_s, end_s) - np.append(0.0, windows.stop_s))) / DAY_S,
             "per_orbit": float(np.mean(seen.by_orbit(k))),
             "in_shadow": float(windows.in_shadow_s.sum() / length.sum()) if length.size else 0.0,
             "best_month": names[int(np.argmax(hours))] if hours.any() else "",
@@ -270,15 +263,6 @@ class VisibleAnswer(Answer):
             for k, target in enumerate(self.targets)
         ]
         return [*super().views, View("Hours of exposure by month", columns, table_of(columns, rows))]
-
-    def _longest_gap_d(self, k: int) -> float:
-        """Return the longest time without a window, in days."""
-        windows = self.windows[k]
-        ends = (
-            np.concatenate([[0.0], windows.stop_s]),
-            np.concatenate([windows.start_s, [self.times.n * self.times.step_s]]),
-        )
-        return float(np.max(ends[1] - ends[0])) / DAY_S
 
     @property
     def _hours_by_month(self) -> dict[str, Any]:
