@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, overload
 
 from mauvecl.host import VERSION
 from mauvecl.host.arrays import ContentEquality
-from mauvecl.host.exposure.star import Neighbour, rate_of
+from mauvecl.host.exposure.star import rate_of
 from mauvecl.host.instrument.paths import shipped_names
 from mauvecl.host.tables.files import check_size, json_text, open_regular, read_text, write_whole, writing
 from mauvecl.schema.calls import validated
@@ -218,12 +218,8 @@ class Answer(Drawable, ContentEquality):
         """Neighbours of the stars that the answer observes, or None."""
         if not self.study.has_neighbours or "instrument" not in self.uses:
             return None
-        rows = [
-            NeighbourRow(case, neighbour)
-            for case in self.observed
-            for neighbour in (() if case.neighbours is None else case.neighbours.stars)
-        ]
-        shares = sorted({row.case.star.neighbour_share for row in rows})
+        rows = [row for case in self.observed for row in _neighbour_rows(case)]
+        shares = sorted({row["assumed_share"] for row in rows})
         about = {"assumed_share": shares[0] if len(shares) == 1 else shares, "study": self.study.text()}
         return table_of(NEIGHBOUR_COLUMNS, rows, **about) if rows else None
 
@@ -471,6 +467,8 @@ def write_record(
     the digests of the written `files` and its own; see `verify_answer`. If these are the `whole` answer, unchanged
     files of an earlier run in the folder that this run did not write are removed.
     """
+    from importlib.metadata import version
+
     record: dict[str, Any] = {
         "mauvecl": VERSION,
         "verb": verb,
@@ -481,7 +479,7 @@ def write_record(
         "inputs": [{"name": x.name} | dict(x.provenance) for x in expectations],
         "messages": list(messages),
         "python": platform.python_version(),
-        "packages": _versions("numpy", "scipy", "astropy", "synphot", "pyopencl"),
+        "packages": {name: version(name) for name in ("numpy", "scipy", "astropy", "synphot", "pyopencl")},
     }
     if pool is not None:
         record |= _devices(pool.devices, pool.kernel_digest) | {"shards": asdict(pool.standing)}
@@ -527,49 +525,33 @@ def write_json(content: Any, path: Path) -> Path:
     return path
 
 
-def _versions(*names: str) -> dict[str, str]:
-    from importlib.metadata import version
-
-    return {name: version(name) for name in names}
-
-
-@dataclass(frozen=True, eq=False)
-class NeighbourRow:
-    """A neighbour of a case's star."""
-
-    case: Case
-    neighbour: Neighbour
-
-    @property
-    def enters(self) -> bool:
-        """True if the neighbour is within the fibre's radius."""
-        return self.neighbour.separation_arcsec <= self.case.instrument.field_of_view_radius_arcsec
-
-    @property
-    def spectrum(self) -> str:
-        """Spectrum that represents the neighbour; empty beyond the fibre, where none is needed."""
-        return self.neighbour.spectrum[0] if self.enters else ""
-
-    @property
-    def share(self) -> float:
-        """Share of the electrons of all stars in the fibre."""
-        if not self.enters:
-            return 0.0
-        x, near = self.case.quiet, self.case.neighbours
-        assert near is not None
-        rate = rate_of(self.neighbour, self.case.instrument, self.case.study.observation.order)
-        own = near.share * float(rate.sum()) * x.frame_s
-        return own / float((x.source_electrons + x.neighbour_electrons).sum())
+def _neighbour_rows(case: Case) -> Iterator[dict[str, Any]]:
+    """Yield the neighbours of a case's star by the names of columns."""
+    x, near = case.quiet, case.neighbours
+    if near is None:
+        return
+    for star in near.stars:
+        enters, share = star.separation_arcsec <= case.instrument.field_of_view_radius_arcsec, 0.0
+        if enters:
+            rate = rate_of(star, case.instrument, case.study.observation.order)
+            own = near.share * float(rate.sum()) * x.frame_s
+            share = own / float((x.source_electrons + x.neighbour_electrons).sum())
+        # Beyond the fibre no spectrum is needed.
+        spectrum, magnitude = star.spectrum[0] if enters else "", star.magnitude
+        yield {
+            "star": case.label, "name": star.name, "separation": star.separation_arcsec, "band": star.band,
+            "magnitude": float("nan") if magnitude is None else magnitude, "spectrum": spectrum, "enters": enters,
+            "share": share, "assumed_share": case.star.neighbour_share,
+        }  # fmt: skip
 
 
 #: Columns of the table of neighbours.
 NEIGHBOUR_COLUMNS = (
-    Column("star", "case.label", description="star that is observed", heading="star", kind=str),
-    Column("name", "neighbour.name", description="neighbour", heading="neighbour", kind=str),
-    Column("separation", "neighbour.separation_arcsec", "arcsec", "from the star", "arcsec", ".4g"),
-    Column("magnitude", lambda row: float("nan") if row.neighbour.magnitude is None else row.neighbour.magnitude,
-           "mag", "in the band", "magnitude", ".2f"),
-    Column("band", "neighbour.band", heading="band", kind=str),
+    Column("star", description="star that is observed", heading="star", kind=str),
+    Column("name", description="neighbour", heading="neighbour", kind=str),
+    Column("separation", "", "arcsec", "from the star", "arcsec", ".4g"),
+    Column("magnitude", "", "mag", "in the band", "magnitude", ".2f"),
+    Column("band", heading="band", kind=str),
     Column("spectrum", description="spectrum that represents it; empty if its light does not enter",
            heading="spectrum", kind=str),
     Column("enters", description="whether it is within the fibre's radius, so that the assumed share of its light "

@@ -75,14 +75,11 @@ class Fitted:
         return (self.value - self.nominal) / self.error if self.determined and self.error > 0 else float("nan")
 
 
-def _significant(value: float, error: float) -> str:
-    return f"{value:.6g} +- {error:.2g}" if error == error else f"{value:.6g}"
-
-
 #: Columns of the table of values.
 COLUMNS = (
     Column("quantity", "name", "", "value of the instrument", "quantity", kind=str),
-    Column("value", "value", "", "fitted, or nominal where it is not determined", "value", _significant, ("error",)),
+    Column("value", "value", "", "fitted, or nominal where it is not determined", "value",
+           lambda value, error: f"{value:.6g} +- {error:.2g}" if error == error else f"{value:.6g}", ("error",)),
     Column("error", "error", "", "standard error; nan: not determined by these observations"),
     Column("nominal", "nominal", "", "value of the instrument that was given", "nominal", ".6g"),
     Column("deviation", "deviation", "", "fitted less nominal value in standard errors", "sigma", number("+.1f")),

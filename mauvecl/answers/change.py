@@ -293,10 +293,8 @@ def change(study: Study, engine: Engine | Pool | None = None, progress: Progress
         own = _changes(case, file)
         rows += own
         indices += _indices(case)
-        magnitude = case.star.magnitude
-        if magnitude is not None:
-            for step in MAGNITUDES:
-                along += _changes(case.with_value("magnitude", float(magnitude + step)), file)
+        for step in () if case.star.magnitude is None else case.star.magnitude + MAGNITUDES:
+            along += _changes(case.with_value("magnitude", float(step)), file)
         if times is not None:
             recovery = recover_periods(
                 times, np.geomspace(asked.shortest_d, asked.longest_d, asked.steps),

@@ -172,25 +172,21 @@ class DetectAnswer(Answer):
         run, quiet = self.study.run, [star.detection.quiet for star in self.stars]
         frames = {x.exposure_s: "1 frame" if x.n_frames == 1 else f"{x.n_frames} frames" for x in quiet}
         exposures = " and ".join(f"{exposure_s:g} s ({text})" for exposure_s, text in frames.items())
-        title = (
-            f"Detection at a false-alarm probability of {run.fap:g} per test, {exposures}, {run.realisations:,} "
-            "realisations"
-        )
+        how = f"{exposures}, {run.realisations:,} realisations"
+        title = f"Detection at a false-alarm probability of {run.fap:g} per test, {how}"
         detected = DetectAnswer.table.view(self, title)
         if not len(self.departures):
             return [detected]
         differing = self.departures[self.departures["differs"]]
-        if not len(differing):
-            line = (
-                f"At the thresholds for Gaussian noise the simulated false-alarm probability is {run.fap:g} within 4 "
-                "standard errors, for every statistic."
-            )
-            return [detected, View(line)]
-        title = (
-            "Where the simulation differs from the closed form: false-alarm probability at the threshold that should "
-            f"give {run.fap:g}"
+        if len(differing):
+            threshold = f"false-alarm probability at the threshold that should give {run.fap:g}"
+            title = f"Where the simulation differs from the closed form: {threshold}"
+            return [detected, DetectAnswer.departures.view(self, title, differing)]
+        line = (
+            f"At the thresholds for Gaussian noise the simulated false-alarm probability is {run.fap:g} within 4 "
+            "standard errors, for every statistic."
         )
-        return [detected, DetectAnswer.departures.view(self, title, differing)]
+        return [detected, View(line)]
 
     @property
     def _curves(self) -> Iterator[dict[str, Any]]:
@@ -293,11 +289,10 @@ def detect(study: Study, engine: Engine | Pool | None = None, progress: Progress
 def _messages(answer: DetectAnswer, prepared: Sequence[Case]) -> list[str]:
     """Return messages on lost pixels, on thresholds, and of the expectations."""
     run, detections = answer.study.run, [(star.title, star.detection) for star in answer.stars]
-    blinding = [message.about(title) for title, one in detections for message in one.messages]
-    blinding += [message.about(title) for title, one in detections for message in one.without_threshold(run.fap)]
-    blinding += [message.about(title) for title, one in detections for message in one.lowered]
-    expectations = [x for case in prepared for x in case.expectations]
-    messages: list[str] = [*blinding, *collect_messages(expectations, answer.study.processes)]
+    messages: list[str] = [message.about(title) for title, one in detections for message in one.messages]
+    messages += [message.about(title) for title, one in detections for message in one.without_threshold(run.fap)]
+    messages += [message.about(title) for title, one in detections for message in one.lowered]
+    messages += collect_messages([x for case in prepared for x in case.expectations], answer.study.processes)
     errors = answer.table["fap_error"][np.isfinite(answer.table["fap_error"])]
     if not countable(run.fap, run.realisations) and errors.size:
         text = (
@@ -321,12 +316,8 @@ def _cost_of_unknowns(prepared: Sequence[Case]) -> list[str]:
 
 def _few_terms(stars: Sequence[StarDetection]) -> list[str]:
     """Return a sentence on the number of independent squares of the paper's sum, if it is requested."""
-    forms = [
-        star.detection.closed_form("paper", template=flare)
-        for star in stars
-        if "paper" in star.detection.statistics
-        for flare in range(len(star.amplitudes))
-    ]
+    summed = [star for star in stars if "paper" in star.detection.statistics]
+    forms = [star.detection.closed_form("paper", template=k) for star in summed for k in range(len(star.amplitudes))]
     terms = [form.effective_terms for form in forms if isinstance(form, QuadraticForm)]
     if not terms:
         return []
@@ -350,14 +341,12 @@ def _other_templates(case: Case) -> list[Linear]:
 def _template_costs(case: Case, star: StarDetection) -> list[str]:
     """Return sentences on the S/N lost to templates of another temperature, for Gaussian noise."""
     detection, lines, light = star.detection, [], case.study.flare.light().describe()
-    for temperature in case.study.run.template_temperatures_k:
+    for kelvin in case.study.run.template_temperatures_k:
         right = Matched().closed_form(detection.setting, detection.flares[0], detection.flares[0]).mean
-        name = f"matched {temperature:g} K"
+        name = f"matched {kelvin:g} K"
         share = detection.closed_form(name, 0).mean / detection.closed_form(name).std / right if right else 0.0
-        lines.append(
-            f"{star.label}: looking for a flare of {temperature:g} K in one of {light} keeps "
-            f"{100 * share:.1f} % of the matched statistic's S/N."
-        )
+        kept = f"keeps {100 * share:.1f} % of the matched statistic's S/N"
+        lines.append(f"{star.label}: looking for a flare of {kelvin:g} K in one of {light} {kept}.")
     return lines
 
 

@@ -142,7 +142,6 @@ class Limit:
     amplitude: float  # amplitude of the flare; NaN if the amplitude is the limit
     of: str
     statistic: str
-    fap: float
     power: float
     value: Interval  # limit with its 95 % interval, including that of the threshold
     closed_form: float  # limit for Gaussian noise
@@ -241,9 +240,8 @@ def _unknown_columns(digits: str) -> tuple[Column, ...]:
 
 def _draw_columns(answer: LimitAnswer) -> tuple[Column, ...]:
     draws = next(limit.unknown.draws for limit in answer.limits if limit.unknown is not None)
-    values = (column.of(attrgetter("unknown")) for column in draw_columns(draws))
     limit = Column(answer.study.limit.of, "unknown.limits", description="closed-form limit")
-    return (*answer.flare_columns, *values, limit)
+    return (*answer.flare_columns, *(column.of(attrgetter("unknown")) for column in draw_columns(draws)), limit)
 
 
 @dataclass(eq=False)
@@ -358,7 +356,6 @@ def solve(case: Case, statistic: str, engine: Engine | Pool, report: Report = No
         amplitude=float("nan") if question.of == "amplitude" else case.amplitudes[0],
         of=question.of,
         statistic=statistic,
-        fap=question.fap,
         power=question.power,
         value=value,
         closed_form=theory,

@@ -57,11 +57,6 @@ class Conditions:
     swing: tuple[tuple[float, float], ...]
     hits_per_cm2_s: float  # mean of cosmic rays and trapped protons while the target is visible
 
-    def swings(self, orbits: int, orbit_s: float) -> tuple[tuple[float, float], ...]:
-        """Return the swing of N orbits."""
-        points = [point for point in self.swing if point[0] < orbit_s]
-        return tuple((n * orbit_s + t, value) for n in range(orbits) for t, value in points)
-
 
 @dataclass(frozen=True, eq=False)
 class OrbitConditions:
@@ -333,7 +328,8 @@ def injection_case(observation: TargetObservation) -> Case:
     changes: dict[str, Any] = {"duration_s": ORBITS * orbit_s, "orbit_s": orbit_s, "orbit_gap_s": gap}
     changes |= {"gaps": (), "along_orbit": False}
     if conditions is not None and study.stare.thermal is None:
-        changes["thermal"] = Curve(points=conditions.swings(ORBITS, orbit_s))
+        swing = [(t, value) for t, value in conditions.swing if t < orbit_s]
+        changes["thermal"] = Curve(points=tuple((n * orbit_s + t, value) for n in range(ORBITS) for t, value in swing))
     injections = InjectionQuestion(
         of="energy", sizes=2, widths=WIDTHS, half_width_low_s=WIDTH_RANGE_S[0], half_width_high_s=WIDTH_RANGE_S[1],
         count=study.plan.injections, positions=min(POSITIONS, study.plan.injections), fitted=0,

@@ -321,18 +321,16 @@ def simulate(
     flaring : bool
         Whether the flares of the study are observed, too.
     """
-    observations, everything = [], []
-    study = study.ideal()
+    study, observations = study.ideal(), []
     prepared = cases(study, swept=False)
     for case in reported(prepared, len(prepared), progress):
-        xs = case.expectations if flaring else [case.quiet]
-        for i, x in enumerate(xs):
+        for i, x in enumerate(case.expectations if flaring else [case.quiet]):
             title = star_label(case.star, x) + (f", flare {100 * case.amplitudes[i - 1]:g} %" if i else "")
             table = components(x, realisation=realisation, seed=study.run.seed, **case.draw_options)
             table.meta["study"] = study.text()
             observations.append(Observation(title, x, table))
-        everything += xs
-    return SimulateAnswer(study, observations, collect_messages(everything, study.processes))
+    messages = collect_messages([observation.expectation for observation in observations], study.processes)
+    return SimulateAnswer(study, observations, messages)
 
 
 #: Wavelengths of the elements that terminal and pictures show, nm; the tables hold all of them.
@@ -352,7 +350,7 @@ class StarSnr(InCell):
         if self.asked_nm is not None:
             return [self.asked_nm]
         first, last = self.result.expectation.wavelength_nm[[0, -1]]
-        return [wavelength for wavelength in SHOWN_NM if first <= wavelength <= last]
+        return [nm for nm in SHOWN_NM if first <= nm <= last]
 
 
 #: Metadata of tables of realisations.

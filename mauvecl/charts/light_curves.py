@@ -127,8 +127,8 @@ def _edges(middles: Any) -> Any:
 Float = NDArray[np.float64]
 #: Largest number of points of a light curve, and of rows of a dynamic spectrum; longer stares are averaged.
 MOST_POINTS, MOST_ROWS = 4000, 600
-#: Longest durations that are shown in seconds, and in minutes, s.
-IN_SECONDS_S, IN_MINUTES_S = 600.0, 4 * 3600.0
+#: Units of time: longest duration that is shown in it, its length, s, and its name.
+TIME_UNITS = ((600.0, 1.0, "s"), (4 * 3600.0, 60.0, "min"), (3 * 86_400.0, 3600.0, "h"), (np.inf, 86_400.0, "d"))
 
 
 @picture_of("StareAnswer", "light-curve", each=lambda answer: [(star,) for star in answer.stares])
@@ -241,15 +241,8 @@ def spectra_panel(
 
 
 def time_unit(duration_s: float) -> tuple[float, str]:
-    if duration_s <= IN_SECONDS_S:
-        return 1.0, "s"
-    return (
-        (60.0, "min")
-        if duration_s <= IN_MINUTES_S
-        else (3600.0, "h")
-        if duration_s <= 3 * 86_400.0
-        else (86_400.0, "d")
-    )
+    """Return the length of the unit in which a duration is shown, and its name."""
+    return next((length_s, name) for longest_s, length_s, name in TIME_UNITS if duration_s <= longest_s)
 
 
 def _runs(numbers: NDArray[np.int64]) -> list[NDArray[np.intp]]:
