@@ -189,6 +189,11 @@ class Answer(Drawable, ContentEquality):
         keyed = {table.key: getattr(self, table.name) for table in self._declared() if table.key}
         return keyed or {"rows": next(iter(self.tables.values()))}
 
+    @property
+    def instrument_name(self) -> str:
+        """The instrument as sentences name it."""
+        return name_of_instrument(self.study)
+
     def placed(self, columns: Sequence[Column]) -> tuple[Column, ...]:
         """Return columns after those of the star and of swept quantities that are not among them."""
         return (*place_columns(self.study.sweep, *(column.name for column in columns)), *columns)

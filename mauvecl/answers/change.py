@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, name_of_instrument, reported
+from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, reported
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.host.orbit.visibility import Visibility
 from mauvecl.observations.visits import (
@@ -228,7 +228,7 @@ class ChangeAnswer(Answer):
     def headline(self) -> str:
         """The smallest change of the first row that is not hidden."""
         row = next((row for row in self.changes if np.isfinite(row.smallest.one)), self.changes[0])
-        unit, instrument = row.change.unit, name_of_instrument(self.study)
+        unit, instrument = row.change.unit, self.instrument_name
         where = f"{row.change.name} of {row.title} between {self.visits}"
         if not np.isfinite(row.smallest.one):
             return f"{instrument} would see no change in {where}: {row.note or 'there is no light'}."

@@ -158,7 +158,7 @@ class DetectAnswer(Answer):
         rows = self.table[self.table["statistic"] == statistic]
         chances = np.asarray(rows["probability"])
         if not np.isfinite(chances).any():
-            return f"{name_of_instrument(self.study)} would see none of these flares: every pixel saturates."
+            return f"{self.instrument_name} would see none of these flares: every pixel saturates."
         place = int(np.nanargmin(np.abs(chances - 0.5)))
         row, star = rows[place], self.stars[place // len(self.stars[0].amplitudes)]
         ideal = f"; {chance_text(row['ideal'])} {IF_KNOWN}" if "ideal" in rows.colnames else ""

@@ -11,16 +11,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.answers.answer import (
-    IF_KNOWN,
-    Answer,
-    InCell,
-    TableOf,
-    first_of,
-    name_of_instrument,
-    reported,
-    share_columns,
-)
+from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, first_of, reported, share_columns
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection.distributions import Interval
 from mauvecl.device.engine import Stares
@@ -355,7 +346,7 @@ class InjectAnswer(Answer):
         if not np.isfinite(half.value):
             return f"Fewer than half of the injected flares on {star.title} are found at any {of}{least}."
         return (
-            f"A search of {name_of_instrument(self.study)}'s frames of {star.title} would find half of the flares of "
+            f"A search of {self.instrument_name}'s frames of {star.title} would find half of the flares of "
             f"{of} {scale * half.value:.3g} {unit} ({scale * half.low:.3g} to {scale * half.high:.3g}{ideal}), "
             f"with {self.study.search.rate_text}{least}."
         )

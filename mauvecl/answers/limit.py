@@ -11,14 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from mauvecl.answers.answer import (
-    IF_KNOWN,
-    Answer,
-    TableOf,
-    first_of,
-    name_of_instrument,
-    share_columns,
-)
+from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf, first_of, share_columns
 from mauvecl.answers.closed_forms import Cost, cost_lines, describe_shares, draw_columns, marginal_lines, unknown_cost
 from mauvecl.answers.limit_search import LimitSearch, MarginalLimitSearch, Point, Report, Unknown, settle, single_flares
 from mauvecl.answers.verbs import Progress, by_keywords
@@ -283,7 +276,7 @@ class LimitAnswer(Answer):
         ideal = "" if np.isnan(limit.ideal) else f"; {number(limit.ideal)} {IF_KNOWN}"
         least = first_of(len(self.limits), "limits")
         return (
-            f"{name_of_instrument(self.study)} would see {flare} on {full_label(limit.star, limit.at)}{within} with a "
+            f"{self.instrument_name} would see {flare} on {full_label(limit.star, limit.at)}{within} with a "
             f"chance of {100 * asked.power:g} % {before} {number(limit.value.value)} "
             f"({number(limit.value.low)} to {number(limit.value.high)}{ideal}){least}."
         )

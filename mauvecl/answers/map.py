@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf, name_of_instrument
+from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf
 from mauvecl.answers.closed_forms import (
     IDEAL,
     average,
@@ -117,7 +117,7 @@ class MapAnswer(Answer):
         seen, known = (int(np.count_nonzero(chances[number] >= 0.5)) for chances in (self.probability, self.ideal))
         ideal = "" if self.study.nuisances.none else f" ({known} {IF_KNOWN})"
         return (
-            f"{name_of_instrument(self.study)} would see a flare on {self.star} with a chance of at least 50 % in "
+            f"{self.instrument_name} would see a flare on {self.star} with a chance of at least 50 % in "
             f"{seen} of {self.probability[number].size} cells of the map{ideal}."
         )
 

@@ -14,7 +14,7 @@ import scipy
 from astropy.table import QTable
 from numpy.typing import NDArray
 
-from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf, name_of_instrument, reported
+from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf, reported
 from mauvecl.answers.measurements import (
     JOINT_COLUMNS,
     ExpectedMeasurement,
@@ -238,7 +238,7 @@ class MeasureAnswer(Answer):
         error, known = flare.ahead.errors[0], flare.known.errors[0]
         ideal = "" if self.study.nuisances.none else f" ({known:.3g} {unit} {IF_KNOWN})"
         return (
-            f"{name_of_instrument(self.study)} would measure the {name.replace('_', ' ')} of a flare of "
+            f"{self.instrument_name} would measure the {name.replace('_', ' ')} of a flare of "
             f"{100 * flare.amplitude:g} % on {flare.title} in {flare.quiet.exposure_s:g} s with a standard error of "
             f"{error:.3g} {unit}{ideal}."
         )

@@ -22,15 +22,7 @@ from mauvecl.fits.spectrum import (
     forecast,
     forecast_two_temperatures,
 )
-from mauvecl.fits.time_course import (
-    CoolingCourse,
-    MeasuredBins,
-    cooling_course,
-    cooling_event,
-    fit_bins,
-    fit_cooling,
-    measure_along,
-)
+from mauvecl.fits.time_course import MeasuredBins, cooling_course, cooling_event, fit_bins, fit_cooling, measure_along
 from mauvecl.flares.settings import Cooling
 from mauvecl.flares.stare_scene import StaresRequest
 from mauvecl.host.stars.bands import photons
@@ -52,6 +44,7 @@ from mauvecl.study.analyses import fitted_models
 if TYPE_CHECKING:
     from mauvecl.detection.nuisances import Nuisances
     from mauvecl.device.engine import Engine
+    from mauvecl.fits.time_course import CoolingCourse
     from mauvecl.flares.frames import Components, StareExpectation
     from mauvecl.flares.stare import Event
     from mauvecl.host.exposure.expectation import Expectation

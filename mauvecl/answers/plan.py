@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf, name_of_instrument, reported, share_columns
+from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf, reported, share_columns
 from mauvecl.answers.plan_targets import (
     NOTHING,
     CompletenessOf,
@@ -179,7 +179,7 @@ class PlanAnswer(Answer):
         ideal = "" if np.isnan(best.ideal) else f"; {two_digits(best.ideal)} {IF_KNOWN}"
         most = f", the most of {len(self.planned)} targets" if len(self.planned) > 1 else ""
         return (
-            f"{name_of_instrument(self.study)} would recover {two_digits(best.recovered.expected)} flares of "
+            f"{self.instrument_name} would recover {two_digits(best.recovered.expected)} flares of "
             f"{best.name} in {best.hours:.0f} h (95 % of campaigns: {best.recovered.low} to {best.recovered.high}"
             f"{ideal}){most}."
         )

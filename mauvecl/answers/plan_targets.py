@@ -22,15 +22,7 @@ from mauvecl.host.stars.library import nearest_spectrum
 from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool
 from mauvecl.schema.errors import InputError
-from mauvecl.search.completeness import (
-    PER_DECADE,
-    SMALL,
-    Completeness,
-    DurationLaw,
-    Yield,
-    frame_signal,
-    recovered_per_day,
-)
+from mauvecl.search.completeness import PER_DECADE, SMALL, Completeness, frame_signal, recovered_per_day
 from mauvecl.search.templates import frame_nuisances
 from mauvecl.study.cases import Case
 from mauvecl.study.plan import PlanTarget
@@ -44,6 +36,7 @@ if TYPE_CHECKING:
     from mauvecl.detection.snr import Arrays
     from mauvecl.device.engine import Stares
     from mauvecl.host.exposure.expectation import Expectation
+    from mauvecl.search.completeness import DurationLaw, Yield
 
 Float = NDArray[np.float64]
 

@@ -279,14 +279,15 @@ class Entry:
 ENTRIES: defaultdict[str, list[Entry]] = defaultdict(list)
 
 
+def register(kind: str, name: str, make: F, **how: Any) -> F:
+    """Register a function that makes a picture, or the bytes of a document, of a class; `how` as in `Entry`."""
+    ENTRIES[kind].append(Entry(name, make, **how))
+    return make
+
+
 def document_of(kind: str, name: str, **how: Any) -> Callable[[F], F]:
     """Register a function that returns the bytes of a document of a class; arguments as for `matplotlib.picture_of`."""
-
-    def register(make: F) -> F:
-        ENTRIES[kind].append(Entry(name, make, document=True, **how))
-        return make
-
-    return register
+    return lambda make: register(kind, name, make, document=True, **how)
 
 
 def pictures_of(thing: Any) -> dict[str, Callable[..., Any]]:

@@ -11,21 +11,7 @@ from typing import Any, ParamSpec
 
 import numpy as np
 
-from mauvecl.charts.chart import (
-    AXES,
-    ENTRIES,
-    Band,
-    Dots,
-    Entry,
-    Line,
-    Mesh,
-    Panel,
-    Picture,
-    Rule,
-    Series,
-    Strips,
-    Targets,
-)
+from mauvecl.charts.chart import AXES, Band, Dots, Line, Mesh, Panel, Picture, Rule, Series, Strips, Targets, register
 from mauvecl.host.tables.files import write_whole
 from mauvecl.schema.errors import InputError
 
@@ -237,13 +223,7 @@ def picture_of(kind: str, name: str, **how: Any) -> Callable[[Callable[P, Any]],
     **how
         `given`, `each` and `when`; see `chart.Entry`.
     """
-
-    def register(draw: Callable[P, Any]) -> Callable[..., Any]:
-        picture = styled_picture(draw)
-        ENTRIES[kind].append(Entry(name, picture, **how))
-        return picture
-
-    return register
+    return lambda draw: register(kind, name, styled_picture(draw), **how)
 
 
 def draw_picture(picture: Picture, figure: Any = None) -> Any:
