@@ -12,6 +12,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Se
 from dataclasses import KW_ONLY, asdict, dataclass
 from functools import cached_property
 from html import escape
+from importlib.metadata import version
 from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, overload
@@ -472,8 +473,6 @@ def write_record(
     the digests of the written `files` and its own; see `verify_answer`. If these are the `whole` answer, unchanged
     files of an earlier run in the folder that this run did not write are removed.
     """
-    from importlib.metadata import version
-
     record: dict[str, Any] = {
         "mauvecl": VERSION,
         "verb": verb,

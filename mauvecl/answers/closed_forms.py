@@ -229,19 +229,17 @@ def drawn(study: Study) -> DrawnStudies:
     certain = study.model_copy(update={"unknowns": type(asked)(), "run": run})
     studies = []
     for row in values:
-        changes: dict[str, Any] = {}
-        at = nominal
+        changes, at = dict[str, Any](), nominal
         for name, value in zip(priors, row, strict=True):
             change = rows[name].changes(at, float(value))
             changes |= change
             # The next mode is added to those before it.
             at = at.model_copy(update=change) if isinstance(rows[name], ThroughputMode) else at
-        changed = certain.with_instrument(changes)
         try:
             nominal.with_(**changes)
         except InputError as error:
             raise error.within("the priors of unknown values include impossible ones") from error
-        studies.append(changed)
+        studies.append(certain.with_instrument(changes))
     return DrawnStudies(tuple(priors), tuple(rows[name].label for name in priors), values, tuple(studies))
 
 

@@ -253,8 +253,12 @@ class LimitAnswer(Answer):
                     about=("study.limit.power", "study.run.fap", "study.run.realisations", "study"))  # fmt: skip
     #: One row per limit and draw of the unknown: its values and the closed-form limit.
     draws = TableOf("unknowns", _draw_columns, "limits", place=True, when="study.unknowns.draws")
-    _assumptions = TableOf("assumptions", lambda answer: assumption_columns(answer.study.limit.of), "assumptions",
-                           key="assumptions", when=lambda answer: answer.assumptions is not None)  # fmt: skip
+    _assumptions = TableOf(
+        "assumptions", lambda answer: assumption_columns(answer.study.limit.of), "assumptions", key="assumptions",
+        title=lambda answer: f"What is assumed, and how far it moves the closed-form limit of {answer.study.limit.of}, "
+        "the largest first",
+        when=lambda answer: answer.assumptions is not None,
+    )  # fmt: skip
 
     def placed(self, columns: Sequence[Column]) -> tuple[Column, ...]:
         """Return columns after those of the star and of swept quantities other than the amplitude."""
@@ -292,18 +296,12 @@ class LimitAnswer(Answer):
         )
         views = [View(title, shown, table_of(shown, self.limits))]
         if draws:
-            shares = Column("shares", lambda row: describe_shares(row.unknown.shares),
-                            heading="matters most, share of the variance")  # fmt: skip
-            title = (
-                f"Averaged over {draws} draws of what is unknown of the instrument: the limits of each, and what "
-                "explains their scatter"
-            )
+            heading = "matters most, share of the variance"
+            shares = Column("shares", lambda row: describe_shares(row.unknown.shares), heading=heading)
             shown = (*self.placed(self.flare_columns), *_unknown_columns(DIGITS[of])[:2], shares)
-            views.append(View(title, shown, table_of(shown, self.limits)))
-        if self.assumptions is not None:
-            title = f"What is assumed, and how far it moves the closed-form limit of {of}, the largest first"
-            views.append(LimitAnswer._assumptions.view(self, title))
-        return views
+            what = "what is unknown of the instrument: the limits of each, and what explains their scatter"
+            views.append(View(f"Averaged over {draws} draws of {what}", shown, table_of(shown, self.limits)))
+        return [*views, *super().views]
 
     @cached_property
     def inputs(self) -> list[Expectation]:

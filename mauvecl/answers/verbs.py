@@ -120,18 +120,10 @@ class Verb:
     def study_of(
         self, given: dict[str, Any], keywords: Mapping[str, Keyword], study: Study | None, where: str
     ) -> tuple[Study, list[str]]:
-        """Return the study that keywords ask for, with messages on what they do not state.
+        """Return the study that keywords of the verb ask for, with messages on what they do not state.
 
-        Parameters
-        ----------
-        given : dict
-            Value of each keyword, or None; also ``paper``, and ``set``, texts of any keys.
-        keywords : mapping
-            Keywords of the verb.
-        study : Study or None
-            Study that keywords change; without one, the verb's default.
-        where : str
-            Origin of the keywords, for messages.
+        `given` has the value of each keyword, or None, and also ``paper``, and ``set``, texts of any keys. They change
+        the study or, without one, the verb's default; `where` names their origin in messages.
         """
         from mauvecl.study.keywords import changes_of, stars_of
         from mauvecl.study.study import Study

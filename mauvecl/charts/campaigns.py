@@ -101,9 +101,8 @@ def _overview(answer: PlanAnswer) -> Picture:
     for k, target in enumerate(planned):
         if target.recovered is not None and target.recovered.high > 0:
             # A logarithmic axis cannot show zero.
-            low, high, expected = np.maximum(
-                [target.recovered.low, target.recovered.high, target.recovered.expected], 0.05
-            )
+            yields = target.recovered
+            low, high, expected = np.maximum([yields.low, yields.high, yields.expected], 0.05)
             left += [_bar("star", (low, high), k), Dots("", "star", size=7, at=([expected], [k]))]
         if np.isfinite(ends[k][0]):
             right += [_bar("flare", ends[k], k), Dots("", "flare", size=7, at=([ends[k][0]], [k]))]

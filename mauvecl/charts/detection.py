@@ -90,10 +90,8 @@ def _distributions(title: str, outcome: Detection, flares: Sequence[str], statis
         edges, counts = outcome.histogram(statistic, flare, bins=120)
         middle, height = (edges[1:] + edges[:-1]) / 2, counts / counts.max()
         ends += [edges[0], edges[-1]]
-        series += [
-            Band("", colour, alpha=0.3, step=True, at=(middle, 0 * height, height)),
-            Line(name, colour, step=True, at=(middle, height)),
-        ]
+        series.append(Band("", colour, alpha=0.3, step=True, at=(middle, 0 * height, height)))
+        series.append(Line(name, colour, step=True, at=(middle, height)))
     # Statistics that are scaled by the flare have a threshold per flare.
     own, cuts = chosen if kind.shaped and not linear else [0], list[float]()
     for k, colour in zip(own, cycle(COLOURS if len(own) > 1 else ["text"]), strict=False):
@@ -273,12 +271,9 @@ def unknowns(answer: UnknownAnswer) -> Picture:
         series: list[Series] = [Line("everything known", "text", width=4, at=at)]
         smallest = [Dots("", "text", size=12, at=([0], [answer.smallest(star, None)]))]
         for k, (colour, (unknown, cost)) in enumerate(zip(cycle(COLOURS), costs.items(), strict=False), 1):
-            series += [
-                Line(
-                    unknown.replace("+-", "±"), colour, at=(relative, power(cost.marginal * relative / amplitude, fap))
-                ),
-                Line("", colour, dash="dashed", at=(relative, power(cost.plain * relative / amplitude, fap))),
-            ]
+            marginal, plain = (power(snr * relative / amplitude, fap) for snr in (cost.marginal, cost.plain))
+            series.append(Line(unknown.replace("+-", "±"), colour, at=(relative, marginal)))
+            series.append(Line("", colour, dash="dashed", at=(relative, plain)))
             smallest.append(Dots("", colour, size=12, at=([k], [answer.smallest(star, unknown)])))
         y = Axis("detection probability", limits=(-0.02, 1.02))
         above.append(Panel(Axis(QUANTITIES["amplitude"].label, log=True), y, series, star))

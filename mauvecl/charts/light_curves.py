@@ -336,9 +336,8 @@ def observed_dynamic_spectrum(answer: AnalyseAnswer) -> Picture:
     marks = []
     for event in analysis.events:
         first, last = (stare.start_s[k] - stare.start_s[0] for k in (event.first, event.last))
-        marks.append(
-            (np.array([first, last + stare.frame_s]) / time_unit(stare.duration_s)[0], _colour(analysis, event))
-        )
+        ends = np.array([first, last + stare.frame_s]) / time_unit(stare.duration_s)[0]
+        marks.append((ends, _colour(analysis, event)))
     panel, _ = spectra_panel(stare, spectra.series.excess, sd, noise.wavelength_nm, marks)
     shown = {_colour(analysis, event) for event in analysis.events}
     marked = ", ".join(f"{EVENTS[colour]}s ({INKS[colour]})" for colour in EVENTS if colour in shown)

@@ -238,14 +238,9 @@ def exposures(answer: ExposureAnswer) -> Picture:
     first, series = answer.exposures[0], list[Series]()
     for e, colour in zip(answer.exposures, cycle(COLOURS), strict=False):
         x = np.geomspace(e.exposure_s / e.frames, 4 * e.exposure_s, 50)
-        series += [
-            Line(
-                f"{e.star}: {written(float(f'{e.exposure_s:.4g}'))} s",
-                colour,
-                at=(x, e.snr * np.sqrt(x / e.exposure_s)),
-            ),
-            Dots("", colour, size=8, at=([e.exposure_s], [e.snr])),
-        ]
+        text = f"{e.star}: {written(float(f'{e.exposure_s:.4g}'))} s"
+        series.append(Line(text, colour, at=(x, e.snr * np.sqrt(x / e.exposure_s))))
+        series.append(Dots("", colour, size=8, at=([e.exposure_s], [e.snr])))
     series.append(Rule(f"wanted S/N of {first.wanted:g}", along="y", at=first.wanted))
     per = "10.5 nm element" if first.per == "element" else first.per
     panel = Panel(Axis("exposure (s)", log=True), Axis(f"S/N per {per}", log=True), series)
@@ -341,9 +336,8 @@ def pulls(flares: Sequence[MeasuredFlare]) -> Picture:
             series.append(Line(flare.found.names[q], colour, step=True, at=((edges[1:] + edges[:-1]) / 2, density)))
         normal = np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi)
         series.append(Line("standard normal", "text", dash="dashed", at=(x, normal)))
-        return Panel(
-            Axis("(estimate \N{MINUS SIGN} truth) / standard error"), Axis("probability density"), series, flare.name
-        )
+        x_axis = Axis("(estimate \N{MINUS SIGN} truth) / standard error")
+        return Panel(x_axis, Axis("probability density"), series, flare.name)
 
     return _each(flares, panel)
 
@@ -355,10 +349,8 @@ def errors(flares: Sequence[MeasuredFlare]) -> Picture:
     def panel(flare: MeasuredFlare) -> Panel:
         amplitudes, series = FACTORS * flare.perfect.estimates[0, 1], list[Series]()
         for unknown, dash in {None: "dashed", flare.unknown: "-"}.items():
-            ahead, whose = (
-                flare.forecasts(FACTORS, unknown),
-                "everything else known" if unknown is None else "with unknowns",
-            )
+            ahead = flare.forecasts(FACTORS, unknown)
+            whose = "everything else known" if unknown is None else "with unknowns"
             for colour, q in zip(COLOURS, range(2), strict=False):
                 relative = [f.errors[q] / f.values[q] for f in ahead]
                 series.append(Line(f"{flare.fitted.names[q]}, {whose}", colour, dash=dash, at=(amplitudes, relative)))
