@@ -309,7 +309,8 @@ def _measured(case: Case, amplitude: float, flare: Expectation, engine: Engine |
             arrays |= {f"{k} {key}": value for key, value in measurement.arrays().items()}
         return arrays
 
-    checkpoint, parts = engine.checkpoint if isinstance(engine, Pool) else None, list[Arrays]()
+    checkpoint = engine.checkpoint if isinstance(engine, Pool) else None
+    parts: list[Arrays] = []
     for start in range(0, study.measure.fits, BATCH):
         count = min(BATCH, study.measure.fits - start)
         # The number changes with the arrays that a fit keeps.
