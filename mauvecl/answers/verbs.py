@@ -35,26 +35,14 @@ FEWER = {"run.realisations": 100_000}
 
 # Keys of a study whose flags verbs take, in the order of `--help`.
 
-#: Those of every verb that observes.
-OBSERVATION = (
-    "star.library",
-    "star.magnitude",
-    "star.band",
-    "star.magnitude_system",
-    "star.ebv",
-    "star.wavelength_unit",
-    "star.flux_unit",
-    "star.extend",
-    "star.ignore_checksum",
-    "star.bin_nm",
-    "star.neighbours",
-    "star.neighbours_of",
-    "star.neighbour_share",
-    "observation.exposure_s",
-    "observation.instrument",
-    "observation.temperature_c",
-    "sky",
+#: Those of a star's spectrum, brightness and neighbours.
+STAR = (
+    *("library", "magnitude", "band", "magnitude_system", "ebv", "wavelength_unit", "flux_unit", "extend"),
+    *("ignore_checksum", "bin_nm", "neighbours", "neighbours_of", "neighbour_share"),
 )
+INSTRUMENT = ("observation.instrument", "observation.temperature_c")
+#: Those of every verb that observes.
+OBSERVATION = (*(f"star.{key}" for key in STAR), "observation.exposure_s", *INSTRUMENT, "sky")
 SIZE = ("star.distance_pc", "star.radius_rsun", "star.effective_temperature_k")
 SIGNAL = ("observation.signal",)
 DRAWS = ("run.realisations", "run.seed")
@@ -62,14 +50,11 @@ DETECTION = ("run.statistics", "run.fap", "run.tails", "run.reference", "run.var
 NUISANCES = ("nuisances.own", "nuisances.usual")
 UNKNOWN = ("unknowns.draws", "unknowns.known")
 FRAMES = ("stare.duration_s", "stare.gaps", "stare.orbit_gap_s", "stare.thermal", "stare.pointing")
-STARE = (
-    *FRAMES,
-    "stare.half_width_s",
-    "stare.shape",
-    "stare.energies_erg",
-    "stare.search",
-    "nuisances.usual",
+STARE = (*FRAMES, "stare.half_width_s", "stare.shape", "stare.energies_erg", "stare.search", "nuisances.usual")
+FLARE_LIGHT = tuple(
+    f"flare.{key}" for key in ("temperature_k", "band", "geometry", "photosphere_temperature_k", "spectrum")
 )
+FALSE_ALARMS = ("search.false_alarms", "search.per")
 #: Those of verbs that look from the orbit; targets are given in another way.
 ORBIT = (
     *(f"orbit.{key}" for key in ("start", "days", "step_s", "tle", "kind", "simbad")),
@@ -329,20 +314,7 @@ VERBS: dict[str, Verb] = {
 
     mauvecl inject --star M3V --magnitude 9 --orbit-gap 2100 --with-unknowns --sweep flare_temperature=7000,10000,15000
     """,
-            (
-                "flare.temperature_k",
-                "flare.band",
-                "flare.geometry",
-                "flare.photosphere_temperature_k",
-                "flare.spectrum",
-                *FRAMES,
-                "nuisances.usual",
-                *SIZE,
-                "search",
-                "injections",
-                "run.seed",
-                "sweep",
-            ),
+            (*FLARE_LIGHT, *FRAMES, "nuisances.usual", *SIZE, "search", "injections", "run.seed", "sweep"),
             common=("duration", "orbit_gap", "distance", "false_alarms", "alarms_per", "injections", "with_unknowns"),
             counts="injections",
             without="observation.exposure_s",
@@ -360,16 +332,7 @@ VERBS: dict[str, Verb] = {
 
     mauvecl analyse light-curve-1.fits --star M3V --magnitude 9 --distance 5
     """,
-            (
-                "data",
-                "orbit.tle",
-                "orbit.kind",
-                *SIZE,
-                "flare.temperature_k",
-                "search.false_alarms",
-                "search.per",
-                "run.seed",
-            ),
+            ("data", "orbit.tle", "orbit.kind", *SIZE, "flare.temperature_k", *FALSE_ALARMS, "run.seed"),
             group="analyse",
             common=("mapping", "quality_bits", "false_alarms", "alarms_per", "distance", "report"),
             counts="frames",
@@ -429,10 +392,8 @@ VERBS: dict[str, Verb] = {
     """,
             (
                 "plan",
-                "search.false_alarms",
-                "search.per",
-                "observation.instrument",
-                "observation.temperature_c",
+                *FALSE_ALARMS,
+                *INSTRUMENT,
                 "flare.temperature_k",
                 "flare.band",
                 "flare.spectrum",
