@@ -530,15 +530,11 @@ class AnalyseAnswer(Answer):
 
     @property
     def views(self) -> list[View]:
-        return [*self._event_views, *super().views]
-
-    @property
-    def _event_views(self) -> list[View]:
         analysis = self.analysis
         where = f"in {analysis.days:.3g} star-days of {analysis.frames.name}"
         wanted = f"{analysis.wanted:.3g} false alarms per star-day"
         if not analysis.events:
-            return [View(f"Nothing above {analysis.candidates:.2f} {where} ({wanted}).")]
+            return [View(f"Nothing above {analysis.candidates:.2f} {where} ({wanted})."), *super().views]
         title = (
             f"Events {where}; detected above {analysis.threshold:.2f} ({wanted}), "
             f"candidates above {analysis.candidates:.2f}"
@@ -553,7 +549,7 @@ class AnalyseAnswer(Answer):
                 f"amplitudes in the {flare.band} band, for light that is that of all stars in the fibre"
             )
             views.append(AnalyseAnswer.neighbour_flares.view(self, title))
-        return views
+        return [*views, *super().views]
 
     @property
     def remarks(self) -> list[str]:
@@ -596,15 +592,13 @@ def analyse(
                              ignore_checksum=study.data.ignore_checksum)  # fmt: skip
     if study.data.barycentric is not None:
         frames = barycentric(frames, Target.of(study.data.barycentric), _orbit(study, frames))
-    search = study.search
-    model = frame_model(study, frames)
-    jitters = search.spreads() or None
+    search, model = study.search, frame_model(study, frames)
     if study.has_neighbours:
         # Errors of the star or its neighbours are reported before the search.
         blended_stars(cases(study, swept=False))
     analysis = analyse_frames(
         frames, false_alarms=search.false_alarms, per=search.per, shape=search.shape, seed=study.run.seed,
-        model=model if isinstance(model, FrameModel) else None, rank=search.sums, jitters=jitters,
+        model=model if isinstance(model, FrameModel) else None, rank=search.sums, jitters=search.spreads() or None,
         temperature_k=study.flare.temperature_k, report=_in_frames(progress, frames.n_frames),
     )  # fmt: skip
     return AnalyseAnswer(study, analysis, model if isinstance(model, str) else "")
@@ -639,20 +633,19 @@ def frame_model(study: Study, frames: Frames) -> FrameModel | str:
     (case, *_) = cases(study, swept=False)
     observation = study.observation.model_copy(update={"exposure_s": float(np.median(frames.exposure_s))})
     case = case.with_sections(observation=observation)
-    star = case.star
     source = case.source if named else Source.from_library("G2V").at_magnitude(ANY_MAGNITUDE)
     try:
         quiet = case.expect(source)[0]
         flare = FlareModel.of(
             source, case.instrument, quiet, band=study.flare.band, bands_nm=study.measure.bands_nm,
-            distance_pc=star.distance_pc if named else None, radius_rsun=star.radius_rsun if named else None,
+            distance_pc=case.star.distance_pc if named else None,
+            radius_rsun=case.star.radius_rsun if named else None,
             order=study.observation.order,
         )  # fmt: skip
         if not named:
             # An amplitude is relative to the star.
-            flare = replace(
-                flare, derived=tuple(quantity for quantity in flare.derived if quantity.name != "amplitude")
-            )
+            derived = tuple(quantity for quantity in flare.derived if quantity.name != "amplitude")
+            flare = replace(flare, derived=derived)
         model = FrameModel.of(frames, quiet, flare, flux_per_dn(quiet, case.instrument))
         return replace(model, star_is_known=named)
     except InputError as error:

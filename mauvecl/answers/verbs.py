@@ -54,7 +54,7 @@ STARE = (*FRAMES, "stare.half_width_s", "stare.shape", "stare.energies_erg", "st
 FLARE_LIGHT = tuple(
     f"flare.{key}" for key in ("temperature_k", "band", "geometry", "photosphere_temperature_k", "spectrum")
 )
-FALSE_ALARMS = ("search.false_alarms", "search.per")
+ALARMS = ("search.false_alarms", "search.per")
 #: Those of verbs that look from the orbit; targets are given in another way.
 ORBIT = (
     *(f"orbit.{key}" for key in ("start", "days", "step_s", "tle", "kind", "simbad")),
@@ -332,7 +332,7 @@ VERBS: dict[str, Verb] = {
 
     mauvecl analyse light-curve-1.fits --star M3V --magnitude 9 --distance 5
     """,
-            ("data", "orbit.tle", "orbit.kind", *SIZE, "flare.temperature_k", *FALSE_ALARMS, "run.seed"),
+            ("data", "orbit.tle", "orbit.kind", *SIZE, "flare.temperature_k", *ALARMS, "run.seed"),
             group="analyse",
             common=("mapping", "quality_bits", "false_alarms", "alarms_per", "distance", "report"),
             counts="frames",
@@ -390,15 +390,7 @@ VERBS: dict[str, Verb] = {
 
     Example: mauvecl plan targets.csv --hours 200 --start 2027-01-01
     """,
-            (
-                "plan",
-                *FALSE_ALARMS,
-                *INSTRUMENT,
-                "flare.temperature_k",
-                "flare.band",
-                "flare.spectrum",
-                "nuisances.usual",
-            ),
+            ("plan", *ALARMS, *INSTRUMENT, "flare.temperature_k", "flare.band", "flare.spectrum", "nuisances.usual"),
             common=("targets", "hours", "start", "days", "completeness", "report", "false_alarms"),
             counts="targets",
             observation=ORBIT,
