@@ -301,7 +301,6 @@ class FileFault:
 #: Largest size of a file of an answer, bytes.
 LARGEST = 2**30
 
-#: Columns of the table of faults.
 FAULT_COLUMNS = (Column("file", heading="file"), Column("state", heading="what"))
 
 
@@ -549,7 +548,6 @@ def _neighbour_rows(case: Case) -> Iterator[dict[str, Any]]:
         }  # fmt: skip
 
 
-#: Columns of the table of neighbours.
 NEIGHBOUR_COLUMNS = (
     Column("star", description="star that is observed", heading="star", kind=str),
     Column("name", description="neighbour", heading="neighbour", kind=str),

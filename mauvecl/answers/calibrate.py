@@ -87,7 +87,6 @@ COLUMNS = (
     Column("determined", "determined", "", "whether these observations determine it", "status",
            lambda determined: "" if determined else "assumed", kind=bool),
 )  # fmt: skip
-#: Columns of the table of fits.
 FIT_COLUMNS = (
     Column("fit", "name", "", "what is fitted", "fit", kind=str),
     Column("chi2", "chi2", "", "chi-squared", "chi-squared / dof", lambda chi2, dof: f"{chi2:.1f} / {dof:.1f}",
@@ -95,7 +94,6 @@ FIT_COLUMNS = (
     Column("dof", "dof", "", "values less the effective number of parameters"),
     Column("p_value", "p_value", "", "probability of a chi-squared at least as large", "p", number(".3g")),
 )  # fmt: skip
-#: Columns of the throughput, one row per pixel.
 THROUGHPUT_COLUMNS = (
     Column("wavelength", "throughput.wavelength_nm", "nm", "middle of the pixel", "nm", ".1f"),
     Column("throughput", "fitted_throughput", "", "electrons per photon", "throughput", ".4f"),
@@ -108,7 +106,6 @@ THROUGHPUT_COLUMNS = (
     Column("relative_error_counts", "relative_error_counts", "",
            "relative standard error of DN per photon, which the gain does not change"),
 )  # fmt: skip
-#: Columns of the dark current, one row per pixel.
 DARK_COLUMNS = (
     Column("wavelength", "nominal.wavelength_nm", "nm", "middle of the pixel"),
     Column("dark", "dark.level_dn_per_s", "DN / s", "dark current at the reference temperature"),
@@ -119,7 +116,6 @@ DARK_COLUMNS = (
     Column("bias", "dark.bias_dn", "DN", "fitted or assumed"),
     Column("bias_error", "dark.bias_error", "DN", "its standard error"),
 )  # fmt: skip
-#: Columns of the photon transfer, one row per observation and usable pixel.
 TRANSFER_COLUMNS = (
     Column("light", "transfer.mean_dn", "DN", "mean light of a frame"),
     Column("variance", "transfer.variance", "DN2", "variance of frames"),

@@ -137,7 +137,6 @@ COLUMNS = (
     Column("meaning", "change.meaning", "", "what a change of one unit is", "of", kind=str, detail=True),
     Column("note", "note", "", "what limits the row: saturated pixels or unknowns", "note", kind=str),
 )  # fmt: skip
-#: Columns of the table of indices.
 INDEX_COLUMNS = (
     Column("index", "value.index.name", "", "line or lines", "index", kind=str),
     Column("flux", "value.value", "erg / (s cm2)", "flux in the band above the continuum; absorption is negative",
@@ -156,9 +155,7 @@ INDEX_COLUMNS = (
            kind=str),
     Column("note", "note", "", "saturated pixels of the index, which has no value then", "note", kind=str),
 )  # fmt: skip
-#: Columns of the changes against magnitude.
 MAGNITUDE_COLUMNS = (Column("magnitude", "magnitude", "mag", "of the star in its band"), *COLUMNS[:2], COLUMNS[4])
-#: Columns of the recovered periods.
 PERIOD_COLUMNS = (
     Column("change", "change.name", "", "what varies", "change", kind=str),
     Column("unit", "change.unit", "", "of the amplitude; empty if relative", kind=str),

@@ -423,7 +423,6 @@ SHOWN: dict[str, NuisanceChoice] = {
     )
 }
 
-#: Columns of the table of unknowns.
 UNKNOWN_COLUMNS = (
     star_column(),
     amplitude_column(),

@@ -202,7 +202,6 @@ def cell_columns(of: str) -> tuple[Column, ...]:
     )
 
 
-#: Columns of the table of searches.
 SEARCH_COLUMNS = (
     Column("threshold", "threshold.value", "", "S/N from which on a template is an alarm", "threshold", ".3f"),
     Column("threshold_low", "threshold.low", "", "its 95 % interval, lower end", INTERVAL, interval(".3f"),

@@ -155,7 +155,6 @@ THROUGHPUT_COLUMN = Column("error_throughput", "of_throughput", "",
                            "by throughput", number(".4g"))  # fmt: skip
 
 
-#: Columns of the table of fits.
 FIT_COLUMNS = (
     Column("snr", lambda row: row.snr[0], "", "S/N of the flare in one exposure, everything known", "ideal S/N",
            ".2f"),

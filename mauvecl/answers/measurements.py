@@ -333,7 +333,6 @@ def matched_filter(
     return (weights / np.sqrt(power), float(np.sqrt(power))) if power > 0 else (weights, 0.0)
 
 
-#: Columns of the table of joint fits, for a `MeasuredStare`.
 JOINT_COLUMNS = (
     Column("quantity", "joint.found.names", "", "what is measured", "quantity"),
     Column("unit", "joint.found.units", "", "of truth, estimate and intervals", "unit"),

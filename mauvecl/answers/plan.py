@@ -128,7 +128,6 @@ STAR_COLUMNS = (
     Column("scatter", lambda row: np.nan if row.rates is None else row.rates.scatter_dex, "",
            "standard deviation of the rate's logarithm, dex"),
 )  # fmt: skip
-#: Columns of the table of recovered fractions and rates by energy.
 ENERGY_COLUMNS = (
     Column("target", description="name of the target", kind=str),
     Column("energy", "", "erg", "bolometric"),

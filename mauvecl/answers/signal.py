@@ -55,7 +55,6 @@ def _floored(snr: float) -> str:
     return f"{math.floor(1000 * snr) / 1000:.3f}"
 
 
-#: Columns of the table of exposures.
 EXPOSURE_COLUMNS = (
     star_column(),
     Column("wavelength", "wavelength_nm", "nm", "vacuum wavelength, the middle of the pixel or element"),
@@ -240,7 +239,6 @@ class Observation(NamedTuple):
         return int(self.expectation.signal_dn.argmax())
 
 
-#: Columns of the summary of observations.
 SUMMARY_COLUMNS = (
     Column("observation", "title", description="star, and flare", heading="observation"),
     Column("frames", "expectation.n_frames", description="frames of the exposure", heading="frames", detail=True),
