@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -139,8 +139,8 @@ class LimitSearch:
         """Return the first value at which the closed form reaches the power, from the hardest or near one."""
         from scipy.optimize import brentq
 
-        def crossing(*ends: float, **tolerance: float) -> float:
-            return float(brentq(lambda v: self.theory(v) - self.power, *sorted(ends), **tolerance))
+        def crossing(*ends: float, **tolerance: Any) -> float:
+            return float(brentq(lambda v: self.theory(v) - self.power, min(ends), max(ends), **tolerance))
 
         if near is not None and self.of != "exposure":
             ends = [_value(self.of, _coordinate(self.of, near) + step) for step in (-1.0, 1.0)]

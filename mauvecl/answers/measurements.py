@@ -293,8 +293,9 @@ def expected_measurements(
             moved = [fit_model(exposure, quiet, model, unknown, skipped).estimates[0] for exposure in calibrated]
             of_throughput = np.asarray(np.sqrt(np.sum(np.square(moved - perfect.estimates[0]), axis=0)))
         place = case.label, case.at, amplitude, name, (known_snr, snr)
-        fit = true, known, ahead, perfect, model, quiet, unknown, of_throughput, skipped
-        expected.append(ExpectedMeasurement(*place, *fit))
+        expected.append(
+            ExpectedMeasurement(*place, true, known, ahead, perfect, model, quiet, unknown, of_throughput, skipped)
+        )
     return expected
 
 

@@ -529,9 +529,9 @@ def _found_flare(case: Case, alarm: Alarm) -> FoundFlare:
     if not alarm.measured:
         return FoundFlare(case.label, case.at, alarm, float("nan"), 0)
     fit = alarm.recovered
-    kelvin = np.nan_to_num(fit.temperature_k[0], nan=case.study.flare.temperature_k)
-    values = map(float, (fit.peak_s[0], fit.half_width_s[0], fit.amplitude[0], kelvin))
-    event = Event(*values, case.study.search.shape)
+    kelvin = float(np.nan_to_num(fit.temperature_k[0], nan=case.study.flare.temperature_k))
+    values = (float(fit.peak_s[0]), float(fit.half_width_s[0]), float(fit.amplitude[0]))
+    event = Event(*values, kelvin, case.study.search.shape)
     away = [abs(other.peak_s - event.peak_s) for other in case.events]
     nearest = int(np.argmin(away)) if away else -1
     reach = 2 * case.stare_expectation.stare.frame_s
