@@ -41,11 +41,11 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "an ideal answer with the unknowns": (
         "test_ideal_answer_is_that_of_the_ideal_study[detect]",
-        ("setting = case.with_sections(nuisances=KNOWN).setting(", "setting = case.setting("),
+        ("case.with_sections(nuisances=KNOWN).setting(case.quiet", "case.setting(case.quiet"),
     ),
     "an ideal limit with the unknowns": (
         "test_ideal_answer_is_that_of_the_ideal_study[limit]",
-        ("LimitSearch(case.with_sections(nuisances=KNOWN), statistic)", "LimitSearch(case, statistic)"),
+        ("study.nuisances.none, case.with_sections(nuisances=KNOWN)", "study.nuisances.none, case"),
     ),
     "jitters that cost a plan nothing": (
         "test_plan_by_the_closed_form_is_worse_than_the_ideal",

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 from operator import itemgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mauvecl.answers.answer import Answer, TableOf
-from mauvecl.answers.verbs import by_keywords
+from mauvecl.answers.answer import Answer, TableOf, metadata_of
+from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.fits.flare_model import FlareModel
 from mauvecl.fits.spectrum import Measurement
 from mauvecl.host.orbit.orbit import Orbit, Target
 from mauvecl.host.stars.flare import check_scales
 from mauvecl.host.stars.source import Source
-from mauvecl.observations.analysis import Analysis, analyse_frames
+from mauvecl.observations.analysis import Analysis, SpectralAnalysis, analyse_frames
 from mauvecl.observations.events import GAP_FRAMES, ObservedEvent
 from mauvecl.observations.frame_files import read_frames
 from mauvecl.observations.frame_model import FrameModel
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
     from astropy.table import Table
 
     from mauvecl.device.engine import Engine
-    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.runs.pool import Pool
     from mauvecl.study.cases import Case, Use
     from mauvecl.study.study import Study
@@ -76,36 +76,15 @@ def _electrons(case: Case, source: Source) -> float:
     return float((with_it.source_electrons - without.source_electrons).sum())
 
 
-@dataclass(frozen=True, eq=False)
-class NeighbourFlare:
-    """A flare on a star in the fibre that would look like an observed event."""
-
-    date: str  # of the brightest frame of the event
-    event: ObservedEvent
-    star: BlendedStar
-
-    @property
-    def amplitude(self) -> float:
-        """Rise of this star alone."""
-        return self.event.amplitude / self.star.rise if self.star.rise else float("inf")
-
-    @property
-    def equivalent_duration_s(self) -> float:
-        """Equivalent duration of the flare."""
-        return self.event.equivalent_duration_s / self.event.amplitude * self.amplitude
-
-
-#: Columns of the table.
+#: Columns of flares on the stars in the fibre that would look like an observed event.
 COLUMNS = (
-    Column("date", "date", "", "of the brightest frame of the event", "event at", lambda text: text[:22], kind=str),
-    Column("ampl_rec", "event.amplitude", "", "largest rise of the light of all stars", "rise of all light",
-           percent(".3g")),
-    Column("star", "star.name", "", "star on which the flare would be", "star", kind=str),
-    Column("separation", "star.separation_arcsec", "arcsec", "from the observed star", "arcsec", ".4g"),
-    Column("amplitude", "amplitude", "", "rise of this star alone, in the flare's band, at the brightest frame, for a "
+    Column("date", "", "", "of the brightest frame of the event", "event at", lambda text: text[:22], kind=str),
+    Column("ampl_rec", "", "", "largest rise of the light of all stars", "rise of all light", percent(".3g")),
+    Column("star", "", "", "star on which the flare would be", "star", kind=str),
+    Column("separation", "", "arcsec", "from the observed star", "arcsec", ".4g"),
+    Column("amplitude", "", "", "rise of this star alone, in the flare's band, at the brightest frame, for a "
            "flare that looks like the event", "flare of the star", percent(".4g")),
-    Column("equivalent_duration", "equivalent_duration_s", "s", "of that flare, in the flare's band", "ED (s)",
-           number(".4g")),
+    Column("equivalent_duration", "", "s", "of that flare, in the flare's band", "ED (s)", number(".4g")),
 )  # fmt: skip
 
 
@@ -439,40 +418,6 @@ NOISE = (
 )  # fmt: skip
 
 
-def _frames_of(answer: AnalyseAnswer) -> dict[str, object]:
-    frames = answer.analysis.frames
-    return {"star": frames.name, "unit": frames.unit, **frames.time_keywords}
-
-
-def _events_of(answer: AnalyseAnswer) -> dict[str, object]:
-    frames, threshold = answer.analysis.frames, answer.analysis.threshold
-    about = {"star": frames.name, "unit": frames.unit, "threshold": threshold}
-    return {"study": answer.study.text(), **frames.time_keywords, **about}
-
-
-def _has_spectra(answer: AnalyseAnswer) -> bool:
-    return answer.analysis.spectra is not None
-
-
-def _has_level(answer: AnalyseAnswer) -> bool:
-    return bool(np.isfinite(answer.analysis.level_ratio))
-
-
-def _noise_of_pixels(answer: AnalyseAnswer) -> list[object]:
-    spectra = answer.analysis.spectra
-    return [] if spectra is None else [spectra.series.noise]
-
-
-def _changes_of_throughput(answer: AnalyseAnswer) -> list[object]:
-    spectra = answer.analysis.spectra
-    return [] if spectra is None else [(spectra.cleaned.frames, change) for change in spectra.series.changes]
-
-
-def _neighbour_flares(answer: AnalyseAnswer) -> list[NeighbourFlare]:
-    stars = blended_stars(cases(answer.study, swept=False))
-    return [NeighbourFlare(row.date, row.event, star) for row in answer.rows for star in stars]
-
-
 @dataclass(frozen=True, eq=False)
 class AnalyseAnswer(Answer):
     """Answer of `analyse`."""
@@ -484,36 +429,63 @@ class AnalyseAnswer(Answer):
     white: str = ""  # why spectra are searched as their sum over wavelength; empty if they are not
 
     #: One row per event, in order of time.
-    events = TableOf("events", EVENTS, "rows", key="events", about=_events_of, study=False)
+    events = TableOf("events", EVENTS, "rows", key="events", about=lambda answer: {
+        **metadata_of(answer, "study"), **answer.analysis.frames.time_keywords, "star": answer.analysis.frames.name,
+        **metadata_of(answer, "analysis.frames.unit", "analysis.threshold")})  # fmt: skip
     #: One row per frame: flux, level, noise, and why it is not searched.
-    frames = TableOf("frames", FRAMES, "analysis", about=_frames_of, study=False, cached=False)
+    frames = TableOf("frames", FRAMES, "analysis", cached=False, about=lambda answer: {
+        "star": answer.analysis.frames.name, "unit": answer.analysis.frames.unit,
+        **answer.analysis.frames.time_keywords})  # fmt: skip
     #: One row per half-width and size of injected flares.
-    completeness = TableOf("completeness", COMPLETENESS, "analysis", when=_has_level, study=False,
-                           about=lambda answer: {"threshold": answer.analysis.threshold})  # fmt: skip
+    completeness = TableOf("completeness", COMPLETENESS, "analysis", when="_has_level",
+                           about=("analysis.threshold",))  # fmt: skip
     #: One row per half-width: the smallest flare that the search detects with a probability of 90 %.
-    limits = TableOf("limits", LIMITS, "analysis", key="limits", when=_has_level, study=False,
+    limits = TableOf("limits", LIMITS, "analysis", key="limits", when="_has_level", about=(),
                      title="Smallest flares that would have been detected, by injecting into these frames")  # fmt: skip
     #: One row per number of frames: scatter of their means.
-    noise = TableOf("noise", NOISE, "analysis.scatter", key="noise", study=False,
+    noise = TableOf("noise", NOISE, "analysis.scatter", key="noise", about=(),
                     title="Noise of quiescent frames, less the fitted process")  # fmt: skip
     #: One row per combination of terms that was tried for the quiescent light, with its criterion.
     process = TableOf(
-        "process", PROCESS, lambda answer: sorted(answer.analysis.level.process.bic, key=itemgetter(1)), study=False,
+        "process", PROCESS, lambda answer: sorted(answer.analysis.level.process.bic, key=itemgetter(1)), about=(),
         title="What was tried for the quiescent light",
     )  # fmt: skip
     #: One row per event and measured quantity, with intervals.
     measured = TableOf(
         "measured", MEASURED, lambda answer: [row for row in answer.rows if not isinstance(row.measured, str)],
-        when=_has_spectra, study=False,
+        when="_spectra", about=(),
     )  # fmt: skip
     #: One row per pixel of spectra: noise as stated and as measured.
-    pixels = TableOf("noise-per-pixel", PIXELS, _noise_of_pixels, when=_has_spectra, study=False,
-                     about=lambda answer: {"unit": answer.analysis.frames.unit})  # fmt: skip
+    pixels = TableOf("noise-per-pixel", PIXELS, lambda answer: [spectra.series.noise for spectra in answer._spectra],
+                     when="_spectra", about=("analysis.frames.unit",))  # fmt: skip
     #: One row per sudden change of the light that all pixels of spectra share.
-    throughput = TableOf("throughput", THROUGHPUT, _changes_of_throughput, when=_has_spectra, study=False)
+    throughput = TableOf("throughput", THROUGHPUT, lambda answer: [
+        (spectra.cleaned.frames, change) for spectra in answer._spectra for change in spectra.series.changes
+    ], when="_spectra", about=())  # fmt: skip
     #: One row per event and star in the fibre: the flare of that star which would look like the event.
-    neighbour_flares = TableOf("neighbour-flares", COLUMNS, _neighbour_flares,
-                               when=lambda answer: answer.study.has_neighbours)  # fmt: skip
+    neighbour_flares = TableOf("neighbour-flares", COLUMNS, "_flares_of_stars",
+                               when="study.has_neighbours")  # fmt: skip
+
+    @property
+    def _has_level(self) -> bool:
+        return bool(np.isfinite(self.analysis.level_ratio))
+
+    @property
+    def _spectra(self) -> list[SpectralAnalysis]:
+        """The analysis of the spectra, if they are searched with weights for flares."""
+        return [] if self.analysis.spectra is None else [self.analysis.spectra]
+
+    @property
+    def _flares_of_stars(self) -> Iterator[dict[str, object]]:
+        stars = blended_stars(cases(self.study, swept=False))
+        for row, star in product(self.rows, stars):
+            event = row.event
+            amplitude = event.amplitude / star.rise if star.rise else float("inf")
+            yield {
+                "date": row.date, "ampl_rec": event.amplitude, "star": star.name,
+                "separation": star.separation_arcsec, "amplitude": amplitude,
+                "equivalent_duration": event.equivalent_duration_s / event.amplitude * amplitude,
+            }  # fmt: skip
 
     @property
     def messages(self) -> list[str]:
@@ -557,15 +529,11 @@ class AnalyseAnswer(Answer):
 
     @property
     def views(self) -> list[View]:
-        return [*self._event_views, *super().views]
-
-    @property
-    def _event_views(self) -> list[View]:
         analysis = self.analysis
         where = f"in {analysis.days:.3g} star-days of {analysis.frames.name}"
         wanted = f"{analysis.wanted:.3g} false alarms per star-day"
         if not analysis.events:
-            return [View(f"Nothing above {analysis.candidates:.2f} {where} ({wanted}).")]
+            return [View(f"Nothing above {analysis.candidates:.2f} {where} ({wanted})."), *super().views]
         title = (
             f"Events {where}; detected above {analysis.threshold:.2f} ({wanted}), "
             f"candidates above {analysis.candidates:.2f}"
@@ -580,16 +548,11 @@ class AnalyseAnswer(Answer):
                 f"amplitudes in the {flare.band} band, for light that is that of all stars in the fibre"
             )
             views.append(AnalyseAnswer.neighbour_flares.view(self, title))
-        return views
+        return [*views, *super().views]
 
     @property
     def remarks(self) -> list[str]:
         return [f"{row.date[:19]}: {row.note}." for row in self.rows if row.note]
-
-    @property
-    def inputs(self) -> list[Expectation]:
-        """No expectations: the noise is measured."""
-        return []
 
 
 def _orbit(study: Study, frames: Frames) -> Orbit | None:
@@ -602,7 +565,7 @@ def _orbit(study: Study, frames: Frames) -> Orbit | None:
 def analyse(
     study: Study,
     engine: Engine | Pool | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress = None,
     *,
     frames: Frames | None = None,
 ) -> AnalyseAnswer:
@@ -628,21 +591,19 @@ def analyse(
                              ignore_checksum=study.data.ignore_checksum)  # fmt: skip
     if study.data.barycentric is not None:
         frames = barycentric(frames, Target.of(study.data.barycentric), _orbit(study, frames))
-    search = study.search
-    model = frame_model(study, frames)
-    jitters = search.spreads() or None
+    search, model = study.search, frame_model(study, frames)
     if study.has_neighbours:
         # Errors of the star or its neighbours are reported before the search.
         blended_stars(cases(study, swept=False))
     analysis = analyse_frames(
         frames, false_alarms=search.false_alarms, per=search.per, shape=search.shape, seed=study.run.seed,
-        model=model if isinstance(model, FrameModel) else None, rank=search.sums, jitters=jitters,
+        model=model if isinstance(model, FrameModel) else None, rank=search.sums, jitters=search.spreads() or None,
         temperature_k=study.flare.temperature_k, report=_in_frames(progress, frames.n_frames),
     )  # fmt: skip
     return AnalyseAnswer(study, analysis, model if isinstance(model, str) else "")
 
 
-def _in_frames(progress: Callable[[int, int], None] | None, total: int) -> Callable[[float], None] | None:
+def _in_frames(progress: Progress, total: int) -> Callable[[float], None] | None:
     """Return a function of the share that is done, which reports it in whole frames whenever their number rises."""
     if progress is None:
         return None
@@ -671,20 +632,19 @@ def frame_model(study: Study, frames: Frames) -> FrameModel | str:
     (case, *_) = cases(study, swept=False)
     observation = study.observation.model_copy(update={"exposure_s": float(np.median(frames.exposure_s))})
     case = case.with_sections(observation=observation)
-    star = case.star
     source = case.source if named else Source.from_library("G2V").at_magnitude(ANY_MAGNITUDE)
     try:
         quiet = case.expect(source)[0]
         flare = FlareModel.of(
             source, case.instrument, quiet, band=study.flare.band, bands_nm=study.measure.bands_nm,
-            distance_pc=star.distance_pc if named else None, radius_rsun=star.radius_rsun if named else None,
+            distance_pc=case.star.distance_pc if named else None,
+            radius_rsun=case.star.radius_rsun if named else None,
             order=study.observation.order,
         )  # fmt: skip
         if not named:
             # An amplitude is relative to the star.
-            flare = replace(
-                flare, derived=tuple(quantity for quantity in flare.derived if quantity.name != "amplitude")
-            )
+            derived = tuple(quantity for quantity in flare.derived if quantity.name != "amplitude")
+            flare = replace(flare, derived=derived)
         model = FrameModel.of(frames, quiet, flare, flux_per_dn(quiet, case.instrument))
         return replace(model, star_is_known=named)
     except InputError as error:

@@ -8,18 +8,18 @@ import hashlib
 import io
 import json
 import platform
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass
 from functools import cached_property
 from html import escape
+from importlib.metadata import version
 from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, overload
 
 from mauvecl.host import VERSION
 from mauvecl.host.arrays import ContentEquality
-from mauvecl.host.exposure.star import Neighbour, rate_of
+from mauvecl.host.exposure.star import rate_of
 from mauvecl.host.instrument.paths import shipped_names
 from mauvecl.host.tables.files import check_size, json_text, open_regular, read_text, write_whole, writing
 from mauvecl.schema.calls import validated
@@ -31,6 +31,7 @@ from mauvecl.study.study import read_embedded_study
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
+    from mauvecl.answers.verbs import Progress
     from mauvecl.device.build import Device, DeviceRecord
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.runs.pool import Pool
@@ -81,9 +82,10 @@ class TableOf:
     place: bool = False  # whether columns of the star and of swept quantities precede those that are given
     title: str | Callable[[Any], str] = ""  # of the printed view; without one there is none
     key: str = ""  # in JSON
-    when: Callable[[Any], object] = lambda answer: True  # whether the answer has the table
-    about: Callable[[Any], Mapping[str, object]] = lambda answer: {}  # metadata, which precede the study
-    study: bool = True  # whether the metadata include the study
+    # Whether the answer has the table: an attribute, or a function of the answer; every answer has it by default.
+    when: str | Callable[[Any], object] = lambda answer: True
+    # Metadata: paths of attributes of the answer, whose last names are the keys, or a function of the answer.
+    about: Sequence[str] | Callable[[Any], Mapping[str, object]] = ("study",)
     cached: bool = True  # whether the answer keeps the table, which may be large
 
     def __set_name__(self, owner: type, name: str) -> None:
@@ -105,12 +107,12 @@ class TableOf:
         return table
 
     def _made(self, answer: Answer) -> Any:
-        rows: Any = self.rows(answer) if callable(self.rows) else attrgetter(self.rows)(answer)
+        rows: Any = _of_answer(self.rows, answer)
         if hasattr(rows, "colnames"):
             return rows
         if isinstance(rows, Mapping) or not isinstance(rows, Iterable):
             rows = [rows]
-        about = {**self.about(answer), **({"study": answer.study.text()} if self.study else {})}
+        about = self.about(answer) if callable(self.about) else metadata_of(answer, *self.about)
         if self.of is None:
             return table_of(self.columns_of(answer), rows, **about)
         parts = [(row, self.of(answer, row)) for row in rows]
@@ -128,7 +130,18 @@ class TableOf:
         return View(title, self.columns_of(answer), getattr(answer, self.name) if table is None else table)
 
 
-class Answer(Drawable, ContentEquality, ABC):
+def _of_answer(get: str | Callable[[Any], Any], answer: Answer) -> Any:
+    """Return an attribute of an answer by its path, or the value of a function of the answer."""
+    return get(answer) if callable(get) else attrgetter(get)(answer)
+
+
+def metadata_of(answer: Answer, *paths: str) -> dict[str, object]:
+    """Return attributes of an answer by the last names of their paths; "study" is the text of the study."""
+    values = {path.rpartition(".")[2]: attrgetter(path)(answer) for path in paths}
+    return values | ({"study": answer.study.text()} if "study" in values else {})
+
+
+class Answer(Drawable, ContentEquality):
     """Answer of a verb to a study: tables, printed views, messages, pictures and files.
 
     Subclasses declare tables with `TableOf`, in the order of the files; the first is the answer itself.
@@ -149,14 +162,17 @@ class Answer(Drawable, ContentEquality, ABC):
         def messages(self) -> Sequence[str]:
             """Messages for users, the most severe first."""
 
-    @property
-    @abstractmethod
-    def inputs(self) -> list[Expectation]:
-        """Expectations on which the answer is based, for the run record."""
+        @property
+        def inputs(self) -> Sequence[Expectation]:
+            """Expectations on which the answer is based, for the run record; none if nothing is exposed."""
+    else:
+        inputs = ()
 
     def _declared(self) -> list[TableOf]:
         """Return the declarations of the tables that the answer has."""
-        return [table for table in vars(type(self)).values() if isinstance(table, TableOf) and table.when(self)]
+        return [
+            table for table in vars(type(self)).values() if isinstance(table, TableOf) and _of_answer(table.when, self)
+        ]
 
     @property
     def tables(self) -> dict[str, Table]:
@@ -173,6 +189,11 @@ class Answer(Drawable, ContentEquality, ABC):
         """Tables in JSON by key; "rows" is the first table unless others are declared."""
         keyed = {table.key: getattr(self, table.name) for table in self._declared() if table.key}
         return keyed or {"rows": next(iter(self.tables.values()))}
+
+    @property
+    def instrument_name(self) -> str:
+        """The instrument as sentences name it."""
+        return name_of_instrument(self.study)
 
     def placed(self, columns: Sequence[Column]) -> tuple[Column, ...]:
         """Return columns after those of the star and of swept quantities that are not among them."""
@@ -203,12 +224,8 @@ class Answer(Drawable, ContentEquality, ABC):
         """Neighbours of the stars that the answer observes, or None."""
         if not self.study.has_neighbours or "instrument" not in self.uses:
             return None
-        rows = [
-            NeighbourRow(case, neighbour)
-            for case in self.observed
-            for neighbour in (() if case.neighbours is None else case.neighbours.stars)
-        ]
-        shares = sorted({row.case.star.neighbour_share for row in rows})
+        rows = [row for case in self.observed for row in _neighbour_rows(case)]
+        shares = sorted({row["assumed_share"] for row in rows})
         about = {"assumed_share": shares[0] if len(shares) == 1 else shares, "study": self.study.text()}
         return table_of(NEIGHBOUR_COLUMNS, rows, **about) if rows else None
 
@@ -284,7 +301,6 @@ class FileFault:
 #: Largest size of a file of an answer, bytes.
 LARGEST = 2**30
 
-#: Columns of the table of faults.
 FAULT_COLUMNS = (Column("file", heading="file"), Column("state", heading="what"))
 
 
@@ -466,7 +482,7 @@ def write_record(
         "inputs": [{"name": x.name} | dict(x.provenance) for x in expectations],
         "messages": list(messages),
         "python": platform.python_version(),
-        "packages": _versions("numpy", "scipy", "astropy", "synphot", "pyopencl"),
+        "packages": {name: version(name) for name in ("numpy", "scipy", "astropy", "synphot", "pyopencl")},
     }
     if pool is not None:
         record |= _devices(pool.devices, pool.kernel_digest) | {"shards": asdict(pool.standing)}
@@ -512,49 +528,32 @@ def write_json(content: Any, path: Path) -> Path:
     return path
 
 
-def _versions(*names: str) -> dict[str, str]:
-    from importlib.metadata import version
-
-    return {name: version(name) for name in names}
-
-
-@dataclass(frozen=True, eq=False)
-class NeighbourRow:
-    """A neighbour of a case's star."""
-
-    case: Case
-    neighbour: Neighbour
-
-    @property
-    def enters(self) -> bool:
-        """True if the neighbour is within the fibre's radius."""
-        return self.neighbour.separation_arcsec <= self.case.instrument.field_of_view_radius_arcsec
-
-    @property
-    def spectrum(self) -> str:
-        """Spectrum that represents the neighbour; empty beyond the fibre, where none is needed."""
-        return self.neighbour.spectrum[0] if self.enters else ""
-
-    @property
-    def share(self) -> float:
-        """Share of the electrons of all stars in the fibre."""
-        if not self.enters:
-            return 0.0
-        x, near = self.case.quiet, self.case.neighbours
-        assert near is not None
-        rate = rate_of(self.neighbour, self.case.instrument, self.case.study.observation.order)
-        own = near.share * float(rate.sum()) * x.frame_s
-        return own / float((x.source_electrons + x.neighbour_electrons).sum())
+def _neighbour_rows(case: Case) -> Iterator[dict[str, Any]]:
+    """Yield the neighbours of a case's star by the names of columns."""
+    x, near = case.quiet, case.neighbours
+    if near is None:
+        return
+    for star in near.stars:
+        enters, share = star.separation_arcsec <= case.instrument.field_of_view_radius_arcsec, 0.0
+        if enters:
+            rate = rate_of(star, case.instrument, case.study.observation.order)
+            own = near.share * float(rate.sum()) * x.frame_s
+            share = own / float((x.source_electrons + x.neighbour_electrons).sum())
+        # Beyond the fibre no spectrum is needed.
+        spectrum, magnitude = star.spectrum[0] if enters else "", star.magnitude
+        yield {
+            "star": case.label, "name": star.name, "separation": star.separation_arcsec, "band": star.band,
+            "magnitude": float("nan") if magnitude is None else magnitude, "spectrum": spectrum, "enters": enters,
+            "share": share, "assumed_share": case.star.neighbour_share,
+        }  # fmt: skip
 
 
-#: Columns of the table of neighbours.
 NEIGHBOUR_COLUMNS = (
-    Column("star", "case.label", description="star that is observed", heading="star", kind=str),
-    Column("name", "neighbour.name", description="neighbour", heading="neighbour", kind=str),
-    Column("separation", "neighbour.separation_arcsec", "arcsec", "from the star", "arcsec", ".4g"),
-    Column("magnitude", lambda row: float("nan") if row.neighbour.magnitude is None else row.neighbour.magnitude,
-           "mag", "in the band", "magnitude", ".2f"),
-    Column("band", "neighbour.band", heading="band", kind=str),
+    Column("star", description="star that is observed", heading="star", kind=str),
+    Column("name", description="neighbour", heading="neighbour", kind=str),
+    Column("separation", "", "arcsec", "from the star", "arcsec", ".4g"),
+    Column("magnitude", "", "mag", "in the band", "magnitude", ".2f"),
+    Column("band", heading="band", kind=str),
     Column("spectrum", description="spectrum that represents it; empty if its light does not enter",
            heading="spectrum", kind=str),
     Column("enters", description="whether it is within the fibre's radius, so that the assumed share of its light "
@@ -570,15 +569,10 @@ def share_columns(study: Study, get: str) -> tuple[Column, ...]:
     return (Column("target_share", get, "", text, "star's share", percent(".3g")),) if study.has_neighbours else ()
 
 
-def realisations_of(answer: Answer) -> dict[str, object]:
-    """Return the number of a study's realisations, for the metadata of tables."""
-    return {"realisations": answer.study.run.realisations}
-
-
 Item = TypeVar("Item")
 
 
-def reported(items: Iterable[Item], total: int, progress: Callable[[int, int], None] | None) -> Iterator[Item]:
+def reported(items: Iterable[Item], total: int, progress: Progress) -> Iterator[Item]:
     """Yield items, and call ``progress(done, total)`` after the work on each.
 
     If that raises, a generator of items is closed at once, while the workers that it uses are still open.

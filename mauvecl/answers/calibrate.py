@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer, TableOf, ecsv_text
-from mauvecl.answers.verbs import by_keywords
+from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.host.exposure.expectation import expect
 from mauvecl.host.instrument.curves import CALIBRATED, MODE, ThroughputErrors
 from mauvecl.host.instrument.instrument import FILE_VERSION, Instrument
@@ -75,14 +75,11 @@ class Fitted:
         return (self.value - self.nominal) / self.error if self.determined and self.error > 0 else float("nan")
 
 
-def _significant(value: float, error: float) -> str:
-    return f"{value:.6g} +- {error:.2g}" if error == error else f"{value:.6g}"
-
-
 #: Columns of the table of values.
 COLUMNS = (
     Column("quantity", "name", "", "value of the instrument", "quantity", kind=str),
-    Column("value", "value", "", "fitted, or nominal where it is not determined", "value", _significant, ("error",)),
+    Column("value", "value", "", "fitted, or nominal where it is not determined", "value",
+           lambda value, error: f"{value:.6g} +- {error:.2g}" if error == error else f"{value:.6g}", ("error",)),
     Column("error", "error", "", "standard error; nan: not determined by these observations"),
     Column("nominal", "nominal", "", "value of the instrument that was given", "nominal", ".6g"),
     Column("deviation", "deviation", "", "fitted less nominal value in standard errors", "sigma", number("+.1f")),
@@ -90,7 +87,6 @@ COLUMNS = (
     Column("determined", "determined", "", "whether these observations determine it", "status",
            lambda determined: "" if determined else "assumed", kind=bool),
 )  # fmt: skip
-#: Columns of the table of fits.
 FIT_COLUMNS = (
     Column("fit", "name", "", "what is fitted", "fit", kind=str),
     Column("chi2", "chi2", "", "chi-squared", "chi-squared / dof", lambda chi2, dof: f"{chi2:.1f} / {dof:.1f}",
@@ -98,7 +94,6 @@ FIT_COLUMNS = (
     Column("dof", "dof", "", "values less the effective number of parameters"),
     Column("p_value", "p_value", "", "probability of a chi-squared at least as large", "p", number(".3g")),
 )  # fmt: skip
-#: Columns of the throughput, one row per pixel.
 THROUGHPUT_COLUMNS = (
     Column("wavelength", "throughput.wavelength_nm", "nm", "middle of the pixel", "nm", ".1f"),
     Column("throughput", "fitted_throughput", "", "electrons per photon", "throughput", ".4f"),
@@ -111,7 +106,6 @@ THROUGHPUT_COLUMNS = (
     Column("relative_error_counts", "relative_error_counts", "",
            "relative standard error of DN per photon, which the gain does not change"),
 )  # fmt: skip
-#: Columns of the dark current, one row per pixel.
 DARK_COLUMNS = (
     Column("wavelength", "nominal.wavelength_nm", "nm", "middle of the pixel"),
     Column("dark", "dark.level_dn_per_s", "DN / s", "dark current at the reference temperature"),
@@ -122,21 +116,11 @@ DARK_COLUMNS = (
     Column("bias", "dark.bias_dn", "DN", "fitted or assumed"),
     Column("bias_error", "dark.bias_error", "DN", "its standard error"),
 )  # fmt: skip
-#: Columns of the photon transfer, one row per observation and usable pixel.
 TRANSFER_COLUMNS = (
     Column("light", "transfer.mean_dn", "DN", "mean light of a frame"),
     Column("variance", "transfer.variance", "DN2", "variance of frames"),
     Column("model", "transfer.model", "DN2", "fitted variance"),
 )
-
-
-def _reference(answer: CalibrateAnswer) -> dict[str, object]:
-    return {"reference_c": answer.dark.reference_c}
-
-
-def _title(answer: CalibrateAnswer) -> str:
-    stars = f"{len(answer.stars)} standard star{'s' if len(answer.stars) > 1 else ''}"
-    return f"{answer.nominal.name} fitted to {stars}; dark current at {answer.dark.reference_c:.1f} C"
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,16 +138,19 @@ class CalibrateAnswer(Answer):
     throughput: ThroughputFit
 
     #: One row per value of the instrument.
-    values_table = TableOf("calibrate", COLUMNS, "values", title=_title, key="rows", about=lambda answer: {
-        **_reference(answer), "dark_unit": answer.transfer.dark_unit})  # fmt: skip
+    values_table = TableOf(
+        "calibrate", COLUMNS, "values", key="rows", about=("dark.reference_c", "transfer.dark_unit", "study"),
+        title=lambda answer: f"{answer.nominal.name} fitted to {len(answer.stars)} standard star"
+        f"{'s' if len(answer.stars) > 1 else ''}; dark current at {answer.dark.reference_c:.1f} C",
+    )  # fmt: skip
     #: One row per fit: its goodness.
-    fits = TableOf("fits", FIT_COLUMNS, "_fits", title="Goodness of fit", key="fits", study=False)
+    fits = TableOf("fits", FIT_COLUMNS, "_fits", title="Goodness of fit", key="fits", about=())
     #: One row per pixel: fitted and nominal throughput.
     throughput_table = TableOf("throughput", THROUGHPUT_COLUMNS, lambda answer: answer)
     #: One row per pixel: dark current and bias.
-    dark_table = TableOf("dark", DARK_COLUMNS, lambda answer: answer, about=_reference, study=False)
+    dark_table = TableOf("dark", DARK_COLUMNS, lambda answer: answer, about=("dark.reference_c",))
     #: One row per observation and usable pixel: the variance of frames.
-    transfer_table = TableOf("photon-transfer", TRANSFER_COLUMNS, lambda answer: answer, study=False)
+    transfer_table = TableOf("photon-transfer", TRANSFER_COLUMNS, lambda answer: answer, about=())
 
     @property
     def stars(self) -> list[CalibrationFrames]:
@@ -238,7 +225,7 @@ class CalibrateAnswer(Answer):
 
     @property
     def messages(self) -> list[str]:
-        lines = [*self._throughput_messages]
+        lines = self._throughput_messages
         if self.study.calibrate.light_error == 0:
             lines.append("Losses by pointing are taken to be alike in all observations (calibrate.light_error).")
         for row in self.fits:
@@ -288,9 +275,8 @@ class CalibrateAnswer(Answer):
     @property
     def inputs(self) -> list[Expectation]:
         exposure, sky = self.nominal.frame_s, self.study.sky.sky()
-        return [
-            expect(lit.star, self.nominal, exposure=exposure, sky=sky) for lit in self.stars if lit.star is not None
-        ]
+        stars = [observation.star for observation in self.stars]
+        return [expect(star, self.nominal, exposure=exposure, sky=sky) for star in stars if star is not None]
 
     @property
     def source(self) -> str:
@@ -479,7 +465,7 @@ class CalibrateAnswer(Answer):
 def calibrate(
     study: Study,
     engine: Engine | Pool | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress = None,
     *,
     frames: tuple[Frames, ...] | None = None,
     stars: tuple[Source | None, ...] | None = None,

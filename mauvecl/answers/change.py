@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, name_of_instrument, reported
-from mauvecl.answers.verbs import by_keywords
+from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, reported
+from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.host.orbit.visibility import Visibility
 from mauvecl.observations.visits import (
     INDICES,
@@ -67,12 +66,8 @@ class ChangeRow(InCell):
     def note(self) -> str:
         """What limits the row, in a few words."""
         lost, every = self.saturated
-        notes = [_lost_pixels(lost, every)] if lost else []
-        if not every:
-            notes.append("no light")
-        if self.hidden:
-            notes.append("hidden by what is unknown")
-        return "; ".join(notes)
+        hidden = "hidden by what is unknown" if self.hidden else ""
+        return "; ".join(filter(None, [_lost_pixels(lost, every), "" if every else "no light", hidden]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,8 +84,7 @@ class IndexRow(InCell):
     @property
     def note(self) -> str:
         """Why the index has no value; empty if it has one."""
-        lost, every = self.saturated
-        return _lost_pixels(lost, every) if lost else ""
+        return _lost_pixels(*self.saturated)
 
     @property
     def snr(self) -> float:
@@ -112,6 +106,9 @@ class PeriodRow(InCell):
 
 
 def _lost_pixels(lost: int, every: int) -> str:
+    """Return how many pixels saturate, or nothing if none do."""
+    if not lost:
+        return ""
     return "every pixel saturates" if lost == every else f"{lost} of {every} pixels saturate"
 
 
@@ -140,7 +137,6 @@ COLUMNS = (
     Column("meaning", "change.meaning", "", "what a change of one unit is", "of", kind=str, detail=True),
     Column("note", "note", "", "what limits the row: saturated pixels or unknowns", "note", kind=str),
 )  # fmt: skip
-#: Columns of the table of indices.
 INDEX_COLUMNS = (
     Column("index", "value.index.name", "", "line or lines", "index", kind=str),
     Column("flux", "value.value", "erg / (s cm2)", "flux in the band above the continuum; absorption is negative",
@@ -159,9 +155,7 @@ INDEX_COLUMNS = (
            kind=str),
     Column("note", "note", "", "saturated pixels of the index, which has no value then", "note", kind=str),
 )  # fmt: skip
-#: Columns of the changes against magnitude.
 MAGNITUDE_COLUMNS = (Column("magnitude", "magnitude", "mag", "of the star in its band"), *COLUMNS[:2], COLUMNS[4])
-#: Columns of the recovered periods.
 PERIOD_COLUMNS = (
     Column("change", "change.name", "", "what varies", "change", kind=str),
     Column("unit", "change.unit", "", "of the amplitude; empty if relative", kind=str),
@@ -177,19 +171,6 @@ PERIOD_COLUMNS = (
 )  # fmt: skip
 
 
-def _title(answer: ChangeAnswer) -> str:
-    study, visits = answer.study, answer.study.change.visits
-    return (
-        f"Smallest changes between {'two' if visits == 2 else visits} visits of {study.observation.exposure_s:g} s, at "
-        f"a false-alarm probability of {study.run.fap:g} and a power of {study.limit.power:g}"
-    )
-
-
-def _probabilities(answer: ChangeAnswer) -> dict[str, object]:
-    study = answer.study
-    return {"visits": study.change.visits, "fap": study.run.fap, "power": study.limit.power}
-
-
 @dataclass(frozen=True, eq=False)
 class ChangeAnswer(Answer):
     """Answer of `change`."""
@@ -201,21 +182,26 @@ class ChangeAnswer(Answer):
     indices: list[IndexRow]
     along: list[ChangeRow]  # changes of stars at other magnitudes
     periods: list[PeriodRow]  # empty unless the study asks for them
-    expectations: list[Expectation]
+    inputs: list[Expectation]
 
     #: One row per star, cell and change.
-    table = TableOf("change", COLUMNS, "changes", place=True, title=_title, key="rows", about=_probabilities)
+    table = TableOf(
+        "change", COLUMNS, "changes", place=True, key="rows",
+        title=lambda answer: f"Smallest changes between {answer.visits}, at a false-alarm probability of "
+        f"{answer.study.run.fap:g} and a power of {answer.study.limit.power:g}",
+        about=("study.change.visits", "study.run.fap", "study.limit.power", "study"),
+    )  # fmt: skip
     #: One row per star, cell and line index.
     index_table = TableOf(
-        "indices", INDEX_COLUMNS, "indices", place=True, key="indices", study=False,
+        "indices", INDEX_COLUMNS, "indices", place=True, key="indices", about=(),
         title=lambda answer: f"Line indices in {answer.study.observation.exposure_s:g} s",
     )  # fmt: skip
     #: One row per star, cell, change and magnitude.
-    magnitude_table = TableOf("magnitudes", MAGNITUDE_COLUMNS, "along", place=True, study=False,
-                              when=lambda answer: answer.along)  # fmt: skip
+    magnitude_table = TableOf("magnitudes", MAGNITUDE_COLUMNS, "along", place=True, about=(),
+                              when="along")  # fmt: skip
     #: One row per star, cell, change, amplitude and period.
     period_table = TableOf(
-        "periods", PERIOD_COLUMNS, "periods", place=True, study=False, when=lambda answer: answer.periods,
+        "periods", PERIOD_COLUMNS, "periods", place=True, when="periods",
         about=lambda answer: {"fap": answer.study.change.period_fap},
     )  # fmt: skip
 
@@ -230,23 +216,23 @@ class ChangeAnswer(Answer):
         return len(self.along) // (MAGNITUDES.size * len(self.study.change.of))
 
     @property
+    def visits(self) -> str:
+        """Number and exposure of the visits, as sentences say them."""
+        visits = self.study.change.visits
+        return f"{'two' if visits == 2 else visits} visits of {self.study.observation.exposure_s:g} s"
+
+    @property
     def headline(self) -> str:
         """The smallest change of the first row that is not hidden."""
         row = next((row for row in self.changes if np.isfinite(row.smallest.one)), self.changes[0])
-        name, unit, visits = row.change.name, row.change.unit, self.study.change.visits
-        where = (
-            f"{name} of {row.title} between {'two' if visits == 2 else visits} visits of "
-            f"{self.study.observation.exposure_s:g} s"
-        )
+        unit, instrument = row.change.unit, self.instrument_name
+        where = f"{row.change.name} of {row.title} between {self.visits}"
         if not np.isfinite(row.smallest.one):
-            return (
-                f"{name_of_instrument(self.study)} would see no change in {where}: {row.note or 'there is no light'}."
-            )
+            return f"{instrument} would see no change in {where}: {row.note or 'there is no light'}."
         ideal = "" if self.study.nuisances.none else f" ({_amount(row.ideal, unit)} {IF_KNOWN})"
         return (
-            f"{name_of_instrument(self.study)} would see a change of {_amount(row.smallest.one, unit)}{ideal} in "
-            f"{where} with a chance of {100 * self.study.limit.power:g} %; one visit measures it to "
-            f"{_amount(row.error, unit)}."
+            f"{instrument} would see a change of {_amount(row.smallest.one, unit)}{ideal} in {where} with a chance of "
+            f"{100 * self.study.limit.power:g} %; one visit measures it to {_amount(row.error, unit)}."
         )
 
     @property
@@ -260,7 +246,7 @@ class ChangeAnswer(Answer):
 
     @property
     def messages(self) -> list[str]:
-        lines = collect_messages(self.expectations)
+        lines = collect_messages(self.inputs)
         hidden = dict.fromkeys(f"{row.title}: {row.change.name}" for row in self.changes if row.hidden)
         lines += [f"HIDDEN by what is unknown: {text}." for text in hidden]
         left = [name for name in INDICES if name not in {row.value.index.name for row in self.indices}]
@@ -272,15 +258,9 @@ class ChangeAnswer(Answer):
         )
         return lines
 
-    @property
-    def inputs(self) -> list[Expectation]:
-        return self.expectations
-
 
 @by_keywords
-def change(
-    study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
-) -> ChangeAnswer:
+def change(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> ChangeAnswer:
     """Compute the smallest changes of a study's stars between visits that are detected.
 
     Parameters
@@ -310,10 +290,8 @@ def change(
         own = _changes(case, file)
         rows += own
         indices += _indices(case)
-        magnitude = case.star.magnitude
-        if magnitude is not None:
-            for step in MAGNITUDES:
-                along += _changes(case.with_value("magnitude", float(magnitude + step)), file)
+        for step in () if case.star.magnitude is None else case.star.magnitude + MAGNITUDES:
+            along += _changes(case.with_value("magnitude", float(step)), file)
         if times is not None:
             recovery = recover_periods(
                 times, np.geomspace(asked.shortest_d, asked.longest_d, asked.steps),
@@ -331,9 +309,8 @@ def _changes(case: Case, file: Source | None) -> list[ChangeRow]:
     unit = smallest_change(1.0, study.change.visits, study.run.fap, study.limit.power)
     rows = []
     for name in study.change.of:
-        change = Change.named(
-            name, case.source, quiet, case.instrument, study.observation.order, file, study.change.band
-        )
+        order, band = study.observation.order, study.change.band
+        change = Change.named(name, case.source, quiet, case.instrument, order, file, band)
         error, known_error = (error_of_change(change.counts_dn, quiet, unknowns) for unknowns in (unknown, None))
         smallest = Smallest(change.size(error * unit.one), change.size(error * unit.scatter))
         ideal = change.size(known_error * unit.one)

@@ -55,7 +55,7 @@ def unknown_cost(
 
     `of` names star and flare.
     """
-    chosen, used, matched = _or_documented(nuisances), ~quiet.saturated, Matched()
+    chosen, used, matched = NuisanceChoice() if nuisances.none else nuisances, ~quiet.saturated, Matched()
     unknown = chosen.marginalised(quiet)
     plain = Setting(quiet, used, comparison)
     delta = np.where(used, flare.recorded_light_dn - quiet.recorded_light_dn, 0.0)
@@ -86,7 +86,7 @@ def cost_lines(costs: Sequence[Cost], nuisances: NuisanceChoice) -> list[str]:
     if not shown:
         return []
     faintest = min(shown, key=lambda cost: cost.known)
-    which = spoken(nuisances) if not nuisances.none else f"the usual unknowns ({spoken(_or_documented(nuisances))})"
+    which = spoken(nuisances) if not nuisances.none else f"the usual unknowns ({spoken(NuisanceChoice())})"
     others = f", the faintest of {len(shown)}," if len(shown) > 1 else ""
     text = (
         f"What unknowns cost: {faintest.of}{others} has a matched S/N of {faintest.known:.3g} with everything known; "
@@ -120,10 +120,6 @@ def _size(sd: float | str, unit: str) -> str:
     return f"+-{100 * float(sd) if unit == '%' else float(sd):g} {unit}".rstrip()
 
 
-def _or_documented(nuisances: NuisanceChoice) -> NuisanceChoice:
-    return NuisanceChoice() if nuisances.none else nuisances
-
-
 #: Column of the answer with everything but the noise known, the bound of the realistic answer next to it.
 IDEAL = Column(
     "ideal",
@@ -138,22 +134,12 @@ def ideal_chances(
 ) -> NDArray[np.float64] | None:
     """Return the closed-form chances of flares if everything but the noise is known, or None if it is.
 
-    Returns
-    -------
-    ndarray or None, shape (n_flare, n_statistic)
-        NaN where the star or the flare saturates every pixel.
+    Their shape is (n_flare, n_statistic), and they are NaN where the star or the flare saturates every pixel.
     """
-    study = case.study
-    if study.nuisances.none:
+    if case.study.nuisances.none:
         return None
-    setting = case.with_sections(nuisances=KNOWN).setting(case.quiet, *flares)
-
-    def chance(statistic: Statistic, flare: Expectation) -> float:
-        if not setting.used.any() or flare.saturated[setting.used].all():
-            return float("nan")
-        return statistic.detection_forms(setting, flare, study.run.fap).probability
-
-    return np.array([[chance(statistic, flare) for statistic in statistics] for flare in flares])
+    setting, fap = case.with_sections(nuisances=KNOWN).setting(case.quiet, *flares), case.study.run.fap
+    return np.array([[_chance(setting, statistic, flare, fap) for statistic in statistics] for flare in flares])
 
 
 #: Kind of the message.
@@ -171,17 +157,17 @@ def chance_with_unknowns(prepared: Sequence[Case]) -> list[str]:
     if not study.nuisances.none or study.run.comparison().estimated:
         return []
     flares = [(case, flare) for case in prepared for flare in range(len(case.amplitudes))][:MAX_FLARES]
-    chances = {item: chance for item in flares if (chance := _chance(*item)) is not None}
+    chances = {item: chance for item in flares if not math.isnan(chance := _matched_chance(*item))}
     if not chances:
         return []
     case, flare = min(chances, key=lambda item: abs(chances[item] - 0.5))
     of = f"{case.label}, flare of {100 * case.amplitudes[flare]:g} %"
     try:
-        unknown = _chance(case.with_sections(nuisances=NuisanceChoice()), flare)
+        unknown = _matched_chance(case.with_sections(nuisances=NuisanceChoice()), flare)
     except InputError as error:
         # Too few pixels are left.
         return [Message(f"The usual unknowns cannot be taken into account for {of}: {error}.", BOTH_CHANCES)]
-    if unknown is None:
+    if math.isnan(unknown):
         return []
     text = (
         f"Everything but the noise is taken as known: {of} is then detected by the matched statistic with a chance of "
@@ -191,13 +177,16 @@ def chance_with_unknowns(prepared: Sequence[Case]) -> list[str]:
     return [Message(text, BOTH_CHANCES)]
 
 
-def _chance(case: Case, flare: int) -> float | None:
-    """Return the closed-form chance of a flare by the matched statistic, or None if everything saturates."""
+def _matched_chance(case: Case, flare: int) -> float:
     peak = case.flares[flare]
-    setting = case.setting(case.quiet, peak)
-    if not setting.used.any() or peak.saturated[setting.used].all():
-        return None
-    return Matched().detection_forms(setting, peak, case.study.run.fap).probability
+    return _chance(case.setting(case.quiet, peak), Matched(), peak, case.study.run.fap)
+
+
+def _chance(setting: Setting, statistic: Statistic, flare: Expectation, fap: float) -> float:
+    """Return the closed-form chance of a flare; NaN if every pixel saturates."""
+    if not setting.used.any() or flare.saturated[setting.used].all():
+        return float("nan")
+    return statistic.detection_forms(setting, flare, fap).probability
 
 
 Float = NDArray[np.float64]
@@ -234,23 +223,23 @@ def drawn(study: Study) -> DrawnStudies:
     sequence = qmc.LatinHypercube(len(priors), rng=np.random.default_rng(study.run.seed))
     even = sequence.random(asked.draws)
     values = np.column_stack([prior.quantile(even[:, k]) for k, prior in enumerate(priors.values())])
-    run = study.run.model_copy(update={"realisations": realisations_each(study)})
+    # An equal share of the realisations, but enough to count the threshold of each draw.
+    fewest = int(np.ceil(MIN_IN_TAIL / study.run.fap)) if study.run.tails == "counted" else 1000
+    run = study.run.model_copy(update={"realisations": max(study.run.realisations // asked.draws, fewest)})
     certain = study.model_copy(update={"unknowns": type(asked)(), "run": run})
     studies = []
     for row in values:
-        changes: dict[str, Any] = {}
-        at = nominal
+        changes, at = dict[str, Any](), nominal
         for name, value in zip(priors, row, strict=True):
             change = rows[name].changes(at, float(value))
             changes |= change
             # The next mode is added to those before it.
             at = at.model_copy(update=change) if isinstance(rows[name], ThroughputMode) else at
-        changed = certain.with_instrument(changes)
         try:
             nominal.with_(**changes)
         except InputError as error:
             raise error.within("the priors of unknown values include impossible ones") from error
-        studies.append(changed)
+        studies.append(certain.with_instrument(changes))
     return DrawnStudies(tuple(priors), tuple(rows[name].label for name in priors), values, tuple(studies))
 
 
@@ -285,13 +274,6 @@ def _unknown_priors(study: Study, nominal: Instrument) -> dict[str, Prior]:
     return priors
 
 
-def realisations_each(study: Study) -> int:
-    """Return the realisations per draw: an equal share, but enough to count the threshold of each draw."""
-    run, draws = study.run, int(study.unknowns.draws)
-    fewest = int(np.ceil(MIN_IN_TAIL / run.fap)) if run.tails == "counted" else 1000
-    return max(run.realisations // draws, fewest)
-
-
 def average(intervals: Sequence[Interval]) -> Interval:
     """Return the mean of probabilities over draws, with a 95 % interval for their own errors and the number of draws.
 
@@ -323,8 +305,14 @@ def shares(draws: DrawnStudies, outcome: Float) -> dict[str, float]:
     if len(y) <= x.shape[1] + 1 or y.std() == 0.0:
         return dict.fromkeys((*names, REST), float("nan"))
     scaled = (x - x.mean(axis=0)) / x.std(axis=0)
+
+    def explained_by(some: tuple[int, ...]) -> float:
+        straight = np.column_stack([scaled[:, some], np.ones(len(y))])
+        left = y - straight @ np.linalg.lstsq(straight, y, rcond=None)[0]
+        return float(1.0 - left.var() / y.var())
+
     explained = {(): 0.0} | {
-        some: _explained(scaled[:, some], y)
+        some: explained_by(some)
         for size in range(1, len(names) + 1)
         for some in itertools.combinations(range(len(names)), size)
     }
@@ -336,13 +324,6 @@ def shares(draws: DrawnStudies, outcome: Float) -> dict[str, float]:
             share[k] += weight * (explained[tuple(sorted((*some, k)))] - value)
     parts = {names[k]: float(share[k]) for k in np.argsort(-share)}
     return parts | {REST: 1.0 - explained[tuple(range(len(names)))]}
-
-
-def _explained(x: Float, y: Float) -> float:
-    """Return the share of the variance that a linear fit explains."""
-    straight = np.column_stack([x, np.ones(len(y))])
-    left = y - straight @ np.linalg.lstsq(straight, y, rcond=None)[0]
-    return float(1.0 - left.var() / y.var())
 
 
 #: Unknowns whose shares of a scatter are named, at most.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
@@ -16,8 +16,8 @@ from mauvecl.answers.answer import (
     Answer,
     InCell,
     TableOf,
+    metadata_of,
     name_of_instrument,
-    realisations_of,
     reported,
     share_columns,
 )
@@ -31,7 +31,7 @@ from mauvecl.answers.closed_forms import (
     spoken,
     unknown_cost,
 )
-from mauvecl.answers.verbs import by_keywords
+from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection.detection import (
     AREA_COLUMNS,
     COLUMNS,
@@ -74,11 +74,6 @@ class StarDetection(InCell):
     detection: Detection
     #: Closed-form chances if everything but the noise were known, shape (n_flare, n_statistic); None if it is known.
     ideal: NDArray[np.float64] | None = None
-
-    @property
-    def shown(self) -> tuple[str, Detection, list[str]]:
-        """Title, detection and names of the flares, for pictures."""
-        return self.title, self.detection, [f"flare {100 * amplitude:g} %" for amplitude in self.amplitudes]
 
 
 def _detection_columns(answer: DetectAnswer) -> tuple[Column, ...]:
@@ -148,12 +143,12 @@ class DetectAnswer(Answer):
     #: each curve has fewer than its 200.
     roc = TableOf(
         "roc", (*FLARE_COLUMNS, *ROC_COLUMNS, *(column.of(itemgetter("roc")) for column in AREA_COLUMNS)), "_curves",
-        place=True, about=realisations_of,
+        place=True, about=("study.run.realisations", "study"),
     )  # fmt: skip
     #: The extremes of every null (amplitude 0) and flare, with their realisations. Many flares share `MOST_ROWS` rows,
     #: so that each distribution has fewer than its 1000.
     tails = TableOf("tails", (*FLARE_COLUMNS, TEMPLATE_COLUMN), "_extremes", of=lambda _, row: row["tail"], place=True,
-                    about=lambda answer: {"seed": answer.study.run.seed})  # fmt: skip
+                    about=("study.run.seed", "study"))  # fmt: skip
 
     @property
     def headline(self) -> str:
@@ -163,7 +158,7 @@ class DetectAnswer(Answer):
         rows = self.table[self.table["statistic"] == statistic]
         chances = np.asarray(rows["probability"])
         if not np.isfinite(chances).any():
-            return f"{name_of_instrument(self.study)} would see none of these flares: every pixel saturates."
+            return f"{self.instrument_name} would see none of these flares: every pixel saturates."
         place = int(np.nanargmin(np.abs(chances - 0.5)))
         row, star = rows[place], self.stars[place // len(self.stars[0].amplitudes)]
         ideal = f"; {chance_text(row['ideal'])} {IF_KNOWN}" if "ideal" in rows.colnames else ""
@@ -177,25 +172,21 @@ class DetectAnswer(Answer):
         run, quiet = self.study.run, [star.detection.quiet for star in self.stars]
         frames = {x.exposure_s: "1 frame" if x.n_frames == 1 else f"{x.n_frames} frames" for x in quiet}
         exposures = " and ".join(f"{exposure_s:g} s ({text})" for exposure_s, text in frames.items())
-        title = (
-            f"Detection at a false-alarm probability of {run.fap:g} per test, {exposures}, {run.realisations:,} "
-            "realisations"
-        )
+        how = f"{exposures}, {run.realisations:,} realisations"
+        title = f"Detection at a false-alarm probability of {run.fap:g} per test, {how}"
         detected = DetectAnswer.table.view(self, title)
         if not len(self.departures):
             return [detected]
         differing = self.departures[self.departures["differs"]]
-        if not len(differing):
-            line = (
-                f"At the thresholds for Gaussian noise the simulated false-alarm probability is {run.fap:g} within 4 "
-                "standard errors, for every statistic."
-            )
-            return [detected, View(line)]
-        title = (
-            "Where the simulation differs from the closed form: false-alarm probability at the threshold that should "
-            f"give {run.fap:g}"
+        if len(differing):
+            threshold = f"false-alarm probability at the threshold that should give {run.fap:g}"
+            title = f"Where the simulation differs from the closed form: {threshold}"
+            return [detected, DetectAnswer.departures.view(self, title, differing)]
+        line = (
+            f"At the thresholds for Gaussian noise the simulated false-alarm probability is {run.fap:g} within 4 "
+            "standard errors, for every statistic."
         )
-        return [detected, DetectAnswer.departures.view(self, title, differing)]
+        return [detected, View(line)]
 
     @property
     def _curves(self) -> Iterator[dict[str, Any]]:
@@ -240,9 +231,7 @@ class DetectAnswer(Answer):
 
 
 @by_keywords
-def detect(
-    study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
-) -> DetectAnswer:
+def detect(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> DetectAnswer:
     """Simulate the detection of every flare of a study, for every star and sweep value.
 
     Parameters
@@ -300,11 +289,10 @@ def detect(
 def _messages(answer: DetectAnswer, prepared: Sequence[Case]) -> list[str]:
     """Return messages on lost pixels, on thresholds, and of the expectations."""
     run, detections = answer.study.run, [(star.title, star.detection) for star in answer.stars]
-    blinding = [message.about(title) for title, one in detections for message in one.messages]
-    blinding += [message.about(title) for title, one in detections for message in one.without_threshold(run.fap)]
-    blinding += [message.about(title) for title, one in detections for message in one.lowered]
-    expectations = [x for case in prepared for x in case.expectations]
-    messages: list[str] = [*blinding, *collect_messages(expectations, answer.study.processes)]
+    messages: list[str] = [message.about(title) for title, one in detections for message in one.messages]
+    messages += [message.about(title) for title, one in detections for message in one.without_threshold(run.fap)]
+    messages += [message.about(title) for title, one in detections for message in one.lowered]
+    messages += collect_messages([x for case in prepared for x in case.expectations], answer.study.processes)
     errors = answer.table["fap_error"][np.isfinite(answer.table["fap_error"])]
     if not countable(run.fap, run.realisations) and errors.size:
         text = (
@@ -317,25 +305,19 @@ def _messages(answer: DetectAnswer, prepared: Sequence[Case]) -> list[str]:
 
 def _cost_of_unknowns(prepared: Sequence[Case]) -> list[str]:
     """Return the sentence on the S/N that the faintest flare loses to unknowns."""
-    study = prepared[0].study
+    choice, comparison = prepared[0].study.nuisances, prepared[0].study.run.comparison()
     costs = [
-        unknown_cost(
-            f"{case.label}, flare of {100 * a:g} %", case.quiet, flare, study.nuisances, study.run.comparison()
-        )
+        unknown_cost(f"{case.label}, flare of {100 * amplitude:g} %", case.quiet, flare, choice, comparison)
         for case in prepared
-        for a, flare in zip(case.amplitudes, case.flares, strict=True)
+        for amplitude, flare in zip(case.amplitudes, case.flares, strict=True)
     ]
-    return cost_lines(costs, study.nuisances)
+    return cost_lines(costs, choice)
 
 
 def _few_terms(stars: Sequence[StarDetection]) -> list[str]:
     """Return a sentence on the number of independent squares of the paper's sum, if it is requested."""
-    forms = [
-        star.detection.closed_form("paper", template=flare)
-        for star in stars
-        if "paper" in star.detection.statistics
-        for flare in range(len(star.amplitudes))
-    ]
+    summed = [star for star in stars if "paper" in star.detection.statistics]
+    forms = [star.detection.closed_form("paper", template=k) for star in summed for k in range(len(star.amplitudes))]
     terms = [form.effective_terms for form in forms if isinstance(form, QuadraticForm)]
     if not terms:
         return []
@@ -348,25 +330,23 @@ def _few_terms(stars: Sequence[StarDetection]) -> list[str]:
 
 def _other_templates(case: Case) -> list[Linear]:
     """Return matched statistics that search for flares of other temperatures than the study's."""
-    filters, quiet = [], case.quiet
-    for temperature in case.study.run.template_temperatures_k:
-        (shape,) = case.expect(case.with_value("flare_temperature", temperature).flaring(case.amplitudes[0]))
-        setting = Setting(quiet, ~quiet.saturated, case.study.run.comparison())
-        filters.append(Linear(f"matched {temperature:g} K", Matched().weights_per_dn(setting, shape)))
+    filters, run = [], case.study.run
+    setting = Setting(case.quiet, ~case.quiet.saturated, run.comparison())
+    for kelvin in run.template_temperatures_k:
+        (shape,) = case.expect(case.with_value("flare_temperature", kelvin).flaring(case.amplitudes[0]))
+        filters.append(Linear(f"matched {kelvin:g} K", Matched().weights_per_dn(setting, shape)))
     return filters
 
 
 def _template_costs(case: Case, star: StarDetection) -> list[str]:
     """Return sentences on the S/N lost to templates of another temperature, for Gaussian noise."""
     detection, lines, light = star.detection, [], case.study.flare.light().describe()
-    for temperature in case.study.run.template_temperatures_k:
+    for kelvin in case.study.run.template_temperatures_k:
         right = Matched().closed_form(detection.setting, detection.flares[0], detection.flares[0]).mean
-        name = f"matched {temperature:g} K"
+        name = f"matched {kelvin:g} K"
         share = detection.closed_form(name, 0).mean / detection.closed_form(name).std / right if right else 0.0
-        lines.append(
-            f"{star.label}: looking for a flare of {temperature:g} K in one of {light} keeps "
-            f"{100 * share:.1f} % of the matched statistic's S/N."
-        )
+        kept = f"keeps {100 * share:.1f} % of the matched statistic's S/N"
+        lines.append(f"{star.label}: looking for a flare of {kelvin:g} K in one of {light} {kept}.")
     return lines
 
 
@@ -443,7 +423,6 @@ SHOWN: dict[str, NuisanceChoice] = {
     )
 }
 
-#: Columns of the table of unknowns.
 UNKNOWN_COLUMNS = (
     star_column(),
     amplitude_column(),
@@ -469,29 +448,25 @@ class UnknownAnswer(Answer):
 
     study: Study
     costs: dict[tuple[str, float], dict[str, Cost]]  # by (star, amplitude), then by unknown
-    quiets: tuple[Expectation, ...] = ()  # the stars without a flare
+    inputs: list[Expectation]  # the stars without a flare
 
     #: One row per star, flare and unknown.
     table = TableOf(
-        "unknowns", UNKNOWN_COLUMNS, "_rows", study=False,
+        "unknowns", UNKNOWN_COLUMNS, "_rows",
         title="What unknowns cost: S/N of the matched statistic, by closed forms",
-        about=lambda answer: {"fap": answer.study.run.fap, "power": answer.study.limit.power,
-                              "study": answer.study.toml()},
+        about=lambda answer: metadata_of(answer, "study.run.fap", "study.limit.power") | {"study": answer.study.toml()},
     )  # fmt: skip
+
+    def of_star(self, star: str) -> tuple[float, dict[str, Cost]]:
+        """Return the amplitude of the first flare of a star, and its costs by unknown."""
+        return next((amplitude, costs) for (name, amplitude), costs in self.costs.items() if name == star)
 
     def smallest(self, star: str, unknown: str | None) -> float:
         """Return the flare amplitude detected with the study's power at its false-alarm probability, marginalised.
 
-        Parameters
-        ----------
-        unknown : str or None
-            None for everything known.
-
-        Notes
-        -----
-        S/N grows with the amplitude; the flare's own photon noise is left out.
+        `unknown` is None for everything known. S/N grows with the amplitude; the flare's own photon noise is left out.
         """
-        (amplitude, costs), *_ = ((a, c) for (name, a), c in self.costs.items() if name == star)
+        amplitude, costs = self.of_star(star)
         cost = next(iter(costs.values())) if unknown is None else costs[unknown]
         snr = cost.known if unknown is None else cost.marginal
         needed = special.ndtri(self.study.limit.power) - special.ndtri(self.study.run.fap)
@@ -507,26 +482,21 @@ class UnknownAnswer(Answer):
 
     @property
     def messages(self) -> list[str]:
-        return collect_messages(list(self.quiets))
-
-    @property
-    def inputs(self) -> list[Expectation]:
-        return list(self.quiets)
+        return collect_messages(self.inputs)
 
 
 def unknown_table(study: Study) -> UnknownAnswer:
     """Compute the S/N of a study's flares under each of the unknowns of `SHOWN`."""
-    costs: dict[tuple[str, float], dict[str, Cost]] = {}
-    quiets = []
-    comparison = study.run.comparison()
-    for case in cases(study, swept=False):
-        quiets.append(case.quiet)
-        for amplitude, flare in zip(case.amplitudes, case.flares, strict=True):
-            costs[case.label, amplitude] = {
-                unknown: unknown_cost(case.label, case.quiet, flare, choice, comparison)
-                for unknown, choice in SHOWN.items()
-            }
-    return UnknownAnswer(study, costs, tuple(quiets))
+    prepared, comparison = cases(study, swept=False), study.run.comparison()
+    costs = {
+        (case.label, amplitude): {
+            unknown: unknown_cost(case.label, case.quiet, flare, choice, comparison)
+            for unknown, choice in SHOWN.items()
+        }
+        for case in prepared
+        for amplitude, flare in zip(case.amplitudes, case.flares, strict=True)
+    }
+    return UnknownAnswer(study, costs, [case.quiet for case in prepared])
 
 
 def power(snr: float | NDArray[np.float64], fap: float) -> NDArray[np.float64]:

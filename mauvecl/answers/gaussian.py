@@ -6,18 +6,18 @@ deviation of the observed one in 68.27 % of all spectra, and the false-alarm pro
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl.answers.answer import Answer, TableOf, realisations_of
+from mauvecl.answers.answer import Answer, TableOf
 from mauvecl.answers.detect import DetectAnswer, detect
 from mauvecl.answers.signal import SnrAnswer, snr
-from mauvecl.answers.verbs import by_keywords
+from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection.snr import steps_of
 from mauvecl.device.engine import Engine
 from mauvecl.noise.drawing import Cumulants
@@ -75,13 +75,10 @@ WORST_COLUMNS = (
 
 
 def coverage(result: SnrResult) -> NDArray[np.float64]:
-    """Return the coverage of intervals of one estimated standard deviation about the observed signal.
+    """Return the coverage of intervals of one estimated standard deviation about the observed signal, for each pixel.
 
-    Returns
-    -------
-    ndarray, shape (n_pixel,)
-        The standard deviation is estimated from the observed photons and the known dark and read noise. Values are
-        interpolated within the bins of the histogram of counts, 1/64 of a standard deviation or less.
+    The standard deviation is estimated from the observed photons and the known dark and read noise. Values are
+    interpolated within the bins of the histogram of counts, 1/64 of a standard deviation or less.
     """
     seen = result.observers[: result.scene.n_pixel]
     signal = result.expectation.light_dn
@@ -102,15 +99,8 @@ def coverage(result: SnrResult) -> NDArray[np.float64]:
 
 
 def beyond(x: Expectation, sigmas: float) -> NDArray[np.float64]:
-    """Return the probability that a pixel deviates by more than N standard deviations, shape (n_pixel,).
+    """Return the probability that a pixel is more than `sigmas` standard deviations above or (negative) below its mean.
 
-    Parameters
-    ----------
-    sigmas : float
-        Number of standard deviations; negative for deviations below the mean.
-
-    Notes
-    -----
     By the saddle point (Lugannani & Rice 1980, doi 10.2307/1426607) of Gaussian and Poisson parts together; right to
     3e-3 of the probability. For normal noise it would be the same in every pixel.
     """
@@ -148,14 +138,6 @@ def _promises(result: SnrResult) -> QTable:
     return table_of(ELEMENT_COLUMNS, [values], **table.meta)
 
 
-def _title(answer: GaussianAnswer) -> str:
-    run = answer.study.run
-    return (
-        f"The root-of-N formula and {run.realisations:,} realisations; promised: no difference in S/N, 68.3 % "
-        f"of 1-sigma intervals, as many 5-sigma pixels and false alarms ({run.fap:g}) as normal noise has"
-    )
-
-
 @dataclass(eq=False)
 class GaussianAnswer(Answer):
     """Answer of `gaussian`."""
@@ -167,11 +149,15 @@ class GaussianAnswer(Answer):
     detection: DetectAnswer
 
     #: Largest error of each prediction, one row per star and cell.
-    cells = TableOf("gaussian", WORST_COLUMNS, "_largest_errors", place=True, title=_title,
-                    about=lambda answer: {"fap": answer.study.run.fap})  # fmt: skip
+    cells = TableOf(
+        "gaussian", WORST_COLUMNS, "_largest_errors", place=True, about=("study.run.fap", "study"),
+        title=lambda answer: f"The root-of-N formula and {answer.study.run.realisations:,} realisations; promised: no "
+        "difference in S/N, 68.3 % of 1-sigma intervals, as many 5-sigma pixels and false alarms "
+        f"({answer.study.run.fap:g}) as normal noise has",
+    )  # fmt: skip
     #: Predictions and simulation, one row per star, cell and resolution element.
     elements = TableOf("elements", (), "signal.stars", of=lambda _, star: _promises(star.result),
-                       place=True, about=realisations_of)  # fmt: skip
+                       place=True, about=("study.run.realisations", "study"))  # fmt: skip
     #: One row per star, cell and statistic: false-alarm probabilities at the formula's thresholds, with reasons.
     thresholds = TableOf("thresholds", (), "detection.departures")
 
@@ -180,8 +166,7 @@ class GaussianAnswer(Answer):
         """The largest errors of the formula."""
         cells = self.cells
         snr = float(np.abs(cells["snr_off_by"]).max())
-        ratios = np.asarray(cells["fap_ratio"])
-        worst = float(ratios[np.argmax(np.abs(np.log(np.maximum(ratios, SMALLEST_RATIO))))])
+        worst = float(cells["fap_ratio"][_most_wrong(cells["fap_ratio"])])
         return (
             f"The root-of-N formula is {f'off by at most {snr:.2g}' if snr else 'right'} in S/N, and its false alarms "
             f"are {'as many' if worst == 1.0 else f'up to {worst:.3g} times as many'} as promised, in {len(cells)} "
@@ -198,17 +183,15 @@ class GaussianAnswer(Answer):
 
     @property
     def _largest_errors(self) -> list[dict[str, Any]]:
-        tables = [_by_star(t, len(self.signal.stars)) for t in (self.elements, self.thresholds, self.detection.table)]
-        return [
-            vars(star) | _of_signal(star.result, elements) | _of_thresholds(tested, flares)
-            for star, elements, tested, flares in zip(self.signal.stars, *tables, strict=True)
-        ]
-
-
-def _by_star(table: QTable, stars: int) -> list[QTable]:
-    """Split a table into equal parts, in order."""
-    each = len(table) // stars
-    return [table[k * each : (k + 1) * each] for k in range(stars)]
+        rows, stars = [], self.signal.stars
+        for k, star in enumerate(stars):
+            # Each star has as many rows as the others.
+            elements, tested, flares = (
+                table[k * len(table) // len(stars) : (k + 1) * len(table) // len(stars)]
+                for table in (self.elements, self.thresholds, self.detection.table)
+            )
+            rows.append(vars(star) | _of_signal(star.result, elements) | _of_thresholds(tested, flares))
+        return rows
 
 
 def _of_signal(result: SnrResult, elements: QTable) -> dict[str, float]:
@@ -227,10 +210,15 @@ def _of_signal(result: SnrResult, elements: QTable) -> dict[str, float]:
     }
 
 
+def _most_wrong(ratios: Any) -> int:
+    """Return the index of the ratio that is furthest from 1, up or down."""
+    return int(np.argmax(np.abs(np.log(np.maximum(ratios, SMALLEST_RATIO)))))
+
+
 def _of_thresholds(tested: QTable, flares: QTable) -> dict[str, float | str]:
     """Return the largest errors of a star's false-alarm and detection probabilities."""
     off = tested[tested["differs"]]
-    wrong = off[np.argmax(np.abs(np.log(np.maximum(off["ratio"], SMALLEST_RATIO))))] if len(off) else None
+    wrong = off[_most_wrong(off["ratio"])] if len(off) else None
     missed = flares["probability"] - flares["closed_form_probability"]
     # The interval includes the error of the threshold.
     sure = np.abs(missed) > (flares["high"] - flares["low"]) * SURE / ERRORS_IN_INTERVAL
@@ -244,9 +232,7 @@ def _of_thresholds(tested: QTable, flares: QTable) -> dict[str, float | str]:
 
 
 @by_keywords
-def gaussian(
-    study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
-) -> GaussianAnswer:
+def gaussian(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> GaussianAnswer:
     """Compare the usual formula with the simulation, over magnitude and exposure or the study's sweep.
 
     Parameters
@@ -265,11 +251,8 @@ def gaussian(
         usual = own == Observation().exposure_s
         study = study.model_copy(update={"sweep": formula_grid(exposure_s=None if usual else own)})
 
-    def progress_of(part: int) -> Callable[[int, int], None]:
-        def report(done: int, total: int) -> None:
-            if progress is not None:
-                progress(part * total + done, 2 * total)
+    def report(part: int, done: int, total: int) -> None:
+        if progress is not None:
+            progress(part * total + done, 2 * total)
 
-        return report
-
-    return GaussianAnswer(study, snr(study, engine, progress_of(0)), detect(study, engine, progress_of(1)))
+    return GaussianAnswer(study, snr(study, engine, partial(report, 0)), detect(study, engine, partial(report, 1)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any
@@ -11,8 +11,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, first_of, name_of_instrument, share_columns
-from mauvecl.answers.verbs import by_keywords
+from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, first_of, reported, share_columns
+from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection.distributions import Interval
 from mauvecl.device.engine import Stares
 from mauvecl.flares.frames import STEADY, Components
@@ -23,7 +23,7 @@ from mauvecl.schema.columns import INTERVAL, Column, View, interval, number, per
 from mauvecl.schema.errors import InputError, Message
 from mauvecl.schema.physical import DAY_S
 from mauvecl.search.completeness import SMALL, InjectedCompleteness, frame_signal
-from mauvecl.search.false_alarms import CountedRate, SampledRate, consecutive_alarm_rate, sampled_rate
+from mauvecl.search.false_alarms import CountedRate, consecutive_alarm_rate, sampled_rate
 from mauvecl.search.flare_fits import SingleFlareFit
 from mauvecl.search.injections import FitAccuracy, Injections, Refit
 from mauvecl.search.search import Survey
@@ -75,13 +75,8 @@ def survey_star(case: Case) -> StarSurvey:
     hot = frame if flare.spectrum.file is None else frame.with_sections(flare=blackbody)
     quiet, electrons = frame.quiet, hot.flare_electrons(TEMPERATURES_K)
     nuisances = frame_nuisances(quiet, stare, choice.spreads())
-    templates = Templates.of(
-        quiet,
-        electrons * quiet.gain_dn_per_electron,
-        TEMPERATURES_K,
-        nuisances=nuisances,
-        rank=choice.sums,
-    )
+    signal = electrons * quiet.gain_dn_per_electron
+    templates = Templates.of(quiet, signal, TEMPERATURES_K, nuisances=nuisances, rank=choice.sums)
     level = choice.level(stare, case.study.stare.orbit_s)
     bank = Bank(
         choice.half_widths_s, templates.directions[list(templates.chosen)], shape_of(choice.shape), stare.frame_s, level
@@ -207,7 +202,6 @@ def cell_columns(of: str) -> tuple[Column, ...]:
     )
 
 
-#: Columns of the table of searches.
 SEARCH_COLUMNS = (
     Column("threshold", "threshold.value", "", "S/N from which on a template is an alarm", "threshold", ".3f"),
     Column("threshold_low", "threshold.low", "", "its 95 % interval, lower end", INTERVAL, interval(".3f"),
@@ -256,6 +250,12 @@ class StarCompleteness(InCell):
     ideal_share: float
 
     @property
+    def limit_columns(self) -> tuple[Column, ...]:
+        """Columns of `limits`."""
+        known = np.isnan(self.ideal_share)
+        return limit_columns(self.sizes.of) if known else (*limit_columns(self.sizes.of), ideal_column(self.sizes.of))
+
+    @property
     def limits(self) -> QTable:
         """Sizes of which 50 % and 90 % are found, for all half-widths together and for each."""
         rows = [
@@ -263,8 +263,7 @@ class StarCompleteness(InCell):
             | {name: self.injected.limit(power, k) for name, power in POWERS.items()}
             for k, half_width in ((None, np.nan), *enumerate(self.injected.half_widths_s))
         ]
-        ideal = () if np.isnan(self.ideal_share) else (ideal_column(self.sizes.of),)
-        return table_of((*limit_columns(self.sizes.of), *ideal), rows)
+        return table_of(self.limit_columns, rows)
 
     @property
     def cells(self) -> QTable:
@@ -308,11 +307,12 @@ def _share(answer: InjectAnswer) -> tuple[Column, ...]:
     return share_columns(answer.study, "surveyed.quiet.target_share")
 
 
-def _search_of(answer: InjectAnswer) -> dict[str, object]:
+def _search(answer: InjectAnswer) -> dict[str, object]:
     choice, flare = answer.study.search, answer.study.flare
     return {
         "false_alarms": f"{choice.false_alarms:g} per star-{choice.per}",
         "flare": f"{flare.light().describe()}, {choice.shape}, amplitudes in {flare.band}",
+        "study": answer.study.text(),
     }
 
 
@@ -327,11 +327,11 @@ class InjectAnswer(Answer):
     messages: list[str] = field(default_factory=list)
 
     #: Sizes E50 and E90: per star and cell of the sweep, one row for all half-widths and one for each.
-    table = TableOf("limits", _share, "stars", of=lambda _, star: star.limits, place=True, about=_search_of)
+    table = TableOf("limits", _share, "stars", of=lambda _, star: star.limits, place=True, about=_search)
     #: One row per star, cell of the sweep, half-width and size.
-    completeness = TableOf("completeness", _share, "stars", of=lambda _, star: star.cells, place=True, about=_search_of)
+    completeness = TableOf("completeness", _share, "stars", of=lambda _, star: star.cells, place=True, about=_search)
     #: One row per star and cell of the sweep: thresholds, false alarms.
-    search = TableOf("search", lambda answer: (*_share(answer), *SEARCH_COLUMNS), "stars", place=True, about=_search_of)
+    search = TableOf("search", lambda answer: (*_share(answer), *SEARCH_COLUMNS), "stars", place=True, about=_search)
 
     @property
     def headline(self) -> str:
@@ -345,7 +345,7 @@ class InjectAnswer(Answer):
         if not np.isfinite(half.value):
             return f"Fewer than half of the injected flares on {star.title} are found at any {of}{least}."
         return (
-            f"A search of {name_of_instrument(self.study)}'s frames of {star.title} would find half of the flares of "
+            f"A search of {self.instrument_name}'s frames of {star.title} would find half of the flares of "
             f"{of} {scale * half.value:.3g} {unit} ({scale * half.low:.3g} to {scale * half.high:.3g}{ideal}), "
             f"with {self.study.search.rate_text}{least}."
         )
@@ -356,8 +356,7 @@ class InjectAnswer(Answer):
         for star in self.stars:
             unit = f" ({SIZE_UNITS[star.sizes.of]})" if SIZE_UNITS[star.sizes.of] else ""
             title = f"{star.title}: {star.sizes.of}{unit} of which a half (E50) and nine tenths (E90) are found"
-            ideal = () if np.isnan(star.ideal_share) else (ideal_column(star.sizes.of),)
-            views.append(View(title, (*limit_columns(star.sizes.of), *ideal), star.limits))
+            views.append(View(title, star.limit_columns, star.limits))
         return views
 
     @property
@@ -366,9 +365,7 @@ class InjectAnswer(Answer):
 
 
 @by_keywords
-def inject(
-    study: Study, engine: Stares | Pool | None = None, progress: Callable[[int, int], None] | None = None
-) -> InjectAnswer:
+def inject(study: Study, engine: Stares | Pool | None = None, progress: Progress = None) -> InjectAnswer:
     """Compute the completeness of a study's search for every star and sweep value.
 
     Parameters
@@ -409,60 +406,37 @@ def inject(
 
 def _completeness(case: Case, engine: Stares | Pool, report: Callable[[float], None]) -> StarCompleteness:
     """Inject flares into the stare of a case and search for them; `report` receives the share that is done."""
-    choice, asked, seed = case.study.search, case.study.injections, case.study.run.seed
-    processes = case.study.processes.additive_only
-    star = survey_star(case)
-    survey = star.survey
-    drawn, tail, threshold = _threshold(case, survey, engine)
-    sizes = Sizes.chosen(case)
-    values = injected_sizes(case, sizes, star.unit_snr, threshold.value)
+    choice, asked, star = case.study.search, case.study.injections, survey_star(case)
+    survey, found = star.survey, _false_alarms(case, star.survey, engine)
+    sizes, threshold = Sizes.chosen(case), found["threshold"].value
+    values = injected_sizes(case, sizes, star.unit_snr, threshold)
     positions = min(asked.positions, asked.count)
     injections = Injections(
-        survey, 0, asked.half_widths_s, threshold.value, seed, positions, -(-asked.count // positions), processes
-    )
+        survey, 0, asked.half_widths_s, threshold, case.study.run.seed, positions, -(-asked.count // positions),
+        case.study.processes.additive_only,
+    )  # fmt: skip
     widths = np.array(injections.half_widths_s)
     amplitudes = np.asarray(sizes.amplitude(values[None], widths[:, None]))
     refit = Refit(star.fit, amplitudes, case.study.flare.temperature_k, -(-asked.fitted // positions))
-    parts = list(_at_each_peak(injections, refit, positions, engine, report))
-    critical = np.stack([part["critical"].T for part in parts], axis=1)
-    # The comparison with drawn stares has most power where a few in ten have an alarm.
-    checked, likely, error = tail.likely
-    simulated, expected = _checked(drawn, checked, likely, error, survey.stare.observed_s / DAY_S / tail.days)
-    alarmed = 0 if drawn is None else int(np.sum(drawn.maxima >= threshold.value))
-    should = float("nan") if drawn is None else drawn.maxima.size * -np.expm1(-choice.rate * drawn.days)
+
+    def at_one_peak(position: int) -> Arrays:
+        return _reduced(engine, injections.request(position, refit if refit.count else None))
+
+    peaks = map_in_order(engine, at_one_peak, range(positions))
+    parts = list(reported(peaks, positions, lambda done, total: report(done / total)))
+    critical = sizes.of_amplitude(np.stack([part["critical"].T for part in parts], axis=1), widths[:, None, None])
     return StarCompleteness(
         case.label,
         case.at,
         star,
         sizes,
-        threshold,
-        simulated,
-        expected,
-        checked,
-        alarmed,
-        float(should),
-        tail.shifted and choice.null == "sampled",
-        injections.saturates,
-        consecutive_alarm_rate(choice.points, choice.sigma, survey.stare.frame_s),
-        InjectedCompleteness(
-            injections.half_widths_s, values, amplitudes, sizes.of_amplitude(critical, widths[:, None, None])
-        ),
-        FitAccuracy.of(parts) if refit.count else None,
-        _ideal_share(case, star),
+        **found,
+        saturates=injections.saturates,
+        in_a_row=consecutive_alarm_rate(choice.points, choice.sigma, survey.stare.frame_s),
+        injected=InjectedCompleteness(injections.half_widths_s, values, amplitudes, critical),
+        fitted=FitAccuracy.of(parts) if refit.count else None,
+        ideal_share=_ideal_share(case, star),
     )
-
-
-def _at_each_peak(
-    injections: Injections, refit: Refit, positions: int, engine: Stares | Pool, report: Callable[[float], None]
-) -> Iterator[Arrays]:
-    """Yield what injections at each peak time give; `report` receives the share that is done."""
-
-    def at_one_peak(position: int) -> Arrays:
-        return _reduced(engine, injections.request(position, refit if refit.count else None))
-
-    for done, part in enumerate(map_in_order(engine, at_one_peak, range(positions)), 1):
-        report(done / positions)
-        yield part
 
 
 def _ideal_share(case: Case, star: StarSurvey) -> float:
@@ -475,32 +449,41 @@ def _ideal_share(case: Case, star: StarSurvey) -> float:
     return star.unit_snr / known if known > 0 else float("nan")
 
 
-def _threshold(case: Case, survey: Survey, engine: Stares | Pool) -> tuple[CountedRate | None, SampledRate, Interval]:
-    """Return the false-alarm rates in drawn stares and by importance sampling, and the threshold of the study's."""
-    choice, seed, drawn = case.study.search, case.study.run.seed, None
+def _false_alarms(case: Case, survey: Survey, engine: Stares | Pool) -> dict[str, Any]:
+    """Return the threshold and the false alarms of a search, in drawn stares and by importance sampling.
+
+    The keys are the fields of `StarCompleteness`.
+    """
+    choice, seed, days = case.study.search, case.study.run.seed, survey.stare.observed_s / DAY_S
+    drawn = None
     if choice.nulls:
         request = survey.largest_value_request(choice.nulls, seed, case.study.processes.additive_only)
-        drawn = CountedRate(np.sort(_reduced(engine, request)["maximum"]), survey.stare.observed_s / DAY_S)
+        drawn = CountedRate(np.sort(_reduced(engine, request)["maximum"]), days)
     tail = sampled_rate(survey, seed)
-    rate = tail if choice.null == "sampled" or drawn is None else drawn
-    return drawn, tail, rate.threshold(choice.rate)
+    threshold = (tail if choice.null == "sampled" or drawn is None else drawn).threshold(choice.rate)
+    # The comparison with drawn stares has most power where a few in ten have an alarm.
+    checked, likely, error = tail.likely
+    shifted = tail.shifted and choice.null == "sampled"
+    found: dict[str, Any] = {"threshold": threshold, "checked": checked, "shifted": shifted}
+    if drawn is None:
+        nothing = Interval(np.nan, np.nan, np.nan)
+        return found | {"simulated": nothing, "asked": np.nan, "alarmed": 0, "expected": np.nan}
+    n = drawn.maxima.size
+    # Drawn stares may be longer than those of importance sampling.
+    longer = days / tail.days
+    none = (1 - likely) ** longer
+    reach = DIFFERS * np.hypot(np.sqrt(none * (1 - none) / n), longer * none / (1 - likely) * error)
+    p = float(np.mean(drawn.maxima >= checked))
+    with np.errstate(divide="ignore"):
+        ends = [-np.log1p(-np.clip(x, 0.0, 1.0)) / days for x in (p, p - reach, p + reach)]
+        asked = float(-np.log(none) / days)
+    return found | {
+        "simulated": Interval(*(float(x) for x in ends)),
+        "asked": asked,
+        "alarmed": int(np.sum(drawn.maxima >= threshold.value)),
+        "expected": float(n * -np.expm1(-choice.rate * days)),
+    }
 
 
 def _reduced(engine: Stares | Pool, request: StaresRequest) -> Arrays:
     return engine.stares(request) if isinstance(engine, Pool) else engine.reduced(request)
-
-
-def _checked(
-    drawn: CountedRate | None, value: float, probability: float, error: float, longer: float
-) -> tuple[Interval, float]:
-    """Return false alarms per star-day of drawn stares at a value, within 4 standard errors, and the expected rate."""
-    if drawn is None:
-        return Interval(np.nan, np.nan, np.nan), float("nan")
-    n = drawn.maxima.size
-    # Drawn stares may be longer than those of importance sampling.
-    none = (1 - probability) ** longer
-    reach = DIFFERS * np.hypot(np.sqrt(none * (1 - none) / n), longer * none / (1 - probability) * error)
-    p = float(np.mean(drawn.maxima >= value))
-    with np.errstate(divide="ignore"):
-        ends = [-np.log1p(-np.clip(x, 0.0, 1.0)) / drawn.days for x in (p, p - reach, p + reach)]
-        return Interval(*(float(x) for x in ends)), float(-np.log(none) / drawn.days)

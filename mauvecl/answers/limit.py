@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from operator import attrgetter
 from threading import Lock
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf, first_of, name_of_instrument, share_columns
+from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf, first_of, share_columns
 from mauvecl.answers.closed_forms import Cost, cost_lines, describe_shares, draw_columns, marginal_lines, unknown_cost
-from mauvecl.answers.limit_search import LimitSearch, MarginalLimitSearch, Point, Unknown, settle, single_flares
-from mauvecl.answers.verbs import by_keywords
+from mauvecl.answers.limit_search import LimitSearch, MarginalLimitSearch, Point, Report, Unknown, settle, single_flares
+from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection.distributions import Interval
 from mauvecl.detection.names import RECOMMENDED, check_fap
 from mauvecl.device.engine import Engine
@@ -48,8 +48,7 @@ if TYPE_CHECKING:
     from mauvecl.host.instrument.instrument import Instrument
 
 
-@dataclass(frozen=True)
-class Assumption:
+class Assumption(NamedTuple):
     """Uncertain value of the payload with both ends of its range (documentation: what is nominal)."""
 
     name: str
@@ -57,36 +56,16 @@ class Assumption:
     changes: tuple[Mapping[str, Any], Mapping[str, Any]]
 
 
-def assumptions(nominal: Instrument) -> tuple[Assumption, ...]:
+def assumptions(nominal: Instrument) -> list[Assumption]:
     """Return the uncertain values of the payload and their ranges; normal priors extend to one standard deviation."""
-    rows = []
-    values = values_of(nominal)
+    rows, values = list[Assumption](), values_of(nominal)
     for name, prior in Unknowns().priors(nominal).items():
         ends = (prior.low, prior.high) if isinstance(prior, Uniform) else (prior.mean - prior.sd, prior.mean + prior.sd)
         value = values[name]
         low, high = (value.changes(nominal, float(f"{end:.12g}")) for end in ends)
         rows.append(Assumption(value.label, (f"{ends[0]:g}", f"{ends[1]:g}"), (low, high)))
-    dark = Assumption(
-        "dark counts are Poisson in", ("DN", "electrons"), ({"dark_unit": "DN"}, {"dark_unit": "electrons"})
-    )
-    return (*rows, dark)
-
-
-@dataclass(frozen=True)
-class Moved:
-    """Limit with one assumption at both ends of its range."""
-
-    star: str
-    amplitude: float
-    statistic: str
-    assumption: Assumption
-    nominal: float
-    at_ends: tuple[float, float]
-
-    @property
-    def span(self) -> float:
-        """Difference between the ends."""
-        return abs(self.at_ends[1] - self.at_ends[0])
+    units = ("DN", "electrons")
+    return [*rows, Assumption("dark counts are Poisson in", units, ({"dark_unit": units[0]}, {"dark_unit": units[1]}))]
 
 
 @validated
@@ -98,11 +77,13 @@ def what_matters(study: Study) -> QTable:
     QTable
         One row per star, flare, statistic and assumption; for each limit, the assumption that changes it most first.
     """
-    rows: list[Moved] = []
-    for case in cases(study, swept=False):
-        for single in single_flares(case):
-            for statistic in study.run.statistics:
-                rows += sorted(_moves(single, statistic), key=lambda m: -m.span)
+    rows = [
+        row
+        for case in cases(study, swept=False)
+        for single in single_flares(case)
+        for statistic in study.run.statistics
+        for row in sorted(_moves(single, statistic), key=lambda row: -row["span"])
+    ]
     columns = assumption_columns(study.limit.of)
     table = table_of(columns, rows, power=study.limit.power, fap=study.run.fap, study=study.text())
     for column in columns:
@@ -121,29 +102,25 @@ def assumption_columns(of: str) -> tuple[Column, ...]:
         star_column(),
         *(() if of == "amplitude" else (amplitude_column(),)),
         STATISTIC_COLUMN,
-        Column("assumption", "assumption.name", "", "what is assumed of the instrument", "assumption"),
-        Column("low_end", lambda row: row.assumption.ends[0], "", "lower end of its sensible range", "from"),
-        Column("high_end", lambda row: row.assumption.ends[1], "", "upper end of its sensible range", "to"),
+        Column("assumption", "", "", "what is assumed of the instrument", "assumption"),
+        Column("low_end", "", "", "lower end of its sensible range", "from"),
+        Column("high_end", "", "", "upper end of its sensible range", "to"),
         Column(of, "nominal", description=QUANTITIES[of].description, format=LIMIT),
-        Column("at_low_end", lambda row: row.at_ends[0], "", "closed-form limit with the assumption at its lower end",
-               "limit from", LIMIT),
-        Column("at_high_end", lambda row: row.at_ends[1], "", "closed-form limit with the assumption at its upper end",
-               "to", LIMIT),
+        Column("at_low_end", "", "", "closed-form limit with the assumption at its lower end", "limit from", LIMIT),
+        Column("at_high_end", "", "", "closed-form limit with the assumption at its upper end", "to", LIMIT),
         Column("span", "", "", f"how far the closed-form limit of {of} moves from end to end", "moves by", LIMIT),
     )  # fmt: skip
 
 
-def _moves(case: Case, statistic: str) -> list[Moved]:
-    """Return the change of a limit with each assumption."""
-    star, amplitude = case.star.library or str(case.star.file), case.amplitudes[0]
-    if case.study.limit.of == "amplitude":
-        amplitude = float("nan")
-    nominal, moves = LimitSearch(case, statistic).root(), []
-    for assumption in assumptions(case.instrument):
-        changed = (replace(case, study=case.study.with_instrument(change)) for change in assumption.changes)
+def _moves(case: Case, statistic: str) -> Iterator[dict[str, Any]]:
+    """Yield the change of a limit with each assumption at both ends of its range, by the names of columns."""
+    nominal = LimitSearch(case, statistic).root()
+    limit = {"star": case.star.library or str(case.star.file), "amplitude": case.amplitudes[0], "statistic": statistic}
+    for name, (low_end, high_end), changes in assumptions(case.instrument):
+        changed = (replace(case, study=case.study.with_instrument(change)) for change in changes)
         low, high = (LimitSearch(each, statistic).root(near=nominal) for each in changed)
-        moves.append(Moved(star, amplitude, statistic, assumption, nominal, (low, high)))
-    return moves
+        ends = {"low_end": low_end, "high_end": high_end, "at_low_end": low, "at_high_end": high}
+        yield limit | ends | {"assumption": name, "nominal": nominal, "span": abs(high - low)}
 
 
 #: Steps in which the progress of a limit is reported, since its number of simulations is not known beforehand.
@@ -158,7 +135,6 @@ class Limit:
     amplitude: float  # amplitude of the flare; NaN if the amplitude is the limit
     of: str
     statistic: str
-    fap: float
     power: float
     value: Interval  # limit with its 95 % interval, including that of the threshold
     closed_form: float  # limit for Gaussian noise
@@ -257,14 +233,8 @@ def _unknown_columns(digits: str) -> tuple[Column, ...]:
 
 def _draw_columns(answer: LimitAnswer) -> tuple[Column, ...]:
     draws = next(limit.unknown.draws for limit in answer.limits if limit.unknown is not None)
-    values = (column.of(attrgetter("unknown")) for column in draw_columns(draws))
     limit = Column(answer.study.limit.of, "unknown.limits", description="closed-form limit")
-    return (*answer.flare_columns, *values, limit)
-
-
-def _run_of(answer: LimitAnswer) -> dict[str, object]:
-    study = answer.study
-    return {"power": study.limit.power, "fap": study.run.fap, "realisations": study.run.realisations}
+    return (*answer.flare_columns, *(column.of(attrgetter("unknown")) for column in draw_columns(draws)), limit)
 
 
 @dataclass(eq=False)
@@ -274,16 +244,21 @@ class LimitAnswer(Answer):
     USES = ("instrument", "sky", "flare", "processes", "nuisances", "values", "seed")
 
     study: Study
-    limits: list[Limit] = field(default_factory=list)
+    limits: list[Limit]
+    failed: tuple[str, ...]  # reasons for missing limits
     assumptions: QTable | None = None  # change of the limits with assumptions about the instrument; see `what_matters`
-    failed: tuple[str, ...] = ()  # reasons for missing limits
 
     #: One row per star, flare and statistic.
-    table = TableOf("limit", _limit_columns, "limits", place=True, key="rows", about=_run_of)
+    table = TableOf("limit", _limit_columns, "limits", place=True, key="rows",
+                    about=("study.limit.power", "study.run.fap", "study.run.realisations", "study"))  # fmt: skip
     #: One row per limit and draw of the unknown: its values and the closed-form limit.
-    draws = TableOf("unknowns", _draw_columns, "limits", place=True, when=lambda answer: answer.study.unknowns.draws)
-    _assumptions = TableOf("assumptions", lambda answer: assumption_columns(answer.study.limit.of), "assumptions",
-                           key="assumptions", when=lambda answer: answer.assumptions is not None)  # fmt: skip
+    draws = TableOf("unknowns", _draw_columns, "limits", place=True, when="study.unknowns.draws")
+    _assumptions = TableOf(
+        "assumptions", lambda answer: assumption_columns(answer.study.limit.of), "assumptions", key="assumptions",
+        title=lambda answer: f"What is assumed, and how far it moves the closed-form limit of {answer.study.limit.of}, "
+        "the largest first",
+        when=lambda answer: answer.assumptions is not None,
+    )  # fmt: skip
 
     def placed(self, columns: Sequence[Column]) -> tuple[Column, ...]:
         """Return columns after those of the star and of swept quantities other than the amplitude."""
@@ -305,7 +280,7 @@ class LimitAnswer(Answer):
         ideal = "" if np.isnan(limit.ideal) else f"; {number(limit.ideal)} {IF_KNOWN}"
         least = first_of(len(self.limits), "limits")
         return (
-            f"{name_of_instrument(self.study)} would see {flare} on {full_label(limit.star, limit.at)}{within} with a "
+            f"{self.instrument_name} would see {flare} on {full_label(limit.star, limit.at)}{within} with a "
             f"chance of {100 * asked.power:g} % {before} {number(limit.value.value)} "
             f"({number(limit.value.low)} to {number(limit.value.high)}{ideal}){least}."
         )
@@ -321,18 +296,12 @@ class LimitAnswer(Answer):
         )
         views = [View(title, shown, table_of(shown, self.limits))]
         if draws:
-            shares = Column("shares", lambda row: describe_shares(row.unknown.shares),
-                            heading="matters most, share of the variance")  # fmt: skip
-            title = (
-                f"Averaged over {draws} draws of what is unknown of the instrument: the limits of each, and what "
-                "explains their scatter"
-            )
+            heading = "matters most, share of the variance"
+            shares = Column("shares", lambda row: describe_shares(row.unknown.shares), heading=heading)
             shown = (*self.placed(self.flare_columns), *_unknown_columns(DIGITS[of])[:2], shares)
-            views.append(View(title, shown, table_of(shown, self.limits)))
-        if self.assumptions is not None:
-            title = f"What is assumed, and how far it moves the closed-form limit of {of}, the largest first"
-            views.append(LimitAnswer._assumptions.view(self, title))
-        return views
+            what = "what is unknown of the instrument: the limits of each, and what explains their scatter"
+            views.append(View(f"Averaged over {draws} draws of {what}", shown, table_of(shown, self.limits)))
+        return [*views, *super().views]
 
     @cached_property
     def inputs(self) -> list[Expectation]:
@@ -342,18 +311,14 @@ class LimitAnswer(Answer):
     @property
     def messages(self) -> list[str]:
         """Messages about failed limits, the stars, and unknowns."""
-        stars = worst_first(
-            [
-                *(text for limit in self.limits for text in limit.messages),
-                *collect_messages(self.inputs, self.study.processes),
-            ]
-        )
+        at_limits = [text for limit in self.limits for text in limit.messages]
+        stars = worst_first([*at_limits, *collect_messages(self.inputs, self.study.processes)])
         costs = [limit.cost for limit in self.limits if limit.cost is not None]
         failed = [Message(f"NO LIMIT: {text}.", "no limit") for text in self.failed]
         return [*failed, *stars, *marginal_lines(self.study.nuisances), *cost_lines(costs, self.study.nuisances)]
 
 
-def solve(case: Case, statistic: str, engine: Engine | Pool, report: Callable[[int], None] | None = None) -> Limit:
+def solve(case: Case, statistic: str, engine: Engine | Pool, report: Report = None) -> Limit:
     """Return the limit of a case's first flare, or of its amplitude, and simulate it again with another seed.
 
     Averages over draws of unknown instrument values if the study has some. Raises InputError if the power is not
@@ -372,6 +337,7 @@ def solve(case: Case, statistic: str, engine: Engine | Pool, report: Callable[[i
     fresh = (study.run.seed + 0x9E3779B97F4A7C15) % 2**64
     check = Point(value.value, question.simulated(value.value, fresh), fresh)
     quiet, flare = question.pair(value.value)
+    known, ideal = study.nuisances.none, case.with_sections(nuisances=KNOWN)
     named = case.star.model_copy(update={"magnitude": None}) if question.of == "magnitude" else case.star
     rise = value.value if question.of == "amplitude" else case.amplitudes[0]
     there = f"exposure {value.value:.0f} s" if question.of == "exposure" else f"{question.of} {value.value:.4g}"
@@ -381,11 +347,10 @@ def solve(case: Case, statistic: str, engine: Engine | Pool, report: Callable[[i
         amplitude=float("nan") if question.of == "amplitude" else case.amplitudes[0],
         of=question.of,
         statistic=statistic,
-        fap=question.fap,
         power=question.power,
         value=value,
         closed_form=theory,
-        ideal=_ideal(case, statistic, theory),
+        ideal=float("nan") if known else LimitSearch(ideal, statistic).root_or_nan(theory),
         check=check,
         points=simulated,
         question=kind(case, statistic),
@@ -397,20 +362,8 @@ def solve(case: Case, statistic: str, engine: Engine | Pool, report: Callable[[i
     )
 
 
-def _ideal(case: Case, statistic: str, near: float) -> float:
-    """Return the closed-form limit if everything but the noise is known; NaN if it is, or if there is no limit."""
-    if case.study.nuisances.none:
-        return float("nan")
-    try:
-        return LimitSearch(case.with_sections(nuisances=KNOWN), statistic).root(near=near)
-    except InputError:
-        return float("nan")
-
-
 @by_keywords
-def limit(
-    study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
-) -> LimitAnswer:
+def limit(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> LimitAnswer:
     """Compute the limits of a study's stars and flares, by every statistic.
 
     Raises InputError as for `solve` if all limits fail; otherwise see `LimitAnswer.failed`.
@@ -423,7 +376,6 @@ def limit(
         Called as ``progress(done, total)`` in steps, `STEPS` for each limit.
     """
     engine = engine or Engine()
-    result = LimitAnswer(study)
     if any(axis.quantity == study.limit.of for axis in study.sweep.axes):
         raise InputError(
             f"the sweep must run over other quantities than the {study.limit.of}, of which the limit is requested",
@@ -459,9 +411,8 @@ def limit(
     errors = [outcome for outcome in outcomes if isinstance(outcome, InputError)]
     if len(errors) == len(outcomes):
         raise errors[0]
-    result.limits.extend(outcome for outcome in outcomes if isinstance(outcome, Limit))
-    result.failed = tuple(dict.fromkeys(map(str, errors)))
-    return result
+    limits = [outcome for outcome in outcomes if isinstance(outcome, Limit)]
+    return LimitAnswer(study, limits, tuple(dict.fromkeys(map(str, errors))))
 
 
 @validated

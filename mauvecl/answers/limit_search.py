@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.runs.pool import Pool
 
+#: Function that is called with the number of simulations after each of them.
+Report = Callable[[int], None] | None
 #: Steps of the search for the root of the closed form, from where a flare is hardest to see.
 STEPS = {"magnitude": -0.5, "amplitude": 2.0, "exposure": 2.0}
 #: Ends of that search, hardest and easiest.
@@ -59,13 +61,7 @@ class Unknown:
 class LimitSearch:
     """Detection probability of a case's first flare by one statistic, as a function of the limit's quantity."""
 
-    def __init__(
-        self,
-        case: Case,
-        statistic: str,
-        engine: Engine | Pool | None = None,
-        report: Callable[[int], None] | None = None,
-    ) -> None:
+    def __init__(self, case: Case, statistic: str, engine: Engine | Pool | None = None, report: Report = None) -> None:
         self.case, self.statistic, self.engine = case.with_value("amplitude", case.amplitudes[0]), statistic, engine
         self.of, self.power, self.fap = case.study.limit.of, case.study.limit.power, case.study.run.fap
         self.points: list[Point] = []
@@ -134,42 +130,45 @@ class LimitSearch:
 
     def curve(self, value: float) -> tuple[tuple[float, float], ...]:
         """Return the closed form around a value; exposures are whole frames."""
-        at = _coordinate(self.of, value)
-        values = [_value(self.of, at + step) for step in np.linspace(-0.75, 0.75, 25)]
+        values = [_value(self.of, _coordinate(self.of, value) + step) for step in np.linspace(-0.75, 0.75, 25)]
         if self.of == "exposure":
-            frame_s = self.frame_s
-            values = sorted({max(round(v / frame_s), 1) * frame_s for v in values})
+            values = sorted({max(round(v / self.frame_s), 1) * self.frame_s for v in values})
         return tuple((v, self.theory(v)) for v in values)
 
     def root(self, near: float | None = None) -> float:
         """Return the first value at which the closed form reaches the power, from the hardest or near one."""
         from scipy.optimize import brentq
 
+        def crossing(*ends: float, **tolerance: Any) -> float:
+            return float(brentq(lambda v: self.theory(v) - self.power, min(ends), max(ends), **tolerance))
+
         if near is not None and self.of != "exposure":
-            at = _coordinate(self.of, near)
-            ends = [_value(self.of, at + step) for step in (-1.0, 1.0)]
+            ends = [_value(self.of, _coordinate(self.of, near) + step) for step in (-1.0, 1.0)]
             if self.theory(ends[0]) < self.power <= self.theory(ends[1]):
-                low, high = sorted(ends)
-                return float(brentq(lambda v: self.theory(v) - self.power, low, high, rtol=1e-5))
+                return crossing(*ends, rtol=1e-5)
         hardest, easiest = SEARCH[self.of]
         value = self.frame_s if hardest is None else hardest
         if self.theory(value) >= self.power:
             if self.of == "exposure":
                 return value
             raise self._beyond(value, "already exceeds")
-        step = STEPS[self.of]
-        while (easiest - value) * (_further(self.of, value, step) - value) > 0:
-            nearer = _further(self.of, value, step)
-            if self.theory(nearer) >= self.power:
-                if self.of == "exposure":
-                    # Whole frames: the closed form is a staircase.
-                    few, many = (round(end / self.frame_s) for end in (value, nearer))
-                    reached = smallest_integer(lambda n: self.theory(n * self.frame_s) >= self.power, few, many)
-                    return reached * self.frame_s
-                low, high = sorted((value, nearer))
-                return float(brentq(lambda v: self.theory(v) - self.power, low, high, xtol=1e-6 * abs(high - low)))
-            value = nearer
+        while (easiest - value) * (_nearer(self.of, value) - value) > 0:
+            before, value = value, _nearer(self.of, value)
+            if self.theory(value) < self.power:
+                continue
+            if self.of == "exposure":
+                # Whole frames: the closed form is a staircase.
+                few, many = (round(end / self.frame_s) for end in (before, value))
+                return self.frame_s * smallest_integer(lambda n: self.theory(n * self.frame_s) >= self.power, few, many)
+            return crossing(before, value, xtol=1e-6 * abs(value - before))
         raise self._beyond(easiest, "does not reach")
+
+    def root_or_nan(self, near: float) -> float:
+        """Return the root near a value, or NaN if there is none."""
+        try:
+            return self.root(near=near)
+        except InputError:
+            return float("nan")
 
     @property
     def frame_s(self) -> float:
@@ -179,9 +178,9 @@ class LimitSearch:
     def _beyond(self, value: float, verb: str) -> InputError:
         star, (hardest, easiest) = self.case.star, SEARCH[self.of]
         low, high = sorted((hardest or 0.0, easiest))
-        name = f"{star.library or star.file}" + (
-            f" {star.band} = {star.magnitude:g}" if self.of != "magnitude" and star.magnitude is not None else ""
-        )
+        name = str(star.library or star.file)
+        if self.of != "magnitude" and star.magnitude is not None:
+            name += f" {star.band} = {star.magnitude:g}"
         flare = "" if self.of == "amplitude" else f" with a flare of {100 * self.case.amplitudes[0]:.3g} %"
         return InputError(
             f"the detection probability of {name}{flare} by {self.statistic} {verb} {self.power:g} at "
@@ -221,13 +220,7 @@ class LimitSearch:
 class MarginalLimitSearch(LimitSearch):
     """Detection probability averaged over draws of unknown instrument values."""
 
-    def __init__(
-        self,
-        case: Case,
-        statistic: str,
-        engine: Engine | Pool | None = None,
-        report: Callable[[int], None] | None = None,
-    ) -> None:
+    def __init__(self, case: Case, statistic: str, engine: Engine | Pool | None = None, report: Report = None) -> None:
         super().__init__(case, statistic, engine, report)
         self.draws = drawn(case.study)
         self.each = [LimitSearch(replace(case, study=study), statistic, engine) for study in self.draws.studies]
@@ -244,13 +237,7 @@ class MarginalLimitSearch(LimitSearch):
 
     def unknown(self, near: float) -> Unknown:
         """Return the closed-form limit of each draw, and the share of its variance that each unknown explains."""
-        limits = []
-        for draw in self.each:
-            try:
-                limits.append(draw.root(near=near))
-            except InputError:
-                limits.append(float("nan"))
-        roots = np.array(limits)
+        roots = np.array([draw.root_or_nan(near) for draw in self.each])
         return Unknown(self.draws, roots, shares(self.draws, roots))
 
 
@@ -261,8 +248,9 @@ def single_flares(case: Case) -> list[Case]:
     return [case.with_value("amplitude", amplitude) for amplitude in case.amplitudes]
 
 
-def _further(of: str, value: float, step: float) -> float:
-    return value + step if of == "magnitude" else value * step
+def _nearer(of: str, value: float) -> float:
+    """Return the next value towards easier detection."""
+    return value + STEPS[of] if of == "magnitude" else value * STEPS[of]
 
 
 def _coordinate(of: str, value: float) -> float:
@@ -298,16 +286,14 @@ def _settle(question: LimitSearch, start: float) -> Interval:
             f"a slope there{question.saturation_clause(start)}{question.sign_clause(start)}",
             key="limit.of",
         )
-    at = _coordinate(of, start)
-    n = question.case.study.run.realisations
+    at, n = _coordinate(of, start), question.case.study.run.realisations
     for _ in range(MOST_EVALUATIONS):
         p = question.simulated(_value(of, at), seed)
         clipped = (min(max(q, 0.5 / n), 1 - 0.5 / n) for q in (p.value, p.low, p.high))
         here, low, high = (float(special.ndtri(q)) for q in clipped)
         move = (goal - here) / slope
         # Half the interval's width away the slope's own error no longer counts.
-        near = abs(goal - here) <= max(0.5 * (high - low), 0.02)
-        if near:
+        if abs(goal - here) <= max(0.5 * (high - low), 0.02):
             ends = [_value(of, at + (goal - q) / slope) for q in (low, high)]
             return Interval(_value(of, at + move), min(ends), max(ends))
         at += float(np.clip(move, -0.75, 0.75))

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf, name_of_instrument
+from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf
 from mauvecl.answers.closed_forms import (
     IDEAL,
     average,
@@ -22,7 +22,7 @@ from mauvecl.answers.closed_forms import (
     unknown_cost,
 )
 from mauvecl.answers.limit_search import SEARCH, LimitSearch
-from mauvecl.answers.verbs import by_keywords
+from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection.distributions import Interval
 from mauvecl.detection.names import RECOMMENDED, check_fap
 from mauvecl.device.engine import Engine
@@ -77,11 +77,6 @@ def _cell_columns(answer: MapAnswer) -> tuple[Column, ...]:
     )
 
 
-def _run_of(answer: MapAnswer) -> dict[str, object]:
-    run = answer.study.run
-    return {"star": answer.star, "fap": run.fap, "realisations": run.realisations}
-
-
 @dataclass(frozen=True, eq=False)
 class MapAnswer(Answer):
     """Answer of `map`, for the study's first star.
@@ -108,25 +103,22 @@ class MapAnswer(Answer):
     # For maps averaged over unknowns, by statistic: the share of the variance of the mean probability that each unknown
     # explains, largest first.
     shares: dict[str, dict[str, float]] = field(default_factory=dict)
-    quiet: Expectation | None = None  # the star of the first cell
+    inputs: tuple[Expectation, ...] = ()  # the star without a flare in the first cell
 
     #: One row per cell and statistic.
-    table = TableOf("map", _cell_columns, lambda answer: answer, about=_run_of)
+    table = TableOf("map", _cell_columns, lambda answer: answer,
+                    about=("star", "study.run.fap", "study.run.realisations", "study"))  # fmt: skip
 
     @property
     def headline(self) -> str:
         """The share of the map in which a flare is rather seen than not, by the recommended statistic if computed."""
         statistic = RECOMMENDED if RECOMMENDED in self.statistics else self.statistics[0]
         number = self.statistics.index(statistic)
-        cells = self.probability[number].size
-
-        def seen(chances: NDArray[np.float64]) -> int:
-            return int(np.count_nonzero(chances[number] >= 0.5))
-
-        ideal = "" if self.study.nuisances.none else f" ({seen(self.ideal)} {IF_KNOWN})"
+        seen, known = (int(np.count_nonzero(chances[number] >= 0.5)) for chances in (self.probability, self.ideal))
+        ideal = "" if self.study.nuisances.none else f" ({known} {IF_KNOWN})"
         return (
-            f"{name_of_instrument(self.study)} would see a flare on {self.star} with a chance of at least 50 % in "
-            f"{seen(self.probability)} of {cells} cells of the map{ideal}."
+            f"{self.instrument_name} would see a flare on {self.star} with a chance of at least 50 % in "
+            f"{seen} of {self.probability[number].size} cells of the map{ideal}."
         )
 
     @property
@@ -142,36 +134,24 @@ class MapAnswer(Answer):
             Column("y", heading=axes, format=_shown),
             *(Column(f"x{k}", heading=_shown(x), format=lambda p: f"{100 * p:.0f}") for k, x in enumerate(self.x)),
         ]
-        maps = []
         kinds = {"": self.probability} | ({} if self.study.nuisances.none else {", ideal": self.ideal})
-        for number, statistic in enumerate(self.statistics):
-            for kind, chances in kinds.items():
-                rows = [
-                    {"y": y} | {f"x{k}": p for k, p in enumerate(row)}
-                    for y, row in zip(self.y, chances[number], strict=True)
-                ]
-                title = (
-                    f"{self.star}: detection probability in percent, {statistic}{kind}, fap {self.study.run.fap:g} "
-                    "per test"
-                )
-                maps.append(View(title, columns, table_of(columns, rows)))
-        return [*lines, *maps]
+        for (number, statistic), (kind, chances) in product(enumerate(self.statistics), kinds.items()):
+            rows = [
+                {"y": y} | {f"x{k}": p for k, p in enumerate(row)}
+                for y, row in zip(self.y, chances[number], strict=True)
+            ]
+            what = f"detection probability in percent, {statistic}{kind}, fap {self.study.run.fap:g} per test"
+            lines.append(View(f"{self.star}: {what}", columns, table_of(columns, rows)))
+        return lines
 
     @property
     def premises(self) -> list[str]:
         """The study's assumptions apart from the two quantities of the map."""
         return assumptions_of(self.study, self.uses, tuple(axis.quantity for axis in self.study.map.axes))
 
-    @property
-    def inputs(self) -> list[Expectation]:
-        """The star without a flare in the first cell."""
-        return [] if self.quiet is None else [self.quiet]
-
 
 @by_keywords
-def map(
-    study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
-) -> MapAnswer:
+def map(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> MapAnswer:
     """Compute the detection probability of the study's first star and flare over two quantities.
 
     Parameters
@@ -211,7 +191,7 @@ def map(
         statistics=study.run.statistics,
         messages=_messages(case, cells, values),
         shares=parts,
-        quiet=quiet,
+        inputs=(quiet,),
         **values,
     )
 
@@ -279,11 +259,9 @@ def _saturating(quiet: Expectation, magnitude: float) -> float:
 def _cost(case: Case, x: Values, y: Values) -> list[str]:
     """Return the sentence on the cost of unknowns in the middle of the map."""
     middle, study = (x[len(x) // 2], y[len(y) // 2]), case.study
-    there = _cell(case, *middle)
-    (flare,) = there.flares
-    names = (axis.quantity.replace("_", " ") for axis in study.map.axes)
-    at = " and ".join(f"{name} {_shown(value)}" for name, value in zip(names, middle, strict=True))
-    cost = unknown_cost(f"the cell of {at}", there.quiet, flare, study.nuisances, study.run.comparison())
+    there, axes = _cell(case, *middle), zip(study.map.axes, middle, strict=True)
+    at = " and ".join(f"{axis.quantity.replace('_', ' ')} {_shown(value)}" for axis, value in axes)
+    cost = unknown_cost(f"the cell of {at}", there.quiet, there.flares[0], study.nuisances, study.run.comparison())
     return cost_lines([cost], study.nuisances)
 
 
@@ -300,12 +278,9 @@ Lowered = tuple[str, int, int]
 
 def _blinded(values: Arrays) -> list[str]:
     """Return the sentence on cells where every pixel saturates, if any."""
-    form = values["closed_form"][0]
-    cells = int(np.isnan(form).sum())
-    if not cells:
-        return []
-    text = f"SATURATED: every pixel that counts saturates in {cells} of {form.size} cells: no number there."
-    return [Message(text, SATURATED)]
+    lost = np.isnan(values["closed_form"][0])
+    text = f"SATURATED: every pixel that counts saturates in {lost.sum()} of {lost.size} cells: no number there."
+    return [Message(text, SATURATED)] if lost.any() else []
 
 
 def _without_threshold(run: Run, values: Arrays) -> list[str]:
@@ -345,7 +320,7 @@ class Cells:
     y: Values
     engine: Engine | Pool
     n_maps: int
-    progress: Callable[[int, int], None] | None
+    progress: Progress
     done: int = 0  # cells of all maps
     quiet: list[Expectation] = field(default_factory=list)
     saturated: list[str] = field(default_factory=list)  # messages on flares that saturate
@@ -381,9 +356,7 @@ class Cells:
 
 def _averaged(maps: list[Arrays]) -> Arrays:
     """Return the mean over draws of the unknown, with its interval; NaN if a draw has none."""
-    values = {
-        name: np.mean([cells[name] for cells in maps], axis=0) for name in ("probability", "closed_form", "ideal")
-    }
+    values = {name: np.mean([cells[name] for cells in maps], axis=0) for name in NUMBERS}
     values |= {name: np.full_like(values["probability"], np.nan) for name in ("low", "high")}
     for at in zip(*np.nonzero(np.isfinite(values["probability"])), strict=True):
         p = average([Interval(*(float(cells[name][at]) for name in ("probability", "low", "high"))) for cells in maps])
@@ -394,14 +367,10 @@ def _averaged(maps: list[Arrays]) -> Arrays:
 def _groups(question: MapQuestion, x: Values, y: Values) -> list[list[tuple[int, int]]]:
     """Return the cells (i, j) in groups that share a quiescent star."""
     flare_x, flare_y = (axis.quantity in OF_FLARE for axis in question.axes)
-    every = [[(i, j) for i in range(len(x))] for j in range(len(y))]
-    if flare_x and flare_y:
-        return [[cell for row in every for cell in row]]
-    if flare_x:
-        return every
-    if flare_y:
-        return [list(column) for column in zip(*every, strict=True)]
-    return [[cell] for row in every for cell in row]
+    groups: dict[tuple[int | None, int | None], list[tuple[int, int]]] = {}
+    for j, i in np.ndindex(len(y), len(x)):
+        groups.setdefault((None if flare_x else i, None if flare_y else j), []).append((i, j))
+    return list(groups.values())
 
 
 def _cell(case: Case, x: float | str, y: float | str) -> Case:

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from itertools import chain
 from operator import attrgetter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy
 from astropy.table import QTable
 from numpy.typing import NDArray
 
-from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf, name_of_instrument, reported
+from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf, reported
 from mauvecl.answers.measurements import (
     JOINT_COLUMNS,
     ExpectedMeasurement,
@@ -23,7 +24,7 @@ from mauvecl.answers.measurements import (
     matched_filter,
     measured_stare,
 )
-from mauvecl.answers.verbs import by_keywords
+from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection.distributions import Interval, clopper_pearson
 from mauvecl.detection.nuisances import join_names
 from mauvecl.device.engine import Engine
@@ -64,8 +65,7 @@ class MeasuredFlare(ExpectedMeasurement):
 
     def fitted_dn(self) -> tuple[Float, Float]:
         """Return the mean of the fitted flare in the first exposure, and the best values of unknowns, DN."""
-        measurement = self.found
-        mean = self.fitted.counts(np.exp(measurement.log_k[0]), measurement.factor[0] * measurement.amplitudes[0])
+        mean = self.fitted.counts(np.exp(self.found.log_k[0]), self.found.factor[0] * self.found.amplitudes[0])
         if self.unknown is None:
             return mean, np.zeros_like(mean)
         unknown, expected = self.unknown.around(mean), self.unknown.mean_dn
@@ -155,7 +155,6 @@ THROUGHPUT_COLUMN = Column("error_throughput", "of_throughput", "",
                            "by throughput", number(".4g"))  # fmt: skip
 
 
-#: Columns of the table of fits.
 FIT_COLUMNS = (
     Column("snr", lambda row: row.snr[0], "", "S/N of the flare in one exposure, everything known", "ideal S/N",
            ".2f"),
@@ -214,11 +213,11 @@ class MeasureAnswer(Answer):
     temperatures = TableOf(
         "temperatures", (MODEL_COLUMN,), lambda answer: answer.binned or QTable(), place=True, key="temperatures",
         of=lambda _, stare: table_of(_bin_columns(stare), [stare]),
-        when=lambda answer: answer.study.measure.snr_per_bin is not None,
+        when="study.measure.snr_per_bin",
     )  # fmt: skip
     #: Joint fits of shape and spectrum; one row per star, cell and quantity.
     joint = TableOf("joint", JOINT_COLUMNS, "stares", place=True, key="joint",
-                    when=lambda answer: answer.study.measure.joint_fit)  # fmt: skip
+                    when="study.measure.joint_fit")  # fmt: skip
 
     @property
     def uses(self) -> tuple[Use, ...]:
@@ -238,7 +237,7 @@ class MeasureAnswer(Answer):
         error, known = flare.ahead.errors[0], flare.known.errors[0]
         ideal = "" if self.study.nuisances.none else f" ({known:.3g} {unit} {IF_KNOWN})"
         return (
-            f"{name_of_instrument(self.study)} would measure the {name.replace('_', ' ')} of a flare of "
+            f"{self.instrument_name} would measure the {name.replace('_', ' ')} of a flare of "
             f"{100 * flare.amplitude:g} % on {flare.title} in {flare.quiet.exposure_s:g} s with a standard error of "
             f"{error:.3g} {unit}{ideal}."
         )
@@ -262,9 +261,7 @@ class MeasureAnswer(Answer):
 
 
 @by_keywords
-def measure(
-    study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
-) -> MeasureAnswer:
+def measure(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> MeasureAnswer:
     """Forecast and simulate the measurement of a study's flares in one exposure.
 
     Parameters
@@ -285,9 +282,8 @@ def measure(
     expectations = [x for case in prepared for x in case.expectations]
     engine = engine or Engine()
     asked = [(case, *flare, engine) for case in prepared for flare in zip(case.amplitudes, case.flares, strict=True)]
-    flares: list[MeasuredFlare] = []
-    for some in reported(map_in_order(engine, lambda row: _measured(*row), asked), len(asked), progress):
-        flares += some
+    measured = reported(map_in_order(engine, lambda row: _measured(*row), asked), len(asked), progress)
+    flares = list(chain.from_iterable(measured))
     stares = [measured_stare(case, engine) for case in prepared if study.measure.along_stare]
     messages = collect_messages(expectations)
     messages += [stare.drawn for stare in stares if isinstance(stare.drawn, str)]
@@ -323,12 +319,9 @@ def _measured(case: Case, amplitude: float, flare: Expectation, engine: Engine |
     measured = []
     for k, forecast in enumerate(expected):
         own = [{key.removeprefix(f"{k} "): x for key, x in part.items() if key.startswith(f"{k} ")} for part in parts]
-        model = forecast.fitted
-        of_batch = partial(
-            Measurement.of_arrays, levels=LEVELS, names=model.names, units=model.units, bounds=model.bounds
-        )
-        measurement = Measurement.joined(list(map(of_batch, own)))
-        measured.append(MeasuredFlare(**vars(forecast), found=measurement, selected=selected, frame=parts[0]["first"]))
+        about: dict[str, Any] = {name: getattr(forecast.fitted, name) for name in ("names", "units", "bounds")}
+        found = Measurement.joined([Measurement.of_arrays(arrays, levels=LEVELS, **about) for arrays in own])
+        measured.append(MeasuredFlare(**vars(forecast), found=found, selected=selected, frame=parts[0]["first"]))
     return measured
 
 

@@ -22,17 +22,9 @@ from mauvecl.fits.spectrum import (
     forecast,
     forecast_two_temperatures,
 )
-from mauvecl.fits.time_course import (
-    CoolingCourse,
-    MeasuredBins,
-    cooling_course,
-    cooling_event,
-    fit_bins,
-    fit_cooling,
-    measure_along,
-)
+from mauvecl.fits.time_course import MeasuredBins, cooling_course, cooling_event, fit_bins, fit_cooling, measure_along
 from mauvecl.flares.settings import Cooling
-from mauvecl.flares.stare_scene import Arrays, StaresRequest
+from mauvecl.flares.stare_scene import StaresRequest
 from mauvecl.host.stars.bands import photons
 from mauvecl.host.stars.flare_spectra import (
     PARSEC_CM,
@@ -52,6 +44,7 @@ from mauvecl.study.analyses import fitted_models
 if TYPE_CHECKING:
     from mauvecl.detection.nuisances import Nuisances
     from mauvecl.device.engine import Engine
+    from mauvecl.fits.time_course import CoolingCourse
     from mauvecl.flares.frames import Components, StareExpectation
     from mauvecl.flares.stare import Event
     from mauvecl.host.exposure.expectation import Expectation
@@ -128,14 +121,11 @@ class Truth:
     def _line(self, name: str) -> float:
         if not isinstance(self._light, FlareWithLines):
             return 0.0 if self._light.surface else np.nan
-        for mapping, factor in (
-            (self._light.fractions, self._scale * self._light.continuum_flux),
-            (self._light.fluxes_cgs, 1.0),
-        ):
-            for line, value in mapping.items():
-                if EmissionLine.named(line).name == EmissionLine.named(name).name:
-                    return factor * value
-        return 0.0
+        relative = self._scale * self._light.continuum_flux
+        lines = [(line, relative * share) for line, share in self._light.fractions.items()]
+        lines += self._light.fluxes_cgs.items()
+        wanted = EmissionLine.named(name).name
+        return next((flux for line, flux in lines if EmissionLine.named(line).name == wanted), 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,26 +166,15 @@ class ExpectedMeasurement(InCell):
         return [at(float(factor)) for factor in factors]
 
     def region(self, rise: float, n: int = 161) -> tuple[Float, Float, Float]:
-        """Return the expected confidence region of temperature and amplitude, with everything else profiled.
+        """Return temperatures of the expected confidence region, with the smallest and largest amplitude at each.
 
-        Only for models of one temperature.
-
-        Parameters
-        ----------
-        rise : float
-            Increase of chi-squared that bounds the region.
-
-        Returns
-        -------
-        kelvin, low, high : ndarray, shape (n,)
-            Smallest and largest amplitude at each temperature.
+        A `rise` of chi-squared bounds the region; everything else is profiled. Only for models of one temperature.
         """
         assert isinstance(self.fitted, FlareModel)
         best, linear = self.perfect.log_k, self.perfect.factor[0] * self.perfect.amplitudes[0]
         mean_dn = self.fitted.counts(float(np.exp(best[0])), linear)
         reduction = Reduction.of(self.fitted, self.quiet, mean_dn, self.unknown, self.skipped_nm)
-        mean = linear[0] * reduction.spline(best) + linear[1:] @ reduction.fixed
-        light = reduction.light
+        mean, light = linear[0] * reduction.spline(best) + linear[1:] @ reduction.fixed, reduction.light
         of_light = None
         if light is not None:
             # The sum of the factor on light for the fitted flare.
@@ -260,20 +239,12 @@ def forecast_model(
 
 def model_of(case: Case, *, jump: bool = False, lines: tuple[str, ...] = ()) -> FlareModel:
     """Return the model of a blackbody at the star of a case, with a Balmer continuum and lines if they are fitted."""
-    study = case.study
+    study, star = case.study, case.star
     return FlareModel.of(
-        case.source,
-        case.instrument,
-        case.quiet,
-        jump=jump,
-        lines=lines,
-        band=study.flare.band,
-        electron_temperature_k=study.flare.spectrum.electron_temperature_k,
-        distance_pc=case.star.distance_pc,
-        radius_rsun=case.star.radius_rsun,
-        bands_nm=study.measure.bands_nm,
-        order=study.observation.order,
-    )
+        case.source, case.instrument, case.quiet, jump=jump, lines=lines, band=study.flare.band,
+        electron_temperature_k=study.flare.spectrum.electron_temperature_k, distance_pc=star.distance_pc,
+        radius_rsun=star.radius_rsun, bands_nm=study.measure.bands_nm, order=study.observation.order,
+    )  # fmt: skip
 
 
 def models_of(case: Case) -> dict[str, FlareModel | TwoTemperatures]:
@@ -301,7 +272,11 @@ def expected_measurements(
     truth = Truth(case.star, case.source, case.flaring(amplitude), light, band, quiet.exposure_s)
     lit = flare.recorded_dn - quiet.recorded_dn
     known_snr, snr = (matched_filter(quiet, flare, nuisances, lit, skipped)[1] for nuisances in (None, case.unknowns()))
-    calibrated = throughput_cases(case)
+    # Exposures with each mode of the throughput's own errors at one standard deviation.
+    calibrated = [
+        _mean_exposure(quiet, moved.expect(moved.flaring(amplitude))[0].recorded_dn - moved.quiet.recorded_dn, unknown)
+        for moved in throughput_cases(case)
+    ]
     # A fit in few pixels may differ from the flare in those that saturate, which its errors must not use.
     lost = (*skipped, *_saturated_nm(flare))
     expected = []
@@ -314,47 +289,14 @@ def expected_measurements(
         true = np.array([truth.value(quantity) for quantity in model.names])
         of_throughput = None
         if calibrated:
-            of_throughput = _errors_of_throughput(calibrated, amplitude, model, quiet, unknown, skipped, perfect)
+            # The observer knows the quiescent exposure from other frames, and fits with the calibrated throughput.
+            moved = [fit_model(exposure, quiet, model, unknown, skipped).estimates[0] for exposure in calibrated]
+            of_throughput = np.asarray(np.sqrt(np.sum(np.square(moved - perfect.estimates[0]), axis=0)))
+        place = case.label, case.at, amplitude, name, (known_snr, snr)
         expected.append(
-            ExpectedMeasurement(
-                case.label,
-                case.at,
-                amplitude,
-                name,
-                (known_snr, snr),
-                true,
-                known,
-                ahead,
-                perfect,
-                model,
-                quiet,
-                unknown,
-                of_throughput,
-                skipped,
-            )
+            ExpectedMeasurement(*place, true, known, ahead, perfect, model, quiet, unknown, of_throughput, skipped)
         )
     return expected
-
-
-def _errors_of_throughput(
-    calibrated: list[Case],
-    amplitude: float,
-    model: FlareModel | TwoTemperatures,
-    quiet: Expectation,
-    unknown: Nuisances | None,
-    skipped_nm: Ranges,
-    perfect: Measurement,
-) -> Float:
-    """Return the standard errors that the throughput's own errors cause, to first order, shape (n_derived,).
-
-    The observer knows the quiescent exposure from other frames, and fits the flare with the calibrated throughput.
-    """
-    moved = []
-    for case in calibrated:
-        (flare,) = case.expect(case.flaring(amplitude))
-        exposure = _mean_exposure(quiet, flare.recorded_dn - case.quiet.recorded_dn, unknown)
-        moved.append(fit_model(exposure, quiet, model, unknown, skipped_nm).estimates[0] - perfect.estimates[0])
-    return np.asarray(np.sqrt(np.sum(np.square(moved), axis=0)))
 
 
 def _saturated_nm(flare: Expectation) -> list[tuple[float, float]]:
@@ -392,7 +334,6 @@ def matched_filter(
     return (weights / np.sqrt(power), float(np.sqrt(power))) if power > 0 else (weights, 0.0)
 
 
-#: Columns of the table of joint fits, for a `MeasuredStare`.
 JOINT_COLUMNS = (
     Column("quantity", "joint.found.names", "", "what is measured", "quantity"),
     Column("unit", "joint.found.units", "", "of truth, estimate and intervals", "unit"),
@@ -445,20 +386,16 @@ def measured_stare(case: Case, engine: Engine | Pool) -> MeasuredStare:
     processes = study.processes.additive_only
 
     def draw(components: Components) -> Float:
-        request = StaresRequest(components, stare, 1, seed, staring.flare, start=study.stare.number, method="pixels",
-                                processes=processes)  # fmt: skip
-        if isinstance(engine, Pool):
-            return np.asarray(engine.stares(request)["values"][0], np.float64)
         from mauvecl.device.engine import Stares
 
-        return np.asarray(Stares(engine.open_device).reduced(request)["values"][0], np.float64)
-
-    def drawn() -> Arrays:
-        return {"frames": staring.raw(draw)}
+        request = StaresRequest(components, stare, 1, seed, staring.flare, start=study.stare.number, method="pixels",
+                                processes=processes)  # fmt: skip
+        reduced = engine.stares if isinstance(engine, Pool) else Stares(engine.open_device).reduced
+        return np.asarray(reduced(request)["values"][0], np.float64)
 
     checkpoint = engine.checkpoint if isinstance(engine, Pool) else None
     depends_on = ("pixels", quiet, staring.flare_electrons, stare, staring.flare, study.stare.number, seed, processes)
-    raw = kept(checkpoint, depends_on, drawn)["frames"]
+    raw = kept(checkpoint, depends_on, lambda: {"frames": staring.raw(draw)})["frames"]
     where = case.label, case.at, name, staring, tuple(events)
     joint = _joint_fit(case, raw, unknown) if asked.joint_fit else None
     if asked.snr_per_bin is None:

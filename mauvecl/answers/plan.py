@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import calendar
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf, name_of_instrument, reported, share_columns
+from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf, reported, share_columns
 from mauvecl.answers.plan_targets import (
     NOTHING,
     CompletenessOf,
@@ -26,7 +25,7 @@ from mauvecl.answers.plan_targets import (
     rates_of,
     star_of,
 )
-from mauvecl.answers.verbs import by_keywords
+from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.answers.visible import VisibleAnswer, assumption_columns, visible
 from mauvecl.device.engine import Stares
 from mauvecl.host.orbit.visibility import PARTICLES_SOURCE, THERMAL_SOURCE
@@ -129,7 +128,6 @@ STAR_COLUMNS = (
     Column("scatter", lambda row: np.nan if row.rates is None else row.rates.scatter_dex, "",
            "standard deviation of the rate's logarithm, dex"),
 )  # fmt: skip
-#: Columns of the table of recovered fractions and rates by energy.
 ENERGY_COLUMNS = (
     Column("target", description="name of the target", kind=str),
     Column("energy", "", "erg", "bolometric"),
@@ -146,11 +144,6 @@ def _target_columns(answer: PlanAnswer) -> tuple[Column, ...]:
     return (*COLUMNS[:-1], alarms, *share, *(THROUGHPUT_COLUMNS if calibrated else ()), COLUMNS[-1])
 
 
-def _time_of(answer: PlanAnswer) -> dict[str, object]:
-    times = answer.seen.times
-    return {"start": times.iso(0.0), "days": times.days, "false_alarms_per_day": answer.study.search.rate}
-
-
 @dataclass(frozen=True, eq=False)
 class PlanAnswer(Answer):
     """Answer of `plan`."""
@@ -162,7 +155,9 @@ class PlanAnswer(Answer):
     planned: tuple[Planned, ...]
 
     #: One row per target.
-    table = TableOf("plan", _target_columns, "planned", title=lambda answer: answer.heading, about=_time_of)
+    table = TableOf("plan", _target_columns, "planned", title=lambda answer: answer.heading, about=lambda answer: {
+        "start": answer.seen.times.iso(0.0), "days": answer.seen.times.days,
+        "false_alarms_per_day": answer.study.search.rate, "study": answer.study.text()})  # fmt: skip
     #: Inputs, one row per target.
     stars = TableOf("stars", STAR_COLUMNS, "planned")
     #: Recovered fraction and rate by energy, one row per target and energy where either changes.
@@ -170,7 +165,7 @@ class PlanAnswer(Answer):
     months = TableOf("months", (), "seen.months")
     days = TableOf("days", (), "seen.by_day")
     #: All assumptions with their sources.
-    assumptions = TableOf("assumptions", assumption_columns("assumption"), "_assumptions", study=False)
+    assumptions = TableOf("assumptions", assumption_columns("assumption"), "_assumptions", about=())
 
     @property
     def headline(self) -> str:
@@ -183,7 +178,7 @@ class PlanAnswer(Answer):
         ideal = "" if np.isnan(best.ideal) else f"; {two_digits(best.ideal)} {IF_KNOWN}"
         most = f", the most of {len(self.planned)} targets" if len(self.planned) > 1 else ""
         return (
-            f"{name_of_instrument(self.study)} would recover {two_digits(best.recovered.expected)} flares of "
+            f"{self.instrument_name} would recover {two_digits(best.recovered.expected)} flares of "
             f"{best.name} in {best.hours:.0f} h (95 % of campaigns: {best.recovered.low} to {best.recovered.high}"
             f"{ideal}){most}."
         )
@@ -233,7 +228,8 @@ class PlanAnswer(Answer):
              "V of the Hipparcos catalogue (variable stars to 0.2 mag), rounded types (to some two subtypes)"),
             ("spectra", "library", "the embedded spectrum of the nearest type stands for the star, scaled to its V"),
             *(
-                (f"flare rates of {target.name}", target.rates.source, _measured(target))
+                (f"flare rates of {target.name}", target.rates.source,
+                 f"{target.published}, bolometric; scatter {target.rates.scatter_dex:g} dex (assumption)")
                 for target in self.planned
                 if target.rates
             ),
@@ -269,37 +265,17 @@ class PlanAnswer(Answer):
     @property
     def messages(self) -> list[str]:
         """Messages on saturation, targets without an answer, extrapolations and visibility."""
-        lines = of_kind(collect_messages(self.inputs), SATURATED)
+        study, lines = self.study, of_kind(collect_messages(self.inputs), SATURATED)
         if len(self.planned) > 1:
             lines.append("Each target is planned by itself: the hours of different targets may coincide.")
         for case in self.observed:
             if case.neighbours is not None:
                 lines += case.neighbours.messages(case.label, case.instrument)
-        typical = [
-            target.name for target in self.planned if target.rates is not None and "typical" in target.rates.source
-        ]
-        if typical:
-            lines.append(
-                f"Flare rates of {', '.join(typical)} are those typical of their types at 1000 Myr: mass_msun and "
-                "age_myr, or their own rates, are more accurate."
-            )
-        beyond = []
-        for target in self.planned:
-            if target.no_rates:
-                lines.append(f"{target.no_rates[0].upper()}{target.no_rates[1:]}; its expected flares are not given.")
-            if target.rates is not None and target.completeness is not None and target.extrapolated:
-                low, high = target.rates.measured_erg
-                beyond.append(
-                    f"{target.name} ({target.energy_at(0.5):.2g} erg, published for {low:.2g} to {high:.2g} erg)"
-                )
-        if beyond:
-            lines.append(f"Flare rates are extrapolated to E50 of {', '.join(beyond)}.")
-        study = self.study
+        lines += self._messages_on_rates
         if study.plan.completeness == "closed form" and (study.stare.has_unknowns or study.nuisances.usual):
             text = (
                 "FALSE ALARMS may be more than stated: the closed form marginalises over what is unknown in each "
-                "frame, and takes slower changes for known; "
-                "`plan.completeness='injections'` allows for them."
+                "frame, and takes slower changes for known; `plan.completeness='injections'` allows for them."
             )
             lines.append(Message(text, "false alarms"))
         if study.plan.along_orbit and study.processes.particle_processes:
@@ -307,23 +283,32 @@ class PlanAnswer(Answer):
         unused = dict.fromkeys(name for target in study.plan.targets for name in target.unused)
         if unused:
             lines.append(f"Columns of the table of targets that are not used: {printable(', '.join(unused), 300)}.")
-        lines += self.seen.messages
-        return list(dict.fromkeys(lines))
+        return list(dict.fromkeys([*lines, *self.seen.messages]))
 
-
-def _measured(target: Planned) -> str:
-    assert target.rates is not None
-    low, high = target.rates.measured_erg
-    return (
-        f"published for {low:.2g} to {high:.2g} erg, bolometric; scatter {target.rates.scatter_dex:g} dex (assumption)"
-    )
+    @property
+    def _messages_on_rates(self) -> list[str]:
+        lines, typical, beyond = list[str](), list[str](), list[str]()
+        for target in self.planned:
+            if target.no_rates:
+                lines.append(f"{target.no_rates[0].upper()}{target.no_rates[1:]}; its expected flares are not given.")
+            if target.rates is not None and "typical" in target.rates.source:
+                typical.append(target.name)
+            if target.completeness is not None and target.extrapolated:
+                beyond.append(f"{target.name} ({target.energy_at(0.5):.2g} erg, {target.published})")
+        if typical:
+            lines.insert(
+                0,
+                f"Flare rates of {', '.join(typical)} are those typical of their types at 1000 Myr: mass_msun and "
+                "age_myr, or their own rates, are more accurate.",
+            )
+        return [*lines, *([f"Flare rates are extrapolated to E50 of {', '.join(beyond)}."] if beyond else [])]
 
 
 @by_keywords
 def plan(
     study: Study,
     engine: Stares | Pool | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress = None,
     *,
     completeness: CompletenessOf | None = None,
 ) -> PlanAnswer:
@@ -349,28 +334,11 @@ def plan(
     >>> answer.table["hours"].value.tolist()
     [100.0]
     """
-    if not study.plan.targets:
-        raise InputError("the plan has no targets", "some, such as `plan.targets='targets.csv'`", key="plan.targets")
-    if study.orbit.targets:
-        raise InputError("both orbit.targets and plan.targets are given", "plan.targets alone", key="orbit.targets")
     closed = completeness is None and study.plan.completeness == "closed form"
+    _refuse(study, closed=closed)
     if completeness is None:
         completeness = closed_form if closed else partial(inject_target, engine=engine or Stares())
-    for name, _ in study.processes.modulations if closed else ():
-        raise InputError(
-            f"processes.{name} with plan.completeness = 'closed form', which takes the stare for known",
-            "'injections'",
-            key=f"processes.{name}",
-        )
-    stars: list[Star] = []
-    errors: list[InputError] = []
-    for text in study.plan.targets:
-        try:
-            stars.append(star_of(text, study.orbit.simbad))
-        except InputError as error:
-            errors.append(error)
-    if errors:
-        raise together(errors)
+    stars = _stars_of(study)
     if progress is not None:
         progress(0, len(stars))
     seen = visible(study)
@@ -387,37 +355,51 @@ def plan(
         its = None
         if target.window_s > 0:
             its = completeness(target) if target.signal_per_frame > 0 else NOTHING
-        best = _best_months(months, k, study.plan.best_months)
-        return _planned(study, k, target, its, float(seen.visibility.hours[k]), best)
+        return _planned(seen, k, target, its, months)
 
     # With a pool, the noise of a target is drawn while the threshold of the next one is sampled.
     planned = tuple(reported(map_in_order(engine, planned_for, observations()), len(stars), progress))
     return PlanAnswer(study, seen, planned)
 
 
-def _best_months(months: tuple[list[str], NDArray[np.float64]], k: int, most: int) -> tuple[str, ...]:
-    """Return the months, in order, in which target number `k` is seen for the most hours."""
-    names, hours = months
-    order = np.argsort(-hours[:, k], kind="stable")[:most]
-    return tuple(names[i] for i in sorted(order) if hours[i, k] > 0)
+def _refuse(study: Study, *, closed: bool) -> None:
+    """Raise InputError for a study that cannot be planned, or not by the closed form."""
+    if not study.plan.targets:
+        raise InputError("the plan has no targets", "some, such as `plan.targets='targets.csv'`", key="plan.targets")
+    if study.orbit.targets:
+        raise InputError("both orbit.targets and plan.targets are given", "plan.targets alone", key="orbit.targets")
+    for name, _ in study.processes.modulations if closed else ():
+        raise InputError(
+            f"processes.{name} with plan.completeness = 'closed form', which takes the stare for known",
+            "'injections'",
+            key=f"processes.{name}",
+        )
+
+
+def _stars_of(study: Study) -> list[Star]:
+    """Return the library star of each target; the error names all targets without one."""
+    stars: list[Star] = []
+    errors: list[InputError] = []
+    for text in study.plan.targets:
+        try:
+            stars.append(star_of(text, study.orbit.simbad))
+        except InputError as error:
+            errors.append(error)
+    if errors:
+        raise together(errors)
+    return stars
 
 
 def _planned(
-    study: Study, k: int, target: TargetObservation, its: Completeness | None, exposed: float, best: tuple[str, ...]
+    seen: VisibleAnswer, k: int, target: TargetObservation, its: Completeness | None, months: tuple[list[str], Any]
 ) -> Planned:
-    """Return the plan of target number `k`.
-
-    Parameters
-    ----------
-    its : Completeness or None
-        Recovered fraction of its flares; None if no frames follow each other.
-    exposed : float
-        Hours in which it is seen.
-    best : tuple of str
-        Months in which it is seen best.
-    """
+    """Return the plan of target number `k`; its completeness is None if no frames follow each other."""
+    study, exposed, (names, hours) = seen.study, float(seen.visibility.hours[k]), months
     observed = exposed if study.plan.hours is None else min(exposed, study.plan.hours)
     days = observed * 3600 / DAY_S
+    # The months in which it is seen for the most hours, in order.
+    most = sorted(np.argsort(-hours[:, k], kind="stable")[: study.plan.best_months])
+    best = tuple(names[i] for i in most if hours[i, k] > 0)
     rates, why = rates_of(study.plan.targets[k], target)
     recovered, ideal = None, float("nan")
     if rates is not None:

@@ -22,15 +22,7 @@ from mauvecl.host.stars.library import nearest_spectrum
 from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool
 from mauvecl.schema.errors import InputError
-from mauvecl.search.completeness import (
-    PER_DECADE,
-    SMALL,
-    Completeness,
-    DurationLaw,
-    Yield,
-    frame_signal,
-    recovered_per_day,
-)
+from mauvecl.search.completeness import PER_DECADE, SMALL, Completeness, frame_signal, recovered_per_day
 from mauvecl.search.templates import frame_nuisances
 from mauvecl.study.cases import Case
 from mauvecl.study.plan import PlanTarget
@@ -44,6 +36,7 @@ if TYPE_CHECKING:
     from mauvecl.detection.snr import Arrays
     from mauvecl.device.engine import Stares
     from mauvecl.host.exposure.expectation import Expectation
+    from mauvecl.search.completeness import DurationLaw, Yield
 
 Float = NDArray[np.float64]
 
@@ -57,11 +50,6 @@ class Conditions:
     swing: tuple[tuple[float, float], ...]
     hits_per_cm2_s: float  # mean of cosmic rays and trapped protons while the target is visible
 
-    def swings(self, orbits: int, orbit_s: float) -> tuple[tuple[float, float], ...]:
-        """Return the swing of N orbits."""
-        points = [point for point in self.swing if point[0] < orbit_s]
-        return tuple((n * orbit_s + t, value) for n in range(orbits) for t, value in points)
-
 
 @dataclass(frozen=True, eq=False)
 class OrbitConditions:
@@ -74,8 +62,7 @@ class OrbitConditions:
     def along(cls, track: Track) -> OrbitConditions:
         """Compute the conditions along an orbit with the assumed models."""
         light = sunlight(track.position_km, track.bodies.sun, track.bodies.sun_km)
-        temperature = Thermal().temperature_c(light, track.times.step_s)
-        return cls(temperature, Particles().rate_per_cm2_s(track))
+        return cls(Thermal().temperature_c(light, track.times.step_s), Particles().rate_per_cm2_s(track))
 
     def of(self, visibility: Visibility, k: int, orbit_s: float) -> Conditions | None:
         """Return the conditions of target `k`, or None if it is never visible."""
@@ -176,6 +163,11 @@ class Planned:
         return float("inf") if self.completeness is None else self.completeness.energy_at(probability)
 
     @property
+    def published(self) -> str:
+        """Energies at which the rates were measured, for sentences; empty if rates are unknown."""
+        return "" if self.rates is None else "published for {:.2g} to {:.2g} erg".format(*self.rates.measured_erg)
+
+    @property
     def extrapolated(self) -> bool:
         """Whether flares of E50 lie outside the energies at which the rates were measured."""
         if self.rates is None:
@@ -190,14 +182,11 @@ def closed_form(observation: TargetObservation, *, known: bool = False) -> Compl
     `known` takes everything but the noise as known.
     """
     study = observation.case.study
+    signal = observation.ideal_signal_per_frame if known else observation.signal_per_frame
     return Completeness.of_search(
-        observation.ideal_signal_per_frame if known else observation.signal_per_frame,
-        observation.scale,
-        window_s=observation.window_s,
-        false_alarms_per_day=study.search.rate,
-        bank=study.search.white_bank(observation.quiet.frame_s),
-        law=study.plan.law(),
-    )
+        signal, observation.scale, window_s=observation.window_s, false_alarms_per_day=study.search.rate,
+        bank=study.search.white_bank(observation.quiet.frame_s), law=study.plan.law(),
+    )  # fmt: skip
 
 
 def errors_of_throughput(observation: TargetObservation, rates: Rates | None) -> tuple[float, float] | None:
@@ -286,10 +275,9 @@ def observe(
 
 def sky_behind(seen: VisibleAnswer, k: int) -> float | None:
     """Return the median sky brightness, V mag arcsec^-2, over the days on which a target is visible, or over all."""
-    light, hours = seen.zodiacal[k], seen.visibility.by_day(k)
-    used = np.isfinite(light) & (hours > 0)
-    used = used if used.any() else np.isfinite(light)
-    return float(np.median(light[used])) if used.any() else None
+    known = np.isfinite(seen.zodiacal[k])
+    used = known & (seen.visibility.by_day(k) > 0)
+    return float(np.median(seen.zodiacal[k][used if used.any() else known])) if known.any() else None
 
 
 #: Orbits of a stare; the baseline window of a search spans several of them.
@@ -311,11 +299,8 @@ def inject_target(observation: TargetObservation, engine: Stares | Pool | None =
         widths = np.array(star.injected.half_widths_s)
         critical = star.injected.critical.reshape(widths.size, -1)
         probability = found_by_energy(critical, widths, energy, study.plan.law())
-        return {
-            "probability": probability,
-            "threshold": np.array(star.threshold.value),
-            "shifted": np.array(star.shifted),
-        }
+        threshold, shifted = np.array(star.threshold.value), np.array(star.shifted)
+        return {"probability": probability, "threshold": threshold, "shifted": shifted}
 
     depends_on = ("completeness of a target", question.text(), observation.quiet, observation.scale)
     arrays = kept(engine.checkpoint if isinstance(engine, Pool) else None, depends_on, computed)
@@ -333,32 +318,24 @@ def injection_case(observation: TargetObservation) -> Case:
     study, conditions = observation.case.study, observation.conditions
     orbit_s = study.orbit.orbit().elements.period_s
     gap = max(orbit_s - observation.window_s, 0.0)
-    changes: dict[str, Any] = {
-        "duration_s": ORBITS * orbit_s, "orbit_s": orbit_s, "orbit_gap_s": gap, "gaps": (), "along_orbit": False,
-    }  # fmt: skip
+    changes: dict[str, Any] = {"duration_s": ORBITS * orbit_s, "orbit_s": orbit_s, "orbit_gap_s": gap}
+    changes |= {"gaps": (), "along_orbit": False}
     if conditions is not None and study.stare.thermal is None:
-        changes["thermal"] = Curve(points=conditions.swings(ORBITS, orbit_s))
+        swing = [(t, value) for t, value in conditions.swing if t < orbit_s]
+        changes["thermal"] = Curve(points=tuple((n * orbit_s + t, value) for n in range(ORBITS) for t, value in swing))
     injections = InjectionQuestion(
         of="energy", sizes=2, widths=WIDTHS, half_width_low_s=WIDTH_RANGE_S[0], half_width_high_s=WIDTH_RANGE_S[1],
         count=study.plan.injections, positions=min(POSITIONS, study.plan.injections), fitted=0,
     )  # fmt: skip
-    return observation.case.with_sections(
-        stare=study.stare.model_copy(update=changes),
-        search=study.search.model_copy(update={"nulls": 0}),
-        injections=injections,
-    )
+    stare, search = study.stare.model_copy(update=changes), study.search.model_copy(update={"nulls": 0})
+    return observation.case.with_sections(stare=stare, search=search, injections=injections)
 
 
 def found_by_energy(critical_erg: Float, half_widths_s: Float, energy_erg: Float, law: DurationLaw) -> Float:
     """Return the completeness by energy, averaged over the half-widths of an energy, shape (n_energy,).
 
-    Parameters
-    ----------
-    critical_erg : ndarray, shape (n_half_width, n_draw)
-        Smallest detected energy of each injection. It is zero if there is an alarm without the flare; these injections
-        are ignored, since false alarms are counted separately.
-    half_widths_s : ndarray, shape (n_half_width,)
-    energy_erg : ndarray, shape (n_energy,)
+    `critical_erg` holds the smallest detected energy of each injection, shape (n_half_width, n_draw). It is zero if
+    there is an alarm without the flare; these injections are ignored, since false alarms are counted separately.
     """
     of_width = np.empty((half_widths_s.size, energy_erg.size))
     for row, energies in zip(of_width, critical_erg, strict=True):

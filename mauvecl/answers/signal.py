@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
-from mauvecl.answers.answer import Answer, InCell, TableOf, first_of, realisations_of, reported
-from mauvecl.answers.verbs import by_keywords
+from mauvecl.answers.answer import Answer, InCell, TableOf, first_of, reported
+from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection.snr import COLUMNS
 from mauvecl.device.engine import Engine
 from mauvecl.host.exposure.expectation import BUDGET_COLUMNS
@@ -56,7 +55,6 @@ def _floored(snr: float) -> str:
     return f"{math.floor(1000 * snr) / 1000:.3f}"
 
 
-#: Columns of the table of exposures.
 EXPOSURE_COLUMNS = (
     star_column(),
     Column("wavelength", "wavelength_nm", "nm", "vacuum wavelength, the middle of the pixel or element"),
@@ -73,14 +71,6 @@ EXPOSURE_COLUMNS = (
 )  # fmt: skip
 
 
-def _exposure_title(answer: ExposureAnswer) -> str:
-    wanted = answer.study.signal
-    return (
-        f"Exposure for an S/N of {wanted.snr:g} per {wanted.per} at {wanted.wavelength_nm:g} nm (closed form, whole "
-        "frames)"
-    )
-
-
 @dataclass(frozen=True)
 class ExposureAnswer(Answer):
     """Answer of `exposure`."""
@@ -90,10 +80,14 @@ class ExposureAnswer(Answer):
     study: Study
     exposures: tuple[Exposure, ...]
     messages: tuple[str, ...]
-    expectations: tuple[Expectation, ...]  # each star at its exposure
+    inputs: tuple[Expectation, ...]  # each star at its exposure
 
     #: One row per star.
-    table = TableOf("exposure", EXPOSURE_COLUMNS, "exposures", title=_exposure_title)
+    table = TableOf(
+        "exposure", EXPOSURE_COLUMNS, "exposures",
+        title=lambda answer: f"Exposure for an S/N of {answer.study.signal.snr:g} per {answer.study.signal.per} at "
+        f"{answer.study.signal.wavelength_nm:g} nm (closed form, whole frames)",
+    )  # fmt: skip
 
     @property
     def headline(self) -> str:
@@ -104,10 +98,6 @@ class ExposureAnswer(Answer):
             f"{first.star} reaches an S/N of {first.wanted:g} per {first.per} at {first.wavelength_nm:g} nm in "
             f"{first.exposure_s:g} s, {first.frames} frame{'' if first.frames == 1 else 's'}{least}."
         )
-
-    @property
-    def inputs(self) -> list[Expectation]:
-        return list(self.expectations)
 
 
 def snr_at(x: Expectation, wavelength_nm: float, per: Per = "element") -> float:
@@ -127,9 +117,7 @@ def place_of(x: Expectation, wavelength_nm: float, per: Per) -> int:
 
 
 @by_keywords
-def exposure(
-    study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
-) -> ExposureAnswer:
+def exposure(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> ExposureAnswer:
     """Compute the fewest frames whose closed-form S/N at a wavelength reaches a wanted one.
 
     An S/N that no exposure up to 1e7 s reaches, or a wavelength outside the spectrum, raises InputError if it holds of
@@ -146,12 +134,8 @@ def exposure(
     """
     snr, wavelength_nm, per = study.signal.snr, study.signal.wavelength_nm, study.signal.per
     if snr is None or wavelength_nm is None:
-        missing = "S/N" if snr is None else "wavelength"
-        raise InputError(
-            f"no wanted {missing}",
-            "`signal.snr` and `signal.wavelength_nm`",
-            key="signal.snr" if snr is None else "signal.wavelength_nm",
-        )
+        missing, key = ("S/N", "signal.snr") if snr is None else ("wavelength", "signal.wavelength_nm")
+        raise InputError(f"no wanted {missing}", "`signal.snr` and `signal.wavelength_nm`", key=key)
     answered, failed = [], []
     prepared = cases(study, swept=False)
     for case in reported(prepared, len(prepared), progress):
@@ -163,20 +147,11 @@ def exposure(
     if not answered:
         raise failed[0]
     exposures, seen = zip(*answered, strict=True)
-    long = [
-        Message(
-            f"{e.star} needs more than a day: {np.ceil(e.exposure_s / DAY_S):.0f} exposures of a day at most, added "
-            "up.",
-            "long exposure",
-        )
-        for e in exposures
-        if e.exposure_s > DAY_S
-    ]
-    messages = [
-        *(Message(f"NO ANSWER: {error}.", "no answer") for error in failed),
-        *collect_messages(list(seen)),
-        *long,
-    ]
+    messages = [Message(f"NO ANSWER: {error}.", "no answer") for error in failed] + collect_messages(list(seen))
+    for e in exposures:
+        if e.exposure_s > DAY_S:
+            days = f"{np.ceil(e.exposure_s / DAY_S):.0f} exposures of a day at most, added up"
+            messages.append(Message(f"{e.star} needs more than a day: {days}.", "long exposure"))
     return ExposureAnswer(study, exposures, tuple(messages), seen)
 
 
@@ -202,14 +177,14 @@ def exposure_for(
 
 def _one(case: Case, snr: float, wavelength_nm: float, per: Per) -> tuple[Exposure, Expectation]:
     """Return the fewest frames for an S/N, and the expectation of as many."""
-    frame, frame_s = case.one_frame.quiet, case.instrument.frame_s
+    frame = case.one_frame.quiet
 
-    def after(frames: int) -> Expectation:
-        # The frames may exceed one exposure.
-        return replace(frame, n_frames=frames)
+    def after(frames: int) -> float:
+        """Return the S/N of some frames, which may exceed one exposure."""
+        return snr_at(replace(frame, n_frames=frames), wavelength_nm, per)
 
-    single = snr_at(after(1), wavelength_nm, per)
-    if not single > 0 or (snr / single) ** 2 * frame_s > LONGEST_S:
+    single = after(1)
+    if not single > 0 or (snr / single) ** 2 * case.instrument.frame_s > LONGEST_S:
         raise InputError(
             f"{case.one_frame.label} has an S/N of {single:.3g} per {per} at {wavelength_nm:g} nm in one frame",
             f"enough for {snr:g} within {LONGEST_S:g} s{frame.saturation_clause}",
@@ -217,11 +192,11 @@ def _one(case: Case, snr: float, wavelength_nm: float, per: Per) -> tuple[Exposu
         )
     # S/N is proportional to the root of the number of frames, so only rounding has to be corrected.
     frames = max(int(np.ceil((snr / single) ** 2)), 1)
-    while frames > 1 and snr_at(after(frames - 1), wavelength_nm, per) >= snr:
+    while frames > 1 and after(frames - 1) >= snr:
         frames -= 1
-    while snr_at(after(frames), wavelength_nm, per) < snr:
+    while after(frames) < snr:
         frames += 1
-    x = after(frames)
+    x = replace(frame, n_frames=frames)
     place = place_of(x, wavelength_nm, per)
     here = x.saturated[x.element == place] if per == "element" else x.saturated[[place]]
     answer = Exposure(
@@ -231,8 +206,8 @@ def _one(case: Case, snr: float, wavelength_nm: float, per: Per) -> tuple[Exposu
         wanted=snr,
         exposure_s=x.exposure_s,
         frames=x.n_frames,
-        snr=snr_at(x, wavelength_nm, per),
-        snr_one_frame_less=snr_at(after(frames - 1), wavelength_nm, per) if frames > 1 else 0.0,
+        snr=after(frames),
+        snr_one_frame_less=after(frames - 1) if frames > 1 else 0.0,
         saturated=bool(here.any()),
     )
     return answer, x
@@ -264,7 +239,6 @@ class Observation(NamedTuple):
         return int(self.expectation.signal_dn.argmax())
 
 
-#: Columns of the summary of observations.
 SUMMARY_COLUMNS = (
     Column("observation", "title", description="star, and flare", heading="observation"),
     Column("frames", "expectation.n_frames", description="frames of the exposure", heading="frames", detail=True),
@@ -295,7 +269,7 @@ class SimulateAnswer(Answer):
 
     #: Peak, best closed-form S/N and saturated pixels of each observation.
     summary = TableOf("", SUMMARY_COLUMNS, "observations", title="One observation each (closed-form S/N)",
-                      key="observations", study=False)  # fmt: skip
+                      key="observations", about=())  # fmt: skip
 
     @property
     def uses(self) -> tuple[Use, ...]:
@@ -325,7 +299,7 @@ class SimulateAnswer(Answer):
 def simulate(
     study: Study,
     engine: Engine | Pool | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress = None,
     *,
     realisation: FirstRealisation = 0,
     flaring: bool = False,
@@ -345,18 +319,16 @@ def simulate(
     flaring : bool
         Whether the flares of the study are observed, too.
     """
-    observations, everything = [], []
-    study = study.ideal()
+    study, observations = study.ideal(), []
     prepared = cases(study, swept=False)
     for case in reported(prepared, len(prepared), progress):
-        xs = case.expectations if flaring else [case.quiet]
-        for i, x in enumerate(xs):
+        for i, x in enumerate(case.expectations if flaring else [case.quiet]):
             title = star_label(case.star, x) + (f", flare {100 * case.amplitudes[i - 1]:g} %" if i else "")
             table = components(x, realisation=realisation, seed=study.run.seed, **case.draw_options)
             table.meta["study"] = study.text()
             observations.append(Observation(title, x, table))
-        everything += xs
-    return SimulateAnswer(study, observations, collect_messages(everything, study.processes))
+    messages = collect_messages([observation.expectation for observation in observations], study.processes)
+    return SimulateAnswer(study, observations, messages)
 
 
 #: Wavelengths of the elements that terminal and pictures show, nm; the tables hold all of them.
@@ -376,7 +348,11 @@ class StarSnr(InCell):
         if self.asked_nm is not None:
             return [self.asked_nm]
         first, last = self.result.expectation.wavelength_nm[[0, -1]]
-        return [wavelength for wavelength in SHOWN_NM if first <= wavelength <= last]
+        return [nm for nm in SHOWN_NM if first <= nm <= last]
+
+
+#: Metadata of tables of realisations.
+REALISATIONS = ("study.run.realisations", "study")
 
 
 @dataclass(eq=False)
@@ -391,12 +367,12 @@ class SnrAnswer(Answer):
 
     #: S/N per resolution element of 10.5 nm, one row per star, cell and element.
     element = TableOf("snr-element", (), "stars", of=lambda _, star: star.result.element, place=True,
-                      key="snr-element", about=realisations_of)  # fmt: skip
+                      key="snr-element", about=REALISATIONS)  # fmt: skip
     #: S/N per pixel, one row per star, cell and pixel.
-    pixel = TableOf("snr-pixel", (), "stars", of=lambda _, star: star.result.pixel, place=True, about=realisations_of)
+    pixel = TableOf("snr-pixel", (), "stars", of=lambda _, star: star.result.pixel, place=True, about=REALISATIONS)
     #: Noise by origin, DN rms per pixel, one row per star, cell and pixel.
     noise_budget = TableOf("noise-budget", (), "stars", of=lambda _, star: star.result.expectation.noise_budget(),
-                           place=True, key="noise-budget", about=realisations_of)  # fmt: skip
+                           place=True, key="noise-budget", about=REALISATIONS)  # fmt: skip
 
     @property
     def headline(self) -> str:
@@ -426,9 +402,7 @@ class SnrAnswer(Answer):
 
 
 @by_keywords
-def snr(
-    study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
-) -> SnrAnswer:
+def snr(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> SnrAnswer:
     """Simulate the S/N of every star of a study without flares, for every sweep value.
 
     Parameters
@@ -455,24 +429,16 @@ def snr(
     if isinstance(engine, Pool):
         engine.expect(len(prepared) * run.realisations)
     stars = list(reported(map_in_order(engine, answered, prepared), len(prepared), progress))
-    return SnrAnswer(
-        study,
-        stars,
-        [
-            *collect_messages(quiet, study.processes),
-            *filter(None, map(_cut_off, stars)),
-        ],
-    )
+    return SnrAnswer(study, stars, [*collect_messages(quiet, study.processes), *filter(None, map(_cut_off, stars))])
 
 
 def _cut_off(star: StarSnr) -> str:
     """Return a message on pixels that saturated in the simulation, or an empty text."""
-    result = star.result
-    cut = result.counts.clipped[:, 1]
+    counts, cut = star.result.counts, star.result.counts.clipped[:, 1]
     clipped = cut[cut > 0]
     if not clipped.size:
         return ""
-    share = 100 * clipped.mean() / (result.counts.n * result.expectation.n_frames)
+    share = 100 * clipped.mean() / (counts.n * star.result.expectation.n_frames)
     return (
         f"{star.title}: saturation cut off {clipped.size} of {cut.size} pixels in the simulation, each of them in "
         f"{share:.3g} % of its frames on average."

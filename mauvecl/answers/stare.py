@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from mauvecl.answers.answer import Answer, InCell, TableOf, first_of, reported
+from mauvecl.answers.answer import Answer, InCell, TableOf, first_of, metadata_of, reported
 from mauvecl.answers.inject import survey_star
-from mauvecl.answers.verbs import by_keywords
+from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.device.engine import Stares
 from mauvecl.flares.energies import Kind
 from mauvecl.flares.frames import Draw, LightCurves, StareExpectation, draw_light_curves
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from mauvecl.detection.snr import Arrays
     from mauvecl.flares.stare import Stare
     from mauvecl.host.exposure.expectation import Expectation
-    from mauvecl.search.flare_fits import Factor, FittedFlares
+    from mauvecl.search.flare_fits import Factor
     from mauvecl.study.sections import SkyLight
 
 #: Start of a stare whose study names no time: 2026-01-01, MJD. Any would do.
@@ -72,7 +72,8 @@ def light_curve_file(star: StarStare, sky: SkyLight, *, seed: int, number: int) 
             place = parse_position(sky.target).icrs
         position = {"RA_OBJ": (place.ra.deg, "[deg]"), "DEC_OBJ": (place.dec.deg, "[deg]")}
         primary.header.update({"RADESYS": "ICRS", **position})
-    tables = [_table(star), _intervals(star)]
+    start, stop = star.staring.stare.gtis.T / DAY_S
+    tables = [_table(star), _hdu("GTI", [("START", "D", "d", start), ("STOP", "D", "d", stop)])]
     for table in tables:
         table.header.update(times)
     content = io.BytesIO()
@@ -100,8 +101,6 @@ def _times(stare: Stare, sky: SkyLight) -> dict[str, tuple[str | float, str]]:
 
 
 def _table(star: StarStare) -> fits.BinTableHDU:
-    from astropy.io import fits
-
     stare, light = star.staring.stare, star.light
     columns: list[tuple[str, str, str | None, Any]] = [
         ("TIME", "D", "d", stare.middle_s / DAY_S),
@@ -113,24 +112,14 @@ def _table(star: StarStare) -> fits.BinTableHDU:
             columns.append((kind.upper() + band_suffix(name, k), "E", "adu/s", getattr(light, attribute)[:, k]))
     if star.pointing_loss is not None:
         columns.append(("POINTING_LOSS", "E", None, star.pointing_loss))
-    made = [fits.Column(*about, array=values) for *about, values in columns]
-    hdu = fits.BinTableHDU.from_columns(made, name="LIGHTCURVE")
+    hdu = _hdu("LIGHTCURVE", columns)
     hdu.header["BANDS"] = ", ".join(light.bands)
     hdu.header["COMMENT"] = "FLUX: star and sky, bias and known dark taken off. MEAN: the same without noise."
     hdu.header["COMMENT"] = "TIME: middle of the frame, days after MJDREF. QUALITY 1: saturated pixels. 0: none."
     if star.pointing_loss is not None:
-        lost = int(np.count_nonzero(star.pointing_loss))
-        hdu.header["LOSTFRMS"] = (lost, "frames that lost light, assumed drifts")
+        hdu.header["LOSTFRMS"] = (star.drifting_frames, "frames that lost light, assumed drifts")
         hdu.header["COMMENT"] = "POINTING_LOSS: share of all light lost in the frame, as drawn."
     return hdu
-
-
-def _intervals(star: StarStare) -> fits.BinTableHDU:
-    from astropy.io import fits
-
-    start, stop = star.staring.stare.gtis.T / DAY_S
-    columns = [fits.Column(name="START", format="D", unit="d", array=start), fits.Column("STOP", "D", "d", array=stop)]
-    return fits.BinTableHDU.from_columns(columns, name="GTI")
 
 
 def _spectra(star: StarStare) -> list[Any]:
@@ -142,8 +131,15 @@ def _spectra(star: StarStare) -> list[Any]:
         image = fits.ImageHDU(np.asarray(values, np.float32), name=name)
         image.header["BUNIT"] = ("adu/s", "of a resolution element; rows are frames")
         images.append(image)
-    column = fits.Column(name="WAVELENGTH", format="D", unit="nm", array=light.element_nm)
-    return [*images, fits.BinTableHDU.from_columns([column], name="WAVELENGTH")]
+    return [*images, _hdu("WAVELENGTH", [("WAVELENGTH", "D", "nm", light.element_nm)])]
+
+
+def _hdu(name: str, columns: Sequence[tuple[str, str, str | None, Any]]) -> fits.BinTableHDU:
+    """Return a table of columns: name, format, unit and values."""
+    from astropy.io import fits
+
+    made = [fits.Column(*about, array=values) for *about, values in columns]
+    return fits.BinTableHDU.from_columns(made, name=name)
 
 
 Float = NDArray[np.float64]
@@ -194,6 +190,16 @@ class StarStare(InCell):
         """Flares that the search found."""
         return self.search.flares if isinstance(self.search, SearchResult) else []
 
+    @property
+    def saturated_frames(self) -> int:
+        """Number of frames in which a used pixel saturates."""
+        return int(np.count_nonzero(self.staring.quality))
+
+    @property
+    def drifting_frames(self) -> int:
+        """Number of frames that lost light in pointing drifts."""
+        return 0 if self.pointing_loss is None else int(np.count_nonzero(self.pointing_loss))
+
 
 KINDS: tuple[Kind, ...] = ("band", "bolometric")
 #: Largest number of frames of light curves in text files; longer ones are in FITS files only.
@@ -226,14 +232,10 @@ SEARCHED_COLUMNS = (
     Column("found", lambda row: len(row.found) if isinstance(row.search, SearchResult) else -1, "",
            "flares found; -1: not searched"),
 )  # fmt: skip
-SATURATED_COLUMN = Column(
-    "saturated_frames", lambda row: int(np.count_nonzero(row.staring.quality)), "",
-    "frames in which the mean of a used pixel reaches saturation", "saturated",
-)  # fmt: skip
-POINTING_COLUMN = Column(
-    "drifting_frames", lambda row: int(np.count_nonzero(row.pointing_loss)), "",
-    "frames that lost light in pointing drifts, which are assumptions", "drifting",
-)  # fmt: skip
+SATURATED_COLUMN = Column("saturated_frames", "", "", "frames in which the mean of a used pixel reaches saturation",
+                          "saturated")  # fmt: skip
+POINTING_COLUMN = Column("drifting_frames", "", "", "frames that lost light in pointing drifts, which are assumptions",
+                         "drifting")  # fmt: skip
 #: Columns of the table of flares, for `StareFlare`.
 EVENT_COLUMNS = (
     Column("peak_time", "event.peak_s", "s", "from the start of the stare; tau = 0 of the shape", "peak at (s)", ".6g"),
@@ -302,9 +304,9 @@ FRAME_COLUMNS = (
     Column("quality", "staring.quality", "", "1 where the mean of a used pixel reaches saturation"),
 )
 LOSS_COLUMN = Column(
-    "pointing_loss", "", "",
-    "share of all light that the frame lost in pointing drifts, as drawn; an observer does not know it",
-)  # fmt: skip
+    "pointing_loss",
+    description="share of all light that the frame lost in pointing drifts, as drawn; an observer does not know it",
+)
 #: Attributes of light curves and descriptions of them, by the names of columns.
 LIGHT = {
     "flux": ("flux", "net light, bias and known dark taken off"),
@@ -330,8 +332,8 @@ def _stare_columns(answer: StareAnswer) -> tuple[Column, ...]:
     return (*COLUMNS, *searched, SATURATED_COLUMN, *drifting)
 
 
-def _seed(answer: StareAnswer) -> dict[str, object]:
-    return {"study": answer.study.text(), "seed": answer.study.run.seed}
+#: Metadata of the tables.
+SEED = ("study", "study.run.seed")
 
 
 @dataclass(eq=False)
@@ -345,19 +347,19 @@ class StareAnswer(Answer):
     messages: list[str] = field(default_factory=list)
 
     #: One row per star and cell: frames, gaps, light and noise of a frame, flares.
-    table = TableOf("stare", _stare_columns, "stares", place=True, title="One stare each", key="stares", about=_seed,
-                    study=False)  # fmt: skip
+    table = TableOf("stare", _stare_columns, "stares", place=True, title="One stare each", key="stares",
+                    about=SEED)  # fmt: skip
     #: One row per flare: peak, half-width, amplitude, temperature, energies, and the S/N of its matched filter.
     events = TableOf(
         "events", EVENT_COLUMNS, lambda answer: chain.from_iterable(stare.flares for stare in answer.stares),
         place=True, title="Flares in them; S/N of one who knows all but whether the flare is there", key="events",
-        about=_seed, study=False,
+        about=SEED,
     )  # fmt: skip
     #: One row per flare that the search found: fitted values with errors, and the number of the flare in the stare.
     #: Values are NaN where the fit does not measure the flare: `note` says why.
     found = TableOf(
         "found", FOUND_COLUMNS, lambda answer: chain.from_iterable(stare.found for stare in answer.stares), place=True,
-        key="found", when=lambda answer: answer.study.stare.search, about=_seed, study=False,
+        key="found", when="study.stare.search", about=SEED,
     )  # fmt: skip
 
     def placed(self, columns: Sequence[Column]) -> tuple[Column, ...]:
@@ -393,7 +395,7 @@ class StareAnswer(Answer):
         star = self.stares[number]
         columns = [*FRAME_COLUMNS, *(() if star.pointing_loss is None else (LOSS_COLUMN,))]
         columns += [_light_column(kind, band, k) for k, band in enumerate(star.light.bands) for kind in LIGHT]
-        return table_of(columns, [star], star=star.label, **_seed(self), **star.at)
+        return table_of(columns, [star], star=star.label, **metadata_of(self, *SEED), **star.at)
 
     @property
     def tables(self) -> dict[str, Table]:
@@ -418,19 +420,15 @@ class StareAnswer(Answer):
 
     @property
     def remarks(self) -> list[str]:
-        long = [stare.title for stare in self.stares if stare.staring.stare.n_frames > MOST_ROWS]
-        return (
-            [f"More than {MOST_ROWS} frames: light curves of {', '.join(long)} are in FITS files alone."]
-            if long
-            else []
-        )
+        long = ", ".join(stare.title for stare in self.stares if stare.staring.stare.n_frames > MOST_ROWS)
+        return [f"More than {MOST_ROWS} frames: light curves of {long} are in FITS files alone."] if long else []
 
 
 @by_keywords
 def stare(
     study: Study,
     engine: Stares | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress = None,
     *,
     checkpoint: Checkpoint | None = None,
 ) -> StareAnswer:
@@ -464,16 +462,12 @@ def stare(
         line for case in prepared for line in unused_lines(case.study.observation.exposure_s, case.stare, case.events)
     )
     messages += [star.search for star in drawn if isinstance(star.search, str)]
-    messages += [
-        threshold_line(star.title, star.search.threshold)
-        for star in drawn
-        if isinstance(star.search, SearchResult) and star.search.shifted
-    ]
+    searched = [(star.title, star.search) for star in drawn if isinstance(star.search, SearchResult)]
+    messages += [threshold_line(title, search.threshold) for title, search in searched if search.shifted]
     messages += [line for star in drawn for line in _pointing_lines(star)]
     for star in drawn:
-        saturated = int(np.count_nonzero(star.staring.quality))
-        if saturated:
-            text = f"SATURATED: {saturated} frames of the stare at {star.title}; their quality is 1."
+        if star.saturated_frames:
+            text = f"SATURATED: {star.saturated_frames} frames of the stare at {star.title}; their quality is 1."
             messages.insert(0, Message(text, "saturated"))
     return StareAnswer(study, drawn, messages)
 
@@ -483,11 +477,10 @@ def _pointing_lines(star: StarStare) -> list[str]:
     lost, drifts = star.pointing_loss, star.staring.stare.pointing
     if lost is None or drifts is None:
         return []
-    n_lost = int(np.count_nonzero(lost))
     return [
-        f"POINTING DRIFTS: {n_lost} of {lost.size} frames at {star.title} lose light, up to {100 * lost.max():.3g} %; "
-        f"assumed: {drifts.rate_per_h:g} per hour, {drifts.duration_s:g} s long on average, with up to "
-        f"{100 * drifts.depth:g} % of the light lost. The search marginalises over the level of each frame."
+        f"POINTING DRIFTS: {star.drifting_frames} of {lost.size} frames at {star.title} lose light, up to "
+        f"{100 * lost.max():.3g} %; assumed: {drifts.rate_per_h:g} per hour, {drifts.duration_s:g} s long on average, "
+        f"with up to {100 * drifts.depth:g} % of the light lost. The search marginalises over the level of each frame."
     ]
 
 
@@ -497,18 +490,17 @@ def _draw(case: Case, stares: Stares, checkpoint: Checkpoint | None) -> StarStar
     staring = case.stare_expectation
 
     def draw(components: Any) -> Any:
+        what = components, staring.stare, staring.flare
+
         def computed() -> Arrays:
-            what = components, staring.stare, staring.flare
             return {"frames": stares.frames(*what, first=q.number, count=1, seed=seed, processes=processes)[0]}
 
-        depends_on = ("frames", components, staring.stare, staring.flare, q.number, seed, processes)
-        return kept(checkpoint, depends_on, computed)["frames"]
+        return kept(checkpoint, ("frames", *what, q.number, seed, processes), computed)["frames"]
 
     light = draw_light_curves(staring, q.bands_nm, draw)
     searched = _search(case, draw, checkpoint) if q.search else None
-    lost = None
-    if staring.stare.pointing is not None:
-        lost = staring.stare.pointing_losses(np.array([q.number], np.uint64), seed)[0]
+    drifting, numbers = staring.stare.pointing is not None, np.array([q.number], np.uint64)
+    lost = staring.stare.pointing_losses(numbers, seed)[0] if drifting else None
     return StarStare(case.label, case.at, staring, _flares(case), light, searched, lost)
 
 
@@ -536,7 +528,10 @@ def _found_flare(case: Case, alarm: Alarm) -> FoundFlare:
     """Return an alarm with the energy of its flare and the number of the nearest flare of the stare."""
     if not alarm.measured:
         return FoundFlare(case.label, case.at, alarm, float("nan"), 0)
-    event = _event_of(case, alarm.recovered)
+    fit = alarm.recovered
+    kelvin = float(np.nan_to_num(fit.temperature_k[0], nan=case.study.flare.temperature_k))
+    values = (float(fit.peak_s[0]), float(fit.half_width_s[0]), float(fit.amplitude[0]))
+    event = Event(*values, kelvin, case.study.search.shape)
     away = [abs(other.peak_s - event.peak_s) for other in case.events]
     nearest = int(np.argmin(away)) if away else -1
     reach = 2 * case.stare_expectation.stare.frame_s
@@ -544,19 +539,11 @@ def _found_flare(case: Case, alarm: Alarm) -> FoundFlare:
     return FoundFlare(case.label, case.at, alarm, _found_energy(case, event), nearest + 1 if near else 0)
 
 
-def _event_of(case: Case, fit: FittedFlares) -> Event:
-    """Return a fitted flare as an event."""
-    kelvin = float(np.nan_to_num(fit.temperature_k[0], nan=case.study.flare.temperature_k))
-    values = (float(fit.peak_s[0]), float(fit.half_width_s[0]), float(fit.amplitude[0]))
-    return Event(*values, kelvin, case.study.search.shape)
-
-
 def _log_energy(case: Case, kelvin: Sequence[float]) -> Factor | None:
     """Return the logarithm of the energy per second of equivalent duration as a function of log temperature.
 
-    It is a spline through the energies at temperatures, K.
-
-    Returns None if the star's size is unknown, or a template's temperature gives no energy.
+    It is a spline through the energies at temperatures, K; None if the star's size is unknown, or a template's
+    temperature gives no energy.
     """
     unit = Event(0.0, 1.0, 1.0, kelvin[0], case.study.search.shape)
     events = [replace(unit, temperature=k) for k in kelvin]

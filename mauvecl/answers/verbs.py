@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     #: Function of a command's flags that returns the study where no file is given.
     DefaultStudy = Callable[[dict[str, Any]], Study]
 
+#: Function that is called as ``progress(done, total)``; it may raise to stop the work.
+Progress = Callable[[int, int], None] | None
+
 #: Headings of the command line's list of commands and of the page's tabs, by the group of a verb.
 GROUPS = {
     "plan": "Plan observations",
@@ -32,26 +35,14 @@ FEWER = {"run.realisations": 100_000}
 
 # Keys of a study whose flags verbs take, in the order of `--help`.
 
-#: Those of every verb that observes.
-OBSERVATION = (
-    "star.library",
-    "star.magnitude",
-    "star.band",
-    "star.magnitude_system",
-    "star.ebv",
-    "star.wavelength_unit",
-    "star.flux_unit",
-    "star.extend",
-    "star.ignore_checksum",
-    "star.bin_nm",
-    "star.neighbours",
-    "star.neighbours_of",
-    "star.neighbour_share",
-    "observation.exposure_s",
-    "observation.instrument",
-    "observation.temperature_c",
-    "sky",
+#: Those of a star's spectrum, brightness and neighbours.
+STAR = (
+    *("library", "magnitude", "band", "magnitude_system", "ebv", "wavelength_unit", "flux_unit", "extend"),
+    *("ignore_checksum", "bin_nm", "neighbours", "neighbours_of", "neighbour_share"),
 )
+INSTRUMENT = ("observation.instrument", "observation.temperature_c")
+#: Those of every verb that observes.
+OBSERVATION = (*(f"star.{key}" for key in STAR), "observation.exposure_s", *INSTRUMENT, "sky")
 SIZE = ("star.distance_pc", "star.radius_rsun", "star.effective_temperature_k")
 SIGNAL = ("observation.signal",)
 DRAWS = ("run.realisations", "run.seed")
@@ -59,14 +50,11 @@ DETECTION = ("run.statistics", "run.fap", "run.tails", "run.reference", "run.var
 NUISANCES = ("nuisances.own", "nuisances.usual")
 UNKNOWN = ("unknowns.draws", "unknowns.known")
 FRAMES = ("stare.duration_s", "stare.gaps", "stare.orbit_gap_s", "stare.thermal", "stare.pointing")
-STARE = (
-    *FRAMES,
-    "stare.half_width_s",
-    "stare.shape",
-    "stare.energies_erg",
-    "stare.search",
-    "nuisances.usual",
+STARE = (*FRAMES, "stare.half_width_s", "stare.shape", "stare.energies_erg", "stare.search", "nuisances.usual")
+FLARE_LIGHT = tuple(
+    f"flare.{key}" for key in ("temperature_k", "band", "geometry", "photosphere_temperature_k", "spectrum")
 )
+ALARMS = ("search.false_alarms", "search.per")
 #: Those of verbs that look from the orbit; targets are given in another way.
 ORBIT = (
     *(f"orbit.{key}" for key in ("start", "days", "step_s", "tle", "kind", "simbad")),
@@ -117,18 +105,10 @@ class Verb:
     def study_of(
         self, given: dict[str, Any], keywords: Mapping[str, Keyword], study: Study | None, where: str
     ) -> tuple[Study, list[str]]:
-        """Return the study that keywords ask for, with messages on what they do not state.
+        """Return the study that keywords of the verb ask for, with messages on what they do not state.
 
-        Parameters
-        ----------
-        given : dict
-            Value of each keyword, or None; also ``paper``, and ``set``, texts of any keys.
-        keywords : mapping
-            Keywords of the verb.
-        study : Study or None
-            Study that keywords change; without one, the verb's default.
-        where : str
-            Origin of the keywords, for messages.
+        `given` has the value of each keyword, or None, and also ``paper``, and ``set``, texts of any keys. They change
+        the study or, without one, the verb's default; `where` names their origin in messages.
         """
         from mauvecl.study.keywords import changes_of, stars_of
         from mauvecl.study.study import Study
@@ -334,20 +314,7 @@ VERBS: dict[str, Verb] = {
 
     mauvecl inject --star M3V --magnitude 9 --orbit-gap 2100 --with-unknowns --sweep flare_temperature=7000,10000,15000
     """,
-            (
-                "flare.temperature_k",
-                "flare.band",
-                "flare.geometry",
-                "flare.photosphere_temperature_k",
-                "flare.spectrum",
-                *FRAMES,
-                "nuisances.usual",
-                *SIZE,
-                "search",
-                "injections",
-                "run.seed",
-                "sweep",
-            ),
+            (*FLARE_LIGHT, *FRAMES, "nuisances.usual", *SIZE, "search", "injections", "run.seed", "sweep"),
             common=("duration", "orbit_gap", "distance", "false_alarms", "alarms_per", "injections", "with_unknowns"),
             counts="injections",
             without="observation.exposure_s",
@@ -365,16 +332,7 @@ VERBS: dict[str, Verb] = {
 
     mauvecl analyse light-curve-1.fits --star M3V --magnitude 9 --distance 5
     """,
-            (
-                "data",
-                "orbit.tle",
-                "orbit.kind",
-                *SIZE,
-                "flare.temperature_k",
-                "search.false_alarms",
-                "search.per",
-                "run.seed",
-            ),
+            ("data", "orbit.tle", "orbit.kind", *SIZE, "flare.temperature_k", *ALARMS, "run.seed"),
             group="analyse",
             common=("mapping", "quality_bits", "false_alarms", "alarms_per", "distance", "report"),
             counts="frames",
@@ -432,17 +390,7 @@ VERBS: dict[str, Verb] = {
 
     Example: mauvecl plan targets.csv --hours 200 --start 2027-01-01
     """,
-            (
-                "plan",
-                "search.false_alarms",
-                "search.per",
-                "observation.instrument",
-                "observation.temperature_c",
-                "flare.temperature_k",
-                "flare.band",
-                "flare.spectrum",
-                "nuisances.usual",
-            ),
+            ("plan", *ALARMS, *INSTRUMENT, "flare.temperature_k", "flare.band", "flare.spectrum", "nuisances.usual"),
             common=("targets", "hours", "start", "days", "completeness", "report", "false_alarms"),
             counts="targets",
             observation=ORBIT,
@@ -462,7 +410,7 @@ class Question(Protocol[Answered]):
         self,
         study: Study | None = None,
         engine: Any = None,
-        progress: Callable[[int, int], None] | None = None,
+        progress: Progress = None,
         **keywords: Any,
     ) -> Answered: ...
 

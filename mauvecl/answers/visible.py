@@ -8,13 +8,13 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.answers.answer import Answer, TableOf, first_of
-from mauvecl.answers.verbs import by_keywords
+from mauvecl.answers.answer import Answer, TableOf, first_of, metadata_of
+from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.host import VERSION
 from mauvecl.host.orbit.geometry import Bodies, TimeGrid
 from mauvecl.host.orbit.orbit import Target
@@ -26,19 +26,17 @@ from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
     from mauvecl.device.engine import Engine
-    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.runs.pool import Pool
 
 
-@dataclass(frozen=True)
-class Entry:
+class Entry(NamedTuple):
     """Appointment in a calendar."""
 
     #: UTC, ISO 8601 to the second; dates without time make an entry of whole days, including the last.
     start: str
     stop: str
     title: str
-    text: str = ""
+    text: str
 
 
 def calendar_bytes(entries: Iterable[Entry], name: str) -> bytes:
@@ -51,19 +49,19 @@ def calendar_bytes(entries: Iterable[Entry], name: str) -> bytes:
     ]
     for entry in entries:
         stop = entry.stop
-        if _is_day(stop):
+        if len(stop) == len("2027-01-31"):
             # An event ends at the beginning of the next day.
             stop = (datetime.date.fromisoformat(stop) + datetime.timedelta(days=1)).isoformat()
-        unique = hashlib.sha256("\0".join((entry.start, entry.stop, entry.title)).encode()).hexdigest()[:24]
+        unique = hashlib.sha256("\0".join(entry[:3]).encode()).hexdigest()[:24]
         lines += [
             "BEGIN:VEVENT",
             f"UID:{unique}@mauvecl",
             # A fixed time, so that equal plans give equal files.
-            f"DTSTAMP:{_moment(entry.start).removeprefix(':').removeprefix(';VALUE=DATE:')[:8]}T000000Z",
+            f"DTSTAMP:{entry.start[:10].replace('-', '')}T000000Z",
             f"DTSTART{_moment(entry.start)}",
             f"DTEND{_moment(stop)}",
             f"SUMMARY:{_text(entry.title)}",
-            *([f"DESCRIPTION:{_text(entry.text)}"] if entry.text else []),
+            f"DESCRIPTION:{_text(entry.text)}",
             "TRANSP:TRANSPARENT",
             "END:VEVENT",
         ]
@@ -71,13 +69,9 @@ def calendar_bytes(entries: Iterable[Entry], name: str) -> bytes:
     return "".join(f"{_folded(line)}\r\n" for line in lines).encode()
 
 
-def _is_day(text: str) -> bool:
-    return len(text) == 10
-
-
 def _moment(text: str) -> str:
     plain = text.replace("-", "").replace(":", "")
-    return f";VALUE=DATE:{plain}" if _is_day(text) else f":{plain}Z"
+    return f":{plain}Z" if "T" in plain else f";VALUE=DATE:{plain}"
 
 
 def _text(value: str) -> str:
@@ -88,14 +82,12 @@ def _text(value: str) -> str:
 
 def _folded(line: str) -> str:
     """Fold a line to at most 75 bytes; continuation lines begin with a space."""
-    parts: list[str] = []
-    part = ""
+    parts = [""]
     for character in line:
-        if len((part + character).encode()) > (75 if not parts else 74):
-            parts.append(part)
-            part = ""
-        part += character
-    return "\r\n ".join([*parts, part])
+        if len((parts[-1] + character).encode()) > (75 if len(parts) == 1 else 74):
+            parts.append("")
+        parts[-1] += character
+    return "\r\n ".join(parts)
 
 
 Float = NDArray[np.float64]
@@ -175,7 +167,7 @@ class VisibleAnswer(Answer):
     table = TableOf(
         "visible", _target_columns, lambda answer: [answer._row(k) for k in range(len(answer.targets))],
         title=lambda answer: f"Seen in {answer.times.days:g} days from {answer.times.iso(0.0)} UTC",
-        about=lambda answer: {"start": answer.times.iso(0.0), "days": answer.times.days},
+        about=lambda answer: {"start": answer.times.iso(0.0), **metadata_of(answer, "times.days", "study")},
     )  # fmt: skip
     #: One row per month, one column of hours per target.
     months = TableOf(
@@ -186,12 +178,10 @@ class VisibleAnswer(Answer):
     #: One row per target and day.
     by_day = TableOf("days", DAY_COLUMNS, "_day_rows")
     #: One row per window.
-    window_table = TableOf("windows", WINDOW_COLUMNS, "_window_rows", when=lambda answer: answer.writes_windows,
-                           about=lambda answer: {"study": answer.study.text(), "step_s": answer.times.step_s},
-                           study=False)  # fmt: skip
+    window_table = TableOf("windows", WINDOW_COLUMNS, "_window_rows", when="writes_windows",
+                           about=("study", "times.step_s"))  # fmt: skip
     #: Active limits with their values and the sources of their defaults.
-    assumptions = TableOf("assumptions", assumption_columns("limit"), "visibility.limits.assumptions",
-                          study=False)  # fmt: skip
+    assumptions = TableOf("assumptions", assumption_columns("limit"), "visibility.limits.assumptions", about=())
 
     @property
     def headline(self) -> str:
@@ -242,7 +232,7 @@ class VisibleAnswer(Answer):
         names, by_month = seen.by_month()
         hours, away = by_month[:, k], self.elongation_deg(k)
         light = self.zodiacal[k][np.isfinite(self.zodiacal[k])]
-        length = windows.length_s
+        length, end_s = windows.length_s, self.times.n * self.times.step_s
         return {
             "target": target.name,
             "ra": target.ra_deg,
@@ -252,7 +242,7 @@ class VisibleAnswer(Answer):
             **{f"leaves_{name}": shares[k] for name, shares in seen.kept_by.items()},
             "windows": length.size,
             "median_window": float(np.median(length / 60)) if length.size else 0.0,
-            "longest_gap": self._longest_gap_d(k),
+            "longest_gap": float(np.max(np.append(windows.start_s, end_s) - np.append(0.0, windows.stop_s))) / DAY_S,
             "per_orbit": float(np.mean(seen.by_orbit(k))),
             "in_shadow": float(windows.in_shadow_s.sum() / length.sum()) if length.size else 0.0,
             "best_month": names[int(np.argmax(hours))] if hours.any() else "",
@@ -273,15 +263,6 @@ class VisibleAnswer(Answer):
             for k, target in enumerate(self.targets)
         ]
         return [*super().views, View("Hours of exposure by month", columns, table_of(columns, rows))]
-
-    def _longest_gap_d(self, k: int) -> float:
-        """Return the longest time without a window, in days."""
-        windows = self.windows[k]
-        ends = (
-            np.concatenate([[0.0], windows.stop_s]),
-            np.concatenate([windows.start_s, [self.times.n * self.times.step_s]]),
-        )
-        return float(np.max(ends[1] - ends[0])) / DAY_S
 
     @property
     def _hours_by_month(self) -> dict[str, Any]:
@@ -343,11 +324,6 @@ class VisibleAnswer(Answer):
         return entries
 
     @property
-    def inputs(self) -> list[Expectation]:
-        """No expectations, since nothing is exposed."""
-        return []
-
-    @property
     def messages(self) -> list[str]:
         """Messages on the orbit, assumptions, effects that are not modelled, and targets that are never visible."""
         never = [target.name for target, part in zip(self.targets, self.visibility.share, strict=True) if part == 0]
@@ -375,9 +351,7 @@ class VisibleAnswer(Answer):
 
 
 @by_keywords
-def visible(
-    study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
-) -> VisibleAnswer:
+def visible(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> VisibleAnswer:
     """Compute when a study's targets are visible.
 
     Parameters

@@ -8,22 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.charts.chart import (
-    WAVELENGTH,
-    Axis,
-    Band,
-    Chart,
-    Dots,
-    Line,
-    Mesh,
-    Panel,
-    Picture,
-    Rule,
-    Strips,
-    Targets,
-    picture_of,
-)
-from mauvecl.charts.matplotlib import in_figure, styled_picture
+from mauvecl.charts.chart import WAVELENGTH, Axis, Band, Chart, Dots, Line, Mesh, Panel, Picture, Rule, Strips, Targets
+from mauvecl.charts.matplotlib import in_figure, picture_of
 from mauvecl.schema.columns import First, with_error
 
 if TYPE_CHECKING:
@@ -60,7 +46,6 @@ def throughput_series(answer: CalibrateAnswer, scale: str = "throughput") -> dic
 
 
 @picture_of("CalibrateAnswer", "throughput")
-@styled_picture
 def fitted_throughput(answer: CalibrateAnswer) -> Picture:
     """Plot the fitted throughput with its 95 % band next to the nominal one, and their ratio."""
     above = THROUGHPUT.panel(throughput_series(answer), f"nominal: {answer.nominal.name}")
@@ -77,7 +62,6 @@ def residual_series(answer: CalibrateAnswer) -> list[tuple[str, Any, Any]]:
 
 
 @picture_of("CalibrateAnswer", "residuals")
-@styled_picture
 def calibration_residuals(answer: CalibrateAnswer) -> Picture:
     """Plot the residuals of each star, averaged over some pixels, in their standard deviations."""
     two = Strips(along="y", alpha=0.2, at=([-2], [2]))
@@ -102,7 +86,6 @@ def transfer_series(answer: CalibrateAnswer) -> tuple[dict[str, Any], Any]:
 
 
 @picture_of("CalibrateAnswer", "photon-transfer", when=lambda answer: "gain" not in answer.transfer.assumed)
-@styled_picture
 def photon_transfer(answer: CalibrateAnswer) -> Picture:
     """Plot the variance of frames against their mean, binned, with the fit and its residuals."""
     t, (series, error) = answer.transfer, transfer_series(answer)
@@ -117,7 +100,6 @@ def photon_transfer(answer: CalibrateAnswer) -> Picture:
 
 
 @picture_of("CalibrateAnswer", "dark", when=lambda answer: answer.dark.dof > 0)
-@styled_picture
 def dark_current(answer: CalibrateAnswer) -> Picture:
     """Plot the dark current of each pixel, and its mean against temperature with the fit."""
     d, n = answer.dark, answer.nominal
@@ -166,7 +148,6 @@ def shown_name(change: str) -> str:
 
 
 @picture_of("ChangeAnswer", "change", when=lambda answer: bool(answer.along))
-@styled_picture
 def change_against_magnitude(answer: ChangeAnswer) -> Picture:
     """Plot the smallest detectable changes against the magnitude of the star, one panel for each unit."""
     titles = First(list(dict.fromkeys(row.title for row in answer.changes)), 1, "stars")
@@ -188,7 +169,6 @@ def change_against_magnitude(answer: ChangeAnswer) -> Picture:
 
 
 @picture_of("ChangeAnswer", "periods", when=lambda answer: bool(answer.periods))
-@styled_picture
 def recovered_periods(answer: ChangeAnswer) -> Picture:
     """Plot the share of recovered periods over period and semi-amplitude, for the first changes."""
     first, row = First(answer.periods, MOST, "changes"), []
@@ -205,7 +185,6 @@ def recovered_periods(answer: ChangeAnswer) -> Picture:
 
 
 @picture_of("ChangeAnswer", "indices", when=lambda answer: bool(answer.indices))
-@styled_picture
 def line_indices(answer: ChangeAnswer) -> Picture:
     """Plot the mean calibrated spectrum around each line index, with its band and continuum."""
     title, row = answer.indices[0].title, []

@@ -10,13 +10,12 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from html import escape
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.charts.chart import Axis, Dots, Line, Mesh, Panel, Picture, Series, picture_of, pictures_of
-from mauvecl.charts.matplotlib import COLOURS, NULL, available, draw_picture, new_figure, style, styled_picture
+from mauvecl.charts.chart import Axis, Dots, Line, Mesh, Panel, Picture, Series, document_of, pictures_of
+from mauvecl.charts.matplotlib import COLOURS, NULL, available, draw_picture, new_figure, picture_of, style
 from mauvecl.host import VERSION
 from mauvecl.schema.columns import without_empty
 
@@ -32,7 +31,6 @@ MOST_MONTHS = 8
 
 
 @picture_of("VisibleAnswer", "visible")
-@styled_picture
 def calendar(answer: VisibleAnswer) -> Picture:
     """Plot daily hours of exposure: a calendar per target or, for many targets, a row."""
     hours = np.array([answer.visibility.by_day(k) for k in range(len(answer.targets))])
@@ -91,7 +89,6 @@ PANELS = {"left": 0.085, "right": 0.905, "top": 0.955, "bottom": 0.09, "hspace":
 
 
 @picture_of("PlanAnswer", "plan")
-@styled_picture
 def overview(answer: PlanAnswer) -> Picture:
     """Plot each target's expected number of flares with the range of 95 % of campaigns, and E50 to E90."""
     return _overview(answer)
@@ -104,9 +101,8 @@ def _overview(answer: PlanAnswer) -> Picture:
     for k, target in enumerate(planned):
         if target.recovered is not None and target.recovered.high > 0:
             # A logarithmic axis cannot show zero.
-            low, high, expected = np.maximum(
-                [target.recovered.low, target.recovered.high, target.recovered.expected], 0.05
-            )
+            yields = target.recovered
+            low, high, expected = np.maximum([yields.low, yields.high, yields.expected], 0.05)
             left += [_bar("star", (low, high), k), Dots("", "star", size=7, at=([expected], [k]))]
         if np.isfinite(ends[k][0]):
             right += [_bar("flare", ends[k], k), Dots("", "flare", size=7, at=([ends[k][0]], [k]))]
@@ -127,12 +123,12 @@ def _bar(colour: str, ends: tuple[float, float], k: int) -> Line:
 
 
 @picture_of("PlanAnswer", "visible")
-def visible(answer: PlanAnswer, path: str | Path | None = None) -> Any:
+def visible(answer: PlanAnswer) -> Any:
     """Plot the daily hours of exposure of all targets."""
-    return calendar(answer.seen, path=path)
+    return calendar(answer.seen)
 
 
-@picture_of("PlanAnswer", "plan.pdf", document=True, when=lambda answer: answer.study.plan.report == "pdf")
+@document_of("PlanAnswer", "plan.pdf", when=lambda answer: answer.study.plan.report == "pdf")
 def pdf_bytes(answer: PlanAnswer) -> bytes:
     """Return the report as PDF: summary, a page per target, and all assumptions."""
 
@@ -337,7 +333,7 @@ PAGE_STYLE = (
 )
 
 
-@picture_of("PlanAnswer", "plan.html", document=True, when=lambda answer: answer.study.plan.report == "html")
+@document_of("PlanAnswer", "plan.html", when=lambda answer: answer.study.plan.report == "html")
 def plan_html(answer: PlanAnswer) -> bytes:
     """Return the report: summary, a section per target (with pictures if matplotlib is installed), assumptions."""
     from mauvecl.answers.plan import LEGEND, target_lines
@@ -403,7 +399,7 @@ def _sections(answer: AnalyseAnswer) -> list[tuple[str, list[str], list[list[str
     return [(view.title, *without_empty(*view.texts())) for view in answer.all_views]
 
 
-@picture_of("AnalyseAnswer", "analyse.html", document=True, when=lambda answer: answer.study.data.report == "html")
+@document_of("AnalyseAnswer", "analyse.html", when=lambda answer: answer.study.data.report == "html")
 def analysis_html(answer: AnalyseAnswer) -> bytes:
     """Return the report: messages, tables, remarks, and pictures if matplotlib is installed."""
     parts = [
@@ -419,7 +415,7 @@ def analysis_html(answer: AnalyseAnswer) -> bytes:
     return "\n".join([*parts, "</html>"]).encode()
 
 
-@picture_of("AnalyseAnswer", "analyse.pdf", document=True, when=lambda answer: answer.study.data.report == "pdf")
+@document_of("AnalyseAnswer", "analyse.pdf", when=lambda answer: answer.study.data.report == "pdf")
 def report_pdf(answer: AnalyseAnswer) -> bytes:
     """Return the report as PDF: messages, tables, remarks, and a page for each picture."""
 

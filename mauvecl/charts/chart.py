@@ -279,24 +279,15 @@ class Entry:
 ENTRIES: defaultdict[str, list[Entry]] = defaultdict(list)
 
 
-def picture_of(kind: str, name: str, **how: Any) -> Callable[[F], F]:
-    """Register a function as a picture of a class, or as the bytes of a document; `plot` draws the first picture.
+def register(kind: str, name: str, make: F, **how: Any) -> F:
+    """Register a function that makes a picture, or the bytes of a document, of a class; `how` as in `Entry`."""
+    ENTRIES[kind].append(Entry(name, make, **how))
+    return make
 
-    Parameters
-    ----------
-    kind : str
-        Name of the class, as in ``"LimitAnswer"``.
-    name : str
-        Name of the picture's file without its ending, or of the document.
-    **how
-        `given`, `each`, `when` and `document`; see `Entry`.
-    """
 
-    def register(make: F) -> F:
-        ENTRIES[kind].append(Entry(name, make, **how))
-        return make
-
-    return register
+def document_of(kind: str, name: str, **how: Any) -> Callable[[F], F]:
+    """Register a function that returns the bytes of a document of a class; arguments as for `matplotlib.picture_of`."""
+    return lambda make: register(kind, name, make, document=True, **how)
 
 
 def pictures_of(thing: Any) -> dict[str, Callable[..., Any]]:

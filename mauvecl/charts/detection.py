@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.charts.chart import WAVELENGTH, Axis, Band, Dots, Line, Panel, Picture, Rule, Series, picture_of
-from mauvecl.charts.matplotlib import COLOURS, COLUMN, MAX_COLUMNS, UNBROKEN, styled_picture, written
+from mauvecl.charts.chart import WAVELENGTH, Axis, Band, Dots, Line, Panel, Picture, Rule, Series
+from mauvecl.charts.matplotlib import COLOURS, COLUMN, MAX_COLUMNS, UNBROKEN, picture_of, written
 from mauvecl.detection.names import NoThresholdError
 from mauvecl.detection.requests import statistic_label
 from mauvecl.detection.statistics import LinearStatistic
@@ -41,7 +41,8 @@ WIDE = 5.0
 
 def _few(answer: DetectAnswer) -> First[Shown]:
     """Limit the number of stars so that each panel stays readable."""
-    return First([star.shown for star in answer.stars], MOST_STARS, "stars")
+    stars = [(star.title, star.detection, [f"flare {100 * a:g} %" for a in star.amplitudes]) for star in answer.stars]
+    return First[Shown](stars, MOST_STARS, "stars")
 
 
 def _alone(outcome: Detection) -> list[Shown]:
@@ -50,7 +51,6 @@ def _alone(outcome: Detection) -> list[Shown]:
 
 @picture_of("DetectAnswer", "detection", given=lambda answer: (_few(answer), answer.study.run.fap))
 @picture_of("Detection", "detection", given=lambda outcome: (_alone(outcome),))
-@styled_picture
 def detection(stars: Sequence[Shown], fap: float = 1e-3) -> Picture:
     """Plot null and flare distributions, with a row per star and a column per statistic."""
     first = stars[0][1]
@@ -90,10 +90,8 @@ def _distributions(title: str, outcome: Detection, flares: Sequence[str], statis
         edges, counts = outcome.histogram(statistic, flare, bins=120)
         middle, height = (edges[1:] + edges[:-1]) / 2, counts / counts.max()
         ends += [edges[0], edges[-1]]
-        series += [
-            Band("", colour, alpha=0.3, step=True, at=(middle, 0 * height, height)),
-            Line(name, colour, step=True, at=(middle, height)),
-        ]
+        series.append(Band("", colour, alpha=0.3, step=True, at=(middle, 0 * height, height)))
+        series.append(Line(name, colour, step=True, at=(middle, height)))
     # Statistics that are scaled by the flare have a threshold per flare.
     own, cuts = chosen if kind.shaped and not linear else [0], list[float]()
     for k, colour in zip(own, cycle(COLOURS if len(own) > 1 else ["text"]), strict=False):
@@ -151,7 +149,6 @@ def roc_columns(curve: Roc) -> tuple[Any, ...]:
 
 
 @picture_of("Roc", "roc")
-@styled_picture
 def roc(curves: Roc | Sequence[tuple[str, Roc]], *, name: str = "") -> Panel:
     """Plot receiver operating characteristics with their areas: one with its name, or several with theirs."""
     from mauvecl.detection.detection import Roc
@@ -167,7 +164,6 @@ def roc(curves: Roc | Sequence[tuple[str, Roc]], *, name: str = "") -> Panel:
 
 
 @picture_of("DetectAnswer", "spectra", given=lambda answer: (_few(answer),))
-@styled_picture
 def spectra(stars: Sequence[Shown]) -> Picture:
     """Plot mean spectra per second with pixel noise and, below, the flares in sigma of an element's noise."""
 
@@ -215,7 +211,6 @@ COMPONENTS = {
 @picture_of(
     "SimulateAnswer", "observation", each=lambda answer: [(title, table) for title, _, table in answer.observations]
 )
-@styled_picture
 def observation(title: str, table: QTable) -> Picture:
     """Plot a raw spectrum and its components, as the paper's figure of components."""
     nm, rows = table["wavelength"].to_value("nm"), list[list[Panel]]()
@@ -232,7 +227,6 @@ def observation(title: str, table: QTable) -> Picture:
     given=lambda answer: (First([(star.title, star.result) for star in answer.stars], MOST_STARS, "stars"),),
 )
 @picture_of("SnrResult", "snr", given=lambda result: ([(result.expectation.name, result)],))
-@styled_picture
 def signal_to_noise(stars: Sequence[tuple[str, SnrResult | Expectation]]) -> Picture:
     """Plot the closed-form S/N per pixel and resolution element, and the spread of realisations if simulated."""
     from mauvecl.detection.snr import SnrResult
@@ -263,7 +257,6 @@ def _snr_panel(title: str, what: str, nm: Any, expected: Any, table: QTable | No
 
 
 @picture_of("UnknownAnswer", "unknowns")
-@styled_picture
 def unknowns(answer: UnknownAnswer) -> Picture:
     """Plot closed-form power per star (dashed plain, solid marginalised), and the smallest amplitudes."""
     from mauvecl.answers.detect import power
@@ -271,19 +264,16 @@ def unknowns(answer: UnknownAnswer) -> Picture:
     stars = list(dict.fromkeys(star for star, _ in answer.costs))
     fap, above, below = answer.study.run.fap, list[Panel](), list[Panel]()
     for star in stars:
-        amplitude, costs = next((a, c) for (s, a), c in answer.costs.items() if s == star)
+        amplitude, costs = answer.of_star(star)
         relative = np.geomspace(0.03, 300.0, 200) * answer.smallest(star, None)
         known_snr = next(iter(costs.values())).known
         at = relative, power(known_snr * relative / amplitude, fap)
         series: list[Series] = [Line("everything known", "text", width=4, at=at)]
         smallest = [Dots("", "text", size=12, at=([0], [answer.smallest(star, None)]))]
         for k, (colour, (unknown, cost)) in enumerate(zip(cycle(COLOURS), costs.items(), strict=False), 1):
-            series += [
-                Line(
-                    unknown.replace("+-", "±"), colour, at=(relative, power(cost.marginal * relative / amplitude, fap))
-                ),
-                Line("", colour, dash="dashed", at=(relative, power(cost.plain * relative / amplitude, fap))),
-            ]
+            marginal, plain = (power(snr * relative / amplitude, fap) for snr in (cost.marginal, cost.plain))
+            series.append(Line(unknown.replace("+-", "±"), colour, at=(relative, marginal)))
+            series.append(Line("", colour, dash="dashed", at=(relative, plain)))
             smallest.append(Dots("", colour, size=12, at=([k], [answer.smallest(star, unknown)])))
         y = Axis("detection probability", limits=(-0.02, 1.02))
         above.append(Panel(Axis(QUANTITIES["amplitude"].label, log=True), y, series, star))

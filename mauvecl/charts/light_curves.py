@@ -12,20 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from mauvecl.charts.chart import (
-    Axis,
-    Band,
-    Chart,
-    Dots,
-    Line,
-    Mesh,
-    Panel,
-    Picture,
-    Rule,
-    Series,
-    Strips,
-    picture_of,
-)
+from mauvecl.charts.chart import Axis, Band, Chart, Dots, Line, Mesh, Panel, Picture, Rule, Series, Strips
 from mauvecl.charts.matplotlib import (
     COLOURS,
     EMPTY,
@@ -33,6 +20,7 @@ from mauvecl.charts.matplotlib import (
     MAX_COLUMNS,
     contour_entries,
     draw_contours,
+    picture_of,
     strokes_of,
     styled_picture,
 )
@@ -72,7 +60,6 @@ def _stars(answer: InjectAnswer, panel: Callable[[Any], Panel], *notes: str, bel
 
 
 @picture_of("InjectAnswer", "completeness")
-@styled_picture
 def maps(answer: InjectAnswer) -> Picture:
     """Plot completeness over half-width and size, one panel per star."""
 
@@ -91,7 +78,6 @@ def maps(answer: InjectAnswer) -> Picture:
 
 
 @picture_of("InjectAnswer", "curves")
-@styled_picture
 def curves(answer: InjectAnswer) -> Picture:
     """Plot completeness over size at some half-widths, with 95 % intervals."""
 
@@ -114,7 +100,6 @@ def curves(answer: InjectAnswer) -> Picture:
 
 
 @picture_of("InjectAnswer", "energies", when=lambda answer: all(star.fitted for star in answer.stars))
-@styled_picture
 def energies(answer: InjectAnswer) -> Picture:
     """Plot recovered over injected energy of found flares."""
 
@@ -142,12 +127,11 @@ def _edges(middles: Any) -> Any:
 Float = NDArray[np.float64]
 #: Largest number of points of a light curve, and of rows of a dynamic spectrum; longer stares are averaged.
 MOST_POINTS, MOST_ROWS = 4000, 600
-#: Longest durations that are shown in seconds, and in minutes, s.
-IN_SECONDS_S, IN_MINUTES_S = 600.0, 4 * 3600.0
+#: Units of time: longest duration that is shown in it, its length, s, and its name.
+TIME_UNITS = ((600.0, 1.0, "s"), (4 * 3600.0, 60.0, "min"), (3 * 86_400.0, 3600.0, "h"), (np.inf, 86_400.0, "d"))
 
 
 @picture_of("StareAnswer", "light-curve", each=lambda answer: [(star,) for star in answer.stares])
-@styled_picture
 def light_curves(star: StarStare) -> Picture:
     """Plot light curves in all bands, relative to the quiescent star, with injected and found flares."""
     stare, light, rows = star.staring.stare, star.light, list[list[Panel]]()
@@ -211,7 +195,6 @@ def compare_light_curves(answers: Sequence[tuple[str, StareAnswer]], band: int =
 
 
 @picture_of("StareAnswer", "dynamic-spectrum", each=lambda answer: [(star,) for star in answer.stares])
-@styled_picture
 def dynamic_spectrum(star: StarStare) -> Picture:
     """Plot each resolution element and frame, in standard deviations from the median over the stare."""
     light = star.light
@@ -258,15 +241,8 @@ def spectra_panel(
 
 
 def time_unit(duration_s: float) -> tuple[float, str]:
-    if duration_s <= IN_SECONDS_S:
-        return 1.0, "s"
-    return (
-        (60.0, "min")
-        if duration_s <= IN_MINUTES_S
-        else (3600.0, "h")
-        if duration_s <= 3 * 86_400.0
-        else (86_400.0, "d")
-    )
+    """Return the length of the unit in which a duration is shown, and its name."""
+    return next((length_s, name) for longest_s, length_s, name in TIME_UNITS if duration_s <= longest_s)
 
 
 def _runs(numbers: NDArray[np.int64]) -> list[NDArray[np.intp]]:
@@ -300,7 +276,6 @@ def _unit(analysis: Analysis) -> tuple[float, str]:
 
 
 @picture_of("AnalyseAnswer", "light-curve")
-@styled_picture
 def observed_light_curve(answer: AnalyseAnswer) -> Picture:
     """Plot the observed light curve with its level and the level's band of 95 %, events, and frames not searched.
 
@@ -352,7 +327,6 @@ def _colour(analysis: Analysis, event: ObservedEvent) -> str:
 
 
 @picture_of("AnalyseAnswer", "dynamic-spectrum", when=lambda answer: answer.analysis.spectra is not None)
-@styled_picture
 def observed_dynamic_spectrum(answer: AnalyseAnswer) -> Picture:
     """Plot the searched spectra, in standard deviations from their median, and mark the events."""
     analysis, spectra = answer.analysis, answer.analysis.spectra
@@ -362,9 +336,8 @@ def observed_dynamic_spectrum(answer: AnalyseAnswer) -> Picture:
     marks = []
     for event in analysis.events:
         first, last = (stare.start_s[k] - stare.start_s[0] for k in (event.first, event.last))
-        marks.append(
-            (np.array([first, last + stare.frame_s]) / time_unit(stare.duration_s)[0], _colour(analysis, event))
-        )
+        ends = np.array([first, last + stare.frame_s]) / time_unit(stare.duration_s)[0]
+        marks.append((ends, _colour(analysis, event)))
     panel, _ = spectra_panel(stare, spectra.series.excess, sd, noise.wavelength_nm, marks)
     shown = {_colour(analysis, event) for event in analysis.events}
     marked = ", ".join(f"{EVENTS[colour]}s ({INKS[colour]})" for colour in EVENTS if colour in shown)
@@ -373,7 +346,6 @@ def observed_dynamic_spectrum(answer: AnalyseAnswer) -> Picture:
 
 
 @picture_of("AnalyseAnswer", "noise-per-pixel", when=lambda answer: answer.analysis.spectra is not None)
-@styled_picture
 def observed_pixel_noise(answer: AnalyseAnswer) -> Picture:
     """Plot the measured over the stated noise of each pixel, with the range of 95 % of normal noise."""
     spectra = answer.analysis.spectra
@@ -392,7 +364,6 @@ def observed_pixel_noise(answer: AnalyseAnswer) -> Picture:
 
 
 @picture_of("AnalyseAnswer", "residuals")
-@styled_picture
 def observed_residuals(answer: AnalyseAnswer) -> Picture:
     """Plot the residuals of the fitted process against time, their autocorrelation, and their quantiles."""
     analysis = answer.analysis
@@ -447,7 +418,6 @@ def scatter_series(answer: AnalyseAnswer) -> dict[str, Any]:
 
 
 @picture_of("AnalyseAnswer", "noise", when=lambda answer: len(answer.analysis.scatter) > 1)
-@styled_picture
 def observed_noise(answer: AnalyseAnswer) -> Picture:
     """Plot the scatter of means of quiescent frames against their number, and that of independent frames."""
     panel, title = SCATTER.panel(scatter_series(answer)), f"{answer.analysis.frames.name}: quiescent frames"

@@ -6,25 +6,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import cycle
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.charts.chart import (
-    WAVELENGTH,
-    Axis,
-    Chart,
-    Dots,
-    Line,
-    Mesh,
-    Panel,
-    Picture,
-    Rule,
-    Series,
-    Strips,
-    picture_of,
-)
+from mauvecl.charts.chart import WAVELENGTH, Axis, Chart, Dots, Line, Mesh, Panel, Picture, Rule, Series, Strips
 from mauvecl.charts.matplotlib import (
     COLOURS,
     COLUMN,
@@ -34,6 +20,7 @@ from mauvecl.charts.matplotlib import (
     contour_entries,
     draw_contours,
     in_figure,
+    picture_of,
     strokes_of,
     styled_picture,
     written,
@@ -66,7 +53,6 @@ def quantity_axis(study: Study, name: str, **how: Any) -> Axis:
 
 
 @picture_of("MapAnswer", "map")
-@styled_picture
 def detection_map(answer: MapAnswer) -> Picture:
     """Plot the detection probability over two quantities, one panel per statistic."""
     question, study = answer.study.map, answer.study
@@ -102,7 +88,6 @@ def detection_map(answer: MapAnswer) -> Picture:
 
 
 @picture_of("LimitAnswer", "limit")
-@styled_picture
 def limits(answer: LimitAnswer) -> Picture:
     """Plot the detection probability at every simulated value, and the limits."""
     of, power = answer.study.limit.of, answer.study.limit.power
@@ -158,11 +143,11 @@ def budget_series(x: Expectation) -> dict[str, Any]:
 
 
 @picture_of("SnrAnswer", "noise-budget")
-def noise_budgets(answer: SnrAnswer, path: str | Path | None = None) -> Any:
+def noise_budgets(answer: SnrAnswer) -> Any:
     """Plot pixel noise by origin against wavelength, one panel per star and cell, as in the paper."""
     observed = [(star, star.result.expectation) for star in answer.stars]
     named = [(star.title if star.at else f"{star.title}, {x.exposure_s:g} s", x) for star, x in observed]
-    return noise_budget(named, each=answer.study.sweep.size, path=path)
+    return noise_budget(named, each=answer.study.sweep.size)
 
 
 @styled_picture
@@ -186,7 +171,6 @@ def noise_budget(observed: Sequence[tuple[str, Expectation]], *, each: int = 1) 
 
 
 @picture_of("SnrAnswer", "snr-sweep", when=lambda answer: answer.study.sweep.axes)
-@styled_picture
 def snr_sweep(answer: SnrAnswer) -> Picture:
     """Plot the S/N of some elements against the first swept quantity, a line per value of the others."""
     from mauvecl.answers.signal import place_of
@@ -214,7 +198,6 @@ def snr_sweep(answer: SnrAnswer) -> Picture:
 
 
 @picture_of("GaussianAnswer", "gaussian")
-@styled_picture
 def gaussian(answer: GaussianAnswer) -> Picture:
     """Plot how well each prediction of the Gaussian formula holds in every cell."""
     from matplotlib.ticker import MaxNLocator
@@ -250,20 +233,14 @@ def gaussian(answer: GaussianAnswer) -> Picture:
 
 
 @picture_of("ExposureAnswer", "exposure")
-@styled_picture
 def exposures(answer: ExposureAnswer) -> Picture:
     """Plot the S/N of each star against exposure."""
     first, series = answer.exposures[0], list[Series]()
     for e, colour in zip(answer.exposures, cycle(COLOURS), strict=False):
         x = np.geomspace(e.exposure_s / e.frames, 4 * e.exposure_s, 50)
-        series += [
-            Line(
-                f"{e.star}: {written(float(f'{e.exposure_s:.4g}'))} s",
-                colour,
-                at=(x, e.snr * np.sqrt(x / e.exposure_s)),
-            ),
-            Dots("", colour, size=8, at=([e.exposure_s], [e.snr])),
-        ]
+        text = f"{e.star}: {written(float(f'{e.exposure_s:.4g}'))} s"
+        series.append(Line(text, colour, at=(x, e.snr * np.sqrt(x / e.exposure_s))))
+        series.append(Dots("", colour, size=8, at=([e.exposure_s], [e.snr])))
     series.append(Rule(f"wanted S/N of {first.wanted:g}", along="y", at=first.wanted))
     per = "10.5 nm element" if first.per == "element" else first.per
     panel = Panel(Axis("exposure (s)", log=True), Axis(f"S/N per {per}", log=True), series)
@@ -288,7 +265,6 @@ def _few(answer: MeasureAnswer) -> tuple[Any, ...]:
 
 
 @picture_of("MeasureAnswer", "fit", given=_few)
-@styled_picture
 def fits(flares: Sequence[MeasuredFlare]) -> Picture:
     """Plot the first exposure minus unknowns with the fitted flare, and the residuals, with a column per fit."""
     above, below = list[Panel](), list[Panel]()
@@ -326,7 +302,6 @@ def _single(answer: MeasureAnswer) -> tuple[Any, ...]:
 
 
 @picture_of("MeasureAnswer", "contours", given=_single, when=lambda answer: bool(_single(answer)[0]))
-@styled_picture
 def contours(flares: Sequence[MeasuredFlare]) -> Picture:
     """Plot expected confidence regions of temperature and amplitude, with unknowns marginalised."""
 
@@ -345,7 +320,6 @@ def contours(flares: Sequence[MeasuredFlare]) -> Picture:
 
 
 @picture_of("MeasureAnswer", "pulls", given=_few)
-@styled_picture
 def pulls(flares: Sequence[MeasuredFlare]) -> Picture:
     """Plot the pulls of estimates, (estimate - truth) / standard error, and the standard normal."""
     # Few fits need wide bins.
@@ -362,25 +336,21 @@ def pulls(flares: Sequence[MeasuredFlare]) -> Picture:
             series.append(Line(flare.found.names[q], colour, step=True, at=((edges[1:] + edges[:-1]) / 2, density)))
         normal = np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi)
         series.append(Line("standard normal", "text", dash="dashed", at=(x, normal)))
-        return Panel(
-            Axis("(estimate \N{MINUS SIGN} truth) / standard error"), Axis("probability density"), series, flare.name
-        )
+        x_axis = Axis("(estimate \N{MINUS SIGN} truth) / standard error")
+        return Panel(x_axis, Axis("probability density"), series, flare.name)
 
     return _each(flares, panel)
 
 
 @picture_of("MeasureAnswer", "errors", given=_few)
-@styled_picture
 def errors(flares: Sequence[MeasuredFlare]) -> Picture:
     """Plot forecast errors of temperature and amplitude against the amplitude, with and without unknowns."""
 
     def panel(flare: MeasuredFlare) -> Panel:
         amplitudes, series = FACTORS * flare.perfect.estimates[0, 1], list[Series]()
         for unknown, dash in {None: "dashed", flare.unknown: "-"}.items():
-            ahead, whose = (
-                flare.forecasts(FACTORS, unknown),
-                "everything else known" if unknown is None else "with unknowns",
-            )
+            ahead = flare.forecasts(FACTORS, unknown)
+            whose = "everything else known" if unknown is None else "with unknowns"
             for colour, q in zip(COLOURS, range(2), strict=False):
                 relative = [f.errors[q] / f.values[q] for f in ahead]
                 series.append(Line(f"{flare.fitted.names[q]}, {whose}", colour, dash=dash, at=(amplitudes, relative)))
@@ -391,7 +361,6 @@ def errors(flares: Sequence[MeasuredFlare]) -> Picture:
 
 
 @picture_of("MeasureAnswer", "temperatures", each=lambda answer: [(star,) for star in answer.stares if star.perfect])
-@styled_picture
 def temperatures(star: MeasuredStare) -> Picture:
     """Plot temperature, size and light of the flares of a stare against time, with 95 % intervals.
 
@@ -426,7 +395,6 @@ def temperatures(star: MeasuredStare) -> Picture:
 
 
 @picture_of("MeasureAnswer", "joint", each=lambda answer: [(star, star.joint) for star in answer.stares if star.joint])
-@styled_picture
 def joint(star: MeasuredStare, fit: JointFit) -> Picture:
     """Plot the light of a flare in each frame, the joint fit of its shape and spectrum, residuals and temperature."""
     stare, (event,), (drawn, mean) = star.staring.stare, star.events, (fit.fitted.drawn_dn, fit.fitted.mean_dn)

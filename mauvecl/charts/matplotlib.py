@@ -11,7 +11,7 @@ from typing import Any, ParamSpec
 
 import numpy as np
 
-from mauvecl.charts.chart import AXES, Band, Dots, Line, Mesh, Panel, Picture, Rule, Series, Strips, Targets
+from mauvecl.charts.chart import AXES, Band, Dots, Line, Mesh, Panel, Picture, Rule, Series, Strips, Targets, register
 from mauvecl.host.tables.files import write_whole
 from mauvecl.schema.errors import InputError
 
@@ -209,6 +209,21 @@ def styled_picture(draw: Callable[P, Any]) -> Callable[..., Any]:
             return save_or_return(draw_picture(made) if isinstance(made, Picture) else made, path)
 
     return picture
+
+
+def picture_of(kind: str, name: str, **how: Any) -> Callable[[Callable[P, Any]], Callable[..., Any]]:
+    """Register a function as a picture of a class, and decorate it as `styled_picture` does; `plot` draws the first.
+
+    Parameters
+    ----------
+    kind : str
+        Name of the class, as in ``"LimitAnswer"``.
+    name : str
+        Name of the picture's file without its ending.
+    **how
+        `given`, `each` and `when`; see `chart.Entry`.
+    """
+    return lambda draw: register(kind, name, styled_picture(draw), **how)
 
 
 def draw_picture(picture: Picture, figure: Any = None) -> Any:

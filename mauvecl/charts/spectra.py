@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mauvecl.charts.chart import WAVELENGTH, Axis, Band, Line, Panel, Picture, picture_of
-from mauvecl.charts.matplotlib import COLOURS, RANGE_NM, styled_picture
+from mauvecl.charts.chart import WAVELENGTH, Axis, Band, Line, Panel, Picture
+from mauvecl.charts.matplotlib import COLOURS, RANGE_NM, picture_of, styled_picture
 
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
@@ -29,7 +29,6 @@ OPTICS = {
 
 
 @picture_of("Source", "source")
-@styled_picture
 def source(star: Source) -> Panel:
     """Plot a spectrum in Mauve's wavelength range."""
     inside = (star.wavelength_nm >= RANGE_NM[0]) & (star.wavelength_nm <= RANGE_NM[1])
@@ -38,7 +37,6 @@ def source(star: Source) -> Panel:
 
 
 @picture_of("Expectation", "expectation")
-@styled_picture
 def expectation(x: Expectation) -> Panel:
     """Plot the mean signal of an exposure with its noise."""
     w, mean, noise = (x.table[name].value for name in ("wavelength", "signal", "noise"))

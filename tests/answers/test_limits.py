@@ -199,7 +199,7 @@ def test_map_without_magnitudes_has_those_over_which_flares_are_lost(star: str, 
     assert chances[0, 0] > 0.9
     assert chances[1, -1] < 0.1 < chances[1, -2]
     assert found.x == found.study.map.axes[0].points()
-    assert not found.quiet.saturated.any()
+    assert not found.inputs[0].saturated.any()
 
 
 def test_map_of_a_star_whose_flares_are_seen_to_where_it_saturates_begins_there(engine: Engine) -> None:
@@ -208,7 +208,7 @@ def test_map_of_a_star_whose_flares_are_seen_to_where_it_saturates_begins_there(
     found = detection_map(asked, engine)
     brighter, *_ = expectations(asked.at("magnitude", found.x[0] - 1))
     assert brighter.saturated.any()
-    assert not found.quiet.saturated.any()
+    assert not found.inputs[0].saturated.any()
     assert not np.isnan(found.probability).any()
 
 
