@@ -19,8 +19,8 @@ from mauvecl.host.exposure import DEFAULT_SKY
 from mauvecl.host.exposure.response import Order, electrons_per_second, negative_means_message
 from mauvecl.host.exposure.sky import Sky
 from mauvecl.host.exposure.star import Neighbours
+from mauvecl.host.instrument import DEFAULT_INSTRUMENT
 from mauvecl.host.instrument.instrument import Instrument, LineSpread
-from mauvecl.host.instrument.paths import DEFAULT_INSTRUMENT
 from mauvecl.host.spectra.units import SPAN_NM
 from mauvecl.host.stars.coverage import check_covers, continued
 from mauvecl.schema.calls import validated

@@ -16,8 +16,8 @@ from pydantic import BeforeValidator, ConfigDict, Field, ValidationError, model_
 from pydantic_core import PydanticCustomError
 from scipy.special import erf, ndtr
 
+from mauvecl.host.instrument import FORMERLY_MAUVE, instrument_path, shipped_names
 from mauvecl.host.instrument.curves import MAX_PIXELS, Curve, PixelMap, ThroughputErrors
-from mauvecl.host.instrument.paths import FORMERLY_MAUVE, instrument_path, shipped_names
 from mauvecl.host.tables.files import read_text, toml
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened

@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.exposure.sky import HelioEcliptic, zodiacal_brightness
-from mauvecl.host.orbit import geometry
+from mauvecl.host.orbit import Limits, geometry
 from mauvecl.host.orbit.geometry import Bodies, Flags, TimeGrid, Vectors, unit
-from mauvecl.host.orbit.observing_limits import Limits
 from mauvecl.host.orbit.orbit import Orbit, Track
 from mauvecl.host.tables.ecsv import parse_ecsv
 from mauvecl.schema.calls import validated

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.stars.bands import photons
-from mauvecl.host.stars.blackbody import blackbody
+from mauvecl.host.stars.flare_spectra import FlareSpectrum, blackbody
 from mauvecl.host.tables.files import LARGEST, SMALLEST
 from mauvecl.host.tables.opening import read_table
 from mauvecl.host.tables.table import Rows
@@ -20,8 +20,6 @@ from mauvecl.schema.physical import Amplitude, Temperature
 
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
-
-    from mauvecl.host.stars.flare_spectra import FlareSpectrum
 
 Geometry = Literal["added", "replaces"]
 Float = NDArray[np.float64]

@@ -12,13 +12,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
+import astropy.units as u
 import numpy as np
+from astropy.constants import c, h, k_B
 from numpy.typing import ArrayLike, NDArray
 
-from mauvecl.host.arrays import ContentEquality, set_read_only
+from mauvecl.host.arrays import ContentEquality, array_cache, set_read_only
 from mauvecl.host.spectra.formats import read_spectrum
 from mauvecl.host.spectra.units import NEEDED_NM
-from mauvecl.host.stars.blackbody import blackbody
+from mauvecl.host.stars.bands import ANGSTROM
 from mauvecl.host.stars.coverage import check_points
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
@@ -70,6 +72,20 @@ CONTINUED_NM, CONTINUED_RATIO = (50.0, 30_000.0), 1.01
 JOIN_NM, GAP_NM = 20.0, 5.0
 #: Share of the star's light below which a flare is the rounding of its subtraction.
 ROUNDING = 1e-12
+
+
+@array_cache(32)
+def blackbody(wavelength_nm: NDArray[np.float64], temperature_k: float) -> NDArray[np.float64]:
+    """Return the surface flux pi B_lambda of a blackbody, erg s-1 cm-2 A-1, shape (n,)."""
+    # The steps of astropy's BlackBody to the last bit, without the slow import of its models.
+    metre = u.m.to(u.AA)
+    frequency = c.value / (wavelength_nm * ANGSTROM / metre)
+    # Overflow in the Wien tail gives zero flux.
+    with np.errstate(over="ignore"):
+        steps = c.value**2 * np.expm1(h.value * frequency / (k_B.value * temperature_k))
+    per_hz = 2.0 * h.value * frequency**3 / steps
+    # From W m-2 Hz-1 to erg s-1 cm-2 Hz-1, and to erg s-1 cm-2 A-1.
+    return np.asarray(np.pi * (per_hz / 1e-3 / ((c.value / frequency * metre) ** 2 / c.to_value(u.AA / u.s))))
 
 
 @validated

@@ -28,18 +28,12 @@ from mauvecl.schema.physical import Temperature
 if TYPE_CHECKING:
     import numpy as np
     from astropy.table import Table
-    from numpy.typing import NDArray
 
 
 #: Names by which they are offered.
 EXAMPLES = ("blackbody 9000 K", "power law -2")
 #: Indices of power laws that are accepted; steeper spectra say nothing of stars (assumed).
 INDEX = Range(-10, 10)
-#: First and last wavelength of the spectra, nm, and number of points: they cover all bands, and straight lines between
-#: them are true to 2e-5 for 3000 K at 200 nm, and closer elsewhere and for hotter stars.
-GRID = (100.0, 3000.0, 8000)
-#: Wavelength at which a power law has unit flux, nm.
-PIVOT_NM = 550.0
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?"
 _NAME = re.compile(
     rf"\s*(?:(?P<body>black[ -]?body|planck)\s+(?P<kelvin>{_NUMBER})\s*K?|power[ -]?law\s+(?P<index>{_NUMBER}))\s*",
@@ -49,10 +43,10 @@ _NAME = re.compile(
 
 @dataclass(frozen=True)
 class ModelStar:
-    """Blackbody of a temperature, or power law of an index; exactly one of them is given."""
+    """Blackbody of a temperature, or else power law of an index."""
 
     temperature_k: float | None
-    index: float | None
+    index: float = 0.0
 
     @classmethod
     def named(cls, text: str) -> ModelStar | None:
@@ -64,30 +58,18 @@ class ModelStar:
         if found is None:
             return None
         if found["body"] is not None:
-            return cls(checked(Temperature, "temperature of the blackbody", float(found["kelvin"])), None)
+            return cls(checked(Temperature, "temperature of the blackbody", float(found["kelvin"])))
         return cls(None, number("index of the power law", float(found["index"]), "", INDEX))
 
     @property
     def name(self) -> str:
         """Name that gives this star again."""
-        return f"blackbody {self.temperature_k:.15g} K" if self.index is None else f"power law {self.index:.15g}"
+        return f"blackbody {self.temperature_k:.15g} K" if self.temperature_k else f"power law {self.index:.15g}"
 
     @property
     def origin(self) -> str:
         """Formula of the spectrum."""
-        return "Planck's law" if self.index is None else f"flux per wavelength proportional to its power {self.index:g}"
-
-    def spectrum(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return wavelengths, nm, and fluxes, erg s-1 cm-2 A-1, of an arbitrary level."""
-        import numpy as np
-
-        nm = np.geomspace(*GRID)
-        if self.index is not None:
-            return nm, (nm / PIVOT_NM) ** self.index
-        from mauvecl.host.stars.blackbody import blackbody
-
-        assert self.temperature_k is not None
-        return nm, blackbody(nm, self.temperature_k)
+        return "Planck's law" if self.temperature_k else f"flux per wavelength proportional to its power {self.index:g}"
 
 
 @dataclass(frozen=True)

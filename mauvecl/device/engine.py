@@ -60,8 +60,8 @@ from mauvecl.flares.stare_scene import (
     padded_frames,
 )
 from mauvecl.noise.drawing import Drawing, DrawingOptions
-from mauvecl.noise.processes import NOISE_FREE, NONE, Comparison, Processes
 from mauvecl.noise.scene import BATCH, prepare
+from mauvecl.noise.unknowns import NOISE_FREE, NONE, Comparison, Processes
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import OneOrMore

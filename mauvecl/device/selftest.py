@@ -33,8 +33,8 @@ from mauvecl.host import VERSION
 from mauvecl.host.exposure.expectation import Expectation
 from mauvecl.noise import layout, reference
 from mauvecl.noise.disturbances import CosmicRays, Uniform
-from mauvecl.noise.processes import NONE, Comparison, Processes
 from mauvecl.noise.scene import prepare
+from mauvecl.noise.unknowns import NONE, Comparison, Processes
 from mauvecl.schema.columns import Column
 
 if TYPE_CHECKING:

@@ -38,7 +38,7 @@ class AdditiveProcess(Section, ABC):
     """Charge that each pixel collects independently in each draw, and the study section that describes it.
 
     Kernels draw it from a table of `charge` in a separate stream, multiply it by the gain, and add it to the other
-    noise of the pixel. Subclasses are listed in `unknowns.ADDITIVE` by their study keys.
+    noise of the pixel. Subclasses are listed in `ADDITIVE` by their study keys.
     """
 
     #: Number of the random stream in `layout.STREAMS`.
@@ -171,6 +171,9 @@ class CosmicRays(AdditiveProcess):
         low, high = self.electrons
         return ("charge of a hit", f"{low:g} to {high:g} electrons in one pixel", "assumption; adds to the noise")
 
+
+#: Additive processes: fields of `Processes`, keys of studies' ``processes``.
+ADDITIVE: dict[str, type[AdditiveProcess]] = {"cosmic_rays": CosmicRays}
 
 #: Drifts that are drawn at a time, per stare.
 BATCH = 16

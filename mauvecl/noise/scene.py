@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from mauvecl.noise import layout
+from mauvecl.noise.disturbances import ADDITIVE
 from mauvecl.noise.drawing import (
     Cumulants,
     Drawing,
@@ -26,13 +27,11 @@ from mauvecl.noise.drawing import (
     sky_share,
 )
 from mauvecl.noise.layout import LARGEST_MEAN, SMALLEST_EXPANDED, AliasTable, alias_table_of, table_set
-from mauvecl.noise.processes import NOISE_FREE, Comparison
-from mauvecl.noise.unknowns import ADDITIVE, PROCESSES, SIGNAL_PARTS, SignalPart
+from mauvecl.noise.unknowns import NOISE_FREE, PROCESSES, SIGNAL_PARTS, Comparison, Processes, SignalPart
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
-    from mauvecl.noise.processes import Processes
 
 Float = NDArray[np.float64]
 

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.arrays import map_in_threads
 from mauvecl.host.tables.files import UNFINISHED, check_size, read_bytes, write_whole
-from mauvecl.host.threads import map_in_threads
 from mauvecl.runs.checkpoint import locked
 from mauvecl.runs.export import Selection, export
 from mauvecl.runs.pool import Pool, map_in_order

@@ -18,7 +18,7 @@ from mauvecl.detection.snr import Arrays, DetectionSums, SnrSums
 from mauvecl.device.engine import DeviceError, DeviceRecord, Engine, Stares
 from mauvecl.device.launches import Progress
 from mauvecl.flares.stare_scene import StaresRequest, StareSums
-from mauvecl.host.threads import map_in_threads
+from mauvecl.host.arrays import map_in_threads
 from mauvecl.runs.checkpoint import Checkpoint, Task, fingerprint, shards
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
