@@ -256,15 +256,10 @@ class Visibility:
     def by_month(self) -> tuple[list[str], NDArray[np.float64]]:
         """Return the calendar months (UTC), such as "2027-01", and the hours of exposure, shape (n_month, k)."""
         times = self.track.times
-        _, days = times.julian
-        day = np.datetime64(times.iso(0.0)[:10], "D") + np.arange(int(np.floor(days[-1])) + 1)
-        month = day.astype("datetime64[M]")
-        names, place = np.unique(month, return_inverse=True)
-        starts = np.searchsorted(np.floor(days).astype(int), np.arange(day.size))
-        per_day = np.add.reduceat(self.seen, starts, axis=0, dtype=np.int64) * self._step_h
-        hours = np.zeros((names.size, len(self.target)))
-        np.add.at(hours, place, per_day)
-        return [str(name) for name in names], hours
+        day = np.datetime64(times.iso(0.0)[:10], "D") + np.floor(times.julian[1]).astype(int)
+        months, starts = np.unique(day.astype("datetime64[M]"), return_index=True)
+        hours = np.add.reduceat(self.seen, starts, axis=0, dtype=np.int64) * self._step_h
+        return [str(month) for month in months], hours
 
     def by_orbit(self, k: int) -> NDArray[np.float64]:
         """Return the minutes of exposure between ascending nodes, shape (n_orbit,).
@@ -288,19 +283,29 @@ def in_shadow(track: Track) -> Flags:
 def _rules(track: Track, target: Vectors, limits: Limits) -> dict[str, Rule]:
     """Return the limits in force by name."""
     at, bodies, rules = track.position_km, track.bodies, dict[str, Rule]()
-    if (earth := limits.earth_limb_deg) is not None:
-        rules["earth_limb"] = lambda part: geometry.clear_of_earth(at[part], target, earth)
-    if (sun := limits.sun_deg) is not None:
-        rules["sun"] = lambda part: geometry.clear_of_sun(bodies.sun[part], target, sun)
-    if (moon := limits.moon_deg) is not None:
-        rules["moon"] = lambda part: geometry.clear_of_moon(bodies.moon_km[part], at[part], target, moon)
-    if (regard := limits.declination_deg) is not None:
-        inside = geometry.in_declinations(target, *regard)
-        rules["declination"] = lambda part: inside[None, :]
-    if (cone := limits.normal_cone_deg) is not None:
-        rules["normal_cone"] = lambda part: (
-            geometry.in_cone(track.normal[part], target, cone) | geometry.in_cone(-track.normal[part], target, cone)
-        )
+    stars = target.T.astype(np.float32)
+
+    def far_from(directions: Vectors, angle_rad: NDArray[np.float64] | float) -> Flags:
+        """Return whether targets are at least an angle from directions, unit vectors of shape (n, 3)."""
+        return np.asarray(directions.astype(np.float32) @ stars <= np.float32(np.cos(angle_rad)))
+
+    if limits.earth_limb_deg is not None:
+        limb = geometry.limb_angle_rad(at)[:, None] + np.radians(limits.earth_limb_deg)
+        rules["earth_limb"] = lambda part: far_from(-unit(at[part]), limb[part])
+    if limits.sun_deg is not None:
+        sun = np.radians(limits.sun_deg)
+        rules["sun"] = lambda part: far_from(bodies.sun[part], sun)
+    if limits.moon_deg is not None:
+        moon = np.radians(limits.moon_deg)
+        rules["moon"] = lambda part: far_from(unit(bodies.moon_km[part] - at[part]), moon)
+    if limits.declination_deg is not None:
+        low, high = limits.declination_deg
+        declination = np.degrees(np.arcsin(np.clip(target[:, 2], -1, 1)))
+        regarded = (declination >= low) & (declination <= high)
+        rules["declination"] = lambda part: regarded[None, :]
+    if limits.normal_cone_deg is not None:
+        cone = np.float32(np.cos(np.radians(limits.normal_cone_deg)))
+        rules["normal_cone"] = lambda part: np.abs(track.normal[part].astype(np.float32) @ stars) >= cone
     if limits.eclipse != "any":
         allowed = in_shadow(track) == (limits.eclipse == "only")
         rules["eclipse"] = lambda part: allowed[part, None]
