@@ -23,6 +23,7 @@ from mauvecl.host.instrument import DEFAULT_INSTRUMENT
 from mauvecl.host.instrument.instrument import Instrument, LineSpread
 from mauvecl.host.spectra.units import SPAN_NM
 from mauvecl.host.stars.coverage import check_covers, continued
+from mauvecl.host.stars.source import Source, listed_star
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, Drawable, table_of
 from mauvecl.schema.errors import InputError, Message, missing_package
@@ -31,8 +32,6 @@ from mauvecl.schema.physical import Duration, Exposure, SkyBrightness
 
 if TYPE_CHECKING:
     from astropy.table import QTable
-
-    from mauvecl.host.stars.source import Source
 
 Float = NDArray[np.float64]
 
@@ -135,8 +134,6 @@ class Expectation(Drawable, ContentEquality):
 
         This needs the extra ``spectra``.
         """
-        import astropy.units as u
-
         try:
             from astropy.nddata import StdDevUncertainty
             from specutils import Spectrum
@@ -471,8 +468,6 @@ def expect(
     >>> float(round(quiet.snr().max(), 2)), float(round(quiet.snr_per_element().max(), 1))
     (10.33, 61.0)
     """
-    from mauvecl.host.stars.source import listed_star
-
     source = listed_star(source) if isinstance(source, str) else source
     instrument = instrument if isinstance(instrument, Instrument) else Instrument.load(instrument)
     sky = sky if isinstance(sky, Sky) else Sky.of_brightness(DEFAULT_SKY if sky is None else sky)

@@ -75,12 +75,7 @@ def electrons_per_second(
 ) -> Float:
     """Return the mean electrons per second in each pixel, shape (n_pixel,), for a spectrum of any number of nodes.
 
-    Parameters
-    ----------
-    instrument, wavelength_nm, order
-        As in `response_matrix`.
-    flux_flam : array_like, shape (n_wavelength,)
-        Flux at the nodes, erg s^-1 cm^-2 A^-1.
+    The flux at the nodes is in erg s^-1 cm^-2 A^-1; see `response_matrix`.
     """
     nodes = _nodes(wavelength_nm)
     flux = np.asarray(flux_flam, np.float64)

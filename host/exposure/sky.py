@@ -41,13 +41,7 @@ class HelioEcliptic:
 def helioecliptic(target: SkyCoord | str, time: Time | str) -> HelioEcliptic:
     """Return the helio-ecliptic coordinates of a target, in the true geocentric ecliptic of date.
 
-    Parameters
-    ----------
-    target : SkyCoord or str
-        Single position; a string is a well-known star, or ICRS in degrees ("290.0 -11.2") or sexagesimal hours and
-        degrees.
-    time : Time or str
-        Single time within 1990-2100; a string is ISO 8601, UTC.
+    The arguments are those of `Sky.at`.
     """
     with offline():
         from astropy.coordinates import GeocentricTrueEcliptic, get_sun
@@ -97,7 +91,6 @@ def parse_time(time: Time | str) -> Time:
 
 def parse_position(target: SkyCoord | str) -> SkyCoord:
     """Return a single finite position; text is a name, or ICRS in degrees or sexagesimal hours and degrees."""
-    import astropy.units as u
     from astropy.coordinates import SkyCoord
     from astropy.coordinates.baseframe import BaseCoordinateFrame
 
@@ -105,9 +98,9 @@ def parse_position(target: SkyCoord | str) -> SkyCoord:
     if isinstance(target, str):
         star = by_key().get(name_key(target))
         if star is not None:
-            return SkyCoord(star.ra_deg, star.dec_deg, unit=u.deg)
+            return SkyCoord(star.ra_deg, star.dec_deg, unit="deg")
         try:
-            return SkyCoord(*coordinates(target), unit=u.deg)
+            return SkyCoord(*coordinates(target), unit="deg")
         except InputError as error:
             if not re.match(r"\s*[^\W\d]", target):
                 raise

@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 import warnings
 from importlib import resources
-from importlib.resources.abc import Traversable
 from pathlib import Path
 
 from mauvecl.host.tables.files import is_file
@@ -40,7 +39,8 @@ def instrument_path(name: str | Path, folder: Path) -> Path:
     names = shipped_names()
     name = current_name(name) if isinstance(name, str) else name
     if name in names:
-        return _local(resources.files(__package__).joinpath("instruments", f"{name}.toml"))
+        # setuptools installs real files; a zipped package would have to be extracted.
+        return Path(str(resources.files(__package__).joinpath("instruments", f"{name}.toml")))
     path = folder / name
     if is_file(path):
         return path
@@ -54,8 +54,3 @@ def instrument_path(name: str | Path, folder: Path) -> Path:
         f"{' or '.join(names)} (nearest: {near!r}) or the path of a TOML file",
         key="instrument",
     )
-
-
-def _local(resource: Traversable) -> Path:
-    # setuptools installs real files; a zipped package would have to be extracted.
-    return Path(str(resource))

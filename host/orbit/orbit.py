@@ -30,7 +30,7 @@ from mauvecl.host.orbit.geometry import (
     unit,
     utc_text,
 )
-from mauvecl.host.stars.library import by_key, name_key, near_names, well_known_text
+from mauvecl.host.stars.library import by_key, library_text, name_key, near_names
 from mauvecl.host.tables.coordinates import EXPECTED
 from mauvecl.host.tables.ecsv import parse_ecsv
 from mauvecl.host.tables.files import read_text
@@ -434,7 +434,7 @@ def target_table() -> Table:
     Table
         Columns name, ra, dec (deg, ICRS), distance (pc), V, spectral_type, other_names and source.
     """
-    return parse_ecsv(well_known_text(), "the embedded list of stars")
+    return parse_ecsv(library_text("well_known.ecsv"), "the embedded list of stars")
 
 
 #: ADQL query of SIMBAD (tried with astroquery 0.4.11). The left join keeps stars without a V magnitude.

@@ -184,24 +184,12 @@ def continued(
     *,
     dark_only: bool = False,
 ) -> tuple[Float, Float, tuple[str, ...]]:
-    """Continue the ends of a spectrum at their level, within the reach of the line spread function.
+    """Continue the ends of a spectrum at their level, within reach of the line spread function, and return messages.
 
-    Parameters
-    ----------
-    wavelength, flux : ndarray, shape (n,)
-    needed_nm : tuple of float
-        Range of the pixels; the line spread function reaches beyond it as `SPAN_NM` beyond `NEEDED_NM`.
-    line : LineSpread, optional
-        Line spread function; that of the nominal instrument by default.
-    dark_only : bool
-        Whether to leave ends unchanged that are too bright, or within the range of the pixels.
-
-    Returns
-    -------
-    wavelength, flux : ndarray
-    messages : tuple of str
-
-    Raises InputError if a continuation would be more than `MAX_CONTINUED` of the brightest pixel's light.
+    `needed_nm` is the range of the pixels; the line spread function, by default that of the nominal instrument, reaches
+    beyond it as `SPAN_NM` beyond `NEEDED_NM`. With `dark_only`, ends that are too bright or within the range of the
+    pixels are left unchanged. Raises InputError if a continuation would be more than `MAX_CONTINUED` of the brightest
+    pixel's light.
     """
     span = (needed_nm[0] - NEEDED_NM[0] + SPAN_NM[0], needed_nm[1] - NEEDED_NM[1] + SPAN_NM[1])
     if wavelength[0] <= span[0] and wavelength[-1] >= span[1]:
@@ -262,19 +250,10 @@ def extended(
     *,
     ultraviolet: tuple[str, ...] = (),
 ) -> tuple[Float, Float, tuple[str, ...]]:
-    """Continue a spectrum by a longer one, scaled at the join, and return messages.
+    """Continue a spectrum by a longer one, `extension`, scaled at the join, and return messages.
 
-    Parameters
-    ----------
-    wavelength, flux : ndarray, shape (n,)
-    extension : str
-        Name of the other spectrum.
-    beyond, shape : ndarray, shape (m,)
-        Wavelengths, nm, and fluxes of the other spectrum.
-    ultraviolet : tuple of str
-        Messages on the other spectrum's ultraviolet, returned if it continues the spectrum to the blue.
-
-    Raises InputError if less than a third of 200-700 nm is measured, or a spectrum has no light at a join.
+    The messages on the ultraviolet of the other spectrum are returned if it continues the spectrum to the blue. Raises
+    InputError if less than a third of 200-700 nm is measured, or a spectrum has no light at a join.
     """
     messages = []
     # Consecutive zeros at an end are missing data.

@@ -141,7 +141,6 @@ class Blackbody(FlareSpectrum):
         return STEFAN_BOLTZMANN * self.temperature_k**4
 
     def describe(self) -> str:
-        """Return the spectrum in a few words."""
         return f"{self.temperature_k:g} K"
 
 
@@ -171,7 +170,6 @@ class TwoBlackbodies(FlareSpectrum):
         return STEFAN_BOLTZMANN * (self.temperature_k**4 + self.second_area * self.second_temperature_k**4)
 
     def describe(self) -> str:
-        """Return the spectrum in a few words."""
         return f"{self.temperature_k:g} K and {self.second_area:g} of its area at {self.second_temperature_k:g} K"
 
 
@@ -214,7 +212,6 @@ class BalmerFlare(FlareSpectrum):
         return STEFAN_BOLTZMANN * self.temperature_k**4 + self.edge_flux * width
 
     def describe(self) -> str:
-        """Return the spectrum in a few words."""
         return f"{self.temperature_k:g} K with a Balmer jump of {self.jump:g}"
 
 
@@ -331,7 +328,6 @@ class FlareWithLines(FlareSpectrum):
         return self.continuum.bolometric_flux() + self.continuum_flux * sum(self.fractions.values())
 
     def describe(self) -> str:
-        """Return the spectrum in a few words."""
         lines = [f"{100 * value:g} % in {name}" for name, value in self.fractions.items()]
         lines += [f"{value:g} erg/s/cm2 in {name}" for name, value in self.fluxes_cgs.items()]
         return f"{self.continuum.describe()}{' with ' if lines else ''}{', '.join(lines)}"
@@ -487,7 +483,6 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
         return 10.0 * float(np.trapezoid(self.flux_flam, self.wavelength_nm))
 
     def describe(self) -> str:
-        """Return the spectrum in a few words."""
         return f"the spectrum {self.name}"
 
 

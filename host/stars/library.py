@@ -15,7 +15,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib import resources
-from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -190,21 +189,29 @@ class WellKnown:
         return f"{self.spectral_type}, {self.distance_pc:g} pc, V = {self.magnitude:g}; {self.source.partition(',')[0]}"
 
 
-def well_known_text() -> str:
-    """Return the list as ECSV."""
-    return resources.files(__package__).joinpath("library", "well_known.ecsv").read_text(encoding="utf-8")
+_LIBRARY = resources.files(__package__) / "library"
+
+
+def library_text(*path: str) -> str:
+    """Return a file of the library."""
+    return _LIBRARY.joinpath(*path).read_text(encoding="utf-8")
+
+
+def _rows(file: str) -> list[dict[str, str]]:
+    """Read a table of the library without astropy, which keeps the error for a misspelt name fast."""
+    lines = [line for line in library_text(file).splitlines() if not line.startswith("#")]
+    return list(csv.DictReader(lines, delimiter=" "))
 
 
 @cache
 def well_known_stars() -> tuple[WellKnown, ...]:
     """Return the stars of the list."""
-    lines = [line for line in well_known_text().splitlines() if not line.startswith("#")]
     return tuple(
         WellKnown(
             row["name"], tuple(name.strip() for name in row["other_names"].split(",")), float(row["ra"]),
             float(row["dec"]), float(row["distance"]), float(row["V"]), row["spectral_type"], row["source"],
         )
-        for row in csv.DictReader(lines, delimiter=" ")
+        for row in _rows("well_known.ecsv")
     )  # fmt: skip
 
 
@@ -223,15 +230,9 @@ def name_key(name: str) -> str:
     return key
 
 
-_LIBRARY = files("mauvecl.host.stars") / "library"
-
-
 @cache
 def _index() -> dict[str, dict[str, str]]:
-    # Read without astropy, which keeps the error for a misspelt name fast.
-    text = _LIBRARY.joinpath("index.ecsv").read_text(encoding="utf-8")
-    lines = [line for line in text.splitlines() if not line.startswith("#")]
-    return {entry["name"].casefold(): entry for entry in csv.DictReader(lines, delimiter=" ")}
+    return {entry["name"].casefold(): entry for entry in _rows("index.ecsv")}
 
 
 @cache
@@ -293,7 +294,7 @@ def library_table() -> Table:
     """
     from astropy.table import Table
 
-    table = Table.read(_LIBRARY.joinpath("index.ecsv").read_text(encoding="utf-8"), format="ascii.ecsv")
+    table = Table.read(library_text("index.ecsv"), format="ascii.ecsv")
     # The reader masks empty text.
     table = table.filled("")
     table.remove_columns(["file", "source_file"])
@@ -330,7 +331,7 @@ def band_table(file: str) -> Numbers:
 
 
 def _numbers(folder: str, file: str) -> Numbers:
-    return parse_numbers(_LIBRARY.joinpath(folder, file).read_text(encoding="utf-8"), f"library file {file}")
+    return parse_numbers(library_text(folder, file), f"library file {file}")
 
 
 #: Spectral classes in order of decreasing temperature.
@@ -380,13 +381,8 @@ class NamedStar:
 def resolve(text: str, *, own: bool = True) -> NamedStar | None:
     """Find a star or spectral type by any name, in any case and spacing, or return None.
 
-    Parameters
-    ----------
-    text : str
-        A name of the library ("M3V", short "M3"), a star ("GJ 581", "Proxima", "HD 1835"), any other spectral type, or
-        a formula ("blackbody 9000 K", "power law -2").
-    own : bool
-        Whether to search among the user's own stars.
+    A text is a name of the library ("M3V", short "M3"), a star ("GJ 581", "Proxima", "HD 1835"), any other spectral
+    type, or a formula ("blackbody 9000 K", "power law -2"). The user's own stars are searched if `own` is true.
     """
     model = ModelStar.named(text)
     if model is not None:
@@ -409,14 +405,8 @@ def resolve(text: str, *, own: bool = True) -> NamedStar | None:
 def spectrum_name(text: str, key: str = "star", *, own: bool = True) -> str:
     """Return the name of the spectrum of a star: its own, or that of the nearest type of the library.
 
-    Raises InputError for an unknown star; the message proposes similar names.
-
-    Parameters
-    ----------
-    key : str
-        Key of the error.
-    own : bool
-        Whether to search among the user's own stars.
+    Raises InputError, with this key, for an unknown star; the message proposes similar names. The user's own stars are
+    searched if `own` is true.
     """
     star = resolve(text, own=own)
     if star is None:
@@ -438,10 +428,7 @@ def listed_values(name: str) -> dict[str, float]:
 def listed_note(name: str, **used: float | None) -> str:
     """Describe what the library and the list supply for a star; empty if it has a spectrum of its own.
 
-    Parameters
-    ----------
-    **used : float
-        The magnitude in V and the distance, in pc, that are used; those of the list are named with their source.
+    Magnitude (V) and distance (pc) that are `used` are named with their source if they are those of the list.
     """
     star = resolve(name)
     if star is None:
@@ -465,13 +452,7 @@ def all_names() -> list[str]:
 
 
 def near_names(text: str, *, stars_only: bool = False) -> list[str]:
-    """Return up to four known names that resemble a text, or a few examples.
-
-    Parameters
-    ----------
-    stars_only : bool
-        Whether names must be of stars with known coordinates.
-    """
+    """Return up to four known names that resemble a text, or a few examples; on request only stars with coordinates."""
     names = {key: star.name for key, star in by_key().items()}
     if not stars_only:
         names |= {name_key(name): name for name in library_names()}

@@ -143,7 +143,6 @@ class CosmicRays(AdditiveProcess):
         return np.asarray(np.maximum(np.fft.irfft(spectrum, size)[: most + 1], 0.0))
 
     def most_electrons(self, seconds: Annotated[float, Unit("s"), Range(0)]) -> int:
-        """Return the charge that a pixel exceeds in a time with a probability of at most `NEGLIGIBLE`."""
         from scipy import special
 
         hits = self._hits(seconds)
@@ -162,12 +161,10 @@ class CosmicRays(AdditiveProcess):
         return self.rate_per_cm2_s
 
     def with_particles(self, rate_per_cm2_s: ParticleRate) -> Self:
-        """Return the process at another rate of incident particles."""
         return self.model_copy(update={"rate_per_cm2_s": rate_per_cm2_s})
 
     @property
     def assumption(self) -> tuple[str, str, str]:
-        """Row of a table of assumptions: quantity, value and source."""
         low, high = self.electrons
         return ("charge of a hit", f"{low:g} to {high:g} electrons in one pixel", "assumption; adds to the noise")
 
