@@ -97,14 +97,8 @@ WORK, ABANDONED_S = "mauvecl-work-", 90 * 86400.0
 class KernelCache:
     """Working folder of a process, and the archives that outlive it.
 
-    Attributes
-    ----------
-    store : Path
-        Folder with an archive of each program and of each text, by their keys; need not exist.
-    work : Path
-        PoCL's cache folder.
-    pid : int
-        Process that owns the working folder.
+    `store` is the folder with an archive of each program and of each text, by their keys, which need not exist; `work`
+    is PoCL's cache folder, which belongs to the process `pid`.
     """
 
     def __init__(self, store: Path, work: Path) -> None:
@@ -438,22 +432,10 @@ _one_at_a_time = threading.Lock()
 
 
 def choose_processor_level(device: Any, others: Callable[[], Sequence[Any]]) -> str | None:
-    """Set the highest processor level at which the driver works, and return its name.
+    """Set the highest processor level at which the driver works, and return its name; None if the driver chooses.
 
-    Parameters
-    ----------
-    others : callable
-        Function that returns all devices, including `device`, in the order in which another process finds them.
-
-    Returns
-    -------
-    str or None
-        None if the driver makes the choice.
-
-    Raises
-    ------
-    DeviceError
-        If the driver works at no level.
+    `others` returns all devices, including this one, in the order in which another process finds them. Raises
+    DeviceError if the driver works at no level.
     """
     place = int(device.int_ptr)
     with _one_at_a_time:

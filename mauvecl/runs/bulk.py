@@ -19,13 +19,14 @@ from mauvecl.runs.export import Selection, export
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.runs.store import (
     CRC_BYTES,
+    LATER_ATTRIBUTES,
+    OTHERWISE_IN_VERSION_1,
     Chunk,
     Store,
     StoredScene,
     crc,
     digest,
-    without_later_attributes,
-    without_version,
+    without,
 )
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column
@@ -372,14 +373,14 @@ def _fault(store: Store, chunk: Chunk, engine: Engine | Pool | None, repair: boo
 
 def _faults_of_description(store: Store, repair: bool) -> Iterator[Fault]:
     """Compare groups, descriptions of arrays and calibration with those of the study."""
+    left_out = ("mauvecl", *(OTHERWISE_IN_VERSION_1 if store.of_version_1 else ()))
     for name, content in sorted(store.description().items()):
         there = store.path / name
         try:
             data = read_bytes(there, "description")
             if name.endswith("zarr.json"):
-                old = store.of_version_1
-                existing, made = (without_version(json.loads(text), of_version_1=old) for text in (data, content))
-                same, seen = existing in (made, without_later_attributes(made)), "foreign"
+                existing, made = (without(json.loads(text), left_out) for text in (data, content))
+                same, seen = existing in (made, without(made, LATER_ATTRIBUTES)), "foreign"
             else:
                 same, seen = data == content, "damaged"
         except (ValueError, TypeError, AttributeError, RecursionError):

@@ -45,23 +45,21 @@ def locked(folder: Path, what: str) -> Iterator[None]:
 
     Raises InputError if another process holds the lock, or the file system has no locks.
     """
+
+    def unusable(why: str) -> InputError:
+        return InputError(f"{what} {str(folder)!r} {why}", key="lock")
+
     try:
         handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     except OSError as error:
-        raise InputError(
-            f"{what} {str(folder)!r} cannot be opened ({error.strerror}): use a readable folder", key="lock"
-        ) from error
+        raise unusable(f"cannot be opened ({error.strerror}): use a readable folder") from error
     try:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            raise InputError(
-                f"{what} {str(folder)!r} is being written by another process: wait until it ends", key="lock"
-            ) from error
+            raise unusable("is being written by another process: wait until it ends") from error
         except OSError as error:
-            raise InputError(
-                f"{what} {str(folder)!r} cannot be locked ({error.strerror}): use a file system with locks", key="lock"
-            ) from error
+            raise unusable(f"cannot be locked ({error.strerror}): use a file system with locks") from error
         yield
     finally:
         os.close(handle)
@@ -387,12 +385,7 @@ class Checkpoint:
 def kept(checkpoint: Checkpoint | None, question: object, compute: Callable[[], Arrays]) -> Arrays:
     """Return the arrays of a computation, from the checkpoint if an earlier run has finished it.
 
-    Parameters
-    ----------
-    checkpoint : Checkpoint, optional
-        If omitted, the arrays are computed.
-    question : object
-        Everything on which the result depends, as for `fingerprint`.
+    The question is everything on which the result depends, as for `fingerprint`.
     """
     if checkpoint is None:
         return compute()

@@ -38,8 +38,7 @@ SHARDS_PER_WORKER = 2
 PREPARED = 1
 
 
-Divided = DetectRequest | SnrRequest | StaresRequest
-Sums = DetectionSums | SnrSums | StareSums
+Sums = TypeVar("Sums", DetectionSums, SnrSums, StareSums)
 Item = TypeVar("Item")
 Answer = TypeVar("Answer")
 
@@ -51,10 +50,7 @@ class Stopped(Exception):  # noqa: N818
 class ShardLost(Exception):  # noqa: N818
     """Raised by workers that could not count a shard, which the pool then submits again.
 
-    Attributes
-    ----------
-    failed : bool
-        Whether to count it as a failure of the shard, of which there may be `MAX_FAILURES`.
+    If `failed` is true it counts as a failure of the shard, of which there may be `MAX_FAILURES`.
     """
 
     def __init__(self, reason: object, *, failed: bool = True) -> None:
@@ -242,22 +238,16 @@ class Pool:
     def detect(self, quiet: Expectation, flares: Sequence[Expectation] | Expectation, **how: Any) -> Detection:
         """Compute a detection; parameters as for `Engine.detect`."""
         request = DetectRequest.of(quiet, flares, **how)
-        sums = DetectionSums(request)
-        self._add_up(request, sums)
-        return sums.answer()
+        return self._add_up(request, DetectionSums(request)).answer()
 
     def snr(self, expectation: Expectation, **how: Any) -> SnrResult:
         """Compute distributions of the S/N; parameters as for `Engine.snr`."""
         request = SnrRequest.of(expectation, **how)
-        sums = SnrSums(request)
-        self._add_up(request, sums)
-        return sums.answer()
+        return self._add_up(request, SnrSums(request)).answer()
 
     def stares(self, request: StaresRequest) -> Arrays:
         """Reduce all stares of a request; see `Stares.reduced`."""
-        sums = StareSums(request)
-        self._add_up(request, sums)
-        return sums.answer()
+        return self._add_up(request, StareSums(request)).answer()
 
     def realise(
         self, expectation: Expectation, *, count: Realisations, out: NDArray[Any] | None = None, **how: Any
@@ -275,7 +265,8 @@ class Pool:
         out[:] = rows
         return out
 
-    def _add_up(self, request: Divided, sums: Sums) -> None:
+    def _add_up(self, request: DetectRequest | SnrRequest | StaresRequest, sums: Sums) -> Sums:
+        """Count all shards of a request and return their sums."""
         key = fingerprint(request)
         todo = shards(request)
         with self._lock:
@@ -288,6 +279,7 @@ class Pool:
             if self.checkpoint is not None:
                 self.checkpoint.put(task.name, counted)
             self._finished(task)
+        return sums
 
     def _without_resumed(self, tasks: Iterable[Task], sums: Sums) -> Iterator[Task]:
         """Add shards of the checkpoint to the sums, and yield the others."""

@@ -55,23 +55,14 @@ NOMINAL = "the throughput is nominal, not a flight calibration"
 LATER_ATTRIBUTES = ("instrument", "saturation_dn", "dark_unit", "temperature_c")
 
 
-def without_later_attributes(described: dict[str, Any]) -> dict[str, Any]:
-    """Return the description of a group as earlier versions wrote it."""
-    attributes = described.get("attributes", {})
-    return described | {"attributes": {k: v for k, v in attributes.items() if k not in LATER_ATTRIBUTES}}
-
-
 #: Attributes in which stores of version 1 state the study and the instrument by other defaults and names.
 OTHERWISE_IN_VERSION_1 = ("study", "study_sha256", "instrument", "provenance")
 
 
-def without_version(described: dict[str, Any], *, of_version_1: bool = False) -> dict[str, Any]:
-    """Return the description of a group without the version that wrote it, and what version 1 states otherwise."""
-    attributes, left_out = (
-        described.get("attributes", {}),
-        ("mauvecl", *(OTHERWISE_IN_VERSION_1 if of_version_1 else ())),
-    )
-    return described | {"attributes": {k: v for k, v in attributes.items() if k not in left_out}}
+def without(described: dict[str, Any], names: Sequence[str]) -> dict[str, Any]:
+    """Return the description of a group without some attributes."""
+    attributes = described.get("attributes", {})
+    return described | {"attributes": {key: value for key, value in attributes.items() if key not in names}}
 
 
 def describe(study: Study, scenes: Sequence[StoredScene], folder: Path) -> None:
@@ -338,7 +329,6 @@ class Store:
             self._check_same()
             self.read_digests()
             return
-        self.make_folder()
         ours = {scene.group for scene in self.scenes}
         other = [p.name for p in self.path.iterdir() if p.name not in ours and not p.name.startswith(UNFINISHED)]
         if other:
