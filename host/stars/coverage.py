@@ -217,12 +217,13 @@ def continued(
             f"it {word} at {end:g} nm and is continued to {goal:g} nm at its end's level, {level:.3g}: at most "
             f"{100 * share:.2g} % of the brightest pixel's light"
         )
-        wavelength, flux = (
-            (np.append(goal, wavelength), np.append(level, flux))
-            if is_blue
-            else (np.append(wavelength, goal), np.append(flux, level))
-        )
+        wavelength, flux = _attached(wavelength, goal, is_blue), _attached(flux, level, is_blue)
     return wavelength, flux, tuple(messages)
+
+
+def _attached(values: Float, more: Float | float, before: bool) -> Float:
+    """Return values with more of them before or after."""
+    return np.append(more, values) if before else np.append(values, more)
 
 
 def _brightest(wavelength: Float, flux: Float, needed_nm: tuple[float, float]) -> float:
@@ -275,11 +276,7 @@ def extended(
         )
         if blue:
             messages += [f"in {extension}, {message}" for message in ultraviolet]
-        wavelength, flux = (
-            (np.append(beyond[more], wavelength), np.append(added, flux))
-            if blue
-            else (np.append(wavelength, beyond[more]), np.append(flux, added))
-        )
+        wavelength, flux = _attached(wavelength, beyond[more], blue), _attached(flux, added, blue)
     return wavelength, flux, tuple(messages) or (f"its extension {extension} reaches no farther and is not used",)
 
 

@@ -169,11 +169,6 @@ def _kind(device: Any) -> str:
     return next((name for name, bit in kinds.items() if device.type & bit), "other")
 
 
-def _promise(device: Any) -> str:
-    lacking = weaknesses(device)
-    return SAME_BITS if not lacking else f"same draws to float rounding: no {', no '.join(lacking)}"
-
-
 def weaknesses(device: Any) -> list[str]:
     """Return the properties of strict arithmetic that a device lacks."""
     cl = load_opencl()
@@ -197,7 +192,9 @@ def devices() -> list[DeviceRecord]:
             compute_units=int(device.max_compute_units),
             global_memory=int(device.global_mem_size),
             default=index == 0,
-            promise=_promise(device),
+            promise=f"same draws to float rounding: no {', no '.join(lacking)}"
+            if (lacking := weaknesses(device))
+            else SAME_BITS,
         )
         for index, device in enumerate(_devices())
     ]

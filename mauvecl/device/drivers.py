@@ -453,7 +453,10 @@ def _working_level(device: Any, names: tuple[str | None, ...], others: Callable[
     number = next((i for i, other in enumerate(others()) if other.int_ptr == device.int_ptr), None)
     if limit_s == 0 or number is None or not sys.executable:
         return names[0]
-    cache, key = kernel_cache(), _key(device, names)
+    # The level's key in the cache is unique for driver, processor and installation.
+    about = (device.platform.version, device.name, device.version, device.driver_version, sys.prefix)
+    said = "\0".join((*map(str, about), *map(str, names), *sorted(flags())))
+    cache, key = kernel_cache(), f"level-{hashlib.sha256(said.encode()).hexdigest()[:32]}"
     known = cache.read_text(key)
     if known is not None:
         return known or None
@@ -483,13 +486,6 @@ def _limit_s() -> float:
         if not said or 0 <= float(said) <= 86400:
             return float(said or LIMIT_S)
     raise InputError.of(LIMIT, said, "1 to 86400 seconds of processor time, or 0 for no limit")
-
-
-def _key(device: Any, names: tuple[str | None, ...]) -> str:
-    """Return the name of the level in the cache, unique for driver, processor and installation."""
-    about = (device.platform.version, device.name, device.version, device.driver_version, sys.prefix)
-    said = "\0".join((*map(str, about), *map(str, names), *sorted(flags())))
-    return f"level-{hashlib.sha256(said.encode()).hexdigest()[:32]}"
 
 
 def _try(name: str | None, number: int, device: Any, limit_s: float) -> str | None:

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
-from pydantic import PlainSerializer, PlainValidator, WithJsonSchema, model_validator
+from pydantic import BeforeValidator, PlainSerializer, PlainValidator, WithJsonSchema, model_validator
 
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
@@ -22,8 +22,6 @@ from mauvecl.schema.section import Section
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
-    from pydantic import GetCoreSchemaHandler
-    from pydantic_core import CoreSchema
 
     from mauvecl.host.exposure.expectation import Expectation
 
@@ -289,21 +287,13 @@ def _lost_until(times_s: Float, start_s: Float, duration_s: Float, depth: Float,
 MAX_CUT_SD = 1e5
 
 
-class PriorUnit:
-    """Unit of a value with a prior: deg C of temperatures, none of others."""
-
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        from pydantic_core import core_schema
-
-        return core_schema.no_info_before_validator_function(self._plain, handler(source))
-
-    @staticmethod
-    def _plain(value: Any) -> Any:
-        is_temperature = is_quantity(value) and value.unit.physical_type == "temperature"
-        return without_unit(value, "deg_C") if is_temperature else value
+def _in_celsius(value: Any) -> Any:
+    """Convert a Quantity of temperature to deg C, which prior values have; return others unchanged."""
+    is_temperature = is_quantity(value) and value.unit.physical_type == "temperature"
+    return without_unit(value, "deg_C") if is_temperature else value
 
 
-PriorValue = Annotated[float, PriorUnit(), Range()]
+PriorValue = Annotated[float, BeforeValidator(_in_celsius), Range()]
 
 
 @validated

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.device.launches import Progress
 from mauvecl.host.arrays import map_in_threads
 from mauvecl.host.tables.files import UNFINISHED, check_size, read_bytes, write_whole
 from mauvecl.runs.checkpoint import locked
@@ -38,8 +39,6 @@ from mauvecl.study.study import Study
 if TYPE_CHECKING:
     from mauvecl.device.engine import Engine
 
-
-Progress = Callable[[int, int], None]
 
 #: Chunks drawn at once, and threads that write them while the next are drawn.
 CHUNKS_AT_ONCE, WRITERS = 4, 4

@@ -32,7 +32,7 @@ from pydantic import BaseModel
 
 from mauvecl.detection.requests import Countable, Shard
 from mauvecl.host import VERSION
-from mauvecl.host.tables.files import UNFINISHED, json_data, read_bytes, read_text, write_whole
+from mauvecl.host.tables.files import UNFINISHED, read_bytes, write_whole
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
@@ -232,7 +232,6 @@ class Checkpoint:
         self.messages: list[str] = []
         self._held: list[tuple[str, Arrays]] = []
         self._lock = threading.Lock()
-        self._stack = ExitStack()
 
     def __enter__(self) -> Self:
         """Lock the output folder and read its state.
@@ -240,13 +239,11 @@ class Checkpoint:
         Raises InputError if another process writes to the folder, or it contains an unfinished run without `resume` or
         `restart`, or one of another study (the message lists the keys that differ).
         """
-        if not self._is_held:
-            self._stack.enter_context(locked(self.parent, "output folder"))
-        try:
+        with ExitStack() as stack:
+            if not self._is_held:
+                stack.enter_context(locked(self.parent, "output folder"))
             self._look()
-        except BaseException:
-            self._stack.close()
-            raise
+            self._stack = stack.pop_all()
         self._started, self._written = time.monotonic(), any(self._files())
         return self
 
@@ -272,13 +269,8 @@ class Checkpoint:
                 "discard it",
                 key="resume",
             )
-        try:
-            manifest = json_data(read_text(self.folder / MANIFEST, "manifest"), "manifest")
-            if manifest["digest"] != _digest_of(manifest):
-                raise ValueError
-            theirs = {"mauvecl": manifest["mauvecl"], "verb": manifest["verb"], **manifest["study"]}
-            form = manifest.get("form", 1)
-        except (OSError, ValueError, KeyError, TypeError):
+        manifest = _intact(self.folder / MANIFEST)
+        if manifest is None:
             # Names of files include the fingerprint, so shards of another study are never used.
             self.messages.append(
                 f"The manifest of {str(self.folder)!r} was damaged or missing and is written anew; the shards that "
@@ -286,6 +278,7 @@ class Checkpoint:
             )
             self._write_manifest()
             return
+        form = manifest.get("form", 1)
         if form != FORM:
             raise InputError(
                 f"the unfinished run in {str(self.folder)!r} has counts in format {form}, but this version needs "
@@ -293,6 +286,7 @@ class Checkpoint:
                 key="restart",
             )
         ours = {"mauvecl": VERSION, "verb": self.verb, **self._plain_study()}
+        theirs = {"mauvecl": manifest["mauvecl"], "verb": manifest["verb"], **manifest["study"]}
         differing = differing_keys(ours, theirs)
         if differing:
             raise InputError(
@@ -358,7 +352,7 @@ class Checkpoint:
         """
         names = sorted(os.listdir(self.folder)) if self.folder.is_dir() else []
         shards = [name for name in names if SHARD_NAME.fullmatch(name)]
-        if MANIFEST in names and not shards and not _is_ours(self.folder / MANIFEST):
+        if MANIFEST in names and not shards and _intact(self.folder / MANIFEST) is None:
             raise InputError(
                 f"{str(self.folder / MANIFEST)!r} is not mauvecl's: use another output folder", key="folder"
             )
@@ -397,13 +391,14 @@ def kept(checkpoint: Checkpoint | None, question: object, compute: Callable[[], 
     return arrays
 
 
-def _is_ours(manifest: Path) -> bool:
-    """Return whether a manifest is an intact one of a checkpoint."""
+def _intact(manifest: Path) -> dict[str, Any] | None:
+    """Return the content of a manifest, or None if it is not an intact one of a checkpoint."""
     try:
         content = json.loads(read_bytes(manifest, "manifest"))
-        return bool(content["digest"] == _digest_of(content))
+        is_whole = content["digest"] == _digest_of(content) and isinstance(content["study"], dict)
+        return dict(content) if is_whole and {"mauvecl", "verb"} <= content.keys() else None
     except (InputError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
-        return False
+        return None
 
 
 def _named(name: str, body: bytes) -> bytes:
