@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cache, cached_property
 from importlib import resources
 from typing import Literal
 
@@ -20,49 +20,28 @@ from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import DetectorTemperature, Duration, NotNegative, Share
 
-Energy = Literal[10, 30]
 
-
-@dataclass(frozen=True, eq=False)
-class FluxMap:
-    """Omnidirectional flux of trapped protons by sub-satellite point, cm^-2 s^-1."""
-
-    step_deg: float  # spacing of the grid
-    # By lower energy limit, MeV; each of shape (n_latitude, n_longitude), from latitude -90 and longitude -180.
-    flux: dict[int, NDArray[np.float64]]
-    source: str
-
-    def at(
-        self, longitude_deg: NDArray[np.float64], latitude_deg: NDArray[np.float64], above_mev: Energy = 10
-    ) -> NDArray[np.float64]:
-        """Interpolate the flux above an energy bilinearly, shape (n,)."""
-        if above_mev not in self.flux:
-            raise InputError.of("above_mev", above_mev, " or ".join(map(str, self.flux)))
-        grid = self.flux[above_mev]
-        row = np.clip((np.asarray(latitude_deg, float) + 90) / self.step_deg, 0, grid.shape[0] - 1)
-        column = (np.asarray(longitude_deg, float) + 180) / self.step_deg % grid.shape[1]
-        i, j = np.minimum(row.astype(int), grid.shape[0] - 2), column.astype(int) % grid.shape[1]
-        right, up, along = (j + 1) % grid.shape[1], row - i, column - np.floor(column)
-        south = (1 - along) * grid[i, j] + along * grid[i, right]
-        north = (1 - along) * grid[i + 1, j] + along * grid[i + 1, right]
-        return np.asarray((1 - up) * south + up * north)
-
-
-@lru_cache(maxsize=1)
-def proton_map() -> FluxMap:
+@cache
+def _proton_map(above_mev: int) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
     """Return the map of AP8 at solar maximum, at an altitude of 510 km (see `tools/build_flux_map.py`)."""
+    from scipy.interpolate import RegularGridInterpolator
+
     text = resources.files(__package__).joinpath("protons.ecsv").read_text(encoding="utf-8")
     table = parse_ecsv(text, "the embedded map of protons")
     step = float(table.meta["step_deg"])
+    latitude, longitude = (np.arange(-end, end + step / 2, step) for end in (90.0, 180.0))
     row = np.round((np.asarray(table["latitude"]) + 90) / step).astype(int)
     column = np.round((np.asarray(table["longitude"]) + 180) / step).astype(int)
-    maps = {}
-    for energy in (10, 30):
-        grid = np.zeros((round(180 / step) + 1, round(360 / step)))
-        grid[row, column] = table[f"above_{energy}_mev"]
-        grid.setflags(write=False)
-        maps[energy] = grid
-    return FluxMap(step, maps, str(table.meta["source"]))
+    flux = np.zeros((latitude.size, longitude.size))
+    flux[row, column] = table[f"above_{above_mev}_mev"]
+    flux[:, -1] = flux[:, 0]
+    return RegularGridInterpolator((latitude, longitude), flux)
+
+
+def proton_flux(track: Track, *, above_mev: Literal[10, 30]) -> NDArray[np.float64]:
+    """Return the omnidirectional flux of trapped protons above an energy along a track, cm^-2 s^-1, shape (n,)."""
+    longitude, latitude = track.subsatellite_deg
+    return np.asarray(_proton_map(above_mev)(np.stack([latitude, longitude], axis=-1)))
 
 
 @validated
@@ -126,7 +105,7 @@ class Particles:
 
     def rate_per_cm2_s(self, track: Track) -> NDArray[np.float64]:
         """Return the rate of hits along a track, cm^-2 s^-1, shape (n,)."""
-        return np.asarray(self.cosmic_per_cm2_s + self.share * proton_map().at(*track.subsatellite_deg, above_mev=30))
+        return np.asarray(self.cosmic_per_cm2_s + self.share * proton_flux(track, above_mev=30))
 
 
 #: Sources of the default values.
@@ -313,7 +292,7 @@ def _rules(track: Track, target: Vectors, limits: Limits) -> dict[str, Rule]:
         if limits.anomaly:
             outside = ~geometry.in_polygon(*track.subsatellite_deg, np.array(limits.anomaly))
         else:
-            outside = proton_map().at(*track.subsatellite_deg) <= (limits.proton_flux or 0.0)
+            outside = proton_flux(track, above_mev=10) <= (limits.proton_flux or 0.0)
         rules["anomaly"] = lambda part: outside[part, None]
     return rules
 

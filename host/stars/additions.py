@@ -63,7 +63,6 @@ def add(
     check_covers(source.name, source.measured_nm or (source.wavelength_nm[0], source.wavelength_nm[-1]))
     name = (name or source.name).strip()
     place = _place_of(name, replace=replace)
-    dereddened = any("dereddened" in note for note in source.notes)
     table = Table({"wavelength": source.wavelength_nm, "flux": source.flux_flam})
     table["wavelength"].unit, table["flux"].unit = "nm", "erg / (s cm2 Angstrom)"
     table.meta |= {
@@ -72,7 +71,7 @@ def add(
         "file_sha256": hashlib.sha256(content).hexdigest(),
         "spectrum_sha256": spectrum_digest(source.wavelength_nm, source.flux_flam),
         "kept_utc": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "dereddened": dereddened,
+        "dereddened": any("dereddened" in note for note in source.notes),
         "notes": list(source.notes),
         "told": list(source.messages),
         "unscaled": source.unscaled,
