@@ -137,7 +137,6 @@ class Blackbody(FlareSpectrum):
         return blackbody(wavelength_nm, self.temperature_k)
 
     def bolometric_flux(self) -> float:
-        """Return the surface flux over all wavelengths, erg s-1 cm-2."""
         return STEFAN_BOLTZMANN * self.temperature_k**4
 
     def describe(self) -> str:
@@ -166,7 +165,6 @@ class TwoBlackbodies(FlareSpectrum):
         return np.asarray(blackbody(wavelength_nm, self.temperature_k) + self.second_area * second)
 
     def bolometric_flux(self) -> float:
-        """Return the surface flux over all wavelengths, erg s-1 cm-2."""
         return STEFAN_BOLTZMANN * (self.temperature_k**4 + self.second_area * self.second_temperature_k**4)
 
     def describe(self) -> str:
@@ -206,7 +204,6 @@ class BalmerFlare(FlareSpectrum):
         return (self.jump - 1.0) * float(blackbody(np.array([BALMER_EDGE_NM]), self.temperature_k)[0])
 
     def bolometric_flux(self) -> float:
-        """Return the surface flux over all wavelengths, erg s-1 cm-2."""
         # The integral of (edge / l)^2 exp(-h c / k T (1 / l - 1 / edge)) over l, in Angstrom.
         width = 10.0 * BALMER_EDGE_NM**2 * self.electron_temperature_k / HC_OVER_K_NM_K
         return STEFAN_BOLTZMANN * self.temperature_k**4 + self.edge_flux * width

@@ -222,7 +222,7 @@ class Stares:
                     values = np.moveaxis(out[..., : stare.n_frames], 2, 3)[scenarios]
                     more = []
                     if request.glow:
-                        launches.glow(few, glow, 0)
+                        launches.glow(few, glow)
                         more = [np.moveaxis(glow[0, : few.wanted, :, : stare.n_frames], 1, 2)]
                     reduced.append(dict(reduction(values, first, *more)))
                 # Results are added last, since a tile that fails is drawn again.

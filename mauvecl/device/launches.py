@@ -468,12 +468,12 @@ class StareLaunches(Launches):
             self._cl.enqueue_copy(self._queue, host, values)
             out[..., begin : begin + size] = host[..., tile.start : tile.stop].transpose(1, 3, 2, 0)
 
-    def glow(self, tile: Tile, out: Floats, row: int) -> None:
+    def glow(self, tile: Tile, out: Floats) -> None:
         """Compute the values with which `Injections` add flares to a tile's frames.
 
         `out` has the shape (1, n_stare, n_statistic + 1, n_padded_frame).
         """
-        self._in_frames("stare_glow", replace(self.variant, in_time=True), [], tile, out, row)
+        self._in_frames("stare_glow", replace(self.variant, in_time=True), [], tile, out, 0)
 
     def _in_frames(self, name: str, variant: Variant, own: list[Any], tile: Tile, out: Floats, row: int) -> None:
         """Launch a kernel whose lanes are frames."""
@@ -512,34 +512,28 @@ def scene_launches(
     scene: Scene,
     seed: int,
     *,
-    pair: bool = False,
-    elements: bool = True,
     linears: int = 0,
     smooths: int = 0,
-    slots: int = 0,
-    row_type: str = "int",
     chunk: int | None = None,
+    **options: Any,
 ) -> Launches:
-    """Return the launches of a scene, with the smallest kernel variant that suits it."""
+    """Return the launches of a scene, with the smallest kernel variant that suits it and has these options."""
     variant = replace(
         device.variant,
         scenarios=BATCH[scene.frames],
         linears=_capacity(linears),
         frames=scene.frames,
         clip=scene.clip,
-        pair=pair,
         noisy=scene.comparison.exposures > 0,
         estimated=scene.comparison.estimated,
         smooths=_capacity(smooths),
-        slots=slots,
-        elements=elements,
         joint=scene.joint,
         quartic=scene.quartic,
         photons=scene.photons,
         additive=scene.additive,
         modulations=scene.modulations,
-        row_type=row_type,
         chunk=min(chunk or device.variant.chunk, device.variant.chunk),
+        **options,
     )
     single = device.width == 1 or scene.frames or variant.compared
     many = VECTORS if not (variant.elements or variant.linears) else FEW_VECTORS

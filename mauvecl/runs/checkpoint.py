@@ -251,7 +251,7 @@ class Checkpoint:
         try:
             if kind is not None:
                 # After an interruption or error, write pending shards unless the run was short.
-                self._write_held(only_if_late=not self._written)
+                self._write_held()
         except InputError:
             # The original exception is more important.
             pass
@@ -319,10 +319,10 @@ class Checkpoint:
         """Keep a shard, and write it to disk once the run has lasted `patience_s`."""
         with self._lock:
             self._held.append((name, shard))
-            self._write_held(only_if_late=not self._written)
+            self._write_held()
 
-    def _write_held(self, *, only_if_late: bool = False) -> None:
-        if only_if_late and time.monotonic() - self._started < self._patience_s:
+    def _write_held(self) -> None:
+        if not self._written and time.monotonic() - self._started < self._patience_s:
             return
         if not self._written and self._held:
             self._write_manifest()
