@@ -606,11 +606,9 @@ def continued_to_reach(source: Source, instrument: Instrument) -> Source:
         return source
     range_nm = (instrument.output_min_nm, instrument.output_max_nm)
     nm, flux, messages = continued(source.name, nm, source.flux_flam, range_nm, LineSpread.of(instrument))
-    return (
-        replace(source, wavelength_nm=nm, flux_flam=flux, messages=(*source.messages, *messages))
-        if messages
-        else source
-    )
+    if not messages:
+        return source
+    return replace(source, wavelength_nm=nm, flux_flam=flux, messages=(*source.messages, *messages))
 
 
 def _elements(instrument: Instrument) -> tuple[NDArray[np.int32], Float]:

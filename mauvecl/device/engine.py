@@ -84,12 +84,8 @@ class Stares:
     ----------
     device : str or Device, optional
         Number or name, as for `Engine`, or an open device.
-    progress : callable, optional
-        Called as ``progress(done, total)`` before and between tiles, in stares. It may raise to stop the work.
-    tile : int, optional
-        Stares per launch, for tests; by default chosen from the device and the work. Does not affect results.
-    width : int, optional
-        Stares or frames per work-item, for tests; by default 16 on CPUs and 1 elsewhere. Does not affect results.
+    progress, tile, width : optional
+        As for `Engine`, in stares instead of realisations.
     tiles : Tiles, optional
         Division of the work, instead of `progress` and `tile`.
 

@@ -9,6 +9,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import partial
+from queue import SimpleQueue
 from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeVar
 
 from numpy.typing import NDArray
@@ -99,9 +100,10 @@ class LocalWorkers:
         self._ticks: list[Callable[[int], None] | None] = [None] * len(devices)
         self._stopping = False
         self._engines: list[Engine] = [self._made(place) for place in range(len(devices))]
-        self._free = list(range(len(devices)))
+        self._free: SimpleQueue[int] = SimpleQueue()
+        for place in range(len(devices)):
+            self._free.put(place)
         self._threads = ThreadPoolExecutor(len(devices))
-        self._lock = threading.Lock()
 
     def _made(self, place: int) -> Engine:
         return self._make(self._devices[place], progress=partial(self._tick, place))
@@ -134,8 +136,7 @@ class LocalWorkers:
     def _count(self, task: Task) -> Arrays:
         if self._stopping:
             raise Stopped
-        with self._lock:
-            place = self._free.pop(0)
+        place = self._free.get()
         self._ticks[place] = task.tick
         engine = self._engines[place]
         try:
@@ -148,8 +149,7 @@ class LocalWorkers:
             raise ShardLost(f"{engine.device_name}: {error}") from error
         finally:
             self._ticks[place] = None
-            with self._lock:
-                self._free.append(place)
+            self._free.put(place)
 
     def stop(self) -> None:
         """Stop work in progress between two tiles."""

@@ -326,7 +326,14 @@ class Store:
         """
         root = self.path / "zarr.json"
         if root.exists():
-            self._check_same()
+            there = Store.open(self.path).study
+            differing = differing_keys(self.study.model_dump(mode="json"), there.model_dump(mode="json"))
+            if differing:
+                raise InputError(
+                    f"store {str(self.path)!r} was started by another study, which differs in {', '.join(differing)}: "
+                    "use the same study or another place",
+                    key="store",
+                )
             self.read_digests()
             return
         ours = {scene.group for scene in self.scenes}
@@ -362,16 +369,6 @@ class Store:
             describe(self.study, self.scenes, Path(folder))
             files = [p for p in Path(folder).rglob("*") if p.is_file()]
             return {str(p.relative_to(folder)): p.read_bytes() for p in files}
-
-    def _check_same(self) -> None:
-        there = Store.open(self.path).study
-        differing = differing_keys(self.study.model_dump(mode="json"), there.model_dump(mode="json"))
-        if differing:
-            raise InputError(
-                f"store {str(self.path)!r} was started by another study, which differs in {', '.join(differing)}: use "
-                "the same study or another place",
-                key="store",
-            )
 
     def read_digests(self) -> None:
         """Read the digests of written chunks; incomplete lines are ignored."""
