@@ -12,7 +12,7 @@ from functools import lru_cache, wraps
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -24,6 +24,11 @@ def set_read_only(owner: object, **arrays: ArrayLike) -> None:
         private = np.array(values, np.float64)
         private.setflags(write=False)
         object.__setattr__(owner, name, private)
+
+
+def true_runs(flags: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Return the first index of each run of true values and one past its last, shape (n_run, 2)."""
+    return np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]))).reshape(-1, 2)
 
 
 class _Arguments:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl.host.arrays import ContentEquality
+from mauvecl.host.arrays import ContentEquality, true_runs
 from mauvecl.host.exposure import DEFAULT_SKY
 from mauvecl.host.exposure.response import Order, electrons_per_second, negative_means_message
 from mauvecl.host.exposure.sky import Sky
@@ -656,8 +656,7 @@ def _saturation(x: Expectation) -> tuple[str, ...]:
         )
         return (Message(text, "saturated"),)
     # First and last wavelength of each run of saturated pixels.
-    steps = np.flatnonzero(np.diff(np.concatenate([[0], x.saturated.astype(np.int8), [0]])))
-    runs = [f"{x.wavelength_nm[a]:.1f}-{x.wavelength_nm[b - 1]:.1f}" for a, b in steps.reshape(-1, 2)]
+    runs = [f"{x.wavelength_nm[a]:.1f}-{x.wavelength_nm[b - 1]:.1f}" for a, b in true_runs(x.saturated)]
     where = ", ".join(runs)
     if len(runs) > MOST_RUNS:
         where = f"{len(runs)} intervals between {runs[0].partition('-')[0]} and {runs[-1].partition('-')[2]}"

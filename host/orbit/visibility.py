@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.arrays import true_runs
 from mauvecl.host.exposure.sky import HelioEcliptic, zodiacal_brightness
 from mauvecl.host.orbit import Limits, geometry
 from mauvecl.host.orbit.geometry import Bodies, Flags, TimeGrid, Vectors, unit
@@ -220,8 +221,7 @@ class Visibility:
 
     def windows(self, k: int) -> Windows:
         """Return the windows of one target in order, with ends accurate to one step."""
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], self.seen[:, k], [False]])))
-        first, last = edges[::2], edges[1::2]
+        first, last = true_runs(self.seen[:, k]).T
         dark = np.concatenate([[0], np.cumsum(self.shadow)])
         step = np.float64(self.track.times.step_s)
         return Windows(first * step, last * step, (dark[last] - dark[first]) * step)
@@ -300,7 +300,6 @@ def _rules(track: Track, target: Vectors, limits: Limits) -> dict[str, Rule]:
 def _drop_short(seen: Flags, step_s: float, shortest_s: float) -> None:
     """Clear intervals shorter than `shortest_s` in each column, in place."""
     for column in seen.T:
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], column, [False]])))
-        for first, last in zip(edges[::2], edges[1::2], strict=True):
+        for first, last in true_runs(column):
             if (last - first) * step_s < shortest_s:
                 column[first:last] = False

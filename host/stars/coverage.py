@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.arrays import true_runs
 from mauvecl.host.spectra.units import MIN_MEASURED, NEEDED_NM, SPAN_NM, is_gap, likely_unit, measured_part
 from mauvecl.schema.errors import InputError
 
@@ -150,9 +151,10 @@ def remarks(wavelength: Float, flux: Float) -> tuple[str, ...]:
             f"{values[i]:.3g} at {nm[i]:.1f} nm: measured noise, kept; `bin_nm` bins it"
         )
     # Runs of at least three zeros are not measurements.
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], (values == 0.0).astype(np.int8), [0]])))
     runs = [
-        (a, b) for a, b in edges.reshape(-1, 2) if b - a >= 3 and nm[b - 1] >= NEEDED_NM[0] and nm[a] <= NEEDED_NM[1]
+        (a, b)
+        for a, b in true_runs(values == 0.0)
+        if b - a >= 3 and nm[b - 1] >= NEEDED_NM[0] and nm[a] <= NEEDED_NM[1]
     ]
     if runs:
         where = ", ".join(f"{nm[a]:.1f}-{nm[b - 1]:.1f}" for a, b in runs[:3])
