@@ -1,15 +1,18 @@
-"""Arrays that no caller can modify, results that are cached by the content of arrays, and equality by content."""
+"""Computations with arrays: copies that no caller can modify, cached results, equality by content, work in threads."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+import os
+from collections import deque
+from collections.abc import Callable, Generator, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import fields, is_dataclass
 from functools import lru_cache, wraps
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -21,6 +24,11 @@ def set_read_only(owner: object, **arrays: ArrayLike) -> None:
         private = np.array(values, np.float64)
         private.setflags(write=False)
         object.__setattr__(owner, name, private)
+
+
+def true_runs(flags: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Return the first index of each run of true values and one past its last, shape (n_run, 2)."""
+    return np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]))).reshape(-1, 2)
 
 
 class _Arguments:
@@ -127,3 +135,50 @@ def _parts(thing: Any) -> dict[str, Any]:
     if is_dataclass(thing):
         return {each.name: getattr(thing, each.name) for each in fields(thing) if each.compare}
     return dict(vars(thing))
+
+
+Item = TypeVar("Item")
+Answer = TypeVar("Answer")
+
+#: Largest number of threads that work at the same time; each may hold large arrays.
+MOST_THREADS = 4
+
+
+def map_in_threads(
+    work: Callable[[Item], Answer],
+    items: Iterable[Item],
+    number: int | None = None,
+    stop: Callable[[], object] | None = None,
+) -> Generator[Answer]:
+    """Apply a function to items in several threads and yield the results in the order of the items.
+
+    At most one result for each thread waits to be yielded, so that the memory stays limited.
+
+    Parameters
+    ----------
+    work : callable
+    items : iterable
+    number : int, optional
+        Number of threads, by default that of the cores, up to `MOST_THREADS`; one works in the caller's thread.
+    stop : callable, optional
+        Ends work in progress if it fails, or if its caller needs no more results; without it, that work is awaited.
+    """
+    number = number or min(os.cpu_count() or 1, MOST_THREADS)
+    if number == 1:
+        yield from map(work, items)
+        return
+    ahead: deque[Future[Answer]] = deque()
+    with ThreadPoolExecutor(number) as threads:
+        try:
+            for item in items:
+                ahead.append(threads.submit(work, item))
+                if len(ahead) > number:
+                    yield ahead.popleft().result()
+            while ahead:
+                yield ahead.popleft().result()
+        except BaseException:
+            for future in ahead:
+                future.cancel()
+            if stop is not None:
+                stop()
+            raise

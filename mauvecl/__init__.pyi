@@ -52,8 +52,8 @@ from mauvecl.host.stars.source import Source as Source
 from mauvecl.noise.disturbances import CosmicRays as CosmicRays
 from mauvecl.noise.disturbances import Normal as Normal
 from mauvecl.noise.disturbances import Uniform as Uniform
-from mauvecl.noise.processes import Comparison as Comparison
-from mauvecl.noise.processes import Processes as Processes
+from mauvecl.noise.unknowns import Comparison as Comparison
+from mauvecl.noise.unknowns import Processes as Processes
 from mauvecl.observations.frame_files import read_frames as read_frames
 from mauvecl.observations.frames import Frames as Frames
 from mauvecl.runs import bulk as bulk

@@ -14,15 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl.host.arrays import ContentEquality
+from mauvecl.host.arrays import ContentEquality, true_runs
 from mauvecl.host.exposure import DEFAULT_SKY
 from mauvecl.host.exposure.response import Order, electrons_per_second, negative_means_message
 from mauvecl.host.exposure.sky import Sky
 from mauvecl.host.exposure.star import Neighbours
+from mauvecl.host.instrument import DEFAULT_INSTRUMENT
 from mauvecl.host.instrument.instrument import Instrument, LineSpread
-from mauvecl.host.instrument.paths import DEFAULT_INSTRUMENT
 from mauvecl.host.spectra.units import SPAN_NM
 from mauvecl.host.stars.coverage import check_covers, continued
+from mauvecl.host.stars.source import Source, listed_star
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, Drawable, table_of
 from mauvecl.schema.errors import InputError, Message, missing_package
@@ -31,8 +32,6 @@ from mauvecl.schema.physical import Duration, Exposure, SkyBrightness
 
 if TYPE_CHECKING:
     from astropy.table import QTable
-
-    from mauvecl.host.stars.source import Source
 
 Float = NDArray[np.float64]
 
@@ -135,8 +134,6 @@ class Expectation(Drawable, ContentEquality):
 
         This needs the extra ``spectra``.
         """
-        import astropy.units as u
-
         try:
             from astropy.nddata import StdDevUncertainty
             from specutils import Spectrum
@@ -471,8 +468,6 @@ def expect(
     >>> float(round(quiet.snr().max(), 2)), float(round(quiet.snr_per_element().max(), 1))
     (10.33, 61.0)
     """
-    from mauvecl.host.stars.source import listed_star
-
     source = listed_star(source) if isinstance(source, str) else source
     instrument = instrument if isinstance(instrument, Instrument) else Instrument.load(instrument)
     sky = sky if isinstance(sky, Sky) else Sky.of_brightness(DEFAULT_SKY if sky is None else sky)
@@ -611,11 +606,9 @@ def continued_to_reach(source: Source, instrument: Instrument) -> Source:
         return source
     range_nm = (instrument.output_min_nm, instrument.output_max_nm)
     nm, flux, messages = continued(source.name, nm, source.flux_flam, range_nm, LineSpread.of(instrument))
-    return (
-        replace(source, wavelength_nm=nm, flux_flam=flux, messages=(*source.messages, *messages))
-        if messages
-        else source
-    )
+    if not messages:
+        return source
+    return replace(source, wavelength_nm=nm, flux_flam=flux, messages=(*source.messages, *messages))
 
 
 def _elements(instrument: Instrument) -> tuple[NDArray[np.int32], Float]:
@@ -663,8 +656,7 @@ def _saturation(x: Expectation) -> tuple[str, ...]:
         )
         return (Message(text, "saturated"),)
     # First and last wavelength of each run of saturated pixels.
-    steps = np.flatnonzero(np.diff(np.concatenate([[0], x.saturated.astype(np.int8), [0]])))
-    runs = [f"{x.wavelength_nm[a]:.1f}-{x.wavelength_nm[b - 1]:.1f}" for a, b in steps.reshape(-1, 2)]
+    runs = [f"{x.wavelength_nm[a]:.1f}-{x.wavelength_nm[b - 1]:.1f}" for a, b in true_runs(x.saturated)]
     where = ", ".join(runs)
     if len(runs) > MOST_RUNS:
         where = f"{len(runs)} intervals between {runs[0].partition('-')[0]} and {runs[-1].partition('-')[2]}"

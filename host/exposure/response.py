@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import lru_cache
-from typing import TYPE_CHECKING, Literal, cast
+from typing import TYPE_CHECKING, Literal, cast, get_args
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss, legvander
@@ -67,7 +67,7 @@ def response_matrix(instrument: Instrument, wavelength_nm: ArrayLike, order: Ord
         Electrons s^-1 per (erg s^-1 cm^-2 A^-1): `response_matrix(...) @ flux_flam` is electrons per second. The
         matrix is cached and read-only.
     """
-    return _response(instrument, _nodes(wavelength_nm).tobytes(), _known(order))
+    return _response(instrument, _nodes(wavelength_nm).tobytes(), order)
 
 
 def electrons_per_second(
@@ -75,12 +75,7 @@ def electrons_per_second(
 ) -> Float:
     """Return the mean electrons per second in each pixel, shape (n_pixel,), for a spectrum of any number of nodes.
 
-    Parameters
-    ----------
-    instrument, wavelength_nm, order
-        As in `response_matrix`.
-    flux_flam : array_like, shape (n_wavelength,)
-        Flux at the nodes, erg s^-1 cm^-2 A^-1.
+    The flux at the nodes is in erg s^-1 cm^-2 A^-1; see `response_matrix`.
     """
     nodes = _nodes(wavelength_nm)
     flux = np.asarray(flux_flam, np.float64)
@@ -122,9 +117,11 @@ def _product(line: LineSpread, nodes: bytes, by_light: Instrument | None) -> csr
     return _read_only(csr_array(_line_landing(line, _knots(by_light)) @ gathering))
 
 
-def _by_light(instrument: Instrument, order: str) -> Instrument | None:
+def _by_light(instrument: Instrument, order: Order) -> Instrument | None:
     """Return the instrument whose efficiencies act at the wavelength of the light; None in the paper's order."""
-    return instrument if _known(order) == "physical" else None
+    if order not in get_args(Order):
+        raise InputError.of("order", order, "'paper' or 'physical'")
+    return instrument if order == "physical" else None
 
 
 def _efficiencies(instrument: Instrument) -> Float:
@@ -226,12 +223,6 @@ def _nodes(wavelength_nm: ArrayLike) -> Float:
             "the wavelengths of a spectrum", "at least two, finite and strictly increasing, in nm", key="wavelength_nm"
         )
     return nodes
-
-
-def _known(order: str) -> Order:
-    if order not in ("paper", "physical"):
-        raise InputError.of("order", order, "'paper' or 'physical'")
-    return cast(Order, order)
 
 
 #: Accepted distance of a mean below zero, in standard errors; noise exceeds it in one of 740 independent pixels.

@@ -41,13 +41,7 @@ class HelioEcliptic:
 def helioecliptic(target: SkyCoord | str, time: Time | str) -> HelioEcliptic:
     """Return the helio-ecliptic coordinates of a target, in the true geocentric ecliptic of date.
 
-    Parameters
-    ----------
-    target : SkyCoord or str
-        Single position; a string is a well-known star, or ICRS in degrees ("290.0 -11.2") or sexagesimal hours and
-        degrees.
-    time : Time or str
-        Single time within 1990-2100; a string is ISO 8601, UTC.
+    The arguments are those of `Sky.at`.
     """
     with offline():
         from astropy.coordinates import GeocentricTrueEcliptic, get_sun
@@ -63,12 +57,7 @@ def helioecliptic(target: SkyCoord | str, time: Time | str) -> HelioEcliptic:
                 f"target in the frame {position.frame.name!r} cannot be turned to the ecliptic", "ICRS", key="target"
             ) from None
         difference = float((star.lon - sun.lon).wrap_at("180d").deg)
-        longitude, latitude = abs(difference), float(star.lat.deg)
-        sun_latitude = float(sun.lat.rad)
-    cosine = np.sin(np.radians(latitude)) * np.sin(sun_latitude) + np.cos(np.radians(latitude)) * np.cos(
-        sun_latitude
-    ) * np.cos(np.radians(longitude))
-    return HelioEcliptic(longitude, abs(latitude), float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))))
+        return HelioEcliptic(abs(difference), abs(float(star.lat.deg)), float(star.separation(sun).deg))
 
 
 def parse_time(time: Time | str) -> Time:
@@ -97,7 +86,6 @@ def parse_time(time: Time | str) -> Time:
 
 def parse_position(target: SkyCoord | str) -> SkyCoord:
     """Return a single finite position; text is a name, or ICRS in degrees or sexagesimal hours and degrees."""
-    import astropy.units as u
     from astropy.coordinates import SkyCoord
     from astropy.coordinates.baseframe import BaseCoordinateFrame
 
@@ -105,9 +93,9 @@ def parse_position(target: SkyCoord | str) -> SkyCoord:
     if isinstance(target, str):
         star = by_key().get(name_key(target))
         if star is not None:
-            return SkyCoord(star.ra_deg, star.dec_deg, unit=u.deg)
+            return SkyCoord(star.ra_deg, star.dec_deg, unit="deg")
         try:
-            return SkyCoord(*coordinates(target), unit=u.deg)
+            return SkyCoord(*coordinates(target), unit="deg")
         except InputError as error:
             if not re.match(r"\s*[^\W\d]", target):
                 raise
@@ -226,26 +214,22 @@ def _sunlight(magnitude: float) -> Source:
     return Source.from_library("Sun").at_magnitude(magnitude)
 
 
-@dataclass(frozen=True)
-class ZodiacalTable:
-    """Surface brightness of the zodiacal light on a grid of helio-ecliptic coordinates."""
-
-    longitude_deg: NDArray[np.float64]  # 0 to 180 in equal steps, shape (13,)
-    latitude_deg: NDArray[np.float64]  # 0 to 90 in the same steps, shape (7,)
-    brightness: NDArray[np.float64]  # V mag arcsec^-2, shape (13, 7); NaN in the solar avoidance zone
+#: Steps of helio-ecliptic longitude and latitude in the table of the zodiacal light, deg.
+STEP_DEG = 15.0
 
 
 @lru_cache(maxsize=1)
-def zodiacal_table() -> ZodiacalTable:
-    """Return the table of the MauveSim paper."""
+def zodiacal_table() -> NDArray[np.float64]:
+    """Return the table of the MauveSim paper, V mag arcsec^-2; NaN in the solar avoidance zone.
+
+    Rows are longitudes from 0 to 180 deg, columns are latitudes from 0 to 90 deg.
+    """
     from astropy.table import Table
 
     path = resources.files(__package__).joinpath("zodiacal.ecsv")
     table = Table.read(path.read_text(encoding="utf-8"), format="ascii.ecsv")
     names = [name for name in table.colnames if name.startswith("latitude_")]
-    cells = np.stack([np.ma.filled(np.ma.asarray(table[name]), np.nan) for name in names], axis=1)
-    latitude = np.array([float(name.removeprefix("latitude_")) for name in names])
-    return ZodiacalTable(np.asarray(table["longitude"], np.float64), latitude, cells.astype(np.float64))
+    return np.stack([np.ma.filled(np.ma.asarray(table[name], np.float64), np.nan) for name in names], axis=1)
 
 
 def zodiacal_brightness(place: HelioEcliptic, lookup: Lookup = "bilinear") -> float:
@@ -255,9 +239,8 @@ def zodiacal_brightness(place: HelioEcliptic, lookup: Lookup = "bilinear") -> fl
     zone.
     """
     table = zodiacal_table()
-    step = table.longitude_deg[1] - table.longitude_deg[0]
-    row, column = place.longitude_deg / step, place.latitude_deg / step
-    nearest = float(table.brightness[int(np.floor(row + 0.5)), int(np.floor(column + 0.5))])
+    row, column = place.longitude_deg / STEP_DEG, place.latitude_deg / STEP_DEG
+    nearest = float(table[int(np.floor(row + 0.5)), int(np.floor(column + 0.5))])
     if np.isnan(nearest):
         raise InputError(
             f"the Sun is {place.separation_deg:.1f} deg from the target (helio-ecliptic longitude "
@@ -267,10 +250,9 @@ def zodiacal_brightness(place: HelioEcliptic, lookup: Lookup = "bilinear") -> fl
         )
     if lookup == "nearest":
         return nearest
-    i = min(int(row), table.longitude_deg.size - 2)
-    j = min(int(column), table.latitude_deg.size - 2)
+    i, j = (min(int(at), size - 2) for at, size in zip((row, column), table.shape, strict=True))
     along, across = row - i, column - j
     weights = np.outer([1 - along, along], [1 - across, across])
-    corners = table.brightness[i : i + 2, j : j + 2]
+    corners = table[i : i + 2, j : j + 2]
     weights[np.isnan(corners)] = 0.0
     return float(np.sum(weights * np.nan_to_num(corners)) / weights.sum())

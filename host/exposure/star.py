@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.exposure.response import Order, electrons_per_second
+from mauvecl.host.exposure.sky import parse_position
 from mauvecl.host.stars.library import embedded, known_band, library_table, nearest_spectrum
 from mauvecl.host.stars.source import Source
 from mauvecl.host.tables.names import (
@@ -128,10 +129,8 @@ class Neighbours:
 
     def electrons_per_second(self, instrument: Instrument, order: Order = "paper") -> Float:
         """Return the mean electrons per second of all neighbours in the fibre, shape (n_pixel,)."""
-        total = np.zeros(instrument.wavelength_nm.size)
-        for neighbour in self.within(instrument):
-            total += self.share * rate_of(neighbour, instrument, order)
-        return total
+        rates = (self.share * rate_of(neighbour, instrument, order) for neighbour in self.within(instrument))
+        return sum(rates, np.zeros(instrument.wavelength_nm.size))
 
     def provenance(self, instrument: Instrument) -> dict[str, str]:
         """Return the neighbours in the fibre with their spectra, for the record of an expectation."""
@@ -241,17 +240,12 @@ MOST_ROWS = 100_000
 def read_neighbours(path: str | Path, target: str | None = None) -> tuple[tuple[Neighbour, ...], tuple[str, ...]]:
     """Read neighbours, nearest first, and return them with statements on how the table was read.
 
-    Raises InputError if the table has no separations and no positions, or a cell is invalid.
-
-    Parameters
-    ----------
-    path : str or Path
-        CSV, ECSV, FITS or VOTable with a row per star. A separation, or right ascension and declination, and for stars
-        within the fibre a magnitude and a spectral type, spectrum file, temperature or Gaia colour, in columns of any
-        of the names in this module, in any case. Files of spectra are relative to the table.
-    target : str, optional
-        Name of the row that is the target itself, which is left out, or coordinates such as "290.68 +11.12". Positions
-        are measured from it; it is needed if there are no separations.
+    The file is a CSV, ECSV, FITS or VOTable with a row per star. A separation, or right ascension and declination, and
+    for stars within the fibre a magnitude and a spectral type, spectrum file, temperature or Gaia colour, are in
+    columns of any of the names in this module, in any case. Files of spectra are relative to the table. The target is
+    the name of the row that is the target itself, which is left out, or coordinates such as "290.68 +11.12". Positions
+    are measured from it; it is needed if there are no separations. Raises InputError if the table has no separations
+    and no positions, or a cell is invalid.
     """
     path = Path(path)
     named = f"table of neighbours {shortened(path.name)}"
@@ -364,8 +358,6 @@ class _Neighbours(Rows):
 
 def _coordinates(text: str, named: str) -> tuple[float, float]:
     """Return right ascension and declination in radians. Raises InputError unless the text is coordinates."""
-    from mauvecl.host.exposure.sky import parse_position
-
     try:
         place = parse_position(text)
     except InputError as error:

@@ -13,11 +13,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.host.arrays import ContentEquality, set_read_only
-from mauvecl.host.tables.files import read_numbers
+from mauvecl.host.tables.files import Numbers, read_numbers
 from mauvecl.host.tables.units import unit_of
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range, Unit
+
+
+def _table_and_source(path: str | Path, what: str) -> tuple[Numbers, str]:
+    """Read an ECSV table of numbers, and the origin of its values, "tag: source", from its metadata."""
+    table = read_numbers(path, what)
+    source = table.meta.get("source", f"assumed, no source in {Path(path).name}")
+    return table, f"{table.meta.get('tag', 'A')}: {source}"
 
 
 @dataclass(frozen=True)
@@ -29,8 +36,7 @@ class Curve:
     source: str = "A: assumed, no source given"  # "tag: source" of the values
 
     def __post_init__(self) -> None:
-        wavelength = np.asarray(self.wavelength_nm, dtype=np.float64)
-        value = np.asarray(self.value, dtype=np.float64)
+        wavelength, value = np.asarray(self.wavelength_nm, np.float64), np.asarray(self.value, np.float64)
         if wavelength.ndim != 1 or wavelength.size == 0 or wavelength.shape != value.shape:
             raise InputError(
                 f"the curve needs one value per wavelength, but has {wavelength.size} wavelengths "
@@ -56,7 +62,7 @@ class Curve:
         The table's metadata give the values' origin: `tag` (P, D, C or A) and `source`. Raises InputError if the file
         is missing or is not such a table.
         """
-        table = read_numbers(path, "curve file")
+        table, source = _table_and_source(path, "curve file")
         if "wavelength" not in table.columns or len(table.columns) != 2:
             raise InputError(
                 f"curve file {path} has the columns {', '.join(table.columns)}",
@@ -64,18 +70,13 @@ class Curve:
                 key="columns",
             )
         name = next(column for column in table.columns if column != "wavelength")
-        meta = table.meta
         try:
             length = unit_of(table.units["wavelength"]) if table.units["wavelength"] else None
             wavelength = _converted(table["wavelength"], "wavelength", length, [u.nm])
             # Here A is ampere, not Angstrom.
             unit = u.Unit(table.units[name].replace("percent", "%"), parse_strict="silent")
             value = _converted(table[name], name, unit, [u.A / u.W, u.dimensionless_unscaled])
-            return cls(
-                tuple(wavelength.tolist()),
-                tuple(value.tolist()),
-                f"{meta.get('tag', 'A')}: {meta.get('source', f'assumed, no source in {Path(path).name}')}",
-            )
+            return cls(tuple(wavelength.tolist()), tuple(value.tolist()), source)
         except InputError as error:
             raise error.within(f"curve file {path}") from None
 
@@ -143,12 +144,9 @@ class PixelMap(ContentEquality):
                 raise InputError(
                     f"{name} of the pixel map has the shape {values.shape}", "one value per pixel", key=name
                 )
-            bad = ~(np.isfinite(values) & (values >= 0))
-            if name == "gain":
-                bad |= values == 0
+            bad = ~(np.isfinite(values) & (values > 0 if name == "gain" else values >= 0))
             if bad.any():
-                pixel = int(np.argmax(bad))
-                above = "above 0" if name == "gain" else "0 or more"
+                pixel, above = int(np.argmax(bad)), "above 0" if name == "gain" else "0 or more"
                 raise InputError.of(name, values[pixel], f"finite and {above}", where=f"pixel map, pixel {pixel}")
             set_read_only(self, **{name: values})
             sizes.add(values.size)
@@ -179,7 +177,7 @@ class PixelMap(ContentEquality):
     @classmethod
     def read(cls, path: str | Path) -> PixelMap:
         """Read an ECSV table with one row per pixel of the array, in order, and any of the columns of `COLUMNS`."""
-        table = read_numbers(path, "pixel map")
+        table, source = _table_and_source(path, "pixel map")
         unknown = [name for name in table.columns if name not in COLUMNS and name != "pixel"]
         if unknown or list(table.columns) in ([], ["pixel"]):
             what = f"the column {unknown[0]!r}" if unknown else "no column of values"
@@ -197,7 +195,6 @@ class PixelMap(ContentEquality):
                 wanted = str(COLUMNS[name]) or "none"
                 raise InputError(f"pixel map {path}: {name} has the unit {str(unit) or 'none'!r}", wanted, key=name)
             values[name] = table[name]
-        source = f"{table.meta.get('tag', 'A')}: {table.meta.get('source', f'assumed, no source in {Path(path).name}')}"
         try:
             return cls(**values, source=source)
         except InputError as error:
@@ -330,16 +327,9 @@ class ThroughputErrors(ContentEquality):
     ) -> ThroughputErrors:
         """Return the modes of a covariance of log throughput and of the logarithms of other values.
 
-        Parameters
-        ----------
-        wavelength_nm : array_like, shape (n,)
-        covariance : array_like, shape (n + n_name, n + n_name)
-        source : str
-        names : sequence of str
-            Of the other values.
-        sums : ndarray, shape (n_sum, n), optional
-            Weighted sums of the curve, such as the light in bands. The first modes hold all errors of these sums and of
-            the other values.
+        The covariance has the shape (n + n_name, n + n_name) for n wavelengths and the names of the other values. If
+        `sums`, shape (n_sum, n), are weighted sums of the curve, such as the light in bands, the first modes hold all
+        errors of these sums and of the other values.
         """
         nm, total = np.asarray(wavelength_nm, np.float64), np.asarray(covariance, np.float64)
         sd = np.sqrt(np.diag(total))
@@ -362,7 +352,7 @@ class ThroughputErrors(ContentEquality):
     @classmethod
     def read(cls, path: str | Path) -> ThroughputErrors:
         """Read an ECSV table with the columns wavelength (nm) and mode_1, mode_2 and so on."""
-        table = read_numbers(path, "throughput errors")
+        table, source = _table_and_source(path, "throughput errors")
         names = [name for name in table.columns if name.startswith(MODE)]
         if "wavelength" not in table.columns or not names or len(names) + 1 != len(table.columns):
             raise InputError(
@@ -372,7 +362,6 @@ class ThroughputErrors(ContentEquality):
             )
         if table.units["wavelength"] != "nm":
             raise InputError.of("unit", table.units["wavelength"], "nm", where=f"throughput errors {path}")
-        source = f"{table.meta.get('tag', 'A')}: {table.meta.get('source', f'assumed, no source in {Path(path).name}')}"
         try:
             modes = np.array([table[name] for name in names])
             return cls(table["wavelength"], modes, source, table.meta.get("values", {}))

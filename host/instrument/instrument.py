@@ -10,14 +10,15 @@ from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import astropy.units as u
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
 from scipy.special import erf, ndtr
 
+from mauvecl.host.instrument import FORMERLY_MAUVE, instrument_path, shipped_names
 from mauvecl.host.instrument.curves import MAX_PIXELS, Curve, PixelMap, ThroughputErrors
-from mauvecl.host.instrument.paths import FORMERLY_MAUVE, instrument_path, shipped_names
 from mauvecl.host.tables.files import read_text, toml
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened
@@ -42,12 +43,7 @@ def read_values(
 ) -> tuple[dict[str, Any], dict[str, str]]:
     """Return the values and sources of a file, merged over those of the file that it extends.
 
-    Parameters
-    ----------
-    files : mapping
-        Classes of the values that may be paths, relative to the file.
-    seen : tuple of Path
-        Files that extend this one.
+    Values of the classes in `files` may be paths, relative to the file; `seen` are the files that extend this one.
     """
     if path.resolve() in seen:
         raise InputError(f"{path.name} extends itself; the chain of files must end", key="extends")
@@ -120,17 +116,12 @@ def _as_curve(value: Any, unit: str) -> Any:
         raise PydanticCustomError("expected", "Input should be {expected}", {"expected": expected}) from None
     if isinstance(plain, int | float) and not isinstance(plain, bool):
         return Curve.flat(float(plain))
-    return Curve.read(plain) if isinstance(plain, str | Path) else plain
+    return _read_path(plain, Curve)
 
 
-def _as_map(value: Any) -> Any:
-    """Convert a path to a pixel map."""
-    return PixelMap.read(value) if isinstance(value, str | Path) else value
-
-
-def _as_errors(value: Any) -> Any:
-    """Convert a path to the uncertainty of a throughput."""
-    return ThroughputErrors.read(value) if isinstance(value, str | Path) else value
+def _read_path(value: Any, kind: type[Curve | PixelMap | ThroughputErrors]) -> Any:
+    """Read a path as an object of a class; return other values unchanged."""
+    return kind.read(value) if isinstance(value, str | Path) else value
 
 
 Efficiency = Annotated[Curve, BeforeValidator(partial(_as_curve, unit=""))]
@@ -216,7 +207,9 @@ class Instrument(Section):
     bias_dn: Annotated[NotNegative, Unit("DN"), Help("Bias")]
     frame_s: Annotated[Exposure, Help("Length of a frame")]
     pixel_map: Annotated[
-        PixelMap | None, BeforeValidator(_as_map), Help("Deviations of single pixels from these values")
+        PixelMap | None,
+        BeforeValidator(partial(_read_path, kind=PixelMap)),
+        Help("Deviations of single pixels from these values"),
     ] = None
     throughput_factor: Annotated[
         Curve | None,
@@ -224,7 +217,9 @@ class Instrument(Section):
         Help("Calibrated throughput over that of the curves and losses above, with the end values beyond its knots"),
     ] = None
     throughput_errors: Annotated[
-        ThroughputErrors | None, BeforeValidator(_as_errors), Help("Uncertainty of the calibrated throughput")
+        ThroughputErrors | None,
+        BeforeValidator(partial(_read_path, kind=ThroughputErrors)),
+        Help("Uncertainty of the calibrated throughput"),
     ] = None
     throughput_amplitudes: Annotated[
         tuple[float, ...],
@@ -494,7 +489,6 @@ class Instrument(Section):
     @property
     def table(self) -> QTable:
         """Wavelength, throughput and effective area of each pixel that is read, with units."""
-        import astropy.units as u
         from astropy.table import QTable
 
         table = QTable({"wavelength": self.wavelength_nm * u.nm, "throughput": self.throughput(self.wavelength_nm)})
@@ -533,17 +527,14 @@ def _counted(name: str, value: Any) -> Any:
     return count(name, value) if is_number and field is not None and field.annotation is int else value
 
 
-@cache
-def _embedded(name: str) -> Instrument:
-    return _from_file(name)
-
-
 def _from_file(name: str | Path) -> Instrument:
     path = instrument_path(name, Path())
     values, sources = read_values(path, FILES)
     own_sources = {name: source for name, source in sources.items() if name not in LABELS}
     return Instrument.build({**values, "sources": own_sources}, path.name)
 
+
+_embedded = cache(_from_file)
 
 #: Fields that do not affect a measurement.
 LABELS = ("name", "notice", "sources")

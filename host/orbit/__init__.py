@@ -1,1 +1,106 @@
-"""The satellite's orbit: position, visibility of targets, temperature and radiation. Nothing is downloaded."""
+"""The orbit and its targets, and the limits of observations, a section of studies for which no NumPy is imported."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import model_serializer, model_validator
+
+from mauvecl.schema import parsing
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.fields import Flag, Help, OrNone, Range, Unit
+from mauvecl.schema.section import Section
+
+#: Angle between two directions; None for no limit.
+Separation = Annotated[float | None, Unit("deg"), Range(0, 180), OrNone()]
+
+
+class Limits(Section):
+    """Conditions for a target to be visible. Mauve's own limits are not public: all defaults are assumptions.
+
+    None means no limit; study files say "none".
+    """
+
+    earth_limb_deg: Annotated[
+        Annotated[float | None, Unit("deg"), Range(0, 90), OrNone()],
+        Help("Smallest angle from the Earth's limb", "or none"),
+        Flag("--earth-limb", kind=str),
+    ] = 25.0
+    sun_deg: Annotated[Separation, Help("Smallest angle from the Sun", "or none"), Flag("--sun", kind=str)] = 46.0
+    moon_deg: Annotated[Separation, Help("Smallest angle from the Moon", "or none"), Flag("--moon", kind=str)] = 25.0
+    declination_deg: Annotated[
+        tuple[float, float] | None,
+        Unit("deg"),
+        OrNone(),
+        Help("Field of regard, low:high", "or none", default="-46.4:31.8"),
+        Flag("--declination", kind=str, read=parsing.declinations),
+    ] = (-46.4, 31.8)
+    normal_cone_deg: Annotated[
+        Separation, Help("Field of regard as a double cone about the orbit's normal", "or none", default="none")
+    ] = None
+    eclipse: Annotated[
+        Literal["any", "only", "never"],
+        Help("Observing in the Earth's shadow", choices="any, only (in the shadow) or never"),
+        Flag("--eclipse"),
+    ] = "any"
+    proton_flux: Annotated[
+        Annotated[float | None, Unit("1 / (cm2 s)"), Range(0, open_low=True), OrNone()],
+        Help("Largest flux of protons above 10 MeV", "or none"),
+        Flag("--protons", kind=str),
+    ] = 10.0
+    anomaly: Annotated[
+        tuple[tuple[float, float], ...],
+        Unit("deg"),
+        Help("Polygon of longitude and latitude in deg that replaces the map of protons"),
+    ] = ()
+    shortest_s: Annotated[float, Unit("s"), Range(0), Help("Length below which windows are dropped")] = 0.0
+    duty_cycle: Annotated[
+        float, Range(0, 1, open_low=True), Help("Fraction of a window in which the star is exposed")
+    ] = 1.0
+
+    @model_validator(mode="after")
+    def _possible(self) -> Self:
+        if self.declination_deg is not None:
+            low, high = self.declination_deg
+            if not -90 <= low < high <= 90:
+                raise InputError.of("declination_deg", (low, high), "two rising values within -90 to 90")
+        if self.anomaly and (
+            len(self.anomaly) < 3 or not all(math.isfinite(angle) for corner in self.anomaly for angle in corner)
+        ):
+            raise InputError(
+                f"anomaly is a polygon of {len(self.anomaly)} corners", "at least 3, finite", key="anomaly"
+            )
+        return self
+
+    @model_serializer(mode="plain")
+    def _with_none_as_text(self) -> dict[str, Any]:
+        """Write "none" for no limit, since studies leave out what is None."""
+        return {name: "none" if value is None else value for name, value in self}
+
+    @property
+    def assumptions(self) -> list[tuple[str, str, str]]:
+        """Name, value and source of each limit in force."""
+        return [(name, _text(value), SOURCES[name]) for name, value in self if value not in (None, ())]
+
+
+_UVEX = "assumption, borrowed from UVEX (m4opt's definition of that mission); Mauve's own is not public"
+#: Sources of the default values.
+SOURCES = {
+    "earth_limb_deg": _UVEX,
+    "sun_deg": _UVEX,
+    "moon_deg": _UVEX,
+    "declination_deg": "assumption, field of regard in a talk of 2024, before launch; the flown orbit's is not public",
+    "normal_cone_deg": "assumption: such a cone of 39.1 deg gives the field of regard of the talk of 2024",
+    "eclipse": "assumption: observing is allowed in sunlight and shadow alike",
+    "proton_flux": "assumption: no exposures above this flux of protons beyond 10 MeV (AP8 at solar maximum, 510 km)",
+    "anomaly": "user-defined polygon that replaces the map of protons",
+    "shortest_s": "assumption: no time is lost to pointing and acquisition",
+    "duty_cycle": "assumption: the whole window is exposed; the share that Mauve reaches is not public",
+}
+
+
+def _text(value: object) -> str:
+    if isinstance(value, tuple):
+        return " ".join(_text(item) for item in value)
+    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -1,4 +1,4 @@
-"""Geometry of an orbit: the Earth, Sun and Moon, times, and constraints on the visibility of targets."""
+"""Geometry of an orbit: the Earth, Sun and Moon, and times."""
 
 from __future__ import annotations
 
@@ -66,12 +66,7 @@ def subsatellite_point(
 ) -> tuple[Vectors, Vectors]:
     """Return the geodetic longitude (-180 to 180) and latitude of the sub-satellite point, deg, shape (n,) each.
 
-    Parameters
-    ----------
-    position_km : ndarray, shape (n, 3)
-        Position in SGP4's frame.
-    midnight, days : ndarray, shape (n,)
-        Parts of the Julian date, UTC.
+    Positions are in SGP4's frame, shape (n, 3), and `midnight` and `days` are parts of the Julian dates, UTC.
     """
     # The angle from SGP4's frame to the Earth-fixed frame.
     theta = erfa.gmst82(midnight, days)
@@ -92,45 +87,6 @@ def limb_angle_rad(position_km: Vectors) -> NDArray[np.float64]:
     return np.asarray(np.arcsin(LIMB_KM / np.linalg.norm(position_km, axis=-1)))
 
 
-def clear_of_earth(position_km: Vectors, target: Vectors, margin_deg: float) -> Flags:
-    """Return whether targets are at least `margin_deg` above the Earth's limb, shape (n, k).
-
-    `position_km` is geocentric, shape (n, 3); `target` holds unit vectors, shape (k, 3), here and below.
-    """
-    least = limb_angle_rad(position_km) + np.radians(margin_deg)
-    towards_earth = (-unit(position_km)).astype(np.float32) @ target.T.astype(np.float32)
-    return np.asarray(towards_earth <= np.cos(least).astype(np.float32)[:, None])
-
-
-def clear_of_sun(sun: Vectors, target: Vectors, least_deg: float) -> Flags:
-    """Return whether targets are at least `least_deg` from the Sun's centre, shape (n, k).
-
-    `sun` holds unit vectors, shape (n, 3).
-    """
-    return np.asarray(sun.astype(np.float32) @ target.T.astype(np.float32) <= np.float32(np.cos(np.radians(least_deg))))
-
-
-def clear_of_moon(moon_km: Vectors, position_km: Vectors, target: Vectors, least_deg: float) -> Flags:
-    """Return whether targets are at least `least_deg` from the Moon's centre at the satellite, shape (n, k)."""
-    return clear_of_sun(unit(moon_km - position_km), target, least_deg)
-
-
-def in_declinations(target: Vectors, low_deg: float, high_deg: float) -> Flags:
-    """Return whether targets lie between two declinations, shape (k,)."""
-    declination = np.degrees(np.arcsin(np.clip(target[:, 2], -1, 1)))
-    return np.asarray((declination >= low_deg) & (declination <= high_deg))
-
-
-def in_cone(axis: Vectors, target: Vectors, half_angle_deg: float) -> Flags:
-    """Return whether targets lie within an angle of an axis such as the orbit's normal, shape (n, k).
-
-    `axis` holds unit vectors, shape (n, 3).
-    """
-    return np.asarray(
-        axis.astype(np.float32) @ target.T.astype(np.float32) >= np.float32(np.cos(np.radians(half_angle_deg)))
-    )
-
-
 def sunlight(position_km: Vectors, sun: Vectors, sun_km: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the fraction of the Sun's disk that the Earth does not hide, 0 to 1, shape (n,).
 
@@ -138,19 +94,14 @@ def sunlight(position_km: Vectors, sun: Vectors, sun_km: NDArray[np.float64]) ->
     """
     distance = np.linalg.norm(position_km, axis=1)
     separation = np.arccos(np.clip(-np.einsum("ni,ni->n", position_km, sun) / distance, -1, 1))
-    earth, disk = np.arcsin(LIMB_KM / distance), np.arcsin(SUN_KM / sun_km)
+    earth, disk = limb_angle_rad(position_km), np.arcsin(SUN_KM / sun_km)
     return np.asarray(np.clip((separation - earth + disk) / (2 * disk), 0, 1))
 
 
 def in_polygon(longitude_deg: NDArray[np.float64], latitude_deg: NDArray[np.float64], corners: Vectors) -> Flags:
-    """Return whether positions lie inside a polygon in the plane of longitude and latitude, shape (n,).
+    """Return whether positions lie inside a polygon in the plane of longitude and latitude, deg, shape (n,).
 
-    Parameters
-    ----------
-    longitude_deg, latitude_deg : ndarray, shape (n,)
-        Longitudes may exceed 180 deg on either side.
-    corners : ndarray, shape (m, 2)
-        Longitude and latitude of the corners in order, deg. The polygon may cross longitude 180.
+    Longitudes may exceed 180 deg, and the polygon, of shape (m, 2) with its corners in order, may cross longitude 180.
     """
     # Longitudes are relative to the first corner.
     x = (longitude_deg - corners[0, 0] + 180) % 360 - 180

@@ -5,8 +5,9 @@ from __future__ import annotations
 import re
 import threading
 from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass, field
-from functools import cache, cached_property, lru_cache
+from functools import cached_property, lru_cache
 from importlib import resources
 from itertools import pairwise
 from pathlib import Path
@@ -29,7 +30,7 @@ from mauvecl.host.orbit.geometry import (
     unit,
     utc_text,
 )
-from mauvecl.host.stars.library import by_key, name_key, near_names, well_known_text
+from mauvecl.host.stars.library import by_key, library_text, name_key, near_names
 from mauvecl.host.tables.files import parse_ecsv, read_text
 from mauvecl.host.tables.names import EXPECTED_POSITION, is_missing_position
 from mauvecl.host.tables.units import offline
@@ -263,16 +264,10 @@ class Orbit:
     def states(
         self, midnight: NDArray[np.float64], days: NDArray[np.float64], kind: Literal["tle", "mean"]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return positions (km) and velocities (km/s) in SGP4's frame, shape (n, 3) each.
+        """Return positions (km) and velocities (km/s) in SGP4's frame by SGP4 or in the mean orbit, shape (n, 3) each.
 
-        Parameters
-        ----------
-        midnight, days : ndarray, shape (n,)
-            Parts of the Julian date, UTC.
-        kind : {"tle", "mean"}
-            Propagation by SGP4, or the mean orbit.
-
-        Raises InputError if SGP4 fails at one of the times.
+        `midnight` and `days` are parts of the Julian dates, UTC, of shape (n,). Raises InputError if SGP4 fails at one
+        of the times.
         """
         if kind == "mean":
             return self._mean(midnight, days)
@@ -429,11 +424,6 @@ class Target:
         return direction(self.ra_deg, self.dec_deg)
 
 
-@cache
-def _list() -> Table:
-    return parse_ecsv(well_known_text(), "the embedded list of stars")
-
-
 def target_table() -> Table:
     """Return the embedded stars.
 
@@ -442,7 +432,7 @@ def target_table() -> Table:
     Table
         Columns name, ra, dec (deg, ICRS), distance (pc), V, spectral_type, other_names and source.
     """
-    return _list().copy()
+    return parse_ecsv(library_text("well_known.ecsv"), "the embedded list of stars")
 
 
 #: ADQL query of SIMBAD (tried with astroquery 0.4.11). The left join keeps stars without a V magnitude.
@@ -490,21 +480,14 @@ def _from_simbad(text: str, name: str | None) -> Target:
 
 def _within(seconds: float, ask: Callable[[], Any]) -> Any:
     """Call a function and raise TimeoutError if it takes too long, since astroquery's requests may never return."""
-    answers: list[Any] = []
-    failed: list[BaseException] = []
+    answer: Future[Any] = Future()
 
     def run() -> None:
         try:
-            answers.append(ask())
+            answer.set_result(ask())
         except Exception as error:
-            failed.append(error)
+            answer.set_exception(error)
 
     # A daemon thread does not delay the exit of the program.
-    thread = threading.Thread(target=run, daemon=True)
-    thread.start()
-    thread.join(seconds)
-    if failed:
-        raise failed[0]
-    if not answers:
-        raise TimeoutError
-    return answers[0]
+    threading.Thread(target=run, daemon=True).start()
+    return answer.result(seconds)

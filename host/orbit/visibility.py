@@ -4,66 +4,45 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cache, cached_property
 from importlib import resources
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.arrays import true_runs
 from mauvecl.host.exposure.sky import HelioEcliptic, zodiacal_brightness
-from mauvecl.host.orbit import geometry
+from mauvecl.host.orbit import Limits, geometry
 from mauvecl.host.orbit.geometry import Bodies, Flags, TimeGrid, Vectors, unit
-from mauvecl.host.orbit.observing_limits import Limits
 from mauvecl.host.orbit.orbit import Orbit, Track
 from mauvecl.host.tables.files import parse_ecsv
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import DetectorTemperature, Duration, NotNegative, Share
 
-Energy = Literal[10, 30]
 
-
-@dataclass(frozen=True, eq=False)
-class FluxMap:
-    """Omnidirectional flux of trapped protons by sub-satellite point, cm^-2 s^-1."""
-
-    step_deg: float  # spacing of the grid
-    # By lower energy limit, MeV; each of shape (n_latitude, n_longitude), from latitude -90 and longitude -180.
-    flux: dict[int, NDArray[np.float64]]
-    source: str
-
-    def at(
-        self, longitude_deg: NDArray[np.float64], latitude_deg: NDArray[np.float64], above_mev: Energy = 10
-    ) -> NDArray[np.float64]:
-        """Interpolate the flux above an energy bilinearly, shape (n,)."""
-        if above_mev not in self.flux:
-            raise InputError.of("above_mev", above_mev, " or ".join(map(str, self.flux)))
-        grid = self.flux[above_mev]
-        row = np.clip((np.asarray(latitude_deg, float) + 90) / self.step_deg, 0, grid.shape[0] - 1)
-        column = (np.asarray(longitude_deg, float) + 180) / self.step_deg % grid.shape[1]
-        i, j = np.minimum(row.astype(int), grid.shape[0] - 2), column.astype(int) % grid.shape[1]
-        right, up, along = (j + 1) % grid.shape[1], row - i, column - np.floor(column)
-        south = (1 - along) * grid[i, j] + along * grid[i, right]
-        north = (1 - along) * grid[i + 1, j] + along * grid[i + 1, right]
-        return np.asarray((1 - up) * south + up * north)
-
-
-@lru_cache(maxsize=1)
-def proton_map() -> FluxMap:
+@cache
+def _proton_map(above_mev: int) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
     """Return the map of AP8 at solar maximum, at an altitude of 510 km (see `tools/build_flux_map.py`)."""
+    from scipy.interpolate import RegularGridInterpolator
+
     text = resources.files(__package__).joinpath("protons.ecsv").read_text(encoding="utf-8")
     table = parse_ecsv(text, "the embedded map of protons")
     step = float(table.meta["step_deg"])
+    latitude, longitude = (np.arange(-end, end + step / 2, step) for end in (90.0, 180.0))
     row = np.round((np.asarray(table["latitude"]) + 90) / step).astype(int)
     column = np.round((np.asarray(table["longitude"]) + 180) / step).astype(int)
-    maps = {}
-    for energy in (10, 30):
-        grid = np.zeros((round(180 / step) + 1, round(360 / step)))
-        grid[row, column] = table[f"above_{energy}_mev"]
-        grid.setflags(write=False)
-        maps[energy] = grid
-    return FluxMap(step, maps, str(table.meta["source"]))
+    flux = np.zeros((latitude.size, longitude.size))
+    flux[row, column] = table[f"above_{above_mev}_mev"]
+    flux[:, -1] = flux[:, 0]
+    return RegularGridInterpolator((latitude, longitude), flux)
+
+
+def proton_flux(track: Track, *, above_mev: Literal[10, 30]) -> NDArray[np.float64]:
+    """Return the omnidirectional flux of trapped protons above an energy along a track, cm^-2 s^-1, shape (n,)."""
+    longitude, latitude = track.subsatellite_deg
+    return np.asarray(_proton_map(above_mev)(np.stack([latitude, longitude], axis=-1)))
 
 
 @validated
@@ -127,7 +106,7 @@ class Particles:
 
     def rate_per_cm2_s(self, track: Track) -> NDArray[np.float64]:
         """Return the rate of hits along a track, cm^-2 s^-1, shape (n,)."""
-        return np.asarray(self.cosmic_per_cm2_s + self.share * proton_map().at(*track.subsatellite_deg, above_mev=30))
+        return np.asarray(self.cosmic_per_cm2_s + self.share * proton_flux(track, above_mev=30))
 
 
 #: Sources of the default values.
@@ -242,8 +221,7 @@ class Visibility:
 
     def windows(self, k: int) -> Windows:
         """Return the windows of one target in order, with ends accurate to one step."""
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], self.seen[:, k], [False]])))
-        first, last = edges[::2], edges[1::2]
+        first, last = true_runs(self.seen[:, k]).T
         dark = np.concatenate([[0], np.cumsum(self.shadow)])
         step = np.float64(self.track.times.step_s)
         return Windows(first * step, last * step, (dark[last] - dark[first]) * step)
@@ -257,15 +235,10 @@ class Visibility:
     def by_month(self) -> tuple[list[str], NDArray[np.float64]]:
         """Return the calendar months (UTC), such as "2027-01", and the hours of exposure, shape (n_month, k)."""
         times = self.track.times
-        _, days = times.julian
-        day = np.datetime64(times.iso(0.0)[:10], "D") + np.arange(int(np.floor(days[-1])) + 1)
-        month = day.astype("datetime64[M]")
-        names, place = np.unique(month, return_inverse=True)
-        starts = np.searchsorted(np.floor(days).astype(int), np.arange(day.size))
-        per_day = np.add.reduceat(self.seen, starts, axis=0, dtype=np.int64) * self._step_h
-        hours = np.zeros((names.size, len(self.target)))
-        np.add.at(hours, place, per_day)
-        return [str(name) for name in names], hours
+        day = np.datetime64(times.iso(0.0)[:10], "D") + np.floor(times.julian[1]).astype(int)
+        months, starts = np.unique(day.astype("datetime64[M]"), return_index=True)
+        hours = np.add.reduceat(self.seen, starts, axis=0, dtype=np.int64) * self._step_h
+        return [str(month) for month in months], hours
 
     def by_orbit(self, k: int) -> NDArray[np.float64]:
         """Return the minutes of exposure between ascending nodes, shape (n_orbit,).
@@ -289,19 +262,29 @@ def in_shadow(track: Track) -> Flags:
 def _rules(track: Track, target: Vectors, limits: Limits) -> dict[str, Rule]:
     """Return the limits in force by name."""
     at, bodies, rules = track.position_km, track.bodies, dict[str, Rule]()
-    if (earth := limits.earth_limb_deg) is not None:
-        rules["earth_limb"] = lambda part: geometry.clear_of_earth(at[part], target, earth)
-    if (sun := limits.sun_deg) is not None:
-        rules["sun"] = lambda part: geometry.clear_of_sun(bodies.sun[part], target, sun)
-    if (moon := limits.moon_deg) is not None:
-        rules["moon"] = lambda part: geometry.clear_of_moon(bodies.moon_km[part], at[part], target, moon)
-    if (regard := limits.declination_deg) is not None:
-        inside = geometry.in_declinations(target, *regard)
-        rules["declination"] = lambda part: inside[None, :]
-    if (cone := limits.normal_cone_deg) is not None:
-        rules["normal_cone"] = lambda part: (
-            geometry.in_cone(track.normal[part], target, cone) | geometry.in_cone(-track.normal[part], target, cone)
-        )
+    stars = target.T.astype(np.float32)
+
+    def far_from(directions: Vectors, angle_rad: NDArray[np.float64] | float) -> Flags:
+        """Return whether targets are at least an angle from directions, unit vectors of shape (n, 3)."""
+        return np.asarray(directions.astype(np.float32) @ stars <= np.float32(np.cos(angle_rad)))
+
+    if limits.earth_limb_deg is not None:
+        limb = geometry.limb_angle_rad(at)[:, None] + np.radians(limits.earth_limb_deg)
+        rules["earth_limb"] = lambda part: far_from(-unit(at[part]), limb[part])
+    if limits.sun_deg is not None:
+        sun = np.radians(limits.sun_deg)
+        rules["sun"] = lambda part: far_from(bodies.sun[part], sun)
+    if limits.moon_deg is not None:
+        moon = np.radians(limits.moon_deg)
+        rules["moon"] = lambda part: far_from(unit(bodies.moon_km[part] - at[part]), moon)
+    if limits.declination_deg is not None:
+        low, high = limits.declination_deg
+        declination = np.degrees(np.arcsin(np.clip(target[:, 2], -1, 1)))
+        regarded = (declination >= low) & (declination <= high)
+        rules["declination"] = lambda part: regarded[None, :]
+    if limits.normal_cone_deg is not None:
+        cone = np.float32(np.cos(np.radians(limits.normal_cone_deg)))
+        rules["normal_cone"] = lambda part: np.abs(track.normal[part].astype(np.float32) @ stars) >= cone
     if limits.eclipse != "any":
         allowed = in_shadow(track) == (limits.eclipse == "only")
         rules["eclipse"] = lambda part: allowed[part, None]
@@ -309,7 +292,7 @@ def _rules(track: Track, target: Vectors, limits: Limits) -> dict[str, Rule]:
         if limits.anomaly:
             outside = ~geometry.in_polygon(*track.subsatellite_deg, np.array(limits.anomaly))
         else:
-            outside = proton_map().at(*track.subsatellite_deg) <= (limits.proton_flux or 0.0)
+            outside = proton_flux(track, above_mev=10) <= (limits.proton_flux or 0.0)
         rules["anomaly"] = lambda part: outside[part, None]
     return rules
 
@@ -317,7 +300,6 @@ def _rules(track: Track, target: Vectors, limits: Limits) -> dict[str, Rule]:
 def _drop_short(seen: Flags, step_s: float, shortest_s: float) -> None:
     """Clear intervals shorter than `shortest_s` in each column, in place."""
     for column in seen.T:
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], column, [False]])))
-        for first, last in zip(edges[::2], edges[1::2], strict=True):
+        for first, last in true_runs(column):
             if (last - first) * step_s < shortest_s:
                 column[first:last] = False

@@ -326,15 +326,7 @@ class Choice:
 
 
 def choose(names: Sequence[str], roles: Sequence[Role], asked: Sequence[str] = ()) -> Choice:
-    """Choose the columns of wavelength and flux.
-
-    Parameters
-    ----------
-    roles : sequence of Role
-        Role of each column.
-    asked : sequence of str
-        Columns named by the user: a flux, a wavelength, or both.
-    """
+    """Choose the columns of wavelength and flux, of which the user may name one or both."""
     wanted = [_named(name, names) for name in asked]
     if len(wanted) > 2:
         raise InputError.of("columns", asked, "one flux, and one wavelength at most")

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import astropy.units as u
 import numpy as np
 from numpy.typing import NDArray
 
@@ -195,14 +196,8 @@ def _selected_rows(
 ) -> tuple[list[list[Any]], str, tuple[str, ...]]:
     """Return the selected row, or all rows if they are segments of one spectrum, the name of one, and messages.
 
-    Parameters
-    ----------
-    choice : Choice
-        Columns of wavelength and flux.
-    cells : list
-        Cells of these columns; wavelengths of shape (n,) apply to all rows of fluxes of shape (n_row, n).
-    asked : sequence of str
-        Words given by the user that may name a row.
+    The cells are those of the chosen columns; wavelengths of shape (n,) apply to all rows of fluxes of shape (n_row,
+    n). The user's words in `asked` may name a row.
     """
     n = len(cells[-1])
     if np.ndim(cells[-1]) == 2:
@@ -327,10 +322,7 @@ class ReadSpectrum:
 def converted(raw: RawSpectrum, wavelength_unit: Any = None, flux_unit: Any = None) -> ReadSpectrum:
     """Convert a spectrum.
 
-    Parameters
-    ----------
-    wavelength_unit, flux_unit : str or Unit, optional
-        Units that override those of the file. A unit of wavelength may end in "air" or "vacuum".
+    Given units override those of the file, and a unit of wavelength may end in "air" or "vacuum".
     """
     messages = list(raw.messages)
     medium: Medium | None = None
@@ -469,8 +461,6 @@ def _without_marks(segments: list[tuple[Float, Float]], messages: list[str]) -> 
 
 def _in_nm(values: Float, flux: Float, scale: _Scale) -> tuple[Float, Float]:
     """Return wavelengths in nm, and the fluxes of points with a wavelength."""
-    import astropy.units as u
-
     with np.errstate(all="ignore"):
         nm = np.asarray(u.Quantity(scale.linear_values(values), scale.unit).to_value(u.nm, u.spectral()), np.float64)
     bad = np.flatnonzero(~np.isfinite(nm))
@@ -483,8 +473,6 @@ def _in_nm(values: Float, flux: Float, scale: _Scale) -> tuple[Float, Float]:
 
 
 def _in_flam(flux: Float, nm: Float, scale: _Scale) -> Float:
-    import astropy.units as u
-
     flam = u.erg / (u.s * u.cm**2 * u.AA)
     with np.errstate(all="ignore"):
         quantity = u.Quantity(scale.linear_values(flux), scale.unit)

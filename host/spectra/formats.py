@@ -17,9 +17,9 @@ from typing import IO, TYPE_CHECKING, Any
 import numpy as np
 
 from mauvecl.host.spectra.columns import AXES, Role, divided, is_unit, listed, role_of, words_of
-from mauvecl.host.spectra.conversion import SpectrumTable
+from mauvecl.host.spectra.conversion import ReadSpectrum, SpectrumTable, converted, spectrum_in
 from mauvecl.host.spectra.units import medium_of, stated_units
-from mauvecl.host.tables.files import check_size, parsing, without_columns
+from mauvecl.host.tables.files import check_size, parse_ecsv, parsing, without_columns
 from mauvecl.host.tables.fits_tables import (
     FLUX_UNITS,
     WAVE_UNITS,
@@ -36,17 +36,24 @@ from mauvecl.host.tables.fits_tables import (
     text_at,
     unit_at,
 )
-from mauvecl.host.tables.table import Values
-from mauvecl.host.tables.text_tables import PROSE, NumberLines, bracketed, divided_names, keywords_of, numbered_names
+from mauvecl.host.tables.opening import Content, check_form, open_content, votables
+from mauvecl.host.tables.table import MemoryTable, Values
+from mauvecl.host.tables.text_tables import (
+    PROSE,
+    NumberLines,
+    bracketed,
+    divided_names,
+    is_described,
+    keywords_of,
+    numbered_names,
+    text_of,
+    text_table,
+)
 from mauvecl.host.tables.units import is_stated, time_in_name
 from mauvecl.schema.errors import InputError, shortened
 
 if TYPE_CHECKING:
     import astropy.units as u
-
-    from mauvecl.host.spectra.conversion import ReadSpectrum
-    from mauvecl.host.tables.opening import Content
-    from mauvecl.host.tables.table import MemoryTable
 
 #: Units of a text file without stated units (the paper's rule).
 TEXT_UNITS = ("nm", "erg / (s cm2 Angstrom)")
@@ -59,12 +66,8 @@ def table_of_text(
 ) -> SpectrumTable:
     """Read the table of a text file.
 
-    Parameters
-    ----------
-    asked : sequence of str
-        Words given by the user; for columns without names, their numbers.
-    wavelength, flux : bool
-        Whether to search the header for the units of wavelength and flux.
+    The user's words in `asked` are the numbers of columns if these have no names. The units of wavelength and flux are
+    searched in the header if requested.
     """
     lines = NumberLines(text, "wavelength and flux")
     names, units = _names(lines)
@@ -426,11 +429,6 @@ def read_spectrum(
     ignore_checksum : bool
         Whether a FITS file is read that its CHECKSUM or DATASUM contradicts.
     """
-    import numpy as np
-
-    from mauvecl.host.spectra.conversion import converted, spectrum_in
-    from mauvecl.host.tables.opening import open_content
-
     try:
         place, asked = without_columns(path)
     except (OSError, ValueError):
@@ -460,11 +458,6 @@ def _stem(name: str) -> str:
 def _tables(
     content: Content, name: str, origin: str, asked: Sequence[str], units: tuple[bool, bool], check: bool
 ) -> list[SpectrumTable]:
-    from mauvecl.host.tables.files import parse_ecsv
-    from mauvecl.host.tables.opening import check_form, votables
-    from mauvecl.host.tables.table import MemoryTable
-    from mauvecl.host.tables.text_tables import is_described, text_of, text_table
-
     if content.form == "FITS":
         return fits_tables(content.file, name, origin, asked, check)
     if content.form == "VOTable":
@@ -484,9 +477,6 @@ def _tables(
 
 def _in_memory(file: MemoryTable, name: str, origin: str, label: str = "") -> SpectrumTable:
     """Return the table of an ECSV file or a VOTable."""
-    from mauvecl.host.spectra.conversion import SpectrumTable
-    from mauvecl.host.spectra.units import medium_of
-
     columns = [file.find(one) for one in file.names]
     said = [f"{one.ucd} {one.description}" for one in columns]
     return SpectrumTable(

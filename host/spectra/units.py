@@ -282,17 +282,8 @@ def vacuum_wavelengths(
 ) -> tuple[Float, tuple[str, ...]]:
     """Return vacuum wavelengths, nm, and messages about them.
 
-    Parameters
-    ----------
-    nm : ndarray, shape (n,)
-    column : str
-        Name of their column, which takes precedence over the header.
-    remarks : str
-        Text of the file's header.
-    given : {"air", "vacuum"} or None
-        Medium given by the user, or with the unit, which takes precedence over everything else.
-    keyword : callable
-        Function that returns the medium of keywords, which takes precedence over remarks.
+    The medium is what the user or the unit gives, else what the name of the column says, else what the function
+    `keyword` finds in keywords, else what the remarks of the file's header say.
     """
     messages: tuple[str, ...] = ()
     named, said = _words(column), _words(remarks)

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import IO
+from typing import IO, TYPE_CHECKING
 from urllib.parse import urljoin, urlsplit
 
 from mauvecl.host import VERSION
@@ -22,6 +22,9 @@ from mauvecl.host.stars.library import OwnStar, embedded, find, folder, kept, sp
 from mauvecl.host.stars.source import Source
 from mauvecl.host.tables.files import limit_bytes, parsing, read_bytes, without_columns, write_whole
 from mauvecl.schema.errors import InputError, shortened
+
+if TYPE_CHECKING:
+    from astropy.table import Table
 
 
 def add(
@@ -54,8 +57,6 @@ def add(
     InputError
         If the file holds no usable spectrum, the name is taken or invalid, or the folder cannot be written.
     """
-    from astropy.table import Table
-
     given = path
     path, _ = without_columns(path)
     content = read_bytes(path, "spectrum file")
@@ -63,22 +64,9 @@ def add(
     check_covers(source.name, source.measured_nm or (source.wavelength_nm[0], source.wavelength_nm[-1]))
     name = (name or source.name).strip()
     place = _place_of(name, replace=replace)
-    dereddened = any("dereddened" in note for note in source.notes)
-    table = Table({"wavelength": source.wavelength_nm, "flux": source.flux_flam})
-    table["wavelength"].unit, table["flux"].unit = "nm", "erg / (s cm2 Angstrom)"
-    table.meta |= {
-        "name": name,
-        "origin": origin or f"file {path.name}",
-        "file_sha256": hashlib.sha256(content).hexdigest(),
-        "spectrum_sha256": spectrum_digest(source.wavelength_nm, source.flux_flam),
-        "kept_utc": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "dereddened": dereddened,
-        "notes": list(source.notes),
-        "told": list(source.messages),
-        "unscaled": source.unscaled,
-    }
-    if source.measured_nm is not None:
-        table.meta["measured_nm"] = list(source.measured_nm)
+    table = _kept_table(source)
+    digest = hashlib.sha256(content).hexdigest()
+    table.meta = {"name": name, "origin": origin or f"file {path.name}", "file_sha256": digest} | table.meta
     text = io.StringIO()
     table.write(text, format="ascii.ecsv")
     try:
@@ -88,6 +76,25 @@ def add(
     star = find(name)
     assert star is not None
     return star
+
+
+def _kept_table(source: Source) -> Table:
+    """Return a spectrum and what is known of it as a table."""
+    from astropy.table import Table
+
+    table = Table({"wavelength": source.wavelength_nm, "flux": source.flux_flam})
+    table["wavelength"].unit, table["flux"].unit = "nm", "erg / (s cm2 Angstrom)"
+    table.meta |= {
+        "spectrum_sha256": spectrum_digest(source.wavelength_nm, source.flux_flam),
+        "kept_utc": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "dereddened": any("dereddened" in note for note in source.notes),
+        "notes": list(source.notes),
+        "told": list(source.messages),
+        "unscaled": source.unscaled,
+    }
+    if source.measured_nm is not None:
+        table.meta["measured_nm"] = list(source.measured_nm)
+    return table
 
 
 def _place_of(name: str, *, replace: bool) -> Path:

@@ -18,7 +18,6 @@ from astropy.constants import c, h
 from numpy.typing import NDArray
 
 from mauvecl.host.arrays import array_cache
-from mauvecl.host.stars.blackbody import ANGSTROM
 from mauvecl.host.stars.library import band_table, embedded, known_band, spectrum_table
 from mauvecl.schema.errors import InputError, shortened
 
@@ -29,6 +28,8 @@ System = Literal["catalogue", "vega", "ab"]
 SYSTEMS: tuple[System, ...] = get_args(System)
 #: Fraction of a band's throughput that a spectrum must cover.
 COVERAGE = 0.99
+#: Angstrom per nanometre, with astropy's rounding.
+ANGSTROM = float(u.nm.to(u.AA))
 #: h c in erg Angstrom, with astropy's rounding.
 HC = float(h.cgs.value * c.to_value(u.AA / u.s))
 #: Distance up to which two wavelengths count as one, Angstrom (synphot).

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.arrays import true_runs
 from mauvecl.host.spectra.units import MIN_MEASURED, NEEDED_NM, SPAN_NM, is_gap, likely_unit, measured_part
 from mauvecl.schema.errors import InputError
 
@@ -150,9 +151,10 @@ def remarks(wavelength: Float, flux: Float) -> tuple[str, ...]:
             f"{values[i]:.3g} at {nm[i]:.1f} nm: measured noise, kept; `bin_nm` bins it"
         )
     # Runs of at least three zeros are not measurements.
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], (values == 0.0).astype(np.int8), [0]])))
     runs = [
-        (a, b) for a, b in edges.reshape(-1, 2) if b - a >= 3 and nm[b - 1] >= NEEDED_NM[0] and nm[a] <= NEEDED_NM[1]
+        (a, b)
+        for a, b in true_runs(values == 0.0)
+        if b - a >= 3 and nm[b - 1] >= NEEDED_NM[0] and nm[a] <= NEEDED_NM[1]
     ]
     if runs:
         where = ", ".join(f"{nm[a]:.1f}-{nm[b - 1]:.1f}" for a, b in runs[:3])
@@ -184,24 +186,12 @@ def continued(
     *,
     dark_only: bool = False,
 ) -> tuple[Float, Float, tuple[str, ...]]:
-    """Continue the ends of a spectrum at their level, within the reach of the line spread function.
+    """Continue the ends of a spectrum at their level, within reach of the line spread function, and return messages.
 
-    Parameters
-    ----------
-    wavelength, flux : ndarray, shape (n,)
-    needed_nm : tuple of float
-        Range of the pixels; the line spread function reaches beyond it as `SPAN_NM` beyond `NEEDED_NM`.
-    line : LineSpread, optional
-        Line spread function; that of the nominal instrument by default.
-    dark_only : bool
-        Whether to leave ends unchanged that are too bright, or within the range of the pixels.
-
-    Returns
-    -------
-    wavelength, flux : ndarray
-    messages : tuple of str
-
-    Raises InputError if a continuation would be more than `MAX_CONTINUED` of the brightest pixel's light.
+    `needed_nm` is the range of the pixels; the line spread function, by default that of the nominal instrument, reaches
+    beyond it as `SPAN_NM` beyond `NEEDED_NM`. With `dark_only`, ends that are too bright or within the range of the
+    pixels are left unchanged. Raises InputError if a continuation would be more than `MAX_CONTINUED` of the brightest
+    pixel's light.
     """
     span = (needed_nm[0] - NEEDED_NM[0] + SPAN_NM[0], needed_nm[1] - NEEDED_NM[1] + SPAN_NM[1])
     if wavelength[0] <= span[0] and wavelength[-1] >= span[1]:
@@ -229,12 +219,13 @@ def continued(
             f"it {word} at {end:g} nm and is continued to {goal:g} nm at its end's level, {level:.3g}: at most "
             f"{100 * share:.2g} % of the brightest pixel's light"
         )
-        wavelength, flux = (
-            (np.append(goal, wavelength), np.append(level, flux))
-            if is_blue
-            else (np.append(wavelength, goal), np.append(flux, level))
-        )
+        wavelength, flux = _attached(wavelength, goal, is_blue), _attached(flux, level, is_blue)
     return wavelength, flux, tuple(messages)
+
+
+def _attached(values: Float, more: Float | float, before: bool) -> Float:
+    """Return values with more of them before or after."""
+    return np.append(more, values) if before else np.append(values, more)
 
 
 def _brightest(wavelength: Float, flux: Float, needed_nm: tuple[float, float]) -> float:
@@ -262,19 +253,10 @@ def extended(
     *,
     ultraviolet: tuple[str, ...] = (),
 ) -> tuple[Float, Float, tuple[str, ...]]:
-    """Continue a spectrum by a longer one, scaled at the join, and return messages.
+    """Continue a spectrum by a longer one, `extension`, scaled at the join, and return messages.
 
-    Parameters
-    ----------
-    wavelength, flux : ndarray, shape (n,)
-    extension : str
-        Name of the other spectrum.
-    beyond, shape : ndarray, shape (m,)
-        Wavelengths, nm, and fluxes of the other spectrum.
-    ultraviolet : tuple of str
-        Messages on the other spectrum's ultraviolet, returned if it continues the spectrum to the blue.
-
-    Raises InputError if less than a third of 200-700 nm is measured, or a spectrum has no light at a join.
+    The messages on the ultraviolet of the other spectrum are returned if it continues the spectrum to the blue. Raises
+    InputError if less than a third of 200-700 nm is measured, or a spectrum has no light at a join.
     """
     messages = []
     # Consecutive zeros at an end are missing data.
@@ -296,11 +278,7 @@ def extended(
         )
         if blue:
             messages += [f"in {extension}, {message}" for message in ultraviolet]
-        wavelength, flux = (
-            (np.append(beyond[more], wavelength), np.append(added, flux))
-            if blue
-            else (np.append(wavelength, beyond[more]), np.append(flux, added))
-        )
+        wavelength, flux = _attached(wavelength, beyond[more], blue), _attached(flux, added, blue)
     return wavelength, flux, tuple(messages) or (f"its extension {extension} reaches no farther and is not used",)
 
 

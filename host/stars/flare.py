@@ -1,4 +1,4 @@
-"""Flares as blackbodies that are added to a star or replace part of its photosphere, their tables and study section."""
+"""Flares that are added to a star or replace part of its photosphere, and tables of flares."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.stars.bands import photons
-from mauvecl.host.stars.blackbody import blackbody
+from mauvecl.host.stars.flare_spectra import FlareSpectrum, blackbody
 from mauvecl.host.tables.files import LARGEST, SMALLEST
 from mauvecl.host.tables.opening import read_table
 from mauvecl.host.tables.table import Rows
@@ -20,8 +20,6 @@ from mauvecl.schema.physical import Amplitude, Temperature
 
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
-
-    from mauvecl.host.stars.flare_spectra import FlareSpectrum
 
 Geometry = Literal["added", "replaces"]
 Float = NDArray[np.float64]
@@ -57,29 +55,29 @@ def with_flare(
         Temperature of the photosphere, which ``replaces`` requires.
     """
     checked(Amplitude, "flare amplitude", amplitude)
-    light = _photons_in_band(wavelength_nm, flux_flam, spectrum, band, geometry, photosphere_temperature_k)
+    star, hot, ratio = _photons_in_band(wavelength_nm, flux_flam, spectrum, band, geometry, photosphere_temperature_k)
     grid, quiescent = _on_grid(wavelength_nm, flux_flam, spectrum)
     body = spectrum.flux(grid)
     if spectrum.fixed_lines:
         lines = spectrum.flux_at_telescope(grid)
-        rise = photons(grid, lines, band) / light.star
+        rise = photons(grid, lines, band) / star
         if rise > amplitude:
             raise InputError(
                 f"flare amplitude = {amplitude:g} is less than the rise of {rise:g} by its lines in {band}",
                 "more",
                 key="flare_amplitude",
             )
-        return grid, quiescent + lines + (amplitude - rise) * light.star / light.hot * body
-    if light.ratio is None:
-        return grid, quiescent + amplitude * light.star / light.hot * body
-    filling = amplitude / (light.ratio - 1.0)
+        return grid, quiescent + lines + (amplitude - rise) * star / hot * body
+    if ratio is None:
+        return grid, quiescent + amplitude * star / hot * body
+    filling = amplitude / (ratio - 1.0)
     if filling > 1.0:
         raise InputError(
             f"flare amplitude = {amplitude:g} needs {filling:.2f} of the star's disc at {spectrum.describe()}",
-            f"at most {light.ratio - 1.0:.3g}",
+            f"at most {ratio - 1.0:.3g}",
             key="flare_amplitude",
         )
-    return grid, quiescent * (1.0 - filling) + filling * light.ratio * light.star / light.hot * body
+    return grid, quiescent * (1.0 - filling) + filling * ratio * star / hot * body
 
 
 def _on_grid(wavelength_nm: Float, flux_flam: Float, spectrum: FlareSpectrum) -> tuple[Float, Float]:
@@ -110,10 +108,10 @@ def added_light(
     `with_flare` adds it times the amplitude, whose largest value it checks. Lines must scale with the amplitude.
     """
     check_scales(spectrum)
-    light = _photons_in_band(wavelength_nm, flux_flam, spectrum, band, geometry, photosphere_temperature_k)
-    if light.ratio is None:
-        return AddedLight(light.star / light.hot, 0.0)
-    return AddedLight(light.ratio / (light.ratio - 1.0) * light.star / light.hot, 1.0 / (light.ratio - 1.0))
+    star, hot, ratio = _photons_in_band(wavelength_nm, flux_flam, spectrum, band, geometry, photosphere_temperature_k)
+    if ratio is None:
+        return AddedLight(star / hot, 0.0)
+    return AddedLight(ratio / (ratio - 1.0) * star / hot, 1.0 / (ratio - 1.0))
 
 
 def check_scales(spectrum: FlareSpectrum) -> None:
@@ -126,15 +124,6 @@ def check_scales(spectrum: FlareSpectrum) -> None:
         )
 
 
-@dataclass(frozen=True)
-class _Photons:
-    """Photons in the band in which amplitudes are measured."""
-
-    star: float
-    hot: float  # of the flare's spectrum
-    ratio: float | None  # surface flux of flare over photosphere; None if the flare does not replace photosphere
-
-
 def _photons_in_band(
     wavelength_nm: Float,
     flux_flam: Float,
@@ -142,7 +131,11 @@ def _photons_in_band(
     band: str,
     geometry: Geometry,
     photosphere_temperature_k: float | None,
-) -> _Photons:
+) -> tuple[float, float, float | None]:
+    """Return photons in the band in which amplitudes are measured, of the star and of the flare's spectrum.
+
+    The last value is the ratio of the surface fluxes of flare and photosphere; None if no photosphere is replaced.
+    """
     grid, quiescent = _on_grid(wavelength_nm, flux_flam, spectrum)
     star = photons(grid, quiescent, band)
     if not star > 0.0:
@@ -153,7 +146,7 @@ def _photons_in_band(
             f"the flare, {spectrum.describe()}, has no light in the band {band}", "some to scale", key="band"
         )
     if geometry == "added":
-        return _Photons(star, hot, None)
+        return star, hot, None
     if geometry != "replaces":
         raise InputError.of("flare geometry", geometry, "'added' or 'replaces'")
     if photosphere_temperature_k is None:
@@ -173,7 +166,7 @@ def _photons_in_band(
             f"more than {photosphere_temperature_k:g} K",
             key="flare_temperature",
         )
-    return _Photons(star, hot, ratio)
+    return star, hot, ratio
 
 
 #: Names of the column of the relative rise above the quiescent flux; AltaiPony's first.

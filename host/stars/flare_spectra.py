@@ -12,13 +12,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
+import astropy.units as u
 import numpy as np
+from astropy.constants import c, h, k_B
 from numpy.typing import ArrayLike, NDArray
 
-from mauvecl.host.arrays import ContentEquality, set_read_only
+from mauvecl.host.arrays import ContentEquality, array_cache, set_read_only
 from mauvecl.host.spectra.formats import read_spectrum
 from mauvecl.host.spectra.units import NEEDED_NM
-from mauvecl.host.stars.blackbody import blackbody
+from mauvecl.host.stars.bands import ANGSTROM
 from mauvecl.host.stars.coverage import check_points
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
@@ -72,6 +74,20 @@ JOIN_NM, GAP_NM = 20.0, 5.0
 ROUNDING = 1e-12
 
 
+@array_cache(32)
+def blackbody(wavelength_nm: NDArray[np.float64], temperature_k: float) -> NDArray[np.float64]:
+    """Return the surface flux pi B_lambda of a blackbody, erg s-1 cm-2 A-1, shape (n,)."""
+    # The steps of astropy's BlackBody to the last bit, without the slow import of its models.
+    metre = u.m.to(u.AA)
+    frequency = c.value / (wavelength_nm * ANGSTROM / metre)
+    # Overflow in the Wien tail gives zero flux.
+    with np.errstate(over="ignore"):
+        steps = c.value**2 * np.expm1(h.value * frequency / (k_B.value * temperature_k))
+    per_hz = 2.0 * h.value * frequency**3 / steps
+    # From W m-2 Hz-1 to erg s-1 cm-2 Hz-1, and to erg s-1 cm-2 A-1.
+    return np.asarray(np.pi * (per_hz / 1e-3 / ((c.value / frequency * metre) ** 2 / c.to_value(u.AA / u.s))))
+
+
 @validated
 class FlareSpectrum:
     """Spectrum of a flare, up to a factor."""
@@ -121,11 +137,9 @@ class Blackbody(FlareSpectrum):
         return blackbody(wavelength_nm, self.temperature_k)
 
     def bolometric_flux(self) -> float:
-        """Return the surface flux over all wavelengths, erg s-1 cm-2."""
         return STEFAN_BOLTZMANN * self.temperature_k**4
 
     def describe(self) -> str:
-        """Return the spectrum in a few words."""
         return f"{self.temperature_k:g} K"
 
 
@@ -151,11 +165,9 @@ class TwoBlackbodies(FlareSpectrum):
         return np.asarray(blackbody(wavelength_nm, self.temperature_k) + self.second_area * second)
 
     def bolometric_flux(self) -> float:
-        """Return the surface flux over all wavelengths, erg s-1 cm-2."""
         return STEFAN_BOLTZMANN * (self.temperature_k**4 + self.second_area * self.second_temperature_k**4)
 
     def describe(self) -> str:
-        """Return the spectrum in a few words."""
         return f"{self.temperature_k:g} K and {self.second_area:g} of its area at {self.second_temperature_k:g} K"
 
 
@@ -192,13 +204,11 @@ class BalmerFlare(FlareSpectrum):
         return (self.jump - 1.0) * float(blackbody(np.array([BALMER_EDGE_NM]), self.temperature_k)[0])
 
     def bolometric_flux(self) -> float:
-        """Return the surface flux over all wavelengths, erg s-1 cm-2."""
         # The integral of (edge / l)^2 exp(-h c / k T (1 / l - 1 / edge)) over l, in Angstrom.
         width = 10.0 * BALMER_EDGE_NM**2 * self.electron_temperature_k / HC_OVER_K_NM_K
         return STEFAN_BOLTZMANN * self.temperature_k**4 + self.edge_flux * width
 
     def describe(self) -> str:
-        """Return the spectrum in a few words."""
         return f"{self.temperature_k:g} K with a Balmer jump of {self.jump:g}"
 
 
@@ -315,7 +325,6 @@ class FlareWithLines(FlareSpectrum):
         return self.continuum.bolometric_flux() + self.continuum_flux * sum(self.fractions.values())
 
     def describe(self) -> str:
-        """Return the spectrum in a few words."""
         lines = [f"{100 * value:g} % in {name}" for name, value in self.fractions.items()]
         lines += [f"{value:g} erg/s/cm2 in {name}" for name, value in self.fluxes_cgs.items()]
         return f"{self.continuum.describe()}{' with ' if lines else ''}{', '.join(lines)}"
@@ -471,7 +480,6 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
         return 10.0 * float(np.trapezoid(self.flux_flam, self.wavelength_nm))
 
     def describe(self) -> str:
-        """Return the spectrum in a few words."""
         return f"the spectrum {self.name}"
 
 

@@ -15,7 +15,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib import resources
-from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,18 +27,12 @@ from mauvecl.schema.physical import Temperature
 if TYPE_CHECKING:
     import numpy as np
     from astropy.table import Table
-    from numpy.typing import NDArray
 
 
 #: Names by which they are offered.
 EXAMPLES = ("blackbody 9000 K", "power law -2")
 #: Indices of power laws that are accepted; steeper spectra say nothing of stars (assumed).
 INDEX = Range(-10, 10)
-#: First and last wavelength of the spectra, nm, and number of points: they cover all bands, and straight lines between
-#: them are true to 2e-5 for 3000 K at 200 nm, and closer elsewhere and for hotter stars.
-GRID = (100.0, 3000.0, 8000)
-#: Wavelength at which a power law has unit flux, nm.
-PIVOT_NM = 550.0
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?"
 _NAME = re.compile(
     rf"\s*(?:(?P<body>black[ -]?body|planck)\s+(?P<kelvin>{_NUMBER})\s*K?|power[ -]?law\s+(?P<index>{_NUMBER}))\s*",
@@ -49,10 +42,10 @@ _NAME = re.compile(
 
 @dataclass(frozen=True)
 class ModelStar:
-    """Blackbody of a temperature, or power law of an index; exactly one of them is given."""
+    """Blackbody of a temperature, or else power law of an index."""
 
     temperature_k: float | None
-    index: float | None
+    index: float = 0.0
 
     @classmethod
     def named(cls, text: str) -> ModelStar | None:
@@ -64,30 +57,18 @@ class ModelStar:
         if found is None:
             return None
         if found["body"] is not None:
-            return cls(checked(Temperature, "temperature of the blackbody", float(found["kelvin"])), None)
+            return cls(checked(Temperature, "temperature of the blackbody", float(found["kelvin"])))
         return cls(None, number("index of the power law", float(found["index"]), "", INDEX))
 
     @property
     def name(self) -> str:
         """Name that gives this star again."""
-        return f"blackbody {self.temperature_k:.15g} K" if self.index is None else f"power law {self.index:.15g}"
+        return f"blackbody {self.temperature_k:.15g} K" if self.temperature_k else f"power law {self.index:.15g}"
 
     @property
     def origin(self) -> str:
         """Formula of the spectrum."""
-        return "Planck's law" if self.index is None else f"flux per wavelength proportional to its power {self.index:g}"
-
-    def spectrum(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return wavelengths, nm, and fluxes, erg s-1 cm-2 A-1, of an arbitrary level."""
-        import numpy as np
-
-        nm = np.geomspace(*GRID)
-        if self.index is not None:
-            return nm, (nm / PIVOT_NM) ** self.index
-        from mauvecl.host.stars.blackbody import blackbody
-
-        assert self.temperature_k is not None
-        return nm, blackbody(nm, self.temperature_k)
+        return "Planck's law" if self.temperature_k else f"flux per wavelength proportional to its power {self.index:g}"
 
 
 @dataclass(frozen=True)
@@ -208,21 +189,29 @@ class WellKnown:
         return f"{self.spectral_type}, {self.distance_pc:g} pc, V = {self.magnitude:g}; {self.source.partition(',')[0]}"
 
 
-def well_known_text() -> str:
-    """Return the list as ECSV."""
-    return resources.files(__package__).joinpath("library", "well_known.ecsv").read_text(encoding="utf-8")
+_LIBRARY = resources.files(__package__) / "library"
+
+
+def library_text(*path: str) -> str:
+    """Return a file of the library."""
+    return _LIBRARY.joinpath(*path).read_text(encoding="utf-8")
+
+
+def _rows(file: str) -> list[dict[str, str]]:
+    """Read a table of the library without astropy, which keeps the error for a misspelt name fast."""
+    lines = [line for line in library_text(file).splitlines() if not line.startswith("#")]
+    return list(csv.DictReader(lines, delimiter=" "))
 
 
 @cache
 def well_known_stars() -> tuple[WellKnown, ...]:
     """Return the stars of the list."""
-    lines = [line for line in well_known_text().splitlines() if not line.startswith("#")]
     return tuple(
         WellKnown(
             row["name"], tuple(name.strip() for name in row["other_names"].split(",")), float(row["ra"]),
             float(row["dec"]), float(row["distance"]), float(row["V"]), row["spectral_type"], row["source"],
         )
-        for row in csv.DictReader(lines, delimiter=" ")
+        for row in _rows("well_known.ecsv")
     )  # fmt: skip
 
 
@@ -241,15 +230,9 @@ def name_key(name: str) -> str:
     return key
 
 
-_LIBRARY = files("mauvecl.host.stars") / "library"
-
-
 @cache
 def _index() -> dict[str, dict[str, str]]:
-    # Read without astropy, which keeps the error for a misspelt name fast.
-    text = _LIBRARY.joinpath("index.ecsv").read_text(encoding="utf-8")
-    lines = [line for line in text.splitlines() if not line.startswith("#")]
-    return {entry["name"].casefold(): entry for entry in csv.DictReader(lines, delimiter=" ")}
+    return {entry["name"].casefold(): entry for entry in _rows("index.ecsv")}
 
 
 @cache
@@ -311,7 +294,7 @@ def library_table() -> Table:
     """
     from astropy.table import Table
 
-    table = Table.read(_LIBRARY.joinpath("index.ecsv").read_text(encoding="utf-8"), format="ascii.ecsv")
+    table = Table.read(library_text("index.ecsv"), format="ascii.ecsv")
     # The reader masks empty text.
     table = table.filled("")
     table.remove_columns(["file", "source_file"])
@@ -348,7 +331,7 @@ def band_table(file: str) -> Numbers:
 
 
 def _numbers(folder: str, file: str) -> Numbers:
-    return parse_numbers(_LIBRARY.joinpath(folder, file).read_text(encoding="utf-8"), f"library file {file}")
+    return parse_numbers(library_text(folder, file), f"library file {file}")
 
 
 #: Spectral classes in order of decreasing temperature.
@@ -398,13 +381,8 @@ class NamedStar:
 def resolve(text: str, *, own: bool = True) -> NamedStar | None:
     """Find a star or spectral type by any name, in any case and spacing, or return None.
 
-    Parameters
-    ----------
-    text : str
-        A name of the library ("M3V", short "M3"), a star ("GJ 581", "Proxima", "HD 1835"), any other spectral type, or
-        a formula ("blackbody 9000 K", "power law -2").
-    own : bool
-        Whether to search among the user's own stars.
+    A text is a name of the library ("M3V", short "M3"), a star ("GJ 581", "Proxima", "HD 1835"), any other spectral
+    type, or a formula ("blackbody 9000 K", "power law -2"). The user's own stars are searched if `own` is true.
     """
     model = ModelStar.named(text)
     if model is not None:
@@ -427,14 +405,8 @@ def resolve(text: str, *, own: bool = True) -> NamedStar | None:
 def spectrum_name(text: str, key: str = "star", *, own: bool = True) -> str:
     """Return the name of the spectrum of a star: its own, or that of the nearest type of the library.
 
-    Raises InputError for an unknown star; the message proposes similar names.
-
-    Parameters
-    ----------
-    key : str
-        Key of the error.
-    own : bool
-        Whether to search among the user's own stars.
+    Raises InputError, with this key, for an unknown star; the message proposes similar names. The user's own stars are
+    searched if `own` is true.
     """
     star = resolve(text, own=own)
     if star is None:
@@ -456,10 +428,7 @@ def listed_values(name: str) -> dict[str, float]:
 def listed_note(name: str, **used: float | None) -> str:
     """Describe what the library and the list supply for a star; empty if it has a spectrum of its own.
 
-    Parameters
-    ----------
-    **used : float
-        The magnitude in V and the distance, in pc, that are used; those of the list are named with their source.
+    Magnitude (V) and distance (pc) that are `used` are named with their source if they are those of the list.
     """
     star = resolve(name)
     if star is None:
@@ -483,13 +452,7 @@ def all_names() -> list[str]:
 
 
 def near_names(text: str, *, stars_only: bool = False) -> list[str]:
-    """Return up to four known names that resemble a text, or a few examples.
-
-    Parameters
-    ----------
-    stars_only : bool
-        Whether names must be of stars with known coordinates.
-    """
+    """Return up to four known names that resemble a text, or a few examples; on request only stars with coordinates."""
     names = {key: star.name for key, star in by_key().items()}
     if not stars_only:
         names |= {name_key(name): name for name in library_names()}

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, overload
 from mauvecl.host import VERSION
 from mauvecl.host.arrays import ContentEquality
 from mauvecl.host.exposure.star import rate_of
-from mauvecl.host.instrument.paths import shipped_names
+from mauvecl.host.instrument import shipped_names
 from mauvecl.host.tables.files import check_size, json_text, open_regular, read_text, write_whole, writing
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, Drawable, View, documents_of, percent, records, stacked, table_of

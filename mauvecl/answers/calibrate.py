@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from mauvecl.answers.answer import Answer, TableOf, ecsv_text
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.host.exposure.expectation import expect
+from mauvecl.host.instrument import shipped_names
 from mauvecl.host.instrument.curves import CALIBRATED, MODE, ThroughputErrors
 from mauvecl.host.instrument.instrument import FILE_VERSION, Instrument
-from mauvecl.host.instrument.paths import shipped_names
 from mauvecl.observations.detector import (
     CalibrationFrames,
     DarkFit,

@@ -22,7 +22,7 @@ from mauvecl.detection.distributions import CONFIDENCE, Gaussian, Interval
 from mauvecl.detection.names import MIN_IN_TAIL
 from mauvecl.detection.nuisances import Nuisances, join_names
 from mauvecl.detection.statistics import Matched, Setting
-from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, NUISANCES, PROCESSES, ThroughputMode, values_of
+from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, NUISANCES, PROCESSES, Comparison, ThroughputMode, values_of
 from mauvecl.schema.columns import Column, First, chance_text, number
 from mauvecl.schema.errors import InputError, Message
 from mauvecl.study.cases import Case
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.noise.disturbances import Prior
-    from mauvecl.noise.processes import Comparison
     from mauvecl.study.study import Study
 
 

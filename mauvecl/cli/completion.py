@@ -23,7 +23,7 @@ def complete_star(incomplete: str) -> list[str]:
 
 def complete_instrument(incomplete: str) -> list[str]:
     """Return names of instruments, and TOML files."""
-    from mauvecl.host.instrument.paths import shipped_names
+    from mauvecl.host.instrument import shipped_names
 
     return [*_continued(incomplete, shipped_names()), *_files(incomplete, (".toml",))]
 

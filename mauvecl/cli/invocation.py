@@ -46,7 +46,7 @@ def question_values(study: Study, *, detects: bool) -> None:
         Whether the verb needs flares and thresholds.
     """
     from mauvecl.detection.names import check_fap, check_statistic
-    from mauvecl.host.instrument.paths import instrument_path
+    from mauvecl.host.instrument import instrument_path
     from mauvecl.host.stars.library import known_band, spectrum_name
 
     for star in study.star:

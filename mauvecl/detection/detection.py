@@ -27,8 +27,8 @@ from mauvecl.detection.requests import ChannelPlan, Hypotheses, Key
 from mauvecl.detection.statistics import Differences, LinearStatistic, QuadraticStatistic
 from mauvecl.detection.tails import Tail, tail
 from mauvecl.host.arrays import ContentEquality
+from mauvecl.noise.disturbances import ADDITIVE
 from mauvecl.noise.drawing import Cumulants
-from mauvecl.noise.unknowns import ADDITIVE
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import INTERVAL, Column, Drawable, interval, number, percent, table_of
 from mauvecl.schema.errors import Message

@@ -32,8 +32,8 @@ from mauvecl.detection.statistics import (
 from mauvecl.host.exposure.expectation import Expectation, entirely_saturated
 from mauvecl.noise.drawing import AUTOMATIC, Drawing, DrawingOptions
 from mauvecl.noise.layout import FIXED_STATISTICS
-from mauvecl.noise.processes import NOISE_FREE, Comparison
 from mauvecl.noise.scene import BATCH, FactorDistributions, Scene, prepare
+from mauvecl.noise.unknowns import NOISE_FREE, Comparison
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, Message
 from mauvecl.schema.fields import OneOrMore

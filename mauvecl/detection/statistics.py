@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from mauvecl.detection.distributions import Form, Gaussian, Mixture, QuadraticForm
 from mauvecl.detection.nuisances import Nuisances, join_names, read_values
 from mauvecl.host.arrays import ContentEquality
-from mauvecl.noise.processes import NOISE_FREE, Comparison
 from mauvecl.noise.scene import FactorDistributions, changes_of
+from mauvecl.noise.unknowns import NOISE_FREE, Comparison
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened
 

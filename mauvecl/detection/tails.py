@@ -29,8 +29,9 @@ from mauvecl.detection.distributions import (
 from mauvecl.detection.names import check_atom
 from mauvecl.detection.statistics import Differences
 from mauvecl.noise import layout
+from mauvecl.noise.disturbances import ADDITIVE
 from mauvecl.noise.scene import quantile_at_score
-from mauvecl.noise.unknowns import ADDITIVE, PROCESSES, SIGNAL_PARTS
+from mauvecl.noise.unknowns import PROCESSES, SIGNAL_PARTS
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:

@@ -169,11 +169,6 @@ def _kind(device: Any) -> str:
     return next((name for name, bit in kinds.items() if device.type & bit), "other")
 
 
-def _promise(device: Any) -> str:
-    lacking = weaknesses(device)
-    return SAME_BITS if not lacking else f"same draws to float rounding: no {', no '.join(lacking)}"
-
-
 def weaknesses(device: Any) -> list[str]:
     """Return the properties of strict arithmetic that a device lacks."""
     cl = load_opencl()
@@ -197,7 +192,9 @@ def devices() -> list[DeviceRecord]:
             compute_units=int(device.max_compute_units),
             global_memory=int(device.global_mem_size),
             default=index == 0,
-            promise=_promise(device),
+            promise=f"same draws to float rounding: no {', no '.join(lacking)}"
+            if (lacking := weaknesses(device))
+            else SAME_BITS,
         )
         for index, device in enumerate(_devices())
     ]
@@ -273,11 +270,6 @@ def out_of_memory(error: Exception) -> bool:
     return any(code in str(error) for code in codes)
 
 
-def digest(source: str) -> str:
-    """Return the short sha256 of a rendered source, for run records."""
-    return hashlib.sha256(source.encode()).hexdigest()[:16]
-
-
 def build(context: pyopencl.Context, source: str) -> pyopencl.Program:
     """Compile a rendered source with strict arithmetic, or load it from the cache."""
     cl = load_opencl()
@@ -322,22 +314,8 @@ VECTORS = 4
 class Device:
     """Open OpenCL device with its context, queue and compiled kernels.
 
-    Parameters
-    ----------
-    wanted : str, optional
-        Number or part of the name, as for `Engine`.
-    width : int, optional
-        Realisations per work-item; by default 16 on CPUs, 1 elsewhere.
-
-    Attributes
-    ----------
-    record : DeviceRecord
-    cl : module
-        The imported pyopencl.
-    context, queue : pyopencl.Context, pyopencl.CommandQueue
-    width : int
-    step : int
-        Realisations per work-item of the widest kernel; launches are cut at its multiples.
+    `wanted` is the number or part of the name, as for `Engine`, and `width` the number of realisations per work-item,
+    by default 16 on CPUs and 1 elsewhere.
     """
 
     def __init__(self, wanted: str | None = None, *, width: int | None = None) -> None:
@@ -346,6 +324,7 @@ class Device:
         self.context = self.cl.Context([handle])
         self.queue = self.cl.CommandQueue(self.context)
         self.width = width or (16 if self.record.kind == "cpu" else 1)
+        # Realisations per work-item of the widest kernel; launches are cut at its multiples.
         self.step = VECTORS * self.width if self.width > 1 else 1
         self._vector_forms = self.width == 16 and self.record.platform == POCL
         self._programs: dict[str, Any] = {}
@@ -370,7 +349,7 @@ class Device:
     @property
     def kernel_digest(self) -> str:
         """Short sha256 of the kernels rendered so far, for run records."""
-        return digest("\n".join(self.programs))
+        return hashlib.sha256("\n".join(self.programs).encode()).hexdigest()[:16]
 
     def kernel(self, kernel_files: tuple[str, ...], variant: Variant, name: str) -> Any:
         """Return a kernel of the program of these files; both are built once."""

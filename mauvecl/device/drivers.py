@@ -55,34 +55,27 @@ from zipfile import BadZipFile, ZipFile
 from mauvecl.host import VERSION
 from mauvecl.schema.errors import InputError
 
+_PACKAGE = "`apt-get install pocl-opencl-icd` (Debian, Ubuntu) or `dnf install pocl` (Fedora)"
+_CONDA = "`conda install -c conda-forge pyopencl pocl`"
+_MAKER = "the driver of your GPU's maker"
+_WHEELS = (
+    "`pip install 'pyopencl[pocl]'` (PoCL, for processors)",
+    "`pip install 'mauvecl[intel]'` (Intel's runtime, for processors)",
+)
 #: Sources by system and machine, as Python's `platform` spells them; "" is any other machine.
 SOURCES = {
-    ("Linux", "x86_64"): (
-        "`pip install 'pyopencl[pocl]'` (PoCL, for processors)",
-        "`pip install 'mauvecl[intel]'` (Intel's runtime, for processors)",
-        "`apt-get install pocl-opencl-icd` (Debian, Ubuntu) or `dnf install pocl` (Fedora)",
-        "`conda install -c conda-forge pyopencl pocl`",
-        "the driver of your GPU's maker",
-    ),
-    ("Linux", ""): (
-        "`apt-get install pocl-opencl-icd` (Debian, Ubuntu) or `dnf install pocl` (Fedora)",
-        "`conda install -c conda-forge pyopencl pocl`",
-        "the driver of your GPU's maker",
-    ),
-    ("Darwin", ""): (
-        "`conda install -c conda-forge pyopencl pocl`",
-        "the OpenCL that macOS brings, with pip's pyopencl",
-    ),
+    ("Linux", "x86_64"): (*_WHEELS, _PACKAGE, _CONDA, _MAKER),
+    ("Linux", ""): (_PACKAGE, _CONDA, _MAKER),
+    ("Darwin", ""): (_CONDA, "the OpenCL that macOS brings, with pip's pyopencl"),
     ("Windows", ""): ("Linux on Windows (`wsl --install`), since mauvecl needs Linux or macOS",),
-    ("", ""): ("`conda install -c conda-forge pyopencl pocl`", "a driver for your device"),
+    ("", ""): (_CONDA, "a driver for your device"),
 }
 
 
-def driver_sources(system: str | None = None, machine: str | None = None) -> str:
-    """Return the sources of drivers for a machine, by default this one, as the end of a sentence."""
+def driver_sources(system: str | None = None) -> str:
+    """Return the sources of drivers for a system, by default this one, as the end of a sentence."""
     system = platform.system() if system is None else system
-    machine = platform.machine() if machine is None else machine
-    sources = SOURCES.get((system, machine)) or SOURCES.get((system, "")) or SOURCES["", ""]
+    sources = SOURCES.get((system, platform.machine())) or SOURCES.get((system, "")) or SOURCES["", ""]
     return ", or ".join(sources)
 
 
@@ -97,14 +90,8 @@ WORK, ABANDONED_S = "mauvecl-work-", 90 * 86400.0
 class KernelCache:
     """Working folder of a process, and the archives that outlive it.
 
-    Attributes
-    ----------
-    store : Path
-        Folder with an archive of each program and of each text, by their keys; need not exist.
-    work : Path
-        PoCL's cache folder.
-    pid : int
-        Process that owns the working folder.
+    `store` is the folder with an archive of each program and of each text, by their keys, which need not exist; `work`
+    is PoCL's cache folder, which belongs to the process `pid`.
     """
 
     def __init__(self, store: Path, work: Path) -> None:
@@ -438,22 +425,10 @@ _one_at_a_time = threading.Lock()
 
 
 def choose_processor_level(device: Any, others: Callable[[], Sequence[Any]]) -> str | None:
-    """Set the highest processor level at which the driver works, and return its name.
+    """Set the highest processor level at which the driver works, and return its name; None if the driver chooses.
 
-    Parameters
-    ----------
-    others : callable
-        Function that returns all devices, including `device`, in the order in which another process finds them.
-
-    Returns
-    -------
-    str or None
-        None if the driver makes the choice.
-
-    Raises
-    ------
-    DeviceError
-        If the driver works at no level.
+    `others` returns all devices, including this one, in the order in which another process finds them. Raises
+    DeviceError if the driver works at no level.
     """
     place = int(device.int_ptr)
     with _one_at_a_time:
@@ -471,7 +446,10 @@ def _working_level(device: Any, names: tuple[str | None, ...], others: Callable[
     number = next((i for i, other in enumerate(others()) if other.int_ptr == device.int_ptr), None)
     if limit_s == 0 or number is None or not sys.executable:
         return names[0]
-    cache, key = kernel_cache(), _key(device, names)
+    # The level's key in the cache is unique for driver, processor and installation.
+    about = (device.platform.version, device.name, device.version, device.driver_version, sys.prefix)
+    said = "\0".join((*map(str, about), *map(str, names), *sorted(flags())))
+    cache, key = kernel_cache(), f"level-{hashlib.sha256(said.encode()).hexdigest()[:32]}"
     known = cache.read_text(key)
     if known is not None:
         return known or None
@@ -501,13 +479,6 @@ def _limit_s() -> float:
         if not said or 0 <= float(said) <= 86400:
             return float(said or LIMIT_S)
     raise InputError.of(LIMIT, said, "1 to 86400 seconds of processor time, or 0 for no limit")
-
-
-def _key(device: Any, names: tuple[str | None, ...]) -> str:
-    """Return the name of the level in the cache, unique for driver, processor and installation."""
-    about = (device.platform.version, device.name, device.version, device.driver_version, sys.prefix)
-    said = "\0".join((*map(str, about), *map(str, names), *sorted(flags())))
-    return f"level-{hashlib.sha256(said.encode()).hexdigest()[:32]}"
 
 
 def _try(name: str | None, number: int, device: Any, limit_s: float) -> str | None:

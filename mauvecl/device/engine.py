@@ -60,8 +60,8 @@ from mauvecl.flares.stare_scene import (
     padded_frames,
 )
 from mauvecl.noise.drawing import Drawing, DrawingOptions
-from mauvecl.noise.processes import NOISE_FREE, NONE, Comparison, Processes
 from mauvecl.noise.scene import BATCH, prepare
+from mauvecl.noise.unknowns import NOISE_FREE, NONE, Comparison, Processes
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import OneOrMore
@@ -84,12 +84,8 @@ class Stares:
     ----------
     device : str or Device, optional
         Number or name, as for `Engine`, or an open device.
-    progress : callable, optional
-        Called as ``progress(done, total)`` before and between tiles, in stares. It may raise to stop the work.
-    tile : int, optional
-        Stares per launch, for tests; by default chosen from the device and the work. Does not affect results.
-    width : int, optional
-        Stares or frames per work-item, for tests; by default 16 on CPUs and 1 elsewhere. Does not affect results.
+    progress, tile, width : optional
+        As for `Engine`, in stares instead of realisations.
     tiles : Tiles, optional
         Division of the work, instead of `progress` and `tile`.
 
@@ -222,7 +218,7 @@ class Stares:
                     values = np.moveaxis(out[..., : stare.n_frames], 2, 3)[scenarios]
                     more = []
                     if request.glow:
-                        launches.glow(few, glow, 0)
+                        launches.glow(few, glow)
                         more = [np.moveaxis(glow[0, : few.wanted, :, : stare.n_frames], 1, 2)]
                     reduced.append(dict(reduction(values, first, *more)))
                 # Results are added last, since a tile that fails is drawn again.

@@ -65,14 +65,10 @@ class Tile:
 
 
 class Tiles:
-    """Division of a device's work into tiles.
+    """Division of a device's work into tiles of at most `largest` realisations.
 
-    Parameters
-    ----------
-    progress : callable, optional
-        Called as ``progress(done, total)`` before and between tiles, in realisations. It may raise to stop the work.
-    largest : int, optional
-        Largest number of realisations per tile.
+    Progress is called as ``progress(done, total)`` before and between tiles, in realisations. It may raise to stop the
+    work.
     """
 
     def __init__(self, device: Device, *, progress: Progress | None = None, largest: int | None = None) -> None:
@@ -151,22 +147,8 @@ class Launches:
         self._subtractions: list[Any] = []
         job = scene.job.copy()
         job["seed_low"], job["seed_high"] = seed & 0xFFFFFFFF, seed >> 32
-        self._arguments = [
-            self.upload(job.reshape(1)),
-            *(
-                self.upload(padded(array))
-                for array in (
-                    scene.pixels,
-                    scene.levels,
-                    scene.edges,
-                    scene.dark_counts,
-                    scene.photon_counts,
-                    scene.responses,
-                )
-            ),
-            self.upload(scene.tables),
-            self.upload(scene.priors),
-        ]
+        per_pixel = (scene.pixels, scene.levels, scene.edges, scene.dark_counts, scene.photon_counts, scene.responses)
+        self._arguments = [*map(self.upload, (job.reshape(1), *map(padded, per_pixel), scene.tables, scene.priors))]
 
     def __enter__(self) -> Self:
         return self
@@ -179,7 +161,7 @@ class Launches:
     def upload(self, array: NDArray[Any]) -> Any:
         """Copy an array to a new device buffer. Raises DeviceError if the memory does not suffice."""
         flags = self._cl.mem_flags
-        data = np.ascontiguousarray(array if array.size else np.zeros(1, array.dtype))
+        data = contiguous(array)
         try:
             buffer = self._cl.Buffer(self._device.context, flags.READ_WRITE | flags.COPY_HOST_PTR, hostbuf=data)
         except self._cl.Error as error:
@@ -233,16 +215,9 @@ class Launches:
         self._kernels[name](self._queue, items, local, *arguments)
 
     def realise(self, tile: Tile, out: NDArray[Any]) -> NDArray[np.uint32]:
-        """Draw the raw spectra of a tile into `out`.
+        """Draw the raw spectra of a tile into `out`, of uint16 or int32 and shape (tile.wanted, n_pixel).
 
-        Parameters
-        ----------
-        out : ndarray of uint16 or int32, shape (tile.wanted, n_pixel)
-
-        Returns
-        -------
-        ndarray of uint32, shape (tile.wanted,)
-            Number of samples (pixels times frames) clipped at zero or saturation.
+        Return the number of samples (pixels times frames) clipped at zero or saturation, shape (tile.wanted,).
         """
         clipped = np.empty(tile.wanted, np.uint32)
         counts, items = self._scratch("clipped", clipped.nbytes), (tile.size // self.variant.width,)
@@ -253,38 +228,22 @@ class Launches:
 
     def observe(self, observers: NDArray[np.void], elements: NDArray[np.void]) -> None:
         """Upload the observer's subtraction and variances, and the resolution elements."""
-        self._n_element = len(elements)
-        self._observers, self._elements = self.upload(padded(observers)), self.upload(elements)
-        shape = (self._scene.n_pixel + PIXEL_BLOCK, layout.OBSERVER_BINS)
-        self._pixel_counts = self.upload(np.zeros(shape, np.uint32))
-        self._element_counts = self.upload(np.zeros((len(elements), layout.OBSERVER_BINS), np.uint32))
-        self._clipped = self.upload(np.zeros((shape[0], 2), np.uint32))
-        self._outside = self.upload(np.zeros(len(elements), np.uint32))
+        n_pixel, n_element = self._scene.n_pixel + PIXEL_BLOCK, len(elements)
+        self._observing = [self.upload(padded(observers)), self.upload(elements)]
+        self._shapes = ((n_pixel, layout.OBSERVER_BINS), (n_element, layout.OBSERVER_BINS), (n_pixel, 2), (n_element,))
+        self._histograms = [self.upload(np.zeros(shape, np.uint32)) for shape in self._shapes]
         self._observed = observers, elements
 
     def histogram(self, tile: Tile, counts: Counts) -> None:
         """Add each pixel's DN and each element's S/N of a tile to the device's histograms."""
-        width = self.variant.width
-        items = (self._n_element,) if width > 1 else (self._n_element, min(tile.wanted, ITEMS))
-        self._launch(
-            "histogram",
-            items,
-            *self._arguments,
-            *tile.address(),
-            *tile.rows(),
-            self._observers,
-            self._elements,
-            self._pixel_counts,
-            self._element_counts,
-            self._clipped,
-            self._outside,
-        )
+        n_element = len(self._observed[1])
+        items = (n_element,) if self.variant.width > 1 else (n_element, min(tile.wanted, ITEMS))
+        observed = (*self._arguments, *tile.address(), *tile.rows(), *self._observing, *self._histograms)
+        self._launch("histogram", items, *observed)
         self._queue.finish()
         self._counted += tile.wanted
-        outside = np.empty(self._n_element, np.uint32)
-        self._cl.enqueue_copy(self._queue, outside, self._outside)
+        outside = self._take(self._histograms[-1], self._shapes[-1])
         if outside.any():
-            self._cl.enqueue_copy(self._queue, self._outside, np.zeros_like(outside))
             self._add_far_snr(tile, counts, np.flatnonzero(outside))
         if self._counted * self._scene.n_draws > MAX_COUNTED:
             self.flush_counts(counts)
@@ -300,15 +259,8 @@ class Launches:
     def flush_counts(self, counts: Counts) -> None:
         """Move the device's histograms to the host."""
         n = self._scene.n_pixel
-        pixels, elements, clipped = (
-            self._take(buffer, shape)
-            for buffer, shape in (
-                (self._pixel_counts, (n, layout.OBSERVER_BINS)),
-                (self._element_counts, (self._n_element, layout.OBSERVER_BINS)),
-                (self._clipped, (n, 2)),
-            )
-        )
-        counts.add(pixels, elements, clipped, self._counted)
+        pixels, elements, clipped, _ = map(self._take, self._histograms, self._shapes)
+        counts.add(pixels[:n], elements, clipped[:n], self._counted)
         self._counted = 0
 
     def _take(self, buffer: Any, shape: tuple[int, ...], dtype: type = np.uint32) -> NDArray[Any]:
@@ -318,43 +270,21 @@ class Launches:
         self._cl.enqueue_copy(self._queue, buffer, np.zeros(shape, dtype))
         return host
 
-    def weigh(
-        self, weights: NDArray[np.float32], linear_end: NDArray[np.uint32], pixels_end: NDArray[np.uint32]
-    ) -> None:
-        """Upload the linear statistics' weights and the end of each scenario's; see `ChannelPlan`."""
-        scene = self._scene
-        # A final row of zeros serves scenarios without linear statistics.
-        behind = np.concatenate([weights, np.zeros((1, len(scene.pixels)), np.float32)])
-        constants = scene.constants(weights, linear_end, pixels_end)
-        self._weighing = [*map(self.upload, (constants, behind, linear_end, pixels_end))]
-        self._rows = len(layout.FIXED_STATISTICS) * len(scene.levels) + len(weights)
+    def weigh(self, plan: ChannelPlan, bands: NDArray[np.float32], finished: NDArray[np.uint32]) -> None:
+        """Upload the weights and scales of all statistics, and which squares are subtracted from which rows.
 
-    def marginalise(self, subtractions: NDArray[np.uint32]) -> None:
-        """Upload which squares are subtracted from which rows; see `ChannelPlan`."""
-        self._subtractions = [np.uint32(subtractions.shape[1]), *map(self.upload, subtractions)]
-
-    def compare(
-        self,
-        bands: NDArray[np.float32],
-        finished: NDArray[np.uint32],
-        scales: NDArray[np.float32],
-        scale_end: NDArray[np.uint32],
-    ) -> None:
-        """Upload the additional arguments of the kernel `comparison`; call after `weigh`.
-
-        Parameters
-        ----------
-        bands : ndarray of float32, shape (n_chunk, n_slot, chunk)
-        finished : ndarray of uint32, shape (n_chunk,)
-            See `smoothing.Smoothing.bands`.
-        scales : ndarray of float32, shape (n_smoothed, n_centre)
-        scale_end : ndarray of uint32, shape (n_scenario,)
-            One past the last smoothed statistic of each scenario.
+        `bands`, shape (n_chunk, n_slot, chunk), and `finished`, shape (n_chunk,), are those of `Smoothing.bands`.
         """
-        scene = self._scene
-        more = map(self.upload, (padded(scene.estimates), bands, finished, scales, scale_end))
-        self._weighing = [self.upload(scene.references), *self._weighing, *more, np.uint32(scales.shape[1])]
-        self._rows += len(scales)
+        scene, self._rows = self._scene, plan.n_rows
+        # A final row of zeros serves scenarios without linear statistics.
+        weights = np.concatenate([plan.weights, np.zeros((1, len(scene.pixels)), np.float32)])
+        constants = scene.constants(plan.weights, plan.linear_end, plan.pixels_end)
+        self._weighing = [*map(self.upload, (constants, weights, plan.linear_end, plan.pixels_end))]
+        if self.variant.compared:
+            more = map(self.upload, (padded(scene.estimates), bands, finished, plan.scales, plan.scale_end))
+            self._weighing = [self.upload(scene.references), *self._weighing, *more, np.uint32(plan.scales.shape[1])]
+        if plan.subtractions.size:
+            self._subtractions = [np.uint32(plan.subtractions.shape[1]), *map(self.upload, plan.subtractions)]
 
     def statistics(self, tile: Tile) -> None:
         """Compute every channel of a tile on the device."""
@@ -388,18 +318,8 @@ class Launches:
             self._named["histogram"] = self.upload(np.zeros((count, layout.BINS), np.uint32))
             self._named["sums"] = self.upload(np.zeros((count, items, 2), np.int64))
             self._named["outside"] = self.upload(np.zeros(count, np.uint32))
-        named = self._named
-        self._launch(
-            "tally",
-            (count,) if items == 1 else (count, items),
-            *tile.rows(),
-            np.uint32(tile.size),
-            named["values"],
-            named["grids"],
-            named["histogram"],
-            named["sums"],
-            named["outside"],
-        )
+        buffers = (self._named[name] for name in ("values", "grids", "histogram", "sums", "outside"))
+        self._launch("tally", (count,) if items == 1 else (count, items), *tile.rows(), np.uint32(tile.size), *buffers)
         self._queue.finish()
         self._counted += tile.wanted
         self._add_far(tile, tally)
@@ -408,11 +328,7 @@ class Launches:
 
     def _add_far(self, tile: Tile, tally: Tally) -> None:
         """Count values outside the device's bins on the host."""
-        outside = np.empty(len(tally.grids), np.uint32)
-        self._cl.enqueue_copy(self._queue, outside, self._named["outside"])
-        if not outside.any():
-            return
-        self._cl.enqueue_copy(self._queue, self._named["outside"], np.zeros_like(outside))
+        outside = self._take(self._named["outside"], (len(tally.grids),))
         for index in np.flatnonzero(outside):
             outlying = tally.add_far(int(index), self.channel(tile, tally.grids[index].channel))
             if outlying != outside[index]:
@@ -428,6 +344,11 @@ class Launches:
         sums = self._take(self._named["sums"], (count, self._named["sums"].size // (16 * count), 2), np.int64)
         tally.add(histogram, sums.sum(axis=1), self._counted)
         self._counted = 0
+
+
+def contiguous(array: NDArray[Any]) -> NDArray[Any]:
+    """Return a contiguous array of at least one value, since buffers cannot be empty."""
+    return np.ascontiguousarray(array if array.size else np.zeros(1, array.dtype))
 
 
 def padded(array: NDArray[np.void]) -> NDArray[np.void]:
@@ -482,44 +403,37 @@ class StareLaunches(Launches):
 
     def upload_flares(self, flares: Flares, first: int, count: int) -> None:
         """Upload the flares and the pointing losses of the next `count` stares."""
-        self._scenarios = len(flares.amplitudes)
+        self._scenarios, losses = len(flares.amplitudes), np.zeros(0, np.float32)
+        if self.variant.pointing:
+            losses = self._stare.losses(np.arange(count, dtype=np.uint64) + np.uint64(first), self._seed)
         self._flares = [
             self._fill("stare_job", self._stare.stare_struct(flares)),
             *self._known,
             self._shared(flares.rows) if self._device.record.kind == "cpu" else self._fill("flares", flares.rows),
             self._fill("amplitudes", flares.amplitudes),
-            self._fill("losses", self._losses(first, count)),
+            self._fill("losses", losses),
         ]
-
-    def _losses(self, first: int, count: int) -> Floats:
-        if not self.variant.pointing:
-            return np.zeros(0, np.float32)
-        return self._stare.losses(np.arange(count, dtype=np.uint64) + np.uint64(first), self._seed)
 
     def _shared(self, array: NDArray[Any]) -> Any:
         """Return a buffer that shares the host's memory, valid until the next flares are uploaded."""
         if self._held is not None:
             self._held.release()
         flags = self._cl.mem_flags
-        self._given = np.ascontiguousarray(array if array.size else np.zeros(1, array.dtype))
+        self._given = contiguous(array)
         self._held = self._cl.Buffer(self._device.context, flags.READ_ONLY | flags.USE_HOST_PTR, hostbuf=self._given)
         return self._held
 
     def _fill(self, name: str, array: NDArray[Any]) -> Any:
         """Copy an array to a reused buffer."""
-        data = np.ascontiguousarray(array if array.size else np.zeros(1, array.dtype))
+        data = contiguous(array)
         buffer = self._scratch(name, data.nbytes)
         self._cl.enqueue_copy(self._queue, buffer, data)
         return buffer
 
     def draw(self, tile: Tile, out: Floats, row: int) -> None:
-        """Draw the statistics of a tile's frames into `out`.
+        """Draw the statistics of a tile's frames into `out`, in which `row` is the index of the tile's first stare.
 
-        Parameters
-        ----------
-        out : ndarray of float32, shape (n_scenario, n_stare, n_statistic, n_padded_frame)
-        row : int
-            Index in `out` of the tile's first stare.
+        `out` is of float32 and of shape (n_scenario, n_stare, n_statistic, n_padded_frame).
         """
         if self._by_sums:
             self._in_frames("stare_sums", self.variant, self._own, tile, out, row)
@@ -554,12 +468,12 @@ class StareLaunches(Launches):
             self._cl.enqueue_copy(self._queue, host, values)
             out[..., begin : begin + size] = host[..., tile.start : tile.stop].transpose(1, 3, 2, 0)
 
-    def glow(self, tile: Tile, out: Floats, row: int) -> None:
+    def glow(self, tile: Tile, out: Floats) -> None:
         """Compute the values with which `Injections` add flares to a tile's frames.
 
         `out` has the shape (1, n_stare, n_statistic + 1, n_padded_frame).
         """
-        self._in_frames("stare_glow", replace(self.variant, in_time=True), [], tile, out, row)
+        self._in_frames("stare_glow", replace(self.variant, in_time=True), [], tile, out, 0)
 
     def _in_frames(self, name: str, variant: Variant, own: list[Any], tile: Tile, out: Floats, row: int) -> None:
         """Launch a kernel whose lanes are frames."""
@@ -598,34 +512,28 @@ def scene_launches(
     scene: Scene,
     seed: int,
     *,
-    pair: bool = False,
-    elements: bool = True,
     linears: int = 0,
     smooths: int = 0,
-    slots: int = 0,
-    row_type: str = "int",
     chunk: int | None = None,
+    **options: Any,
 ) -> Launches:
-    """Return the launches of a scene, with the smallest kernel variant that suits it."""
+    """Return the launches of a scene, with the smallest kernel variant that suits it and has these options."""
     variant = replace(
         device.variant,
         scenarios=BATCH[scene.frames],
         linears=_capacity(linears),
         frames=scene.frames,
         clip=scene.clip,
-        pair=pair,
         noisy=scene.comparison.exposures > 0,
         estimated=scene.comparison.estimated,
         smooths=_capacity(smooths),
-        slots=slots,
-        elements=elements,
         joint=scene.joint,
         quartic=scene.quartic,
         photons=scene.photons,
         additive=scene.additive,
         modulations=scene.modulations,
-        row_type=row_type,
         chunk=min(chunk or device.variant.chunk, device.variant.chunk),
+        **options,
     )
     single = device.width == 1 or scene.frames or variant.compared
     many = VECTORS if not (variant.elements or variant.linears) else FEW_VECTORS
@@ -648,11 +556,7 @@ def detection_launches(device: Device, scene: Scene, seed: int, plan: ChannelPla
         smooths=len(plan.scales),
         slots=bands.shape[1],
     )
-    launches.weigh(plan.weights, plan.linear_end, plan.pixels_end)
-    if plan.subtractions.size:
-        launches.marginalise(plan.subtractions)
-    if launches.variant.compared:
-        launches.compare(bands, finished, plan.scales, plan.scale_end)
+    launches.weigh(plan, bands, finished)
     return launches
 
 

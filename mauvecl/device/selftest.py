@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from importlib import resources
+from itertools import chain
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -33,8 +34,8 @@ from mauvecl.host import VERSION
 from mauvecl.host.exposure.expectation import Expectation
 from mauvecl.noise import layout, reference
 from mauvecl.noise.disturbances import CosmicRays, Uniform
-from mauvecl.noise.processes import NONE, Comparison, Processes
 from mauvecl.noise.scene import prepare
+from mauvecl.noise.unknowns import NONE, Comparison, Processes
 from mauvecl.schema.columns import Column
 
 if TYPE_CHECKING:
@@ -178,10 +179,8 @@ def _rate(rate: float | None) -> str:
 def list_devices(*, measure: bool = True) -> list[dict[str, Any]]:
     """List all devices with their promise and, if `measure` is true, their speed.
 
-    Returns
-    -------
-    list of dict
-        Fields of `DeviceRecord`, ``rate`` (None if not measured) and ``error`` (the reason of a failure, or "").
+    Each has the fields of `DeviceRecord`, ``rate`` (None if not measured) and ``error`` (the reason of a failure, or
+    "").
     """
     rates = []
     for number, record in enumerate(devices()):
@@ -538,30 +537,19 @@ def closed_forms(engine: Engine) -> Iterator[Check]:
             yield Check(f"{name}, closed form", bool(abs(error) < 5), f"{error:+.1f} standard errors")
 
 
-def tiles(engine: Engine) -> Check:
+def tiles(engine: Engine) -> Iterator[Check]:
     """Compare realisations drawn at once with the same ones drawn in pieces."""
     quiet = toy()
     whole = engine.realise(quiet, start=0, count=500, seed=SEED)
     parts = [engine.realise(quiet, start=a, count=b - a, seed=SEED) for a, b in ((0, 1), (1, 77), (77, 500))]
-    return Check("same bits in pieces", bool(np.array_equal(whole, np.concatenate(parts))), "500 realisations in 3")
+    yield Check("same bits in pieces", bool(np.array_equal(whole, np.concatenate(parts))), "500 realisations in 3")
 
 
 def run(engine: Engine, report: Callable[[Check], None] = lambda check: None) -> list[Check]:
     """Run all checks and call `report` with each outcome."""
     checks: list[Check] = []
-
-    def note(check: Check) -> None:
+    groups = (check_results, check_stares, chance, closed_forms, tiles)
+    for check in chain([known_answers(engine)], *(group(engine) for group in groups)):
         checks.append(check)
         report(check)
-
-    note(known_answers(engine))
-    for group in (
-        check_results(engine),
-        check_stares(engine),
-        chance(engine),
-        closed_forms(engine),
-    ):
-        for check in group:
-            note(check)
-    note(tiles(engine))
     return checks

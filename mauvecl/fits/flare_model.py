@@ -28,7 +28,6 @@ from mauvecl.detection.nuisances import Nuisances, join_names
 from mauvecl.detection.statistics import Linear
 from mauvecl.host.exposure.response import Order, response_matrix
 from mauvecl.host.stars.bands import photons
-from mauvecl.host.stars.blackbody import blackbody
 from mauvecl.host.stars.flare_spectra import (
     BALMER_EDGE_NM,
     ELECTRON_TEMPERATURE_K,
@@ -38,6 +37,7 @@ from mauvecl.host.stars.flare_spectra import (
     BalmerFlare,
     EmissionLine,
     balmer_continuum,
+    blackbody,
 )
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError

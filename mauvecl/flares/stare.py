@@ -14,8 +14,8 @@ from mauvecl.flares.energies import EnergyScale, amplitude_of, amplitude_of_peak
 from mauvecl.flares.settings import ORBIT_S, SAME_K, Cooling, Curve, Sinusoid
 from mauvecl.flares.shapes import SHAPES, Shape, shape_of
 from mauvecl.host.arrays import set_read_only
+from mauvecl.host.orbit import Limits
 from mauvecl.host.orbit.geometry import TimeGrid, sunlight
-from mauvecl.host.orbit.observing_limits import Limits
 from mauvecl.host.orbit.orbit import Orbit, Target, Track
 from mauvecl.host.orbit.visibility import Particles, Thermal, Visibility
 from mauvecl.noise.disturbances import PointingDrifts

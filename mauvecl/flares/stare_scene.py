@@ -23,10 +23,10 @@ from mauvecl.detection.requests import Countable
 from mauvecl.flares.frames import MOST_STATISTICS, STEADY, Components
 from mauvecl.flares.stare import Stare
 from mauvecl.noise import layout
+from mauvecl.noise.disturbances import ADDITIVE
 from mauvecl.noise.drawing import Cumulants, expansion_error, joint_is_exact
-from mauvecl.noise.processes import NONE, Processes
 from mauvecl.noise.scene import Scene, padded, prepare
-from mauvecl.noise.unknowns import ADDITIVE
+from mauvecl.noise.unknowns import NONE, Processes
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
-from pydantic import PlainSerializer, PlainValidator, WithJsonSchema, model_validator
+from pydantic import BeforeValidator, PlainSerializer, PlainValidator, WithJsonSchema, model_validator
 
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
@@ -22,8 +22,6 @@ from mauvecl.schema.section import Section
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
-    from pydantic import GetCoreSchemaHandler
-    from pydantic_core import CoreSchema
 
     from mauvecl.host.exposure.expectation import Expectation
 
@@ -38,7 +36,7 @@ class AdditiveProcess(Section, ABC):
     """Charge that each pixel collects independently in each draw, and the study section that describes it.
 
     Kernels draw it from a table of `charge` in a separate stream, multiply it by the gain, and add it to the other
-    noise of the pixel. Subclasses are listed in `unknowns.ADDITIVE` by their study keys.
+    noise of the pixel. Subclasses are listed in `ADDITIVE` by their study keys.
     """
 
     #: Number of the random stream in `layout.STREAMS`.
@@ -143,7 +141,6 @@ class CosmicRays(AdditiveProcess):
         return np.asarray(np.maximum(np.fft.irfft(spectrum, size)[: most + 1], 0.0))
 
     def most_electrons(self, seconds: Annotated[float, Unit("s"), Range(0)]) -> int:
-        """Return the charge that a pixel exceeds in a time with a probability of at most `NEGLIGIBLE`."""
         from scipy import special
 
         hits = self._hits(seconds)
@@ -162,15 +159,16 @@ class CosmicRays(AdditiveProcess):
         return self.rate_per_cm2_s
 
     def with_particles(self, rate_per_cm2_s: ParticleRate) -> Self:
-        """Return the process at another rate of incident particles."""
         return self.model_copy(update={"rate_per_cm2_s": rate_per_cm2_s})
 
     @property
     def assumption(self) -> tuple[str, str, str]:
-        """Row of a table of assumptions: quantity, value and source."""
         low, high = self.electrons
         return ("charge of a hit", f"{low:g} to {high:g} electrons in one pixel", "assumption; adds to the noise")
 
+
+#: Additive processes: fields of `Processes`, keys of studies' ``processes``.
+ADDITIVE: dict[str, type[AdditiveProcess]] = {"cosmic_rays": CosmicRays}
 
 #: Drifts that are drawn at a time, per stare.
 BATCH = 16
@@ -289,21 +287,13 @@ def _lost_until(times_s: Float, start_s: Float, duration_s: Float, depth: Float,
 MAX_CUT_SD = 1e5
 
 
-class PriorUnit:
-    """Unit of a value with a prior: deg C of temperatures, none of others."""
-
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        from pydantic_core import core_schema
-
-        return core_schema.no_info_before_validator_function(self._plain, handler(source))
-
-    @staticmethod
-    def _plain(value: Any) -> Any:
-        is_temperature = is_quantity(value) and value.unit.physical_type == "temperature"
-        return without_unit(value, "deg_C") if is_temperature else value
+def _in_celsius(value: Any) -> Any:
+    """Convert a Quantity of temperature to deg C, which prior values have; return others unchanged."""
+    is_temperature = is_quantity(value) and value.unit.physical_type == "temperature"
+    return without_unit(value, "deg_C") if is_temperature else value
 
 
-PriorValue = Annotated[float, PriorUnit(), Range()]
+PriorValue = Annotated[float, BeforeValidator(_in_celsius), Range()]
 
 
 @validated

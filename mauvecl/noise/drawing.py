@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from mauvecl.noise import layout
 from mauvecl.noise.disturbances import Prior
-from mauvecl.noise.processes import NONE, Processes
-from mauvecl.noise.unknowns import PROCESSES, SIGNAL_PARTS, Conditions, SignalPart
+from mauvecl.noise.unknowns import NONE, PROCESSES, SIGNAL_PARTS, Conditions, Processes, SignalPart
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl.noise.unknowns import ADDITIVE, CHANGING, PROCESSES, STARE_PROCESSES
+from mauvecl.noise.disturbances import ADDITIVE
+from mauvecl.noise.unknowns import CHANGING, PROCESSES, STARE_PROCESSES
 
 WORD_BITS = 32
 

@@ -15,10 +15,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
 from mauvecl.noise import layout, random_numbers
+from mauvecl.noise.disturbances import ADDITIVE
 from mauvecl.noise.drawing import DrawingOptions
 from mauvecl.noise.random_numbers import Floats, Words, fma, four_normals, words
 from mauvecl.noise.scene import Scene, prepare
-from mauvecl.noise.unknowns import ADDITIVE, PROCESSES, SIGNAL_PARTS
+from mauvecl.noise.unknowns import PROCESSES, SIGNAL_PARTS
 from mauvecl.schema.columns import Column, table_of
 
 if TYPE_CHECKING:

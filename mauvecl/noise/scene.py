@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from mauvecl.noise import layout
+from mauvecl.noise.disturbances import ADDITIVE
 from mauvecl.noise.drawing import (
     Cumulants,
     Drawing,
@@ -26,13 +27,11 @@ from mauvecl.noise.drawing import (
     sky_share,
 )
 from mauvecl.noise.layout import LARGEST_MEAN, SMALLEST_EXPANDED, AliasTable, alias_table_of, table_set
-from mauvecl.noise.processes import NOISE_FREE, Comparison
-from mauvecl.noise.unknowns import ADDITIVE, PROCESSES, SIGNAL_PARTS, SignalPart
+from mauvecl.noise.unknowns import NOISE_FREE, PROCESSES, SIGNAL_PARTS, Comparison, Processes, SignalPart
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
-    from mauvecl.noise.processes import Processes
 
 Float = NDArray[np.float64]
 
@@ -375,20 +374,15 @@ def prepare(
     method = choose_method(scenarios, drawing, factors)
     compared = np.zeros(len(scenarios), np.uint32) if references is None else np.array(references, np.uint32)
     used = ~np.any([scenarios[t].saturated for t in np.unique(compared)], axis=0)
-    n_pixel, tables = used.size, list[AliasTable]()
-
-    darks, dark_centre = np.zeros(padded(n_pixel), layout.POISSON), np.zeros(n_pixel)
-    if not method.joint:
-        step = quiet.dark_step_dn
-        dark_dn = method.each * quiet.dark_dn
-        dark_centre = fill_poisson_counts(darks[:n_pixel], dark_dn / step, step, tables)
+    tables = list[AliasTable]()
+    darks, dark_dn = _dark_counts(quiet, method, tables)
     arrays = _PerScenario.empty(scenarios, method, comparison, modulated=bool(drawing.processes.modulations))
     for k, x in enumerate(scenarios):
-        arrays.fill_draw(k, x, method, factors, quiet.dark_step_dn * dark_centre, tables)
+        arrays.fill_draw(k, x, method, factors, dark_dn, tables)
         arrays.fill_comparison(k, x, scenarios[compared[k]], method, comparison, used)
     job = _job(scenarios, drawing, method, comparison, first_group, tables)
     return Scene(
-        n_pixel=n_pixel,
+        n_pixel=used.size,
         n_frames=quiet.n_frames,
         frames=method.frames,
         joint=method.joint,
@@ -407,6 +401,15 @@ def prepare(
         used=used,
         **vars(arrays),
     )
+
+
+def _dark_counts(quiet: Expectation, method: DrawMethod, tables: list[AliasTable]) -> tuple[NDArray[np.void], Float]:
+    """Return the array of separate dark counts, and the DN to which they are relative, both zero for joint draws."""
+    n_pixel, step = quiet.wavelength_nm.size, quiet.dark_step_dn
+    darks = np.zeros(padded(n_pixel), layout.POISSON)
+    if method.joint:
+        return darks, np.zeros(n_pixel)
+    return darks, step * fill_poisson_counts(darks[:n_pixel], method.each * quiet.dark_dn / step, step, tables)
 
 
 @dataclass(eq=False)

@@ -12,7 +12,7 @@ import scipy
 from numpy.typing import NDArray
 
 from mauvecl.flares.shapes import between, sides
-from mauvecl.host.threads import map_in_threads
+from mauvecl.host.arrays import map_in_threads
 from mauvecl.observations.event_fits import Fit, Mixture, fit_event, joined, light_of
 from mauvecl.observations.event_windows import GENERAL, LOG_TIME, FittedFlare, Likelihood, Window, log_time
 from mauvecl.observations.process import Steps

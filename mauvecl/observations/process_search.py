@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.threads import map_in_threads
+from mauvecl.host.arrays import map_in_threads
 from mauvecl.search.templates import LEAST_SHARE, Bank, Template
 
 if TYPE_CHECKING:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,20 +12,22 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.device.launches import Progress
+from mauvecl.host.arrays import map_in_threads
 from mauvecl.host.tables.files import UNFINISHED, check_size, read_bytes, write_whole
-from mauvecl.host.threads import map_in_threads
 from mauvecl.runs.checkpoint import locked
 from mauvecl.runs.export import Selection, export
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.runs.store import (
     CRC_BYTES,
+    LATER_ATTRIBUTES,
+    OTHERWISE_IN_VERSION_1,
     Chunk,
     Store,
     StoredScene,
     crc,
     digest,
-    without_later_attributes,
-    without_version,
+    without,
 )
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column
@@ -37,8 +39,6 @@ from mauvecl.study.study import Study
 if TYPE_CHECKING:
     from mauvecl.device.engine import Engine
 
-
-Progress = Callable[[int, int], None]
 
 #: Chunks drawn at once, and threads that write them while the next are drawn.
 CHUNKS_AT_ONCE, WRITERS = 4, 4
@@ -372,14 +372,14 @@ def _fault(store: Store, chunk: Chunk, engine: Engine | Pool | None, repair: boo
 
 def _faults_of_description(store: Store, repair: bool) -> Iterator[Fault]:
     """Compare groups, descriptions of arrays and calibration with those of the study."""
+    left_out = ("mauvecl", *(OTHERWISE_IN_VERSION_1 if store.of_version_1 else ()))
     for name, content in sorted(store.description().items()):
         there = store.path / name
         try:
             data = read_bytes(there, "description")
             if name.endswith("zarr.json"):
-                old = store.of_version_1
-                existing, made = (without_version(json.loads(text), of_version_1=old) for text in (data, content))
-                same, seen = existing in (made, without_later_attributes(made)), "foreign"
+                existing, made = (without(json.loads(text), left_out) for text in (data, content))
+                same, seen = existing in (made, without(made, LATER_ATTRIBUTES)), "foreign"
             else:
                 same, seen = data == content, "damaged"
         except (ValueError, TypeError, AttributeError, RecursionError):

@@ -32,7 +32,7 @@ from pydantic import BaseModel
 
 from mauvecl.detection.requests import Countable, Shard
 from mauvecl.host import VERSION
-from mauvecl.host.tables.files import UNFINISHED, json_data, read_bytes, read_text, write_whole
+from mauvecl.host.tables.files import UNFINISHED, read_bytes, write_whole
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
@@ -45,23 +45,21 @@ def locked(folder: Path, what: str) -> Iterator[None]:
 
     Raises InputError if another process holds the lock, or the file system has no locks.
     """
+
+    def unusable(why: str) -> InputError:
+        return InputError(f"{what} {str(folder)!r} {why}", key="lock")
+
     try:
         handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     except OSError as error:
-        raise InputError(
-            f"{what} {str(folder)!r} cannot be opened ({error.strerror}): use a readable folder", key="lock"
-        ) from error
+        raise unusable(f"cannot be opened ({error.strerror}): use a readable folder") from error
     try:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            raise InputError(
-                f"{what} {str(folder)!r} is being written by another process: wait until it ends", key="lock"
-            ) from error
+            raise unusable("is being written by another process: wait until it ends") from error
         except OSError as error:
-            raise InputError(
-                f"{what} {str(folder)!r} cannot be locked ({error.strerror}): use a file system with locks", key="lock"
-            ) from error
+            raise unusable(f"cannot be locked ({error.strerror}): use a file system with locks") from error
         yield
     finally:
         os.close(handle)
@@ -234,7 +232,6 @@ class Checkpoint:
         self.messages: list[str] = []
         self._held: list[tuple[str, Arrays]] = []
         self._lock = threading.Lock()
-        self._stack = ExitStack()
 
     def __enter__(self) -> Self:
         """Lock the output folder and read its state.
@@ -242,13 +239,11 @@ class Checkpoint:
         Raises InputError if another process writes to the folder, or it contains an unfinished run without `resume` or
         `restart`, or one of another study (the message lists the keys that differ).
         """
-        if not self._is_held:
-            self._stack.enter_context(locked(self.parent, "output folder"))
-        try:
+        with ExitStack() as stack:
+            if not self._is_held:
+                stack.enter_context(locked(self.parent, "output folder"))
             self._look()
-        except BaseException:
-            self._stack.close()
-            raise
+            self._stack = stack.pop_all()
         self._started, self._written = time.monotonic(), any(self._files())
         return self
 
@@ -256,7 +251,7 @@ class Checkpoint:
         try:
             if kind is not None:
                 # After an interruption or error, write pending shards unless the run was short.
-                self._write_held(only_if_late=not self._written)
+                self._write_held()
         except InputError:
             # The original exception is more important.
             pass
@@ -274,13 +269,8 @@ class Checkpoint:
                 "discard it",
                 key="resume",
             )
-        try:
-            manifest = json_data(read_text(self.folder / MANIFEST, "manifest"), "manifest")
-            if manifest["digest"] != _digest_of(manifest):
-                raise ValueError
-            theirs = {"mauvecl": manifest["mauvecl"], "verb": manifest["verb"], **manifest["study"]}
-            form = manifest.get("form", 1)
-        except (OSError, ValueError, KeyError, TypeError):
+        manifest = _intact(self.folder / MANIFEST)
+        if manifest is None:
             # Names of files include the fingerprint, so shards of another study are never used.
             self.messages.append(
                 f"The manifest of {str(self.folder)!r} was damaged or missing and is written anew; the shards that "
@@ -288,6 +278,7 @@ class Checkpoint:
             )
             self._write_manifest()
             return
+        form = manifest.get("form", 1)
         if form != FORM:
             raise InputError(
                 f"the unfinished run in {str(self.folder)!r} has counts in format {form}, but this version needs "
@@ -295,6 +286,7 @@ class Checkpoint:
                 key="restart",
             )
         ours = {"mauvecl": VERSION, "verb": self.verb, **self._plain_study()}
+        theirs = {"mauvecl": manifest["mauvecl"], "verb": manifest["verb"], **manifest["study"]}
         differing = differing_keys(ours, theirs)
         if differing:
             raise InputError(
@@ -327,10 +319,10 @@ class Checkpoint:
         """Keep a shard, and write it to disk once the run has lasted `patience_s`."""
         with self._lock:
             self._held.append((name, shard))
-            self._write_held(only_if_late=not self._written)
+            self._write_held()
 
-    def _write_held(self, *, only_if_late: bool = False) -> None:
-        if only_if_late and time.monotonic() - self._started < self._patience_s:
+    def _write_held(self) -> None:
+        if not self._written and time.monotonic() - self._started < self._patience_s:
             return
         if not self._written and self._held:
             self._write_manifest()
@@ -360,7 +352,7 @@ class Checkpoint:
         """
         names = sorted(os.listdir(self.folder)) if self.folder.is_dir() else []
         shards = [name for name in names if SHARD_NAME.fullmatch(name)]
-        if MANIFEST in names and not shards and not _is_ours(self.folder / MANIFEST):
+        if MANIFEST in names and not shards and _intact(self.folder / MANIFEST) is None:
             raise InputError(
                 f"{str(self.folder / MANIFEST)!r} is not mauvecl's: use another output folder", key="folder"
             )
@@ -387,12 +379,7 @@ class Checkpoint:
 def kept(checkpoint: Checkpoint | None, question: object, compute: Callable[[], Arrays]) -> Arrays:
     """Return the arrays of a computation, from the checkpoint if an earlier run has finished it.
 
-    Parameters
-    ----------
-    checkpoint : Checkpoint, optional
-        If omitted, the arrays are computed.
-    question : object
-        Everything on which the result depends, as for `fingerprint`.
+    The question is everything on which the result depends, as for `fingerprint`.
     """
     if checkpoint is None:
         return compute()
@@ -404,13 +391,14 @@ def kept(checkpoint: Checkpoint | None, question: object, compute: Callable[[], 
     return arrays
 
 
-def _is_ours(manifest: Path) -> bool:
-    """Return whether a manifest is an intact one of a checkpoint."""
+def _intact(manifest: Path) -> dict[str, Any] | None:
+    """Return the content of a manifest, or None if it is not an intact one of a checkpoint."""
     try:
         content = json.loads(read_bytes(manifest, "manifest"))
-        return bool(content["digest"] == _digest_of(content))
+        is_whole = content["digest"] == _digest_of(content) and isinstance(content["study"], dict)
+        return dict(content) if is_whole and {"mauvecl", "verb"} <= content.keys() else None
     except (InputError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
-        return False
+        return None
 
 
 def _named(name: str, body: bytes) -> bytes:

@@ -225,44 +225,40 @@ class DaskWorkers:
             self._given.pop(attempt.task.key, None)
 
     def _came(self, attempt: _Attempt, sent: DaskFuture[Any]) -> None:
-        awaited = attempt.awaited
         with self._lock:
             if self._sent.pop(sent, None) is None:
                 # The result is no longer needed.
                 return
         try:
-            if sent.status == "finished":
-                try:
-                    answer = _result(sent)
-                except ShardLost as lost:
-                    self._forget_request(attempt)
-                    awaited.set_exception(lost)
-                    return
-                except OSError as broken:
-                    # The connection may break between the end of a shard and the transfer of its counts.
-                    awaited.set_exception(self._gone().with_traceback(broken.__traceback__))
-                    return
-                if isinstance(answer, Counted) and answer.code == code_identity():
-                    awaited.set_result(answer.sums)
-                    return
-            error = sent.exception() if sent.status == "error" else None
-            if sent.status in ("finished", "error") and self._find_strangers():
-                awaited.set_exception(ShardLost("counted by a worker with other code", failed=False))
-            elif isinstance(error, InputError | DeviceError):
-                # Another attempt would end as this one.
-                awaited.set_exception(
-                    DeviceError(f"cluster {self._where} failed at {attempt.task.shard}: {error}", "failed")
-                )
-            elif sent.status in ("cancelled", "lost") and self._client.status != "running":
-                awaited.set_exception(self._gone())
-            else:
-                if error is None:
-                    self._forget_request(attempt)
-                other = "workers with other code" if sent.status == "finished" else "workers that have left"
-                awaited.set_exception(ShardLost(f"cluster {self._where}: {error or other}"))
+            attempt.awaited.set_result(self._sums(attempt, sent))
+        except OSError as broken:
+            # The connection may break between the end of a shard and the transfer of its counts.
+            attempt.awaited.set_exception(self._gone().with_traceback(broken.__traceback__))
         except BaseException as error:
-            if not awaited.done():
-                awaited.set_exception(self._gone() if isinstance(error, OSError) else error)
+            attempt.awaited.set_exception(error)
+
+    def _sums(self, attempt: _Attempt, sent: DaskFuture[Any]) -> Arrays:
+        """Return the counts of a task that has ended, or raise why there are none."""
+        if sent.status == "finished":
+            try:
+                answer = _result(sent)
+            except ShardLost:
+                self._forget_request(attempt)
+                raise
+            if isinstance(answer, Counted) and answer.code == code_identity():
+                return answer.sums
+        error = sent.exception() if sent.status == "error" else None
+        if sent.status in ("finished", "error") and self._find_strangers():
+            raise ShardLost("counted by a worker with other code", failed=False)
+        if isinstance(error, InputError | DeviceError):
+            # Another attempt would end as this one.
+            raise DeviceError(f"cluster {self._where} failed at {attempt.task.shard}: {error}", "failed")
+        if sent.status in ("cancelled", "lost") and self._client.status != "running":
+            raise self._gone()
+        if error is None:
+            self._forget_request(attempt)
+        other = "workers with other code" if sent.status == "finished" else "workers that have left"
+        raise ShardLost(f"cluster {self._where}: {error or other}")
 
     def stop(self) -> None:
         """Cancel submitted shards; workers of other machines complete the shard in progress."""

@@ -156,13 +156,9 @@ def _study(text: str) -> BinTableHDU:
     from astropy.io import fits
 
     # FITS is restricted to ASCII; TOML strings accept escapes of other characters.
-    lines = [re.sub(r"[^\x00-\x7f]", _escaped, line) for line in text.splitlines()]
+    lines = [re.sub(r"[^\x00-\x7f]", lambda letter: f"\\U{ord(letter[0]):08X}", line) for line in text.splitlines()]
     column = fits.Column("LINE", f"{max(map(len, lines))}A", array=lines)
     return fits.BinTableHDU.from_columns([column], name="STUDY")
-
-
-def _escaped(letter: re.Match[str]) -> str:
-    return f"\\U{ord(letter[0]):08X}"
 
 
 def _image(selection: Selection, scene: StoredScene, table: str) -> ImageHDU:

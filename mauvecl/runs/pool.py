@@ -9,6 +9,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import partial
+from queue import SimpleQueue
 from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeVar
 
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ from mauvecl.detection.snr import Arrays, DetectionSums, SnrSums
 from mauvecl.device.engine import DeviceError, DeviceRecord, Engine, Stares
 from mauvecl.device.launches import Progress
 from mauvecl.flares.stare_scene import StaresRequest, StareSums
-from mauvecl.host.threads import map_in_threads
+from mauvecl.host.arrays import map_in_threads
 from mauvecl.runs.checkpoint import Checkpoint, Task, fingerprint, shards
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
@@ -38,8 +39,7 @@ SHARDS_PER_WORKER = 2
 PREPARED = 1
 
 
-Divided = DetectRequest | SnrRequest | StaresRequest
-Sums = DetectionSums | SnrSums | StareSums
+Sums = TypeVar("Sums", DetectionSums, SnrSums, StareSums)
 Item = TypeVar("Item")
 Answer = TypeVar("Answer")
 
@@ -51,10 +51,7 @@ class Stopped(Exception):  # noqa: N818
 class ShardLost(Exception):  # noqa: N818
     """Raised by workers that could not count a shard, which the pool then submits again.
 
-    Attributes
-    ----------
-    failed : bool
-        Whether to count it as a failure of the shard, of which there may be `MAX_FAILURES`.
+    If `failed` is true it counts as a failure of the shard, of which there may be `MAX_FAILURES`.
     """
 
     def __init__(self, reason: object, *, failed: bool = True) -> None:
@@ -103,9 +100,10 @@ class LocalWorkers:
         self._ticks: list[Callable[[int], None] | None] = [None] * len(devices)
         self._stopping = False
         self._engines: list[Engine] = [self._made(place) for place in range(len(devices))]
-        self._free = list(range(len(devices)))
+        self._free: SimpleQueue[int] = SimpleQueue()
+        for place in range(len(devices)):
+            self._free.put(place)
         self._threads = ThreadPoolExecutor(len(devices))
-        self._lock = threading.Lock()
 
     def _made(self, place: int) -> Engine:
         return self._make(self._devices[place], progress=partial(self._tick, place))
@@ -138,8 +136,7 @@ class LocalWorkers:
     def _count(self, task: Task) -> Arrays:
         if self._stopping:
             raise Stopped
-        with self._lock:
-            place = self._free.pop(0)
+        place = self._free.get()
         self._ticks[place] = task.tick
         engine = self._engines[place]
         try:
@@ -152,8 +149,7 @@ class LocalWorkers:
             raise ShardLost(f"{engine.device_name}: {error}") from error
         finally:
             self._ticks[place] = None
-            with self._lock:
-                self._free.append(place)
+            self._free.put(place)
 
     def stop(self) -> None:
         """Stop work in progress between two tiles."""
@@ -242,22 +238,16 @@ class Pool:
     def detect(self, quiet: Expectation, flares: Sequence[Expectation] | Expectation, **how: Any) -> Detection:
         """Compute a detection; parameters as for `Engine.detect`."""
         request = DetectRequest.of(quiet, flares, **how)
-        sums = DetectionSums(request)
-        self._add_up(request, sums)
-        return sums.answer()
+        return self._add_up(request, DetectionSums(request)).answer()
 
     def snr(self, expectation: Expectation, **how: Any) -> SnrResult:
         """Compute distributions of the S/N; parameters as for `Engine.snr`."""
         request = SnrRequest.of(expectation, **how)
-        sums = SnrSums(request)
-        self._add_up(request, sums)
-        return sums.answer()
+        return self._add_up(request, SnrSums(request)).answer()
 
     def stares(self, request: StaresRequest) -> Arrays:
         """Reduce all stares of a request; see `Stares.reduced`."""
-        sums = StareSums(request)
-        self._add_up(request, sums)
-        return sums.answer()
+        return self._add_up(request, StareSums(request)).answer()
 
     def realise(
         self, expectation: Expectation, *, count: Realisations, out: NDArray[Any] | None = None, **how: Any
@@ -275,7 +265,8 @@ class Pool:
         out[:] = rows
         return out
 
-    def _add_up(self, request: Divided, sums: Sums) -> None:
+    def _add_up(self, request: DetectRequest | SnrRequest | StaresRequest, sums: Sums) -> Sums:
+        """Count all shards of a request and return their sums."""
         key = fingerprint(request)
         todo = shards(request)
         with self._lock:
@@ -288,6 +279,7 @@ class Pool:
             if self.checkpoint is not None:
                 self.checkpoint.put(task.name, counted)
             self._finished(task)
+        return sums
 
     def _without_resumed(self, tasks: Iterable[Task], sums: Sums) -> Iterator[Task]:
         """Add shards of the checkpoint to the sums, and yield the others."""

@@ -55,23 +55,14 @@ NOMINAL = "the throughput is nominal, not a flight calibration"
 LATER_ATTRIBUTES = ("instrument", "saturation_dn", "dark_unit", "temperature_c")
 
 
-def without_later_attributes(described: dict[str, Any]) -> dict[str, Any]:
-    """Return the description of a group as earlier versions wrote it."""
-    attributes = described.get("attributes", {})
-    return described | {"attributes": {k: v for k, v in attributes.items() if k not in LATER_ATTRIBUTES}}
-
-
 #: Attributes in which stores of version 1 state the study and the instrument by other defaults and names.
 OTHERWISE_IN_VERSION_1 = ("study", "study_sha256", "instrument", "provenance")
 
 
-def without_version(described: dict[str, Any], *, of_version_1: bool = False) -> dict[str, Any]:
-    """Return the description of a group without the version that wrote it, and what version 1 states otherwise."""
-    attributes, left_out = (
-        described.get("attributes", {}),
-        ("mauvecl", *(OTHERWISE_IN_VERSION_1 if of_version_1 else ())),
-    )
-    return described | {"attributes": {k: v for k, v in attributes.items() if k not in left_out}}
+def without(described: dict[str, Any], names: Sequence[str]) -> dict[str, Any]:
+    """Return the description of a group without some attributes."""
+    attributes = described.get("attributes", {})
+    return described | {"attributes": {key: value for key, value in attributes.items() if key not in names}}
 
 
 def describe(study: Study, scenes: Sequence[StoredScene], folder: Path) -> None:
@@ -335,10 +326,16 @@ class Store:
         """
         root = self.path / "zarr.json"
         if root.exists():
-            self._check_same()
+            there = Store.open(self.path).study
+            differing = differing_keys(self.study.model_dump(mode="json"), there.model_dump(mode="json"))
+            if differing:
+                raise InputError(
+                    f"store {str(self.path)!r} was started by another study, which differs in {', '.join(differing)}: "
+                    "use the same study or another place",
+                    key="store",
+                )
             self.read_digests()
             return
-        self.make_folder()
         ours = {scene.group for scene in self.scenes}
         other = [p.name for p in self.path.iterdir() if p.name not in ours and not p.name.startswith(UNFINISHED)]
         if other:
@@ -372,16 +369,6 @@ class Store:
             describe(self.study, self.scenes, Path(folder))
             files = [p for p in Path(folder).rglob("*") if p.is_file()]
             return {str(p.relative_to(folder)): p.read_bytes() for p in files}
-
-    def _check_same(self) -> None:
-        there = Store.open(self.path).study
-        differing = differing_keys(self.study.model_dump(mode="json"), there.model_dump(mode="json"))
-        if differing:
-            raise InputError(
-                f"store {str(self.path)!r} was started by another study, which differs in {', '.join(differing)}: use "
-                "the same study or another place",
-                key="store",
-            )
 
     def read_digests(self) -> None:
         """Read the digests of written chunks; incomplete lines are ignored."""

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from mauvecl.flares.frames import STEADY, Components
 from mauvecl.flares.stare import select_frames
 from mauvecl.flares.stare_scene import Method, StaresRequest, method_for
-from mauvecl.noise.processes import NONE, Processes
+from mauvecl.noise.unknowns import NONE, Processes
 from mauvecl.schema.columns import Column
 from mauvecl.schema.errors import InputError
 from mauvecl.search.search import Search, subtract_known

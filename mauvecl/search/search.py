@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from mauvecl.flares.stare import select_frames
 from mauvecl.flares.stare_scene import StaresRequest, method_for
-from mauvecl.noise.processes import NONE, Processes
+from mauvecl.noise.unknowns import NONE, Changing, Processes
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import DAY_S
 from mauvecl.search.templates import LEAST_SHARE, Bank, Template
@@ -43,7 +43,6 @@ if TYPE_CHECKING:
 
     from mauvecl.flares.frames import Components
     from mauvecl.flares.stare import Stare, StareUnknown
-    from mauvecl.noise.unknowns import Changing
 
 Float = NDArray[np.float64]
 

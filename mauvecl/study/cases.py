@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 import numpy as np
 
 from mauvecl.noise.drawing import Cumulants, stack_is_exact
-from mauvecl.noise.unknowns import COURSES, PROCESSES, STARE_PROCESSES
+from mauvecl.noise.unknowns import COURSES, PROCESSES, STARE_PROCESSES, Processes
 from mauvecl.schema.columns import Column, percent, short
 from mauvecl.schema.errors import Message, of_kind
 from mauvecl.study.questions import QUANTITIES, Sweep
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from mauvecl.host.exposure.star import Neighbours
     from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.host.stars.source import Source
-    from mauvecl.noise.processes import Processes
     from mauvecl.study.sections import Observation, SkyLight
     from mauvecl.study.study import Study
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field, create_model, model_validator
 
-from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, NUISANCES, default_processes
+from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, NUISANCES, Processes, default_processes
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.fields import Flag, Help
 from mauvecl.schema.section import Section
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
     from mauvecl.detection.nuisances import Nuisances
     from mauvecl.host.exposure.expectation import Expectation
-    from mauvecl.noise.processes import Processes
 
 
 def _spread(given: Any) -> Any:

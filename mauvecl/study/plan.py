@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import ValidationError, field_validator, model_validator
 
-from mauvecl.host.orbit.observing_limits import Limits
+from mauvecl.host.orbit import Limits
 from mauvecl.host.tables.names import (
     BANDS,
     DECLINATIONS,

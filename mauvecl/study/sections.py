@@ -10,10 +10,10 @@ from pydantic import Field, create_model, field_validator, model_validator
 
 from mauvecl.detection.names import DEFAULT_STATISTICS, RECOMMENDED, STATISTIC_NAMES
 from mauvecl.host.exposure import DEFAULT_SKY
-from mauvecl.host.instrument.paths import DEFAULT_INSTRUMENT, current_name
+from mauvecl.host.instrument import DEFAULT_INSTRUMENT, current_name
 from mauvecl.host.stars.library import ALIASES, listed_values
 from mauvecl.noise.disturbances import Prior, PriorField
-from mauvecl.noise.unknowns import INSTRUMENT_VALUES, values_of
+from mauvecl.noise.unknowns import INSTRUMENT_VALUES, Comparison, values_of
 from mauvecl.schema import parsing
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help, Quantity, Range, Slider, Widget
@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.host.stars.flare_spectra import FlareSpectrum
     from mauvecl.host.stars.source import Source
-    from mauvecl.noise.processes import Comparison
 
 
 def amplitudes_in(path: Path, _: str) -> list[float]:
@@ -583,8 +582,6 @@ class Run(Section):
 
     def comparison(self) -> Comparison:
         """Return the reference of the comparison for the engine."""
-        from mauvecl.noise.processes import Comparison
-
         return Comparison.of(self.reference, self.variances)
 
 

@@ -17,11 +17,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, Union, get_args
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from mauvecl.detection.names import DEFAULT_STATISTICS, countable, least_countable
-from mauvecl.host.instrument.paths import FORMER_NAMES, FORMERLY_MAUVE
-from mauvecl.host.orbit.observing_limits import Limits
+from mauvecl.host.instrument import FORMER_NAMES, FORMERLY_MAUVE
+from mauvecl.host.orbit import Limits
 from mauvecl.host.tables.files import parsing, possible, read_bytes, read_ecsv, read_text, toml, without_columns
-from mauvecl.noise.processes import NONE, Processes
-from mauvecl.noise.unknowns import COURSES
+from mauvecl.noise.unknowns import COURSES, NONE, Processes
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, Message, shortened
 from mauvecl.schema.fields import AnyUnit, Flag, Help, found

@@ -14,7 +14,7 @@ from typing import Any, Literal, NamedTuple, get_args, get_origin
 from pydantic.fields import FieldInfo
 
 from mauvecl.detection.requests import STATISTICS
-from mauvecl.host.instrument.paths import FORMER_NAMES, FORMERLY_MAUVE
+from mauvecl.host.instrument import FORMER_NAMES, FORMERLY_MAUVE
 from mauvecl.host.stars.library import ModelStar, embedded, near_names, spectrum_name
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.fields import (

@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from mauvecl.host.threads import map_in_threads
+from mauvecl.host.arrays import map_in_threads
 
 Work = list[int]
 #: At most as many, however many cores there are.

@@ -10,16 +10,17 @@ from processes import python
 
 from mauvecl import Engine, Processes
 from mauvecl.device.selftest import toy
-from mauvecl.noise import layout, reference, unknowns
+from mauvecl.noise import layout, reference
+from mauvecl.noise.disturbances import ADDITIVE
 from mauvecl.noise.scene import prepare
 
 N = 4000
 
 
-@pytest.mark.parametrize("name", unknowns.ADDITIVE)
+@pytest.mark.parametrize("name", ADDITIVE)
 def test_charge_is_a_distribution(name: str) -> None:
     """The distribution sums to one, and its variance is that of the process; longer times add up independently."""
-    process = unknowns.ADDITIVE[name]()
+    process = ADDITIVE[name]()
     short, long = process.charge(50.0), process.charge(100.0)
     assert short.sum() == pytest.approx(1.0, abs=1e-9)
     assert short.size <= process.most_electrons(50.0) + 1
@@ -34,10 +35,10 @@ def test_charge_is_a_distribution(name: str) -> None:
     assert process.variance_dn2(quiet) == pytest.approx(variance * quiet.gain_dn_per_electron**2)
 
 
-@pytest.mark.parametrize("name", unknowns.ADDITIVE)
+@pytest.mark.parametrize("name", ADDITIVE)
 def test_device_draws_what_the_reference_draws(engine: Engine, name: str) -> None:
     quiet = toy(64, 3)
-    processes = Processes(**{name: unknowns.ADDITIVE[name]()}).with_particles(500.0)
+    processes = Processes(**{name: ADDITIVE[name]()}).with_particles(500.0)
     index = np.arange(20, dtype=np.uint64)
     scene = prepare([quiet], processes=processes)
     assert scene.additive == (name,)
@@ -69,8 +70,7 @@ class Bursts(additive.AdditiveProcess):
     def most_electrons(self, seconds):
         return 12_000
 
-from mauvecl.noise import unknowns
-unknowns.ADDITIVE["bursts"] = Bursts
+additive.ADDITIVE["bursts"] = Bursts
 from mauvecl import Engine, Processes, Stare, Stares, Study, simulate
 from mauvecl.device.selftest import toy
 from mauvecl.flares.frames import Components
