@@ -14,15 +14,12 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-from mauvecl.cli.console import writes_to
+from mauvecl.cli.console import Meter, show, show_view, with_flags, writes_to
 from mauvecl.cli.flags import Options
-from mauvecl.schema.errors import InputError, of_kind
+from mauvecl.schema.errors import InputError, of_kind, reworded
 
 if TYPE_CHECKING:
-    from astropy.table import Table
-
     from mauvecl.answers.answer import Answer
-    from mauvecl.cli.console import Meter
     from mauvecl.device.build import Device
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.runs.checkpoint import Checkpoint
@@ -38,13 +35,7 @@ MOST_REALISATIONS = 2**63 - 1
 
 
 def question_values(study: Study, *, detects: bool) -> None:
-    """Raise InputError for values that a later step would reject.
-
-    Parameters
-    ----------
-    detects : bool
-        Whether the verb needs flares and thresholds.
-    """
+    """Raise InputError for values that a later step would reject; a verb that `detects` needs flares and thresholds."""
     from mauvecl.detection.names import check_fap, check_statistic
     from mauvecl.host.instrument.paths import instrument_path
     from mauvecl.host.stars.library import known_band, spectrum_name
@@ -151,8 +142,6 @@ class Session(Options):
 
         Raises InputError if a file of the answer could not be written; the answer is printed before.
         """
-        from mauvecl.schema.errors import reworded
-
         self._held.close()
         if kind is None and self._lost:
             others = f"; the same holds for {len(self._lost) - 1} more files of this answer" if self._lost[1:] else ""
@@ -173,10 +162,7 @@ class Session(Options):
     def pool(self, *, unit: str = "realisations") -> Iterator[Pool]:
         """Yield the pool of workers, with progress and a checkpoint; interruptions are reported.
 
-        Parameters
-        ----------
-        unit : str
-            Unit of progress: realisations, which the pool reports, or items that the caller reports to `meter`.
+        The pool reports its progress in realisations; the caller reports that in another unit to `meter`.
         """
         from mauvecl.runs.pool import Pool
 
@@ -219,8 +205,6 @@ class Session(Options):
 
     def metered(self, unit: str) -> Meter:
         """Return the progress in a unit, for a `with` block."""
-        from mauvecl.cli.console import Meter
-
         return Meter(quiet=self.quiet or self.as_json, unit=unit)
 
     def _kept(self, checkpoint: Checkpoint) -> str:
@@ -232,8 +216,6 @@ class Session(Options):
 
     def say(self, lines: Sequence[str]) -> None:
         """Print messages, unless standard output is reserved for JSON."""
-        from mauvecl.cli.console import show, with_flags
-
         if lines and not self.as_json:
             show([with_flags(line) for line in lines])
 
@@ -248,21 +230,8 @@ class Session(Options):
             return False
         return self.pictures
 
-    def write(self, table: Table, name: str) -> None:
-        """Write a table to the folder, in the format of its file extension."""
-        from mauvecl.answers.answer import write_table
-
-        self.leave(lambda: write_table(table, self.folder / name))
-
-    def _document(self, name: str, content: Callable[[], bytes]) -> Path:
-        from mauvecl.answers.answer import write_document
-
-        return write_document(content(), self.folder / name)
-
     def leave(self, write: Callable[[], Path | Sequence[Path]]) -> None:
         """Write files; failures are reported at the end, after the answer is printed."""
-        from mauvecl.schema.errors import InputError
-
         try:
             made = write()
         except InputError as error:
@@ -301,15 +270,11 @@ class Session(Options):
         with report_interrupts(self._written):
             self._leave_all(answer)
         if self.as_json:
-            from mauvecl.cli.console import with_flags
-
             content = answer.as_json()
             said = [with_flags(line) for line in (*self._notes_on(answer), *content["messages"])]
             remarks = {"headline": answer.headline, "assumed": answer.assumed, "messages": said}
             self.print_json(remarks | {key: value for key, value in content.items() if key != "messages"})
             return
-        from mauvecl.cli.console import show_view
-
         self.say([answer.headline])
         left_out = [show_view(view, wide=self.wide) for view in answer.all_views]
         self.say(["Assumed:", *(f"  {clause}" for clause in answer.premises)])
@@ -325,10 +290,12 @@ class Session(Options):
 
     def _leave_all(self, answer: Answer) -> None:
         """Write tables, documents and pictures of an answer, then the run record."""
+        from mauvecl.answers.answer import write_document, write_table
+
         for name, table in answer.files.items():
-            self.write(table, name)
+            self.leave(partial(write_table, table, self.folder / name))
         for name, content in answer.documents.items():
-            self.leave(partial(self._document, name, content))
+            self.leave(partial(write_document, content, self.folder / name))
         if self.draws_pictures:
             for name, draw in answer.pictures.items():
                 self.leave(partial(draw, self.folder / f"{name}.png"))
