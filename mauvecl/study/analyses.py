@@ -13,11 +13,11 @@ from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help, Range, Slider, Unit, Widget
 from mauvecl.schema.physical import DetectorTemperature, Magnitude, Positive, Wavelength
 from mauvecl.schema.section import Section
-from mauvecl.study.sections import Star
+from mauvecl.study.star import Star
 
 if TYPE_CHECKING:
     from mauvecl.host.stars.source import Source
-    from mauvecl.study.sections import Flare
+    from mauvecl.study.star import Flare
 
 
 class CalibrationObservation(Section):

@@ -15,7 +15,7 @@ from mauvecl.noise.unknowns import COURSES, PROCESSES, STARE_PROCESSES
 from mauvecl.schema.columns import Column, percent, short
 from mauvecl.schema.errors import Message, of_kind
 from mauvecl.study.questions import QUANTITIES, Sweep
-from mauvecl.study.sections import Star
+from mauvecl.study.star import Star
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.host.stars.source import Source
     from mauvecl.noise.processes import Processes
-    from mauvecl.study.sections import Observation, SkyLight
+    from mauvecl.study.observation import Observation, SkyLight
     from mauvecl.study.study import Study
 
 #: Parts of a study that answers use.

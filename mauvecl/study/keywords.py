@@ -15,13 +15,13 @@ from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Unit, first, unit_of
 from mauvecl.schema.parsing import assignment, number
 from mauvecl.schema.physical import SkyBrightness
-from mauvecl.study.sections import FILE_KEYS
+from mauvecl.study.star import FILE_KEYS
 
 if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
 
-    from mauvecl.study.nuisances import NuisanceChoice
-    from mauvecl.study.sections import Star
+    from mauvecl.study.observation import NuisanceChoice
+    from mauvecl.study.star import Star
 
 
 class Keyword(NamedTuple):

@@ -14,7 +14,8 @@ from mauvecl.schema.errors import InputError, shown
 from mauvecl.schema.fields import Flag, Help, Quantity, Range, Slider, Unit, Widget, first, number
 from mauvecl.schema.physical import Positive, Probability, Wavelength
 from mauvecl.schema.section import Section, fields_of
-from mauvecl.study.sections import Flare, Observation, SkyLight, Star
+from mauvecl.study.observation import Observation, SkyLight
+from mauvecl.study.star import Flare, Star
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -27,7 +27,7 @@ from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help, Range, Unit, Widget
 from mauvecl.schema.physical import Amplitude, Duration, Energy, Positive, Temperature, Wavelength
 from mauvecl.schema.section import Section
-from mauvecl.study.nuisances import Spread, sd_of
+from mauvecl.study.observation import Spread, sd_of
 
 if TYPE_CHECKING:
     from mauvecl.flares.shapes import Shape

@@ -19,12 +19,10 @@ from mauvecl.answers.verbs import VERBS
 from mauvecl.schema import parsing
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, found
-from mauvecl.study.analyses import PATHS
-from mauvecl.study.sections import Star
-from mauvecl.study.study import Study, keys_of
+from mauvecl.study.star import Star
+from mauvecl.study.study import Study, keys_of, with_paths
 from mauvecl.web.page import TABS
 from mauvecl.web.question import asked
-from mauvecl.web.uploads import placed
 
 if TYPE_CHECKING:
     from mauvecl.answers.verbs import Verb
@@ -185,7 +183,7 @@ _drawing = threading.Lock()
 
 def study_file(study: Study, name: str) -> tuple[str, bytes]:
     """Return name and content of the study file, in a zip archive with the visitor's files if there are any."""
-    files, text = [*visitor_files(study).values(), *observation_files(study)], study.toml()
+    files, text = visitor_files(study), study.toml()
     if not files:
         return f"{name}.toml", text.encode()
     out = io.BytesIO()
@@ -198,21 +196,11 @@ def study_file(study: Study, name: str) -> tuple[str, bytes]:
     return f"{name}.zip", out.getvalue()
 
 
-def visitor_files(study: Study) -> dict[tuple[str, ...], Path]:
-    """Return the visitor's files that a study names, by the path of sections and key."""
-    star, light, data = study.star[0], study.flare.spectrum, study.data
-    every = {("star", "file"): star.file, ("star", "neighbours"): star.neighbours,
-             ("flare", "spectrum", "file"): light.file, ("flare", "spectrum", "quiescent"): light.quiescent,
-             ("change", "file"): study.change.file, ("data", "file"): data.file,
-             ("data", "mapping"): data.mapping}  # fmt: skip
-    return {place: file for place, file in every.items() if file is not None}
-
-
-def observation_files(study: Study) -> list[Path]:
-    """Return the visitor's files that the observations of a calibration name, without duplicates."""
-    rows = study.calibrate.observations
-    every = (getattr(row, key) for row in rows for key in PATHS)
-    return list(dict.fromkeys(file for file in every if file is not None))
+def visitor_files(study: Study) -> list[Path]:
+    """Return the visitor's files that a study names, each once."""
+    files: dict[Path, Path] = {}
+    with_paths(study.model_dump(mode="json"), Study, lambda file: files.setdefault(file, file))
+    return list(files)
 
 
 def as_file(tab: Tab, name: str, ending: str, closed: ClosedForms, answers: Answers) -> tuple[str, bytes]:
@@ -244,11 +232,9 @@ def commands_and_programs(tab: Tab, question: Question, folder: Path) -> list[di
     entries = []
     for name in tab.questions:
         verb, study = asked(name, question.study(folder))
-        for place, file in visitor_files(study).items():
-            # Relative to the study, instead of that on the server.
-            study = study.with_value(place, Path(file.name))
-        if rows := placed(study.calibrate.observations, lambda file: file.name):
-            study = study.with_changes({"calibrate": {"observations": rows}}, None, "page")
+        # Paths relative to the study, instead of those on the server.
+        data = with_paths(study.model_dump(mode="json"), Study, lambda file: Path(file.name))
+        study = Study.build(data, "page")
         entries.append({"question": name, "command": as_command(verb, study), "python": as_program(verb, study)})
     return entries
 

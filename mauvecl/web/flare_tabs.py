@@ -18,7 +18,7 @@ from mauvecl.answers.measurements import expected_measurements, models_of
 from mauvecl.charts.chart import Axis, Band, Chart, ChartData, Contours, Custom, Dots, Line, Listed, Own, Rule
 from mauvecl.fits.flare_model import FlareModel
 from mauvecl.schema.columns import View, records
-from mauvecl.study.nuisances import KNOWN, NuisanceChoice
+from mauvecl.study.observation import KNOWN, NuisanceChoice
 from mauvecl.web.closed_forms import LIMITS, Answers, short
 from mauvecl.web.tab import Tab
 

@@ -14,7 +14,7 @@ import tomllib
 import zipfile
 import zlib
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PureWindowsPath
@@ -80,13 +80,8 @@ class Observations:
                 (new / name).write_bytes(content)
 
         home = content_folder(folder, self.content, unpack)
-        return placed(self.rows, lambda name: str(home / name))
-
-
-def placed(rows: Iterable[CalibrationObservation], place: Callable[[Path], str]) -> list[dict[str, Any]]:
-    """Return observations as data of a study, with other paths."""
-    data = [row.model_dump(exclude_none=True) for row in rows]
-    return [row | {key: place(row[key]) for key in PATHS if key in row} for row in data]
+        data = (row.model_dump(exclude_none=True) for row in self.rows)
+        return [row | {key: str(home / row[key]) for key in PATHS if key in row} for row in data]
 
 
 def unpacked(content: bytes) -> dict[str, bytes]:
