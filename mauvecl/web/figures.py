@@ -147,10 +147,6 @@ class Canvas:
             "major_label_text_font": "system-ui",
         }  # fmt: skip
 
-    def source(self, name: str, *columns: str) -> ColumnDataSource:
-        """Add an empty data source."""
-        return ColumnDataSource({column: [] for column in columns}, name=name)
-
     def _pins(self) -> list[Series]:
         """Return a line for each scenario that can be pinned, drawn as the series that it repeats."""
         repeated = [item for item in self.chart.series if item.key == self.chart.pins]

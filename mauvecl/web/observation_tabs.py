@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from bokeh.models import FixedTicker, HoverTool, LinearColorMapper
 from bokeh.models.annotations import ColorBar
+from bokeh.palettes import diverging_palette
 from numpy.typing import NDArray
 
 from mauvecl.answers.plan import COLUMNS
@@ -56,9 +57,8 @@ if TYPE_CHECKING:
     from mauvecl.answers.plan import PlanAnswer
     from mauvecl.observations.analysis import Analysis
     from mauvecl.observations.frames import Frames
-    from mauvecl.web.closed_forms import ClosedForms
+    from mauvecl.web.closed_forms import ClosedForms, Question
     from mauvecl.web.figures import Canvas
-    from mauvecl.web.question import Question
     from mauvecl.web.uploads import Observations
 
 
@@ -141,9 +141,6 @@ def _summary(rows: Any, analysis: Analysis) -> str:
 
 
 def _image(canvas: Canvas, source: ColumnDataSource) -> None:
-    from bokeh.models import HoverTool, LinearColorMapper
-    from bokeh.palettes import diverging_palette
-
     colours = diverging_palette(_shades(BLUE), _shades(RED), 255)
     mapper = LinearColorMapper(palette=colours, name="deviation", low=-5, high=5, nan_color=canvas.ink["grid"])
     image = canvas.plot.image("image", "x", "y", "dw", "dh", source=source, color_mapper=mapper)
@@ -255,14 +252,6 @@ class Analyse(Tab):
     def offers(self, name: str, answers: Answers) -> bool:
         """Return whether the answer has a table; some exist only for spectra."""
         return self.answer in answers and name in answers[self.answer].tables
-
-    def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
-        """Return a table of the answer; raises InputError for one that only spectra have."""
-        tables = answers[self.answer].tables
-        if name not in tables:
-            raise InputError(f"a light curve has no table {name}", f"one of {', '.join(tables)}", key="name")
-        table: Table = tables[name]
-        return table
 
     def shown(self, closed: ClosedForms, answers: Answers) -> View | None:
         """Return the table of events; without an event, the sentence that says so."""

@@ -33,6 +33,9 @@ from mauvecl.study.analyses import PATHS, CalibrateQuestion, CalibrationObservat
 from mauvecl.web.fields import FIELDS, UPLOADED, UPLOADED_FILE, UPLOADED_UNKNOWN
 from mauvecl.web.sandboxed_reader import Spectrum, read_frames_limited, read_limited
 
+#: Name of a table of neighbours in its folder.
+NEIGHBOURS_FILE = "neighbours.csv"
+
 
 def content_folder(folder: Path, content: bytes, fill: Callable[[Path], object]) -> Path:
     """Return the subfolder for some content, named after its digest; the first call fills it."""
@@ -179,6 +182,26 @@ def _observations(name: str, content: bytes) -> list[dict[str, Any]]:
         )
     rows = section["observations"]
     return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
+
+
+def write_table(text: str, folder: Path) -> Path:
+    """Write a table of neighbours to a file, once per text, and return its path."""
+    home = content_folder(folder, text.encode(), lambda new: (new / NEIGHBOURS_FILE).write_text(text))
+    return home / NEIGHBOURS_FILE
+
+
+def write_spectrum(source: Source | ReadSpectrum, folder: Path, name: str) -> Path:
+    """Write an uploaded spectrum to a file of this name without loss, once per spectrum, and return its path."""
+    from astropy.table import Table
+
+    def write(new: Path) -> None:
+        table = Table({"wavelength": source.wavelength_nm, "flux": source.flux_flam})
+        table["wavelength"].unit, table["flux"].unit = "nm", "erg / (s cm2 Angstrom)"
+        table.meta |= {"name": source.name, "told": list(source.messages)}
+        table.write(new / name, format="ascii.ecsv")
+
+    content = name.encode() + source.wavelength_nm.tobytes() + source.flux_flam.tobytes()
+    return content_folder(folder, content, write) / name
 
 
 Points = tuple[tuple[float, float], ...]

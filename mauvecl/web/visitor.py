@@ -31,11 +31,10 @@ from mauvecl.host import VERSION
 from mauvecl.runs.pool import LocalWorkers, Pool, Stopped
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.web.closed_forms import ClosedForms, other_payloads, solved
-from mauvecl.web.downloads import as_file, asked_study, commands_and_programs
 from mauvecl.web.fields import FIELDS, field_of, remedies, sentence
 from mauvecl.web.page import TABS, State, asking, card, known, reads_of
-from mauvecl.web.question import DRAWING, SIMULATIONS, verbs_of
 from mauvecl.web.sandboxed_reader import read_columns_limited
+from mauvecl.web.tab import DRAWING, SIMULATIONS, as_file, asked_study, commands_and_programs, verbs_of
 from mauvecl.web.uploads import RESULTS, UPLOADS
 from mauvecl.web.uploads import UPLOAD_SHELF as UPLOADED
 
@@ -575,7 +574,9 @@ class Visitor(WebSocketHandler):
     def file(self, state: State, tab: str, name: str, ending: str) -> tuple[str, bytes]:
         """Send a table or study of the question; the last ones are cached."""
         # The page asks for the study of a question by its name alone.
-        front = TABS.get(tab) or next((other for other in TABS.values() if name in other.questions), tab_of(tab))
+        front = TABS.get(tab) or next((other for other in TABS.values() if name in other.questions), None)
+        if front is None:
+            raise InputError(f"no tab asks {name[:40]!r}", "a question of a tab", key="name")
         # A simulation asks what its own answers depend on, which their tables state.
         reads = reads_of(name) if tab not in TABS and name in SIMULATIONS else front.reads
         answers = self.answers(state)
