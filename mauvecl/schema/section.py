@@ -251,28 +251,22 @@ class Key(NamedTuple):
 
 def keys_of(section: type[BaseModel]) -> list[Key]:
     """Return the reference of every key of a section and of the sections in it, in the order of their declaration."""
-    return [
-        Key(
-            ".".join(path),
-            _meaning(first(field, Help)),
-            _accepted(field.annotation, (first(field, Unit) or Unit("")).name, first(field, Range)),
-            _default(field, first(field, Help)),
-            ", ".join(name for flag in found(field, Flag) for name in flag.names),
-        )
-        for path, field in fields_of(section)
-        if first(field, Help) is not None
-    ]
+    keys = []
+    for path, field in fields_of(section):
+        if (help := first(field, Help)) is None:
+            continue
+        meaning = help.text + (f": {help.choices}" if help.choices else "") + (f", {help.more}" if help.more else "")
+        accepted = _accepted(field.annotation, (first(field, Unit) or Unit("")).name, first(field, Range) or Range())
+        value = field.get_default(call_default_factory=True)
+        default = help.default or ("required" if value is PydanticUndefined else _text(value))
+        flags = ", ".join(name for flag in found(field, Flag) for name in flag.names)
+        keys.append(Key(".".join(path), meaning, accepted, default, flags))
+    return keys
 
 
-def _meaning(help: Help | None) -> str:
-    if help is None:
-        return ""
-    return help.text + (f": {help.choices}" if help.choices else "") + (f", {help.more}" if help.more else "")
-
-
-def _accepted(annotation: Any, unit: str, reach: Range | None) -> str:
+def _accepted(annotation: Any, unit: str, reach: Range) -> str:
     """Describe the values of a type in words."""
-    inner, parts = annotation, get_args(annotation)
+    parts = get_args(annotation)
     if get_origin(annotation) is Annotated:
         return _accepted(parts[0], unit, reach)
     if get_origin(annotation) in (Union, UnionType):
@@ -286,16 +280,9 @@ def _accepted(annotation: Any, unit: str, reach: Range | None) -> str:
         return f"table of {_accepted(parts[1], unit, reach)}"
     if model_in(annotation) is not None:
         return "table"
-    if inner in (float, int):
-        return (reach or Range()).words(unit, whole=inner is int)
-    return {str: "text", bool: "true or false", Path: "path"}.get(inner, "file")
-
-
-def _default(field: Any, help: Help | None) -> str:
-    if help is not None and help.default:
-        return help.default
-    value = field.get_default(call_default_factory=True)
-    return "required" if value is PydanticUndefined else _text(value)
+    if annotation in (float, int):
+        return reach.words(unit, whole=annotation is int)
+    return {str: "text", bool: "true or false", Path: "path"}.get(annotation, "file")
 
 
 def _text(value: Any) -> str:

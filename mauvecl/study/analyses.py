@@ -93,7 +93,6 @@ class CalibrateQuestion(Section):
             hint="By how much the light of an observation differs, by pointing.",
             group="Standards",
             unit="%",
-            scale=100.0,
         ),
     ] = 0.0
     spectrum_error: Annotated[
@@ -107,7 +106,6 @@ class CalibrateQuestion(Section):
             "disagree.",
             group="Standards",
             unit="%",
-            scale=100.0,
         ),
     ] = None  # fmt: skip
 

@@ -50,12 +50,7 @@ def assumption_line(study: Study, uses: Collection[Use], varied: Collection[str]
 def assumptions_of(study: Study, uses: Collection[Use], varied: Collection[str] = ()) -> list[str]:
     """Return the assumptions of a study about the parts that an answer uses, one clause each.
 
-    Parameters
-    ----------
-    uses : collection of str
-        Parts of the study; see `Use`.
-    varied : collection of str
-        Quantities that the answer varies in addition to those that the study sweeps.
+    The answer varies the quantities `varied` in addition to those that the study sweeps.
     """
     swept = {axis.quantity for axis in study.sweep.axes} | set(varied)
     words: dict[str, Callable[[], str]] = {

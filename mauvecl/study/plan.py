@@ -326,14 +326,8 @@ def targets_in(table: Table, named: str, folder: Path | None = None) -> list[dic
     """Return the targets of a table with a column ``name`` and any other keys of `PlanTarget`, in any case.
 
     ``ra`` and ``dec`` in degrees, or in the unit that they state, replace ``coordinates``; ``V`` replaces ``magnitude``
-    and ``parallax`` a distance. Empty cells are ignored, and other columns are left out.
-
-    Parameters
-    ----------
-    named : str
-        Description of the table, for messages.
-    folder : Path, optional
-        Folder of paths in the table; without it, columns of paths are refused.
+    and ``parallax`` a distance. Empty cells are ignored, and other columns are left out. Messages call the table
+    `named`; paths in it are relative to a folder, without which columns of paths are refused.
     """
     from mauvecl.host.tables.table import Rows
 

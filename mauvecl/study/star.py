@@ -497,7 +497,6 @@ class Flare(Section):
             name="amplitude_percent",
             first="2",
             unit="%",
-            scale=100.0,
             slider=Slider(0.01, 1000, 10**0.1, log=True),
         ),
         Quantity("amplitude", "flare amplitude: relative rise of the photons in the flare's band", "flare amplitude"),

@@ -128,15 +128,10 @@ def _along_orbit(study: Study, frame_s: float, changes: dict[str, Any]) -> Stare
 def expect_stare(
     stare: Stare, events: Sequence[Event], quiet: Expectation, flare_electrons: Callable[[Float], Float]
 ) -> StareExpectation:
-    """Compute the expectation of a stare with its flares.
+    """Compute the expectation of a stare with its flares, from one quiet frame.
 
-    Parameters
-    ----------
-    quiet : Expectation
-        One frame without a flare.
-    flare_electrons : callable
-        Electrons that flares of unit amplitude and some temperatures, K, add to a frame, shape
-        (n_temperature, n_pixel).
+    `flare_electrons` returns the electrons that flares of unit amplitude and some temperatures, K, add to a frame,
+    shape (n_temperature, n_pixel).
     """
     check_contributions(events, stare.start_s, stare.frame_s)
     kelvin = temperatures_of(events)

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from bokeh.models import FixedTicker, HoverTool, LinearColorMapper
-from bokeh.models.annotations import ColorBar
 from contourpy import contour_generator
 from numpy.typing import NDArray
 from scipy import special
@@ -170,17 +169,16 @@ def _reach(x: Float, y: Float, power: float, band: str) -> str:
 
 
 def _draw_map(canvas: Canvas, source: ColumnDataSource) -> None:
-    plot, mapper = canvas.plot, _mapper()
+    plot, mapper = canvas.plot, canvas.share_colours("detected")
     image = plot.image("image", "x", "y", "dw", "dh", source=source, color_mapper=mapper)
     shown = [("detected", "@image{0.000}"), ("magnitude", "$x{0.00}"), ("amplitude", "@percent{0.[00]} %")]
     plot.add_tools(HoverTool(renderers=[image], tooltips=shown))
     plot.yaxis.ticker = FixedTicker(ticks=[-1, 0, 1, 2])
     plot.yaxis.major_label_overrides = {-1: "0.1 %", 0: "1 %", 1: "10 %", 2: "100 %"}
-    plot.add_layout(ColorBar(color_mapper=mapper, width=10, title="detected", **canvas.bar_text), "right")
 
 
 def _draw_cells(canvas: Canvas, source: ColumnDataSource) -> None:
-    colour = {"field": "p", "transform": _mapper()}
+    colour = {"field": "p", "transform": LinearColorMapper(palette="Cividis256", low=0, high=1)}
     cells = canvas.plot.scatter("x", "y", source=source, size=10, marker="square", fill_color=colour,
                                 line_color="#ffffff")  # fmt: skip
     cells.name = "simulated"
@@ -192,10 +190,6 @@ def _draw_labels(canvas: Canvas, source: ColumnDataSource) -> None:
         text_font={"value": "system-ui"}, text_font_size="11px", text_color="#1b2733", level="annotation",
         background_fill_color="#ffffff", background_fill_alpha=0.85, padding=2,
     ).name = "labels"  # fmt: skip
-
-
-def _mapper() -> LinearColorMapper:
-    return LinearColorMapper(palette="Cividis256", low=0, high=1)
 
 
 @Chart(

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from bokeh.models import FixedTicker, HoverTool, LinearColorMapper
-from bokeh.models.annotations import ColorBar
 from bokeh.palettes import diverging_palette
 from numpy.typing import NDArray
 
@@ -439,7 +438,7 @@ class Change(Tab):
 
 
 def _cells(canvas: Canvas, source: ColumnDataSource) -> None:
-    plot, mapper = canvas.plot, LinearColorMapper(palette="Cividis256", low=0, high=1)
+    plot, mapper = canvas.plot, canvas.share_colours("recovered")
     cells = plot.quad("left", "right", "bottom", "top", source=source, line_color=None,
                       fill_color={"field": "share", "transform": mapper})  # fmt: skip
     cells.name = "recovered"
@@ -447,7 +446,6 @@ def _cells(canvas: Canvas, source: ColumnDataSource) -> None:
     plot.add_tools(HoverTool(renderers=[cells], tooltips=shown))
     plot.xaxis.ticker = FixedTicker(ticks=[0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200])
     plot.yaxis.ticker = FixedTicker(ticks=[0.5, 1, 2, 4])
-    plot.add_layout(ColorBar(color_mapper=mapper, width=10, title="recovered", **canvas.bar_text), "right")
 
 
 @Chart(

@@ -129,11 +129,6 @@ class AccessMatcher(Matcher):
     def __init__(self, allowed: frozenset[str]) -> None:
         self._allowed = allowed
 
-    @classmethod
-    def rule(cls, allowed: frozenset[str]) -> Rule:
-        """Return the routing rule, which must precede all others."""
-        return Rule(cls(allowed), RefusalHandler)
-
     def match(self, request: HTTPServerRequest) -> dict[str, Any] | None:
         """Return the reason for which a request is rejected, or None."""
         refused = self._foreign(request) or self._too_many(request)
@@ -255,7 +250,7 @@ def make(address: str, port: int, allowed: Sequence[str]) -> Any:
         log_function=lambda handler: None,
     )
     # Access control comes first.
-    application.default_router.rules.insert(0, AccessMatcher.rule(let_in))
+    application.default_router.rules.insert(0, Rule(AccessMatcher(let_in), RefusalHandler))
     server = BoundedServer(
         application,
         max_body_size=BODY,

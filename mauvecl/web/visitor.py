@@ -215,6 +215,10 @@ OWN_FAULT = "the page failed, and there is no answer; this is a fault of mauvecl
 #: Why a connection was ended, for the page.
 UNUSED = 4000
 
+#: What replies to requests hold if these are refused.
+REFUSED: dict[str, dict[str, Any]] = {
+    "solve": {"solved": ""}, "pinned": {"pins": {}}, "columns": {"columns": []}, "file": {"file": ""},
+}  # fmt: skip
 #: Fields of the section `data`, which say how files of frames are read.
 DATA = {name for name, field in FIELDS.items() if field.path[:1] == ("data",)}
 
@@ -297,7 +301,8 @@ class Visitor(WebSocketHandler):
             log.warning("a message is not a valid request: %s", shortened(message))
             self.close(1003, "expected a question as the page asks it")
             return
-        ask(asked)
+        if (work := ask(asked)) is not None:
+            self._give(work, n=asked["n"], **REFUSED.get(asked["ask"], {}))
 
     # State and answers
 
@@ -414,13 +419,10 @@ class Visitor(WebSocketHandler):
         """Run a function in a thread."""
         return await asyncio.get_running_loop().run_in_executor(_closed_forms, work)
 
-    def _ask_solve(self, asked: dict[str, Any]) -> None:
+    async def _ask_solve(self, asked: dict[str, Any]) -> None:
         """Send the limit of the quantity for which the question solves, and the chances with other payloads."""
         n = self._solving = asked["n"]
-        self._give(self._solve(n, self.state(asked["link"])), n=n, solved="")
-
-    async def _solve(self, n: int, state: State) -> None:
-        closed = await self._in_thread(partial(self.closed, state, tab_of("")))
+        closed = await self._in_thread(partial(self.closed, self.state(asked["link"]), tab_of("")))
         if n != self._solving:
             # It takes long for a bright star, and a later question waits.
             self.send(n=n, solved="")
@@ -428,18 +430,15 @@ class Visitor(WebSocketHandler):
         self.send(n=n, payloads=await self._in_thread(partial(other_payloads, closed)))
         self.send(n=n, solved=await self._in_thread(partial(solved, closed)))
 
-    def _ask_pinned(self, asked: dict[str, Any]) -> None:
+    async def _ask_pinned(self, asked: dict[str, Any]) -> None:
         """Send the data of a pinned scenario for a tab's pictures."""
-        n = asked["n"]
-        self._give(self._pinned(n, self.state(asked["link"]), str(asked.get("tab"))), n=n, pins={})
-
-    async def _pinned(self, n: int, state: State, name: str) -> None:
-        tab = tab_of(name)
+        tab = tab_of(str(asked.get("tab")))
         pictures = [picture for picture in tab.pictures if picture.pins]
-        question = state.question(tab.reads)
+        question = self.state(asked["link"]).question(tab.reads)
         closed = await self._in_thread(partial(ClosedForms.of, question, Path(self._folder.name)))
         drawn = await self._in_thread(lambda: {p.name: p.drawn(closed, {})["sources"][p.pins] for p in pictures})
-        self.send(n=n, pins={name: {c: packed(v) for c, v in columns.items()} for name, columns in drawn.items()})
+        pins = {name: {c: packed(v) for c, v in columns.items()} for name, columns in drawn.items()}
+        self.send(n=asked["n"], pins=pins)
 
     # Draws and simulations
 
@@ -552,24 +551,18 @@ class Visitor(WebSocketHandler):
 
         self._when_done(reading(lambda: upload.read(name, content, state.values_of(names))), came)
 
-    def _ask_columns(self, asked: dict[str, Any]) -> None:
+    async def _ask_columns(self, asked: dict[str, Any]) -> None:
         """Send the names of the columns of the visitor's frames; none if they are no table."""
-        self._give(self._columns(asked["n"]), n=asked["n"], columns=[])
-
-    async def _columns(self, n: int) -> None:
         file, names = self._uploads.get("frames"), ()
         if file is not None:
             names = await asyncio.wrap_future(reading(partial(read_columns_limited, file.name, file.content)))
-        self.send(n=n, columns=names)
+        self.send(n=asked["n"], columns=names)
 
-    def _ask_file(self, asked: dict[str, Any]) -> None:
-        n = asked["n"]
+    async def _ask_file(self, asked: dict[str, Any]) -> None:
+        """Send a table, document or study."""
         which = (str(asked.get(word)) for word in ("tab", "name", "ending"))
-        self._give(self._file(n, self.state(asked["link"]), *which), n=n, file="")
-
-    async def _file(self, n: int, state: State, tab: str, name: str, ending: str) -> None:
-        file, content = await self._in_thread(partial(self.file, state, tab, name, ending))
-        self.send(content, n=n, file=file)
+        file, content = await self._in_thread(partial(self.file, self.state(asked["link"]), *which))
+        self.send(content, n=asked["n"], file=file)
 
     def file(self, state: State, tab: str, name: str, ending: str) -> tuple[str, bytes]:
         """Send a table or study of the question; the last ones are cached."""
@@ -593,14 +586,12 @@ class Visitor(WebSocketHandler):
             return made
         return self._files[which]
 
-    def _ask_export(self, asked: dict[str, Any]) -> None:
+    async def _ask_export(self, asked: dict[str, Any]) -> None:
         """Send a tab's questions as commands and as Python programs."""
-        n, tab = asked["n"], tab_of(str(asked.get("tab")))
-        self._give(self._export(n, self.state(asked["link"]), tab), n=n)
-
-    async def _export(self, n: int, state: State, tab: Tab) -> None:
-        work = partial(commands_and_programs, tab, state.question(tab.reads), Path(self._folder.name))
-        self.send(n=n, taken=await self._in_thread(work))
+        tab = tab_of(str(asked.get("tab")))
+        question = self.state(asked["link"]).question(tab.reads)
+        taken = await self._in_thread(partial(commands_and_programs, tab, question, Path(self._folder.name)))
+        self.send(n=asked["n"], taken=taken)
 
 
 def tab_of(name: str) -> Tab:
