@@ -347,8 +347,6 @@ class Case:
         The factor on all light has the mean and, unless the study states another, the standard deviation of what is
         drawn; those of a stare are of the stare. The documented set leaves the star's own level free as well.
         """
-        import numpy as np
-
         from mauvecl.noise.scene import FactorDistributions
 
         quiet = self.quiet if quiet is None else quiet
@@ -419,8 +417,6 @@ class Case:
 
         Raises InputError if some lines of the flare do not scale with its amplitude.
         """
-        import numpy as np
-
         from mauvecl.host.stars.flare import check_scales
 
         check_scales(self.study.flare.light())

@@ -23,7 +23,7 @@ from mauvecl.flares.settings import (
 from mauvecl.noise.disturbances import PointingDrifts
 from mauvecl.noise.unknowns import COURSES, STARE_PROCESSES, Changing, NuisanceName
 from mauvecl.schema import parsing
-from mauvecl.schema.errors import InputError
+from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.fields import Flag, Help, Range, Unit, Widget
 from mauvecl.schema.physical import Amplitude, Duration, Energy, Positive, Temperature, Wavelength
 from mauvecl.schema.section import Section
@@ -165,7 +165,6 @@ class EventChoice(Section):
         """Return the shape, or the published shape named `default` if none is given."""
         from mauvecl.flares.shapes import TableShape, shape_of
         from mauvecl.host.tables.text_tables import read_columns
-        from mauvecl.schema.errors import shortened
 
         if self.shape_file is None:
             return shape_of(self.shape or default)

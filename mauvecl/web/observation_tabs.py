@@ -72,12 +72,6 @@ BLUE, RED = "#0072B2", "#D55E00"
 NO_FRAMES = "Choose a file of frames: a light curve or a sequence of spectra."
 
 
-def frames_of(closed: ClosedForms) -> Frames | None:
-    """Return the frames of the question, or None if there is no file."""
-    frames: Frames | None = closed.given.get("frames")
-    return frames
-
-
 def minutes(frames: Frames, time_s: Any) -> Float:
     """Return times in minutes from the first frame."""
     return np.asarray(time_s - frames.time_s[0]) / 60.0
@@ -105,7 +99,8 @@ def thinned(values: Float, most: int) -> NDArray[np.int64]:
 ).data()  # fmt: skip
 def light_curve(closed: ClosedForms, answers: Answers) -> ChartData:
     """Return the light curve, its quiescent level, and the events."""
-    frames, series = frames_of(closed), dict[str, Any]()
+    frames: Frames | None = closed.given.get("frames")
+    series = dict[str, Any]()
     if frames is None:
         return ChartData(NO_FRAMES)
     flux, used = frames.white_light[0], frames.faults == 0
@@ -158,7 +153,7 @@ def _image(canvas: Canvas, source: ColumnDataSource) -> None:
 ).data()  # fmt: skip
 def dynamic_spectrum(closed: ClosedForms, answers: Answers) -> ChartData:
     """Return every spectrum against time, in standard deviations from the median."""
-    frames = frames_of(closed)
+    frames: Frames | None = closed.given.get("frames")
     if frames is None or frames.wavelength_nm is None:
         return ChartData("A light curve has no spectra." if frames else NO_FRAMES)
     image, nm = _deviations(frames), frames.wavelength_nm

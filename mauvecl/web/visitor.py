@@ -114,18 +114,15 @@ class Job:
         self.future: Future[Any] = _threads.submit(self._run)
 
     def _run(self) -> Any:
-        try:
-            return self._run_cancellable()
-        finally:
-            if time.monotonic() - (self._started or math.inf) > LONG_S:
-                release_memory()
-
-    def _run_cancellable(self) -> Any:
         if not self.drawing:
             with self._lock:
                 self._thread = threading.get_ident()
         try:
-            return self._asked()
+            self._check()
+            self._started = time.monotonic()
+            workers = LocalWorkers([None], make=lambda device, progress: _engine(progress))
+            self._pool = Pool(workers, progress=lambda done, total: self._check())
+            return self.ask(self._pool, self._count) if self.unit else self.ask(self._pool)
         except Stopped as error:
             raise Cancelled from error
         finally:
@@ -134,13 +131,8 @@ class Job:
                 if self._thread is not None:
                     _set_pending(self._thread, None)
                 self._thread = None
-
-    def _asked(self) -> Any:
-        self._check()
-        self._started = time.monotonic()
-        workers = LocalWorkers([None], make=lambda device, progress: _engine(progress))
-        self._pool = Pool(workers, progress=lambda done, total: self._check())
-        return self.ask(self._pool, self._count) if self.unit else self.ask(self._pool)
+            if time.monotonic() - (self._started or math.inf) > LONG_S:
+                release_memory()
 
     def _count(self, done: int, total: int) -> None:
         self._counted = done, total
@@ -447,19 +439,22 @@ class Visitor(WebSocketHandler):
         state, tab = self.state(asked["link"]), tab_of(str(asked.get("tab")))
         if self._closed is None or self._closed[0] != (self._key(state, tab.reads), tab.chance):
             return
-        closed = self._closed[1]
         if self._drawing is not None:
             self._drawing.cancel()
+        closed = self._closed[1]
         how = closed.case.draw_options | {"seed": closed.study.run.seed}
         self._drawing = Job(lambda pool: pool.realise(closed.flare, count=1, **how)[0])
 
-        def came(future: Future[Any]) -> None:
-            if self._closed is None or self._closed[1] is not closed or future.cancelled() or future.exception():
+        async def draw(job: Job) -> None:
+            try:
+                drawn = await asyncio.wrap_future(job.future)
+            except (Exception, asyncio.CancelledError):
+                # Another draw took its place, or a simulation reports what is wrong.
                 return
-            answers = self.answers(state) | {"draw": future.result()}
-            self.send(n=asked["n"], **shown(tab.name, closed, answers))
+            if self._closed is not None and self._closed[1] is closed:
+                self.send(n=asked["n"], **shown(tab.name, closed, self.answers(state) | {"draw": drawn}))
 
-        self._when_done(self._drawing.future, came)
+        self._begin(draw(self._drawing))
 
     def _ask_simulate(self, asked: dict[str, Any]) -> None:
         """Simulate, report progress, and send the answer."""
@@ -501,17 +496,6 @@ class Visitor(WebSocketHandler):
         if self.job is not None:
             self.job.cancel()
 
-    @staticmethod
-    def _when_done(work: Future[Any], then: Callable[[Future[Any]], None]) -> None:
-        """Call a function in the event loop when some work is done, unless the server has ended by then."""
-        loop = asyncio.get_running_loop()
-
-        def tell(work: Future[Any]) -> None:
-            if not loop.is_closed():
-                loop.call_soon_threadsafe(then, work)
-
-        work.add_done_callback(tell)
-
     # Files from and to the visitor
 
     def _ask_upload(self, asked: dict[str, Any]) -> None:
@@ -525,31 +509,29 @@ class Visitor(WebSocketHandler):
             self.close(1003, "expected a question as the page asks it")
             return
         asked, self._coming = self._coming, None
-        n, field, name = asked["n"], asked["field"], str(asked.get("name"))
-        upload = UPLOADS[field]
-        self._uploads.pop(field, None)
+        self._uploads.pop(asked["field"], None)
         state = self.state(asked["link"])
+        options = tuple(state.entered[name] for name in UPLOADS[asked["field"]].options.values())
+        self._digests[asked["field"]] = hashlib.sha256(content + repr(options).encode()).hexdigest()
+        self._begin(self._read(asked, content, state))
+
+    async def _read(self, asked: dict[str, Any], content: bytes, state: State) -> None:
+        field, name, upload = asked["field"], str(asked.get("name")), UPLOADS[asked["field"]]
         names = tuple(upload.options.values())
-        options = tuple(state.entered[name] for name in names)
-        self._digests[field] = hashlib.sha256(content + repr(options).encode()).hexdigest()
-
-        def came(future: Future[Any]) -> None:
-            try:
-                self._uploads[field] = future.result()
-                UPLOADED.keep(self, field, self._uploads[field], partial(self._uploads.pop, field, None))
-            except InputError as error:
-                proposed = [remedy for remedy in remedies(error, upload.options) if remedy[0] in names]
-                self.send(n=n, field=field, lacks=sentence(error, upload.options), remedies=proposed)
-            except Exception as error:
-                log.exception("an upload failed")
-                self.send(
-                    n=n, field=field,
-                    lacks=f"upload {shortened(name)} cannot be read ({type(error).__name__}), expected another",
-                )  # fmt: skip
-            else:
-                self.send(n=n, field=field, entered=upload.entered)
-
-        self._when_done(reading(lambda: upload.read(name, content, state.values_of(names))), came)
+        reply: dict[str, Any] = {"n": asked["n"], "field": field}
+        try:
+            work = reading(lambda: upload.read(name, content, state.values_of(names)))
+            self._uploads[field] = await asyncio.wrap_future(work)
+            UPLOADED.keep(self, field, self._uploads[field], partial(self._uploads.pop, field, None))
+            reply["entered"] = upload.entered
+        except InputError as error:
+            reply["lacks"] = sentence(error, upload.options)
+            reply["remedies"] = [remedy for remedy in remedies(error, upload.options) if remedy[0] in names]
+        except Exception as error:
+            log.exception("an upload failed")
+            kind = type(error).__name__
+            reply["lacks"] = f"upload {shortened(name)} cannot be read ({kind}), expected another"
+        self.send(**reply)
 
     async def _ask_columns(self, asked: dict[str, Any]) -> None:
         """Send the names of the columns of the visitor's frames; none if they are no table."""
