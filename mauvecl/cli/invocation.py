@@ -21,7 +21,6 @@ from mauvecl.schema.errors import InputError, of_kind, reworded
 if TYPE_CHECKING:
     from mauvecl.answers.answer import Answer
     from mauvecl.device.build import Device
-    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.runs.checkpoint import Checkpoint
     from mauvecl.runs.pool import Pool, Workers
     from mauvecl.runs.store import Store
@@ -219,17 +218,6 @@ class Session(Options):
         if lines and not self.as_json:
             show([with_flags(line) for line in lines])
 
-    @cached_property
-    def draws_pictures(self) -> bool:
-        """Return whether to draw pictures; print a message if matplotlib is missing."""
-        from mauvecl.charts.matplotlib import available
-
-        if self.pictures and not available():
-            if not self.quiet:
-                self.say(["No pictures: matplotlib is missing, `pip install 'mauvecl[plot]'` brings it."])
-            return False
-        return self.pictures
-
     def leave(self, write: Callable[[], Path | Sequence[Path]]) -> None:
         """Write files; failures are reported at the end, after the answer is printed."""
         try:
@@ -238,22 +226,6 @@ class Session(Options):
             self._lost.append(error)
             return
         self.files += [made] if isinstance(made, Path) else made
-
-    def record(self, study: Study, inputs: Sequence[Expectation], messages: Sequence[str]) -> None:
-        """Write the study and the run record to the folder, and remove the checkpoint."""
-        from mauvecl.answers.answer import write_record, write_study
-
-        if self.folder / "study.toml" not in self.files:
-            self.leave(lambda: write_study(study.toml(), self.folder))
-        seconds = time.perf_counter() - self.started
-        pool = self._pool
-        how: dict[str, Any] = {"pool": pool, "opened": self.opened, "seconds": seconds, "messages": messages}
-        # Only a complete answer replaces another's files.
-        how |= {"files": self.files, "whole": not self._lost}
-        data = study.model_dump(mode="json", exclude_none=True)
-        self.leave(lambda: write_record(self.verb, data, inputs, self.folder, **how))
-        if self._checkpoint is not None and not self._lost:
-            self._checkpoint.forget()
 
     def ask(self) -> Any:
         """Return the answer of the session's verb to its study; a pool draws if the verb counts something."""
@@ -281,7 +253,9 @@ class Session(Options):
         self.say([*self._notes_on(answer), *answer.messages, *answer.remarks])
         if any(left_out):
             self.say(["Tables are shown without details: `--wide` shows all columns, and the files hold them."])
-        self.finish()
+        if self.files and not self.quiet:
+            names = ", ".join(path.name for path in self.files)
+            self.say([f"Wrote {names} to {self.folder}/ in {time.perf_counter() - self.started:.1f} s."])
 
     def _notes_on(self, answer: Answer) -> list[str]:
         """Return the notes of the session, without that on sampled thresholds where the answer has its own."""
@@ -289,17 +263,30 @@ class Session(Options):
         return [note for note in self.notes if note not in told]
 
     def _leave_all(self, answer: Answer) -> None:
-        """Write tables, documents and pictures of an answer, then the run record."""
-        from mauvecl.answers.answer import write_document, write_table
+        """Write tables, documents and pictures of an answer, its study and the run record; remove the checkpoint."""
+        from mauvecl.answers.answer import write_document, write_record, write_study, write_table
+        from mauvecl.charts.matplotlib import available
 
         for name, table in answer.files.items():
             self.leave(partial(write_table, table, self.folder / name))
         for name, content in answer.documents.items():
             self.leave(partial(write_document, content, self.folder / name))
-        if self.draws_pictures:
+        if self.pictures and available():
             for name, draw in answer.pictures.items():
                 self.leave(partial(draw, self.folder / f"{name}.png"))
-        self.record(answer.study, answer.inputs, [*answer.messages, *answer.remarks])
+        elif self.pictures and not self.quiet:
+            self.say(["No pictures: matplotlib is missing, `pip install 'mauvecl[plot]'` brings it."])
+        study = answer.study
+        if self.folder / "study.toml" not in self.files:
+            self.leave(lambda: write_study(study.toml(), self.folder))
+        seconds, messages = time.perf_counter() - self.started, [*answer.messages, *answer.remarks]
+        how: dict[str, Any] = {"pool": self._pool, "opened": self.opened, "seconds": seconds, "messages": messages}
+        # Only a complete answer replaces another's files.
+        how |= {"files": self.files, "whole": not self._lost}
+        data = study.model_dump(mode="json", exclude_none=True)
+        self.leave(lambda: write_record(self.verb, data, answer.inputs, self.folder, **how))
+        if self._checkpoint is not None and not self._lost:
+            self._checkpoint.forget()
 
     def _written(self) -> str:
         """Describe what an interruption leaves while files are written."""
@@ -313,12 +300,6 @@ class Session(Options):
         from mauvecl.host.tables.files import json_text
 
         print(json_text(content))
-
-    def finish(self) -> None:
-        """Print the names of the written files."""
-        if self.files and not self.quiet:
-            names = ", ".join(path.name for path in self.files)
-            self.say([f"Wrote {names} to {self.folder}/ in {time.perf_counter() - self.started:.1f} s."])
 
 
 @contextmanager

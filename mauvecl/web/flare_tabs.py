@@ -1,4 +1,4 @@
-"""Tabs of the flares that are detected, and of the errors with which a flare's spectrum is measured."""
+"""Tabs of flares: limits of detection, errors with which spectra are measured, and the share that a search finds."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mauvecl.answers.measure import COLUMNS
 from mauvecl.answers.measurements import expected_measurements, models_of
 from mauvecl.charts.chart import Axis, Band, Chart, ChartData, Contours, Custom, Dots, Line, Listed, Own, Rule
 from mauvecl.fits.flare_model import FlareModel
-from mauvecl.schema.columns import View, records
+from mauvecl.schema.columns import View, chance_text, records
 from mauvecl.study.observation import KNOWN, NuisanceChoice
 from mauvecl.web.closed_forms import LIMITS, Answers, short
 from mauvecl.web.tab import Tab
@@ -465,3 +465,63 @@ class Measurement(Tab):
         errors = [replace(verb["error"], name=name, heading=f"error, {name}") for name in each]
         columns = [verb["quantity"], verb["unit"], verb["truth"], *errors, *(verb[name] for name in counted)]
         return View(self.title, columns, table)
+
+
+#: Half-widths of the flares: as many as there are lines.
+LENGTHS = ("shortest", "middle", "longest")
+
+
+@Chart(
+    "shares", "Share of flares that a search of a stare finds",
+    Axis("peak amplitude of the flare (%)", log=True, limits=(0.01, 100)),
+    Axis("share of flares found", limits=(-0.03, 1.05)),
+    (
+        *(
+            series
+            for k, called in enumerate(LENGTHS)
+            for series in (
+                Band(f"{called} flares", called, f"band {k}", listed=False),
+                Line(f"{called} flares", called, f"line {k}", width=2,
+                     tips=("amplitude (%)", f"found of the {called}")),
+            )
+        ),
+        Rule("amplitude of your question", "own", "own"),
+    ),
+).data()  # fmt: skip
+def shares(closed: ClosedForms, answers: Answers) -> ChartData:
+    """Return the fraction of injected flares that the search finds against their amplitude."""
+    series: dict[str, Any] = {"own": closed.question.amplitude_percent}
+    if "completeness" not in answers:
+        text = (
+            "Nothing is injected yet: Inject flares puts flares of several lengths and sizes into a stare of one "
+            "orbit, and searches it."
+        )
+        return ChartData(text, series)
+    injected, parts = answers["completeness"].stars[0].injected, []
+    for k, width in enumerate(injected.half_widths_s):
+        x, share = 100 * injected.sizes, injected.completeness[k]
+        series |= {
+            f"band {k}": (x, injected.completeness_low[k], injected.completeness_high[k]),
+            f"line {k}": (x, share),
+        }
+        seen = float(np.interp(np.log(closed.question.amplitude_percent), np.log(x), share))
+        parts.append(f"{chance_text(seen)} of those of half-width {short(width)} s")
+    peak = f"{closed.question.amplitude_percent:g} %"
+    return ChartData(f"Of flares that peak at {peak} the search finds {'; '.join(parts)}.", series)
+
+
+class Completeness(Tab):
+    """Tab of completeness."""
+
+    name, title = "completeness", "Stare"
+    about = (
+        "One exposure sees a flare at its peak; a stare sees it rise and fade. This tab shows which flares a search of "
+        "one orbit finds at the chosen rate of false alarms, with losses while the star drifts out of the fibre."
+    )
+    pictures = (shares,)
+    chance = False
+    # The picture reads off the share of flares of this size.
+    also = ("amplitude_percent",)
+    simulations = {"completeness": "Inject flares"}  # noqa: RUF012
+    answer, view = "completeness", 1
+    files = {"completeness": "completeness", "limits": "completeness"}  # noqa: RUF012

@@ -24,8 +24,8 @@ from mauvecl.study.plan import PlanTarget
 from mauvecl.web.closed_forms import OTHER, TITLES, Answers, Chance, ClosedForms, Question, chances, short
 from mauvecl.web.exposure_tabs import Detection, Noise, Signal, Spectrum, Unknown
 from mauvecl.web.fields import FIELDS, FORMER_VALUES, IDEAL, REALISTIC, UPLOADED, Choice, Field, note, sentence, targets
-from mauvecl.web.flare_tabs import Limit, Measurement
-from mauvecl.web.observation_tabs import Analyse, Calibrate, Change, Completeness, Periods, Plan, Visibility
+from mauvecl.web.flare_tabs import Completeness, Limit, Measurement
+from mauvecl.web.observation_tabs import Analyse, Calibrate, Change, Periods, Plan, Visibility
 from mauvecl.web.tab import SIMULATIONS, Compare, Tab
 from mauvecl.web.uploads import UPLOADS
 
