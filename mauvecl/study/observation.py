@@ -356,9 +356,13 @@ class NuisanceChoice(create_model("_Amplitudes", __base__=Section, **_keys)):  #
 
     def marginalised(self, quiet: Expectation) -> Nuisances | None:
         """Return the nuisance parameters for the engine, or None if there are none."""
-        from mauvecl.detection.nuisances import Nuisances
+        from mauvecl.detection.nuisances import Nuisances, spectrum_of
 
-        sd = usual_spreads(quiet) if self.usual else {}
+        documented = DOCUMENTED_NUISANCES if self.usual else ()
+        # Parameters without effect, such as the brightness of no sky, are left out.
+        sd = {
+            row.name: row.prior.sd for row in documented if row.prior is not None and spectrum_of(row.name, quiet).any()
+        }
         sd |= {name: sd_of(spread) for name, spread in self.spreads().items()}
         own: dict[str, NDArray[np.float64]] = {}
         for name, nuisance in self.own.items():
@@ -382,17 +386,6 @@ class NuisanceChoice(create_model("_Amplitudes", __base__=Section, **_keys)):  #
 
 #: Choice of unknowns with which everything but the noise is known.
 KNOWN = NuisanceChoice(usual=False)
-
-
-def usual_spreads(quiet: Expectation) -> dict[str, float]:
-    """Return the standard deviations of the documented set, omitting parameters without effect, such as no sky."""
-    from mauvecl.detection.nuisances import spectrum_of
-
-    return {
-        row.name: row.prior.sd
-        for row in DOCUMENTED_NUISANCES
-        if row.prior is not None and spectrum_of(row.name, quiet).any()
-    }
 
 
 Draws = Annotated[

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -407,12 +406,13 @@ def solved(closed: ClosedForms) -> str:
     """Return a sentence on the limit of the quantity that the question solves for, with and without unknowns."""
     q, asked = closed.question, closed.study.limit
     words = LIMITS[asked.of]
-    clauses, near = {}, None
+    clauses: dict[str, str] = {}
+    near: float | None = None
     # The ideal limit is found at once, and the realistic one near it.
     for unknown in (IDEAL, REALISTIC):
         try:
             assumed = closed.assuming(unknown)
-            near = None if assumed.slow else _limit(assumed, near)
+            near = None if assumed.slow else LimitSearch(assumed.case, assumed.question.statistic).root(near)
             clauses[unknown] = words.slow if near is None else f"{words.before.format(band=q.band)} {words.value(near)}"
         except InputError:
             clauses[unknown] = words.none
@@ -422,18 +422,6 @@ def solved(closed: ClosedForms) -> str:
     # The size belongs to the flares, what is exposed to their detection.
     where = f" {first}{at} are detected" if asked.of == "amplitude" else f"{at} are detected {first}"
     return f"{100 * asked.power:g} % of {flares}{where}, and {clauses[IDEAL]} if everything but the noise were known."
-
-
-def _limit(assumed: ClosedForms, limit: float | None) -> float:
-    """Return the limit in closed form, as `mauvecl limit` finds it; faster with the limit if everything is known."""
-    search, near = LimitSearch(assumed.case, assumed.question.statistic), None
-    if limit is not None and search.of != "exposure":
-        nuisances, compared = assumed.study.nuisances, assumed.study.run.comparison()
-        cost = unknown_cost("", assumed.quiet, assumed.flare, nuisances, compared)
-        # Where dark noise dominates, the S/N is proportional to the light.
-        loss = cost.known / cost.marginal if cost.marginal else 1.0
-        near = limit * loss if search.of == "amplitude" else limit - 2.5 * math.log10(loss)
-    return search.root(near)
 
 
 def other_payloads(closed: ClosedForms) -> str:

@@ -35,7 +35,7 @@ from mauvecl.answers.verbs import GROUPS
 from mauvecl.host import VERSION
 from mauvecl.host.exposure.star import KNOWN
 from mauvecl.host.stars.library import all_names, library_names, well_known_stars
-from mauvecl.schema.errors import InputError, shortened
+from mauvecl.schema.errors import InputError, printable, shortened
 from mauvecl.study.plan import TARGET_COLUMNS
 from mauvecl.web import fields
 from mauvecl.web.closed_forms import TITLES, ClosedForms
@@ -193,8 +193,7 @@ class Plain(logging.Formatter):
 
 def _line(text: str) -> str:
     """Shorten text to one bounded line."""
-    shown = " ".join(text.split())
-    return "".join(c if c.isprintable() else "?" for c in shown[:MOST])
+    return printable(" ".join(text.split()), MOST)
 
 
 def _where(error: BaseException) -> str:
