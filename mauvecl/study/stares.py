@@ -16,6 +16,7 @@ from mauvecl.flares.stare import Event, Stare, check_contributions, coefficients
 from mauvecl.noise.disturbances import Normal, Prior
 from mauvecl.noise.unknowns import CHANGING, COURSES, PROCESSES, STARE_PROCESSES, Changing, Course, default_spreads
 from mauvecl.schema.errors import InputError, Message
+from mauvecl.schema.physical import DAY_S
 from mauvecl.study.stare import EventChoice, StareQuestion
 
 if TYPE_CHECKING:
@@ -157,7 +158,6 @@ def unused_lines(exposure_s: float, stare: Stare, events: Sequence[Event]) -> li
 def orbit_lines(stare: StareQuestion, orbit: OrbitQuestion, frame_s: float) -> list[str]:
     """Return messages about the orbit of a stare with `along_orbit`."""
     from mauvecl.host.orbit.geometry import TimeGrid
-    from mauvecl.schema.physical import DAY_S
 
     if not stare.along_orbit:
         return []

@@ -24,6 +24,7 @@ from mauvecl.schema import parsing
 from mauvecl.schema.columns import View, without_empty
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, found
+from mauvecl.study.observation import SkyLight
 from mauvecl.study.star import Star
 from mauvecl.study.study import Study, keys_of, with_paths
 from mauvecl.web.closed_forms import OTHER
@@ -344,7 +345,7 @@ def as_command(verb: str, study: Study) -> str:
         elif name == "star":
             words += [word for star in value for word in _star_words(star)]
         elif name == "sky":
-            words += _sky_words(value)
+            words += ["--sky", "none"] if value.get("none") else _words(SkyLight, value)
         else:
             words += _flag_words(name, value, question) or ["--set", f"{name}={_toml(value)}"]
     long = any(len(word) > MOST_CHARACTERS for word in words)
@@ -384,19 +385,15 @@ def _flag_words(name: str, value: Any, verb: Verb) -> list[str]:
 
 def _star_words(star: dict[str, Any]) -> list[str]:
     """Return the flags of a star of the library."""
-    names = {key: flag.names[0] for key, field in Star.model_fields.items() for flag in found(field, Flag)}
     usual = Star(library=star.get("library"))
-    said = {key: value for key, value in star.items() if key in names and value != getattr(usual, key)}
-    said = {"library": star.get("library")} | said
-    return [word for key, value in said.items() for word in (names[key], _text(value))]
+    said = {key: value for key, value in star.items() if value != getattr(usual, key)}
+    return _words(Star, {"library": star.get("library")} | said)
 
 
-def _sky_words(sky: dict[str, Any]) -> list[str]:
-    if sky.get("none"):
-        return ["--sky", "none"]
-    if "target" in sky:
-        return ["--target", sky["target"], "--time", sky["time"]]
-    return ["--sky", _text(sky["surface_brightness"])] if "surface_brightness" in sky else []
+def _words(section: type[BaseModel], values: Mapping[str, Any]) -> list[str]:
+    """Return the words of the first flags of a section's keys, with their values."""
+    names = {key: flags[0].names[0] for key, each in section.model_fields.items() if (flags := found(each, Flag))}
+    return [word for key, value in values.items() if key in names for word in (names[key], _text(value))]
 
 
 def _text(value: str | float) -> str:
