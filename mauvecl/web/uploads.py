@@ -22,6 +22,7 @@ from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
 from mauvecl.host.spectra.conversion import ReadSpectrum
 from mauvecl.host.stars.flare_spectra import ObservedFlare
@@ -29,6 +30,7 @@ from mauvecl.host.stars.source import Source
 from mauvecl.host.tables.text_tables import columns
 from mauvecl.observations.frames import Frames
 from mauvecl.schema.errors import InputError, printable, reworded, shortened
+from mauvecl.schema.section import input_error
 from mauvecl.study.analyses import PATHS, CalibrateQuestion, CalibrationObservation
 from mauvecl.web.fields import FIELDS, UPLOADED, UPLOADED_FILE, UPLOADED_UNKNOWN
 from mauvecl.web.sandboxed_reader import Spectrum, read_frames_limited, read_limited
@@ -158,7 +160,10 @@ def observations_in(files: Mapping[str, bytes]) -> tuple[CalibrationObservation,
                     expected = f"its file in the archive, which holds {', '.join(sorted(files))}"
                     raise InputError(f"{shortened(name)} is missing", expected, key="observations")
                 row[key] = name
-    return CalibrateQuestion.model_validate({"observations": rows}).observations
+    try:
+        return CalibrateQuestion.model_validate({"observations": rows}).observations
+    except ValidationError as error:
+        raise input_error("the archive", CalibrateQuestion, error) from error
 
 
 def _observations(name: str, content: bytes) -> list[dict[str, Any]]:
