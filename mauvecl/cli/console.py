@@ -69,8 +69,11 @@ def guarded(app: typer.Typer) -> int:
     """Run the command line, and return its exit code."""
     global _folder
     _folder = None
-    _print_anything()
     out = sys.stdout
+    for stream in (sys.stdout, sys.stderr):
+        # Names may contain any character; those that the terminal's encoding lacks are written as escapes.
+        if (change := getattr(stream, "reconfigure", None)) is not None:
+            change(errors="backslashreplace")
     with warnings.catch_warnings():
         warnings.showwarning = _warn
         try:
@@ -159,14 +162,6 @@ def _warn(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -
     _say(f"note: {message}" + ("" if category is UserWarning else f" ({category.__name__})"), 0)
 
 
-def _print_anything() -> None:
-    """Write characters that the terminal's encoding lacks as escapes, since names may contain any character."""
-    for stream in (sys.stdout, sys.stderr):
-        change: Callable[..., None] | None = getattr(stream, "reconfigure", None)
-        if change is not None:
-            change(errors="backslashreplace")
-
-
 def _flushed(code: int) -> int:
     """Flush standard output; return the exit code, or that of a failure to write."""
     try:
@@ -191,10 +186,8 @@ def _not_written(error: OSError) -> int:
 
 def _raised_by(error: BaseException) -> str:
     """Return the name of the module that raised an exception."""
-    step = error.__traceback__
-    while step is not None and step.tb_next is not None:
-        step = step.tb_next
-    return "" if step is None else str(step.tb_frame.f_globals.get("__name__", ""))
+    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+    return str(frames[-1].f_globals.get("__name__", "")) if frames else ""
 
 
 def _discard() -> None:
