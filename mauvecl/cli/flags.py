@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, get_args,
 import typer
 
 from mauvecl.schema.fields import Flag, Help, Unit, as_typed, first, is_measure
-from mauvecl.schema.parsing import count, number, refusal, several
 
 if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
@@ -121,6 +120,7 @@ def study_flags(*keys: str, defaults: Mapping[str, Any]) -> dict[str, StudyFlag]
     `defaults` holds defaults of a verb that differ from the study's, by key.
     """
     # `mauvecl --help` shows no flags, and starts twice as fast without importing the study.
+    from mauvecl.schema.section import read_count, read_number, read_several
     from mauvecl.study.keywords import Keyword
     from mauvecl.study.study import keys_of
 
@@ -131,9 +131,11 @@ def study_flags(*keys: str, defaults: Mapping[str, Any]) -> dict[str, StudyFlag]
         kind, read, metavar = keyword.kind, None, {str: "TEXT", Path: "FILE"}.get(each)
         if each in (float, int):
             kind, metavar = list[str] if keyword.many else str, "NUMBER" if each is float else "INTEGER"
-            read = partial(number, unit=keyword.unit) if each is float else count
+            read = partial(read_number, unit=keyword.unit) if each is float else read_count
             read = (
-                partial(several, name=flag.names[0], read=read) if keyword.many else partial(read, name=flag.names[0])
+                partial(read_several, name=flag.names[0], read=read)
+                if keyword.many
+                else partial(read, name=flag.names[0])
             )
         made = option(
             *flag.names,
@@ -217,8 +219,10 @@ def holds_study(file: Path) -> bool:
 
 def warn_of_percent(texts: Sequence[str]) -> None:
     """Warn of amplitudes that look like a percentage without its sign."""
+    from mauvecl.schema.section import read_number
+
     for text in (word.strip() for texts_of_flag in texts for word in texts_of_flag.split(",")):
-        if not is_measure(text) and number(text, "--amplitude") >= 1:
+        if not is_measure(text) and read_number(text, "--amplitude") >= 1:
             warnings.warn(
                 f"--amplitude {text} is a rise of {100 * float(text):g} %; --amplitude {text}% is one of {text} %",
                 stacklevel=2,
@@ -227,7 +231,9 @@ def warn_of_percent(texts: Sequence[str]) -> None:
 
 def whole(text: str, flag: str, low: int, high: int) -> int:
     """Read a whole number between two ends."""
-    value = count(text, flag)
+    from mauvecl.schema.section import read_count, refusal
+
+    value = read_count(text, flag)
     if not low <= value <= high:
         raise refusal(flag, text, f"{low:g} to {high:g}")
     return value

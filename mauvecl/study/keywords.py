@@ -13,8 +13,8 @@ from mauvecl.host.tables.files import without_columns
 from mauvecl.noise.unknowns import NUISANCES
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Unit, first, unit_of
-from mauvecl.schema.parsing import assignment, number
 from mauvecl.schema.physical import SkyBrightness
+from mauvecl.schema.section import read_assignment, read_number
 from mauvecl.study.star import FILE_KEYS
 
 if TYPE_CHECKING:
@@ -141,7 +141,7 @@ def sky_of(given: Mapping[str, Any]) -> dict[str, Any]:
         sky["none"] = True
     elif isinstance(value, str):
         try:
-            sky["surface_brightness"] = number(value, "sky =", unit_of(SkyBrightness))
+            sky["surface_brightness"] = read_number(value, "sky =", unit_of(SkyBrightness))
         except ValueError as error:
             raise InputError(f"sky = {value!r}", "V mag/arcsec^2 or none", key="sky") from error
     else:
@@ -155,7 +155,9 @@ def nuisances_of(nuisances: NuisanceChoice, given: Sequence[str] | Mapping[str, 
     own = {name: choice.model_dump(exclude_none=True) for name, choice in nuisances.own.items()}
     expected = f"NAME=SD, with a name of {', '.join(NUISANCES)} or a file's, and a standard deviation or free"
     pairs = (
-        given.items() if isinstance(given, Mapping) else [assignment(text, "nuisance =", expected) for text in given]
+        given.items()
+        if isinstance(given, Mapping)
+        else [read_assignment(text, "nuisance =", expected) for text in given]
     )
     for name, sd in pairs:
         if name in NUISANCES:

@@ -14,7 +14,6 @@ from mauvecl.host.exposure import DEFAULT_SKY
 from mauvecl.host.instrument.paths import DEFAULT_INSTRUMENT, current_name
 from mauvecl.noise.disturbances import Prior, PriorField
 from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, INSTRUMENT_VALUES, NUISANCES, default_processes, values_of
-from mauvecl.schema import parsing
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.fields import Flag, Help, Quantity, Range, Slider, Widget
 from mauvecl.schema.physical import (
@@ -25,7 +24,7 @@ from mauvecl.schema.physical import (
     SkyBrightness,
     Temperature,
 )
-from mauvecl.schema.section import Section
+from mauvecl.schema.section import Section, read_words
 
 if TYPE_CHECKING:
     import numpy as np
@@ -204,7 +203,7 @@ class Run(Section):
         tuple[str, ...],
         Field(min_length=1),
         Help("Detection statistic", choices=f"{', '.join(STATISTIC_NAMES)}, or all"),
-        Flag("--statistic", read=parsing.words),
+        Flag("--statistic", read=read_words),
         Flag(
             "--all-statistics",
             kind=bool,
@@ -397,7 +396,7 @@ Draws = Annotated[
 Known = Annotated[
     tuple[str, ...],
     Help("Instrument value that is known", "as in temperature_c,light_loss"),
-    Flag("--known", read=parsing.words),
+    Flag("--known", read=read_words),
 ]
 #: Number of draws, priors by name, and names of known values.
 _unknown_keys: Any = (

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 from pydantic import Field, model_validator
 
 from mauvecl.host.stars.library import ALIASES, listed_values
-from mauvecl.schema import parsing
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help, Quantity, Range, Slider, Unit, Widget
 from mauvecl.schema.physical import (
@@ -27,7 +26,7 @@ from mauvecl.schema.physical import (
     Share,
     Temperature,
 )
-from mauvecl.schema.section import Section
+from mauvecl.schema.section import Section, read_line_fluxes
 
 if TYPE_CHECKING:
     from mauvecl.host.exposure.star import Neighbours
@@ -316,12 +315,12 @@ class FlareLight(Section):
             "Emission line as a fraction of the continuum in 200-700 nm, by name or wavelength in nm",
             "as in 'Mg II=0.05'",
         ),
-        Flag("--line", kind=list[str], read=parsing.line_fluxes),
+        Flag("--line", kind=list[str], read=read_line_fluxes),
     ] = Field(default_factory=dict)
     line_fluxes: Annotated[
         dict[str, Annotated[float, Unit("erg / (s cm2)"), Range(0)]],
         Help("Emission line at the telescope, by name or wavelength in nm", "as in '280=1e-12'"),
-        Flag("--line-flux", kind=list[str], read=parsing.line_fluxes),
+        Flag("--line-flux", kind=list[str], read=read_line_fluxes),
     ] = Field(default_factory=dict)
     line_scale: Annotated[
         LineScale,

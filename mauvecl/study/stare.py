@@ -22,11 +22,10 @@ from mauvecl.flares.settings import (
 )
 from mauvecl.noise.disturbances import PointingDrifts
 from mauvecl.noise.unknowns import COURSES, STARE_PROCESSES, Changing, NuisanceName
-from mauvecl.schema import parsing
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.fields import Flag, Help, Range, Unit, Widget
 from mauvecl.schema.physical import Amplitude, Duration, Energy, Positive, Temperature, Wavelength
-from mauvecl.schema.section import Section
+from mauvecl.schema.section import Section, read_gaps
 from mauvecl.study.observation import Spread, sd_of
 
 if TYPE_CHECKING:
@@ -51,7 +50,7 @@ class StareQuestion(Section):
         tuple[tuple[float, float], ...],
         Unit("s"),
         Help("Gap without recorded frames, from:to", "as in 1000:2000"),
-        Flag("--gap", kind=list[str], read=parsing.gaps),
+        Flag("--gap", kind=list[str], read=read_gaps),
     ] = ()
     orbit_s: Annotated[Duration, Help("Orbital period")] = ORBIT_S
     orbit_gap_s: Annotated[float, Unit("s"), Range(0), Help("Gap at the end of every orbit"), Flag("--orbit-gap")] = 0.0

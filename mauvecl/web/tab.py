@@ -20,10 +20,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from pydantic import BaseModel
 
 from mauvecl.answers.verbs import VERBS
-from mauvecl.schema import parsing
 from mauvecl.schema.columns import View, without_empty
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, found
+from mauvecl.schema.section import read_axis, read_line_fluxes, read_words
 from mauvecl.study.observation import SkyLight
 from mauvecl.study.star import Star
 from mauvecl.study.study import Study, keys_of, with_paths
@@ -371,12 +371,12 @@ def _flag_words(name: str, value: Any, verb: Verb) -> list[str]:
         if isinstance(value, bool) and flag.read is None:
             on, _, off = flag.names[0].partition("/")
             return [on] if value else [off] if off else []
-        if flag.read is parsing.line_fluxes:
+        if flag.read is read_line_fluxes:
             return [word for line, share in value.items() for word in (flag.names[0], f"{line}={share!r}")]
-        if flag.read is parsing.axis and "start" in value:
+        if flag.read is read_axis and "start" in value:
             spaced = [value["quantity"], *(_text(value[key]) for key in ("start", "stop", "steps"))]
             return [flag.names[0], ":".join(spaced + ["log"] * value.get("log", False))]
-        if flag.read in (None, parsing.words) and flag.kind in (None, str, list[str]):
+        if flag.read in (None, read_words) and flag.kind in (None, str, list[str]):
             values = value if isinstance(value, list) else [value]
             if all(isinstance(item, str | int | float) for item in values):
                 return [word for item in values for word in (flag.names[0], _text(item))]
