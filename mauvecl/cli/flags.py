@@ -131,12 +131,8 @@ def study_flags(*keys: str, defaults: Mapping[str, Any]) -> dict[str, StudyFlag]
         kind, read, metavar = keyword.kind, None, {str: "TEXT", Path: "FILE"}.get(each)
         if each in (float, int):
             kind, metavar = list[str] if keyword.many else str, "NUMBER" if each is float else "INTEGER"
-            read = partial(read_number, unit=keyword.unit) if each is float else read_count
-            read = (
-                partial(read_several, name=flag.names[0], read=read)
-                if keyword.many
-                else partial(read, name=flag.names[0])
-            )
+            one, name = partial(read_number, unit=keyword.unit) if each is float else read_count, flag.names[0]
+            read = partial(read_several, name=name, read=one) if keyword.many else partial(one, name=name)
         made = option(
             *flag.names,
             text=_help(path, field, flag, keyword.kind, defaults),

@@ -1,4 +1,4 @@
-"""Records and sections of a study: validation with errors in one style, their reference, and readers of written values."""
+"""Records and sections of a study: validation with errors in one style, their reference, readers of written values."""
 
 from __future__ import annotations
 

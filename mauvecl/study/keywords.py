@@ -154,12 +154,9 @@ def nuisances_of(nuisances: NuisanceChoice, given: Sequence[str] | Mapping[str, 
     changed: dict[str, Any] = {}
     own = {name: choice.model_dump(exclude_none=True) for name, choice in nuisances.own.items()}
     expected = f"NAME=SD, with a name of {', '.join(NUISANCES)} or a file's, and a standard deviation or free"
-    pairs = (
-        given.items()
-        if isinstance(given, Mapping)
-        else [read_assignment(text, "nuisance =", expected) for text in given]
-    )
-    for name, sd in pairs:
+    if not isinstance(given, Mapping):
+        given = dict(read_assignment(text, "nuisance =", expected) for text in given)
+    for name, sd in given.items():
         if name in NUISANCES:
             changed[name] = sd
         else:
