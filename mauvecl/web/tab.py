@@ -140,7 +140,7 @@ def simulation_of(name: str) -> Simulation:
     return SIMULATIONS.get(name) or Simulation({name: name})
 
 
-def asked(name: str, study: Study) -> tuple[str, Study]:
+def asked_study(name: str, study: Study) -> tuple[str, Study]:
     """Return the verb of a simulation, with its study derived from the page's."""
     simulation = simulation_of(name)
     return next(iter(simulation.verbs.values())), simulation.asked(study)
@@ -468,15 +468,9 @@ def commands_and_programs(tab: Tab, question: Question, folder: Path) -> list[di
     """Return each of a tab's `questions` as a command and as a Python program; `folder` holds the visitor's files."""
     entries = []
     for name in tab.questions:
-        verb, study = asked(name, question.study(folder))
+        verb, study = asked_study(name, question.study(folder))
         # Paths relative to the study, instead of those on the server.
         data = with_paths(study.model_dump(mode="json"), Study, lambda file: Path(file.name))
         study = Study.build(data, "page")
         entries.append({"question": name, "command": as_command(verb, study), "python": as_program(verb, study)})
     return entries
-
-
-def asked_study(name: str, study: Study) -> tuple[str, bytes]:
-    """Return the study file of one of a tab's `questions`."""
-    _, wanted = asked(name, study)
-    return study_file(wanted, "study")

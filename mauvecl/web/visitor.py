@@ -34,7 +34,7 @@ from mauvecl.web.closed_forms import ClosedForms, other_payloads, solved
 from mauvecl.web.fields import FIELDS, field_of, remedies, sentence
 from mauvecl.web.page import TABS, State, asking, card, known, reads_of
 from mauvecl.web.sandboxed_reader import read_columns_limited
-from mauvecl.web.tab import DRAWING, SIMULATIONS, as_file, asked_study, commands_and_programs, verbs_of
+from mauvecl.web.tab import DRAWING, SIMULATIONS, as_file, asked_study, commands_and_programs, study_file, verbs_of
 from mauvecl.web.uploads import RESULTS, UPLOADS
 from mauvecl.web.uploads import UPLOAD_SHELF as UPLOADED
 
@@ -560,7 +560,8 @@ class Visitor(WebSocketHandler):
             if tab in TABS:
                 made = as_file(TABS[tab], name, ending, self.closed(state, front), answers)
             else:
-                made = asked_study(name, state.question(reads).study(Path(self._folder.name)))
+                _, study = asked_study(name, state.question(reads).study(Path(self._folder.name)))
+                made = study_file(study, "study")
             self._files[which] = made
             RESULTS.keep(self, which, made, partial(self._files.pop, which, None))
             while len(self._files) > MOST_KEPT:
