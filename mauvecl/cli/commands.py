@@ -34,7 +34,7 @@ from mauvecl.cli.flags import (
     warn_of_percent,
     whole,
 )
-from mauvecl.schema.columns import View
+from mauvecl.schema.columns import Column, View
 from mauvecl.schema.errors import InputError, together
 
 if TYPE_CHECKING:
@@ -306,7 +306,8 @@ def verify(
                 key="store",
             )
         faults: Sequence[Any] = verify_answer(store)
-        columns, left = FAULT_COLUMNS, len(faults)
+        columns: Sequence[Column] = FAULT_COLUMNS
+        left = len(faults)
         outcome = "" if faults else "Every file agrees with the run record, and the record with its own digest."
     else:
         from mauvecl.device.engine import Engine

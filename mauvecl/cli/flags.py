@@ -128,10 +128,12 @@ def study_flags(*keys: str, defaults: Mapping[str, Any]) -> dict[str, StudyFlag]
     for path, field, flag in keys_of(keys):
         keyword = Keyword.of(path, field, flag)
         each = get_args(keyword.kind)[0] if keyword.many else keyword.kind
-        kind, read, metavar = keyword.kind, None, {str: "TEXT", Path: "FILE"}.get(each)
+        kind, metavar = keyword.kind, {str: "TEXT", Path: "FILE"}.get(each)
+        read: Callable[[Any], Any] | None = None
         if each in (float, int):
             kind, metavar = list[str] if keyword.many else str, "NUMBER" if each is float else "INTEGER"
-            one, name = partial(read_number, unit=keyword.unit) if each is float else read_count, flag.names[0]
+            one: Callable[..., Any] = partial(read_number, unit=keyword.unit) if each is float else read_count
+            name = flag.names[0]
             read = partial(read_several, name=name, read=one) if keyword.many else partial(one, name=name)
         made = option(
             *flag.names,
