@@ -30,7 +30,7 @@ from mauvecl.runs.checkpoint import Checkpoint, fingerprint, shards
 from mauvecl.runs.cluster import DaskWorkers
 from mauvecl.runs.pool import LocalWorkers, Pool
 from mauvecl.study.cases import Case
-from mauvecl.study.sections import Run
+from mauvecl.study.observation import Run
 from mauvecl.study.study import Study
 
 #: The plan's work, pixel-realisations, and its cores.

@@ -27,12 +27,10 @@ from mauvecl.cli.app import app
 from mauvecl.detection.requests import STATISTICS
 from mauvecl.runs.pool import LocalWorkers, Pool
 from mauvecl.schema.errors import InputError
-from mauvecl.web.closed_forms import ClosedForms
-from mauvecl.web.downloads import commands_and_programs
+from mauvecl.web.closed_forms import ClosedForms, Question
 from mauvecl.web.fields import FIELDS, UPLOADED_FILE, Choice, Number
 from mauvecl.web.page import TABS, State, reads_of
-from mauvecl.web.question import SIMULATIONS, Question
-from mauvecl.web.tab import Tab
+from mauvecl.web.tab import SIMULATIONS, Tab, commands_and_programs
 
 #: Names of the commands' files, where they are not those of the page.
 WRITTEN = {"observation": "observation-2", "snr": "snr-element"}

@@ -7,10 +7,9 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import model_serializer, model_validator
 
-from mauvecl.schema import parsing
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help, OrNone, Range, Unit
-from mauvecl.schema.section import Section
+from mauvecl.schema.section import Section, read_declinations
 
 #: Angle between two directions; None for no limit.
 Separation = Annotated[float | None, Unit("deg"), Range(0, 180), OrNone()]
@@ -34,7 +33,7 @@ class Limits(Section):
         Unit("deg"),
         OrNone(),
         Help("Field of regard, low:high", "or none", default="-46.4:31.8"),
-        Flag("--declination", kind=str, read=parsing.declinations),
+        Flag("--declination", kind=str, read=read_declinations),
     ] = (-46.4, 31.8)
     normal_cone_deg: Annotated[
         Separation, Help("Field of regard as a double cone about the orbit's normal", "or none", default="none")

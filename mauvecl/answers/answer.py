@@ -270,7 +270,7 @@ class Answer(Drawable, ContentEquality):
         place = make_folder(Path(folder))
         return [
             *(write_table(table, place / name) for name, table in self.files.items()),
-            *(write_document(content(), place / name) for name, content in self.documents.items()),
+            *(write_document(content, place / name) for name, content in self.documents.items()),
             write_study(self.study.toml(), place),
         ]
 
@@ -442,15 +442,15 @@ def _quoted(word: str) -> str:
     return line.getvalue().removesuffix(" end") or '""'
 
 
-def write_document(content: bytes, path: Path) -> Path:
-    """Write a file from its bytes; errors as for `write_table`."""
-    write_whole(path, content)
+def write_document(content: Callable[[], bytes], path: Path) -> Path:
+    """Write a file from a function that returns its bytes; errors as for `write_table`."""
+    write_whole(path, content())
     return path
 
 
 def write_study(text: str, folder: Path) -> Path:
     """Write the text of a study; errors as for `write_table`."""
-    return write_document(text.encode(), folder / "study.toml")
+    return write_document(text.encode, folder / "study.toml")
 
 
 def write_record(

@@ -26,7 +26,7 @@ from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, NUISANCES, PROCESSES, C
 from mauvecl.schema.columns import Column, First, chance_text, number
 from mauvecl.schema.errors import InputError, Message
 from mauvecl.study.cases import Case
-from mauvecl.study.nuisances import KNOWN, NuisanceChoice
+from mauvecl.study.observation import KNOWN, NuisanceChoice
 
 if TYPE_CHECKING:
     from mauvecl.detection.distributions import Form

@@ -53,7 +53,7 @@ from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.columns import Column, View, chance_range, chance_text, percent
 from mauvecl.schema.errors import InputError, Message
 from mauvecl.study.cases import Case, amplitude_column, cases, collect_messages, star_column
-from mauvecl.study.nuisances import NuisanceChoice
+from mauvecl.study.observation import NuisanceChoice
 from mauvecl.study.study import PAPER_STARS, Study
 
 if TYPE_CHECKING:

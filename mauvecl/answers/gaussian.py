@@ -22,8 +22,8 @@ from mauvecl.detection.snr import steps_of
 from mauvecl.device.engine import Engine
 from mauvecl.noise.drawing import Cumulants
 from mauvecl.schema.columns import Column, number, table_of
+from mauvecl.study.observation import Observation
 from mauvecl.study.questions import formula_grid
-from mauvecl.study.sections import Observation
 from mauvecl.study.study import PAPER_STARS, Study
 
 if TYPE_CHECKING:

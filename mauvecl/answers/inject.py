@@ -29,7 +29,7 @@ from mauvecl.search.injections import FitAccuracy, Injections, Refit
 from mauvecl.search.search import Survey
 from mauvecl.search.templates import TEMPERATURES_K, Bank, Templates, frame_nuisances
 from mauvecl.study.cases import Case, cases, collect_messages
-from mauvecl.study.flare_light import FlareLight
+from mauvecl.study.star import FlareLight
 from mauvecl.study.stares import energy_scale, orbit_lines, threshold_line
 from mauvecl.study.study import Study
 

@@ -36,9 +36,8 @@ from mauvecl.study.cases import (
     star_label,
     worst_first,
 )
-from mauvecl.study.nuisances import KNOWN
+from mauvecl.study.observation import KNOWN, Unknowns
 from mauvecl.study.questions import QUANTITIES, UNITS
-from mauvecl.study.sections import Unknowns
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:

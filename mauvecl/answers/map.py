@@ -44,8 +44,8 @@ from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
+    from mauvecl.study.observation import Run
     from mauvecl.study.questions import MapQuestion
-    from mauvecl.study.sections import Run
 
 #: Quantities of the flare alone: cells that differ in them share their quiescent star, and one launch.
 OF_FLARE = tuple(name for name, quantity in QUANTITIES.items() if quantity.path[0] == "flare")

@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from mauvecl.host.stars.flare_spectra import FlareSpectrum
     from mauvecl.host.stars.source import Source
     from mauvecl.study.cases import Case
-    from mauvecl.study.sections import Star
+    from mauvecl.study.star import Star
 
 Float = NDArray[np.float64]
 

@@ -40,7 +40,7 @@ from mauvecl.study.study import Study
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.runs.pool import Pool
-    from mauvecl.study.sections import Star
+    from mauvecl.study.star import Star
 
 
 def two_digits(value: float) -> str:

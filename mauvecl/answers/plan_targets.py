@@ -25,8 +25,9 @@ from mauvecl.schema.errors import InputError
 from mauvecl.search.completeness import PER_DECADE, SMALL, Completeness, frame_signal, recovered_per_day
 from mauvecl.search.templates import frame_nuisances
 from mauvecl.study.cases import Case
+from mauvecl.study.observation import SkyLight
 from mauvecl.study.plan import PlanTarget
-from mauvecl.study.sections import SkyLight, Star
+from mauvecl.study.star import Star
 from mauvecl.study.stare import InjectionQuestion
 from mauvecl.study.stares import energy_scale
 

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from mauvecl.flares.stare import Stare
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.search.flare_fits import Factor
-    from mauvecl.study.sections import SkyLight
+    from mauvecl.study.observation import SkyLight
 
 #: Start of a stare whose study names no time: 2026-01-01, MJD. Any would do.
 NO_TIME_MJD = 61_041.0

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import atexit
 import gc
+import inspect
 import json
 import os
+import re
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -15,24 +17,29 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
-from mauvecl.answers.verbs import COMMON, VERBS
+from mauvecl.answers.verbs import COMMON, GROUPS, VERBS
 from mauvecl.cli.commands import COMMANDS, add_plain_commands, export, verify
-from mauvecl.cli.console import EXIT_CODES, guarded, name_flags_of
-from mauvecl.cli.flags import DeviceFlag, JsonFlag, QuietFlag, option_of, within
-from mauvecl.cli.help import CommandWithHelp, text_of, write_commands
+from mauvecl.cli.console import EXIT_CODES, Meter, guarded, name_flags_of, show, show_view
+from mauvecl.cli.flags import (
+    SHOWS_ALL,
+    DeviceFlag,
+    JsonFlag,
+    QuietFlag,
+    ReplaceFlag,
+    option,
+    option_of,
+    output_option,
+    whole,
+)
 from mauvecl.host import VERSION
-from mauvecl.schema.parsing import count
+from mauvecl.schema.columns import View, records
+from mauvecl.schema.errors import InputError, missing_package, shortened
 
 if TYPE_CHECKING:
     from mauvecl.host.stars.library import OwnStar
-
-WhereFlag = Annotated[
-    Path | None,
-    typer.Option("--output", "-o", metavar="PATH", help="Where to write [nowhere].", show_default=False),
-]
 
 
 def devices(
@@ -47,20 +54,20 @@ def devices(
     Example: mauvecl devices
     """
     from mauvecl.device.selftest import DEVICE_COLUMNS, list_devices
-    from mauvecl.schema.columns import View
 
-    records = list_devices() if rate else list_devices(measure=False)
+    found = list_devices(measure=rate)
     if as_json:
-        print(json.dumps(records, indent=2))
+        print(json.dumps(found, indent=2))
         return
-    from mauvecl.cli.console import show_view
-
-    numbered = [{"number": number} | record for number, record in enumerate(records)]
+    numbered = [{"number": number} | record for number, record in enumerate(found)]
     show_view(View("OpenCL devices; choose with --device NUMBER or part of a name", DEVICE_COLUMNS, numbered))
 
 
 def selftest(
-    device: DeviceFlag = None, output: WhereFlag = None, as_json: JsonFlag = False, quiet: QuietFlag = False
+    device: DeviceFlag = None,
+    output: Annotated[Path | None, output_option("nowhere")] = None,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
 ) -> None:
     """Check that your device computes what it should.
 
@@ -73,10 +80,8 @@ def selftest(
     from dataclasses import asdict
 
     from mauvecl.answers.answer import make_folder, write_json
-    from mauvecl.cli.console import Meter, show, show_view
     from mauvecl.device import selftest
     from mauvecl.device.engine import Engine
-    from mauvecl.schema.columns import View
 
     started = time.perf_counter()
     folder = None if output is None else make_folder(output)
@@ -112,7 +117,6 @@ def schema() -> None:
 
 
 library_app = typer.Typer(invoke_without_command=True, rich_markup_mode=None, add_completion=False)
-ReplaceFlag = Annotated[bool, typer.Option("--replace", help="Replace an existing entry of that name.")]
 
 
 @library_app.callback()
@@ -132,14 +136,11 @@ def library(context: typer.Context, as_json: JsonFlag = False) -> None:
     if context.invoked_subcommand is not None:
         return
     from mauvecl.host.stars.library import COLUMNS, OWN_COLUMNS, library_table
-    from mauvecl.schema.columns import View, records
 
     table = library_table()
     if as_json:
         print(json.dumps(records(table), indent=2))
         return
-    from mauvecl.cli.console import show_view
-
     title = "Embedded spectra (UV: mean flux over that at 540-560 nm); origin, citation: --json"
     show_view(View(title, COLUMNS, table[table["kept"] == "embedded"]))
     yours = table[table["kept"] == "yours"]
@@ -150,9 +151,7 @@ def library(context: typer.Context, as_json: JsonFlag = False) -> None:
 @library_app.command()
 def add(
     files: Annotated[list[Path], typer.Argument(help="Text, ECSV, VOTable or FITS; FILE[COLUMN] names a column.")],
-    name: Annotated[
-        str | None, typer.Option(metavar="TEXT", help="Name of the star, for a single file.", show_default=False)
-    ] = None,
+    name: Annotated[str | None, option(metavar="TEXT", text="Name of the star, for a single file.")] = None,
     replace: ReplaceFlag = False,
     wavelength_unit: Annotated[str | None, option_of("star.wavelength_unit")] = None,
     flux_unit: Annotated[str | None, option_of("star.flux_unit")] = None,
@@ -164,7 +163,6 @@ def add(
     Example: mauvecl library add my-star.txt --name "HD 1234"
     """
     from mauvecl.host.stars.additions import add
-    from mauvecl.schema.errors import InputError
 
     if name is not None and len(files) > 1:
         raise InputError(f"--name {name!r} needs a single file, but {len(files)} are given", key="name")
@@ -178,10 +176,7 @@ def fetch(
     names: Annotated[
         list[str], typer.Argument(help="Stars, such as ngsl:HD 37202; in calspec, ngsl or lowlib, or in any of them.")
     ],
-    base: Annotated[
-        str | None,
-        typer.Option("--from", metavar="TEXT", help="Address of a mirror of the collection.", show_default=False),
-    ] = None,
+    base: Annotated[str | None, option("--from", metavar="TEXT", text="Address of a mirror of the collection.")] = None,
     replace: ReplaceFlag = False,
     extend: Annotated[str | None, option_of("star.extend")] = None,
     quiet: QuietFlag = False,
@@ -190,8 +185,6 @@ def fetch(
 
     Example: mauvecl library fetch "calspec:18sco"
     """
-    import sys
-
     from mauvecl.host.stars.additions import fetch
 
     for name in names:
@@ -205,7 +198,6 @@ def remove(names: Annotated[list[str], typer.Argument(help="Names of kept stars.
 
     Example: mauvecl library remove "HD 1234"
     """
-    from mauvecl.cli.console import show
     from mauvecl.host.stars.library import remove
 
     for name in names:
@@ -215,8 +207,6 @@ def remove(names: Annotated[list[str], typer.Argument(help="Names of kept stars.
 
 
 def _tell(star: OwnStar, quiet: bool) -> None:
-    from mauvecl.cli.console import show
-
     if quiet:
         return
     lines = [
@@ -238,11 +228,10 @@ def serve(
     port: Annotated[str, typer.Option(metavar="INTEGER", help="Port to listen on.")] = "5006",
     allow_origin: Annotated[
         list[str] | None,
-        typer.Option(
+        option(
             metavar="TEXT",
-            help="Public address of the page, such as https://mauve.example.org; required if --address "
+            text="Public address of the page, such as https://mauve.example.org; required if --address "
             "accepts other machines. May be repeated.",
-            show_default=False,
         ),
     ] = None,
     show: Annotated[bool, typer.Option("--show", help="Open a browser.")] = False,
@@ -251,9 +240,8 @@ def serve(
 
     Example: mauvecl serve --show
     """
-    from mauvecl.schema.errors import InputError, missing_package, shortened
 
-    number = within(port, "--port", read=count, low=1, high=65535)
+    number = whole(port, "--port", 1, 65535)
     if find_spec("bokeh") is None or find_spec("tornado") is None:
         raise missing_package("bokeh", "the page", "web")
     from mauvecl.web.server import serve
@@ -264,6 +252,54 @@ def serve(
         raise InputError(
             f"port {port} of {shortened(address)} cannot be used ({error.strerror})", "another: --port", key="port"
         ) from error
+
+
+#: Heading of the flags that set no key of a study.
+OUTPUT = "Output and devices"
+
+
+class CommandWithHelp(TyperCommand):
+    """Command whose `--help` shows its common flags, and `--help-all` all of them in groups."""
+
+    common: frozenset[str] = frozenset()  # parameters of the common flags; empty for a command that shows all
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write the arguments, and the flags under their headings."""
+        shows_all = ctx.meta.get(SHOWS_ALL, False)
+        shown = self.common | {"help", "help_all"}
+        groups: dict[str, list[tuple[str, str]]] = {}
+        for one in self.get_params(ctx):
+            record = one.get_help_record(ctx)
+            if one.param_type_name == "argument":
+                heading = "Arguments"
+            elif shows_all:
+                heading = getattr(one, "rich_help_panel", None) or OUTPUT
+            elif self.common:
+                heading = "Common flags"
+            else:
+                heading = "Options"
+            if record is not None and (heading != "Common flags" or one.name in shown):
+                groups.setdefault(heading, []).append(record)
+        for heading, lines in groups.items():
+            with formatter.section(heading):
+                formatter.write_dl(lines)
+
+
+def text_of(text: str | None) -> str:
+    """Return a help text with examples on separate lines of at most 80 columns, which can be pasted."""
+    text = re.sub(r"(?m)^(Examples?:) (?=mauvecl )", r"\1\n\n", inspect.cleandoc(text or ""))
+    return re.sub(r"(?m)^mauvecl .*$", lambda match: "\b\n" + _broken(match[0]), text)
+
+
+def _broken(command: str) -> str:
+    """Divide a command longer than 72 characters into lines that end in a backslash before a flag."""
+    lines = [""]
+    for part in re.split(r" (?=-)", command):
+        if lines[-1] and len(lines[-1]) + len(part) > 72:
+            lines[-1] += " \\"
+            lines.append("   ")
+        lines[-1] += f" {part}" if lines[-1] else part
+    return "\n".join(lines)
 
 
 add_plain_commands()
@@ -319,7 +355,11 @@ class _Group(TyperGroup):
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write the commands in groups, and then the flags."""
         groups = {name: COMMANDS[name].verb.group if name in COMMANDS else "tools" for name in HELP}
-        write_commands(formatter, HELP, groups)
+        width = max(map(len, HELP))
+        for group, heading in GROUPS.items():
+            names = [name for name in HELP if groups[name] == group]
+            with formatter.section(heading):
+                formatter.write_dl([(name.ljust(width), HELP[name].partition("\n")[0]) for name in names])
         with formatter.section("Options"):
             formatter.write_dl([record for one in self.get_params(ctx) if (record := one.get_help_record(ctx))])
 

@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import typer
 
 from mauvecl.answers.verbs import DRAWS, FEWER, VERBS, Verb
+from mauvecl.cli.console import Meter, show, show_view
 from mauvecl.cli.flags import (
+    HELP_ALL,
     RESUMING,
     WORKERS,
     DeviceFlag,
@@ -21,22 +23,23 @@ from mauvecl.cli.flags import (
     Options,
     PaperFlag,
     QuietFlag,
+    ReplaceFlag,
     SetFlag,
-    as_text,
     holds_study,
     is_star,
-    output_flag,
+    option,
+    output_option,
     study_argument,
     study_flags,
     warn_of_percent,
+    whole,
 )
-from mauvecl.cli.help import HELP_ALL
+from mauvecl.schema.columns import Column, View
 from mauvecl.schema.errors import InputError, together
 
 if TYPE_CHECKING:
     from mauvecl.cli.invocation import Session
     from mauvecl.runs.store import Store
-    from mauvecl.schema.columns import Column
     from mauvecl.study.keywords import Keyword
 
 
@@ -62,57 +65,63 @@ class Command:
         flags = study_flags(*verb.keys, defaults=verb.defaults or {})
         kinds = get_type_hints(self.run, localns={"Session": Any}, include_extras=True)
         _, *own = inspect.signature(self.run).parameters.values()
-        named, observes = inspect.Parameter.KEYWORD_ONLY, verb.accepts("observation.instrument")
-        options = self._options().items()
-        parameters = [
-            inspect.Parameter("study_file", named, default=None, annotation=study_argument(flags)),
-            *(inspect.Parameter(key, named, default=None, annotation=flag.kind) for key, flag in flags.items()),
-            inspect.Parameter("set", named, default=None, annotation=SetFlag),
-            *([inspect.Parameter("paper", named, default=False, annotation=PaperFlag)] if observes else []),
-            *(p.replace(kind=named, annotation=kinds[p.name]) for p in own if p.name != "given"),
-            *(inspect.Parameter(key, named, default=usual, annotation=kind) for key, (kind, usual) in options),
-            inspect.Parameter("help_all", named, default=False, annotation=Annotated[bool, HELP_ALL]),
-        ]
-        units = {key: flag.unit for key, flag in flags.items()}
-        taken = [as_text(parameter, units.get(parameter.name, "")) for parameter in parameters]
-        readers = {parameter.name: read for parameter, read in taken if read is not None}
+        # Annotations and defaults by parameter.
+        options: dict[str, tuple[Any, Any]] = {
+            "study_file": (study_argument(flags), None),
+            **{name: (flag.annotation, None) for name, flag in flags.items()},
+            "set": (SetFlag, None),
+            **({"paper": (PaperFlag, False)} if verb.accepts("observation.instrument") else {}),
+            **{p.name: (kinds[p.name], p.default) for p in own if p.name != "given"},
+            **self._options(),
+            "help_all": (Annotated[bool, HELP_ALL], False),
+        }
 
         def command(study_file: Path | None = None, **values: Any) -> None:
             del values["help_all"]
-            amplitudes = values.get("amplitude") or ()
-            errors: list[InputError] = []
-            for key, read in readers.items():
-                if values.get(key) is not None and not isinstance(values[key], int | float):
+            given = {name: values.pop(name, None) for name in (*flags, "set", "paper")}
+            amplitudes, errors = given.get("amplitude") or (), list[InputError]()
+            for name, flag in flags.items():
+                if flag.read is not None and given[name] is not None:
                     try:
-                        values[key] = read(values[key])
+                        given[name] = flag.read(given[name])
                     except InputError as error:
                         errors.append(error)
             if errors:
                 raise together(errors)
             warn_of_percent(amplitudes)
-            self._call(study_file, flags, values, tells_flags="given" in kinds)
+            keywords = {name: flag.keyword for name, flag in flags.items()}
+            self._call(study_file, keywords, given, values, tells_flags="given" in kinds)
 
+        parameters = [
+            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=usual, annotation=kind)
+            for name, (kind, usual) in options.items()
+        ]
         command.__name__ = verb.name
-        command.__signature__ = inspect.Signature([parameter for parameter, _ in taken])  # type: ignore[attr-defined]
-        command.__annotations__ = {parameter.name: parameter.annotation for parameter, _ in taken}
+        command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        command.__annotations__ = {name: kind for name, (kind, _) in options.items()}
         return command
 
     def _call(
-        self, study_file: Path | None, flags: dict[str, Keyword], values: dict[str, Any], *, tells_flags: bool
+        self,
+        study_file: Path | None,
+        keywords: dict[str, Keyword],
+        given: dict[str, Any],
+        values: dict[str, Any],
+        *,
+        tells_flags: bool,
     ) -> None:
-        """Run the command with the values of all its options."""
+        """Run the command with the values of its flags and of its other options."""
         from mauvecl.cli.invocation import Session, question_time, question_values
         from mauvecl.study.study import Study
 
         verb = self.verb
-        given = {key: values.pop(key, None) for key in (*flags, "set", "paper")}
         study_file = _placed(study_file, given)
-        how = {key: values.pop(key, usual) for key, (_, usual) in self._options().items()}
+        how = {name: values.pop(name, usual) for name, (_, usual) in self._options().items()}
         if tells_flags:
             values["given"] = given
         own = None if study_file is None else Study.read(study_file)
-        study, messages = verb.study_of(given, flags, own, "command line")
-        question_values(study, detects={"fap", "realisations"} <= flags.keys())
+        study, messages = verb.study_of(given, keywords, own, "command line")
+        question_values(study, detects={"fap", "realisations"} <= keywords.keys())
         if self.draws:
             question_time(study, insist=how["insist"])
         with Session(verb.name, study, notes=messages, **how) as session:
@@ -120,11 +129,13 @@ class Command:
 
     def _options(self) -> dict[str, tuple[Any, Any]]:
         """Return the options of the session, with their defaults."""
-        output = output_flag(self.writes or f"the folder mauvecl-{self.verb.name}")
+        output = output_option(self.writes or f"the folder mauvecl-{self.verb.name}")
         workers = WORKERS if self.draws else RESUMING if self.resumes else ()
         names = ("as_json", "quiet", "wide", *(["pictures"] if self.pictures else []), *workers)
         kinds = get_type_hints(Options, include_extras=True)
-        return {"output": (output, None)} | {name: (kinds[name], getattr(Options, name)) for name in names}
+        return {"output": (Annotated[Path | None, output], None)} | {
+            name: (kinds[name], getattr(Options, name)) for name in names
+        }
 
 
 #: Commands with a study by name, filled by `command_of`.
@@ -134,15 +145,7 @@ COMMANDS: dict[str, Command] = {}
 def command_of(
     verb: Verb, *, draws: bool | None = None, **how: Any
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Make a function of the session the command of a verb.
-
-    Parameters
-    ----------
-    draws : bool, optional
-        Whether workers draw; by default if the verb counts something.
-    **how
-        Other fields of `Command`.
-    """
+    """Make a function of the session the command of a verb; workers draw by default if the verb counts something."""
 
     def decorate(run: Callable[..., None]) -> Callable[..., None]:
         COMMANDS[verb.name] = Command(verb=verb, run=run, draws=bool(verb.counts) if draws is None else draws, **how)
@@ -153,19 +156,22 @@ def command_of(
 
 def _placed(study_file: Path | None, given: dict[str, Any]) -> Path | None:
     """Give a file that is no study to the flag that takes such files, and return None in its place."""
-    others: dict[str, tuple[Callable[[Path], bool], str, Callable[[Path], Any]]] = {
-        "targets": (lambda path: not holds_study(path), "tables of targets", lambda path: path),
-        "data": (lambda path: path.suffix.lower() != ".toml", "observed frames", lambda path: path),
-        "star": (is_star, "stars", lambda path: [str(path)]),
-        "look_at": (is_star, "targets", lambda path: [str(path)]),
+    if study_file is None:
+        return None
+    others: dict[str, tuple[Callable[[Path], bool], str]] = {
+        "targets": (lambda path: not holds_study(path), "tables of targets"),
+        "data": (lambda path: path.suffix.lower() != ".toml", "observed frames"),
+        "star": (is_star, "stars"),
+        "look_at": (is_star, "targets"),
     }
-    for key, (applies, plural, value) in others.items():
-        if key in given and study_file is not None and applies(study_file):
+    for key, (applies, plural) in others.items():
+        if key in given and applies(study_file):
             if given[key]:
                 raise InputError(
                     f"{str(study_file)!r} and --{key} are both {plural}, but only one may be given", key=key
                 )
-            given[key], study_file = value(study_file), None
+            given[key] = [str(study_file)] if applies is is_star else study_file
+            return None
     return study_file
 
 
@@ -183,7 +189,7 @@ def add_plain_commands() -> None:
 StoreArgument = Annotated[Path, typer.Argument(help="Store that `mauvecl realise` wrote.")]
 RowsFlag = Annotated[
     str | None,
-    typer.Option(metavar="TEXT", help="Realisations, such as 1000:2000, without the last.", show_default=False),
+    option(metavar="TEXT", text="Realisations, such as 1000:2000, without the last."),
 ]
 
 
@@ -236,9 +242,7 @@ def realise(session: Session) -> None:
 
 
 def _tell(store: Store, place: Path, session: Session) -> None:
-    from mauvecl.cli.console import show_view
     from mauvecl.runs.store import ARRAY_COLUMNS
-    from mauvecl.schema.columns import View
     from mauvecl.study.cases import assumption_line, collect_messages
 
     messages = collect_messages([scene.expectation for scene in store.scenes], store.study.processes)
@@ -291,8 +295,7 @@ def verify(
 
     Example: mauvecl verify frames.zarr --repair
     """
-    from mauvecl.answers.answer import is_answer
-    from mauvecl.cli.console import Meter
+    from mauvecl.answers.answer import FAULT_COLUMNS, is_answer, verify_answer
 
     if is_answer(store):
         if repair or redraw or rows is not None:
@@ -302,43 +305,33 @@ def verify(
                 "--restart writes the answer again",
                 key="store",
             )
-        _verify_answer(store, as_json=as_json)
-        return
-    from mauvecl.device.engine import Engine
-    from mauvecl.runs import bulk
+        faults: Sequence[Any] = verify_answer(store)
+        columns: Sequence[Column] = FAULT_COLUMNS
+        left = len(faults)
+        outcome = "" if faults else "Every file agrees with the run record, and the record with its own digest."
+    else:
+        from mauvecl.device.engine import Engine
+        from mauvecl.runs import bulk
 
-    engine = Engine(device) if repair or redraw else None
-    with Meter(quiet=quiet or as_json, unit="chunks") as meter:
-        faults = bulk.verify(store, engine, repair=repair, redraw=redraw, rows=_rows_of(rows), progress=meter)
-    left = sum(not fault.mended for fault in faults)
-    source = "with what was written" if not redraw else "with what the engine draws"
-    outcome = f"{len(faults) - left} repaired, {left} left as found." if faults else f"Everything agrees {source}."
-    _tell_faults(store, bulk.FAULT_COLUMNS, faults, outcome, as_json=as_json)
+        engine = Engine(device) if repair or redraw else None
+        with Meter(quiet=quiet or as_json, unit="chunks") as meter:
+            faults = bulk.verify(store, engine, repair=repair, redraw=redraw, rows=_rows_of(rows), progress=meter)
+        columns, left = bulk.FAULT_COLUMNS, sum(not fault.mended for fault in faults)
+        source = "with what was written" if not redraw else "with what the engine draws"
+        outcome = f"{len(faults) - left} repaired, {left} left as found." if faults else f"Everything agrees {source}."
+    _print_faults(
+        View(f"Not as it was written: {store}", columns, [asdict(fault) for fault in faults]), outcome, as_json
+    )
     if left:
         raise typer.Exit(1)
 
 
-def _verify_answer(folder: Path, *, as_json: bool) -> None:
-    from mauvecl.answers.answer import FAULT_COLUMNS, verify_answer
-
-    faults = verify_answer(folder)
-    outcome = "" if faults else "Every file agrees with the run record, and the record with its own digest."
-    _tell_faults(folder, FAULT_COLUMNS, faults, outcome, as_json=as_json)
-    if faults:
-        raise typer.Exit(1)
-
-
-def _tell_faults(place: Path, columns: Sequence[Column], faults: Sequence[Any], outcome: str, *, as_json: bool) -> None:
-    """Print what is not as it was written, and the outcome unless it is empty."""
-    from mauvecl.cli.console import show, show_view
-    from mauvecl.schema.columns import View
-
-    rows = [asdict(fault) for fault in faults]
+def _print_faults(found: View, outcome: str, as_json: bool) -> None:
     if as_json:
-        print(json.dumps(rows, indent=2))
+        print(json.dumps(found.table, indent=2))
         return
-    if rows:
-        show_view(View(f"Not as it was written: {place}", columns, rows))
+    if found.table:
+        show_view(found)
     show([outcome] if outcome else [])
 
 
@@ -347,19 +340,16 @@ def export(
     file: Annotated[Path, typer.Argument(help="Ending in .fits, .h5 or .hdf5.")],
     array: Annotated[
         list[str] | None,
-        typer.Option(
-            "--array", metavar="TEXT", help="Such as star-1/flare-2; may be repeated [all].", show_default=False
-        ),
+        option("--array", metavar="TEXT", text="Such as star-1/flare-2; may be repeated [all]."),
     ] = None,
     rows: RowsFlag = None,
-    replace: Annotated[bool, typer.Option("--replace", help="Replace an existing entry of that name.")] = False,
+    replace: ReplaceFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
     """Write a part of a store as one FITS or HDF5 file.
 
     Example: mauvecl export frames.zarr some.fits --array star-1/quiescent --rows 0:1000
     """
-    from mauvecl.cli.console import show
     from mauvecl.runs.export import Selection
     from mauvecl.runs.export import export as write
     from mauvecl.runs.store import Store
@@ -399,12 +389,13 @@ def limit(
 def simulate(
     session: Session,
     given: dict[str, Any],
-    realisation: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Which realisation to show.")] = 0,
+    realisation: Annotated[str, typer.Option(metavar="INTEGER", help="Which realisation to show.")] = "0",
 ) -> None:
     """Draw a realisation, with flares if a flag names their amplitude."""
     from mauvecl.answers.signal import simulate as compute
 
-    session.answer(compute(session.study, realisation=realisation, flaring=bool(given["amplitude"])))
+    number = whole(realisation, "--realisation", 0, 2**63 - 1)
+    session.answer(compute(session.study, realisation=number, flaring=bool(given["amplitude"])))
 
 
 @command_of(VERBS["plan"])

@@ -16,18 +16,18 @@ import textwrap
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from mauvecl.schema.columns import INTERVAL, View, without_empty
+from mauvecl.schema.errors import InputError, printable
 
 if TYPE_CHECKING:
     import typer
     from rich.table import Table
 
     from mauvecl.runs.pool import PoolProgress
-    from mauvecl.schema.errors import InputError
 
 #: Exit codes other than 0; 70 and 74 as sysexits.h has them, those above 128 as shells count signals.
 FAULTY: Final = 1
@@ -66,17 +66,14 @@ def writes_to(folder: Path) -> None:
 
 
 def guarded(app: typer.Typer) -> int:
-    """Run the command line.
-
-    Returns
-    -------
-    int
-        The exit code.
-    """
+    """Run the command line, and return its exit code."""
     global _folder
     _folder = None
-    _print_anything()
     out = sys.stdout
+    for stream in (sys.stdout, sys.stderr):
+        # Names may contain any character; those that the terminal's encoding lacks are written as escapes.
+        if (change := getattr(stream, "reconfigure", None)) is not None:
+            change(errors="backslashreplace")
     with warnings.catch_warnings():
         warnings.showwarning = _warn
         try:
@@ -90,9 +87,6 @@ def guarded(app: typer.Typer) -> int:
 
 
 def _run(app: typer.Typer) -> int:
-    # Click's own classes are private to newer versions of typer.
-    from mauvecl.schema.errors import InputError
-
     try:
         code = app(standalone_mode=False)
     except InputError as error:
@@ -110,6 +104,7 @@ def _run(app: typer.Typer) -> int:
 
 def _failed(error: Exception) -> int:
     """Report a wrong use of flags, a device that fails, or an unforeseen failure."""
+    # Click's own classes are private to newer versions of typer.
     if hasattr(error, "format_message") and isinstance(getattr(error, "exit_code", None), int):
         # A usage error of Click, or the help text of an empty command line, which Click prints itself.
         text = str(error.format_message())
@@ -143,13 +138,11 @@ def _failed_call(error: OSError) -> int:
         return _not_written(error)
     if error.filename is None and error.errno not in DISK:
         return _failed(error)
-    name = (
-        "a file"
-        if error.filename is None
-        else repr(os.fsdecode(error.filename) if not isinstance(error.filename, int) else error.filename)
-    )
+    name = "a file"
+    if error.filename is not None:
+        name = repr(error.filename if isinstance(error.filename, int) else os.fsdecode(error.filename))
     return _say(
-        f"{name if len(name) < 200 else name[:100] + '...' + name[-60:]} cannot be used ({error.strerror or error}), "
+        f"{printable(name, 200)} cannot be used ({error.strerror or error}), "
         "expected a place that can; what was written before is kept",
         BAD_INPUT,
     )
@@ -158,9 +151,7 @@ def _failed_call(error: OSError) -> int:
 def _say(text: str, code: int, *, whole: bool = False) -> int:
     """Print one sentence on standard error; `whole` keeps the lines of a compiler's log."""
     if not whole:
-        if len(text) > LONGEST:
-            text = f"{text[: LONGEST - 203]}...{text[-200:]}"
-        text = "".join(c if c.isprintable() else " " if c in "\n\t" else repr(c)[1:-1] for c in text)
+        text = printable(re.sub(r"[\n\t]", " ", text), LONGEST)
     with contextlib.suppress(OSError, ValueError):
         print(f"mauvecl: {text}", file=sys.stderr, flush=True)
     return code
@@ -169,14 +160,6 @@ def _say(text: str, code: int, *, whole: bool = False) -> int:
 def _warn(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
     """Print a warning on one line, with its kind unless it is one of mauvecl's own."""
     _say(f"note: {message}" + ("" if category is UserWarning else f" ({category.__name__})"), 0)
-
-
-def _print_anything() -> None:
-    """Write characters that the terminal's encoding lacks as escapes, since names may contain any character."""
-    for stream in (sys.stdout, sys.stderr):
-        change: Callable[..., None] | None = getattr(stream, "reconfigure", None)
-        if change is not None:
-            change(errors="backslashreplace")
 
 
 def _flushed(code: int) -> int:
@@ -203,10 +186,8 @@ def _not_written(error: OSError) -> int:
 
 def _raised_by(error: BaseException) -> str:
     """Return the name of the module that raised an exception."""
-    step = error.__traceback__
-    while step is not None and step.tb_next is not None:
-        step = step.tb_next
-    return "" if step is None else str(step.tb_frame.f_globals.get("__name__", ""))
+    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+    return str(frames[-1].f_globals.get("__name__", "")) if frames else ""
 
 
 def _discard() -> None:
@@ -290,29 +271,25 @@ class Meter:
         if self._quiet or now - self._started < PATIENCE_S or now - self._shown < (0.2 if self._changes else 10.0):
             return
         self._shown = now
-        rate = self._rate(done)
-        line = f"{done} of {total} {self._unit}, {rate:.3g} a second, {self._left(done, total, rate)}{self._retries()}"
+        line = self._line(done, total)
         print(*((CLEARED, line) if self._changes else (line, "\n")), sep="", end="", file=sys.stderr, flush=True)
 
-    def _left(self, done: int, total: int, rate: float) -> str:
-        """Return the remaining time, once enough work is done to estimate it."""
-        if rate * (time.monotonic() - self._started) < TOLD_FROM * total:
-            return "time left unknown"
-        seconds = (total - done) / rate
-        for unit, size in (("days", 86_400.0), ("hours", 3600.0), ("min", 60.0)):
-            if seconds > 3 * size:
-                return f"{seconds / size:.0f} {unit} left"
-        return f"{seconds:.0f} s left"
+    def _line(self, done: int, total: int) -> str:
+        """Return the progress in words; the remaining time is estimated once enough work is done."""
+        standing = None if self.standing is None else self.standing()
+        # Parts from a checkpoint took no time.
+        resumed = standing.resumed if standing is not None and self._unit == "realisations" else 0
+        rate = (done - resumed) / max(time.monotonic() - self._started, 1e-9)
+        left = _time_left((total - done) / rate) if done - resumed >= TOLD_FROM * total else "time left unknown"
+        again = f", {standing.retries} parts counted again" if standing is not None and standing.retries else ""
+        return f"{done} of {total} {self._unit}, {rate:.3g} a second, {left}{again}"
 
-    def _rate(self, done: int) -> float:
-        """Return the work done per second, without parts from a checkpoint."""
-        resumed = self.standing().resumed if self.standing is not None and self._unit == "realisations" else 0
-        return (done - resumed) / max(time.monotonic() - self._started, 1e-9)
 
-    def _retries(self) -> str:
-        """Return a note on failed devices, if any."""
-        retries = 0 if self.standing is None else self.standing().retries
-        return f", {retries} parts counted again" if retries else ""
+def _time_left(seconds: float) -> str:
+    for unit, size in (("days", 86_400.0), ("hours", 3600.0), ("min", 60.0)):
+        if seconds > 3 * size:
+            return f"{seconds / size:.0f} {unit} left"
+    return f"{seconds:.0f} s left"
 
 
 def show(lines: Sequence[str]) -> None:
@@ -332,110 +309,87 @@ def _broken(line: str, width: int) -> str:
     )
 
 
+#: A column of a printed table: its heading and its cells.
+Printed = list[str]
+
+
 def show_view(view: View, *, wide: bool = True) -> bool:
-    """Print a table of an answer, or the sentence in its place.
+    """Print a table of an answer, or the sentence in its place, and return whether columns were left out.
 
-    Unless `wide`, a table that is too wide is printed without the columns of details.
-
-    Returns
-    -------
-    bool
-        Whether columns were left out.
+    Unless `wide`, a table that is too wide is printed without the columns of details, and first columns whose values
+    all rows share stand in the title. A `wide` table in a pipe is as wide as it needs to be.
     """
+    from rich.console import Console
+
     if view.table is None:
         show([view.title])
         return False
-    headings, cells = without_empty(*view.texts())
-    left_out = not wide and bool(view.details) and _width(headings, cells, range(len(headings))) > _room()
-    if left_out:
-        headings, cells = without_empty(*view.texts(view.details))
-    title = view.title
-    if not wide and cells and _width(headings, cells, range(len(headings))) > _room():
-        shared, others, values = _without_shared(headings, cells)
-        # The parts of a single row begin with its label.
-        if len(cells) > 1 or _width(others, values, range(len(others))) <= _room():
-            title, headings, cells = "; ".join([title, *shared]), others, values
-    show_table(title, headings, cells, wide=wide)
-    return left_out
-
-
-def _without_shared(
-    headings: Sequence[str], cells: Sequence[Sequence[str]]
-) -> tuple[list[str], list[str], list[list[str]]]:
-    """Return the values of the first columns that all rows share, and the other headings and cells.
-
-    Of a single row the first column alone counts as shared.
-    """
-    differing = (k for k, column in enumerate(zip(*cells, strict=True)) if len(set(column)) > 1)
-    first = 1 if len(cells) == 1 else next(differing, 0)
-    shared = [f"{heading} {text}" for heading, text in zip(headings[:first], cells[0], strict=False)]
-    return shared, list(headings[first:]), [list(row[first:]) for row in cells]
-
-
-def _room() -> int:
-    """Return the width of the terminal, or 80 columns where there is none."""
-    from rich.console import Console
-
-    return Console().width
-
-
-def show_table(title: str, columns: Sequence[str], cells: Sequence[Sequence[Any]], *, wide: bool = True) -> None:
-    """Print a table, in parts if the terminal is narrower; cells are text.
-
-    A `wide` table in a pipe is as wide as it needs to be.
-    """
-    from rich.console import Console
-
-    filled = list(range(len(columns)))
     # Names may contain brackets and colons, which are not markup here.
     how: dict[str, Any] = {"highlight": False, "markup": False, "emoji": False}
     console = Console(**how)
-    if wide and not console.is_terminal:
-        console = Console(**how, width=WIDEST)
+    room = WIDEST if wide and not console.is_terminal else console.width
+    title, columns = view.title, _printed(view)
+    left_out = not wide and bool(view.details) and _width(columns) > room
+    if left_out:
+        columns = _printed(view, view.details)
+    n_rows = len(columns[0]) - 1 if columns else 0
+    if not wide and n_rows and _width(columns) > room:
+        # Of a single row the first column alone counts as shared, since its parts begin with its label.
+        differing = (k for k, (_, *cells) in enumerate(columns) if len(set(cells)) > 1)
+        shared = 1 if n_rows == 1 else next(differing, 0)
+        if n_rows > 1 or _width(columns[shared:]) <= room:
+            title = "; ".join([title, *(f"{heading} {cell}" for heading, cell, *_ in columns[:shared])])
+            columns = columns[shared:]
     show([title])
-    for part in _parts(columns, cells, filled, console.width):
+    for part in _parts(columns, room):
         # A column that exceeds the terminal is printed completely.
-        Console(**how, width=max(console.width, _width(columns, cells, part))).print(_table(columns, cells, part))
+        Console(**how, width=max(room, _width(part))).print(_table(part))
+    return left_out
 
 
-def _table(columns: Sequence[str], cells: Sequence[Sequence[Any]], part: Sequence[int]) -> Table:
+def _printed(view: View, hidden: Collection[str] = ()) -> list[Printed]:
+    headings, cells = without_empty(*view.texts(hidden))
+    return list(map(list, zip(headings, *cells, strict=True)))
+
+
+def _table(columns: Sequence[Printed]) -> Table:
     from rich import box
     from rich.table import Table
 
     table = Table(box=box.SIMPLE_HEAD)
-    for i in part:
-        numeric = all(isinstance(row[i], str) and row[i][:1] in "0123456789-+.<>=" for row in cells) and bool(cells)
-        table.add_column(columns[i], justify="right" if numeric else "left", no_wrap=True)
-    for row in cells:
-        table.add_row(*(str(row[i]) for i in part))
+    for heading, *cells in columns:
+        numeric = bool(cells) and all(cell[:1] in "0123456789-+.<>=" for cell in cells)
+        table.add_column(heading, justify="right" if numeric else "left", no_wrap=True)
+    for row in zip(*(cells for _, *cells in columns), strict=True):
+        table.add_row(*row)
     return table
 
 
-def _width(columns: Sequence[str], cells: Sequence[Sequence[Any]], part: Sequence[int]) -> int:
+def _width(columns: Sequence[Printed]) -> int:
     """Return the width of a table: two blanks per column, and lines between columns and at both ends."""
     from rich.cells import cell_len
 
-    return 1 + sum(3 + max(cell_len(text) for text in (columns[i], *(str(row[i]) for row in cells))) for i in part)
+    return 1 + sum(3 + max(map(cell_len, column)) for column in columns)
 
 
-def _parts(columns: Sequence[str], cells: Sequence[Sequence[Any]], filled: list[int], room: int) -> list[list[int]]:
-    """Return the columns of each part: the first columns, which identify rows, and as many others as fit."""
-    if _width(columns, cells, filled) <= room:
-        return [filled]
+def _parts(columns: list[Printed], room: int) -> list[list[Printed]]:
+    """Divide a table: each part has the first columns, which identify rows, and as many others as fit."""
+    if _width(columns) <= room:
+        return [columns]
     # As few as needed, so that the first months are not repeated in each part.
-    apart = next((n for n in (1, 2, 3) if len({tuple(row[i] for i in filled[:n]) for row in cells}) == len(cells)), 3)
-    fitting = (filled[:n] for n in range(apart, 1, -1) if _width(columns, cells, filled[:n]) <= room / 2)
-    first = next(fitting, filled[:1])
-    together: list[list[int]] = []
-    for i in filled[len(first) :]:
-        if together and columns[i] == INTERVAL:
-            together[-1].append(i)
+    n_lines = len(columns[0])
+    apart = next((n for n in (1, 2, 3) if len(set(zip(*columns[:n], strict=True))) == n_lines), 3)
+    first = columns[: next((n for n in range(apart, 1, -1) if _width(columns[:n]) <= room / 2), 1)]
+    together: list[list[Printed]] = []
+    for column in columns[len(first) :]:
+        if together and column[0] == INTERVAL:
+            together[-1].append(column)
         else:
-            together.append([i])
-    parts = [list(first)]
+            together.append([column])
+    parts = [[*first]]
     for some in together:
-        if len(parts[-1]) > len(first) and _width(columns, cells, [*parts[-1], *some]) > room:
-            parts.append(list(first))
+        if len(parts[-1]) > len(first) and _width([*parts[-1], *some]) > room:
+            parts.append([*first])
         parts[-1] += some
     return parts
 
@@ -516,13 +470,14 @@ def name_flag(error: InputError) -> str:
     if not flags:
         # "flare amplitude" is the amplitude of a flare.
         flags = _flags(name.removeprefix("flare_"), command)
-    if not any(_gives(word, flags) for word in sys.argv[1:]):
+    given = (
+        word.partition("=")[0] == flag if flag.startswith("--") else word.startswith(flag)
+        for word in sys.argv[1:]
+        for flag in flags
+    )
+    if not any(given):
         return text
     # The key as written, which may contain blanks, after its location.
     section, _, own = re.escape(key).replace("_", "[_ ]").rpartition(r"\.")
     shown = rf"(?:{section}\.)?{own}" if section else own
     return re.sub(rf"^(?:[^:=]*: )?{shown} = ", lambda _: f"{flags[0]} ", text)
-
-
-def _gives(word: str, flags: list[str]) -> bool:
-    return any(word.partition("=")[0] == flag if flag.startswith("--") else word.startswith(flag) for flag in flags)

@@ -1,21 +1,20 @@
-"""Flags of studies: how they are read, and the study that they make."""
+"""Flags of studies and of commands: how they are declared, read, and completed in shells."""
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable, Collection, Mapping, Sequence
-from copy import copy
+import tomllib
+import warnings
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from glob import escape, glob
 from pathlib import Path
 from types import NoneType
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, get_args, get_origin
 
 import typer
 
-from mauvecl.cli.completion import OF_KEYS, complete_study
 from mauvecl.schema.fields import Flag, Help, Unit, as_typed, first, is_measure
-from mauvecl.schema.parsing import count, number, refusal, several
 
 if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
@@ -34,61 +33,123 @@ def study_argument(flags: Collection[str]) -> Any:
     return Annotated[Path | None, argument]
 
 
-DeviceFlag = Annotated[
-    str | None,
-    typer.Option(metavar="TEXT", help="OpenCL device: number or part of its name [PoCL].", show_default=False),
-]
-JsonFlag = Annotated[bool, typer.Option("--json", help="Print JSON and nothing else.")]
-QuietFlag = Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress and no file names.")]
+def option(*names: str, text: str, **how: Any) -> Any:
+    """Return an option without its default in the help text."""
+    return typer.Option(*names, help=text, show_default=False, **how)
+
+
+def output_option(usual: str) -> Any:
+    """Return the option of the output, with its default."""
+    return option("--output", "-o", metavar="PATH", text=f"Where to write [{usual}].")
+
+
+DeviceFlag = Annotated[str | None, option(metavar="TEXT", text="OpenCL device: number or part of its name [PoCL].")]
+JsonFlag = Annotated[bool, option("--json", text="Print JSON and nothing else.")]
+QuietFlag = Annotated[bool, option("--quiet", "-q", text="Print no progress and no file names.")]
 SetFlag = Annotated[
     list[str] | None,
-    typer.Option(
-        "--set", metavar="TEXT", help="Any key of the study, as in run.fap=0.01; may be repeated.", show_default=False
-    ),
+    option("--set", metavar="TEXT", text="Any key of the study, as in run.fap=0.01; may be repeated."),
 ]
-
-
 PaperFlag = Annotated[
     bool,
-    typer.Option(
-        "--paper", help="Ask with the conventions of the MauveSim paper: dark drawn in DN, all but the noise known."
+    option(
+        "--paper", text="Ask with the conventions of the MauveSim paper: dark drawn in DN, all but the noise known."
     ),
 ]
+#: Key of a context that shows all flags.
+SHOWS_ALL = "mauvecl.help_all"
 
 
-def study_flags(*keys: str, defaults: Mapping[str, Any]) -> dict[str, Keyword]:
-    """Return keywords whose types have the options of the command line, by the names of their parameters.
+def _show_all(context: typer.Context, wanted: bool) -> None:
+    if wanted:
+        context.meta[SHOWS_ALL] = True
+        print(context.get_help())
+        raise typer.Exit
 
-    Parameters
-    ----------
-    *keys : str
-        Keys and sections such as ``"observation.exposure_s"`` or ``"flare"``.
-    defaults : mapping
-        Defaults of a verb that differ from the study's, by key.
+
+HELP_ALL = option("--help-all", callback=_show_all, is_eager=True, text="Show all flags and exit.")
+ReplaceFlag = Annotated[bool, option("--replace", text="Replace an existing entry of that name.")]
+
+
+@dataclass(eq=False, kw_only=True)
+class Options:
+    """Values of a call that are no keys of a study, each with its flag."""
+
+    output: Path | None = None  # where everything is written; its flag states the default of the command
+    as_json: JsonFlag = False
+    quiet: QuietFlag = False
+    wide: Annotated[bool, option("--wide", text="Show all columns of tables, however wide they are.")] = False
+    pictures: Annotated[bool, typer.Option("--pictures/--no-pictures", help="Draw pictures (needs mauvecl[plot]).")] = (
+        True
+    )
+    device: Annotated[
+        str | None,
+        option("--device", text="OpenCL device: number or part of its name [PoCL; 0,1 for several together]."),
+    ] = None
+    cluster: Annotated[
+        str | None,
+        option(
+            "--cluster",
+            text="Draw on Dask workers: local:N, tcp://host:8786, or a scheduler file (needs mauvecl[cluster]).",
+        ),
+    ] = None
+    resume: Annotated[bool, option("--resume", text="Continue the unfinished run in the output folder.")] = False
+    restart: Annotated[bool, option("--restart", text="Discard the unfinished run in the output folder.")] = False
+    insist: Annotated[
+        bool,
+        option("--insist", text="Run even if the estimated time exceeds a year, or the files the free disk space."),
+    ] = False
+
+
+#: Options of verbs that can be resumed and draw no realisations, and of those that draw.
+RESUMING = ("resume", "restart")
+WORKERS = ("device", "cluster", *RESUMING, "insist")
+
+
+class StudyFlag(NamedTuple):
+    """Flag of a key of the study."""
+
+    keyword: Keyword
+    annotation: Any  # for typer, which leaves numbers as text, so that messages have one style
+    read: Callable[[Any], Any] | None  # converts texts of numbers
+
+
+def study_flags(*keys: str, defaults: Mapping[str, Any]) -> dict[str, StudyFlag]:
+    """Return flags by the names of their parameters, for keys and sections such as ``"observation.exposure_s"``.
+
+    `defaults` holds defaults of a verb that differ from the study's, by key.
     """
     # `mauvecl --help` shows no flags, and starts twice as fast without importing the study.
+    from mauvecl.schema.section import read_count, read_number, read_several
     from mauvecl.study.keywords import Keyword
     from mauvecl.study.study import keys_of
 
-    flags: dict[str, Keyword] = {}
+    flags = {}
     for path, field, flag in keys_of(keys):
         keyword = Keyword.of(path, field, flag)
-        option = typer.Option(
+        each = get_args(keyword.kind)[0] if keyword.many else keyword.kind
+        kind, metavar = keyword.kind, {str: "TEXT", Path: "FILE"}.get(each)
+        read: Callable[[Any], Any] | None = None
+        if each in (float, int):
+            kind, metavar = list[str] if keyword.many else str, "NUMBER" if each is float else "INTEGER"
+            one: Callable[..., Any] = partial(read_number, unit=keyword.unit) if each is float else read_count
+            name = flag.names[0]
+            read = partial(read_several, name=name, read=one) if keyword.many else partial(one, name=name)
+        made = option(
             *flag.names,
-            help=_help(path, field, flag, keyword.kind, defaults),
-            show_default=False,
+            text=_help(path, field, flag, keyword.kind, defaults),
             rich_help_panel=path.partition(".")[0].capitalize(),
-            autocompletion=OF_KEYS.get(path),
-            metavar={str: "TEXT", list[str]: "TEXT", Path: "FILE"}.get(keyword.kind),
+            autocompletion=COMPLETIONS.get(path),
+            metavar=f"{metavar},..." if read and keyword.many else metavar,
         )
-        flags[keyword.name] = keyword._replace(kind=Annotated[keyword.kind | None, option])
+        flags[keyword.name] = StudyFlag(keyword, Annotated[kind | None, made], read)
     return flags
 
 
 def option_of(key: str) -> Any:
     """Return the option of a key's flag, for a verb without a study."""
     (flag,) = study_flags(key, defaults={}).values()
-    return get_args(flag.kind)[1]
+    return get_args(flag.annotation)[1]
 
 
 def _help(path: str, field: FieldInfo, flag: Flag, kind: Any, defaults: Mapping[str, Any]) -> str:
@@ -99,15 +160,11 @@ def _help(path: str, field: FieldInfo, flag: Flag, kind: Any, defaults: Mapping[
     text = help.text + (f": {choices}" if choices else "") + (f", {unit.written}" if unit else "")
     text += (f", {help.more}" if help.more else "") + ("; may be repeated" if get_origin(kind) is list else "")
     if path in defaults:
-        default = (
-            f"{defaults[path]:g}, or the study's"
-            if isinstance(defaults[path], float)
-            else (f"{defaults[path]}, or the study's")
-        )
+        default = f"{as_typed(defaults[path])}, or the study's"
+    elif help.default or flag.help or kind is bool:
+        default = help.default
     else:
-        default = help.default or (
-            "" if flag.help or kind is bool else as_typed(field.get_default(call_default_factory=True))
-        )
+        default = as_typed(field.get_default(call_default_factory=True))
     return text + (f" [{default}]" if default else "") + "."
 
 
@@ -118,53 +175,6 @@ def _words(annotation: Any) -> str:
         return f"{', '.join(others)} or {last}"
     inner = [part for part in get_args(annotation) if part not in (NoneType, ...)]
     return _words(inner[0]) if len(inner) == 1 else ""
-
-
-def output_flag(usual: str) -> Any:
-    """Return the option of the output, with its default."""
-    return Annotated[
-        Path | None,
-        typer.Option("--output", "-o", metavar="PATH", help=f"Where to write [{usual}].", show_default=False),
-    ]
-
-
-def _option(*names: str, text: str, **how: Any) -> Any:
-    return typer.Option(*names, help=text, show_default=False, **how)
-
-
-@dataclass(eq=False, kw_only=True)
-class Options:
-    """Values of a call that are no keys of a study, each with its flag."""
-
-    output: Path | None = None  # where everything is written; its flag states the default of the command
-    as_json: JsonFlag = False
-    quiet: QuietFlag = False
-    wide: Annotated[bool, _option("--wide", text="Show all columns of tables, however wide they are.")] = False
-    pictures: Annotated[bool, typer.Option("--pictures/--no-pictures", help="Draw pictures (needs mauvecl[plot]).")] = (
-        True
-    )
-    device: Annotated[
-        str | None,
-        _option("--device", text="OpenCL device: number or part of its name [PoCL; 0,1 for several together]."),
-    ] = None
-    cluster: Annotated[
-        str | None,
-        _option(
-            "--cluster",
-            text="Draw on Dask workers: local:N, tcp://host:8786, or a scheduler file (needs mauvecl[cluster]).",
-        ),
-    ] = None
-    resume: Annotated[bool, _option("--resume", text="Continue the unfinished run in the output folder.")] = False
-    restart: Annotated[bool, _option("--restart", text="Discard the unfinished run in the output folder.")] = False
-    insist: Annotated[
-        bool,
-        _option("--insist", text="Run even if the estimated time exceeds a year, or the files the free disk space."),
-    ] = False
-
-
-#: Options of verbs that can be resumed and draw no realisations, and of those that draw.
-RESUMING = ("resume", "restart")
-WORKERS = ("device", "cluster", *RESUMING, "insist")
 
 
 def is_star(given: Path) -> bool:
@@ -186,8 +196,6 @@ def is_star(given: Path) -> bool:
 
 def _is_toml(file: Path) -> bool:
     """Return whether a file contains TOML, that is a study, regardless of its name."""
-    import tomllib
-
     from mauvecl.host.tables.files import read_bytes
 
     try:
@@ -209,48 +217,64 @@ def holds_study(file: Path) -> bool:
 
 def warn_of_percent(texts: Sequence[str]) -> None:
     """Warn of amplitudes that look like a percentage without its sign."""
-    import warnings
+    from mauvecl.schema.section import read_number
 
     for text in (word.strip() for texts_of_flag in texts for word in texts_of_flag.split(",")):
-        if not is_measure(text) and number(text, "--amplitude") >= 1:
+        if not is_measure(text) and read_number(text, "--amplitude") >= 1:
             warnings.warn(
                 f"--amplitude {text} is a rise of {100 * float(text):g} %; --amplitude {text}% is one of {text} %",
                 stacklevel=2,
             )
 
 
-def as_text(parameter: inspect.Parameter, unit: str = "") -> tuple[inspect.Parameter, Callable[[Any], Any] | None]:
-    """Return an option of which numbers are taken as text, so that messages have one style, and its reader if any.
+def whole(text: str, flag: str, low: int, high: int) -> int:
+    """Read a whole number between two ends."""
+    from mauvecl.schema.section import read_count, refusal
 
-    Parameters
-    ----------
-    unit : str
-        Unit to which numbers with another one are converted.
-    """
-    if get_origin(parameter.annotation) is not Annotated:
-        return parameter, None
-    wanted, option, *_ = get_args(parameter.annotation)
-    (inner, *_) = [kind for kind in (get_args(wanted) or (wanted,)) if kind is not NoneType]
-    many = get_origin(inner) is list or get_origin(wanted) is list
-    each = get_args(inner)[0] if get_origin(inner) is list else inner
-    if each not in (float, int):
-        return parameter, None
-    option, low, high = copy(option), option.min, option.max
-    option.min = option.max = None
-    option.metavar = ("NUMBER" if each is float else "INTEGER") + (",..." if many else "")
-    named = (flag for flag in option.param_decls or () if flag.startswith("--"))
-    flag = next(named, "--" + parameter.name.replace("_", "-"))
-    read = partial(within, read=partial(number, unit=unit) if each is float else count, low=low, high=high)
-    texts: Any = list[str] if many else str
-    default = None if parameter.default is None else f"{parameter.default:g}"
-    taken = parameter.replace(annotation=Annotated[texts | None, option], default=default)
-    return taken, partial(several, name=flag, read=read) if many else partial(read, flag=flag)
-
-
-def within(text: str, flag: str, *, read: Callable[[str, str], Any], low: float | None, high: float | None) -> Any:
-    """Read a number between two ends, either of which may be missing."""
-    value = read(text, flag)
-    if (low is not None and not value >= low) or (high is not None and not value <= high):
-        reach = f"at least {low:g}" if high is None else f"{low:g} to {high:g}"
-        raise refusal(flag, text, reach)
+    value = read_count(text, flag)
+    if not low <= value <= high:
+        raise refusal(flag, text, f"{low:g} to {high:g}")
     return value
+
+
+def complete_star(incomplete: str) -> list[str]:
+    """Return names of stars, and files, that continue the last of the stars with commas between them."""
+    from mauvecl.host.stars.library import EXAMPLES, all_names, kept
+
+    before, comma, last = incomplete.rpartition(",")
+    # Shells take a blank for the end of a word; names are known without blanks.
+    names = [name.replace(" ", "") for name in all_names() if name not in EXAMPLES]
+    names += [star.name for star in kept() if " " not in star.name]
+    return [f"{before}{comma}{word}" for word in (*_continued(last, names), *_files(last))]
+
+
+def complete_instrument(incomplete: str) -> list[str]:
+    """Return names of instruments, and TOML files."""
+    from mauvecl.host.instrument import shipped_names
+
+    return [*_continued(incomplete, shipped_names()), *_files(incomplete, (".toml",))]
+
+
+def complete_study(incomplete: str) -> list[str]:
+    """Return files, and names of stars if something is typed."""
+    return complete_star(incomplete) if incomplete else _files(incomplete)
+
+
+#: Functions that complete values, by the keys of flags. Shells complete files by themselves where nothing else is
+#: offered, so only names bring their files along.
+COMPLETIONS = {
+    "star.library": complete_star, "star.extend": complete_star, "change.extend": complete_star,
+    "observation.instrument": complete_instrument,
+}  # fmt: skip
+
+
+def _continued(typed: str, names: Iterable[str]) -> list[str]:
+    """Return the names that begin with a text in any case, with the text as it was typed."""
+    return [typed + name[len(typed) :] for name in names if name.casefold().startswith(typed.casefold())]
+
+
+def _files(typed: str, endings: Sequence[str] = ()) -> list[str]:
+    """Return the files and folders that begin with a text."""
+    found = sorted(glob(escape(typed) + "*"))
+    folders = [f"{path}/" for path in found if Path(path).is_dir()]
+    return [*folders, *(p for p in found if not Path(p).is_dir() and (not endings or p.endswith(tuple(endings))))]

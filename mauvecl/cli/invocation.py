@@ -14,17 +14,13 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-from mauvecl.cli.console import writes_to
+from mauvecl.cli.console import Meter, show, show_view, with_flags, writes_to
 from mauvecl.cli.flags import Options
-from mauvecl.schema.errors import InputError, of_kind
+from mauvecl.schema.errors import InputError, of_kind, reworded
 
 if TYPE_CHECKING:
-    from astropy.table import Table
-
     from mauvecl.answers.answer import Answer
-    from mauvecl.cli.console import Meter
     from mauvecl.device.build import Device
-    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.runs.checkpoint import Checkpoint
     from mauvecl.runs.pool import Pool, Workers
     from mauvecl.runs.store import Store
@@ -38,13 +34,7 @@ MOST_REALISATIONS = 2**63 - 1
 
 
 def question_values(study: Study, *, detects: bool) -> None:
-    """Raise InputError for values that a later step would reject.
-
-    Parameters
-    ----------
-    detects : bool
-        Whether the verb needs flares and thresholds.
-    """
+    """Raise InputError for values that a later step would reject; a verb that `detects` needs flares and thresholds."""
     from mauvecl.detection.names import check_fap, check_statistic
     from mauvecl.host.instrument import instrument_path
     from mauvecl.host.stars.library import known_band, spectrum_name
@@ -151,8 +141,6 @@ class Session(Options):
 
         Raises InputError if a file of the answer could not be written; the answer is printed before.
         """
-        from mauvecl.schema.errors import reworded
-
         self._held.close()
         if kind is None and self._lost:
             others = f"; the same holds for {len(self._lost) - 1} more files of this answer" if self._lost[1:] else ""
@@ -173,10 +161,7 @@ class Session(Options):
     def pool(self, *, unit: str = "realisations") -> Iterator[Pool]:
         """Yield the pool of workers, with progress and a checkpoint; interruptions are reported.
 
-        Parameters
-        ----------
-        unit : str
-            Unit of progress: realisations, which the pool reports, or items that the caller reports to `meter`.
+        The pool reports its progress in realisations; the caller reports that in another unit to `meter`.
         """
         from mauvecl.runs.pool import Pool
 
@@ -219,8 +204,6 @@ class Session(Options):
 
     def metered(self, unit: str) -> Meter:
         """Return the progress in a unit, for a `with` block."""
-        from mauvecl.cli.console import Meter
-
         return Meter(quiet=self.quiet or self.as_json, unit=unit)
 
     def _kept(self, checkpoint: Checkpoint) -> str:
@@ -232,59 +215,17 @@ class Session(Options):
 
     def say(self, lines: Sequence[str]) -> None:
         """Print messages, unless standard output is reserved for JSON."""
-        from mauvecl.cli.console import show, with_flags
-
         if lines and not self.as_json:
             show([with_flags(line) for line in lines])
 
-    @cached_property
-    def draws_pictures(self) -> bool:
-        """Return whether to draw pictures; print a message if matplotlib is missing."""
-        from mauvecl.charts.matplotlib import available
-
-        if self.pictures and not available():
-            if not self.quiet:
-                self.say(["No pictures: matplotlib is missing, `pip install 'mauvecl[plot]'` brings it."])
-            return False
-        return self.pictures
-
-    def write(self, table: Table, name: str) -> None:
-        """Write a table to the folder, in the format of its file extension."""
-        from mauvecl.answers.answer import write_table
-
-        self.leave(lambda: write_table(table, self.folder / name))
-
-    def _document(self, name: str, content: Callable[[], bytes]) -> Path:
-        from mauvecl.answers.answer import write_document
-
-        return write_document(content(), self.folder / name)
-
     def leave(self, write: Callable[[], Path | Sequence[Path]]) -> None:
         """Write files; failures are reported at the end, after the answer is printed."""
-        from mauvecl.schema.errors import InputError
-
         try:
             made = write()
         except InputError as error:
             self._lost.append(error)
             return
         self.files += [made] if isinstance(made, Path) else made
-
-    def record(self, study: Study, inputs: Sequence[Expectation], messages: Sequence[str]) -> None:
-        """Write the study and the run record to the folder, and remove the checkpoint."""
-        from mauvecl.answers.answer import write_record, write_study
-
-        if self.folder / "study.toml" not in self.files:
-            self.leave(lambda: write_study(study.toml(), self.folder))
-        seconds = time.perf_counter() - self.started
-        pool = self._pool
-        how: dict[str, Any] = {"pool": pool, "opened": self.opened, "seconds": seconds, "messages": messages}
-        # Only a complete answer replaces another's files.
-        how |= {"files": self.files, "whole": not self._lost}
-        data = study.model_dump(mode="json", exclude_none=True)
-        self.leave(lambda: write_record(self.verb, data, inputs, self.folder, **how))
-        if self._checkpoint is not None and not self._lost:
-            self._checkpoint.forget()
 
     def ask(self) -> Any:
         """Return the answer of the session's verb to its study; a pool draws if the verb counts something."""
@@ -301,22 +242,20 @@ class Session(Options):
         with report_interrupts(self._written):
             self._leave_all(answer)
         if self.as_json:
-            from mauvecl.cli.console import with_flags
-
             content = answer.as_json()
             said = [with_flags(line) for line in (*self._notes_on(answer), *content["messages"])]
             remarks = {"headline": answer.headline, "assumed": answer.assumed, "messages": said}
             self.print_json(remarks | {key: value for key, value in content.items() if key != "messages"})
             return
-        from mauvecl.cli.console import show_view
-
         self.say([answer.headline])
         left_out = [show_view(view, wide=self.wide) for view in answer.all_views]
         self.say(["Assumed:", *(f"  {clause}" for clause in answer.premises)])
         self.say([*self._notes_on(answer), *answer.messages, *answer.remarks])
         if any(left_out):
             self.say(["Tables are shown without details: `--wide` shows all columns, and the files hold them."])
-        self.finish()
+        if self.files and not self.quiet:
+            names = ", ".join(path.name for path in self.files)
+            self.say([f"Wrote {names} to {self.folder}/ in {time.perf_counter() - self.started:.1f} s."])
 
     def _notes_on(self, answer: Answer) -> list[str]:
         """Return the notes of the session, without that on sampled thresholds where the answer has its own."""
@@ -324,15 +263,30 @@ class Session(Options):
         return [note for note in self.notes if note not in told]
 
     def _leave_all(self, answer: Answer) -> None:
-        """Write tables, documents and pictures of an answer, then the run record."""
+        """Write tables, documents and pictures of an answer, its study and the run record; remove the checkpoint."""
+        from mauvecl.answers.answer import write_document, write_record, write_study, write_table
+        from mauvecl.charts.matplotlib import available
+
         for name, table in answer.files.items():
-            self.write(table, name)
+            self.leave(partial(write_table, table, self.folder / name))
         for name, content in answer.documents.items():
-            self.leave(partial(self._document, name, content))
-        if self.draws_pictures:
+            self.leave(partial(write_document, content, self.folder / name))
+        if self.pictures and available():
             for name, draw in answer.pictures.items():
                 self.leave(partial(draw, self.folder / f"{name}.png"))
-        self.record(answer.study, answer.inputs, [*answer.messages, *answer.remarks])
+        elif self.pictures and not self.quiet:
+            self.say(["No pictures: matplotlib is missing, `pip install 'mauvecl[plot]'` brings it."])
+        study = answer.study
+        if self.folder / "study.toml" not in self.files:
+            self.leave(lambda: write_study(study.toml(), self.folder))
+        seconds, messages = time.perf_counter() - self.started, [*answer.messages, *answer.remarks]
+        how: dict[str, Any] = {"pool": self._pool, "opened": self.opened, "seconds": seconds, "messages": messages}
+        # Only a complete answer replaces another's files.
+        how |= {"files": self.files, "whole": not self._lost}
+        data = study.model_dump(mode="json", exclude_none=True)
+        self.leave(lambda: write_record(self.verb, data, answer.inputs, self.folder, **how))
+        if self._checkpoint is not None and not self._lost:
+            self._checkpoint.forget()
 
     def _written(self) -> str:
         """Describe what an interruption leaves while files are written."""
@@ -346,12 +300,6 @@ class Session(Options):
         from mauvecl.host.tables.files import json_text
 
         print(json_text(content))
-
-    def finish(self) -> None:
-        """Print the names of the written files."""
-        if self.files and not self.quiet:
-            names = ", ".join(path.name for path in self.files)
-            self.say([f"Wrote {names} to {self.folder}/ in {time.perf_counter() - self.started:.1f} s."])
 
 
 @contextmanager

@@ -229,7 +229,6 @@ class PointingDrifts(Section):
             place=2,
             name="pointing_depth",
             unit="%",
-            scale=100.0,
         ),
     ] = 0.5
 

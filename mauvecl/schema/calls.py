@@ -23,7 +23,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_
 from pydantic_core import CoreSchema, PydanticCustomError, SchemaValidator, ValidationError, core_schema
 
 from mauvecl.schema.errors import InputError, shown
-from mauvecl.schema.fields import is_quantity, is_truth, without_unit
+from mauvecl.schema.fields import is_quantity, is_truth, or_error, without_unit
 
 #: Place of an error inside an alternative of a union.
 ALTERNATIVE = "|"
@@ -74,8 +74,7 @@ def schema_of(hint: Any) -> CoreSchema:
 
 def _leaf(take: Callable[[Any], Any], words: str) -> CoreSchema:
     """Return the schema of a function's argument, whose errors state the accepted values."""
-    schema = core_schema.no_info_plain_validator_function(take)
-    return core_schema.custom_error_schema(schema, "expected", custom_error_message=f"Input should be {words}")
+    return or_error(core_schema.no_info_plain_validator_function(take), words)
 
 
 def _number(value: Any) -> float:
@@ -159,12 +158,11 @@ LEAVES: dict[Any, tuple[Callable[[Any], Any], str]] = {
 
 def _sequence(origin: Any, args: tuple[Any, ...]) -> CoreSchema:
     items = [schema_of(kind) for kind in args if kind is not ...]
-    if origin is list:
-        return core_schema.no_info_before_validator_function(_items, core_schema.list_schema(items[0]))
     if origin is tuple and ... not in args:
         schema = core_schema.tuple_positional_schema(items)
         return core_schema.no_info_before_validator_function(partial(_items, size=len(items)), schema)
-    return core_schema.no_info_before_validator_function(_items, core_schema.tuple_variable_schema(items[0]))
+    some = core_schema.list_schema(items[0]) if origin is list else core_schema.tuple_variable_schema(items[0])
+    return core_schema.no_info_before_validator_function(_items, some)
 
 
 def _instance(kind: type) -> CoreSchema:
@@ -172,11 +170,7 @@ def _instance(kind: type) -> CoreSchema:
         # Methods of a protocol are checked when they are called.
         return core_schema.any_schema()
     article = "an" if kind.__name__[0] in "AEIOU" else "a"
-    return core_schema.custom_error_schema(
-        core_schema.is_instance_schema(kind),
-        "expected",
-        custom_error_message=f"Input should be {article} {kind.__name__}",
-    )
+    return or_error(core_schema.is_instance_schema(kind), f"{article} {kind.__name__}")
 
 
 def _origin(hint: Any) -> Any:

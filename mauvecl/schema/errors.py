@@ -97,18 +97,7 @@ class InputError(ValueError):
     def of(cls, key: str, value: Any, expected: str, *, unit: str = "", where: str = "") -> InputError:
         """Return the error of one value: ``where: key = value unit, expected this``.
 
-        Parameters
-        ----------
-        key : str
-            The parameter or key. Words such as "flare amplitude" name the parameter `flare_amplitude`.
-        value : object
-            Shown on one line, shortened.
-        expected : str
-            What is accepted.
-        unit : str, optional
-            Unit of a plain number.
-        where : str, optional
-            File or section that holds the value.
+        Words such as "flare amplitude" name the parameter `flare_amplitude`; the value is shown on one line, shortened.
         """
         place, after = f"{where}: " if where else "", f" {unit}" if unit else ""
         return cls(f"{place}{key} = {shown(value)}{after}", expected, key=key.replace(" ", "_"))

@@ -139,7 +139,7 @@ class Unit:
         from pydantic_core import core_schema
 
         schema = core_schema.no_info_before_validator_function(self.plain, handler(source))
-        return _or_error(schema, word_of(self.name), unit=self.name)
+        return or_error(schema, word_of(self.name), unit=self.name)
 
     def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> Any:
         return _or_text(handler(schema))
@@ -175,7 +175,7 @@ class Range:
             schema = core_schema.no_info_before_validator_function(
                 lambda value: Unit("").plain(value) if isinstance(value, str) else value, schema
             )
-        return _or_error(schema, self.words(unit, whole=int in (source, *get_args(source))), unit=unit)
+        return or_error(schema, self.words(unit, whole=int in (source, *get_args(source))), unit=unit)
 
     def __contains__(self, value: Any) -> bool:
         if not math.isfinite(value) or not self.low <= value <= self.high:
@@ -284,10 +284,10 @@ class OneOrMore:
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         from pydantic_core import core_schema
 
-        return core_schema.no_info_before_validator_function(self._listed, handler(source))
+        def listed(value: Any) -> Any:
+            return (value,) if isinstance(value, self.item) else value
 
-    def _listed(self, value: Any) -> Any:
-        return (value,) if isinstance(value, self.item) else value
+        return core_schema.no_info_before_validator_function(listed, handler(source))
 
 
 class OrNone:
@@ -299,7 +299,7 @@ class OrNone:
         inner = handler(source)
         schema = core_schema.no_info_before_validator_function(self._or_none, inner)
         expected = str(inner.get("custom_error_message", "")).removeprefix("Input should be ")
-        return _or_error(schema, f"{expected or 'a number'}, or none")
+        return or_error(schema, f"{expected or 'a number'}, or none")
 
     def _or_none(self, value: Any) -> Any:
         return None if isinstance(value, str) and value.strip().lower() == "none" else value
@@ -317,7 +317,7 @@ def _or_text(schema: dict[str, Any]) -> dict[str, Any]:
     return schema | items | several
 
 
-def _or_error(schema: CoreSchema, words: str, **metadata: str) -> CoreSchema:
+def or_error(schema: CoreSchema, words: str, **metadata: str) -> CoreSchema:
     """Replace every error of a schema by a statement of the accepted values."""
     from pydantic_core import core_schema
 
@@ -340,18 +340,10 @@ class Help:
 
 
 class Flag:
-    """Flag of the command line that sets a field.
+    """Flag of the command line that sets a field; the first of its names is its parameter.
 
-    Parameters
-    ----------
-    *names : str
-        As in ``"--exposure", "-t"``; the first is the flag's parameter.
-    kind : type, optional
-        Type of the flag's value; that of the field by default.
-    read : callable, optional
-        Function that converts the flag's value to the field's; also receives the flag's name, for messages.
-    help : Help, optional
-        Description, if it differs from the field's.
+    `kind` is the type of its value, by default that of the field; `read` converts the value to that of the field and
+    also receives the flag's name, for messages. `help` describes the flag if it differs from the field.
     """
 
     def __init__(
@@ -400,7 +392,6 @@ class Widget:
     first: str | None = None  # text of a new page; the default of the key by default
     choices: tuple[str, ...] = ()  # accepted words; those of the key by default
     unit: str | None = None  # unit as the page shows it; that of the key by default
-    scale: float = 1.0  # factor from the value of the key to that of the page
     most: float | None = None  # largest value that a server computes for a visitor; that of the key by default
     # "day" for a calendar, "library" for a name of the library, "table" for a text of several lines, "file" for a
     # spectrum, "upload" for a file as it is; by default a field of text, or a choice of words.
@@ -408,6 +399,11 @@ class Widget:
     slider: Slider | None = None
     suggestions: tuple[str, ...] = ()  # texts that the page offers for a field of text
     placeholder: str = ""  # what an empty field stands for, or an example; a slider stands at the number it begins with
+
+    @property
+    def scale(self) -> float:
+        """Factor from the value of the key to that of the page."""
+        return 100.0 if self.unit == "%" else 1.0
 
 
 def found(kind: Any, of: type[Metadata]) -> list[Metadata]:

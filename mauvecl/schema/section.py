@@ -1,9 +1,10 @@
-"""Records and sections of a study, validated by pydantic, with errors in one style, and their reference."""
+"""Records and sections of a study: validation with errors in one style, their reference, readers of written values."""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from decimal import Decimal, InvalidOperation
 from functools import cache
 from pathlib import Path
 from types import NoneType, UnionType
@@ -21,7 +22,20 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError, PydanticUndefined
 
 from mauvecl.schema.errors import InputError, shortened, shown, together
-from mauvecl.schema.fields import Flag, Help, Range, Unit, as_typed, first, found, is_quantity, is_truth, numbers
+from mauvecl.schema.fields import (
+    Flag,
+    Help,
+    Range,
+    Unit,
+    as_typed,
+    first,
+    found,
+    is_measure,
+    is_quantity,
+    is_truth,
+    numbers,
+    with_unit,
+)
 
 if TYPE_CHECKING:
     from pydantic._internal._model_construction import ModelMetaclass
@@ -251,28 +265,22 @@ class Key(NamedTuple):
 
 def keys_of(section: type[BaseModel]) -> list[Key]:
     """Return the reference of every key of a section and of the sections in it, in the order of their declaration."""
-    return [
-        Key(
-            ".".join(path),
-            _meaning(first(field, Help)),
-            _accepted(field.annotation, (first(field, Unit) or Unit("")).name, first(field, Range)),
-            _default(field, first(field, Help)),
-            ", ".join(name for flag in found(field, Flag) for name in flag.names),
-        )
-        for path, field in fields_of(section)
-        if first(field, Help) is not None
-    ]
+    keys = []
+    for path, field in fields_of(section):
+        if (help := first(field, Help)) is None:
+            continue
+        meaning = help.text + (f": {help.choices}" if help.choices else "") + (f", {help.more}" if help.more else "")
+        accepted = _accepted(field.annotation, (first(field, Unit) or Unit("")).name, first(field, Range) or Range())
+        value = field.get_default(call_default_factory=True)
+        default = help.default or ("required" if value is PydanticUndefined else _text(value))
+        flags = ", ".join(name for flag in found(field, Flag) for name in flag.names)
+        keys.append(Key(".".join(path), meaning, accepted, default, flags))
+    return keys
 
 
-def _meaning(help: Help | None) -> str:
-    if help is None:
-        return ""
-    return help.text + (f": {help.choices}" if help.choices else "") + (f", {help.more}" if help.more else "")
-
-
-def _accepted(annotation: Any, unit: str, reach: Range | None) -> str:
+def _accepted(annotation: Any, unit: str, reach: Range) -> str:
     """Describe the values of a type in words."""
-    inner, parts = annotation, get_args(annotation)
+    parts = get_args(annotation)
     if get_origin(annotation) is Annotated:
         return _accepted(parts[0], unit, reach)
     if get_origin(annotation) in (Union, UnionType):
@@ -286,19 +294,139 @@ def _accepted(annotation: Any, unit: str, reach: Range | None) -> str:
         return f"table of {_accepted(parts[1], unit, reach)}"
     if model_in(annotation) is not None:
         return "table"
-    if inner in (float, int):
-        return (reach or Range()).words(unit, whole=inner is int)
-    return {str: "text", bool: "true or false", Path: "path"}.get(inner, "file")
-
-
-def _default(field: Any, help: Help | None) -> str:
-    if help is not None and help.default:
-        return help.default
-    value = field.get_default(call_default_factory=True)
-    return "required" if value is PydanticUndefined else _text(value)
+    if annotation in (float, int):
+        return reach.words(unit, whole=annotation is int)
+    return {str: "text", bool: "true or false", Path: "path"}.get(annotation, "file")
 
 
 def _text(value: Any) -> str:
     if isinstance(value, tuple):
         return f"[{', '.join(map(_text, value))}]"
     return as_typed(value)
+
+
+# Readers of values that are written as text, as on the command line; each receives the value's name for messages.
+
+
+def refusal(name: str, text: str, expected: str, more: str = "") -> InputError:
+    """Return the error of a value's text; its key is the parameter that a flag sets, or else the value's name."""
+    parameter = name.split()[0].strip("-").replace("-", "_")
+    return InputError(f"{name} {shortened(text)}{more}", expected, key=parameter)
+
+
+def read_number(text: str, name: str, unit: str = "") -> float:
+    """Read a number in a unit, which may be followed by another one, as in "10 min" or "24%"."""
+    try:
+        value = with_unit(text, unit)
+        return float(text) if value is None else value
+    except ValueError as error:
+        accepted = f" in {Unit(unit).written}, or in a unit of the same kind" if unit else ""
+        raise refusal(name, text, f"a number{accepted}") from error
+
+
+def read_count(text: str, name: str) -> int:
+    """Read a whole number, also in the form 1e6."""
+    try:
+        exact = Decimal(text)
+        # Writing out more digits than any count has would take forever.
+        whole = int(exact) if exact.is_finite() and exact.adjusted() < 40 else None
+    except InvalidOperation:
+        exact, whole = Decimal(0), None
+    if whole is None or whole != exact:
+        raise refusal(name, text, "a whole number, such as 1000000 or 1e6")
+    return whole
+
+
+def read_several(texts: Sequence[str], name: str, read: Callable[[str, str], Any]) -> list[Any]:
+    """Read values from several texts, each with one value or values with commas between them."""
+    return [read(word.strip(), name) for text in texts for word in text.split(",")]
+
+
+def read_words(texts: Sequence[str], name: str) -> list[str]:
+    """Read names from several texts, each with one name or names with commas between them."""
+    return read_several(texts, name, lambda word, _: word)
+
+
+def read_axis(text: str, name: str) -> dict[str, Any]:
+    """Read an axis: magnitude:4:10:16, amplitude:0.01:1:16:log, or exposure=5,50,600."""
+    if "=" in text:
+        quantity, _, values = text.partition("=")
+        parts = [part.strip() for part in values.split(",")]
+        try:
+            return {"quantity": quantity, "values": parts if quantity == "star" else list(map(_measure, parts))}
+        except ValueError as error:
+            raise refusal(name, text, f"numbers, such as {quantity}=5,50,600") from error
+    parts = text.split(":")
+    try:
+        quantity, start, stop, steps, *rest = parts
+        spaced = {"quantity": quantity, "start": _measure(start), "stop": _measure(stop), "steps": int(steps)}
+    except ValueError as error:
+        raise refusal(name, text, "quantity:start:stop:steps, the same with :log, or quantity=a,b,c") from error
+    if rest not in ([], ["log"]):
+        raise refusal(name, text, "log or nothing", f" ends in {':'.join(rest)!r}")
+    return spaced | {"log": bool(rest)}
+
+
+def _measure(text: str) -> float | str:
+    """Read a number; return a text with a unit unchanged, since the axis converts it."""
+    return text if is_measure(text) else float(text)
+
+
+def read_axes(texts: Sequence[str], name: str) -> list[dict[str, Any]]:
+    """Read several axes."""
+    return [read_axis(text, name) for text in texts]
+
+
+def read_assignment(text: str, name: str, expected: str) -> tuple[str, str]:
+    """Read a name and its value, with an equals sign between them."""
+    key, _, value = (part.strip() for part in text.rpartition("="))
+    if not (key and value):
+        raise refusal(name, text, expected)
+    return key, value
+
+
+def read_line_fluxes(texts: Sequence[str], name: str) -> dict[str, float]:
+    """Read fluxes of emission lines, such as 'Mg II=0.05'."""
+    lines = {}
+    for text in texts:
+        line, value = read_assignment(text, name, "NAME=FLUX, such as 'Mg II=0.05'")
+        lines[line] = read_number(value, f"{name} {shortened(text)}:")
+    return lines
+
+
+def read_gaps(texts: Sequence[str], name: str) -> list[tuple[float, float]]:
+    """Read ranges of time such as 1000:2000."""
+    return [_pair(text, name, "two times in s, such as 1000:2000", "s") for text in texts]
+
+
+def read_wavelengths(texts: Sequence[str], name: str) -> list[tuple[float, float]]:
+    """Read ranges of wavelengths such as 322:368."""
+    return [_pair(text, name, "two wavelengths in nm, such as 322:368", "nm") for text in texts]
+
+
+def read_declinations(text: str, name: str) -> tuple[float, float] | str:
+    """Read a range of declinations such as -46.4:31.8, or none."""
+    if text.strip().lower() == "none":
+        return "none"
+    return _pair(text, name, "low:high in degrees, or none", "deg")
+
+
+def _pair(text: str, name: str, expected: str, unit: str) -> tuple[float, float]:
+    """Read two numbers, each of which may have a unit of its own."""
+    try:
+        low, high = (read_number(part, name, unit) for part in text.split(":"))
+    except ValueError as error:
+        raise refusal(name, text, expected) from error
+    return low, high
+
+
+def read_frames(text: str, name: str) -> str | list[int]:
+    """Read which frames are kept: stack, all, or numbers such as 0,4,9."""
+    return text if text in ("stack", "all") else read_several([text], name, _frame)
+
+
+def _frame(text: str, name: str) -> int:
+    try:
+        return int(text)
+    except ValueError as error:
+        raise refusal(name, text, "stack, all, or numbers such as 0,4,9") from error

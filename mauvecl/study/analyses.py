@@ -8,16 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from mauvecl.host.stars.library import ALIASES
-from mauvecl.schema import parsing
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help, Range, Slider, Unit, Widget
 from mauvecl.schema.physical import DetectorTemperature, Magnitude, Positive, Wavelength
-from mauvecl.schema.section import Section
-from mauvecl.study.sections import Star
+from mauvecl.schema.section import Section, read_wavelengths, read_words
+from mauvecl.study.star import Star
 
 if TYPE_CHECKING:
     from mauvecl.host.stars.source import Source
-    from mauvecl.study.sections import Flare
+    from mauvecl.study.star import Flare
 
 
 class CalibrationObservation(Section):
@@ -93,7 +92,6 @@ class CalibrateQuestion(Section):
             hint="By how much the light of an observation differs, by pointing.",
             group="Standards",
             unit="%",
-            scale=100.0,
         ),
     ] = 0.0
     spectrum_error: Annotated[
@@ -107,7 +105,6 @@ class CalibrateQuestion(Section):
             "disagree.",
             group="Standards",
             unit="%",
-            scale=100.0,
         ),
     ] = None  # fmt: skip
 
@@ -126,7 +123,7 @@ class ChangeQuestion(Section):
         tuple[str, ...],
         Field(min_length=1),
         Help("Change", choices="a line such as Mg II, balmer jump, colour, a band in nm such as 200-320, or spectrum"),
-        Flag("--change", kind=list[str], read=parsing.words),
+        Flag("--change", kind=list[str], read=read_words),
         Widget(
             label="Changes",
             hint="What changes, with commas: lines such as Mg II or 656.5 (nm), balmer jump, colour, and bands such as "
@@ -335,12 +332,12 @@ class MeasureQuestion(Section):
     models: Annotated[
         tuple[FittedModel, ...],
         Help("Fitted model", default="the flare's, and simpler ones"),
-        Flag("--model", read=parsing.words),
+        Flag("--model", read=read_words),
     ] = ()
     lines: Annotated[
         tuple[str, ...],
         Help("Line that the model 'lines' fits", default="the flare's"),
-        Flag("--fit-line", read=parsing.words),
+        Flag("--fit-line", read=read_words),
     ] = ()
     fits: Annotated[int, Range(1, 1_000_000), Help("Simulated exposures of each flare"), Flag("--fits")] = 1000
     bands_nm: Annotated[
@@ -349,7 +346,7 @@ class MeasureQuestion(Section):
     skipped_nm: Annotated[
         tuple[tuple[Wavelength, Wavelength], ...],
         Help("Wavelengths that fits leave out, from:to", "as in 322:368"),
-        Flag("--skip", kind=list[str], read=parsing.wavelengths),
+        Flag("--skip", kind=list[str], read=read_wavelengths),
         Widget(
             label="Leave out wavelengths",
             hint="Ranges in nm that fits do not use, such as 322:368, or 200:250, 322:368.",

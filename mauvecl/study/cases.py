@@ -15,7 +15,7 @@ from mauvecl.noise.unknowns import COURSES, PROCESSES, STARE_PROCESSES, Processe
 from mauvecl.schema.columns import Column, percent, short
 from mauvecl.schema.errors import Message, of_kind
 from mauvecl.study.questions import QUANTITIES, Sweep
-from mauvecl.study.sections import Star
+from mauvecl.study.star import Star
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from mauvecl.host.exposure.star import Neighbours
     from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.host.stars.source import Source
-    from mauvecl.study.sections import Observation, SkyLight
+    from mauvecl.study.observation import Observation, SkyLight
     from mauvecl.study.study import Study
 
 #: Parts of a study that answers use.
@@ -49,12 +49,7 @@ def assumption_line(study: Study, uses: Collection[Use], varied: Collection[str]
 def assumptions_of(study: Study, uses: Collection[Use], varied: Collection[str] = ()) -> list[str]:
     """Return the assumptions of a study about the parts that an answer uses, one clause each.
 
-    Parameters
-    ----------
-    uses : collection of str
-        Parts of the study; see `Use`.
-    varied : collection of str
-        Quantities that the answer varies in addition to those that the study sweeps.
+    The answer varies the quantities `varied` in addition to those that the study sweeps.
     """
     swept = {axis.quantity for axis in study.sweep.axes} | set(varied)
     words: dict[str, Callable[[], str]] = {
@@ -351,8 +346,6 @@ class Case:
         The factor on all light has the mean and, unless the study states another, the standard deviation of what is
         drawn; those of a stare are of the stare. The documented set leaves the star's own level free as well.
         """
-        import numpy as np
-
         from mauvecl.noise.scene import FactorDistributions
 
         quiet = self.quiet if quiet is None else quiet
@@ -423,8 +416,6 @@ class Case:
 
         Raises InputError if some lines of the flare do not scale with its amplitude.
         """
-        import numpy as np
-
         from mauvecl.host.stars.flare import check_scales
 
         check_scales(self.study.flare.light())

@@ -13,15 +13,15 @@ from mauvecl.host.tables.files import without_columns
 from mauvecl.noise.unknowns import NUISANCES
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Unit, first, unit_of
-from mauvecl.schema.parsing import assignment, number
 from mauvecl.schema.physical import SkyBrightness
-from mauvecl.study.sections import FILE_KEYS
+from mauvecl.schema.section import read_assignment, read_number
+from mauvecl.study.star import FILE_KEYS
 
 if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
 
-    from mauvecl.study.nuisances import NuisanceChoice
-    from mauvecl.study.sections import Star
+    from mauvecl.study.observation import NuisanceChoice
+    from mauvecl.study.star import Star
 
 
 class Keyword(NamedTuple):
@@ -141,7 +141,7 @@ def sky_of(given: Mapping[str, Any]) -> dict[str, Any]:
         sky["none"] = True
     elif isinstance(value, str):
         try:
-            sky["surface_brightness"] = number(value, "sky =", unit_of(SkyBrightness))
+            sky["surface_brightness"] = read_number(value, "sky =", unit_of(SkyBrightness))
         except ValueError as error:
             raise InputError(f"sky = {value!r}", "V mag/arcsec^2 or none", key="sky") from error
     else:
@@ -154,10 +154,9 @@ def nuisances_of(nuisances: NuisanceChoice, given: Sequence[str] | Mapping[str, 
     changed: dict[str, Any] = {}
     own = {name: choice.model_dump(exclude_none=True) for name, choice in nuisances.own.items()}
     expected = f"NAME=SD, with a name of {', '.join(NUISANCES)} or a file's, and a standard deviation or free"
-    pairs = (
-        given.items() if isinstance(given, Mapping) else [assignment(text, "nuisance =", expected) for text in given]
-    )
-    for name, sd in pairs:
+    if not isinstance(given, Mapping):
+        given = dict(read_assignment(text, "nuisance =", expected) for text in given)
+    for name, sd in given.items():
         if name in NUISANCES:
             changed[name] = sd
         else:

@@ -326,14 +326,8 @@ def targets_in(table: Table, named: str, folder: Path | None = None) -> list[dic
     """Return the targets of a table with a column ``name`` and any other keys of `PlanTarget`, in any case.
 
     ``ra`` and ``dec`` in degrees, or in the unit that they state, replace ``coordinates``; ``V`` replaces ``magnitude``
-    and ``parallax`` a distance. Empty cells are ignored, and other columns are left out.
-
-    Parameters
-    ----------
-    named : str
-        Description of the table, for messages.
-    folder : Path, optional
-        Folder of paths in the table; without it, columns of paths are refused.
+    and ``parallax`` a distance. Empty cells are ignored, and other columns are left out. Messages call the table
+    `named`; paths in it are relative to a folder, without which columns of paths are refused.
     """
     from mauvecl.host.tables.table import Rows
 
@@ -430,17 +424,14 @@ def _coordinates(rows: Rows, columns: dict[str, str | None], row: int, target: d
             raise rows.error(fault, "numbers in degrees, or only one of these columns", ra)
         return f"{east!r} {north!r}"
     if "coordinates" not in target and name_key(name := target.get("name", "")) not in by_key():
-        for column in (ra, columns["coordinates"]):
-            if column is not None and _is_marked_missing(text := str(rows.table[column][row])):
+        for column in filter(None, (ra, columns["coordinates"])):
+            text = str(rows.table[column][row])
+            # The cell says that a coordinate, or a pair of them, is not a number, instead of being empty.
+            if text.strip().lower() == "nan" or is_missing_position(text):
                 fault = f"row {row + 1} has no coordinates ({column} = {' '.join(text.split())}), and {shortened(name)}"
                 expected = "its coordinates, or a name of the list"
                 raise rows.error(f"{fault} is not in the embedded list", expected, column)
     return None
-
-
-def _is_marked_missing(cell: str) -> bool:
-    """Return whether a cell says that a coordinate, or a pair of them, is not a number, instead of being empty."""
-    return cell.strip().lower() == "nan" or is_missing_position(cell)
 
 
 def _is_number(cell: str) -> bool:

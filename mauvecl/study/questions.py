@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from mauvecl.schema import parsing
 from mauvecl.schema.errors import InputError, shown
 from mauvecl.schema.fields import Flag, Help, Quantity, Range, Slider, Unit, Widget, first, number
 from mauvecl.schema.physical import Positive, Probability, Wavelength
-from mauvecl.schema.section import Section, fields_of
-from mauvecl.study.sections import Flare, Observation, SkyLight, Star
+from mauvecl.schema.section import Section, fields_of, read_axes, read_axis, read_frames
+from mauvecl.study.observation import Observation, SkyLight
+from mauvecl.study.star import Flare, Star
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -122,7 +122,7 @@ class BulkQuestion(Section):
     frames: Annotated[
         Literal["stack", "all"] | Annotated[tuple[Annotated[int, Range(0)], ...], Field(min_length=1)],
         Help("Stored frames", choices="stack (the sum of an exposure), all, or numbers of frames such as 0,4,9"),
-        Flag("--frames", kind=str, read=parsing.frames),
+        Flag("--frames", kind=str, read=read_frames),
     ] = "stack"
     components: Annotated[
         bool, Help("Also store the mean of star, sky and noise of each pixel"), Flag("--components")
@@ -249,12 +249,12 @@ class MapQuestion(Section):
             "such as magnitude:4:10:16, or exposure=5,50,600",
             default="the magnitudes over which the flares are lost",
         ),
-        Flag("--x", kind=str, read=parsing.axis),
+        Flag("--x", kind=str, read=read_axis),
     ] = None
     y: Annotated[
         Axis,
         Help("Vertical axis of the map", "such as amplitude:0.01:1:16:log"),
-        Flag("--y", kind=str, read=parsing.axis),
+        Flag("--y", kind=str, read=read_axis),
     ] = Axis(quantity="amplitude", start=0.01, stop=1.0, steps=16, log=True)
     contours: Annotated[tuple[Probability, ...], Help("Detection probabilities of contours")] = (0.1, 0.5, 0.9)
 
@@ -292,7 +292,7 @@ class Sweep(Section):
             "Values of a quantity",
             "as in exposure=5,50,600 or magnitude:4:10:7; several give every combination",
         ),
-        Flag("--sweep", kind=list[str], read=parsing.axes),
+        Flag("--sweep", kind=list[str], read=read_axes),
     ] = ()
 
     @model_validator(mode="after")

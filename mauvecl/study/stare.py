@@ -22,12 +22,11 @@ from mauvecl.flares.settings import (
 )
 from mauvecl.noise.disturbances import PointingDrifts
 from mauvecl.noise.unknowns import COURSES, STARE_PROCESSES, Changing, NuisanceName
-from mauvecl.schema import parsing
-from mauvecl.schema.errors import InputError
+from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.fields import Flag, Help, Range, Unit, Widget
 from mauvecl.schema.physical import Amplitude, Duration, Energy, Positive, Temperature, Wavelength
-from mauvecl.schema.section import Section
-from mauvecl.study.nuisances import Spread, sd_of
+from mauvecl.schema.section import Section, read_gaps
+from mauvecl.study.observation import Spread, sd_of
 
 if TYPE_CHECKING:
     from mauvecl.flares.shapes import Shape
@@ -51,7 +50,7 @@ class StareQuestion(Section):
         tuple[tuple[float, float], ...],
         Unit("s"),
         Help("Gap without recorded frames, from:to", "as in 1000:2000"),
-        Flag("--gap", kind=list[str], read=parsing.gaps),
+        Flag("--gap", kind=list[str], read=read_gaps),
     ] = ()
     orbit_s: Annotated[Duration, Help("Orbital period")] = ORBIT_S
     orbit_gap_s: Annotated[float, Unit("s"), Range(0), Help("Gap at the end of every orbit"), Flag("--orbit-gap")] = 0.0
@@ -165,7 +164,6 @@ class EventChoice(Section):
         """Return the shape, or the published shape named `default` if none is given."""
         from mauvecl.flares.shapes import TableShape, shape_of
         from mauvecl.host.tables.text_tables import read_columns
-        from mauvecl.schema.errors import shortened
 
         if self.shape_file is None:
             return shape_of(self.shape or default)

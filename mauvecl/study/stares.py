@@ -16,6 +16,7 @@ from mauvecl.flares.stare import Event, Stare, check_contributions, coefficients
 from mauvecl.noise.disturbances import Normal, Prior
 from mauvecl.noise.unknowns import CHANGING, COURSES, PROCESSES, STARE_PROCESSES, Changing, Course, default_spreads
 from mauvecl.schema.errors import InputError, Message
+from mauvecl.schema.physical import DAY_S
 from mauvecl.study.stare import EventChoice, StareQuestion
 
 if TYPE_CHECKING:
@@ -128,15 +129,10 @@ def _along_orbit(study: Study, frame_s: float, changes: dict[str, Any]) -> Stare
 def expect_stare(
     stare: Stare, events: Sequence[Event], quiet: Expectation, flare_electrons: Callable[[Float], Float]
 ) -> StareExpectation:
-    """Compute the expectation of a stare with its flares.
+    """Compute the expectation of a stare with its flares, from one quiet frame.
 
-    Parameters
-    ----------
-    quiet : Expectation
-        One frame without a flare.
-    flare_electrons : callable
-        Electrons that flares of unit amplitude and some temperatures, K, add to a frame, shape
-        (n_temperature, n_pixel).
+    `flare_electrons` returns the electrons that flares of unit amplitude and some temperatures, K, add to a frame,
+    shape (n_temperature, n_pixel).
     """
     check_contributions(events, stare.start_s, stare.frame_s)
     kelvin = temperatures_of(events)
@@ -162,7 +158,6 @@ def unused_lines(exposure_s: float, stare: Stare, events: Sequence[Event]) -> li
 def orbit_lines(stare: StareQuestion, orbit: OrbitQuestion, frame_s: float) -> list[str]:
     """Return messages about the orbit of a stare with `along_orbit`."""
     from mauvecl.host.orbit.geometry import TimeGrid
-    from mauvecl.schema.physical import DAY_S
 
     if not stare.along_orbit:
         return []

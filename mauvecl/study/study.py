@@ -20,15 +20,14 @@ from mauvecl.detection.names import DEFAULT_STATISTICS, countable, least_countab
 from mauvecl.host.instrument import FORMER_NAMES, FORMERLY_MAUVE
 from mauvecl.host.orbit import Limits
 from mauvecl.host.tables.files import parsing, possible, read_bytes, read_ecsv, read_text, toml, without_columns
-from mauvecl.noise.unknowns import COURSES, NONE, Processes
+from mauvecl.noise.unknowns import NONE, Processes
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, Message, shortened
 from mauvecl.schema.fields import AnyUnit, Flag, Help, found
 from mauvecl.schema.section import Section, fields_of, input_error
 from mauvecl.study.analyses import PATHS, CalibrateQuestion, ChangeQuestion, DataChoice, MeasureQuestion
-from mauvecl.study.flare_light import drop_default_spectrum
 from mauvecl.study.keywords import changes_of, keywords_of, stars_of, values_of
-from mauvecl.study.nuisances import NuisanceChoice
+from mauvecl.study.observation import NuisanceChoice, Observation, Run, SkyLight, Unknowns
 from mauvecl.study.plan import OrbitQuestion, PlanQuestion
 from mauvecl.study.questions import (
     QUANTITIES,
@@ -40,7 +39,7 @@ from mauvecl.study.questions import (
     SignalQuestion,
     Sweep,
 )
-from mauvecl.study.sections import Flare, Observation, Run, SkyLight, Star, Unknowns
+from mauvecl.study.star import Flare, Star
 from mauvecl.study.stare import EventChoice, InjectionQuestion, SearchChoice, StareQuestion
 
 if TYPE_CHECKING:
@@ -99,6 +98,16 @@ def with_paths(data: Any, kind: Any, change: Callable[[Path], Path]) -> Any:
     return data
 
 
+#: Keys of files that the study in an answer's table gives by name and digest, by their section.
+NAMED_FILES = {
+    "star": ("file", "neighbours"),
+    "flare.spectrum": ("file", "quiescent"),
+    "data": ("file", "mapping"),
+    "calibrate.observations": PATHS,
+    "change": ("file",),
+}
+
+
 def with_file_digests(text: str) -> str:
     """Replace the paths of files in a study's text by names and digests, not by paths."""
     import tomli_w
@@ -117,18 +126,15 @@ def with_file_digests(text: str) -> str:
 
 
 def _named_files(data: dict[str, Any]) -> list[tuple[dict[str, Any], str]]:
-    """List the sections of stars, flare, observations and changes that name a file, with the key."""
-    stars, flare = data.get("star"), data.get("flare")
-    sections = [(star, key) for star in (stars if isinstance(stars, list) else []) for key in ("file", "neighbours")]
-    light = flare.get("spectrum") if isinstance(flare, dict) else None
-    sections += [(light, "file"), (light, "quiescent"), (data.get("data"), "file"), (data.get("data"), "mapping")]
-    asked = data.get("calibrate")
-    rows = asked.get("observations") if isinstance(asked, dict) else None
-    sections += [(row, key) for row in (rows if isinstance(rows, list) else []) for key in PATHS]
-    sections += [(data.get("change"), "file")]
-    return [
-        (section, key) for section, key in sections if isinstance(section, dict) and isinstance(section.get(key), str)
-    ]
+    """List the sections that name one of `NAMED_FILES`, with the key."""
+    found = []
+    for place, keys in NAMED_FILES.items():
+        section: Any = data
+        for part in place.split("."):
+            section = section.get(part) if isinstance(section, dict) else None
+        rows = [row for row in (section if isinstance(section, list) else [section]) if isinstance(row, dict)]
+        found += [(row, key) for row in rows for key in keys if isinstance(row.get(key), str)]
+    return found
 
 
 def locate_files(data: dict[str, Any], table: Path) -> None:
@@ -390,35 +396,24 @@ class Study(Section):
         import tomli_w
 
         data = with_paths(self.model_dump(mode="json", exclude_none=True), type(self), Path.resolve)
+        unused = {"sweep": not self.sweep.axes, "unknowns": not self.unknowns.draws, "signal": self.signal.snr is None}
+        fields = type(self).model_fields
+        for name in [*data]:
+            if unused.get(name) or (name in OMITTED and getattr(self, name) == fields[name].default):
+                del data[name]
         if not self.sky.none:
             del data["sky"]["none"]
-        if not data["observation"]["changes"]:
-            del data["observation"]["changes"]
-        if not self.sweep.axes:
-            del data["sweep"]
-        if not self.unknowns.draws:
-            del data["unknowns"]
-        if self.signal.snr is None:
-            del data["signal"]
-        for section in OMITTED:
-            if getattr(self, section) == type(self).model_fields[section].default:
-                del data[section]
-        for course in COURSES:
-            if "stare" in data and not data["stare"][course]:
-                del data["stare"][course]
-        if "search" in data and not data["search"]["frame"]:
-            del data["search"]["frame"]
         if "orbit" in data and self.orbit.limits == Limits():
             del data["orbit"]["limits"]
-        drop_default_spectrum(data, self.flare.spectrum)
-        for section in ("processes", "campaign"):
-            if not data[section]:
-                del data[section]
-        if not data["run"]["weights"]:
-            del data["run"]["weights"]
+        if self.flare.is_blackbody:
+            del data["flare"]["spectrum"]
         for star in data["star"]:
             if "neighbours" not in star:
                 del star["neighbour_share"]
+        data = _without_empty(data)
+        if "nuisances" in data:
+            # Study files have this table even if it is empty.
+            data["nuisances"].setdefault("own", {})
         return tomli_w.dumps(data)
 
     def __repr__(self) -> str:
@@ -468,6 +463,13 @@ class Study(Section):
         """True if a star or a target of a plan has a table of neighbours."""
         targets = any(target.neighbours is not None for target in self.plan.targets)
         return targets or any(star.neighbours is not None for star in self.star)
+
+
+def _without_empty(data: Any) -> Any:
+    """Return nested tables without those that are empty."""
+    if not isinstance(data, dict):
+        return data
+    return {key: inner for key, value in data.items() if (inner := _without_empty(value)) != {}}
 
 
 def _has_values(data: Any) -> bool:

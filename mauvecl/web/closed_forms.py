@@ -1,8 +1,8 @@
-"""Closed forms of a question, which answer at once, and the chance that they give."""
+"""A visitor's question as a study, and its closed forms, which answer at once."""
 
 from __future__ import annotations
 
-import math
+import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -19,23 +19,157 @@ from mauvecl.detection.requests import STATISTICS
 from mauvecl.host.exposure.expectation import entirely_saturated
 from mauvecl.schema.columns import chance_range, chance_text
 from mauvecl.schema.errors import InputError
-from mauvecl.study.cases import collect_messages
-from mauvecl.web.fields import FIELDS, IDEAL, REALISTIC, UNKNOWN, Choice, star_words
-from mauvecl.web.question import OTHER
+from mauvecl.study.analyses import SPECTRUM
+from mauvecl.study.cases import Case, Loader, collect_messages
+from mauvecl.study.study import Study
+from mauvecl.web.fields import FIELDS, IDEAL, REALISTIC, UNKNOWN, WITH_FILE, Choice, Draws, Field, star_words
+from mauvecl.web.uploads import write_spectrum, write_table
 
 if TYPE_CHECKING:
     from mauvecl.answers.detect import DetectAnswer
     from mauvecl.detection.statistics import DetectionForms
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.host.stars.source import Source
-    from mauvecl.study.cases import Case
-    from mauvecl.study.study import Study
-    from mauvecl.web.question import Question
 
 Float = NDArray[np.float64]
 
+#: Fields that set their keys together with the file of another field; units do not, since files are written in nm.
+SET_WITH_FILE = {"flare_file": ("continue_at_k", "flare_quiescent", "as_observed"), "change_file": ("change_band",)}
+#: Fields whose values only apply together with those of others.
+CONDITIONAL = (
+    "sky_brightness", "target", "time", "second_area", "hours", "pointing_rate", "pointing_duration",
+    "pointing_depth", *itertools.chain(*WITH_FILE.values()),
+)  # fmt: skip
+#: Names of uploaded spectra by field, and of a table of neighbours, in the folder of their study.
+SPECTRA = {
+    "star": "star.ecsv",
+    "flare_file": "flare.ecsv",
+    "flare_quiescent": "quiescent.ecsv",
+    "change_file": "added.ecsv",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Question:
+    """Valid values of all fields of `fields.FIELDS`, by name, and the contents of files that stand in them."""
+
+    values: Mapping[str, Any]
+    uploads: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def uploaded(self) -> Source | None:
+        """The visitor's own star, or None."""
+        return self.uploads.get("star")
+
+    def __getattr__(self, name: str) -> Any:
+        """Return the value of a field, as in ``question.magnitude``."""
+        if name != "values" and name in self.values:
+            return self.values[name]
+        raise AttributeError(name)
+
+    @property
+    def star_in_words(self) -> str:
+        """The star, as part of a sentence."""
+        return "your own star" if self.uploaded is not None else star_words(self.star)
+
+    @property
+    def as_bright_as_observed(self) -> bool:
+        """Whether the flare has the brightness of the visitor's file, in place of the amplitude."""
+        return "flare_file" in self.uploads and bool(self.values["as_observed"])
+
+    def study(self, folder: Path | None = None) -> Study:
+        """Return the question as a study; parameters and errors as for `case`."""
+        return self.case(folder).study
+
+    def case(self, folder: Path | None = None) -> Case:
+        """Return the question as a case; a flare that is as bright as observed has the amplitude of its brightness.
+
+        The visitor's files are written to the folder for the study to find. Raises InputError for incompatible values.
+        """
+        if folder is None and (self.uploads.keys() - {"own_unknown"} or self.neighbours is not None):
+            raise InputError("no folder for the visitor's files", "a folder", key="folder")
+        uploaded = self.uploaded
+        # An uploaded spectrum is not read from its file at every change.
+        loader = Loader(None if uploaded is None else lambda star: star.applied(uploaded))
+        case = Case(Study.build(self._data(folder), "page"), loader=loader)
+        return case.at_observed_brightness() if self.as_bright_as_observed else case
+
+    def _data(self, folder: Path | None) -> dict[str, Any]:
+        """Return the question as the data of a study, whose files are written to a folder."""
+        values = self.values
+        data: dict[str, Any] = {}
+        for name, page_field in FIELDS.items():
+            if page_field.path and name not in CONDITIONAL:
+                self._set_valid(data, name, folder)
+        data["star"] = [self._star(data["star"], folder)]
+        data["sky"] = {
+            "brightness": {"surface_brightness": values["sky_brightness"]},
+            "target and time": {"target": values["target"], "time": values["time"]},
+            "none": {"none": True},
+        }[values["sky"]]
+        if values["second_temperature_k"] is not None:
+            self._set(data, FIELDS["second_area"], values["second_area"])
+        if values["pointing_rate"] is not None:
+            for name in ("pointing_rate", "pointing_duration", "pointing_depth"):
+                self._set(data, FIELDS[name], values[name])
+        if values["lines"]:
+            data["flare"].setdefault("spectrum", {})["lines"] = dict(values["lines"])
+        for name in SET_WITH_FILE.keys() & self.uploads.keys():
+            for other in SET_WITH_FILE[name]:
+                self._set_valid(data, other, folder)
+        if "change_file" in self.uploads and SPECTRUM not in values["changes"]:
+            self._set(data, FIELDS["changes"], (*values["changes"], SPECTRUM))
+        points = self.uploads.get("own_unknown", values["own_unknown"])
+        own = {"own": {"points": points}} if points else {}
+        data["nuisances"] = {"usual": values["unknown"] == REALISTIC, "own": own}
+        draws: Draws = values["realisations"]
+        data["run"] |= {
+            "realisations": draws.number,
+            "tails": draws.tails,
+            "statistics": list(dict.fromkeys(["chi2", "chi2_element", values["statistic"]])),
+        }
+        if values["targets"]:
+            data["plan"] = {"targets": list(values["targets"]), "hours": values["hours"]}
+        return data
+
+    def _star(self, star: dict[str, Any], folder: Path | None) -> dict[str, Any]:
+        """Return the data of a star with its spectrum and neighbours."""
+        if folder is not None and self.neighbours is not None:
+            star["neighbours"] = str(write_table(self.neighbours, folder))
+        if folder is not None and self.uploaded is not None:
+            return star | {"file": str(write_spectrum(self.uploaded, folder, SPECTRA["star"]))}
+        return star | {"library": self.values["star"]}
+
+    def _set_valid(self, data: dict[str, Any], name: str, folder: Path | None) -> None:
+        """Set the key of a field in the data of a study, in place, unless it is empty; its file goes to a folder."""
+        page_field, value = FIELDS[name], self.values[name]
+        if page_field.kind in ("file", "upload"):
+            if folder is None or name not in self.uploads:
+                return
+            upload = self.uploads[name]
+            written = (
+                write_spectrum(upload, folder, SPECTRA[name]) if page_field.kind == "file" else upload.written(folder)
+            )
+            value = str(written) if isinstance(written, Path) else written
+        if value is not None:
+            self._set(data, page_field, value)
+
+    @staticmethod
+    def _set(data: dict[str, Any], target: Field, value: Any) -> None:
+        """Set the key of a field in the data of a study, in place."""
+        *sections, key = target.path
+        for section in sections:
+            data = data.setdefault(section, {})
+        if target.scale != 1.0:
+            value = value / target.scale
+        # A single flare.
+        data[key] = [value] if key == "amplitudes" else value
+
+
 #: Answers that are simulated, by name: of one question.
 Answers = Mapping[str, Any]
+#: Name of the detection with the other choice of unknowns; the card shows both.
+OTHER = "detection otherwise"
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,10 +272,9 @@ class ClosedForms:
         """Question in words, as part of a sentence."""
         q, x = self.question, self.quiet
         frames = "one frame" if x.n_frames == 1 else f"{x.n_frames} frames"
-        star = "your own star" if q.uploaded is not None else star_words(q.star)
         return (
-            f"a {q.amplitude_percent:g} % flare ({self.study.flare.light().describe()}) on {star} of {q.band} = "
-            f"{q.magnitude:g}, in {x.exposure_s:g} s ({frames})"
+            f"a {q.amplitude_percent:g} % flare ({self.study.flare.light().describe()}) on {q.star_in_words} of "
+            f"{q.band} = {q.magnitude:g}, in {x.exposure_s:g} s ({frames})"
         )
 
     def at(self, light: float, rises: Float, *, sky: bool = False) -> list[DetectionForms]:
@@ -273,12 +406,13 @@ def solved(closed: ClosedForms) -> str:
     """Return a sentence on the limit of the quantity that the question solves for, with and without unknowns."""
     q, asked = closed.question, closed.study.limit
     words = LIMITS[asked.of]
-    clauses, near = {}, None
+    clauses: dict[str, str] = {}
+    near: float | None = None
     # The ideal limit is found at once, and the realistic one near it.
     for unknown in (IDEAL, REALISTIC):
         try:
             assumed = closed.assuming(unknown)
-            near = None if assumed.slow else _limit(assumed, near)
+            near = None if assumed.slow else LimitSearch(assumed.case, assumed.question.statistic).root(near)
             clauses[unknown] = words.slow if near is None else f"{words.before.format(band=q.band)} {words.value(near)}"
         except InputError:
             clauses[unknown] = words.none
@@ -288,18 +422,6 @@ def solved(closed: ClosedForms) -> str:
     # The size belongs to the flares, what is exposed to their detection.
     where = f" {first}{at} are detected" if asked.of == "amplitude" else f"{at} are detected {first}"
     return f"{100 * asked.power:g} % of {flares}{where}, and {clauses[IDEAL]} if everything but the noise were known."
-
-
-def _limit(assumed: ClosedForms, limit: float | None) -> float:
-    """Return the limit in closed form, as `mauvecl limit` finds it; faster with the limit if everything is known."""
-    search, near = LimitSearch(assumed.case, assumed.question.statistic), None
-    if limit is not None and search.of != "exposure":
-        nuisances, compared = assumed.study.nuisances, assumed.study.run.comparison()
-        cost = unknown_cost("", assumed.quiet, assumed.flare, nuisances, compared)
-        # Where dark noise dominates, the S/N is proportional to the light.
-        loss = cost.known / cost.marginal if cost.marginal else 1.0
-        near = limit * loss if search.of == "amplitude" else limit - 2.5 * math.log10(loss)
-    return search.root(near)
 
 
 def other_payloads(closed: ClosedForms) -> str:

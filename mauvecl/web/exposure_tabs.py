@@ -31,7 +31,7 @@ from mauvecl.detection.requests import statistic_label
 from mauvecl.noise.unknowns import NUISANCES, Nuisance
 from mauvecl.schema.columns import View, chance_text, stacked, with_error
 from mauvecl.study.cases import star_column, star_label
-from mauvecl.study.nuisances import NuisanceChoice
+from mauvecl.study.observation import NuisanceChoice
 from mauvecl.web.closed_forms import Answers, short
 from mauvecl.web.figures import strips
 from mauvecl.web.tab import Tab

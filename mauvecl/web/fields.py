@@ -27,7 +27,6 @@ from mauvecl.schema.fields import (
     found,
     is_measure,
     range_of,
-    unit_of,
     with_unit,
 )
 from mauvecl.schema.physical import LineFraction
@@ -84,11 +83,6 @@ class Number:
         return value
 
 
-def number_of(kind: Any) -> Number:
-    """Return the parser of a number in the unit and range of an annotation."""
-    return Number(range_of(kind), unit=unit_of(kind))
-
-
 @dataclass(frozen=True)
 class Choice:
     """One of several words."""
@@ -121,19 +115,13 @@ def points(text: str) -> tuple[tuple[float, float], ...] | None:
     return spectrum
 
 
-def or_nothing(number: Number) -> Callable[[str], float | int | None]:
-    """Return a parser that converts empty text to None."""
-    return lambda text: number(text) if text.strip() else None
-
-
 def line_fluxes(text: str) -> tuple[tuple[str, float], ...]:
     """Parse emission lines such as "Mg II = 0.03, Balmer = 0.1"."""
     from mauvecl.host.stars.flare_spectra import EmissionLine
 
     pairs = [pair.partition("=") for pair in text.split(",") if text.strip()]
-    fractions = tuple(
-        (EmissionLine.named(name).name, float(number_of(LineFraction)(value))) for name, _, value in pairs
-    )
+    share = Number(range_of(LineFraction))
+    fractions = tuple((EmissionLine.named(name).name, float(share(value))) for name, _, value in pairs)
     if len(dict(fractions)) < len(fractions):
         raise InputError(f"{shortened(text)} contains a line twice, but each must be given once", key="lines")
     return fractions
@@ -307,7 +295,7 @@ def _reader(field: FieldInfo, widget: Widget, unit: str, *, optional: bool) -> C
     if widget.scale != 1.0:
         reach = replace(reach, low=widget.scale * reach.low, high=widget.scale * reach.high)
     number = Number(reach, whole=field.annotation is int, unit=unit, scale=widget.scale)
-    return or_nothing(number) if optional else number
+    return (lambda text: number(text) if text.strip() else None) if optional else number
 
 
 #: Fields that do not stand for one key of the study.

@@ -10,6 +10,7 @@ from bokeh.models import (
     BoxZoomTool,
     DataRange1d,
     HoverTool,
+    LinearColorMapper,
     NoOverlap,
     Range1d,
     ResetTool,
@@ -17,7 +18,7 @@ from bokeh.models import (
     Step,
     WheelZoomTool,
 )
-from bokeh.models.annotations import Label, Span
+from bokeh.models.annotations import ColorBar, Label, Span
 from bokeh.models.sources import ColumnDataSource
 from bokeh.plotting import figure
 
@@ -137,19 +138,16 @@ class Canvas:
         # Hidden marks do not affect the range; without data, the range is a default one.
         return DataRange1d(only_visible=True, default_span=2.0) if name == "y" else None
 
-    @property
-    def bar_text(self) -> dict[str, Any]:
-        """Look of a colour bar's text."""
-        text = self.ink["text"]
-        return {
-            "background_fill_color": None, "major_label_text_color": text, "title_text_color": text,
-            "major_tick_line_color": text, "title_text_font_style": "normal", "title_text_font": "system-ui",
-            "major_label_text_font": "system-ui",
-        }  # fmt: skip
-
-    def source(self, name: str, *columns: str) -> ColumnDataSource:
-        """Add an empty data source."""
-        return ColumnDataSource({column: [] for column in columns}, name=name)
+    def share_colours(self, title: str) -> LinearColorMapper:
+        """Add the colour bar of a share, and return its colours."""
+        text, mapper = self.ink["text"], LinearColorMapper(palette="Cividis256", low=0, high=1)
+        bar = ColorBar(
+            color_mapper=mapper, width=10, title=title, background_fill_color=None, major_label_text_color=text,
+            title_text_color=text, major_tick_line_color=text, title_text_font_style="normal",
+            title_text_font="system-ui", major_label_text_font="system-ui",
+        )  # fmt: skip
+        self.plot.add_layout(bar, "right")
+        return mapper
 
     def _pins(self) -> list[Series]:
         """Return a line for each scenario that can be pinned, drawn as the series that it repeats."""

@@ -1,14 +1,14 @@
-"""Tabs of the flares that are detected, and of the errors with which a flare's spectrum is measured."""
+"""Tabs of flares: limits of detection, errors with which spectra are measured, and the share that a search finds."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from bokeh.models import FixedTicker, HoverTool, LinearColorMapper
-from bokeh.models.annotations import ColorBar
+from contourpy import contour_generator
 from numpy.typing import NDArray
 from scipy import special
 from scipy.interpolate import PchipInterpolator
@@ -17,8 +17,8 @@ from mauvecl.answers.measure import COLUMNS
 from mauvecl.answers.measurements import expected_measurements, models_of
 from mauvecl.charts.chart import Axis, Band, Chart, ChartData, Contours, Custom, Dots, Line, Listed, Own, Rule
 from mauvecl.fits.flare_model import FlareModel
-from mauvecl.schema.columns import View, records
-from mauvecl.study.nuisances import KNOWN, NuisanceChoice
+from mauvecl.schema.columns import View, chance_text, records
+from mauvecl.study.observation import KNOWN, NuisanceChoice
 from mauvecl.web.closed_forms import LIMITS, Answers, short
 from mauvecl.web.tab import Tab
 
@@ -54,38 +54,26 @@ def odds(closed: ClosedForms, magnitude: float, rises: Float) -> list[DetectionF
     return closed.at(10 ** (-0.4 * (magnitude - closed.question.magnitude)), rises)
 
 
-def _key(closed: ClosedForms) -> tuple[Any, ...]:
-    """Return everything on which a map depends except its axes."""
-    asked = closed.question.values.items()
-    uploaded = closed.question.uploaded
-    return (*(value for name, value in asked if name not in FREE), None if uploaded is None else uploaded.digest)
-
-
+@dataclass(frozen=True)
 class _Kept:
     """Question identified by the values on which its map or curve depends."""
 
-    def __init__(self, closed: ClosedForms, *more: float) -> None:
-        self._closed: ClosedForms | None = closed
-        self.key = (*_key(closed), *more)
+    key: tuple[Any, ...]
+    # Taken by what computes the map: caches keep this object, and closed forms take tens of MB.
+    closed: list[ClosedForms] = field(compare=False)
 
-    def take(self) -> ClosedForms:
-        """Return the closed forms and forget them, since caches keep this key and they take tens of MB."""
-        closed, self._closed = self._closed, None
-        assert closed is not None
-        return closed
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Kept) and self.key == other.key
-
-    def __hash__(self) -> int:
-        return hash(self.key)
+    @classmethod
+    def of(cls, closed: ClosedForms, *more: float) -> _Kept:
+        """Identify a question; `more` are further values on which the result depends."""
+        question = closed.question
+        values = (value for name, value in question.values.items() if name not in FREE)
+        return cls((*values, question.uploaded and question.uploaded.digest, *more), [closed])
 
 
 @lru_cache(maxsize=32)
 def _curve(kept: _Kept) -> tuple[Float, Float]:
     """Return magnitudes and probabilities, with more points where these change."""
-
-    closed = kept.take()
+    closed = kept.closed.pop()
 
     def exact(magnitudes: Float) -> list[float]:
         each = (odds(closed, magnitude, np.ones(1)) for magnitude in magnitudes)
@@ -111,7 +99,7 @@ def _map(kept: _Kept) -> tuple[Float, Float, Float]:
     statistic and of its spread, the threshold and the skewness. A gamma distribution of these moments (Pearson's type
     III) is within 0.05 of the closed forms where they are steepest.
     """
-    closed = kept.take()
+    closed = kept.closed.pop()
     (columns, rows), (low, high) = STEPS, np.log10(PERCENTS)
     x, y = np.linspace(*MAGNITUDES, columns), np.linspace(low, high, rows)
     # A saturated star has no detectable flare.
@@ -120,10 +108,8 @@ def _map(kept: _Kept) -> tuple[Float, Float, Float]:
     for i, magnitude in enumerate(x):
         for j, outcome in enumerate(odds(closed, magnitude, 10**y / closed.question.amplitude_percent)):
             unit, seen = outcome.null.std, outcome.flaring
-            part, cut = (
-                max(seen.mean - outcome.null.mean, 1e-9 * unit) / unit,
-                (outcome.threshold - outcome.null.mean) / unit,
-            )
+            part = max((seen.mean - outcome.null.mean) / unit, 1e-9)
+            cut = (outcome.threshold - outcome.null.mean) / unit
             forms[:, j, i] = np.log(part), np.log(seen.std / unit), cut, seen.third / seen.std**3
     fine = np.linspace(*MAGNITUDES, 97), np.linspace(low, high, 61)
     return *fine, _pearson(*PchipInterpolator(y, PchipInterpolator(x, forms, axis=2)(fine[0]), axis=1)(fine[1]))
@@ -154,7 +140,7 @@ def curve(closed: ClosedForms, answers: Answers) -> ChartData:
     series: dict[str, Any] = {"own": ([q.magnitude], [closed.chance]), "power": power}
     text = f"The closed form of {q.statistic} takes too long for a curve: simulate it."
     if not closed.slow:
-        x, y = series["closed form"] = _curve(_Kept(closed, q.amplitude_percent))
+        x, y = series["closed form"] = _curve(_Kept.of(closed, q.amplitude_percent))
         text = f"{100 * power:g} % of such flares are detected {_reach(x, y, power, q.band)}"
     if "limit" in answers:
         limits = [limit for limit in answers["limit"].limits if limit.statistic == q.statistic]
@@ -183,17 +169,16 @@ def _reach(x: Float, y: Float, power: float, band: str) -> str:
 
 
 def _draw_map(canvas: Canvas, source: ColumnDataSource) -> None:
-    plot, mapper = canvas.plot, _mapper()
+    plot, mapper = canvas.plot, canvas.share_colours("detected")
     image = plot.image("image", "x", "y", "dw", "dh", source=source, color_mapper=mapper)
     shown = [("detected", "@image{0.000}"), ("magnitude", "$x{0.00}"), ("amplitude", "@percent{0.[00]} %")]
     plot.add_tools(HoverTool(renderers=[image], tooltips=shown))
     plot.yaxis.ticker = FixedTicker(ticks=[-1, 0, 1, 2])
     plot.yaxis.major_label_overrides = {-1: "0.1 %", 0: "1 %", 1: "10 %", 2: "100 %"}
-    plot.add_layout(ColorBar(color_mapper=mapper, width=10, title="detected", **canvas.bar_text), "right")
 
 
 def _draw_cells(canvas: Canvas, source: ColumnDataSource) -> None:
-    colour = {"field": "p", "transform": _mapper()}
+    colour = {"field": "p", "transform": LinearColorMapper(palette="Cividis256", low=0, high=1)}
     cells = canvas.plot.scatter("x", "y", source=source, size=10, marker="square", fill_color=colour,
                                 line_color="#ffffff")  # fmt: skip
     cells.name = "simulated"
@@ -205,10 +190,6 @@ def _draw_labels(canvas: Canvas, source: ColumnDataSource) -> None:
         text_font={"value": "system-ui"}, text_font_size="11px", text_color="#1b2733", level="annotation",
         background_fill_color="#ffffff", background_fill_alpha=0.85, padding=2,
     ).name = "labels"  # fmt: skip
-
-
-def _mapper() -> LinearColorMapper:
-    return LinearColorMapper(palette="Cividis256", low=0, high=1)
 
 
 @Chart(
@@ -232,7 +213,7 @@ def detection_map(closed: ClosedForms, answers: Answers) -> ChartData:
     series: dict[str, Any] = {"own": ([q.magnitude], [np.log10(q.amplitude_percent)])}
     text = f"The closed form of {q.statistic} takes too long for a map: simulate it."
     if not closed.slow:
-        x, y, p = _map(_Kept(closed))
+        x, y, p = _map(_Kept.of(closed))
         series |= {
             "map": _image(x, y, p),
             "contours": _contours(x, y, p, 0.1, 0.9),
@@ -261,16 +242,12 @@ def _image(x: Float, y: Float, p: Float) -> tuple[Any, ...]:
 
 
 def _contours(x: Float, y: Float, p: Float, *levels: float) -> tuple[Any, Any]:
-    from contourpy import contour_generator
-
     lines: list[Any] = [line for level in levels for line in contour_generator(x, y, p).lines(level)]
     return [line[:, 0].tolist() for line in lines], [line[:, 1].tolist() for line in lines]
 
 
 def _labels(x: Float, y: Float, p: Float) -> tuple[Any, ...]:
     """Return the names of contours, each at another part of its line: the lines are close to each other."""
-    from contourpy import contour_generator
-
     labels = []
     for level, part in LABELLED.items():
         lines: list[Any] = list(contour_generator(x, y, p).lines(level))
@@ -351,14 +328,10 @@ def temperature_errors(closed: ClosedForms, answers: Answers) -> ChartData:
     which = "temperature" if isinstance(all_known.fitted, FlareModel) else "lower temperature"
     series["own"] = [own], [100 * all_known.ahead.errors[0] / all_known.ahead.values[0]]
     text = (
-        f"With everything known the {which} has a standard error of {_error(all_known)}, with dark level and star "
-        f"unknown one of {_error(free)}."
+        f"With everything known the {which} has a standard error of {short(all_known.ahead.errors[0])} K, with dark "
+        f"level and star unknown one of {short(free.ahead.errors[0])} K."
     )
     return ChartData(text, series)
-
-
-def _error(measurement: ExpectedMeasurement) -> str:
-    return f"{short(measurement.ahead.errors[0])} K"
 
 
 @Chart(
@@ -492,3 +465,63 @@ class Measurement(Tab):
         errors = [replace(verb["error"], name=name, heading=f"error, {name}") for name in each]
         columns = [verb["quantity"], verb["unit"], verb["truth"], *errors, *(verb[name] for name in counted)]
         return View(self.title, columns, table)
+
+
+#: Half-widths of the flares: as many as there are lines.
+LENGTHS = ("shortest", "middle", "longest")
+
+
+@Chart(
+    "shares", "Share of flares that a search of a stare finds",
+    Axis("peak amplitude of the flare (%)", log=True, limits=(0.01, 100)),
+    Axis("share of flares found", limits=(-0.03, 1.05)),
+    (
+        *(
+            series
+            for k, called in enumerate(LENGTHS)
+            for series in (
+                Band(f"{called} flares", called, f"band {k}", listed=False),
+                Line(f"{called} flares", called, f"line {k}", width=2,
+                     tips=("amplitude (%)", f"found of the {called}")),
+            )
+        ),
+        Rule("amplitude of your question", "own", "own"),
+    ),
+).data()  # fmt: skip
+def shares(closed: ClosedForms, answers: Answers) -> ChartData:
+    """Return the fraction of injected flares that the search finds against their amplitude."""
+    series: dict[str, Any] = {"own": closed.question.amplitude_percent}
+    if "completeness" not in answers:
+        text = (
+            "Nothing is injected yet: Inject flares puts flares of several lengths and sizes into a stare of one "
+            "orbit, and searches it."
+        )
+        return ChartData(text, series)
+    injected, parts = answers["completeness"].stars[0].injected, []
+    for k, width in enumerate(injected.half_widths_s):
+        x, share = 100 * injected.sizes, injected.completeness[k]
+        series |= {
+            f"band {k}": (x, injected.completeness_low[k], injected.completeness_high[k]),
+            f"line {k}": (x, share),
+        }
+        seen = float(np.interp(np.log(closed.question.amplitude_percent), np.log(x), share))
+        parts.append(f"{chance_text(seen)} of those of half-width {short(width)} s")
+    peak = f"{closed.question.amplitude_percent:g} %"
+    return ChartData(f"Of flares that peak at {peak} the search finds {'; '.join(parts)}.", series)
+
+
+class Completeness(Tab):
+    """Tab of completeness."""
+
+    name, title = "completeness", "Stare"
+    about = (
+        "One exposure sees a flare at its peak; a stare sees it rise and fade. This tab shows which flares a search of "
+        "one orbit finds at the chosen rate of false alarms, with losses while the star drifts out of the fibre."
+    )
+    pictures = (shares,)
+    chance = False
+    # The picture reads off the share of flares of this size.
+    also = ("amplitude_percent",)
+    simulations = {"completeness": "Inject flares"}  # noqa: RUF012
+    answer, view = "completeness", 1
+    files = {"completeness": "completeness", "limits": "completeness"}  # noqa: RUF012

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from bokeh.models import FixedTicker, HoverTool, LinearColorMapper
-from bokeh.models.annotations import ColorBar
+from bokeh.palettes import diverging_palette
 from numpy.typing import NDArray
 
 from mauvecl.answers.plan import COLUMNS
@@ -24,7 +24,6 @@ from mauvecl.charts.calibrations import (
 from mauvecl.charts.chart import (
     WAVELENGTH,
     Axis,
-    Band,
     Chart,
     ChartData,
     Contours,
@@ -39,7 +38,7 @@ from mauvecl.charts.chart import (
 )
 from mauvecl.charts.light_curves import SCATTER, scatter_series
 from mauvecl.host.stars.source import Source
-from mauvecl.schema.columns import View, chance_text, with_error
+from mauvecl.schema.columns import View, with_error
 from mauvecl.schema.errors import InputError
 from mauvecl.web.closed_forms import Answers, short
 from mauvecl.web.sandboxed_reader import read_limited
@@ -56,9 +55,8 @@ if TYPE_CHECKING:
     from mauvecl.answers.plan import PlanAnswer
     from mauvecl.observations.analysis import Analysis
     from mauvecl.observations.frames import Frames
-    from mauvecl.web.closed_forms import ClosedForms
+    from mauvecl.web.closed_forms import ClosedForms, Question
     from mauvecl.web.figures import Canvas
-    from mauvecl.web.question import Question
     from mauvecl.web.uploads import Observations
 
 
@@ -71,12 +69,6 @@ VERDICTS = {"detected": "star", "candidate": "drawn", "rejected": "own", "undeci
 #: Colours of the dynamic spectrum.
 BLUE, RED = "#0072B2", "#D55E00"
 NO_FRAMES = "Choose a file of frames: a light curve or a sequence of spectra."
-
-
-def frames_of(closed: ClosedForms) -> Frames | None:
-    """Return the frames of the question, or None if there is no file."""
-    frames: Frames | None = closed.given.get("frames")
-    return frames
 
 
 def minutes(frames: Frames, time_s: Any) -> Float:
@@ -106,7 +98,8 @@ def thinned(values: Float, most: int) -> NDArray[np.int64]:
 ).data()  # fmt: skip
 def light_curve(closed: ClosedForms, answers: Answers) -> ChartData:
     """Return the light curve, its quiescent level, and the events."""
-    frames, series = frames_of(closed), dict[str, Any]()
+    frames: Frames | None = closed.given.get("frames")
+    series = dict[str, Any]()
     if frames is None:
         return ChartData(NO_FRAMES)
     flux, used = frames.white_light[0], frames.faults == 0
@@ -141,9 +134,6 @@ def _summary(rows: Any, analysis: Analysis) -> str:
 
 
 def _image(canvas: Canvas, source: ColumnDataSource) -> None:
-    from bokeh.models import HoverTool, LinearColorMapper
-    from bokeh.palettes import diverging_palette
-
     colours = diverging_palette(_shades(BLUE), _shades(RED), 255)
     mapper = LinearColorMapper(palette=colours, name="deviation", low=-5, high=5, nan_color=canvas.ink["grid"])
     image = canvas.plot.image("image", "x", "y", "dw", "dh", source=source, color_mapper=mapper)
@@ -162,7 +152,7 @@ def _image(canvas: Canvas, source: ColumnDataSource) -> None:
 ).data()  # fmt: skip
 def dynamic_spectrum(closed: ClosedForms, answers: Answers) -> ChartData:
     """Return every spectrum against time, in standard deviations from the median."""
-    frames = frames_of(closed)
+    frames: Frames | None = closed.given.get("frames")
     if frames is None or frames.wavelength_nm is None:
         return ChartData("A light curve has no spectra." if frames else NO_FRAMES)
     image, nm = _deviations(frames), frames.wavelength_nm
@@ -256,78 +246,10 @@ class Analyse(Tab):
         """Return whether the answer has a table; some exist only for spectra."""
         return self.answer in answers and name in answers[self.answer].tables
 
-    def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
-        """Return a table of the answer; raises InputError for one that only spectra have."""
-        tables = answers[self.answer].tables
-        if name not in tables:
-            raise InputError(f"a light curve has no table {name}", f"one of {', '.join(tables)}", key="name")
-        table: Table = tables[name]
-        return table
-
     def shown(self, closed: ClosedForms, answers: Answers) -> View | None:
         """Return the table of events; without an event, the sentence that says so."""
         view = super().shown(closed, answers)
         return view if view is not None and view.columns else None
-
-
-#: Half-widths of the flares: as many as there are lines.
-LENGTHS = ("shortest", "middle", "longest")
-
-
-@Chart(
-    "shares", "Share of flares that a search of a stare finds",
-    Axis("peak amplitude of the flare (%)", log=True, limits=(0.01, 100)),
-    Axis("share of flares found", limits=(-0.03, 1.05)),
-    (
-        *(
-            series
-            for k, called in enumerate(LENGTHS)
-            for series in (
-                Band(f"{called} flares", called, f"band {k}", listed=False),
-                Line(f"{called} flares", called, f"line {k}", width=2,
-                     tips=("amplitude (%)", f"found of the {called}")),
-            )
-        ),
-        Rule("amplitude of your question", "own", "own"),
-    ),
-).data()  # fmt: skip
-def shares(closed: ClosedForms, answers: Answers) -> ChartData:
-    """Return the fraction of injected flares that the search finds against their amplitude."""
-    series: dict[str, Any] = {"own": closed.question.amplitude_percent}
-    if "completeness" not in answers:
-        text = (
-            "Nothing is injected yet: Inject flares puts flares of several lengths and sizes into a stare of one "
-            "orbit, and searches it."
-        )
-        return ChartData(text, series)
-    injected, parts = answers["completeness"].stars[0].injected, []
-    for k, width in enumerate(injected.half_widths_s):
-        x, share = 100 * injected.sizes, injected.completeness[k]
-        series |= {
-            f"band {k}": (x, injected.completeness_low[k], injected.completeness_high[k]),
-            f"line {k}": (x, share),
-        }
-        seen = float(np.interp(np.log(closed.question.amplitude_percent), np.log(x), share))
-        parts.append(f"{chance_text(seen)} of those of half-width {short(width)} s")
-    peak = f"{closed.question.amplitude_percent:g} %"
-    return ChartData(f"Of flares that peak at {peak} the search finds {'; '.join(parts)}.", series)
-
-
-class Completeness(Tab):
-    """Tab of completeness."""
-
-    name, title = "completeness", "Stare"
-    about = (
-        "One exposure sees a flare at its peak; a stare sees it rise and fade. This tab shows which flares a search of "
-        "one orbit finds at the chosen rate of false alarms, with losses while the star drifts out of the fibre."
-    )
-    pictures = (shares,)
-    chance = False
-    # The picture reads off the share of flares of this size.
-    also = ("amplitude_percent",)
-    simulations = {"completeness": "Inject flares"}  # noqa: RUF012
-    answer, view = "completeness", 1
-    files = {"completeness": "completeness", "limits": "completeness"}  # noqa: RUF012
 
 
 NO_OBSERVATIONS = "Choose an archive of observations; Calibrate then fits the instrument."
@@ -450,7 +372,7 @@ class Change(Tab):
 
 
 def _cells(canvas: Canvas, source: ColumnDataSource) -> None:
-    plot, mapper = canvas.plot, LinearColorMapper(palette="Cividis256", low=0, high=1)
+    plot, mapper = canvas.plot, canvas.share_colours("recovered")
     cells = plot.quad("left", "right", "bottom", "top", source=source, line_color=None,
                       fill_color={"field": "share", "transform": mapper})  # fmt: skip
     cells.name = "recovered"
@@ -458,7 +380,6 @@ def _cells(canvas: Canvas, source: ColumnDataSource) -> None:
     plot.add_tools(HoverTool(renderers=[cells], tooltips=shown))
     plot.xaxis.ticker = FixedTicker(ticks=[0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200])
     plot.yaxis.ticker = FixedTicker(ticks=[0.5, 1, 2, 4])
-    plot.add_layout(ColorBar(color_mapper=mapper, width=10, title="recovered", **canvas.bar_text), "right")
 
 
 @Chart(

@@ -21,13 +21,12 @@ from mauvecl.host.tables.units import offline
 from mauvecl.schema.columns import chance_text
 from mauvecl.schema.errors import InputError, of_kind, shortened
 from mauvecl.study.plan import PlanTarget
-from mauvecl.web.closed_forms import TITLES, Answers, Chance, ClosedForms, chances, short
+from mauvecl.web.closed_forms import OTHER, TITLES, Answers, Chance, ClosedForms, Question, chances, short
 from mauvecl.web.exposure_tabs import Detection, Noise, Signal, Spectrum, Unknown
 from mauvecl.web.fields import FIELDS, FORMER_VALUES, IDEAL, REALISTIC, UPLOADED, Choice, Field, note, sentence, targets
-from mauvecl.web.flare_tabs import Limit, Measurement
-from mauvecl.web.observation_tabs import Analyse, Calibrate, Change, Completeness, Periods, Plan, Visibility
-from mauvecl.web.question import OTHER, SIMULATIONS, Question
-from mauvecl.web.tab import Compare, Tab
+from mauvecl.web.flare_tabs import Completeness, Limit, Measurement
+from mauvecl.web.observation_tabs import Analyse, Calibrate, Change, Periods, Plan, Visibility
+from mauvecl.web.tab import SIMULATIONS, Compare, Tab
 from mauvecl.web.uploads import UPLOADS
 
 #: Tabs with pictures, in the order of their group.

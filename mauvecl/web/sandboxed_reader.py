@@ -103,7 +103,8 @@ def _read_apart(reader: str, files: Mapping[str, bytes], options: Mapping[str, A
         **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"),
         "MAUVECL_LARGEST_CONTENT_MIB": str(CONTENT_MIB),
         "PYTHONIOENCODING": "utf-8",
-        "PYTHONPATH": os.pathsep.join(filter(None, (_here(), os.environ.get("PYTHONPATH")))),
+        # The reading process starts in another folder than that of the package.
+        "PYTHONPATH": os.pathsep.join(filter(None, (str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH")))),
     }
     words = json.dumps({"reader": reader, "file": next(iter(files)), "options": dict(options)})
     # A fresh interpreter, as spawn makes one: OpenCL does not survive a fork.
@@ -131,11 +132,6 @@ def _read_apart(reader: str, files: Mapping[str, bytes], options: Mapping[str, A
     if done.returncode == _NO_ROOM:
         raise InputError(f"the upload takes more than {MEMORY_MIB} MiB of memory to read", smaller, key="upload")
     raise InputError("the upload ends its reader", other, key="upload")
-
-
-def _here() -> str:
-    """Return the folder of the package, since the reading process starts in another one."""
-    return str(Path(__file__).parents[2])
 
 
 def _limit(memory_mib: int, seconds: int) -> None:

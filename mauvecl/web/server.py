@@ -35,13 +35,13 @@ from mauvecl.answers.verbs import GROUPS
 from mauvecl.host import VERSION
 from mauvecl.host.exposure.star import KNOWN
 from mauvecl.host.stars.library import all_names, library_names, well_known_stars
-from mauvecl.schema.errors import InputError, shortened
+from mauvecl.schema.errors import InputError, printable, shortened
 from mauvecl.study.plan import TARGET_COLUMNS
 from mauvecl.web import fields
 from mauvecl.web.closed_forms import TITLES, ClosedForms
 from mauvecl.web.figures import INKS, PINS, Canvas
 from mauvecl.web.page import SEEN, TABS, State, reads_of
-from mauvecl.web.question import SIMULATIONS
+from mauvecl.web.tab import SIMULATIONS
 from mauvecl.web.uploads import EXAMPLES, MAPPED, TIME_UNITS, UPLOADS
 from mauvecl.web.visitor import UNUSED, Job, Visitor, limit_arenas, reading, release_memory, shown
 
@@ -129,11 +129,6 @@ class AccessMatcher(Matcher):
     def __init__(self, allowed: frozenset[str]) -> None:
         self._allowed = allowed
 
-    @classmethod
-    def rule(cls, allowed: frozenset[str]) -> Rule:
-        """Return the routing rule, which must precede all others."""
-        return Rule(cls(allowed), RefusalHandler)
-
     def match(self, request: HTTPServerRequest) -> dict[str, Any] | None:
         """Return the reason for which a request is rejected, or None."""
         refused = self._foreign(request) or self._too_many(request)
@@ -198,8 +193,7 @@ class Plain(logging.Formatter):
 
 def _line(text: str) -> str:
     """Shorten text to one bounded line."""
-    shown = " ".join(text.split())
-    return "".join(c if c.isprintable() else "?" for c in shown[:MOST])
+    return printable(" ".join(text.split()), MOST)
 
 
 def _where(error: BaseException) -> str:
@@ -255,7 +249,7 @@ def make(address: str, port: int, allowed: Sequence[str]) -> Any:
         log_function=lambda handler: None,
     )
     # Access control comes first.
-    application.default_router.rules.insert(0, AccessMatcher.rule(let_in))
+    application.default_router.rules.insert(0, Rule(AccessMatcher(let_in), RefusalHandler))
     server = BoundedServer(
         application,
         max_body_size=BODY,

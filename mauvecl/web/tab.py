@@ -1,25 +1,159 @@
-"""Base class of tabs: charts, simulations and tables for download."""
+"""Tabs of the page: the simulations that they start, their base class, and the tables and commands that they offer."""
 
 from __future__ import annotations
 
+import io
+import json
+import math
+import shlex
+import tempfile
+import threading
+import zipfile
 from abc import ABC
-from collections.abc import Mapping
-from functools import cached_property
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from pathlib import Path
+from pprint import pformat
 from typing import TYPE_CHECKING, Any, ClassVar
+
+from pydantic import BaseModel
 
 from mauvecl.answers.verbs import VERBS
 from mauvecl.schema.columns import View, without_empty
-from mauvecl.web.closed_forms import Answers
-from mauvecl.web.fields import FIELDS, star_words
-from mauvecl.web.question import verbs_of
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.fields import Flag, found
+from mauvecl.schema.section import read_axis, read_line_fluxes, read_words
+from mauvecl.study.observation import SkyLight
+from mauvecl.study.star import Star
+from mauvecl.study.study import Study, keys_of, with_paths
+from mauvecl.web.closed_forms import OTHER
+from mauvecl.web.fields import FIELDS
 
 if TYPE_CHECKING:
     from astropy.table import Table
 
+    from mauvecl.answers.verbs import Verb
     from mauvecl.charts.chart import Chart
-    from mauvecl.study.study import Study
-    from mauvecl.web.closed_forms import ClosedForms
-    from mauvecl.web.question import Question
+    from mauvecl.runs.pool import Pool
+    from mauvecl.web.closed_forms import Answers, ClosedForms, Question
+
+#: Cells along each axis of the page's map, and realisations per cell.
+MAP_STEPS, MAP_REALISATIONS = 8, 20_000
+#: Injected flares: numbers of sizes and half-widths, flares of each, and positions.
+INJECTED = {"of": "amplitude", "sizes": 12, "widths": 3, "count": 200, "positions": 4, "fitted": 0}
+#: Largest number of simulated fits, and of those of two temperatures, which take fifty times as long.
+MOST_FITS, MOST_OF_TWO = 10_000, 1000
+
+
+def _map_around(study: Study) -> Study:
+    """Return the study of a coarse map around the question's star."""
+    star, amplitude = study.star[0], study.flare.amplitudes[0]
+    middle = 7.0 if star.magnitude is None else star.magnitude
+    x = {"quantity": "magnitude", "start": middle - 2.5, "stop": middle + 2.5, "steps": MAP_STEPS}
+    y = {"quantity": "amplitude", "start": amplitude / 10, "stop": amplitude * 3, "steps": MAP_STEPS, "log": True}
+    # One statistic and the fewest realisations that the false-alarm probability allows keep the map fast.
+    fewest = math.ceil(100 / study.run.fap)
+    n = min(max(MAP_REALISATIONS, fewest), study.run.realisations)
+    return _changed(study, map={"x": x, "y": y}, run={"realisations": n, "statistics": [study.run.statistics[-1]]})
+
+
+def _changed(study: Study, **sections: dict[str, Any]) -> Study:
+    """Return a study with other values of keys, by section."""
+    return study.with_changes(sections, None, "page")
+
+
+def _tabulated(answers: dict[str, Any]) -> dict[str, Any]:
+    """Add the tables of a visibility, which are slow to make and read repeatedly."""
+    answer = answers["visible"]
+    return answers | {"seen": {name: getattr(answer, name) for name in ("table", "months", "by_day")}}
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """Question that a button of the page asks."""
+
+    # Verbs that answer it, by the names under which the page keeps their answers; the first is the main one.
+    verbs: Mapping[str, str]
+    asked: Callable[[Study], Study] = lambda study: study  # makes the study that is asked from that of the page
+    # Adds to the answers what the page reads repeatedly.
+    completed: Callable[[dict[str, Any]], dict[str, Any]] = lambda answers: answers
+    # Further answers of the main verb by name, with what makes their study; a refused one is left out.
+    others: Mapping[str, Callable[[Study], Study]] = field(default_factory=dict)
+    needs: str = ""  # field without which it cannot start
+
+    def __call__(
+        self,
+        study: Study,
+        pool: Pool,
+        progress: Callable[[int, int], None] | None = None,
+        *,
+        given: Mapping[str, Any] | None = None,
+    ) -> dict[str, Any]:
+        """Return the answers by name; the main verb reports its progress and takes the contents of files."""
+        asked = self.asked(study)
+        main = next(iter(self.verbs.values()))
+        wanted = [(name, verb, asked) for name, verb in self.verbs.items()]
+        wanted += [(name, main, change(asked)) for name, change in self.others.items()]
+        counted = sum(VERBS[verb].counts == "realisations" for _, verb, _ in wanted)
+        if counted > 1:
+            pool.expect(counted * asked.run.realisations)
+        answers: dict[str, Any] = {}
+        for name, verb, question in wanted:
+            try:
+                answers[name] = VERBS[verb].ask(question, pool, progress, **(given or {} if verb == main else {}))
+            except InputError:
+                if name not in self.others:
+                    raise
+        return self.completed(answers)
+
+
+def _fits(study: Study) -> Study:
+    """Return the study of fits of the flare's spectrum."""
+    most = MOST_FITS if study.flare.spectrum.second_area is None else MOST_OF_TWO
+    return _changed(study, measure={"fits": min(study.run.realisations, most)})
+
+
+def _other_unknowns(study: Study) -> Study:
+    """Return the study with the usual unknowns if it has none, or without."""
+    return _changed(study, nuisances={"usual": not study.nuisances.usual})
+
+
+#: Simulations that change the study or have another name than their verb.
+_OWN_SIMULATIONS = {
+    "detection": Simulation({"detection": "detect", "snr": "snr"}, others={OTHER: _other_unknowns}),
+    "map": Simulation({"map": "map"}, _map_around),
+    "measure": Simulation({"measure": "measure"}, _fits),
+    "completeness": Simulation({"completeness": "inject"}, partial(_changed, injections=INJECTED, search={"nulls": 0})),
+    "visible": Simulation({"visible": "visible"}, completed=_tabulated, needs="targets"),
+    "plan": Simulation({"plan": "plan"}, needs="targets"),
+    "analyse": Simulation({"analyse": "analyse"}, needs="frames"),
+    "calibrate": Simulation({"calibrate": "calibrate"}, needs="observations"),
+    "periods": Simulation({"periods": "change"}, partial(_changed, change={"periods": True}), needs="targets"),
+}
+#: All simulations by name: those above, and the verbs that have a tab.
+SIMULATIONS = {name: Simulation({name: name}) for name, verb in VERBS.items() if verb.tab} | _OWN_SIMULATIONS
+
+
+def simulation_of(name: str) -> Simulation:
+    """Return the simulation of a name, or the verb of that name as one."""
+    return SIMULATIONS.get(name) or Simulation({name: name})
+
+
+def asked_study(name: str, study: Study) -> tuple[str, Study]:
+    """Return the verb of a simulation, with its study derived from the page's."""
+    simulation = simulation_of(name)
+    return next(iter(simulation.verbs.values())), simulation.asked(study)
+
+
+def verbs_of(name: str) -> tuple[str, ...]:
+    """Return the verbs that answer a simulation."""
+    return tuple(simulation_of(name).verbs.values())
+
+
+#: Simulations that use the pool's devices.
+DRAWING = {"detection", "map"} | {name for name in SIMULATIONS.keys() - _OWN_SIMULATIONS.keys() if VERBS[name].counts}
+
 
 #: Columns that the page does not show: its question has one star and one flare.
 FIXED = ("star", "amplitude")
@@ -98,8 +232,7 @@ class Tab(ABC):
 
     def words(self, question: Question) -> str:
         """Return the question of a tab without the chance, in words."""
-        star = "your own star" if question.uploaded is not None else star_words(question.star)
-        return f"{star} of {question.band} = {question.magnitude:g}"
+        return f"{question.star_in_words} of {question.band} = {question.magnitude:g}"
 
     def offers(self, name: str, answers: Answers) -> bool:
         """Return whether one of `files` can be downloaded; by default, whether the answer it needs is simulated."""
@@ -136,3 +269,208 @@ class Compare(Tab):
 
     name, title, group = "compare", "Compare", "tools"
     about = "Scenarios that you have pinned, side by side, and what you have simulated; this browser tab keeps them."
+
+
+#: Keys that are stated even at their default, so that readers see what was assumed.
+STATED = ("star", "flare.amplitudes", "observation.exposure_s", "observation.instrument", "sky", "run.fap",
+          "run.realisations", "run.seed")  # fmt: skip
+#: Keys without a flag of their own verb that it uses: unknowns are drawn by everything that observes.
+ALWAYS_USED = ("nuisances.", "observation.temperature_c")
+#: Longest value in a command; a longer one is in the study file.
+MOST_CHARACTERS = 500
+#: Name of the study file in a command that needs it.
+STUDY_FILE = "study.toml"
+
+#: Arguments of verbs for what their command does if a flare is given.
+OPTIONS = {"simulate": ", flaring=True"}
+
+PROGRAM = """from mauvecl import Engine, Study, {verb}
+
+study = Study.build(
+    {data},
+    "page",
+)
+answer = {verb}(study, Engine(){options})
+print(next(iter(answer.tables.values())))
+"""
+
+
+def differing(new: BaseModel, old: BaseModel, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the dotted path and the plain value of each key that has another value in `old`, or is `STATED`."""
+    for key, own_field in type(new).model_fields.items():
+        name, values = f"{path}{key}", (getattr(new, key), getattr(old, key))
+        # A new sky replaces all keys of the old one, and so does a section with a flag of its own.
+        whole = name == "sky" or bool(found(own_field, Flag))
+        if isinstance(values[0], BaseModel) and isinstance(values[1], BaseModel) and not whole:
+            yield from differing(*values, f"{name}.")
+        elif values[0] is not None and (values[0] != values[1] or name in STATED):
+            yield name, _plain(values[0])
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as TOML can hold it, without the defaults of records."""
+    if isinstance(value, BaseModel):
+        return value.model_dump(mode="json", exclude_defaults=True, exclude_none=True)
+    if isinstance(value, tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    return str(value) if isinstance(value, Path) else value
+
+
+def as_program(verb: str, study: Study) -> str:
+    """Return a question to a verb as a Python program."""
+    data: dict[str, Any] = {}
+    for name, value in keys_used(VERBS[verb], study, Study()):
+        *sections, key = name.split(".")
+        place = data
+        for section in sections:
+            place = place.setdefault(section, {})
+        place[key] = value
+    text = pformat(data, width=100, sort_dicts=False).replace("\n", "\n    ")
+    return PROGRAM.format(verb=verb, data=text, options=OPTIONS.get(verb, ""))
+
+
+def as_command(verb: str, study: Study) -> str:
+    """Return a question to a verb as a command, which names a study file if flags cannot say all of it."""
+    from_file = ["mauvecl", verb, STUDY_FILE]
+    if any(file is not None for file in (study.flare.spectrum.file, *(star.file for star in study.star))):
+        return shlex.join(from_file)
+    question = VERBS[verb]
+    base = Study().with_settings([f"{key}={value}" for key, value in (question.defaults or {}).items()])
+    words = ["mauvecl", verb]
+    for name, value in keys_used(question, study, base):
+        if name == "data.file":
+            words.insert(2, value)
+        elif name == "star":
+            words += [word for star in value for word in _star_words(star)]
+        elif name == "sky":
+            words += ["--sky", "none"] if value.get("none") else _words(SkyLight, value)
+        else:
+            words += _flag_words(name, value, question) or ["--set", f"{name}={_toml(value)}"]
+    long = any(len(word) > MOST_CHARACTERS for word in words)
+    return shlex.join(from_file if long else words)
+
+
+def keys_used(verb: Verb, study: Study, base: Study) -> Iterator[tuple[str, Any]]:
+    """Yield the keys that a verb uses of a study, with their plain values, if they are `differing` from a base."""
+    flagged = {key for key, *_ in keys_of()}
+    observes = verb.accepts("star.library")
+    for name, value in differing(study, base):
+        if name in ("star", "sky"):
+            used = observes if name == "star" else verb.accepts("sky.surface_brightness")
+        else:
+            used = verb.accepts(name) or name not in flagged or (observes and name.startswith(ALWAYS_USED))
+        if used:
+            yield name, value
+
+
+def _flag_words(name: str, value: Any, verb: Verb) -> list[str]:
+    """Return the words of a key's flag, or none if the verb has no flag that takes such a value."""
+    for flag in (flag for key, _, flag in keys_of() if key == name and verb.accepts(name)):
+        if isinstance(value, bool) and flag.read is None:
+            on, _, off = flag.names[0].partition("/")
+            return [on] if value else [off] if off else []
+        if flag.read is read_line_fluxes:
+            return [word for line, share in value.items() for word in (flag.names[0], f"{line}={share!r}")]
+        if flag.read is read_axis and "start" in value:
+            spaced = [value["quantity"], *(_text(value[key]) for key in ("start", "stop", "steps"))]
+            return [flag.names[0], ":".join(spaced + ["log"] * value.get("log", False))]
+        if flag.read in (None, read_words) and flag.kind in (None, str, list[str]):
+            values = value if isinstance(value, list) else [value]
+            if all(isinstance(item, str | int | float) for item in values):
+                return [word for item in values for word in (flag.names[0], _text(item))]
+    return []
+
+
+def _star_words(star: dict[str, Any]) -> list[str]:
+    """Return the flags of a star of the library."""
+    usual = Star(library=star.get("library"))
+    said = {key: value for key, value in star.items() if value != getattr(usual, key)}
+    return _words(Star, {"library": star.get("library")} | said)
+
+
+def _words(section: type[BaseModel], values: Mapping[str, Any]) -> list[str]:
+    """Return the words of the first flags of a section's keys, with their values."""
+    names = {key: flags[0].names[0] for key, each in section.model_fields.items() if (flags := found(each, Flag))}
+    return [word for key, value in values.items() if key in names for word in (names[key], _text(value))]
+
+
+def _text(value: str | float) -> str:
+    """Return a value as it is typed, with every digit of a number."""
+    return value if isinstance(value, str) else f"{value:.17g}" if float(f"{value:.15g}") != value else f"{value:.15g}"
+
+
+def _key(key: str) -> str:
+    return key if key.isidentifier() and key.isascii() else json.dumps(key)
+
+
+def _toml(value: Any) -> str:
+    """Return a value as TOML on one line."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{_key(key)} = {_toml(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, list):
+        return f"[{', '.join(map(_toml, value))}]"
+    return json.dumps(value, ensure_ascii=False)
+
+
+#: Held while matplotlib draws.
+_drawing = threading.Lock()
+
+
+def study_file(study: Study, name: str) -> tuple[str, bytes]:
+    """Return name and content of the study file, in a zip archive with the visitor's files if there are any."""
+    files, text = visitor_files(study), study.toml()
+    if not files:
+        return f"{name}.toml", text.encode()
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+        for file in files:
+            archive.write(file, file.name)
+            # Paths relative to the study, instead of those on the server.
+            text = text.replace(str(file.resolve()), file.name)
+        archive.writestr("study.toml", text)
+    return f"{name}.zip", out.getvalue()
+
+
+def visitor_files(study: Study) -> list[Path]:
+    """Return the visitor's files that a study names, each once."""
+    files: dict[Path, Path] = {}
+    with_paths(study.model_dump(mode="json"), Study, lambda file: files.setdefault(file, file))
+    return list(files)
+
+
+def as_file(tab: Tab, name: str, ending: str, closed: ClosedForms, answers: Answers) -> tuple[str, bytes]:
+    """Return file name and content of one of a tab's `files` or `documents`, or of the study that reproduces it.
+
+    The ending is "ecsv", "fits" or "study", and empty for a document. Raises InputError if there is no such file, or it
+    is not simulated yet.
+    """
+    from mauvecl.answers.answer import write_table
+
+    if name in tab.documents and tab.documents[name] in answers:
+        # Matplotlib's settings are those of the process.
+        with _drawing:
+            return name, answers[tab.documents[name]].documents[name]()
+    if name not in tab.files or ending not in ("ecsv", "fits", "study"):
+        raise InputError(f"{tab.title} has no file {name[:40]!r}.{ending[:10]}", "one of its own", key="name")
+    if not tab.offers(name, answers):
+        raise InputError(f"no {name} is computed yet: start a simulation first", key="name")
+    if ending == "study":
+        return study_file(tab.study(name, closed, answers), f"mauvecl-{name}")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"mauvecl-{name}.{ending}"
+        write_table(tab.table(name, closed, answers), path)
+        return path.name, path.read_bytes()
+
+
+def commands_and_programs(tab: Tab, question: Question, folder: Path) -> list[dict[str, str]]:
+    """Return each of a tab's `questions` as a command and as a Python program; `folder` holds the visitor's files."""
+    entries = []
+    for name in tab.questions:
+        verb, study = asked_study(name, question.study(folder))
+        # Paths relative to the study, instead of those on the server.
+        data = with_paths(study.model_dump(mode="json"), Study, lambda file: Path(file.name))
+        study = Study.build(data, "page")
+        entries.append({"question": name, "command": as_command(verb, study), "python": as_program(verb, study)})
+    return entries

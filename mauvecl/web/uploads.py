@@ -14,7 +14,7 @@ import tomllib
 import zipfile
 import zlib
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PureWindowsPath
@@ -22,6 +22,7 @@ from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
 from mauvecl.host.spectra.conversion import ReadSpectrum
 from mauvecl.host.stars.flare_spectra import ObservedFlare
@@ -29,9 +30,13 @@ from mauvecl.host.stars.source import Source
 from mauvecl.host.tables.text_tables import columns
 from mauvecl.observations.frames import Frames
 from mauvecl.schema.errors import InputError, printable, reworded, shortened
+from mauvecl.schema.section import input_error
 from mauvecl.study.analyses import PATHS, CalibrateQuestion, CalibrationObservation
 from mauvecl.web.fields import FIELDS, UPLOADED, UPLOADED_FILE, UPLOADED_UNKNOWN
 from mauvecl.web.sandboxed_reader import Spectrum, read_frames_limited, read_limited
+
+#: Name of a table of neighbours in its folder.
+NEIGHBOURS_FILE = "neighbours.csv"
 
 
 def content_folder(folder: Path, content: bytes, fill: Callable[[Path], object]) -> Path:
@@ -80,13 +85,8 @@ class Observations:
                 (new / name).write_bytes(content)
 
         home = content_folder(folder, self.content, unpack)
-        return placed(self.rows, lambda name: str(home / name))
-
-
-def placed(rows: Iterable[CalibrationObservation], place: Callable[[Path], str]) -> list[dict[str, Any]]:
-    """Return observations as data of a study, with other paths."""
-    data = [row.model_dump(exclude_none=True) for row in rows]
-    return [row | {key: place(row[key]) for key in PATHS if key in row} for row in data]
+        data = (row.model_dump(exclude_none=True) for row in self.rows)
+        return [row | {key: str(home / row[key]) for key in PATHS if key in row} for row in data]
 
 
 def unpacked(content: bytes) -> dict[str, bytes]:
@@ -160,7 +160,10 @@ def observations_in(files: Mapping[str, bytes]) -> tuple[CalibrationObservation,
                     expected = f"its file in the archive, which holds {', '.join(sorted(files))}"
                     raise InputError(f"{shortened(name)} is missing", expected, key="observations")
                 row[key] = name
-    return CalibrateQuestion.model_validate({"observations": rows}).observations
+    try:
+        return CalibrateQuestion.model_validate({"observations": rows}).observations
+    except ValidationError as error:
+        raise input_error("the archive", CalibrateQuestion, error) from error
 
 
 def _observations(name: str, content: bytes) -> list[dict[str, Any]]:
@@ -184,6 +187,26 @@ def _observations(name: str, content: bytes) -> list[dict[str, Any]]:
         )
     rows = section["observations"]
     return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
+
+
+def write_table(text: str, folder: Path) -> Path:
+    """Write a table of neighbours to a file, once per text, and return its path."""
+    home = content_folder(folder, text.encode(), lambda new: (new / NEIGHBOURS_FILE).write_text(text))
+    return home / NEIGHBOURS_FILE
+
+
+def write_spectrum(source: Source | ReadSpectrum, folder: Path, name: str) -> Path:
+    """Write an uploaded spectrum to a file of this name without loss, once per spectrum, and return its path."""
+    from astropy.table import Table
+
+    def write(new: Path) -> None:
+        table = Table({"wavelength": source.wavelength_nm, "flux": source.flux_flam})
+        table["wavelength"].unit, table["flux"].unit = "nm", "erg / (s cm2 Angstrom)"
+        table.meta |= {"name": source.name, "told": list(source.messages)}
+        table.write(new / name, format="ascii.ecsv")
+
+    content = name.encode() + source.wavelength_nm.tobytes() + source.flux_flam.tobytes()
+    return content_folder(folder, content, write) / name
 
 
 Points = tuple[tuple[float, float], ...]

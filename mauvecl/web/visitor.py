@@ -31,11 +31,10 @@ from mauvecl.host import VERSION
 from mauvecl.runs.pool import LocalWorkers, Pool, Stopped
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.web.closed_forms import ClosedForms, other_payloads, solved
-from mauvecl.web.downloads import as_file, asked_study, commands_and_programs
 from mauvecl.web.fields import FIELDS, field_of, remedies, sentence
 from mauvecl.web.page import TABS, State, asking, card, known, reads_of
-from mauvecl.web.question import DRAWING, SIMULATIONS, verbs_of
 from mauvecl.web.sandboxed_reader import read_columns_limited
+from mauvecl.web.tab import DRAWING, SIMULATIONS, as_file, asked_study, commands_and_programs, study_file, verbs_of
 from mauvecl.web.uploads import RESULTS, UPLOADS
 from mauvecl.web.uploads import UPLOAD_SHELF as UPLOADED
 
@@ -115,18 +114,15 @@ class Job:
         self.future: Future[Any] = _threads.submit(self._run)
 
     def _run(self) -> Any:
-        try:
-            return self._run_cancellable()
-        finally:
-            if time.monotonic() - (self._started or math.inf) > LONG_S:
-                release_memory()
-
-    def _run_cancellable(self) -> Any:
         if not self.drawing:
             with self._lock:
                 self._thread = threading.get_ident()
         try:
-            return self._asked()
+            self._check()
+            self._started = time.monotonic()
+            workers = LocalWorkers([None], make=lambda device, progress: _engine(progress))
+            self._pool = Pool(workers, progress=lambda done, total: self._check())
+            return self.ask(self._pool, self._count) if self.unit else self.ask(self._pool)
         except Stopped as error:
             raise Cancelled from error
         finally:
@@ -135,13 +131,8 @@ class Job:
                 if self._thread is not None:
                     _set_pending(self._thread, None)
                 self._thread = None
-
-    def _asked(self) -> Any:
-        self._check()
-        self._started = time.monotonic()
-        workers = LocalWorkers([None], make=lambda device, progress: _engine(progress))
-        self._pool = Pool(workers, progress=lambda done, total: self._check())
-        return self.ask(self._pool, self._count) if self.unit else self.ask(self._pool)
+            if time.monotonic() - (self._started or math.inf) > LONG_S:
+                release_memory()
 
     def _count(self, done: int, total: int) -> None:
         self._counted = done, total
@@ -216,6 +207,10 @@ OWN_FAULT = "the page failed, and there is no answer; this is a fault of mauvecl
 #: Why a connection was ended, for the page.
 UNUSED = 4000
 
+#: What replies to requests hold if these are refused.
+REFUSED: dict[str, dict[str, Any]] = {
+    "solve": {"solved": ""}, "pinned": {"pins": {}}, "columns": {"columns": []}, "file": {"file": ""},
+}  # fmt: skip
 #: Fields of the section `data`, which say how files of frames are read.
 DATA = {name for name, field in FIELDS.items() if field.path[:1] == ("data",)}
 
@@ -298,7 +293,8 @@ class Visitor(WebSocketHandler):
             log.warning("a message is not a valid request: %s", shortened(message))
             self.close(1003, "expected a question as the page asks it")
             return
-        ask(asked)
+        if (work := ask(asked)) is not None:
+            self._give(work, n=asked["n"], **REFUSED.get(asked["ask"], {}))
 
     # State and answers
 
@@ -415,13 +411,10 @@ class Visitor(WebSocketHandler):
         """Run a function in a thread."""
         return await asyncio.get_running_loop().run_in_executor(_closed_forms, work)
 
-    def _ask_solve(self, asked: dict[str, Any]) -> None:
+    async def _ask_solve(self, asked: dict[str, Any]) -> None:
         """Send the limit of the quantity for which the question solves, and the chances with other payloads."""
         n = self._solving = asked["n"]
-        self._give(self._solve(n, self.state(asked["link"])), n=n, solved="")
-
-    async def _solve(self, n: int, state: State) -> None:
-        closed = await self._in_thread(partial(self.closed, state, tab_of("")))
+        closed = await self._in_thread(partial(self.closed, self.state(asked["link"]), tab_of("")))
         if n != self._solving:
             # It takes long for a bright star, and a later question waits.
             self.send(n=n, solved="")
@@ -429,18 +422,15 @@ class Visitor(WebSocketHandler):
         self.send(n=n, payloads=await self._in_thread(partial(other_payloads, closed)))
         self.send(n=n, solved=await self._in_thread(partial(solved, closed)))
 
-    def _ask_pinned(self, asked: dict[str, Any]) -> None:
+    async def _ask_pinned(self, asked: dict[str, Any]) -> None:
         """Send the data of a pinned scenario for a tab's pictures."""
-        n = asked["n"]
-        self._give(self._pinned(n, self.state(asked["link"]), str(asked.get("tab"))), n=n, pins={})
-
-    async def _pinned(self, n: int, state: State, name: str) -> None:
-        tab = tab_of(name)
+        tab = tab_of(str(asked.get("tab")))
         pictures = [picture for picture in tab.pictures if picture.pins]
-        question = state.question(tab.reads)
+        question = self.state(asked["link"]).question(tab.reads)
         closed = await self._in_thread(partial(ClosedForms.of, question, Path(self._folder.name)))
         drawn = await self._in_thread(lambda: {p.name: p.drawn(closed, {})["sources"][p.pins] for p in pictures})
-        self.send(n=n, pins={name: {c: packed(v) for c, v in columns.items()} for name, columns in drawn.items()})
+        pins = {name: {c: packed(v) for c, v in columns.items()} for name, columns in drawn.items()}
+        self.send(n=asked["n"], pins=pins)
 
     # Draws and simulations
 
@@ -449,19 +439,22 @@ class Visitor(WebSocketHandler):
         state, tab = self.state(asked["link"]), tab_of(str(asked.get("tab")))
         if self._closed is None or self._closed[0] != (self._key(state, tab.reads), tab.chance):
             return
-        closed = self._closed[1]
         if self._drawing is not None:
             self._drawing.cancel()
+        closed = self._closed[1]
         how = closed.case.draw_options | {"seed": closed.study.run.seed}
         self._drawing = Job(lambda pool: pool.realise(closed.flare, count=1, **how)[0])
 
-        def came(future: Future[Any]) -> None:
-            if self._closed is None or self._closed[1] is not closed or future.cancelled() or future.exception():
+        async def draw(job: Job) -> None:
+            try:
+                drawn = await asyncio.wrap_future(job.future)
+            except (Exception, asyncio.CancelledError):
+                # Another draw took its place, or a simulation reports what is wrong.
                 return
-            answers = self.answers(state) | {"draw": future.result()}
-            self.send(n=asked["n"], **shown(tab.name, closed, answers))
+            if self._closed is not None and self._closed[1] is closed:
+                self.send(n=asked["n"], **shown(tab.name, closed, self.answers(state) | {"draw": drawn}))
 
-        self._when_done(self._drawing.future, came)
+        self._begin(draw(self._drawing))
 
     def _ask_simulate(self, asked: dict[str, Any]) -> None:
         """Simulate, report progress, and send the answer."""
@@ -503,17 +496,6 @@ class Visitor(WebSocketHandler):
         if self.job is not None:
             self.job.cancel()
 
-    @staticmethod
-    def _when_done(work: Future[Any], then: Callable[[Future[Any]], None]) -> None:
-        """Call a function in the event loop when some work is done, unless the server has ended by then."""
-        loop = asyncio.get_running_loop()
-
-        def tell(work: Future[Any]) -> None:
-            if not loop.is_closed():
-                loop.call_soon_threadsafe(then, work)
-
-        work.add_done_callback(tell)
-
     # Files from and to the visitor
 
     def _ask_upload(self, asked: dict[str, Any]) -> None:
@@ -527,55 +509,49 @@ class Visitor(WebSocketHandler):
             self.close(1003, "expected a question as the page asks it")
             return
         asked, self._coming = self._coming, None
-        n, field, name = asked["n"], asked["field"], str(asked.get("name"))
-        upload = UPLOADS[field]
-        self._uploads.pop(field, None)
+        self._uploads.pop(asked["field"], None)
         state = self.state(asked["link"])
+        options = tuple(state.entered[name] for name in UPLOADS[asked["field"]].options.values())
+        self._digests[asked["field"]] = hashlib.sha256(content + repr(options).encode()).hexdigest()
+        self._begin(self._read(asked, content, state))
+
+    async def _read(self, asked: dict[str, Any], content: bytes, state: State) -> None:
+        field, name, upload = asked["field"], str(asked.get("name")), UPLOADS[asked["field"]]
         names = tuple(upload.options.values())
-        options = tuple(state.entered[name] for name in names)
-        self._digests[field] = hashlib.sha256(content + repr(options).encode()).hexdigest()
+        reply: dict[str, Any] = {"n": asked["n"], "field": field}
+        try:
+            work = reading(lambda: upload.read(name, content, state.values_of(names)))
+            self._uploads[field] = await asyncio.wrap_future(work)
+            UPLOADED.keep(self, field, self._uploads[field], partial(self._uploads.pop, field, None))
+            reply["entered"] = upload.entered
+        except InputError as error:
+            reply["lacks"] = sentence(error, upload.options)
+            reply["remedies"] = [remedy for remedy in remedies(error, upload.options) if remedy[0] in names]
+        except Exception as error:
+            log.exception("an upload failed")
+            kind = type(error).__name__
+            reply["lacks"] = f"upload {shortened(name)} cannot be read ({kind}), expected another"
+        self.send(**reply)
 
-        def came(future: Future[Any]) -> None:
-            try:
-                self._uploads[field] = future.result()
-                UPLOADED.keep(self, field, self._uploads[field], partial(self._uploads.pop, field, None))
-            except InputError as error:
-                proposed = [remedy for remedy in remedies(error, upload.options) if remedy[0] in names]
-                self.send(n=n, field=field, lacks=sentence(error, upload.options), remedies=proposed)
-            except Exception as error:
-                log.exception("an upload failed")
-                self.send(
-                    n=n, field=field,
-                    lacks=f"upload {shortened(name)} cannot be read ({type(error).__name__}), expected another",
-                )  # fmt: skip
-            else:
-                self.send(n=n, field=field, entered=upload.entered)
-
-        self._when_done(reading(lambda: upload.read(name, content, state.values_of(names))), came)
-
-    def _ask_columns(self, asked: dict[str, Any]) -> None:
+    async def _ask_columns(self, asked: dict[str, Any]) -> None:
         """Send the names of the columns of the visitor's frames; none if they are no table."""
-        self._give(self._columns(asked["n"]), n=asked["n"], columns=[])
-
-    async def _columns(self, n: int) -> None:
         file, names = self._uploads.get("frames"), ()
         if file is not None:
             names = await asyncio.wrap_future(reading(partial(read_columns_limited, file.name, file.content)))
-        self.send(n=n, columns=names)
+        self.send(n=asked["n"], columns=names)
 
-    def _ask_file(self, asked: dict[str, Any]) -> None:
-        n = asked["n"]
+    async def _ask_file(self, asked: dict[str, Any]) -> None:
+        """Send a table, document or study."""
         which = (str(asked.get(word)) for word in ("tab", "name", "ending"))
-        self._give(self._file(n, self.state(asked["link"]), *which), n=n, file="")
-
-    async def _file(self, n: int, state: State, tab: str, name: str, ending: str) -> None:
-        file, content = await self._in_thread(partial(self.file, state, tab, name, ending))
-        self.send(content, n=n, file=file)
+        file, content = await self._in_thread(partial(self.file, self.state(asked["link"]), *which))
+        self.send(content, n=asked["n"], file=file)
 
     def file(self, state: State, tab: str, name: str, ending: str) -> tuple[str, bytes]:
         """Send a table or study of the question; the last ones are cached."""
         # The page asks for the study of a question by its name alone.
-        front = TABS.get(tab) or next((other for other in TABS.values() if name in other.questions), tab_of(tab))
+        front = TABS.get(tab) or next((other for other in TABS.values() if name in other.questions), None)
+        if front is None:
+            raise InputError(f"no tab asks {name[:40]!r}", "a question of a tab", key="name")
         # A simulation asks what its own answers depend on, which their tables state.
         reads = reads_of(name) if tab not in TABS and name in SIMULATIONS else front.reads
         answers = self.answers(state)
@@ -584,7 +560,8 @@ class Visitor(WebSocketHandler):
             if tab in TABS:
                 made = as_file(TABS[tab], name, ending, self.closed(state, front), answers)
             else:
-                made = asked_study(name, state.question(reads).study(Path(self._folder.name)))
+                _, study = asked_study(name, state.question(reads).study(Path(self._folder.name)))
+                made = study_file(study, "study")
             self._files[which] = made
             RESULTS.keep(self, which, made, partial(self._files.pop, which, None))
             while len(self._files) > MOST_KEPT:
@@ -592,14 +569,12 @@ class Visitor(WebSocketHandler):
             return made
         return self._files[which]
 
-    def _ask_export(self, asked: dict[str, Any]) -> None:
+    async def _ask_export(self, asked: dict[str, Any]) -> None:
         """Send a tab's questions as commands and as Python programs."""
-        n, tab = asked["n"], tab_of(str(asked.get("tab")))
-        self._give(self._export(n, self.state(asked["link"]), tab), n=n)
-
-    async def _export(self, n: int, state: State, tab: Tab) -> None:
-        work = partial(commands_and_programs, tab, state.question(tab.reads), Path(self._folder.name))
-        self.send(n=n, taken=await self._in_thread(work))
+        tab = tab_of(str(asked.get("tab")))
+        question = self.state(asked["link"]).question(tab.reads)
+        taken = await self._in_thread(partial(commands_and_programs, tab, question, Path(self._folder.name)))
+        self.send(n=asked["n"], taken=taken)
 
 
 def tab_of(name: str) -> Tab:

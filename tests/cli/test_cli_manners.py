@@ -202,7 +202,7 @@ def test_line_on_a_terminal_is_cleared_before_the_next_star(
 
 ROOT = Path(mauvecl.__file__).parent
 #: The command line itself, and the command that the page offers.
-OF_FLAGS = ("cli/", "web/downloads.py")
+OF_FLAGS = ("cli/", "web/tab.py")
 FLAG = re.compile(r"(?<![\w-])--[a-z][a-z-]+")
 #: Whole commands are named as they are typed.
 COMMAND = re.compile(r"`(?:mauvecl|wsl) [^`]*`")

@@ -79,7 +79,7 @@ def test_flags_refuse_wrong_units(words: tuple[str, ...], found: str, tmp_path: 
 
 def test_units_are_imported_only_with_a_unit() -> None:
     """Reading plain numbers must not take the time that importing astropy takes."""
-    code = "import sys; from mauvecl.schema.parsing import number; number({!r}, '--exposure', 's'); "
+    code = "import sys; from mauvecl.schema.section import read_number; read_number({!r}, '--exposure', 's'); "
     code += "print('astropy' in sys.modules)"
     for text, imported in (("600", "False"), ("10 min", "True")):
         done = subprocess.run([sys.executable, "-c", code.format(text)], capture_output=True, text=True, check=True)

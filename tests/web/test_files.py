@@ -713,6 +713,7 @@ BROKEN: list[tuple[dict[str, bytes | None], str]] = [
     ({"b3v.ecsv": b"nothing of the kind"}, "numbers"),
     ({"standards.toml": f"[sky]\nnone = true\n{STUDY}".encode()}, "sky"),
     ({"standards.toml": STUDY.encode() * 40}, ""),
+    ({"standards.toml": STUDY.encode() + b"\nodd = 1\n"}, "odd"),
     ({"standards.toml": b"a = " + b"[" * 10_000}, ""),
     ({"standards.toml": STUDY.encode() + b"#" * 2**18}, ""),
 ]

@@ -1,59 +1,37 @@
-"""Study sections for star, flare, observation, sky, noise processes, run and unknown instrument values."""
+"""Study sections of a star, of the spectrum of its flares, and of their amplitudes."""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import Field, create_model, field_validator, model_validator
+from pydantic import Field, model_validator
 
-from mauvecl.detection.names import DEFAULT_STATISTICS, RECOMMENDED, STATISTIC_NAMES
-from mauvecl.host.exposure import DEFAULT_SKY
-from mauvecl.host.instrument import DEFAULT_INSTRUMENT, current_name
 from mauvecl.host.stars.library import ALIASES, listed_values
-from mauvecl.noise.disturbances import Prior, PriorField
-from mauvecl.noise.unknowns import INSTRUMENT_VALUES, Comparison, values_of
-from mauvecl.schema import parsing
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Flag, Help, Quantity, Range, Slider, Widget
+from mauvecl.schema.fields import Flag, Help, Quantity, Range, Slider, Unit, Widget
 from mauvecl.schema.physical import (
-    DEFAULT_SEED,
     Amplitude,
+    AreaRatio,
+    BalmerJump,
     BinWidth,
-    DetectorTemperature,
     Distance,
-    Exposure,
+    LineFraction,
+    LineScale,
     Magnitude,
-    Probability,
     Radius,
     Reddening,
     Share,
-    SkyBrightness,
     Temperature,
 )
-from mauvecl.schema.section import Section
-from mauvecl.study.flare_light import FlareLight
+from mauvecl.schema.section import Section, read_line_fluxes
 
 if TYPE_CHECKING:
-    from mauvecl.host.exposure.sky import Sky
     from mauvecl.host.exposure.star import Neighbours
-    from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.host.stars.flare_spectra import FlareSpectrum
     from mauvecl.host.stars.source import Source
-
-
-def amplitudes_in(path: Path, _: str) -> list[float]:
-    """Read the amplitudes of a table of flares, each value once, and warn of columns that are not used."""
-    import warnings
-
-    from mauvecl.host.stars.flare import read_flares
-
-    flares = read_flares(path)
-    for remark in flares.meta["comments"]:
-        warnings.warn(remark, stacklevel=2)
-    return sorted({float(value) for value in flares["amplitude"]})
-
 
 #: Keys that only apply to a star from a file.
 FILE_KEYS = ("file", "wavelength_unit", "flux_unit", "extend", "ignore_checksum")
@@ -284,6 +262,219 @@ class Star(Section):
         return source.at_magnitude(self.magnitude, self.band, self.magnitude_system)
 
 
+#: Keys, other than `file`, that only apply to a flare from a file.
+FLARE_FILE_KEYS = ("quiescent", "wavelength_unit", "flux_unit", "continue_at_k", "as_observed")
+#: Keys that do not apply to a flare from a file.
+BLACKBODY_KEYS = ("second_temperature_k", "second_area", "balmer_jump")
+
+
+class FlareLight(Section):
+    """Spectrum of a flare; by default a blackbody of `flare.temperature_k`."""
+
+    balmer_jump: Annotated[
+        BalmerJump | None,
+        Help("Ratio of the flare's flux just below the Balmer edge to that just above", default="1"),
+        Flag("--balmer-jump"),
+        Widget(
+            label="Balmer jump",
+            hint="Flux just below 364.6 nm over that just above, by hydrogen recombination: 1 to 4 in most flares. "
+            "Nothing: a plain blackbody.",
+            group="Flare's spectrum",
+        ),
+        Quantity(
+            "balmer_jump", "flux of the flare just below the Balmer edge over that just above", "Balmer jump ratio"
+        ),
+    ] = None
+    electron_temperature_k: Annotated[Temperature, Help("Electron temperature of the Balmer continuum")] = 10_000.0
+    second_temperature_k: Annotated[
+        Temperature | None,
+        Help("Temperature of a second blackbody of the flare", "needs its area"),
+        Flag("--second-temperature"),
+        Widget(
+            label="Second temperature",
+            hint="A second blackbody in the flare, instead of a Balmer jump. Nothing: there is none.",
+            group="Flare's spectrum",
+        ),
+        Quantity("second_temperature", "temperature of the flare's second blackbody", "second temperature (K)"),
+    ] = None
+    second_area: Annotated[
+        AreaRatio | None,
+        Help("Area of the second blackbody over that of the first"),
+        Flag("--second-area"),
+        Widget(
+            label="Second area",
+            hint="Area at the second temperature over that at the first, if there is one.",
+            group="Flare's spectrum",
+            first="0.05",
+        ),
+        Quantity("second_area", "area of the flare's second blackbody over that of the first", "second area"),
+    ] = None
+    lines: Annotated[
+        dict[str, LineFraction],
+        Help(
+            "Emission line as a fraction of the continuum in 200-700 nm, by name or wavelength in nm",
+            "as in 'Mg II=0.05'",
+        ),
+        Flag("--line", kind=list[str], read=read_line_fluxes),
+    ] = Field(default_factory=dict)
+    line_fluxes: Annotated[
+        dict[str, Annotated[float, Unit("erg / (s cm2)"), Range(0)]],
+        Help("Emission line at the telescope, by name or wavelength in nm", "as in '280=1e-12'"),
+        Flag("--line-flux", kind=list[str], read=read_line_fluxes),
+    ] = Field(default_factory=dict)
+    line_scale: Annotated[
+        LineScale,
+        Help("Factor on all line fluxes"),
+        Quantity("line_scale", "factor of all line fluxes of the flare", "line fluxes"),
+    ] = 1.0
+    file: Annotated[
+        Path | None,
+        Help("Spectrum file of an observed or computed flare"),
+        Flag("--flare-file"),
+        Widget(
+            label="Own flare spectrum",
+            hint="Spectrum of an observed or computed flare without its star, in place of a blackbody. The amplitude "
+            "scales it.",
+            group="Flare's spectrum",
+            name="flare_file",
+            place=2,
+            kind="file",
+        ),
+    ] = None
+    quiescent: Annotated[
+        Path | None,
+        Help("Spectrum file of its star without the flare, which is subtracted"),
+        Flag("--flare-quiescent"),
+        Widget(
+            label="Star without the flare",
+            hint="Spectrum of the same star without the flare, on the same scale and in the same units. It is "
+            "subtracted. Nothing: the file holds the flare alone.",
+            group="Own flare",
+            name="flare_quiescent",
+            place=1,
+            kind="file",
+        ),
+    ] = None
+    wavelength_unit: Annotated[
+        str | None,
+        Help("Unit of the wavelengths of the flare's files"),
+        Flag("--flare-wavelength-unit"),
+        Widget(
+            label="Flare: unit of wavelengths",
+            hint="Such as Angstrom or Angstrom air. Nothing: what the file says.",
+            group="Own flare",
+            name="flare_wavelength_unit",
+            suggestions=("nm", "Angstrom", "um", "nm air", "Angstrom air"),
+        ),
+    ] = None
+    flux_unit: Annotated[
+        str | None,
+        Help("Unit of the fluxes of the flare's files"),
+        Flag("--flare-flux-unit"),
+        Widget(
+            label="Flare: unit of fluxes",
+            hint="Such as W m-2 nm-1 or Jy. Nothing: what the file says.",
+            group="Own flare",
+            name="flare_flux_unit",
+            suggestions=("erg s-1 cm-2 Angstrom-1", "W m-2 nm-1", "Jy"),
+        ),
+    ] = None
+    continue_at_k: Annotated[
+        Temperature | None,
+        Help("Temperature of a blackbody that continues the flare's file beyond its ends"),
+        Flag("--continue-at"),
+        Widget(
+            label="Continue at",
+            hint="Temperature of a blackbody that continues the flare's spectrum beyond its ends. Nothing: it must "
+            "cover what the instrument sees.",
+            group="Own flare",
+        ),
+    ] = None
+    as_observed: Annotated[
+        bool,
+        Help("Take the flare for as bright at the telescope as its file states, in place of amplitudes"),
+        Flag("--as-observed"),
+        Widget(
+            label="As bright as observed",
+            hint="Whether the flare has the flux of its file at the telescope, in place of the amplitude above.",
+            group="Own flare",
+            place=2,
+        ),
+    ] = False
+
+    @model_validator(mode="after")
+    def _one_model(self) -> Self:
+        given = [key for key in BLACKBODY_KEYS if getattr(self, key) is not None]
+        if self.file is not None and given:
+            raise InputError(f"the spectrum of a flare needs either file or {given[0]}, but has both", key="file")
+        own = [key for key in FLARE_FILE_KEYS if getattr(self, key)]
+        if self.file is None and own:
+            raise InputError(f"the spectrum of a flare has {own[0]}, which needs a file as well", key=own[0])
+        if (self.second_temperature_k is None) != (self.second_area is None):
+            raise InputError(
+                "the spectrum of a flare needs both second_temperature_k and second_area, or neither, but has only one",
+                key="second_area",
+            )
+        if self.balmer_jump is not None and self.second_area is not None:
+            raise InputError(
+                "the spectrum of a flare needs either balmer_jump or second_area, but has both", key="balmer_jump"
+            )
+        if self.file is None and self != FlareLight.model_construct():
+            self.at_temperature(10_000.0)
+        return self
+
+    def at_temperature(self, temperature_k: float) -> FlareSpectrum:
+        """Return the spectrum at a temperature, which a spectrum from a file ignores."""
+        from mauvecl.host.stars.flare_spectra import (
+            BalmerFlare,
+            Blackbody,
+            FlareWithLines,
+            ObservedFlare,
+            TwoBlackbodies,
+        )
+
+        light: FlareSpectrum = Blackbody(temperature_k)
+        if self.file is not None:
+            light = ObservedFlare.read(
+                self.file,
+                self.quiescent,
+                wavelength_unit=self.wavelength_unit,
+                flux_unit=self.flux_unit,
+                continue_at_k=self.continue_at_k,
+            )
+        elif self.second_temperature_k is not None and self.second_area is not None:
+            light = TwoBlackbodies(temperature_k, self.second_temperature_k, self.second_area)
+        elif self.balmer_jump is not None:
+            light = BalmerFlare(temperature_k, self.balmer_jump, self.electron_temperature_k)
+        if not (self.lines or self.line_fluxes):
+            return light
+        scaled = (
+            {name: self.line_scale * value for name, value in each.items()} for each in (self.lines, self.line_fluxes)
+        )
+        return FlareWithLines(light, *scaled)
+
+    def with_value(self, path: Sequence[str], value: Any) -> Self:
+        """Return a copy with another value of one key; raises InputError if the key has no effect."""
+        (key,) = path
+        if key == "line_scale" and not (self.lines or self.line_fluxes):
+            raise InputError(
+                f"line_scale = {value} has no effect on a flare without lines",
+                "lines in flare.spectrum.lines",
+                key="line_scale",
+            )
+        return type(self)(**(self.model_dump() | {key: value}))
+
+
+def amplitudes_in(path: Path, _: str) -> list[float]:
+    """Read the amplitudes of a table of flares, each value once, and warn of columns that are not used."""
+    from mauvecl.host.stars.flare import read_flares
+
+    flares = read_flares(path)
+    for remark in flares.meta["comments"]:
+        warnings.warn(remark, stacklevel=2)
+    return sorted({float(value) for value in flares["amplitude"]})
+
+
 class Flare(Section):
     """Amplitudes, spectrum and geometry of flares."""
 
@@ -305,7 +496,6 @@ class Flare(Section):
             name="amplitude_percent",
             first="2",
             unit="%",
-            scale=100.0,
             slider=Slider(0.01, 1000, 10**0.1, log=True),
         ),
         Quantity("amplitude", "flare amplitude: relative rise of the photons in the flare's band", "flare amplitude"),
@@ -355,272 +545,3 @@ class Flare(Section):
     def is_blackbody(self) -> bool:
         """True if the spectrum is a single blackbody."""
         return self.spectrum == FlareLight()
-
-
-class Observation(Section):
-    """Instrument, exposure, and how the detector is modelled."""
-
-    exposure_s: Annotated[
-        Exposure,
-        Help("Exposure time", "rounded up to whole frames of 5 s"),
-        Flag("--exposure", "-t"),
-        Widget(
-            label="Exposure",
-            hint="Time on the star; whole frames of 5 s are added up.",
-            place=1,
-            slider=Slider(5, 3600, 5),
-        ),
-        Quantity("exposure", "length of the exposure", "exposure (s)"),
-    ] = 50.0
-    instrument: Annotated[
-        str,
-        Help(
-            "Instrument", choices="mauve, mauvesim (with the conventions of the MauveSim paper), or your own TOML file"
-        ),
-        Flag("--instrument"),
-        Widget(
-            label="Payload",
-            hint="mauve: dark counts are Poisson in electrons, as in physics. mauvesim: Poisson in DN, as in the "
-            "MauveSim paper, which makes the dark noise 1.3 times as large.",
-            place=2,
-            choices=("mauve", "mauvesim"),
-        ),
-    ] = DEFAULT_INSTRUMENT
-    temperature_c: Annotated[
-        DetectorTemperature | None,
-        Help("Detector temperature", default="the instrument's"),
-        Flag("--temperature"),
-        Widget(
-            label="Detector temperature",
-            hint="The dark current doubles every few degrees.",
-            group="Detector",
-            placeholder="21, or along the orbit in plans",
-            slider=Slider(-10, 40, 1),
-        ),
-        Quantity("detector_temperature", "temperature of the detector", "detector temperature (deg C)"),
-    ] = None
-    order: Annotated[
-        Literal["paper", "physical"],
-        Help("Order of efficiency and line spread function"),
-    ] = "paper"
-    signal: Annotated[
-        Literal["net", "paper"],
-        Help("Signal of an S/N", choices="net (the star alone) or paper (with the zodiacal light)"),
-        Flag("--signal"),
-        Widget(
-            label="Counted as signal",
-            hint="In the S/N: the light of the star alone (net), or that of the sky too, as in the MauveSim paper. It "
-            "moves no detection.",
-            group="Sky",
-            place=2,
-        ),
-    ] = "net"
-    mode: Annotated[Literal["auto", "frames", "stacked"], Help("How the frames of an exposure are drawn")] = "auto"
-    recipe: Annotated[Literal["auto", "joint", "apart"], Help("How the noise of a frame is drawn")] = "auto"
-    changes: Annotated[dict[str, float | int | str], Help("Changed values of the instrument, by name")] = Field(
-        default_factory=dict
-    )
-
-    @field_validator("instrument")
-    @classmethod
-    def _current_name(cls, given: str) -> str:
-        return current_name(given)
-
-    def load_instrument(self) -> Instrument:
-        """Load the instrument and apply `changes` and the detector temperature."""
-        from mauvecl.host.instrument.instrument import Instrument
-
-        return self.changed(Instrument.load(self.instrument))
-
-    def changed(self, instrument: Instrument) -> Instrument:
-        """Return an instrument with `changes` and the detector temperature."""
-        changes = self.changes | ({} if self.temperature_c is None else {"temperature_c": self.temperature_c})
-        return instrument.with_(**changes) if changes else instrument
-
-
-class SkyLight(Section):
-    """Sky background: a surface brightness, that of a target at a time, or none."""
-
-    surface_brightness: Annotated[
-        SkyBrightness | None,
-        Help("Surface brightness of the sky in V", "or none", default=f"{DEFAULT_SKY:g}"),
-        Flag("--sky", kind=str),
-        Widget(
-            label="Sky brightness",
-            hint="Zodiacal light, V magnitudes per square arc second.",
-            group="Sky",
-            place=1,
-            name="sky_brightness",
-            first=f"{DEFAULT_SKY:g}",
-            unit="mag/arcsec²",
-            slider=Slider(20, 24, 0.1),
-        ),
-        Quantity("sky", "zodiacal surface brightness in V", "sky brightness (V mag / arcsec²)"),
-    ] = None
-    target: Annotated[
-        str | None,
-        Help("Target whose zodiacal light is the sky, with the time", "a star such as 'AU Mic', or '290.68 +11.12'"),
-        Flag("--target"),
-        Widget(
-            label="Sky target",
-            hint="A star by name, such as AU Mic, or coordinates in degrees such as 290.68 +11.12.",
-            group="Sky",
-            place=1,
-        ),
-    ] = None
-    time: Annotated[
-        str | None,
-        Help("Time of the observation, UTC, with the target"),
-        Flag("--time"),
-        Widget(label="Time, UTC", hint="Such as 2026-09-01T12:00.", group="Sky", place=1),
-    ] = None
-    none: Annotated[bool, Help("Whether there is no sky")] = False
-
-    @model_validator(mode="before")
-    @classmethod
-    def _default_brightness(cls, given: Any) -> Any:
-        return given or {"surface_brightness": DEFAULT_SKY}
-
-    @model_validator(mode="after")
-    def _one_sky(self) -> Self:
-        if (self.target is None) != (self.time is None):
-            raise InputError("the sky needs both target and time, or neither, but has only one", key="time")
-        if (self.surface_brightness is not None) + (self.target is not None) + self.none > 1:
-            raise InputError(
-                "the sky is given twice",
-                "one of surface_brightness, target with time, and none",
-                key="surface_brightness",
-            )
-        return self
-
-    def with_value(self, path: Sequence[str], value: Any) -> Self:
-        """Return the sky of one value, which replaces all others."""
-        return type(self)(**{path[0]: value})
-
-    def sky(self) -> Sky:
-        """Return the sky for the host."""
-        from mauvecl.host.exposure.sky import Sky
-
-        if self.none:
-            return Sky.none()
-        if self.target is not None and self.time is not None:
-            return Sky.at(self.target, self.time)
-        return Sky.none() if self.surface_brightness is None else Sky.of_brightness(self.surface_brightness)
-
-
-class Run(Section):
-    """Number of realisations, seed, statistics and false-alarm probability."""
-
-    realisations: Annotated[int, Range(1), Help("Noise realisations"), Flag("--realisations", "-n")] = 1_000_000
-    seed: Annotated[
-        int,
-        Range(0, 2**64 - 1),
-        Help("Seed"),
-        Flag("--seed"),
-        Widget(label="Seed", hint="The same seed gives the same noise, to the bit.", group="Detection", place=3),
-    ] = DEFAULT_SEED
-    statistics: Annotated[
-        tuple[str, ...],
-        Field(min_length=1),
-        Help("Detection statistic", choices=f"{', '.join(STATISTIC_NAMES)}, or all"),
-        Flag("--statistic", read=parsing.words),
-        Flag(
-            "--all-statistics",
-            kind=bool,
-            read=lambda *_: DEFAULT_STATISTICS,
-            help=Help(f"Answer by {', '.join(DEFAULT_STATISTICS)} instead of {RECOMMENDED} alone"),
-        ),
-    ] = (RECOMMENDED,)
-    fap: Annotated[
-        Probability,
-        Help("False-alarm probability per test"),
-        Flag("--fap"),
-        Widget(
-            label="False-alarm probability",
-            hint="How often noise alone passes for a flare, per test: it sets the threshold.",
-            group="Detection",
-            unit="per test",
-            slider=Slider(1e-6, 0.1, 10**0.1, log=True),
-        ),
-    ] = 1e-3
-    tails: Annotated[
-        Literal["counted", "sampled"],
-        Help(
-            "Thresholds with fewer than 100 draws beyond them",
-            choices="counted rejects them, sampled finds them by importance sampling",
-        ),
-        Flag("--tails"),
-    ] = "counted"
-    reference: Annotated[
-        str,
-        Help("Spectrum that is subtracted", choices="template (noise-free), exposure (noisy), or stack:N of them"),
-        Flag("--reference"),
-    ] = "template"
-    variances: Annotated[
-        Literal["model", "estimated"],
-        Help("Variances", choices="model, or estimated from the counts as an observer must"),
-        Flag("--variances"),
-    ] = "model"
-    template_temperatures_k: Annotated[
-        tuple[Temperature, ...],
-        Help("Temperature of a flare that is also looked for", "shows what a wrong template costs"),
-        Flag("--template"),
-    ] = ()
-    weights: Annotated[dict[str, Path], Help("Files with weights of your own statistics, by name")] = Field(
-        default_factory=dict
-    )
-
-    @field_validator("statistics")
-    @classmethod
-    def _expand_all(cls, given: tuple[str, ...]) -> tuple[str, ...]:
-        return STATISTIC_NAMES if "all" in given else given
-
-    @model_validator(mode="after")
-    def _comparable(self) -> Self:
-        self.comparison()
-        return self
-
-    def comparison(self) -> Comparison:
-        """Return the reference of the comparison for the engine."""
-        return Comparison.of(self.reference, self.variances)
-
-
-Draws = Annotated[
-    int,
-    Range(0, 4096),
-    Help("Draws of unknown instrument values over which the answer is averaged"),
-    Flag("--unknown"),
-]
-Known = Annotated[
-    tuple[str, ...],
-    Help("Instrument value that is known", "as in temperature_c,light_loss"),
-    Flag("--known", read=parsing.words),
-]
-#: Number of draws, priors by name, and names of known values.
-_unknown_keys: Any = (
-    {"draws": (Draws, 0)}
-    | {name: (PriorField | None, value.prior) for name, value in INSTRUMENT_VALUES.items()}
-    | {"known": (Known, ())}
-)
-
-
-class Unknowns(create_model("_InstrumentValues", __base__=Section, **_unknown_keys)):  # type: ignore[misc]
-    """Priors of instrument values that are unknown but constant; ignored unless `draws` is positive.
-
-    The documentation page on nominal values explains the default priors.
-    """
-
-    @model_validator(mode="after")
-    def _possible(self) -> Self:
-        if self.draws == 1:
-            raise InputError.of("unknowns.draws", self.draws, "0 or at least 2")
-        other = next((name for name in self.known if name not in INSTRUMENT_VALUES), None)
-        if other is not None:
-            raise InputError(f"unknowns.known names {other!r}", f"some of {', '.join(INSTRUMENT_VALUES)}", key="known")
-        return self
-
-    def priors(self, instrument: Instrument) -> dict[str, Prior]:
-        """Return the priors of an instrument's unknown values by name, as in `noise.unknowns.values_of`."""
-        rows = {name: row for name, row in values_of(instrument).items() if name not in self.known}
-        given: dict[str, Any] = {name: getattr(self, name, row.prior) for name, row in rows.items()}
-        return {name: prior for name, prior in given.items() if prior is not None}

@@ -1,0 +1,433 @@
+"""Study sections of an observation: instrument and exposure, sky, realisations, and what is unknown of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+
+from pydantic import BeforeValidator, Field, create_model, field_validator, model_validator
+
+from mauvecl.detection.names import DEFAULT_STATISTICS, RECOMMENDED, STATISTIC_NAMES
+from mauvecl.host.exposure import DEFAULT_SKY
+from mauvecl.host.instrument import DEFAULT_INSTRUMENT, current_name
+from mauvecl.noise.disturbances import Prior, PriorField
+from mauvecl.noise.unknowns import (
+    DOCUMENTED_NUISANCES,
+    INSTRUMENT_VALUES,
+    NUISANCES,
+    Comparison,
+    Processes,
+    default_processes,
+    values_of,
+)
+from mauvecl.schema.errors import InputError, shortened
+from mauvecl.schema.fields import Flag, Help, Quantity, Range, Slider, Widget
+from mauvecl.schema.physical import (
+    DEFAULT_SEED,
+    DetectorTemperature,
+    Exposure,
+    Probability,
+    SkyBrightness,
+    Temperature,
+)
+from mauvecl.schema.section import Section, read_words
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from mauvecl.detection.nuisances import Nuisances
+    from mauvecl.host.exposure.expectation import Expectation
+    from mauvecl.host.exposure.sky import Sky
+    from mauvecl.host.instrument.instrument import Instrument
+
+
+class Observation(Section):
+    """Instrument, exposure, and how the detector is modelled."""
+
+    exposure_s: Annotated[
+        Exposure,
+        Help("Exposure time", "rounded up to whole frames of 5 s"),
+        Flag("--exposure", "-t"),
+        Widget(
+            label="Exposure",
+            hint="Time on the star; whole frames of 5 s are added up.",
+            place=1,
+            slider=Slider(5, 3600, 5),
+        ),
+        Quantity("exposure", "length of the exposure", "exposure (s)"),
+    ] = 50.0
+    instrument: Annotated[
+        str,
+        Help(
+            "Instrument", choices="mauve, mauvesim (with the conventions of the MauveSim paper), or your own TOML file"
+        ),
+        Flag("--instrument"),
+        Widget(
+            label="Payload",
+            hint="mauve: dark counts are Poisson in electrons, as in physics. mauvesim: Poisson in DN, as in the "
+            "MauveSim paper, which makes the dark noise 1.3 times as large.",
+            place=2,
+            choices=("mauve", "mauvesim"),
+        ),
+    ] = DEFAULT_INSTRUMENT
+    temperature_c: Annotated[
+        DetectorTemperature | None,
+        Help("Detector temperature", default="the instrument's"),
+        Flag("--temperature"),
+        Widget(
+            label="Detector temperature",
+            hint="The dark current doubles every few degrees.",
+            group="Detector",
+            placeholder="21, or along the orbit in plans",
+            slider=Slider(-10, 40, 1),
+        ),
+        Quantity("detector_temperature", "temperature of the detector", "detector temperature (deg C)"),
+    ] = None
+    order: Annotated[
+        Literal["paper", "physical"],
+        Help("Order of efficiency and line spread function"),
+    ] = "paper"
+    signal: Annotated[
+        Literal["net", "paper"],
+        Help("Signal of an S/N", choices="net (the star alone) or paper (with the zodiacal light)"),
+        Flag("--signal"),
+        Widget(
+            label="Counted as signal",
+            hint="In the S/N: the light of the star alone (net), or that of the sky too, as in the MauveSim paper. It "
+            "moves no detection.",
+            group="Sky",
+            place=2,
+        ),
+    ] = "net"
+    mode: Annotated[Literal["auto", "frames", "stacked"], Help("How the frames of an exposure are drawn")] = "auto"
+    recipe: Annotated[Literal["auto", "joint", "apart"], Help("How the noise of a frame is drawn")] = "auto"
+    changes: Annotated[dict[str, float | int | str], Help("Changed values of the instrument, by name")] = Field(
+        default_factory=dict
+    )
+
+    @field_validator("instrument")
+    @classmethod
+    def _current_name(cls, given: str) -> str:
+        return current_name(given)
+
+    def load_instrument(self) -> Instrument:
+        """Load the instrument and apply `changes` and the detector temperature."""
+        from mauvecl.host.instrument.instrument import Instrument
+
+        return self.changed(Instrument.load(self.instrument))
+
+    def changed(self, instrument: Instrument) -> Instrument:
+        """Return an instrument with `changes` and the detector temperature."""
+        changes = self.changes | ({} if self.temperature_c is None else {"temperature_c": self.temperature_c})
+        return instrument.with_(**changes) if changes else instrument
+
+
+class SkyLight(Section):
+    """Sky background: a surface brightness, that of a target at a time, or none."""
+
+    surface_brightness: Annotated[
+        SkyBrightness | None,
+        Help("Surface brightness of the sky in V", "or none", default=f"{DEFAULT_SKY:g}"),
+        Flag("--sky", kind=str),
+        Widget(
+            label="Sky brightness",
+            hint="Zodiacal light, V magnitudes per square arc second.",
+            group="Sky",
+            place=1,
+            name="sky_brightness",
+            first=f"{DEFAULT_SKY:g}",
+            unit="mag/arcsec²",
+            slider=Slider(20, 24, 0.1),
+        ),
+        Quantity("sky", "zodiacal surface brightness in V", "sky brightness (V mag / arcsec²)"),
+    ] = None
+    target: Annotated[
+        str | None,
+        Help("Target whose zodiacal light is the sky, with the time", "a star such as 'AU Mic', or '290.68 +11.12'"),
+        Flag("--target"),
+        Widget(
+            label="Sky target",
+            hint="A star by name, such as AU Mic, or coordinates in degrees such as 290.68 +11.12.",
+            group="Sky",
+            place=1,
+        ),
+    ] = None
+    time: Annotated[
+        str | None,
+        Help("Time of the observation, UTC, with the target"),
+        Flag("--time"),
+        Widget(label="Time, UTC", hint="Such as 2026-09-01T12:00.", group="Sky", place=1),
+    ] = None
+    none: Annotated[bool, Help("Whether there is no sky")] = False
+
+    @model_validator(mode="before")
+    @classmethod
+    def _default_brightness(cls, given: Any) -> Any:
+        return given or {"surface_brightness": DEFAULT_SKY}
+
+    @model_validator(mode="after")
+    def _one_sky(self) -> Self:
+        if (self.target is None) != (self.time is None):
+            raise InputError("the sky needs both target and time, or neither, but has only one", key="time")
+        if (self.surface_brightness is not None) + (self.target is not None) + self.none > 1:
+            raise InputError(
+                "the sky is given twice",
+                "one of surface_brightness, target with time, and none",
+                key="surface_brightness",
+            )
+        return self
+
+    def with_value(self, path: Sequence[str], value: Any) -> Self:
+        """Return the sky of one value, which replaces all others."""
+        return type(self)(**{path[0]: value})
+
+    def sky(self) -> Sky:
+        """Return the sky for the host."""
+        from mauvecl.host.exposure.sky import Sky
+
+        if self.none:
+            return Sky.none()
+        if self.target is not None and self.time is not None:
+            return Sky.at(self.target, self.time)
+        return Sky.none() if self.surface_brightness is None else Sky.of_brightness(self.surface_brightness)
+
+
+class Run(Section):
+    """Number of realisations, seed, statistics and false-alarm probability."""
+
+    realisations: Annotated[int, Range(1), Help("Noise realisations"), Flag("--realisations", "-n")] = 1_000_000
+    seed: Annotated[
+        int,
+        Range(0, 2**64 - 1),
+        Help("Seed"),
+        Flag("--seed"),
+        Widget(label="Seed", hint="The same seed gives the same noise, to the bit.", group="Detection", place=3),
+    ] = DEFAULT_SEED
+    statistics: Annotated[
+        tuple[str, ...],
+        Field(min_length=1),
+        Help("Detection statistic", choices=f"{', '.join(STATISTIC_NAMES)}, or all"),
+        Flag("--statistic", read=read_words),
+        Flag(
+            "--all-statistics",
+            kind=bool,
+            read=lambda *_: DEFAULT_STATISTICS,
+            help=Help(f"Answer by {', '.join(DEFAULT_STATISTICS)} instead of {RECOMMENDED} alone"),
+        ),
+    ] = (RECOMMENDED,)
+    fap: Annotated[
+        Probability,
+        Help("False-alarm probability per test"),
+        Flag("--fap"),
+        Widget(
+            label="False-alarm probability",
+            hint="How often noise alone passes for a flare, per test: it sets the threshold.",
+            group="Detection",
+            unit="per test",
+            slider=Slider(1e-6, 0.1, 10**0.1, log=True),
+        ),
+    ] = 1e-3
+    tails: Annotated[
+        Literal["counted", "sampled"],
+        Help(
+            "Thresholds with fewer than 100 draws beyond them",
+            choices="counted rejects them, sampled finds them by importance sampling",
+        ),
+        Flag("--tails"),
+    ] = "counted"
+    reference: Annotated[
+        str,
+        Help("Spectrum that is subtracted", choices="template (noise-free), exposure (noisy), or stack:N of them"),
+        Flag("--reference"),
+    ] = "template"
+    variances: Annotated[
+        Literal["model", "estimated"],
+        Help("Variances", choices="model, or estimated from the counts as an observer must"),
+        Flag("--variances"),
+    ] = "model"
+    template_temperatures_k: Annotated[
+        tuple[Temperature, ...],
+        Help("Temperature of a flare that is also looked for", "shows what a wrong template costs"),
+        Flag("--template"),
+    ] = ()
+    weights: Annotated[dict[str, Path], Help("Files with weights of your own statistics, by name")] = Field(
+        default_factory=dict
+    )
+
+    @field_validator("statistics")
+    @classmethod
+    def _expand_all(cls, given: tuple[str, ...]) -> tuple[str, ...]:
+        return STATISTIC_NAMES if "all" in given else given
+
+    @model_validator(mode="after")
+    def _comparable(self) -> Self:
+        self.comparison()
+        return self
+
+    def comparison(self) -> Comparison:
+        """Return the reference of the comparison for the engine."""
+        return Comparison.of(self.reference, self.variances)
+
+
+def _spread(given: Any) -> Any:
+    """Validate a standard deviation or "free"."""
+    if given == "free":
+        return given
+    try:
+        value = float(given) if not isinstance(given, bool) else float("nan")
+    except (TypeError, ValueError):
+        value = float("nan")
+    if not 0 < value < float("inf"):
+        raise InputError(
+            f"the standard deviation of an unknown is {shortened(str(given))}", "a number above 0, or 'free'"
+        )
+    return value
+
+
+Spread = Annotated[float | Literal["free"], BeforeValidator(_spread)]
+
+
+def sd_of(spread: Spread) -> float:
+    """Return the standard deviation of a spread, infinite for "free"."""
+    return math.inf if spread == "free" else spread
+
+
+class OwnNuisance(Section):
+    """User-defined nuisance spectrum: wavelength in nm and DN per exposure at unit amplitude, as a file or points."""
+
+    file: Annotated[Path | None, Help("File with two columns, wavelength in nm and DN per exposure")] = None
+    points: Annotated[tuple[tuple[float, float], ...] | None, Help("Wavelengths in nm, and DN per exposure")] = None
+    sd: Annotated[Spread, Help("Standard deviation of the amplitude, or free")] = "free"
+
+    @model_validator(mode="after")
+    def _one_spectrum(self) -> Self:
+        if (self.file is None) == (self.points is None):
+            raise InputError("a nuisance spectrum needs either file or points, but has neither or both", key="points")
+        return self
+
+    def spectrum(self, name: str, wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the DN per exposure at unit amplitude, shape (n_pixel,)."""
+        import numpy as np
+
+        from mauvecl.detection.nuisances import at_pixels, read_spectrum
+
+        if self.file is not None:
+            return read_spectrum(name, self.file, wavelength_nm)
+        return at_pixels(f"points of {shortened(name)}", "DN", np.array(self.points), wavelength_nm)
+
+
+Usual = Annotated[
+    bool,
+    Help("Draw the usual unknowns and marginalise over them, or take everything but the noise as known"),
+    Flag("--with-unknowns/--ideal"),
+]
+Own = Annotated[
+    dict[str, OwnNuisance],
+    Help("Your own nuisance spectra, by name"),
+    Flag(
+        "--nuisance",
+        kind=list[str],
+        help=Help(
+            f"Marginalise over {', '.join(NUISANCES)} or a file's spectrum, with a standard deviation or free",
+            "as in dark=0.1 or stray.txt=free",
+        ),
+    ),
+]
+_keys: Any = (
+    {"usual": (Usual, True)}
+    | {
+        name: (Annotated[Spread | None, Help(f"Standard deviation of {row.label}, or free")], None)
+        for name, row in NUISANCES.items()
+    }
+    | {"own": (Own, Field(default_factory=dict))}
+)
+
+
+class NuisanceChoice(create_model("_Amplitudes", __base__=Section, **_keys)):  # type: ignore[misc]
+    """Prior standard deviations of the amplitudes that statistics are marginalised over, or "free" (projected out).
+
+    With `usual`, the default, the documented set is drawn and marginalised over; values given here replace those of the
+    set.
+    """
+
+    @property
+    def none(self) -> bool:
+        """True if everything but the noise is known."""
+        return self == KNOWN
+
+    def marginalised(self, quiet: Expectation) -> Nuisances | None:
+        """Return the nuisance parameters for the engine, or None if there are none."""
+        from mauvecl.detection.nuisances import Nuisances, spectrum_of
+
+        documented = DOCUMENTED_NUISANCES if self.usual else ()
+        # Parameters without effect, such as the brightness of no sky, are left out.
+        sd = {
+            row.name: row.prior.sd for row in documented if row.prior is not None and spectrum_of(row.name, quiet).any()
+        }
+        sd |= {name: sd_of(spread) for name, spread in self.spreads().items()}
+        own: dict[str, NDArray[np.float64]] = {}
+        for name, nuisance in self.own.items():
+            own[name] = nuisance.spectrum(name, quiet.wavelength_nm)
+            sd[name] = sd_of(nuisance.sd)
+        return Nuisances.of(quiet, sd, own) if sd else None
+
+    def spreads(self) -> dict[str, float | Literal["free"]]:
+        """Return the given standard deviations of amplitudes with built-in spectra."""
+        return {name: spread for name in NUISANCES if (spread := getattr(self, name)) is not None}
+
+    def processes(self, named: Processes, temperature_c: float) -> Processes:
+        """Return the processes to draw: those given and, with `usual`, those of the documented set."""
+        if not self.usual:
+            return named
+        added = default_processes(temperature_c)
+        update = {name: prior for name, prior in added.items() if getattr(named, name) is None}
+        every: Processes = named.model_copy(update=update)
+        return every
+
+
+#: Choice of unknowns with which everything but the noise is known.
+KNOWN = NuisanceChoice(usual=False)
+
+
+Draws = Annotated[
+    int,
+    Range(0, 4096),
+    Help("Draws of unknown instrument values over which the answer is averaged"),
+    Flag("--unknown"),
+]
+Known = Annotated[
+    tuple[str, ...],
+    Help("Instrument value that is known", "as in temperature_c,light_loss"),
+    Flag("--known", read=read_words),
+]
+#: Number of draws, priors by name, and names of known values.
+_unknown_keys: Any = (
+    {"draws": (Draws, 0)}
+    | {name: (PriorField | None, value.prior) for name, value in INSTRUMENT_VALUES.items()}
+    | {"known": (Known, ())}
+)
+
+
+class Unknowns(create_model("_InstrumentValues", __base__=Section, **_unknown_keys)):  # type: ignore[misc]
+    """Priors of instrument values that are unknown but constant; ignored unless `draws` is positive.
+
+    The documentation page on nominal values explains the default priors.
+    """
+
+    @model_validator(mode="after")
+    def _possible(self) -> Self:
+        if self.draws == 1:
+            raise InputError.of("unknowns.draws", self.draws, "0 or at least 2")
+        other = next((name for name in self.known if name not in INSTRUMENT_VALUES), None)
+        if other is not None:
+            raise InputError(f"unknowns.known names {other!r}", f"some of {', '.join(INSTRUMENT_VALUES)}", key="known")
+        return self
+
+    def priors(self, instrument: Instrument) -> dict[str, Prior]:
+        """Return the priors of an instrument's unknown values by name, as in `noise.unknowns.values_of`."""
+        rows = {name: row for name, row in values_of(instrument).items() if name not in self.known}
+        given: dict[str, Any] = {name: getattr(self, name, row.prior) for name, row in rows.items()}
+        return {name: prior for name, prior in given.items() if prior is not None}
