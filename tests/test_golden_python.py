@@ -65,7 +65,7 @@ from mauvecl import (
     what_matters,
 )
 from mauvecl.flares.frames import Components
-from mauvecl.observations.visits import line_index, recover_periods
+from mauvecl.observations import visits
 
 GOLDEN = Path(__file__).parent / "data" / "golden" / "python"
 # Of longer arrays evenly spaced values are kept.
@@ -385,10 +385,10 @@ def lines_and_periods(folder: Path) -> Answer:
     found: Answer = {}
     for path in sorted((DATA / "flares" / "aumic_iue").glob("lp*.txt"))[:4]:
         angstrom, flux, error = np.loadtxt(path, skiprows=19, usecols=(0, 1, 2)).T
-        one = line_index(angstrom / 10, 10 * flux, 10 * error, **MG_II)
+        one = visits.line_index(angstrom / 10, 10 * flux, 10 * error, **MG_II)
         found[path.stem] = [one.flux, one.error]
     time_d = np.sort(np.random.Generator(np.random.PCG64(1)).uniform(0, 60, 30))
-    periods = recover_periods(time_d, np.array([2.0, 10.0]), np.array([1.0, 3.0]), fap=0.05)
+    periods = visits.recover_periods(time_d, np.array([2.0, 10.0]), np.array([1.0, 3.0]), fap=0.05)
     found["periods"] = {
         "threshold": periods.threshold, "recovered": [[cell.value for cell in row] for row in periods.recovered]
     }  # fmt: skip

@@ -19,7 +19,7 @@ from scipy.interpolate import RegularGridInterpolator
 
 import mauvecl
 from mauvecl import InputError, Sky, Study, visible
-from mauvecl.host.orbit.visibility import Particles, Thermal
+from mauvecl.host.orbit import visibility
 
 VECTORS = Path(sgp4.__file__).parent
 PROTONS = Path(mauvecl.__file__).parent / "host" / "orbit" / "protons.ecsv"
@@ -327,14 +327,14 @@ def test_protons_along_the_orbit(month: Any) -> None:
     place = month.track.subsatellite_deg
     allowed = seen(**MONTH, limits=NO_LIMITS | {"proton_flux": 10.0}).seen[:, 0]
     np.testing.assert_array_equal(allowed, protons(10, *place) <= 10.0)
-    hits = Particles(1.0, 0.5).rate_per_cm2_s(month.track)
+    hits = visibility.Particles(1.0, 0.5).rate_per_cm2_s(month.track)
     np.testing.assert_allclose(hits, 1.0 + 0.5 * protons(30, *place), rtol=1e-9)
     assert hits.max() > 100
 
 
 def test_temperature_follows_its_equation() -> None:
     """Check exp(-t / tau) after a step from shadow to sunlight, and that balance is kept."""
-    thermal = Thermal(20.0, 10.0, 600.0)
+    thermal = visibility.Thermal(20.0, 10.0, 600.0)
     assert thermal.temperature_c(np.full(50, 1.0), 30.0) == pytest.approx(20.0)
     light = np.r_[np.zeros(5000), np.ones(100)]
     found = thermal.temperature_c(light, 30.0)

@@ -9,7 +9,7 @@ import pytest
 from processes import python
 
 from mauvecl import Engine, Processes
-from mauvecl.device.selftest import toy
+from mauvecl.device import selftest
 from mauvecl.noise import layout, reference, unknowns
 from mauvecl.noise.scene import prepare
 
@@ -27,7 +27,7 @@ def test_charge_is_a_distribution(name: str) -> None:
     size = max(long.size, doubled.size)
     padded = [np.pad(p, (0, size - p.size)) for p in (long, doubled)]
     assert np.abs(padded[0] - padded[1]).sum() < 1e3 * 2.0**-40, "a thousand times what may be neglected"
-    quiet = toy(64, 1)
+    quiet = selftest.toy(64, 1)
     electrons = np.arange(process.charge(quiet.frame_s).size)
     p = process.charge(quiet.frame_s)
     variance = p @ electrons**2 - (p @ electrons) ** 2
@@ -36,7 +36,7 @@ def test_charge_is_a_distribution(name: str) -> None:
 
 @pytest.mark.parametrize("name", unknowns.ADDITIVE)
 def test_device_draws_what_the_reference_draws(engine: Engine, name: str) -> None:
-    quiet = toy(64, 3)
+    quiet = selftest.toy(64, 3)
     processes = Processes(**{name: unknowns.ADDITIVE[name]()}).with_particles(500.0)
     index = np.arange(20, dtype=np.uint64)
     scene = prepare([quiet], processes=processes)

@@ -15,10 +15,9 @@ from scipy import stats
 
 from mauvecl import SHAPES, Frames, Study, analyse, read_frames, stare
 from mauvecl.answers.analyse import frame_model
+from mauvecl.observations import event_spectra, spectra
 from mauvecl.observations.detection import detect_events
-from mauvecl.observations.event_spectra import drifts, event_spectrum, measure_flare
 from mauvecl.observations.false_alarms import simulated_rates
-from mauvecl.observations.spectra import clean_spectra, survey_spectra
 
 Float = NDArray[np.float64]
 SHAPE = SHAPES["davenport2014"]
@@ -64,8 +63,8 @@ def drawn(rng: np.random.Generator, added: Float | float = 0.0, scale: float | F
 
 
 def prepared(frames: Frames, **how: Any) -> Prepared:
-    cleaned = clean_spectra(frames, model())
-    survey, series, _ = survey_spectra(cleaned, SHAPE, 3, 1, **how)
+    cleaned = spectra.clean_spectra(frames, model())
+    survey, series, _ = spectra.survey_spectra(cleaned, SHAPE, 3, 1, **how)
     return cleaned, survey, series
 
 
@@ -195,12 +194,12 @@ def test_cosmic_rays_are_replaced_and_counted_and_flares_are_not() -> None:
     hits = rng.choice(N, 30, replace=False)
     pixels = rng.integers(light().size, size=30)
     flux[hits, pixels] += rng.uniform(12, 80, 30) * sd[pixels]
-    cleaned = clean_spectra(element_frames(flux, clean.error), model())
+    cleaned = spectra.clean_spectra(element_frames(flux, clean.error), model())
     # Pixels next to one another in time are light, not rays.
     assert cleaned.rays.sum() >= 28
     assert (cleaned.rays[hits] > 0).sum() >= 28
     assert cleaned.rays.sum() <= 31
-    assert clean_spectra(clean, model()).rays.sum() <= 1
+    assert spectra.clean_spectra(clean, model()).rays.sum() <= 1
     left = np.abs(cleaned.frames.flux - clean.flux)[hits, pixels] / sd[pixels]
     assert np.median(left) < 2.0
 
@@ -232,7 +231,7 @@ def test_counts_with_and_without_bias_and_dark_current_are_distinguished() -> No
         found = frame_model(STUDY, frames)
         assert not isinstance(found, str)
         assert found.raw == (flux is raw)
-        levels.append(float(np.median(clean_spectra(frames, found).frames.white_light[0])))
+        levels.append(float(np.median(spectra.clean_spectra(frames, found).frames.white_light[0])))
     assert levels[0] == pytest.approx(levels[1], rel=1e-6)
     # The noise of 40 frames is 1 % of the light.
     assert levels[0] == pytest.approx(quiet.light_dn.sum(), rel=0.06)
@@ -330,8 +329,8 @@ def test_intervals_of_temperature_and_energy_cover(threshold: float) -> None:
         _, survey, series = prepared(drawn(rng, added + np.outer(drift, light())))
         found, taken = detect_events(survey, threshold)
         one = max(found, key=lambda each: each.value)
-        assert event_spectrum(survey, series, taken, one).cause == "flare"
-        measured = measure_flare(survey, series, taken, one)
+        assert event_spectra.event_spectrum(survey, series, taken, one).cause == "flare"
+        measured = event_spectra.measure_flare(survey, series, taken, one)
         assert not isinstance(measured, str), measured
         # What the flare adds in the frames of the event: its part of the amplitude, of the model's energy of a frame.
         flares = model().flare.values(kelvin, [1.0])
@@ -357,7 +356,7 @@ def test_drifts_are_measured_next_to_a_short_event() -> None:
     numbers = survey.stare.numbers
     quiet = np.zeros(numbers.size, np.bool_)
     short = (numbers >= 200) & (numbers < 210)
-    without, with_event = (drifts(survey, series, taken, N // 8) for taken in (quiet, short))
+    without, with_event = (event_spectra.drifts(survey, series, taken, N // 8) for taken in (quiet, short))
     for name in ("light", "dark"):
         assert with_event[name] == pytest.approx(without[name], rel=0.3)
 

@@ -46,7 +46,7 @@ from mauvecl import (
 )
 from mauvecl.detection import requests
 from mauvecl.runs import checkpoint as shards
-from mauvecl.runs.pool import Stopped, map_in_order
+from mauvecl.runs import pool as pools
 
 pytestmark = pytest.mark.usefixtures("small_shards")
 
@@ -176,7 +176,7 @@ def test_closed_workers_end_every_wait(engine: Engine, scene: list[Expectation])
     def ask() -> None:
         try:
             Pool(workers).detect(quiet, flares, realisations=8192, seed=5)
-        except (Stopped, RuntimeError) as end:
+        except (pools.Stopped, RuntimeError) as end:
             ends.append(end)
 
     # Daemon threads: one that waits for ever fails the test instead of holding it.
@@ -433,7 +433,7 @@ def test_answers_keep_their_order_and_errors_end_the_rest(engine: Engine) -> Non
         time.sleep(pauses[number])
         return number
 
-    assert list(map_in_order(pool, slow, range(6))) == list(range(6))
+    assert list(pools.map_in_order(pool, slow, range(6))) == list(range(6))
 
     def bad(number: int) -> int:
         if number == 2:
@@ -441,8 +441,8 @@ def test_answers_keep_their_order_and_errors_end_the_rest(engine: Engine) -> Non
         return number
 
     with refused("number", "2"):
-        list(map_in_order(pool, bad, range(6)))
-    with pytest.raises(Stopped):
+        list(pools.map_in_order(pool, bad, range(6)))
+    with pytest.raises(pools.Stopped):
         pool.detect(SCENE[0], SCENE[1:], realisations=N, seed=5)
 
 
@@ -456,7 +456,7 @@ def test_progress_that_raises_stops_the_work_ahead_of_it(engine: Engine) -> None
     try:
         detection_map(small(map=AXES), pool, progress)
     except ArithmeticError:
-        with pytest.raises(Stopped):
+        with pytest.raises(pools.Stopped):
             pool.detect(SCENE[0], SCENE[1:], realisations=N, seed=5)
     else:
         pytest.fail("the progress was not asked")
