@@ -22,28 +22,8 @@ from refusals import refused
 from scenes import instrument, star
 from stores import flip, full_after
 
-from mauvecl import (
-    Comparison,
-    DaskWorkers,
-    Detection,
-    Engine,
-    Expectation,
-    InputError,
-    Linear,
-    LocalWorkers,
-    Pool,
-    Processes,
-    Study,
-    Uniform,
-    detect,
-    snr,
-)
-from mauvecl import (
-    limit as limiting_magnitude,
-)
-from mauvecl import (
-    map as detection_map,
-)
+import mauvecl
+from mauvecl import Comparison, DaskWorkers, Detection, Engine, Expectation, Linear, LocalWorkers, Pool, Processes
 from mauvecl.detection import requests
 from mauvecl.runs import checkpoint as shards
 from mauvecl.runs import pool as pools
@@ -103,7 +83,7 @@ def test_shards_of_every_kind_of_request_join(engine: Engine) -> None:
         "seed": 1,
         "statistics": ("chi2_pair", "matched"),
         "comparison": Comparison.of("stack:3", "estimated"),
-        "processes": Processes(jitter=Uniform(0.0, 0.05)),
+        "processes": Processes(jitter=mauvecl.Uniform(0.0, 0.05)),
     }
     pool = Pool(Shuffled(engine, 4))
     same(pool.detect(quiet, flares, **how), engine.detect(quiet, flares, **how))
@@ -209,18 +189,18 @@ AXES = {"x": {"quantity": "magnitude", "values": [6, 8, 10]}, "y": {"quantity": 
 @pytest.mark.parametrize(
     ("ask", "sections"),
     [
-        (lambda s, e: detect(s, e).table, {}),
-        (lambda s, e: snr(s, e).element, {"sweep": {"axes": [{"quantity": "exposure", "values": [5, 50]}]}}),
-        pytest.param(lambda s, e: limiting_magnitude(s, e).table, {}, marks=pytest.mark.long),
-        (lambda s, e: detection_map(s, e).table, {"map": AXES}),
+        (lambda s, e: mauvecl.detect(s, e).table, {}),
+        (lambda s, e: mauvecl.snr(s, e).element, {"sweep": {"axes": [{"quantity": "exposure", "values": [5, 50]}]}}),
+        pytest.param(lambda s, e: mauvecl.limit(s, e).table, {}, marks=pytest.mark.long),
+        (lambda s, e: mauvecl.map(s, e).table, {"map": AXES}),
         pytest.param(
-            lambda s, e: detection_map(s, e).table, {"map": AXES, "unknowns": {"draws": 3}}, marks=pytest.mark.long
+            lambda s, e: mauvecl.map(s, e).table, {"map": AXES, "unknowns": {"draws": 3}}, marks=pytest.mark.long
         ),
     ],
     ids=["detect", "snr", "limit", "map", "unknowns"],
 )
 def test_pool_gives_the_table_of_the_engine(
-    engine: Engine, ask: Callable[[Study, Any], Any], sections: dict[str, Any]
+    engine: Engine, ask: Callable[[mauvecl.Study, Any], Any], sections: dict[str, Any]
 ) -> None:
     ours, theirs = ask(small(**sections), engine), ask(small(**sections), Pool(Shuffled(engine, 9)))
     assert ours.colnames == theirs.colnames
@@ -245,7 +225,7 @@ def test_fingerprints_distinguish_requests(scene: list[Expectation]) -> None:
         asked(flares[::-1]),
         asked([flares[0], brighter]),
         asked(comparison=Comparison.of("exposure")),
-        asked(processes=Processes(jitter=Uniform(0.0, 0.01))),
+        asked(processes=Processes(jitter=mauvecl.Uniform(0.0, 0.01))),
         asked(mode="frames"),
         *(asked(nuisances={"dark": sd}) for sd in (0.1, 0.2)),
     ]
@@ -287,7 +267,7 @@ def interrupting(after: int) -> Callable[[int, int], None]:
     return progress
 
 
-def at_work(folder: Path, engine: Engine, progress: Any = None, study: Study | None = None, **how: Any) -> Any:
+def at_work(folder: Path, engine: Engine, progress: Any = None, study: mauvecl.Study | None = None, **how: Any) -> Any:
     """Ask for a detection whose shards are kept; return it, the pool and the checkpoint."""
     quiet, *flares = SCENE
     with shards.Checkpoint(folder, "detect", study or small(), patience_s=0.0, **how) as checkpoint:
@@ -437,7 +417,7 @@ def test_answers_keep_their_order_and_errors_end_the_rest(engine: Engine) -> Non
 
     def bad(number: int) -> int:
         if number == 2:
-            raise InputError.of("number", 2, "another")
+            raise mauvecl.InputError.of("number", 2, "another")
         return number
 
     with refused("number", "2"):
@@ -454,7 +434,7 @@ def test_progress_that_raises_stops_the_work_ahead_of_it(engine: Engine) -> None
         raise ArithmeticError
 
     try:
-        detection_map(small(map=AXES), pool, progress)
+        mauvecl.map(small(map=AXES), pool, progress)
     except ArithmeticError:
         with pytest.raises(pools.Stopped):
             pool.detect(SCENE[0], SCENE[1:], realisations=N, seed=5)
