@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import pytest
 from answers import expectations, of_kind
-from marks import long_but
 from scenes import paper
 
 import mauvecl
@@ -65,36 +64,6 @@ def test_limit_inverts_detect(engine: Engine) -> None:
     assert shortest.value.value % 5 == 0
     assert abs(shortest.value.value - 50) <= 5
     assert shortest.value.low <= shortest.value.value <= shortest.value.high
-
-
-@pytest.mark.parametrize(
-    "harder",
-    long_but(
-        [
-            {"observation": {"exposure_s": 25.0}},
-            {"observation": {"temperature_c": 25.0}},
-            {"flare": {"amplitudes": [0.12]}},
-            {"sky": {"surface_brightness": 14.0}},
-        ],
-        {"flare": {"amplitudes": [0.12]}},
-    ),
-)
-def test_limits_are_monotone(engine: Engine, harder: dict[str, Any]) -> None:
-    (plain,), (worse,) = (mauvecl.limit(study(run=FEW, **c), engine).limits for c in ({}, harder))
-    assert worse.value.value < plain.value.value
-
-
-@pytest.mark.long
-def test_cooler_detector_gains_as_predicted(engine: Engine) -> None:
-    """Compare 13 and 21 deg C, whose dark currents have a ratio of 0.58, with the closed form."""
-    few = {"statistics": ("matched",)}
-    (warm,), (cool,) = (
-        mauvecl.limit(study(run=few, observation={"temperature_c": t}), engine).limits for t in (21.0, 13.0)
-    )
-    gain = cool.value.value - warm.value.value
-    assert gain == pytest.approx(cool.closed_form - warm.closed_form, abs=0.02)
-    # Dark alone: 1.25 log10 of its ratio; the read noise and the star leave less.
-    assert 0.15 < gain < 1.25 * 0.0684 * 8 / np.log(10)
 
 
 @pytest.mark.parametrize(("verb", "faint", "kind"), [("limit", 25.0, "no limit"), ("exposure", 28.0, "no answer")])
@@ -270,15 +239,6 @@ def test_engine_finds_the_wanted_snr(engine: Engine) -> None:
     table = engine.snr(quiet, realisations=20_000, seed=4).element
     row = table[int(np.argmin(np.abs(table["wavelength"].value - 300.0)))]
     assert row["mean"] == pytest.approx(found.snr, abs=5 * row["std"] / np.sqrt(20_000) + 0.01 * found.snr)
-
-
-def test_fainter_stars_need_longer_exposures_and_saturation_is_reported() -> None:
-    bright, faint = (exposure_for(sunlike(m), 10.0, 400.0).exposures[0] for m in (6.0, 8.0))
-    assert faint.frames > bright.frames
-    blinding = exposure_for(sunlike(-2.0), 10.0, 450.0)
-    assert blinding.exposures[0].saturated
-    assert of_kind(blinding.messages, "saturated")
-    assert not bright.saturated
 
 
 def test_exposure_above_one_day_is_answered() -> None:
