@@ -97,7 +97,7 @@ def test_own_unknowns_are_read_from_files_points_and_flags(tmp_path: Path, engin
     again = tmp_path / "elsewhere" / "again.toml"
     again.write_text(asked.toml())
     assert Study.read(again).nuisances == asked.nuisances
-    flags = (
+    flags = [
         "--star",
         "G2V",
         "-m",
@@ -111,7 +111,7 @@ def test_own_unknowns_are_read_from_files_points_and_flags(tmp_path: Path, engin
         "--statistic",
         "matched",
         "--ideal",
-    )
+    ]
     run("detect", *flags, "--nuisance", "dark=0.1", "--nuisance", "stray.txt=2", "--no-pictures", folder=tmp_path)
     of_flags = Study.read(tmp_path / "mauvecl-detect" / "detection.ecsv")
     kept = asked.nuisances.own["stray"].model_copy(update={"file": tmp_path / "stray.txt"})

@@ -186,26 +186,8 @@ def test_frames_that_cannot_be_calibrated_raise(change: dict[str, Any], key: str
 
 def test_stored_spectra_are_calibrated_as_raw_counts(tmp_path: Path) -> None:
     """Throughput of a stored star within four of its errors of the nominal one, with which it was drawn."""
-    run(
-        "realise",
-        "--star",
-        "A0V",
-        "-m",
-        5,
-        "-a",
-        0.1,
-        "-n",
-        40,
-        "-t",
-        5,
-        "--paper",
-        "-o",
-        "single.zarr",
-        folder=tmp_path,
-    )
-    run(
-        "realise", "--star", "A0V", "-m", 5, "-a", 0.1, "-n", 4, "-t", 50, "--paper", "-o", "sums.zarr", folder=tmp_path
-    )
+    for more in ("-n 40 -t 5 -o single.zarr", "-n 4 -t 50 -o sums.zarr"):
+        run("realise", *f"--star A0V -m 5 -a 0.1 --paper {more}".split(), folder=tmp_path)
     study = "calibrate.observations = [{{ frames = '{}[star-1/quiescent]', library = 'A0V', magnitude = 5.0 }}]"
     (tmp_path / "single.toml").write_text(study.format("single.zarr"))
     (tmp_path / "sums.toml").write_text(study.format("sums.zarr"))

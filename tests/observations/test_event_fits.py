@@ -176,6 +176,10 @@ def test_coefficients_are_those_of_celerite2() -> None:
             np.testing.assert_array_equal(one, other)
 
 
+#: Frequent false alarms, whose rate takes little time.
+OFTEN = Study.build({"search": {"per": "day"}}, "test")
+
+
 def few_frames() -> Frames:
     rng = np.random.default_rng(6)
     time = np.arange(500) * 60.0
@@ -185,7 +189,7 @@ def few_frames() -> Frames:
 
 def test_progress_rises_to_the_number_of_frames() -> None:
     reported: list[tuple[int, int]] = []
-    answer = analyse(Study().paper(), progress=lambda done, total: reported.append((done, total)), frames=few_frames())
+    answer = analyse(OFTEN, progress=lambda done, total: reported.append((done, total)), frames=few_frames())
     assert max(row.event.value for row in answer.rows) > 20
     done, totals = (list(each) for each in zip(*reported, strict=True))
     assert set(totals) == {500}
@@ -205,7 +209,7 @@ def test_a_report_may_stop_the_analysis() -> None:
             raise StoppedError
 
     with pytest.raises(StoppedError):
-        analyse(Study().paper(), progress=stop, frames=few_frames())
+        analyse(OFTEN, progress=stop, frames=few_frames())
 
 
 def test_events_that_wait_are_not_measured_once_the_analysis_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:

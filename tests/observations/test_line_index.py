@@ -81,7 +81,7 @@ SHARE = 0.8
 def study(tmp_path: Path) -> Study:
     (tmp_path / "near.csv").write_text("name,separation,magnitude,spectral_type\nB,8,10,M4V\nC,30,12,G2V\nD,60,1,A0V\n")
     star = {"library": "M3V", "magnitude": 9.0, "neighbours": tmp_path / "near.csv", "neighbour_share": SHARE}
-    return Study.model_validate({"star": [star]})
+    return Study.model_validate({"star": [star], "search": {"per": "day"}})
 
 
 def electrons(source: Source) -> float:

@@ -58,15 +58,9 @@ def test_shards_of_stares_join_to_the_same_bits(engine: Engine, method: Any, red
     workers.close()
     assert pool.standing.shards == len(shards.shards(asked)) == 5, "cut at multiples of 64, and where the word ends"
     whole = Stares(engine.open_device).frames(
-        asked.components,
-        asked.stare,
-        asked.flare,
-        amplitudes=asked.amplitudes,
-        first=START,
-        count=N,
-        seed=5,
+        asked.components, asked.stare, asked.flare, amplitudes=asked.amplitudes, first=START, count=N, seed=5,
         method=method,
-    )
+    )  # fmt: skip
     if reduction is None:
         np.testing.assert_array_equal(found["values"], np.moveaxis(whole, 0, 1))
     else:
