@@ -241,6 +241,13 @@ def test_engine_finds_the_wanted_snr(engine: Engine) -> None:
     assert row["mean"] == pytest.approx(found.snr, abs=5 * row["std"] / np.sqrt(20_000) + 0.01 * found.snr)
 
 
+def test_saturated_pixels_of_an_exposure_are_marked() -> None:
+    blinding = exposure_for(sunlike(-2.0), 10.0, 450.0)
+    assert blinding.exposures[0].saturated
+    assert of_kind(blinding.messages, "saturated")
+    assert not exposure_for(sunlike(), 10.0, 400.0).exposures[0].saturated
+
+
 def test_exposure_above_one_day_is_answered() -> None:
     """Check that longer times are sums of several exposures, although `expect` allows only one day."""
     found = exposure_for(sunlike(14.5), 10.0, 550.0)
