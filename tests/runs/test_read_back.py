@@ -5,8 +5,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from answers import expectations
 from commands import run
-from stores import Painter, expectations, study
+from stores import Painter, study
 
 from mauvecl import Engine, Study, bulk, read_frames
 from mauvecl.observations import frame_files
