@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from answers import expectations, of_kind
-from scenes import paper
+from scenes import paper, study_of_g2v
 
 import mauvecl
 from mauvecl import Engine, Study, exposure_for, shortest_exposure
@@ -16,14 +16,8 @@ STATISTICS = ("chi2", "chi2_element", "matched", "uv_excess")
 
 def study(**changes: Any) -> Study:
     """Return the paper's G2V star with a 24 % flare, 1e5 realisations at 1e-2."""
-    data: dict[str, Any] = {
-        "star": [{"library": "G2V", "magnitude": 7.4}],
-        "flare": {"amplitudes": [0.24]},
-        "run": {"realisations": 100_000, "fap": 1e-2, "statistics": STATISTICS, "seed": 5},
-    }
-    for section, values in changes.items():
-        data[section] = (data.get(section, {}) | values) if isinstance(values, dict) else values
-    return Study.build(data, "test").paper()
+    run = {"realisations": 100_000, "statistics": STATISTICS} | changes.pop("run", {})
+    return study_of_g2v(run=run, **changes).paper()
 
 
 FEW = {"statistics": ("matched",), "realisations": 20_000}
@@ -130,15 +124,8 @@ N = 20_000
 
 
 def mapped(x: dict, y: dict) -> Study:
-    return Study.build(
-        {
-            "star": [{"library": "G2V", "magnitude": 7.4}],
-            "flare": {"amplitudes": [0.1]},
-            "run": {"realisations": N, "fap": 1e-2, "statistics": ("chi2", "matched"), "seed": 9},
-            "map": {"x": x, "y": y},
-        },
-        "test",
-    ).paper()
+    run = {"statistics": ("chi2", "matched"), "seed": 9}
+    return study_of_g2v(flare={"amplitudes": [0.1]}, run=run, map={"x": x, "y": y}).paper()
 
 
 MAGNITUDE = {"quantity": "magnitude", "start": 6.0, "stop": 10.0, "steps": 5}

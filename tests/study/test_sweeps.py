@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scenes import instrument, star
+from scenes import instrument, star, study_of_g2v
 from scipy import stats
 
 import mauvecl
@@ -12,14 +12,8 @@ from mauvecl import Blackbody, Engine, Study, TwoBlackbodies, detect, gaussian
 
 
 def study(axes: list[dict[str, Any]], how: str = "product", **changes: Any) -> Study:
-    """Return a study of the paper's G2V star."""
-    data: dict[str, Any] = {
-        "star": [{"library": "G2V", "magnitude": 7.4}],
-        "flare": {"amplitudes": [0.1]},
-        "run": {"realisations": 20_000, "fap": 1e-2, "statistics": ["matched"], "seed": 5},
-        "sweep": {"how": how, "axes": axes},
-    }
-    return Study.build(data | changes, "test").paper()
+    swept = {"flare": {"amplitudes": [0.1]}, "sweep": {"how": how, "axes": axes}}
+    return study_of_g2v(**swept | changes).paper()
 
 
 MAGNITUDES = {"quantity": "magnitude", "values": [6.0, 9.0]}
