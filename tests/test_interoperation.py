@@ -23,7 +23,6 @@ def test_synphot_spectrum_round_trips() -> None:
 
 
 def test_synphot_blackbody_is_read() -> None:
-    """Read a synphot SourceSpectrum, as stsynphot's grids return."""
     from synphot import SourceSpectrum
     from synphot.models import BlackBodyNorm1D
 

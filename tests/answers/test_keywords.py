@@ -58,7 +58,6 @@ ASKED: dict[str, tuple[str, dict[str, Any], str]] = {
 
 @pytest.mark.parametrize("name", ASKED)
 def test_keywords_ask_what_flags_ask(name: str, tmp_path: Path) -> None:
-    """Python and the command line have the same study, and the same answer to the last digit."""
     verb, keywords, flags = ASKED[name]
     run(verb, *shlex.split(flags), "--no-pictures", "-o", "answer", folder=tmp_path)
     answer = getattr(mauvecl, verb)(**keywords)

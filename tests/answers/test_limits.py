@@ -183,7 +183,6 @@ def test_each_cell_equals_its_own_detection(engine: Engine, x: dict, y: dict) ->
 
 
 def test_probability_decreases_with_magnitude(engine: Engine) -> None:
-    """Check that brighter stars and larger flares are detected as often or more, but for the threshold's error."""
     found = mauvecl.map(mapped(MAGNITUDE, AMPLITUDE), engine)
     slack = 5e-3
     assert (np.diff(found.probability, axis=2) < slack).all()

@@ -213,7 +213,6 @@ def test_false_alarms_with_drawn_unknowns_are_as_requested(engine: Engine) -> No
 
 
 def test_chance_with_unknowns_is_that_of_their_study() -> None:
-    """The sentence of `detect` holds the closed forms of the table for both studies, of the most uncertain flare."""
     stars = [{"library": "M3V", "magnitude": 9.0}]
     run = {"realisations": 10_000, "fap": 0.02, "statistics": ["matched"]}
     data: dict[str, Any] = {"star": stars, "flare": {"amplitudes": [0.0001, 0.02, 3.0]}, "run": run} | CONVENTIONS

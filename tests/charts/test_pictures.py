@@ -178,7 +178,6 @@ def test_saved_picture_equals_savefig(engine: Engine, tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_report_has_every_table_remark_and_picture() -> None:
-    """With equal bytes for equal analyses."""
     time, rng = np.arange(300) * 60.0, np.random.default_rng(1)
     light = rng.normal(100.0, 1.0, 300) + np.where(time > 9000, 30 * np.exp((9000 - time) / 600), 0.0)
     answer = mauvecl.analyse(Study().paper(), frames=mauvecl.Frames.of(time, light, np.ones(300), name="<A & B>"))

@@ -94,7 +94,6 @@ def test_study_defines_weights(tmp_path: Path, engine: Engine) -> None:
 
 
 def test_flags_override_the_study_file(tmp_path: Path) -> None:
-    """Combine a study with the user's own spectrum and flags; any key can be set."""
     wavelength = np.arange(170.0, 1100.0, 2.0)
     np.savetxt(tmp_path / "mine.txt", np.column_stack([wavelength, 1e-11 * np.ones_like(wavelength)]))
     (tmp_path / "study.toml").write_text(
@@ -397,7 +396,6 @@ def test_export_to_a_full_disk_keeps_the_earlier_file(name: str, small_disk: Pat
 
 
 def test_import_loads_no_heavy_package_and_help_builds_no_study() -> None:
-    """Importing the package, or asking for help, loads neither OpenCL nor synphot nor the models of a study."""
     heavy = ("pyopencl", "synphot", "astropy", "scipy")
     code = (
         f"import sys, mauvecl, mauvecl.cli.app; print([m for m in {heavy} if m in sys.modules]);"

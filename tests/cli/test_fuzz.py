@@ -256,7 +256,6 @@ def test_environments_never_crash(folder: Path, name: str, value: str) -> None:
 
 
 def test_check_detects_an_unexpected_error(folder: Path) -> None:
-    """A verb that fails in a way that nobody foresaw fails here."""
     with mock.patch("json.dumps", side_effect=KeyError("x")), pytest.raises(AssertionError):
         check(folder, "library", "--json")
     assert sys.stdout is not None

@@ -166,7 +166,6 @@ def test_tally_counts_values_at_the_ends_of_its_bins(any_width: Engine) -> None:
 
 
 def test_saturating_star_is_drawn_frame_by_frame(engine: Engine) -> None:
-    """By default, a saturating star is drawn frame by frame and clipped."""
     (bright, *_), _ = case("at the rail")
     assert prepare([bright]).frames
     raw = engine.realise(bright, count=200, seed=1)
@@ -244,14 +243,12 @@ print(hashlib.sha256(repr([tuple(row) for row in table]).encode()).hexdigest())
 
 @pytest.mark.long
 def test_number_of_threads_does_not_affect_results() -> None:
-    """Compare all digits of a table from one thread and from two."""
     code = THREADS.format(tests=str(Path(__file__).parents[1]))
     one, two = (python(code, POCL_MAX_PTHREAD_COUNT=threads).stdout for threads in ("1", "2"))
     assert one == two
 
 
 def test_flares_in_batches_equal_single_flares(engine: Engine) -> None:
-    """Compare flares of several launches with the same flares alone."""
     amplitudes = tuple(np.linspace(0.01, 0.3, 18))
     payload = instrument(part=True)
     quiet, *flares = star(amplitudes=amplitudes, payload=payload)

@@ -199,7 +199,6 @@ def test_messages_about_the_epoch() -> None:
 
 @pytest.mark.parametrize("start", ["2027-01-01", "2027-01-01T11:59:59", "2027-01-01T12:00:01", "2027-01-01T23:59:59.5"])
 def test_days_begin_at_midnight(start: str) -> None:
-    """Check all divisions of a date into two numbers by astropy."""
     times = section(start=start, days=1.0, step_s=3600.0).times()
     midnight, fraction = times.first
     assert midnight % 1 == 0.5
@@ -379,7 +378,6 @@ def _simbad(monkeypatch: pytest.MonkeyPatch, query_tap: Callable[[str], object])
 
 
 def test_answer_of_simbad_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Read degrees and mas of the TAP service, masked values, blanks and quotes."""
     asked = []
 
     def answer(query: str) -> Table:

@@ -283,7 +283,6 @@ if not hasattr(cluster, "changed"):
 def test_shards_of_workers_with_other_code_are_drawn_again(
     change: str, scheduler_file: str, tmp_path: Path, engine: Engine, scene: list[Expectation]
 ) -> None:
-    """Let a worker with other code join a running cluster: its counts are not used."""
     quiet, *flares = scene
     (tmp_path / "other_code.py").write_text(PRELOAD.format(change=OTHER_CODE[change]))
     n = 200_000

@@ -353,7 +353,6 @@ def test_unfinished_run_is_not_overwritten(begun: Path, engine: Engine) -> None:
 
 
 def test_counts_of_another_form_raise(begun: Path, engine: Engine) -> None:
-    """Refuse shards of an older version."""
     manifest = json.loads(manifest_of(begun))
     old = {key: value for key, value in manifest.items() if key not in ("form", "digest")}
     change(begun, json.dumps(old | {"digest": hashlib.sha256(json.dumps(old, sort_keys=True).encode()).hexdigest()}))
