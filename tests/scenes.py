@@ -67,6 +67,18 @@ def paper(*settings: str) -> Study:
     return Study().paper().with_settings(settings)
 
 
+def study_of_g2v(**sections: Any) -> Study:
+    """Return a study of the paper's G2V star, a 24 % flare and a short run, with sections changed or added."""
+    data: dict[str, Any] = {
+        "star": [{"library": "G2V", "magnitude": 7.4}],
+        "flare": {"amplitudes": [0.24]},
+        "run": {"realisations": 20_000, "fap": 1e-2, "statistics": ["matched"], "seed": 5},
+    }
+    for name, values in sections.items():
+        data[name] = data.get(name, {}) | values if isinstance(values, dict) else values
+    return Study.build(data, "test")
+
+
 @cache
 def source(library: str = "M3V", magnitude: float = 9.0) -> Source:
     return Source.from_library(library).at_magnitude(magnitude)

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mauvecl import Engine, Expectation, Study
-from mauvecl.study.cases import Case
+from mauvecl import Engine, Study
 
 CHUNK, LAST = "star-1/quiescent/c/1/0", "star-1/flare-1/c/4/0"
 
@@ -28,11 +27,6 @@ def study(realisations: int = 300, **sections: Any) -> Study:
     for name, values in sections.items():
         data[name] = {**data.get(name, {}), **values}  # type: ignore[dict-item]
     return Study.build(data, "test").paper()
-
-
-def expectations(asked: Study) -> list[Expectation]:
-    """Return the expectations of a study's quiescent star and its flare."""
-    return Case(asked).expectations
 
 
 @contextmanager

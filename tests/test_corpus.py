@@ -20,7 +20,7 @@ from scenes import instrument, star
 
 from mauvecl import Source, Study, read_frames
 from mauvecl.host.spectra.formats import read_spectrum
-from mauvecl.host.stars.flare import read_flares
+from mauvecl.host.stars import flare as flare_tables
 from mauvecl.observations.frames import Reason
 
 # Astropy warns of the usual units when it writes a VOTable.
@@ -162,7 +162,7 @@ def _neighbours(path: Path, case: Case) -> tuple[str, ...]:
 
 
 def _flares(path: Path, case: Case) -> tuple[str, ...]:
-    table = read_flares(path)
+    table = flare_tables.read_flares(path)
     np.testing.assert_array_equal(table["amplitude"], case["amplitudes"])
     assert "start" not in case or table["start"].to_value("d").tolist() == case["start"]
     remarks = tuple(table.meta["comments"])

@@ -44,7 +44,6 @@ def test_every_page_is_in_the_contents() -> None:
 
 
 def test_documented_names_exist() -> None:
-    """Check files, and the definition of each name in `file: name`."""
     named = [(page.name, *found) for page in all_pages() for found in NAMED.findall(page.read_text(encoding="utf-8"))]
     missing = [(page, file) for page, file, _ in named if not list(ROOT.glob(file))]
     assert not missing
@@ -149,7 +148,6 @@ def test_examples_of_docstrings_run(name: str) -> None:
 
 
 def test_main_names_have_examples() -> None:
-    """Check the main names of the package."""
     finder = doctest.DocTestFinder(recurse=False)
     for name in ("Source", "Sky", "Instrument", "expect", "Engine", "Study"):
         thing = getattr(mauvecl, name)

@@ -127,7 +127,6 @@ def read_snippet(kind: str, snippet: str, names: dict[str, object]) -> None:
 
 
 def test_skipped_snippets_exist_on_pages() -> None:
-    """Check that every exception still belongs to a snippet."""
     every = [(page.name, kind, snippet) for page in PAGES for kind, snippet in snippets(page)]
     commands = [snippet.removeprefix("mauvecl ") for _, kind, snippet in every if kind == "command"]
     python = "".join(snippet for _, kind, snippet in every if kind == "python")

@@ -22,50 +22,10 @@ from scenes import MG_II, NEAR, instrument, paper, source, star
 from stores import CHUNK, flip
 from stores import study as stored_study
 
-from mauvecl import (
-    SHAPES,
-    BalmerFlare,
-    Blackbody,
-    Comparison,
-    Cooling,
-    CosmicRays,
-    EnergyScale,
-    Engine,
-    Event,
-    FlareModel,
-    FlareWithLines,
-    Instrument,
-    Linear,
-    Normal,
-    Nuisances,
-    ObservedFlare,
-    PixelMap,
-    Pool,
-    Processes,
-    Sinusoid,
-    Sky,
-    Source,
-    Stare,
-    Stares,
-    TableShape,
-    TwoBlackbodies,
-    Uniform,
-    bulk,
-    departures,
-    expect,
-    exposure_for,
-    fit,
-    fit_cooling,
-    fit_two_temperatures,
-    forecast,
-    measure_along,
-    read_frames,
-    shortest_exposure,
-    smallest_amplitude,
-    what_matters,
-)
+import mauvecl
+from mauvecl import BalmerFlare, EnergyScale, Engine, Event, FlareModel, Nuisances, Sky, Source, bulk, expect, fit
 from mauvecl.flares.frames import Components
-from mauvecl.observations.visits import line_index, recover_periods
+from mauvecl.observations import visits
 
 GOLDEN = Path(__file__).parent / "data" / "golden" / "python"
 # Of longer arrays evenly spaced values are kept.
@@ -165,10 +125,10 @@ def library(folder: Path) -> Answer:
 @golden()
 def flare_spectra(folder: Path) -> Answer:
     models = {
-        "blackbody": Blackbody(10_000.0), "balmer": BalmerFlare(9000.0, 2.5),
-        "two": TwoBlackbodies(9000.0, 25_000.0, 0.1),
-        "lines": FlareWithLines(BalmerFlare(9000.0, 2.0), {"Mg II": 0.05, "H alpha": 0.02}),
-        "observed": ObservedFlare.read(
+        "blackbody": mauvecl.Blackbody(10_000.0), "balmer": BalmerFlare(9000.0, 2.5),
+        "two": mauvecl.TwoBlackbodies(9000.0, 25_000.0, 0.1),
+        "lines": mauvecl.FlareWithLines(BalmerFlare(9000.0, 2.0), {"Mg II": 0.05, "H alpha": 0.02}),
+        "observed": mauvecl.ObservedFlare.read(
             DATA / "flares" / "ADLeo_1497s.dat", DATA / "flares" / "adleo_quiescent2.dat", wavelength_unit="Angstrom",
             continue_at_k=9500.0,
         ),
@@ -179,8 +139,8 @@ def flare_spectra(folder: Path) -> Answer:
 @golden()
 def flares_in_time(folder: Path) -> Answer:
     edges = np.column_stack([np.arange(-100.0, 400.0, 20.0), np.arange(-80.0, 420.0, 20.0)])
-    own = TableShape((-1.0, 0.0, 1.0, 4.0), (0.0, 1.0, 0.4, 0.0), "own")
-    found: Answer = {name: one.mean_over(edges, 50.0, 30.0) for name, one in {**SHAPES, "own": own}.items()}
+    own = mauvecl.TableShape((-1.0, 0.0, 1.0, 4.0), (0.0, 1.0, 0.4, 0.0), "own")
+    found: Answer = {name: one.mean_over(edges, 50.0, 30.0) for name, one in {**mauvecl.SHAPES, "own": own}.items()}
     scales = {
         "star": EnergyScale.of_star(source(), 5.0), "disc": EnergyScale.of_blackbody(0.4, 3300.0, band="TESS"),
         "shibayama": EnergyScale.shibayama2013(1.0, 5778.0),
@@ -191,8 +151,8 @@ def flares_in_time(folder: Path) -> Answer:
     found["event"] = [event.amplitude, event.equivalent_duration_s, event.peak, event.energy(scales["star"])]
     found["of duration"] = Event.of_equivalent_duration(50.0, peak_s=600.0, half_width_s=60.0).amplitude
     found["of peak"] = Event.of_peak(0.7, peak_s=600.0, half_width_s=60.0, shape="tovarmendoza2022").amplitude
-    found["cooling"] = Cooling(15_000.0, 7000.0, 80.0).at(np.linspace(-50, 500, 12))
-    found["sinusoid"] = Sinusoid(0.5, 3000.0, 1.0).mean_over(np.arange(0.0, 6000.0, 500.0), 5.0)
+    found["cooling"] = mauvecl.Cooling(15_000.0, 7000.0, 80.0).at(np.linspace(-50, 500, 12))
+    found["sinusoid"] = mauvecl.Sinusoid(0.5, 3000.0, 1.0).mean_over(np.arange(0.0, 6000.0, 500.0), 5.0)
     return found
 
 
@@ -200,7 +160,7 @@ def flares_in_time(folder: Path) -> Answer:
 def instruments(folder: Path) -> Answer:
     found: Answer = {}
     for name in ("mauvesim", "mauve"):
-        one = Instrument.load(name)
+        one = mauvecl.Instrument.load(name)
         found[name] = {
             "throughput": one.throughput(SEEN_NM), "efficiency": one.efficiency(SEEN_NM),
             "area": one.effective_area_cm2(SEEN_NM), "per joule": one.electrons_per_joule_cm2(SEEN_NM),
@@ -208,9 +168,13 @@ def instruments(folder: Path) -> Answer:
             "numbers": [one.dark_dn_per_s, one.gain_dn_per_electron, one.saturation_dn, one.field_of_view_arcsec2],
             "warm": one.with_(temperature_c=10.0).dark_dn_per_s,
         }  # fmt: skip
-    drawn = PixelMap.made_up(1643, seed=5, hot_share=0.01)
+    drawn = mauvecl.PixelMap.made_up(1643, seed=5, hot_share=0.01)
     drawn.write(folder / "map.ecsv")
-    found["map"] = {"response": drawn.response, "dark": drawn.dark, "read": PixelMap.read(folder / "map.ecsv").response}
+    found["map"] = {
+        "response": drawn.response,
+        "dark": drawn.dark,
+        "read": mauvecl.PixelMap.read(folder / "map.ecsv").response,
+    }
     return found
 
 
@@ -251,16 +215,18 @@ def draws(folder: Path) -> Answer:
     """
     engine = Engine()
     quiet, flare = star(amplitudes=(0.1,), payload=QUICK)
-    rays = Processes(cosmic_rays=CosmicRays(rate_per_cm2_s=300.0), jitter=Uniform(0.0, 0.05))
+    rays = mauvecl.Processes(cosmic_rays=mauvecl.CosmicRays(rate_per_cm2_s=300.0), jitter=mauvecl.Uniform(0.0, 0.05))
     raw, clipped = engine.realise_and_count(quiet, count=20, seed=3, start=2**32 - 10)
     names = ("chi2", "chi2_pair", "matched", "paper")
-    values = engine.statistic_values(quiet, [flare], count=20, seed=4, statistics=names, comparison=Comparison(3))
+    values = engine.statistic_values(
+        quiet, [flare], count=20, seed=4, statistics=names, comparison=mauvecl.Comparison(3)
+    )
     one, lit = (replace(x, n_frames=1) for x in (quiet, flare))
     parts = Components.of(one, [lit], np.ones((1, one.wavelength_nm.size)))
-    frames = Stares().frames(parts, Stare.of(30.0), count=2, seed=9)
+    frames = mauvecl.Stares().frames(parts, mauvecl.Stare.of(30.0), count=2, seed=9)
     return {
         "raw": raw, "clipped": clipped, "rays": engine.realise(flare, count=20, seed=5, processes=rays),
-        "pool": Pool().realise(quiet, count=20, seed=3, start=2**32 - 10),
+        "pool": mauvecl.Pool().realise(quiet, count=20, seed=3, start=2**32 - 10),
         "snr": table(engine.snr(quiet, realisations=1000, seed=6).element), "values": values.view(np.uint32),
         "stare": frames.astype(np.int64),
     }  # fmt: skip
@@ -269,7 +235,7 @@ def draws(folder: Path) -> Answer:
 @golden()
 def detections(folder: Path) -> Answer:
     quiet, *flares = star(amplitudes=(0.02, 0.1), payload=QUICK)
-    line = Linear("line", np.exp(-0.5 * ((quiet.wavelength_nm - 320.0) / 5.0) ** 2))
+    line = mauvecl.Linear("line", np.exp(-0.5 * ((quiet.wavelength_nm - 320.0) / 5.0) ** 2))
     unknown = Nuisances.of(quiet, {"dark": 0.1, "light": 0.02})
     found: Answer = {}
     for name, how in {"known": {}, "unknown": {"nuisances": unknown}}.items():
@@ -280,7 +246,7 @@ def detections(folder: Path) -> Answer:
         found[name] = {
             "table": table(one.table(0.05)), "weights": one.weights("line"),
             "quantile": asdict(one.quantile(0.3, "matched", 1)), "area": asdict(one.roc("chi2_element", 1).area),
-            "departures": [[row.threshold, row.simulated.value] for row in departures(one, 0.05)],
+            "departures": [[row.threshold, row.simulated.value] for row in mauvecl.departures(one, 0.05)],
             "false alarms": asdict(one.false_alarm_probability(3.0, "matched")),
             "histogram": one.histogram("matched", 0, bins=12),
             "closed": [form.mean, form.std, form.sf(form.mean + form.std)],
@@ -294,9 +260,10 @@ def priors(folder: Path) -> Answer:
     share = np.linspace(0.01, 0.99, 9)
     quiet = star(payload=QUICK)[0]
     unknown = Nuisances.of(quiet, {"dark": 0.1, "sky": np.inf, "tilt": 0.01})
-    rays = CosmicRays(rate_per_cm2_s=5.0)
+    rays = mauvecl.CosmicRays(rate_per_cm2_s=5.0)
     return {
-        "normal": Normal(0.1, 0.05, 0.0, 0.3).quantile(share), "uniform": Uniform(0.1, 0.4).quantile(share),
+        "normal": mauvecl.Normal(0.1, 0.05, 0.0, 0.3).quantile(share),
+        "uniform": mauvecl.Uniform(0.1, 0.4).quantile(share),
         "spectra": unknown.spectra, "sd": unknown.sd, "rows": unknown.rows(quiet.variance_dn2, unknown.spectra),
         "rays": [rays.most_electrons(50.0), *np.ravel(rays.variance_dn2(quiet))[:1]],
     }  # fmt: skip
@@ -310,12 +277,12 @@ def fits(folder: Path) -> Answer:
     unknown = Nuisances.of(quiet, {"dark": np.inf, "light": np.inf})
     model = FlareModel.of(dwarf, mauve, quiet, distance_pc=5.0, radius_rsun=0.4)
     frames = Engine().realise(flare, count=3, seed=1)
-    ahead = forecast(quiet, model, 9800.0, [0.5], unknown)
+    ahead = mauvecl.forecast(quiet, model, 9800.0, [0.5], unknown)
     found: Answer = {"names": list(ahead.names), "errors": ahead.errors}
     fitted = {
         "known": fit(frames, quiet, model), "unknown": fit(frames, quiet, model, unknown),
         "jump": fit(frames, quiet, FlareModel.of(dwarf, mauve, quiet, jump=True), skipped_nm=[(322, 368)]),
-        "two": fit_two_temperatures(frames[:1], quiet, FlareModel.of(dwarf, mauve, quiet, distance_pc=5.0)),
+        "two": mauvecl.fit_two_temperatures(frames[:1], quiet, FlareModel.of(dwarf, mauve, quiet, distance_pc=5.0)),
     }  # fmt: skip
     for name, one in fitted.items():
         found[name] = {"estimates": one.estimates, "errors": one.errors, "low": one.low, "high": one.high,
@@ -330,8 +297,8 @@ def fits_in_time(folder: Path) -> Answer:
     quiet, flare = (expect(s, mauve, exposure=5.0) for s in (dwarf, dwarf.flaring(2.0, 9800.0)))
     frames = np.vstack([Engine().realise(x, count=4, seed=2) for x in (quiet, flare, quiet)])
     model = FlareModel.of(dwarf, mauve, quiet, distance_pc=5.0)
-    along = measure_along(frames, quiet, model, snr_per_bin=40.0).table()
-    whole = fit_cooling(frames, quiet, model, peak_s=25.0, half_width_s=10.0, levels=()).table()
+    along = mauvecl.measure_along(frames, quiet, model, snr_per_bin=40.0).table()
+    whole = mauvecl.fit_cooling(frames, quiet, model, peak_s=25.0, half_width_s=10.0, levels=()).table()
     return {"along": table(along), "whole": table(whole)}
 
 
@@ -343,8 +310,10 @@ def frames_of_files(folder: Path) -> Answer:
         "gj65": ("flares/gj65_galex_nuv_5s.csv", "flares/gj65.toml"),
         "rotating": ("cases/rotating-star/slow-30min.fits", None),
     }  # fmt: skip
-    read = {name: read_frames(DATA / file, mapping and DATA / mapping) for name, (file, mapping) in named.items()}
-    read |= {"drawn": read_frames(folder / "flares.csv", folder / "curve.toml")}
+    read = {
+        name: mauvecl.read_frames(DATA / file, mapping and DATA / mapping) for name, (file, mapping) in named.items()
+    }
+    read |= {"drawn": mauvecl.read_frames(folder / "flares.csv", folder / "curve.toml")}
     return {
         name: {"time": one.time_s, "flux": one.flux, "error": one.error, "cadence": one.cadence_s,
                "faults": one.faults, "mjd": one.reference_mjd,
@@ -374,9 +343,10 @@ def answers_in_python(folder: Path) -> Answer:
     )
     engine = Engine()
     return {
-        "exposure": table(shortest_exposure(asked, engine).table),
-        "amplitude": table(smallest_amplitude(asked, engine).table),
-        "exposure for": table(exposure_for(asked, 5.0, 450.0).table), "matters": table(what_matters(asked)),
+        "exposure": table(mauvecl.shortest_exposure(asked, engine).table),
+        "amplitude": table(mauvecl.smallest_amplitude(asked, engine).table),
+        "exposure for": table(mauvecl.exposure_for(asked, 5.0, 450.0).table),
+        "matters": table(mauvecl.what_matters(asked)),
     }  # fmt: skip
 
 
@@ -385,10 +355,10 @@ def lines_and_periods(folder: Path) -> Answer:
     found: Answer = {}
     for path in sorted((DATA / "flares" / "aumic_iue").glob("lp*.txt"))[:4]:
         angstrom, flux, error = np.loadtxt(path, skiprows=19, usecols=(0, 1, 2)).T
-        one = line_index(angstrom / 10, 10 * flux, 10 * error, **MG_II)
+        one = visits.line_index(angstrom / 10, 10 * flux, 10 * error, **MG_II)
         found[path.stem] = [one.flux, one.error]
     time_d = np.sort(np.random.Generator(np.random.PCG64(1)).uniform(0, 60, 30))
-    periods = recover_periods(time_d, np.array([2.0, 10.0]), np.array([1.0, 3.0]), fap=0.05)
+    periods = visits.recover_periods(time_d, np.array([2.0, 10.0]), np.array([1.0, 3.0]), fap=0.05)
     found["periods"] = {
         "threshold": periods.threshold, "recovered": [[cell.value for cell in row] for row in periods.recovered]
     }  # fmt: skip

@@ -10,7 +10,7 @@ from commands import run
 from scenes import star
 
 from mauvecl import Blackbody, Source
-from mauvecl.host.stars.flare import flares_of, read_flares
+from mauvecl.host.stars import flare as flare_tables
 
 
 def test_synphot_spectrum_round_trips() -> None:
@@ -23,7 +23,6 @@ def test_synphot_spectrum_round_trips() -> None:
 
 
 def test_synphot_blackbody_is_read() -> None:
-    """Read a synphot SourceSpectrum, as stsynphot's grids return."""
     from synphot import SourceSpectrum
     from synphot.models import BlackBodyNorm1D
 
@@ -84,9 +83,9 @@ def test_altaipony_table_is_read(tmp_path: Path) -> None:
 def test_data_frame_and_fits_table_are_read(tmp_path: Path) -> None:
     pandas = pytest.importorskip("pandas")
     frame = pandas.DataFrame({"Amplitude": [0.1, 0.2], "Start": [1.0, 2.0]})
-    np.testing.assert_array_equal(flares_of(frame)["amplitude"], [0.1, 0.2])
+    np.testing.assert_array_equal(flare_tables.flares_of(frame)["amplitude"], [0.1, 0.2])
     Table({"amp": [0.3]}).write(tmp_path / "f.fits")
-    np.testing.assert_array_equal(read_flares(tmp_path / "f.fits")["amplitude"], [0.3])
+    np.testing.assert_array_equal(flare_tables.read_flares(tmp_path / "f.fits")["amplitude"], [0.3])
 
 
 def test_html_representations_contain_values() -> None:

@@ -11,32 +11,8 @@ import pytest
 from marks import long_but
 from refusals import refused
 
-from mauvecl import (
-    Engine,
-    Expectation,
-    Instrument,
-    Linear,
-    Nuisances,
-    PixelMap,
-    Pool,
-    Sky,
-    Source,
-    Study,
-    detect,
-    expect,
-    exposure_for,
-    simulate,
-    snr,
-)
-from mauvecl import (
-    gaussian as gaussian_report,
-)
-from mauvecl import (
-    limit as limiting_magnitude,
-)
-from mauvecl import (
-    map as detection_map,
-)
+import mauvecl
+from mauvecl import Engine, Expectation, Instrument, Pool, Sky, Source, Study, detect, expect, snr
 
 
 def study(**settings: object) -> Study:
@@ -62,11 +38,11 @@ ANSWERS: dict[str, Callable[[Engine, dict[str, object]], Any]] = {
     "detection": lambda e, s: detect(study(**s), e).stars[0].detection,
     "snr": lambda e, s: snr(study(**s), e),
     "snr result": lambda e, s: snr(study(**s), e).stars[0].result,
-    "exposure": lambda e, s: exposure_for(study(**s), 5.0, 310.0),
-    "simulate": lambda e, s: simulate(study(**s)),
-    "limit": lambda e, s: limiting_magnitude(study(**ONE, **s), e),
-    "map": lambda e, s: detection_map(study(**ONE, **s), e),
-    "gaussian": lambda e, s: gaussian_report(study(**{"sweep.axes": "[{quantity='magnitude',values=[7.0]}]"}, **s), e),
+    "exposure": lambda e, s: mauvecl.exposure_for(study(**s), 5.0, 310.0),
+    "simulate": lambda e, s: mauvecl.simulate(study(**s)),
+    "limit": lambda e, s: mauvecl.limit(study(**ONE, **s), e),
+    "map": lambda e, s: mauvecl.map(study(**ONE, **s), e),
+    "gaussian": lambda e, s: mauvecl.gaussian(study(**{"sweep.axes": "[{quantity='magnitude',values=[7.0]}]"}, **s), e),
 }
 
 
@@ -98,9 +74,9 @@ def things() -> dict[str, Callable[[float], Any]]:
         "Expectation": lambda v: expect(Source.from_library("G2V").at_magnitude(v), mauve, exposure=50),
         "Sky": Sky.of_brightness,
         "Study": lambda v: study(**{"star.0.magnitude": v}),
-        "PixelMap": lambda v: PixelMap.made_up(50, seed=int(v)),
-        "Linear": lambda v: Linear("mine", np.full(9, v)),
-        "Nuisances": lambda v: Nuisances(("own",), np.ones((1, 5)), np.array([v])),
+        "PixelMap": lambda v: mauvecl.PixelMap.made_up(50, seed=int(v)),
+        "Linear": lambda v: mauvecl.Linear("mine", np.full(9, v)),
+        "Nuisances": lambda v: mauvecl.Nuisances(("own",), np.ones((1, 5)), np.array([v])),
     }
 
 

@@ -41,7 +41,7 @@ def test_bad_input_is_refused(path: Path, row: dict[str, Any], tmp_path: Path) -
     for name, text in (CONTENT[path].get("files", {}) | row.get("files", {})).items():
         (tmp_path / name).write_text(text, encoding="utf-8")
     if "call" in row:
-        with refused(row["key"], *row["says"]):
+        with refused(row.get("key"), *row["says"]):
             eval(row["call"], _names(path) | {"folder": tmp_path})
         return
     code, out, reported = ended(*shlex.split(row["run"]), folder=tmp_path)

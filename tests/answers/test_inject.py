@@ -109,7 +109,6 @@ def test_temperature_drift_hides_no_flare(stares):
 
 @pytest.mark.long
 def test_cosmic_rays_and_saturation_are_reported(stares):
-    """Check that cosmic rays of the study hide flares, and that saturating flares are reported."""
     quick = {"count": 10, "positions": 2, "fitted": 0, "widths": 1, "sizes": 2, "low": 1e33, "high": 1e39}
     plain, struck = (
         inject(study(injections=quick, search={"nulls": 5}, stare={"duration_s": 2500.0, "gaps": []}, **more), stares)

@@ -9,7 +9,6 @@ import astropy.units as u
 import numpy as np
 import pytest
 from commands import run
-from refusals import refused
 from scenes import paper
 
 import mauvecl
@@ -59,7 +58,6 @@ ASKED: dict[str, tuple[str, dict[str, Any], str]] = {
 
 @pytest.mark.parametrize("name", ASKED)
 def test_keywords_ask_what_flags_ask(name: str, tmp_path: Path) -> None:
-    """Python and the command line have the same study, and the same answer to the last digit."""
     verb, keywords, flags = ASKED[name]
     run(verb, *shlex.split(flags), "--no-pictures", "-o", "answer", folder=tmp_path)
     answer = getattr(mauvecl, verb)(**keywords)
@@ -112,22 +110,6 @@ def test_maps_draw_more_instead() -> None:
         mauvecl.map(star="G2V", **axes, realisations=10, fap=1e-6, ideal=True)
 
 
-@pytest.mark.parametrize(("named", "keywords"), [
-    ("'magnitud'", {"star": "G2V", "magnitud": 7}),
-    ("no keyword 'ideal'", {"star": "G2V", "magnitude": 7, "ideal": True}),
-    ("needs a star", {"magnitude": 7}),
-    ("2 magnitudes for one star", {"star": "G2V", "magnitude": [7, 8]}),
-    ("'Nowhere'", {"star": "Nowhere"}),
-    ("exposure_s", {"star": "G2V", "exposure": 3 * u.nm}),
-    ("'bright'", {"star": "G2V", "magnitude": 7, "sky": "bright"}),
-    ("amplitudes", {"star": "G2V", "magnitude": 7, "amplitude": [-1]}),
-    ("expected a Study", {"study": "G2V", "amplitude": 0.1}),
-])  # fmt: skip
-def test_wrong_keywords_are_refused(named: str, keywords: dict[str, Any]) -> None:
-    with pytest.raises(InputError, match=re.escape(named)):
-        mauvecl.simulate(**keywords)
-
-
 @pytest.fixture
 def quiet() -> Expectation:
     return expect("AU Mic", exposure=50)
@@ -173,8 +155,3 @@ def test_engine_and_measurement_have_short_reprs(quiet: Expectation, engine: Eng
         assert written is not None
         np.testing.assert_allclose([float(number) for number in written.groups()], [values[0], errors[0]], rtol=0.05)
     assert repr(measured).endswith("; the first of 3 frames>")
-
-
-def test_keys_of_studies_name_the_keyword() -> None:
-    with refused(None, expected="such as data"):
-        mauvecl.analyse(file="light-curve.fits")

@@ -64,7 +64,6 @@ def test_star_that_saturates_is_reported(engine: Engine, tmp_path: Path, name: s
 
 @pytest.mark.parametrize("verb", ["simulate", "detect", "map", "realise", "gaussian"])
 def test_flare_that_saturates_alone_is_reported(engine: Engine, tmp_path: Path, verb: str) -> None:
-    """Check that the message names the flare if the star alone does not saturate."""
     study = hot_star(3.3, 300.0, **(SATURATED[verb] | {"flare": {"amplitudes": [12.0]}}))
     quiet, flare = expectations(study)
     assert not of_kind(quiet.messages, "saturated")

@@ -15,7 +15,7 @@ from scipy import stats
 
 from mauvecl import Study, plan, stare
 from mauvecl.answers.plan_targets import found_by_energy
-from mauvecl.search.completeness import Completeness
+from mauvecl.search import completeness
 
 #: Injections take ten seconds a target.
 QUICK = {"completeness": "closed form"}
@@ -181,10 +181,10 @@ def test_report_escapes_markup_in_names(study: Study) -> None:
 
 
 def test_plan_takes_completeness_as_argument(study: Study) -> None:
-    def none_below(observed: Any) -> Completeness:
+    def none_below(observed: Any) -> completeness.Completeness:
         assert observed.window_s > 600
         edge = np.array([1e30, 1e33 * (1 - 1e-12), 1e33, 1e40])
-        return Completeness(edge, np.array([0.0, 0.0, 1.0, 1.0]), "bolometric", "a step")
+        return completeness.Completeness(edge, np.array([0.0, 0.0, 1.0, 1.0]), "bolometric", "a step")
 
     one = study.with_settings(["plan.targets=[{name = 'eps Eri', alpha = 2.0, rate_per_day = 0.5, at_erg = 1e33}]"])
     answer = plan(one, completeness=none_below)

@@ -97,7 +97,7 @@ def test_own_unknowns_are_read_from_files_points_and_flags(tmp_path: Path, engin
     again = tmp_path / "elsewhere" / "again.toml"
     again.write_text(asked.toml())
     assert Study.read(again).nuisances == asked.nuisances
-    flags = (
+    flags = [
         "--star",
         "G2V",
         "-m",
@@ -111,7 +111,7 @@ def test_own_unknowns_are_read_from_files_points_and_flags(tmp_path: Path, engin
         "--statistic",
         "matched",
         "--ideal",
-    )
+    ]
     run("detect", *flags, "--nuisance", "dark=0.1", "--nuisance", "stray.txt=2", "--no-pictures", folder=tmp_path)
     of_flags = Study.read(tmp_path / "mauvecl-detect" / "detection.ecsv")
     kept = asked.nuisances.own["stray"].model_copy(update={"file": tmp_path / "stray.txt"})
@@ -213,7 +213,6 @@ def test_false_alarms_with_drawn_unknowns_are_as_requested(engine: Engine) -> No
 
 
 def test_chance_with_unknowns_is_that_of_their_study() -> None:
-    """The sentence of `detect` holds the closed forms of the table for both studies, of the most uncertain flare."""
     stars = [{"library": "M3V", "magnitude": 9.0}]
     run = {"realisations": 10_000, "fap": 0.02, "statistics": ["matched"]}
     data: dict[str, Any] = {"star": stars, "flare": {"amplitudes": [0.0001, 0.02, 3.0]}, "run": run} | CONVENTIONS

@@ -79,7 +79,6 @@ def rows_of(table: Table, names: list[str]) -> list[list[object]]:
 # Observed frames take too long for this test.
 @pytest.mark.parametrize("name", long_but(QUICK | SLOW, "exposure", "detect"))
 def test_files_json_and_terminal_agree(name: str, tmp_path: Path) -> None:
-    """Check names, units, descriptions and values of each table, and every text that the terminal shows."""
     answer = getattr(mauvecl, name)(paper(*FEW, *(QUICK | SLOW)[name]))
     answer.write(tmp_path / "files")
     for file, table in answer.tables.items():

@@ -4,7 +4,6 @@ import tomllib
 from typing import Any
 
 import icalendar
-import numpy as np
 import pytest
 from scenes import paper
 
@@ -22,30 +21,6 @@ def study() -> Study:
 @pytest.fixture(scope="module")
 def found(study: Study) -> Any:
     return visible(study)
-
-
-def test_tables_give_the_same_hours(found: Any) -> None:
-    table, months, days, windows = found.table, found.months, found.by_day, found.window_table
-    for k, name in enumerate(NAMES):
-        hours = table["hours"][k].value
-        assert months[name].value.sum() == pytest.approx(hours)
-        assert days["hours"][days["target"] == name].value.sum() == pytest.approx(hours)
-        assert windows["length"][windows["target"] == name].value.sum() / 60 == pytest.approx(hours)
-        assert table["share"][k] * 40 * 24 == pytest.approx(hours)
-        assert table["windows"][k] == (windows["target"] == name).sum()
-    assert months["month"].tolist() == ["2027-02", "2027-03"]
-    assert len(days) == 3 * 41  # from six in the morning to six in the morning
-    gaps = found.windows[0].start_s[1:] - found.windows[0].stop_s[:-1]
-    assert table["longest_gap"][0].value * 86_400 >= gaps.max()
-
-
-def test_windows_by_orbit(found: Any) -> None:
-    """Check that there is about one window per orbit, as long as the mean exposure."""
-    table = found.window_table
-    mine = table[table["target"] == "eps Eri"]
-    assert (np.diff(mine["orbit"]) >= 0).all()
-    orbits = 40 * 86_400 / found.study.orbit.orbit().elements.period_s
-    assert found.table["per_orbit"][0].value * orbits / 60 == pytest.approx(found.table["hours"][0].value, rel=0.005)
 
 
 def test_messages_name_unseen_targets_and_the_orbit(found: Any) -> None:

@@ -21,31 +21,8 @@ from marks import long_but
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Text
 
-from mauvecl import (
-    Engine,
-    Frames,
-    Source,
-    Stares,
-    Study,
-    analyse,
-    detect,
-    expect,
-    exposure_for,
-    inject,
-    measure,
-    simulate,
-    snr,
-    visible,
-)
-from mauvecl import (
-    gaussian as gaussian_report,
-)
-from mauvecl import (
-    limit as limiting_magnitude,
-)
-from mauvecl import (
-    map as detection_map,
-)
+import mauvecl
+from mauvecl import Engine, Study, detect, snr
 
 #: Width of one column of a journal, inches.
 COLUMN = 3.5
@@ -64,20 +41,20 @@ CASES: dict[str, tuple[Any, tuple[str, ...], bool]] = {
     "detect, the paper's question": (detect, FEW, False),
     "detect, one statistic": (detect, (*FEW, ONE, TWO, 'run.statistics=["chi2"]'), True),
     "detect, every statistic": (detect, (*FEW, ONE, TWO, 'run.statistics=["all"]'), False),
-    "limit": (limiting_magnitude, (*FEW, BARE, TWO), True),
-    "limit of exposure": (limiting_magnitude, (*FEW, ONE, TWO, ONLY, 'limit.of="exposure"'), True),
-    "map": (detection_map, (*FEW, BARE, *GRID), False),
-    "map, one statistic": (detection_map, (*FEW, BARE, *GRID, ONLY), False),
-    "gaussian": (gaussian_report, (*FEW, BARE, SWEEP), False),
+    "limit": (mauvecl.limit, (*FEW, BARE, TWO), True),
+    "limit of exposure": (mauvecl.limit, (*FEW, ONE, TWO, ONLY, 'limit.of="exposure"'), True),
+    "map": (mauvecl.map, (*FEW, BARE, *GRID), False),
+    "map, one statistic": (mauvecl.map, (*FEW, BARE, *GRID, ONLY), False),
+    "gaussian": (mauvecl.gaussian, (*FEW, BARE, SWEEP), False),
     "snr": (snr, FEW, False),
     "snr, swept": (snr, (*FEW, ONE, SWEEP), False),
-    "exposure": (lambda study, _: exposure_for(study), ("signal.snr=10", "signal.wavelength_nm=300"), True),
+    "exposure": (lambda study, _: mauvecl.exposure_for(study), ("signal.snr=10", "signal.wavelength_nm=300"), True),
     "visible": (
-        lambda study, _: visible(study),
+        lambda study, _: mauvecl.visible(study),
         ('orbit.targets=["eps Eri"]', "orbit.days=31", "orbit.step_s=600"),
         False,
     ),
-    "simulate": (lambda study, _: simulate(study, realisation=0, flaring=False), (), False),
+    "simulate": (lambda study, _: mauvecl.simulate(study, realisation=0, flaring=False), (), False),
 }
 
 
@@ -167,10 +144,11 @@ PARTS: dict[str, tuple[Any, tuple[str, ...], str, set[str]]] = {
     "detect": (detect, (*FEW, stars(7), "flare.amplitudes=[0.5]"), "6 of 7 stars shown", set()),
     "snr": (snr, (stars(7), "flare.amplitudes=[0.5]"), "6 of 7 stars shown", {"noise-budget"}),
     "measure": (
-        measure, (ONE, "flare.amplitudes=[0.5, 0.6, 0.7, 0.8, 0.9]", "measure.fits=20"), "4 of 5 flares shown", set(),
+        mauvecl.measure, (ONE, "flare.amplitudes=[0.5, 0.6, 0.7, 0.8, 0.9]", "measure.fits=20"), "4 of 5 flares shown",
+        set(),
     ),
     "inject": (
-        lambda study, _: inject(study, Stares()), (ONE, *INJECTED), "6 of 8 half-widths shown",
+        lambda study, _: mauvecl.inject(study, mauvecl.Stares()), (ONE, *INJECTED), "6 of 8 half-widths shown",
         {"completeness", "energies"},
     ),
 }  # fmt: skip
@@ -200,10 +178,9 @@ def test_saved_picture_equals_savefig(engine: Engine, tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_report_has_every_table_remark_and_picture() -> None:
-    """With equal bytes for equal analyses."""
     time, rng = np.arange(300) * 60.0, np.random.default_rng(1)
     light = rng.normal(100.0, 1.0, 300) + np.where(time > 9000, 30 * np.exp((9000 - time) / 600), 0.0)
-    answer = analyse(Study().paper(), frames=Frames.of(time, light, np.ones(300), name="<A & B>"))
+    answer = mauvecl.analyse(Study().paper(), frames=mauvecl.Frames.of(time, light, np.ones(300), name="<A & B>"))
     (page,) = (make().decode() for make in answer.documents.values())
     assert "<A & B>" not in page
     assert "&lt;A &amp; B&gt;: 300 frames" in page
@@ -218,9 +195,10 @@ def test_report_has_every_table_remark_and_picture() -> None:
 
 
 def test_a_curve_is_listed_by_its_name(engine: Engine) -> None:
-    star = Source.from_library("G2V").at_magnitude(7.4)
+    star = mauvecl.Source.from_library("G2V").at_magnitude(7.4)
     quiet, flare = (
-        expect(one, "mauvesim", exposure=5, sky=22.1) for one in (star, star.flaring(amplitude=0.2, temperature=1e4))
+        mauvecl.expect(one, "mauvesim", exposure=5, sky=22.1)
+        for one in (star, star.flaring(amplitude=0.2, temperature=1e4))
     )
     curve = engine.detect(quiet, flare, realisations=1000, seed=1).roc("matched")
     for name, start in (("", "area "), ("own words", "own words: area ")):

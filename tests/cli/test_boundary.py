@@ -81,7 +81,6 @@ def test_names_outside_of_the_encoding_are_escaped(tmp_path: Path) -> None:
 
 
 def test_names_are_not_parsed_as_markup(tmp_path: Path) -> None:
-    """Brackets and colons of names stay in tables as they are."""
     name = "[bold]a:star:[red].txt"
     write_star(tmp_path / name)
     assert "[bold]a:star:[red]" in run(*OBSERVE[:2], "--star", name, "-m", "7", folder=tmp_path).stdout

@@ -94,7 +94,6 @@ def test_study_defines_weights(tmp_path: Path, engine: Engine) -> None:
 
 
 def test_flags_override_the_study_file(tmp_path: Path) -> None:
-    """Combine a study with the user's own spectrum and flags; any key can be set."""
     wavelength = np.arange(170.0, 1100.0, 2.0)
     np.savetxt(tmp_path / "mine.txt", np.column_stack([wavelength, 1e-11 * np.ones_like(wavelength)]))
     (tmp_path / "study.toml").write_text(
@@ -313,6 +312,61 @@ def test_interrupted_run_is_resumed_to_the_same_bits(tmp_path: Path) -> None:
     assert {str(p.relative_to(shards)) for p in shards.rglob("*") if p.is_file()} == set(FOREIGN)
 
 
+PLAN = """
+plan = {targets = [{name = "eps Eri"}, {name = "GJ 205"}], hours = 10, injections = 20}
+orbit = {days = 3, step_s = 300}
+search = {half_widths_s = [120]}
+"""
+STARE = """
+star = [{library = "M3V", magnitude = 9}, {library = "K5V", magnitude = 8}]
+stare = {duration_s = 1000}
+search = {half_widths_s = [60]}
+"""
+MEASURE = """
+star = [{library = "M3V", magnitude = 9}]
+flare = {amplitudes = [0.1, 0.3, 0.5, 1.0], spectrum = {balmer_jump = 2}}
+measure = {fits = 60}
+nuisances = {dark = "free"}
+"""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("verb", "study"), [("plan", PLAN), ("stare", STARE), ("measure", MEASURE)])
+def test_killed_run_is_resumed_to_the_same_bits(verb: str, study: str, tmp_path: Path) -> None:
+    """Kill a run twice: what it had finished is not written again, and the tables are those of an undisturbed run."""
+    (tmp_path / "study.toml").write_text(study)
+    words = [verb, "study.toml", "--no-pictures", "--quiet"]
+    again = [*SMALL_SHARDS, *words, "--output", "out", "--resume"]
+    kept = tmp_path / "out" / "checkpoint"
+
+    def finished() -> dict[str, int]:
+        return {path.name: path.stat().st_mtime_ns for path in kept.glob("[!.]*.npz")}
+
+    before: dict[str, int] = {}
+    for _ in range(2):
+        process = subprocess.Popen(again, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        while finished().keys() <= before.keys():
+            time.sleep(0.005)
+            assert process.poll() is None, process.communicate()
+        process.send_signal(signal.SIGKILL)
+        process.communicate(timeout=60)
+        now = finished()
+        assert before.items() <= now.items(), "what was finished is kept, and not written again"
+        before = now
+    refusal = run(*words, "--output", "out", folder=tmp_path, code=2).stderr
+    assert "--resume" in refusal
+    assert "--restart" in refusal
+    done = subprocess.run(again, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert not kept.exists()
+    run(*words, "--output", "whole", folder=tmp_path)
+    tables = sorted((tmp_path / "whole").glob("*.ecsv"))
+    assert len(tables) >= 2
+    for path in tables:
+        assert (tmp_path / "out" / path.name).read_bytes() == path.read_bytes()
+    assert json.loads((tmp_path / "out" / "run.json").read_text())["verb"] == verb
+
+
 INVALID = ["[" * 100_000, "null", "[]", '{"attributes": []}', '{"attributes": {"study": "a = 1e999"}}']
 
 
@@ -342,7 +396,6 @@ def test_export_to_a_full_disk_keeps_the_earlier_file(name: str, small_disk: Pat
 
 
 def test_import_loads_no_heavy_package_and_help_builds_no_study() -> None:
-    """Importing the package, or asking for help, loads neither OpenCL nor synphot nor the models of a study."""
     heavy = ("pyopencl", "synphot", "astropy", "scipy")
     code = (
         f"import sys, mauvecl, mauvecl.cli.app; print([m for m in {heavy} if m in sys.modules]);"

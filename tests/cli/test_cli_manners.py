@@ -63,7 +63,6 @@ for words in json.loads(sys.argv[1]):
 
 
 def test_mistakes_load_no_heavy_package(tmp_path: Path) -> None:
-    """Check that an error appears before any package is imported that takes long."""
     code = TRIED.replace("HEAVY", repr(HEAVY))
     asked = [["--version"], *map(shlex.split, MISTAKES.strip().splitlines())]
     done = subprocess.run(

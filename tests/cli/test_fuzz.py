@@ -222,6 +222,10 @@ SPOILS = {
 }
 
 
+#: Fewer realisations than the threshold needs: everything is read, and then refused.
+FEW = ("detect", "--star", "G2V", "-m", "8", "-n", "100", "--tails", "counted")
+
+
 @many(25)
 @given(kind=st.integers(0, 2), ending=st.sampled_from([".csv", ".ecsv", ".fits", ".txt"]), **SPOILS)
 def test_flare_tables_never_crash(
@@ -229,29 +233,14 @@ def test_flare_tables_never_crash(
 ) -> None:
     file = folder / f"flares{ending}"
     file.write_bytes(spoilt(_flares()[kind], place, splice, cut, pack))
-    # Fewer realisations than the threshold needs: everything is read, and then refused.
-    check(folder, "detect", "--star", "G2V", "-m", "8", "-n", "100", "--tails", "counted", "--flares", str(file))
+    check(folder, *FEW, "--flares", str(file))
 
 
 @many(25)
 @given(lines=st.lists(st.tuples(NUMBERS, NUMBERS).map(" ".join), max_size=4), junk=st.binary(max_size=8))
 def test_weights_never_crash(folder: Path, lines: list[str], junk: bytes) -> None:
     (folder / "weights.txt").write_bytes("\n".join(["190 0.5", *lines, "700 1"]).encode() + junk)
-    # Fewer realisations than the threshold needs: everything is read, and then refused.
-    check(
-        folder,
-        "detect",
-        "--star",
-        "G2V",
-        "-m",
-        "8",
-        "-n",
-        "100",
-        "--tails",
-        "counted",
-        "--set",
-        "run.weights.mine='weights.txt'",
-    )
+    check(folder, *FEW, "--set", "run.weights.mine='weights.txt'")
 
 
 @many(20)
@@ -267,7 +256,6 @@ def test_environments_never_crash(folder: Path, name: str, value: str) -> None:
 
 
 def test_check_detects_an_unexpected_error(folder: Path) -> None:
-    """A verb that fails in a way that nobody foresaw fails here."""
     with mock.patch("json.dumps", side_effect=KeyError("x")), pytest.raises(AssertionError):
         check(folder, "library", "--json")
     assert sys.stdout is not None

@@ -61,7 +61,6 @@ def test_flags_equal_those_of_the_file() -> None:
 
 
 def test_each_flag_has_one_help_text() -> None:
-    """A flag has one help text, whatever the verb; only its default differs."""
     said: dict[str, set[str]] = {}
     for flags in all_flags().values():
         for flag, about in flags.items():
@@ -237,7 +236,6 @@ def test_counts_are_read(text: str, value: int, tmp_path: Path) -> None:
 
 
 def test_every_numeric_flag_refuses_text(tmp_path: Path) -> None:
-    """Check that the message has flag, value and expectation for every numeric flag."""
     flags = {
         max(option.opts, key=len): name
         for name, verb in TOP.items()

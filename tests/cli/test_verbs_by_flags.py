@@ -228,7 +228,6 @@ def test_interruption_while_writing_is_reported(tmp_path: Path, monkeypatch: pyt
 
 
 def test_output_folder_is_locked_while_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ask into the same folder while each file of another answer is written."""
     refused: list[bool] = []
 
     def fsync(handle: int) -> None:

@@ -44,37 +44,12 @@ def test_lists_of_a_study_have_units() -> None:
     assert build("sweep", axes=[axis]).sweep.axes[0].points() == (60.0, 5.0, 7200.0)
 
 
-@pytest.mark.parametrize(("section", "key", "text", "accepted"), [
-    ("observation", "exposure_s", "10 m", "seconds"), ("observation", "exposure_s", "2 banana", "seconds"),
-    ("star.0", "magnitude", "7 K", "mag"), ("flare", "temperature_k", "20 pc", "K"),
-    ("star.0", "distance_pc", "5 %", "pc"), ("observation", "temperature_c", "20 s", "deg C"),
-    ("observation", "exposure_s", "25 h", "86400"), ("run", "fap", "120 %", "below 1"),
-])  # fmt: skip
-def test_wrong_units_are_refused(section: str, key: str, text: object, accepted: str) -> None:
-    with refused(f"{section}.{key}", repr(text), expected=accepted):
-        build(section.removesuffix(".0"), **{key: text})
-
-
 def test_flags_take_units(tmp_path: Path) -> None:
     words = ("-s", "M3V", "-m", "9 mag", "-t", "10min", "-a", "24%,2 %", "--flare-temperature", "9000 K")
     run("simulate", *words, "--sky", "22 mag/arcsec2", "--no-pictures", folder=tmp_path)
     study = Study.read(tmp_path / "mauvecl-simulate" / "study.toml")
     assert (study.star[0].magnitude, study.observation.exposure_s, study.flare.temperature_k) == (9.0, 600.0, 9000.0)
     assert (study.flare.amplitudes, study.sky.surface_brightness) == (pytest.approx((0.24, 0.02)), 22.0)
-
-
-@pytest.mark.parametrize(("words", "found"), [
-    (("-t", "10 m"), "--exposure '10 m', expected a number in s"), (("-m", "7 K"), "--magnitude '7 K', expected a num"),
-    (("-a", "5%,24s"), "--amplitude '24s', expected a number"),
-    (("--sky", "3 K"), "--sky '3 K', expected V mag/arcsec"),
-    (("-t", "30 h"), "--exposure 108000.0, expected seconds above 0 and up to 86400"),
-    (("-n", "3 %"), "--realisations '3 %', expected a whole number"),
-    (("--sweep", "exposure=1 min,2 pc"), "the axis 'exposure' has the value 2 pc, expected seconds"),
-])  # fmt: skip
-def test_flags_refuse_wrong_units(words: tuple[str, ...], found: str, tmp_path: Path) -> None:
-    code, out, reported = ended("detect", "-s", "M3V", *words, folder=tmp_path)
-    assert (code, out, reported.count("\n")) == (2, "", 1)
-    assert found in reported
 
 
 def test_units_are_imported_only_with_a_unit() -> None:
@@ -96,17 +71,6 @@ def test_amplitudes_like_percentages_have_a_note(tmp_path: Path) -> None:
         assert "is a rise" not in run(*words, text, folder=tmp_path).stderr
 
 
-@pytest.mark.parametrize(("verb", "flag"), [
-    ("detect", "-m"), ("limit", "--magnitude"), ("gaussian", "-m"), ("snr", "-m"), ("inject", "--distance"),
-    ("realise", "-m"), ("analyse", "--distance"), ("stare", "--neighbour-share"),
-])  # fmt: skip
-def test_values_of_no_star_ask_for_a_star(verb: str, flag: str, tmp_path: Path) -> None:
-    code, out, reported = ended(verb, flag, "1", folder=tmp_path)
-    assert (code, out, reported.count("\n")) == (2, "", 1)
-    assert "--star M3V" in reported
-    assert "mauvecl library" in reported
-
-
 def test_a_study_has_its_star(tmp_path: Path) -> None:
     run(*FAST, "-s", "K5V", "-m", "8", folder=tmp_path)
     run(*FAST, "mauvecl-exposure/study.toml", "-m", "9", "-o", "again", folder=tmp_path)
@@ -124,12 +88,6 @@ def test_few_realisations_sample_the_tails(tmp_path: Path) -> None:
     # The threshold is that of many realisations: 3.09 standard deviations of a normal.
     table = Table.read(tmp_path / "mauvecl-detect" / "detection.ecsv")
     assert table["threshold"][0] == pytest.approx(3.09, abs=0.03)
-
-
-def test_counted_tails_are_refused_for_few_realisations(tmp_path: Path) -> None:
-    for words in (("detect", "--tails", "counted"), ("map", "--tails", "counted")):
-        code, _, reported = ended(*words, "-s", "M3V", "-m", "9", "-n", "1000", folder=tmp_path)
-        assert (code, "100000 realisations" in reported) == (2, True)
 
 
 def test_several_wrong_values_are_reported_together(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from scenes import instrument, star
 from scipy import optimize, stats
 
 from mauvecl import Engine
-from mauvecl.detection.distributions import detection_interval
+from mauvecl.detection import distributions
 
 #: Of the chi-squared statistic here.
 DOF = 48
@@ -65,7 +65,8 @@ def test_interval_has_nominal_coverage(kind: str, fap: float, n: int, seeds: int
     for probability in probabilities:
         above, shared = counted(kind, fap, probability, n, seeds)
         found = [
-            detection_interval([int(k) for k in row], n, fap, float(r)) for row, r in zip(above, shared, strict=True)
+            distributions.detection_interval([int(k) for k in row], n, fap, float(r))
+            for row, r in zip(above, shared, strict=True)
         ]
         covered = np.mean([x.low <= probability <= x.high for x in found])
         error = 5 * np.sqrt(0.05 * 0.95 / seeds)
@@ -80,7 +81,8 @@ def test_interval_covers_near_the_ends(probability: float) -> None:
     for kind in ("matched", "chi2"):
         above, shared = counted(kind, 0.1, probability, 1000, 1000)
         found = [
-            detection_interval([int(k) for k in row], 1000, 0.1, float(r)) for row, r in zip(above, shared, strict=True)
+            distributions.detection_interval([int(k) for k in row], 1000, 0.1, float(r))
+            for row, r in zip(above, shared, strict=True)
         ]
         covered = np.mean([x.low <= probability <= x.high for x in found])
         assert covered > 0.94 - 5 * np.sqrt(0.05 * 0.95 / 1000)
@@ -88,15 +90,15 @@ def test_interval_covers_near_the_ends(probability: float) -> None:
 
 def test_ends_of_the_counts() -> None:
     """Compare no and all detections with Clopper and Pearson's interval, which an uncertain threshold widens."""
-    sure = detection_interval((1000, 1000, 1000), 1000, 1e-3)
+    sure = distributions.detection_interval((1000, 1000, 1000), 1000, 1e-3)
     assert (sure.value, sure.high) == (1.0, 1.0)
     assert 0.99 < sure.low < exact(1000, 1000)[0] + 1e-9
-    less = detection_interval((1000, 990, 1000), 1000, 1e-3)
+    less = distributions.detection_interval((1000, 990, 1000), 1000, 1e-3)
     assert less.low < sure.low
-    none = detection_interval((0, 0, 0), 1000, 1e-3)
+    none = distributions.detection_interval((0, 0, 0), 1000, 1e-3)
     assert (none.value, none.low) == (0.0, 0.0)
     assert none.high == pytest.approx(1 - sure.low, rel=1e-9)
-    plain = detection_interval((300, 300, 300), 1000, 1e-3)
+    plain = distributions.detection_interval((300, 300, 300), 1000, 1e-3)
     jeffreys = stats.beta.ppf([0.025, 0.975], 300.5, 700.5)
     assert (plain.low, plain.high) == pytest.approx(tuple(jeffreys), rel=1e-3)
 
@@ -117,7 +119,7 @@ def test_ends_combine_three_errors_that_are_correlated(correlation: float) -> No
             middle + sign * np.sqrt(one**2 + other**2 - 2 * shared * one * other)
             for sign, one, other in ((-1, middle - low, middle - few), (1, high - middle, many - middle))
         ]
-        found = detection_interval(above, n, fap, correlation)
+        found = distributions.detection_interval(above, n, fap, correlation)
         assert (found.low, found.high) == pytest.approx(tuple(stats.norm.cdf(ends)), abs=1e-7)
 
 

@@ -15,22 +15,10 @@ from scenes import quiescent as quiet
 from scenes import source as star
 from scipy import stats
 
-from mauvecl import (
-    BalmerFlare,
-    Engine,
-    Expectation,
-    FlareModel,
-    Instrument,
-    Nuisances,
-    TwoBlackbodies,
-    expect,
-    fit,
-    fit_two_temperatures,
-    forecast,
-)
-from mauvecl import fit_two_temperatures as fit_two
+import mauvecl
+from mauvecl import BalmerFlare, Engine, Expectation, FlareModel, Nuisances, TwoBlackbodies, expect, fit
 
-MAUVE = Instrument.load("mauvesim")
+MAUVE = mauvecl.Instrument.load("mauvesim")
 FREE, SKY_SD, DARK_C = np.inf, 0.1, 0.5
 
 
@@ -76,7 +64,7 @@ def test_intervals_cover_where_light_is_lost(
     covered(found, truth, 0.935, 0.965)
     # Errors in advance are those of the fits, to 5 standard errors of a standard deviation of 600.
     scatter = np.subtract(*np.quantile(found.estimates, [0.84135, 0.15865], axis=0)) / 2
-    ahead = forecast(x, m, kelvin, m.amplitudes(kelvin, amplitude, jump=jump), unknown).errors
+    ahead = mauvecl.forecast(x, m, kelvin, m.amplitudes(kelvin, amplitude, jump=jump), unknown).errors
     np.testing.assert_allclose(scatter, ahead, rtol=5 * 1.3 / np.sqrt(1200) + 0.03)
 
 
@@ -151,7 +139,7 @@ def test_two_temperatures_are_dimmed_alike() -> None:
     lit = expect(source.flaring(2.0, spectrum=TwoBlackbodies(8000.0, 30_000.0, 0.05)), MAUVE, exposure=50.0)
     unknown = Nuisances.of(x, {"light": FREE})
     raw = [lit.recorded_dn + (f - 1.0) * lit.light_dn for f in (1.0, 0.9)]
-    found = fit_two_temperatures(np.array(raw), x, m, unknown)
+    found = mauvecl.fit_two_temperatures(np.array(raw), x, m, unknown)
     # Second temperatures lie on a grid, that of both exposures.
     assert found.factor[1] / found.factor[0] == pytest.approx(0.9, rel=1e-4)
     away = (found.estimates[1] - found.estimates[0]) / found.errors[0]
@@ -271,7 +259,7 @@ def model(**how: bool) -> FlareModel:
 def test_two_temperatures_are_recovered_without_noise() -> None:
     """Compare to 0.6 %, the step between second temperatures, which is far below their error."""
     quiet, two, _ = expectations()
-    found = fit_two(two.recorded_dn, quiet, model())
+    found = mauvecl.fit_two_temperatures(two.recorded_dn, quiet, model())
     best = dict(zip(found.names, found.estimates[0], strict=True))
     assert best["second temperature"] == pytest.approx(30_000.0, rel=0.007)
     assert best["temperature"] == pytest.approx(8000.0, rel=0.01)
@@ -290,8 +278,8 @@ def test_two_temperatures_are_recovered_without_noise() -> None:
 def test_intervals_of_two_temperatures_have_nominal_coverage(engine: Engine) -> None:
     """Fit 400 draws: a coverage of 93 to 97 % fails in 1e-6 of seeds on each side of four quantities."""
     quiet, two, _ = expectations()
-    found = fit_two(engine.realise(two, count=400, seed=3), quiet, model(), levels=(0.95,))
-    exact = fit_two(two.recorded_dn, quiet, model())
+    found = mauvecl.fit_two_temperatures(engine.realise(two, count=400, seed=3), quiet, model(), levels=(0.95,))
+    exact = mauvecl.fit_two_temperatures(two.recorded_dn, quiet, model())
     truth = {"temperature": 8000.0, "second temperature": 30_000.0, "second area": 0.05}
     truth["flux bolometric"] = float(exact.estimates[0, exact.column("flux bolometric")])
     for name, value in truth.items():
@@ -307,7 +295,7 @@ def test_intervals_of_two_temperatures_have_nominal_coverage(engine: Engine) -> 
 def test_second_temperature_of_a_single_blackbody_is_unconstrained(engine: Engine) -> None:
     """Fit a blackbody of 9000 K: the second temperature has no limit, the first is that of the plain fit."""
     quiet, _, one = expectations()
-    found = fit_two(engine.realise(one, count=20, seed=5), quiet, model(), levels=(0.95,))
+    found = mauvecl.fit_two_temperatures(engine.realise(one, count=20, seed=5), quiet, model(), levels=(0.95,))
     area, second = found.column("second area"), found.column("second temperature")
     assert (found.low[0, :, area] == 0.0).sum() >= 15
     assert np.isinf(found.high[0, :, second]).sum() >= 15

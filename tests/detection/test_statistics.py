@@ -10,8 +10,7 @@ from scipy import integrate, stats
 from scipy.ndimage import gaussian_filter1d
 
 from mauvecl import Comparison, Expectation, Instrument, Sky, Source, expect
-from mauvecl.detection import chi2
-from mauvecl.detection.distributions import Gaussian, Mixture, QuadraticForm
+from mauvecl.detection import chi2, distributions
 
 
 @pytest.mark.parametrize("n", [10, 48, 1643])
@@ -19,7 +18,7 @@ from mauvecl.detection.distributions import Gaussian, Mixture, QuadraticForm
 def test_equal_weights_are_a_scaled_non_central_chi_squared(n: int, scale: float) -> None:
     """Compare with scipy's ncx2 (Boost); weights of 1 + 1e-12 keep ours from using it."""
     shift = np.linspace(-0.5, 0.7, n)
-    form = QuadraticForm(np.full(n, scale * (1 + 1e-12)), shift)
+    form = distributions.QuadraticForm(np.full(n, scale * (1 + 1e-12)), shift)
     exact = stats.ncx2(n, np.sum(shift**2), scale=scale)
     assert form.mean == pytest.approx(exact.mean())
     assert form.std == pytest.approx(exact.std())
@@ -28,12 +27,12 @@ def test_equal_weights_are_a_scaled_non_central_chi_squared(n: int, scale: float
 
 
 def test_unit_weights_use_scipy() -> None:
-    assert QuadraticForm(np.ones(30), np.zeros(30)).isf(1e-3) == stats.chi2.isf(1e-3, 30)
-    form = QuadraticForm(np.ones(30), np.full(30, 0.3))
+    assert distributions.QuadraticForm(np.ones(30), np.zeros(30)).isf(1e-3) == stats.chi2.isf(1e-3, 30)
+    form = distributions.QuadraticForm(np.ones(30), np.full(30, 0.3))
     assert form.sf(40.0) == pytest.approx(stats.ncx2.sf(40.0, 30, 30 * 0.09), rel=1e-12)
 
 
-def of_two(form: QuadraticForm, x: float, *, upper: bool) -> float:
+def of_two(form: distributions.QuadraticForm, x: float, *, upper: bool) -> float:
     """Return the probability above or below x for two terms, integrated over the normal of the first."""
     (a, b), (first, second) = form.weight, form.shift
     most = np.sqrt(x / a)
@@ -57,7 +56,9 @@ def test_two_terms_of_any_kind_against_quadrature() -> None:
     """Compare weights up to 1e4 apart and shifts up to 8: every tail to 1e-10, quantiles in half a second."""
     generator = np.random.default_rng(8)
     for _ in range(3):
-        form = QuadraticForm(10 ** generator.uniform(-4, 0, 2), generator.normal(0, 1, 2) * generator.choice([0, 1, 4]))
+        form = distributions.QuadraticForm(
+            10 ** generator.uniform(-4, 0, 2), generator.normal(0, 1, 2) * generator.choice([0, 1, 4])
+        )
         for p in (1e-10, 1e-3, 0.3, 0.9, 1 - 1e-4):
             began = time.process_time()
             x = form.isf(p)
@@ -71,7 +72,7 @@ def test_two_terms_of_any_kind_against_quadrature() -> None:
 @pytest.mark.parametrize("push", [0.0, 0.5, 1e4])
 def test_few_terms_and_far_tails_agree_with_scipy(n: int, push: float) -> None:
     """Compare equal weights down to 1e-100, with the accuracy that scipy has below 1e-10."""
-    form = QuadraticForm(np.full(n, 2.5), np.sqrt(np.append(push, np.zeros(n - 1))))
+    form = distributions.QuadraticForm(np.full(n, 2.5), np.sqrt(np.append(push, np.zeros(n - 1))))
     exact = stats.ncx2(n, push, scale=2.5) if push else stats.chi2(n, scale=2.5)
     for p in (1e-10, 1e-5, 0.2):
         assert exact.sf(form.isf(p)) == pytest.approx(p, rel=1e-6)
@@ -83,7 +84,7 @@ def test_few_terms_and_far_tails_agree_with_scipy(n: int, push: float) -> None:
 def test_several_weights_with_a_closed_form() -> None:
     """Compare five pairs of equal weights from 1 to 1e-3 with sums of exponentials, also at 1e-12."""
     weight = np.array([1.0, 0.4, 0.05, 0.01, 1e-3])
-    form = QuadraticForm(np.repeat(weight, 2), np.zeros(10))
+    form = distributions.QuadraticForm(np.repeat(weight, 2), np.zeros(10))
     share = np.array([np.prod(w / (w - np.delete(weight, k))) for k, w in enumerate(weight)])
     for p in (0.9, 0.1, 1e-3, 1e-12):
         x = form.isf(p)
@@ -94,7 +95,7 @@ def test_several_weights_with_a_closed_form() -> None:
 def test_many_terms_of_two_kinds_have_the_tail_of_their_convolution(spread: float) -> None:
     """Compare 300 terms of two weights with the convolution of two of scipy's non-central chi-squareds."""
     a, b, n, push = 1.0, 10.0**-spread, 150, 0.09 * 150
-    form = QuadraticForm(np.repeat([a, b], n), np.full(2 * n, 0.3))
+    form = distributions.QuadraticForm(np.repeat([a, b], n), np.full(2 * n, 0.3))
     one, other = stats.ncx2(n, push, scale=a), stats.ncx2(n, push, scale=b)
     nodes, weights = np.polynomial.legendre.leggauss(400)
     low, high = other.isf(1 - 1e-13), other.isf(1e-13)
@@ -109,7 +110,9 @@ def test_mixture_follows_simulation() -> None:
     """Compare moments, tails and quantiles with draws from the components: 4.5 standard errors of 4e5 draws."""
     rng, n = np.random.default_rng(20_261_122), 400_000
     weight, shift = np.array([0.5, 2.0, 1.0]), np.array([0.3, 1.0, 0.0])
-    found = Mixture((Gaussian(-1.0, 0.5), QuadraticForm(weight, shift)), np.array([0.3, 0.7]))
+    found = distributions.Mixture(
+        (distributions.Gaussian(-1.0, 0.5), distributions.QuadraticForm(weight, shift)), np.array([0.3, 0.7])
+    )
     squares = ((rng.normal(size=(n, 3)) + shift) ** 2) @ weight
     x = np.where(rng.random(n) < 0.3, rng.normal(-1.0, 0.5, n), squares)
     assert abs(x.mean() - found.mean) < 4.5 * found.std / np.sqrt(n)
@@ -124,9 +127,11 @@ def test_mixture_follows_simulation() -> None:
 
 def test_mixture_of_parts_far_apart_is_the_sum_of_their_chances() -> None:
     """In the middle of one part, far above another, and above both, where chances are below those of rounding."""
-    parts = tuple(QuadraticForm(np.linspace(0.9, 1.1, 300) * size, np.full(300, 0.1)) for size in (1.0, 1.3, 9.0))
+    parts = tuple(
+        distributions.QuadraticForm(np.linspace(0.9, 1.1, 300) * size, np.full(300, 0.1)) for size in (1.0, 1.3, 9.0)
+    )
     shares = np.array([0.6, 0.3999, 1e-4])
-    found = Mixture(parts, shares)
+    found = distributions.Mixture(parts, shares)
     for value in (200.0, 310.0, 420.0, 900.0, 2700.0, 4000.0, 6000.0):
         chance = float(shares @ [part.sf(value) for part in parts])
         assert found.sf(value) == pytest.approx(chance, rel=1e-5, abs=0)
@@ -157,7 +162,7 @@ def test_few_centres_represent_all_pixels() -> None:
     for x in (noise, noise + flare.signal_dn - quiet.signal_dn):
         ours = (x @ smoothing.rows.T) ** 2 @ smoothing.scale(flare)
         np.testing.assert_allclose(ours, (x @ rows.T) ** 2 @ factor, rtol=1e-3)
-    full = QuadraticForm(modes, np.zeros(modes.size))
+    full = distributions.QuadraticForm(modes, np.zeros(modes.size))
     form = smoothing.form(smoothing.scale(flare), np.zeros(len(rows)), 2 * quiet.variance_dn2)
     for fap, error in ((1e-2, 1e-3), (1e-10, 5e-3)):
         assert form.isf(fap) == pytest.approx(full.isf(fap), rel=1e-4)

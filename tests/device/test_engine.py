@@ -16,8 +16,8 @@ from scenes import instrument, star
 
 from mauvecl import Comparison, CosmicRays, Engine, Linear, Normal, PixelMap, Processes, Uniform
 from mauvecl.detection import counts, requests
+from mauvecl.device import selftest
 from mauvecl.device.launches import scene_launches
-from mauvecl.device.selftest import toy
 from mauvecl.noise import layout, reference
 from mauvecl.noise.scene import prepare
 
@@ -108,7 +108,7 @@ def test_raw_spectra_equal_reference(any_width: Engine, name: str) -> None:
 def test_raw_sums_above_float32_integers_are_exact(engine: Engine) -> None:
     """Sum 400 frames that lose up to 48 000 DN each."""
     how = {"mode": "frames", "processes": Processes(light_loss=Uniform(0.0, 0.9))}
-    quiet = toy(20, 400, light=90_000.0)
+    quiet = selftest.toy(20, 400, light=90_000.0)
     raw, scene = engine.realise(quiet, count=40, seed=SEED, **how), prepare([quiet], **how)
     assert np.abs(raw - 400 * scene.base_dn[0]).max() > 2**24
     np.testing.assert_array_equal(raw, reference.realise(scene, np.arange(40, dtype=np.uint64), SEED))
@@ -151,7 +151,7 @@ def test_tally_counts_values_at_the_ends_of_its_bins(any_width: Engine) -> None:
     values = np.array([*steps, *far, 0, 0, *steps, *far], np.float32)
     tally = counts.Tally([counts.Grid(0, 0.0, float(layout.STEPS_PER_SIGMA))])
     tile = any_width._tiles.at(0, values.size, 4096)
-    with scene_launches(any_width.open_device, prepare([toy()]), 1) as launches:
+    with scene_launches(any_width.open_device, prepare([selftest.toy()]), 1) as launches:
         launches._named["values"] = launches.upload(np.resize(values, tile.size))
         launches.tally(tile, tally)
         launches.flush(tally)
@@ -166,7 +166,6 @@ def test_tally_counts_values_at_the_ends_of_its_bins(any_width: Engine) -> None:
 
 
 def test_saturating_star_is_drawn_frame_by_frame(engine: Engine) -> None:
-    """By default, a saturating star is drawn frame by frame and clipped."""
     (bright, *_), _ = case("at the rail")
     assert prepare([bright]).frames
     raw = engine.realise(bright, count=200, seed=1)
@@ -244,14 +243,12 @@ print(hashlib.sha256(repr([tuple(row) for row in table]).encode()).hexdigest())
 
 @pytest.mark.long
 def test_number_of_threads_does_not_affect_results() -> None:
-    """Compare all digits of a table from one thread and from two."""
     code = THREADS.format(tests=str(Path(__file__).parents[1]))
     one, two = (python(code, POCL_MAX_PTHREAD_COUNT=threads).stdout for threads in ("1", "2"))
     assert one == two
 
 
 def test_flares_in_batches_equal_single_flares(engine: Engine) -> None:
-    """Compare flares of several launches with the same flares alone."""
     amplitudes = tuple(np.linspace(0.01, 0.3, 18))
     payload = instrument(part=True)
     quiet, *flares = star(amplitudes=amplitudes, payload=payload)

@@ -190,7 +190,6 @@ assert first == digest(two) == digest(one)
 
 
 def test_store_is_limited_in_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Remove the oldest programs."""
     monkeypatch.setattr(drivers, "MAX_STORED", 25_000)
     for number in range(4):
         cache = drivers.KernelCache(tmp_path / "store", tmp_path / f"work{number}")

@@ -14,8 +14,7 @@ from processes import python
 from refusals import refused
 
 from mauvecl import Engine
-from mauvecl.device import build, drivers
-from mauvecl.device.selftest import toy
+from mauvecl.device import build, drivers, selftest
 
 
 def test_device_is_chosen_by_name_or_number() -> None:
@@ -77,7 +76,7 @@ def test_engine_after_fork_raises(engine: Engine, new: bool) -> None:
 
     def child() -> None:
         try:
-            (Engine() if new else engine).realise(toy(), count=1, seed=1)
+            (Engine() if new else engine).realise(selftest.toy(), count=1, seed=1)
         except RuntimeError as error:
             queue.put(str(error))
 
@@ -117,7 +116,7 @@ def refuse_beyond(monkeypatch: pytest.MonkeyPatch, limit: int, *, scenes: bool =
 
 
 def test_little_memory_shrinks_tiles_without_affecting_results(monkeypatch: pytest.MonkeyPatch) -> None:
-    quiet, flare = toy(), toy(flare=0.3)
+    quiet, flare = selftest.toy(), selftest.toy(flare=0.3)
 
     def work() -> list[np.ndarray]:
         engine = Engine()
@@ -136,12 +135,12 @@ def test_little_memory_shrinks_tiles_without_affecting_results(monkeypatch: pyte
 def test_too_little_memory_raises(monkeypatch: pytest.MonkeyPatch) -> None:
     refuse_beyond(monkeypatch, 100)
     with pytest.raises(RuntimeError) as error:
-        Engine().detect(toy(), [toy(flare=0.3)], realisations=20_000, seed=1)
+        Engine().detect(selftest.toy(), [selftest.toy(flare=0.3)], realisations=20_000, seed=1)
     assert error.value.kind == "memory"
     assert " 64 realisations" in str(error.value)
     refuse_beyond(monkeypatch, 100, scenes=True)
     with pytest.raises(RuntimeError) as error:
-        Engine().realise(toy(), count=1, seed=1)
+        Engine().realise(selftest.toy(), count=1, seed=1)
     assert error.value.kind == "memory"
     assert "scene" in str(error.value)
 
@@ -151,7 +150,7 @@ def test_other_device_errors_are_not_retried(monkeypatch: pytest.MonkeyPatch) ->
     both = cl.mem_flags.READ_ONLY | cl.mem_flags.WRITE_ONLY
     monkeypatch.setattr(cl, "Buffer", lambda context, flags, *rest, **more: real(context, both, 64))
     with pytest.raises(cl.LogicError, match="INVALID_VALUE"):
-        engine.realise(toy(), count=10, seed=1)
+        engine.realise(selftest.toy(), count=10, seed=1)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, -1.0, 1e13])
@@ -159,7 +158,7 @@ def test_other_device_errors_are_not_retried(monkeypatch: pytest.MonkeyPatch) ->
     "name", ["source_electrons", "sky_electrons", "dark_dn", "bias_dn", "read_noise_dn", "gain_dn_per_electron"]
 )
 def test_invalid_expectation_names_pixel(name: str, value: float) -> None:
-    x = toy()
+    x = selftest.toy()
     wrong = getattr(x, name).copy()
     wrong[17] = value
     with refused(name, "pixel 17"):

@@ -89,7 +89,6 @@ def test_weaker_promise_is_checked_and_marked(
 
 @pytest.mark.long
 def test_wrong_kernel_fails_both_promises(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fail for another key schedule, which changes draws, not rounding."""
     few_cases(monkeypatch, "stack")
     rendered_otherwise(monkeypatch, another_key_schedule)
     wrong = Engine()

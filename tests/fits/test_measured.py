@@ -10,23 +10,10 @@ import scipy
 from scenes import assert_covered, quiescent
 from scenes import source as star
 
-from mauvecl import (
-    Cooling,
-    Engine,
-    Event,
-    Expectation,
-    FlareModel,
-    Instrument,
-    Nuisances,
-    Sinusoid,
-    Stare,
-    expect,
-    fit,
-    fit_cooling,
-    measure_along,
-)
+import mauvecl
+from mauvecl import Cooling, Engine, Event, FlareModel, Nuisances, Sinusoid, Stare, fit_cooling, measure_along
 
-MAUVE = Instrument.load("mauvesim")
+MAUVE = mauvecl.Instrument.load("mauvesim")
 STEADY = Cooling(9000.0, 9000.0, 1.0)
 SEEDS = 20
 
@@ -39,7 +26,7 @@ def model() -> FlareModel:
     return FlareModel.of(star(), MAUVE, quiet(), distance_pc=5.0, radius_rsun=0.4)
 
 
-def lit_frames(cooling: Cooling, stare: Stare) -> tuple[list[Expectation], np.ndarray]:
+def lit_frames(cooling: Cooling, stare: Stare) -> tuple[list[mauvecl.Expectation], np.ndarray]:
     """Return frames with a flare that peaks at 52 s, each of one temperature, and these temperatures.
 
     Each frame is an expectation of its own: neither the model's spectra nor its conditions are those of the fits.
@@ -50,7 +37,7 @@ def lit_frames(cooling: Cooling, stare: Stare) -> tuple[list[Expectation], np.nd
     kelvin, dark = cooling.at(start + 2.5 - 52.0), stare.dark_factor(x)
     lit = []
     for k in range(stare.n_frames):
-        flaring = expect(star().flaring(float(rise[k]), float(kelvin[k])), MAUVE, exposure=5.0)
+        flaring = mauvecl.expect(star().flaring(float(rise[k]), float(kelvin[k])), MAUVE, exposure=5.0)
         added = flaring.source_electrons - x.source_electrons
         lit.append(replace(
             x, source_electrons=stare.light[k] * (stare.star[k] * x.source_electrons + added),
@@ -92,7 +79,7 @@ def test_temperature_is_measured_with_correct_errors(
             if (first, n) not in truths:
                 unknown_n = None if nuisances is None else replace(nuisances, spectra=n * nuisances.spectra)
                 one = replace(quiet(), n_frames=int(n))
-                exact = fit(means[some].sum(axis=0), one, model().stacked(int(n)), unknown_n)
+                exact = mauvecl.fit(means[some].sum(axis=0), one, model().stacked(int(n)), unknown_n)
                 truths[first, n] = float(exact.estimates[0, 0])
             truth = truths[first, n]
             assert 0.995 * kelvin[some].min() < truth < 1.005 * kelvin[some].max()

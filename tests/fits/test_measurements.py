@@ -15,21 +15,10 @@ from scenes import assert_covered
 from scenes import quiescent as quiet
 from scenes import source as star
 
-from mauvecl import (
-    BalmerFlare,
-    Blackbody,
-    Expectation,
-    FlareModel,
-    Instrument,
-    Nuisances,
-    ObservedFlare,
-    Source,
-    expect,
-    fit,
-    forecast,
-)
+import mauvecl
+from mauvecl import BalmerFlare, Expectation, FlareModel, Nuisances, Source, expect, fit, forecast
 
-MAUVE = Instrument.load("mauvesim")
+MAUVE = mauvecl.Instrument.load("mauvesim")
 #: Forecasts that an independent script computed for the project's specification.
 PUBLISHED = tomllib.loads((Path(__file__).parents[1] / "data" / "published-fits.toml").read_text(encoding="utf-8"))
 
@@ -120,7 +109,9 @@ def test_forecasts_agree_with_brute_force(
     base = np.interp(grid, s.wavelength_nm, s.flux_flam)
 
     def counts(amplitude: float, temperature: float, ratio: float, flux: float) -> np.ndarray:
-        body = Source.from_arrays(s.wavelength_nm, Blackbody(temperature).flux(s.wavelength_nm), name="blackbody")
+        body = Source.from_arrays(
+            s.wavelength_nm, mauvecl.Blackbody(temperature).flux(s.wavelength_nm), name="blackbody"
+        )
         brightness = 10 ** (-0.4 * (s.magnitude("Kepler") - body.magnitude("Kepler")))
         shape = BalmerFlare(temperature, max(ratio, 1.0)).flux(grid)
         hot = amplitude * brightness * shape
@@ -258,7 +249,9 @@ def test_great_flare_of_ad_leo(
     """Fit the mean exposure: no blackbody, a Balmer jump, and an interval that contains the optical 9500 K."""
     data, units = Path(__file__).parents[1] / "data", {"wavelength_unit": "Angstrom"}
     ad_leo = Source.read(data / "flares" / "adleo_quiescent2.dat", extend="M3V", **units)  # type: ignore[arg-type]
-    flare = ObservedFlare.read(data / file, data / "flares" / "adleo_quiescent2.dat", continue_at_k=9500.0, **units)  # type: ignore[arg-type]
+    flare = mauvecl.ObservedFlare.read(
+        data / file, data / "flares" / "adleo_quiescent2.dat", continue_at_k=9500.0, **units
+    )  # type: ignore[arg-type]
     nm = flare.grid(ad_leo.wavelength_nm)
     light = np.interp(nm, ad_leo.wavelength_nm, ad_leo.flux_flam) + flare.flux(nm)
     x, lit = (expect(one, MAUVE, exposure=50.0) for one in (ad_leo, Source(nm, light, "flaring", "test")))

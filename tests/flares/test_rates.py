@@ -12,7 +12,7 @@ from scenes import through
 from scipy import stats
 
 from mauvecl import SHAPES, EnergyScale, Source, Study, plan
-from mauvecl.search.completeness import Completeness, fit_power_law
+from mauvecl.search import completeness
 
 QUICK = {"completeness": "closed form"}
 
@@ -155,7 +155,7 @@ def test_power_law_is_recovered_from_drawn_flares(alpha: float) -> None:
     """
     rng, error, campaigns = np.random.default_rng(19), 0.1, 350
     table = planned({"own": {"alpha": alpha, "rate_per_day": 0.2, "at_erg": 1e33}}).by_energy
-    form = Completeness(table["energy"].value, np.asarray(table["recovered"]), "bolometric", "a plan")
+    form = completeness.Completeness(table["energy"].value, np.asarray(table["recovered"]), "bolometric", "a plan")
 
     def per_day(energy: Any) -> Any:
         return 0.2 * (energy / 1e33) ** (1 - alpha)
@@ -170,7 +170,9 @@ def test_power_law_is_recovered_from_drawn_flares(alpha: float) -> None:
     for k in range(campaigns):
         energy = least * (1 - rng.random(rng.poisson(mean))) ** (1 / (1 - alpha))
         energy = energy[rng.random(energy.size) < form.at(energy)]
-        fit = fit_power_law(energy * 10 ** (error * rng.standard_normal(energy.size)), form, days, error_dex=error)
+        fit = completeness.fit_power_law(
+            energy * 10 ** (error * rng.standard_normal(energy.size)), form, days, error_dex=error
+        )
         truth = np.log10(per_day(fit.pivot_erg))
         inside[k] = abs(fit.alpha - alpha) < fit.alpha_sd, abs(fit.log10_rate - truth) < fit.log10_rate_sd
     assert inside.mean(axis=0) == pytest.approx([0.68, 0.68], abs=0.05)

@@ -48,13 +48,6 @@ def test_every_value_has_a_source(name: str) -> None:
     assert "not a flight calibration" in instrument.notice
 
 
-def test_mauve_electrons_differs_only_in_counting(mauve: Instrument) -> None:
-    electrons = Instrument.load("mauve")
-    assert (mauve.dark_unit, electrons.dark_unit) == ("DN", "electrons")
-    assert electrons != mauve
-    assert electrons.with_(dark_unit="DN", photon_noise="gaussian") == mauve
-
-
 def test_with_returns_a_marked_copy(mauve: Instrument) -> None:
     cold = mauve.with_(temperature_c=13, grating_efficiency=0.5)
     assert (mauve.temperature_c, cold.temperature_c) == (21, 13)

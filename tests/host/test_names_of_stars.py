@@ -185,7 +185,6 @@ def test_light_and_noise_equal_those_of_the_summed_spectrum(tmp_path: Path, shar
 
 
 def test_dilution_follows_from_magnitudes(tmp_path: Path) -> None:
-    """Check that stars of one type share the light by their magnitudes."""
     x = seen(tmp_path, "twin,1.0,8.4,G2V", "faint,1.0,9.9,G2V", share=0.5)
     assert x.target_share == pytest.approx(1 / (1 + 0.5 * (10**-0.4 + 10**-1.0)), rel=1e-9)
 

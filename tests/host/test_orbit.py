@@ -19,7 +19,7 @@ from scipy.interpolate import RegularGridInterpolator
 
 import mauvecl
 from mauvecl import InputError, Sky, Study, visible
-from mauvecl.host.orbit.visibility import Particles, Thermal
+from mauvecl.host.orbit import visibility
 
 VECTORS = Path(sgp4.__file__).parent
 PROTONS = Path(mauvecl.__file__).parent / "host" / "orbit" / "protons.ecsv"
@@ -199,7 +199,6 @@ def test_messages_about_the_epoch() -> None:
 
 @pytest.mark.parametrize("start", ["2027-01-01", "2027-01-01T11:59:59", "2027-01-01T12:00:01", "2027-01-01T23:59:59.5"])
 def test_days_begin_at_midnight(start: str) -> None:
-    """Check all divisions of a date into two numbers by astropy."""
     times = section(start=start, days=1.0, step_s=3600.0).times()
     midnight, fraction = times.first
     assert midnight % 1 == 0.5
@@ -327,14 +326,14 @@ def test_protons_along_the_orbit(month: Any) -> None:
     place = month.track.subsatellite_deg
     allowed = seen(**MONTH, limits=NO_LIMITS | {"proton_flux": 10.0}).seen[:, 0]
     np.testing.assert_array_equal(allowed, protons(10, *place) <= 10.0)
-    hits = Particles(1.0, 0.5).rate_per_cm2_s(month.track)
+    hits = visibility.Particles(1.0, 0.5).rate_per_cm2_s(month.track)
     np.testing.assert_allclose(hits, 1.0 + 0.5 * protons(30, *place), rtol=1e-9)
     assert hits.max() > 100
 
 
 def test_temperature_follows_its_equation() -> None:
     """Check exp(-t / tau) after a step from shadow to sunlight, and that balance is kept."""
-    thermal = Thermal(20.0, 10.0, 600.0)
+    thermal = visibility.Thermal(20.0, 10.0, 600.0)
     assert thermal.temperature_c(np.full(50, 1.0), 30.0) == pytest.approx(20.0)
     light = np.r_[np.zeros(5000), np.ones(100)]
     found = thermal.temperature_c(light, 30.0)
@@ -379,7 +378,6 @@ def _simbad(monkeypatch: pytest.MonkeyPatch, query_tap: Callable[[str], object])
 
 
 def test_answer_of_simbad_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Read degrees and mas of the TAP service, masked values, blanks and quotes."""
     asked = []
 
     def answer(query: str) -> Table:

@@ -128,11 +128,6 @@ def test_no_network_access_and_no_global_state(monkeypatch: pytest.MonkeyPatch) 
     assert (iers.conf.auto_download, solar_system_ephemeris.get()) == before
 
 
-def test_brightness_can_be_a_quantity() -> None:
-    assert Sky.of_brightness(22.1).surface_brightness == 22.1
-    assert Sky.of_brightness(22.1 * u.mag / u.arcsec**2) == Sky.of_brightness(22.1)
-
-
 def test_total_magnitude_and_spectrum() -> None:
     area = np.pi * 47.46**2
     sky = Sky.of_brightness(22.1)

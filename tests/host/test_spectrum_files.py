@@ -128,7 +128,6 @@ def test_any_table_is_read_correctly_or_raises(
     tmp_path: Path, wave: str, flux: str, extras: list[str], like_flux: list[bool], order: Any, mark: str, remark: bool,
     prose: str,
 ) -> None:  # fmt: skip
-    """Read tables of random columns in random order; each gives the spectrum or an InputError."""
     columns = [(wave, WAVES[wave]), (flux, FLUXES[flux])]
     columns += [
         (name, 0.3 * (k + 1) * FLUX if one else NM + 3.0 * (k + 1))

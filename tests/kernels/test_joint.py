@@ -10,7 +10,7 @@ from scenes import instrument, star
 from scipy import optimize
 
 from mauvecl import Engine, Expectation, InputError, Processes, Uniform
-from mauvecl.device.selftest import toy
+from mauvecl.device import selftest
 from mauvecl.noise import layout, reference
 from mauvecl.noise.scene import prepare
 
@@ -22,7 +22,7 @@ TAIL = 5e-3
 
 def one_frame(dark: float, photons: float, read: float, *, gain: float = 0.6, pixels: int = 8, **kind) -> Expectation:
     """Return one frame of equal pixels."""
-    x = toy(pixels, 1, dark=dark, read=read, **({"photon_noise": "poisson"} | kind))
+    x = selftest.toy(pixels, 1, dark=dark, read=read, **({"photon_noise": "poisson"} | kind))
     full = np.ones(pixels)
     return replace(
         x,
@@ -175,7 +175,7 @@ def test_smallest_poisson_means() -> None:
 @pytest.mark.parametrize("quartic", [False, True])
 def test_factors_follow_the_cumulants(quartic: bool, photon_noise: str) -> None:
     """Compare the reference's draw under factors on light and dark with the polynomial of the scaled cumulants."""
-    x = toy(8, 1, dark=288.0 if quartic else 2225.0, read=12.0, photon_noise=photon_noise)
+    x = selftest.toy(8, 1, dark=288.0 if quartic else 2225.0, read=12.0, photon_noise=photon_noise)
     processes = Processes(qe_scale=Uniform(1.4, 1.4), detector_temperature=Uniform(12.0, 12.0))
     scene, index = prepare([x], processes=processes), np.arange(3000, dtype=np.uint64)
     assert scene.quartic == quartic

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from probes import Probes
 from scipy import stats
 
-from mauvecl.device.selftest import toy
+from mauvecl.device import selftest
 from mauvecl.noise import layout, random_numbers, reference
 from mauvecl.noise.scene import prepare
 
@@ -113,7 +113,7 @@ def test_pearson_of_the_expansion(drawn: dict[tuple[str, float], np.ndarray], me
 @pytest.mark.parametrize("mean", [SMALLEST_EXPANDED, 2225.0, 22250.0, 1e6])
 def test_expansion_cannot_be_distinguished_from_exact_draws(mean: float) -> None:
     """Check the device's expansion; without its last term, 2e10 draws of a mean of 1000 would show it."""
-    (source,) = prepare([toy(4, 1, dark=mean)], recipe="apart").dark_counts[:1]
+    (source,) = prepare([selftest.toy(4, 1, dark=mean)], recipe="apart").dark_counts[:1]
     assert source["bits"] == 0
     half, slope = int(9 * np.sqrt(mean)), float(source["slope"])
     low, size = round(mean) - half, 2 * half
@@ -140,7 +140,7 @@ def test_expansion_equals_the_reference(probes: Probes) -> None:
 
 def test_equal_means_share_a_table() -> None:
     alike, other = (
-        prepare([replace(toy(4, 1, read=0.7, light=0.0), dark_dn=np.array(means))], recipe="apart")
+        prepare([replace(selftest.toy(4, 1, read=0.7, light=0.0), dark_dn=np.array(means))], recipe="apart")
         for means in ([5.0, 5.0, 5.0, 5.0], [5.0, 64.0, 5.0, 64.0])
     )
     assert alike.tables.size == layout.alias_table(5.0).entries.size

@@ -9,7 +9,7 @@ import pytest
 from probes import Probes
 
 from mauvecl import Normal, Processes, Uniform
-from mauvecl.device.selftest import toy
+from mauvecl.device import selftest
 from mauvecl.noise import layout, reference
 from mauvecl.noise.scene import prepare
 
@@ -50,7 +50,7 @@ PRIORS = [
 @cache
 def factors(name: str, prior: Prior) -> tuple[np.ndarray, float]:
     """Return the table of one prior, made once for all tests, and the factor at its median."""
-    scene = prepare([replace(toy(), conditions=CONDITIONS)], processes=Processes(**{name: prior}))
+    scene = prepare([replace(selftest.toy(), conditions=CONDITIONS)], processes=Processes(**{name: prior}))
     return scene.priors[0], float(np.prod(scene.medians))
 
 

@@ -9,18 +9,17 @@ import pytest
 from processes import python
 
 from mauvecl import Engine, Processes
-from mauvecl.device.selftest import toy
-from mauvecl.noise import layout, reference
-from mauvecl.noise.disturbances import ADDITIVE
+from mauvecl.device import selftest
+from mauvecl.noise import disturbances, layout, reference
 from mauvecl.noise.scene import prepare
 
 N = 4000
 
 
-@pytest.mark.parametrize("name", ADDITIVE)
+@pytest.mark.parametrize("name", disturbances.ADDITIVE)
 def test_charge_is_a_distribution(name: str) -> None:
     """The distribution sums to one, and its variance is that of the process; longer times add up independently."""
-    process = ADDITIVE[name]()
+    process = disturbances.ADDITIVE[name]()
     short, long = process.charge(50.0), process.charge(100.0)
     assert short.sum() == pytest.approx(1.0, abs=1e-9)
     assert short.size <= process.most_electrons(50.0) + 1
@@ -28,17 +27,17 @@ def test_charge_is_a_distribution(name: str) -> None:
     size = max(long.size, doubled.size)
     padded = [np.pad(p, (0, size - p.size)) for p in (long, doubled)]
     assert np.abs(padded[0] - padded[1]).sum() < 1e3 * 2.0**-40, "a thousand times what may be neglected"
-    quiet = toy(64, 1)
+    quiet = selftest.toy(64, 1)
     electrons = np.arange(process.charge(quiet.frame_s).size)
     p = process.charge(quiet.frame_s)
     variance = p @ electrons**2 - (p @ electrons) ** 2
     assert process.variance_dn2(quiet) == pytest.approx(variance * quiet.gain_dn_per_electron**2)
 
 
-@pytest.mark.parametrize("name", ADDITIVE)
+@pytest.mark.parametrize("name", disturbances.ADDITIVE)
 def test_device_draws_what_the_reference_draws(engine: Engine, name: str) -> None:
-    quiet = toy(64, 3)
-    processes = Processes(**{name: ADDITIVE[name]()}).with_particles(500.0)
+    quiet = selftest.toy(64, 3)
+    processes = Processes(**{name: disturbances.ADDITIVE[name]()}).with_particles(500.0)
     index = np.arange(20, dtype=np.uint64)
     scene = prepare([quiet], processes=processes)
     assert scene.additive == (name,)

@@ -7,7 +7,7 @@ import pytest
 from scenes import instrument, star
 
 from mauvecl import CosmicRays, Engine, Expectation, Normal, PixelMap, Processes
-from mauvecl.device.selftest import toy
+from mauvecl.device import selftest
 from mauvecl.noise import layout
 from mauvecl.noise.scene import prepare
 
@@ -17,7 +17,7 @@ MIXED = np.array([1500.0 + 7 * g if g >> i & 1 else 300.0 + 11 * g for g in rang
 
 def detector(dark: np.ndarray | float, electrons: np.ndarray | float, read: float = 0.7, **changes) -> Expectation:
     """Return one frame of 64 pixels with given means."""
-    x = toy(64, 1, read=read, **changes)
+    x = selftest.toy(64, 1, read=read, **changes)
     ones = np.ones(64)
     return replace(x, dark_dn=dark * ones, source_electrons=electrons * ones, sky_electrons=0 * ones)
 
@@ -77,7 +77,9 @@ def test_pairs_of_pixels_use_one_method() -> None:
         start = int(counts["table"][p])
         np.testing.assert_array_equal(scene.tables[start : start + table.entries.size], table.entries)
     # The last of an odd number has no neighbour.
-    odd = replace(toy(65, 1, read=0.7, light=0.0), dark_dn=np.append(MIXED, 1500.0), bias_dn=np.full(65, 600.0))
+    odd = replace(
+        selftest.toy(65, 1, read=0.7, light=0.0), dark_dn=np.append(MIXED, 1500.0), bias_dn=np.full(65, 600.0)
+    )
     assert prepare([odd]).dark_counts["bits"][64] == 0
 
 

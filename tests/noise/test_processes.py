@@ -34,17 +34,6 @@ def test_light_follows_distribution_of_prior(engine: Engine) -> None:
     assert stats.kstest(found, stats.truncnorm(-2, 2, 1.0, 0.3).cdf).pvalue > 1e-6
 
 
-@pytest.mark.parametrize("sd", [0.01, 0.1])
-def test_light_has_moments_of_normal_prior(engine: Engine, sd: float) -> None:
-    """Compare the light's moments for a normal prior with wide cuts: five standard errors fail once in 4e5."""
-    light = total_light(engine, Processes(qe_scale=Normal(1.0, sd, 0.5, 1.5)))
-    noise = total_light(engine, NONE).var()
-    variance = light.var() - noise
-    assert abs(light.mean() - 1) < 5 * sd / np.sqrt(N)
-    assert abs(variance / sd**2 - 1) < 5 * np.sqrt(2 / N) * light.var() / variance
-    assert abs(stats.kurtosis(light)) < 5 * np.sqrt(24 / N)
-
-
 def test_jitter_of_frames_is_uncorrelated(engine: Engine) -> None:
     """Check frames, which take finer digits from each other's words: five standard errors fail once in 2e5."""
     (x,) = star(magnitude=2.0, exposure=5.0)

@@ -10,7 +10,7 @@ from scenes import instrument, star
 from scipy import optimize
 
 from mauvecl import Engine, Expectation, Processes, Uniform
-from mauvecl.device.selftest import toy
+from mauvecl.device import selftest
 from mauvecl.noise.scene import prepare
 
 #: Smallest number of draws of one pixel that distinguish an allowed stack from its frames, by exact convolution.
@@ -19,7 +19,7 @@ SOONEST = 4e13
 
 def quiet(read: float, frames: int, *, dark: float = 0.0, light: float = 0.0, gain: float = 0.6, **kind) -> Expectation:
     """Return eight pixels whose bias has different fractions of a DN."""
-    x = toy(8, frames, read=read, dark=dark, light=light, **kind)
+    x = selftest.toy(8, frames, read=read, dark=dark, light=light, **kind)
     full = np.ones(8)
     return replace(
         x,

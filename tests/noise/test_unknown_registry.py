@@ -6,8 +6,7 @@ import pytest
 from scenes import instrument, star
 
 from mauvecl import Processes, Stare, Study
-from mauvecl.noise import layout, unknowns
-from mauvecl.noise.disturbances import ADDITIVE
+from mauvecl.noise import disturbances, layout, unknowns
 from mauvecl.noise.scene import changes_of
 
 ROWS = [
@@ -21,7 +20,7 @@ ROWS = [
 def test_keys_of_studies_are_the_registry() -> None:
     """Compare names and order of the processes' fields and of the keys of each section with the registry."""
     sections = Study().model_dump()
-    assert list(Processes.model_fields) == [*ADDITIVE, *unknowns.PROCESSES]
+    assert list(Processes.model_fields) == [*disturbances.ADDITIVE, *unknowns.PROCESSES]
     assert list(sections["nuisances"]) == ["usual", *unknowns.NUISANCES, "own"]
     assert list(sections["unknowns"]) == ["draws", *unknowns.INSTRUMENT_VALUES, "known"]
     assert {*unknowns.COURSES, *unknowns.STARE_PROCESSES} <= sections["stare"].keys()
@@ -38,7 +37,7 @@ def test_every_default_prior_has_a_source_or_documentation() -> None:
 
 
 def test_streams_of_processes_are_those_of_the_rows() -> None:
-    rows = [*ADDITIVE.items(), *unknowns.PROCESSES.items()]
+    rows = [*disturbances.ADDITIVE.items(), *unknowns.PROCESSES.items()]
     rows += [(f"stare_{name}", process) for name, process in unknowns.STARE_PROCESSES.items()]
     assert all(layout.STREAMS[name] == row.stream for name, row in rows)
 

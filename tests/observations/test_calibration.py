@@ -16,24 +16,11 @@ from refusals import refused
 from scenes import paper
 from scenes import source as star
 
-from mauvecl import (
-    Expectation,
-    Frames,
-    Instrument,
-    PixelMap,
-    Sky,
-    Source,
-    Study,
-    calibrate,
-    expect,
-    measure,
-    plan,
-    read_frames,
-    what_matters,
-)
+import mauvecl
+from mauvecl import Frames, Instrument, Source, calibrate, plan
 
 NOMINAL = Instrument.load("mauvesim")
-SKY = Sky.of_brightness(22.1)
+SKY = mauvecl.Sky.of_brightness(22.1)
 STARS = (("B3V", 4.5), ("A0V", 5.0), ("F0V", 4.0), ("G2V", 4.0), ("B0V", 5.0))
 #: Standard deviations beyond which a fitted value is wrong; a normal one is once in 16 000 times.
 FAR = 4.0
@@ -57,8 +44,8 @@ def truth(**changes: Any) -> Instrument:
 
 
 @lru_cache(maxsize=32)
-def expected(source: Source, instrument: Instrument) -> Expectation:
-    return expect(source, instrument, exposure=5.0, sky=SKY)
+def expected(source: Source, instrument: Instrument) -> mauvecl.Expectation:
+    return mauvecl.expect(source, instrument, exposure=5.0, sky=SKY)
 
 
 def frames_of(
@@ -83,7 +70,7 @@ def frames_of(
     )  # fmt: skip
 
 
-def study_of(stars: tuple[tuple[str, float], ...], dark: bool = True) -> Study:
+def study_of(stars: tuple[tuple[str, float], ...], dark: bool = True) -> mauvecl.Study:
     rows = [f'{{frames="x", library="{name}", magnitude={magnitude}}}' for name, magnitude in stars]
     rows += ['{frames="y"}'] if dark else []
     return paper(f"calibrate.observations=[{', '.join(rows)}]")
@@ -199,26 +186,8 @@ def test_frames_that_cannot_be_calibrated_raise(change: dict[str, Any], key: str
 
 def test_stored_spectra_are_calibrated_as_raw_counts(tmp_path: Path) -> None:
     """Throughput of a stored star within four of its errors of the nominal one, with which it was drawn."""
-    run(
-        "realise",
-        "--star",
-        "A0V",
-        "-m",
-        5,
-        "-a",
-        0.1,
-        "-n",
-        40,
-        "-t",
-        5,
-        "--paper",
-        "-o",
-        "single.zarr",
-        folder=tmp_path,
-    )
-    run(
-        "realise", "--star", "A0V", "-m", 5, "-a", 0.1, "-n", 4, "-t", 50, "--paper", "-o", "sums.zarr", folder=tmp_path
-    )
+    for more in ("-n 40 -t 5 -o single.zarr", "-n 4 -t 50 -o sums.zarr"):
+        run("realise", *f"--star A0V -m 5 -a 0.1 --paper {more}".split(), folder=tmp_path)
     study = "calibrate.observations = [{{ frames = '{}[star-1/quiescent]', library = 'A0V', magnitude = 5.0 }}]"
     (tmp_path / "single.toml").write_text(study.format("single.zarr"))
     (tmp_path / "sums.toml").write_text(study.format("sums.zarr"))
@@ -226,7 +195,7 @@ def test_stored_spectra_are_calibrated_as_raw_counts(tmp_path: Path) -> None:
     table = Table.read(tmp_path / "mauvecl-calibrate" / "throughput.ecsv")
     assert (np.abs(table["ratio"] - 1) < FAR * table["relative_error"]).all()
     assert "single frames" in run("calibrate", "sums.toml", folder=tmp_path, code=2).stderr
-    net = read_frames(tmp_path / "single.zarr[star-1/quiescent]")
+    net = mauvecl.read_frames(tmp_path / "single.zarr[star-1/quiescent]")
     with refused("frames"):
         calibrate(study_of((("A0V", 5.0),), dark=False), frames=(net,))
 
@@ -288,7 +257,7 @@ def test_dark_frames_of_two_exposure_times_determine_the_bias_of_pixels() -> Non
     rng = np.random.default_rng(4)
     bias = np.full(NOMINAL.pixels, 600.0)
     bias[NOMINAL.read_pixels] += np.linspace(-20, 20, NOMINAL.wavelength_nm.size)
-    true = truth(pixel_map=PixelMap(bias_dn=bias))
+    true = truth(pixel_map=mauvecl.PixelMap(bias_dn=bias))
     frames = [frames_of(true, None, [15.0, 19.0], 30, rng, exposure_s) for exposure_s in (1.0, 5.0)]
     frames.insert(0, frames_of(true, star("A0V", 5.0), [16.0], 40, rng))
     study = paper("calibrate.observations=[{frames='x', library='A0V', magnitude=5.0}, {frames='y'}, {frames='z'}]")
@@ -321,7 +290,7 @@ def test_answers_through_a_calibrated_instrument_state_its_modes(answer: Any, tm
     answer.write(tmp_path)
     settings = ["star=[{library='G2V', magnitude=7.4}]", "flare.amplitudes=[0.24]", "run.statistics=['matched']"]
     study = paper(*settings, f"observation.instrument={tmp_path / 'instrument.toml'}")
-    named = set(what_matters(study)["assumption"])
+    named = set(mauvecl.what_matters(study)["assumption"])
     assert "calibration, mode 1" in named
     assert "light loss" not in named
 
@@ -329,7 +298,7 @@ def test_answers_through_a_calibrated_instrument_state_its_modes(answer: Any, tm
 def test_measurements_state_the_error_of_the_throughput(grey: str) -> None:
     """Light alike at all wavelengths moves fluxes by 5 %, and no temperature."""
     settings = ["star=[{library='M3V', magnitude=9}]", "flare.amplitudes=[0.5]", f"observation.instrument={grey}"]
-    table = measure(paper(*settings, "run.realisations=10")).table
+    table = mauvecl.measure(paper(*settings, "run.realisations=10")).table
     found = {row["quantity"]: row["error_throughput"] / row["perfect"] for row in table}
     assert found["flux 200-700 nm"] == pytest.approx(np.expm1(0.05), rel=0.01)
     assert found["temperature"] < 1e-3

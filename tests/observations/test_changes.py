@@ -9,7 +9,7 @@ import scipy
 from scenes import MG_II, paper
 
 from mauvecl import Engine, Expectation, Instrument, Nuisances, Sky, Source, change, expect
-from mauvecl.observations.visits import line_index, recover_periods
+from mauvecl.observations import visits
 
 AU_MIC = Path(__file__).parents[1] / "data" / "flares" / "aumic_iue"
 MAUVE = Instrument.load("mauvesim")
@@ -48,16 +48,16 @@ def test_two_visits_are_the_two_sided_test_of_a_difference(fap: float, power: fl
 
 def test_smallest_changes_have_the_power() -> None:
     """Draws of 30 visits: 20 000 tests each, within 4 binomial standard errors (once in 16 000 times)."""
-    visits, fap, power, n = 30, 0.01, 0.8, 20_000
-    (row,) = asked("change.of=['320-700']", f"run.fap={fap}", f"limit.power={power}", f"change.visits={visits}").table
+    number, fap, power, n = 30, 0.01, 0.8, 20_000
+    (row,) = asked("change.of=['320-700']", f"run.fap={fap}", f"limit.power={power}", f"change.visits={number}").table
     rng = np.random.default_rng(1)
-    noise = row["error"] * rng.standard_normal((n, visits))
+    noise = row["error"] * rng.standard_normal((n, number))
     one = noise.copy()
     one[:, 3] += row["smallest"]
-    scattered = noise + row["smallest_scatter"] * rng.standard_normal((n, visits))
-    cut = scipy.stats.chi2.isf(fap, visits - 1)
+    scattered = noise + row["smallest_scatter"] * rng.standard_normal((n, number))
+    cut = scipy.stats.chi2.isf(fap, number - 1)
     for values, expected in ((noise, fap), (one, power), (scattered, power)):
-        share = np.mean(values.var(axis=1) * visits / row["error"] ** 2 > cut)
+        share = np.mean(values.var(axis=1) * number / row["error"] ** 2 > cut)
         assert abs(share - expected) < 4 * np.sqrt(expected * (1 - expected) / n)
 
 
@@ -131,7 +131,7 @@ def test_indices_of_au_mic_are_those_of_a_direct_integration(file: str, tmp_path
     direct = np.trapezoid(np.interp(fine, nm, flux) - np.polyval(line, fine), fine)
     assert row["flux"].value == pytest.approx(direct, rel=0.01, abs=0)
     # The index at the resolution of IUE, times the share that is captured, leaves the continuum's curvature.
-    sharp = line_index(source.wavelength_nm, 10 * source.flux_flam, **MG_II)
+    sharp = visits.line_index(source.wavelength_nm, 10 * source.flux_flam, **MG_II)
     assert 0.2 < row["flux"].value / (row["captured"] * float(sharp.flux)) < 5
 
 
@@ -141,7 +141,7 @@ def test_captured_share_is_that_of_a_narrow_line() -> None:
     (row,) = table[table["index"] == "H beta"]
     nm = np.arange(380.0, 590.0, 0.05)
     profile = spread(nm, np.maximum(0, 1 - np.abs(nm - 486.269) / 0.1) / 0.1, nm)
-    direct = line_index(nm, profile, band_nm=(478.0, 494.0), continuum_nm=((464.0, 476.0), (496.0, 508.0)))
+    direct = visits.line_index(nm, profile, band_nm=(478.0, 494.0), continuum_nm=((464.0, 476.0), (496.0, 508.0)))
     assert row["captured"] == pytest.approx(float(direct.flux), rel=0.01)
 
 
@@ -174,7 +174,9 @@ def test_recovered_periods_are_those_of_another_periodogram() -> None:
     rng = np.random.default_rng(4)
     time = np.sort(rng.uniform(0, 40, 25))
     periods, amplitudes, fap, n = np.array([1.5, 7.0, 15.0]), np.array([1.0, 1.6]), 0.05, 1000
-    found = recover_periods(time, periods, amplitudes, fap=fap, trials=100, seed=5, shortest_d=1.2, longest_d=20.0)
+    found = visits.recover_periods(
+        time, periods, amplitudes, fap=fap, trials=100, seed=5, shortest_d=1.2, longest_d=20.0
+    )
     base = np.ptp(time)
     frequency = np.arange(1 / 20, 1 / 1.2 + 0.5 / base, 1 / (5 * base))
     cut = np.quantile(peaks(time, rng.standard_normal((4000, time.size)), frequency)[0], 1 - fap)

@@ -12,8 +12,8 @@ from scipy import stats
 
 from mauvecl import SHAPES, Frames
 from mauvecl.observations import events
+from mauvecl.observations import level as levels
 from mauvecl.observations.detection import detect_events
-from mauvecl.observations.level import likeness, quiet_variance
 from mauvecl.observations.light_curve import survey_light_curve
 from mauvecl.observations.search import simulated_rates
 
@@ -87,7 +87,7 @@ def test_noise_at_the_level_is_that_of_its_counts() -> None:
     flux = rng.normal(mean, np.sqrt(mean + 25))
     quiet = mean < 1.001 * LEVEL
     level = flux[quiet].mean()
-    variance, slope = quiet_variance(flux, np.sqrt(flux + 25), np.full(FRAMES, level), quiet)
+    variance, slope = levels.quiet_variance(flux, np.sqrt(flux + 25), np.full(FRAMES, level), quiet)
     assert slope == pytest.approx(1.0, rel=1e-9)
     np.testing.assert_allclose(variance, level + 25, rtol=1e-9)
 
@@ -97,14 +97,14 @@ def test_correlations_do_not_bridge_gaps() -> None:
     first, other = np.random.default_rng(301).normal(0, 1, (2, 2000))
     pairs = np.arange(4000) + np.arange(4000) // 2 * 50
     for second, alike in ((first, False), (np.roll(first, -1), True), (other, True)):
-        assert likeness(pairs, np.column_stack([first, second]).reshape(-1, 1)).alike == alike
+        assert levels.likeness(pairs, np.column_stack([first, second]).reshape(-1, 1)).alike == alike
 
 
 def test_correlations_at_long_lags_have_the_errors_of_their_pairs() -> None:
     """Independent noise in visits of 40 frames is alike: 4000 correlations exceed five errors once in some 200 runs."""
     rng = np.random.default_rng(303)
     numbers = (1000 * np.arange(12)[:, None] + np.arange(40)).ravel()
-    assert all(likeness(numbers, rng.normal(0, 1, (numbers.size, 1))).alike for _ in range(100))
+    assert all(levels.likeness(numbers, rng.normal(0, 1, (numbers.size, 1))).alike for _ in range(100))
 
 
 def test_a_flare_is_found_at_its_time_and_a_step_is_a_step() -> None:

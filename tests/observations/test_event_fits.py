@@ -14,11 +14,11 @@ from scipy import stats
 
 from mauvecl import SHAPES, Frames, Study, analyse
 from mauvecl.observations import event_windows, events
+from mauvecl.observations import level as levels
+from mauvecl.observations import process as processes
+from mauvecl.observations import search as searches
 from mauvecl.observations.detection import detect_events
 from mauvecl.observations.event_fits import Mixture
-from mauvecl.observations.level import process_level
-from mauvecl.observations.process import Covariance, Process, ProcessTerm, Steps
-from mauvecl.observations.search import Detection, SeriesSurvey
 
 
 @pytest.mark.parametrize("mean", [-40.0, -5.0, 0.0, 3.0, 1e4])
@@ -34,32 +34,32 @@ def test_quantiles_of_many_parts_are_those_of_their_sum(middle: float) -> None:
     rng = np.random.default_rng(2)
     log_weight, mean, log_sd = rng.normal([0.0, middle, 0.0], [1.0, 2.0, 0.4], (50_000, 3)).T
     mixture, weight = Mixture(log_weight, mean, np.exp(log_sd)), np.exp(log_weight)
-    levels = (0.025, 0.16, 0.5, 0.84, 0.975)
-    none, *above = (weight @ stats.norm.sf(q, mean, np.exp(log_sd)) for q in (0.0, *map(mixture.quantile, levels)))
-    assert np.array(above) / none == pytest.approx(1 - np.array(levels), abs=2e-5)
+    shares = (0.025, 0.16, 0.5, 0.84, 0.975)
+    none, *above = (weight @ stats.norm.sf(q, mean, np.exp(log_sd)) for q in (0.0, *map(mixture.quantile, shares)))
+    assert np.array(above) / none == pytest.approx(1 - np.array(shares), abs=2e-5)
 
 
 Float = NDArray[np.float64]
 SHAPE = SHAPES["davenport2014"]
 CADENCE_S, LEVEL, SD = 20.0, 10_000.0, 10.0
 SHORT, LONG = 80_000, 320_000
-SMOOTH = Process((ProcessTerm("smooth", (np.log(2.0), np.log(40_000.0))),), 1.0)
-WHITE = Process((), 1.0)
+SMOOTH = processes.Process((processes.ProcessTerm("smooth", (np.log(2.0), np.log(40_000.0))),), 1.0)
+WHITE = processes.Process((), 1.0)
 
 
-def survey_of(n: int, model: Process) -> SeriesSurvey:
+def survey_of(n: int, model: processes.Process) -> searches.SeriesSurvey:
     """Return frames with a flare in the middle, around which light curves of each length are the same."""
     noise = np.random.default_rng(5).normal(0.0, SD, LONG)[(LONG - n) // 2 : (LONG + n) // 2]
     time = np.arange(n) * CADENCE_S
     flux = LEVEL * (1 + 0.05 * flare(time + CADENCE_S / 2, CADENCE_S, time[n // 2], 120.0)) + noise
     frames = Frames.of(time, flux, np.full(n, SD))
-    survey = SeriesSurvey.of(frames, flux, np.full(n, SD**2), np.ones(n, np.bool_), LEVEL, 0.0, SHAPE)
+    survey = searches.SeriesSurvey.of(frames, flux, np.full(n, SD**2), np.ones(n, np.bool_), LEVEL, 0.0, SHAPE)
     return replace(survey, processes=(model,), flux_process=model)
 
 
-def event_of(survey: SeriesSurvey) -> Detection:
+def event_of(survey: searches.SeriesSurvey) -> searches.Detection:
     middle = survey.stare.n_frames // 2
-    return Detection(100.0, 120.0, float(survey.stare.start_s[middle]), 0, 20.0, middle - 8, middle + 120)
+    return searches.Detection(100.0, 120.0, float(survey.stare.start_s[middle]), 0, 20.0, middle - 8, middle + 120)
 
 
 class Sizes:
@@ -94,12 +94,14 @@ def test_general_family_has_the_same_bits_in_each_process() -> None:
 
 
 @pytest.mark.parametrize("model", [SMOOTH, WHITE], ids=["smooth", "white"])
-def test_work_of_an_event_does_not_grow_with_the_light_curve(model: Process, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_work_of_an_event_does_not_grow_with_the_light_curve(
+    model: processes.Process, monkeypatch: pytest.MonkeyPatch
+) -> None:
     sizes = Sizes(monkeypatch)
     sizes.watch(event_windows, "_bins", 0)
-    sizes.watch(Process, "covariance", 1)
-    sizes.watch(Process, "times", 1)
-    sizes.watch(Process, "at", 1)
+    sizes.watch(processes.Process, "covariance", 1)
+    sizes.watch(processes.Process, "times", 1)
+    sizes.watch(processes.Process, "at", 1)
     measured, work = [], []
     for n in (SHORT, LONG):
         survey = survey_of(n, model)
@@ -119,7 +121,7 @@ def test_search_solves_as_many_templates_around_an_event_in_a_longer_light_curve
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     sizes = Sizes(monkeypatch)
-    sizes.watch(Covariance, "squared_norms", 1)
+    sizes.watch(processes.Covariance, "squared_norms", 1)
     work = []
     for n in (SHORT, LONG):
         found, _ = detect_events(survey_of(n, SMOOTH), 7.0)
@@ -130,13 +132,17 @@ def test_search_solves_as_many_templates_around_an_event_in_a_longer_light_curve
 
 @pytest.mark.parametrize(
     "term",
-    [ProcessTerm("rotation", (1.0, 8.0, 1.0, 0.1, -0.5)), ProcessTerm("correlated", (0.5, 6.0)), *SMOOTH.terms],
+    [
+        processes.ProcessTerm("rotation", (1.0, 8.0, 1.0, 0.1, -0.5)),
+        processes.ProcessTerm("correlated", (0.5, 6.0)),
+        *SMOOTH.terms,
+    ],
     ids=lambda term: term.kind,
 )
-def test_level_norms_and_covariances_are_those_of_the_matrices(term: ProcessTerm) -> None:
+def test_level_norms_and_covariances_are_those_of_the_matrices(term: processes.ProcessTerm) -> None:
     rng = np.random.default_rng(8)
     time = np.sort(rng.choice(900, 500, replace=False)) * CADENCE_S
-    model = Process((ProcessTerm("smooth", (np.log(3.0), np.log(2000.0))), term), 1.1)
+    model = processes.Process((processes.ProcessTerm("smooth", (np.log(3.0), np.log(2000.0))), term), 1.1)
     variance = rng.uniform(0.8, 1.3, time.size)
     quiet = rng.random(time.size) < 0.8
     values = rng.normal(1000.0, 2.0, (time.size, 2))
@@ -145,7 +151,7 @@ def test_level_norms_and_covariances_are_those_of_the_matrices(term: ProcessTerm
     inverse = np.linalg.inv(between[np.ix_(quiet, quiet)] + np.diag(noise[quiet]))
     mean = inverse.sum(axis=0) @ values[quiet] / inverse.sum()
     expected = mean + between[:, quiet] @ inverse @ (values[quiet] - mean)
-    found = process_level(model, time, values, variance, quiet)
+    found = levels.process_level(model, time, values, variance, quiet)
     np.testing.assert_allclose(found, expected, rtol=1e-8)
     weights = np.where(np.arange(time.size) % 90 < 20, rng.random(time.size), 0.0)
     np.testing.assert_allclose(model.times(time, weights), between @ weights, rtol=1e-9)
@@ -172,9 +178,15 @@ def test_coefficients_are_those_of_celerite2() -> None:
             terms.RotationTerm(sigma=sigma, period=scale, **dict(zip(("Q0", "dQ", "f"), others, strict=True))),
             *(terms.SHOTerm(sigma=s, rho=period / k, Q=k * quality) for k, s in zip(number, sigmas, strict=True)),
         )
-        found = Process(tuple(ProcessTerm(kind, tuple(values)) for kind, values in drawn.items()), 1.0).kernel()
+        found = processes.Process(
+            tuple(processes.ProcessTerm(kind, tuple(values)) for kind, values in drawn.items()), 1.0
+        ).kernel()
         for one, other in zip(found.get_coefficients(), expected.get_coefficients(), strict=True):
             np.testing.assert_array_equal(one, other)
+
+
+#: Frequent false alarms, whose rate takes little time.
+OFTEN = Study.build({"search": {"per": "day"}}, "test")
 
 
 def few_frames() -> Frames:
@@ -186,7 +198,7 @@ def few_frames() -> Frames:
 
 def test_progress_rises_to_the_number_of_frames() -> None:
     reported: list[tuple[int, int]] = []
-    answer = analyse(Study().paper(), progress=lambda done, total: reported.append((done, total)), frames=few_frames())
+    answer = analyse(OFTEN, progress=lambda done, total: reported.append((done, total)), frames=few_frames())
     assert max(row.event.value for row in answer.rows) > 20
     done, totals = (list(each) for each in zip(*reported, strict=True))
     assert set(totals) == {500}
@@ -206,7 +218,7 @@ def test_a_report_may_stop_the_analysis() -> None:
             raise StoppedError
 
     with pytest.raises(StoppedError):
-        analyse(Study().paper(), progress=stop, frames=few_frames())
+        analyse(OFTEN, progress=stop, frames=few_frames())
 
 
 def test_events_that_wait_are_not_measured_once_the_analysis_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -222,5 +234,5 @@ def test_events_that_wait_are_not_measured_once_the_analysis_is_stopped(monkeypa
     monkeypatch.setattr(events, "measure_event", slow)
     survey: Any = SimpleNamespace(flux_level=lambda quiet: None)
     with pytest.raises(StoppedError):
-        events.measure_events(survey, np.zeros(3, np.bool_), [None] * 100, steps=Steps(stop))  # type: ignore[list-item]
+        events.measure_events(survey, np.zeros(3, np.bool_), [None] * 100, steps=processes.Steps(stop))  # type: ignore[list-item]
     assert 0 < len(begun) < 30

@@ -13,7 +13,7 @@ from astropy.timeseries import BinnedTimeSeries, TimeSeries
 from layouts import documented_files
 
 from mauvecl import Frames, read_frames
-from mauvecl.observations.frame_files import frames_of
+from mauvecl.observations import frame_files
 from mauvecl.observations.mapping import FrameMapping
 
 RNG = np.random.default_rng(29)
@@ -53,10 +53,12 @@ def test_the_errors_are_those_of_the_chosen_flux() -> None:
     """A light curve that lightkurve exports has its own flux next to those of the mission."""
     ones = np.ones(30)
     columns = {"time": np.arange(30.0), "pdcsap_flux": 2 * ones, "pdcsap_flux_err": 3 * ones, "flux": ones}
-    frames = frames_of(Table(columns, units={"time": "s"}))
+    frames = frame_files.frames_of(Table(columns, units={"time": "s"}))
     assert frames.flux.tolist() == ones.tolist()
     assert frames.error is None
-    frames = frames_of(Table({name: columns[name] for name in columns if name != "flux"}, units={"time": "s"}))
+    frames = frame_files.frames_of(
+        Table({name: columns[name] for name in columns if name != "flux"}, units={"time": "s"})
+    )
     assert (frames.flux[0], frames.error[0]) == (2.0, 3.0)
 
 
@@ -68,7 +70,7 @@ NM = np.array([300.0, 400.0, 500.0, 600.0])
 
 def test_time_series_of_astropy_are_frames() -> None:
     series = TimeSeries(time=WHEN, data={"flux": LIGHT[:, 0] * u.Jy, "flux_err": np.full(N, 1000.0) * u.mJy})
-    frames = frames_of(series)
+    frames = frame_files.frames_of(series)
     np.testing.assert_allclose(frames.flux, LIGHT[:, 0])
     np.testing.assert_allclose(frames.error, 1.0)
     np.testing.assert_allclose(frames.time_s, np.arange(N) * 20.0, atol=2e-5)
@@ -78,7 +80,7 @@ def test_time_series_of_astropy_are_frames() -> None:
 def test_binned_time_series_are_frames_through_a_mapping() -> None:
     series = BinnedTimeSeries(time_bin_start=WHEN, time_bin_size=18.0 * u.s, data={"flux": LIGHT[:, 0]})
     how = FrameMapping(time="time_bin_start", time_at="start", exposure="time_bin_size", flux="flux")
-    frames = frames_of(series, how)
+    frames = frame_files.frames_of(series, how)
     np.testing.assert_allclose(frames.time_s, np.arange(N) * 20.0 + 9.0, atol=2e-5)
     np.testing.assert_allclose(frames.exposure_s, 18.0)
 
@@ -93,7 +95,7 @@ def test_spectra_of_specutils_are_frames(kind: type | None) -> None:
     spectra = specutils.Spectrum(
         flux=LIGHT * u.adu, spectral_axis=NM * 10 * u.AA, uncertainty=uncertainty, mask=mask, meta={"OBJECT": "AU Mic"}
     )
-    frames = frames_of(spectra, time=WHEN)
+    frames = frame_files.frames_of(spectra, time=WHEN)
     np.testing.assert_allclose(frames.flux, np.where(mask, np.nan, LIGHT))
     np.testing.assert_allclose(frames.wavelength_nm, NM)
     assert (frames.unit, frames.name, frames.scale) == ("adu", "AU Mic", "tdb")

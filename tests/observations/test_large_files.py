@@ -11,7 +11,7 @@ from astropy.io import fits
 from astropy.table import Table
 
 from mauvecl import InputError, read_frames
-from mauvecl.observations.frame_files import reduce_frames
+from mauvecl.observations import frame_files
 from mauvecl.observations.mapping import FrameMapping
 
 FRAMES, PIXELS = 65_536, 1024
@@ -99,7 +99,7 @@ def test_pieces_give_what_the_whole_gives(tmp_path: Path, monkeypatch: pytest.Mo
         np.testing.assert_allclose(found, wanted)
     np.testing.assert_array_equal(pieces.quality, whole.quality)
     assert "1 pixel is not finite in most frames" in pieces.remarks[-1]
-    pixels = reduce_frames(path, mapping=mapping).pixels
+    pixels = frame_files.reduce_frames(path, mapping=mapping).pixels
     quiet = np.delete(flux, 7, axis=0)
     np.testing.assert_allclose(pixels.mean[:4], quiet[:, :4].mean(axis=0))
     assert pixels.count[[3, 4, 5]].tolist() == [1499, 0, 1498]

@@ -8,7 +8,7 @@ import pytest
 from scenes import MG_II, analysed
 
 from mauvecl import Frames, Instrument, Source, Study, analyse, expect
-from mauvecl.observations.visits import line_index
+from mauvecl.observations import visits
 
 AU_MIC = Path(__file__).parents[1] / "data" / "flares" / "aumic_iue"
 NM = np.linspace(270.0, 290.0, 201)
@@ -16,13 +16,13 @@ LINE = np.exp(-((NM - 280.0) ** 2) / 2 / 0.3**2) / 0.3 / np.sqrt(2 * np.pi)
 
 
 def mg_ii(nm: np.ndarray, flux: np.ndarray, error: np.ndarray | None = None) -> tuple[float, float]:
-    found = line_index(nm, flux, error, **MG_II)
+    found = visits.line_index(nm, flux, error, **MG_II)
     return float(found.flux), float(found.error)
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.3])
 def test_straight_continuum_is_removed_exactly(slope: float) -> None:
-    found = line_index(NM, 5.0 + slope * (NM - 280) + 2 * LINE, **MG_II)
+    found = visits.line_index(NM, 5.0 + slope * (NM - 280) + 2 * LINE, **MG_II)
     assert found.flux == pytest.approx(2.0, abs=2e-6)
     assert found.equivalent_width_nm == pytest.approx(0.4, abs=1e-5)
     assert np.isnan(found.error)
@@ -32,7 +32,7 @@ def test_batch_of_spectra_equals_single_spectra() -> None:
     rng = np.random.default_rng(1)
     flux, error = 5.0 + rng.normal(0, 0.1, (4, NM.size)), rng.uniform(0.05, 0.2, (4, NM.size))
     error[2, 60] = np.nan
-    found = line_index(NM * u.nm, flux, error, **MG_II)
+    found = visits.line_index(NM * u.nm, flux, error, **MG_II)
     for k in range(4):
         assert (found.flux[k], found.error[k]) == pytest.approx(mg_ii(NM, flux[k], error[k]), rel=1e-12)
 
@@ -81,7 +81,7 @@ SHARE = 0.8
 def study(tmp_path: Path) -> Study:
     (tmp_path / "near.csv").write_text("name,separation,magnitude,spectral_type\nB,8,10,M4V\nC,30,12,G2V\nD,60,1,A0V\n")
     star = {"library": "M3V", "magnitude": 9.0, "neighbours": tmp_path / "near.csv", "neighbour_share": SHARE}
-    return Study.model_validate({"star": [star]})
+    return Study.model_validate({"star": [star], "search": {"per": "day"}})
 
 
 def electrons(source: Source) -> float:

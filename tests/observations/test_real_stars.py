@@ -14,23 +14,23 @@ from scipy import stats
 from scipy.linalg import null_space
 
 from mauvecl import SHAPES, Frames, read_frames
-from mauvecl.observations.process import Process, ProcessTerm, level_fit
-from mauvecl.observations.process_search import Correlations, ProcessSearch
-from mauvecl.observations.search import bank_of, stare_of
+from mauvecl.observations import process as processes
+from mauvecl.observations import process_search
+from mauvecl.observations import search as searches
 
 Float = NDArray[np.float64]
 DAVENPORT = SHAPES["davenport2014"]
 CASES = Path(__file__).parent.parent / "data" / "cases"
 #: Rotation and correlated noise, in standard deviations of a frame.
-ROTATOR = Process(
+ROTATOR = processes.Process(
     (
-        ProcessTerm("rotation", tuple(np.log([20.0, 40_000.0, 10.0, 1.0, 0.3]))),
-        ProcessTerm("correlated", tuple(np.log([0.5, 1000.0]))),
+        processes.ProcessTerm("rotation", tuple(np.log([20.0, 40_000.0, 10.0, 1.0, 0.3]))),
+        processes.ProcessTerm("correlated", tuple(np.log([0.5, 1000.0]))),
     ),
     1.0,
 )
 #: A sinusoid that keeps its phase for longer than the light curve.
-LASTING = Process((ProcessTerm("rotation", tuple(np.log([4.0, 40_000.0, 1e4, 2.0, 0.1]))),), 1.0)
+LASTING = processes.Process((processes.ProcessTerm("rotation", tuple(np.log([4.0, 40_000.0, 1e4, 2.0, 0.1]))),), 1.0)
 
 
 def one_over_f(rng: np.random.Generator, n: int, rms: float) -> Float:
@@ -48,7 +48,7 @@ def test_correlations_are_sums_over_the_kernel(n: int) -> None:
     rng = np.random.default_rng(411)
     values = rng.standard_normal((2, 1, n))
     kernels = [(1, 0), (30, -5), (1024, -1023), (1025, 3), (4097, -700)]
-    found = Correlations(values, kernels)
+    found = process_search.Correlations(values, kernels)
     for size, first in kernels:
         kernel = rng.standard_normal(size)
         around = np.pad(values[1, 0], 5000)
@@ -67,7 +67,7 @@ def test_covariance_is_that_of_dense_matrices() -> None:
     np.testing.assert_allclose(made.coloured(made.whitened(values)), values, rtol=1e-9, atol=1e-9)
     assert made.log_determinant == pytest.approx(np.linalg.slogdet(dense)[1], rel=1e-10)
     ones = np.linalg.solve(dense, np.ones(200))
-    fit = level_fit(made, values[:, 0])
+    fit = processes.level_fit(made, values[:, 0])
     assert fit.mean == pytest.approx(float(ones @ values[:, 0] / ones.sum()))
     assert fit.mean_variance == pytest.approx(1 / float(ones.sum()))
     # A constant of any size leaves the sums of values whose weights add up to zero.
@@ -88,7 +88,7 @@ def test_covariance_is_that_of_dense_matrices() -> None:
     ],
 )
 def test_statistics_have_unit_variance_over_gaps_and_changing_noise(
-    process: Process, n: int, spread: float, tolerance: float, apart: int, taken: bool
+    process: processes.Process, n: int, spread: float, tolerance: float, apart: int, taken: bool
 ) -> None:
     """Denominators against dense matrices at 40 random onsets of each template: exact near gaps, close elsewhere.
 
@@ -102,14 +102,14 @@ def test_statistics_have_unit_variance_over_gaps_and_changing_noise(
     number[number >= 2 * n // 3] += apart
     frames = Frames.of(number * 120.0, np.ones(number.size), exposure_s=120.0)
     left = np.ones(number.size, np.bool_)
-    stare = stare_of(frames, left)
+    stare = searches.stare_of(frames, left)
     variance = 1 + spread * rng.standard_normal(number.size)
-    bank = bank_of(stare, np.ones((1, 1)), DAVENPORT)
-    search = ProcessSearch(bank, stare, (process,), variance)
+    bank = searches.bank_of(stare, np.ones((1, 1)), DAVENPORT)
+    search = process_search.ProcessSearch(bank, stare, (process,), variance)
     if taken:
         left = ((number < n // 2) | (number > n // 2 + 40)) & ((number > 10) | (number == number[0]))
         number, variance = number[left], variance[left]
-        search = ProcessSearch(bank, stare_of(frames, left), (process,), variance, search)
+        search = process_search.ProcessSearch(bank, searches.stare_of(frames, left), (process,), variance, search)
     time = number * 120.0
     dense = np.linalg.inv(process.at(time[:, None] - time) + np.diag(variance))
     ones = dense.sum(axis=1)
@@ -130,17 +130,19 @@ def test_values_above_a_threshold_are_those_of_all_solved_denominators(threshold
     rng = np.random.default_rng(402)
     number = np.flatnonzero((rng.random(2500) > 0.03) & (np.abs(np.arange(2500) - 900) > 20))
     frames = Frames.of(number * 120.0, np.ones(number.size), exposure_s=120.0)
-    stare = stare_of(frames, np.ones(number.size, np.bool_))
-    bank = bank_of(stare, np.ones((1, 1)), DAVENPORT)
+    stare = searches.stare_of(frames, np.ones(number.size, np.bool_))
+    bank = searches.bank_of(stare, np.ones((1, 1)), DAVENPORT)
     left = np.abs(number - 1500) > 40
     unsolved = 0
-    searches = []
+    made = []
     for above in (None, threshold):
-        whole = ProcessSearch(bank, stare, (ROTATOR,), np.ones(number.size))
+        whole = process_search.ProcessSearch(bank, stare, (ROTATOR,), np.ones(number.size))
         list(whole.values(np.zeros((1, number.size, 1)), above))
-        searches.append(ProcessSearch(bank, stare_of(frames, left), (ROTATOR,), np.ones(left.sum()), whole))
+        made.append(
+            process_search.ProcessSearch(bank, searches.stare_of(frames, left), (ROTATOR,), np.ones(left.sum()), whole)
+        )
     sums = rng.standard_normal((2, int(left.sum()), 1))
-    exact, quick = (list(one.values(sums, above)) for one, above in zip(searches, (None, threshold), strict=True))
+    exact, quick = (list(one.values(sums, above)) for one, above in zip(made, (None, threshold), strict=True))
     for (_, values), (_, found) in zip(exact, quick, strict=True):
         higher = values[0] > threshold
         # Denominators are kept where frames that are taken away hardly contribute: exact to `IRREGULAR`.

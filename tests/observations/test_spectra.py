@@ -15,10 +15,10 @@ from scipy import stats
 
 from mauvecl import SHAPES, Frames, Study, analyse, read_frames, stare
 from mauvecl.answers.analyse import frame_model
+from mauvecl.observations import spectra
 from mauvecl.observations.detection import detect_events
 from mauvecl.observations.frame_model import clean_spectra
 from mauvecl.observations.search import simulated_rates
-from mauvecl.observations.spectra import drifts, event_spectrum, measure_flare, survey_spectra
 
 Float = NDArray[np.float64]
 SHAPE = SHAPES["davenport2014"]
@@ -65,7 +65,7 @@ def drawn(rng: np.random.Generator, added: Float | float = 0.0, scale: float | F
 
 def prepared(frames: Frames, **how: Any) -> Prepared:
     cleaned = clean_spectra(frames, model())
-    survey, series, _ = survey_spectra(cleaned, SHAPE, 3, 1, **how)
+    survey, series, _ = spectra.survey_spectra(cleaned, SHAPE, 3, 1, **how)
     return cleaned, survey, series
 
 
@@ -331,8 +331,8 @@ def test_intervals_of_temperature_and_energy_cover(threshold: float) -> None:
         _, survey, series = prepared(drawn(rng, added + np.outer(drift, light())))
         found, taken = detect_events(survey, threshold)
         one = max(found, key=lambda each: each.value)
-        assert event_spectrum(survey, series, taken, one).cause == "flare"
-        measured = measure_flare(survey, series, taken, one)
+        assert spectra.event_spectrum(survey, series, taken, one).cause == "flare"
+        measured = spectra.measure_flare(survey, series, taken, one)
         assert not isinstance(measured, str), measured
         # What the flare adds in the frames of the event: its part of the amplitude, of the model's energy of a frame.
         flares = model().flare.values(kelvin, [1.0])
@@ -358,7 +358,7 @@ def test_drifts_are_measured_next_to_a_short_event() -> None:
     numbers = survey.stare.numbers
     quiet = np.zeros(numbers.size, np.bool_)
     short = (numbers >= 200) & (numbers < 210)
-    without, with_event = (drifts(survey, series, taken, N // 8) for taken in (quiet, short))
+    without, with_event = (spectra.drifts(survey, series, taken, N // 8) for taken in (quiet, short))
     for name in ("light", "dark"):
         assert with_event[name] == pytest.approx(without[name], rel=0.3)
 

@@ -17,12 +17,13 @@ import h5py
 import numpy as np
 import pytest
 import zarr
+from answers import expectations
 from astropy.io import fits
 from astropy.wcs import WCS
 from commands import run
 from marks import long_but
 from refusals import refused
-from stores import CHUNK, LAST, Painter, expectations, flip, forked, full_after, killed, study, tree
+from stores import CHUNK, LAST, Painter, flip, forked, full_after, killed, study, tree
 
 from mauvecl import Engine, Study, bulk
 from mauvecl.runs.store import Store

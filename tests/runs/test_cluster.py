@@ -24,7 +24,7 @@ from commands import run
 from scenes import flaring_stares, instrument, paper, star
 
 from mauvecl import DaskWorkers, Engine, Expectation, Pool, Stares, bulk, measure
-from mauvecl.runs.pool import Stopped, map_in_order
+from mauvecl.runs import pool as pools
 
 pytestmark = [pytest.mark.long, pytest.mark.usefixtures("small_shards")]
 
@@ -172,7 +172,7 @@ def test_waiting_threads_are_woken_at_the_end(scene: list[Expectation], monkeypa
     works = [
         detect,
         lambda: pool.realise(scene[0], start=0, count=3, seed=1),
-        lambda: list(map_in_order(pool, lambda work: work(), [detect, detect, detect])),
+        lambda: list(pools.map_in_order(pool, lambda work: work(), [detect, detect, detect])),
     ]
     threads = [threading.Thread(target=ask, args=(work,), daemon=True) for work in works]
     for thread in threads:
@@ -182,7 +182,7 @@ def test_waiting_threads_are_woken_at_the_end(scene: list[Expectation], monkeypa
     pool.stop()
     for thread in threads:
         thread.join(5)
-    assert ended == [Stopped] * 3
+    assert ended == [pools.Stopped] * 3
 
 
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
@@ -283,7 +283,6 @@ if not hasattr(cluster, "changed"):
 def test_shards_of_workers_with_other_code_are_drawn_again(
     change: str, scheduler_file: str, tmp_path: Path, engine: Engine, scene: list[Expectation]
 ) -> None:
-    """Let a worker with other code join a running cluster: its counts are not used."""
     quiet, *flares = scene
     (tmp_path / "other_code.py").write_text(PRELOAD.format(change=OTHER_CODE[change]))
     n = 200_000

@@ -22,31 +22,11 @@ from refusals import refused
 from scenes import instrument, star
 from stores import flip, full_after
 
-from mauvecl import (
-    Comparison,
-    DaskWorkers,
-    Detection,
-    Engine,
-    Expectation,
-    InputError,
-    Linear,
-    LocalWorkers,
-    Pool,
-    Processes,
-    Study,
-    Uniform,
-    detect,
-    snr,
-)
-from mauvecl import (
-    limit as limiting_magnitude,
-)
-from mauvecl import (
-    map as detection_map,
-)
+import mauvecl
+from mauvecl import Comparison, DaskWorkers, Detection, Engine, Expectation, Linear, LocalWorkers, Pool, Processes
 from mauvecl.detection import requests
 from mauvecl.runs import checkpoint as shards
-from mauvecl.runs.pool import Stopped, map_in_order
+from mauvecl.runs import pool as pools
 
 pytestmark = pytest.mark.usefixtures("small_shards")
 
@@ -103,7 +83,7 @@ def test_shards_of_every_kind_of_request_join(engine: Engine) -> None:
         "seed": 1,
         "statistics": ("chi2_pair", "matched"),
         "comparison": Comparison.of("stack:3", "estimated"),
-        "processes": Processes(jitter=Uniform(0.0, 0.05)),
+        "processes": Processes(jitter=mauvecl.Uniform(0.0, 0.05)),
     }
     pool = Pool(Shuffled(engine, 4))
     same(pool.detect(quiet, flares, **how), engine.detect(quiet, flares, **how))
@@ -176,7 +156,7 @@ def test_closed_workers_end_every_wait(engine: Engine, scene: list[Expectation])
     def ask() -> None:
         try:
             Pool(workers).detect(quiet, flares, realisations=8192, seed=5)
-        except (Stopped, RuntimeError) as end:
+        except (pools.Stopped, RuntimeError) as end:
             ends.append(end)
 
     # Daemon threads: one that waits for ever fails the test instead of holding it.
@@ -209,18 +189,18 @@ AXES = {"x": {"quantity": "magnitude", "values": [6, 8, 10]}, "y": {"quantity": 
 @pytest.mark.parametrize(
     ("ask", "sections"),
     [
-        (lambda s, e: detect(s, e).table, {}),
-        (lambda s, e: snr(s, e).element, {"sweep": {"axes": [{"quantity": "exposure", "values": [5, 50]}]}}),
-        pytest.param(lambda s, e: limiting_magnitude(s, e).table, {}, marks=pytest.mark.long),
-        (lambda s, e: detection_map(s, e).table, {"map": AXES}),
+        (lambda s, e: mauvecl.detect(s, e).table, {}),
+        (lambda s, e: mauvecl.snr(s, e).element, {"sweep": {"axes": [{"quantity": "exposure", "values": [5, 50]}]}}),
+        pytest.param(lambda s, e: mauvecl.limit(s, e).table, {}, marks=pytest.mark.long),
+        (lambda s, e: mauvecl.map(s, e).table, {"map": AXES}),
         pytest.param(
-            lambda s, e: detection_map(s, e).table, {"map": AXES, "unknowns": {"draws": 3}}, marks=pytest.mark.long
+            lambda s, e: mauvecl.map(s, e).table, {"map": AXES, "unknowns": {"draws": 3}}, marks=pytest.mark.long
         ),
     ],
     ids=["detect", "snr", "limit", "map", "unknowns"],
 )
 def test_pool_gives_the_table_of_the_engine(
-    engine: Engine, ask: Callable[[Study, Any], Any], sections: dict[str, Any]
+    engine: Engine, ask: Callable[[mauvecl.Study, Any], Any], sections: dict[str, Any]
 ) -> None:
     ours, theirs = ask(small(**sections), engine), ask(small(**sections), Pool(Shuffled(engine, 9)))
     assert ours.colnames == theirs.colnames
@@ -245,7 +225,7 @@ def test_fingerprints_distinguish_requests(scene: list[Expectation]) -> None:
         asked(flares[::-1]),
         asked([flares[0], brighter]),
         asked(comparison=Comparison.of("exposure")),
-        asked(processes=Processes(jitter=Uniform(0.0, 0.01))),
+        asked(processes=Processes(jitter=mauvecl.Uniform(0.0, 0.01))),
         asked(mode="frames"),
         *(asked(nuisances={"dark": sd}) for sd in (0.1, 0.2)),
     ]
@@ -287,7 +267,7 @@ def interrupting(after: int) -> Callable[[int, int], None]:
     return progress
 
 
-def at_work(folder: Path, engine: Engine, progress: Any = None, study: Study | None = None, **how: Any) -> Any:
+def at_work(folder: Path, engine: Engine, progress: Any = None, study: mauvecl.Study | None = None, **how: Any) -> Any:
     """Ask for a detection whose shards are kept; return it, the pool and the checkpoint."""
     quiet, *flares = SCENE
     with shards.Checkpoint(folder, "detect", study or small(), patience_s=0.0, **how) as checkpoint:
@@ -373,7 +353,6 @@ def test_unfinished_run_is_not_overwritten(begun: Path, engine: Engine) -> None:
 
 
 def test_counts_of_another_form_raise(begun: Path, engine: Engine) -> None:
-    """Refuse shards of an older version."""
     manifest = json.loads(manifest_of(begun))
     old = {key: value for key, value in manifest.items() if key not in ("form", "digest")}
     change(begun, json.dumps(old | {"digest": hashlib.sha256(json.dumps(old, sort_keys=True).encode()).hexdigest()}))
@@ -433,16 +412,16 @@ def test_answers_keep_their_order_and_errors_end_the_rest(engine: Engine) -> Non
         time.sleep(pauses[number])
         return number
 
-    assert list(map_in_order(pool, slow, range(6))) == list(range(6))
+    assert list(pools.map_in_order(pool, slow, range(6))) == list(range(6))
 
     def bad(number: int) -> int:
         if number == 2:
-            raise InputError.of("number", 2, "another")
+            raise mauvecl.InputError.of("number", 2, "another")
         return number
 
     with refused("number", "2"):
-        list(map_in_order(pool, bad, range(6)))
-    with pytest.raises(Stopped):
+        list(pools.map_in_order(pool, bad, range(6)))
+    with pytest.raises(pools.Stopped):
         pool.detect(SCENE[0], SCENE[1:], realisations=N, seed=5)
 
 
@@ -454,9 +433,9 @@ def test_progress_that_raises_stops_the_work_ahead_of_it(engine: Engine) -> None
         raise ArithmeticError
 
     try:
-        detection_map(small(map=AXES), pool, progress)
+        mauvecl.map(small(map=AXES), pool, progress)
     except ArithmeticError:
-        with pytest.raises(Stopped):
+        with pytest.raises(pools.Stopped):
             pool.detect(SCENE[0], SCENE[1:], realisations=N, seed=5)
     else:
         pytest.fail("the progress was not asked")

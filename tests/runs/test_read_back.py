@@ -5,11 +5,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from answers import expectations
 from commands import run
-from stores import Painter, expectations, study
+from stores import Painter, study
 
 from mauvecl import Engine, Study, bulk, read_frames
-from mauvecl.observations.frame_files import reduce_frames
+from mauvecl.observations import frame_files
 
 #: Stacks of two frames, and single frames of which the second is stored.
 STACKED: dict[str, Any] = {"observation": {"exposure_s": 10.0}}
@@ -45,7 +46,7 @@ def test_stores_are_reduced_in_pieces(
     light, error = read_frames(path).white_light
     # Seven frames at once, which divide realisations of two frames.
     monkeypatch.setattr("mauvecl.host.tables.table.PIECE_BYTES", 7 * 8 * 197)
-    (curve,) = reduce_frames(path).light_curves
+    (curve,) = frame_files.reduce_frames(path).light_curves
     np.testing.assert_allclose(curve.flux, light, rtol=1e-12)
     np.testing.assert_allclose(curve.error, error, rtol=1e-12)
 

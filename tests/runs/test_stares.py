@@ -14,7 +14,7 @@ from scenes import flaring_stares as request
 
 from mauvecl import Engine, LocalWorkers, Pool, Stare, Stares
 from mauvecl.runs import checkpoint as shards
-from mauvecl.runs.pool import Stopped
+from mauvecl.runs import pool as pools
 
 pytestmark = pytest.mark.usefixtures("small_shards")
 
@@ -58,15 +58,9 @@ def test_shards_of_stares_join_to_the_same_bits(engine: Engine, method: Any, red
     workers.close()
     assert pool.standing.shards == len(shards.shards(asked)) == 5, "cut at multiples of 64, and where the word ends"
     whole = Stares(engine.open_device).frames(
-        asked.components,
-        asked.stare,
-        asked.flare,
-        amplitudes=asked.amplitudes,
-        first=START,
-        count=N,
-        seed=5,
+        asked.components, asked.stare, asked.flare, amplitudes=asked.amplitudes, first=START, count=N, seed=5,
         method=method,
-    )
+    )  # fmt: skip
     if reduction is None:
         np.testing.assert_array_equal(found["values"], np.moveaxis(whole, 0, 1))
     else:
@@ -86,10 +80,10 @@ def test_run_of_stares_is_resumed(engine: Engine, tmp_path: Path) -> None:
         def submit(self, *given: Any, **more: Any) -> Any:
             self.left -= 1
             if self.left < 0:
-                raise Stopped
+                raise pools.Stopped
             return super().submit(*given, **more)
 
-    with pytest.raises(Stopped), shards.Checkpoint(tmp_path, "inject", study, patience_s=0.0) as kept:
+    with pytest.raises(pools.Stopped), shards.Checkpoint(tmp_path, "inject", study, patience_s=0.0) as kept:
         Pool(Stopping(3), checkpoint=kept).stares(asked)
     with shards.Checkpoint(tmp_path, "inject", study, resume=True) as kept:
         workers = Stopping(99)

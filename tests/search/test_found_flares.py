@@ -11,7 +11,7 @@ from scenes import paper
 from scipy.stats import binom, chi2
 
 from mauvecl import Event, Study, stare
-from mauvecl.search.false_alarms import sampled_rate
+from mauvecl.search import false_alarms
 
 #: One false alarm in a star-month is at 4.9.
 FAINT: tuple[str, ...] = ('star=[{library="M3V", magnitude=9}]',)
@@ -26,7 +26,7 @@ def one_threshold_per_star() -> Iterator[None]:
     def sampled_once(survey: Any, seed: int) -> Any:
         name = survey.components.quiet.name
         if name not in rates:
-            rates[name] = sampled_rate(survey, seed)
+            rates[name] = false_alarms.sampled_rate(survey, seed)
         return rates[name]
 
     with pytest.MonkeyPatch.context() as patch:

@@ -6,14 +6,12 @@ from refusals import refused
 from scipy import special
 
 from mauvecl import SHAPES, Stare, Study
-from mauvecl.search.completeness import search_threshold
-from mauvecl.search.false_alarms import sample_rate
+from mauvecl.search import completeness, false_alarms, templates
 from mauvecl.search.search import Search
-from mauvecl.search.templates import Bank, Baseline
 
 DAVENPORT = SHAPES["davenport2014"]
 ONE = np.ones((1, 1))
-KNOWN = Baseline(offset=False, slope=False, window_s=0.0)
+KNOWN = templates.Baseline(offset=False, slope=False, window_s=0.0)
 HALF_WIDTHS_S = Study().search.half_widths_s
 
 
@@ -44,7 +42,9 @@ def filtered(search, sums, curves):
             yield rho[:, :, onset], found
 
 
-@pytest.mark.parametrize("level", [KNOWN, Baseline(window_s=600.0), Baseline(cycle=True, window_s=600.0)])
+@pytest.mark.parametrize(
+    "level", [KNOWN, templates.Baseline(window_s=600.0), templates.Baseline(cycle=True, window_s=600.0)]
+)
 def test_filters_are_least_squares_over_gaps(level):
     """Compare correlations by FFT with a fit for each template, with gaps, unequal variances and a varying level.
 
@@ -53,7 +53,7 @@ def test_filters_are_least_squares_over_gaps(level):
     stare = Stare.of(6000.0, gaps=[(1000, 1500), (3000, 3050)])
     rng = np.random.default_rng(1)
     curves = np.array([np.sin(stare.start_s / 600), np.cos(stare.start_s / 600)]) if level.cycle else np.zeros((0, 1))
-    bank = Bank((11.0, 54.0, 266.0, 2000.0), np.array([[1.0, 0.0], [0.8, 0.6]]), DAVENPORT, 5.0, level)
+    bank = templates.Bank((11.0, 54.0, 266.0, 2000.0), np.array([[1.0, 0.0], [0.8, 0.6]]), DAVENPORT, 5.0, level)
     assert bank.window(2000.0)[1] > stare.n_frames or level.offset
     variance = rng.uniform(0.5, 2.0, stare.n_frames)
     search = Search(bank, stare, curves if level.cycle else None, variance)
@@ -65,10 +65,10 @@ def test_filters_are_least_squares_over_gaps(level):
     assert max(np.abs(a - b).max() for a, b in pairs) < 5e-3
 
 
-@pytest.mark.parametrize("level", [KNOWN, Baseline()])
+@pytest.mark.parametrize("level", [KNOWN, templates.Baseline()])
 def test_bank_loses_little_in_time(level):
     """Check a loss of 1.3 % of S/N at most for half-widths of 10-1800 s at any phase (spectra: 0.7 %)."""
-    bank = Bank(HALF_WIDTHS_S, ONE, DAVENPORT, 5.0, level)
+    bank = templates.Bank(HALF_WIDTHS_S, ONE, DAVENPORT, 5.0, level)
     stare = Stare.of(60_000.0)
     search = Search(bank, stare)
     edges = np.arange(stare.n_frames + 1) * 5.0
@@ -88,7 +88,7 @@ def test_bank_loses_little_in_time(level):
 @pytest.fixture(scope="module")
 def day():
     """Return a day and the bank of the theory's table: eight filters from 30 s on, a factor of two apart."""
-    return Search(Bank(tuple(30.0 * 2**k for k in range(8)), ONE, DAVENPORT, 5.0, KNOWN), Stare.of(86_400.0))
+    return Search(templates.Bank(tuple(30.0 * 2**k for k in range(8)), ONE, DAVENPORT, 5.0, KNOWN), Stare.of(86_400.0))
 
 
 def test_largest_value_of_a_day(day):
@@ -111,9 +111,11 @@ def test_largest_value_of_a_day(day):
 def short():
     """Return a search of two sums over a stare with a gap, and its null by importance sampling."""
     stare = Stare.of(9000.0, gaps=[(4000, 5000)])
-    bank = Bank((20.0, 60.0, 180.0), np.array([[1.0, 0.0], [0.8, 0.6]]), DAVENPORT, 5.0, Baseline(window_s=900.0))
+    bank = templates.Bank(
+        (20.0, 60.0, 180.0), np.array([[1.0, 0.0], [0.8, 0.6]]), DAVENPORT, 5.0, templates.Baseline(window_s=900.0)
+    )
     search = Search(bank, stare)
-    return search, sample_rate(search, seed=2, draws=400)
+    return search, false_alarms.sample_rate(search, seed=2, draws=400)
 
 
 @pytest.mark.long
@@ -126,7 +128,7 @@ def test_repeated_estimates_scatter_by_their_errors():
     """
     stare = Stare.of(2500.0)
     search = Search(Study().search.white_bank(5.0), stare)
-    repeats = [sample_rate(search, seed=seed) for seed in range(8)]
+    repeats = [false_alarms.sample_rate(search, seed=seed) for seed in range(8)]
     for u in (4.25, 5.0, 6.5):
         k = list(repeats[0].thresholds).index(u)
         p, error = (np.array([getattr(tail, name)[k] for tail in repeats]) for name in ("probability", "error"))
@@ -145,8 +147,8 @@ def test_repeated_estimates_scatter_by_their_errors():
 def test_rate_of_one_filter_equals_the_closed_form():
     """Compare independent frames with P = 1 - (1 - Q)^n."""
     stare = Stare.of(500.0)
-    search = Search(Bank((0.02,), ONE, DAVENPORT, 5.0, KNOWN), stare)
-    tail = sample_rate(search, seed=1, draws=50)
+    search = Search(templates.Bank((0.02,), ONE, DAVENPORT, 5.0, KNOWN), stare)
+    tail = false_alarms.sample_rate(search, seed=1, draws=50)
     # Both phases of a template see its one frame: they are the same filter.
     exact = -np.expm1(100 * np.log1p(-special.ndtr(-tail.thresholds)))
     kept = tail.thresholds >= 4.5
@@ -171,10 +173,10 @@ def test_closed_form_of_the_rate_agrees_with_importance_sampling(widths):
     one bank share: fails by chance once in 10^4 runs.
     """
     directions = ONE if widths is HALF_WIDTHS_S else np.array([[1.0, 0.0], [0.95, 0.312], [0.8, 0.6]])
-    bank = Bank(widths, directions, DAVENPORT, 5.0, Baseline(window_s=900.0))
-    tail = sample_rate(Search(bank, Stare.of(12_000.0)), seed=2, draws=120)
+    bank = templates.Bank(widths, directions, DAVENPORT, 5.0, templates.Baseline(window_s=900.0))
+    tail = false_alarms.sample_rate(Search(bank, Stare.of(12_000.0)), seed=2, draws=120)
     for asked in (1.0, 1e-2, 1e-4, 1e-7, 1e-10):
-        log_rate, error = tail.log_rate(search_threshold(asked, bank))
+        log_rate, error = tail.log_rate(completeness.search_threshold(asked, bank))
         assert -0.1 - 4 * error < log_rate - np.log(asked) < 4 * error
 
 
@@ -183,8 +185,8 @@ def test_closed_form_of_the_rate_has_known_values():
 
     Both phases of a template shorter than a frame are the same filter.
     """
-    eight = Bank(tuple(30.0 * 2**k for k in range(8)), ONE, DAVENPORT, 5.0, KNOWN)
-    assert search_threshold(np.log(2), eight) == pytest.approx(3.73, abs=0.05)
-    alone = Bank((0.02,), ONE, DAVENPORT, 5.0, KNOWN)
+    eight = templates.Bank(tuple(30.0 * 2**k for k in range(8)), ONE, DAVENPORT, 5.0, KNOWN)
+    assert completeness.search_threshold(np.log(2), eight) == pytest.approx(3.73, abs=0.05)
+    alone = templates.Bank((0.02,), ONE, DAVENPORT, 5.0, KNOWN)
     for sigma in (4.5, 5.0, 6.0):
-        assert search_threshold(17_280 * special.ndtr(-sigma), alone) == pytest.approx(sigma, abs=1e-3)
+        assert completeness.search_threshold(17_280 * special.ndtr(-sigma), alone) == pytest.approx(sigma, abs=1e-3)

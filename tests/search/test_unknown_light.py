@@ -7,20 +7,10 @@ import numpy as np
 import pytest
 import scipy
 
-from mauvecl import (
-    Event,
-    Expectation,
-    FlareModel,
-    Instrument,
-    Nuisances,
-    Source,
-    Stare,
-    expect,
-    fit_cooling,
-    measure_along,
-)
+import mauvecl
+from mauvecl import Expectation, FlareModel, Source, Stare, expect, fit_cooling
 
-MAUVE = Instrument.load("mauvesim")
+MAUVE = mauvecl.Instrument.load("mauvesim")
 PEAK_S, HALF_WIDTH_S, AMPLITUDE, KELVIN = 100.0, 40.0, 1.5, 10_000.0
 START = {"peak_s": PEAK_S, "half_width_s": HALF_WIDTH_S, "cooling": False}
 
@@ -38,7 +28,9 @@ def quiet(magnitude: float) -> Expectation:
 def flare_dn(stare: Stare, m: FlareModel) -> np.ndarray:
     """Return the mean DN that the flare adds to each frame."""
     edges = np.column_stack([stare.start_s, stare.start_s + stare.frame_s])
-    rise = AMPLITUDE * Event(PEAK_S, HALF_WIDTH_S, AMPLITUDE, KELVIN).form.mean_over(edges, PEAK_S, HALF_WIDTH_S)
+    rise = AMPLITUDE * mauvecl.Event(PEAK_S, HALF_WIDTH_S, AMPLITUDE, KELVIN).form.mean_over(
+        edges, PEAK_S, HALF_WIDTH_S
+    )
     return np.asarray(rise[:, None] * m.hot_spline(np.log(KELVIN)))
 
 
@@ -102,12 +94,12 @@ def test_bins_marginalise_what_a_stare_does_not_know() -> None:
     stare = Stare.of(300.0, offsets={"light": 0.03}, jitters={"light": 0.01})
     m = FlareModel.of(source(6.0), MAUVE, x)
     flare, rng = flare_dn(stare, m), np.random.default_rng(4402)
-    dark = Nuisances.of(x, {"dark": np.inf})
+    dark = mauvecl.Nuisances.of(x, {"dark": np.inf})
     pulls, plain = [], []
     for _ in range(20):
         raw = frames(stare, x, flare, rng)
         for given, kept in ((stare, pulls), (replace(stare, unknowns=(), light_jitter=0.0), plain)):
-            bins = measure_along(raw, x, m, dark, snr_per_bin=400.0, stare=given, levels=(0.95,))
+            bins = mauvecl.measure_along(raw, x, m, dark, snr_per_bin=400.0, stare=given, levels=(0.95,))
             place = bins.found.column("flux bolometric")
             per_amplitude = m.values(KELVIN, [1.0])["flux bolometric"]
             rise = flare / m.hot_spline(np.log(KELVIN))

@@ -11,21 +11,7 @@ from astropy.table import Table
 from refusals import refused
 
 import mauvecl
-from mauvecl import (
-    BalmerFlare,
-    Blackbody,
-    EnergyScale,
-    FlareWithLines,
-    Instrument,
-    ObservedFlare,
-    Source,
-    Study,
-    TwoBlackbodies,
-    detect,
-    expect,
-    inject,
-    stare,
-)
+from mauvecl import BalmerFlare, Blackbody, FlareWithLines, Source, Study, stare
 
 DATA = Path(__file__).parent.parent / "data"
 FILE, QUIET = DATA / "spectra" / "ADLeo_912s.dat", DATA / "flares" / "adleo_quiescent2.dat"
@@ -36,12 +22,12 @@ OF_FILE: dict[str, Any] = {
 TEXTS: dict[str, tuple[dict[str, Any], Any]] = {
     "blackbody": ({}, Blackbody(9000.0)),
     "jump": ({"balmer_jump": 2.5, "electron_temperature_k": 8000.0}, BalmerFlare(9000.0, 2.5, 8000.0)),
-    "two": ({"second_temperature_k": 25_000.0, "second_area": 0.1}, TwoBlackbodies(9000.0, 25_000.0, 0.1)),
+    "two": ({"second_temperature_k": 25_000.0, "second_area": 0.1}, mauvecl.TwoBlackbodies(9000.0, 25_000.0, 0.1)),
     "lines": (
         {"lines": {"Mg II": 0.04, "H alpha": 0.1}, "line_scale": 0.5, "balmer_jump": 2.0},
         FlareWithLines(BalmerFlare(9000.0, 2.0), {"Mg II": 0.02, "H alpha": 0.05}),
     ),
-    "file": (OF_FILE, ObservedFlare.read(FILE, QUIET, wavelength_unit="Angstrom", continue_at_k=9500.0)),
+    "file": (OF_FILE, mauvecl.ObservedFlare.read(FILE, QUIET, wavelength_unit="Angstrom", continue_at_k=9500.0)),
 }
 TOGETHER = pytest.mark.parametrize("name", TEXTS)
 
@@ -69,7 +55,7 @@ def test_spectrum_of_a_study_round_trips_through_toml(name: str, tmp_path: Path)
 def expectations(study: Study) -> list[list[Any]]:
     """Return the quiescent and the flaring expectation of each case."""
     few = study.with_settings(["run={realisations=500, fap=0.3, statistics=['matched']}"])
-    return [[one.detection.quiet, *one.detection.flares] for one in detect(few).stars]
+    return [[one.detection.quiet, *one.detection.flares] for one in mauvecl.detect(few).stars]
 
 
 def snr_of(quiet: Any, flare: Any) -> float:
@@ -107,7 +93,7 @@ def test_energies_equal_those_of_the_light(name: str) -> None:
     inside = spectrum.grid(np.linspace(400.0, 600.0, 40_001))
     whole = 10 * share * np.trapezoid(spectrum.flux(far), far) / np.trapezoid(spectrum.flux(inside), inside) * sphere
     for kind, energy in (("band", band), ("bolometric", whole)):
-        scale = EnergyScale.of_star(star, 5.0, flare=spectrum, kind=kind)
+        scale = mauvecl.EnergyScale.of_star(star, 5.0, flare=spectrum, kind=kind)
         assert scale.erg_per_s == pytest.approx(energy, rel=5e-3), kind
     # The same energies are those of a simulated stare.
     short = ["stare.duration_s=600", "observation.exposure_s=5", "stare.search=false"]
@@ -121,8 +107,8 @@ def test_energies_equal_those_of_the_light(name: str) -> None:
 def test_answers_take_any_spectrum(name: str) -> None:
     """The closed-form S/N equals that of the flare's counts, and stares have the light of the spectrum."""
     study = study_of(name, amplitudes=[0.05])
-    star, mauve = Source.from_library("M3V").at_magnitude(9), Instrument.load("mauvesim")
-    wanted = [expect(s, mauve, exposure=50.0) for s in (star, star.flaring(0.05, spectrum=TEXTS[name][1]))]
+    star, mauve = Source.from_library("M3V").at_magnitude(9), mauvecl.Instrument.load("mauvesim")
+    wanted = [mauvecl.expect(s, mauve, exposure=50.0) for s in (star, star.flaring(0.05, spectrum=TEXTS[name][1]))]
     (found,) = expectations(study)
     assert snr_of(*found) == pytest.approx(snr_of(*wanted), rel=1e-9)
     one = study.with_settings(["stare.duration_s=600", "observation.exposure_s=5", "stare.search=false"])
@@ -135,7 +121,8 @@ def test_search_injects_the_flare_of_the_file() -> None:
     """Templates are those of a blackbody for a file, and of the spectrum otherwise; the file has more ultraviolet."""
     few = ["stare.duration_s=2000", "injections={count=20, sizes=2, widths=2, fitted=0}", "search.nulls=0"]
     found = {
-        name: inject(study_of(name).with_settings(few)).stars[0].surveyed for name in ("blackbody", "file", "jump")
+        name: mauvecl.inject(study_of(name).with_settings(few)).stars[0].surveyed
+        for name in ("blackbody", "file", "jump")
     }
     np.testing.assert_array_equal(found["file"].templates.directions, found["blackbody"].templates.directions)
     assert not np.array_equal(found["jump"].templates.directions, found["blackbody"].templates.directions)

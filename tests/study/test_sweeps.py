@@ -4,36 +4,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scenes import instrument, star
+from scenes import instrument, star, study_of_g2v
 from scipy import stats
 
-from mauvecl import BalmerFlare as Balmer
-from mauvecl import (
-    Blackbody,
-    Engine,
-    FlareWithLines,
-    Instrument,
-    Sky,
-    Source,
-    Study,
-    TwoBlackbodies,
-    detect,
-    expect,
-    gaussian,
-    limit,
-    snr,
-)
+import mauvecl
+from mauvecl import Blackbody, Engine, Study, TwoBlackbodies, detect, gaussian
 
 
 def study(axes: list[dict[str, Any]], how: str = "product", **changes: Any) -> Study:
-    """Return a study of the paper's G2V star."""
-    data: dict[str, Any] = {
-        "star": [{"library": "G2V", "magnitude": 7.4}],
-        "flare": {"amplitudes": [0.1]},
-        "run": {"realisations": 20_000, "fap": 1e-2, "statistics": ["matched"], "seed": 5},
-        "sweep": {"how": how, "axes": axes},
-    }
-    return Study.build(data | changes, "test").paper()
+    swept = {"flare": {"amplitudes": [0.1]}, "sweep": {"how": how, "axes": axes}}
+    return study_of_g2v(**swept | changes).paper()
 
 
 MAGNITUDES = {"quantity": "magnitude", "values": [6.0, 9.0]}
@@ -58,10 +38,10 @@ SECTIONS = {"second_temperature": TWO, "second_area": TWO, "line_scale": LINES}
 #: The spectrum of the flare at a value.
 LIGHT = {
     "flare_temperature": Blackbody,
-    "balmer_jump": lambda v: Balmer(10_000.0, v),
+    "balmer_jump": lambda v: mauvecl.BalmerFlare(10_000.0, v),
     "second_temperature": lambda v: TwoBlackbodies(10_000.0, v, 1.0),
     "second_area": lambda v: TwoBlackbodies(10_000.0, 4000.0, v),
-    "line_scale": lambda v: FlareWithLines(Blackbody(10_000.0), {"H alpha": 0.1 * v}),
+    "line_scale": lambda v: mauvecl.FlareWithLines(Blackbody(10_000.0), {"H alpha": 0.1 * v}),
 }
 
 
@@ -82,12 +62,12 @@ def test_sweep_gives_the_expectations_of_each_value(quantity: str, engine: Engin
         given = {"star": "G2V", "magnitude": 7.4, "amplitude": 0.1, "exposure": 50.0, "instrument": None, "sky": 22.1}
         given |= {part: value}
         light = LIGHT[quantity](value) if part == "spectrum" else Blackbody(10_000.0)
-        quiet = Source.from_library(given["star"]).at_magnitude(given["magnitude"])
-        payload = Instrument.load("mauvesim")
+        quiet = mauvecl.Source.from_library(given["star"]).at_magnitude(given["magnitude"])
+        payload = mauvecl.Instrument.load("mauvesim")
         if given["instrument"] is not None:
             payload = payload.with_(temperature_c=given["instrument"])
-        how = {"exposure": given["exposure"], "sky": Sky.of_brightness(given["sky"])}
-        wanted = [expect(x, payload, **how) for x in (quiet, quiet.flaring(given["amplitude"], spectrum=light))]
+        how = {"exposure": given["exposure"], "sky": mauvecl.Sky.of_brightness(given["sky"])}
+        wanted = [mauvecl.expect(x, payload, **how) for x in (quiet, quiet.flaring(given["amplitude"], spectrum=light))]
         for x, y in zip((one.detection.quiet, *one.detection.flares), wanted, strict=True):
             np.testing.assert_allclose(x.source_electrons, y.source_electrons, rtol=1e-12)
             np.testing.assert_allclose(x.recorded_dn, y.recorded_dn, rtol=1e-12)
@@ -130,7 +110,7 @@ def test_each_cell_equals_its_own_detection(engine: Engine) -> None:
 def test_limits_follow_the_sweep(engine: Engine) -> None:
     """A colder detector and a longer exposure have fainter limits."""
     axes = [{"quantity": "detector_temperature", "values": [13.0, 21.0]}, EXPOSURES]
-    table = limit(study(axes), engine).table
+    table = mauvecl.limit(study(axes), engine).table
     assert list(table["detector_temperature"].value) == [13, 13, 21, 21]
     value = table["magnitude"].value
     assert value[0] > value[2]
@@ -147,7 +127,7 @@ def test_formula_holds_for_the_payload_and_fails_at_saturation(engine: Engine) -
     assert np.all(np.abs(cells["fap_ratio"] - 1) < 1e-9)
     assert np.all((cells["coverage_low"] > 0.66) & (cells["coverage_high"] < 0.71))
     # Coverage from histograms equals that of the same realisations.
-    quiet = snr(asked, engine).stars[0].result.expectation
+    quiet = mauvecl.snr(asked, engine).stars[0].result.expectation
     raw = engine.realise(quiet, count=20_000, seed=5)
     net = raw - quiet.n_frames * (quiet.bias_dn + quiet.dark_dn)
     known = quiet.n_frames * (quiet.read_noise_dn**2 + quiet.dark_variance_dn2)

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scenes import study_of_g2v
 from scipy import special, stats
 
 from mauvecl import Engine, Instrument, Study, detect, limit
@@ -14,14 +15,7 @@ ALL = ("temperature_c", "light_loss", "pointing_loss", "qe_scale", "conversion_u
 
 
 def study(unknowns: dict[str, Any], **changes: Any) -> Study:
-    """Return a study of the paper's G2V star with a 24 % flare."""
-    data: dict[str, Any] = {
-        "star": [{"library": "G2V", "magnitude": 7.4}],
-        "flare": {"amplitudes": [0.24]},
-        "run": {"realisations": 40_000, "fap": 1e-2, "statistics": ["matched"], "seed": 5},
-        "unknowns": {"draws": 8} | unknowns,
-    }
-    return Study.build(data | changes, "test")
+    return study_of_g2v(run={"realisations": 40_000}, unknowns={"draws": 8} | unknowns, **changes)
 
 
 @pytest.fixture(scope="module")

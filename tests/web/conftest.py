@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -22,6 +23,28 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     yield found
     found.kill()
     found.quiet()
+
+
+@pytest.fixture(scope="session")
+def words(server: Server) -> dict[str, Any]:
+    """Return what the page tells its script."""
+    return server.words()
+
+
+@pytest.fixture
+def talk(server: Server) -> Server:
+    """Return the server; a test that is a coroutine gets the talk of a new visitor in its place."""
+    return server
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
+    """Run a test that is a coroutine as a visit to the page."""
+    if not inspect.iscoroutinefunction(pyfuncitem.obj):
+        return None
+    given = {name: pyfuncitem.funcargs[name] for name in inspect.signature(pyfuncitem.obj).parameters}
+    given.pop("talk").visited(lambda talk: pyfuncitem.obj(talk=talk, **given))
+    return True
 
 
 @pytest.fixture(scope="module")

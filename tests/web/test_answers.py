@@ -1,6 +1,7 @@
 """Fields and answers of the page, as its script asks for them: what is entered, the two chances, limits, pictures."""
 
 import asyncio
+import io
 import json
 import re
 import tomllib
@@ -9,10 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from astropy.table import QTable
+from commands import run
 from marks import long_but
 from scipy.interpolate import RegularGridInterpolator
 from study_keys import ends, outside
 
+from mauvecl import Study, detect, plan
 from tests.web.visits import Server, Talk, column, link
 
 NUMBER = r"(-?[\d.]+(?:e[+-]\d+)?)"
@@ -37,12 +41,6 @@ OLD_LINK = (
 UNKNOWN = ("realistic", "ideal")
 
 
-@pytest.fixture(scope="module")
-def words(server: Server) -> dict[str, Any]:
-    """Return what the page tells its script."""
-    return server.words()
-
-
 async def faults_of_all(talk: Talk, words: dict[str, Any], entered: dict[str, str]) -> dict[str, str]:
     """Return the faults of all tabs together, each of which reports those of the fields that it shows."""
     found: dict[str, str] = {}
@@ -54,242 +52,208 @@ async def faults_of_all(talk: Talk, words: dict[str, Any], entered: dict[str, st
 # What is entered
 
 
-def test_invalid_numbers_are_faults_and_ranges_include_their_ends(server: Server, words: dict[str, Any]) -> None:
+async def test_invalid_numbers_are_faults_and_ranges_include_their_ends(talk: Talk, words: dict[str, Any]) -> None:
     """Every field with a number says what it accepts, accepts it, and accepts nothing else."""
-
-    async def work(talk: Talk) -> None:
-        found = await faults_of_all(talk, words, dict.fromkeys(words["fields"], "seven"))
-        numbers = {
-            name: why.partition(", expected ")[2]
-            for name, why in found.items()
-            if re.match("'seven' is not a (whole )?number", why)
-        }
-        assert len(numbers) == 29
-        for text in ("7,4", "1e999", "nan", "inf", "-inf", "1_0", "0x10", "٣", "1e400000"):
-            found = await faults_of_all(talk, words, dict.fromkeys(numbers, text))
-            assert {name for name, accepted in numbers.items() if accepted not in found.get(name, "")} == set(), text
-        assert (
-            found["seed"] == "'1e400000' is not a whole number, expected a whole number from 0 to 18446744073709551615"
-        )
-        # What may be left out is empty on a new page.
-        for text in ("", " "):
-            found = await faults_of_all(talk, words, dict.fromkeys(numbers, text))
-            for name, accepted in numbers.items():
-                needed = words["fields"][name] != ""
-                assert (found.get(name) == f"nothing is entered, expected {accepted}") == needed, name
-        for low, closed, opened, sign in (
-            (True, rf"^(?:a whole number from )?{NUMBER} to ", rf"above {NUMBER}", -1),
-            (False, rf" (?:to|up to) {NUMBER}", rf"below {NUMBER}", 1),
-        ):
-            for form, beyond, refused in ((closed, 0, False), (closed, sign, True), (opened, 0, True)):
-                ends = {name: at[1] for name, accepted in numbers.items() if (at := re.search(form, accepted))}
-                assert len(ends) > 1, (low, form)
-                if beyond:
-                    # Whole numbers of any size.
-                    ends = {
-                        n: str(int(x) + sign) if x.isdigit() else f"{float(x) + sign:.17g}" for n, x in ends.items()
-                    }
-                found = await faults_of_all(talk, words, ends)
-                wrong = {name for name in ends if ("out of range" in found.get(name, "")) != refused}
-                assert wrong == set(), (form, beyond)
-
-    server.visited(work)
+    found = await faults_of_all(talk, words, dict.fromkeys(words["fields"], "seven"))
+    numbers = {
+        name: why.partition(", expected ")[2]
+        for name, why in found.items()
+        if re.match("'seven' is not a (whole )?number", why)
+    }
+    assert len(numbers) == 29
+    for text in ("7,4", "1e999", "nan", "inf", "-inf", "1_0", "0x10", "٣", "1e400000"):
+        found = await faults_of_all(talk, words, dict.fromkeys(numbers, text))
+        assert {name for name, accepted in numbers.items() if accepted not in found.get(name, "")} == set(), text
+    assert found["seed"] == "'1e400000' is not a whole number, expected a whole number from 0 to 18446744073709551615"
+    # What may be left out is empty on a new page.
+    for text in ("", " "):
+        found = await faults_of_all(talk, words, dict.fromkeys(numbers, text))
+        for name, accepted in numbers.items():
+            needed = words["fields"][name] != ""
+            assert (found.get(name) == f"nothing is entered, expected {accepted}") == needed, name
+    for low, closed, opened, sign in (
+        (True, rf"^(?:a whole number from )?{NUMBER} to ", rf"above {NUMBER}", -1),
+        (False, rf" (?:to|up to) {NUMBER}", rf"below {NUMBER}", 1),
+    ):
+        for form, beyond, refused in ((closed, 0, False), (closed, sign, True), (opened, 0, True)):
+            ends = {name: at[1] for name, accepted in numbers.items() if (at := re.search(form, accepted))}
+            assert len(ends) > 1, (low, form)
+            if beyond:
+                # Whole numbers of any size.
+                ends = {n: str(int(x) + sign) if x.isdigit() else f"{float(x) + sign:.17g}" for n, x in ends.items()}
+            found = await faults_of_all(talk, words, ends)
+            wrong = {name for name in ends if ("out of range" in found.get(name, "")) != refused}
+            assert wrong == set(), (form, beyond)
 
 
-def test_ranges_are_those_of_studies(server: Server) -> None:
-    async def work(talk: Talk) -> None:
-        for name, field in QUANTITIES.items():
-            scale = 100 if name == "amplitude" else 1
-            for values, faulty in ((outside(name), True), (ends(name), False)):
-                for value in values:
-                    faults = await talk.faults(link(**{field: repr(scale * value)}))
-                    assert ("out of range" in faults.get(field, "")) == faulty, (value, faults)
-
-    server.visited(work)
+async def test_ranges_are_those_of_studies(talk: Talk) -> None:
+    for name, field in QUANTITIES.items():
+        scale = 100 if name == "amplitude" else 1
+        for values, faulty in ((outside(name), True), (ends(name), False)):
+            for value in values:
+                faults = await talk.faults(link(**{field: repr(scale * value)}))
+                assert ("out of range" in faults.get(field, "")) == faulty, (value, faults)
 
 
-def test_texts_are_refused_at_their_field_or_accepted(server: Server) -> None:
-    async def work(talk: Talk) -> None:
-        for row in TEXTS["refused"]:
-            reported = await talk.answer(link(**row["entered"]), row["tab"])
-            assert "answer" not in reported, row
-            # An empty time or target is a fault of its own.
-            assert reported["faults"].keys() <= {row["field"], "target", "time"}, row
-            assert row["says"] in reported["faults"][row["field"]], row
-        for row in TEXTS["accepted"]:
-            reported = await talk.answer(link(**row["entered"]), row["tab"])
-            assert reported["faults"] == {}, row
-            assert row["says"] in reported["answer"]["words"], row
-
-    server.visited(work)
+async def test_texts_are_refused_at_their_field_or_accepted(talk: Talk) -> None:
+    for row in TEXTS["refused"]:
+        reported = await talk.answer(link(**row["entered"]), row["tab"])
+        assert "answer" not in reported, row
+        # An empty time or target is a fault of its own.
+        assert reported["faults"].keys() <= {row["field"], "target", "time"}, row
+        assert row["says"] in reported["faults"][row["field"]], row
+    for row in TEXTS["accepted"]:
+        reported = await talk.answer(link(**row["entered"]), row["tab"])
+        assert reported["faults"] == {}, row
+        assert row["says"] in reported["answer"]["words"], row
 
 
-def test_links_are_read_with_care(server: Server, words: dict[str, Any]) -> None:
-    async def work(talk: Talk) -> None:
-        reported = await talk.answer("?magnitud=8&tab=x")
-        assert "magnitud" in reported["stray"]
-        assert "The link's tab" in reported["stray"]
-        assert "V = 8.5" in reported["answer"]["words"], "what it does not hold stands as at first"
-        reported = await talk.answer("?star=" + "G" * 10_000)
-        assert "more than 8192" in reported["stray"]
-        assert "answer" in reported
-        reported = await talk.answer(OLD_LINK)
-        assert "version 1" in reported["stray"]
-        assert reported["faults"] == {}
-        assert "a 10 % flare (10000 K) on an M3V star" in reported["answer"]["words"]
-        assert "with the payload mauvesim" in reported["answer"]["words"]
-        command = (await talk.exported(OLD_LINK))["detection"]["command"]
-        assert "--ideal" not in command
-        for text in (HOSTILE, "1 & 2=3", "\ud83d\ude00".encode("utf-16", "surrogatepass").decode("utf-16")):
-            assert f"'{text[:8]}" in (await talk.faults(link(star=text)))["star"]
-        assert "magnitude" in (await talk.faults("?magnitude=")), "an emptied field is not filled"
-        # Every name of the page's list has a spectrum.
-        for name in words["stars"]:
-            reported = await talk.ask("export", "taken", "refused", link=link(star=name), tab="detection")
-            assert "taken" in reported, name
-        chances = [(await talk.chances(link(**given)))[0] for given in words["presets"].values()]
-        assert 0.4 < chances[0] < 0.7, "at the edge of detection"
-
-    server.visited(work)
+async def test_links_are_read_with_care(talk: Talk, words: dict[str, Any]) -> None:
+    reported = await talk.answer("?magnitud=8&tab=x")
+    assert "magnitud" in reported["stray"]
+    assert "The link's tab" in reported["stray"]
+    assert "V = 8.5" in reported["answer"]["words"], "what it does not hold stands as at first"
+    reported = await talk.answer("?star=" + "G" * 10_000)
+    assert "more than 8192" in reported["stray"]
+    assert "answer" in reported
+    reported = await talk.answer(OLD_LINK)
+    assert "version 1" in reported["stray"]
+    assert reported["faults"] == {}
+    assert "a 10 % flare (10000 K) on an M3V star" in reported["answer"]["words"]
+    assert "with the payload mauvesim" in reported["answer"]["words"]
+    command = (await talk.exported(OLD_LINK))["detection"]["command"]
+    assert "--ideal" not in command
+    for text in (HOSTILE, "1 & 2=3", "\ud83d\ude00".encode("utf-16", "surrogatepass").decode("utf-16")):
+        assert f"'{text[:8]}" in (await talk.faults(link(star=text)))["star"]
+    assert "magnitude" in (await talk.faults("?magnitude=")), "an emptied field is not filled"
+    # Every name of the page's list has a spectrum.
+    for name in words["stars"]:
+        reported = await talk.ask("export", "taken", "refused", link=link(star=name), tab="detection")
+        assert "taken" in reported, name
+    chances = [(await talk.chances(link(**given)))[0] for given in words["presets"].values()]
+    assert 0.4 < chances[0] < 0.7, "at the edge of detection"
 
 
-def test_stars_and_targets_are_described(server: Server) -> None:
-    async def work(talk: Talk) -> None:
-        star = (await talk.answer("?star=gj+581"))["known"]["star"]
-        assert star["about"] == "M3V, 6.215 pc, V = 10.57; Hipparcos"
-        assert star["given"] == {"magnitude": "10.57", "band": "V", "target": "GJ 581"}
-        star = (await talk.answer("?star=AU+Mic"))["known"]["star"]
-        assert (star["offer"], star["given"]["magnitude"]) == ("Use V = 8.81", "8.81")
-        star = (await talk.answer("?star=M3.5V"))["known"]["star"]
-        assert star["about"] == "spectrum of M3V, the nearest to type M3.5V"
-        mine, other = (await talk.answer(link(targets="YZ CMi\n10 -3"), "plan"))["known"]["targets"]
-        assert (mine["V"], other["coordinates"]) == ("11.19", "10.000 -3.000")
-        refused = await talk.ask("simulate", "ended", kind="plan", link=link(targets="12 34", hours="50"))
-        assert refused["ended"] == ""
-        assert "spectral" in refused["refused"], "a plan needs what is known of a target"
-
-    server.visited(work)
+async def test_stars_and_targets_are_described(talk: Talk) -> None:
+    star = (await talk.answer("?star=gj+581"))["known"]["star"]
+    assert star["about"] == "M3V, 6.215 pc, V = 10.57; Hipparcos"
+    assert star["given"] == {"magnitude": "10.57", "band": "V", "target": "GJ 581"}
+    star = (await talk.answer("?star=AU+Mic"))["known"]["star"]
+    assert (star["offer"], star["given"]["magnitude"]) == ("Use V = 8.81", "8.81")
+    star = (await talk.answer("?star=M3.5V"))["known"]["star"]
+    assert star["about"] == "spectrum of M3V, the nearest to type M3.5V"
+    mine, other = (await talk.answer(link(targets="YZ CMi\n10 -3"), "plan"))["known"]["targets"]
+    assert (mine["V"], other["coordinates"]) == ("11.19", "10.000 -3.000")
+    refused = await talk.ask("simulate", "ended", kind="plan", link=link(targets="12 34", hours="50"))
+    assert refused["ended"] == ""
+    assert "spectral" in refused["refused"], "a plan needs what is known of a target"
 
 
 # Both chances
 
 
-def test_probabilities_are_never_shown_as_certain(server: Server) -> None:
-    async def work(talk: Talk) -> None:
-        seen = set()
-        for fap, percent in (("0.001", "9"), ("0.001", "2"), ("0.001", "0.2"), ("1e-6", "0.001"), ("1e-6", "3.55")):
-            reported = await talk.answer(link(fap=fap, amplitude_percent=percent, realisations="100000 sampled"))
-            for one in reported["answer"]["numbers"]:
-                value = one["value"]
-                expected = f"{100 * value:.2f} %" if not 0.01 <= value <= 0.99 else f"{100 * value:.1f} %"
-                expected = "> 99.99 %" if value > 0.9999 else "< 0.01 %" if value < 1e-4 else expected
-                assert one["shown"] == expected
-                seen.add(expected[0])
-        assert {">", "<", "0"} < seen
-
-    server.visited(work)
+async def test_probabilities_are_never_shown_as_certain(talk: Talk) -> None:
+    seen = set()
+    for fap, percent in (("0.001", "9"), ("0.001", "2"), ("0.001", "0.2"), ("1e-6", "0.001"), ("1e-6", "3.55")):
+        reported = await talk.answer(link(fap=fap, amplitude_percent=percent, realisations="100000 sampled"))
+        for one in reported["answer"]["numbers"]:
+            value = one["value"]
+            expected = f"{100 * value:.2f} %" if not 0.01 <= value <= 0.99 else f"{100 * value:.1f} %"
+            expected = "> 99.99 %" if value > 0.9999 else "< 0.01 %" if value < 1e-4 else expected
+            assert one["shown"] == expected
+            seen.add(expected[0])
+    assert {">", "<", "0"} < seen
 
 
-def test_each_number_is_the_answer_to_its_own_question(server: Server) -> None:
+async def test_each_number_is_the_answer_to_its_own_question(talk: Talk) -> None:
     """Whichever is chosen; with other payloads, too, whose chances are told in a sentence."""
-
-    async def work(talk: Talk) -> None:
-        for more in ({}, {"statistic": "chi2_element"}, {"own_unknown": "200 1, 450 3"}):
-            shown = []
-            for unknown in UNKNOWN:
-                reported = (await talk.answer(link(**M_DWARF, **more, unknown=unknown)))["answer"]
-                shown.append([one["value"] for one in reported["numbers"]])
-                chosen = reported["numbers"][UNKNOWN.index(unknown)]
-                assert (reported["chosen"], reported["shown"]) == (unknown, chosen["shown"])
-                assert "payload mauve" in reported["words"]
-                if not more:
-                    assert [one["shown"] for one in reported["numbers"]] == ["4.9 %", "97.5 %"]
-                    assert {kind for _, kind in reported["notes"]} == {"info"}
-            assert shown[0] == shown[1]
-        notes = (await talk.answer(link(magnitude="-1")))["answer"]["notes"]
-        assert {text.partition(":")[0] for text, kind in notes if kind == "danger"} == {"SATURATED"}
-        other = (await talk.answer(link(**M_DWARF, instrument="mauvesim")))["answer"]["numbers"]
-        payloads, _ = await talk.solved(link(**M_DWARF))
-        assert payloads == f"Chances with mauvesim: {' and '.join(one['shown'] for one in other)}."
-        usual, known = (await talk.answer(link(**M_DWARF, statistic="paper", unknown="ideal")))["answer"]["numbers"]
-        assert known["value"] is not None
-        assert usual["value"] is None
-        assert "cannot be marginalised" in usual["interval"]
-        # The throughput's uncertainty is that of the light of star, flare and sky together.
-        dim = await talk.chances(link(**M_DWARF | {"magnitude": f"{9 - 2.5 * np.log10(0.7):.9f}"}, sky="none"))
-        spread = (await talk.answer(link(**M_DWARF, sky="none")))["answer"]["numbers"][1]["interval"]
-        assert f"; {100 * dim[1]:.1f} % to " in spread
-
-    server.visited(work)
+    for more in ({}, {"statistic": "chi2_element"}, {"own_unknown": "200 1, 450 3"}):
+        shown = []
+        for unknown in UNKNOWN:
+            reported = (await talk.answer(link(**M_DWARF, **more, unknown=unknown)))["answer"]
+            shown.append([one["value"] for one in reported["numbers"]])
+            chosen = reported["numbers"][UNKNOWN.index(unknown)]
+            assert (reported["chosen"], reported["shown"]) == (unknown, chosen["shown"])
+            assert "payload mauve" in reported["words"]
+            if not more:
+                assert [one["shown"] for one in reported["numbers"]] == ["4.9 %", "97.5 %"]
+                assert {kind for _, kind in reported["notes"]} == {"info"}
+        assert shown[0] == shown[1]
+    notes = (await talk.answer(link(magnitude="-1")))["answer"]["notes"]
+    assert {text.partition(":")[0] for text, kind in notes if kind == "danger"} == {"SATURATED"}
+    other = (await talk.answer(link(**M_DWARF, instrument="mauvesim")))["answer"]["numbers"]
+    payloads, _ = await talk.solved(link(**M_DWARF))
+    assert payloads == f"Chances with mauvesim: {' and '.join(one['shown'] for one in other)}."
+    usual, known = (await talk.answer(link(**M_DWARF, statistic="paper", unknown="ideal")))["answer"]["numbers"]
+    assert known["value"] is not None
+    assert usual["value"] is None
+    assert "cannot be marginalised" in usual["interval"]
+    # The throughput's uncertainty is that of the light of star, flare and sky together.
+    dim = await talk.chances(link(**M_DWARF | {"magnitude": f"{9 - 2.5 * np.log10(0.7):.9f}"}, sky="none"))
+    spread = (await talk.answer(link(**M_DWARF, sky="none")))["answer"]["numbers"][1]["interval"]
+    assert f"; {100 * dim[1]:.1f} % to " in spread
 
 
 @pytest.mark.parametrize("of", ["amplitude", "magnitude", "exposure"])
-def test_limits_are_detected_with_the_wanted_probability(server: Server, of: str) -> None:
+async def test_limits_are_detected_with_the_wanted_probability(talk: Talk, of: str) -> None:
     """The limits of the sentence are inverted: their chances are 0.8 within the rounding of the sentence."""
     field = {"amplitude": "amplitude_percent", "magnitude": "magnitude", "exposure": "exposure_s"}[of]
-
-    async def work(talk: Talk) -> None:
-        _, told = await talk.solved(link(**M_DWARF, of=of, power="0.8"))
-        assert told.startswith("80 % of flares")
-        limits = re.findall(r"(?:of at least|to V =|in) ([\d.,]+)", told)
-        assert len(limits) == 2, told
-        for number, limit in enumerate(limits):
-            chances = await talk.chances(link(**M_DWARF | {field: limit.replace(",", "")}))
-            if of == "exposure":
-                # Whole frames have at least the power, and one frame fewer has less.
-                fewer = f"{float(limit.replace(',', '')) - 5:g}"
-                assert (await talk.chances(link(**M_DWARF | {field: fewer})))[number] < 0.8 <= chances[number]
-            else:
-                assert chances[number] == pytest.approx(0.8, abs=0.02)
-        if of == "magnitude":
-            _, told = await talk.solved(link(**M_DWARF | {"amplitude_percent": "0.0001"}, of=of))
-            assert "at no magnitude" in told
-        if of == "amplitude":
-            _, told = await talk.solved(link(**M_DWARF, statistic="chi2_element"))
-            assert told.startswith("90 % of flares of an amplitude that takes a simulation")
-
-    server.visited(work)
+    _, told = await talk.solved(link(**M_DWARF, of=of, power="0.8"))
+    assert told.startswith("80 % of flares")
+    limits = re.findall(r"(?:of at least|to V =|in) ([\d.,]+)", told)
+    assert len(limits) == 2, told
+    for number, limit in enumerate(limits):
+        chances = await talk.chances(link(**M_DWARF | {field: limit.replace(",", "")}))
+        if of == "exposure":
+            # Whole frames have at least the power, and one frame fewer has less.
+            fewer = f"{float(limit.replace(',', '')) - 5:g}"
+            assert (await talk.chances(link(**M_DWARF | {field: fewer})))[number] < 0.8 <= chances[number]
+        else:
+            assert chances[number] == pytest.approx(0.8, abs=0.02)
+    if of == "magnitude":
+        _, told = await talk.solved(link(**M_DWARF | {"amplitude_percent": "0.0001"}, of=of))
+        assert "at no magnitude" in told
+    if of == "amplitude":
+        _, told = await talk.solved(link(**M_DWARF, statistic="chi2_element"))
+        assert told.startswith("90 % of flares of an amplitude that takes a simulation")
 
 
 # Pictures
 
 
 @pytest.mark.long
-def test_pictures_state_what_the_answer_is(server: Server) -> None:
-    async def work(talk: Talk) -> None:
-        drawn = await talk.answer(link(unknown="ideal"))
-        # Squares of the excess per pixel add up to the square of the matched S/N.
-        found = np.sqrt(np.sum(column(drawn, "excess", "pixel", "y").astype(float) ** 2))
-        assert found == pytest.approx(float(dict(drawn["answer"]["facts"])["Expected with flare"]), rel=1e-3)
-        (half,) = re.findall(r"half of them at (\S+)\.$", drawn["pictures"]["roc"]["text"])
-        at_half = await talk.chances(link(fap=half, realisations="1000000 sampled"))
-        assert at_half[1] == pytest.approx(0.5, abs=0.02)
-        drawn = await talk.answer(link(magnitude="7.4", unknown="ideal"))
-        assert "half of them still below 1e-06" in drawn["pictures"]["roc"]["text"]
-        # Regions of two temperatures are those of normal errors of the logarithms.
-        asked = {"second_temperature_k": "30000", "flare_temperature_k": "9000", "magnitude": "6"}
-        drawn = await talk.answer(link(**asked, amplitude_percent="10"), "measure")
-        own = [column(drawn, "region", "own", name)[0] for name in "xy"]
-        assert own == [9000.0, pytest.approx(10.0)]
-        for name in ("known", "free"):
-            kelvin, low, high = (column(drawn, "region", name, axis) for axis in ("x", "low", "high"))
-            # In the middle of the curve the flare is the question's own; its fitted value is near the true one.
-            reach = np.sqrt(5.99) * column(drawn, "errors", name, "y")[4] / 100
-            np.testing.assert_allclose(np.log(kelvin[[0, -1]] / 9000), [-reach, reach], rtol=0.02)
-            assert low.min() * high.max() == pytest.approx(100.0, rel=3e-3)
-            assert low[80] < 10 < high[80]
-        drawn = await talk.answer(link(**asked, amplitude_percent="1"), "measure")
-        assert np.size(column(drawn, "region", "known", "x")) > 0
-        assert np.size(column(drawn, "region", "free", "x")) == 0, "no region has errors of 100 %"
-
-    server.visited(work)
+async def test_pictures_state_what_the_answer_is(talk: Talk) -> None:
+    drawn = await talk.answer(link(unknown="ideal"))
+    # Squares of the excess per pixel add up to the square of the matched S/N.
+    found = np.sqrt(np.sum(column(drawn, "excess", "pixel", "y").astype(float) ** 2))
+    assert found == pytest.approx(float(dict(drawn["answer"]["facts"])["Expected with flare"]), rel=1e-3)
+    (half,) = re.findall(r"half of them at (\S+)\.$", drawn["pictures"]["roc"]["text"])
+    at_half = await talk.chances(link(fap=half, realisations="1000000 sampled"))
+    assert at_half[1] == pytest.approx(0.5, abs=0.02)
+    drawn = await talk.answer(link(magnitude="7.4", unknown="ideal"))
+    assert "half of them still below 1e-06" in drawn["pictures"]["roc"]["text"]
+    # Regions of two temperatures are those of normal errors of the logarithms.
+    asked = {"second_temperature_k": "30000", "flare_temperature_k": "9000", "magnitude": "6"}
+    drawn = await talk.answer(link(**asked, amplitude_percent="10"), "measure")
+    own = [column(drawn, "region", "own", name)[0] for name in "xy"]
+    assert own == [9000.0, pytest.approx(10.0)]
+    for name in ("known", "free"):
+        kelvin, low, high = (column(drawn, "region", name, axis) for axis in ("x", "low", "high"))
+        # In the middle of the curve the flare is the question's own; its fitted value is near the true one.
+        reach = np.sqrt(5.99) * column(drawn, "errors", name, "y")[4] / 100
+        np.testing.assert_allclose(np.log(kelvin[[0, -1]] / 9000), [-reach, reach], rtol=0.02)
+        assert low.min() * high.max() == pytest.approx(100.0, rel=3e-3)
+        assert low[80] < 10 < high[80]
+    drawn = await talk.answer(link(**asked, amplitude_percent="1"), "measure")
+    assert np.size(column(drawn, "region", "known", "x")) > 0
+    assert np.size(column(drawn, "region", "free", "x")) == 0, "no region has errors of 100 %"
 
 
 STATISTICS = ("matched", "chi2", "chi2_element", "chi2_pair", "uv_excess", "paper")
 
 
 @pytest.mark.parametrize("statistic", long_but(STATISTICS, "matched"))
-def test_curve_and_map_show_the_closed_form(server: Server, statistic: str) -> None:
+async def test_curve_and_map_show_the_closed_form(talk: Talk, statistic: str) -> None:
     """Also between computed points: the curve within 1 %, the map within 0.06 mag; labels stand on contours."""
 
     # Sums of squares with unknowns take a simulation.
@@ -301,56 +265,49 @@ def test_curve_and_map_show_the_closed_form(server: Server, statistic: str) -> N
             unknown=unknown, statistic=statistic, amplitude_percent=f"{percent:.9g}", magnitude=f"{magnitude:.9g}"
         )
 
-    async def work(talk: Talk) -> None:
-        drawn = await talk.answer(asked(8.5, 5.0), "limit")
-        x, y = (column(drawn, "limit", "closed form", axis) for axis in "xy")
-        steep = np.nonzero((y > 0.02) & (y < 0.98))[0]
-        steep = steep[:: max(1, steep.size // 5)]
-        assert steep.size >= 3
-        for magnitude, chance in zip(x[steep], y[steep], strict=True):
-            assert chance == pytest.approx((await talk.chances(asked(float(magnitude), 5.0)))[number], abs=0.01)
-        image, percent = (column(drawn, "map", "map", name)[0] for name in ("image", "percent"))
-        across, compared = np.linspace(2.0, 14.0, image.shape[1]), 0
-        assert percent[:, 0] == pytest.approx(np.geomspace(0.1, 100.0, image.shape[0]))
-        for row in range(10, image.shape[0], 15):
-            # Where the chance is about a half.
-            at = int(np.argmin(np.abs(image[row] - 0.5)))
-            if 0.2 < image[row, at] < 0.8:
-                near = (asked(across[at] + shift, float(percent[row, 0])) for shift in (0.06, -0.06))
-                low, high = [(await talk.chances(one))[number] for one in near]
-                assert low - 0.01 < image[row, at] < high + 0.01
-                compared += 1
-        assert compared >= 2
-        labels = {name: column(drawn, "map", "labels", name) for name in ("text", "x", "y")}
-        assert list(labels["text"]) == ["10 %", "50 %", "90 %"]
-        grid = RegularGridInterpolator((np.linspace(-1, 2, image.shape[0]), across), image)
-        assert grid(np.column_stack([labels["y"], labels["x"]])) == pytest.approx([0.1, 0.5, 0.9], abs=0.03)
-        for name, wanted in (("half", (0.5,)), ("contours", (0.1, 0.9))):
-            for xs, ys in zip(*(column(drawn, "map", name, axis) for axis in ("xs", "ys")), strict=True):
-                level = grid(np.column_stack([ys, xs]))
-                assert min(np.abs(level - one).max() for one in wanted) < 0.03
-
-    server.visited(work)
+    drawn = await talk.answer(asked(8.5, 5.0), "limit")
+    x, y = (column(drawn, "limit", "closed form", axis) for axis in "xy")
+    steep = np.nonzero((y > 0.02) & (y < 0.98))[0]
+    steep = steep[:: max(1, steep.size // 5)]
+    assert steep.size >= 3
+    for magnitude, chance in zip(x[steep], y[steep], strict=True):
+        assert chance == pytest.approx((await talk.chances(asked(float(magnitude), 5.0)))[number], abs=0.01)
+    image, percent = (column(drawn, "map", "map", name)[0] for name in ("image", "percent"))
+    across, compared = np.linspace(2.0, 14.0, image.shape[1]), 0
+    assert percent[:, 0] == pytest.approx(np.geomspace(0.1, 100.0, image.shape[0]))
+    for row in range(10, image.shape[0], 15):
+        # Where the chance is about a half.
+        at = int(np.argmin(np.abs(image[row] - 0.5)))
+        if 0.2 < image[row, at] < 0.8:
+            near = (asked(across[at] + shift, float(percent[row, 0])) for shift in (0.06, -0.06))
+            low, high = [(await talk.chances(one))[number] for one in near]
+            assert low - 0.01 < image[row, at] < high + 0.01
+            compared += 1
+    assert compared >= 2
+    labels = {name: column(drawn, "map", "labels", name) for name in ("text", "x", "y")}
+    assert list(labels["text"]) == ["10 %", "50 %", "90 %"]
+    grid = RegularGridInterpolator((np.linspace(-1, 2, image.shape[0]), across), image)
+    assert grid(np.column_stack([labels["y"], labels["x"]])) == pytest.approx([0.1, 0.5, 0.9], abs=0.03)
+    for name, wanted in (("half", (0.5,)), ("contours", (0.1, 0.9))):
+        for xs, ys in zip(*(column(drawn, "map", name, axis) for axis in ("xs", "ys")), strict=True):
+            level = grid(np.column_stack([ys, xs]))
+            assert min(np.abs(level - one).max() for one in wanted) < 0.03
 
 
 @pytest.mark.parametrize("of", long_but(["amplitude", "magnitude"], "magnitude"))
-def test_picture_of_the_limit_has_simulated_points_of_its_own_axis_only(server: Server, of: str) -> None:
+async def test_picture_of_the_limit_has_simulated_points_of_its_own_axis_only(talk: Talk, of: str) -> None:
     asked = link(**M_DWARF, realisations="10000", fap="0.05", of=of)
-
-    async def work(talk: Talk) -> None:
-        assert re.fullmatch(r"Done: 300 of 300 steps, \d+ s\.", await talk.simulate("limit", asked))
-        drawn = await talk.answer(asked, "limit")
-        magnitudes = column(drawn, "limit", "simulated", "x")
-        assert bool(len(magnitudes)) == (of == "magnitude")
-        assert all(5 < magnitude < 14 for magnitude in magnitudes)
-        unit = r"of at least [\d.]+ % \[[\d.]+ % to [\d.]+ %\]" if of == "amplitude" else r"to V = [\d.]+ \["
-        told = drawn["pictures"]["limit"]["text"]
-        assert re.search(f"Simulated: 90 % are detected .*{unit}", told), told
-
-    server.visited(work)
+    assert re.fullmatch(r"Done: 300 of 300 steps, \d+ s\.", await talk.simulate("limit", asked))
+    drawn = await talk.answer(asked, "limit")
+    magnitudes = column(drawn, "limit", "simulated", "x")
+    assert bool(len(magnitudes)) == (of == "magnitude")
+    assert all(5 < magnitude < 14 for magnitude in magnitudes)
+    unit = r"of at least [\d.]+ % \[[\d.]+ % to [\d.]+ %\]" if of == "amplitude" else r"to V = [\d.]+ \["
+    told = drawn["pictures"]["limit"]["text"]
+    assert re.search(f"Simulated: 90 % are detected .*{unit}", told), told
 
 
-def test_every_picture_has_its_data(server: Server, words: dict[str, Any]) -> None:
+async def test_every_picture_has_its_data(talk: Talk, server: Server, words: dict[str, Any]) -> None:
     """A figure's sources and the data that come have the same names and columns, in both themes and on all axes."""
 
     def models(node: Any) -> list[dict[str, Any]]:
@@ -361,28 +318,25 @@ def test_every_picture_has_its_data(server: Server, words: dict[str, Any]) -> No
         own = [node] if node.get("type") == "object" else []
         return own + [one for each in node.values() for one in models(each)]
 
-    async def work(talk: Talk) -> None:
-        for tab, seen in words["tabs"].items():
-            drawn = (await talk.answer("", tab))["pictures"]
-            assert [one["name"] for one in seen["pictures"]] == list(drawn)
-            for one in seen["pictures"]:
-                data = drawn[one["name"]]
-                assert data["text"].endswith(".")
-                logs = "".join(one["logs"]).lower()
-                for theme, log in (("light", ""), ("dark", logs), ("light", logs)):
-                    status, text = await server.got(f"figures/{theme}/{one['name']}.json?log={log}")
-                    assert status == 200
-                    figure = json.loads(text)
-                    found = models(figure["item"]["doc"]["roots"])
-                    named = {model["attributes"].get("name"): model for model in found if "attributes" in model}
-                    for source, columns in data["sources"].items():
-                        entries = named[source]["attributes"]["data"]["entries"]
-                        assert {entry[0] for entry in entries} == columns.keys(), (one["name"], source)
-                    assert data["props"].keys() <= named.keys()
-                    # A map explains itself by its colour bar.
-                    assert figure["legend"] or any(model["name"] == "ColorBar" for model in found)
-
-    server.visited(work)
+    for tab, seen in words["tabs"].items():
+        drawn = (await talk.answer("", tab))["pictures"]
+        assert [one["name"] for one in seen["pictures"]] == list(drawn)
+        for one in seen["pictures"]:
+            data = drawn[one["name"]]
+            assert data["text"].endswith(".")
+            logs = "".join(one["logs"]).lower()
+            for theme, log in (("light", ""), ("dark", logs), ("light", logs)):
+                status, text = await server.got(f"figures/{theme}/{one['name']}.json?log={log}")
+                assert status == 200
+                figure = json.loads(text)
+                found = models(figure["item"]["doc"]["roots"])
+                named = {model["attributes"].get("name"): model for model in found if "attributes" in model}
+                for source, columns in data["sources"].items():
+                    entries = named[source]["attributes"]["data"]["entries"]
+                    assert {entry[0] for entry in entries} == columns.keys(), (one["name"], source)
+                assert data["props"].keys() <= named.keys()
+                # A map explains itself by its colour bar.
+                assert figure["legend"] or any(model["name"] == "ColorBar" for model in found)
 
 
 def test_last_of_several_questions_is_answered(server: Server) -> None:
@@ -397,3 +351,78 @@ def test_last_of_several_questions_is_answered(server: Server) -> None:
                 return answered
 
     assert server.visited(work) < 50, "others have become pointless"
+
+
+# The same questions on the command line, in Python and on the page have the same answers, to the digits
+
+
+#: Questions: star, magnitude, amplitude in per cent, exposure in s, and further fields of the page, flags and settings.
+MORE: dict[str, tuple[dict[str, str], list[str], list[str]]] = {
+    "": ({}, [], []),
+    "hot flare": ({"flare_temperature_k": "15000"}, ["--flare-temperature", "15000"], ["flare.temperature_k=15000"]),
+    "cold": ({"temperature_c": "10"}, ["--temperature", "10"], ["observation.temperature_c=10"]),
+    "paper": ({"instrument": "mauvesim"}, ["--instrument", "mauvesim"], ["observation.instrument=mauvesim"]),
+    "dark sky": ({"sky": "none"}, ["--sky", "none"], ["sky={none=true}"]),
+}
+DETECTIONS = [
+    ("M3V", "9", "2", "50", ""), ("M3V", "10.5", "24", "50", ""), ("G2V", "7.4", "0.76", "50", ""),
+    ("G2V", "8.5", "2", "300", ""), ("K5V", "8", "5", "5", ""), ("AU Mic", "8.81", "1", "60", ""),
+    ("M3V", "9", "2", "50", "hot flare"), ("M3V", "9", "2", "50", "cold"), ("M3V", "9", "2", "50", "paper"),
+    ("K3V", "9", "3", "50", "dark sky"),
+]  # fmt: skip
+FAP, N = "0.1", "2000"
+TARGETS, HOURS = ("eps Eri", "GJ 205", "YZ CMi", "AD Leo"), "100"
+
+
+def on_the_command_line(folder: Path, *words: str) -> dict[str, Any]:
+    return dict(json.loads(run(*words, "--no-pictures", "--json", folder=folder).stdout))
+
+
+async def test_chances_are_the_same_everywhere(talk: Talk, tmp_path: Path) -> None:
+    """Both chances of ten flares, which are twenty numbers, by the closed form that all three give.
+
+    The page says them before a simulation in the words of the command line.
+    """
+    for star, magnitude, percent, exposure, more in DETECTIONS:
+        fields, flags, settings = MORE[more]
+        entered = {"star": star, "magnitude": magnitude, "amplitude_percent": percent, "exposure_s": exposure}
+        said = (await talk.answer(link(**entered | {"fap": FAP} | fields)))["answer"]
+        page, sentence, shown = [one["value"] for one in said["numbers"]], said["headline"], said["shown"]
+        words = ["detect", "--star", star, "-m", magnitude, "-a", f"{percent}%", "-t", exposure, "-n", N, "--fap", FAP]
+        answer = on_the_command_line(tmp_path, *words, *flags)
+        (row,) = answer["rows"]
+        same = re.sub(r"(?<=a chance of ).* % \(.*; ", f"{shown} (", answer["headline"])
+        assert sentence == f"{same[:-1]}, by the estimate before a simulation.", "in the same words"
+        python = Study().with_settings([
+            f"star=[{{library='{star}', magnitude={magnitude}}}]", f"flare.amplitudes=[{float(percent) / 100}]",
+            f"observation.exposure_s={exposure}", f"run.realisations={N}", f"run.fap={FAP}", *settings,
+        ])  # fmt: skip
+        (ours,) = detect(python).table
+        for number, name in enumerate(("closed_form_probability", "ideal")):
+            assert row[name] == pytest.approx(page[number], rel=1e-9), (star, name)
+            assert row[name] == pytest.approx(ours[name], rel=1e-12), (star, name)
+        assert row["probability"] == ours["probability"]
+
+
+async def test_plans_are_the_same_everywhere(talk: Talk, tmp_path: Path) -> None:
+    """Headline, flares, their ideal number and the energy that half of them have, of four targets: twelve numbers."""
+    asked = link(targets="\n".join(TARGETS), hours=HOURS, start="2027-01-01", days="30")
+    assert (await talk.simulate("plan", asked)).startswith("Done")
+    headline = (await talk.answer(asked, "plan"))["answer"]["headline"]
+    command = (await talk.exported(f"{asked}&temperature_c=21", "plan"))["plan"]["command"]
+    assert "--temperature 21" in command, "what is entered is no default"
+    _, table = await talk.file(link=asked, tab="plan", name="plan", ending="ecsv")
+    page = QTable.read(io.BytesIO(table), format="ascii.ecsv")
+    (tmp_path / "targets.csv").write_text("\n".join(["name", *TARGETS]) + "\n")
+    words = ("plan", "targets.csv", "--hours", HOURS, "--start", "2027-01-01", "--days", "30")
+    answer = on_the_command_line(tmp_path, *words)
+    python = plan(Study().with_settings([
+        f"plan.targets=[{', '.join(f'{{name={name!r}}}' for name in TARGETS)}]", f"plan.hours={HOURS}",
+        "orbit.start=2027-01-01", "orbit.days=30",
+    ]))  # fmt: skip
+    assert answer["headline"] == headline, "in the same words"
+    assert "detector temperature along the orbit" in answer["assumed"]
+    for k, row in enumerate(answer["rows"]):
+        for name in ("expected", "ideal", "E50"):
+            numbers = [float(getattr(table[name], "value", table[name])[k]) for table in (page, python.table)]
+            assert [row[name]] * 2 == pytest.approx(numbers, rel=1e-9), (row["target"], name)

@@ -61,39 +61,33 @@ def study_in(file: str, content: bytes) -> str:
         return archive.read("study.toml").decode()
 
 
-def test_fields_are_shown_where_they_matter(server: Server) -> None:
-    assert {tab: {*seen["reads"]} for tab, seen in server.words()["tabs"].items()} == SHOWN
+def test_fields_are_shown_where_they_matter(words: dict[str, Any]) -> None:
+    assert {tab: {*seen["reads"]} for tab, seen in words["tabs"].items()} == SHOWN
 
 
-def test_every_field_is_a_key_of_the_study(server: Server) -> None:
+async def test_every_field_is_a_key_of_the_study(talk: Talk, words: dict[str, Any]) -> None:
     """In the downloaded study, in the printed command and in the printed program."""
-    words = server.words()
     uploads = {name for name, one in words["uploads"].items() for name in (name, *one["options"])}
     assert FIELDS.keys() == words["fields"].keys() - uploads - {"as_observed", "change_band"} | {"star", "own_unknown"}
-
-    async def work(talk: Talk) -> None:
-        for name, row in FIELDS.items():
-            tab = row.get("tab") or next(tab for tab in SHOWN if name in SHOWN[tab])
-            before = row.get("before", {})
-            seen = []
-            for entered in (before, before | {name: row["text"]}):
-                asked = link(**entered)
-                question, printed = next(iter((await talk.exported(asked, tab)).items()))
-                study = study_in(*await talk.file(link=asked, tab="", name=question, ending="study"))
-                given: dict[str, Any] = {}
-                exec(printed["python"].partition("answer =")[0], given)
-                found = (tomllib.loads(study), given["study"].model_dump(mode="json"))
-                seen.append([valued(one, row["key"]) == row["value"] for one in found])
-                seen[-1].append(f"{row['command']} " in f"{printed['command']} ")
-            assert seen == [[False] * 3, [True] * 3], (name, printed)
-
-    server.visited(work)
+    for name, row in FIELDS.items():
+        tab = row.get("tab") or next(tab for tab in SHOWN if name in SHOWN[tab])
+        before = row.get("before", {})
+        seen = []
+        for entered in (before, before | {name: row["text"]}):
+            asked = link(**entered)
+            question, printed = next(iter((await talk.exported(asked, tab)).items()))
+            study = study_in(*await talk.file(link=asked, tab="", name=question, ending="study"))
+            given: dict[str, Any] = {}
+            exec(printed["python"].partition("answer =")[0], given)
+            found = (tomllib.loads(study), given["study"].model_dump(mode="json"))
+            seen.append([valued(one, row["key"]) == row["value"] for one in found])
+            seen[-1].append(f"{row['command']} " in f"{printed['command']} ")
+        assert seen == [[False] * 3, [True] * 3], (name, printed)
 
 
 @pytest.mark.long
-def test_hidden_fields_change_nothing_and_others_do(server: Server) -> None:
+async def test_hidden_fields_change_nothing_and_others_do(talk: Talk, words: dict[str, Any]) -> None:
     """Hidden fields may even be wrong."""
-    words = server.words()
     known: dict[tuple[str, ...], Any] = {}
 
     async def once(ask: Callable[..., Any], asked: str, tab: str) -> Any:
@@ -102,22 +96,19 @@ def test_hidden_fields_change_nothing_and_others_do(server: Server) -> None:
             known[key] = await ask(asked, tab)
         return known[key]
 
-    async def work(talk: Talk) -> None:
-        for tab, shown in SHOWN.items():
-            wrong = {name: "x" for name in words["fields"] if name not in shown}
-            first, other = [await once(talk.answer, link(**entered), tab) for entered in ({}, wrong)]
-            assert {**first, "n": 0} == {**other, "n": 0, "known": first["known"]}, tab
-            for name in FIELDS.keys() & shown:
-                before = FIELDS[name].get("before", {})
-                asked = [link(**entered) for entered in (before, before | {name: FIELDS[name]["text"]})]
-                old, new = [await once(talk.exported, one, tab) for one in asked]
-                if old == new:
-                    old, new = [await once(talk.answer, one, tab) for one in asked]
-                    # Limits stand in a sentence of their own; the number of draws and their seed are the button's.
-                    above = words["tabs"][tab]["chance"] and name in ("of", "power", "realisations", "seed")
-                    assert above or {**old, "n": 0} != {**new, "n": 0}, f"{tab} shows {name}, which changes nothing"
-
-    server.visited(work)
+    for tab, shown in SHOWN.items():
+        wrong = {name: "x" for name in words["fields"] if name not in shown}
+        first, other = [await once(talk.answer, link(**entered), tab) for entered in ({}, wrong)]
+        assert {**first, "n": 0} == {**other, "n": 0, "known": first["known"]}, tab
+        for name in FIELDS.keys() & shown:
+            before = FIELDS[name].get("before", {})
+            asked = [link(**entered) for entered in (before, before | {name: FIELDS[name]["text"]})]
+            old, new = [await once(talk.exported, one, tab) for one in asked]
+            if old == new:
+                old, new = [await once(talk.answer, one, tab) for one in asked]
+                # Limits stand in a sentence of their own; the number of draws and their seed are the button's.
+                above = words["tabs"][tab]["chance"] and name in ("of", "power", "realisations", "seed")
+                assert above or {**old, "n": 0} != {**new, "n": 0}, f"{tab} shows {name}, which changes nothing"
 
 
 # Tables are those of the command line
@@ -168,13 +159,12 @@ def same_numbers(one: Table, other: Table, *names: str) -> None:
 
 
 @pytest.mark.long
-def test_downloads_equal_the_files_of_the_command_line(server: Server, tmp_path: Path) -> None:
+def test_downloads_equal_the_files_of_the_command_line(server: Server, words: dict[str, Any], tmp_path: Path) -> None:
     """With a study that is taken from the page, of an uploaded star and an uploaded unknown: all bytes."""
     entered = {"realisations": "10000", "fap": "0.05", "statistic": "chi2", "magnitude": "7", "targets": "eps Eri"}
     # A short campaign and few periods, whose numbers take seconds.
     entered |= {"days": "10", "shortest_d": "3", "longest_d": "5", "visits": "5"}
     asked = link(**entered, star="uploaded star", own_unknown="uploaded spectrum")
-    words = server.words()
 
     async def work(talk: Talk) -> dict[tuple[str, str], tuple[bytes, bytes, str]]:
         assert (await talk.upload(star_file()))["entered"] == "uploaded star"
@@ -219,24 +209,20 @@ def test_downloads_equal_the_files_of_the_command_line(server: Server, tmp_path:
 
 
 @pytest.mark.parametrize("unknown", long_but(["ideal", "realistic"], "ideal"))
-def test_one_simulation_gives_both_numbers(server: Server, unknown: str, tmp_path: Path) -> None:
+async def test_one_simulation_gives_both_numbers(talk: Talk, unknown: str, tmp_path: Path) -> None:
     """Compare all bits with `detect` with and without the usual unknowns, asked by the printed command and study."""
     entered = {"star": "M3V", "magnitude": "9", "realisations": "10000", "fap": "0.05"}
-
-    async def work(talk: Talk) -> None:
-        asked = link(**entered, unknown=unknown)
-        await talk.simulate("detection", asked)
-        numbers = (await talk.answer(asked))["answer"]["numbers"]
-        _, roc = await talk.file(link=asked, tab="detection", name="roc", ending="fits")
-        assert roc.startswith(b"SIMPLE")
-        for one in numbers:
-            printed = await talk.exported(link(**entered, unknown=one["unknown"]))
-            table = answered(tmp_path, printed["detection"]["command"])["detection"]
-            (row,) = (row for row in table if row["statistic"] == "matched")
-            assert one["value"] == row["probability"]
-            assert "of 10,000 simulated" in one["interval"]
-
-    server.visited(work)
+    asked = link(**entered, unknown=unknown)
+    await talk.simulate("detection", asked)
+    numbers = (await talk.answer(asked))["answer"]["numbers"]
+    _, roc = await talk.file(link=asked, tab="detection", name="roc", ending="fits")
+    assert roc.startswith(b"SIMPLE")
+    for one in numbers:
+        printed = await talk.exported(link(**entered, unknown=one["unknown"]))
+        table = answered(tmp_path, printed["detection"]["command"])["detection"]
+        (row,) = (row for row in table if row["statistic"] == "matched")
+        assert one["value"] == row["probability"]
+        assert "of 10,000 simulated" in one["interval"]
 
 
 @pytest.mark.long
@@ -297,30 +283,26 @@ async def taken(talk: Talk, asked: str, tab: str, folder: Path) -> str:
     return printed["command"]
 
 
-def test_own_star_and_unknown_are_in_the_study_that_the_command_names(server: Server, tmp_path: Path) -> None:
+async def test_own_star_and_unknown_are_in_the_study_that_the_command_names(talk: Talk, tmp_path: Path) -> None:
     """No flag holds a visitor's file: what observes it is asked by the study, next to which the file lies."""
-
-    async def work(talk: Talk) -> None:
-        await talk.upload(rows_of(np.arange(170, 1001), np.full(831, 1e-12)))
-        await talk.upload(b"# nm DN\n200 1\n450 3.5\n700 1\n", "own_unknown", "stray.txt")
-        asked = link(star="uploaded star", own_unknown="uploaded spectrum")
-        reported = (await talk.answer(asked))["answer"]
-        assert "your own star" in reported["words"]
-        assert any("ASSUMED" in text for text, _ in reported["notes"])
-        assert {kind for _, kind in reported["notes"]} == {"info"}, "red is what changes the answer"
-        for tab, shown in SHOWN.items():
-            for one in (await talk.exported(asked, tab)).values() if "star" in shown else ():
-                assert re.fullmatch(r"mauvecl \w+ study\.toml", one["command"])
-                assert "'file': 'star.ecsv'" in one["python"]
-        await taken(talk, asked, "detection", tmp_path)
-
-    server.visited(work)
+    await talk.upload(rows_of(np.arange(170, 1001), np.full(831, 1e-12)))
+    await talk.upload(b"# nm DN\n200 1\n450 3.5\n700 1\n", "own_unknown", "stray.txt")
+    asked = link(star="uploaded star", own_unknown="uploaded spectrum")
+    reported = (await talk.answer(asked))["answer"]
+    assert "your own star" in reported["words"]
+    assert any("ASSUMED" in text for text, _ in reported["notes"])
+    assert {kind for _, kind in reported["notes"]} == {"info"}, "red is what changes the answer"
+    for tab, shown in SHOWN.items():
+        for one in (await talk.exported(asked, tab)).values() if "star" in shown else ():
+            assert re.fullmatch(r"mauvecl \w+ study\.toml", one["command"])
+            assert "'file': 'star.ecsv'" in one["python"]
+    await taken(talk, asked, "detection", tmp_path)
     study = Study.read(tmp_path / "study.toml")
     assert study.star[0].file == tmp_path / "star.ecsv"
     assert study.nuisances.own["own"].points == ((200.0, 1.0), (450.0, 3.5), (700.0, 1.0))
 
 
-def test_observed_flare_without_its_star_answers_as_its_files(server: Server, tmp_path: Path) -> None:
+async def test_observed_flare_without_its_star_answers_as_its_files(talk: Talk, tmp_path: Path) -> None:
     """As bright as observed, in Angstrom: as the command line subtracts the star, and as the study of the page."""
     units = {"flare_wavelength_unit": "Angstrom", "flare_flux_unit": "erg s-1 cm-2 Angstrom-1"}
     entered = {"flare_file": FILE, "flare_quiescent": FILE, "continue_at_k": "9000", "amplitude_percent": "77"}
@@ -330,19 +312,15 @@ def test_observed_flare_without_its_star_answers_as_its_files(server: Server, tm
         flux = 1e-12 * np.ones(nm.size) + (1e-13 * (350 / nm) ** 2 if field == "flare_file" else 0.0)
         contents[field] = rows_of(10 * nm, flux)
         (tmp_path / f"{field}.txt").write_bytes(contents[field])
-
-    async def work(talk: Talk) -> tuple[str, str, list[float]]:
-        for field, content in contents.items():
-            await talk.upload(content, field, f"{field}.txt", asked)
-        words = (await talk.answer(asked))["answer"]["words"]
-        # Without the subtraction the flare is another one, and so it is with an amplitude.
-        observed = units | entered | {"as_observed": "yes"}
-        others = ({}, {"flare_quiescent": ""}, {"as_observed": "no"})
-        chances = [(await talk.chances(link(**observed | one)))[0] for one in others]
-        assert (await talk.exported(asked, "measure"))["measure"]["command"] == "mauvecl measure study.toml"
-        return await taken(talk, asked, "detection", tmp_path), words, chances
-
-    command, words, chances = server.visited(work)
+    for field, content in contents.items():
+        await talk.upload(content, field, f"{field}.txt", asked)
+    words = (await talk.answer(asked))["answer"]["words"]
+    # Without the subtraction the flare is another one, and so it is with an amplitude.
+    observed = units | entered | {"as_observed": "yes"}
+    others = ({}, {"flare_quiescent": ""}, {"as_observed": "no"})
+    chances = [(await talk.chances(link(**observed | one)))[0] for one in others]
+    assert (await talk.exported(asked, "measure"))["measure"]["command"] == "mauvecl measure study.toml"
+    command = await taken(talk, asked, "detection", tmp_path)
     amplitude = Study.read(tmp_path / "study.toml").flare.amplitudes[0]
     (told,) = re.findall(r"a ([\d.]+) % flare", words)
     assert float(told) == pytest.approx(100 * amplitude, rel=1e-4)
@@ -355,24 +333,21 @@ def test_observed_flare_without_its_star_answers_as_its_files(server: Server, tm
 
 
 @pytest.mark.long
-def test_own_added_spectrum_answers_as_its_file(server: Server, tmp_path: Path) -> None:
+async def test_own_added_spectrum_answers_as_its_file(talk: Talk, tmp_path: Path) -> None:
     """In Angstrom, for a band: as the command line reads it itself, and as the command that the page prints."""
     nm = np.linspace(170.0, 1000.0, 800)
     content = rows_of(10 * nm, np.exp(-(((nm - 300) / 80) ** 2)))
     (tmp_path / "own.txt").write_bytes(content)
     entered = {"change_file": FILE, "change_wavelength_unit": "Angstrom", "changes": "Mg II", "magnitude": "7"}
     asked = link(**entered, change_band="B")
-
-    async def work(talk: Talk) -> tuple[str, Table, Table]:
-        await talk.upload(content, "change_file", "own.txt", asked)
-        tables = []
-        for one in (asked, link(**entered)):
-            await talk.simulate("change", one)
-            _, table = await talk.file(link=one, tab="change", name="change", ending="ecsv")
-            tables.append(Table.read(table.decode(), format="ascii.ecsv"))
-        return await taken(talk, asked, "change", tmp_path), *tables
-
-    command, page, other = server.visited(work)
+    await talk.upload(content, "change_file", "own.txt", asked)
+    tables = []
+    for one in (asked, link(**entered)):
+        await talk.simulate("change", one)
+        _, table = await talk.file(link=one, tab="change", name="change", ending="ecsv")
+        tables.append(Table.read(table.decode(), format="ascii.ecsv"))
+    page, other = tables
+    command = await taken(talk, asked, "change", tmp_path)
     assert list(page["change"]) == ["Mg II", "spectrum"]
     assert "--change-file added.ecsv --change-band B" in command
     direct = "change --star G2V --magnitude 7 --temperature 21 --sky 22.1 --visits 20 --change 'Mg II' --change "
@@ -383,19 +358,16 @@ def test_own_added_spectrum_answers_as_its_file(server: Server, tmp_path: Path) 
     assert abs(other["smallest"][1] / page["smallest"][1] - 1) > 0.01
 
 
-def test_neighbours_of_the_page_are_those_of_the_command_line(server: Server, tmp_path: Path) -> None:
+async def test_neighbours_of_the_page_are_those_of_the_command_line(talk: Talk, tmp_path: Path) -> None:
     """A Gaia table whose first row is the star itself dilutes the page's chance as it does that of `detect`."""
     table = 'designation,ra,dec,phot_g_mean_mag,bp_rp\n"Gaia DR3 1",150.0,60.0,9,2.1\n"Gaia DR3 2",150.0,60.003,8,0.8\n'
     entered = {"star": "M3V", "magnitude": "9", "amplitude_percent": "1"}
     near = {"neighbours": table, "neighbours_of": "Gaia DR3 1"}
-
-    async def work(talk: Talk) -> tuple[list[float], str]:
-        asked = [link(**entered | more) for more in ({}, near, near | {"neighbour_share": "0"})]
-        # The ideal chance falls with the noise of the neighbour's light.
-        found = [(await talk.chances(one))[1] for one in asked]
-        return found, await taken(talk, link(**entered, **near, **FEW), "detection", tmp_path)
-
-    (alone, blended, none_of_it), command = server.visited(work)
+    asked = [link(**entered | more) for more in ({}, near, near | {"neighbour_share": "0"})]
+    # The ideal chance falls with the noise of the neighbour's light.
+    found = [(await talk.chances(one))[1] for one in asked]
+    alone, blended, none_of_it = found
+    command = await taken(talk, link(**entered, **near, **FEW), "detection", tmp_path)
     assert alone == none_of_it
     assert blended < alone - 0.004
     assert "--neighbours neighbours.csv --neighbours-of 'Gaia DR3 1'" in command
@@ -421,17 +393,14 @@ BOMBS: dict[str, Callable[[], bytes]] = {
 
 @pytest.mark.long
 @pytest.mark.parametrize("bomb", BOMBS)
-def test_decompression_bombs_are_refused_early(server: Server, bomb: str) -> None:
-    async def work(talk: Talk) -> None:
-        before, memory = server.spent(readers=True), server.memory()
-        reported = await talk.upload(BOMBS[bomb](), name="star.fits")
-        assert ", expected " in reported["lacks"]
-        assert "\n" not in reported["lacks"]
-        # Processor time is the same on a busy machine: 3 s with the start of Python.
-        assert server.spent(readers=True) - before < 10.0
-        assert server.memory() - memory < 100.0
-
-    server.visited(work)
+async def test_decompression_bombs_are_refused_early(talk: Talk, server: Server, bomb: str) -> None:
+    before, memory = server.spent(readers=True), server.memory()
+    reported = await talk.upload(BOMBS[bomb](), name="star.fits")
+    assert ", expected " in reported["lacks"]
+    assert "\n" not in reported["lacks"]
+    # Processor time is the same on a busy machine: 3 s with the start of Python.
+    assert server.spent(readers=True) - before < 10.0
+    assert server.memory() - memory < 100.0
 
 
 #: Uploads that are refused: field, content, words of the sentence.
@@ -448,46 +417,42 @@ UNUSABLE: list[tuple[str, bytes, str]] = [
 
 
 @pytest.mark.long
-def test_unusable_spectra_leave_no_answer(server: Server) -> None:
+async def test_unusable_spectra_leave_no_answer(talk: Talk) -> None:
     """Whatever was there before; a message on a file names the fields of this file, and what they advise works."""
     angstrom = rows_of(np.arange(1700.0, 10_001.0, 10), np.full(831, 1e-12))
-
-    async def work(talk: Talk) -> None:
-        asked = {"star": "uploaded star", "own_unknown": "uploaded spectrum"}
-        for field, content, reported in UNUSABLE:
-            good = star_file() if field == "star" else PAIRS
-            assert (await talk.upload(good, field))["entered"] == asked[field]
-            assert "answer" in await talk.answer(link(**{field: asked[field]}))
-            why = (await talk.upload(content, field, "my ![star](http://x/y.png).txt"))["lacks"]
-            assert reported in why
-            assert says_what_is_accepted(why)
-            faults = await talk.faults(link(**{field: asked[field]}))
-            assert "its file again" in faults[field], content
-            refused = await talk.ask("file", "refused", link=link(**{field: asked[field]}), tab="spectrum",
-                                     name="observation", ending="ecsv")  # fmt: skip
-            assert says_what_is_accepted(refused["refused"])
-        assert "entered" in await talk.upload(gzip.compress(star_file()), name="a.exe"), "its content shows what it is"
-        for field, option in (
-            ("star", "wavelength_unit"), ("flare_file", "flare_wavelength_unit"),
-            ("flare_quiescent", "flare_wavelength_unit"), ("change_file", "change_wavelength_unit"),
-        ):  # fmt: skip
-            told = await talk.upload(angstrom, field)
-            assert told["remedies"] == [[option, "Angstrom"]], told
-            assert "nit of wavelengths Angstrom" in told["lacks"]
-            assert "entered" in await talk.upload(angstrom, field, link=link(**{option: "Angstrom"}))
-        # One file as the flare and as the star without it: nothing is left, continued by a blackbody or not.
-        nm = np.arange(170.0, 1001.0)
-        units = {"flare_wavelength_unit": "nm", "flare_flux_unit": "erg s-1 cm-2 Angstrom-1"}
-        for continued in ("", "9000"):
-            same = link(flare_file=FILE, flare_quiescent=FILE, continue_at_k=continued, **units)
-            for field in ("flare_file", "flare_quiescent"):
-                await talk.upload(rows_of(nm, 1e-12 * (1 + 0.1 * np.sin(nm))), field, "same.txt", same)
-            for tab in ("detection", "measure"):
-                reported = await talk.answer(same, tab)
-                assert "answer" not in reported
-                assert "is no brighter than uploaded star without the flare" in reported["faults"]["flare_quiescent"]
-
-    server.visited(work)
+    asked = {"star": "uploaded star", "own_unknown": "uploaded spectrum"}
+    for field, content, reported in UNUSABLE:
+        good = star_file() if field == "star" else PAIRS
+        assert (await talk.upload(good, field))["entered"] == asked[field]
+        assert "answer" in await talk.answer(link(**{field: asked[field]}))
+        why = (await talk.upload(content, field, "my ![star](http://x/y.png).txt"))["lacks"]
+        assert reported in why
+        assert says_what_is_accepted(why)
+        faults = await talk.faults(link(**{field: asked[field]}))
+        assert "its file again" in faults[field], content
+        refused = await talk.ask("file", "refused", link=link(**{field: asked[field]}), tab="spectrum",
+                                 name="observation", ending="ecsv")  # fmt: skip
+        assert says_what_is_accepted(refused["refused"])
+    assert "entered" in await talk.upload(gzip.compress(star_file()), name="a.exe"), "its content shows what it is"
+    for field, option in (
+        ("star", "wavelength_unit"), ("flare_file", "flare_wavelength_unit"),
+        ("flare_quiescent", "flare_wavelength_unit"), ("change_file", "change_wavelength_unit"),
+    ):  # fmt: skip
+        told = await talk.upload(angstrom, field)
+        assert told["remedies"] == [[option, "Angstrom"]], told
+        assert "nit of wavelengths Angstrom" in told["lacks"]
+        assert "entered" in await talk.upload(angstrom, field, link=link(**{option: "Angstrom"}))
+    # One file as the flare and as the star without it: nothing is left, continued by a blackbody or not.
+    nm = np.arange(170.0, 1001.0)
+    units = {"flare_wavelength_unit": "nm", "flare_flux_unit": "erg s-1 cm-2 Angstrom-1"}
+    for continued in ("", "9000"):
+        same = link(flare_file=FILE, flare_quiescent=FILE, continue_at_k=continued, **units)
+        for field in ("flare_file", "flare_quiescent"):
+            await talk.upload(rows_of(nm, 1e-12 * (1 + 0.1 * np.sin(nm))), field, "same.txt", same)
+        for tab in ("detection", "measure"):
+            reported = await talk.answer(same, tab)
+            assert "answer" not in reported
+            assert "is no brighter than uploaded star without the flare" in reported["faults"]["flare_quiescent"]
 
 
 # Frames of the visitor's
@@ -513,31 +478,28 @@ async def given_frames(talk: Talk, frames: bytes, mapping: bytes | None, name: s
 
 
 @pytest.mark.long
-def test_uploaded_frames_are_analysed_as_on_the_command_line(server: Server, tmp_path: Path) -> None:
-    async def work(talk: Talk) -> tuple[str, dict[str, Table]]:
-        await given_frames(talk, light_curve(), MAPPING)
-        assert (await talk.simulate("analyse", link(**OWN))).startswith("Done")
-        drawn = await talk.answer(link(**OWN), "analyse")
-        assert "1 detected" in drawn["pictures"]["frames"]["text"]
-        assert "A light curve has no spectra." in drawn["pictures"]["dynamic"]["text"]
-        offered = [one.split()[1] for one in drawn["answer"]["files"] if one.startswith("analyse ")]
-        tables = {}
-        for name in offered:
-            ending = "" if name.endswith(".html") else "ecsv"
-            _, content = await talk.file(link=link(**OWN), tab="analyse", name=name, ending=ending)
-            assert b"mauvecl-page" not in content, "nothing names a folder of the server"
-            if ending:
-                tables[name] = Table.read(content.decode(), format="ascii.ecsv")
-            else:
-                assert b"<!doctype html>" in content
-        assert "measured" not in tables
-        told = await talk.ask("file", "refused", link=link(**OWN), tab="analyse", name="measured", ending="ecsv")
-        assert told["refused"]
-        detected = [row for row in drawn["rows"] if "detected" in row]
-        assert len(detected) == 1
-        return await taken(talk, link(**OWN), "analyse", tmp_path), tables
-
-    command, tables = server.visited(work)
+async def test_uploaded_frames_are_analysed_as_on_the_command_line(talk: Talk, server: Server, tmp_path: Path) -> None:
+    await given_frames(talk, light_curve(), MAPPING)
+    assert (await talk.simulate("analyse", link(**OWN))).startswith("Done")
+    drawn = await talk.answer(link(**OWN), "analyse")
+    assert "1 detected" in drawn["pictures"]["frames"]["text"]
+    assert "A light curve has no spectra." in drawn["pictures"]["dynamic"]["text"]
+    offered = [one.split()[1] for one in drawn["answer"]["files"] if one.startswith("analyse ")]
+    tables = {}
+    for name in offered:
+        ending = "" if name.endswith(".html") else "ecsv"
+        _, content = await talk.file(link=link(**OWN), tab="analyse", name=name, ending=ending)
+        assert b"mauvecl-page" not in content, "nothing names a folder of the server"
+        if ending:
+            tables[name] = Table.read(content.decode(), format="ascii.ecsv")
+        else:
+            assert b"<!doctype html>" in content
+    assert "measured" not in tables
+    told = await talk.ask("file", "refused", link=link(**OWN), tab="analyse", name="measured", ending="ecsv")
+    assert told["refused"]
+    detected = [row for row in drawn["rows"] if "detected" in row]
+    assert len(detected) == 1
+    command = await taken(talk, link(**OWN), "analyse", tmp_path)
     assert command.startswith("mauvecl analyse my_curve.csv ")
     assert "--mapping curve.toml" in command
     assert "--alarms-per day" in command
@@ -557,20 +519,16 @@ def test_uploaded_frames_are_analysed_as_on_the_command_line(server: Server, tmp
                     assert list(map(str, found[name][one])) == list(map(str, table[one])), (name, one)
 
 
-def test_quality_bits_are_chosen_as_on_the_command_line(server: Server) -> None:
+async def test_quality_bits_are_chosen_as_on_the_command_line(talk: Talk) -> None:
     """Three frames with the flags 1, 2 and 4; the same file is read again for other bits."""
-
-    async def work(talk: Talk) -> None:
-        await given_frames(talk, light_curve(flags=True), MAPPING + b'quality = "flag"\n')
-        for bits, left_out in (("", 3), ("none", 0), ("all", 3), ("4", 1), ("1,2", 2)):
-            asked = link(**OWN, quality_bits=bits)
-            assert len(column(await talk.answer(asked, "analyse"), "frames", "left out", "x")) == left_out
-            command = (await talk.exported(asked, "analyse"))["analyse"]["command"]
-            assert (f"--quality-bits {bits}" in command) == bool(bits)
-        told = await talk.answer(link(**OWN, quality_bits="NoSuchBit"), "analyse")
-        assert "NoSuchBit" in str(told["faults"]) + str(told.get("refused"))
-
-    server.visited(work)
+    await given_frames(talk, light_curve(flags=True), MAPPING + b'quality = "flag"\n')
+    for bits, left_out in (("", 3), ("none", 0), ("all", 3), ("4", 1), ("1,2", 2)):
+        asked = link(**OWN, quality_bits=bits)
+        assert len(column(await talk.answer(asked, "analyse"), "frames", "left out", "x")) == left_out
+        command = (await talk.exported(asked, "analyse"))["analyse"]["command"]
+        assert (f"--quality-bits {bits}" in command) == bool(bits)
+    told = await talk.answer(link(**OWN, quality_bits="NoSuchBit"), "analyse")
+    assert "NoSuchBit" in str(told["faults"]) + str(told.get("refused"))
 
 
 UNREADABLE: list[tuple[bytes, bytes | None, str]] = [
@@ -584,36 +542,29 @@ UNREADABLE: list[tuple[bytes, bytes | None, str]] = [
 
 
 @pytest.mark.parametrize("number", long_but(range(len(UNREADABLE)), 0))
-def test_unusable_frames_end_in_a_sentence(server: Server, number: int) -> None:
+async def test_unusable_frames_end_in_a_sentence(talk: Talk, number: int) -> None:
     frames, mapping, words = UNREADABLE[number]
-
-    async def work(talk: Talk) -> None:
-        await given_frames(talk, frames, mapping)
-        reported = await talk.answer(link(**OWN | {"mapping": FILE if mapping else ""}), "analyse")
-        assert reported["faults"].keys() == {"frames"}, reported
-        assert words in reported["faults"]["frames"]
-        assert "mauvecl-page" not in reported["faults"]["frames"]
-        assert "\n" not in reported["faults"]["frames"]
-        columns = (await talk.ask("columns", "columns"))["columns"]
-        named = [] if frames.startswith(b"\x89") else frames.partition(b"\n")[0].decode().split(",")
-        assert columns == named, "for menus"
-
-    server.visited(work)
+    await given_frames(talk, frames, mapping)
+    reported = await talk.answer(link(**OWN | {"mapping": FILE if mapping else ""}), "analyse")
+    assert reported["faults"].keys() == {"frames"}, reported
+    assert words in reported["faults"]["frames"]
+    assert "mauvecl-page" not in reported["faults"]["frames"]
+    assert "\n" not in reported["faults"]["frames"]
+    columns = (await talk.ask("columns", "columns"))["columns"]
+    named = [] if frames.startswith(b"\x89") else frames.partition(b"\n")[0].decode().split(",")
+    assert columns == named, "for menus"
 
 
-def test_names_of_files_are_plain(server: Server, tmp_path: Path) -> None:
-    async def work(talk: Talk) -> None:
-        for number, name in enumerate(("../../etc/passwd", "C:\\Users\\me\\passwd", "", "..", "a\nb;$(x) ü.csv", "-rf",
-                                       "x" * 300)):  # fmt: skip
-            await given_frames(talk, light_curve(), MAPPING, name)
-            folder = tmp_path / str(number)
-            await taken(talk, link(**OWN), "analyse", folder)
-            (kept,) = {path.name for path in folder.iterdir()} - {"study.toml", "curve.toml"}
-            assert re.fullmatch(r"[A-Za-z0-9_+][A-Za-z0-9._+-]{0,79}", kept)
-            assert (folder / kept).read_bytes() == light_curve()
-        assert "expected" in (await talk.upload(bytes(2**24 + 1), "frames", "large"))["lacks"]
-
-    server.visited(work)
+async def test_names_of_files_are_plain(talk: Talk, tmp_path: Path) -> None:
+    for number, name in enumerate(("../../etc/passwd", "C:\\Users\\me\\passwd", "", "..", "a\nb;$(x) ü.csv", "-rf",
+                                   "x" * 300)):  # fmt: skip
+        await given_frames(talk, light_curve(), MAPPING, name)
+        folder = tmp_path / str(number)
+        await taken(talk, link(**OWN), "analyse", folder)
+        (kept,) = {path.name for path in folder.iterdir()} - {"study.toml", "curve.toml"}
+        assert re.fullmatch(r"[A-Za-z0-9_+][A-Za-z0-9._+-]{0,79}", kept)
+        assert (folder / kept).read_bytes() == light_curve()
+    assert "expected" in (await talk.upload(bytes(2**24 + 1), "frames", "large"))["lacks"]
 
 
 # Standards of the visitor's
@@ -656,30 +607,25 @@ def zipped(contents: dict[str, bytes], packing: int = zipfile.ZIP_DEFLATED) -> b
 
 
 @pytest.mark.long
-def test_uploaded_standards_are_fitted_as_on_the_command_line(server: Server, tmp_path: Path) -> None:
+async def test_uploaded_standards_are_fitted_as_on_the_command_line(talk: Talk, tmp_path: Path) -> None:
     contents = standards()
-
-    async def work(talk: Talk) -> tuple[bytes, bytes]:
-        hidden = {"__MACOSX/._standards.toml": b"\x00", ".DS_Store": b"1", "nights/.DS_Store": b"2"}
-        before = await talk.answer("", "calibrate")
-        assert before["pictures"]["transfer"]["text"].startswith("Choose an archive")
-        await talk.upload(zipped(contents | hidden), "observations", "standards.zip")
-        assert (await talk.simulate("calibrate", STANDARDS)).startswith("Done")
-        drawn = await talk.answer(STANDARDS, "calibrate")
-        told = {name: one["text"] for name, one in drawn["pictures"].items()}
-        assert "b3v" in told["residuals"].lower()
-        assert "times the nominal one" in told["throughput"]
-        assert "DN per electron" in told["transfer"]
-        assert drawn["rows"][1][0] == "dark current"
-        printed = (await talk.exported(STANDARDS, "calibrate"))["calibrate"]
-        assert "mauvecl-page" not in printed["command"] + printed["python"]
-        _, table = await talk.file(link=STANDARDS, tab="calibrate", name="calibrate", ending="ecsv")
-        _, study = await talk.file(link=STANDARDS, tab="calibrate", name="calibrate", ending="study")
-        _, instrument = await talk.file(link=STANDARDS, tab="calibrate", name="instrument.zip", ending="")
-        assert "mauvecl-page" not in (extracted(study, tmp_path / "again") / "study.toml").read_text()
-        return table, instrument
-
-    table, instrument = server.visited(work)
+    hidden = {"__MACOSX/._standards.toml": b"\x00", ".DS_Store": b"1", "nights/.DS_Store": b"2"}
+    before = await talk.answer("", "calibrate")
+    assert before["pictures"]["transfer"]["text"].startswith("Choose an archive")
+    await talk.upload(zipped(contents | hidden), "observations", "standards.zip")
+    assert (await talk.simulate("calibrate", STANDARDS)).startswith("Done")
+    drawn = await talk.answer(STANDARDS, "calibrate")
+    told = {name: one["text"] for name, one in drawn["pictures"].items()}
+    assert "b3v" in told["residuals"].lower()
+    assert "times the nominal one" in told["throughput"]
+    assert "DN per electron" in told["transfer"]
+    assert drawn["rows"][1][0] == "dark current"
+    printed = (await talk.exported(STANDARDS, "calibrate"))["calibrate"]
+    assert "mauvecl-page" not in printed["command"] + printed["python"]
+    _, table = await talk.file(link=STANDARDS, tab="calibrate", name="calibrate", ending="ecsv")
+    _, study = await talk.file(link=STANDARDS, tab="calibrate", name="calibrate", ending="study")
+    _, instrument = await talk.file(link=STANDARDS, tab="calibrate", name="instrument.zip", ending="")
+    assert "mauvecl-page" not in (extracted(study, tmp_path / "again") / "study.toml").read_text()
     assert b"mauvecl-page" not in table
     here = tmp_path / "here"
     (here / "nights").mkdir(parents=True)
@@ -736,25 +682,21 @@ ARCHIVES = {
 }
 
 
-def test_missing_broken_and_unbounded_archives_are_refused(server: Server) -> None:
+async def test_missing_broken_and_unbounded_archives_are_refused(talk: Talk, server: Server) -> None:
     contents = standards()
-
-    async def work(talk: Talk) -> None:
-        for change, value in BROKEN:
-            chosen = {name: one for name, one in (contents | change).items() if one is not None}
-            told = await talk.upload(zipped(chosen), "observations", "standards.zip")
-            if "lacks" not in told:
-                # Frames and spectra are read with the answer.
-                reported = await talk.answer(STANDARDS, "calibrate")
-                assert reported["faults"].keys() == {"observations"}, value
-                told = {"lacks": reported["faults"]["observations"]}
-            assert value in told["lacks"], told
-            assert says_what_is_accepted(told["lacks"])
-        memory = server.memory()
-        for name, content in ARCHIVES.items():
-            told = await talk.upload(content, "observations", "standards.zip")
-            assert says_what_is_accepted(told["lacks"]), name
-            assert "its file again" in (await talk.faults(STANDARDS, "calibrate"))["observations"]
-        assert server.memory() - memory < 30.0
-
-    server.visited(work)
+    for change, value in BROKEN:
+        chosen = {name: one for name, one in (contents | change).items() if one is not None}
+        told = await talk.upload(zipped(chosen), "observations", "standards.zip")
+        if "lacks" not in told:
+            # Frames and spectra are read with the answer.
+            reported = await talk.answer(STANDARDS, "calibrate")
+            assert reported["faults"].keys() == {"observations"}, value
+            told = {"lacks": reported["faults"]["observations"]}
+        assert value in told["lacks"], told
+        assert says_what_is_accepted(told["lacks"])
+    memory = server.memory()
+    for name, content in ARCHIVES.items():
+        told = await talk.upload(content, "observations", "standards.zip")
+        assert says_what_is_accepted(told["lacks"]), name
+        assert "its file again" in (await talk.faults(STANDARDS, "calibrate"))["observations"]
+    assert server.memory() - memory < 30.0

@@ -43,22 +43,19 @@ def strict(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 # Who is let in
 
 
-def test_foreign_hosts_and_origins_are_refused(server: Server) -> None:
-    async def work(talk: Talk) -> None:
-        port = server.port
-        for foreign in ("evil.example", f"evil.example:{port}", f"127.0.0.1.evil.example:{port}", "127.0.0.1:1"):
-            assert (await server.got(Host=foreign))[0] == 403
-            assert (await server.got("assets/page.js", Host=foreign))[0] == 403
-        for origin in ("http://evil.example", "null", "https://127.0.0.1:1", f"http://localhost.evil:{port}"):
-            assert (await server.got(Origin=origin))[0] == 403
-            assert await server.refuses_talk(Origin=origin) == 403
-        assert await server.refuses_talk(Host=f"evil.example:{port}") == 403
-        assert await server.refuses_talk() == 403
-        assert (await server.got(Origin=f"http://localhost:{port}"))[0] == 200
-        assert (await server.got(Host=f"LOCALHOST:{port}"))[0] == 200
-        assert "answer" in await talk.answer()
-
-    server.visited(work)
+async def test_foreign_hosts_and_origins_are_refused(talk: Talk, server: Server) -> None:
+    port = server.port
+    for foreign in ("evil.example", f"evil.example:{port}", f"127.0.0.1.evil.example:{port}", "127.0.0.1:1"):
+        assert (await server.got(Host=foreign))[0] == 403
+        assert (await server.got("assets/page.js", Host=foreign))[0] == 403
+    for origin in ("http://evil.example", "null", "https://127.0.0.1:1", f"http://localhost.evil:{port}"):
+        assert (await server.got(Origin=origin))[0] == 403
+        assert await server.refuses_talk(Origin=origin) == 403
+    assert await server.refuses_talk(Host=f"evil.example:{port}") == 403
+    assert await server.refuses_talk() == 403
+    assert (await server.got(Origin=f"http://localhost:{port}"))[0] == 200
+    assert (await server.got(Host=f"LOCALHOST:{port}"))[0] == 200
+    assert "answer" in await talk.answer()
 
 
 @pytest.mark.long
@@ -80,26 +77,23 @@ def test_ipv6_and_allowed_origins_are_served(tmp_path: Path) -> None:
     served.quiet()
 
 
-def test_number_of_visitors_is_limited(server: Server) -> None:
-    async def work(talk: Talk) -> None:
-        # Those who have just left may still be counted.
-        here: list[Talk] = []
-        while (reported := await server.got())[0] == 200 and len(here) < 110:
-            here.append(await server.talk())
-        assert 90 < len(here) <= 99
-        assert reported == (503, "Too many visitors are here at the moment; please come again in some minutes.\n")
-        assert await server.refuses_talk(Origin=f"http://{server.host}") == 503
-        assert (await server.got("favicon.svg"))[0] == 200
-        assert "answer" in await talk.answer(), "who is in stays in"
-        for one in here:
-            one.end()
-        for _ in range(100):
-            if (await server.got())[0] == 200:
-                return
-            await asyncio.sleep(0.1)
-        raise AssertionError("full for ever")
-
-    server.visited(work)
+async def test_number_of_visitors_is_limited(talk: Talk, server: Server) -> None:
+    # Those who have just left may still be counted.
+    here: list[Talk] = []
+    while (reported := await server.got())[0] == 200 and len(here) < 110:
+        here.append(await server.talk())
+    assert 90 < len(here) <= 99
+    assert reported == (503, "Too many visitors are here at the moment; please come again in some minutes.\n")
+    assert await server.refuses_talk(Origin=f"http://{server.host}") == 503
+    assert (await server.got("favicon.svg"))[0] == 200
+    assert "answer" in await talk.answer(), "who is in stays in"
+    for one in here:
+        one.end()
+    for _ in range(100):
+        if (await server.got())[0] == 200:
+            return
+        await asyncio.sleep(0.1)
+    raise AssertionError("full for ever")
 
 
 @pytest.mark.long
@@ -210,37 +204,33 @@ def test_invalid_messages_give_no_traceback_and_no_path(strict: Server) -> None:
     assert all(len(line) < 1500 for line in lines)
 
 
-def test_first_load_is_small_and_compressed(server: Server) -> None:
+async def test_first_load_is_small_and_compressed(talk: Talk, server: Server, words: dict[str, Any]) -> None:
     """2.5 MB is the most that the issue allows; nothing for formulas is among it."""
-    _, html = server.fetched()
-    for name in server.words()["fields"]:
+    _, html = await server.got()
+    for name in words["fields"]:
         assert html.count(f'id="f-{name}"') == 1, name
     waiting = ["", *re.findall(r'(?:src|href)="((?:assets|favicon)[^"]+)"', html)]
     waiting += [f"figures/light/{name}.json" for name in ("excess", "distributions", "roc")]
-
-    async def work(talk: Talk) -> float:
-        total, seen = 0, set[str]()
-        while waiting:
-            part = waiting.pop()
-            if part.partition("?")[0] in seen:
-                continue
-            seen.add(part.partition("?")[0])
-            assert "mathjax" not in part
-            request = HTTPRequest(server.address + part, headers={"Accept-Encoding": "gzip"}, decompress_response=False)
-            answer = await AsyncHTTPClient().fetch(request)
-            assert answer.headers["Content-Encoding"] == "gzip", part
-            assert "default-src 'self'" in answer.headers["Content-Security-Policy"]
-            total += len(answer.body)
-            if ".js" in part and "bokeh" not in part:
-                _, text = await server.got(part)
-                waiting.extend(f"assets/{name}" for name in re.findall(r'from "\./([\w.-]+\.js)', text))
-            request.headers["If-None-Match"] = answer.headers["Etag"]
-            with pytest.raises(HTTPClientError, match="304"):
-                await AsyncHTTPClient().fetch(request)
-        assert len(seen) > 20, "scripts import others"
-        return total / 1e6
-
-    assert server.visited(work) < 0.6
+    total, seen = 0, set[str]()
+    while waiting:
+        part = waiting.pop()
+        if part.partition("?")[0] in seen:
+            continue
+        seen.add(part.partition("?")[0])
+        assert "mathjax" not in part
+        request = HTTPRequest(server.address + part, headers={"Accept-Encoding": "gzip"}, decompress_response=False)
+        answer = await AsyncHTTPClient().fetch(request)
+        assert answer.headers["Content-Encoding"] == "gzip", part
+        assert "default-src 'self'" in answer.headers["Content-Security-Policy"]
+        total += len(answer.body)
+        if ".js" in part and "bokeh" not in part:
+            _, text = await server.got(part)
+            waiting.extend(f"assets/{name}" for name in re.findall(r'from "\./([\w.-]+\.js)', text))
+        request.headers["If-None-Match"] = answer.headers["Etag"]
+        with pytest.raises(HTTPClientError, match="304"):
+            await AsyncHTTPClient().fetch(request)
+    assert len(seen) > 20, "scripts import others"
+    assert total / 1e6 < 0.6
 
 
 # What is computed, and for whom
@@ -251,66 +241,58 @@ KINDS = ("detection", "map", "limit", "measure", "change", "periods", "completen
 
 @pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
-def test_cancel_ends_every_computation(server: Server, kind: str) -> None:
+async def test_cancel_ends_every_computation(talk: Talk, server: Server, kind: str) -> None:
     """Cancel each computation once it has started, and compute the next one; progress never falls."""
     bands = ",".join(f"{start}-{start + 150}" for start in range(210, 450, 12))
     many = link(realisations="4000000", targets="eps Eri", visits="100", changes=bands)
-
-    async def work(talk: Talk) -> tuple[float, float]:
-        await talk.answer(many)
-        n = await talk.say("simulate", kind=kind, link=many)
-        shares, left = [0.0], []
-        # The first reports suffice: some computations last a second on a fast machine.
-        while "waiting" in (reported := await talk.next()).get("message", "waiting") or len(shares) < 2:
-            assert "ended" not in reported, reported
-            shares.append(reported.get("progress") or 0.0)
-            left += re.findall(r"about (\d+) s left", reported.get("message", ""))
-        assert shares == sorted(shares)
-        assert [int(one) for one in left] == sorted(map(int, left), reverse=True), "never more"
-        refused = await talk.ask("simulate", "ended", kind=kind, link=many)
-        assert "a simulation is running already" in refused["refused"]
-        used = server.spent()
-        await talk.say("cancel")
-        while (reported := await talk.next()).get("n") != n or "ended" not in reported:
-            pass
-        assert reported["ended"] == "Cancelled."
-        spent = server.spent() - used
-        await asyncio.sleep(0.5)
-        idle = server.spent() - used - spent
-        small = link(realisations="10000", fap="0.05")
-        assert (await talk.simulate("detection", small)).startswith("Done")
-        return spent, idle
-
-    spent, idle = server.visited(work)
+    await talk.answer(many)
+    n = await talk.say("simulate", kind=kind, link=many)
+    shares, left = [0.0], []
+    # The first reports suffice: some computations last a second on a fast machine.
+    while "waiting" in (reported := await talk.next()).get("message", "waiting") or len(shares) < 2:
+        assert "ended" not in reported, reported
+        shares.append(reported.get("progress") or 0.0)
+        left += re.findall(r"about (\d+) s left", reported.get("message", ""))
+    assert shares == sorted(shares)
+    assert [int(one) for one in left] == sorted(map(int, left), reverse=True), "never more"
+    refused = await talk.ask("simulate", "ended", kind=kind, link=many)
+    assert "a simulation is running already" in refused["refused"]
+    used = server.spent()
+    await talk.say("cancel")
+    while (reported := await talk.next()).get("n") != n or "ended" not in reported:
+        pass
+    assert reported["ended"] == "Cancelled."
+    spent = server.spent() - used
+    await asyncio.sleep(0.5)
+    idle = server.spent() - used - spent
+    small = link(realisations="10000", fap="0.05")
+    assert (await talk.simulate("detection", small)).startswith("Done")
     # Processor time, for others may be at work; a tile may be under way on both processors.
     assert spent < (2.0 if kind in ("completeness", "visible") else 8.0)
     assert idle < 0.25, "nothing goes on behind it"
 
 
 @pytest.mark.long
-def test_answers_continue_while_others_compute_upload_and_leave(server: Server) -> None:
-    async def work(talk: Talk) -> None:
-        other = await server.talk()
-        coming = asyncio.create_task(talk.upload(b"# %ECSV 1.0\n# ---\n# meta: " + b"[" * 200_000 + b"\n"))
-        assert "answer" in await other.answer("?magnitude=8")
-        assert not coming.done(), "the event loop does not wait for the reader"
-        assert "expected" in (await coming)["lacks"]
-        many = link(realisations="4000000")
-        await talk.say("simulate", kind="detection", link=many)
-        while "progress" not in await talk.next():
-            pass
-        assert "answer" in await other.answer("?magnitude=8.2")
-        talk.end()
-        for _ in range(60):
-            used = server.spent()
-            await asyncio.sleep(0.5)
-            if server.spent() - used < 0.1:
-                break
-        else:
-            raise AssertionError("a simulation of a visitor who has left goes on")
-        other.end()
-
-    server.visited(work)
+async def test_answers_continue_while_others_compute_upload_and_leave(talk: Talk, server: Server) -> None:
+    other = await server.talk()
+    coming = asyncio.create_task(talk.upload(b"# %ECSV 1.0\n# ---\n# meta: " + b"[" * 200_000 + b"\n"))
+    assert "answer" in await other.answer("?magnitude=8")
+    assert not coming.done(), "the event loop does not wait for the reader"
+    assert "expected" in (await coming)["lacks"]
+    many = link(realisations="4000000")
+    await talk.say("simulate", kind="detection", link=many)
+    while "progress" not in await talk.next():
+        pass
+    assert "answer" in await other.answer("?magnitude=8.2")
+    talk.end()
+    for _ in range(60):
+        used = server.spent()
+        await asyncio.sleep(0.5)
+        if server.spent() - used < 0.1:
+            break
+    else:
+        raise AssertionError("a simulation of a visitor who has left goes on")
+    other.end()
 
 
 @pytest.mark.long
@@ -355,16 +337,12 @@ def test_memory_of_uploads_and_answers_is_bounded(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_plan_of_a_hidden_target_says_so(server: Server) -> None:
+async def test_plan_of_a_hidden_target_says_so(talk: Talk) -> None:
     """Proxima Centauri lies outside the declinations that are observed; its plan has no energies to draw."""
     asked = link(targets="Proxima Cen")
-
-    async def work(talk: Talk) -> None:
-        await talk.simulate("plan", asked)
-        told = (await talk.answer(asked, "plan"))["pictures"]["expected"]["text"]
-        assert "Proxima Cen is never seen" in told
-
-    server.visited(work)
+    await talk.simulate("plan", asked)
+    told = (await talk.answer(asked, "plan"))["pictures"]["expected"]["text"]
+    assert "Proxima Cen is never seen" in told
 
 
 @pytest.mark.long
