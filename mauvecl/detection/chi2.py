@@ -32,11 +32,7 @@ class Chi2(QuadraticStatistic):
     kernel_sum: ClassVar[str | None] = "chi2"
 
     def dof(self, setting: Setting) -> int:
-        return int(setting.used.sum()) - self._free(setting)
-
-    @staticmethod
-    def _free(setting: Setting) -> int:
-        return setting.nuisances.free if setting.nuisances else 0
+        return int(setting.used.sum()) - setting.n_free
 
     def form(self, setting: Setting, seen: Differences, flare: Expectation | None = None) -> QuadraticForm:
         true, scatter = seen.variance * setting.used, seen.scatter
@@ -164,7 +160,7 @@ class Chi2Element(Chi2):
     by_element: ClassVar[bool] = True
 
     def dof(self, setting: Setting) -> int:
-        return int(np.unique(setting.quiet.element[setting.used]).size) - self._free(setting)
+        return int(np.unique(setting.quiet.element[setting.used]).size) - setting.n_free
 
     def tilt(self, setting: Setting, flare: Expectation | None = None) -> Tilt:
         element = setting.quiet.element
@@ -281,11 +277,7 @@ class Smoothing:
     def bands(self, n_padded: int, chunk: int) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
         """Return the weights of unfinished centres per chunk of pixels, and the number of centres each chunk finishes.
 
-        Returns
-        -------
-        weights : ndarray of float32, shape (n_chunk, n_slot, chunk)
-            Slot 0 belongs to the first unfinished centre.
-        finished : ndarray of uint32, shape (n_chunk,)
+        The shapes are (n_chunk, n_slot, chunk) and (n_chunk,). Slot 0 belongs to the first unfinished centre.
         """
         n_centre, n_pixel = self.rows.shape
         weighs = self.rows != 0
