@@ -122,20 +122,10 @@ def departures(detection: Detection, fap: float) -> list[Departure]:
             if digital is not None:
                 rounding = _shifted_fap(detection, statistic, template, *digital[0], cut) / fap - 1.0
                 clipping = _shifted_fap(detection, statistic, template, *digital[1], cut) / fap - 1.0 - rounding
-            rows.append(
-                Departure(
-                    statistic,
-                    template,
-                    cut,
-                    fap,
-                    detection.false_alarm_probability(cut, statistic, template=template),
-                    _skewed_fap(detection, statistic, template, null, cut) / fap - 1.0,
-                    rounding,
-                    clipping,
-                    tuple(others),
-                    detection.realisations,
-                )
-            )
+            simulated = detection.false_alarm_probability(cut, statistic, template=template)
+            skew = _skewed_fap(detection, statistic, template, null, cut) / fap - 1.0
+            effects = skew, rounding, clipping, tuple(others)
+            rows.append(Departure(statistic, template, cut, fap, simulated, *effects, detection.realisations))
     return rows
 
 
