@@ -452,18 +452,15 @@ class CriticalAmplitudes:
             _combined(self.directions @ self.photons, _multiple(own, NOISE_STEP) @ filters[lit]),
         )
 
-    def best(
-        self, site: InjectionSite, drawn: FrameNoise, amplitudes: Float
-    ) -> tuple[Float, NDArray[np.int64], NDArray[np.int64]]:
-        """Return the largest value of all templates, its temperature and its template, (n_amplitude, n_draw) each."""
+    def best(self, site: InjectionSite, drawn: FrameNoise, amplitudes: Float) -> tuple[Float, NDArray[np.int64]]:
+        """Return the largest value of all templates and its template, shape (n_amplitude, n_draw) each."""
         a, b, c = self.values(site, drawn)
         values = np.array([a + x * b + np.sqrt(x) * c for x in amplitudes.astype(np.float32)])
         values[:, ~site.counts[:, None].repeat(a.shape[1], axis=1)] = -np.inf
         flat = np.moveaxis(values, 2, 1).reshape(len(amplitudes), a.shape[1], -1)
         which = flat.argmax(axis=2)
         largest = np.take_along_axis(flat, which[:, :, None], axis=2)[:, :, 0]
-        temperature, template = np.divmod(which, a.shape[2])
-        return largest.astype(np.float64), temperature, template
+        return largest.astype(np.float64), which % a.shape[2]
 
     def sums(self, site: InjectionSite, drawn: FrameNoise, amplitudes: Float) -> Single:
         """Return frames with the flare less their known mean, shape (n_amplitude, n_draw, n_frame, n_sum)."""
@@ -494,7 +491,7 @@ class CriticalAmplitudes:
         for d, (site, row) in enumerate(zip(self.sites, refit.amplitudes, strict=True)):
             if not len(site.filters):
                 continue
-            value, _, template = (each[:, 0] for each in self.best(site, drawn, row))
+            value, template = (each[:, 0] for each in self.best(site, drawn, row))
             alarm = value >= self.threshold
             if not alarm.any():
                 continue
