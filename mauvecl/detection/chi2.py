@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
+from scipy.linalg import orth, solve_triangular
 
 from mauvecl.detection.distributions import QuadraticForm
 from mauvecl.detection.statistics import Differences, QuadraticStatistic, Setting, Tilt
@@ -141,8 +141,7 @@ def _span(vectors: Float, ratio: Float) -> tuple[list[tuple[NDArray[np.intp], Fl
     order = np.argsort(group, kind="stable")
     groups, rest = [], []
     for members in np.split(order, np.flatnonzero(np.diff(group[order])) + 1):
-        basis, sizes, _ = np.linalg.svd(vectors[:, members].T, full_matrices=False)
-        basis = basis[:, sizes > 1e-13 * sizes[0]] if sizes[0] > 0 else basis[:, :0]
+        basis = orth(vectors[:, members].T, rcond=1e-13)
         groups.append((members, basis))
         left = members.size - basis.shape[1]
         total = float(ratio[members].sum() - ratio[members] @ np.sum(basis**2, axis=1))

@@ -342,11 +342,6 @@ class _Data:
         return scipy.interpolate.CubicSpline(self.model.log_k, added)
 
     @cached_property
-    def _middle(self) -> Float:
-        """Middle of each frame, s."""
-        return np.asarray(self.edges.mean(axis=1))
-
-    @cached_property
     def strengths(self) -> Callable[[Float], Pair]:
         """Function of the parameters that returns the amplitude and log temperature of each frame."""
         return remembering(self._strengths)
@@ -363,7 +358,7 @@ class _Data:
 
     def _cooled(self, theta: Float) -> tuple[Float, Float, float]:
         """Return temperatures over that at the peak, as in `Cooling`, times since the peak, and the end."""
-        since = np.maximum(self._middle - theta[0], 0.0)
+        since = np.maximum(self.edges.mean(axis=1) - theta[0], 0.0)
         end = min(float(np.exp(theta[4])), 1.0)
         return end + (1.0 - end) * np.exp(-since / np.exp(theta[5])), since, end
 

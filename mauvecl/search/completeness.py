@@ -217,8 +217,7 @@ def _gains(shape: Shape, window_s: float, frame_s: float) -> tuple[Float, Float]
     for i, half in enumerate(widths):
         tau = (edges[None, :] - peaks[:, None]) / half
         frames = consecutive_integrals(shape, tau) * half / frame_s
-        rest = frames - (frames @ line.T) @ line
-        gain[i] = np.linalg.norm(rest, axis=1)
+        gain[i] = np.linalg.norm(frames - (frames @ line.T) @ line, axis=1)
     gain = np.maximum(gain, 1e-12)
     for shared in (widths, gain):
         shared.setflags(write=False)

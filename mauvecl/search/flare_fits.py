@@ -245,10 +245,7 @@ class SummedStare:
         data = np.einsum("tij,tj->ti", whiten, (self.net[span] - others)[used[span]])
         terms = self._level(used, max(last - first for first, last in windows))
         columns = np.einsum("tij,tp->tijp", whiten, terms).reshape(data.size, -1)
-        basis = np.zeros((data.size, 0))
-        if columns.shape[1]:
-            left, size, _ = np.linalg.svd(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), False)
-            basis = left[:, size > 1e-9 * size[0]]
+        basis = scipy.linalg.orth(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), rcond=1e-9)
         flat = data.ravel()
         return Block(self, used, whiten, basis, flat - basis @ (basis.T @ flat))
 

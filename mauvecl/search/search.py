@@ -244,8 +244,7 @@ class Search:
         """Orthonormal columns that span all baselines of the stare, (n_frame, n)."""
         time = (self._at - self._at.mean()) / max(self.n_grid, 1)
         columns = np.array([time**power * self._series[series][self._at] for power, series in self._terms])
-        span, size, _ = np.linalg.svd(columns.T, full_matrices=False)
-        return np.asarray(span[:, size > 1e-12 * size[0]])
+        return np.asarray(scipy.linalg.orth(columns.T, rcond=1e-12))
 
     def _correlated(self, spectrum: NDArray[Any], kernel: Float, first: int) -> NDArray[Any]:
         """Return sum_t data(t) kernel(t - first - onset) at every frame, in the precision of the spectrum."""
