@@ -584,7 +584,8 @@ class Reduction(MeanSums):
         unknown = nuisances.around(added) if nuisances else None
         rows = unknown.rows(variance, unknown.spectra * used) if unknown else np.zeros((0, variance.size))
         spanning = np.vstack([model.hot[::EVERY], model.fixed]) * used
-        weights, _ = spanning_weights(spanning, variance, nuisances, rows, LEAST)
+        inverse = np.divide(1.0, variance, out=np.zeros_like(variance), where=used)
+        weights, _ = spanning_weights(spanning, spanning * inverse, nuisances, rows, LEAST)
         hot, fixed = model.hot @ weights.T, model.fixed @ weights.T
         light = light_factor(model, unknown, rows)
         return cls(hot, fixed, model.log_k, variance, weights, rows, free, light=light)
@@ -609,15 +610,14 @@ class Reduction(MeanSums):
 
 
 def spanning_weights(
-    spectra: Float, variance: Float, nuisances: Nuisances | None, rows: Float | None, least: float
+    spectra: Float, plain: Float, nuisances: Nuisances | None, rows: Float | None, least: float
 ) -> tuple[Float, Float]:
     """Return weights of sums with unit covariance that span the optimal filters of spectra, and the S/N of each.
 
-    The sums, of shape (n_sum, n_pixel), have ascending eigenvalues above `least` of the largest. Spectra and variance
-    are zero in pixels that are not used, and `rows` are those of `Nuisances.rows`. Raises InputError if the light of a
-    flare cannot be distinguished from the nuisances.
+    The sums, of shape (n_sum, n_pixel), have ascending eigenvalues above `least` of the largest. Spectra are zero in
+    pixels that are not used, `plain` are the same over the variances, and `rows` are those of `Nuisances.rows`. Raises
+    InputError if the light of a flare cannot be distinguished from the nuisances.
     """
-    plain = spectra * np.divide(1.0, variance, out=np.zeros_like(variance), where=variance > 0)
     optimal = plain if rows is None else plain - (spectra @ rows.T) @ rows
     gram = optimal @ spectra.T
     kept, whole = np.diag(gram), np.einsum("tp,tp->t", plain, spectra)

@@ -195,7 +195,8 @@ class Templates:
         with the flux; other arguments are those of `of`.
         """
         rows = nuisances.rows(variance, nuisances.spectra * (variance > 0)) if nuisances else None
-        weights, length = spanning_weights(flares, variance, nuisances, rows, MIN_SINGULAR**2)
+        plain = np.divide(flares, variance, out=np.zeros_like(flares), where=variance > 0)
+        weights, length = spanning_weights(flares, plain, nuisances, rows, MIN_SINGULAR**2)
         weights = weights[::-1][:rank]
         # Signs are arbitrary; choose them so that the hottest flare increases each sum.
         weights *= np.where(weights @ flares[-1] < 0, -1.0, 1.0)[:, None]
