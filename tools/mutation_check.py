@@ -68,7 +68,7 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "unknowns fitted with the wrong sign": (
         "test_light_of_unknowns_is_separated_from_a_flare",
-        ("(scaled / scale)[:-1] @ self.spectra", "-(scaled / scale)[:-1] @ self.spectra"),
+        ("amplitudes[:-1] @ self.spectra", "-amplitudes[:-1] @ self.spectra"),
     ),
     # Draws, statistics, stores and runs.
     "one unknown's row dropped": (
@@ -291,10 +291,7 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "intervals clipped at a standard deviation": (
         "test_intervals_agree_with_minos_and_emcee",
-        (
-            "sign * np.sqrt(np.maximum(room, 0.0) * spread[rows])",
-            "sign * np.sqrt(np.minimum(np.maximum(room, 0.0), 1.0) * spread[rows])",
-        ),
+        ("left = np.maximum(left, 0.0)", "left = np.clip(left, 0.0, 1.0)"),
     ),
     "intervals beyond their bounds": (
         "test_bounded_intervals_agree_with_brute_force",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
+from scipy.linalg import orth, solve_triangular
 
 from mauvecl.detection.distributions import QuadraticForm
 from mauvecl.detection.statistics import Differences, QuadraticStatistic, Setting, Tilt
@@ -32,11 +32,7 @@ class Chi2(QuadraticStatistic):
     kernel_sum: ClassVar[str | None] = "chi2"
 
     def dof(self, setting: Setting) -> int:
-        return int(setting.used.sum()) - self._free(setting)
-
-    @staticmethod
-    def _free(setting: Setting) -> int:
-        return setting.nuisances.free if setting.nuisances else 0
+        return int(setting.used.sum()) - setting.n_free
 
     def form(self, setting: Setting, seen: Differences, flare: Expectation | None = None) -> QuadraticForm:
         true, scatter = seen.variance * setting.used, seen.scatter
@@ -145,8 +141,7 @@ def _span(vectors: Float, ratio: Float) -> tuple[list[tuple[NDArray[np.intp], Fl
     order = np.argsort(group, kind="stable")
     groups, rest = [], []
     for members in np.split(order, np.flatnonzero(np.diff(group[order])) + 1):
-        basis, sizes, _ = np.linalg.svd(vectors[:, members].T, full_matrices=False)
-        basis = basis[:, sizes > 1e-13 * sizes[0]] if sizes[0] > 0 else basis[:, :0]
+        basis = orth(vectors[:, members].T, rcond=1e-13)
         groups.append((members, basis))
         left = members.size - basis.shape[1]
         total = float(ratio[members].sum() - ratio[members] @ np.sum(basis**2, axis=1))
@@ -164,7 +159,7 @@ class Chi2Element(Chi2):
     by_element: ClassVar[bool] = True
 
     def dof(self, setting: Setting) -> int:
-        return int(np.unique(setting.quiet.element[setting.used]).size) - self._free(setting)
+        return int(np.unique(setting.quiet.element[setting.used]).size) - setting.n_free
 
     def tilt(self, setting: Setting, flare: Expectation | None = None) -> Tilt:
         element = setting.quiet.element
@@ -281,11 +276,7 @@ class Smoothing:
     def bands(self, n_padded: int, chunk: int) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
         """Return the weights of unfinished centres per chunk of pixels, and the number of centres each chunk finishes.
 
-        Returns
-        -------
-        weights : ndarray of float32, shape (n_chunk, n_slot, chunk)
-            Slot 0 belongs to the first unfinished centre.
-        finished : ndarray of uint32, shape (n_chunk,)
+        The shapes are (n_chunk, n_slot, chunk) and (n_chunk,). Slot 0 belongs to the first unfinished centre.
         """
         n_centre, n_pixel = self.rows.shape
         weighs = self.rows != 0

@@ -328,11 +328,10 @@ class Distribution:
         variance = (self.second * self.n - self.first**2) / self.n**2
         return self.step * float(np.sqrt(variance))
 
-    def edge(self, index: int | NDArray[np.intp]) -> float | NDArray[np.float64]:
-        """Return the lower edge of a fine bin."""
-        steps = (np.asarray(index) - layout.BINS // 2) * 2.0**layout.FINE_BITS - 0.5
-        edges: NDArray[np.float64] = self.centre + self.step * steps
-        return edges if np.ndim(index) else float(edges)
+    def edge(self, index: NDArray[np.intp]) -> NDArray[np.float64]:
+        """Return the lower edges of fine bins."""
+        steps = (index - layout.BINS // 2) * 2.0**layout.FINE_BITS - 0.5
+        return np.asarray(self.centre + self.step * steps)
 
     # Computed when needed: a detection of hundreds of flares has thousands of distributions.
     @property
@@ -340,14 +339,10 @@ class Distribution:
         """Lower edges, upper edges and counts of all filled bins, ascending; each shape (m,)."""
         self.refuse_undefined()
         filled, counts = self.filled, self.filled_counts
-        lower, upper = np.asarray(self.edge(filled)), np.asarray(self.edge(filled + 1))
+        lower, upper = self.edge(filled), self.edge(filled + 1)
         if not self.far.n:
             return lower, upper, counts
-        ends = (
-            (float(self.edge(FIRST_BIN)), float(self.edge(LAST_BIN + 1)))
-            if math.isfinite(self.step)
-            else (math.inf,) * 2
-        )
+        ends = self.edge(np.array([FIRST_BIN, LAST_BIN + 1])) if math.isfinite(self.step) else np.full(2, np.inf)
         far_lower, far_upper = self.far.edges(*ends)
         place = int(np.count_nonzero(~is_above(self.far.keys)))
         return (
@@ -411,7 +406,7 @@ class Distribution:
         else:
             low, high = int(self.filled[0]), int(self.filled[-1]) + 1
             group = -(-(high - low) // bins)
-            edges = np.asarray(self.edge(np.arange(low, high + group, group)))
+            edges = self.edge(np.arange(low, high + group, group))
         above = [self.above(edge) for edge in edges]
         return edges, -np.diff(np.rint(above)).astype(np.int64)
 

@@ -43,6 +43,8 @@ Float = NDArray[np.float64]
 
 #: Differences above this many standard errors are significant.
 SIGNIFICANT = 4.0
+#: Value that is undefined, since a flare saturates every pixel or no threshold has a false-alarm probability.
+UNDEFINED = Interval(np.nan, np.nan, np.nan)
 
 
 @dataclass(frozen=True)
@@ -120,20 +122,10 @@ def departures(detection: Detection, fap: float) -> list[Departure]:
             if digital is not None:
                 rounding = _shifted_fap(detection, statistic, template, *digital[0], cut) / fap - 1.0
                 clipping = _shifted_fap(detection, statistic, template, *digital[1], cut) / fap - 1.0 - rounding
-            rows.append(
-                Departure(
-                    statistic,
-                    template,
-                    cut,
-                    fap,
-                    detection.false_alarm_probability(cut, statistic, template=template),
-                    _skewed_fap(detection, statistic, template, null, cut) / fap - 1.0,
-                    rounding,
-                    clipping,
-                    tuple(others),
-                    detection.realisations,
-                )
-            )
+            simulated = detection.false_alarm_probability(cut, statistic, template=template)
+            skew = _skewed_fap(detection, statistic, template, null, cut) / fap - 1.0
+            effects = skew, rounding, clipping, tuple(others)
+            rows.append(Departure(statistic, template, cut, fap, simulated, *effects, detection.realisations))
     return rows
 
 
@@ -369,7 +361,7 @@ class Detection(Drawable, ContentEquality, Hypotheses):
     realisations: int
     tails: Tails = "counted"
     seed: int = 0
-    _tails: dict[tuple[str, int, float], Tail] = field(default_factory=dict, init=False, repr=False, compare=False)
+    _tails: dict[tuple[*Key, float], Tail] = field(default_factory=dict, init=False, repr=False, compare=False)
     _distributions: dict[Key, Distribution] = field(default_factory=dict, init=False, repr=False)
     _samples: dict[Key, TailSamples] = field(default_factory=dict, init=False, repr=False)
 
@@ -467,7 +459,7 @@ class Detection(Drawable, ContentEquality, Hypotheses):
         check_fap(fap, self.realisations, self.tails)
         if countable(fap, self.realisations):
             return None
-        key = (statistic, self._null(statistic, template), fap)
+        key = (*self._null_key(statistic, template), fap)
         if key not in self._tails:
             self._tails[key] = tail(self, fap, statistic, template=template, seed=self.seed)
         return self._tails[key]
@@ -478,7 +470,9 @@ class Detection(Drawable, ContentEquality, Hypotheses):
         The fraction is exact at edges of bins, such as counted thresholds, and interpolated linearly within a bin.
         """
         null = self.distribution(statistic, template=template)
-        return self._share_above(null, Interval(threshold, threshold, threshold))
+        above, n = null.above(threshold), null.n
+        low, high = clopper_pearson(int(np.floor(above)), n).low, clopper_pearson(int(np.ceil(above)), n).high
+        return Interval(above / n, low, high)
 
     def detection_probability(self, fap: float = 1e-3, statistic: str = "chi2") -> list[Interval]:
         """Return the fraction of realisations at or above the threshold for each flare.
@@ -488,13 +482,9 @@ class Detection(Drawable, ContentEquality, Hypotheses):
         """
         probabilities = []
         for flare in range(len(self.flares)):
-            if flare in self.blinding:
-                probabilities.append(Interval(np.nan, np.nan, np.nan))
-                continue
-            try:
-                cut = self.threshold(fap, statistic, template=flare)
-            except NoThresholdError:
-                probabilities.append(Interval(np.nan, np.nan, np.nan))
+            cut = UNDEFINED if flare in self.blinding else self._threshold_if_any(fap, statistic, flare)
+            if cut is UNDEFINED:
+                probabilities.append(UNDEFINED)
                 continue
             counted = self._at((statistic, "flare_on_null_grid", flare))
             above = [counted.above(value) for value in (cut.value, cut.high, cut.low)]
@@ -516,15 +506,12 @@ class Detection(Drawable, ContentEquality, Hypotheses):
                     sentences.append(Message(f"NO THRESHOLD: {error}.", "no threshold"))
         return tuple(dict.fromkeys(sentences))
 
-    @staticmethod
-    def _share_above(distribution: Distribution, cut: Interval) -> Interval:
-        """Return the fraction at or above a threshold, with an interval that includes the threshold's."""
-        value, low, high = (distribution.above(x) for x in (cut.value, cut.high, cut.low))
-        return Interval(
-            value / distribution.n,
-            clopper_pearson(int(np.floor(low)), distribution.n).low,
-            clopper_pearson(int(np.ceil(high)), distribution.n).high,
-        )
+    def _threshold_if_any(self, fap: float, statistic: str, template: int) -> Interval:
+        """Return `threshold`, or `UNDEFINED` if no threshold has the false-alarm probability."""
+        try:
+            return self.threshold(fap, statistic, template=template)
+        except NoThresholdError:
+            return UNDEFINED
 
     def quantile(
         self, probability: float, statistic: str = "chi2", flare: int | None = None, *, template: int = 0
@@ -575,10 +562,10 @@ class Detection(Drawable, ContentEquality, Hypotheses):
     def _row(self, fap: float, statistic: str, flare: int, probability: Interval) -> dict[str, Any]:
         """Return the row of one flare and statistic, as `COLUMNS` have it."""
         d, dof = self.distribution(statistic, flare), self.dof(statistic)
-        try:
-            cut = self.threshold(fap, statistic, template=flare)
-        except NoThresholdError:
-            cut = Interval(np.nan, np.nan, np.nan)
+        cut, fap_error = self._threshold_if_any(fap, statistic, flare), np.nan
+        if cut is not UNDEFINED:
+            tail = self.tail(fap, statistic, template=flare)
+            fap_error = np.sqrt((1 - fap) / (fap * self.realisations)) if tail is None else tail.relative_error
         theory = self.closed_form(statistic, flare)
         limit = self.closed_form(statistic, template=flare).isf(fap)
         # A weighted sum has no reduced value.
@@ -598,23 +585,11 @@ class Detection(Drawable, ContentEquality, Hypotheses):
             "low": probability.low,
             "high": probability.high,
             "closed_form_threshold": limit,
-            "fap_error": self._fap_error(fap, statistic, flare),
+            "fap_error": float(fap_error),
         }
 
-    def _fap_error(self, fap: float, statistic: str, template: int) -> float:
-        """Return the relative standard error of the false-alarm probability at a threshold, NaN where there is none."""
-        try:
-            self.threshold(fap, statistic, template=template)
-        except NoThresholdError:
-            return float("nan")
-        tail = self.tail(fap, statistic, template=template)
-        return float(np.sqrt((1 - fap) / (fap * self.realisations))) if tail is None else tail.relative_error
-
     def _null_key(self, statistic: str, template: int) -> Key:
-        return statistic, "null", self._null(statistic, template)
-
-    def _null(self, statistic: str, template: int) -> int:
-        return template if self.statistic(statistic).shaped else 0
+        return statistic, "null", template if self.statistic(statistic).shaped else 0
 
 
 def _detected(probability: float, threshold: float) -> str:

@@ -375,12 +375,8 @@ class QuadraticForm:
     def _near(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Frequencies, and modulus and phase of the characteristic function, for values near the mean."""
         spacing = 2.0 * np.pi / ((40.0 + NEAR) * self.std)
-        weight, count, pull = self.weight, np.ones(self.weight.size), self.shift**2 * self.weight
-        first = np.flatnonzero(np.append(True, weight[1:] != weight[:-1]))
-        if first.size < weight.size / 2:
-            # Most weights of marginalised statistics are equal, and stand together.
-            count = np.diff(first, append=weight.size).astype(np.float64)
-            weight, pull = weight[first], np.add.reduceat(pull, first)
+        weight, count = self._squares.unit * self._squares.weight, self._squares.count
+        pull = weight * self._squares.push
         parts = []
         k = 0.5 + np.arange(256)
         while True:

@@ -124,19 +124,12 @@ class Nuisances(ContentEquality):
                     key="own",
                 )
             spectra.append(spectrum)
-        shape = len(spectra), quiet.wavelength_nm.size
-        return cls(
-            tuple(sd),
-            np.array(spectra).reshape(shape),
-            np.array(list(sd.values()), np.float64),
-            np.array(of_flare).reshape(shape),
-        )
+        rows, light = (np.reshape(each, (len(sd), quiet.wavelength_nm.size)) for each in (spectra, of_flare))
+        return cls(tuple(sd), rows, np.array(list(sd.values()), np.float64), light)
 
     def _line(self) -> str:
-        return ", ".join(
-            f"{name} +-{sd:g}" if np.isfinite(sd) else f"{name} free"
-            for name, sd in zip(self.names, self.sd, strict=True)
-        )
+        priors = zip(self.names, self.sd, strict=True)
+        return ", ".join(f"{name} +-{sd:g}" if np.isfinite(sd) else f"{name} free" for name, sd in priors)
 
     def __bool__(self) -> bool:
         return bool(self.names)
@@ -223,12 +216,10 @@ class Nuisances(ContentEquality):
         """
         for key, values in (("counts", counts), ("variance", variance), ("flare_dn", flare_dn)):
             self._check_pixels(key, values)
-        spectra = np.vstack([self.spectra, flare_dn])
         # The amplitude of the flare has a flat prior.
-        information = (spectra / variance) @ spectra.T + np.diag([*self.sd**-2.0, 0.0])
-        scale = np.sqrt(np.diag(information))
-        scaled, *_ = np.linalg.lstsq(information / np.outer(scale, scale), (spectra / variance) @ counts / scale)
-        return np.asarray((scaled / scale)[:-1] @ self.spectra)
+        sd = np.append(self.sd, np.inf)
+        amplitudes = fitted_amplitudes(np.vstack([self.spectra, flare_dn]), sd, counts, variance)
+        return np.asarray(amplitudes[:-1] @ self.spectra)
 
     def finite(self, spectra: Float) -> Float:
         """Return the spectra with finite priors times their standard deviations, shape (k_finite, n)."""
@@ -253,6 +244,15 @@ class Nuisances(ContentEquality):
                 key="nuisances",
             )
         return np.asarray(np.linalg.solve(np.linalg.cholesky(information), spectra * inverse))
+
+
+def fitted_amplitudes(rows: Float, sd: Float, values: Float, variance: Float) -> Float:
+    """Return the most likely amplitudes, (k,), of known rows, (k, n), in values, with normal priors of mean zero."""
+    information = (rows / variance) @ rows.T + np.diag(sd**-2.0)
+    # Scaled, because amplitudes have different units.
+    scale = np.sqrt(np.diag(information))
+    scaled, *_ = np.linalg.lstsq(information / np.outer(scale, scale), (rows / variance) @ values / scale)
+    return np.asarray(scaled / scale)
 
 
 def spectrum_of(name: str, quiet: Expectation) -> Float:

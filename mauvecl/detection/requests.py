@@ -125,17 +125,12 @@ class Hypotheses:
     def weights(self, statistic: str, template: int = 0) -> NDArray[np.float64] | None:
         """Return the weights per DN of a linear statistic, shape (n_pixel,); None for others.
 
-        Parameters
-        ----------
-        template : int
-            Index of the flare that shaped statistics use as template.
+        Shaped statistics use the flare with the index `template`.
         """
         kind = self.statistic(statistic)
-        return (
-            kind.weights_per_dn(self.setting, self.shape(statistic, template))
-            if isinstance(kind, LinearStatistic)
-            else None
-        )
+        if not isinstance(kind, LinearStatistic):
+            return None
+        return kind.weights_per_dn(self.setting, self.shape(statistic, template))
 
     @cached_property
     def blinding(self) -> tuple[int, ...]:
@@ -288,9 +283,8 @@ def _rows(hypotheses: Hypotheses, asked: Sequence[Statistic], batch: Sequence[in
             for flare in shapes if statistic.shaped else [0]:
                 looked_for = hypotheses.shape(statistic.name, flare)
                 if isinstance(statistic, LinearStatistic):
-                    weighted.add(
-                        statistic.name, scenario, flare, statistic.weights_per_dn(hypotheses.setting, looked_for)
-                    )
+                    weights = statistic.weights_per_dn(hypotheses.setting, looked_for)
+                    weighted.add(statistic.name, scenario, flare, weights)
                 elif isinstance(statistic, QuadraticStatistic) and statistic.kernel_sum is not None:
                     for number, own in enumerate(statistic.subtracted_rows(hypotheses.setting)):
                         weighted.add(statistic.name, scenario, number, own)

@@ -205,12 +205,8 @@ class SnrResult(Drawable, ContentEquality):
     def element(self) -> QTable:
         """S/N per resolution element of 10.5 nm, with the columns of `pixel` except clipped frames."""
         x = self.expectation
-        step = np.divide(
-            1.0,
-            self.elements["bins_per_unit"],
-            out=np.zeros(len(self.elements)),
-            where=self.elements["bins_per_unit"] > 0,
-        )
+        per_unit = self.elements["bins_per_unit"]
+        step = np.divide(1.0, per_unit, out=np.zeros(len(per_unit)), where=per_unit > 0)
 
         def snr(which: NDArray[np.intp], place: NDArray[np.number]) -> NDArray[np.float64]:
             return np.asarray(self.elements["centre"][which] + step[which] * (place - 0.5))
@@ -234,10 +230,8 @@ class SnrResult(Drawable, ContentEquality):
     ) -> dict[str, NDArray[np.float64]]:
         """Return the columns of pixels or elements by name; `snr` converts fractional bin numbers to ratios."""
         counts = self.counts.pixel if kind == "pixel" else self.counts.element
-        numbers, every = (
-            np.arange(layout.OBSERVER_BINS + 1) - layout.OBSERVER_BINS // 2,
-            np.arange(len(counts))[:, None],
-        )
+        numbers = np.arange(layout.OBSERVER_BINS + 1) - layout.OBSERVER_BINS // 2
+        every = np.arange(len(counts))[:, None]
         centres, edges = snr(every, numbers[:-1] + 0.5), snr(every, numbers)
         share = counts / self.counts.n
         mean = np.sum(share * centres, axis=1)
@@ -337,10 +331,8 @@ class SnrSums:
     def add(self, part: int, shard: Arrays) -> None:
         """Add a shard."""
         counts = self._counts
-        pixel, element = (
-            _unpack_array("pixel", shard, counts.pixel.shape),
-            _unpack_array("element", shard, counts.element.shape),
-        )
+        pixel = _unpack_array("pixel", shard, counts.pixel.shape)
+        element = _unpack_array("element", shard, counts.element.shape)
         counts.add(pixel, element, shard["clipped"], int(shard["n"]))
         for name, far in counts.far.items():
             far.add(*_unpack_counts(f"far-{name}", shard))

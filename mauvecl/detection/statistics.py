@@ -35,14 +35,18 @@ class Setting:
     comparison: Comparison = NOISE_FREE  # the subtracted reference and the choice of variances
     flares: Sequence[Expectation] = ()  # possible templates
     nuisances: Nuisances | None = None  # parameters that statistics marginalise over
-    drawn: FactorDistributions | None = (
-        None  # random factors over which closed forms of marginalised statistics integrate
-    )
+    # Random factors over which closed forms of marginalised statistics integrate.
+    drawn: FactorDistributions | None = None
     _cache: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __getstate__(self) -> dict[str, Any]:
         # Keys of the cache hold identities of objects, which are valid in this process only.
         return vars(self) | {"_cache": {}}
+
+    @property
+    def n_free(self) -> int:
+        """Number of projected-out parameters."""
+        return self.nuisances.free if self.nuisances else 0
 
     @property
     def integrates(self) -> bool:

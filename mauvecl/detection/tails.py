@@ -236,11 +236,12 @@ def tail(hypotheses: Hypotheses, fap: float, statistic: str, *, template: int = 
         raise InputError.of("fap", fap, f"{SMALLEST_FAP:g} to 0.1 for importance sampling")
     _check(hypotheses)
     how = _Tilt.for_alarms(fap, hypotheses, statistic, template)
-    values, logs = np.empty(0), np.empty(0)
+    blocks: list[tuple[Float, Float]] = []
     goal = FIRST_REALISATIONS
     while True:
-        more = _tilted(hypotheses, statistic, template, how, seed, values.size, goal)
-        values, logs = (np.concatenate(pair) for pair in zip((values, logs), more, strict=True))
+        for number in range(len(blocks), goal // BLOCK):
+            blocks.append(_block(hypotheses, statistic, template, how, seed, number))
+        values, logs = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
         cut, low, high, error = _threshold(values, logs, fap)
         beyond, at = _probabilities_at(values, logs, cut)
         check_atom(f"{statistic} of {hypotheses.quiet.name}", fap, beyond, at)
@@ -380,18 +381,10 @@ def _stretch(square: Float, goal: float) -> Float:
     return np.asarray(1.0 / np.sqrt(1.0 - x * square / most))
 
 
-def _tilted(
-    hypotheses: Hypotheses, statistic: str, template: int, tilt: _Tilt, seed: int, start: int, stop: int
-) -> tuple[Float, Float]:
-    """Return the values of tilted draws `start` to `stop - 1`, whole blocks, and the logarithms of their weights."""
-    parts = [_block(hypotheses, statistic, template, tilt, seed, b) for b in range(start // BLOCK, stop // BLOCK)]
-    values, logs = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return values, logs
-
-
 def _block(
     hypotheses: Hypotheses, statistic: str, template: int, tilt: _Tilt, seed: int, block: int
 ) -> tuple[Float, Float]:
+    """Return the values of a block of tilted draws, and the logarithms of their weights."""
     scene = hypotheses.scene
     kind = hypotheses.statistic(statistic)
     exposures = 1 if kind.paired else scene.comparison.exposures

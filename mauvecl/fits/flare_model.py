@@ -160,37 +160,31 @@ class FlareModel:
                     "bands_nm", (low, high), f"ascending wavelengths within {GRID_NM[0]:g}-{GRID_NM[-1]:g}"
                 )
         kelvin = np.geomspace(*TEMPERATURES_K, NODES)
-        edge = BalmerFlare().nodes_nm
-        ends = np.ravel(bands_nm)
-        grid = np.unique(np.concatenate([GRID_NM, edge, ends, *(line.nodes_nm for line in chosen)]))
+        nodes = [BalmerFlare().nodes_nm, np.ravel(bands_nm), *(line.nodes_nm for line in chosen)]
+        grid = np.unique(np.concatenate([GRID_NM, *nodes]))
         bodies = np.array([blackbody(grid, float(k)) for k in kelvin])
-        nm = star.wavelength_nm
-        light = photons(nm, star.flux_flam, band)
-        if not light > 0.0:
-            raise InputError(f"the star has no light in the band {band}", "a star with light in the band", key="band")
-        # Ratio of the flux at the telescope to that at the flare's surface, for an amplitude of one.
-        scale = np.array([light / photons(nm, blackbody(nm, float(k)), band) for k in kelvin])
-        extra = ([balmer_continuum(grid, electron_temperature_k)] if jump else []) + [
-            line.profile(grid) for line in chosen
-        ]
+        scale = _flux_ratios(star, band, kelvin)
+        extra = [balmer_continuum(grid, electron_temperature_k)] if jump else []
+        extra += [line.profile(grid) for line in chosen]
         names = ("amplitude", *(["balmer"] if jump else []), *(f"line {line.name}" for line in chosen))
         matrix = response_matrix(instrument, grid, order)
         dn = quiet.exposure_s * instrument.per_pixel("response", 1.0) * quiet.gain_dn_per_electron
-        fluxes = np.vstack([scale[:, None] * bodies, *extra]) if extra else scale[:, None] * bodies
+        fluxes = np.vstack([scale[:, None] * bodies, *extra])
         counts = np.asarray((matrix @ fluxes.T).T) * dn
         # Flux of each component in each range, and over all wavelengths, for an amplitude of one.
-        parts = np.array([_between(grid, fluxes, low, high) for low, high in bands_nm]).reshape(-1, len(fluxes))
+        light = [(f"{low:g}-{high:g} nm", _between(grid, fluxes, low, high)) for low, high in bands_nm]
         balmer = BalmerFlare(10_000.0, 2.0, electron_temperature_k)
         whole = [(balmer.bolometric_flux() - STEFAN_BOLTZMANN * 1e16) / float(balmer.edge_flux)] if jump else []
         every = np.concatenate([scale * STEFAN_BOLTZMANN * kelvin**4, whole, np.ones(len(chosen))])
-        derived = _derived(
-            kelvin, scale, names, parts, every, list(bands_nm), quiet.exposure_s, distance_pc, radius_rsun
-        )
+        light.append(("bolometric", every))
+        derived = _derived(kelvin, scale, names, light)
+        if distance_pc is not None:
+            derived += _derived_at_distance(scale, names, light, quiet.exposure_s, distance_pc, radius_rsun)
         log_k = np.log(kelvin)
         while np.exp(log_k[-1]) > TEMPERATURES_K[1]:
             # The exponential of the last node is a temperature that is accepted.
             log_k[-1] = np.nextafter(log_k[-1], 0.0)
-        return cls(log_k, counts[:NODES], counts[NODES:], names, derived)
+        return cls(log_k, counts[:NODES], counts[NODES:], names, tuple(derived))
 
     def stacked(self, n: int, light: float = 1.0) -> Self:
         """Return the model of exposures that are n times as long, with a known factor on all light.
@@ -312,35 +306,37 @@ def derived_values(model: FlareModel, log_k: Float, linear: Float) -> Float:
     return values
 
 
+def _flux_ratios(star: Source, band: str, kelvin: Float) -> Float:
+    """Return flux at the telescope over that at the surface of flares with an amplitude of one, shape of `kelvin`."""
+    nm = star.wavelength_nm
+    light = photons(nm, star.flux_flam, band)
+    if not light > 0.0:
+        raise InputError(f"the star has no light in the band {band}", "a star with light in the band", key="band")
+    return np.array([light / photons(nm, blackbody(nm, float(k)), band) for k in kelvin])
+
+
 def _between(grid: Float, fluxes: Float, low: float, high: float) -> Float:
     inside = (grid >= low) & (grid <= high)
     return np.asarray(10.0 * np.trapezoid(fluxes[:, inside], grid[inside], axis=1))
 
 
-def _derived(
-    kelvin: Float,
-    scale: Float,
-    names: tuple[str, ...],
-    parts: Float,
-    every: Float,
-    bands_nm: list[tuple[float, float]],
-    exposure_s: float,
-    distance_pc: float | None,
-    radius_rsun: float | None,
-) -> tuple[Derived, ...]:
-    """Return the quantities of a model; `parts` and `every` hold fluxes per amplitude, those of blackbodies first."""
-    n, m = kelvin.size, len(names)
+def _of_one(names: tuple[str, ...], column: int, values: Float | float) -> Float:
+    """Return the factors of a quantity that only one amplitude changes, shape (n_node, n_linear)."""
+    factors = np.zeros((NODES, len(names)))
+    factors[:, column] = values
+    return factors
 
-    def summed(fluxes: Float) -> Float:
-        return np.column_stack([fluxes[:n], np.tile(fluxes[n:], (n, 1))])
 
-    def single(column: int, values: Float | float) -> Float:
-        factors = np.zeros((n, m))
-        factors[:, column] = values
-        return factors
+def _of_all(fluxes: Float) -> Float:
+    """Return the factors of a sum of fluxes per amplitude, those of blackbodies first, shape (n_node, n_linear)."""
+    return np.column_stack([fluxes[:NODES], np.tile(fluxes[NODES:], (NODES, 1))])
 
+
+def _derived(kelvin: Float, scale: Float, names: tuple[str, ...], light: list[tuple[str, Float]]) -> list[Derived]:
+    """Return the quantities of a model that need no distance; `light` holds fluxes per amplitude by range."""
     derived = [Derived("temperature", "K", "temperature of the flare's blackbody")]
-    derived.append(Derived("amplitude", "", "relative rise of the band's photons by the blackbody", single(0, 1.0)))
+    rise = "relative rise of the band's photons by the blackbody"
+    derived.append(Derived("amplitude", "", rise, _of_one(names, 0, 1.0)))
     if "balmer" in names:
         edge = np.array([float(blackbody(np.array([BALMER_EDGE_NM]), float(k))[0]) for k in kelvin])
         derived.append(
@@ -349,25 +345,33 @@ def _derived(
     for column, name in enumerate(names):
         if name.startswith("line "):
             what = f"flux of the line {name[5:]} at the telescope"
-            derived.append(Derived(name, "erg / (cm2 s)", what, single(column, 1.0)))
-    light = [(f"{low:g}-{high:g} nm", flux) for (low, high), flux in zip(bands_nm, parts, strict=True)]
-    light.append(("bolometric", every))
+            derived.append(Derived(name, "erg / (cm2 s)", what, _of_one(names, column, 1.0)))
     for where, flux in light:
-        derived.append(Derived(f"flux {where}", "erg / (cm2 s)", f"flux at the telescope, {where}", summed(flux)))
-    if distance_pc is None:
-        return tuple(derived)
+        derived.append(Derived(f"flux {where}", "erg / (cm2 s)", f"flux at the telescope, {where}", _of_all(flux)))
+    return derived
+
+
+def _derived_at_distance(
+    scale: Float,
+    names: tuple[str, ...],
+    light: list[tuple[str, Float]],
+    exposure_s: float,
+    distance_pc: float,
+    radius_rsun: float | None,
+) -> list[Derived]:
+    """Return the quantities that follow from the distance of the star, and from its radius if it is known."""
     far = distance_pc * PARSEC_CM
-    area = single(0, np.pi * far**2 * scale)
-    derived.append(Derived("area", "cm2", "projected area of the blackbody", area))
+    area = _of_one(names, 0, np.pi * far**2 * scale)
+    derived = [Derived("area", "cm2", "projected area of the blackbody", area)]
     if radius_rsun is not None:
         share = area / (np.pi * (radius_rsun * SUN_CM) ** 2)
         derived.append(Derived("filling factor", "", "share of the star's disc that the blackbody covers", share))
     for where, flux in light:
-        total = summed(flux) * 4 * np.pi * far**2
+        total = _of_all(flux) * 4 * np.pi * far**2
         derived.append(Derived(f"luminosity {where}", "erg / s", f"luminosity, {where}", total))
         energy = total * exposure_s
         derived.append(Derived(f"energy {where}", "erg", f"energy within the exposure, {where}", energy))
-    return tuple(derived)
+    return derived
 
 
 #: Shares of a prior in the variance of a ratio at which thresholds are computed, and steps of their bisection.
@@ -465,6 +469,10 @@ class Ratio:
         """Ratio of the estimates; that of a bottom of at most zero is undefined."""
         return np.divide(self.top, self.bottom, out=np.full_like(self.top, np.nan), where=self.bottom > 0.0)
 
+    def rows(self, rows: NDArray[np.intp]) -> Self:
+        """Return some rows."""
+        return replace(self, **{name: values[rows] for name, values in vars(self).items()})
+
     def variance_at(self, ratio: Float) -> Float:
         """Return the variance of top - ratio x bottom."""
         return self.top_variance - 2.0 * ratio * self.covariance + ratio**2 * self.bottom_variance
@@ -478,7 +486,11 @@ class Ratio:
         a = self.bottom**2 - left * self.bottom_variance
         b = self.top * self.bottom - left * self.covariance
         c = self.top**2 - left * self.top_variance
-        root = np.sqrt(np.maximum(b**2 - a * c, 0.0))
+        # The root of b^2 - a c, without its cancellation.
+        spread = self.bottom**2 * self.top_variance - 2.0 * self.top * self.bottom * self.covariance
+        spread = spread + self.top**2 * self.bottom_variance
+        rest = self.top_variance * self.bottom_variance - self.covariance**2
+        root = np.sqrt(np.maximum(left * (spread - left * rest), 0.0))
         positive = self.bottom > 0.0
         with np.errstate(divide="ignore", invalid="ignore"):
             closed = (b + sign * root) / a
@@ -569,19 +581,11 @@ class Reduction(MeanSums):
             variance = np.where(used, variance, 0.0)
         free = nuisances.free if nuisances else 0
         check_enough(quiet, used, len(model.linear) + 1 + free)
-        inverse = np.divide(1.0, variance, out=np.zeros_like(variance), where=used)
         unknown = nuisances.around(added) if nuisances else None
         rows = unknown.rows(variance, unknown.spectra * used) if unknown else np.zeros((0, variance.size))
         spanning = np.vstack([model.hot[::EVERY], model.fixed]) * used
-        plain = spanning * inverse
-        optimal = plain - (spanning @ rows.T) @ rows
-        gram = optimal @ spanning.T
-        power = np.diag(gram)
-        check_distinct(power, np.einsum("tp,tp->t", plain, spanning), nuisances)
-        length = np.sqrt(power)
-        values, vectors = np.linalg.eigh(gram / np.outer(length, length))
-        large = values > LEAST * values[-1]
-        weights = (vectors[:, large] / length[:, None] / np.sqrt(values[large])).T @ optimal
+        inverse = np.divide(1.0, variance, out=np.zeros_like(variance), where=used)
+        weights, _ = spanning_weights(spanning, spanning * inverse, nuisances, rows, LEAST)
         hot, fixed = model.hot @ weights.T, model.fixed @ weights.T
         light = light_factor(model, unknown, rows)
         return cls(hot, fixed, model.log_k, variance, weights, rows, free, light=light)
@@ -603,6 +607,35 @@ class Reduction(MeanSums):
     def n_used(self) -> int:
         """Number of used pixels."""
         return int((self.variance > 0.0).sum())
+
+
+def spanning_weights(
+    spectra: Float, plain: Float, nuisances: Nuisances | None, rows: Float | None, least: float
+) -> tuple[Float, Float]:
+    """Return weights of sums with unit covariance that span the optimal filters of spectra, and the S/N of each.
+
+    The sums, of shape (n_sum, n_pixel), have ascending eigenvalues above `least` of the largest. Spectra are zero in
+    pixels that are not used, `plain` are the same over the variances, and `rows` are those of `Nuisances.rows`. Raises
+    InputError if the light of a flare cannot be distinguished from the nuisances.
+    """
+    optimal = plain if rows is None else plain - (spectra @ rows.T) @ rows
+    gram = optimal @ spectra.T
+    kept, whole = np.diag(gram), np.einsum("tp,tp->t", plain, spectra)
+    if not (whole > 0.0).all():
+        raise InputError(
+            "a component of the flare has no light in the pixels that neither saturate nor are left out",
+            "a model whose components have light there",
+            key="model",
+        )
+    if not (kept > LEAST_KEPT * whole).all():
+        unknown = join_names(nuisances.names) if nuisances else "nothing"
+        raise InputError(
+            f"the light of a flare cannot be distinguished from {unknown}", "fewer unknowns", key="nuisances"
+        )
+    length = np.sqrt(kept)
+    values, vectors = np.linalg.eigh(gram / np.outer(length, length))
+    large = values > least * values[-1]
+    return (vectors[:, large] / length[:, None] / np.sqrt(values[large])).T @ optimal, length
 
 
 def light_factor(model: FlareModel, unknown: Nuisances | None, rows: Float) -> LightFactor | None:
@@ -681,7 +714,8 @@ def usable_variance(
         highest_dn = added_dn if highest_dn is None else highest_dn
         added_dn = added_dn + nuisances.mean_dn
     variance, used = variance_of(quiet, added_dn, highest_dn)
-    used = used & ~skipped_pixels(quiet, skipped_nm)
+    for low, high in skipped_nm:
+        used = used & ~((quiet.wavelength_nm >= low) & (quiet.wavelength_nm <= high))
     check_enough(quiet, used, 0)
     return np.where(used, variance, 0.0), used
 
@@ -695,27 +729,3 @@ def check_enough(quiet: Expectation, used: NDArray[np.bool_], parameters: int) -
         if not count:
             fault, expected = f"every pixel of {quiet.name} saturates or is left out", "some that count"
         raise InputError(fault, expected, key="skipped_nm")
-
-
-def skipped_pixels(quiet: Expectation, skipped_nm: Ranges) -> NDArray[np.bool_]:
-    """Return which pixels lie in wavelength ranges that are not used, shape (n_pixel,)."""
-    nm = quiet.wavelength_nm
-    skipped = np.zeros(nm.size, np.bool_)
-    for low, high in skipped_nm:
-        skipped |= (nm >= low) & (nm <= high)
-    return skipped
-
-
-def check_distinct(kept: Float, whole: Float, nuisances: Nuisances | None) -> None:
-    """Raise InputError if marginalisation over nuisances removes the S/N^2 of a component."""
-    if not (whole > 0.0).all():
-        raise InputError(
-            "a component of the flare has no light in the pixels that neither saturate nor are left out",
-            "a model whose components have light there",
-            key="model",
-        )
-    if not (kept > LEAST_KEPT * whole).all():
-        unknown = join_names(nuisances.names) if nuisances else "nothing"
-        raise InputError(
-            f"the light of a flare cannot be distinguished from {unknown}", "fewer unknowns", key="nuisances"
-        )

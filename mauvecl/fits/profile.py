@@ -73,10 +73,10 @@ class BestFit:
 
     def replaced(self, rows: NDArray[np.intp], others: BestFit) -> BestFit:
         """Return the fits with those of some frames replaced."""
-        every = [getattr(self, field.name).copy() for field in fields(self)]
-        for values, field in zip(every, fields(self), strict=True):
-            values[rows] = getattr(others, field.name)
-        return BestFit(*every)
+        every = {field.name: getattr(self, field.name).copy() for field in fields(self)}
+        for name, values in every.items():
+            values[rows] = getattr(others, name)
+        return BestFit(**every)
 
 
 class Profile:
@@ -209,13 +209,12 @@ def intervals(
     low, high = profile.ends(best, at_nodes, allowed)
     x, closed = temperature_samples(profile, low, high), ~np.isnan(low) & ~np.isnan(high)
     amplitude, variance, hot = profile.parts(x)
-    linear = profile.linear(x, amplitude, hot)
     spent = best.gain[:, None] - np.einsum("nk,nk->n", profile.along, profile.along)[:, None] - amplitude**2 / variance
-    left = allowed - spent
+    samples = _Samples(profile, x, profile.linear(x, amplitude, hot), variance, hot, allowed - spent, allowed, closed)
 
     def ends(derived: Derived, spline: CubicSpline) -> tuple[Float, Float]:
         if derived.ratio is None:
-            return _linear_interval(profile, spline, x, linear, variance, hot, left, allowed, closed)
+            return samples.interval(spline)
         return _ratio_interval(profile, spline(x), hot, best.gain - allowed)
 
     return ends_of_quantities(model, low, high, ends)
@@ -252,64 +251,60 @@ def temperature_samples(profile: Profile, low: Float, high: Float) -> Float:
     return (first + last)[:, None] / 2 + (last - first)[:, None] / 2 * np.sin(angle)
 
 
-def _linear_interval(
-    profile: Profile,
-    spline: CubicSpline,
-    x: Float,
-    linear: Float,
-    variance: Float,
-    hot: Float,
-    left: Float,
-    allowed: float,
-    closed: NDArray[np.bool_],
-) -> tuple[Float, Float]:
-    ratio = ratio_at(profile, spline, x, linear, variance, hot)
-    value, spread, is_light_known = ratio.top, ratio.top_variance, profile.reduction.light is None
-    # The ratio is straight where the recorded quantity less the ratio times the factor is.
-    middle = ratio.value[:, SAMPLES // 2, None]
-    estimate = value if is_light_known else value - middle * ratio.bottom
-    outside = left < 0.0
-    outside[:, [0, -1]] = False  # rounding decides at the ends themselves
+@dataclass(frozen=True, eq=False)
+class _Samples:
+    """Fits without bounds at temperatures within intervals, arrays of shape (n, n_sample, ...)."""
 
-    def reached(room: Float, sign: float, rows: NDArray[np.intp] | slice = slice(None)) -> Float:
-        if is_light_known:
-            return np.asarray(value[rows] + sign * np.sqrt(np.maximum(room, 0.0) * spread[rows]))
-        return Ratio(*(values[rows] for values in vars(ratio).values())).end(room, sign)
+    profile: Profile
+    log_k: Float
+    linear: Float  # all amplitudes
+    variance: Float  # of the blackbody's amplitude
+    hot: Float  # its sums
+    left: Float  # rise of chi-squared that the temperature leaves to amplitudes
+    allowed: float  # rise of chi-squared at the ends
+    closed: NDArray[np.bool_]  # whether the temperature has two ends, shape (n,)
 
-    ends = [_hull(reached(left, sign), outside, sign)[0] for sign in (-1.0, 1.0)]
-    light = profile.reduction.light
-    if light is not None and light.prior.size:
-        half = SAMPLES // 2
-        change = light.change(ratio.value[:, half], ratio.bottom[:, half], ends[1] - ends[0], allowed)
-        left = left + change[:, None]
-        outside |= left < 0.0
-        ends = [_hull(reached(left, sign), outside, sign)[0] for sign in (-1.0, 1.0)]
-    bend = np.abs(estimate[:, 0] + estimate[:, -1] - 2 * estimate[:, SAMPLES // 2])
-    # Simulated fits need the error of the temperature, which its interval gives if it has both ends.
-    wide = (ends[1] - ends[0]) * (1.0 if is_light_known else ratio.bottom[:, SAMPLES // 2])
-    bent = np.flatnonzero(closed & np.isfinite(wide) & (bend > CURVED * np.sqrt(allowed) * wide))
-    if bent.size:
+    def interval(self, spline: CubicSpline) -> tuple[Float, Float]:
+        """Return the ends of a sum of amplitudes, of which `spline` holds the factors."""
+        ratio = ratio_at(self.profile, spline, self.log_k, self.linear, self.variance, self.hot)
+        half, light, left = SAMPLES // 2, self.profile.reduction.light, self.left
+        # The ratio is straight where the recorded quantity less the ratio times the factor is.
+        estimate = ratio.top if light is None else ratio.top - ratio.value[:, half, None] * ratio.bottom
+        outside = left < 0.0
+        outside[:, [0, -1]] = False  # rounding decides at the ends themselves
+        ends = [_hull(ratio.end(left, sign), outside, sign)[0] for sign in (-1.0, 1.0)]
+        if light is not None and light.prior.size:
+            change = light.change(ratio.value[:, half], ratio.bottom[:, half], ends[1] - ends[0], self.allowed)
+            left = left + change[:, None]
+            outside |= left < 0.0
+            ends = [_hull(ratio.end(left, sign), outside, sign)[0] for sign in (-1.0, 1.0)]
+        bend = np.abs(estimate[:, 0] + estimate[:, -1] - 2 * estimate[:, half])
+        # Simulated fits need the error of the temperature, which its interval gives if it has both ends.
+        wide = (ends[1] - ends[0]) * ratio.bottom[:, half]
+        bent = np.flatnonzero(self.closed & np.isfinite(wide) & (bend > CURVED * np.sqrt(self.allowed) * wide))
+        if bent.size:
+            for end, sign in zip(ends, (-1.0, 1.0), strict=True):
+                end[bent] = self._bent_end(spline, ratio.rows(bent), left[bent], sign, bent)
+        return ends[0], ends[1]
+
+    def _bent_end(self, spline: CubicSpline, ratio: Ratio, left: Float, sign: float, rows: NDArray[np.intp]) -> Float:
+        """Return the ends in some rows, whose quantity bends, by simulated thresholds."""
+        light, allowed, x = self.profile.reduction.light, self.allowed, self.log_k[rows]
+        which = _hull(ratio.end(left, sign), left < 0.0, sign)[1]
+        place = np.arange(rows.size), which
+        # Share of the variance that is not the factor's; the factor is straight.
+        share = np.ones(rows.size)
         if light is not None:
-            nodes = profile.nodes
-            factors = spline(nodes) + float(np.median(middle[bent])) * light.weights_of(nodes)
+            middle, nodes = ratio.value[:, SAMPLES // 2], self.profile.nodes
+            factors = spline(nodes) + float(np.median(middle)) * light.weights_of(nodes)
             spline = scipy.interpolate.CubicSpline(nodes, factors)
-        thresholds = _Thresholds(profile, spline)
-        room, error = left[bent], (x[bent, -1] - x[bent, 0]) / np.sqrt(4 * allowed)
-        for end, sign in zip(ends, (-1.0, 1.0), strict=True):
-            which = _hull(reached(room, sign, bent), room < 0.0, sign)[1]
-            place = np.arange(bent.size), which
-            # Share of the variance that is not the factor's; the factor is straight.
-            share = np.ones(bent.size)
-            if light is not None:
-                at = middle[bent, 0]
-                total = ratio.variance_at(middle)[bent, which]
-                own = light.scale**-2.0 * at**2
-                share = np.clip(1.0 - own / total, 0.0, 1.0)
-            moved = sign * np.sqrt(np.maximum(room[place], 0.0) * share)
-            change = share * (thresholds.at(bent, x[bent, which], moved, error, allowed) - allowed)
-            changed = room + change[:, None]
-            end[bent] = _hull(reached(changed, sign, bent), changed < 0.0, sign)[0]
-    return ends[0], ends[1]
+            total = ratio.variance_at(middle[:, None])[place]
+            share = np.clip(1.0 - light.scale**-2.0 * middle**2 / total, 0.0, 1.0)
+        moved = sign * np.sqrt(np.maximum(left[place], 0.0) * share)
+        error = (x[:, -1] - x[:, 0]) / np.sqrt(4 * allowed)
+        simulated = _Thresholds(self.profile, spline).at(rows, x[place], moved, error, allowed)
+        left = left + (share * (simulated - allowed))[:, None]
+        return _hull(ratio.end(left, sign), left < 0.0, sign)[0]
 
 
 def ratio_at(profile: Profile, spline: CubicSpline, log_k: Float, linear: Float, variance: Float, hot: Float) -> Ratio:
@@ -421,14 +416,8 @@ def _as_probable(root: Float, out: Float, z: float) -> Float:
     """Return the values, (n,), below which roots of ratios are as probable as |distance| is below `z`.
 
     Shares of fits with a smaller ratio are smoothed alike for the simulated fits and where the quantity is straight.
-
-    Parameters
-    ----------
-    root : ndarray, shape (n, n_fit)
-        Roots of the likelihood ratios of simulated fits.
-    out : ndarray, shape (n_fit,)
-        Their distances along the gradient of the quantity, in standard errors.
-    z : float
+    `root`, (n, n_fit), holds the roots of the likelihood ratios of simulated fits, and `out`, (n_fit,), their distances
+    along the gradient of the quantity in standard errors.
     """
     weights = np.exp(-(out**2) / 2)
     level = weights @ scipy.special.ndtr((z - np.abs(out)) / SMOOTH)

@@ -165,13 +165,7 @@ class Measurement:
         return replace(self, **rows)
 
     def column(self, name: str) -> int:
-        """Return the index of a quantity.
-
-        Raises
-        ------
-        InputError
-            For an unknown name.
-        """
+        """Return the index of a quantity; raises InputError for an unknown name."""
         if name not in self.names:
             raise InputError.of("name", name, f"one of {', '.join(self.names)}")
         return self.names.index(name)
@@ -742,7 +736,26 @@ def _covariance(
     columns += [np.tile(row, (n, 1)) for row in reduction.fixed]
     columns += [a[:, None] * reduction.spline(best.log_k, 1), b[:, None] * reduction.spline(second, 1)]
     jacobian = np.stack(columns, axis=1)
-    over = np.where(factor > 0.0, factor, np.nan)
+    gradient, by_factor = _gradient(model, best, second, estimates, np.where(factor > 0.0, factor, np.nan))
+    own = np.zeros((n, by_factor.shape[1], by_factor.shape[1]))
+    if reduction.light is not None:
+        light = reduction.light
+        weights = [light.spline(best.log_k), light.spline(second), *(np.full(n, value) for value in light.fixed)]
+        weights += [a * light.spline(best.log_k, 1), b * light.spline(second, 1)]
+        gradient -= by_factor[:, :, None] * np.stack(weights, axis=1)[:, None, :] / light.scale
+        own = by_factor[:, :, None] * by_factor[:, None, :] / light.scale**2
+    information = np.einsum("nik,njk->nij", jacobian, jacobian)
+    good = (best.linear > 0).all(axis=1)
+    information[~good] = np.eye(m + 2)
+    inverse = np.linalg.pinv(information, rcond=1e-14, hermitian=True)
+    inverse[~good] = np.nan
+    spread = np.einsum("nqi,nij,nrj->nqr", np.nan_to_num(gradient), inverse, np.nan_to_num(gradient))
+    return np.asarray(spread + np.nan_to_num(own))
+
+
+def _gradient(model: FlareModel, best: BestFit, second: Float, estimates: Float, over: Float) -> tuple[Float, Float]:
+    """Return derivatives of quantities by amplitudes and log temperatures, and by the factor on all light, `over`."""
+    (n, m), a, b = best.linear.shape, best.linear[:, 0], best.linear[:, 1]
     gradient, by_factor = np.zeros((n, len(model.derived) + 2, m + 2)), np.zeros((n, len(model.derived) + 2))
     for q, (derived, spline) in enumerate(zip(model.derived, model.splines, strict=True)):
         if spline is None or derived.factors is None:
@@ -762,17 +775,4 @@ def _covariance(
         slopes = [4.0 - bolometric(x, 1)[:, 0] / bolometric(x)[:, 0] for x in (best.log_k, second)]
         gradient[:, -1, 0], gradient[:, -1, 1] = -areas / a, areas / b
         gradient[:, -1, m], gradient[:, -1, m + 1] = areas * slopes[0], -areas * slopes[1]
-    own = np.zeros((n, by_factor.shape[1], by_factor.shape[1]))
-    if reduction.light is not None:
-        light = reduction.light
-        weights = [light.spline(best.log_k), light.spline(second), *(np.full(n, value) for value in light.fixed)]
-        weights += [a * light.spline(best.log_k, 1), b * light.spline(second, 1)]
-        gradient -= by_factor[:, :, None] * np.stack(weights, axis=1)[:, None, :] / light.scale
-        own = by_factor[:, :, None] * by_factor[:, None, :] / light.scale**2
-    information = np.einsum("nik,njk->nij", jacobian, jacobian)
-    good = (best.linear > 0).all(axis=1)
-    information[~good] = np.eye(m + 2)
-    inverse = np.linalg.pinv(information, rcond=1e-14, hermitian=True)
-    inverse[~good] = np.nan
-    spread = np.einsum("nqi,nij,nrj->nqr", np.nan_to_num(gradient), inverse, np.nan_to_num(gradient))
-    return np.asarray(spread + np.nan_to_num(own))
+    return gradient, by_factor

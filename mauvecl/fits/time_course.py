@@ -18,7 +18,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from mauvecl.detection.nuisances import Nuisances, spectrum_of
+from mauvecl.detection.nuisances import Nuisances, fitted_amplitudes, spectrum_of
 from mauvecl.fits.flare_model import EVERY, Exposures, Ranges, Reduction
 from mauvecl.fits.profile import remembering
 from mauvecl.fits.spectrum import LEVELS, Measurement, clipped_pixels, fit
@@ -58,21 +58,13 @@ SHOWN = {
 
 @dataclass(frozen=True, eq=False)
 class MeasuredBins:
-    """Flares measured in bins of consecutive frames.
+    """Flares measured in bins of consecutive frames; arrays have the shape (n_bin,)."""
 
-    Attributes
-    ----------
-    first, count : ndarray of int, shape (n_bin,)
-        First frame of each bin, and number of frames in it.
-    start_s, end_s : ndarray, shape (n_bin,)
-    found : Measurement
-        One row per bin. Amplitudes, fluxes and luminosities are means over the bin; energies are those within it.
-    """
-
-    first: NDArray[np.intp]
-    count: NDArray[np.intp]
+    first: NDArray[np.intp]  #: first frame of each bin
+    count: NDArray[np.intp]  #: number of frames in it
     start_s: Float
     end_s: Float
+    #: One row per bin. Amplitudes, fluxes and luminosities are means over the bin; energies are those within it.
     found: Measurement
 
     def table(self) -> QTable:
@@ -164,8 +156,6 @@ def measure_along(
         If the frames have another shape, the expectation has several frames, or no bin reaches the S/N.
     """
     raw, stare = checked_frames(frames, quiet, stare)
-    if not 0.0 < snr_per_bin < np.inf:
-        raise InputError.of("snr_per_bin", snr_per_bin, "a number above 0")
     bins = _bins(raw, quiet, model, nuisances, known_strengths(stare, quiet), stare, snr_per_bin, skipped_nm)
     if not bins:
         raise InputError.of("snr_per_bin", snr_per_bin, "an S/N that a bin of the stare reaches")
@@ -352,11 +342,6 @@ class _Data:
         return scipy.interpolate.CubicSpline(self.model.log_k, added)
 
     @cached_property
-    def _middle(self) -> Float:
-        """Middle of each frame, s."""
-        return np.asarray(self.edges.mean(axis=1))
-
-    @cached_property
     def strengths(self) -> Callable[[Float], Pair]:
         """Function of the parameters that returns the amplitude and log temperature of each frame."""
         return remembering(self._strengths)
@@ -373,7 +358,7 @@ class _Data:
 
     def _cooled(self, theta: Float) -> tuple[Float, Float, float]:
         """Return temperatures over that at the peak, as in `Cooling`, times since the peak, and the end."""
-        since = np.maximum(self._middle - theta[0], 0.0)
+        since = np.maximum(self.edges.mean(axis=1) - theta[0], 0.0)
         end = min(float(np.exp(theta[4])), 1.0)
         return end + (1.0 - end) * np.exp(-since / np.exp(theta[5])), since, end
 
@@ -549,9 +534,7 @@ def fit_cooling(
     covariance = np.linalg.pinv(jacobian.T @ jacobian, hermitian=True)
     quantities = _quantities(data, stare, cooling)
     estimates = np.array([quantity.value(theta, data) for quantity in quantities])
-    scale = np.array(
-        [1.0 if quantity.place == 0 else value for quantity, value in zip(quantities, estimates, strict=True)]
-    )
+    scale = np.where([quantity.place == 0 for quantity in quantities], 1.0, estimates)
     slopes = scale[:, None] * np.array([quantity.slope(theta, data) for quantity in quantities])[:, free]
     spread = slopes @ covariance @ slopes.T
     sd = np.sqrt(np.diag(spread)) / np.maximum(np.abs(scale), 1e-300)
@@ -601,16 +584,9 @@ def _summed_levels(residual_dn: Float, flare_dn: Float, quiet: Expectation, star
     strengths = known_strengths(stare, quiet)
     components = Components(quiet, np.zeros((0, used.size)), used[None])
     changes, noise = components.directions(strengths), np.sqrt(components.covariance(strengths)[:, 0, 0])
-    levels = np.array(
-        [
-            unknown.sd * unknown.curve * (changes[unknown.of][:, 0] + (flare_dn if unknown.of == "light" else 0.0))
-            for unknown in stare.unknowns
-        ]
-    )
-    # Each level has its prior as another measurement.
-    rows = np.vstack([(levels / noise).T, np.eye(len(levels))])
-    best, *_ = np.linalg.lstsq(rows, np.concatenate([residual_dn / noise, np.zeros(len(levels))]))
-    return np.asarray(best @ levels)
+    own = {of: change[:, 0] + (flare_dn if of == "light" else 0.0) for of, change in changes.items()}
+    levels = np.array([unknown.sd * unknown.curve * own[unknown.of] for unknown in stare.unknowns])
+    return np.asarray(fitted_amplitudes(levels, np.ones(len(levels)), residual_dn, noise**2) @ levels)
 
 
 def cooling_event(measurement: Measurement, shape: Shape) -> Event:

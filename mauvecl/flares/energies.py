@@ -345,14 +345,8 @@ class Rates(ABC):
     def of_light(self, erg_per_s: float, luminosity_erg_s: float) -> Self:
         """Return the rates by the bolometric energy of the light of one star's flares.
 
-        Raises InputError if the energies are already those of light; see `in_band`.
-
-        Parameters
-        ----------
-        erg_per_s : float
-            Bolometric energy per second of equivalent duration in `amplitude_band`; see `EnergyScale`.
-        luminosity_erg_s : float
-            Luminosity of the star in that band; see `quiescent_luminosity`.
+        `erg_per_s` is that of an `EnergyScale` in `amplitude_band`, and the luminosity the star's in that band; see
+        `quiescent_luminosity`. Raises InputError if the energies are already those of light; see `in_band`.
         """
         if self.definition == "light":
             raise InputError.of("definition", self.definition, "a published definition, not that of light")

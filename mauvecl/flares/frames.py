@@ -44,20 +44,11 @@ class Components:
 
     The statistics of a frame are y_k = sum_p weights_kp (raw_p - mean_raw_p), with the mean raw counts of the quiescent
     star at the conditions of its expectation.
-
-    Attributes
-    ----------
-    quiet : Expectation
-        A single frame of the quiescent star, for which the coefficients are one.
-    flare_electrons : ndarray, shape (n_flare, n_pixel)
-        Mean electrons per frame of flares of unit amplitude, one per temperature; at most `MOST_FLARES`.
-    weights : ndarray, shape (n_statistic, n_pixel)
-        Linearly independent, and zero in pixels that saturate.
     """
 
-    quiet: Expectation
-    flare_electrons: Float
-    weights: Float
+    quiet: Expectation  #: a single frame of the quiescent star, for which the coefficients are one
+    flare_electrons: Float  #: mean electrons per frame of flares of unit amplitude by temperature, (n_flare, n_pixel)
+    weights: Float  #: linearly independent, and zero in pixels that saturate, shape (n_statistic, n_pixel)
 
     def __post_init__(self) -> None:
         n_pixel = self.quiet.wavelength_nm.size
@@ -114,12 +105,8 @@ class Components:
     def pixel_cumulants(self, order: int) -> tuple[Float, Float]:
         """Return the cumulants of each pixel's count, of order 1 to 5.
 
-        Returns
-        -------
-        constant : ndarray, shape (n_pixel,)
-            Read noise and rounding.
-        each : ndarray, shape (4 + n_flare, n_pixel)
-            Each component at a coefficient of one.
+        They are the constant part of read noise and rounding, (n_pixel,), and those of each component at a coefficient
+        of one, (4 + n_flare, n_pixel).
         """
         x = self.quiet
         photon = x.gain_dn_per_electron ** (order - 1)
@@ -354,18 +341,9 @@ def draw_light_curves(
     spectrum, spectrum_sd, spectrum_mean = expectation.net(elements[filled], draw, np.float32)
     # Each pixel belongs to one element, so their sum is the whole range.
     whole = spectrum.sum(axis=1, dtype=np.float64), *expectation.expected(used[None])
-    parts = (
-        expectation.net(np.array(rows).reshape(len(rows), used.size), draw) if rows else np.zeros((3, len(whole[0]), 0))
-    )
+    parts = expectation.net(np.array(rows).reshape(len(rows), used.size), draw)
     flux, sd, mean = (np.column_stack(both) for both in zip(whole, parts, strict=True))
     low, high = quiet.wavelength_nm[[0, -1]]
-    return LightCurves(
-        (f"{low:.0f}-{high:.0f} nm", *(f"{a:g}-{b:g} nm" for a, b in bands_nm)),
-        flux,
-        sd,
-        mean,
-        spectrum,
-        spectrum_sd,
-        spectrum_mean,
-        quiet.element_wavelength_nm[filled],
-    )
+    names = (f"{low:.0f}-{high:.0f} nm", *(f"{a:g}-{b:g} nm" for a, b in bands_nm))
+    element_nm = quiet.element_wavelength_nm[filled]
+    return LightCurves(names, flux, sd, mean, spectrum, spectrum_sd, spectrum_mean, element_nm)

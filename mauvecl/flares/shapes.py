@@ -225,18 +225,12 @@ class TovarMendoza2022(Shape):
         # difference is at least zero.
         far = np.maximum(z, 0.0)
         scale = np.sqrt(np.pi) / 2 * self.HEIGHT * self.C * np.exp(-(far**2))
-        return np.asarray(
-            sum(
-                share
-                / rate
-                * np.where(
-                    z > 0,
-                    scale * (scipy.special.erfcx(far) - scipy.special.erfcx(far + self.C * rate / 2)),
-                    self._gaussian(z) - self._part(t, rate),
-                )
-                for share, rate in self.DECAY
-            )
-        )
+
+        def risen(rate: float) -> Float:
+            early = scale * (scipy.special.erfcx(far) - scipy.special.erfcx(far + self.C * rate / 2))
+            return np.where(z > 0, early, self._gaussian(z) - self._part(t, rate))
+
+        return np.asarray(sum(share / rate * risen(rate) for share, rate in self.DECAY))
 
     def after(self, tau: ArrayLike) -> Float:
         t = np.asarray(tau, np.float64)

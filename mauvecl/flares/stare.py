@@ -156,8 +156,8 @@ class Event:
         nodes : ndarray, shape (n_temperature,), optional
             Temperatures of the spectra: `temperatures_of` all flares of the stare; by default of this flare alone.
         """
-        cooling = self.temperature
-        if not isinstance(cooling, Cooling) or cooling.steady:
+        cooling = _cooling_of(self)
+        if cooling is None:
             return self.energy(scale_of(self.hottest_k))
         nodes = temperatures_of([self]) if nodes is None else nodes
         tau = np.concatenate([np.linspace(-10.0, 10.0, 2001), np.geomspace(10.0, 1000.0, 1001)[1:]])
@@ -207,8 +207,9 @@ def temperatures_of(events: Sequence[Event]) -> Float:
     constant: list[float] = []
     cooling = []
     for event in events:
-        if isinstance(event.temperature, Cooling) and not event.temperature.steady:
-            cooling.append(event.temperature)
+        law = _cooling_of(event)
+        if law is not None:
+            cooling.append(law)
         elif all(abs(event.hottest_k - other) >= SAME_K for other in constant):
             constant.append(event.hottest_k)
     left = MOST_TEMPERATURES - len(constant)
@@ -235,28 +236,25 @@ def coefficients(events: Sequence[Event], start_s: Float, frame_s: float, temper
     """
     factors = np.zeros((start_s.size, temperatures_k.size))
     for event in events:
-        if isinstance(event.temperature, Cooling) and not event.temperature.steady:
-            _add_cooling(factors, event, event.temperature, start_s, frame_s, temperatures_k)
-            continue
-        edges = np.column_stack([start_s, start_s + frame_s])
-        mean = event.amplitude * event.form.mean_over(edges, event.peak_s, event.half_width_s)
-        for column, share in _node_weights(np.array([event.hottest_k]), temperatures_k):
-            factors[:, column] += float(share[0]) * mean
+        parts, cooling = 1, _cooling_of(event)
+        if cooling is not None:
+            shortest = min(frame_s, event.half_width_s, cooling.fold_s)
+            parts = int(min(np.ceil(PARTS * frame_s / shortest), MOST_PARTS))
+        for part in range(parts):
+            start = start_s + part * frame_s / parts
+            edges = np.column_stack([start, start + frame_s / parts])
+            mean = event.amplitude / parts * event.form.mean_over(edges, event.peak_s, event.half_width_s)
+            middle = start + frame_s / parts / 2
+            kelvin = np.array([event.hottest_k]) if cooling is None else cooling.at(middle - event.peak_s)
+            for column, share in _node_weights(kelvin, temperatures_k):
+                factors[:, column] += share * mean
     return factors
 
 
-def _add_cooling(
-    factors: Float, event: Event, cooling: Cooling, start_s: Float, frame_s: float, temperatures_k: Float
-) -> None:
-    shortest = min(frame_s, event.half_width_s, cooling.fold_s)
-    parts = int(min(np.ceil(PARTS * frame_s / shortest), MOST_PARTS))
-    for part in range(parts):
-        start = start_s + part * frame_s / parts
-        edges = np.column_stack([start, start + frame_s / parts])
-        mean = event.amplitude / parts * event.form.mean_over(edges, event.peak_s, event.half_width_s)
-        temperature = cooling.at(start + frame_s / parts / 2 - event.peak_s)
-        for column, share in _node_weights(temperature, temperatures_k):
-            factors[:, column] += share * mean
+def _cooling_of(event: Event) -> Cooling | None:
+    """Return how a flare cools, or None if its temperature hardly changes."""
+    law = event.temperature
+    return law if isinstance(law, Cooling) and not law.steady else None
 
 
 def _node_weights(temperature: Float, nodes: Float) -> list[tuple[int, Float]]:
@@ -429,22 +427,15 @@ class Stare:
         InputError
             If the gaps leave no frame, or for an invalid value.
         """
-        count = np.ceil(duration_s / frame_s * (1 - 1e-12))
-        if count > MOST_FRAMES:
-            raise InputError.of("duration_s", duration_s, f"at most {MOST_FRAMES} frames", unit="s")
-        start: Float = np.arange(max(1, int(count)), dtype=np.float64) * float(frame_s)
-        start = start[_frames_outside_gaps(gaps, start, float(frame_s))]
-        if not start.size:
-            raise InputError.of("gaps", gaps, f"gaps that leave a frame of {duration_s:g} s")
+        start = _starts(duration_s, float(frame_s), gaps)
 
         def over_frames(curve: Curve | None) -> Float:
             return np.zeros(start.size) if curve is None else curve.mean_over(start, float(frame_s), orbit_s)
 
         spread = dict(jitters or {})
-        components = STARE_CHANGES["jitters"]
-        other = next((name for name in spread if name not in components), None)
-        if other is not None:
-            raise InputError.of("jitters", other, f"one of {', '.join(components)}")
+        for name in spread:
+            if name not in STARE_CHANGES["jitters"]:
+                raise InputError.of("jitters", name, f"one of {', '.join(STARE_CHANGES['jitters'])}")
         return cls(
             start,
             float(frame_s),
@@ -523,15 +514,21 @@ def select_frames(stare: Stare, part: slice | NDArray[np.bool_]) -> Stare:
     return replace(stare, unknowns=unknowns, **{name: getattr(stare, name)[part] for name in names})
 
 
-def _frames_outside_gaps(gaps: Sequence[tuple[float, float]], start: Float, frame_s: float) -> NDArray[np.bool_]:
-    """Return which frames do not overlap a gap."""
+def _starts(duration_s: float, frame_s: float, gaps: Sequence[tuple[float, float]]) -> Float:
+    """Return the starts of the frames of a stare that do not overlap a gap."""
+    count = np.ceil(duration_s / frame_s * (1 - 1e-12))
+    if count > MOST_FRAMES:
+        raise InputError.of("duration_s", duration_s, f"at most {MOST_FRAMES} frames", unit="s")
+    start: Float = np.arange(max(1, int(count)), dtype=np.float64) * frame_s
     # The tolerance keeps a frame that starts at the end of a gap.
     outside, tolerance = np.ones(start.size, np.bool_), 1e-9 * frame_s
     for first, last in gaps:
         if not (np.isfinite([first, last]).all() and first < last):
             raise InputError.of("gaps", (first, last), "two times, ascending", unit="s")
         outside &= (start + frame_s <= first + tolerance) | (start >= last - tolerance)
-    return outside
+    if not outside.any():
+        raise InputError.of("gaps", gaps, f"gaps that leave a frame of {duration_s:g} s")
+    return start[outside]
 
 
 def _unknowns(

@@ -356,14 +356,9 @@ class Reduction(Protocol):
     depend on each other. ``values`` are float32, (n_stare, n_frame, n_statistic), preceded by an
     axis of scenarios if there are several; they are valid only during the call. If the request has `glow`, it is
     called as ``reduction(values, first, glow)`` with an array of shape (n_stare, n_frame, n_statistic + 1).
-
-    Attributes
-    ----------
-    adds : bool
-        True if results are integers that are summed over stares. Otherwise, arrays are joined along their first axis,
-        in the order of stares.
     """
 
+    #: True if results are integers that are summed over stares; otherwise, arrays are joined in the order of stares.
     adds: ClassVar[bool]
 
     @property
@@ -374,31 +369,20 @@ class Reduction(Protocol):
 @validated
 @dataclass(frozen=True, eq=False)
 class StaresRequest(Countable):
-    """Request for stares; flares and amplitudes as for `Stares.frames`.
-
-    Attributes
-    ----------
-    realisations : int
-        Number of stares.
-    start : int
-        Number of the first stare.
-    reduction : Reduction, optional
-        By default, statistics are returned as they are.
-    glow : bool
-        Whether the reduction also receives the draws for flares that it adds: a standard normal per statistic, for
-        their photon noise, and the factor on all light minus one.
-    """
+    """Request for stares; flares and amplitudes as for `Stares.frames`."""
 
     components: Components
     stare: Stare
-    realisations: Realisations
+    realisations: Realisations  #: number of stares
     seed: Seed
     flare: NDArray[Any] | None = None
     amplitudes: NDArray[Any] | None = None
-    start: StareNumber = 0
+    start: StareNumber = 0  #: number of the first stare
     method: Method = "cumulants"
     processes: Processes = NONE
-    reduction: Reduction | None = None
+    reduction: Reduction | None = None  #: by default, statistics are returned as they are
+    #: Whether the reduction also receives the draws for flares that it adds: a standard normal per statistic, for their
+    #: photon noise, and the factor on all light minus one.
     glow: bool = False
     #: Number of the stare of the first row of flares and amplitudes, if these differ between stares.
     rows_from: int = field(init=False, default=0)

@@ -9,7 +9,7 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import optimize, stats
+from scipy import interpolate, optimize, stats
 
 from mauvecl.detection.distributions import Interval, central_counts, clopper_pearson, smallest_integer
 from mauvecl.detection.nuisances import Nuisances
@@ -40,16 +40,10 @@ class DurationLaw:
 
     The exponent is that of superflares on G dwarfs (Maehara et al. 2015); the default scale gives minutes at 1e34 erg
     and tens of seconds at 1e31 erg.
-
-    Attributes
-    ----------
-    half_width_s, at_erg : float
-        Bolometric energy.
-    exponent, scatter_dex : float
     """
 
     half_width_s: Duration = 100.0
-    at_erg: Energy = 1e33
+    at_erg: Energy = 1e33  #: bolometric
     exponent: DurationExponent = 0.39
     scatter_dex: DurationScatter = 0.3
 
@@ -60,23 +54,12 @@ class DurationLaw:
 
 @dataclass(frozen=True, eq=False)
 class Completeness:
-    """Probability that a flare is recovered, by energy.
+    """Probability that a flare is recovered, by energy."""
 
-    Attributes
-    ----------
-    energy_erg : ndarray, shape (n,)
-        Energies in the band, ascending.
-    probability : ndarray, shape (n,)
-    band : str
-        Name of the band, or "bolometric".
-    how : str
-        Description of the method.
-    """
-
-    energy_erg: Float
-    probability: Float
-    band: str
-    how: str
+    energy_erg: Float  #: in the band, ascending, shape (n,)
+    probability: Float  #: shape (n,)
+    band: str  #: or "bolometric"
+    how: str  #: description of the method
 
     def __post_init__(self) -> None:
         set_read_only(self, energy_erg=self.energy_erg, probability=self.probability)
@@ -105,10 +88,8 @@ class Completeness:
         if reached.all():
             return float(self.energy_erg[0])
         first = int(np.flatnonzero(~reached)[-1])
-        low, high = self.probability[first : first + 2]
-        part = (probability - low) / (high - low)
-        e0, e1 = np.log10(self.energy_erg[first : first + 2])
-        return float(10 ** (e0 + part * (e1 - e0)))
+        around = slice(first, first + 2)
+        return float(10 ** np.interp(probability, self.probability[around], np.log10(self.energy_erg[around])))
 
     @classmethod
     @validated
@@ -154,11 +135,8 @@ class Completeness:
         half = law.half_width(10**log_energy)[:, None] * 10 ** (law.scatter_dex * nodes)
         duration = scale.equivalent_duration(1.0) * 10**log_energy
         amplitude = duration[:, None] / (half * bank.shape.equivalent_duration)
-        place = np.clip(np.log(half / widths[0]) / np.log(widths[-1] / widths[0]), 0, 1) * (WIDTHS - 1)
-        i = np.minimum(place.astype(int), WIDTHS - 2)
-        # The logarithm of the gain is interpolated linearly between half-widths.
-        part = (place - i)[..., None]
-        growth = np.exp((1 - part) * np.log(gain[i]) + part * np.log(gain[i + 1]))
+        log_gain = interpolate.make_interp_spline(np.log(widths), np.log(gain), k=1)
+        growth = np.exp(log_gain(np.log(np.clip(half, widths[0], widths[-1]))))
         signal = amplitude[..., None] * signal_per_frame * growth
         # Small flares that noise lifts above the threshold, about 1 % of them, count as false alarms, since small
         # flares are arbitrarily frequent.
@@ -176,19 +154,15 @@ def default_bank() -> Bank:
     return white_bank(BANK_S, shape_of("davenport2014"), 5.0)
 
 
+# A plan asks for the threshold and the gains of each target and each mode of a calibrated throughput.
+@lru_cache(maxsize=8)
 @validated
-def search_threshold(false_alarms_per_day: Positive, bank: Bank | None = None) -> float:
+def search_threshold(false_alarms_per_day: Positive, bank: Bank) -> float:
     """Return the threshold of a bank in white noise, sigma, for a number of false alarms per day of frames.
 
     The threshold follows from `TemplateGrid` and is about 1 % too high at one alarm per day, and less at lower rates.
     Raises InputError if it is not between 2 and 20 sigma.
     """
-    return _search_threshold(false_alarms_per_day, bank or default_bank())
-
-
-# A plan asks for the threshold and the gains of each target and each mode of a calibrated throughput.
-@lru_cache(maxsize=8)
-def _search_threshold(false_alarms_per_day: float, bank: Bank) -> float:
     grid = TemplateGrid.from_bank(bank)
 
     def over(threshold: float) -> float:
@@ -243,8 +217,7 @@ def _gains(shape: Shape, window_s: float, frame_s: float) -> tuple[Float, Float]
     for i, half in enumerate(widths):
         tau = (edges[None, :] - peaks[:, None]) / half
         frames = consecutive_integrals(shape, tau) * half / frame_s
-        rest = frames - (frames @ line.T) @ line
-        gain[i] = np.linalg.norm(rest, axis=1)
+        gain[i] = np.linalg.norm(frames - (frames @ line.T) @ line, axis=1)
     gain = np.maximum(gain, 1e-12)
     for shared in (widths, gain):
         shared.setflags(write=False)
@@ -267,11 +240,13 @@ class InjectedCompleteness:
 
     @cached_property
     def _cells(self) -> tuple[Float, Float, Float]:
+        """Detected fractions with the ends of their intervals, for the effective number of independent draws."""
         cells = np.empty((3, len(self.half_widths_s), self.sizes.size))
-        for d, critical in enumerate(self.critical):
-            for s, size in enumerate(self.sizes):
-                p = self._completeness(critical, float(size))
-                cells[:, d, s] = p.value, p.low, p.high
+        for d, s in np.ndindex(cells.shape[1:]):
+            each = np.mean(self.critical[d] <= self.sizes[s], axis=1)
+            fraction, trials = float(each.mean()), self._independent(each, self.count)
+            around = clopper_pearson(round(fraction * trials), trials)
+            cells[:, d, s] = fraction, min(around.low, fraction), max(around.high, fraction)
         return cells[0], cells[1], cells[2]
 
     @property
@@ -288,13 +263,6 @@ class InjectedCompleteness:
     def completeness_high(self) -> Float:
         """Upper limits of the 95 % intervals of `completeness`."""
         return self._cells[2]
-
-    def _completeness(self, critical: Float, size: float) -> Interval:
-        """Return the detected fraction at a size, with an interval for the effective number of independent draws."""
-        each = np.mean(critical <= size, axis=1)
-        fraction, trials = float(each.mean()), self._independent(each, critical.size)
-        around = clopper_pearson(round(fraction * trials), trials)
-        return Interval(fraction, min(around.low, fraction), max(around.high, fraction))
 
     @staticmethod
     def _independent(each: Float, count: int) -> int:
@@ -337,22 +305,12 @@ EXPONENTS, GRID = (1.01, 6.0), 1200
 
 @dataclass(frozen=True)
 class Yield:
-    """Number of flares that a campaign recovers.
+    """Number of flares that a campaign recovers, with the scatter of the rate and Poisson noise."""
 
-    Attributes
-    ----------
-    expected : float
-        Mean at the nominal rate.
-    low, high : int
-        Central 95 % of campaigns, with the scatter of the rate and Poisson noise.
-    at_least_one : float
-        Probability of at least one flare, with the same scatter.
-    """
-
-    expected: float
-    low: int
+    expected: float  #: mean at the nominal rate
+    low: int  #: ends of the central 95 % of campaigns
     high: int
-    at_least_one: float
+    at_least_one: float  #: probability of at least one flare
 
     @classmethod
     @validated
@@ -440,9 +398,7 @@ def fit_power_law(
     # The density is unconstrained where the completeness is zero, and may be huge there.
     used = chance > 0
     x, chance = x[used], chance[used]
-    blur = None
-    if error_dex > 0:
-        blur = stats.norm.pdf(recovered[:, None], x, error_dex) * step
+    blur = stats.norm.pdf(recovered[:, None], x, error_dex) * step if error_dex > 0 else None
 
     def seen(alpha: float) -> Float:
         """Return recovered flares per day and dex of true energy, for a rate of 1 above the pivot."""
@@ -459,25 +415,16 @@ def fit_power_law(
     alpha = float(optimize.minimize_scalar(cost, bounds=EXPONENTS, method="bounded", options={"xatol": 1e-7}).x)
     log10_rate = float(np.log10(logs.size / (days * step * seen(alpha).sum())))
     covariance = np.linalg.inv(_curvature(lambda point: cost(point[0], point[1]), np.array([alpha, log10_rate])))
-    return FittedPowerLaw(
-        alpha=alpha,
-        alpha_sd=float(np.sqrt(covariance[0, 0])),
-        log10_rate=log10_rate,
-        log10_rate_sd=float(np.sqrt(covariance[1, 1])),
-        pivot_erg=10**pivot,
-        flares=int(logs.size),
-    )
+    alpha_sd, log10_rate_sd = np.sqrt(np.diag(covariance)).tolist()
+    return FittedPowerLaw(alpha, alpha_sd, log10_rate, log10_rate_sd, 10**pivot, logs.size)
 
 
 def _curvature(cost: Callable[[Float], float], at: Float) -> Float:
     """Return second derivatives by central differences, (2, 2)."""
     h = 1e-3
-    second = np.empty((2, 2))
+
+    def second(i: Float, j: Float) -> float:
+        return (cost(at + i + j) - cost(at + i - j) - cost(at - i + j) + cost(at - i - j)) / (4 * h * h)
+
     steps = h * np.eye(2)
-    for i in range(2):
-        for j in range(2):
-            second[i, j] = (
-                cost(at + steps[i] + steps[j]) - cost(at + steps[i] - steps[j])
-                - cost(at - steps[i] + steps[j]) + cost(at - steps[i] - steps[j])
-            ) / (4 * h * h)  # fmt: skip
-    return second
+    return np.array([[second(i, j) for j in steps] for i in steps])

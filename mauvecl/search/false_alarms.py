@@ -119,6 +119,12 @@ class UnitFilter:
     values: Float  # shape (n,)
     first_frame: int  # frame of values[0] relative to the peak
 
+    @classmethod
+    def of(cls, template: Template, phase: int, powers: tuple[int, ...]) -> UnitFilter:
+        """Remove the fitted baseline polynomial from a template and normalise it."""
+        shape = template.detrended(phase, powers)
+        return cls(shape / np.linalg.norm(shape), template.first)
+
     def shifted(self, n_frames: int) -> UnitFilter:
         """Return the filter delayed by `n_frames`."""
         return UnitFilter(self.values, self.first_frame + n_frames)
@@ -158,7 +164,7 @@ class TemplateGrid:
     def from_bank(cls, bank: Bank) -> TemplateGrid:
         """Compute the correlations between all neighbouring templates of a bank."""
         rows = [
-            [_detrended(template, shape, bank.baseline.powers) for shape in template.shapes]
+            [UnitFilter.of(template, phase, bank.baseline.powers) for phase in range(len(template.phases))]
             for template in bank.templates
         ]
         per_frame, onset, width = [], [], []
@@ -209,14 +215,6 @@ class TemplateGrid:
             _probability_neighbours_below(z, correlations) for correlations in self.temperature_correlations
         ]
         return density, np.array(rows), np.array(temperatures)
-
-
-def _detrended(template: Template, shape: Float, powers: tuple[int, ...]) -> UnitFilter:
-    """Remove the fitted baseline polynomial from a template and normalise it."""
-    if powers:
-        columns = np.stack([template.time**power for power in powers], axis=1)
-        shape = shape - columns @ np.linalg.lstsq(columns, shape, rcond=None)[0]
-    return UnitFilter(shape / np.linalg.norm(shape), template.first)
 
 
 def _neighbour_correlations(unit_filter: UnitFilter, neighbours: list[UnitFilter]) -> tuple[float, ...]:
@@ -339,7 +337,9 @@ class SampledRate:
 
         Raises InputError if the threshold is outside the sampled range.
         """
-        self._check(threshold)
+        low, high = self._ends
+        if not low <= threshold <= high:
+            raise InputError.of("threshold", threshold, f"{low:g} to {high:g} for importance sampling")
         log, error = self.log_rate(threshold)
         reach = float(scipy.special.ndtri(0.5 + CONFIDENCE / 2)) * error
         return Interval(*(float(np.exp(log + d)) for d in (0.0, -reach, reach)))
@@ -384,11 +384,6 @@ class SampledRate:
         """Range of thresholds: from one step below the lowest trusted one to the highest."""
         return float(self.thresholds[self._trusted][0] - STEP), float(self.thresholds[-1])
 
-    def _check(self, threshold: float) -> None:
-        low, high = self._ends
-        if not low <= threshold <= high:
-            raise InputError.of("threshold", threshold, f"{low:g} to {high:g} for importance sampling")
-
 
 def sample_rate(search: Search, *, seed: int, draws: int = DRAWS) -> SampledRate:
     """Estimate the false-alarm rate of a search in normal noise of the assumed variance.
@@ -404,31 +399,19 @@ def sample_rate(search: Search, *, seed: int, draws: int = DRAWS) -> SampledRate
     weights = TemplateGrid.from_bank(search.bank).peak_probabilities(WEIGHTING_THRESHOLD)
     weights = np.maximum(weights, MIN_WEIGHT * weights.max())
     shares = np.cumsum(weights * sizes[:, None])
-    variance = search.variance[:, None]
     estimates = np.empty((draws, len(LADDER)))
-    # One more sum holds the response that changes the chosen template's own value by one, since it is proportional to
-    # the template in time. Batches are small so that they fit into the processor's caches.
     directions = search.bank.directions
+    # Batches are small so that they fit into the processor's caches.
     batch = max(1, BATCH // (8 * (n_sum + 1) * search.n_grid))
     for first in range(0, draws, batch):
         count = min(batch, draws - first)
-        held = np.empty((count, search.stare.n_frames, n_sum + 1))
-        own, along = np.empty(count), np.empty((count, len(directions), 1))
-        for n in range(count):
-            which, direction = divmod(
-                int(np.searchsorted(shares, rng.random() * shares[-1], "right")), weights.shape[1]
-            )
-            onset = int(rng.choice(tried[which]))
-            template = search.in_time(rows[which], np.array([onset]))[0]
-            held[n, :, :n_sum] = np.sqrt(variance) * rng.standard_normal((search.stare.n_frames, n_sum))
-            held[n, :, n_sum] = template * search.variance
-            own[n] = template @ held[n, :, :n_sum] @ directions[direction]
-            along[n, :, 0] = directions @ directions[direction]
+        drawn = [_noise_of_chosen(search, rng, tried, shares) for _ in range(count)]
+        held, own, along = (np.array(each) for each in zip(*drawn, strict=True))
         values: list[list[Float]] = [[] for _ in range(count)]
         for (row, correlated), weight in zip(search.correlations(held), weights, strict=True):
             at = row.per_amplitude > 0
             for n, nearby in enumerate(values):
-                c = along[n] * correlated[n, n_sum, at]
+                c = along[n][:, None] * correlated[n, n_sum, at]
                 r = directions @ correlated[n, :n_sum, at].T - own[n] * c
                 nearby.append(_near(np.array([r, c]), weight, LADDER[0]))
         for n, nearby in enumerate(values):
@@ -438,6 +421,24 @@ def sample_rate(search: Search, *, seed: int, draws: int = DRAWS) -> SampledRate
         np.array(LADDER), estimates.mean(axis=0), estimates.std(axis=0, ddof=1) / np.sqrt(draws),
         search.stare.observed_s / DAY_S,
     )  # fmt: skip
+
+
+def _noise_of_chosen(
+    search: Search, rng: np.random.Generator, tried: list[NDArray[np.intp]], shares: Float
+) -> tuple[Float, float, Float]:
+    """Choose a template; return noise and a response, (n_frame, n_sum + 1), its value, and directions along its own.
+
+    One more sum holds the response that changes the template's value by one, since it is proportional to the template
+    in time.
+    """
+    directions = search.bank.directions
+    which, direction = divmod(int(np.searchsorted(shares, rng.random() * shares[-1], "right")), len(directions))
+    onset = int(rng.choice(tried[which]))
+    template = search.in_time(search.grid[which], np.array([onset]))[0]
+    normals = rng.standard_normal((search.stare.n_frames, directions.shape[1]))
+    noise = np.sqrt(search.variance)[:, None] * normals
+    held = np.column_stack([noise, template * search.variance])
+    return held, template @ noise @ directions[direction], directions @ directions[direction]
 
 
 #: Nodes and weights of an integral over exp(-x).
@@ -536,11 +537,8 @@ def sampled_rate(survey: Survey, seed: int) -> SampledRate:
     return sample_rate(part.search, seed=seed).under(draw_shifts(survey, seed, part))
 
 
-def draw_shifts(survey: Survey, seed: int, part: Survey | None = None) -> UnknownShifts:
-    """Draw the unknowns of a stare and compute scatter and shift of templates' values.
-
-    Shifts are evaluated in a `part` of the stare, by default in all of it.
-    """
+def draw_shifts(survey: Survey, seed: int, part: Survey) -> UnknownShifts:
+    """Draw the unknowns of a stare and compute scatter and, in a part of the stare, shift of templates' values."""
     stare, components, rows = survey.stare, survey.components, survey.bank.directions
     at = np.unique(np.linspace(0, stare.n_frames - 1, POINTS).astype(int))
     rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, CONDITIONS_KEY]))
@@ -561,13 +559,12 @@ def draw_shifts(survey: Survey, seed: int, part: Survey | None = None) -> Unknow
     covariance = components.jittered_covariance(coefficients, stare)
     variance = np.einsum("dk,ntkl,dl->ntd", rows, covariance, rows, optimize=True) / survey.variance[at, None]
     scales = np.sqrt(np.maximum(variance, 1e-12)).reshape(RATE_DRAWS, -1)
-    searched = survey if part is None else part
-    if not _shifted(searched):
+    if not _shifted(part):
         return UnknownShifts(scales, weights / weights.sum(), np.zeros(1), np.ones((RATE_DRAWS, 1)))
     # The same share of draws from both halves.
     some = slice(None, None, ONE_IN)
     weights = weights[some]
-    return UnknownShifts(scales[some], weights / weights.sum(), *_shifts(searched, z[some]))
+    return UnknownShifts(scales[some], weights / weights.sum(), *_shifts(part, z[some]))
 
 
 def _shifted(survey: Survey) -> bool:

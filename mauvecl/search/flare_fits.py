@@ -81,6 +81,35 @@ class ProfileInterval:
     open_high: bool = False
 
 
+@dataclass(frozen=True)
+class Held:
+    """Constraint of a fit: a parameter of a flare, or with a factor the log of amplitude x half-width x factor."""
+
+    flare: int
+    column: int
+    value: float
+    factor: Factor | None
+
+    @property
+    def place(self) -> tuple[int, int]:
+        """Flare and column of the parameter that follows from the constraint."""
+        return self.flare, self.column if self.factor is None else AMPLITUDE
+
+    def apply(self, theta: Float) -> None:
+        """Set the parameter that follows from the others."""
+        others = 0.0
+        if self.factor is not None:
+            others = theta[self.flare, WIDTH] + self.factor(theta[self.flare, KELVIN])[0]
+        theta[self.place] = self.value - others
+
+    def tie(self, derivatives: Float, theta: Float) -> None:
+        """Add to derivatives by the others, (n_row, n_flare, 4), their effect through this parameter."""
+        if self.factor is not None:
+            tied = derivatives[:, self.flare, AMPLITUDE].copy()
+            derivatives[:, self.flare, WIDTH] -= tied
+            derivatives[:, self.flare, KELVIN] -= self.factor(theta[self.flare, KELVIN])[1] * tied
+
+
 class SearchedStare(Protocol):
     """Interface of a stare and its search for fits; the stare is simulated (`search.Survey`) or observed."""
 
@@ -216,10 +245,7 @@ class SummedStare:
         data = np.einsum("tij,tj->ti", whiten, (self.net[span] - others)[used[span]])
         terms = self._level(used, max(last - first for first, last in windows))
         columns = np.einsum("tij,tp->tijp", whiten, terms).reshape(data.size, -1)
-        basis = np.zeros((data.size, 0))
-        if columns.shape[1]:
-            left, size, _ = np.linalg.svd(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), False)
-            basis = left[:, size > 1e-9 * size[0]]
+        basis = scipy.linalg.orth(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), rcond=1e-9)
         flat = data.ravel()
         return Block(self, used, whiten, basis, flat - basis @ (basis.T @ flat))
 
@@ -292,29 +318,21 @@ class Block:
         left = self.data - self.model(theta)[0]
         return float(left @ left)
 
-    def fit(self, theta: Float, fixed: tuple[int, int, float, Factor | None] | None = None) -> BlendFit:
-        """Fit all flares from a starting point, shape (n_flare, 4).
-
-        `fixed` is a constraint of flare, column, value and factor: the column has the value, or with a factor, the sum
-        of log amplitude, log half-width and the factor.
-        """
+    def fit(self, theta: Float, held: Held | None = None) -> BlendFit:
+        """Fit all flares from a starting point, shape (n_flare, 4), optionally with a constraint."""
         low, high = (np.tile(end, (len(theta), 1)) for end in self.sums.bounds)
         moved = np.zeros(theta.shape, np.bool_)
         moved[:, self.sums.free] = True
-        if fixed is not None:
-            moved[fixed[0], fixed[1] if fixed[3] is None else AMPLITUDE] = False
+        if held is not None:
+            moved[held.place] = False
         margin = 1e-9 * (high - low)
         start = np.clip(theta, low + margin, high - margin)
 
         def whole(x: Float) -> Float:
             every = start.copy()
             every[moved] = x
-            if fixed is not None:
-                j, column, value, factor = fixed
-                if factor is None:
-                    every[j, column] = value
-                else:
-                    every[j, AMPLITUDE] = value - every[j, WIDTH] - factor(every[j, KELVIN])[0]
+            if held is not None:
+                held.apply(every)
             return every
 
         @remembering
@@ -325,11 +343,8 @@ class Block:
             """
             every = whole(x)
             model, derivatives = self.model(every)
-            if fixed is not None and fixed[3] is not None:
-                j = fixed[0]
-                tied = derivatives[:, j, AMPLITUDE].copy()
-                derivatives[:, j, WIDTH] -= tied
-                derivatives[:, j, KELVIN] -= fixed[3](every[j, KELVIN])[1] * tied
+            if held is not None:
+                held.tie(derivatives, every)
             columns = np.column_stack([-derivatives[:, moved], self.data - model])
             return np.asarray(np.linalg.qr(columns, mode="r"))
 
@@ -344,7 +359,6 @@ class Block:
         dof = self.data.size - self.basis.shape[1] - theta.shape[0] * len(self.sums.free)
         if not moved.any():
             return BlendFit(whole(start[moved]), self.chi2(whole(start[moved])), dof, True)
-
         solution = scipy.optimize.least_squares(
             residual, start[moved], jacobian, bounds=(low[moved], high[moved]), x_scale=scale[moved],
             ftol=CONVERGED, xtol=1e-9, gtol=None, max_nfev=MAX_EVALUATIONS,
@@ -388,8 +402,8 @@ class Block:
 
             def refit(step: float, start: Float | None, sign: float = sign) -> BlendFit:
                 straight = theta + along * sign * step / variance if variance > 0 else theta
-                fixed = j, column, float(middle + sign * step), factor
-                return self.fit(straight if start is None else start, fixed)
+                held = Held(j, column, float(middle + sign * step), factor)
+                return self.fit(straight if start is None else start, held)
 
             reached, probes = _interval_end(refit, best.chi2, rises, sd * np.sqrt(rises), furthest), list(BEYOND)
             while probes and reached.better is None and reached.step < furthest:

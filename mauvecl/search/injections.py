@@ -111,12 +111,9 @@ class FitAccuracy:
         peak = [quantile("peak", q) for q in (0.16, 0.5, 0.84)]
         return cls(
             fitted=count.astype(np.float64),
-            energy_ratio=quantile("energy", 0.5),
             energy_ratio_low=quantile("energy", 0.16),
             energy_ratio_high=quantile("energy", 0.84),
-            amplitude_ratio=quantile("amplitude", 0.5),
-            half_width_ratio=quantile("half_width", 0.5),
-            temperature_ratio=quantile("temperature", 0.5),
+            **{f"{name}_ratio": quantile(name, 0.5) for name in ("energy", "amplitude", "half_width", "temperature")},
             peak_offset=peak[1],
             peak_scatter=(peak[2] - peak[0]) / 2,
             energy_covered=np.where(none, np.nan, np.nanmean(np.where(none[:, :, None], 0.0, each["covered"]), axis=2)),
@@ -264,17 +261,12 @@ def _site(
     used = np.flatnonzero(weights.any(axis=0))
     ends = slice(int(used[0]), int(used[-1]) + 1) if used.size else slice(0, 0)
     widths = [np.full(response.onsets.size, search.grid[response.row].template.half_width_s) for response in seen]
+    widths_s = np.concatenate([np.zeros(0), *widths])
+    peaks_s = np.concatenate([np.zeros(0), *(response.times_s for response in seen)])
     no_counts = np.zeros((len(search.bank.directions), 0), np.bool_)
-    return InjectionSite(
-        width_s,
-        peak_s,
-        first + ends.start,
-        np.ascontiguousarray(weights[:, ends]),
-        mean[ends].astype(np.float32),
-        np.concatenate([np.zeros(0), *widths]),
-        np.concatenate([np.zeros(0), *(response.times_s for response in seen)]),
-        np.concatenate([no_counts, *(response.values for response in seen)], axis=1),
-    )
+    counts = np.concatenate([no_counts, *(response.values for response in seen)], axis=1)
+    shape, filters_here = mean[ends].astype(np.float32), np.ascontiguousarray(weights[:, ends])
+    return InjectionSite(width_s, peak_s, first + ends.start, filters_here, shape, widths_s, peaks_s, counts)
 
 
 #: Number of stares per batch.
@@ -362,10 +354,10 @@ class Injections:
         """Return the request for the critical amplitudes at a peak time and, with `refit`, fits of detected flares."""
         survey = self.survey
         sites = self.sites(position)
-        reached = [site.frames for site in sites if len(site.filters)]
         # Without templates, one frame is drawn, since requests cannot be empty.
-        first = min((part.start for part in reached), default=0)
-        window = slice(first, max((part.stop for part in reached), default=1))
+        reached = [site.frames for site in sites if len(site.filters)] or [slice(0, 1)]
+        first = min(part.start for part in reached)
+        window = slice(first, max(part.stop for part in reached))
         start = (1 + position) * NUMBERS
         stare = select_frames(survey.stare, window)
         injecting = CriticalAmplitudes(
@@ -448,8 +440,7 @@ class CriticalAmplitudes:
 
     def values(self, site: InjectionSite, drawn: FrameNoise) -> tuple[Single, Single, Single]:
         """Return a, b and c of the module's formula, shapes (n_temperature, n_draw or 1, n_filter)."""
-        filters, here = site.weights, site.frames
-        mean = np.atleast_2d(site.mean if drawn.light is None else site.mean * (1 + drawn.light[:, here]))
+        filters, here, mean = site.weights, site.frames, drawn.mean(site)
         start, width = self.start_s[here], site.half_width_s
         shining = (start > site.peak_s - width - self.frame_s) & (start < site.peak_s + GLOW * width)
         ends = np.flatnonzero(shining)[[0, -1]] if shining.any() else np.array([0, -1])
@@ -461,23 +452,19 @@ class CriticalAmplitudes:
             _combined(self.directions @ self.photons, _multiple(own, NOISE_STEP) @ filters[lit]),
         )
 
-    def best(
-        self, site: InjectionSite, drawn: FrameNoise, amplitudes: Float
-    ) -> tuple[Float, NDArray[np.int64], NDArray[np.int64]]:
-        """Return the largest value of all templates, its temperature and its template, (n_amplitude, n_draw) each."""
+    def best(self, site: InjectionSite, drawn: FrameNoise, amplitudes: Float) -> tuple[Float, NDArray[np.int64]]:
+        """Return the largest value of all templates and its template, shape (n_amplitude, n_draw) each."""
         a, b, c = self.values(site, drawn)
         values = np.array([a + x * b + np.sqrt(x) * c for x in amplitudes.astype(np.float32)])
         values[:, ~site.counts[:, None].repeat(a.shape[1], axis=1)] = -np.inf
         flat = np.moveaxis(values, 2, 1).reshape(len(amplitudes), a.shape[1], -1)
         which = flat.argmax(axis=2)
         largest = np.take_along_axis(flat, which[:, :, None], axis=2)[:, :, 0]
-        temperature, template = np.divmod(which, a.shape[2])
-        return largest.astype(np.float64), temperature, template
+        return largest.astype(np.float64), which % a.shape[2]
 
     def sums(self, site: InjectionSite, drawn: FrameNoise, amplitudes: Float) -> Single:
         """Return frames with the flare less their known mean, shape (n_amplitude, n_draw, n_frame, n_sum)."""
-        here = site.frames
-        mean = np.atleast_2d(site.mean if drawn.light is None else site.mean * (1 + drawn.light[:, here]))
+        here, mean = site.frames, drawn.mean(site)
         glow = np.sqrt(np.maximum(site.mean, 0))
         own = np.einsum("kj,jmt->mtk", self.photons.astype(np.float32), drawn.own[:, :, here] * glow)
         rise = mean[:, :, None] * self.response.astype(np.float32)
@@ -504,7 +491,7 @@ class CriticalAmplitudes:
         for d, (site, row) in enumerate(zip(self.sites, refit.amplitudes, strict=True)):
             if not len(site.filters):
                 continue
-            value, _, template = (each[:, 0] for each in self.best(site, drawn, row))
+            value, template = (each[:, 0] for each in self.best(site, drawn, row))
             alarm = value >= self.threshold
             if not alarm.any():
                 continue
@@ -529,6 +516,10 @@ class FrameNoise:
     noise: Float  # sums without a flare less their known mean, shape (n_sum, n_draw, n_frame)
     own: Single  # standard normals for the photon noise of the flare, shape (n_sum, n_draw, n_frame)
     light: Single | None  # relative change of all light, shape (n_draw, n_frame)
+
+    def mean(self, site: InjectionSite) -> Single:
+        """Return the means of a flare in the frames of its site at unit amplitude, shape (n_draw or 1, n_frame)."""
+        return np.atleast_2d(site.mean if self.light is None else site.mean * (1 + self.light[:, site.frames]))
 
 
 def _multiple(values: Single, step: float) -> Single:

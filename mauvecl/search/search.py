@@ -39,10 +39,11 @@ from mauvecl.schema.physical import DAY_S
 from mauvecl.search.templates import LEAST_SHARE, Bank, Template
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
 
     from mauvecl.flares.frames import Components
-    from mauvecl.flares.stare import Stare, StareUnknown
+    from mauvecl.flares.stare import Stare
+    from mauvecl.noise.unknowns import Changing
 
 Float = NDArray[np.float64]
 
@@ -77,16 +78,9 @@ class Row:
 class Search:
     """Search of stares with a template bank.
 
-    Parameters
-    ----------
-    bank : Bank
-    stare : Stare
-        Only the times of its frames are used.
-    curves : ndarray, shape (n_curve, n_frame), optional
-        Curves with unknown amplitudes in each window, such as sine and cosine of the orbit or the detector's
-        temperature; required if the bank's baseline has `cycle`.
-    variance : ndarray, shape (n_frame,), optional
-        Variance of each frame's sums; 1 by default.
+    Only the times of the stare's frames are used. Curves, (n_curve, n_frame), have unknown amplitudes in each window,
+    such as sine and cosine of the orbit or the detector's temperature; a bank whose baseline has `cycle` requires them.
+    The variance, (n_frame,), is that of each frame's sums, 1 by default.
     """
 
     def __init__(self, bank: Bank, stare: Stare, curves: Float | None = None, variance: Float | None = None) -> None:
@@ -129,12 +123,8 @@ class Search:
     def largest(self, sums: NDArray[Any]) -> LargestValue:
         """Return the largest value of each stare and its template.
 
-        Parameters
-        ----------
-        sums : ndarray, shape (n_stare, n_frame, n_sum)
-            Sums with unit covariance in each frame without a flare.
+        The sums, (n_stare, n_frame, n_sum), have unit covariance in each frame without a flare.
         """
-        sums = self._checked(sums)
         size = max(1, BATCH // (self._size * self.bank.directions.shape[1]))
         parts = [self._largest(sums[i : i + size]) for i in range(0, len(sums), size)]
         return LargestValue(
@@ -146,7 +136,14 @@ class Search:
 
         Values have the precision of the sums. All stares are processed at once, which suits small numbers of stares.
         """
-        yield from self._values(self._checked(sums))
+        sums = self._checked(sums)
+        directions = self.bank.directions.astype(_precision(sums))
+        for row, correlated in self.correlations(sums):
+            tried = row.per_amplitude > 0
+            rho = np.einsum("tk,skn->stn", directions, correlated, optimize=True)
+            if not tried.all():
+                rho[:, :, ~tried] = -np.inf
+            yield row, rho
 
     def correlations(self, sums: NDArray[Any]) -> Iterator[tuple[Row, NDArray[Any]]]:
         """Yield each row with the values of all sums, shape (n_stare, n_sum, n_onset); zero if not searched.
@@ -215,7 +212,7 @@ class Search:
         best = np.full(n, -np.inf)
         peak, width, amplitude = (np.zeros(n) for _ in range(3))
         temperature = np.zeros(n, np.int64)
-        for row, rho in self._values(sums):
+        for row, rho in self.values(sums):
             which = rho.reshape(n, -1).argmax(axis=1)
             value = rho.reshape(n, -1)[every, which]
             better = value > best
@@ -227,38 +224,27 @@ class Search:
             amplitude[better] = value[better] / row.per_amplitude[onset]
         return LargestValue(best, peak, width, temperature, amplitude)
 
-    def _values(self, sums: NDArray[Any]) -> Iterator[tuple[Row, NDArray[Any]]]:
-        directions = self.bank.directions.astype(_precision(sums))
-        for row, correlated in self.correlations(sums):
-            tried = row.per_amplitude > 0
-            rho = np.einsum("tk,skn->stn", directions, correlated, optimize=True)
-            if not tried.all():
-                rho[:, :, ~tried] = -np.inf
-            yield row, rho
-
     def _spectra(self, sums: NDArray[Any]) -> list[NDArray[Any]]:
         """Return transforms of the weighted sums times each series, zero in gaps, (n_stare, n_sum, n_frequency)."""
         real = _precision(sums)
         held = np.zeros((len(sums), sums.shape[2], self.n_grid), real)
-        held[:, :, self._at] = self._levelled(sums) * self._weight[self._at]
+        levelled = np.moveaxis(sums, 2, 1)
+        if self._terms:
+            # The baseline fitted to the whole stare does not change rho, and without it rho is more precise.
+            levelled = levelled - (levelled @ self._level_span) @ self._level_span.T
+        held[:, :, self._at] = levelled * self._weight[self._at]
         used = {series for _, series in self._terms} | {0}
         return [
             scipy.fft.rfft(held * self._series[k].astype(real), self._size) if k in used else held[:0]
             for k in range(len(self._series))
         ]
 
-    def _levelled(self, sums: NDArray[Any]) -> NDArray[Any]:
-        """Subtract the baseline fitted to the whole stare, which does not change rho but improves its precision."""
-        y = np.moveaxis(sums, 2, 1)
-        return np.asarray(y - (y @ self._level_span) @ self._level_span.T) if self._terms else y
-
     @cached_property
     def _level_span(self) -> Float:
         """Orthonormal columns that span all baselines of the stare, (n_frame, n)."""
         time = (self._at - self._at.mean()) / max(self.n_grid, 1)
         columns = np.array([time**power * self._series[series][self._at] for power, series in self._terms])
-        span, size, _ = np.linalg.svd(columns.T, full_matrices=False)
-        return np.asarray(span[:, size > 1e-12 * size[0]])
+        return np.asarray(scipy.linalg.orth(columns.T, rcond=1e-12))
 
     def _correlated(self, spectrum: NDArray[Any], kernel: Float, first: int) -> NDArray[Any]:
         """Return sum_t data(t) kernel(t - first - onset) at every frame, in the precision of the spectrum."""
@@ -272,15 +258,12 @@ class Search:
 
     def _onsets(self, template: Template) -> slice:
         """Return the frames at which a template is tried."""
-        return slice(self._start(template), self.n_grid, template.stride)
-
-    def _start(self, template: Template) -> int:
-        return -self._first % template.stride
+        # Onsets are multiples of the stride from the start of the whole stare, even if only a part is searched.
+        return slice(-self._first % template.stride, self.n_grid, template.stride)
 
     def _rows_of(self, template: Template) -> Iterator[Row]:
         n = len(self._terms)
-        # Onsets are multiples of the stride from the start of the whole stare, even if only a part is searched.
-        peaks = np.arange(self._start(template), self.n_grid, template.stride)
+        peaks = np.arange(self.n_grid)[self._onsets(template)]
         time = template.time
         spectra: dict[tuple[int, int], Any] = {}
 
@@ -306,17 +289,9 @@ class Search:
                 solved = np.linalg.solve(scaled, (shared / size)[:, :, None])[:, :, 0] / size
                 project = solved.T
                 left = power - 2 * np.sum(solved * shared, 1) + np.einsum("ni,nij,nj->n", solved, gram, solved)
-            tried = left >= LEAST_SHARE * self._without_gaps(template, phase)
+            without_gaps = template.detrended(phase, self.bank.baseline.powers)
+            tried = left >= LEAST_SHARE * float(without_gaps @ without_gaps) * float(np.median(self._weight[self._at]))
             yield Row(template, phase, peaks, np.sqrt(np.where(tried, left, 0.0)), project)
-
-    def _without_gaps(self, template: Template, phase: int) -> float:
-        """Return a template's power without gaps, marginalised over powers of time only."""
-        shape = template.shapes[phase]
-        columns = np.array([template.time**power for power in self.bank.baseline.powers])
-        if columns.size:
-            level, *_ = np.linalg.lstsq(columns.T, shape, rcond=None)
-            shape = shape - level @ columns
-        return float(shape @ shape) * float(np.median(self._weight[self._at]))
 
 
 def _precision(sums: NDArray[Any]) -> type[np.floating[Any]]:
@@ -346,26 +321,6 @@ class Trend:
     known: Float  # means of star, sky, neighbours and dark, shape (4, n_frame, n_sum)
     slope_per_c: float  # relative change of the dark current per deg C
 
-    @classmethod
-    def of_unknowns(
-        cls,
-        unknowns: Sequence[StareUnknown],
-        directions: Mapping[Changing, Float],
-        variance: Float,
-        frames: NDArray[np.int64],
-        frame_s: float,
-        slope_per_c: float,
-    ) -> Trend | None:
-        """Return the trend of a stare's unknowns, or None without unknowns; for `directions`, see `Survey`."""
-        if not unknowns:
-            return None
-        star, sky = directions["star"], directions["sky"]
-        neighbours = directions["light"] - star - sky
-        dark = directions["temperature"] / slope_per_c if slope_per_c else np.zeros_like(sky)
-        curves = np.array([unknown.sd * unknown.curve for unknown in unknowns])
-        of = tuple(unknown.of for unknown in unknowns)
-        return cls(frames, frame_s, variance, of, curves, np.stack([star, sky, neighbours, dark]), slope_per_c)
-
     @cached_property
     def extremes(self) -> Float:
         """Amplitudes of `REACH` standard deviations, together and each alone, with both signs, (n, n_unknown)."""
@@ -387,13 +342,8 @@ class Trend:
 
     def part(self, part: slice) -> Trend:
         """Return the trend of some frames."""
-        frames, variance, curves, known = (
-            self.frames[part],
-            self.variance[part],
-            self.curves[:, part],
-            self.known[:, part],
-        )
-        return replace(self, frames=frames, variance=variance, curves=curves, known=known)
+        frames, variance = self.frames[part], self.variance[part]
+        return replace(self, frames=frames, variance=variance, curves=self.curves[:, part], known=self.known[:, part])
 
     def subtracted(self, sums: NDArray[Any]) -> NDArray[np.float64]:
         """Fit the unknowns to sums less their known mean, and subtract their effect beyond first order."""
@@ -537,10 +487,15 @@ class Survey:
     @cached_property
     def unknowns(self) -> Trend | None:
         """Effect of the stare's unknowns, or None without unknowns."""
+        if not self.stare.unknowns:
+            return None
+        star, sky = self.directions["star"], self.directions["sky"]
         slope = self.components.quiet.conditions["dark_slope_per_c"]
-        return Trend.of_unknowns(
-            self.stare.unknowns, self.directions, self.variance, self.stare.numbers, self.stare.frame_s, slope
-        )
+        dark = self.directions["temperature"] / slope if slope else np.zeros_like(sky)
+        known = np.stack([star, sky, self.directions["light"] - star - sky, dark])
+        curves = np.array([unknown.sd * unknown.curve for unknown in self.stare.unknowns])
+        of = tuple(unknown.of for unknown in self.stare.unknowns)
+        return Trend(self.stare.numbers, self.stare.frame_s, self.variance, of, curves, known, slope)
 
     @property
     def trend(self) -> Trend | None:

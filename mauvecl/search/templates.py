@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.detection.nuisances import Nuisances, join_names
-from mauvecl.fits.flare_model import MeanSums
+from mauvecl.detection.nuisances import Nuisances
+from mauvecl.fits.flare_model import MeanSums, spanning_weights
 from mauvecl.flares.settings import RANK, WINDOW_S
 from mauvecl.host.arrays import set_read_only
 from mauvecl.noise.unknowns import CHANGED_PART
@@ -41,21 +41,12 @@ LEAST_SHARE = 0.25
 
 @dataclass(frozen=True)
 class Baseline:
-    """Baseline under a flare: the terms that are marginalised over in each window.
-
-    Attributes
-    ----------
-    offset, slope : bool
-    cycle : bool
-        Curves of unknown amplitude, such as the orbital thermal cycle.
-    window_s : float
-        Smallest window. Windows also include at least 5 half-widths before the peak and 10 after it.
-    """
+    """Baseline under a flare: the terms that are marginalised over in each window."""
 
     offset: bool = True
     slope: bool = True
-    cycle: bool = False
-    window_s: float = WINDOW_S
+    cycle: bool = False  #: curves of unknown amplitude, such as the orbital thermal cycle
+    window_s: float = WINDOW_S  #: of the smallest window; windows hold 5 half-widths before the peak and 10 after
 
     def __post_init__(self) -> None:
         if self.slope and not self.offset:
@@ -85,29 +76,20 @@ class Template:
         n = self.shapes.shape[1]
         return np.asarray((np.arange(n) - (n - 1) / 2) / max((n - 1) / 2, 1.0))
 
-    @cached_property
-    def power(self) -> Float:
-        """Sum of squares without gaps and with a known baseline, shape (n_phase,)."""
-        return np.asarray(np.sum(self.shapes**2, axis=1))
+    def detrended(self, phase: int, powers: tuple[int, ...]) -> Float:
+        """Return a shape less its projection on powers of time, shape (n,)."""
+        columns = np.array([self.time**power for power in powers]).reshape(len(powers), self.time.size).T
+        level, *_ = np.linalg.lstsq(columns, self.shapes[phase])
+        return np.asarray(self.shapes[phase] - columns @ level)
 
 
 @dataclass(frozen=True, eq=False)
 class Bank:
-    """Template bank of a search.
+    """Template bank of a search."""
 
-    Attributes
-    ----------
-    half_widths_s : tuple of float
-        Ascending.
-    directions : ndarray, shape (n_temperature, n_sum)
-        Unit vectors of the change of a frame's sums for each temperature: rows of `Templates.directions`, or one row of
-        ones for a single light curve.
-    shape : Shape
-    frame_s : float
-    baseline : Baseline
-    """
-
-    half_widths_s: tuple[float, ...]
+    half_widths_s: tuple[float, ...]  #: ascending
+    #: Unit vectors of the change of a frame's sums for each temperature: rows of `Templates.directions`, or one row of
+    #: ones for a single light curve; shape (n_temperature, n_sum).
     directions: Float
     shape: Shape
     frame_s: float
@@ -164,27 +146,14 @@ MIN_SINGULAR = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Templates:
-    """Weights of a frame's sums, and the effect of flares on these sums.
+    """Weights of a frame's sums, and the effect of flares of unit amplitude on these sums."""
 
-    Attributes
-    ----------
-    temperatures_k : tuple of float
-        Flare temperatures, ascending.
-    weights : ndarray, shape (n_sum, n_pixel)
-        Weights per DN, for which sums of a quiescent frame have unit covariance, including nuisance parameters.
-    directions : ndarray, shape (n_temperature, n_sum)
-        Mean sums for a flare of unit amplitude.
-    best : ndarray, shape (n_temperature,)
-        S/N of that flare in one frame with its optimal weights: the norm of `directions` without loss.
-    noise : ndarray, shape (n_temperature, n_sum, n_sum)
-        Covariance that the photon noise of a flare of unit amplitude adds to the sums.
-    """
-
-    temperatures_k: tuple[float, ...]
+    temperatures_k: tuple[float, ...]  #: ascending
+    #: Per DN; sums of a quiescent frame have unit covariance, including nuisance parameters; shape (n_sum, n_pixel).
     weights: Float
-    directions: Float
-    best: Float
-    noise: Float
+    directions: Float  #: mean sums, shape (n_temperature, n_sum)
+    best: Float  #: S/N in a frame with optimal weights: the norm of `directions` without loss, shape (n_temperature,)
+    noise: Float  #: covariance that photon noise of the flare adds to the sums, shape (n_temperature, n_sum, n_sum)
 
     @classmethod
     def of(
@@ -225,25 +194,10 @@ class Templates:
         `variance` and `flares` are zero in pixels that are not used, and `photon_variance` is the rise of the variance
         with the flux; other arguments are those of `of`.
         """
-        used = variance > 0
-        plain = np.divide(flares, variance, out=np.zeros_like(flares), where=used)
-        optimal = plain
-        if nuisances:
-            rows = nuisances.rows(variance, nuisances.spectra * used)
-            optimal = plain - (flares @ rows.T) @ rows
-        gram = optimal @ flares.T
-        power = np.diag(gram)
-        if not (power > 1e-10 * np.einsum("tp,tp->t", plain, flares)).all():
-            names = join_names(nuisances.names) if nuisances else "nothing"
-            raise InputError(
-                f"a flare cannot be distinguished from {names} in one frame",
-                "fewer nuisance parameters",
-                key="nuisances",
-            )
-        length = np.sqrt(power)
-        values, vectors = np.linalg.eigh(gram / np.outer(length, length))
-        modes = [k for k in range(len(values))[::-1][:rank] if values[k] > MIN_SINGULAR**2 * values[-1]]
-        weights = (vectors[:, modes] / length[:, None] / np.sqrt(values[modes])).T @ optimal
+        rows = nuisances.rows(variance, nuisances.spectra * (variance > 0)) if nuisances else None
+        plain = np.divide(flares, variance, out=np.zeros_like(flares), where=variance > 0)
+        weights, length = spanning_weights(flares, plain, nuisances, rows, MIN_SINGULAR**2)
+        weights = weights[::-1][:rank]
         # Signs are arbitrary; choose them so that the hottest flare increases each sum.
         weights *= np.where(weights @ flares[-1] < 0, -1.0, 1.0)[:, None]
         photons = flares * photon_variance
@@ -294,9 +248,7 @@ class Templates:
         return np.asarray(self.noise[int(np.argmin(np.abs(np.log(np.array(self.temperatures_k) / kelvin))))])
 
 
-def frame_nuisances(
-    quiet: Expectation, stare: Stare, more: Mapping[str, float] | Nuisances | None = None
-) -> Nuisances | None:
+def frame_nuisances(quiet: Expectation, stare: Stare, more: Mapping[str, float] | None = None) -> Nuisances | None:
     """Return the nuisance parameters of each frame: the stare's jitters, and `more`.
 
     Standard deviations by name in `more` replace jitters of the same kind; an infinite one is projected out.
@@ -304,14 +256,5 @@ def frame_nuisances(
     jitters: dict[str, float] = {CHANGED_PART[of]: sd for of, sd in stare.jitters.items() if sd > 0}
     # Drifts and re-acquisitions change all light alike, by any amount and at any time.
     drifting = {} if stare.pointing is None else {"light": np.inf}
-    jitters |= drifting
-    if isinstance(more, Nuisances):
-        mine = Nuisances.of(quiet, {name: sd for name, sd in jitters.items() if name not in more.names})
-        return replace(
-            more,
-            names=(*more.names, *mine.names),
-            spectra=np.vstack([more.spectra, mine.spectra]),
-            sd=np.concatenate([more.sd, mine.sd]),
-        )
-    spreads = jitters | dict(more or {}) | drifting
+    spreads = jitters | drifting | dict(more or {}) | drifting
     return Nuisances.of(quiet, spreads) if spreads else None
