@@ -346,11 +346,7 @@ class TextRows:
         if not mark and all(name.endswith(",") for name in names[:-1]):
             # Commas divide the names and blanks the rows.
             names = [name.rstrip(",") for name in names]
-        names = [name or f"col{k + 1}" for k, name in enumerate(names)]
-        # Names that occur twice get numbers, so that none is taken for the only one.
-        while twice := [name for name, count in Counter(names).items() if count > 1]:
-            names = [f"{name}_{names[: k + 1].count(name)}" if name in twice else name for k, name in enumerate(names)]
-        rows = cells[at:]
+        names, rows = _distinct(names), cells[at:]
         decimal = _has_decimal_commas(rows, self.what)
         if all(map(_RDB.fullmatch, units)):
             units = []
@@ -517,6 +513,14 @@ def bracketed(line: str) -> list[str]:
     """Divide at blanks and commas, but keep a unit in brackets with the preceding name."""
     brackets = r"[\[(](?:[^\[\]()]|\([^()]*\))*[\])]"
     return re.findall(rf"[^\s\[(,]+(?:\s+in\s+[^\s,]+|(?:\s*{brackets})+[^\s,]*)?|{brackets}", line)
+
+
+def _distinct(names: list[str]) -> list[str]:
+    """Name columns without a name, and number names that occur twice, so that none is taken for the only one."""
+    names = [name or f"col{k + 1}" for k, name in enumerate(names)]
+    while twice := [name for name, count in Counter(names).items() if count > 1]:
+        names = [f"{name}_{names[: k + 1].count(name)}" if name in twice else name for k, name in enumerate(names)]
+    return names
 
 
 def _is_cell_of_row(cell: str) -> bool:

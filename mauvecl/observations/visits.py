@@ -266,6 +266,18 @@ class LineIndex:
     equivalent_width_nm: Float
 
 
+def _integral_of_line(x: Float, weight: Float, share: Float) -> Float:
+    """Return the factors of pixels in the integral of the straight line fitted to them, shape (..., n_pixel).
+
+    It is a linear function of the pixels, by the weights of the least squares; `share` is the width of each pixel that
+    is integrated.
+    """
+    design = np.stack([np.ones_like(x), x])
+    normal = np.einsum("ap,...p,bp->...ab", design, weight, design)
+    coefficients = np.linalg.solve(normal, (design @ share)[:, None])[..., 0]
+    return np.asarray(np.einsum("...a,ap,...p->...p", coefficients, design, weight))
+
+
 @validated
 def line_index(
     wavelength_nm: Annotated[ArrayLike, Unit("nm")],
@@ -332,12 +344,8 @@ def line_index(
     left = good & windows
     if (count := int(left.sum(axis=-1).min(initial=nm.size))) < MIN_CONTINUUM:
         raise InputError.of("continuum_nm", f"{count} usable pixels", f"at least {MIN_CONTINUUM} in each spectrum")
-    # The integral of the continuum is a linear function of the pixels, by the weights of its least squares.
-    design = np.stack([np.ones_like(nm), nm - (low + high) / 2])
     weight = np.where(left, 1.0 / np.where(left, sd, 1.0) ** 2, 0.0)
-    normal = np.einsum("ap,...p,bp->...ab", design, weight, design)
-    coefficients = np.linalg.solve(normal, (design @ share)[:, None])[..., 0]
-    continuum = np.einsum("...a,ap,...p->...p", coefficients, design, weight)
+    continuum = _integral_of_line(nm - (low + high) / 2, weight, share)
     light, sd = (np.where(left | inside, each, 0.0) for each in (light, sd))
     level = (continuum * light).sum(axis=-1)
     index = (share * light).sum(axis=-1) - level
