@@ -41,8 +41,7 @@ WIDE = 5.0
 
 def _few(answer: DetectAnswer) -> First[Shown]:
     """Limit the number of stars so that each panel stays readable."""
-    stars = [(star.title, star.detection, [f"flare {100 * a:g} %" for a in star.amplitudes]) for star in answer.stars]
-    return First[Shown](stars, MOST_STARS, "stars")
+    return First([star.shown for star in answer.stars], MOST_STARS, "stars")
 
 
 def _alone(outcome: Detection) -> list[Shown]:
