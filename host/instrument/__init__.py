@@ -1,4 +1,4 @@
-"""Instruments, and the names and paths of their files, for which no NumPy is imported."""
+"""Instruments, and the names and paths of their files, which studies read without importing NumPy."""
 
 from __future__ import annotations
 

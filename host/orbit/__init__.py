@@ -1,4 +1,4 @@
-"""The orbit and its targets, and the limits of observations, a section of studies for which no NumPy is imported."""
+"""The orbit, its targets, and the limits of observations, which studies read without importing NumPy."""
 
 from __future__ import annotations
 

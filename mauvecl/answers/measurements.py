@@ -25,6 +25,7 @@ from mauvecl.fits.spectrum import (
 from mauvecl.fits.time_course import MeasuredBins, cooling_course, cooling_event, fit_bins, fit_cooling, measure_along
 from mauvecl.flares.settings import Cooling
 from mauvecl.flares.stare_scene import StaresRequest
+from mauvecl.host.arrays import true_runs
 from mauvecl.host.stars.bands import photons
 from mauvecl.host.stars.flare_spectra import (
     PARSEC_CM,
@@ -301,10 +302,8 @@ def expected_measurements(
 
 def _saturated_nm(flare: Expectation) -> list[tuple[float, float]]:
     """Return the wavelengths of runs of pixels near saturation."""
-    near = ~variance_of(flare)[1]
-    steps = np.flatnonzero(np.diff(np.concatenate([[0], near.astype(np.int8), [0]])))
     nm = flare.wavelength_nm
-    return [(float(nm[first]), float(nm[end - 1])) for first, end in steps.reshape(-1, 2)]
+    return [(float(nm[first]), float(nm[end - 1])) for first, end in true_runs(~variance_of(flare)[1])]
 
 
 def _mean_exposure(quiet: Expectation, added_dn: Float, unknown: Nuisances | None) -> Float:

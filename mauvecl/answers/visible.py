@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from mauvecl.answers.answer import Answer, TableOf, first_of, metadata_of
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.host import VERSION
+from mauvecl.host.arrays import true_runs
 from mauvecl.host.orbit.geometry import Bodies, TimeGrid
 from mauvecl.host.orbit.orbit import Target
 from mauvecl.host.orbit.visibility import Visibility, Windows, elongation_deg, zodiacal_light
@@ -317,8 +318,7 @@ class VisibleAnswer(Answer):
                 ]
                 continue
             hours = self.visibility.by_day(k)
-            edges = np.flatnonzero(np.diff(np.concatenate([[False], hours >= SEEN_H, [False]])))
-            for first, last in zip(edges[::2], edges[1::2], strict=True):
+            for first, last in true_runs(hours >= SEEN_H):
                 mean = f"{hours[first:last].mean():.1f} h of exposure a day"
                 entries.append(Entry(self.days[first], self.days[last - 1], target.name, mean))
         return entries

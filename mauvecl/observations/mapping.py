@@ -1,4 +1,4 @@
-"""What the columns of a file are, by a mapping in a short TOML file or by their names, and what their times mean."""
+"""Quantities of a file's columns, stated in a short TOML file or recognised by name, and the meaning of its times."""
 
 from __future__ import annotations
 

@@ -74,7 +74,7 @@ class Question:
 
     @property
     def as_bright_as_observed(self) -> bool:
-        """Whether the flare has the brightness of the visitor's file, in place of the amplitude."""
+        """True if the visitor's file gives the brightness of the flare, and not the amplitude."""
         return "flare_file" in self.uploads and bool(self.values["as_observed"])
 
     def study(self, folder: Path | None = None) -> Study:

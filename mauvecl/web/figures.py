@@ -275,7 +275,8 @@ def strips(wavelength_nm: Any, flags: Any) -> tuple[Any, Any]:
     """Return the ends of runs of flagged pixels, half a pixel beyond each, as columns of `Strips`."""
     import numpy as np
 
-    padded = np.diff(np.concatenate([[0], np.asarray(flags, int), [0]]))
-    first, last = np.nonzero(padded == 1)[0], np.nonzero(padded == -1)[0] - 1
+    from mauvecl.host.arrays import true_runs
+
+    first, end = true_runs(flags).T
     half = 0.5 * np.gradient(wavelength_nm)
-    return (wavelength_nm - half)[first], (wavelength_nm + half)[last]
+    return (wavelength_nm - half)[first], (wavelength_nm + half)[end - 1]
