@@ -209,7 +209,7 @@ def position(text: str) -> tuple[float, float]:
     try:
         ra, dec = (angle(part, right_ascension=k == 0, pair=len(parts[1 - k].split())) for k, part in enumerate(parts))
     except InputError as error:
-        raise error.within(f"target = {shortened(text)}") from error
+        raise error.within(f"target = {shortened(text)}, read as right ascension and declination") from error
     except ValueError:
         raise unknown from None
     return ra, dec
@@ -246,7 +246,7 @@ def angle(text: str, unit: str = "", *, right_ascension: bool, pair: int = 3) ->
         raise ValueError(text)
     name, low, high = ("right ascension", 0.0, 360.0) if right_ascension else ("declination", -90.0, 90.0)
     if not (math.isfinite(value) and low <= value <= high):
-        fault = f"{shortened(text)} is a {name} of {value:g} degrees, but must be between {low:g} and {high:g}"
+        fault = f"{shortened(text)} is a {name} of {value:g}, but must be {low:g} to {high:g} degrees"
         raise InputError(fault, key="target")
     return value
 

@@ -69,7 +69,7 @@ def columns(what: str, text: str, expected: str, unit: str = "") -> NDArray[np.f
         try:
             lines = NumberLines(text, expected)
             if odd := next((len(cells) for cells in lines.cells if len(cells) != 2), 0):
-                raise InputError(f"it must have two columns, {expected}, but has {odd}", key="columns")
+                raise InputError(f"it has {odd} column{'s' * (odd > 1)}, but needs two: {expected}", key="columns")
             first, second = (lines.column(k, str(k + 1)).numbers() for k in range(2))
             return np.column_stack([_in_unit(first, lines.comments, unit) if unit else first, second])
         except InputError as error:

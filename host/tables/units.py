@@ -123,8 +123,8 @@ def _linear_unit(name: str, text: str, expected: str) -> u.UnitBase:
         power = int(match[2] or match[3])
         other = f"1e{power + 1}" if match[2] else f"1e{-power}"
         fault = f"unit = {shortened(text.strip())}: its factor may be 1e{power} or {other}"
-        usual = f"1e{-abs(power)} erg / (s cm2 Angstrom)"
-        raise InputError(f"{fault}; use `flux_unit` to give a unit such as {usual!r}", key="unit")
+        usual = f"a unit such as '1e{-abs(power)} erg / (s cm2 Angstrom)': `flux_unit` names it"
+        raise InputError(f"{fault}; give {usual}", key="unit")
     scale, name = _scale_and_name(name)
     name = balanced(name.rstrip(". "))
     if name not in ("MJy", "MJY"):
