@@ -347,7 +347,7 @@ def _named(name: str, names: Sequence[str]) -> int:
     indices = indices or [i for i, one in enumerate(names) if plain(one) == plain(name)]
     if len(indices) != 1:
         fault = f"{'several columns are' if indices else 'no column is'} named {shortened(name)}"
-        raise InputError(fault, f"one of {listed(names)}", key="columns")
+        raise InputError(f"{fault}; give one of {listed(names)}", key="columns")
     return indices[0]
 
 
@@ -358,7 +358,7 @@ def _wavelength(names: Sequence[str], roles: Sequence[Role]) -> tuple[int, ...]:
     if low or high:
         return _only("lower edge of the bins", names, low), _only("upper edge of the bins", names, high)
     fault = f"no column is recognised as the wavelength among {listed(names) or 'none'}"
-    raise InputError(fault, "one named wavelength: name two columns as in FILE[wavelength,flux]", key="columns")
+    raise InputError(f"{fault}; give two columns as in FILE[wavelength,flux]", key="columns")
 
 
 def _flux(names: Sequence[str], roles: Sequence[Role], wavelength: tuple[int, ...]) -> int:
@@ -372,8 +372,7 @@ def _flux(names: Sequence[str], roles: Sequence[Role], wavelength: tuple[int, ..
     shown = (unknown or rest or [0])[0]
     held = [f"{names[i].strip()[:40]} ({roles[i].kind})" for i in rest]
     fault = f"no column is recognised as a star's flux, only {listed(held) or 'the wavelength'}"
-    expected = f"one named flux: name the column as in {as_typed(names[shown], 'column', shown, names)}"
-    raise InputError(fault, expected, key="columns")
+    raise InputError(f"{fault}; give the column as in {as_typed(names[shown], 'column', shown, names)}", key="columns")
 
 
 def _best(scored: list[tuple[int, int]]) -> list[int]:
@@ -386,7 +385,7 @@ def _only(what: str, names: Sequence[str], indices: Sequence[int]) -> int:
         return indices[0]
     if not indices:
         fault = f"no column is the {what} among {listed(names) or 'none'}"
-        raise InputError(fault, "both edges or the wavelength itself", key="columns")
+        raise InputError(f"{fault}; give both edges or the wavelength itself", key="columns")
     several = [names[i].strip() for i in indices]
     fault = f"{len(several)} columns may be the {what}: {listed(several)}"
-    raise InputError(fault, f"one: name it as in {as_typed(several[-1], 'column', indices[-1], names)}", key="columns")
+    raise InputError(f"{fault}; give one as in {as_typed(several[-1], 'column', indices[-1], names)}", key="columns")

@@ -88,7 +88,7 @@ class RawSpectrum:
 def spectrum_in(tables: Sequence[SpectrumTable], asked: Sequence[str]) -> RawSpectrum:
     """Return the spectrum of a file, or the selected one of several."""
     if not tables:
-        raise InputError("has no table", "one with a wavelength and a flux", key="table")
+        raise InputError("it has no table, but needs one with a wavelength and a flux", key="table")
     labels = [table.label.strip().lower() for table in tables]
     words = {word.lower() for word in asked}
     named = [i for i, label in enumerate(labels) if label and label in words]
@@ -123,7 +123,7 @@ def spectrum_in(tables: Sequence[SpectrumTable], asked: Sequence[str]) -> RawSpe
         held = [one.table.label for one in found]
         fault = f"{len(held)} tables hold a spectrum: {listed(held)}"
         first = as_typed(held[0], "table", labels.index(held[0].strip().lower()), labels)
-        raise InputError(fault, f"one: name it as in {first}", key="table")
+        raise InputError(f"{fault}; give one as in {first}", key="table")
     return found[0]
 
 
@@ -156,7 +156,7 @@ def _spectrum_of(table: SpectrumTable, asked: Sequence[str]) -> RawSpectrum:
         rows = [cells]
     segments = [_segment(row, [column.name.strip() for column in chosen]) for row in rows]
     if sum(flux.size for _, flux in segments) < 2:
-        raise InputError("has fewer than two points", "a spectrum", key="flux")
+        raise InputError("it must have at least two points to be a spectrum", key="flux")
     axis, flux_role = roles[choice.wavelength[0]], roles[choice.flux]
     return RawSpectrum(
         segments, table, chosen[0].name, chosen[-1].name, axis, flux_role, (*table.messages, *messages),
@@ -168,16 +168,16 @@ def _segment(cells: Sequence[Any], names: Sequence[str]) -> tuple[Float, Float]:
     *axes, flux = (_numbers(cell, name) for cell, name in zip(cells, names, strict=True))
     for array, name in ((axes[0], names[0]), (flux, names[-1])):
         if array.ndim != 1:
-            raise InputError(f"column {name} has the shape {array.shape}", "one spectrum", key=name)
+            raise InputError(f"column {name} must hold one spectrum, but has the shape {array.shape}", key=name)
     if axes[0].size != flux.size:
-        raise InputError(f"needs as many wavelengths as fluxes, but has {axes[0].size} for {flux.size}", key="flux")
+        raise InputError(f"it needs as many wavelengths as fluxes, but has {axes[0].size} for {flux.size}", key="flux")
     return sum(axes[1:], axes[0]) / len(axes), flux
 
 
 def _numbers(cells: Any, name: str) -> Float:
     """Return cells as numbers; NaN for missing measurements."""
     if np.asanyarray(cells).dtype.kind == "b":
-        raise InputError(f"{name} holds true and false", "real numbers", key=name)
+        raise InputError(f"{name} must hold real numbers, not true and false", key=name)
     return without_indefinite(Values.of(name, cells, what="its table").numbers())
 
 
@@ -204,7 +204,9 @@ def _selected_rows(
         shape = np.shape(cells[-1])
         cells = [np.broadcast_to(cell, shape) if np.shape(cell) == shape[1:] else cell for cell in cells]
     if len({len(cell) for cell in cells}) > 1:
-        raise InputError(f"needs as many rows of wavelengths as of fluxes, but has {len(cells[0])} for {n}", key="flux")
+        raise InputError(
+            f"it needs as many rows of wavelengths as of fluxes, but has {len(cells[0])} for {n}", key="flux"
+        )
     names = [plain(column.name) for column in table.columns]
     is_only = n == 1 and not asked and not table.row_title
     identifiers = [[""]] if is_only else _identifiers(table, {*choice.wavelength, choice.flux}, n)
@@ -233,7 +235,7 @@ def _selected_rows(
         if kept.any():
             found.append([array[kept] for array in arrays])
     if not found:
-        raise InputError("its rows contain no valid point", "valid points", key="rows")
+        raise InputError("its rows contain no valid point, but need at least one", key="rows")
     return found, identifier, messages
 
 
@@ -241,7 +243,7 @@ def _arrays(cells: list[Any], step: Any, first: int) -> list[Any]:
     """Return a row's cells as arrays of equal length; a step and the start, at point `first`, are expanded."""
     *axes, flux = (np.ma.asanyarray(cell).squeeze() for cell in cells)
     if flux.ndim != 1:
-        raise InputError(f"its row: the flux has the shape {flux.shape}", "one spectrum", key="flux")
+        raise InputError(f"its row must hold one spectrum, but the flux has the shape {flux.shape}", key="flux")
     if axes[0].size == 1 < flux.size:
         if step is None:
             raise InputError(
@@ -289,7 +291,7 @@ def _row_asked(identifiers: Sequence[Sequence[str]], asked: Sequence[str], names
         labels = [f"row {row + 1}" for row in fitting]
     fault = f"{len(fitting)} spectra are in it, one in each row ({listed(labels)})"
     first = as_typed((labels or ["row 1"])[0], "row", (fitting or [0])[0], labels)
-    raise InputError(fault, f"one: name it as in {first}", key="rows")
+    raise InputError(f"{fault}; give one as in {first}", key="rows")
 
 
 #: Range of decimal logarithms of any wavelength in nm, Angstrom, um or Hz, and of any flux.
@@ -380,9 +382,8 @@ def _scale(what: str, column: str, role: Role, asked: Any, implied: str | None) 
     if is_assumed:
         if implied is None:
             usual = "nm" if what == "wavelength" else "erg / (s cm2 Angstrom)"
-            raise InputError(
-                f"column {column} names no unit", f"one such as {usual}: `{what}_unit` names it", key=f"{what}_unit"
-            )
+            fault = f"column {column} names no unit; use `{what}_unit` to give one such as {usual}"
+            raise InputError(fault, key=f"{what}_unit")
         # Logarithms of wavelength are of Angstrom everywhere (SDSS, LAMOST, DESI).
         is_logarithm = is_bare_logarithm or role.logarithm
         per_frequency = what == "flux" and role.per_frequency
@@ -428,7 +429,7 @@ def _power(values: Float, base: str, limits: tuple[float, float], column: str) -
     if finite.size and (finite.min() < limits[0] or finite.max() > limits[1] or np.abs(finite).max() < 1e-3):
         low, high = values[np.isfinite(values)].min(), values[np.isfinite(values)].max()
         fault = f"column {column} is named as a logarithm and holds {low:g} to {high:g}"
-        raise InputError(fault, f"logarithms from {limits[0]:g} to {limits[1]:g}", key=column)
+        raise InputError(f"{fault}, but must hold logarithms from {limits[0]:g} to {limits[1]:g}", key=column)
     with np.errstate(over="ignore"):
         return np.asarray(10.0**logarithms)
 
@@ -440,16 +441,14 @@ def _check_flux_unit(unit: Any, role: Role) -> None:
         raise InputError.of("flux_unit", str(unit), usual)
     if kind == "total" and not role.total:
         fault = f"the unit {unit} is not a flux density (it is not per wavelength or frequency)"
-        expected = f"{usual}, or a column whose name says lambda F_lambda, such as lamFlam"
+        fault += f"; use {usual}, or a column whose name says lambda F_lambda, such as lamFlam"
     elif kind == "density" and role.total:
-        fault = f"the column's name says lambda F_lambda and its unit {unit} a flux density"
-        expected = "them to agree"
+        fault = f"the column's name says lambda F_lambda and its unit {unit} a flux density, but they must agree"
     elif kind == "surface brightness":
-        fault = f"the unit {unit} is per solid angle"
-        expected = "the flux of the whole star, such as erg / (s cm2 Angstrom)"
+        fault = f"the unit {unit} is per solid angle; use the flux of the whole star, such as erg / (s cm2 Angstrom)"
     else:
         return
-    raise InputError(fault, expected, key="flux_unit")
+    raise InputError(fault, key="flux_unit")
 
 
 def _without_marks(segments: list[tuple[Float, Float]], messages: list[str]) -> list[tuple[Float, Float]]:
@@ -486,8 +485,7 @@ def _joined(segments: list[tuple[Float, Float]], messages: list[str]) -> tuple[F
     for more, added in segments[1:]:
         if more[-1] <= nm[-1]:
             fault = f"a segment of {more[0]:g}-{more[-1]:g} nm lies within another, which ends at {nm[-1]:g} nm"
-            expected = "segments side by side: choose one by its name, as in FILE[name]"
-            raise InputError(fault, expected, key="table")
+            raise InputError(f"{fault}; give one of them by its name, as in FILE[name]", key="table")
         if more[0] <= nm[-1]:
             middle = (more[0] + nm[-1]) / 2
             messages.append(f"two segments overlap at {more[0]:g}-{nm[-1]:g} nm and are cut at {middle:g} nm")
@@ -505,13 +503,13 @@ def _check_assumed_flux(flux: Float, raw: RawSpectrum) -> None:
     low, high = float(finite.min()), float(finite.max())
     said = _THROUGHPUT.search(f"{raw.table.remarks}\n{raw.table.origin}".replace("_", " "))
     if low >= LIKELY_MAGNITUDES[0] and high <= LIKELY_MAGNITUDES[1]:
-        fault, expected = f"fluxes of {low:g} to {high:g} without a unit look like magnitudes", "a flux density"
+        fault = f"fluxes of {low:g} to {high:g} without a unit look like magnitudes, but must be a flux density"
     elif said and low >= 0.0 and 1e-3 <= high <= 1.0:
         fault = f"values of {low:g} to {high:g} without a unit and the word {said[0]!r} speak of a throughput"
-        expected = "a star's flux"
+        fault += ", but must be a star's flux"
     else:
         return
-    raise InputError(fault, f"{expected}: `flux_unit` names its unit", key="flux_unit")
+    raise InputError(f"{fault}: `flux_unit` names its unit", key="flux_unit")
 
 
 def _merged(nm: Float, flux: Float, messages: list[str]) -> tuple[Float, Float]:

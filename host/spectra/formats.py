@@ -124,9 +124,7 @@ def _table_of_arrays(
         # Gaia's files have no column of wavelengths.
         names = next((cells for line, _ in lines.header if len(cells := line.split(",")) == lines.n), [])
     if not names:
-        raise InputError(
-            "contains arrays in its cells and no names of columns", "names in its first line", key="columns"
-        )
+        raise InputError("its cells contain arrays, so its first line must name the columns", key="columns")
     columns = [lines.column(k, names[k].strip(), units[k] if units else "") for k in range(lines.n)]
     known = {column.name.lower(): column for column in columns}
     if "source_id" not in known or "wavelength" in known or "flux" not in known:
@@ -221,7 +219,7 @@ def _of_another_length(lines: NumberLines) -> list[str]:
             return [*cells, *(str(k + 1) for k in range(len(cells), lines.n))]
         if not is_comment or not in_order:
             fault = f"its line of names has {len(cells)} ({listed(cells)}) for {lines.n} columns"
-            raise InputError(fault, "one for each", key="columns")
+            raise InputError(f"{fault}, but needs one for each", key="columns")
     return []
 
 
@@ -276,7 +274,7 @@ class _Reader:
         if errors and not images and (not tables or (is_bare and not self.asked)):
             raise errors[0]
         if not tables and not images:
-            raise InputError("has no table and no image", "a FITS table with WAVELENGTH and FLUX", key="table")
+            raise InputError("it has no table and no image; give a table with WAVELENGTH and FLUX", key="table")
         if images and not self.asked and is_bare:
             # A table of wavelengths, of lines or of a log is no spectrum.
             return images

@@ -75,21 +75,17 @@ def stated_units(
     if len(distinct) > 1:
         next_to = re.search(r"flux\w*\W{0,4}(?:in\W+)?(" + _FLUX.pattern + ")", text, re.IGNORECASE)
         if next_to is None:
-            raise InputError(
-                f"its header names several units of the flux: {', '.join(distinct)}",
-                "`flux_unit` to say which", key="flux_unit",
-            )  # fmt: skip
+            fault = f"its header names several units of the flux: {', '.join(distinct)}"
+            raise InputError(f"{fault}; use `flux_unit` to say which", key="flux_unit")
         distinct = [_spelt(next_to[1].strip())]
     if flux and not distinct and not is_named and (match := _NO_FLUX.search(text)):
-        fault = f"its header speaks of {match[1] or match[2]!r}"
-        raise InputError(fault, "a flux density: `flux_unit` names its unit", key="flux_unit")
+        fault = f"its header speaks of {match[1] or match[2]!r}, but must speak of a flux density"
+        raise InputError(f"{fault}: `flux_unit` names its unit", key="flux_unit")
     rest = re.sub(_FLUX.pattern, " FLUXUNIT ", text)
     lengths = _lengths(rest) if wavelength else []
     if len(lengths) > 1:
-        raise InputError(
-            f"its header names several units of the wavelength: {', '.join(lengths)}",
-            "`wavelength_unit` to say which", key="wavelength_unit",
-        )  # fmt: skip
+        fault = f"its header names several units of the wavelength: {', '.join(lengths)}"
+        raise InputError(f"{fault}; use `wavelength_unit` to say which", key="wavelength_unit")
     return (lengths[0] if lengths else None), (distinct[0] if distinct else None)
 
 
@@ -182,21 +178,20 @@ def check_assumed_unit(values: Float, unit: str) -> None:
     own = _part(low * factor, high * factor)
     other = likely_unit(low, high, unit)
     elsewhere = 0.0 if other is None else _part(low * _USUAL_UNITS[other], high * _USUAL_UNITS[other])
-    named = "their unit: `wavelength_unit` names it"
     if own < MIN_MEASURED and other is not None:
-        fault, expected = f"look like {other}", f"their unit: `wavelength_unit={other!r}`"
+        fault = f"look like {other}; give their unit: `wavelength_unit={other!r}`"
     elif other is not None and elsewhere >= max(own, 1.0 - 1e-9):
         fault = f"cover {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm in {other} as well as in {unit}"
-        expected = f"their unit: `wavelength_unit={unit!r}` or `wavelength_unit={other!r}`"
+        fault += f"; give their unit: `wavelength_unit={unit!r}` or `wavelength_unit={other!r}`"
     elif own < MIN_MEASURED:
         fault = f"would hold {own:.0%} of {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm in {unit}"
-        expected = f"at least a third, or {named}"
+        fault += ", but must hold at least a third: `wavelength_unit` names their unit"
     elif low * factor < PLAUSIBLE_NM[0] or high * factor > PLAUSIBLE_NM[1]:
-        fault, expected = f"would extend beyond {PLAUSIBLE_NM[0]:g}-{PLAUSIBLE_NM[1]:g} nm in {unit}", named
+        fault = f"would extend beyond {PLAUSIBLE_NM[0]:g}-{PLAUSIBLE_NM[1]:g} nm in {unit}"
+        fault += "; give their unit: `wavelength_unit` names it"
     else:
         return
-    numbers = f"wavelengths from {low:g} to {high:g} without a stated unit"
-    raise InputError(f"{numbers} {fault}", expected, key="wavelength_unit")
+    raise InputError(f"wavelengths from {low:g} to {high:g} without a stated unit {fault}", key="wavelength_unit")
 
 
 Medium = Literal["air", "vacuum"]
@@ -243,8 +238,8 @@ def medium_of(*headers: Mapping[str, Any]) -> Medium | None:
                 found[name] = medium
     if len(set(found.values())) > 1:
         words = " and ".join(f"{key} says {medium}" for key, medium in sorted(found.items()))
-        raise InputError(f"its header contradicts itself: {words}", "one medium: `wavelength_unit='nm air'` says which",
-                         key="wavelength_unit")  # fmt: skip
+        fault = f"its header contradicts itself: {words}; use `wavelength_unit='nm air'` to say which"
+        raise InputError(fault, key="wavelength_unit")
     return next(iter(found.values()), None)
 
 

@@ -37,8 +37,7 @@ def writing(what: str, path: Path, expected: str, *, key: str) -> Iterator[None]
     try:
         yield
     except OSError as error:
-        fault = f"{what} cannot be written ({error.strerror or error})"
-        raise InputError(fault, expected, key=key) from error
+        raise InputError(f"{what} cannot be written ({error.strerror or error}); use {expected}", key=key) from error
 
 
 def write_whole(path: Path, *parts: bytes | memoryview, shared: bool = False) -> None:
@@ -111,19 +110,17 @@ def open_regular(path: Path, what: str) -> io.BufferedReader:
         # Non-blocking, because a pipe without a writer would never open.
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except FileNotFoundError as error:
-        raise InputError(f"{what} {shown} does not exist", "a file", key="file") from error
+        raise InputError(f"{what} {shown} does not exist; give the path of a file", key="file") from error
     except OSError as error:
-        raise InputError(
-            f"{what} {shown} cannot be opened ({error.strerror})", "a readable file", key="file"
-        ) from error
+        raise InputError(f"{what} {shown} must be readable, but is not ({error.strerror})", key="file") from error
     except ValueError as error:
         # Null bytes, and characters that file names cannot contain.
-        raise InputError(f"{what} {shown} is not a path ({error})", "a file name", key="file") from error
+        raise InputError(f"{what} {shown} is not a path ({error}); give that of a file", key="file") from error
     mode = os.fstat(descriptor).st_mode
     if not stat.S_ISREG(mode):
         os.close(descriptor)
-        kind = "a folder" if stat.S_ISDIR(mode) else "no regular file"
-        raise InputError(f"{what} {shown} is {kind}", "a regular file", key="file")
+        other = ", not a folder" if stat.S_ISDIR(mode) else ""
+        raise InputError(f"{what} {shown} must be a regular file{other}", key="file")
     return open(descriptor, "rb")
 
 
@@ -138,8 +135,8 @@ def read_bytes(path: Path, what: str) -> bytes:
         try:
             content = file.read(most + 1)
         except OSError as error:
-            fault = f"{what} {shortened(str(path))} cannot be read ({error.strerror})"
-            raise InputError(fault, "a readable file", key="file") from error
+            shown = shortened(str(path))
+            raise InputError(f"{what} {shown} must be readable, but is not ({error.strerror})", key="file") from error
     if len(content) > most:
         # It has grown since its size was read, or the system gives it none, as below /proc.
         raise _too_large(path, what)
@@ -161,9 +158,9 @@ def check_size(path: Path, what: str, most: int | None = None) -> int:
 def _too_large(path: Path, what: str, most: int | None = None) -> InputError:
     """Return the error of a file with more bytes than `most`, by default MAUVECL_LARGEST_FILE_MIB."""
     largest = limit_bytes("MAUVECL_LARGEST_FILE_MIB") if most is None else most
+    limit = "; MAUVECL_LARGEST_FILE_MIB sets the limit" if most is None else ""
     return InputError(
-        f"{what} {shortened(str(path))} has more than {largest >> 20} MiB",
-        "less; MAUVECL_LARGEST_FILE_MIB sets the limit" if most is None else "less",
+        f"{what} {shortened(str(path))} must have at most {largest >> 20} MiB{limit}",
         key="MAUVECL_LARGEST_FILE_MIB" if most is None else "file",
     )
 
@@ -188,11 +185,7 @@ def lines_in(file: IO[str], what: str) -> Iterator[str]:
     number = 1
     while line := file.readline(LONGEST_LINE + 2):
         if len(line.rstrip("\r\n")) > LONGEST_LINE:
-            raise InputError(
-                f"{what} has more than {LONGEST_LINE} characters in line {number}",
-                f"at most {LONGEST_LINE}",
-                key="file",
-            )
+            raise InputError(f"{what} must have at most {LONGEST_LINE} characters in line {number}", key="file")
         yield line
         number += 1
 
@@ -231,17 +224,15 @@ def _unpack(content: bytes, start: Callable[[], Any], form: str, what: str) -> b
                 waiting = getattr(stream, "unconsumed_tail", b"")
                 size += len(piece)
                 if size > most:
-                    raise InputError(
-                        f"{what} unpacks to more than {most >> 20} MiB",
-                        "less; MAUVECL_LARGEST_CONTENT_MIB sets the limit",
-                        key="MAUVECL_LARGEST_CONTENT_MIB",
-                    )
+                    limit = "MAUVECL_LARGEST_CONTENT_MIB"
+                    fault = f"{what} must unpack to at most {most >> 20} MiB; {limit} sets the limit"
+                    raise InputError(fault, key=limit)
                 pieces.append(piece)
                 if not piece and not waiting and not stream.eof and getattr(stream, "needs_input", True):
                     raise EOFError("it ends too early")
             content = stream.unused_data.lstrip(b"\0")
     except (OSError, EOFError, zlib.error, lzma.LZMAError, MemoryError) as error:
-        raise InputError(f"{what} is damaged {form}", "a whole file", key="file") from error
+        raise InputError(f"{what} is damaged {form}; give a whole file", key="file") from error
     return b"".join(pieces)
 
 
@@ -274,14 +265,14 @@ def parsing(what: str, expected: str) -> Iterator[None]:
     except InputError:
         raise
     except RecursionError as error:
-        raise InputError(f"{what} is nested too deeply", expected, key="file") from error
+        raise InputError(f"{what} must be nested less deeply", key="file") from error
     except MemoryError as error:
-        raise InputError(f"{what} needs more memory than is available", expected, key="file") from error
+        raise InputError(f"{what} needs more memory than is available", key="file") from error
     except Exception as error:
         # Other libraries' messages are for their programmers, but may state the place.
         place = PLACE.search(str(error))
         fault = f"{what} cannot be read{f' ({place[0]})' if place else ''}"
-        raise InputError(fault, expected, key="file") from error
+        raise InputError(f"{fault}; it must be {expected}", key="file") from error
 
 
 def read_text(path: Path, what: str) -> str:
@@ -294,9 +285,7 @@ def as_text(content: bytes, what: str) -> str:
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(
-            f"{what} is not text (byte {error.start + 1} is not UTF-8)", "text in UTF-8", key="file"
-        ) from error
+        raise InputError(f"{what} must be text in UTF-8, but its byte {error.start + 1} is not", key="file") from error
 
 
 def is_file(path: Path) -> bool:
@@ -312,12 +301,12 @@ def toml(text: str, what: str) -> dict[str, Any]:
     parts = max(part.count(".") for part in re.split(r"[=,{}\[\]\n#]", text))
     if parts > MOST_PARTS:
         # The memory of Python's parser grows with the square of this number.
-        raise InputError(f"{what} has a key of {parts} parts", f"at most {MOST_PARTS}", key="file")
+        raise InputError(f"{what} has a key of {parts} parts, but may have at most {MOST_PARTS}", key="file")
     with parsing(what, "TOML"):
         try:
             tree = tomllib.loads(text)
         except tomllib.TOMLDecodeError as error:
-            raise InputError(f"{what}: {printable(str(error), 160)}", "valid TOML", key="file") from error
+            raise InputError(f"{what} must be valid TOML: {printable(str(error), 160)}", key="file") from error
     possible(tree, what)
     return tree
 
@@ -340,37 +329,37 @@ def possible(data: Any, what: str) -> None:
         energy = key in ENERGIES or any(part.endswith(ERG) for part in key.split("."))
         fault = _fault(value, LARGEST_ERG if energy else LARGEST)
         if depth > DEEPEST:
-            fault = f"is nested more than {DEEPEST} deep", "less"
+            fault = f"must be nested at most {DEEPEST} deep"
             key = shortened(key, 40)
         if fault:
             named = printable(key, 80)
-            raise InputError(f"{what}: {named or 'the value'} {fault[0]}", fault[1], key=named or None)
+            raise InputError(f"{what}: {named or 'the value'} {fault}", key=named or None)
         if isinstance(value, Mapping):
             for name, item in value.items():
                 if isinstance(name, str) and (bad := _fault(name)):
-                    raise InputError(f"{what}: a key {bad[0]}", bad[1], key=printable(name, 80))
+                    raise InputError(f"{what}: a key {bad}", key=printable(name, 80))
                 waiting.append((f"{key}.{name}" if key else str(name), item, depth + 1))
         elif isinstance(value, list | tuple):
             waiting += [(f"{key}.{i}", item, depth + 1) for i, item in enumerate(value)]
 
 
-def _fault(value: Any, largest: float = LARGEST) -> tuple[str, str] | None:
-    """Return the fault of a value and the expected range, or None if the value is possible."""
+def _fault(value: Any, largest: float = LARGEST) -> str | None:
+    """Return what is wrong with a value, as the end of a sentence on it, or None if the value is possible."""
     if isinstance(value, bool):
         return None
     if isinstance(value, int):
         if not WHOLE[0] <= value <= WHOLE[1]:
-            return f"is a whole number of {value.bit_length()} bits", "at most 64"
+            return f"is a whole number of {value.bit_length()} bits, but may have at most 64"
     elif isinstance(value, float):
         # NaN and infinity are checked where the meaning of the value is known.
         if math.isfinite(value) and value and not SMALLEST <= abs(value) <= largest:
-            return f"= {value!r}", f"0 or a size from {SMALLEST:g} to {largest:g}"
+            return f"must be 0 or a size from {SMALLEST:g} to {largest:g}, not {value!r}"
     elif isinstance(value, str | Path):
         text = str(value)
         if len(text) > LONGEST:
-            return f"is a text of {len(text)} characters", f"at most {LONGEST}"
+            return f"is a text of {len(text)} characters, but may have at most {LONGEST}"
         if not text.isprintable() and (bad := next((c for c in text if c == "\0" or "\ud800" <= c <= "\udfff"), None)):
-            return f"= {shortened(text)} holds the character {bad!r}", "text"
+            return f"= {shortened(text)} must not hold the character {bad!r}"
     return None
 
 
@@ -458,7 +447,7 @@ def parse_numbers(text: str, what: str) -> Numbers:
     table = parse_ecsv(text, what)
     for name in table.colnames:
         if table[name].dtype.kind not in "iuf" or np.ma.is_masked(table[name]) or table[name].ndim != 1:
-            raise InputError(f"{what}: {name} has missing or non-numeric values", "numbers", key=name)
+            raise InputError(f"{what}: {name} must hold numbers only, but has missing or other values", key=name)
     columns = {name: np.asarray(table[name], np.float64) for name in table.colnames}
     return Numbers(columns, {name: str(table[name].unit or "") for name in table.colnames}, dict(table.meta))
 
@@ -489,7 +478,7 @@ def check_header(lines: list[str], what: str) -> None:
     header = [line[2:] for line in lines if line.startswith("# ")]
     size = sum(map(len, header))
     if size > MOST_HEADER:
-        raise InputError(f"{what} has a header of {size} characters", f"at most {MOST_HEADER}", key="file")
+        raise InputError(f"{what} must have a header of at most {MOST_HEADER} characters, not {size}", key="file")
     if not any("*" in line for line in header):
         return
     sizes: dict[int, int] = {}
@@ -508,9 +497,7 @@ def check_header(lines: list[str], what: str) -> None:
         root = yaml.compose("\n".join(header[1:]), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
         unfolded = 0 if root is None else values(root)
     if unfolded >= MOST_VALUES:
-        raise InputError(
-            f"{what} has a header that expands to more than {MOST_VALUES} values", "fewer values", key="file"
-        )
+        raise InputError(f"{what} must have a header that expands to fewer than {MOST_VALUES} values", key="file")
 
 
 def check_cells(lines: list[str], what: str) -> None:
@@ -522,13 +509,11 @@ def check_cells(lines: list[str], what: str) -> None:
     most = limit_bytes("MAUVECL_LARGEST_CONTENT_MIB")
     widest = max(map(len, lines), default=0)
     if widest * len(lines) > most:
-        fault = f"{what} has a line of {widest} characters among {len(lines)}"
+        fault = f"{what} has a line of {widest} characters among {len(lines)}, which must have at most {most >> 20} MiB"
         limit = "MAUVECL_LARGEST_CONTENT_MIB"
-        expected = f"less than {most >> 20} MiB together if each were as long; {limit} sets the limit"
-        raise InputError(fault, expected, key=limit)
+        raise InputError(f"{fault} together if each were as long; {limit} sets the limit", key=limit)
     if widest > LONGEST_LINE:
-        fault = f"{what} has a line of {widest} characters"
-        raise InputError(fault, f"at most {LONGEST_LINE}", key="file")
+        raise InputError(f"{what} has a line of {widest} characters, but may have at most {LONGEST_LINE}", key="file")
     odd = next((n for n, line in enumerate(lines, 1) if '"' in line and _OPEN.search(_QUOTED.sub("", line))), None)
     if odd is not None:
-        raise InputError(f"{what} has a cell that extends beyond row {odd}", "one line per row", key="file")
+        raise InputError(f"{what} must have one line per row, but has a cell that extends beyond row {odd}", key="file")

@@ -45,8 +45,8 @@ def check_sizes(content: FileContent) -> None:
         if content[place : place + 8] not in (b"SIMPLE  ", b"XTENSION"):
             if len(content) - place > MAX_AFTER:
                 # astropy would search all of it for the end of a header.
-                fault = f"has {len(content) - place} bytes after its extension {number - 1}"
-                raise InputError(fault, f"at most {MAX_AFTER}", key="file")
+                fault = f"it has {len(content) - place} bytes after its extension {number - 1}"
+                raise InputError(f"{fault}, but may have at most {MAX_AFTER}", key="file")
             return
         if number == MAX_EXTENSIONS:
             break
@@ -55,7 +55,7 @@ def check_sizes(content: FileContent) -> None:
         while content[at : at + 8] != b"END     ":
             card = content[at : at + 80]
             if len(card) < 80 or at - place > 80 * MAX_CARDS:
-                raise InputError(f"has a header {number} without an end", WHOLE, key="file")
+                raise InputError(f"its header {number} has no end; give {WHOLE}", key="file")
             cards.setdefault(card[:8].strip(), card[10:].split(b"/")[0].strip())
             at += 80
         start = place + -(-(at + 80 - place) // BLOCK) * BLOCK
@@ -66,21 +66,19 @@ def check_sizes(content: FileContent) -> None:
                 for k, d in ((b"BITPIX", b""), (b"PCOUNT", b"0"), (b"GCOUNT", b"1"), (b"TFIELDS", b"0"))
             )
         except (KeyError, ValueError) as error:
-            raise InputError(f"has a header {number} whose sizes are not numbers", WHOLE, key="file") from error
+            raise InputError(f"its header {number} has sizes that are not numbers; give {WHOLE}", key="file") from error
         if axes[:1] == [0] and len(axes) > 1:
             # Random groups.
             axes = axes[1:]
         if min([extra, groups, *axes]) < 0 or abs(bits) > 64 or not 0 <= fields <= MAX_FIELDS:
-            raise InputError(f"has a header {number} with impossible sizes", WHOLE, key="file")
+            raise InputError(f"its header {number} has impossible sizes; give {WHOLE}", key="file")
         size = abs(bits) // 8 * groups * (extra + math.prod(axes) if axes else 0)
         if start + size > len(content):
-            fault = (
-                f"is truncated: its extension {number} should have {size} bytes, of which "
-                f"{max(0, len(content) - start)} are present"
-            )
-            raise InputError(fault, "a whole file", key="file")
+            present = max(0, len(content) - start)
+            fault = f"it is truncated: its extension {number} must have {size} bytes, of which {present} are present"
+            raise InputError(fault, key="file")
         place = start + -(-size // BLOCK) * BLOCK
-    raise InputError(f"has more than {MAX_EXTENSIONS} extensions", "fewer", key="file")
+    raise InputError(f"it must have at most {MAX_EXTENSIONS} extensions", key="file")
 
 
 @contextmanager
@@ -131,23 +129,23 @@ def check_extensions(hdus: Any) -> None:
 
     for number, hdu in enumerate(hdus):
         if type(hdu).__name__ in DAMAGED or (number > 0 and "SIMPLE" in hdu.header):
-            raise InputError(f"has a damaged header in extension {number}", WHOLE, key="file")
+            raise InputError(f"its extension {number} has a damaged header; give {WHOLE}", key="file")
         if not isinstance(hdu, fits.BinTableHDU):
             continue
         if text_at(hdu.header, "ZTABLE") == "True":
-            fault = f"has a table compressed by `fpack` in extension {number}"
-            raise InputError(fault, "the file after `funpack`", key="file")
+            fault = f"its extension {number} has a table compressed by `fpack`; use the file after `funpack`"
+            raise InputError(fault, key="file")
         names = hdu.columns.names
         if odd := next((name for name in names if name is not None and names.count(name) > 1), None):
-            fault = f"has several columns named {odd!r} in extension {number}"
-            raise InputError(fault, "another name for each", key="columns")
+            fault = f"its extension {number} has several columns named {odd!r}; give each another name"
+            raise InputError(fault, key="columns")
         if None in names:
-            fault = f"has a column whose TTYPE{names.index(None) + 1} is empty in extension {number}"
-            raise InputError(fault, "a name for each column", key="columns")
+            fault = f"its extension {number} has an empty TTYPE{names.index(None) + 1}; give each column a name"
+            raise InputError(fault, key="columns")
         size = sum(np.dtype(column.format.recformat).itemsize for column in hdu.columns)
         if size != hdu.header["NAXIS1"]:
-            fault = f"has rows of {hdu.header['NAXIS1']} bytes in extension {number}, whose columns take {size}"
-            raise InputError(fault, WHOLE, key="file")
+            fault = f"its extension {number} has rows of {hdu.header['NAXIS1']} bytes, whose columns take {size}"
+            raise InputError(f"{fault}; give {WHOLE}", key="file")
 
 
 def check_images(packed: Sequence[Any]) -> None:
@@ -160,10 +158,11 @@ def check_images(packed: Sequence[Any]) -> None:
             tiles = [int(header.get(f"ZTILE{k + 1}", axes[0] if k == 0 else 1)) for k in range(len(axes))]
             size = abs(int(header["ZBITPIX"])) // 8 * max(math.prod(axes), math.prod(tiles))
         if min(*axes, *tiles) < 1:
-            raise InputError(f"has a compressed image of {axes} pixels in tiles of {tiles}", WHOLE, key="file")
+            fault = f"it has a compressed image of {axes} pixels in tiles of {tiles}; give {WHOLE}"
+            raise InputError(fault, key="file")
         if size > most:
-            raise InputError(f"has a compressed image that unpacks to more than {most >> 20} MiB",
-                             "less; MAUVECL_LARGEST_CONTENT_MIB sets the limit", key="file")  # fmt: skip
+            fault = f"its compressed image must unpack to at most {most >> 20} MiB"
+            raise InputError(f"{fault}; MAUVECL_LARGEST_CONTENT_MIB sets the limit", key="file")
 
 
 class FileContent:
@@ -204,10 +203,9 @@ def check_sums(hdus: Any, content: FileContent) -> None:
 
 
 def _damaged(key: str, part: str, number: int) -> InputError:
-    return InputError(
-        f"differs from its {key} in extension {number}: its {part} damaged or were edited",
-        "the file as it was written, or `ignore_checksum=True` after an intended change", key=key
-    )  # fmt: skip
+    fault = f"it differs from its {key} in extension {number}: its {part} damaged or were edited"
+    remedy = "use the file as it was written, or `ignore_checksum=True` after an intended change"
+    return InputError(f"{fault}; {remedy}", key=key)
 
 
 def _sum(content: FileContent, start: int, stop: int) -> int:
@@ -334,8 +332,8 @@ def spextool_spectra(header: Any, data: Any) -> tuple[Any, Any, list[str]] | Non
         # Merged orders are one, whatever their list says.
         orders = [str(k + 1) for k in range(n_orders)]
     if len(orders) * n_apertures != len(cube):
-        fault = f"has {len(cube)} spectra of {len(orders)} orders and {n_apertures} apertures (NAPS)"
-        raise InputError(fault, "one for each order and aperture", key="NAPS")
+        fault = f"it must have a spectrum for each of {len(orders)} orders and {n_apertures} apertures (NAPS)"
+        raise InputError(f"{fault}, but has {len(cube)}", key="NAPS")
     if n_apertures > 1:
         orders = [f"{order} aperture {k + 1}" for order in orders for k in range(n_apertures)]
     return cube[:, 0], cube[:, 1], orders
@@ -361,8 +359,8 @@ def rows_of(hdu: Any, telescope: str, asked: bool) -> tuple[Any, tuple[str, ...]
     header = hdu.header
     shape = [int(header.get(f"NAXIS{k + 1}", 0)) for k in range(int(header["NAXIS"]))]
     if sum(n > 1 for n in shape) > 2 or shape[0] < 2:
-        fault = f"holds an image of {' x '.join(map(str, shape))} pixels"
-        raise InputError(fault, "a spectrum of one dimension, rows of spectra, or a table", key="table")
+        fault = f"it holds an image of {' x '.join(map(str, shape))} pixels"
+        raise InputError(f"{fault}; use a spectrum of one dimension, rows of spectra, or a table", key="table")
     flux = np.asanyarray(hdu.data).reshape(-1, shape[0])
     if len(flux) == 1:
         return flux[0], (), ()
@@ -397,9 +395,7 @@ def axis_of(header: Any, primary: Any, n: int) -> tuple[Any, str | None, str, tu
         return 10.0 ** (first + slope * np.arange(n)), "Angstrom", "", ("wavelengths from COEFF0 and COEFF1",)
     start, step = number("CRVAL1"), number("CD1_1", "CDELT1")
     if start is None or step is None or step == 0:
-        raise InputError(
-            "has an image without CRVAL1 and CDELT1 or CD1_1", "the wavelengths of its pixels", key="CRVAL1"
-        )
+        raise InputError("its image needs wavelengths of its pixels: CRVAL1, and CDELT1 or CD1_1", key="CRVAL1")
     if number("CDELT1") is not None and number("CD1_1") is None and (scale := number("PC1_1")) is not None:
         step *= scale
     # A missing CRPIX1 is 0 by the FITS standard, but archives' spectra without it start at their first pixel.
@@ -417,8 +413,8 @@ def axis_of(header: Any, primary: Any, n: int) -> tuple[Any, str | None, str, tu
         flag, unit = 1, re.sub(r"^\s*(log|dex)\w*[\s(\[]*|[)\]\s]+$", "", unit, flags=re.IGNORECASE) or None
     if flag != 1 and "LOG" not in kind:
         if unit is None and start < 10.0 and abs(step) < 0.01:
-            fault = f"has an axis from {start:g} in steps of {step:g} without a unit or type"
-            raise InputError(fault, "CTYPE1 and CUNIT1", key="CUNIT1")
+            fault = f"its axis from {start:g} in steps of {step:g} has no unit or type; give CTYPE1 and CUNIT1"
+            raise InputError(fault, key="CUNIT1")
         return value, unit, name, ()
     if algorithm == "LOG" and name in ("WAVE", "AWAV", "FREQ", "ENER") and flag != 1 and start > 20.0:
         # Greisen et al. 2006 (A&A 446, 747), equation 5: the value at the reference pixel times an exponential.
@@ -428,8 +424,8 @@ def axis_of(header: Any, primary: Any, n: int) -> tuple[Any, str | None, str, tu
         # PHOENIX's library at medium resolution (Husser et al. 2013) has natural logarithms of Angstrom.
         return np.exp(value), unit, name, ("wavelengths from natural logarithms",)
     if not 1.0 < start < 6.0:
-        fault = f"has a logarithmic axis from {start:g}"
-        raise InputError(fault, f"logarithms to base ten or the form {name}-LOG", key="CTYPE1")
+        fault = f"its logarithmic axis from {start:g} must have logarithms to base ten or the form {name}-LOG"
+        raise InputError(fault, key="CTYPE1")
     with np.errstate(over="ignore"):
         return 10.0**value, unit, name, ("wavelengths from logarithms to base ten",)
 
@@ -445,12 +441,12 @@ def multispec_axis(header: Any, n: int) -> Values:
         with parsing("it", "attributes of IRAF's multispec system"):
             _, _, kind, first, step, _, redshift = map(float, text.split()[:7])
         if kind not in (0.0, 1.0):
-            fault = f"has wavelengths of the type {kind:g} in IRAF's multispec system"
-            raise InputError(fault, "linear or logarithmic ones, as IRAF's `dispcor` makes", key="CTYPE1")
+            fault = f"its wavelengths of the type {kind:g} in IRAF's multispec system must be linear or logarithmic"
+            raise InputError(f"{fault}, as IRAF's `dispcor` makes them", key="CTYPE1")
         values = first + step * np.arange(n)
         rows.append((10.0**values if kind else values) / (1.0 + redshift))
     if len(rows) != int(header.get("NAXIS2", 1)):
-        raise InputError(f"has {len(rows)} rows in its attributes WAT2", "one for each row", key="CTYPE1")
+        raise InputError(f"its attributes WAT2 must describe each row, but describe {len(rows)}", key="CTYPE1")
     return Values.of("wavelength", np.array(rows) if len(rows) > 1 else rows[0], _iraf_unit(header))
 
 
@@ -529,7 +525,7 @@ class FitsTables(TableFile):
             return self.column(table, column)
         others = [found for k in self.tables if (found := self.column(k, name)) is not None]
         if len(others) > 1:
-            raise InputError(f"{self.what} has {len(others)} columns called {name!r}", "EXTENSION/COLUMN", key=name)
+            raise InputError(f"{self.what} has {len(others)} columns called {name!r}; give EXTENSION/COLUMN", key=name)
         return others[0] if others else None
 
     def axis(self, name: str, dimension: int) -> Values:
@@ -543,8 +539,8 @@ class FitsTables(TableFile):
             try:
                 first, step, reference = (float(header[f"{key}2"]) for key in ("CRVAL", "CDELT", "CRPIX"))
             except (KeyError, ValueError) as error:
-                raise InputError(f"{self.what}: the image {name!r} has no CRVAL2, CDELT2 and CRPIX2",
-                                 "the times of its rows", key="time") from error  # fmt: skip
+                fault = f"{self.what}: the image {name!r} needs the times of its rows: CRVAL2, CDELT2 and CRPIX2"
+                raise InputError(fault, key="time") from error
             return Values.of(name, first + step * (np.arange(1, n + 1) - reference), header.get("CUNIT2"), self.what)
         if text_at(header, "CTYPE1").upper().endswith("-TAB"):
             return self.tabulated(header)
@@ -558,8 +554,8 @@ class FitsTables(TableFile):
         """Return an axis that refers to the column of a table (-TAB, FITS standard 4.0, section 8.3)."""
         found = self.named(f"{text_at(header, 'PS1_0')}/{text_at(header, 'PS1_1')}")
         if found is None:
-            raise InputError(f"{self.what} lacks the table of its wavelengths", "the column that PS1_0 and PS1_1 name",
-                             key="wavelength")  # fmt: skip
+            fault = f"{self.what} lacks the table of its wavelengths: it needs the column that PS1_0 and PS1_1 name"
+            raise InputError(fault, key="wavelength")
         kind, unit = text_at(header, "CTYPE1").upper()[:4], found.unit or header.get("CUNIT1")
         return Values.of(_AXIS_NAMES.get(kind, "wavelength"), found.numbers().ravel(), unit, self.what)
 
@@ -598,8 +594,8 @@ class FitsTables(TableFile):
         is_whole = heap > 0 or hdu.header.get("XTENSION") == "TABLE"
         small = size <= PIECE_BYTES or is_whole
         if is_whole and size > limit_bytes("MAUVECL_LARGEST_FILE_MIB"):
-            raise InputError(f"{self.what}: the table {self._label(number)} has text or columns of variable length and "
-                             f"{size >> 20} MiB", "columns of fixed length", key="hdu")  # fmt: skip
+            fault = f"{self.what}: the table {self._label(number)} has text or columns of variable length"
+            raise InputError(f"{fault} and {size >> 20} MiB; use columns of fixed length", key="hdu")
         pair = str(self.header.get(f"TCTYP{hdu.columns.names.index(found.name) + 1}", "")).upper() in SCALES
 
         def read(start: int, stop: int) -> Any:

@@ -109,10 +109,8 @@ def matched(name: str, names: Iterable[str], what: str = "") -> str | None:
     ]
     if len(fitting) > 1:
         place = f"{what}: " if what else ""
-        raise InputError(
-            f"{place}{len(fitting)} columns are called {shortened(name)} but for case ({', '.join(fitting)})",
-            "the exact name of one", key="column"
-        )  # fmt: skip
+        fault = f"{place}{len(fitting)} columns are called {shortened(name)} but for case ({', '.join(fitting)})"
+        raise InputError(f"{fault}; give the exact name of one", key="column")
     return fitting[0] if fitting else None
 
 
@@ -131,10 +129,8 @@ def first_of(wanted: Sequence[str], names: Iterable[str], what: str = "") -> str
         )
         if len(fitting) > 1:
             place = f"{what}: " if what else ""
-            raise InputError(
-                f"{place}several columns may be {one}: {', '.join(map(shortened, fitting))}",
-                "one of them, or a mapping that names it", key=one
-            )  # fmt: skip
+            fault = f"{place}several columns may be {one}: {', '.join(map(shortened, fitting))}"
+            raise InputError(f"{fault}; give one of them, or a mapping that names it", key=one)
         if fitting:
             return fitting[0]
     return None
@@ -213,7 +209,7 @@ def position(text: str) -> tuple[float, float]:
     try:
         ra, dec = (angle(part, right_ascension=k == 0, pair=len(parts[1 - k].split())) for k, part in enumerate(parts))
     except InputError as error:
-        raise InputError(f"target = {shortened(text)}: {error}", EXPECTED_POSITION, key="target") from error
+        raise error.within(f"target = {shortened(text)}, read as right ascension and declination") from error
     except ValueError:
         raise unknown from None
     return ra, dec
@@ -250,8 +246,8 @@ def angle(text: str, unit: str = "", *, right_ascension: bool, pair: int = 3) ->
         raise ValueError(text)
     name, low, high = ("right ascension", 0.0, 360.0) if right_ascension else ("declination", -90.0, 90.0)
     if not (math.isfinite(value) and low <= value <= high):
-        expected = f"{low:g} to {high:g} degrees"
-        raise InputError(f"{shortened(text)} is a {name} of {value:g}", expected, key="target")
+        fault = f"{shortened(text)} is a {name} of {value:g}, but must be {low:g} to {high:g} degrees"
+        raise InputError(fault, key="target")
     return value
 
 

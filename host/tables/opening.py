@@ -70,8 +70,8 @@ class LargeTable(TableFile):
                 continue
             texts = column.texts() or [str(one) for one in column.numbers().tolist()]
             if any(len(text) > CELL for text in texts):
-                fault = f"{self.what}: a cell of {name!r} is longer than {CELL} characters"
-                raise InputError(fault, "numbers or dates", key=name)
+                fault = f"{self.what}: {name!r} must hold numbers or dates, but a cell has more than {CELL} characters"
+                raise InputError(fault, key=name)
             rows[name] = texts
         rows.tofile(self.file)
         self.n_rows += n
@@ -125,7 +125,7 @@ def open_large(file: IO[bytes], what: str, commas: bool, expected: str) -> Itera
         pieces = _pieces(text, what, commas, expected)
         table = LargeTable(pieces, what)
     except UnicodeDecodeError as error:
-        raise InputError(f"{what} is not text in UTF-8", expected, key="file") from error
+        raise InputError(f"{what} must be text in UTF-8", key="file") from error
     with table.file:
         yield table
     text.detach()
@@ -166,14 +166,14 @@ def _pieces(text: IO[str], what: str, commas: bool, expected: str) -> Iterator[A
             first += len(piece)
             yield piece
     if not first:
-        raise InputError(f"{what} has no rows", "a row for each frame", key="frames")
+        raise InputError(f"{what} has no rows, but needs one for each frame", key="frames")
 
 
 def _check_head(size: int, what: str) -> None:
     """Raise InputError for more than `MOST_HEADER` characters above the rows."""
     if size > MOST_HEADER:
-        fault = f"{what} has more than {MOST_HEADER} characters of comments and empty lines before its rows"
-        raise InputError(fault, "fewer", key="file")
+        fault = f"{what} must have at most {MOST_HEADER} characters of comments and empty lines before its rows"
+        raise InputError(fault, key="file")
 
 
 FORMATS = "CSV, ECSV, FITS or VOTable"
@@ -276,7 +276,7 @@ def _in_memory(content: Content, what: str, commas: bool, expected: str) -> Memo
     if content.form == "VOTable":
         found = next(votables(content.bytes, what, expected), None)
         if found is None:
-            raise InputError(f"{what} has no table", expected, key="file")
+            raise InputError(f"{what} has no table, but needs one", key="file")
         return found
     check_form(content, what, expected)
     try:
@@ -284,7 +284,7 @@ def _in_memory(content: Content, what: str, commas: bool, expected: str) -> Memo
     except InputError as error:
         raise error.within(what) from error
     if not text.strip():
-        raise InputError(f"{what} is empty", expected, key="file")
+        raise InputError(f"{what} is empty, but must be {expected}", key="file")
     return MemoryTable(text_table(text, what, commas, expected), what)
 
 
@@ -308,11 +308,11 @@ def check_form(content: Content, what: str, expected: str) -> None:
     tar = "a TAR archive" if start[257:262] == b"ustar" else ""
     marks = b"".join(start.split())
     if foreign := tar or next((form for mark, form in FOREIGN.items() if marks.startswith(mark)), ""):
-        raise InputError(f"{what} is {foreign}", expected, key="file")
+        raise InputError(f"{what} must be {expected}, but is {foreign}", key="file")
     if content.form == "XML":
         start = content.bytes[:4096].lstrip(b"\xef\xbb\xbf \t\r\n")[:20]
-        fault = f"{what} is a page or XML that begins with {shortened(start.decode('ascii', 'replace'))}"
-        raise InputError(fault, expected, key="file")
+        fault = f"a page or XML that begins with {shortened(start.decode('ascii', 'replace'))}"
+        raise InputError(f"{what} must be {expected}, but is {fault}", key="file")
 
 
 def votables(content: bytes, what: str, expected: str) -> Iterator[MemoryTable]:
@@ -320,14 +320,15 @@ def votables(content: bytes, what: str, expected: str) -> Iterator[MemoryTable]:
     from astropy.io import votable
 
     if b"<!ENTITY" in content or b"<!DOCTYPE" in content:
-        raise InputError(f"{what} defines entities", "a VOTable without entities", key="file")
+        raise InputError(f"{what} must be a VOTable without entities", key="file")
     with parsing(what, "a complete VOTable"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         file = votable.parse(io.BytesIO(content), verify="ignore")
     status = {info.value: info.content for part in file.resources for info in part.infos if info.name == "QUERY_STATUS"}
     if "ERROR" in status:
         said = shortened(str(status["ERROR"] or "without a reason"))
-        raise InputError(f"{what} is the answer to a query that failed: {said}", expected, key="file")
+        fault = f"the answer to a query that failed: {said}"
+        raise InputError(f"{what} must be {expected}, but is {fault}", key="file")
     shared = {str(one.name or one.ID): one.value for resource in file.resources for one in resource.params}
     shared |= _systems(file)
     for table in file.iter_tables():
@@ -360,7 +361,7 @@ def _systems(file: VOTableFile) -> dict[str, Any]:
 def _filled(file: TableFile) -> TableFile:
     """Return a file; raise InputError if it has nothing with rows."""
     if not file.names:
-        raise InputError(f"{file.what} has no table and no image", "a row for each frame, star or flare", key="file")
+        raise InputError(f"{file.what} has no table and no image; give a row for each frame, star or flare", key="file")
     return file
 
 

@@ -152,7 +152,7 @@ class Values:
         if values.dtype.kind in "US":
             return self._parsed(values, start, expected)
         if values.dtype.kind not in "iufb":
-            raise InputError(f"{self.what}: {self.name!r} holds no numbers", "numbers", key=self.name)
+            raise InputError(f"{self.what}: {self.name!r} must hold numbers", key=self.name)
         return np.asarray(np.ma.filled(values.astype(np.float64), np.nan))
 
     def numbers(self, expected: str = "a number") -> Float:
@@ -188,7 +188,7 @@ class Values:
         except ValueError:
             lengths = set()
         if len(lengths) != 1:
-            raise InputError(f"{self.what}: the rows of {self.name!r} differ in length", "one length", key=self.name)
+            raise InputError(f"{self.what}: the rows of {self.name!r} must have the same length", key=self.name)
         return np.ma.asarray(np.stack([np.asarray(one) for one in values]) if len(values) else values.astype(float))
 
     def _parsed(self, values: Any, start: int, expected: str) -> Float:
@@ -204,9 +204,8 @@ class Values:
                 parsed[place] = number_in(text)
             except ValueError as error:
                 row = start + place // max(1, int(np.prod(values.shape[1:]))) + 1
-                raise InputError(
-                    f"{self.what}: {self.name!r} = {shortened(text, 40)} in row {row}", expected, key=self.name
-                ) from error  # fmt: skip
+                fault = f"{self.what}: {self.name!r} in row {row} must be {expected}, not {shortened(text, 40)}"
+                raise InputError(fault, key=self.name) from error
         return parsed.reshape(values.shape)
 
 
@@ -224,8 +223,8 @@ def converted(values: Values, given: str | None, unit: str, key: str) -> Values:
 
     stated = given or values.unit or unit_in_name(values.name)
     if not stated:
-        expected = f"a mapping with {key}, such as {unit}"
-        raise InputError(f"{values.what}: the unit of {values.name!r} is not stated", expected, key=key)
+        fault = f"{values.what}: the unit of {values.name!r} is not stated"
+        raise InputError(f"{fault}; give a mapping with {key}, such as {unit}", key=key)
     equivalencies = {"nm": u.spectral(), "deg_C": u.temperature()}.get(unit, [])
     try:
         known = unit_in(stated)
@@ -314,8 +313,8 @@ class TableFile(ABC):
             return None
         units = {part.unit for part in parts}
         if len(units) > 1 or len({part.shape for part in parts}) > 1 or len(parts[0].shape) != 1:
-            raise InputError(f"{self.what}: the columns {pattern!r} differ in unit or shape",
-                             "columns of numbers in one unit", key=pattern)  # fmt: skip
+            fault = f"{self.what}: the columns {pattern!r} must hold numbers in one unit, but differ in unit or shape"
+            raise InputError(fault, key=pattern)
         return Values(pattern, (parts[0].n_rows, len(parts)),
                       lambda start, stop: np.column_stack([part.rows(start, stop) for part in parts]),
                       parts[0].unit, self.what)  # fmt: skip
@@ -326,13 +325,13 @@ class TableFile(ABC):
         found = [re.findall(r"\d+(?:\.\d+)?", name) for name in names]
         odd = next((name for name, numbers in zip(names, found, strict=True) if len(numbers) != 1), None)
         if odd is not None or not names:
-            raise InputError(f"{self.what}: the column {odd or pattern!r} has no single number in its name",
-                             "names such as flux_350.5", key="wavelength")  # fmt: skip
+            fault = f"{self.what}: the column {odd or pattern!r} has no single number in its name"
+            raise InputError(f"{fault}; use names such as flux_350.5", key="wavelength")
         return Values.of("the names of columns", np.array([float(one[0]) for one in found]), "", self.what)
 
     def axis(self, name: str, dimension: int) -> Values:
         """Return the coordinates of an image along an axis, by the keywords of its header (FITS WCS)."""
-        raise InputError(f"{self.what} has no coordinates of images", "a FITS image", key="wavelength")
+        raise InputError(f"{self.what} has no coordinates of images; use a FITS image", key="wavelength")
 
 
 class MemoryTable(TableFile):
@@ -451,8 +450,10 @@ class Rows:
         unit = self._angles(name)
         try:
             return angle(text, unit, right_ascension=right_ascension)
+        except InputError as error:
+            raise InputError(f"{self.named}: {name} in row {row + 1}: {error}", key=self.key or name) from error
         except ValueError as error:
-            expected = getattr(error, "expected", None) or "degrees, or sexagesimal text such as 10h30m00s or 10:30:00"
+            expected = "degrees, or sexagesimal text such as 10h30m00s or 10:30:00"
             raise self.error(f"row {row + 1} has {name} = {shortened(text)}", expected, name) from error
 
     def _unit_of_angles(self, name: str) -> str:
@@ -484,7 +485,7 @@ class Rows:
 
     def error(self, fault: str, expected: str, name: str) -> InputError:
         """Return the error of a column or cell."""
-        return InputError(f"{self.named}: {fault}", expected, key=self.key or name)
+        return InputError(f"{self.named}: {fault}; give {expected}", key=self.key or name)
 
     def _ratio(self, name: str, unit: str) -> float:
         """Return the factor from the unit of a column to another."""

@@ -65,11 +65,11 @@ def columns(what: str, text: str, expected: str, unit: str = "") -> NDArray[np.f
     The first column of the result is in `unit`, as is that of the text unless its header states another one. `what` and
     `expected` are the text and its two columns, for messages.
     """
-    with parsing(what, expected):
+    with parsing(what, f"two columns of numbers: {expected}"):
         try:
             lines = NumberLines(text, expected)
             if odd := next((len(cells) for cells in lines.cells if len(cells) != 2), 0):
-                raise InputError(f"has {odd} column{'s' * (odd > 1)}", f"two: {expected}", key="columns")
+                raise InputError(f"it has {odd} column{'s' * (odd > 1)}, but needs two: {expected}", key="columns")
             first, second = (lines.column(k, str(k + 1)).numbers() for k in range(2))
             return np.column_stack([_in_unit(first, lines.comments, unit) if unit else first, second])
         except InputError as error:
@@ -91,7 +91,7 @@ def _in_unit(values: NDArray[np.float64], header: str, unit: str) -> NDArray[np.
             if known.is_equivalent(u.Unit(unit), u.spectral() if unit == "nm" else []):
                 said[known] = word
     if len(said) > 1:
-        raise InputError(f"has a header with {' and '.join(said.values())}", "one unit", key="unit")
+        raise InputError(f"its header must state one unit, not {' and '.join(said.values())}", key="unit")
     return np.asarray((values * next(iter(said), u.Unit(unit))).to_value(unit, u.spectral()))
 
 
@@ -103,12 +103,12 @@ def text_of(content: bytes) -> str:
         text = content.decode(code)
     except UnicodeDecodeError as error:
         if b"\0" in content[:4096]:
-            raise InputError("is not text (it holds null bytes)", "text", key="file") from error
+            raise InputError("it must be text, but holds null bytes", key="file") from error
         line, odd = content[: error.start].count(b"\n") + 1, content[error.start]
-        fault = f"is not text in UTF-8 (byte 0x{odd:02x} in line {line})"
-        raise InputError(fault, "UTF-8: save it so", key="file") from error
+        fault = f"it must be text in UTF-8, but its byte 0x{odd:02x} in line {line} is not: save it as UTF-8"
+        raise InputError(fault, key="file") from error
     if "\0" in text:
-        raise InputError("is not text (it holds null bytes)", "text", key="file")
+        raise InputError("it must be text, but holds null bytes", key="file")
     return text
 
 
@@ -134,7 +134,7 @@ class NumberLines:
             else:
                 found.append((number, line.split("#", 1)[0].strip()))
         if not found:
-            raise InputError("does not contain numbers", f"two columns: {expected}", key="columns")
+            raise InputError(f"it contains no numbers, but needs two columns: {expected}", key="columns")
         #: Number and text of the line of each row, and its cells.
         self.lines = found
         self.cells = self._divided([line for _, line in found])
@@ -162,8 +162,8 @@ class NumberLines:
             and all(len(row) > 1 and re.fullmatch(r"\d+", row[1]) for row in sample)
             and (not any("." in cell for row in sample for cell in row))
         ):
-            fault = f"line {shortened(lines[0], 60)} may hold decimal commas or columns"
-            raise InputError(fault, "decimal points", key="columns")
+            fault = f"its line {shortened(lines[0], 60)} may hold decimal commas or columns; use decimal points"
+            raise InputError(fault, key="columns")
         return cells
 
     def column(self, place: int, name: str, unit: str = "") -> Values:
@@ -184,7 +184,7 @@ class NumberLines:
                 number, line = self.lines[start + k]
                 n = "one column" if len(cells) == 1 else f"{len(cells)} columns"
                 fault = f"line {number}: {shortened(line, 60)} {'is not numeric' if len(cells) > place else f'has {n}'}"
-                raise InputError(fault, self.expected, key="columns") from error
+                raise InputError(f"{fault}, but must hold {self.expected}", key="columns") from error
         return values
 
     def _texts_or_arrays(self, place: int, start: int, stop: int) -> Any:
@@ -331,8 +331,9 @@ class TextRows:
             names, units = self._names_above(n, [*above, *lines[:at]], mark)
         if names or is_row:
             if not names and at:
-                fault = f"{self.what} has {n} cells in row 1"
-                raise InputError(fault, f"{len(cells[at - 1])} as in the line above", key="file")
+                above_it = len(cells[at - 1])
+                fault = f"{self.what} has {n} cells in row 1, but must have {above_it} as in the line above"
+                raise InputError(fault, key="file")
             names = names or [f"col{k + 1}" for k in range(n)]
         else:
             names, at = cells[at], at + 1
@@ -385,8 +386,8 @@ class TextRows:
         for number, row in enumerate(self.cells, self.first + 1):
             if len(row) != n:
                 # The file may be cut short.
-                fault = f"{self.what} has {len(row)} cells in row {number}"
-                raise InputError(fault, f"{n} as in the first line", key="file")
+                fault = f"{self.what} has {len(row)} cells in row {number}, but must have {n} as in the first line"
+                raise InputError(fault, key="file")
 
 
 def text_table(text: str, what: str, commas: bool, expected: str = "CSV or ECSV") -> Table:
@@ -484,7 +485,7 @@ def _has_decimal_commas(rows: list[list[str]], what: str) -> bool:
         return False
     if all(_THOUSANDS.fullmatch(cell) for cell in commas):
         fault = f"{what} has numbers such as {commas[0]}, whose comma may be decimal or divide thousands"
-        raise InputError(fault, "decimal points", key="file")
+        raise InputError(f"{fault}; use decimal points", key="file")
     return True
 
 

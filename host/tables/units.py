@@ -124,7 +124,7 @@ def _linear_unit(name: str, text: str, expected: str) -> u.UnitBase:
         other = f"1e{power + 1}" if match[2] else f"1e{-power}"
         fault = f"unit = {shortened(text.strip())}: its factor may be 1e{power} or {other}"
         usual = f"a unit such as '1e{-abs(power)} erg / (s cm2 Angstrom)': `flux_unit` names it"
-        raise InputError(fault, usual, key="unit")
+        raise InputError(f"{fault}; give {usual}", key="unit")
     scale, name = _scale_and_name(name)
     name = balanced(name.rstrip(". "))
     if name not in ("MJy", "MJY"):
@@ -335,8 +335,8 @@ class TimeSystem:
             return 0.0
         stated = time_unit(self.unit) if self.unit else None
         if stated is None and not (unit == u.s and not self.unit):
-            raise InputError(f"{what}: TIMEOFFS or TIMEZERO is {self.offset:g}, and TIMEUNIT = {self.unit!r}",
-                             "the unit of this offset, such as TIMEUNIT = 's'", key="TIMEUNIT")  # fmt: skip
+            fault = f"{what}: TIMEOFFS or TIMEZERO is {self.offset:g}, and TIMEUNIT = {self.unit!r}"
+            raise InputError(f"{fault} must be its unit, such as TIMEUNIT = 's'", key="TIMEUNIT")
         return float(u.Quantity(self.offset, "s" if stated is None else stated.unit).to_value(unit))
 
 
@@ -446,8 +446,9 @@ def mjd_of(texts: Sequence[str], scale: str, name: str, what: str) -> Float:
     with offline():
         if (days := parsed(cleaned)) is None:
             row = next((k for k, text in zip(filled, cleaned, strict=True) if parsed([text]) is None), 0)
-            raise InputError(f"{what}: {name!r} = {shortened(texts[row], 40)} in row {row + 1}",
-                             "a number or a date such as 2026-03-01T12:00:00", key=name)  # fmt: skip
+            expected = "a number or a date such as 2026-03-01T12:00:00"
+            fault = f"{what}: {name!r} in row {row + 1} must be {expected}, not {shortened(texts[row], 40)}"
+            raise InputError(fault, key=name)
     found[filled] = days - hours / 24
     return found
 
