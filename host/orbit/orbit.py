@@ -94,8 +94,8 @@ class Elements:
             raise InputError(f"orbit file {named} must hold a line '1 ...' before a line '2 ...'", key="elements")
         sets = [(first, second) for first, second in sets if first[2:7] == MAUVE] or sets
         if len(numbers := sorted({first[2:7] for first, _ in sets})) > 1:
-            held = printable(", ".join(numbers), 80)
-            fault = f"orbit file {named} must be of Mauve, {MAUVE}, or one satellite, not of {len(numbers)} ({held})"
+            held = f"{len(numbers)} satellites ({printable(', '.join(numbers), 80)})"
+            fault = f"orbit file {named} must hold elements of Mauve, {MAUVE}, or of one satellite, not of {held}"
             raise InputError(fault, key="elements")
         return max((cls(first, second, source) for first, second in sets), key=lambda elements: elements.epoch_jd)
 
