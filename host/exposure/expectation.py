@@ -670,7 +670,7 @@ def _faint_enough(electrons: Float, name: str) -> Float:
     if (electrons > MAX_PER_FRAME).any():
         why = " (at 1 au it has V = -26.76, Willmer 2018)" if name == "Sun" else ""
         raise InputError(
-            f"{name} is too bright: a pixel may have {MAX_PER_FRAME:g} electrons in a frame, not "
+            f"{name} is too bright: a pixel may have at most {MAX_PER_FRAME:g} electrons in a frame, not "
             f"{float(electrons.max()):.3g}{why}; `magnitude` makes it a star at a distance, as in `magnitude=7.4`",
             key="magnitude",
         )

@@ -159,8 +159,8 @@ def _photons_in_band(
     ratio = hot / photons(wavelength_nm, blackbody(wavelength_nm, photosphere_temperature_k), band)
     if ratio <= 1.0:
         raise InputError(
-            f"the flare must be hotter than the photosphere that it replaces ({photosphere_temperature_k:g} K), but "
-            f"is {spectrum.describe()}",
+            f"flare temperature must be above the {photosphere_temperature_k:g} K of the photosphere that it replaces, "
+            f"not {spectrum.describe()}",
             key="flare_temperature",
         )
     return star, hot, ratio

@@ -132,14 +132,11 @@ def _input_error_of(model: type[BaseModel], first: Any) -> InputError:
     match first["type"]:
         case "extra_forbidden":
             fields = list(_fields(model, path[:-1]))
-            unknown = f"unknown key {shortened(key)}"
-            if not (near := difflib.get_close_matches(path[-1], fields, n=1)):
-                return InputError(f"{unknown}; use one of {', '.join(fields)}", key=key)
-            fault = InputError(f"{unknown}, did you mean {near[0]!r}?", key=key)
-            fault.expected = near[0]
-            return fault
+            near = difflib.get_close_matches(path[-1], fields, n=1)
+            remedy = f", did you mean {near[0]!r}?" if near else f": use one of {', '.join(fields)}"
+            return InputError(f"unknown key {shortened(key)}{remedy}", key=key)
         case "missing":
-            return InputError(f"{key!r} is missing; it needs a value", key=key)
+            return InputError(f"{key!r} is missing, but needs a value", key=key)
         case "value_error":
             return _own_error(model, path, key, first)
         case "too_long" | "too_short":
