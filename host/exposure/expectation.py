@@ -174,7 +174,7 @@ class Expectation(Drawable, ContentEquality):
         for name in PER_PIXEL:
             values = getattr(self, name)
             if values.shape != n_pixel:
-                raise ValueError(f"{name} has the shape {values.shape}, expected {n_pixel}")
+                raise ValueError(f"{name} must have the shape {n_pixel}, not {values.shape}")
             bad = ~((values >= 0) & (values <= MAX_PER_FRAME))
             if bad.any():
                 pixel = int(np.argmax(bad))
@@ -346,9 +346,7 @@ class Expectation(Drawable, ContentEquality):
     def per_element(self, values: Float) -> Float:
         """Sum the values of pixels over resolution elements, from shape (n_pixel,) to (n_element,)."""
         if np.shape(values) != self.element.shape:
-            raise InputError(
-                f"values of the shape {np.shape(values)}", f"{self.element.shape}: one for each pixel", key="values"
-            )
+            raise InputError.of("values", np.shape(values), f"of the shape {self.element.shape}, one for each pixel")
         return np.asarray(np.bincount(self.element, values, minlength=self.element_wavelength_nm.size), np.float64)
 
     def noise_budget(self) -> QTable:
@@ -592,8 +590,8 @@ def _usable(source: Source, instrument: Instrument) -> Source:
     check_covers(source.name, (first, last), (low, high), f"{instrument.name}'s output range ")
     if source.unscaled:
         raise InputError(
-            f"the spectrum of {source.name} is not as bright as the star is seen: {source.unscaled}",
-            "a magnitude as well",
+            f"the spectrum of {source.name} is not as bright as the star is seen: {source.unscaled}; give a magnitude "
+            "as well",
             key="magnitude",
         )
     return continued_to_reach(source, instrument)
@@ -629,8 +627,8 @@ MOST_RUNS = 3
 def entirely_saturated(x: Expectation, key: str) -> InputError:
     """Return the error of an exposure of which every pixel saturates."""
     return InputError(
-        f"every pixel of {x.name} is saturated in a frame of {x.frame_s:g} s",
-        f"a fainter star, or frames of at most {_safe_frame_s(x):g} s",
+        f"every pixel of {x.name} is saturated in a frame of {x.frame_s:g} s; use a fainter star, or frames of at "
+        f"most {_safe_frame_s(x):g} s",
         key=key,
     )
 
@@ -670,10 +668,10 @@ def _saturation(x: Expectation) -> tuple[str, ...]:
 def _faint_enough(electrons: Float, name: str) -> Float:
     """Return the mean electrons of a frame; raise InputError if a star is too bright for any pixel."""
     if (electrons > MAX_PER_FRAME).any():
-        why = "; at 1 au it has V = -26.76 (Willmer 2018)" if name == "Sun" else ""
+        why = " (at 1 au it has V = -26.76, Willmer 2018)" if name == "Sun" else ""
         raise InputError(
-            f"{name} is too bright: it makes {float(electrons.max()):.3g} electrons in one frame of a pixel{why}",
-            f"at most {MAX_PER_FRAME:g}: `magnitude` makes it a star at a distance, as in `magnitude=7.4`",
+            f"{name} is too bright: a pixel may have at most {MAX_PER_FRAME:g} electrons in a frame, not "
+            f"{float(electrons.max()):.3g}{why}; `magnitude` makes it a star at a distance, as in `magnitude=7.4`",
             key="magnitude",
         )
     return electrons

@@ -220,7 +220,7 @@ def _nodes(wavelength_nm: ArrayLike) -> Float:
     nodes = np.ascontiguousarray(wavelength_nm, np.float64)
     if nodes.ndim != 1 or nodes.size < 2 or not np.isfinite(nodes).all() or not (np.diff(nodes) > 0).all():
         raise InputError(
-            "the wavelengths of a spectrum", "at least two, finite and strictly increasing, in nm", key="wavelength_nm"
+            "a spectrum must have at least two finite, strictly increasing wavelengths, in nm", key="wavelength_nm"
         )
     return nodes
 
@@ -262,9 +262,9 @@ def negative_means_message(
     nm = instrument.wavelength_nm
     if electrons[worst] < -MAX_SIGMA_BELOW_ZERO * error[worst]:
         raise InputError(
-            f"the spectrum of {source.name} gives a mean of {electrons[worst]:.3g} electrons per frame at "
-            f"{nm[worst]:.1f} nm, beyond {MAX_SIGMA_BELOW_ZERO:g} times its error of {error[worst]:.2g}",
-            "non-negative light: bin the spectrum (`bin_nm`) or correct it",
+            f"the spectrum of {source.name} must be of non-negative light, but gives a mean of {electrons[worst]:.3g} "
+            f"electrons per frame at {nm[worst]:.1f} nm, beyond {MAX_SIGMA_BELOW_ZERO:g} times its error of "
+            f"{error[worst]:.2g}: bin the spectrum (`bin_nm`) or correct it",
             key="bin_nm",
         )
     return (

@@ -54,7 +54,7 @@ def helioecliptic(target: SkyCoord | str, time: Time | str) -> HelioEcliptic:
             star = position.transform_to(frame)
         except Exception:  # frames that cannot be transformed (AltAz without a location) raise many kinds
             raise InputError(
-                f"target in the frame {position.frame.name!r} cannot be turned to the ecliptic", "ICRS", key="target"
+                f"target in the frame {position.frame.name!r} cannot be turned to the ecliptic; use ICRS", key="target"
             ) from None
         difference = float((star.lon - sun.lon).wrap_at("180d").deg)
         return HelioEcliptic(abs(difference), abs(float(star.lat.deg)), float(star.separation(sun).deg))
@@ -244,8 +244,8 @@ def zodiacal_brightness(place: HelioEcliptic, lookup: Lookup = "bilinear") -> fl
     if np.isnan(nearest):
         raise InputError(
             f"the Sun is {place.separation_deg:.1f} deg from the target (helio-ecliptic longitude "
-            f"{place.longitude_deg:.1f} deg, latitude {place.latitude_deg:.1f} deg)",
-            "it outside the zone of solar avoidance, some 50 deg",
+            f"{place.longitude_deg:.1f} deg, latitude {place.latitude_deg:.1f} deg), which must be outside the zone "
+            "of solar avoidance, some 50 deg",
             key="target",
         )
     if lookup == "nearest":

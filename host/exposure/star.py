@@ -79,9 +79,8 @@ class Neighbour:
             text = f"of BP - RP = {self.bp_rp:.2f}: {nearest} ({colour:.2f}), the nearest colour of the library"
             return nearest, text
         raise InputError(
-            f"neighbour {self.name}, {self.separation_arcsec:.3g} arcsec away, has no spectral type, spectrum file, "
-            "temperature or colour",
-            "one of them, since its light enters the fibre",
+            f"neighbour {self.name}, {self.separation_arcsec:.3g} arcsec away, needs a spectral type, spectrum file, "
+            "temperature or colour, since its light enters the fibre",
             key="neighbours",
         )
 
@@ -91,8 +90,8 @@ class Neighbour:
         name, _ = self.spectrum
         if self.magnitude is None and self.file is None:
             raise InputError(
-                f"neighbour {self.name}, {self.separation_arcsec:.3g} arcsec away, has no magnitude",
-                "one, since its light enters the fibre",
+                f"neighbour {self.name}, {self.separation_arcsec:.3g} arcsec away, needs a magnitude, since its light "
+                "enters the fibre",
                 key="neighbours",
             )
         star = Source.from_library(name) if self.file is None else Source.read(self.file)
@@ -103,8 +102,8 @@ class Neighbour:
                 raise error.within(f"neighbour {self.name}, {self.separation_arcsec:.3g} arcsec away") from error
         if star.unscaled:
             raise InputError(
-                f"the spectrum of neighbour {self.name} is not as bright as the star is seen: {star.unscaled}",
-                "a magnitude as well",
+                f"the spectrum of neighbour {self.name} is not as bright as the star is seen: {star.unscaled}; give a "
+                "magnitude as well",
                 key="neighbours",
             )
         return star
@@ -251,7 +250,7 @@ def read_neighbours(path: str | Path, target: str | None = None) -> tuple[tuple[
     named = f"table of neighbours {shortened(path.name)}"
     table = _Neighbours(read_table(path, "table of neighbours"), named, "neighbours")
     if not 1 <= table.n <= MOST_ROWS:
-        raise InputError(f"{named} holds {table.n} stars", f"1 to {MOST_ROWS}", key="neighbours")
+        raise InputError(f"{named} must hold 1 to {MOST_ROWS} stars, not {table.n}", key="neighbours")
     name = table.first(STARS)
     names = [table.text(name, row) or f"row {row + 1}" for row in range(table.n)]
     own = None if target is None else next((k for k, name in enumerate(names) if name == target.strip()), None)
@@ -308,17 +307,18 @@ class _Neighbours(Rows):
             return self._from_positions(ra, dec, own, target), ()
         name = self.first(SEPARATIONS)
         if name is None:
+            columns = f"{self.named} has the columns {shown(', '.join(self.names), 300)}"
+            if ra is None:
+                raise InputError(f"{columns}, but needs separation (arcsec), or ra and dec", key="neighbours")
             raise InputError(
-                f"{self.named} has the columns {shown(', '.join(self.names), 300)}"
-                + ("" if ra is None else " and no position of the star itself"),
-                "separation (arcsec)" + (", or ra and dec" if ra is None else "")
-                + ("" if ra is None else ", or star.neighbours_of: the star's own row by name, or its coordinates"),
-                key="neighbours" if ra is None else "neighbours_of"
-            )  # fmt: skip
+                f"{columns} and no position of the star itself, but needs separation (arcsec), or star.neighbours_of: "
+                "the star's own row by name, or its coordinates",
+                key="neighbours_of",
+            )
         if target is not None and own is None:
             raise InputError(
-                f"{self.named} has no row named {shortened(target)}, and no positions",
-                "the name of a row, which is then left out",
+                f"{self.named} has no row named {shortened(target)}, and no positions; give the name of a row, which "
+                "is then left out",
                 key="neighbours_of",
             )
         return self._stated(name)
@@ -362,8 +362,8 @@ def _coordinates(text: str, named: str) -> tuple[float, float]:
         place = parse_position(text)
     except InputError as error:
         raise InputError(
-            f"{named} has no row named {shortened(text)}, and it is not a position",
-            "the name of the star's own row, or coordinates such as '290.68 +11.12'",
+            f"{named} has no row named {shortened(text)}, and it is not a position; give the name of the star's own "
+            "row, or coordinates such as '290.68 +11.12'",
             key="neighbours_of",
         ) from error
     return float(place.ra.rad), float(place.dec.rad)

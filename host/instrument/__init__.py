@@ -45,12 +45,16 @@ def instrument_path(name: str | Path, folder: Path) -> Path:
     if is_file(path):
         return path
     if path.is_dir():
-        raise InputError(f"instrument {shortened(str(path))} is a folder", "a name or a TOML file", key="instrument")
+        raise InputError(f"instrument {shortened(str(path))} is a folder; give a name or a TOML file", key="instrument")
     if path.suffix == ".toml":
-        raise InputError(f"instrument file {shortened(str(path))} does not exist", "a TOML file", key="instrument")
+        raise InputError(
+            f"instrument file {shortened(str(path))} does not exist; give the name of an instrument or the path of a "
+            "TOML file",
+            key="instrument",
+        )
     near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.0)[0]
     raise InputError(
-        f"unknown instrument {shortened(str(name))}",
-        f"{' or '.join(names)} (nearest: {near!r}) or the path of a TOML file",
+        f"instrument {shortened(str(name))} is unknown; use {' or '.join(names)} (nearest: {near!r}) or the path of a "
+        "TOML file",
         key="instrument",
     )

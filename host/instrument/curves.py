@@ -67,8 +67,7 @@ class Curve:
         table, source = _table_and_source(path, "curve file")
         if "wavelength" not in table.columns or len(table.columns) != 2:
             raise InputError(
-                f"curve file {path} has the columns {', '.join(table.columns)}",
-                "'wavelength' and one value",
+                f"curve file {path} must have the columns 'wavelength' and one value, not {', '.join(table.columns)}",
                 key="columns",
             )
         name = next(column for column in table.columns if column != "wavelength")
@@ -96,7 +95,7 @@ def _converted(values: NDArray[np.float64], name: str, unit: u.UnitBase | None, 
     for wanted in units:
         if unit is not None and unit.is_equivalent(wanted):
             return (values * unit).to_value(wanted)
-    raise InputError(f"column {name!r} has the unit {str(unit or '') or 'none'!r}", str(units[0]), key=name)
+    raise InputError(f"the unit of column {name!r} must be {units[0]}, not {str(unit or '') or 'none'!r}", key=name)
 
 
 Float = NDArray[np.float64]
@@ -144,7 +143,7 @@ class PixelMap(ContentEquality):
             values = np.asarray(getattr(self, name), np.float64)
             if values.ndim != 1:
                 raise InputError(
-                    f"{name} of the pixel map has the shape {values.shape}", "one value per pixel", key=name
+                    f"{name} of the pixel map must have one value per pixel, not the shape {values.shape}", key=name
                 )
             bad = ~(np.isfinite(values) & (values > 0 if name == "gain" else values >= 0))
             if bad.any():
@@ -183,10 +182,10 @@ class PixelMap(ContentEquality):
         unknown = [name for name in table.columns if name not in COLUMNS and name != "pixel"]
         if unknown or list(table.columns) in ([], ["pixel"]):
             what = f"the column {unknown[0]!r}" if unknown else "no column of values"
-            raise InputError(f"pixel map {path} has {what}", f"some of {', '.join(COLUMNS)}", key="pixel_map")
+            raise InputError(f"pixel map {path} has {what}; use some of {', '.join(COLUMNS)}", key="pixel_map")
         if "pixel" in table.columns and not np.array_equal(table["pixel"], np.arange(table["pixel"].size)):
             raise InputError(
-                f"pixel map {path}: the column 'pixel' is not 0, 1, 2, ...", "every pixel in order", key="pixel"
+                f"pixel map {path}: the column 'pixel' must be 0, 1, 2, ..., every pixel in order", key="pixel"
             )
         values = {}
         for name in table.columns:
@@ -195,7 +194,9 @@ class PixelMap(ContentEquality):
             unit = u.Unit(table.units[name], parse_strict="silent")
             if not unit.is_equivalent(COLUMNS[name]):
                 wanted = str(COLUMNS[name]) or "none"
-                raise InputError(f"pixel map {path}: {name} has the unit {str(unit) or 'none'!r}", wanted, key=name)
+                raise InputError(
+                    f"pixel map {path}: the unit of {name} must be {wanted}, not {str(unit) or 'none'!r}", key=name
+                )
             values[name] = table[name]
         try:
             return cls(**values, source=source)
@@ -358,8 +359,8 @@ class ThroughputErrors(ContentEquality):
         names = [name for name in table.columns if name.startswith(MODE)]
         if "wavelength" not in table.columns or not names or len(names) + 1 != len(table.columns):
             raise InputError(
-                f"throughput errors {path} have the columns {', '.join(table.columns)}",
-                f"wavelength, {MODE}1, {MODE}2 and so on",
+                f"throughput errors {path} must have the columns wavelength, {MODE}1, {MODE}2 and so on, not "
+                f"{', '.join(table.columns)}",
                 key="columns",
             )
         if table.units["wavelength"] != "nm":

@@ -71,7 +71,7 @@ def read_values(
     for name, entry in content.items():
         if name == "sources":
             raise InputError(
-                f"{path.name}: unknown key 'sources'", "each value's source in the value's own table", key="sources"
+                f"{path.name}: unknown key 'sources'; give each value's source in the value's own table", key="sources"
             )
         values[name], sources[name] = _entry(name, entry, path, files.get(name))
     return values, sources
@@ -86,7 +86,7 @@ def _entry(
         unknown = [key for key in entry if key not in ("value", "tag", "source")]
         if unknown or "value" not in entry:
             what = f"the unknown key {unknown[0]!r}" if unknown else "no 'value'"
-            raise InputError(f"{path.name}: the table {name} has {what}", "value, tag and source", key=name)
+            raise InputError(f"{path.name}: the table {name} has {what}; use value, tag and source", key=name)
         tag = entry.get("tag", "A")
         if tag not in TAGS:
             raise InputError.of("tag", tag, f"one of {', '.join(TAGS)}", where=f"{path.name}, {name}")
@@ -293,7 +293,7 @@ class Instrument(Section):
             raise InputError.of("bias_dn", self.bias_dn, "below saturation")
         if self.pixel_map is not None and self.pixel_map.size != self.pixels:
             raise InputError(
-                f"pixel_map has {self.pixel_map.size} pixels", f"the array's {self.pixels}", key="pixel_map"
+                f"pixel_map must have the array's {self.pixels} pixels, not {self.pixel_map.size}", key="pixel_map"
             )
         modes = 0 if self.throughput_errors is None else len(self.throughput_errors.modes)
         if len(self.throughput_amplitudes) > modes:
@@ -302,8 +302,8 @@ class Instrument(Section):
             )
         if not (self.throughput(self.wavelength_nm) * self.per_pixel("response", 1.0) > 0).any():
             dark = [name for name in CURVES if not (getattr(self, name).at(self.wavelength_nm) > 0).any()]
-            what = f"{' and '.join(dark) or 'the throughput'} = 0 from {low:g} to {high:g} nm"
-            raise InputError(what, "a throughput above 0 in some pixel, where else all S/N are 0", key="throughput")
+            what = f"{' and '.join(dark) or 'the throughput'} = 0 from {low:g} to {high:g} nm, and all S/N are 0"
+            raise InputError(f"some pixel must have a throughput above 0, but {what}", key="throughput")
         return self
 
     def _check_curves(self, low: float, high: float) -> None:
@@ -316,14 +316,13 @@ class Instrument(Section):
             curve: Curve = getattr(self, name)
             if not curve.covers(low, high):
                 raise InputError(
-                    f"{name} covers {curve.wavelength_nm[0]:g}-{curve.wavelength_nm[-1]:g} nm",
-                    f"at least the output range {low:g}-{high:g} nm",
+                    f"{name} must cover at least the output range {low:g}-{high:g} nm, but covers "
+                    f"{curve.wavelength_nm[0]:g}-{curve.wavelength_nm[-1]:g} nm",
                     key=name,
                 )
         if (most := float(self.quantum_efficiency(self.wavelength_nm).max())) > 1:
             raise InputError(
-                f"quantum_efficiency_a_per_w corresponds to {most:.3g} electrons per photon",
-                "at most 1",
+                f"quantum_efficiency_a_per_w must correspond to at most 1 electron per photon, not {most:.3g}",
                 key="quantum_efficiency_a_per_w",
             )
 

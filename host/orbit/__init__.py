@@ -67,9 +67,7 @@ class Limits(Section):
         if self.anomaly and (
             len(self.anomaly) < 3 or not all(math.isfinite(angle) for corner in self.anomaly for angle in corner)
         ):
-            raise InputError(
-                f"anomaly is a polygon of {len(self.anomaly)} corners", "at least 3, finite", key="anomaly"
-            )
+            raise InputError.of("anomaly", self.anomaly, "a polygon of at least 3 finite corners")
         return self
 
     @model_serializer(mode="plain")

@@ -136,8 +136,8 @@ class TimeGrid:
     def __post_init__(self) -> None:
         if not 1 <= self.n <= MAX_STEPS:
             raise InputError(
-                f"{self.days:g} days in steps of {self.step_s:g} s are {self.days * DAY_S / self.step_s:.3g} steps",
-                f"1 to {MAX_STEPS}",
+                f"{self.days:g} days in steps of {self.step_s:g} s must be 1 to {MAX_STEPS} steps, not "
+                f"{self.days * DAY_S / self.step_s:.3g}",
                 key="step_s",
             )
         _ = self.first  # raises InputError for an invalid start

@@ -64,8 +64,8 @@ class Elements:
             )
         if self.satellite.error:
             raise InputError(
-                f"orbital elements {shortened(self.second)} are refused by SGP4 (error {self.satellite.error})",
-                "those of an orbit around the Earth",
+                f"orbital elements {shortened(self.second)} must be those of an orbit around the Earth, but SGP4 "
+                f"refuses them (error {self.satellite.error})",
                 key="elements",
             )
 
@@ -91,13 +91,12 @@ class Elements:
             (first, second) for first, second in pairwise(lines) if first.startswith("1 ") and second.startswith("2 ")
         ]
         if not sets:
-            fault = f"orbit file {named} holds no two lines of elements"
-            raise InputError(fault, "a line '1 ...' before '2 ...'", key="elements")
+            raise InputError(f"orbit file {named} must hold a line '1 ...' before a line '2 ...'", key="elements")
         sets = [(first, second) for first, second in sets if first[2:7] == MAUVE] or sets
         if len(numbers := sorted({first[2:7] for first, _ in sets})) > 1:
-            held = printable(", ".join(numbers), 80)
-            fault = f"orbit file {named} holds elements of {len(numbers)} satellites ({held})"
-            raise InputError(fault, f"those of Mauve, {MAUVE}, or of one satellite", key="elements")
+            held = f"{len(numbers)} satellites ({printable(', '.join(numbers), 80)})"
+            fault = f"orbit file {named} must hold elements of Mauve, {MAUVE}, or of one satellite, not of {held}"
+            raise InputError(fault, key="elements")
         return max((cls(first, second, source) for first, second in sets), key=lambda elements: elements.epoch_jd)
 
     @cached_property
@@ -162,8 +161,7 @@ def _check(line: str, number: int) -> None:
     checksum = sum(int(c) if c.isdigit() else c == "-" for c in line[:68]) % 10
     if line[68] != str(checksum):
         raise InputError(
-            f"orbital elements {shortened(line)} end in the checksum {line[68]!r}",
-            f"{checksum}: one is wrong",
+            f"orbital elements {shortened(line)} must end in the checksum {checksum}, not {line[68]!r}; one is wrong",
             key="elements",
         )
 
@@ -400,7 +398,7 @@ class Target:
             Whether to query SIMBAD for a name that is not embedded (needs `mauvecl[names]` and a network).
         """
         if is_missing_position(text):
-            raise InputError(f"target {shortened(text)} is a pair of missing values", EXPECTED_POSITION, key="target")
+            raise InputError(f"target {shortened(text)} holds missing values; give {EXPECTED_POSITION}", key="target")
         star = by_key().get(name_key(text))
         if star is not None:
             return cls(name or star.name, star.ra_deg, star.dec_deg, f"embedded list ({star.source})",
@@ -410,8 +408,8 @@ class Target:
                 return _from_simbad(text, name)
             like = ", ".join(near_names(text, stars_only=True))
             raise InputError(
-                f"target {shortened(text)} is not in the embedded list",
-                f"a name such as {like}, coordinates such as '290.0 -11.2', or `simbad=True` to ask SIMBAD",
+                f"target {shortened(text)} is not in the embedded list; give a name such as {like}, coordinates such "
+                "as '290.0 -11.2', or `simbad=True` to ask SIMBAD",
                 key="target",
             )
         with offline():
@@ -448,8 +446,8 @@ def _from_simbad(text: str, name: str | None) -> Target:
         from astroquery.simbad import Simbad
     except ImportError:
         raise InputError(
-            f"target {shortened(text)} is not in the embedded list and astroquery is missing",
-            "coordinates, or `pip install 'mauvecl[names]'`",
+            f"target {shortened(text)} is not in the embedded list and astroquery is missing; give coordinates, or "
+            "`pip install 'mauvecl[names]'`",
             key="target",
         ) from None
     query = SIMBAD_QUERY.format(text.strip().replace("'", "''"))
@@ -457,13 +455,12 @@ def _from_simbad(text: str, name: str | None) -> Target:
         table = _within(TIMEOUT_S, lambda: Simbad.query_tap(query))
     except Exception as error:  # astroquery raises many kinds for a network failure
         raise InputError(
-            f"target {shortened(text)} is not in the embedded list and SIMBAD did not answer within {TIMEOUT_S:g}"
-            f" s ({type(error).__name__})",
-            "a network, or coordinates",
+            f"target {shortened(text)} is not in the embedded list and SIMBAD did not answer within {TIMEOUT_S:g} s "
+            f"({type(error).__name__}); this needs a network, or give coordinates",
             key="target",
         ) from error
     if table is None or len(table) == 0:
-        raise InputError(f"target {shortened(text)} is unknown to SIMBAD", "another name, or coordinates", key="target")
+        raise InputError(f"SIMBAD knows no target {shortened(text)}; give another name, or coordinates", key="target")
     row = table[0]
 
     def number(column: str) -> float | None:
@@ -472,7 +469,7 @@ def _from_simbad(text: str, name: str | None) -> Target:
 
     parallax, ra, dec = number("plx_value"), number("ra"), number("dec")
     if ra is None or dec is None:
-        raise InputError(f"target {shortened(text)} has no coordinates in SIMBAD", "another name", key="target")
+        raise InputError(f"target {shortened(text)} has no coordinates in SIMBAD; give another name", key="target")
     distance = None if parallax is None or parallax <= 0 else 1000 / parallax
     kind = None if np.ma.is_masked(row["sp_type"]) else str(row["sp_type"]).strip() or None
     return Target(name or text.strip(), ra, dec, "SIMBAD", distance, number("V"), kind)

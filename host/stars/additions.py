@@ -230,16 +230,16 @@ def fetch(
             return add(local, star, origin=title, replace=replace, extend=extend)
         except InputError as error:
             raise InputError(
-                f"{url} was downloaded but is not a usable spectrum ({str(error).replace(local.name, file)})",
-                "a whole file",
+                f"the file downloaded from {url} must be a whole, usable spectrum, but is not "
+                f"({str(error).replace(local.name, file)})",
                 key="base",
             ) from error
         finally:
             local.unlink(missing_ok=True)
     where = " or ".join(c.title for c in chosen)
     raise InputError(
-        f"no star {star!r} in {where}",
-        "its name there, such as HD 37202; or bring the file: mauvecl library add",
+        f"no star {star!r} is in {where}; give the name that it has there, such as HD 37202, or bring the file: "
+        "mauvecl library add",
         key="name",
     )
 
@@ -251,12 +251,10 @@ def _star_and_collections(name: str, base: str | None) -> tuple[str, list[Collec
     if not chosen:
         raise InputError.of("collection", word, f"one of {', '.join(c.name for c in COLLECTIONS)}")
     if base is not None and not colon:
-        raise InputError(
-            f"another address is given for {name!r}", f"its collection too, such as ngsl:{name}", key="name"
-        )
+        raise InputError(f"with another address, {name!r} must name its collection too, as in ngsl:{name}", key="name")
     star = star if colon else word
     if not _file_name(star):
-        raise InputError(f"star {name!r} has an empty name", "a name such as ngsl:HD 37202", key="name")
+        raise InputError(f"star {name!r} has an empty name; give a name such as ngsl:HD 37202", key="name")
     return star, chosen
 
 
@@ -299,8 +297,8 @@ def _download(url: str, show_progress: bool, max_bytes: int | None = None) -> Pa
         # Invalid host names raise ValueError (IDNA codec), malformed responses HTTPException.
         reason = getattr(error, "reason", error)
         raise InputError(
-            f"{url} cannot be reached ({reason})",
-            f"a network; without one bring the file: mauvecl library add {url.rsplit('/', 1)[1] or 'FILE'}",
+            f"{url} cannot be reached ({reason}); without a network give the file: mauvecl library add "
+            f"{url.rsplit('/', 1)[1] or 'FILE'}",
             key="base",
         ) from error
 
@@ -330,8 +328,7 @@ def _receive(url: str, file: IO[bytes], max_bytes: int, show_progress: bool) -> 
                     )
     if size is not None and size > max_bytes:
         raise InputError(
-            f"{url} has more than {max_bytes >> 20} MiB",
-            "less; MAUVECL_LARGEST_FILE_MIB sets the limit of files",
+            f"{url} has more than {max_bytes >> 20} MiB; MAUVECL_LARGEST_FILE_MIB may set a higher limit for files",
             key="MAUVECL_LARGEST_FILE_MIB",
         )
     if size is not None and got < size:

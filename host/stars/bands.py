@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from mauvecl.host.arrays import array_cache
 from mauvecl.host.stars.library import band_table, embedded, known_band, spectrum_table
-from mauvecl.schema.errors import InputError, shortened
+from mauvecl.schema.errors import InputError
 
 Float = NDArray[np.float64]
 
@@ -84,9 +84,7 @@ def scale(name: str, system: System = "catalogue") -> str:
 
 def _check_system(system: str) -> None:
     if system not in SYSTEMS:
-        raise InputError(
-            f"magnitude system {shortened(str(system))} is unknown", f"one of {', '.join(SYSTEMS)}", key="system"
-        )
+        raise InputError.of("system", system, f"one of {', '.join(SYSTEMS)}")
 
 
 @array_cache(256)
@@ -110,7 +108,7 @@ def magnitude(wavelength_nm: Float, flux_flam: Float, name: str = "V", system: S
     grid = np.union1d(wavelength_nm, chosen.wavelength_nm) * 10.0
     star = _photon_rate(grid, *_photon_density(wavelength_nm, flux_flam, chosen), chosen)
     if not star > 0.0:
-        raise InputError(f"the spectrum has no light in the band {chosen.name}", "a positive flux", key="band")
+        raise InputError(f"the spectrum must have light in the band {chosen.name}, but has none", key="band")
     if system == "ab" or (system == "catalogue" and chosen.system == "AB"):
         return _ab_magnitude(star, grid, chosen)
     vega = math.log10(photons(*_vega(), chosen.name))
@@ -143,9 +141,9 @@ def _covered(wavelength_nm: Float, name: str) -> Band:
     )
     if share < COVERAGE:
         raise InputError(
-            f"the spectrum covers {wavelength_nm[0]:.0f}-{wavelength_nm[-1]:.0f} nm",
-            f"{COVERAGE:.0%} of the band {chosen.name} ({chosen.wavelength_nm[0]:.0f}-"
-            f"{chosen.wavelength_nm[-1]:.0f} nm), not {share:.0%}",
+            f"the spectrum must cover {COVERAGE:.0%} of the band {chosen.name} "
+            f"({chosen.wavelength_nm[0]:.0f}-{chosen.wavelength_nm[-1]:.0f} nm), but covers {share:.0%} "
+            f"({wavelength_nm[0]:.0f}-{wavelength_nm[-1]:.0f} nm)",
             key="band",
         )
     return chosen

@@ -42,7 +42,7 @@ def check_points(name: str, wavelength: Float, flux: Float) -> None:
     """
     if wavelength.ndim != 1 or wavelength.shape != flux.shape or wavelength.size < 2:
         fault = f"spectrum {name} has {wavelength.shape} wavelengths and {flux.shape} fluxes"
-        raise InputError(fault, "two equal columns", key="flux")
+        raise InputError(f"{fault}, but needs two equal columns of at least two points", key="flux")
     bad = np.flatnonzero(~(np.isfinite(wavelength) & (wavelength > 0.0)))
     if bad.size:
         raise InputError.of(
@@ -51,8 +51,8 @@ def check_points(name: str, wavelength: Float, flux: Float) -> None:
     back = np.flatnonzero(np.diff(wavelength) <= 0)
     if back.size:
         i = int(back[0])
-        fault = f"spectrum {name}: wavelength {wavelength[i + 1]:g} nm at point {i + 2} follows {wavelength[i]:g} nm"
-        raise InputError(fault, "increasing wavelengths", key="wavelength")
+        pair = f"{wavelength[i + 1]:g} nm at point {i + 2} follows {wavelength[i]:g} nm"
+        raise InputError(f"spectrum {name}: wavelengths must increase, but {pair}", key="wavelength")
     outside = np.flatnonzero((wavelength < NEAREST_NM) | (wavelength > FARTHEST_NM))
     if outside.size:
         where = f"spectrum {name}, point {outside[0] + 1}"
@@ -63,9 +63,8 @@ def check_points(name: str, wavelength: Float, flux: Float) -> None:
     if close.size:
         i = int(close[0])
         first, second = (float(end) for end in wavelength[i : i + 2])
-        same = f"{first!r} and {second!r} nm at points {i + 1} and {i + 2} are the same to within rounding"
-        expected = f"wavelengths that differ by {CLOSEST:g} of their value"
-        raise InputError(f"spectrum {name}: wavelengths {same}", expected, key="wavelength")
+        pair = f"{first!r} and {second!r} nm at points {i + 1} and {i + 2}"
+        raise InputError(f"spectrum {name}: {pair} must differ by {CLOSEST:g} of their value", key="wavelength")
     # Undefined ends are cut later.
     largest = float(np.abs(flux[np.isfinite(flux)]).max(initial=0.0))
     if largest and not FAINTEST <= largest <= BRIGHTEST:
@@ -81,7 +80,7 @@ def check_measured(name: str, wavelength: Float, unit: str = "nm") -> None:
     likely = likely_unit(low, high, "nm") if unit == "nm" else None
     meant = f"; as numbers these look like {likely}: `wavelength_unit={likely!r}`" if likely else ""
     fault = f"spectrum {name} covers {low:g}-{high:g} nm, {part:.0%} of {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm"
-    raise InputError(fault, f"at least a third, which `extend` can continue{meant}", key="extend")
+    raise InputError(f"{fault}, but needs at least a third, which `extend` can continue{meant}", key="extend")
 
 
 def check_covers(
@@ -89,9 +88,9 @@ def check_covers(
 ) -> None:
     """Raise InputError if a spectrum's range does not cover that of the pixels."""
     if span_nm[0] > needed_nm[0] or span_nm[1] < needed_nm[1]:
-        fault = f"spectrum {name} spans {span_nm[0]:g}-{span_nm[1]:g} nm"
-        expected = f"at least {of}{needed_nm[0]:g}-{needed_nm[1]:g} nm: `extend` continues it by a library spectrum"
-        raise InputError(fault, expected, key="extend")
+        needed = f"at least {of}{needed_nm[0]:g}-{needed_nm[1]:g} nm"
+        fault = f"spectrum {name} must span {needed}, not {span_nm[0]:g}-{span_nm[1]:g} nm"
+        raise InputError(f"{fault}: `extend` continues it by a library spectrum", key="extend")
 
 
 def coverage(wavelength: Float) -> str:
@@ -111,8 +110,7 @@ def without_undefined_ends(name: str, wavelength: Float, flux: Float) -> tuple[F
     stop = int(high[0]) if high.size else wavelength.size
     defined = wavelength[start:stop]
     if defined.size < 2:
-        fault = f"spectrum {name} has no defined flux in {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm"
-        raise InputError(fault, "some", key="flux")
+        raise InputError(f"spectrum {name} needs defined fluxes in {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm", key="flux")
     note = f"cut to {defined[0]:.1f}-{defined[-1]:.1f} nm: undefined flux beyond"
     return defined, flux[start:stop], (note,)
 
@@ -129,15 +127,14 @@ def check_flux(name: str, wavelength: Float, flux: Float) -> None:
     most, least = (float(f(flux[inside])) if inside.any() else 0.0 for f in (np.max, np.min))
     if max(abs(most), abs(least)) > BRIGHTEST or 0.0 < most < FAINTEST:
         fault = f"spectrum {name}: the highest flux in 200-700 nm is {most:.3g} and the lowest {least:.3g} erg/s/cm2/A"
-        raise InputError(fault, f"{FAINTEST:g} to {BRIGHTEST:g}", key="flux")
+        raise InputError(f"{fault}, but fluxes must reach {FAINTEST:g} and not exceed {BRIGHTEST:g}", key="flux")
     if most <= 0.0:
-        what = "every flux is zero" if not flux.any() else f"no flux in 200-700 nm is above zero, the highest {most:g}"
-        raise InputError(f"spectrum {name}: {what}", "some light", key="flux")
+        what = "every flux is zero" if not flux.any() else f"the highest flux there is {most:g}"
+        raise InputError(f"spectrum {name} must have light in 200-700 nm, but {what}", key="flux")
     if least < -most:
         at = wavelength[inside][int(np.argmin(flux[inside]))]
-        fault = f"flux {least:g} at {at:g} nm lies farther below zero than any in 200-700 nm lies above"
-        expected = "at most measured noise: the value may mark a missing measurement"
-        raise InputError(f"spectrum {name}: {fault}", expected, key="flux")
+        fault = f"flux {least:g} at {at:g} nm must not lie farther below zero than any in 200-700 nm lies above"
+        raise InputError(f"spectrum {name}: {fault}; the value may mark a missing measurement", key="flux")
 
 
 def remarks(wavelength: Float, flux: Float) -> tuple[str, ...]:
@@ -214,9 +211,8 @@ def continued(
         word = "starts" if is_blue else "ends"
         if share > MAX_CONTINUED:
             invented = f"{share:.1%} of the brightest pixel's light would be invented"
-            fault = f"spectrum {name} {word} at {end:g} nm, where it is bright: {invented}"
-            expected = f"a spectrum to {goal:g} nm: `extend` continues it by a library spectrum"
-            raise InputError(fault, expected, key="extend")
+            fault = f"spectrum {name} must reach {goal:g} nm, but {word} at {end:g} nm, where it is bright: {invented}"
+            raise InputError(f"{fault}; `extend` continues it by a library spectrum", key="extend")
         messages.append(
             f"it {word} at {end:g} nm and is continued to {goal:g} nm at its end's level, {level:.3g}: at most "
             f"{100 * share:.2g} % of the brightest pixel's light"
@@ -290,11 +286,11 @@ def _join(
     """Return the range in which two spectra are compared, widened by the noise of the first, and their means."""
     low, high = max(wavelength[0], beyond[0]), min(wavelength[-1], beyond[-1])
     if not low < high:
-        fault = (
-            f"spectrum {name} spans {wavelength[0]:g}-{wavelength[-1]:g} nm and its extension {extension}"
-            f" {beyond[0]:g}-{beyond[-1]:g} nm"
+        raise InputError(
+            f"spectrum {name} and its extension {extension} must overlap, but span "
+            f"{wavelength[0]:g}-{wavelength[-1]:g} nm and {beyond[0]:g}-{beyond[-1]:g} nm",
+            key="extend",
         )
-        raise InputError(fault, "them to overlap", key="extend")
     noise = point_noise(flux)
     for width in JOIN_NM * 2.0 ** np.arange(6):
         join = np.clip([low, low + width] if blue else [high - width, high], low, high)
@@ -303,11 +299,11 @@ def _join(
         error = float(np.sqrt(np.sum(noise[near] ** 2))) / max(int(near.sum()), 1)
         if own > MIN_JOIN_SNR * error and other > 0.0 and np.isfinite(own / other):
             return join, own, other
-    fault = (
-        f"spectrum {name} and its extension {extension} have mean fluxes of {own:g} and {other:g} "
-        f"at {join[0]:g}-{join[1]:g} nm"
+    raise InputError(
+        f"spectrum {name} and its extension {extension} must both have light to scale by, but have mean fluxes of "
+        f"{own:g} and {other:g} at {join[0]:g}-{join[1]:g} nm",
+        key="extend",
     )
-    raise InputError(fault, "light in both to scale by", key="extend")
 
 
 def point_noise(flux_flam: Float) -> Float:

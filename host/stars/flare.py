@@ -63,8 +63,7 @@ def with_flare(
         rise = photons(grid, lines, band) / star
         if rise > amplitude:
             raise InputError(
-                f"flare amplitude = {amplitude:g} is less than the rise of {rise:g} by its lines in {band}",
-                "more",
+                f"flare amplitude must be at least {rise:g}, the rise by its lines in {band}, not {amplitude:g}",
                 key="flare_amplitude",
             )
         return grid, quiescent + lines + (amplitude - rise) * star / hot * body
@@ -73,8 +72,8 @@ def with_flare(
     filling = amplitude / (ratio - 1.0)
     if filling > 1.0:
         raise InputError(
-            f"flare amplitude = {amplitude:g} needs {filling:.2f} of the star's disc at {spectrum.describe()}",
-            f"at most {ratio - 1.0:.3g}",
+            f"flare amplitude must be at most {ratio - 1.0:.3g} at {spectrum.describe()}, not {amplitude:g}, which "
+            f"needs {filling:.2f} of the star's disc",
             key="flare_amplitude",
         )
     return grid, quiescent * (1.0 - filling) + filling * ratio * star / hot * body
@@ -118,8 +117,8 @@ def check_scales(spectrum: FlareSpectrum) -> None:
     """Raise InputError if some lines of a flare do not scale with its amplitude."""
     if spectrum.fixed_lines:
         raise InputError(
-            f"a flare of {spectrum.describe()} has lines that do not scale with its amplitude",
-            "lines as a fraction of its continuum",
+            f"the lines of a flare of {spectrum.describe()} must be given as a fraction of its continuum to scale "
+            "with its amplitude",
             key="lines",
         )
 
@@ -139,12 +138,10 @@ def _photons_in_band(
     grid, quiescent = _on_grid(wavelength_nm, flux_flam, spectrum)
     star = photons(grid, quiescent, band)
     if not star > 0.0:
-        raise InputError(f"the star has no light in the band {band}", "a star with light in the band", key="band")
+        raise InputError(f"the star must have light in the band {band}, but has none", key="band")
     hot = photons(grid, spectrum.flux(grid), band)
     if not hot > 0.0:
-        raise InputError(
-            f"the flare, {spectrum.describe()}, has no light in the band {band}", "some to scale", key="band"
-        )
+        raise InputError(f"the flare, {spectrum.describe()}, needs light in the band {band} to be scaled", key="band")
     if geometry == "added":
         return star, hot, None
     if geometry != "replaces":
@@ -162,8 +159,8 @@ def _photons_in_band(
     ratio = hot / photons(wavelength_nm, blackbody(wavelength_nm, photosphere_temperature_k), band)
     if ratio <= 1.0:
         raise InputError(
-            f"flare temperature = {spectrum.describe()} is no hotter than the photosphere it replaces",
-            f"more than {photosphere_temperature_k:g} K",
+            f"flare temperature must be above the {photosphere_temperature_k:g} K of the photosphere that it replaces, "
+            f"not {spectrum.describe()}",
             key="flare_temperature",
         )
     return star, hot, ratio

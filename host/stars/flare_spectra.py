@@ -365,15 +365,15 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
         ends = float(self.wavelength_nm[0]), float(self.wavelength_nm[-1])
         if ends[0] > NEEDED_NM[0] or ends[1] < NEEDED_NM[1]:
             raise InputError(
-                f"the flare spectrum {self.name} covers {ends[0]:g}-{ends[1]:g} nm",
-                f"{NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm, or the temperature of a blackbody that continues it",
+                f"the flare spectrum {self.name} must cover {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm, but covers "
+                f"{ends[0]:g}-{ends[1]:g} nm; give the temperature of a blackbody that continues it",
                 key="continue_at_k",
             )
         if self.measured_nm == (0.0, 0.0):
             object.__setattr__(self, "measured_nm", ends)
         if not self.bolometric_flux() > 0.0:
             raise InputError(
-                f"the flare spectrum {self.name} has a total flux of {self.bolometric_flux():g}", "> 0", key="flux"
+                f"the flare spectrum {self.name} needs a total flux above 0, not {self.bolometric_flux():g}", key="flux"
             )
 
     @classmethod
@@ -399,7 +399,7 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
         nm, flux = np.asarray(wavelength_nm, np.float64), np.asarray(flux_flam, np.float64)
         check_points(name, nm, flux)
         if not np.isfinite(flux).all():
-            raise InputError(f"the flare spectrum {name} has undefined fluxes", "finite ones", key="flux")
+            raise InputError(f"the flare spectrum {name} must have finite fluxes, but some are undefined", key="flux")
         measured = float(nm[0]), float(nm[-1])
         gaps = [f"{nm[i]:.1f}-{nm[i + 1]:.1f}" for i in np.flatnonzero(np.diff(nm) > GAP_NM)]
         if gaps:
@@ -457,7 +457,7 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
             left, rounding = np.trapezoid([flux, ROUNDING * np.abs(quiet)], nm)
             if not left > rounding:
                 raise InputError(
-                    f"the spectrum {read.name} is no brighter than {star.name}, which is subtracted from it",
+                    f"the spectrum {read.name} must be brighter than {star.name}, which is subtracted from it: give "
                     "the star with its flare, and the same star without it",
                     key="quiescent",
                 )
@@ -502,8 +502,7 @@ def _continued(name: str, nm: Float, flux: Float, kelvin: float) -> tuple[Float,
             continue
         if not scale > 0.0:
             raise InputError(
-                f"the flare spectrum {name} has no light near {end:g} nm",
-                "some to scale a blackbody to",
+                f"the flare spectrum {name} has no light near {end:g} nm, but needs some to scale a blackbody to",
                 key="continue_at_k",
             )
         if first:

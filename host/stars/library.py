@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 from mauvecl.host.tables.files import Numbers, parse_numbers, read_ecsv
 from mauvecl.schema.columns import Column
-from mauvecl.schema.errors import InputError, shortened
+from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range, checked, number
 from mauvecl.schema.physical import Temperature
 
@@ -129,9 +129,7 @@ def spectrum(star: OwnStar) -> tuple[np.ndarray, np.ndarray]:
     wavelength, flux = (np.asarray(table[name], float) for name in ("wavelength", "flux"))
     if spectrum_digest(wavelength, flux) != table.meta["spectrum_sha256"]:
         raise InputError(
-            f"kept star {star.name!r} was changed after it was kept (its digest differs)",
-            "the unchanged file: add or fetch it again",
-            key="name",
+            f"kept star {star.name!r} must be unchanged, but its digest differs: add or fetch it again", key="name"
         )
     return wavelength, flux
 
@@ -343,9 +341,7 @@ def subtype(spectral_type: str) -> float:
     """Convert a spectral type to a number, ten per class: K5 is 55, M0 is 60, and a class without subtype is x5."""
     matched = _TYPE.match(spectral_type)
     if not matched:
-        raise InputError(
-            f"spectral type {shortened(spectral_type)} is unknown", "one from O to M, such as M3V", key="spectral_type"
-        )
+        raise InputError.of("spectral type", spectral_type, "one from O to M, such as M3V")
     return 10.0 * CLASSES.index(matched[1]) + (5.0 if matched[2] is None else float(matched[2]))
 
 
@@ -410,7 +406,7 @@ def spectrum_name(text: str, key: str = "star", *, own: bool = True) -> str:
     """
     star = resolve(text, own=own)
     if star is None:
-        raise InputError(f"star {text.strip()!r} is unknown", f"a name such as {', '.join(near_names(text))}", key=key)
+        raise InputError(f"star {text.strip()!r} is unknown; try a name such as {', '.join(near_names(text))}", key=key)
     return star.nearest
 
 
@@ -481,4 +477,4 @@ def known_band(name: str) -> str:
     for band, others in ALIASES.items():
         if wanted in (band.casefold(), *(other.casefold() for other in others)):
             return band
-    raise InputError(f"band {name!r} is unknown", f"one of {', '.join(ALIASES)}", key="band")
+    raise InputError.of("band", name, f"one of {', '.join(ALIASES)}")

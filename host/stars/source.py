@@ -295,7 +295,7 @@ class Source(Drawable, ContentEquality):
             nm = nm.to(u.nm, u.spectral())
             values = values.to(FLUX_UNIT, u.spectral_density(nm))
         except (u.UnitConversionError, TypeError, ValueError) as error:
-            raise InputError(f"spectrum {name}: {error}", "a wavelength and a flux density", key="flux") from error
+            raise InputError(f"spectrum {name} needs a wavelength and a flux density: {error}", key="flux") from error
         axis, density = np.ma.filled(nm.value, np.nan), np.ma.filled(values.value, np.nan)
         if isinstance(wavelength, u.Quantity) and wavelength.unit.physical_type != "length" and axis[:1] > axis[-1:]:
             # Rising frequencies or energies are falling wavelengths.
@@ -311,7 +311,7 @@ class Source(Drawable, ContentEquality):
             raise InputError.of("spectrum", spectrum, "a SourceSpectrum of synphot")
         own = spectrum.waveset
         if own is None:
-            raise InputError(f"{name} defines no wavelengths", "a spectrum with a waveset", key="spectrum")
+            raise InputError(f"{name} defines no wavelengths; use a spectrum with a waveset", key="spectrum")
         grid = np.arange(160.0, 1150.0, 0.5)
         nm = np.unique(own.to_value(u.nm))
         inside = grid[(grid > nm[0]) & (grid < nm[-1])]
@@ -329,7 +329,7 @@ class Source(Drawable, ContentEquality):
             raise InputError.of("spectrum", spectrum, "a Spectrum of specutils")
         axis, flux = spectrum.spectral_axis, spectrum.flux
         if flux.ndim != 1:
-            raise InputError(f"{name} has shape {flux.shape}", "one spectrum", key="spectrum")
+            raise InputError(f"{name} must be one spectrum, but has the shape {flux.shape}", key="spectrum")
         order = np.argsort(axis.to_value(u.nm, u.spectral()))
         return cls.from_arrays(u.Quantity(axis)[order], u.Quantity(flux)[order], name=name, origin="specutils Spectrum")
 
@@ -480,12 +480,12 @@ class Source(Drawable, ContentEquality):
         try:
             model = getattr(parameter_averages, law)(Rv=rv)
         except ValueError as error:
-            raise InputError(f"R_V = {rv!r}: {error}", f"what the law {law} allows", key="rv") from error
+            raise InputError(f"R_V must be a value that the law {law} allows, not {rv!r}: {error}", key="rv") from error
         # Laws end in the far ultraviolet, whose light does not reach the detector.
         low, high = 1000.0 / np.asarray(model.x_range)[::-1]
         inside = (self.wavelength_nm >= low) & (self.wavelength_nm <= high)
         if low > SPAN_NM[0] or high < SPAN_NM[1]:
-            raise InputError(f"extinction law {law} covers {low:.0f}-{high:.0f} nm", "180-750 nm", key="law")
+            raise InputError(f"the law {law} must cover 180-750 nm, not {low:.0f}-{high:.0f} nm", key="law")
         flux = self.flux_flam[inside] * model.extinguish(self.wavelength_nm[inside] * u.nm, Ebv=ebv)
         history = (*self.history, f"reddened by E(B-V) = {ebv:g}, {law}, R_V = {rv:g}")
         return replace(self, wavelength_nm=self.wavelength_nm[inside], flux_flam=flux, history=history)

@@ -109,7 +109,7 @@ def _own_part(ax: Any) -> Any:
     spec = ax.get_subplotspec()
     if spec is None:
         raise InputError(
-            "ax is not part of a grid", "axes from plt.subplots, for a picture of several panels", key="ax"
+            "ax must be part of a grid for a picture of several panels; use axes from plt.subplots", key="ax"
         )
     ax.set_axis_off()
     return ax.figure.add_subfigure(spec)

@@ -117,7 +117,7 @@ def load_opencl() -> Any:
     _provide_libraries(kernel_cache().work / "libraries")
     if kernel_cache().pid != os.getpid():
         # PoCL's threads do not survive a fork; its next call would wait forever.
-        raise DeviceError("OpenCL was loaded before a fork, expected a newly started process (use spawn)")
+        raise DeviceError("OpenCL was loaded before a fork, but needs a newly started process (use spawn)")
     # pyopencl's own cache would duplicate PoCL's.
     os.environ.setdefault("PYOPENCL_NO_CACHE", "1")
     try:
@@ -212,7 +212,7 @@ def choose_device(wanted: str | None) -> tuple[Any, DeviceRecord]:
         if wanted == str(index) or wanted.casefold() in record.label.casefold():
             return handles[index], record
     present = "; ".join(f"{index} = {record.label}" for index, record in enumerate(records))
-    raise DeviceError(f"device {wanted!r} is not here, expected one of: {present}", "unknown device")
+    raise DeviceError(f"device {wanted!r} is not here; use one of: {present}", "unknown device")
 
 
 @cache
@@ -363,4 +363,4 @@ class Device:
     def check_process(self) -> None:
         """Raise DeviceError after a fork, which PoCL's threads do not survive: its next call would wait forever."""
         if os.getpid() != self._pid:
-            raise DeviceError("this Engine was made before a fork, expected an Engine made in this process (use spawn)")
+            raise DeviceError("this Engine was made before a fork; make one in this process (use spawn)")

@@ -468,7 +468,7 @@ def _working_level(device: Any, names: tuple[str | None, ...], others: Callable[
         failed.append(f"{'it' if name is None else f'level {name}'} {why}")
     raise DeviceError(
         f"{device.platform.version.strip()}, driver {device.driver_version.strip()}, cannot build kernels for the "
-        f"processor {device.name.strip()} ({'; '.join(failed)}), expected enough memory, a linker that works, another "
+        f"processor {device.name.strip()} ({'; '.join(failed)}); it needs enough memory, a linker that works, another "
         f"device (`mauvecl devices` lists them) or another driver: {driver_sources()}; {LIMIT} sets the limit of time"
     )
 

@@ -385,15 +385,15 @@ class Engine:
         shape, dtype = (count, scene.n_pixel), np.dtype(np.uint16 if narrow else np.int32)
         if scene.n_frames * expectation.adc_max_dn >= 2**31:
             raise InputError(
-                f"{scene.n_frames} frames of up to {expectation.adc_max_dn} DN overflow 32 bits",
-                f"at most {2**31 // expectation.adc_max_dn} frames",
+                f"{scene.n_frames} frames of up to {expectation.adc_max_dn} DN overflow 32 bits; use at most "
+                f"{2**31 // expectation.adc_max_dn} frames",
                 key="frames",
             )
         if out is None:
             out = np.empty(shape, dtype)
         elif out.shape != shape or out.dtype != dtype or not out.flags.c_contiguous or not out.flags.writeable:
             raise InputError(
-                f"out is {out.dtype} of shape {out.shape}", f"writable contiguous {dtype} of {shape}", key="out"
+                f"out must be writable contiguous {dtype} of {shape}, not {out.dtype} of {out.shape}", key="out"
             )
         clipped = np.empty(count, np.uint32)
         rows = out
@@ -461,7 +461,7 @@ class Engine:
                 return {"rows": rows}
             case StaresRequest():
                 return Stares(self.open_device, tiles=self._tiles).reduced(request, shard)
-        raise TypeError(f"{type(request).__name__}, expected a request")
+        raise TypeError(f"a request is needed, not {type(request).__name__}")
 
     def _snr(self, request: SnrRequest, shard: Shard) -> Counts:
         self.open_device.check_process()
@@ -577,7 +577,7 @@ class Engine:
         flares, statistics = request.flares, request.statistics
         scene = prepare([quiet, *flares], comparison=comparison, **drawing)
         if len(flares) >= BATCH[scene.frames]:
-            raise InputError(f"{len(flares)} flares", f"at most {BATCH[scene.frames] - 1} in one launch", key="flares")
+            raise InputError.of("flares", len(flares), f"at most {BATCH[scene.frames] - 1} in one launch")
         hypotheses = Hypotheses(quiet, flares, statistics, scene, nuisances=as_nuisances(nuisances, quiet))
         plan = plan_channels(hypotheses, range(len(flares)), first=True)
         out = np.empty((plan.n_rows, count), np.float32)

@@ -333,8 +333,8 @@ class Launches:
             outlying = tally.add_far(int(index), self.channel(tile, tally.grids[index].channel))
             if outlying != outside[index]:
                 raise DeviceError(
-                    f"{self._device.name} has {outside[index]} values outside a histogram where the host has "
-                    f"{outlying}, expected the same arithmetic"
+                    f"{self._device.name} must have {outlying} values outside a histogram as the host, but has "
+                    f"{outside[index]}"
                 )
 
     def flush(self, tally: Tally) -> None:

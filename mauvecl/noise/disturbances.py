@@ -130,8 +130,8 @@ class CosmicRays(AdditiveProcess):
         size = 1 << (most + 1).bit_length()
         if size > 2**24:
             raise InputError(
-                f"cosmic rays free up to {most} electrons in a pixel and draw",
-                f"at most {2**23}: lower the rate, the charge or the exposure",
+                f"cosmic rays may free at most {2**23} electrons in a pixel and draw, not {most}: lower the rate, the "
+                "charge or the exposure",
                 key="rate_per_cm2_s",
             )
         charge = np.zeros(size)
@@ -330,16 +330,15 @@ class Normal:
     def __post_init__(self) -> None:
         if not (self.sd > 0 and self.low < self.high):
             raise InputError(
-                f"a normal prior of mean {self.mean:g}, sd {self.sd:g}, cut at {self.low:g} and {self.high:g}",
-                "sd > 0 and low < high",
+                f"a normal prior must have sd > 0 and low < high, not mean {self.mean:g}, sd {self.sd:g}, low "
+                f"{self.low:g} and high {self.high:g}",
                 key="sd",
             )
         away = max(self.low - self.mean, self.mean - self.high) / self.sd
         if away > MAX_CUT_SD:
             raise InputError(
-                f"a normal prior of mean {self.mean:g} and sd {self.sd:g} is cut at {self.low:g} and "
-                f"{self.high:g}, {away:g} sd from its mean",
-                f"at most {MAX_CUT_SD:g}",
+                f"a normal prior of mean {self.mean:g} and sd {self.sd:g} must be cut at most {MAX_CUT_SD:g} sd from "
+                f"its mean, not at {self.low:g} and {self.high:g}, {away:g} sd from it",
                 key="low",
             )
 
@@ -385,11 +384,9 @@ def _from_study(given: Any) -> Prior:
             return kind(*(value for key, n in form.items() for value in _values(key, given[key], n)))
     keys = [key for form in _FORMS.values() for key in form]
     if isinstance(given, Mapping) and (other := next((key for key in given if key not in keys), None)):
-        raise InputError(f"unknown key {other!r} of a prior", f"some of {', '.join(keys)}", key=other)
+        raise InputError(f"unknown key {other!r} of a prior; use some of {', '.join(keys)}", key=other)
     raise InputError(
-        "a prior is neither { uniform = [low, high] } nor { normal = [mean, sd], between = [low, high] }",
-        "one of them",
-        key="uniform",
+        "a prior must be { uniform = [low, high] } or { normal = [mean, sd], between = [low, high] }", key="uniform"
     )
 
 

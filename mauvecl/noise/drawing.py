@@ -370,7 +370,7 @@ def choose_method(scenarios: Sequence[Expectation], drawing: Drawing, factors: F
     quiet, processes = scenarios[0], drawing.processes
     modulations = processes.modulations
     if quiet.wavelength_nm.size > MAX_PIXELS:
-        raise InputError(f"{quiet.wavelength_nm.size} pixels", f"at most {MAX_PIXELS}", key="pixels")
+        raise InputError.of("pixels", quiet.wavelength_nm.size, f"at most {MAX_PIXELS}")
     for other in scenarios[1:]:
         _check_same_detector(quiet, other)
     corners = _corners(factors)
@@ -381,7 +381,7 @@ def choose_method(scenarios: Sequence[Expectation], drawing: Drawing, factors: F
     joint = _joint(scenarios, varied, drawing.recipe)
     if modulations and not joint:
         raise InputError(
-            f"{modulations[0][0]} varies within a run, and the noise of {quiet.name} cannot be drawn jointly",
+            f"the noise of {quiet.name} must be drawn jointly if {modulations[0][0]} varies within a run: it needs "
             "Gaussian noise of at least 1.5 Poisson counts in each pixel and more for few counts, or no such process",
             key=modulations[0][0],
         )
@@ -435,9 +435,8 @@ def _joint(scenarios: Sequence[Expectation], varied: Sequence[Sequence[Cumulants
             if recipe == "joint":
                 pixel = int(np.argmin(exact))
                 raise InputError(
-                    f"recipe = 'joint', and pixel {pixel} of {x.name} has {np.sqrt(c.gaussian[pixel]):.3g} DN of "
-                    "Gaussian noise next to Poisson counts",
-                    "recipe 'apart' or 'auto'",
+                    f"recipe must be 'apart' or 'auto', not 'joint', since pixel {pixel} of {x.name} has "
+                    f"{np.sqrt(c.gaussian[pixel]):.3g} DN of Gaussian noise next to Poisson counts",
                     key="recipe",
                 )
             return False
@@ -466,8 +465,7 @@ def _draw_frames(
                 if mode == "stacked":
                     where = float(x.wavelength_nm[pixels][0])
                     raise InputError(
-                        f"mode = 'stacked' {why} in the pixel at {where:.1f} nm of {x.name}",
-                        "mode 'frames' or 'auto'",
+                        f"mode must be 'frames' or 'auto': 'stacked' {why} in the pixel at {where:.1f} nm of {x.name}",
                         key="mode",
                     )
                 return True
@@ -486,8 +484,8 @@ def check_reach(x: Expectation, c: Cumulants, factors: Factors) -> None:
     if (reach >= REACH_DN).any():
         pixel = int(np.argmax(reach))
         raise InputError(
-            f"the priors move pixel {pixel} of {x.name} {reach[pixel]:.3g} DN away from its mean",
-            f"less than {REACH_DN:g}: shorten the exposure or draw frame by frame",
+            f"the priors must move pixel {pixel} of {x.name} less than {REACH_DN:g} DN away from its mean, not "
+            f"{reach[pixel]:.3g}: shorten the exposure or draw frame by frame",
             key="priors",
         )
 
@@ -509,8 +507,8 @@ def _check_same_detector(quiet: Expectation, other: Expectation) -> None:
     ):
         if not np.array_equal(getattr(quiet, name), getattr(other, name)):
             raise InputError(
-                f"{name} of {other.name} differs from that of {quiet.name}",
-                "scenarios of one study to share instrument and exposure",
+                f"scenarios of one study must share instrument and exposure, but {name} of {other.name} differs from "
+                f"that of {quiet.name}",
                 key=name,
             )
 

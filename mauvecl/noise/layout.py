@@ -232,7 +232,7 @@ def alias_table(mean: float) -> AliasTable:
     of 2**-32 that sum to one, which the table then represents exactly.
     """
     if not 0.0 <= mean <= LARGEST_MEAN:
-        raise ValueError(f"Poisson mean = {mean!r}, expected 0 to {LARGEST_MEAN:g}")
+        raise ValueError(f"Poisson mean must be 0 to {LARGEST_MEAN:g}, not {mean!r}")
     if mean == 0.0:
         return AliasTable(0, 1, _pack(np.array([2**WORD_BITS, 0]), 1))
     # All counts beyond this range have together less than half a word.

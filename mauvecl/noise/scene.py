@@ -229,9 +229,8 @@ def fill_poisson_counts(out: NDArray[np.void], mean: Float, gain: Float, tables:
     if (mean[~expanded] > LARGEST_MEAN).any():
         pixel = int(np.argmax(np.where(expanded, 0.0, mean)))
         raise InputError(
-            f"pixel {pixel} has a Poisson mean of {mean[pixel]:.3g} in one draw next to a pixel of less than "
-            f"{SMALLEST_EXPANDED:g}",
-            f"at most {LARGEST_MEAN:g} there: draw frame by frame",
+            f"pixel {pixel} must have a Poisson mean of at most {LARGEST_MEAN:g} in one draw next to a pixel of less "
+            f"than {SMALLEST_EXPANDED:g}, not {mean[pixel]:.3g}: draw frame by frame",
             key="mode",
         )
     alias, starts = table_set(mean[~expanded].tolist(), tables)

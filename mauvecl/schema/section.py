@@ -76,8 +76,7 @@ class Record(BaseModel, metaclass=_InputErrorMeta):
             super().__setattr__(name, value)
         except ValidationError:
             raise InputError(
-                f"{type(self).__name__}.{name} is not set in place",
-                "a changed copy: with_, with_settings, at",
+                f"{type(self).__name__}.{name} cannot be set in place; use a changed copy: with_, with_settings, at",
                 key=name,
             ) from None
 
@@ -133,14 +132,11 @@ def _input_error_of(model: type[BaseModel], first: Any) -> InputError:
     match first["type"]:
         case "extra_forbidden":
             fields = list(_fields(model, path[:-1]))
-            unknown = f"unknown key {shortened(key)}"
-            if not (near := difflib.get_close_matches(path[-1], fields, n=1)):
-                return InputError(unknown, f"one of {', '.join(fields)}", key=key)
-            fault = InputError(f"{unknown}, did you mean {near[0]!r}?", key=key)
-            fault.expected = near[0]
-            return fault
+            near = difflib.get_close_matches(path[-1], fields, n=1)
+            remedy = f", did you mean {near[0]!r}?" if near else f": use one of {', '.join(fields)}"
+            return InputError(f"unknown key {shortened(key)}{remedy}", key=key)
         case "missing":
-            return InputError(f"{key!r} is missing", "a value", key=key)
+            return InputError(f"{key!r} is missing, but needs a value", key=key)
         case "value_error":
             return _own_error(model, path, key, first)
         case "too_long" | "too_short":
@@ -163,8 +159,7 @@ def _own_error(model: type[BaseModel], path: list[str], key: str, first: Any) ->
     # A record's own error names the key; that of a single value's validator may not.
     own = field is None or model_in(field.annotation) is not None or path[-1] in message
     if not isinstance(inner, InputError):
-        fault, _, expected = message.partition(", expected ")
-        inner = InputError(fault, expected or None, key=key if path else None)
+        inner = InputError(message, key=key if path else None)
     # The message of the value's reader is more precise than its location.
     found = inner if own else inner.within(key)
     found.key = _full_key(model, path, inner.key)

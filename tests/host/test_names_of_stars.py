@@ -73,7 +73,7 @@ def test_given_values_win_over_those_of_the_list() -> None:
     assert notes(magnitude=9) == ((9.0, 9.91), "spectrum of type M1V, 9.91 pc, from Hipparcos")
     assert notes(magnitude=9, distance_pc=10) == ((9.0, 10.0), "spectrum of type M1V")
     # The list has no magnitude in another band.
-    with refused("magnitude", expected="a magnitude"):
+    with refused("magnitude", "give a magnitude"):
         expect(Study.build({"star": [{"library": "AU Mic", "band": "TESS"}]}, "test").star[0].source(), "mauve",
                exposure=50)  # fmt: skip
 

@@ -130,7 +130,7 @@ def test_error_on_a_worker_raises(workers: DaskWorkers) -> None:
     with pytest.raises(RuntimeError) as error:
         pool.realise(bright, start=0, count=10, seed=1, mode="stacked")
     assert error.value.kind == "failed"
-    assert "realisations 0 to 9: mode = 'stacked'" in str(error.value)
+    assert "realisations 0 to 9: mode must be 'frames' or 'auto'" in str(error.value)
     assert pool.standing.retries == 0
 
 

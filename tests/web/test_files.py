@@ -452,7 +452,7 @@ async def test_unusable_spectra_leave_no_answer(talk: Talk) -> None:
         for tab in ("detection", "measure"):
             reported = await talk.answer(same, tab)
             assert "answer" not in reported
-            assert "is no brighter than uploaded star without the flare" in reported["faults"]["flare_quiescent"]
+            assert "must be brighter than uploaded star without the flare" in reported["faults"]["flare_quiescent"]
 
 
 # Frames of the visitor's
