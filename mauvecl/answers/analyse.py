@@ -52,8 +52,8 @@ def blended_stars(cases: Sequence[Case]) -> list[BlendedStar]:
     """Return the stars in the fibre of the observed star, itself first; raises InputError for several cases."""
     if len(cases) != 1:
         raise InputError(
-            f"neighbours of observed frames with {len(cases)} stars",
-            "the star that was observed, such as `star=G2V` with its magnitude",
+            "neighbours of observed frames need the one star that was observed, such as `star=G2V` with its magnitude, "
+            f"not {len(cases)} stars",
             key="star",
         )
     (case,) = cases
@@ -586,7 +586,7 @@ def analyse(
     """
     if frames is None:
         if study.data.file is None:
-            raise InputError("no observed frames are given", "data.file, or frames", key="data.file")
+            raise InputError("no observed frames are given; use data.file, or frames", key="data.file")
         frames = read_frames(study.data.file, study.data.mapping, quality_bits=study.data.quality_bits,
                              ignore_checksum=study.data.ignore_checksum)  # fmt: skip
     if study.data.barycentric is not None:

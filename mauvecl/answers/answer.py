@@ -351,7 +351,7 @@ def verify_answer(folder: str | Path) -> list[FileFault]:
     """
     folder = Path(folder)
     if not is_answer(folder):
-        raise InputError(f"{str(folder)!r} holds no {RECORD}", "the output folder of a verb", key="folder")
+        raise InputError(f"{str(folder)!r} holds no {RECORD}; give the output folder of a verb", key="folder")
     if not (folder / RECORD).is_file():
         return [FileFault(RECORD, "missing")]
     text = read_text(folder / RECORD, "run record")

@@ -508,8 +508,9 @@ def _observations(
     """Return the instrument from which the fit starts and the observations; parameters as for `calibrate`."""
     asked = study.calibrate
     if not any(observation.library or observation.spectrum for observation in asked.observations):
-        raise InputError("no observation of a standard star is given",
-                         "calibrate.observations with library or spectrum", key="calibrate.observations")  # fmt: skip
+        raise InputError(
+            "calibrate.observations must name the library or spectrum of a standard star", key="calibrate.observations"
+        )
     for name, given in (("frames", frames), ("stars", stars)):
         if given is not None and len(given) != len(asked.observations):
             raise InputError.of(name, len(given), f"{len(asked.observations)}, one for each observation")

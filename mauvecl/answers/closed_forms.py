@@ -255,8 +255,8 @@ def throughput_cases(case: Case) -> list[Case]:
             same = next((sign for sign in signs if sign.instrument.read_pixels == pixels), None)
             if same is None:
                 raise InputError(
-                    "an error of the calibrated wavelengths changes the pixels of the output range",
-                    "an output range that ends further from a pixel",
+                    "an error of the calibrated wavelengths changes the pixels of the output range, which must end "
+                    "further from a pixel",
                     key="observation.instrument",
                 )
             moved.append(same)
@@ -269,7 +269,7 @@ def _unknown_priors(study: Study, nominal: Instrument) -> dict[str, Prior]:
     fixed = {*o.changes, *(() if o.temperature_c is None else ("temperature_c",))}
     priors = {name: prior for name, prior in study.unknowns.priors(nominal).items() if name not in fixed}
     if study.unknowns.draws and not priors:
-        raise InputError("no instrument value is unknown", "a prior, or unknowns.draws = 0", key="unknowns.draws")
+        raise InputError("no instrument value is unknown; give a prior, or unknowns.draws = 0", key="unknowns.draws")
     return priors
 
 

@@ -387,9 +387,7 @@ def _wanted(asked: CampaignQuestion, tests: int, stack: int, seed: int) -> list[
         lines.append(f"{text}: `fap={rate.at_least:.4g}`.")
     if asked.alarms is not None:
         if not asked.alarms < tests:
-            raise InputError(
-                f"campaign.alarms = {asked.alarms:g} of {tests} tests", "fewer alarms than tests", key="campaign.alarms"
-            )
+            raise InputError.of("campaign.alarms", asked.alarms, f"fewer than the {tests} tests")
         alarms = "false alarm" if asked.alarms == 1 else "false alarms"
         lines.append(
             f"For {asked.alarms:g} {alarms} expected in the campaign each of its {tests} tests may have "

@@ -111,8 +111,8 @@ class Sizes:
         scale = energy_scale(case.study, case.source, kind, flare_k)
         if scale is None:
             raise InputError(
-                f"injections.of = {asked!r}, but the size of {case.source.name} is unknown",
-                "the star's distance_pc, or radius_rsun and effective_temperature_k",
+                f"injections.of = {asked!r}, but the size of {case.source.name} is unknown; give the star's "
+                "distance_pc, or radius_rsun and effective_temperature_k",
                 key="injections.of",
             )
         return cls(asked, 1, area * scale.erg_per_s)

@@ -112,8 +112,7 @@ class LimitSearch:
         )
         for message in detection.messages:
             raise InputError(
-                f"at a {self.of} of {value:g}: {message.rstrip('.')}",
-                "a limit at which some pixel is not saturated",
+                f"at a {self.of} of {value:g}: {message.rstrip('.')}; some pixel must not be saturated at a limit",
                 key="limit.of",
             )
         # Raises InputError where no threshold has the false-alarm probability.
@@ -184,8 +183,8 @@ class LimitSearch:
         flare = "" if self.of == "amplitude" else f" with a flare of {100 * self.case.amplitudes[0]:.3g} %"
         return InputError(
             f"the detection probability of {name}{flare} by {self.statistic} {verb} {self.power:g} at "
-            f"{self.of} = {value:g}",
-            f"a limit between {low:g} and {high:g}{self.saturation_clause(value)}{self.sign_clause(value)}",
+            f"{self.of} = {value:g}; a limit must lie between {low:g} and {high:g}"
+            f"{self.saturation_clause(value)}{self.sign_clause(value)}",
             key="limit.of",
         )
 
@@ -282,8 +281,8 @@ def _settle(question: LimitSearch, start: float) -> Interval:
     slope, goal = question.slope(start), float(special.ndtri(question.power))
     if not slope > 0:
         raise InputError(
-            f"the detection probability does not rise towards an easier {of} at {start:g}",
-            f"a slope there{question.saturation_clause(start)}{question.sign_clause(start)}",
+            f"the detection probability must rise towards an easier {of}, but does not at {start:g}"
+            f"{question.saturation_clause(start)}{question.sign_clause(start)}",
             key="limit.of",
         )
     at, n = _coordinate(of, start), question.case.study.run.realisations
@@ -298,8 +297,8 @@ def _settle(question: LimitSearch, start: float) -> Interval:
             return Interval(_value(of, at + move), min(ends), max(ends))
         at += float(np.clip(move, -0.75, 0.75))
     raise InputError(
-        f"the limit of {of} did not settle near {_value(of, at):g}",
-        f"it within {MOST_EVALUATIONS} simulations{question.saturation_clause(_value(of, at))}",
+        f"the limit of {of} must settle within {MOST_EVALUATIONS} simulations, but did not near {_value(of, at):g}"
+        f"{question.saturation_clause(_value(of, at))}",
         key="limit.of",
     )
 

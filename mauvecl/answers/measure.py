@@ -278,7 +278,7 @@ def measure(study: Study, engine: Engine | Pool | None = None, progress: Progres
         check_sweep(study.sweep, study.stare, study.events)
     prepared = cases(study)
     if any(not amplitude > 0.0 for case in prepared for amplitude in case.amplitudes):
-        raise InputError("flare amplitude = 0 in a measurement", "one above 0", key="flare.amplitudes")
+        raise InputError.of("flare.amplitudes", 0, "above 0 in a measurement")
     expectations = [x for case in prepared for x in case.expectations]
     engine = engine or Engine()
     asked = [(case, *flare, engine) for case in prepared for flare in zip(case.amplitudes, case.flares, strict=True)]

@@ -365,13 +365,12 @@ def plan(
 def _refuse(study: Study, *, closed: bool) -> None:
     """Raise InputError for a study that cannot be planned, or not by the closed form."""
     if not study.plan.targets:
-        raise InputError("the plan has no targets", "some, such as `plan.targets='targets.csv'`", key="plan.targets")
+        raise InputError("the plan needs targets, such as `plan.targets='targets.csv'`", key="plan.targets")
     if study.orbit.targets:
-        raise InputError("both orbit.targets and plan.targets are given", "plan.targets alone", key="orbit.targets")
+        raise InputError("both orbit.targets and plan.targets are given; use plan.targets alone", key="orbit.targets")
     for name, _ in study.processes.modulations if closed else ():
         raise InputError(
-            f"processes.{name} with plan.completeness = 'closed form', which takes the stare for known",
-            "'injections'",
+            f"processes.{name} needs plan.completeness = 'injections', since 'closed form' takes the stare for known",
             key=f"processes.{name}",
         )
 

@@ -244,8 +244,8 @@ def star_of(text: PlanTarget, simbad: bool) -> Star:
         gaia = next((name for name in text.unused if name.casefold() == "phot_g_mean_mag"), None)
         other = f", and {gaia} is a magnitude in G, not in V" if gaia is not None and "magnitude" in missing else ""
         raise InputError(
-            f"target {text.name!r} has no {' and no '.join(missing)}",
-            f"them in the table of targets: it is not in the embedded list{other}",
+            f"target {text.name!r} has no {' and no '.join(missing)}; give them in the table of targets, since it is "
+            f"not in the embedded list{other}",
             key="plan.targets",
         )
     library = nearest_spectrum(given.pop("spectral_type"))

@@ -108,7 +108,7 @@ def snr_at(x: Expectation, wavelength_nm: float, per: Per = "element") -> float:
 def place_of(x: Expectation, wavelength_nm: float, per: Per) -> int:
     """Return the index of the pixel or element at a wavelength; raises InputError outside the spectrum."""
     if per not in ("pixel", "element"):
-        raise InputError(f"S/N per {per!r}", "pixel or element", key="per")
+        raise InputError.of("per", per, "'pixel' or 'element'")
     first, last = float(x.wavelength_nm[0]), float(x.wavelength_nm[-1])
     if not first <= wavelength_nm <= last:
         raise InputError.of("wavelength", wavelength_nm, f"between {first:.1f} and {last:.1f} nm", unit="nm")
@@ -135,7 +135,7 @@ def exposure(study: Study, engine: Engine | Pool | None = None, progress: Progre
     snr, wavelength_nm, per = study.signal.snr, study.signal.wavelength_nm, study.signal.per
     if snr is None or wavelength_nm is None:
         missing, key = ("S/N", "signal.snr") if snr is None else ("wavelength", "signal.wavelength_nm")
-        raise InputError(f"no wanted {missing}", "`signal.snr` and `signal.wavelength_nm`", key=key)
+        raise InputError(f"no wanted {missing} is given; use `signal.snr` and `signal.wavelength_nm`", key=key)
     answered, failed = [], []
     prepared = cases(study, swept=False)
     for case in reported(prepared, len(prepared), progress):
@@ -186,8 +186,8 @@ def _one(case: Case, snr: float, wavelength_nm: float, per: Per) -> tuple[Exposu
     single = after(1)
     if not single > 0 or (snr / single) ** 2 * case.instrument.frame_s > LONGEST_S:
         raise InputError(
-            f"{case.one_frame.label} has an S/N of {single:.3g} per {per} at {wavelength_nm:g} nm in one frame",
-            f"enough for {snr:g} within {LONGEST_S:g} s{frame.saturation_clause}",
+            f"{case.one_frame.label} has an S/N of {single:.3g} per {per} at {wavelength_nm:g} nm in one frame, but "
+            f"must reach {snr:g} within {LONGEST_S:g} s{frame.saturation_clause}",
             key="signal.snr",
         )
     # S/N is proportional to the root of the number of frames, so only rounding has to be corrected.

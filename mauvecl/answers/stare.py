@@ -451,7 +451,8 @@ def stare(
     frames = prepared[0].stare.n_frames
     if frames > MOST_SHOWN:
         raise InputError(
-            f"a stare of {frames} frames, each with a spectrum", f"at most {MOST_SHOWN}", key="stare.duration_s"
+            f"a stare with a spectrum for each frame must have at most {MOST_SHOWN} frames, not {frames}",
+            key="stare.duration_s",
         )
     # Bad input is refused before anything is drawn.
     quiet = [case.stare_expectation.quiet for case in prepared]

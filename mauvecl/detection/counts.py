@@ -305,8 +305,7 @@ class Distribution:
         """Raise InputError if values are not finite."""
         if self.far.undefined:
             raise InputError(
-                f"{what} is infinite or no number in {self.far.undefined} of {self.n} realisations",
-                "finite values of float32",
+                f"{what} must be finite, but is infinite or no number in {self.far.undefined} of {self.n} realisations",
                 key="statistic",
             )
 

@@ -74,7 +74,7 @@ def check_fap(fap: float, realisations: int, tails: Tails = "counted") -> None:
         raise InputError.of("tails", tails, "'counted' or 'sampled'")
     if tails == "counted" and not countable(fap, realisations):
         raise InputError(
-            f"fap = {fap:g} leaves {fap * realisations:.3g} of {realisations} realisations beyond the threshold",
-            f"at least {MIN_IN_TAIL}: ask for {least_countable(fap)} realisations, or for `tails='sampled'`",
+            f"fap = {fap:g} leaves {fap * realisations:.3g} of {realisations} realisations beyond the threshold, but "
+            f"needs at least {MIN_IN_TAIL}: ask for {least_countable(fap)} realisations, or for `tails='sampled'`",
             key="fap",
         )

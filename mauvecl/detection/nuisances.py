@@ -60,26 +60,25 @@ class Nuisances(ContentEquality):
         shapes = np.shape(self.spectra), np.shape(self.sd)
         if len(shapes[0]) != 2 or shapes[0][:1] != shapes[1] or shapes[1] != (len(self.names),):
             raise InputError(
-                f"{len(self.names)} names of unknowns, spectra of the shape {shapes[0]} and standard deviations of "
-                f"the shape {shapes[1]}",
-                "one spectrum and one standard deviation for each name",
+                f"each unknown must have one spectrum and one standard deviation, but {len(self.names)} names have "
+                f"spectra of the shape {shapes[0]} and standard deviations of the shape {shapes[1]}",
                 key="names",
             )
         for name, spectrum, sd in zip(self.names, self.spectra, self.sd, strict=True):
             if not np.isfinite(spectrum).all():
-                raise InputError(
-                    f"the spectrum of the unknown {name!r} is not finite everywhere", "numbers", key="spectra"
-                )
+                raise InputError(f"the spectrum of the unknown {name!r} must be finite everywhere", key="spectra")
             if not sd > 0:
                 raise InputError(
-                    f"the unknown {name!r} has a standard deviation of {sd:g}", "one above 0 or 'free'", key="sd"
+                    f"the standard deviation of the unknown {name!r} must be above 0 or 'free', not {sd:g}", key="sd"
                 )
         for name, expected in (("of_flare", np.shape(self.spectra)), ("mean", np.shape(self.sd))):
             given = getattr(self, name)
             values = np.asarray(given, np.float64) if np.size(given) else np.zeros(expected)
             if values.shape != expected or not np.isfinite(values).all():
-                raise InputError(f"{name} of the unknowns has the shape {values.shape}", f"finite numbers, {expected}",
-                                 key=name)  # fmt: skip
+                raise InputError(
+                    f"{name} of the unknowns must be finite and of the shape {expected}; its shape is {values.shape}",
+                    key=name,
+                )
             object.__setattr__(self, name, values)
 
     @classmethod
@@ -111,17 +110,15 @@ class Nuisances(ContentEquality):
                 spectrum = np.asarray(own[name], np.float64)
                 if spectrum.shape != quiet.wavelength_nm.shape:
                     raise InputError(
-                        f"the spectrum of the unknown {name!r} has the shape {spectrum.shape}",
-                        f"one value for each of the {quiet.wavelength_nm.size} pixels",
+                        f"the spectrum of the unknown {name!r} must have one value for each of the "
+                        f"{quiet.wavelength_nm.size} pixels, but has the shape {spectrum.shape}",
                         key="own",
                     )
             else:
                 spectrum = spectrum_of(name, quiet)
             if not spectrum.any():
                 raise InputError(
-                    f"the unknown {name!r} changes no pixel of {quiet.name}",
-                    "a spectrum that changes pixels",
-                    key="own",
+                    f"the unknown {name!r} must change pixels of {quiet.name}, but changes none", key="own"
                 )
             spectra.append(spectrum)
         rows, light = (np.reshape(each, (len(sd), quiet.wavelength_nm.size)) for each in (spectra, of_flare))
@@ -239,8 +236,8 @@ class Nuisances(ContentEquality):
         eigenvalues = np.linalg.eigvalsh(information / np.outer(scale, scale))
         if eigenvalues[0] < 1e-10:
             raise InputError(
-                f"the unknowns {', '.join(self.names)} cannot be distinguished in these pixels",
-                "fewer of them or standard deviations instead of 'free'",
+                f"the unknowns {', '.join(self.names)} cannot be distinguished in these pixels; use fewer of them or "
+                "standard deviations instead of 'free'",
                 key="nuisances",
             )
         return np.asarray(np.linalg.solve(np.linalg.cholesky(information), spectra * inverse))
@@ -259,7 +256,7 @@ def spectrum_of(name: str, quiet: Expectation) -> Float:
     """Return the spectrum of one of `NUISANCES`, DN of the exposure for unit amplitude, shape (n_pixel,)."""
     if name not in NUISANCES:
         raise InputError(
-            f"the unknown {name!r} has no spectrum", f"one of {', '.join(NUISANCES)} or a file", key="nuisances"
+            f"the unknown {name!r} has no spectrum; use one of {', '.join(NUISANCES)} or a file", key="nuisances"
         )
     return np.asarray(NUISANCES[name].spectrum(quiet))
 
@@ -296,18 +293,18 @@ def at_pixels(
     `what` and `kind` name the source and its values in messages.
     """
     if rows.ndim != 2 or rows.shape[1] != 2:
-        raise InputError(f"{what} have the shape {rows.shape}", f"two columns, nm and {kind}", key=what)
+        raise InputError(f"{what} must have two columns, nm and {kind}, but have the shape {rows.shape}", key=what)
     if not np.all(np.diff(rows[:, 0]) > 0):
-        raise InputError(f"{what} do not ascend in wavelength", f"ascending wavelengths and {kind}", key=what)
+        raise InputError(f"{what} must ascend in wavelength", key=what)
     sizes = np.abs(rows)
     bad = ~((rows == 0) | ((sizes >= SMALLEST) & (sizes <= LARGEST)))
     if bad.any():
-        raise InputError(f"{what} hold {rows[bad][0]!r}", f"0 or a size from {SMALLEST:g} to {LARGEST:g}", key=what)
+        raise InputError(
+            f"{what} must be 0 or of a size from {SMALLEST:g} to {LARGEST:g}, but hold {rows[bad][0]!r}", key=what
+        )
     values = np.interp(wavelength_nm, rows[:, 0], rows[:, 1], left=0.0, right=0.0)
     if not values.any():
         raise InputError(
-            f"{what} are 0 at every pixel",
-            f"some of {wavelength_nm.min():.0f}-{wavelength_nm.max():.0f} nm to count",
-            key=what,
+            f"{what} must differ from 0 somewhere in {wavelength_nm.min():.0f}-{wavelength_nm.max():.0f} nm", key=what
         )
     return np.asarray(values)

@@ -59,13 +59,13 @@ def statistics_by_name(asked: Sequence[str | Linear]) -> dict[str, Statistic]:
             named.setdefault(statistic, STATISTICS[statistic])
             continue
         if statistic.name in STATISTICS:
-            raise InputError(f"statistic {statistic.name!r} is one of mauvecl's own", "another name", key="statistics")
+            raise InputError(f"statistic {statistic.name!r} is mauvecl's own; use another name", key="statistics")
         if statistic.name in own:
             raise InputError.of("statistics", statistic.name, "different names")
         own.add(statistic.name)
         named[statistic.name] = statistic
     if not named:
-        raise InputError("no statistic named", f"some of {', '.join(STATISTICS)}", key="statistics")
+        raise InputError(f"no statistic is named; give some of {', '.join(STATISTICS)}", key="statistics")
     return named
 
 
@@ -101,7 +101,7 @@ class Hypotheses:
         self.setting = Setting(self.quiet, self.scene.used, self.scene.comparison, self.flares, self.nuisances, drawn)
         shaped = next((name for name, statistic in self._chosen.items() if statistic.shaped), None)
         if shaped is not None and not self.flares:
-            raise InputError("no flare given", f"at least one for the statistic {shaped!r}", key="flares")
+            raise InputError(f"the statistic {shaped!r} needs at least one flare, but none is given", key="flares")
         if not self.scene.used.any():
             raise entirely_saturated(self.quiet, "quiet")
         for statistic in self._chosen.values():
@@ -208,8 +208,8 @@ def check_shape(quiet: Expectation, flare: Expectation, used: NDArray[np.bool_],
     """Raise InputError if a flare changes no used pixel, since it cannot be a template."""
     if not (flare.recorded_light_dn != quiet.recorded_light_dn)[used].any():
         raise InputError(
-            f"flare {number + 1} of {quiet.name} changes no pixel that counts",
-            "an amplitude above 0 for the statistic 'matched', which looks for its shape",
+            f"flare {number + 1} of {quiet.name} changes no pixel that counts; the statistic 'matched', which looks "
+            "for its shape, needs an amplitude above 0",
             key="amplitude",
         )
 

@@ -131,8 +131,8 @@ class Counts:
             steps = np.rint((ratio - element["centre"]) * element["bins_per_unit"])
             if not (np.abs(steps) < MAX_BIN).all():
                 raise InputError(
-                    f"the S/N of resolution element {e} is {ratio[np.abs(steps).argmax()]:g} in a realisation",
-                    f"something nearer to its closed form of {element['centre']:g}",
+                    f"the S/N of resolution element {e} is {ratio[np.abs(steps).argmax()]:g} in a realisation, but "
+                    f"must be nearer to its closed form of {element['centre']:g}",
                     key="expectation",
                 )
             self._count_far("element", e, steps.astype(np.int64))

@@ -132,8 +132,8 @@ class Statistic(ABC):
         if setting.nuisances and (setting.comparison.estimated or not self.marginal):
             why = "with estimated variances" if self.marginal else "which compares with one noisy exposure"
             raise InputError(
-                f"statistic {self.name!r} {why} cannot be marginalised over {join_names(setting.nuisances.names)}",
-                "no unknowns, as `nuisances.usual=false` has it, or another statistic by the model's variances",
+                f"statistic {self.name!r} {why} cannot be marginalised over {join_names(setting.nuisances.names)}; use "
+                "no unknowns, as with `nuisances.usual=false`, or another statistic by the model's variances",
                 key="statistic",
             )
 
@@ -264,8 +264,8 @@ class LinearStatistic(Statistic):
             where = f" in the {used} of {every} pixels that are used" if used < every else ""
             raise InputError(
                 f"the flare that {self.name!r} looks for cannot be distinguished from "
-                f"{join_names(setting.nuisances.names)}{where}",
-                "fewer unknowns or smaller standard deviations, such as `nuisances.usual=false`",
+                f"{join_names(setting.nuisances.names)}{where}; use fewer unknowns or smaller standard deviations, "
+                "such as `nuisances.usual=false`",
                 key="statistic",
             )
         return np.asarray(left / np.sqrt(power) if self.normalised else left)
@@ -362,8 +362,7 @@ class UvExcess(LinearStatistic):
         super().check(setting)
         if not self._inside(setting).any():
             raise InputError(
-                f"{setting.quiet.name} has no used pixel at {UV_NM[0]:g}-{UV_NM[1]:g} nm",
-                "used pixels there for the statistic 'uv_excess'",
+                f"'uv_excess' needs used pixels at {UV_NM[0]:g}-{UV_NM[1]:g} nm, but {setting.quiet.name} has none",
                 key="statistic",
             )
 
@@ -401,8 +400,8 @@ class Linear(ContentEquality, LinearStatistic):
         if weights.ndim != 1 or not np.isfinite(weights).all() or not weights.any():
             bad = int((~np.isfinite(weights)).sum())
             raise InputError(
-                f"statistic {self.name!r} has weights of the shape {weights.shape}, {bad} of them not finite",
-                "one finite value per pixel, not all zero",
+                f"statistic {self.name!r} must have one finite weight per pixel, not all zero, but has weights of the "
+                f"shape {weights.shape}, {bad} of them not finite",
                 key="weights",
             )
 
@@ -410,13 +409,13 @@ class Linear(ContentEquality, LinearStatistic):
         super().check(setting)
         if self.weights.size != setting.used.size:
             raise InputError(
-                f"statistic {self.name!r} has {self.weights.size} weights",
-                f"one for each of the {setting.used.size} pixels",
+                f"statistic {self.name!r} must have {setting.used.size} weights, one for each pixel, not "
+                f"{self.weights.size}",
                 key="weights",
             )
         if not (self.weights * setting.used).any():
             raise InputError(
-                f"statistic {self.name!r} weights only saturated pixels", "weights of other pixels", key="weights"
+                f"statistic {self.name!r} weights only saturated pixels, but must weight others", key="weights"
             )
 
     def plain_weights(self, setting: Setting, flare: Expectation | None = None) -> Float:

@@ -152,8 +152,7 @@ def count_tests(frames: int, stack: int, step: int) -> int:
     """Return the number of stacks in a campaign."""
     if not (1 <= stack <= frames and 1 <= step <= stack):
         raise InputError(
-            f"a campaign of {frames} frames in stacks of {stack}, {step} apart",
-            "1 <= step <= stack <= frames",
+            f"a campaign of {frames} frames in stacks of {stack}, {step} apart, must have 1 <= step <= stack <= frames",
             key="step",
         )
     return (frames - stack) // step + 1
@@ -249,9 +248,8 @@ def tail(hypotheses: Hypotheses, fap: float, statistic: str, *, template: int = 
             return Tail(Interval(cut, low, high), fap, error, values.size)
         if goal >= MAX_REALISATIONS:
             raise InputError(
-                f"the threshold of {statistic} at fap = {fap:g} has a relative error of {error:.2g} after {goal}"
-                " tilted draws",
-                f"{WANTED_ERROR:g}",
+                f"the threshold of {statistic} at fap = {fap:g} must have a relative error of at most "
+                f"{WANTED_ERROR:g}, but has {error:.2g} after {goal} tilted draws",
                 key="fap",
             )
         goal *= 2
@@ -269,8 +267,8 @@ def _check(hypotheses: Hypotheses) -> None:
     for reason, holds in reasons.items():
         if holds:
             raise InputError(
-                f"importance sampling with {reason}",
-                f"stacks of joint draws and at most {MAX_AVERAGED} averaged exposures: draw enough realisations",
+                f"importance sampling is impossible with {reason}: it needs stacks of joint draws and at most "
+                f"{MAX_AVERAGED} averaged exposures; draw enough realisations instead",
                 key="tails",
             )
 

@@ -101,7 +101,7 @@ class EnergyScale:
         """
         if source.unscaled:
             raise InputError(
-                f"the flux of {source.name} has no absolute scale: {source.unscaled}", "a magnitude", key="source"
+                f"the flux of {source.name} has no absolute scale: {source.unscaled}; give a magnitude", key="source"
             )
         source.magnitude(band)  # raises InputError if the spectrum does not cover the band
         return cls._of_light(
@@ -432,12 +432,10 @@ class RateTable(Rates):
         if energy.ndim != 1 or energy.shape != rate.shape or energy.size < 2:
             raise InputError.of("per_day", rate.size, f"one rate for each of {energy.size} energies, at least 2")
         if not (np.isfinite(energy).all() and (energy > 0).all() and (np.diff(energy) > 0).all()):
-            raise InputError(
-                "the energies of a table of rates do not ascend", "ascending energies above 0", key="energy_erg"
-            )
+            raise InputError("the energies of a table of rates must be above 0 and ascend", key="energy_erg")
         if not (np.isfinite(rate).all() and (rate > 0).all() and (np.diff(rate) <= 0).all()):
             raise InputError(
-                "the rates of a table increase with energy", "decreasing rates above 0, per day", key="per_day"
+                "the rates of a table, per day, must be above 0 and must not increase with energy", key="per_day"
             )
 
     @classmethod
@@ -449,14 +447,16 @@ class RateTable(Rates):
         for name, unit in (("energy", "erg"), ("rate", "1 / d")):
             held = rows.first((name,))
             if held is None:
-                fault = f"{rows.named} has no column {name!r}"
-                raise InputError(fault, "energy and rate", key="columns")
+                raise InputError(f"{rows.named} has no column {name!r}, but needs energy and rate", key="columns")
             values = [rows.number(held, row, unit) for row in range(rows.n)]
             columns.append(np.array([np.nan if value is None else value for value in values]))
         energy, rate = columns
-        if np.nanmax(energy, initial=0.0) < LIKELY_LOGARITHM:
-            fault = f"{rows.named} has energies up to {np.nanmax(energy, initial=0.0):g}, which look like logarithms"
-            raise InputError(fault, "energies in erg", key="energy")
+        largest = np.nanmax(energy, initial=0.0)
+        if largest < LIKELY_LOGARITHM:
+            raise InputError(
+                f"{rows.named} has energies up to {largest:g}, which look like logarithms; give them in erg",
+                key="energy",
+            )
         rates = cls(energy_erg=energy, per_day=rate, band=band, source=path.name)
         return replace(rates, measured_erg=(float(energy[0]), float(energy[-1])))
 
@@ -502,8 +502,7 @@ def davenport2019(*, mass_msun: float, age_myr: float) -> PowerLaw:
     if slope >= 0:
         raise InputError(
             f"the relation of Davenport et al. 2019 rises with energy for mass_msun = {mass_msun:g} and "
-            f"age_myr = {age_myr:g}",
-            "less mass or another distribution",
+            f"age_myr = {age_myr:g}; use less mass or another distribution",
             key="mass_msun",
         )
     return PowerLaw(

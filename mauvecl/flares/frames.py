@@ -57,24 +57,21 @@ class Components:
         for name, what, least in (("flare_electrons", "flare spectra", 0), ("weights", "spectral weights", 1)):
             spectra = np.asarray(getattr(self, name), np.float64)
             if spectra.ndim != 2 or spectra.shape[1] != n_pixel or len(spectra) < least:
-                raise InputError(f"{what} have the shape {spectra.shape}", f"(n, {n_pixel})", key=name)
+                raise InputError(f"{what} must have the shape (n, {n_pixel}), not {spectra.shape}", key=name)
             if not np.isfinite(spectra).all():
-                raise InputError(
-                    f"{what} of pixel {int(np.argmin(np.isfinite(spectra).all(axis=0)))} are not finite",
-                    "finite numbers",
-                    key=name,
-                )
+                pixel = int(np.argmin(np.isfinite(spectra).all(axis=0)))
+                raise InputError(f"{what} must be finite, but those of pixel {pixel} are not", key=name)
             set_read_only(self, **{name: spectra})
         if (self.flare_electrons < 0).any():
             pixel = int(np.argmax((self.flare_electrons < 0).any(axis=0)))
             raise InputError(
-                f"a flare takes light from pixel {pixel}", "flare spectra of 0 and above", key="flare_electrons"
+                f"flare spectra must be 0 or above, but a flare takes light from pixel {pixel}", key="flare_electrons"
             )
         if len(self.flare_electrons) > MOST_FLARES:
             raise InputError.of("flare_electrons", len(self.flare_electrons), f"at most {MOST_FLARES} spectra")
         unusable = self.quiet.saturated & (self.weights != 0).any(axis=0)
         if unusable.any():
-            raise InputError(f"pixel {int(np.argmax(unusable))} saturates and has a weight", "0 there", key="weights")
+            raise InputError(f"pixel {int(np.argmax(unusable))} saturates, so its weights must be 0", key="weights")
 
     @classmethod
     def of(cls, quiet: Expectation, flares: Sequence[Expectation], weights: Float) -> Self:
@@ -154,8 +151,7 @@ class Components:
         if flare is not None:
             if np.shape(flare) != (stare.n_frames, self.n_flares):
                 raise InputError(
-                    f"flare coefficients have the shape {np.shape(flare)}",
-                    f"{(stare.n_frames, self.n_flares)}",
+                    f"flare coefficients must have the shape {(stare.n_frames, self.n_flares)}, not {np.shape(flare)}",
                     key="flare",
                 )
             factors[:, len(STEADY) :] = stare.light[:, None] * flare

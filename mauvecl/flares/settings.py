@@ -184,7 +184,7 @@ def _check_points(points: Sequence[Sequence[float]]) -> None:
     if len(points) < 2:
         raise InputError.of("points", len(points), "at least 2 points")
     if not all(math.isfinite(number) for point in points for number in point):
-        raise InputError("a curve holds a time or value that is not finite", "numbers", key="points")
+        raise InputError("the times and values of a curve must be finite", key="points")
     for (time, _), (following, _) in pairwise(points):
         if time >= following:
             raise InputError.of("points", (time, following), "ascending times", unit="s")

@@ -328,11 +328,11 @@ class TableShape(Shape):
         if tau.ndim != 1 or tau.shape != values.shape or tau.size < 2:
             raise InputError.of("values", values.size, f"one for each of {tau.size} times, at least 2", where=name)
         if not (np.isfinite(tau).all() and (np.diff(tau) > 0).all()):
-            raise InputError(f"the times of {name} do not ascend", "finite times in ascending order", key="tau")
+            raise InputError(f"the times of {name} must be finite and ascend", key="tau")
         if not (np.isfinite(values).all() and values.min() >= 0 and values.max() > 0):
             raise InputError(
-                f"the values of {name} range from {values.min():g} to {values.max():g}",
-                "finite values of at least 0, some above 0",
+                f"the values of {name} must be finite and at least 0, and some above 0, but range from "
+                f"{values.min():g} to {values.max():g}",
                 key="values",
             )
         set_read_only(self, tau=tau, values=values / values.max())

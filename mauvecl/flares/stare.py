@@ -184,8 +184,8 @@ def check_contributions(events: Sequence[Event], start_s: Float, frame_s: float)
         share = float(mean.sum()) * frame_s / event.half_width_s / event.form.equivalent_duration
         if max(share, float(mean.max()) / event.form.peak) < LEAST_LIGHT:
             raise InputError(
-                f"flare {number}, which peaks at {event.peak_s:g} s, adds no light to the frames of the stare",
-                f"light between {start_s[0]:g} and {start_s[-1] + frame_s:g} s and outside gaps",
+                f"flare {number}, which peaks at {event.peak_s:g} s, adds no light to the frames of the stare; it must "
+                f"shine between {start_s[0]:g} and {start_s[-1] + frame_s:g} s and outside gaps",
                 key="peak_s",
             )
         peak_s = event.peak_s + event.half_width_s * event.form.peak_at
@@ -214,9 +214,10 @@ def temperatures_of(events: Sequence[Event]) -> Float:
             constant.append(event.hottest_k)
     left = MOST_TEMPERATURES - len(constant)
     if left < (LEAST_STEPS if cooling else 0):
+        most = MOST_TEMPERATURES - (LEAST_STEPS if cooling else 0)
         raise InputError(
-            f"flares of {len(constant)} constant temperatures{' and some that cool' if cooling else ''}",
-            f"at most {MOST_TEMPERATURES - (LEAST_STEPS if cooling else 0)}",
+            f"flares of a stare must have at most {most} constant "
+            f"temperatures{' besides those that cool' if cooling else ''}, not {len(constant)}",
             key="events",
         )
     if cooling:
@@ -261,8 +262,8 @@ def _node_weights(temperature: Float, nodes: Float) -> list[tuple[int, Float]]:
     """Return the weights of the nodes for temperatures, linear in 1 / T, by index of the node."""
     if temperature.min() < nodes[0] - SAME_K or temperature.max() > nodes[-1] + SAME_K:
         raise InputError(
-            f"a flare of {temperature.min():g} to {temperature.max():g} K",
-            f"temperatures within {nodes[0]:g} to {nodes[-1]:g} K",
+            f"the temperatures of a flare must be within {nodes[0]:g} to {nodes[-1]:g} K, but are "
+            f"{temperature.min():g} to {temperature.max():g} K",
             key="temperature",
         )
     inverse = -1.0 / nodes
@@ -355,22 +356,24 @@ class Stare:
         curves = [(unknown.name, unknown.curve) for unknown in self.unknowns]
         for name, values in [*((name, getattr(self, name)) for name in own), *curves]:
             if values.shape != (n,):
-                raise InputError(f"{name} of the stare has the shape {values.shape}", f"({n},)", key=name)
+                raise InputError(f"{name} of the stare must have the shape ({n},), not {values.shape}", key=name)
             if not np.isfinite(values).all():
                 raise InputError(
-                    f"{name} of frame {int(np.argmin(np.isfinite(values)))} is not finite", "finite numbers", key=name
+                    f"{name} must be finite, but is not in frame {int(np.argmin(np.isfinite(values)))}", key=name
                 )
         off = np.abs(self.start_s / self.frame_s - self.numbers)
         if not (off < 1e-6).all() or self.numbers[0] < 0 or not (np.diff(self.numbers) > 0).all():
             raise InputError(
-                f"the frames of a stare start at {self.start_s[0]:g} ... {self.start_s[-1]:g} s",
-                f"ascending multiples of {self.frame_s:g} s from 0",
+                f"the frames of a stare must start at ascending multiples of {self.frame_s:g} s from 0, not at "
+                f"{self.start_s[0]:g} ... {self.start_s[-1]:g} s",
                 key="start_s",
             )
         for name, values in (("star", self.star), ("light", self.light), ("sky", self.sky)):
             if not (values >= 0).all():
                 k = int(np.argmin(values >= 0))
-                raise InputError(f"the factor on the {name} of frame {k} = {values[k]:g}", "at least 0", key=name)
+                raise InputError(
+                    f"the factor on the {name} must be at least 0, but is {values[k]:g} in frame {k}", key=name
+                )
         for of, sd in self.jitters.items():
             _check_spread(f"{of} jitter", of, sd, least=0.0)
         for unknown in self.unknowns:
@@ -631,8 +634,8 @@ def stare_along(
     seen = visible.seen[:, 0]
     if not seen.any():
         raise InputError(
-            f"target {place.name!r} is never seen in {duration_s / 3600:g} h from {times.iso(0.0)}",
-            "another time or other limits",
+            f"target {place.name!r} is never seen in {duration_s / 3600:g} h from {times.iso(0.0)}; try another time "
+            "or other limits",
             key="target",
         )
     # All but the temperature follow from a stare without gaps.

@@ -65,15 +65,15 @@ class Flares:
             given = given[None]
         if given.shape[1:] != (n_frames, n_flares) or given.shape[0] not in (1, count):
             raise InputError(
-                f"flare coefficients have the shape {given.shape}",
-                f"({count}, {n_frames}, {n_flares}), or one row for all stares",
+                f"flare coefficients must have the shape ({count}, {n_frames}, {n_flares}), or one row for all stares, "
+                f"not {given.shape}",
                 key="flare",
             )
         factors = np.ones((1, 1)) if amplitudes is None else np.asarray(amplitudes)
         if factors.ndim != 2 or factors.shape[1] not in (1, count) or not 1 <= len(factors) <= MOST_SCENARIOS:
             raise InputError(
-                f"amplitudes have the shape {factors.shape}",
-                f"(n, {count}) or (n, 1) with n of 1 to {MOST_SCENARIOS} scenarios",
+                f"amplitudes must have the shape (n, {count}) or (n, 1) with n from 1 to {MOST_SCENARIOS} scenarios, "
+                f"not {factors.shape}",
                 key="amplitudes",
             )
         # The minimum of values that include NaN is NaN.
@@ -136,7 +136,7 @@ class StareScene:
         if len(stare.unknowns) > MOST_UNKNOWNS:
             raise InputError.of("unknowns", len(stare.unknowns), f"at most {MOST_UNKNOWNS} of a stare")
         for name, _ in processes.modulations:
-            raise InputError(f"{name} is a prior of exposures", "an unknown of the stare", key=name)
+            raise InputError(f"{name} is a prior of exposures; use an unknown of the stare", key=name)
         scene = prepare([x], processes=processes)
         if not scene.joint:
             raise _not_joint_error(x.name)
@@ -221,8 +221,8 @@ class StareScene:
         for of in ("light", "star", "sky"):
             if (REACH_SIGMA * spread[of] >= 1.0).any():
                 raise InputError(
-                    f"the {of} of a frame scatters by {float(spread[of].max()):.3g}",
-                    f"less than {1 / REACH_SIGMA:.3g}, so that it is never drawn below zero",
+                    f"the {of} of a frame scatters by {float(spread[of].max()):.3g}, but must scatter by less than "
+                    f"{1 / REACH_SIGMA:.3g}, so that it is never drawn below zero",
                     key=of,
                 )
         x, mean = self.components.quiet, self.components.mean_dn
@@ -232,8 +232,8 @@ class StareScene:
         if not (reach < REACH_DN).all():
             pixel = int(np.argmax(~(reach < REACH_DN)))
             raise InputError(
-                f"the stare carries pixel {pixel} of {x.name} to {reach[pixel]:.3g} DN in a frame",
-                f"less than {REACH_DN:g}",
+                f"the stare carries pixel {pixel} of {x.name} to {reach[pixel]:.3g} DN in a frame, but must stay below "
+                f"{REACH_DN:g} DN",
                 key="flare",
             )
         if not _joint_throughout(x, self.conditions(flares)):
@@ -335,8 +335,8 @@ def _known(components: Components, stare: Stare) -> Floats:
 
 def _not_joint_error(name: str) -> InputError:
     return InputError(
-        f"the noise of a frame of {name} cannot be drawn jointly under all conditions of the stare",
-        "Gaussian noise with the variance of at least 1.5 Poisson counts in each pixel, and more where counts are few",
+        f"the noise of a frame of {name} cannot be drawn jointly under all conditions of the stare: it must be "
+        "Gaussian with the variance of at least 1.5 Poisson counts in each pixel, and more where counts are few",
         key="recipe",
     )
 
@@ -476,7 +476,7 @@ class SumTable:
         covariance = constant + each[: len(STEADY)].sum(axis=0)
         sd = np.sqrt(np.diag(covariance))
         if (sd == 0).any() or np.linalg.eigvalsh(covariance / np.outer(sd, sd))[0] < 1e-9:
-            raise InputError(f"{n} spectral weights of which one is a sum of others", "independent ones", key="weights")
+            raise InputError(f"the {n} spectral weights must be independent, but one is a sum of others", key="weights")
         lower = np.linalg.cholesky(covariance)
         white = Components(
             components.quiet,
@@ -504,7 +504,7 @@ class SumTable:
 def check_sums(scene: StareScene, flares: Flares) -> None:
     """Raise InputError if cumulants do not describe frames: clipping, pixels without noise, or rare large hits."""
     for name in scene.scene.additive:
-        raise InputError(f"{ADDITIVE[name].label} with method 'cumulants'", "method 'pixels'", key="method")
+        raise InputError(f"{ADDITIVE[name].label} must be drawn with method 'pixels', not 'cumulants'", key="method")
     x = scene.components.quiet
     used = (scene.components.weights != 0).any(axis=0)
     for light, dark in scene.conditions(flares):
@@ -515,15 +515,15 @@ def check_sums(scene: StareScene, flares: Flares) -> None:
         if near.any():
             pixel = int(np.argmax(near))
             raise InputError(
-                f"pixel {pixel} of {x.name} comes within {RAIL_SIGMA:g} sigma of zero or saturation and has a weight",
-                "method 'pixels', which clips, or weight 0 there",
+                f"pixel {pixel} of {x.name} comes within {RAIL_SIGMA:g} sigma of zero or saturation and has a weight; "
+                "use method 'pixels', which clips, or give the pixel the weight 0",
                 key="method",
             )
         if (used & (variance < LEAST_VARIANCE)).any():
             pixel = int(np.argmax(used & (variance < LEAST_VARIANCE)))
             raise InputError(
-                f"pixel {pixel} of {x.name} scatters by {sd[pixel]:.2g} DN, too little for its rounding to be noise",
-                "method 'pixels'",
+                f"pixel {pixel} of {x.name} scatters by {sd[pixel]:.2g} DN, too little for its rounding to be noise; "
+                "use method 'pixels'",
                 key="method",
             )
 
@@ -565,8 +565,7 @@ def _fourths_are_needed(components: Components) -> bool:
         row = int(np.argmax(beyond))
         raise InputError(
             f"the sum with spectral weight {row} has a skewness of {abs(shapes[0][row]):.2g} in a frame "
-            f"of {components.quiet.name}, too much for method 'cumulants'",
-            "method 'pixels'",
+            f"of {components.quiet.name}, too much for method 'cumulants'; use method 'pixels'",
             key="method",
         )
     g3, g4 = shapes[0], shapes[1]

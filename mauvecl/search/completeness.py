@@ -389,7 +389,7 @@ def fit_power_law(
     """
     logs = np.log10(np.asarray(energy_erg, np.float64))
     if logs.size < 3 or not np.isfinite(logs).all():
-        raise InputError(f"energy_erg has {logs.size} flares", "at least 3 with energies above 0", key="energy_erg")
+        raise InputError(f"energy_erg has {logs.size} flares, but needs at least 3, all above 0", key="energy_erg")
     pivot = float(np.median(logs))
     x = np.linspace(*completeness.decades, GRID)
     step = float(x[1] - x[0])

@@ -87,8 +87,8 @@ class CountedRate:
         alarmed = -np.expm1(-rate * self.days)
         if min(alarmed, 1 - alarmed) * n < MIN_ALARMS:
             raise InputError(
-                f"{rate:g} false alarms per star-day occur in {alarmed * n:.3g} of {n} simulated stares",
-                f"at least {MIN_ALARMS} with an alarm and as many without",
+                f"{rate:g} false alarms per star-day occur in {alarmed * n:.3g} of {n} simulated stares, but a "
+                f"threshold needs at least {MIN_ALARMS} with an alarm and as many without",
                 key="false_alarms",
             )
         low, high = central_counts(n, 1 - alarmed)
@@ -355,9 +355,9 @@ class SampledRate:
         if self.shifted and most >= -np.expm1(-rate * self.days):
             least = -np.log1p(-min(most, 1 - 1e-16)) / self.days
             raise InputError(
-                f"{rate:g} false alarms per star-day",
-                f"at least {least:.2g}: what is unknown of the stare moves the level in ways that the "
-                "search does not marginalise over (see search.cycle, slope, offset and window_s)",
+                f"false alarms per star-day must be at least {least:.2g}, not {rate:g}: what is unknown of the stare "
+                "moves the level in ways that the search does not marginalise over (see search.cycle, slope, offset "
+                "and window_s)",
                 key="false_alarms",
             )
         low, high = self._ends
@@ -365,8 +365,8 @@ class SampledRate:
         if not self.log_rate(high)[0] <= goal <= self.log_rate(low)[0]:
             ends = [float(np.exp(self.log_rate(u)[0])) for u in (high, low)]
             raise InputError(
-                f"{rate:g} false alarms per star-day",
-                f"{ends[0]:.2g} to {ends[1]:.2g} for importance sampling of stares of {self.days:.3g} star-days",
+                f"false alarms per star-day must be {ends[0]:.2g} to {ends[1]:.2g} for importance sampling of stares "
+                f"of {self.days:.3g} star-days, not {rate:g}",
                 key="false_alarms",
             )
         value = float(brentq(lambda u: self.log_rate(u)[0] - goal, low, high, xtol=1e-6))

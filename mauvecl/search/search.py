@@ -202,7 +202,7 @@ class Search:
         expected = (self.stare.n_frames, self.bank.directions.shape[1])
         if sums.ndim != 3 or sums.shape[1:] != expected:
             raise InputError(
-                f"sums have the shape {sums.shape}", f"(n_stare, {expected[0]}, {expected[1]})", key="sums"
+                f"sums must have the shape (n_stare, {expected[0]}, {expected[1]}), not {sums.shape}", key="sums"
             )
         return sums
 

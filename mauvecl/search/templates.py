@@ -104,7 +104,7 @@ class Bank:
         directions = np.atleast_2d(np.array(self.directions, np.float64))
         length = np.linalg.norm(directions, axis=1, keepdims=True)
         if not (length > 0).all():
-            raise InputError("a direction of the bank is zero", "flares that change a sum of a frame", key="directions")
+            raise InputError("every direction of the bank must change a sum of a frame", key="directions")
         set_read_only(self, directions=directions / length)
 
     @cached_property
