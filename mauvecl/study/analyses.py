@@ -256,7 +256,7 @@ class ChangeQuestion(Section):
             raise InputError.of("change.longest_d", self.longest_d, f"more than {self.shortest_d:g} d", unit="d")
         if self.file is None:
             if SPECTRUM in self.of:
-                raise InputError("the change 'spectrum' has no file", "`change.file`", key="change.file")
+                raise InputError("the change 'spectrum' needs a file: give `change.file`", key="change.file")
             for key in ("wavelength_unit", "flux_unit", "extend"):
                 if getattr(self, key):
                     raise InputError(f"change.{key} needs change.file as well", key=f"change.{key}")

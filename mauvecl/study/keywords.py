@@ -72,7 +72,7 @@ def values_of(given: Mapping[str, Any], keywords: Mapping[str, Keyword], where: 
     for name in given.keys() - known:
         keys = [keyword for keyword, of in keywords.items() if of.key == name]
         close = keys or get_close_matches(name, known, n=3) or known
-        raise InputError(f"{where} has no keyword {name!r}", f"a flag of the command, such as {', '.join(close)}")
+        raise InputError(f"{where} has no keyword {name!r}; use a flag of the command, such as {', '.join(close)}")
     values = {name: keyword.listed(given.get(name)) for name, keyword in keywords.items()}
     if given.get("ideal"):
         values["with_unknowns"] = False
@@ -121,9 +121,7 @@ def changes_of(
                 other = setting.setdefault((keyword.section, keyword.key), name)
                 if other != name:
                     raise InputError(
-                        f"`{other}` and `{name}` are both given",
-                        f"one of them: both set {keyword.section}.{keyword.key}",
-                        key=other,
+                        f"give either `{other}` or `{name}`: both set {keyword.section}.{keyword.key}", key=other
                     )
                 changes.setdefault(keyword.section, {})[keyword.key] = keyword.value(value)
     if given.get("nuisance"):
@@ -143,7 +141,7 @@ def sky_of(given: Mapping[str, Any]) -> dict[str, Any]:
         try:
             sky["surface_brightness"] = read_number(value, "sky =", unit_of(SkyBrightness))
         except ValueError as error:
-            raise InputError(f"sky = {value!r}", "V mag/arcsec^2 or none", key="sky") from error
+            raise InputError.of("sky", value, "a number in V mag/arcsec^2, or none") from error
     else:
         sky["surface_brightness"] = value
     return sky
@@ -195,7 +193,9 @@ def stars_of(
     if magnitudes:
         if len(magnitudes) not in (1, len(data)):
             of = "one star" if len(data) == 1 else f"{len(data)} stars"
-            raise InputError(f"{len(magnitudes)} magnitudes for {of}", "one for all or one each", key="magnitude")
+            raise InputError(
+                f"there are {len(magnitudes)} magnitudes for {of}; give one for all or one each", key="magnitude"
+            )
         for entry, value in zip(data, magnitudes * (len(data) if len(magnitudes) == 1 else 1), strict=True):
             entry["magnitude"] = value
     if of_files and not any("file" in entry for entry in data):

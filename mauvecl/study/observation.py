@@ -174,8 +174,7 @@ class SkyLight(Section):
             raise InputError("the sky needs both target and time, or neither, but has only one", key="time")
         if (self.surface_brightness is not None) + (self.target is not None) + self.none > 1:
             raise InputError(
-                "the sky is given twice",
-                "one of surface_brightness, target with time, and none",
+                "the sky is given twice; give only one of surface_brightness, target with time, and none",
                 key="surface_brightness",
             )
         return self
@@ -282,7 +281,7 @@ def _spread(given: Any) -> Any:
         value = float("nan")
     if not 0 < value < float("inf"):
         raise InputError(
-            f"the standard deviation of an unknown is {shortened(str(given))}", "a number above 0, or 'free'"
+            f"the standard deviation of an unknown must be a number above 0, or 'free', not {shortened(str(given))}"
         )
     return value
 
@@ -423,7 +422,7 @@ class Unknowns(create_model("_InstrumentValues", __base__=Section, **_unknown_ke
             raise InputError.of("unknowns.draws", self.draws, "0 or at least 2")
         other = next((name for name in self.known if name not in INSTRUMENT_VALUES), None)
         if other is not None:
-            raise InputError(f"unknowns.known names {other!r}", f"some of {', '.join(INSTRUMENT_VALUES)}", key="known")
+            raise InputError.of("unknowns.known", other, f"some of {', '.join(INSTRUMENT_VALUES)}")
         return self
 
     def priors(self, instrument: Instrument) -> dict[str, Prior]:

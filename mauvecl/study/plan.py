@@ -198,8 +198,8 @@ class PlanTarget(Section):
                 if simbad or not self.unused:
                     raise
                 fault = f"target {shortened(self.name)} is not in the embedded list, and its table has no coordinates"
-                expected = f"columns ra and dec, or coordinates, besides {shown(', '.join(self.unused), 200)}"
-                raise InputError(fault, expected, key="coordinates") from error
+                remedy = f"give columns ra and dec, or coordinates, besides {shown(', '.join(self.unused), 200)}"
+                raise InputError(f"{fault}; {remedy}", key="coordinates") from error
         place = Target.of(self.coordinates, name=self.name)
         try:
             target = Target.of(self.name)
@@ -222,8 +222,8 @@ class PlanTarget(Section):
             alpha = EXPONENTS.get(kind)
             exception = "" if alpha is None else f" except for an exponent of {alpha} (Althukair & Tsiklauri 2023)"
             raise InputError(
-                f"flare rates of {self.name}, of the type {shortened(spectral_type)}, are unknown{exception}",
-                "alpha with rate_per_day and at_erg, rates, mass_msun and age_myr, or rates_file",
+                f"flare rates of {self.name}, of the type {shortened(spectral_type)}, are unknown{exception}; "
+                "give alpha with rate_per_day and at_erg, rates, mass_msun and age_myr, or rates_file",
                 key="rates",
             )
         return preset(kind)
@@ -294,7 +294,9 @@ def targets_of(orbit: OrbitQuestion, plan: PlanQuestion) -> list[Target]:
         target.target(orbit.simbad) for target in plan.targets
     ]
     if not targets:
-        raise InputError("no targets", "names or coordinates, such as `orbit.targets='eps Eri'`", key="orbit.targets")
+        raise InputError(
+            "there are no targets; give names or coordinates, such as `orbit.targets='eps Eri'`", key="orbit.targets"
+        )
     names = [target.name for target in targets]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
@@ -338,17 +340,17 @@ def targets_in(table: Table, named: str, folder: Path | None = None) -> list[dic
         # A right ascension next to a declination, otherwise the exponent of a distribution.
         columns["alpha" if columns["dec"] is not None else "ra"] = None
     if columns["name"] is None:
-        raise InputError(f"{named} has the columns {shown(', '.join(rows.names), 200)}", "one called name", key="name")
+        raise InputError(f"{named} needs a column called name, but has {shown(', '.join(rows.names), 200)}", key="name")
     path = next((held for key in PATH_KEYS if (held := columns[key]) and folder is None), None)
     if path is not None:
-        raise InputError(f"{named} has the column {shortened(path)}", "no names of files", key=path)
+        raise InputError(f"{named} has the column {shortened(path)}, but must not name files", key=path)
     for key in ("distance_pc", "mass_msun", "age_myr"):
         held = columns[key]
         if held is not None and key_of(held) in ("distance", "dist", "mass", "age") and not rows.unit(held):
             # A distance in an unknown unit is none.
             columns[key] = None
     if not 1 <= rows.n <= MAX_TARGETS:
-        raise InputError(f"{named} holds {rows.n} targets", f"1 to {MAX_TARGETS}", key="name")
+        raise InputError(f"{named} must hold 1 to {MAX_TARGETS} targets, but holds {rows.n}", key="name")
     unused = tuple(name for name in rows.names if name not in columns.values())
     return [_target(rows, columns, row, folder, unused) for row in range(rows.n)]
 

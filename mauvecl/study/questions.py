@@ -195,7 +195,9 @@ class Axis(Section):
             return given | {key: Unit(quantity.unit).plain(given[key]) for key in keys}
         except ValueError as error:
             accepted = quantity.range.words(quantity.unit)
-            raise InputError(f"the axis {quantity.name!r} has the value {error}", accepted, key="values") from error
+            raise InputError(
+                f"a value of the axis {quantity.name!r} must be {accepted}, not {error}", key="values"
+            ) from error
 
     @model_validator(mode="after")
     def _one_way(self) -> Self:
@@ -210,13 +212,14 @@ class Axis(Section):
         quantity = QUANTITIES[self.quantity]
         for value in self.points():
             if quantity.is_name != isinstance(value, str):
-                expected = "names of the library" if quantity.is_name else "numbers"
-                raise InputError(f"the axis {self.quantity!r} has the value {value!r}", expected, key="values")
-            if not isinstance(value, str) and value not in quantity.range:
+                accepted = "a name of the library" if quantity.is_name else "a number"
                 raise InputError(
-                    f"the axis {self.quantity!r} reaches {shown(value)}",
-                    quantity.range.words(quantity.unit),
-                    key="values",
+                    f"a value of the axis {self.quantity!r} must be {accepted}, not {value!r}", key="values"
+                )
+            if not isinstance(value, str) and value not in quantity.range:
+                accepted = quantity.range.words(quantity.unit)
+                raise InputError(
+                    f"a value of the axis {self.quantity!r} must be {accepted}, not {shown(value)}", key="values"
                 )
         return self
 
@@ -308,7 +311,7 @@ class Sweep(Section):
                 f"the sweep is a list, whose axes must have equally many values, but it has {counts}", key="axes"
             )
         if self.size > MAX_CELLS:
-            raise InputError(f"the sweep has {self.size} combinations", f"at most {MAX_CELLS}", key="axes")
+            raise InputError(f"the sweep must have at most {MAX_CELLS} combinations, but has {self.size}", key="axes")
         return self
 
     @property
@@ -344,7 +347,7 @@ def check_sweep(sweep: Sweep, stare: StareQuestion, events: Sequence[EventChoice
     for axis in sweep.axes:
         if fixed.get(axis.quantity):
             raise InputError(
-                f"a sweep over {axis.quantity.replace('_', ' ')} changes no flare of this stare",
-                "a quantity that [stare] and [[events]] do not fix",
+                f"a sweep over {axis.quantity.replace('_', ' ')} changes no flare of this stare; "
+                "give a quantity that [stare] and [[events]] do not fix",
                 key="sweep",
             )

@@ -458,8 +458,7 @@ class FlareLight(Section):
         (key,) = path
         if key == "line_scale" and not (self.lines or self.line_fluxes):
             raise InputError(
-                f"line_scale = {value} has no effect on a flare without lines",
-                "lines in flare.spectrum.lines",
+                f"line_scale = {value} has no effect on a flare without lines; give lines in flare.spectrum.lines",
                 key="line_scale",
             )
         return type(self)(**(self.model_dump() | {key: value}))

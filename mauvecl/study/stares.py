@@ -53,9 +53,8 @@ class StarePrior:
         """Convert the prior of a process. Raises InputError unless it is normal and cut far from its mean."""
         if not isinstance(prior, Normal) or not prior.is_wide(NEGLIGIBLE_CUT_SD):
             raise InputError(
-                f"processes.{name} is drawn from a normal distribution in a stare",
-                f"a normal prior whose cuts are {NEGLIGIBLE_CUT_SD:g} sd or more from its mean, or jitters, offsets, "
-                "drifts or cycles in [stare]",
+                f"processes.{name} is drawn from a normal distribution in a stare; give a normal prior whose cuts are "
+                f"{NEGLIGIBLE_CUT_SD:g} sd or more from its mean, or jitters, offsets, drifts or cycles in [stare]",
                 key=f"processes.{name}",
             )
         process = PROCESSES[name]
@@ -261,8 +260,8 @@ def _of_energy(study: Study, source: Source, choice: EventChoice, event: Event, 
     energy = energy_of(study, source, event, choice.energy, temperatures_k)
     if energy is None:
         raise InputError(
-            f"the amplitude of a flare of {choice.energy_erg:g} erg on {source.name} is unknown",
-            "the star's distance_pc, or radius_rsun and effective_temperature_k",
+            f"the amplitude of a flare of {choice.energy_erg:g} erg on {source.name} needs the star's distance_pc, "
+            "or radius_rsun and effective_temperature_k",
             key="events.energy_erg",
         )
     return replace(event, amplitude=choice.energy_erg / energy)

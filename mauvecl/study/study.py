@@ -50,7 +50,7 @@ def read_embedded_study(path: Path) -> str:
     """Return the text of the study in an answer's metadata."""
     study = read_ecsv(path, "study", "an answer's ECSV table").meta.get("study")
     if not isinstance(study, str):
-        raise InputError(f"{path.name} contains no study", "an answer's ECSV table", key="study")
+        raise InputError(f"{path.name} contains no study; give an answer's ECSV table", key="study")
     return study
 
 
@@ -154,9 +154,8 @@ def locate_files(data: dict[str, Any], table: Path) -> None:
                 break
         else:
             raise InputError(
-                f"{shortened(table.name)}: its file {shortened(name)} with sha256 "
-                f"{shortened(str(digest))} is missing or has changed",
-                "it next to the table",
+                f"{shortened(table.name)}: its file {shortened(name)} with sha256 {shortened(str(digest))} is missing "
+                "or has changed; it must lie next to the table",
                 key=key,
             )
 
@@ -193,8 +192,7 @@ def set_key(data: Any, path: list[str], value: Any, text: str) -> None:
         if isinstance(data, list | tuple):
             if part not in (numbers := [str(i) for i in range(len(data))]):
                 raise InputError(
-                    f"setting = {shortened(text)}: no entry {shortened(part)}",
-                    f"0 to {len(numbers) - 1}",
+                    f"setting = {shortened(text)}: the entry must be 0 to {len(numbers) - 1}, not {shortened(part)}",
                     key="setting",
                 )
             data = data[int(part)]
@@ -202,8 +200,7 @@ def set_key(data: Any, path: list[str], value: Any, text: str) -> None:
             data = data.setdefault(part, {})
     if not isinstance(data, dict):
         raise InputError(
-            f"setting = {shortened(text)}: {shortened('.'.join(parents))} is a value",
-            "a section with keys",
+            f"setting = {shortened(text)}: {shortened('.'.join(parents))} must be a section with keys, but is a value",
             key="setting",
         )
     data[last] = value
@@ -283,9 +280,8 @@ class Study(Section):
         data = toml(text, f"study file {shortened(path.name)}")
         if not _has_values(data):
             raise InputError(
-                f"study file {shortened(path.name)} sets nothing",
-                "at least one key, such as magnitude in [[star]]; a verb without a study file answers "
-                "the paper's question",
+                f"study file {shortened(path.name)} must set at least one key, such as magnitude in [[star]], but "
+                "sets nothing; a verb without a study file answers the paper's question",
                 key="study_file",
             )
         if path.suffix == ".ecsv":
@@ -362,7 +358,7 @@ class Study(Section):
         for text in settings:
             path, equals, value = (part.strip() for part in text.partition("="))
             if not (path and equals):
-                raise InputError(f"setting = {text!r}", "key=value, such as run.fap=0.01", key="setting")
+                raise InputError.of("setting", text, "key=value, such as run.fap=0.01")
             set_key(data, path.split("."), parse_toml_value(value), text)
         return self.build(data, where)
 
@@ -452,9 +448,7 @@ class Study(Section):
             For "star", a name of the library.
         """
         if quantity not in QUANTITIES:
-            raise InputError(
-                f"quantity {shortened(str(quantity))!r} is unknown", f"one of {', '.join(QUANTITIES)}", key="quantity"
-            )
+            raise InputError.of("quantity", quantity, f"one of {', '.join(QUANTITIES)}")
         swept = QUANTITIES[quantity]
         return self.with_value(swept.path, swept.checked(value))
 

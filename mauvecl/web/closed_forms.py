@@ -22,7 +22,7 @@ from mauvecl.schema.errors import InputError
 from mauvecl.study.analyses import SPECTRUM
 from mauvecl.study.cases import Case, Loader, collect_messages
 from mauvecl.study.study import Study
-from mauvecl.web.fields import FIELDS, IDEAL, REALISTIC, UNKNOWN, WITH_FILE, Choice, Draws, Field, star_words
+from mauvecl.web.fields import FIELDS, IDEAL, REALISTIC, UNKNOWN, WITH_FILE, Choice, Draws, Field, sentence, star_words
 from mauvecl.web.uploads import write_spectrum, write_table
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ class Question:
         The visitor's files are written to the folder for the study to find. Raises InputError for incompatible values.
         """
         if folder is None and (self.uploads.keys() - {"own_unknown"} or self.neighbours is not None):
-            raise InputError("no folder for the visitor's files", "a folder", key="folder")
+            raise InputError("the visitor's files need a folder", key="folder")
         uploaded = self.uploaded
         # An uploaded spectrum is not read from its file at every change.
         loader = Loader(None if uploaded is None else lambda star: star.applied(uploaded))
@@ -354,7 +354,7 @@ def chances(closed: ClosedForms, answers: Answers) -> list[Chance]:
         except InputError as error:
             if unknown == closed.question.unknown:
                 raise
-            chance = Chance(unknown, float("nan"), str(error).partition(", expected ")[0])
+            chance = Chance(unknown, float("nan"), sentence(error))
         all_chances.append(chance)
     return all_chances
 

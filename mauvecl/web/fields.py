@@ -68,18 +68,18 @@ class Number:
         accepted = self.range.words(self.unit, whole=self.whole)
         form = r"[+-]?\d+" if self.whole else r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,3})?"
         if not text.strip():
-            raise InputError("nothing is entered", accepted, key="number")
+            raise InputError(f"nothing is entered; {accepted} is needed", key="number")
         if not self.whole and is_measure(text):
             try:
                 text = repr(self.scale * float(with_unit(text, self.unit) or 0.0))
             except ValueError:
-                raise InputError(f"{shortened(text)} has another unit", accepted, key="number") from None
+                raise InputError(f"{shortened(text)} has another unit: enter {accepted}", key="number") from None
         if re.fullmatch(form, text.strip(), flags=re.ASCII) is None:
             point = ", with a point for decimals" if "," in text else ""
-            raise InputError(f"{shortened(text)} is not {kind}", f"{accepted}{point}", key="number")
+            raise InputError(f"{shortened(text)} is not {kind}: enter {accepted}{point}", key="number")
         value = int(text) if self.whole else float(text)
         if value not in self.range:
-            raise InputError(f"{shortened(text.strip())} is out of range", accepted, key="number")
+            raise InputError(f"{shortened(text.strip())} is out of range: enter {accepted}", key="number")
         return value
 
 
@@ -93,7 +93,7 @@ class Choice:
     def __call__(self, text: str) -> Any:
         """Parse the value; an error states what is accepted."""
         if text not in self.options:
-            raise InputError(f"{shortened(text)} is not a choice", f"one of {', '.join(self.options)}", key="choice")
+            raise InputError(f"{shortened(text)} is not a choice: use one of {', '.join(self.options)}", key="choice")
         return self.made(text)
 
 
@@ -105,12 +105,12 @@ def points(text: str) -> tuple[tuple[float, float], ...] | None:
     pairs = [pair.split() for pair in text.split(",") if text.strip()]
     if any(len(pair) != 2 for pair in pairs):
         raise InputError(
-            f"{shortened(text)} is not a spectrum", "pairs of nm and DN with commas between them", key="own_unknown"
+            f"{shortened(text)} is not a spectrum: give pairs of nm and DN with commas between them", key="own_unknown"
         )
     spectrum = tuple((float(number(nm)), float(number(dn))) for nm, dn in pairs)
     if any(low >= high for (low, _), (high, _) in itertools.pairwise(spectrum)):
         raise InputError(
-            f"{shortened(text)} does not ascend in nm", "pairs of nm and DN in ascending order", key="own_unknown"
+            f"{shortened(text)} does not ascend in nm: give pairs of nm and DN in ascending order", key="own_unknown"
         )
     return spectrum
 
@@ -154,13 +154,13 @@ def day(text: str) -> str:
     """Parse a day such as 2027-01-31."""
     from mauvecl.host.exposure.sky import YEARS
 
-    expected = f"a day such as 2027-01-31, from {YEARS[0]} to {YEARS[1] - 1}"
+    remedy = f"give a day such as 2027-01-31, from {YEARS[0]} to {YEARS[1] - 1}"
     try:
         date = datetime.date.fromisoformat(text.strip())
     except ValueError:
-        raise InputError(f"{shortened(text)} is not a day", expected, key="start") from None
+        raise InputError(f"{shortened(text)} is not a day: {remedy}", key="start") from None
     if not YEARS[0] <= date.year < YEARS[1]:
-        raise InputError(f"{date} is out of range", expected, key="start")
+        raise InputError(f"{date} is out of range: {remedy}", key="start")
     return date.isoformat()
 
 
@@ -192,8 +192,8 @@ def targets(text: str, *, check: bool = True) -> tuple[dict[str, Any], ...]:
         except InputError as error:
             like = ", ".join(near_names(row["name"], stars_only=True))
             raise InputError(
-                f"the position of {shortened(row['name'])} (target {number}) is unknown",
-                f"a name such as {like}, or coordinates such as 53.23 -9.46",
+                f"the position of {shortened(row['name'])} (target {number}) is unknown: give a name such as {like}, "
+                "or coordinates such as 53.23 -9.46",
                 key="targets",
             ) from error
     names = [row["name"] for row in rows]
@@ -218,9 +218,10 @@ def neighbours(text: str) -> str | None:
     names = {name.strip().lower() for name in text_table(text, "the table of neighbours", commas=True).colnames}
     if files := names & {*FILES}:
         raise InputError(
-            f"the table of neighbours has a column {min(files)}",
-            "spectral_type; the command line reads files of spectra", key="neighbours",
-        )  # fmt: skip
+            f"the table of neighbours has a column {min(files)}, but must have spectral_type instead; the command line "
+            "reads files of spectra",
+            key="neighbours",
+        )
     return text
 
 

@@ -314,8 +314,7 @@ class Calibrate(Tab):
             frames.append(read_frames_of(files[str(row.frames)], mapping, "observations"))
             if sum(some.flux.size for some in frames) > MOST_VALUES:
                 raise InputError(
-                    "the archive holds more raw values than are read here",
-                    f"{MOST_VALUES}, or the command line",
+                    f"the archive holds more than {MOST_VALUES} raw values; give fewer, or use the command line",
                     key="observations",
                 )
             if row.spectrum is None:

@@ -191,7 +191,9 @@ def _several(text: str) -> tuple[str, ...]:
     """Parse names of simulations, without repetitions."""
     names = [name for name in text.split(",") if name]
     if len(names) > len(SIMULATIONS) or not set(names) <= SIMULATIONS.keys():
-        raise InputError(f"{shortened(text)} is not a simulation", f"some of {', '.join(SIMULATIONS)}", key="simulated")
+        raise InputError(
+            f"{shortened(text)} is not a simulation: use some of {', '.join(SIMULATIONS)}", key="simulated"
+        )
     return tuple(dict.fromkeys(names))
 
 
@@ -227,7 +229,7 @@ class State:
             try:
                 if len(text) > field.characters:
                     raise InputError(
-                        f"{shortened(text)} is too long", f"at most {field.characters} characters", key=name
+                        f"{shortened(text)} is too long: enter at most {field.characters} characters", key=name
                     )
                 value = field.read(text)
                 if self._holds_file(name) and name not in self.uploads:
@@ -280,8 +282,7 @@ class State:
         faults = self.faults_of(names)
         if faults:
             all_of_them = "; ".join(f"{self._fields[name].label}: {why}" for name, why in faults.items())
-            fault, _, expected = all_of_them.partition(", expected ")
-            raise InputError(fault, expected or None, key=next(iter(faults)))
+            raise InputError(all_of_them, key=next(iter(faults)))
         first = State()
         values = {name: (self if name in names else first)._values[name] for name in FIELDS}
         return Question(

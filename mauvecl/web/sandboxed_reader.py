@@ -118,7 +118,7 @@ def _read_apart(reader: str, files: Mapping[str, bytes], options: Mapping[str, A
                 command, capture_output=True, timeout=SECONDS, cwd=folder, env=environment, check=False
             )
         except subprocess.TimeoutExpired as error:
-            raise InputError(f"the upload takes more than {SECONDS} s to read", smaller, key="upload") from error
+            raise InputError(f"the upload takes more than {SECONDS} s to read; give {smaller}", key="upload") from error
         except OSError as error:
             raise InputError(
                 f"the upload cannot be read now ({error.strerror}): try again later", key="upload"
@@ -127,11 +127,10 @@ def _read_apart(reader: str, files: Mapping[str, bytes], options: Mapping[str, A
         return done.stdout
     if done.returncode == _REFUSED:
         # The reader prints its error as a sentence.
-        fault, _, expected = done.stderr.decode("utf-8", "replace").strip().partition(", expected ")
-        raise InputError(fault, expected or None, key="upload")
+        raise InputError(done.stderr.decode("utf-8", "replace").strip(), key="upload")
     if done.returncode == _NO_ROOM:
-        raise InputError(f"the upload takes more than {MEMORY_MIB} MiB of memory to read", smaller, key="upload")
-    raise InputError("the upload ends its reader", other, key="upload")
+        raise InputError(f"the upload takes more than {MEMORY_MIB} MiB of memory to read; give {smaller}", key="upload")
+    raise InputError(f"the upload ended its reader; give {other}", key="upload")
 
 
 def _limit(memory_mib: int, seconds: int) -> None:

@@ -60,7 +60,7 @@ def local(address: str) -> bool:
     Raises InputError if it is empty, or this machine cannot resolve it.
     """
     if not address.strip():
-        raise InputError("address = '' is empty", "an address such as 127.0.0.1, ::1 or 0.0.0.0", key="address")
+        raise InputError.of("address", address, "one such as 127.0.0.1, ::1 or 0.0.0.0")
     try:
         addresses = {
             str(info[4][0]).split("%")[0] for info in socket.getaddrinfo(address, None, type=socket.SOCK_STREAM)
@@ -99,8 +99,8 @@ def hosts(address: str, port: int, allowed: Iterable[str]) -> frozenset[str]:
     named = {origin(text) for text in allowed}
     if not local(address) and not named:
         raise InputError(
-            f"address = {shortened(address)} accepts other machines",
-            "`allow_origin` with the address that visitors' browsers will show, such as https://mauve.example.org",
+            f"address = {shortened(address)} accepts other machines; give `allow_origin` with the address that "
+            "visitors' browsers will show, such as https://mauve.example.org",
             key="address",
         )
     own = {"127.0.0.1", "localhost", "::1"} | ({address} if local(address) else set())

@@ -453,7 +453,7 @@ def as_file(tab: Tab, name: str, ending: str, closed: ClosedForms, answers: Answ
         with _drawing:
             return name, answers[tab.documents[name]].documents[name]()
     if name not in tab.files or ending not in ("ecsv", "fits", "study"):
-        raise InputError(f"{tab.title} has no file {name[:40]!r}.{ending[:10]}", "one of its own", key="name")
+        raise InputError(f"{tab.title} has no file {name[:40]!r}.{ending[:10]}; use one of its own", key="name")
     if not tab.offers(name, answers):
         raise InputError(f"no {name} is computed yet: start a simulation first", key="name")
     if ending == "study":

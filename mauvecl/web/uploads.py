@@ -101,12 +101,12 @@ def unpacked(content: bytes) -> dict[str, bytes]:
             entries = {entry: name for entry, name in entries.items() if not name.startswith(".")}
             if len(entries) > MOST_FILES or sum(entry.file_size for entry in entries) > MOST_BYTES:
                 raise InputError(
-                    "the archive holds too much", f"at most {MOST_FILES} files of {MOST_BYTES // 2**20} MiB in all",
+                    f"the archive must hold at most {MOST_FILES} files of {MOST_BYTES // 2**20} MiB in all",
                     key="observations",
-                )  # fmt: skip
+                )
             if any(entry.compress_type not in BOUNDED for entry in entries):
                 raise InputError(
-                    "the archive is packed in an unusual way", "a zip archive with deflate", key="observations"
+                    "the archive is packed in an unusual way; use a zip archive with deflate", key="observations"
                 )
             files = {}
             for entry, name in entries.items():
@@ -117,8 +117,8 @@ def unpacked(content: bytes) -> dict[str, bytes]:
         raise
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, OSError, ValueError) as error:
         raise InputError(
-            f"the observations are no sound zip archive ({error})",
-            "a TOML file and the files that it names in a zip archive without a password",
+            f"the observations are no sound zip archive ({error}); give a TOML file and the files that it names in a "
+            "zip archive without a password",
             key="observations",
         ) from error
     if len(files) < len(entries):
@@ -131,8 +131,8 @@ def _name(path: str) -> str:
     parts = PureWindowsPath(path)
     if parts.anchor or ".." in parts.parts or not parts.name.isprintable() or not 0 < len(parts.name) <= MOST_NAME:
         raise InputError(
-            f"the archive holds a file named {shortened(path)}",
-            f"files in folders of the archive, with printable names of at most {MOST_NAME} characters",
+            f"the archive holds a file named {shortened(path)}, but its files must lie in folders of the archive and "
+            f"have printable names of at most {MOST_NAME} characters",
             key="observations",
         )
     return parts.name
@@ -146,19 +146,21 @@ def observations_in(files: Mapping[str, bytes]) -> tuple[CalibrationObservation,
     studies = [rows for name, file in files.items() if name.endswith(".toml") and (rows := _observations(name, file))]
     if len(studies) != 1:
         raise InputError(
-            f"{len(studies)} files of the archive list observations", "one TOML file with [[calibrate.observations]]",
+            f"the archive must hold one TOML file with [[calibrate.observations]], but holds {len(studies)}",
             key="observations",
-        )  # fmt: skip
+        )
     (rows,) = studies
     if len(rows) > MOST_FILES:
-        raise InputError(f"{len(rows)} observations are too many", f"at most {MOST_FILES}", key="observations")
+        raise InputError(
+            f"the archive may list at most {MOST_FILES} observations, but lists {len(rows)}", key="observations"
+        )
     for row in rows:
         for key in PATHS:
             if isinstance(row.get(key), str):
                 name = PureWindowsPath(row[key]).name
                 if name not in files:
-                    expected = f"its file in the archive, which holds {', '.join(sorted(files))}"
-                    raise InputError(f"{shortened(name)} is missing", expected, key="observations")
+                    held = ", ".join(sorted(files))
+                    raise InputError(f"the archive needs {shortened(name)}, but holds {held}", key="observations")
                 row[key] = name
     try:
         return CalibrateQuestion.model_validate({"observations": rows}).observations
@@ -169,20 +171,21 @@ def observations_in(files: Mapping[str, bytes]) -> tuple[CalibrationObservation,
 def _observations(name: str, content: bytes) -> list[dict[str, Any]]:
     """Return the rows of a file's table of observations; empty if it has none."""
     if len(content) > MOST_TOML_BYTES:
-        raise InputError(f"{shortened(name)} is too large", f"TOML of at most {MOST_TOML_BYTES // 2**10} KiB",
-                         key="observations")  # fmt: skip
+        raise InputError(
+            f"{shortened(name)} must be TOML of at most {MOST_TOML_BYTES // 2**10} KiB", key="observations"
+        )
     try:
         study = tomllib.loads(content.decode("utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"{shortened(name)} is not a TOML file ({error})", "valid TOML", key="observations") from error
+        raise InputError(f"{shortened(name)} must be valid TOML, but is not ({error})", key="observations") from error
     section = study.get("calibrate")
     if not isinstance(section, dict) or "observations" not in section:
         return []
     others = [*(study.keys() - {"calibrate"}), *(f"calibrate.{key}" for key in section.keys() - {"observations"})]
     if others:
         raise InputError(
-            f"{shortened(name)} sets {shortened(min(others))}",
-            "calibrate.observations alone; fields set the rest",
+            f"{shortened(name)} sets {shortened(min(others))}, but must set calibrate.observations alone; fields set "
+            "the rest",
             key="observations",
         )
     rows = section["observations"]
@@ -261,12 +264,14 @@ def read_pairs(name: str, content: bytes) -> Points:
     try:
         text = content.decode("utf-8")
     except UnicodeDecodeError as error:
-        raise InputError(f"{shortened(name)} is not text", "two columns, nm and DN", key="upload") from error
+        raise InputError(f"{shortened(name)} must be text with two columns, nm and DN", key="upload") from error
     pairs = columns(f"upload {shortened(name)}", text, "nm and DN", "nm")
     if not 2 <= len(pairs) <= MOST_PAIRS:
-        raise InputError(f"{shortened(name)} has {len(pairs)} rows", f"2 to {MOST_PAIRS} of nm and DN", key="upload")
+        raise InputError(
+            f"{shortened(name)} must have 2 to {MOST_PAIRS} rows of nm and DN, but has {len(pairs)}", key="upload"
+        )
     if not np.isfinite(pairs).all() or (np.diff(pairs[:, 0]) <= 0).any():
-        raise InputError(f"{shortened(name)} does not ascend in nm", "rows in ascending order", key="upload")
+        raise InputError(f"{shortened(name)} must have rows in ascending order of nm", key="upload")
     return tuple((float(nm), float(dn)) for nm, dn in pairs)
 
 
@@ -308,7 +313,9 @@ class Upload:
         """Read an untrusted file with the values of fields; raises InputError if it is too large or unusable."""
         if len(content) > self.most:
             size = len(content) / 2**20
-            raise InputError(f"upload of {size:.1f} MiB", f"at most {self.most / 2**20:g} MiB", key="upload")
+            raise InputError(
+                f"the upload has {size:.1f} MiB, but may have at most {self.most / 2**20:g} MiB", key="upload"
+            )
         return self.reader(name, content, **{option: values[name] for option, name in self.options.items()})
 
 

@@ -291,7 +291,7 @@ class Visitor(WebSocketHandler):
                 raise TypeError
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
             log.warning("a message is not a valid request: %s", shortened(message))
-            self.close(1003, "expected a question as the page asks it")
+            self.close(1003, "a message must be a question as the page asks it")
             return
         if (work := ask(asked)) is not None:
             self._give(work, n=asked["n"], **REFUSED.get(asked["ask"], {}))
@@ -387,7 +387,7 @@ class Visitor(WebSocketHandler):
             self._begin(self._or_why(work, **message))
             return
         work.close()
-        self.send(**message, refused="too many requests at the same time, expected one after the other")
+        self.send(**message, refused="too many requests at the same time; wait for an answer before the next one")
 
     async def _or_why(self, work: Coroutine[Any, Any, None], **message: Any) -> None:
         """Run a function, and report an invalid request or an internal error."""
@@ -506,7 +506,7 @@ class Visitor(WebSocketHandler):
     def _content(self, content: bytes) -> None:
         """Read an uploaded file in a thread; its field is empty until then."""
         if self._coming is None:
-            self.close(1003, "expected a question as the page asks it")
+            self.close(1003, "a message must be a question as the page asks it")
             return
         asked, self._coming = self._coming, None
         self._uploads.pop(asked["field"], None)
@@ -530,7 +530,7 @@ class Visitor(WebSocketHandler):
         except Exception as error:
             log.exception("an upload failed")
             kind = type(error).__name__
-            reply["lacks"] = f"upload {shortened(name)} cannot be read ({kind}), expected another"
+            reply["lacks"] = f"upload {shortened(name)} cannot be read ({kind}); give another"
         self.send(**reply)
 
     async def _ask_columns(self, asked: dict[str, Any]) -> None:
@@ -551,7 +551,7 @@ class Visitor(WebSocketHandler):
         # The page asks for the study of a question by its name alone.
         front = TABS.get(tab) or next((other for other in TABS.values() if name in other.questions), None)
         if front is None:
-            raise InputError(f"no tab asks {name[:40]!r}", "a question of a tab", key="name")
+            raise InputError(f"no tab asks {name[:40]!r}; give a question of a tab", key="name")
         # A simulation asks what its own answers depend on, which their tables state.
         reads = reads_of(name) if tab not in TABS and name in SIMULATIONS else front.reads
         answers = self.answers(state)

@@ -56,7 +56,7 @@ async def test_invalid_numbers_are_faults_and_ranges_include_their_ends(talk: Ta
     """Every field with a number says what it accepts, accepts it, and accepts nothing else."""
     found = await faults_of_all(talk, words, dict.fromkeys(words["fields"], "seven"))
     numbers = {
-        name: why.partition(", expected ")[2]
+        name: why.partition(": enter ")[2]
         for name, why in found.items()
         if re.match("'seven' is not a (whole )?number", why)
     }
@@ -64,13 +64,13 @@ async def test_invalid_numbers_are_faults_and_ranges_include_their_ends(talk: Ta
     for text in ("7,4", "1e999", "nan", "inf", "-inf", "1_0", "0x10", "٣", "1e400000"):
         found = await faults_of_all(talk, words, dict.fromkeys(numbers, text))
         assert {name for name, accepted in numbers.items() if accepted not in found.get(name, "")} == set(), text
-    assert found["seed"] == "'1e400000' is not a whole number, expected a whole number from 0 to 18446744073709551615"
+    assert found["seed"] == "'1e400000' is not a whole number: enter a whole number from 0 to 18446744073709551615"
     # What may be left out is empty on a new page.
     for text in ("", " "):
         found = await faults_of_all(talk, words, dict.fromkeys(numbers, text))
         for name, accepted in numbers.items():
             needed = words["fields"][name] != ""
-            assert (found.get(name) == f"nothing is entered, expected {accepted}") == needed, name
+            assert (found.get(name) == f"nothing is entered; {accepted} is needed") == needed, name
     for low, closed, opened, sign in (
         (True, rf"(?:from|between) {NUMBER} ", rf"above {NUMBER}", -1),
         (False, rf" (?:to|and|up to) {NUMBER}", rf"below {NUMBER}", 1),

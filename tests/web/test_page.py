@@ -155,9 +155,9 @@ def test_visitor_changes_values_and_reads_the_answer(browser: Browser, server: S
     place = "document.querySelector('#plot-excess').getBoundingClientRect().y + scrollY"
     top = page.evaluate(place)
     for label, wrong, right, reported in (
-        ("Magnitude", "99", "8.5", "'99' is out of range, expected a number between -30 and 40 mag"),
+        ("Magnitude", "99", "8.5", "'99' is out of range: enter a number between -30 and 40 mag"),
         ("Magnitude", "7,4", "8.5", "'7,4' is not a number"),
-        ("Seed", "", "1", "nothing is entered, expected a whole number"),
+        ("Seed", "", "1", "nothing is entered; a whole number"),
         ("Star", "Nowhere", "G2V", "'Nowhere' is unknown"),
     ):
         enter(page, label, wrong)
@@ -596,7 +596,7 @@ def test_visitor_uploads_spectra(browser: Browser, page: Page, tmp_path: Path) -
         with large.open("wb") as file:
             file.truncate(int(size * 2**20))
         choose.set_input_files(large)
-        page.locator("#w-star", has_text=f"upload of {size:.1f} MiB, expected at most 4 MiB").wait_for()
+        page.locator("#w-star", has_text=f"the upload has {size:.1f} MiB, but may have at most 4 MiB").wait_for()
         answerless(page)
     enter(page, "Star", "K5V")
     assert "K5V" in shown(page)
@@ -730,7 +730,7 @@ def test_visitor_finds_reasons_and_targets_at_any_width(browser: Browser, server
             seen.add(name)
             most = "page.uploads.words.uploads[name].most"
             page.evaluate(f"name => {most} = 10", name)
-            refuse(name, bytes(11), "expected at most")
+            refuse(name, bytes(11), "may have at most")
             page.evaluate(f"([name, bytes]) => {most} = bytes", [name, upload["most"]])
             if any(option.endswith("wavelength_unit") for option in upload["options"]):
                 refuse(name, angstrom, "look like Angstrom")

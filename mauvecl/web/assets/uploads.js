@@ -90,7 +90,7 @@ export class Uploads {
     this.then.none()
     const {most} = this.words.uploads[field]
     if (file.size > most) {
-      this.lack(field, `upload of ${(file.size / MIB).toFixed(1)} MiB, expected at most ${most / MIB} MiB`)
+      this.lack(field, `the upload has ${(file.size / MIB).toFixed(1)} MiB, but may have at most ${most / MIB} MiB`)
       return
     }
     const chosen = this.files[field] = {at: Date.now(), name: file.name, content: await file.arrayBuffer()}
