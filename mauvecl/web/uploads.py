@@ -378,37 +378,46 @@ class Shelf:
 
     def __init__(self, most: int) -> None:
         self.most, self.size = most, 0
-        self._held: OrderedDict[tuple[int, Hashable], tuple[int, Callable[[], object]]] = OrderedDict()
+        # By visitor, kind and key: size and value.
+        self._held: OrderedDict[tuple[int, str, Hashable], tuple[int, Any]] = OrderedDict()
         self._lock = threading.Lock()
 
-    def keep(self, owner: object, key: Hashable, value: object, drop: Callable[[], object]) -> None:
-        """Count a value that its owner keeps; `drop` is called if it must go."""
-        size = size_of(value)
+    def keep(self, owner: object, kind: str, key: Hashable, value: object, most: int = 1) -> None:
+        """Keep a value for its owner, who has at most `most` of its kind."""
+        size, entry = size_of(value), (id(owner), kind, key)
         with self._lock:
-            self._remove((id(owner), key))
-            self._held[id(owner), key] = size, drop
+            self._remove(entry)
+            self._held[entry] = size, value
             self.size += size
-            gone = []
+            for old in self._entries(owner, kind)[:-most]:
+                self._remove(old)
             while self.size > self.most and len(self._held) > 1:
-                oldest = next(iter(self._held))
-                gone.append(self._held[oldest][1])
-                self._remove(oldest)
-        for release in gone:
-            release()
+                self._remove(next(iter(self._held)))
 
-    def used(self, owner: object, key: Hashable) -> None:
-        """Note that a value was used."""
+    def get(self, owner: object, kind: str, key: Hashable) -> Any:
+        """Return a value, which is used, or None if it is not here any more."""
         with self._lock:
-            if (id(owner), key) in self._held:
-                self._held.move_to_end((id(owner), key))
+            if (entry := (id(owner), kind, key)) not in self._held:
+                return None
+            self._held.move_to_end(entry)
+            return self._held[entry][1]
 
-    def leave(self, owner: object) -> None:
-        """Forget the values of an owner."""
+    def of(self, owner: object, kind: str) -> dict[Any, Any]:
+        """Return an owner's values of a kind by key."""
         with self._lock:
-            for entry in [entry for entry in self._held if entry[0] == id(owner)]:
+            return {entry[2]: self._held[entry][1] for entry in self._entries(owner, kind)}
+
+    def drop(self, owner: object, *which: Hashable) -> None:
+        """Drop the values of an owner: all of them, or those of a kind, or of a kind and key."""
+        with self._lock:
+            for entry in self._entries(owner, *which):
                 self._remove(entry)
 
-    def _remove(self, entry: tuple[int, Hashable]) -> None:
+    def _entries(self, *which: Any) -> list[tuple[int, str, Hashable]]:
+        wanted = (id(which[0]), *which[1:])
+        return [entry for entry in self._held if entry[: len(wanted)] == wanted]
+
+    def _remove(self, entry: tuple[int, str, Hashable]) -> None:
         self.size -= self._held.pop(entry, (0, None))[0]
 
 
