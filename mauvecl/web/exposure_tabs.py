@@ -166,7 +166,7 @@ def recorded(closed: ClosedForms, answers: Answers) -> ChartData:
 ).data()  # fmt: skip
 def telescope(closed: ClosedForms, answers: Answers) -> ChartData:
     """Return the star's spectrum at the telescope, without and with the flare."""
-    star, flare = closed.light
+    star, flare = closed.case.source, closed.case.flaring(closed.case.amplitudes[0])
     # A jump or line of the flare adds wavelengths.
     nm = flare.wavelength_nm[(flare.wavelength_nm >= 190) & (flare.wavelength_nm <= 710)]
     light = [np.interp(nm, source.wavelength_nm, source.flux_flam) for source in (star, flare)]

@@ -46,7 +46,6 @@ from mauvecl.web.tab import Tab, target_words
 from mauvecl.web.uploads import MOST_VALUES, VisitorFile, read_frames_of, reported_for
 
 if TYPE_CHECKING:
-    from astropy.table import Table
     from bokeh.models.sources import ColumnDataSource
 
     from mauvecl.answers.analyse import AnalyseAnswer
@@ -516,7 +515,7 @@ def hours(closed: ClosedForms, answers: Answers) -> ChartData:
     if "visible" not in answers:
         text = "For each target, how many hours of each day it is seen."
         return ChartData(text, {"hours": [(name, [], []) for name in names]})
-    table = answers["seen"]["by_day"]
+    table = answers["visible"].by_day
     lines, parts = [], []
     for name in names:
         hours = np.asarray(table[np.asarray(table["target"]) == name]["hours"].to_value("h"))
@@ -537,7 +536,6 @@ class Visibility(Tab):
     about = "When the satellite can look at targets: clear of Earth, Sun, Moon and radiation."
     chance = False
     pictures = (hours,)
-    answer = "visible"
     simulations = {"visible": "Find when"}  # noqa: RUF012
     view = 1
     files = {"visible": "visible", "months": "visible", "days": "visible"}  # noqa: RUF012
@@ -545,6 +543,3 @@ class Visibility(Tab):
     def words(self, question: Question) -> str:
         """Return the targets and days."""
         return target_words(question)
-
-    def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
-        return answers["seen"][{"visible": "table", "months": "months", "days": "by_day"}[name]]

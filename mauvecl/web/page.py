@@ -6,6 +6,7 @@ text of all fields, their errors, and the question if all are valid.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Collection, Mapping
 from typing import Any
 from urllib.parse import parse_qsl, urlencode
@@ -51,19 +52,13 @@ DRAWN: dict[str, Tab] = {
 }
 
 
-def _tab_of(verb: str) -> Tab:
-    """Return the tab with the first view of a verb's answer."""
-    made: Tab = type(verb.capitalize(), (Tab,), {"verb": verb})()
-    return made
-
-
-#: All tabs by name, in the order of the page: group by group.
+#: All tabs by name, in the order of the page: group by group. A verb without a class of its own shows its first view.
 TABS: dict[str, Tab] = {
     tab.name: tab
     for group in GROUPS
     for tab in (
         *DRAWN.values(),
-        *(_tab_of(name) for name, verb in VERBS.items() if verb.tab and name not in DRAWN),
+        *(type(name, (Tab,), {"verb": name})() for name, verb in VERBS.items() if verb.tab and name not in DRAWN),
         Compare(),
     )
     if tab.group == group
@@ -101,7 +96,7 @@ def card(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
     return {
         "chance": tab.chance,
         **(_with_chance(tab, closed, answers) if tab.chance else _without_chance(tab, closed, answers)),
-        "simulated": sorted(name for name in answers if name not in ("snr", "draw", "seen", OTHER)),
+        "simulated": sorted(name for name in answers if name not in ("snr", "draw", OTHER)),
         "files": _files(answers),
     }
 
@@ -325,7 +320,10 @@ def known(state: State) -> dict[str, Any]:
     The star has ``about`` in words, ``given``, texts of fields, and ``offer``, the words of a button that enters them;
     ``targets`` has texts by the columns of the table for each row.
     """
-    return {"star": _star(state.entered["star"]), "targets": [_target(row) for row in _rows(state.entered["targets"])]}
+    rows: tuple[dict[str, Any], ...] = ()
+    with contextlib.suppress(InputError):
+        rows = targets(state.entered["targets"], check=False)
+    return {"star": _star(state.entered["star"]), "targets": list(map(_target, rows))}
 
 
 def _star(text: str) -> dict[str, Any]:
@@ -337,14 +335,6 @@ def _star(text: str) -> dict[str, Any]:
     magnitude = f"{star.known.magnitude:g}"
     given = {"magnitude": magnitude, "band": "V", "target": star.name}
     return {"about": star.known.about, "given": given, "offer": f"Use V = {magnitude}"}
-
-
-def _rows(text: str) -> list[dict[str, Any]]:
-    """Return the rows of a table, without the check of their names."""
-    try:
-        return list(targets(text, check=False))
-    except InputError:
-        return []
 
 
 def _target(row: dict[str, Any]) -> dict[str, str]:

@@ -63,12 +63,6 @@ def _changed(study: Study, **sections: dict[str, Any]) -> Study:
     return study.with_changes(sections, None, "page")
 
 
-def _tabulated(answers: dict[str, Any]) -> dict[str, Any]:
-    """Add the tables of a visibility, which are slow to make and read repeatedly."""
-    answer = answers["visible"]
-    return answers | {"seen": {name: getattr(answer, name) for name in ("table", "months", "by_day")}}
-
-
 @dataclass(frozen=True)
 class Simulation:
     """Question that a button of the page asks."""
@@ -76,8 +70,6 @@ class Simulation:
     # Verbs that answer it, by the names under which the page keeps their answers; the first is the main one.
     verbs: Mapping[str, str]
     asked: Callable[[Study], Study] = lambda study: study  # makes the study that is asked from that of the page
-    # Adds to the answers what the page reads repeatedly.
-    completed: Callable[[dict[str, Any]], dict[str, Any]] = lambda answers: answers
     # Further answers of the main verb by name, with what makes their study; a refused one is left out.
     others: Mapping[str, Callable[[Study], Study]] = field(default_factory=dict)
     needs: str = ""  # field without which it cannot start
@@ -105,7 +97,7 @@ class Simulation:
             except InputError:
                 if name not in self.others:
                     raise
-        return self.completed(answers)
+        return answers
 
 
 def _fits(study: Study) -> Study:
@@ -114,18 +106,16 @@ def _fits(study: Study) -> Study:
     return _changed(study, measure={"fits": min(study.run.realisations, most)})
 
 
-def _other_unknowns(study: Study) -> Study:
-    """Return the study with the usual unknowns if it has none, or without."""
-    return _changed(study, nuisances={"usual": not study.nuisances.usual})
-
-
 #: Simulations that change the study or have another name than their verb.
 _OWN_SIMULATIONS = {
-    "detection": Simulation({"detection": "detect", "snr": "snr"}, others={OTHER: _other_unknowns}),
+    "detection": Simulation(
+        {"detection": "detect", "snr": "snr"},
+        others={OTHER: lambda study: _changed(study, nuisances={"usual": not study.nuisances.usual})},
+    ),
     "map": Simulation({"map": "map"}, _map_around),
     "measure": Simulation({"measure": "measure"}, _fits),
     "completeness": Simulation({"completeness": "inject"}, partial(_changed, injections=INJECTED, search={"nulls": 0})),
-    "visible": Simulation({"visible": "visible"}, completed=_tabulated, needs="targets"),
+    "visible": Simulation({"visible": "visible"}, needs="targets"),
     "plan": Simulation({"plan": "plan"}, needs="targets"),
     "analyse": Simulation({"analyse": "analyse"}, needs="frames"),
     "calibrate": Simulation({"calibrate": "calibrate"}, needs="observations"),
@@ -192,22 +182,16 @@ class Tab(ABC):
 
     def __init_subclass__(cls, **words: Any) -> None:
         super().__init_subclass__(**words)
-        if cls.verb:
-            cls._follow_verb()
+        if verb := cls.verb:
+            title, (about, *_) = verb.capitalize(), VERBS[verb].help.split("\n")
+            of_verb = {"name": verb, "title": title, "about": about, "simulations": {verb: title}, "answer": verb}
+            for key, value in (of_verb | {"files": {verb: verb}}).items():
+                if key not in vars(cls):
+                    setattr(cls, key, value)
         if "questions" not in vars(cls):
             cls.questions = tuple(cls.simulations) or ("detection",)
         if "group" not in vars(cls):
             cls.group = VERBS[verbs_of(cls.questions[0])[0]].group
-
-    @classmethod
-    def _follow_verb(cls) -> None:
-        """Set the attributes that the tab does not define from its verb."""
-        verb, title = cls.verb, cls.verb.capitalize()
-        about, *_ = VERBS[verb].help.split("\n")
-        of_verb = {"name": verb, "title": title, "about": about, "simulations": {verb: title}, "answer": verb}
-        for key, value in (of_verb | {"files": {verb: verb}}).items():
-            if key not in vars(cls):
-                setattr(cls, key, value)
 
     @cached_property
     def reads(self) -> frozenset[str]:
@@ -343,7 +327,10 @@ def as_command(verb: str, study: Study) -> str:
         if name == "data.file":
             words.insert(2, value)
         elif name == "star":
-            words += [word for star in value for word in _star_words(star)]
+            for star in value:
+                usual = Star(library=star.get("library"))
+                said = {key: given for key, given in star.items() if given != getattr(usual, key)}
+                words += _words(Star, {"library": star.get("library")} | said)
         elif name == "sky":
             words += ["--sky", "none"] if value.get("none") else _words(SkyLight, value)
         else:
@@ -383,13 +370,6 @@ def _flag_words(name: str, value: Any, verb: Verb) -> list[str]:
     return []
 
 
-def _star_words(star: dict[str, Any]) -> list[str]:
-    """Return the flags of a star of the library."""
-    usual = Star(library=star.get("library"))
-    said = {key: value for key, value in star.items() if value != getattr(usual, key)}
-    return _words(Star, {"library": star.get("library")} | said)
-
-
 def _words(section: type[BaseModel], values: Mapping[str, Any]) -> list[str]:
     """Return the words of the first flags of a section's keys, with their values."""
     names = {key: flags[0].names[0] for key, each in section.model_fields.items() if (flags := found(each, Flag))}
@@ -401,14 +381,13 @@ def _text(value: str | float) -> str:
     return value if isinstance(value, str) else f"{value:.17g}" if float(f"{value:.15g}") != value else f"{value:.15g}"
 
 
-def _key(key: str) -> str:
-    return key if key.isidentifier() and key.isascii() else json.dumps(key)
-
-
 def _toml(value: Any) -> str:
     """Return a value as TOML on one line."""
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{_key(key)} = {_toml(item)}" for key, item in value.items()) + "}"
+        plain = (
+            (key if key.isidentifier() and key.isascii() else json.dumps(key), item) for key, item in value.items()
+        )
+        return "{" + ", ".join(f"{key} = {_toml(item)}" for key, item in plain) + "}"
     if isinstance(value, list):
         return f"[{', '.join(map(_toml, value))}]"
     return json.dumps(value, ensure_ascii=False)
@@ -420,7 +399,9 @@ _drawing = threading.Lock()
 
 def study_file(study: Study, name: str) -> tuple[str, bytes]:
     """Return name and content of the study file, in a zip archive with the visitor's files if there are any."""
-    files, text = visitor_files(study), study.toml()
+    # The visitor's files that the study names, each once.
+    files, text = dict[Path, Path](), study.toml()
+    with_paths(study.model_dump(mode="json"), Study, lambda file: files.setdefault(file, file))
     if not files:
         return f"{name}.toml", text.encode()
     out = io.BytesIO()
@@ -431,13 +412,6 @@ def study_file(study: Study, name: str) -> tuple[str, bytes]:
             text = text.replace(str(file.resolve()), file.name)
         archive.writestr("study.toml", text)
     return f"{name}.zip", out.getvalue()
-
-
-def visitor_files(study: Study) -> list[Path]:
-    """Return the visitor's files that a study names, each once."""
-    files: dict[Path, Path] = {}
-    with_paths(study.model_dump(mode="json"), Study, lambda file: files.setdefault(file, file))
-    return list(files)
 
 
 def as_file(tab: Tab, name: str, ending: str, closed: ClosedForms, answers: Answers) -> tuple[str, bytes]:
@@ -468,7 +442,7 @@ def commands_and_programs(tab: Tab, question: Question, folder: Path) -> list[di
     """Return each of a tab's `questions` as a command and as a Python program; `folder` holds the visitor's files."""
     entries = []
     for name in tab.questions:
-        verb, study = asked_study(name, question.study(folder))
+        verb, study = asked_study(name, question.case(folder).study)
         # Paths relative to the study, instead of those on the server.
         data = with_paths(study.model_dump(mode="json"), Study, lambda file: Path(file.name))
         study = Study.build(data, "page")

@@ -547,7 +547,7 @@ class Visitor(WebSocketHandler):
         def make() -> tuple[str, bytes]:
             if tab in TABS:
                 return as_file(TABS[tab], name, ending, self.closed(state, front), answers)
-            _, study = asked_study(name, state.question(reads).study(Path(self._folder.name)))
+            _, study = asked_study(name, state.question(reads).case(Path(self._folder.name)).study)
             return study_file(study, "study")
 
         which = self._key(state, reads), tab, name, ending, tuple(answers)
