@@ -7,7 +7,7 @@ text of all fields, their errors, and the question if all are valid.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 from urllib.parse import parse_qsl, urlencode
 
@@ -93,12 +93,22 @@ def card(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
     ``interval`` are of the question's choice; ``facts``, pairs of names and values; ``notes``, pairs of sentences and
     kinds; ``simulated``, names of what is simulated; ``files``, tabs and names of downloads.
     """
-    return {
+    messages = answers[tab.answer].messages if tab.answer in answers else []
+    plain = {
         "chance": tab.chance,
-        **(_with_chance(tab, closed, answers) if tab.chance else _without_chance(tab, closed, answers)),
+        "headline": _headline(tab, answers),
+        "numbers": [],
+        "chosen": "",
+        "shown": tab.title,
+        "interval": "",
+        "words": tab.words(closed.question),
+        "facts": [],
+        "notes": _notes(messages),
         "simulated": sorted(name for name in answers if name not in ("snr", "draw", OTHER)),
-        "files": _files(answers),
+        "files": [f"{each.name} {name}" for each in TABS.values() for name in each.files if each.offers(name, answers)]
+        + [f"{each.name} {name}" for each in TABS.values() for name, of in each.documents.items() if of in answers],
     }
+    return plain | (_with_chance(tab, closed, answers) if tab.chance else {})
 
 
 def _headline(tab: Tab, answers: Answers) -> str:
@@ -121,6 +131,7 @@ def _estimate(closed: ClosedForms, both: list[Chance]) -> str:
 def _with_chance(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
     q, x = closed.question, closed.quiet
     cut, both = closed.odds.threshold, chances(closed, answers)
+    told = [message for name in TOLD if name in answers for message in answers[name].messages]
     (chosen,) = (chance for chance in both if chance.unknown == q.unknown)
     facts = []
     if "detection" in answers:
@@ -145,41 +156,15 @@ def _with_chance(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, A
         "interval": f"{TITLES[q.unknown]}; {chosen.how}",
         "words": words,
         "facts": facts,
-        "notes": _with_kinds(_messages(closed, answers)),
+        # The card shows both chances itself.
+        "notes": _notes(m for m in (*told, *closed.messages) if m not in of_kind(told, BOTH_CHANCES)),
     }
 
 
-def _without_chance(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
-    messages = list(answers[tab.answer].messages) if tab.answer in answers else []
-    return {
-        "headline": _headline(tab, answers),
-        "numbers": [],
-        "chosen": "",
-        "shown": tab.title,
-        "interval": "",
-        "words": tab.words(closed.question),
-        "facts": [],
-        "notes": _with_kinds([m for m in dict.fromkeys(messages) if not m.startswith(NOMINAL)]),
-    }
-
-
-def _files(answers: Answers) -> list[str]:
-    tables = [f"{tab.name} {name}" for tab in TABS.values() for name in tab.files if tab.offers(name, answers)]
-    return tables + [
-        f"{tab.name} {name}" for tab in TABS.values() for name, of in tab.documents.items() if of in answers
-    ]
-
-
-def _with_kinds(messages: list[str]) -> list[tuple[str, str]]:
-    """Return messages, and whether each is a danger to the answer or mere information."""
-    return [(note(m), "danger" if getattr(m, "kind", "") in CHANGING else "info") for m in messages]
-
-
-def _messages(closed: ClosedForms, answers: Answers) -> list[str]:
-    of_answers = [m for name in TOLD if name in answers for m in answers[name].messages]
-    # The card shows both chances itself.
-    both = of_kind(of_answers, BOTH_CHANCES)
-    return [m for m in dict.fromkeys([*of_answers, *closed.messages]) if not m.startswith(NOMINAL) and m not in both]
+def _notes(messages: Iterable[str]) -> list[tuple[str, str]]:
+    """Return messages once each, and whether each is a danger to the answer or mere information."""
+    once = [m for m in dict.fromkeys(messages) if not m.startswith(NOMINAL)]
+    return [(note(m), "danger" if getattr(m, "kind", "") in CHANGING else "info") for m in once]
 
 
 def _several(text: str) -> tuple[str, ...]:

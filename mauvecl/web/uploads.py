@@ -17,6 +17,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path, PureWindowsPath
 from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
 from typing import Any
@@ -221,39 +222,25 @@ MOST_VALUES = 2**24
 MOST_PAIRS_BYTES, MOST_PAIRS = 2**18, 4000
 
 
-def _star(name: str, content: bytes, **options: Any) -> Source:
-    """Read an untrusted spectrum, packed or not; its format follows from the content, not the name.
+def _spectrum(kind: type[Spectrum], called: str, name: str, content: bytes, **options: Any) -> Spectrum:
+    """Read an untrusted spectrum, packed or not, and name it if `called`; its format follows from the content.
 
     Raises InputError if it holds no usable spectrum. Called on a thread of its own; any other exception is reported to
     the visitor too.
     """
-    return replace(_spectrum(content, Source, options), name=UPLOADED, origin="upload")
-
-
-def _added(name: str, content: bytes, **options: Any) -> Source:
-    """Read a spectrum of light that a change adds."""
-    return replace(_star(name, content, **options), name="added spectrum")
+    spectrum = read_limited(content, kind, options)
+    if spectrum.wavelength_nm.size > MOST_POINTS:
+        raise InputError.of("points", spectrum.wavelength_nm.size, f"at most {MOST_POINTS}")
+    return replace(spectrum, name=called, origin="upload") if called else spectrum
 
 
 def _flare(name: str, content: bytes, **options: Any) -> ReadSpectrum:
     """Read the measured range of a flare's spectrum; the study that reads the file continues it."""
-    flare = _spectrum(content, ObservedFlare, options)
+    flare = _spectrum(ObservedFlare, "", name, content, **options)
     low, high = flare.measured_nm
     inside = (flare.wavelength_nm >= low) & (flare.wavelength_nm <= high)
     own = tuple(text for text in flare.messages if text.startswith(f"{flare.name}: "))
     return ReadSpectrum(flare.wavelength_nm[inside], flare.flux_flam[inside], "uploaded flare", "upload", messages=own)
-
-
-def _quiescent(name: str, content: bytes, **options: Any) -> ReadSpectrum:
-    """Read a spectrum of a star without its flare, which may cover any range."""
-    return replace(_spectrum(content, ReadSpectrum, options), name="uploaded star without the flare", origin="upload")
-
-
-def _spectrum(content: bytes, kind: type[Spectrum], options: Mapping[str, Any]) -> Spectrum:
-    spectrum = read_limited(content, kind, options)
-    if spectrum.wavelength_nm.size > MOST_POINTS:
-        raise InputError.of("points", spectrum.wavelength_nm.size, f"at most {MOST_POINTS}")
-    return spectrum
 
 
 def read_pairs(name: str, content: bytes) -> Points:
@@ -314,12 +301,20 @@ class Upload:
 
 #: Files by the field that takes them.
 UPLOADS: Mapping[str, Upload] = {
-    "star": Upload(_star, UPLOADED, options=_options("wavelength_unit", "flux_unit", "extend")),
+    "star": Upload(
+        partial(_spectrum, Source, UPLOADED), UPLOADED, options=_options("wavelength_unit", "flux_unit", "extend")
+    ),
     "flare_file": Upload(
         _flare, options=_options("wavelength_unit", "flux_unit", prefix="flare_") | _options("continue_at_k")
     ),
-    "flare_quiescent": Upload(_quiescent, options=_options("wavelength_unit", "flux_unit", prefix="flare_")),
-    "change_file": Upload(_added, options=_options("wavelength_unit", "flux_unit", "extend", prefix="change_")),
+    "flare_quiescent": Upload(
+        partial(_spectrum, ReadSpectrum, "uploaded star without the flare"),
+        options=_options("wavelength_unit", "flux_unit", prefix="flare_"),
+    ),
+    "change_file": Upload(
+        partial(_spectrum, Source, "added spectrum"),
+        options=_options("wavelength_unit", "flux_unit", "extend", prefix="change_"),
+    ),
     "own_unknown": Upload(read_pairs, UPLOADED_UNKNOWN, most=MOST_PAIRS_BYTES),
     **{
         name: Upload(VisitorFile.of, most=MOST_KEPT_BYTES)
