@@ -231,7 +231,8 @@ def _spectrum(kind: type[Spectrum], called: str, name: str, content: bytes, **op
     spectrum = read_limited(content, kind, options)
     if spectrum.wavelength_nm.size > MOST_POINTS:
         raise InputError.of("points", spectrum.wavelength_nm.size, f"at most {MOST_POINTS}")
-    return replace(spectrum, name=called, origin="upload") if called else spectrum
+    named: Any = {"name": called, "origin": "upload"} if called else {}
+    return replace(spectrum, **named)
 
 
 def _flare(name: str, content: bytes, **options: Any) -> ReadSpectrum:
