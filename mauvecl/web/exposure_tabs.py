@@ -54,20 +54,22 @@ def budget(closed: ClosedForms, answers: Answers) -> ChartData:
     return ChartData(f"Most of the noise's power comes from {most.called}: {share:.0f} % over all pixels.", series)
 
 
-class Noise(Tab):
-    """Noise by origin."""
+def budget_table(closed: ClosedForms, answers: Answers) -> Table:
+    """Return the closed-form table of `mauvecl snr`."""
+    study = closed.study
+    parts = [({"star": star_label(study.star[0], closed.quiet)}, closed.quiet.noise_budget())]
+    return stacked([star_column()], parts, realisations=study.run.realisations, study=study.ideal().text())
 
-    name, title = "noise", "Noise"
-    about = "Where the noise comes from, pixel by pixel, without a flare; of pinned scenarios the photons of the star."
-    pictures = (budget,)
-    questions = ("snr",)
-    files = {"noise-budget": None}  # noqa: RUF012
 
-    def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
-        """Return the closed-form table of `mauvecl snr`."""
-        study = closed.study
-        parts = [({"star": star_label(study.star[0], closed.quiet)}, closed.quiet.noise_budget())]
-        return stacked([star_column()], parts, realisations=study.run.realisations, study=study.ideal().text())
+NOISE = Tab(
+    name="noise",
+    title="Noise",
+    about="Where the noise comes from, pixel by pixel, without a flare; of pinned scenarios the photons of the star.",
+    pictures=(budget,),
+    questions=("snr",),
+    files={"noise-budget": None},
+    own_table=budget_table,
+)
 
 
 @Chart(
@@ -100,18 +102,16 @@ def signal_to_noise(closed: ClosedForms, answers: Answers) -> ChartData:
     return ChartData(text, series)
 
 
-class Signal(Tab):
-    """Signal to noise."""
-
-    name, title = "snr", "S/N"
-    about = "How well the star itself is measured, wavelength by wavelength."
-    pictures = (signal_to_noise,)
-    simulations = {"detection": "Simulate"}  # noqa: RUF012
-    questions = ("snr",)
-    files = {"snr": "detection"}  # noqa: RUF012
-
-    def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
-        return answers["snr"].element
+SIGNAL = Tab(
+    name="snr",
+    title="S/N",
+    about="How well the star itself is measured, wavelength by wavelength.",
+    pictures=(signal_to_noise,),
+    simulations={"detection": "Simulate"},
+    questions=("snr",),
+    files={"snr": "detection"},
+    own_table=lambda closed, answers: answers["snr"].element,
+)
 
 
 @Chart(
@@ -177,20 +177,22 @@ def telescope(closed: ClosedForms, answers: Answers) -> ChartData:
     return ChartData(text, {"star": (nm, quiet), "flare": (nm, flaring)})
 
 
-class Spectrum(Tab):
-    """Tab of spectra."""
+def observed_table(closed: ClosedForms, answers: Answers) -> Table:
+    """Return one observation with the flare and its components."""
+    from mauvecl.answers.signal import simulate
 
-    name, title = "spectrum", "Spectrum"
-    about = "What the detector records, and the light that comes to the telescope."
-    pictures = (recorded, telescope)
-    questions = ("simulate",)
-    files = {"observation": None}  # noqa: RUF012
+    return simulate(closed.study, flaring=True).observations[1][2]
 
-    def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
-        """Return one observation with the flare and its components."""
-        from mauvecl.answers.signal import simulate
 
-        return simulate(closed.study, flaring=True).observations[1][2]
+SPECTRUM = Tab(
+    name="spectrum",
+    title="Spectrum",
+    about="What the detector records, and the light that comes to the telescope.",
+    pictures=(recorded, telescope),
+    questions=("simulate",),
+    files={"observation": None},
+    own_table=observed_table,
+)
 
 
 @Chart(
@@ -304,15 +306,15 @@ def trade(closed: ClosedForms, answers: Answers) -> ChartData:
     return ChartData(text, series)
 
 
-class Detection(Tab):
-    """Tab of the detection, the first one."""
-
-    name, title = "detection", "Detection"
-    about = "The flare relative to the noise, and the statistic with and without the flare."
-    pictures = (excess, distributions, trade)
-    simulations = {"detection": "Simulate"}  # noqa: RUF012
-    answer = "detection"
-    files = {"detection": "detection", "roc": "detection"}  # noqa: RUF012
+DETECTION = Tab(
+    name="detection",
+    title="Detection",
+    about="The flare relative to the noise, and the statistic with and without the flare.",
+    pictures=(excess, distributions, trade),
+    simulations={"detection": "Simulate"},
+    answer="detection",
+    files={"detection": "detection", "roc": "detection"},
+)
 
 
 #: Name of an unknown, and the matched S/N plain and marginalised.
@@ -371,22 +373,23 @@ def unknown_costs(closed: ClosedForms, answers: Answers) -> ChartData:
     return ChartData(text, {"bars": bars}, {"y range": {"factors": names}})
 
 
-class Unknown(Tab):
-    """Cost of unknown properties of the instrument."""
+def table_of_costs(closed: ClosedForms, answers: Answers) -> View:
+    """Return the S/N of the flare with each unknown, and the chance to detect it."""
+    known_snr, rows = costs(closed)
+    given: list[Row] = [("nothing: everything is known", known_snr, known_snr), *rows]
+    fap = closed.question.fap
+    table = [
+        {"unknown": name, "plain": plain, "marginalised": marginal, "detected": float(power(marginal, fap))}
+        for name, plain, marginal in given
+    ]
+    return View("", [column for column in COLUMNS if column.name in table[0]], table)
 
-    name, title = "unknowns", "Unknowns"
-    about = (
-        "What it costs not to know the detector's temperature, the light lost, or the sky: a statistic that is blind "
-        "to them sees less of the flare; one that ignores them is fooled by them."
-    )
-    pictures = (unknown_costs,)
 
-    def shown(self, closed: ClosedForms, answers: Answers) -> View:
-        known_snr, rows = costs(closed)
-        given: list[Row] = [("nothing: everything is known", known_snr, known_snr), *rows]
-        fap = closed.question.fap
-        table = [
-            {"unknown": name, "plain": plain, "marginalised": marginal, "detected": float(power(marginal, fap))}
-            for name, plain, marginal in given
-        ]
-        return View(self.title, [column for column in COLUMNS if column.name in table[0]], table)
+UNKNOWN = Tab(
+    name="unknowns",
+    title="Unknowns",
+    about="What it costs not to know the detector's temperature, the light lost, or the sky: a statistic that is blind "
+    "to them sees less of the flare; one that ignores them is fooled by them.",
+    pictures=(unknown_costs,),
+    own_view=table_of_costs,
+)

@@ -23,43 +23,31 @@ from mauvecl.schema.columns import chance_text
 from mauvecl.schema.errors import InputError, of_kind, shortened
 from mauvecl.study.plan import PlanTarget
 from mauvecl.web.closed_forms import OTHER, TITLES, Answers, Chance, ClosedForms, Question, chances, short
-from mauvecl.web.exposure_tabs import Detection, Noise, Signal, Spectrum, Unknown
+from mauvecl.web.exposure_tabs import DETECTION, NOISE, SIGNAL, SPECTRUM, UNKNOWN
 from mauvecl.web.fields import FIELDS, FORMER_VALUES, IDEAL, REALISTIC, UPLOADED, Choice, Field, note, sentence, targets
-from mauvecl.web.flare_tabs import Completeness, Limit, Measurement
-from mauvecl.web.observation_tabs import Analyse, Calibrate, Change, Periods, Plan, Visibility
-from mauvecl.web.tab import SIMULATIONS, Compare, Tab
+from mauvecl.web.flare_tabs import COMPLETENESS, LIMIT, MEASUREMENT
+from mauvecl.web.observation_tabs import ANALYSE, CALIBRATE, CHANGE, PERIODS, PLAN, VISIBILITY
+from mauvecl.web.tab import SIMULATIONS, Tab
 from mauvecl.web.uploads import UPLOADS
 
 #: Tabs with pictures, in the order of their group.
-DRAWN: dict[str, Tab] = {
-    tab.name: tab
-    for tab in (
-        Detection(),
-        Spectrum(),
-        Signal(),
-        Noise(),
-        Limit(),
-        Measurement(),
-        Unknown(),
-        Change(),
-        Periods(),
-        Completeness(),
-        Analyse(),
-        Calibrate(),
-        Visibility(),
-        Plan(),
-    )
-}
-
-
-#: All tabs by name, in the order of the page: group by group. A verb without a class of its own shows its first view.
+DRAWN = (DETECTION, SPECTRUM, SIGNAL, NOISE, LIMIT, MEASUREMENT, UNKNOWN, CHANGE, PERIODS, COMPLETENESS, ANALYSE,
+         CALIBRATE, VISIBILITY, PLAN)  # fmt: skip
+#: Tab with pinned scenarios and the history of runs.
+COMPARE = Tab(
+    name="compare",
+    title="Compare",
+    group="tools",
+    about="Scenarios that you have pinned, side by side, and what you have simulated; this browser tab keeps them.",
+)
+#: All tabs by name, in the order of the page: group by group. Verbs without pictures show their first view.
 TABS: dict[str, Tab] = {
     tab.name: tab
     for group in GROUPS
     for tab in (
-        *DRAWN.values(),
-        *(type(name, (Tab,), {"verb": name})() for name, verb in VERBS.items() if verb.tab and name not in DRAWN),
-        Compare(),
+        *DRAWN,
+        *(Tab(verb=name) for name, verb in VERBS.items() if verb.tab and name not in {drawn.name for drawn in DRAWN}),
+        COMPARE,
     )
     if tab.group == group
 }

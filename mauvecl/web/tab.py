@@ -9,13 +9,12 @@ import shlex
 import tempfile
 import threading
 import zipfile
-from abc import ABC
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
 from pprint import pformat
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel
 
@@ -155,43 +154,50 @@ def target_words(question: Question) -> str:
     return f"{names}; {question.days:g} days from {question.start}"
 
 
-class Tab(ABC):
-    """Tab of the page; a `verb` gives name, title, help, button, answer and file that the tab does not state itself."""
+@dataclass(kw_only=True, eq=False)
+class Tab:
+    """Tab of the page; what a tab with a verb does not state follows from its verb."""
 
-    verb: ClassVar[str] = ""  # name of the verb that it shows, if any
-    name: ClassVar[str]
-    title: ClassVar[str]
-    about: ClassVar[str]  # what it shows, in a sentence
-    pictures: ClassVar[tuple[Chart, ...]] = ()
-    simulations: ClassVar[Mapping[str, str]] = {}  # what can be simulated here, with the label of the button
-    answer: ClassVar[str] = ""  # name of the simulated answer whose table is below the pictures
-    view: ClassVar[int] = 0  # number of that table among the answer's `views`
+    verb: str = ""  # name of the verb that it shows, if any
+    name: str = ""
+    title: str = ""
+    about: str = ""  # what it shows, in a sentence
+    pictures: tuple[Chart, ...] = ()
+    simulations: Mapping[str, str] = field(default_factory=dict)  # what can be simulated here, with labels of buttons
+    answer: str = ""  # name of the simulated answer whose table is below the pictures
+    view: int = 0  # number of that table among the answer's `views`
+    #: Another table below the pictures, and the rows before there is an answer.
+    own_view: Callable[[ClosedForms, Answers], View] | None = None
+    rows_before: Callable[[Question], list[list[str]]] = lambda question: []
     #: Questions of "Share, export, cite": names of simulations or verbs; by default its own simulations.
-    questions: ClassVar[tuple[str, ...]] = ()
+    questions: tuple[str, ...] = ()
     #: Key of `GROUPS` under whose heading it stands; by default that of the verb that answers its first question.
-    group: ClassVar[str]
+    group: str = ""
     #: Whether the chance of detection stands above it, whose fields it then shows.
-    chance: ClassVar[bool] = True
+    chance: bool = True
+    #: Its question in words, if it has no chance.
+    words: Callable[[Question], str] = lambda q: f"{q.star_in_words} of {q.band} = {q.magnitude:g}"
+    #: Reads the visitor's files on a thread of its own, and returns them as arguments of the verb; raises InputError
+    #: with the name of the field whose file cannot be read.
+    given: Callable[[Question], dict[str, Any]] = lambda question: {}
     #: Fields that it reads although its verbs do not take their keys, and those that it does not read.
-    also: ClassVar[tuple[str, ...]] = ()
-    never: ClassVar[tuple[str, ...]] = ()
+    also: tuple[str, ...] = ()
+    never: tuple[str, ...] = ()
     #: Tables that can be downloaded, with the simulation that each needs, or none.
-    files: ClassVar[Mapping[str, str | None]] = {}
+    files: Mapping[str, str | None] = field(default_factory=dict)
+    own_table: Callable[[ClosedForms, Answers], Table] | None = None  # table of its only file, if no answer has it
+    some: bool = False  # whether some answers lack a table of `files`
     #: Documents of answers that can be downloaded, by file name, with the simulation that each needs.
-    documents: ClassVar[Mapping[str, str]] = {}
+    documents: Mapping[str, str] = field(default_factory=dict)
 
-    def __init_subclass__(cls, **words: Any) -> None:
-        super().__init_subclass__(**words)
-        if verb := cls.verb:
+    def __post_init__(self) -> None:
+        if verb := self.verb:
             title, (about, *_) = verb.capitalize(), VERBS[verb].help.split("\n")
             of_verb = {"name": verb, "title": title, "about": about, "simulations": {verb: title}, "answer": verb}
             for key, value in (of_verb | {"files": {verb: verb}}).items():
-                if key not in vars(cls):
-                    setattr(cls, key, value)
-        if "questions" not in vars(cls):
-            cls.questions = tuple(cls.simulations) or ("detection",)
-        if "group" not in vars(cls):
-            cls.group = VERBS[verbs_of(cls.questions[0])[0]].group
+                setattr(self, key, getattr(self, key) or value)
+        self.questions = self.questions or tuple(self.simulations) or ("detection",)
+        self.group = self.group or VERBS[verbs_of(self.questions[0])[0]].group
 
     @cached_property
     def reads(self) -> frozenset[str]:
@@ -207,52 +213,33 @@ class Tab(ABC):
         }
         return frozenset(taken | set(self.also)) - set(self.never)
 
-    def given(self, question: Question) -> dict[str, Any]:
-        """Read the visitor's files, and return them as arguments of the verb: by default none.
-
-        Raises InputError with the name of the field whose file cannot be read. Called on a thread of its own.
-        """
-        return {}
-
-    def words(self, question: Question) -> str:
-        """Return the question of a tab without the chance, in words."""
-        return f"{question.star_in_words} of {question.band} = {question.magnitude:g}"
-
     def offers(self, name: str, answers: Answers) -> bool:
-        """Return whether one of `files` can be downloaded; by default, whether the answer it needs is simulated."""
+        """Return whether one of `files` can be downloaded: whether the answer it needs is simulated and has it."""
         needed = self.files[name]
-        return needed is None or needed in answers
+        return needed is None or (needed in answers and not (self.some and name not in answers[needed].tables))
 
     def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
-        """Return the table of one of `files`: by default that of the answer it needs."""
-        table: Table = answers[str(self.files[name])].tables[name]
+        """Return the table of one of `files`."""
+        table: Table = (
+            answers[str(self.files[name])].tables[name] if self.own_table is None else self.own_table(closed, answers)
+        )
         return table
 
     def rows(self, closed: ClosedForms, answers: Answers) -> list[list[str]]:
         """Return a small table as text with a header row; empty if there is nothing to report."""
-        shown = self.shown(closed, answers)
-        if shown is None:
+        if self.own_view is None and self.answer not in answers:
+            return self.rows_before(closed.question)
+        shown = answers[self.answer].views[self.view] if self.own_view is None else self.own_view(closed, answers)
+        if not shown.columns:
             return []
         headings, cells = without_empty(*shown.texts(FIXED))
         return [headings, *cells]
-
-    def shown(self, closed: ClosedForms, answers: Answers) -> View | None:
-        """Return the table below the pictures: by default a view of the simulated answer, if there is one."""
-        view: View | None = answers[self.answer].views[self.view] if self.answer in answers else None
-        return view
 
     def study(self, name: str, closed: ClosedForms, answers: Answers) -> Study:
         """Return the study that reproduces one of `files`: by default that of the answer it needs."""
         needed = self.files[name]
         study: Study = closed.study if needed is None else answers[needed].study
         return study
-
-
-class Compare(Tab):
-    """Pinned scenarios and the history of runs."""
-
-    name, title, group = "compare", "Compare", "tools"
-    about = "Scenarios that you have pinned, side by side, and what you have simulated; this browser tab keeps them."
 
 
 #: Keys that are stated even at their default, so that readers see what was assumed.
