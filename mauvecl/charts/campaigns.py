@@ -150,13 +150,6 @@ def _pdf(title: str, figures: Callable[[], list[Any]]) -> bytes:
     return made.getvalue()
 
 
-def target_figure(answer: PlanAnswer, k: int) -> Any:
-    """Return the pictures of a target."""
-    figure = new_figure((7.4, 5.4), layout="none")
-    _panels(figure, answer, k)
-    return figure
-
-
 def html_image(draw: Callable[[], Any], text: str) -> str:
     """Return a figure as an image of few colours; nothing if matplotlib is not installed."""
     if not available():
@@ -270,13 +263,14 @@ def _target(answer: PlanAnswer, k: int) -> Any:
         figure.text(1 - margin, y, where, fontsize=6.5, va="top", ha="right", color=NULL)
         y -= 0.018 * len(lines)
     if answer.planned[k].seen_h > 0:
-        _panels(pictures, answer, k)
+        _panels(answer, k, pictures)
     return figure
 
 
-def _panels(figure: Any, answer: PlanAnswer, k: int) -> None:
+def _panels(answer: PlanAnswer, k: int, figure: Any = None) -> Any:
     """Plot daily hours with elongation, monthly hours, and recovered fraction with the rate by energy."""
     target, seen = answer.planned[k], answer.seen
+    figure = new_figure((7.4, 5.4), layout="none") if figure is None else figure
     top, bottom = figure.subplots(2, 1)
     figure.subplots_adjust(**PANELS)
     days = np.arange(len(seen.days))
@@ -293,7 +287,7 @@ def _panels(figure: Any, answer: PlanAnswer, k: int) -> None:
     top.set_title("when it is seen")
     if target.completeness is None:
         bottom.set_visible(False)
-        return
+        return figure
     energy, p = target.completeness.energy_erg, target.completeness.probability
     first = int(np.argmax(p > 0))
     shown = slice(max(first - 4, 0), min(first + 100, energy.size))
@@ -314,6 +308,7 @@ def _panels(figure: Any, answer: PlanAnswer, k: int) -> None:
         often.spines["right"].set_visible(True)
         often.yaxis.label.set_color(COLOURS[4])
         _plain_decades(often.yaxis)
+    return figure
 
 
 def _plain_decades(axis: Any) -> None:
@@ -350,7 +345,7 @@ def plan_html(answer: PlanAnswer) -> bytes:
         lines = html_table(("", "", "table: column"), target_lines(answer, k))
         parts.append(f"<section id=target-{k}><h2>{escape(target.name)}</h2>{lines}")
         if target.seen_h > 0:
-            parts.append(html_image(partial(target_figure, answer, k), f"hours and energies of {target.name}"))
+            parts.append(html_image(partial(_panels, answer, k), f"hours and energies of {target.name}"))
         parts.append("</section>")
     table = answer.assumptions
     rows = [tuple(str(cell) for cell in row) for row in table]

@@ -30,7 +30,7 @@ from mauvecl.cli.flags import (
     option,
     output_option,
     study_argument,
-    study_flags,
+    study_option,
     warn_of_percent,
     whole,
 )
@@ -61,14 +61,21 @@ class Command:
 
     def build(self) -> Callable[..., None]:
         """Return the function that typer calls."""
-        verb = self.verb
-        flags = study_flags(*verb.keys, defaults=verb.defaults or {})
+        from mauvecl.study.keywords import keywords_of
+        from mauvecl.study.study import keys_of
+
+        verb, entries = self.verb, keys_of(self.verb.keys)
+        keywords = keywords_of(entries)
+        flags = {
+            entry[2].parameter: study_option(*entry, keywords[entry[2].parameter], verb.defaults or {})
+            for entry in entries
+        }
         kinds = get_type_hints(self.run, localns={"Session": Any}, include_extras=True)
         _, *own = inspect.signature(self.run).parameters.values()
         # Annotations and defaults by parameter.
         options: dict[str, tuple[Any, Any]] = {
             "study_file": (study_argument(flags), None),
-            **{name: (flag.annotation, None) for name, flag in flags.items()},
+            **{name: (annotation, None) for name, (annotation, _) in flags.items()},
             "set": (SetFlag, None),
             **({"paper": (PaperFlag, False)} if verb.accepts("observation.instrument") else {}),
             **{p.name: (kinds[p.name], p.default) for p in own if p.name != "given"},
@@ -80,16 +87,15 @@ class Command:
             del values["help_all"]
             given = {name: values.pop(name, None) for name in (*flags, "set", "paper")}
             amplitudes, errors = given.get("amplitude") or (), list[InputError]()
-            for name, flag in flags.items():
-                if flag.read is not None and given[name] is not None:
+            for name, (_, read) in flags.items():
+                if read is not None and given[name] is not None:
                     try:
-                        given[name] = flag.read(given[name])
+                        given[name] = read(given[name])
                     except InputError as error:
                         errors.append(error)
             if errors:
                 raise together(errors)
             warn_of_percent(amplitudes)
-            keywords = {name: flag.keyword for name, flag in flags.items()}
             self._call(study_file, keywords, given, values, tells_flags="given" in kinds)
 
         parameters = [

@@ -199,6 +199,8 @@ def full_label(name: str, at: Mapping[str, float | str]) -> str:
 WITHOUT_LIGHT = frozenset({"nuisances"})
 #: Number of stars whose spectra a study's cases keep, since a sweep may have any number of them.
 MAX_SOURCES = 16
+#: Values of an observation without changes of its instrument.
+UNCHANGED: dict[str, Any] = {"changes": {}, "temperature_c": None}
 
 
 class Loader:
@@ -212,7 +214,6 @@ class Loader:
         self.sky: Callable[[SkyLight], Sky] = lru_cache(MAX_SOURCES)(lambda light: light.sky())
         self._near: Callable[[Star], Neighbours | None] = lru_cache(MAX_SOURCES)(lambda star: star.near())
         self._instruments: dict[str, Instrument] = {}
-        self._unchanged: dict[str, Instrument] = {}
 
     def neighbours(self, star: Star) -> Neighbours | None:
         """Return the neighbours of a star, which do not depend on its magnitude."""
@@ -220,14 +221,12 @@ class Loader:
 
     def instrument(self, observation: Observation) -> Instrument:
         """Return the instrument of an observation."""
-        key = repr((observation.instrument, observation.temperature_c, sorted(observation.changes.items())))
-        if key not in self._instruments:
-            file = str(observation.instrument)
-            if file not in self._unchanged:
-                unchanged = observation.model_copy(update={"changes": {}, "temperature_c": None})
-                self._unchanged[file] = unchanged.load_instrument()
-            self._instruments[key] = observation.changed(self._unchanged[file])
-        return self._instruments[key]
+        file, kept = observation.instrument, self._instruments
+        key = repr((file, observation.temperature_c, sorted(observation.changes.items())))
+        if key not in kept:
+            kept[file] = kept.get(file) or observation.model_copy(update=UNCHANGED).load_instrument()
+            kept[key] = observation.changed(kept[file])
+        return kept[key]
 
 
 @dataclass(frozen=True, eq=False)

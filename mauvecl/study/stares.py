@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Self
+from functools import partial
+from typing import TYPE_CHECKING, Any, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -204,12 +205,7 @@ def energy_of(
     """
     if energy_scale(study, source, kind, event.hottest_k) is None:
         return None
-
-    def scale_of(kelvin: float) -> EnergyScale:
-        scale = energy_scale(study, source, kind, kelvin)
-        assert scale is not None
-        return scale
-
+    scale_of = cast("Callable[[float], EnergyScale]", partial(energy_scale, study, source, kind))
     return event.total_energy(scale_of, temperatures_k)
 
 
