@@ -86,15 +86,8 @@ class Command:
         def command(study_file: Path | None = None, **values: Any) -> None:
             del values["help_all"]
             given = {name: values.pop(name, None) for name in (*flags, "set", "paper")}
-            amplitudes, errors = given.get("amplitude") or (), list[InputError]()
-            for name, (_, read) in flags.items():
-                if read is not None and given[name] is not None:
-                    try:
-                        given[name] = read(given[name])
-                    except InputError as error:
-                        errors.append(error)
-            if errors:
-                raise together(errors)
+            amplitudes = given.get("amplitude") or ()
+            _read_numbers(given, {name: read for name, (_, read) in flags.items() if read is not None})
             warn_of_percent(amplitudes)
             self._call(study_file, keywords, given, values, tells_flags="given" in kinds)
 
@@ -158,6 +151,19 @@ def command_of(
         return run
 
     return decorate
+
+
+def _read_numbers(given: dict[str, Any], readers: dict[str, Callable[[Any], Any]]) -> None:
+    """Convert the texts of numbers, in place; raises InputError that names all wrong ones."""
+    errors = []
+    for name, read in readers.items():
+        if given[name] is not None:
+            try:
+                given[name] = read(given[name])
+            except InputError as error:
+                errors.append(error)
+    if errors:
+        raise together(errors)
 
 
 def _placed(study_file: Path | None, given: dict[str, Any]) -> Path | None:
