@@ -368,6 +368,28 @@ class Quantity:
     name: str
     description: str  # of a column of tables
     label: str  # of an axis, with the unit
+    path: tuple[str, ...] = ()  # sections and key of the study
+    unit: str = ""  # in astropy's notation; empty if dimensionless
+    range: Range | None = None  # None for names instead of numbers
+
+    @property
+    def is_name(self) -> bool:
+        """True if it has names instead of numbers."""
+        return self.range is None
+
+    @property
+    def accepted(self) -> str:
+        """The values in words."""
+        return (self.range or Range()).words(self.unit)
+
+    def checked(self, value: Any) -> float | str:
+        """Return a value in the unit of the quantity; raises InputError if it is outside of the range."""
+        return value if self.range is None else number(self.name.replace("_", " "), value, self.unit, self.range)
+
+    @property
+    def suffix(self) -> str:
+        """Unit that follows a value in a title."""
+        return f" {Unit(self.unit).written}" if self.unit else ""
 
 
 @dataclass(frozen=True)

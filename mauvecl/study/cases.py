@@ -115,39 +115,41 @@ def _orbit(study: Study) -> str:
     return f"orbit of {source}; least angles: {', '.join(kept) or 'none'}"
 
 
+def _given_unknowns(study: Study) -> dict[Use, dict[str, str]]:
+    """Return the study's unknowns in words, by the parts that hold them and by key."""
+    n, s, draws = study.nuisances, study.stare, study.unknowns.draws
+    changes = {f"stare.{name}": name for name in KNOWN_CHANGES if getattr(s, name) is not None}
+    changes |= {f"stare.{course}": f"{course} of {', '.join(of)}" for course in COURSES if (of := getattr(s, course))}
+    processes = {name: process for name, process in STARE_PROCESSES.items() if getattr(s, name)}
+    return {
+        "processes": {
+            f"processes.{name}": name.replace("_", " ") for name, value in study.processes if value is not None
+        },
+        "nuisances": {f"nuisances.{name}": name for name in n.spreads()}
+        | {f"nuisances.own.{name}": name for name in n.own},
+        "stare": changes | {f"stare.{name}": f"{process.label} (assumed)" for name, process in processes.items()},
+        "values": {"unknowns.draws": f"{draws} draws of the instrument's unknowns"} if draws else {},
+    }
+
+
 def _unknowns(study: Study, uses: Collection[Use]) -> str:
     """List the unknowns that an answer draws, marginalises over or averages over."""
-    n, s = study.nuisances, study.stare
-    drawn = [name.replace("_", " ") for name, value in study.processes if value is not None and "processes" in uses]
-    if "stare" in uses:
-        drawn += [name for name in KNOWN_CHANGES if getattr(s, name) is not None]
-        drawn += [f"{course} of {', '.join(of)}" for course in COURSES if (of := getattr(s, course))]
-        drawn += [f"{process.label} (assumed)" for name, process in STARE_PROCESSES.items() if getattr(s, name)]
+    given = {use: words.values() for use, words in _given_unknowns(study).items() if use in uses}
     how = {"drawn": {"processes", "stare"}, "marginalised": {"nuisances", "stare"}}
     usual = " and ".join(word for word, of in how.items() if of & {*uses})
-    parts = [f"the usual unknowns {usual}"] if n.usual else []
+    parts = [f"the usual unknowns {usual}"] if study.nuisances.usual else []
+    drawn = [*given.get("processes", ()), *given.get("stare", ())]
     parts += [f"drawn: {', '.join(drawn)}"] if drawn else []
-    named = [*n.spreads(), *n.own] if "nuisances" in uses else []
-    parts += [f"marginalised: {', '.join(named)}"] if named else []
-    if study.unknowns.draws and "values" in uses:
-        parts.append(f"{study.unknowns.draws} draws of the instrument's unknowns")
-    return "; ".join(parts) or "everything known but the noise"
+    parts += [f"marginalised: {', '.join(named)}"] if (named := given.get("nuisances")) else []
+    return "; ".join([*parts, *given.get("values", ())]) or "everything known but the noise"
 
 
 def unused_unknowns(study: Study, uses: Collection[Use]) -> list[str]:
     """Return the keys of the study's unknowns that an answer ignores."""
-    n, s = study.nuisances, study.stare
-    given: dict[Use, list[str]] = {
-        "processes": [f"processes.{name}" for name, value in study.processes if value is not None],
-        "nuisances": [f"nuisances.{name}" for name in n.spreads()] + [f"nuisances.own.{name}" for name in n.own],
-        "stare": [f"stare.{name}" for name in KNOWN_CHANGES if getattr(s, name) is not None]
-        + [f"stare.{name}" for name in (*COURSES, *STARE_PROCESSES) if getattr(s, name)],
-        "values": ["unknowns.draws"] if study.unknowns.draws else [],
-    }
     # Verbs of an orbit look at targets, not at the study's star.
     observes = "instrument" in uses and "orbit" not in uses
     near = [] if observes or all(star.neighbours is None for star in study.star) else ["star.neighbours"]
-    return [key for use, keys in given.items() if use not in uses for key in keys] + near
+    return [key for use, keys in _given_unknowns(study).items() if use not in uses for key in keys] + near
 
 
 def star_label(star: Star, x: Expectation) -> str:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
 from mauvecl.schema.errors import InputError, shown
-from mauvecl.schema.fields import Flag, Help, Quantity, Range, Slider, Unit, Widget, first, number
+from mauvecl.schema.fields import Flag, Help, Quantity, Range, Slider, Unit, Widget, first
 from mauvecl.schema.physical import Positive, Probability, Wavelength
 from mauvecl.schema.section import Section, fields_of, read_axes, read_axis, read_frames
 from mauvecl.study.observation import Observation, SkyLight
@@ -22,35 +22,9 @@ if TYPE_CHECKING:
     from mauvecl.study.stare import EventChoice, StareQuestion
 
 
-@dataclass(frozen=True)
-class StudyQuantity(Quantity):
-    """Quantity of a study, with the unit and range of its field."""
-
-    path: tuple[str, ...]  # sections and key
-    unit: str  # in astropy's notation; empty if dimensionless
-    range: Range
-    is_name: bool  # names instead of numbers
-
-    def checked(self, value: Any) -> float | str:
-        """Return a value in the unit of the quantity; raises InputError if it is outside of the range."""
-        return value if self.is_name else number(self.name.replace("_", " "), value, self.unit, self.range)
-
-    @property
-    def suffix(self) -> str:
-        """Unit that follows a value in a title."""
-        return f" {Unit(self.unit).written}" if self.unit else ""
-
-
+#: Quantities that vary, by name, with the unit and range of their fields.
 QUANTITIES = {
-    one.name: StudyQuantity(
-        one.name,
-        one.description,
-        one.label,
-        path,
-        unit=(first(field, Unit) or Unit("")).name,
-        range=first(field, Range) or Range(),
-        is_name=first(field, Range) is None,
-    )
+    one.name: replace(one, path=path, unit=(first(field, Unit) or Unit("")).name, range=first(field, Range))
     for name, section in (("star", Star), ("flare", Flare), ("observation", Observation), ("sky", SkyLight))
     for path, field in fields_of(section, (name,))
     if (one := first(field, Quantity)) is not None
@@ -194,7 +168,7 @@ class Axis(Section):
         try:
             return given | {key: Unit(quantity.unit).plain(given[key]) for key in keys}
         except ValueError as error:
-            accepted = quantity.range.words(quantity.unit)
+            accepted = quantity.accepted
             raise InputError(f"the axis {quantity.name!r} has the value {error}", accepted, key="values") from error
 
     @model_validator(mode="after")
@@ -212,10 +186,10 @@ class Axis(Section):
             if quantity.is_name != isinstance(value, str):
                 expected = "names of the library" if quantity.is_name else "numbers"
                 raise InputError(f"the axis {self.quantity!r} has the value {value!r}", expected, key="values")
-            if not isinstance(value, str) and value not in quantity.range:
+            if quantity.range is not None and value not in quantity.range:
                 raise InputError(
                     f"the axis {self.quantity!r} reaches {shown(value)}",
-                    quantity.range.words(quantity.unit),
+                    quantity.accepted,
                     key="values",
                 )
         return self

@@ -22,7 +22,7 @@ from mauvecl.schema.errors import InputError
 from mauvecl.study.analyses import SPECTRUM
 from mauvecl.study.cases import Case, Loader, collect_messages
 from mauvecl.study.study import Study
-from mauvecl.web.fields import FIELDS, IDEAL, REALISTIC, UNKNOWN, WITH_FILE, Choice, Draws, star_words
+from mauvecl.web.fields import FIELDS, IDEAL, REALISTIC, UNKNOWN, WITH_FILE, Choice, star_words
 from mauvecl.web.uploads import write_spectrum, write_table
 
 if TYPE_CHECKING:
@@ -103,10 +103,10 @@ class Question:
         points = self.uploads.get("own_unknown", values["own_unknown"])
         spectra = {"own": {"points": points}} if points else {}
         data["nuisances"] = {"usual": values["unknown"] == REALISTIC, "own": spectra}
-        draws: Draws = values["realisations"]
+        number, tails = values["realisations"]
         data["run"] |= {
-            "realisations": draws.number,
-            "tails": draws.tails,
+            "realisations": number,
+            "tails": tails,
             "statistics": list(dict.fromkeys(["chi2", "chi2_element", values["statistic"]])),
         }
         if values["targets"]:
@@ -282,17 +282,6 @@ class ClosedForms:
         """Whether closed forms are slow: sums of squares integrated over random factors."""
         return isinstance(self.odds.null, Mixture) and not isinstance(self.odds.null.parts[0], Gaussian)
 
-    @property
-    def excess(self) -> tuple[Float, Float]:
-        """Flare minus quiet in standard deviations of the noise, per pixel and per resolution element."""
-        x = self.quiet
-        rise = np.where(x.saturated, 0.0, self.flare.signal_dn - x.signal_dn)
-        noise2 = np.where(x.saturated, 0.0, x.variance_dn2)
-        pixel = np.divide(rise, np.sqrt(x.variance_dn2))
-        total = x.per_element(noise2)
-        element = np.divide(x.per_element(rise), np.sqrt(total), out=np.zeros(total.size), where=total > 0)
-        return pixel, element
-
 
 def short(value: float) -> str:
     """Format a number with three significant digits and no power of ten."""
@@ -336,7 +325,7 @@ def chances(closed: ClosedForms, answers: Answers) -> list[Chance]:
                 chance = Chance(unknown, assumed.chance, f"in closed form{_spread(assumed)}")
             else:
                 (row,) = (row for row in answer.table if row["statistic"] == closed.question.statistic)
-                drawn = f"of {closed.question.realisations.number:,} simulated"
+                drawn = f"of {closed.question.realisations[0]:,} simulated"
                 chance = Chance(unknown, float(row["probability"]), f"{chance_range(row['low'], row['high'])}, {drawn}")
         except InputError as error:
             if unknown == closed.question.unknown:

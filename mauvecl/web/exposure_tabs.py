@@ -210,9 +210,13 @@ SPECTRUM = Tab(
 def excess(closed: ClosedForms, answers: Answers) -> ChartData:
     """Return the flare minus quiet in standard deviations of the noise."""
     x, saturated = closed.quiet, closed.quiet.saturated | closed.flare.saturated
-    pixel, element = closed.excess
+    rise, noise2 = (
+        np.where(x.saturated, 0.0, values) for values in (closed.flare.signal_dn - x.signal_dn, x.variance_dn2)
+    )
+    noise = np.sqrt(x.per_element(noise2))
+    element = np.divide(x.per_element(rise), noise, out=np.zeros(noise.size), where=noise > 0)
     series: dict[str, Any] = {
-        "pixel": (x.wavelength_nm, pixel),
+        "pixel": (x.wavelength_nm, rise / np.sqrt(x.variance_dn2)),
         "element": (x.element_wavelength_nm, element),
         "noise": ([190.0, 710.0], [-1.96] * 2, [1.96] * 2),
         "saturated": strips(x.wavelength_nm, saturated),
@@ -224,7 +228,6 @@ def excess(closed: ClosedForms, answers: Answers) -> ChartData:
             variance, flare_dn = np.where(saturated, np.inf, x.variance_dn2), closed.flare.recorded_dn - x.recorded_dn
             raw = np.where(saturated, 0.0, raw - unknown.fitted_dn(raw, variance, flare_dn))
             drawn = " The drawn exposure is shown less the levels of what is unknown, fitted to it."
-        noise = np.sqrt(x.per_element(np.where(x.saturated, 0.0, x.variance_dn2)))
         shown = np.divide(x.per_element(raw), noise, out=np.full(noise.size, np.nan), where=noise > 0)
         series["drawn"] = x.element_wavelength_nm, shown
     best, lost = int(np.argmax(element)), int(np.count_nonzero(saturated))

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple, get_args, get_origin
+from typing import Any, Literal, get_args, get_origin
 
 from pydantic.fields import FieldInfo
 
@@ -127,17 +127,10 @@ def line_fluxes(text: str) -> tuple[tuple[str, float], ...]:
     return fractions
 
 
-class Draws(NamedTuple):
-    """Number of realisations, and whether the tail beyond them is sampled."""
-
-    number: int
-    tails: str
-
-
-def draws(text: str) -> Draws:
-    """Parse a choice such as "100000" or "100000 sampled"."""
+def draws(text: str) -> tuple[int, str]:
+    """Parse the number of realisations, and how the tail is found, such as "100000" or "100000 sampled"."""
     number, _, tails = text.partition(" ")
-    return Draws(int(number), tails or "counted")
+    return int(number), tails or "counted"
 
 
 def star_name(text: str) -> str:
@@ -418,22 +411,15 @@ _KEY = re.compile(r"(?<![\w.'])(?:[a-z]+\.)*[a-z0-9]+(?:_[a-z0-9]+)+(?![\w.]*')"
 
 @cache
 def _fields() -> dict[str, str]:
-    """Return the field of each key of the study, whole and without its section, and of each own name."""
-    names = {
-        part: name for name, field in FIELDS.items() if field.path for part in (".".join(field.path), field.path[-1])
-    }
-    return names | {name: name for name in FIELDS} | {"tails": "realisations", "plan.targets": "targets"}
-
-
-@cache
-def _flags() -> dict[str, str]:
-    """Return the field of each flag whose key has one."""
+    """Return the field of each key of the study, whole and without its section, of each own name, and of each flag."""
     names = {".".join(field.path): name for name, field in FIELDS.items() if field.path}
-    return {flag: names[key] for key, _, option in keys_of() if key in names for flag in option.names}
+    flags = {flag: names[key] for key, _, option in keys_of() if key in names for flag in option.names}
+    names |= {FIELDS[name].path[-1]: name for name in names.values()}
+    return names | {name: name for name in FIELDS} | flags | {"tails": "realisations", "plan.targets": "targets"}
 
 
 def field_of(key: str | None) -> str | None:
-    """Return the name of the field that sets a key of the study, or None."""
+    """Return the name of the field that sets a key of the study or stands for a flag, or None."""
     return _fields().get(key or "")
 
 
@@ -447,7 +433,7 @@ def sentence(error: InputError, keys: Mapping[str, str] = NO_KEYS) -> str:
 
 def note(text: str, keys: Mapping[str, str] = NO_KEYS) -> str:
     """Return a message with the labels of fields in place of keys and flags."""
-    text = _FLAG.sub(lambda match: f"“{FIELDS[_flags()[match[0]]].label}”" if match[0] in _flags() else match[0], text)
+    text = _FLAG.sub(lambda match: f"“{FIELDS[name].label}”" if (name := field_of(match[0])) else match[0], text)
     text = _REMEDY.sub(lambda match: _remedy(match, keys), text)
     return _KEY.sub(lambda match: _label(match[0], keys), text)
 

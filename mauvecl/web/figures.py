@@ -162,9 +162,11 @@ class Canvas:
     def _add(self, series: Series) -> None:
         """Add a series with its data source, entry of the legend, and tooltip."""
         if isinstance(series, Rule):
-            self._add_rule(series)
-            return
-        if isinstance(series, Listed):
+            # Its position is set later.
+            dimension: Literal["height", "width"] = "height" if series.along == "x" else "width"
+            look: dict[str, Any] = {"line_color": self.ink.get(series.colour, series.colour), "line_dash": series.dash}
+            self.plot.add_layout(Span(dimension=dimension, location=None, name=series.key, **look))
+        if isinstance(series, Rule | Listed):
             self._list(series)
             return
         if isinstance(series, Targets):
@@ -218,13 +220,6 @@ class Canvas:
             case Line(step=True):
                 return plot.step(*columns, source=source, mode="center", **line)
         return plot.line(*columns, source=source, **line)
-
-    def _add_rule(self, rule: Rule) -> None:
-        """Add a straight line, whose position is set later."""
-        dimension: Literal["height", "width"] = "height" if rule.along == "x" else "width"
-        look: dict[str, Any] = {"line_color": self.ink.get(rule.colour, rule.colour), "line_dash": rule.dash}
-        self.plot.add_layout(Span(dimension=dimension, location=None, name=rule.key, **look))
-        self._list(rule)
 
     def _list(self, series: Series) -> None:
         """Add an entry to the legend."""

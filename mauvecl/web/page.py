@@ -170,6 +170,9 @@ SEEN = {
     "tab": Field(label="Tab", hint="", first=next(iter(TABS)), read=Choice(tuple(TABS))),
     "simulated": Field(label="Simulated", hint="", first="", read=_several),
 }
+#: All entries of a link, and their values on a new page.
+ENTRIES = FIELDS | SEEN
+FIRST = {name: field.read(field.first) for name, field in ENTRIES.items()}
 
 
 class State:
@@ -179,9 +182,8 @@ class State:
     """
 
     def __init__(self, uploads: Mapping[str, Any] | None = None) -> None:
-        self._fields = FIELDS | SEEN
-        self.entered = {name: field.first for name, field in self._fields.items()}
-        self._values = {name: field.read(field.first) for name, field in self._fields.items()}
+        self.entered = {name: field.first for name, field in ENTRIES.items()}
+        self._values = dict(FIRST)
         self._invalid: dict[str, str] = {}
         self.stray = ""
         self.uploads = dict(uploads or {})
@@ -189,7 +191,7 @@ class State:
     def enter(self, given: Mapping[str, str]) -> None:
         """Enter text into fields."""
         for name, text in given.items():
-            field = self._fields[name]
+            field = ENTRIES[name]
             self.entered[name] = text[: field.characters]
             self._invalid.pop(name, None)
             try:
@@ -224,7 +226,7 @@ class State:
         """Return the values of fields by name; raises InputError if one is invalid."""
         for name in names:
             if name in self._invalid:
-                raise InputError(f"{self._fields[name].label}: {self._invalid[name]}", key=name)
+                raise InputError(f"{ENTRIES[name].label}: {self._invalid[name]}", key=name)
         return {name: self._values[name] for name in names}
 
     def _check(self, name: str) -> None:
@@ -247,11 +249,10 @@ class State:
         """
         faults = self.faults_of(names)
         if faults:
-            all_of_them = "; ".join(f"{self._fields[name].label}: {why}" for name, why in faults.items())
+            all_of_them = "; ".join(f"{ENTRIES[name].label}: {why}" for name, why in faults.items())
             fault, _, expected = all_of_them.partition(", expected ")
             raise InputError(fault, expected or None, key=next(iter(faults)))
-        first = State()
-        values = {name: (self if name in names else first)._values[name] for name in FIELDS}
+        values = {name: (self._values if name in names else FIRST)[name] for name in FIELDS}
         return Question(
             values, {name: self.uploads[name] for name in UPLOADS if name in names and self._holds_file(name)}
         )
@@ -261,7 +262,7 @@ class State:
     @property
     def link(self) -> str:
         """Return all entries as the query of a URL."""
-        return "?" + urlencode({name: text for name, text in self.entered.items() if text or self._fields[name].first})
+        return "?" + urlencode({name: text for name, text in self.entered.items() if text or ENTRIES[name].first})
 
     def follow(self, link: str) -> None:
         """Enter the values of a link, and defaults for all others."""
@@ -270,16 +271,16 @@ class State:
         if len(query) > MOST_LINKED:
             query, self.stray = "", f"The link has more than {MOST_LINKED} characters and was left out."
         pairs = parse_qsl(query, keep_blank_values=True, errors="replace")
-        strange = sorted({name for name, _ in pairs} - set(self._fields))
+        strange = sorted({name for name, _ in pairs} - set(ENTRIES))
         if strange:
             self.stray = f"The link holds {shortened(', '.join(strange))}, which is no field here; it was left out."
-        given = {name: text for name, text in pairs if name in self._fields}
+        given = {name: text for name, text in pairs if name in ENTRIES}
         if given.get("unknown") in FORMER_VALUES["unknown"]:
             self.stray += " The link is of version 1: its payload and unknowns have other names today."
             given |= {
                 name: words.get(given[name], given[name]) for name, words in FORMER_VALUES.items() if name in given
             }
-        first = {name: field.first for name, field in self._fields.items()}
+        first = {name: field.first for name, field in ENTRIES.items()}
         self.enter(first | given)
         for name in SEEN.keys() & self._invalid.keys():
             # The page has no field to correct them.

@@ -155,32 +155,19 @@ class Job:
         self.future.cancel()
 
     @property
-    def counts(self) -> tuple[int, int]:
-        """Return the finished part and the total, or 0 if nothing is counted yet."""
-        if self.unit:
-            return self._counted
-        standing = None if self._pool is None else self._pool.standing
-        return (0, 0) if standing is None else (standing.done, standing.total)
-
-    @property
-    def share(self) -> float:
-        """Return the share that is done."""
-        done, total = self.counts
-        return min(done / total, 1.0) if total else 0.0
-
-    @property
-    def words(self) -> str:
-        """Return the progress in words; the estimated time never rises."""
+    def progress(self) -> tuple[float, str]:
+        """Return the share that is done, and the progress in words; the estimated time never rises."""
         if self._started is None:
-            return "waiting for its turn"
-        (done, total), spent = self.counts, time.monotonic() - self._started
+            return 0.0, "waiting for its turn"
+        standing, spent = None if self._pool is None else self._pool.standing, time.monotonic() - self._started
+        done, total = self._counted if self.unit or standing is None else (standing.done, standing.total)
         if not total:
-            return f"{spent:.0f} s"
-        words = f"{done:,} of {total:,} {self.unit or 'realisations'}"
-        if not 0 < done < total:
-            return f"{words}, {spent:.0f} s"
-        self._left_s = min(self._left_s, spent * (total - done) / done)
-        return f"{words}, about {self._left_s:.0f} s left"
+            return 0.0, f"{spent:.0f} s"
+        words, when = f"{done:,} of {total:,} {self.unit or 'realisations'}", f"{spent:.0f} s"
+        if 0 < done < total:
+            self._left_s = min(self._left_s, spent * (total - done) / done)
+            when = f"about {self._left_s:.0f} s left"
+        return min(done / total, 1.0), f"{words}, {when}"
 
 
 log = logging.getLogger(__name__)
@@ -473,9 +460,10 @@ class Visitor(WebSocketHandler):
         done = asyncio.wrap_future(job.future)
         try:
             while not (await asyncio.wait([done], timeout=LOOK_S))[0]:
-                self.send(n=n, progress=job.share, message=job.words)
+                share, words = job.progress
+                self.send(n=n, progress=share, message=words)
             RESULTS.keep(self, "answers", key, done.result(), MOST_ANSWERS)
-            self.send(n=n, ended=f"Done: {job.words}.", kind=kind)
+            self.send(n=n, ended=f"Done: {job.progress[1]}.", kind=kind)
         except (Cancelled, CancelledError, asyncio.CancelledError):
             self.send(n=n, ended="Cancelled.")
         finally:
