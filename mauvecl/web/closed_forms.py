@@ -21,7 +21,7 @@ from mauvecl.schema.columns import chance_range, chance_text
 from mauvecl.schema.errors import InputError
 from mauvecl.study.analyses import SPECTRUM
 from mauvecl.study.cases import Case, Loader, collect_messages
-from mauvecl.study.study import Study
+from mauvecl.study.study import Study, set_key
 from mauvecl.web.fields import FIELDS, IDEAL, REALISTIC, UNKNOWN, WITH_FILE, Choice, star_words
 from mauvecl.web.uploads import write_spectrum, write_table
 
@@ -143,14 +143,11 @@ class Question:
             return
         if page_field.kind == "table" and folder is not None:
             value = write_table(value, folder)
-        *sections, key = page_field.path
-        for section in sections:
-            data = data.setdefault(section, {})
         value = (
             str(value) if isinstance(value, Path) else value if page_field.scale == 1.0 else value / page_field.scale
         )
         # A single flare.
-        data[key] = [value] if key == "amplitudes" else value
+        set_key(data, [*page_field.path], [value] if page_field.path[-1] == "amplitudes" else value, name)
 
 
 #: Answers that are simulated, by name: of one question.

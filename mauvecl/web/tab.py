@@ -16,7 +16,7 @@ from pathlib import Path
 from pprint import pformat
 from typing import TYPE_CHECKING, Any
 
-from pydantic import BaseModel
+from pydantic import BaseModel, TypeAdapter
 
 from mauvecl.answers.verbs import VERBS
 from mauvecl.schema.columns import View, without_empty
@@ -25,7 +25,7 @@ from mauvecl.schema.fields import Flag, found
 from mauvecl.schema.section import read_axis, read_line_fluxes, read_words
 from mauvecl.study.observation import SkyLight
 from mauvecl.study.star import Star
-from mauvecl.study.study import Study, keys_of, with_paths
+from mauvecl.study.study import Study, keys_of, set_key, with_paths
 from mauvecl.web.closed_forms import OTHER
 from mauvecl.web.fields import FIELDS
 
@@ -266,6 +266,9 @@ print(next(iter(answer.tables.values())))
 """
 
 
+ANYTHING = TypeAdapter(Any)
+
+
 def differing(new: BaseModel, old: BaseModel, path: str = "") -> Iterator[tuple[str, Any]]:
     """Yield the dotted path and the plain value of each key that has another value in `old`, or is `STATED`."""
     for key, own_field in type(new).model_fields.items():
@@ -275,29 +278,15 @@ def differing(new: BaseModel, old: BaseModel, path: str = "") -> Iterator[tuple[
         if isinstance(values[0], BaseModel) and isinstance(values[1], BaseModel) and not whole:
             yield from differing(*values, f"{name}.")
         elif values[0] is not None and (values[0] != values[1] or name in STATED):
-            yield name, _plain(values[0])
-
-
-def _plain(value: Any) -> Any:
-    """Return a value as TOML can hold it, without the defaults of records."""
-    if isinstance(value, BaseModel):
-        return value.model_dump(mode="json", exclude_defaults=True, exclude_none=True)
-    if isinstance(value, tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    return str(value) if isinstance(value, Path) else value
+            # As TOML can hold it, without the defaults of records.
+            yield name, ANYTHING.dump_python(values[0], mode="json", exclude_defaults=True, exclude_none=True)
 
 
 def as_program(verb: str, study: Study) -> str:
     """Return a question to a verb as a Python program."""
     data: dict[str, Any] = {}
     for name, value in keys_used(VERBS[verb], study, Study()):
-        *sections, key = name.split(".")
-        place = data
-        for section in sections:
-            place = place.setdefault(section, {})
-        place[key] = value
+        set_key(data, name.split("."), value, name)
     text = pformat(data, width=100, sort_dicts=False).replace("\n", "\n    ")
     return PROGRAM.format(verb=verb, data=text, options=OPTIONS.get(verb, ""))
 
