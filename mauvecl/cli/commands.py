@@ -255,10 +255,11 @@ def realise(session: Session) -> None:
 
 def _tell(store: Store, place: Path, session: Session) -> None:
     from mauvecl.runs.store import ARRAY_COLUMNS
-    from mauvecl.study.cases import assumption_line, collect_messages
+    from mauvecl.study.cases import assumptions_of, collect_messages
 
     messages = collect_messages([scene.expectation for scene in store.scenes], store.study.processes)
-    assumed = assumption_line(store.study, ("instrument", "sky", "flare", "processes", "seed"))
+    clauses = assumptions_of(store.study, ("instrument", "sky", "flare", "processes", "seed"))
+    assumed = f"Assumed: {'; '.join(clauses)}."
     session.say([*messages, assumed])
     rows = [
         {

@@ -41,11 +41,6 @@ UNKNOWN_USES: tuple[Use, ...] = ("processes", "nuisances", "stare", "values")
 KNOWN_CHANGES = ("thermal", "variability", "throughput", "sky")
 
 
-def assumption_line(study: Study, uses: Collection[Use], varied: Collection[str] = ()) -> str:
-    """Return one line with the assumptions of a study; see `assumptions_of`."""
-    return f"Assumed: {'; '.join(assumptions_of(study, uses, varied))}."
-
-
 def assumptions_of(study: Study, uses: Collection[Use], varied: Collection[str] = ()) -> list[str]:
     """Return the assumptions of a study about the parts that an answer uses, one clause each.
 

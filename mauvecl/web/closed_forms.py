@@ -70,20 +70,18 @@ class Question:
         """True if the visitor's file gives the brightness of the flare, and not the amplitude."""
         return "flare_file" in self.uploads and bool(self.values["as_observed"])
 
-    def case(self, folder: Path | None = None) -> Case:
+    def case(self, folder: Path) -> Case:
         """Return the question as a case; a flare that is as bright as observed has the amplitude of its brightness.
 
         The visitor's files are written to the folder for the study to find. Raises InputError for incompatible values.
         """
-        if folder is None and (self.uploads.keys() - {"own_unknown"} or self.neighbours is not None):
-            raise InputError("no folder for the visitor's files", "a folder", key="folder")
         uploaded = self.uploaded
         # An uploaded spectrum is not read from its file at every change.
         loader = Loader(None if uploaded is None else lambda star: star.applied(uploaded))
         case = Case(Study.build(self._data(folder), "page"), loader=loader)
         return case.at_observed_brightness() if self.as_bright_as_observed else case
 
-    def _data(self, folder: Path | None) -> dict[str, Any]:
+    def _data(self, folder: Path) -> dict[str, Any]:
         """Return the question as the data of a study, whose files are written to a folder."""
         values = self.values
         data: dict[str, Any] = {}
@@ -91,7 +89,7 @@ class Question:
             if page_field.path and self._applies(name):
                 self._set(data, name, folder)
         star = {"library": values["star"]}
-        if folder is not None and self.uploaded is not None:
+        if self.uploaded is not None:
             star = {"file": str(write_spectrum(self.uploaded, folder, SPECTRA["star"]))}
         data["star"] = [data["star"] | star]
         if values["sky"] == "none":
@@ -129,19 +127,19 @@ class Question:
         }
         return conditions.get(name, True)
 
-    def _set(self, data: dict[str, Any], name: str, folder: Path | None) -> None:
+    def _set(self, data: dict[str, Any], name: str, folder: Path) -> None:
         """Set the key of a field in the data of a study, in place, unless it is empty; its file goes to a folder."""
         page_field, value = FIELDS[name], self.values[name]
         if page_field.kind in ("file", "upload"):
             upload = self.uploads.get(name)
-            if folder is None or upload is None:
+            if upload is None:
                 return
             value = (
                 upload.written(folder) if page_field.kind == "upload" else write_spectrum(upload, folder, SPECTRA[name])
             )
         if value is None:
             return
-        if page_field.kind == "table" and folder is not None:
+        if page_field.kind == "table":
             value = write_table(value, folder)
         value = (
             str(value) if isinstance(value, Path) else value if page_field.scale == 1.0 else value / page_field.scale
