@@ -406,9 +406,9 @@ class Slider:
 class Widget:
     """Field of the page that sets a key."""
 
-    label: str
     hint: str  # explanation for visitors, in sentences
-    group: str = ""  # heading of the field's group; empty for fields that show at once
+    label: str = ""  # text of the key's help by default
+    group: str = ""  # heading of the field's group; by default that of its section, if fields do not show at once
     place: int = 0  # order within the group; fields of the same place follow the order of the study
     name: str = ""  # name in links; that of the key by default
     first: str | None = None  # text of a new page; the default of the key by default

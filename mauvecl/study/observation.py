@@ -54,7 +54,6 @@ class Observation(Section):
         Widget(
             label="Exposure",
             hint="Time on the star; whole frames of 5 s are added up.",
-            place=1,
             slider=Slider(5, 3600, 5),
         ),
         Quantity("exposure", "length of the exposure", "exposure (s)"),
@@ -69,7 +68,6 @@ class Observation(Section):
             label="Payload",
             hint="mauve: dark counts are Poisson in electrons, as in physics. mauvesim: Poisson in DN, as in the "
             "MauveSim paper, which makes the dark noise 1.3 times as large.",
-            place=2,
             choices=("mauve", "mauvesim"),
         ),
     ] = DEFAULT_INSTRUMENT
@@ -78,7 +76,6 @@ class Observation(Section):
         Help("Detector temperature", default="the instrument's"),
         Flag("--temperature"),
         Widget(
-            label="Detector temperature",
             hint="The dark current doubles every few degrees.",
             group="Detector",
             placeholder="21, or along the orbit in plans",
@@ -135,8 +132,6 @@ class SkyLight(Section):
         Widget(
             label="Sky brightness",
             hint="Zodiacal light, V magnitudes per square arc second.",
-            group="Sky",
-            place=1,
             name="sky_brightness",
             first=f"{DEFAULT_SKY:g}",
             unit="mag/arcsec²",
@@ -151,15 +146,13 @@ class SkyLight(Section):
         Widget(
             label="Sky target",
             hint="A star by name, such as AU Mic, or coordinates in degrees such as 290.68 +11.12.",
-            group="Sky",
-            place=1,
         ),
     ] = None
     time: Annotated[
         str | None,
         Help("Time of the observation, UTC, with the target"),
         Flag("--time"),
-        Widget(label="Time, UTC", hint="Such as 2026-09-01T12:00.", group="Sky", place=1),
+        Widget(label="Time, UTC", hint="Such as 2026-09-01T12:00."),
     ] = None
     none: Annotated[bool, Help("Whether there is no sky")] = False
 
@@ -204,7 +197,7 @@ class Run(Section):
         Range(0, 2**64 - 1),
         Help("Seed"),
         Flag("--seed"),
-        Widget(label="Seed", hint="The same seed gives the same noise, to the bit.", group="Detection", place=3),
+        Widget(hint="The same seed gives the same noise, to the bit.", place=3),
     ] = DEFAULT_SEED
     statistics: Annotated[
         tuple[str, ...],
@@ -225,7 +218,6 @@ class Run(Section):
         Widget(
             label="False-alarm probability",
             hint="How often noise alone passes for a flare, per test: it sets the threshold.",
-            group="Detection",
             unit="per test",
             slider=Slider(1e-6, 0.1, 10**0.1, log=True),
         ),

@@ -130,7 +130,6 @@ class LimitQuestion(Section):
             label="Solve for",
             hint="The smallest flare, the faintest star or the shortest exposure that is detected with the wanted "
             "probability; all else is as entered. The tab Limit and map simulates it.",
-            group="Limit",
             first="amplitude",
         ),
     ] = "magnitude"

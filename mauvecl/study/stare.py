@@ -204,7 +204,6 @@ class SearchChoice(Section):
         Widget(
             label="False alarms",
             hint="Expected number of detections that are only noise, in the time that the next field states.",
-            group="Search",
         ),
     ] = 1.0
     per: Annotated[
@@ -214,8 +213,6 @@ class SearchChoice(Section):
         Widget(
             label="False alarms per",
             hint="Observing time of one star to which the number of false alarms refers.",
-            group="Search",
-            place=1,
         ),
     ] = "month"
     null: Annotated[

@@ -19,6 +19,7 @@ from mauvecl.host.stars.library import ModelStar, embedded, near_names, spectrum
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.fields import (
     Flag,
+    Help,
     Range,
     Unit,
     Widget,
@@ -248,12 +249,22 @@ class Field(Widget):
         return self.own_keys or (".".join(self.path),)
 
 
+#: Headings of fields by the section of their key, unless they state another; fields of other sections show at once.
+HEADINGS = {
+    "flare.spectrum": "Flare's spectrum", "sky": "Sky", "run": "Detection", "limit": "Limit", "search": "Search",
+    "stare.pointing": "Pointing", "orbit": "Campaign", "plan": "Campaign", "measure": "Measurement", "data": "Frames",
+    "calibrate": "Standards", "change": "Change",
+}  # fmt: skip
+
+
 def _field(path: tuple[str, ...], field: FieldInfo, widget: Widget) -> Field:
     """Return the field of a key from its metadata."""
     default, unit = field.get_default(), first(field, Unit) or Unit("")
     text = as_typed(default * widget.scale if isinstance(default, float) else default, truth=("no", "yes"))
     optional = text == "" if widget.first is None else not widget.first
     own = {
+        "label": widget.label or getattr(first(field, Help), "text", ""),
+        "group": widget.group or HEADINGS.get(".".join(path[:-1]), ""),
         "first": text if widget.first is None else widget.first,
         "unit": unit.written if widget.unit is None else widget.unit,
         "read": _reader(field, widget, unit.name, optional=optional),
