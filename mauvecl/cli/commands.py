@@ -332,20 +332,15 @@ def verify(
         columns, left = bulk.FAULT_COLUMNS, sum(not fault.mended for fault in faults)
         source = "with what was written" if not redraw else "with what the engine draws"
         outcome = f"{len(faults) - left} repaired, {left} left as found." if faults else f"Everything agrees {source}."
-    _print_faults(
-        View(f"Not as it was written: {store}", columns, [asdict(fault) for fault in faults]), outcome, as_json
-    )
+    rows_of_faults = [asdict(fault) for fault in faults]
+    if as_json:
+        print(json.dumps(rows_of_faults, indent=2))
+    else:
+        if faults:
+            show_view(View(f"Not as it was written: {store}", columns, rows_of_faults))
+        show([outcome] if outcome else [])
     if left:
         raise typer.Exit(1)
-
-
-def _print_faults(found: View, outcome: str, as_json: bool) -> None:
-    if as_json:
-        print(json.dumps(found.table, indent=2))
-        return
-    if found.table:
-        show_view(found)
-    show([outcome] if outcome else [])
 
 
 def export(

@@ -245,23 +245,19 @@ class _Parameter:
         try:
             return self.validate(value)
         except ValidationError as error:
-            raise _input_error(self.name, error) from None
+            faults = [
+                (tuple(part for part in fault["loc"] if part != ALTERNATIVE), fault)
+                for fault in error.errors(include_url=False)
+            ]
+        # The innermost wrong value, with the alternatives that it may be.
+        place, first = max(faults, key=lambda item: len(item[0]))
+        expected = dict.fromkeys(fault["msg"].removeprefix("Input should be ") for at, fault in faults if at == place)
+        where = self.name + "".join(f"[{part!r}]" for part in place if part != "[key]")
+        raise InputError(f"{where} = {shown(first['input'])}", " or ".join(expected), key=self.name)
 
     def annotation(self) -> Any:
         """Return the resolved annotation."""
         return eval(self.text, {}, _Names(*self.modules)) if isinstance(self.text, str) else self.text
-
-
-def _input_error(name: str, error: ValidationError) -> InputError:
-    """Return the error of the innermost wrong value, with the alternatives that it may be."""
-    faults = [
-        (tuple(part for part in fault["loc"] if part != ALTERNATIVE), fault)
-        for fault in error.errors(include_url=False)
-    ]
-    place, first = max(faults, key=lambda item: len(item[0]))
-    expected = dict.fromkeys(fault["msg"].removeprefix("Input should be ") for at, fault in faults if at == place)
-    where = name + "".join(f"[{part!r}]" for part in place if part != "[key]")
-    return InputError(f"{where} = {shown(first['input'])}", " or ".join(expected), key=name)
 
 
 #: Types of other packages that modules import for type checkers only.

@@ -297,12 +297,11 @@ class OrNone:
         from pydantic_core import core_schema
 
         inner = handler(source)
-        schema = core_schema.no_info_before_validator_function(self._or_none, inner)
+        schema = core_schema.no_info_before_validator_function(
+            lambda value: None if isinstance(value, str) and value.strip().lower() == "none" else value, inner
+        )
         expected = str(inner.get("custom_error_message", "")).removeprefix("Input should be ")
         return or_error(schema, f"{expected or 'a number'}, or none")
-
-    def _or_none(self, value: Any) -> Any:
-        return None if isinstance(value, str) and value.strip().lower() == "none" else value
 
     def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> Any:
         return {"anyOf": [handler(schema), {"const": "none"}]}

@@ -57,7 +57,10 @@ def assumptions_of(study: Study, uses: Collection[Use], varied: Collection[str] 
         "seed": lambda: f"seed {study.run.seed}",
     }
     stated = {*uses, *(("unknowns",) if {*UNKNOWN_USES} & {*uses} else ())}
-    unused = unused_unknowns(study, uses)
+    # Verbs of an orbit look at targets, not at the study's star.
+    observes = "instrument" in uses and "orbit" not in uses
+    unused = [key for use, keys in _given_unknowns(study).items() if use not in uses for key in keys]
+    unused += [] if observes or all(star.neighbours is None for star in study.star) else ["star.neighbours"]
     ignored = [f"not used: {', '.join(unused)}"] if unused else []
     return [*(words[use]() for use in words if use in stated), *ignored]
 
@@ -137,14 +140,6 @@ def _unknowns(study: Study, uses: Collection[Use]) -> str:
     parts += [f"drawn: {', '.join(drawn)}"] if drawn else []
     parts += [f"marginalised: {', '.join(named)}"] if (named := given.get("nuisances")) else []
     return "; ".join([*parts, *given.get("values", ())]) or "everything known but the noise"
-
-
-def unused_unknowns(study: Study, uses: Collection[Use]) -> list[str]:
-    """Return the keys of the study's unknowns that an answer ignores."""
-    # Verbs of an orbit look at targets, not at the study's star.
-    observes = "instrument" in uses and "orbit" not in uses
-    near = [] if observes or all(star.neighbours is None for star in study.star) else ["star.neighbours"]
-    return [key for use, keys in _given_unknowns(study).items() if use not in uses for key in keys] + near
 
 
 def star_label(star: Star, x: Expectation) -> str:

@@ -214,19 +214,17 @@ def events_of(study: Study, source: Source) -> list[Event]:
 
     Raises InputError if an energy is given for a star of unknown distance and radius.
     """
-    choices = study.events or _evenly_spaced(study)
+    choices: Sequence[EventChoice] = study.events
+    if not choices:
+        q = study.stare
+        sizes = [{"energy_erg": e} for e in q.energies_erg] or [{"amplitude": a} for a in study.flare.amplitudes]
+        # The time before the first flare equals the spacing.
+        step = q.duration_s / (len(sizes) + 1)
+        choices = [EventChoice(peak_s=step * (n + 1), **size) for n, size in enumerate(sizes)]
     events = [_event(study, choice) for choice in choices]
     # The spectrum of a cooling flare is interpolated between the temperatures of all flares.
     kelvin = temperatures_of(events)
     return [_of_energy(study, source, choice, event, kelvin) for choice, event in zip(choices, events, strict=True)]
-
-
-def _evenly_spaced(study: Study) -> Sequence[EventChoice]:
-    q = study.stare
-    sizes = [{"energy_erg": e} for e in q.energies_erg] or [{"amplitude": a} for a in study.flare.amplitudes]
-    # The time before the first flare equals the spacing.
-    step = q.duration_s / (len(sizes) + 1)
-    return [EventChoice(peak_s=step * (n + 1), **size) for n, size in enumerate(sizes)]
 
 
 def _event(study: Study, choice: EventChoice) -> Event:

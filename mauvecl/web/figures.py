@@ -76,7 +76,7 @@ class Canvas:
     """Empty figure of a chart, whose data sources have the names of the chart's data."""
 
     def __init__(self, chart: Chart, theme: str, logs: frozenset[str]) -> None:
-        self.ink, self.pins, self.chart = INKS[theme], PINS[theme], chart
+        self.ink, self.chart = INKS[theme], chart
         offered = {axis.lower() for axis in chart.logs}
         self.logs = logs | {name for name, axis in (("x", chart.x), ("y", chart.y)) if axis.log and name not in offered}
         self.plot = self._frame(chart.x, chart.y)
@@ -85,7 +85,13 @@ class Canvas:
         if chart.x.kind == "wavelength":
             self._mark()
         own = [item for item in chart.series if isinstance(item, Own)]
-        for series in (*(item for item in chart.series if item not in own), *self._pins(), *own):
+        # A line for each scenario that can be pinned is drawn as the series that it repeats.
+        pins = [
+            replace(item, called=f"pinned {k + 1}", name=f"pin {k}", colour=colour, dash=dash, width=2.0, show="pins",
+                    tips=(), listed=False)
+            for k, (colour, dash) in enumerate(PINS[theme]) for item in chart.series if item.key == chart.pins
+        ]  # fmt: skip
+        for series in (*(item for item in chart.series if item not in own), *pins, *own):
             self._add(series)
 
     def _frame(self, x: Axis, y: Axis) -> Any:
@@ -148,16 +154,6 @@ class Canvas:
         )  # fmt: skip
         self.plot.add_layout(bar, "right")
         return mapper
-
-    def _pins(self) -> list[Series]:
-        """Return a line for each scenario that can be pinned, drawn as the series that it repeats."""
-        repeated = [item for item in self.chart.series if item.key == self.chart.pins]
-        looks = enumerate(self.pins)
-        return [
-            replace(item, called=f"pinned {k + 1}", name=f"pin {k}", colour=colour, dash=dash, width=2.0, show="pins",
-                    tips=(), listed=False)
-            for k, (colour, dash) in looks for item in repeated
-        ]  # fmt: skip
 
     def _add(self, series: Series) -> None:
         """Add a series with its data source, entry of the legend, and tooltip."""

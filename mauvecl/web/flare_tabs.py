@@ -112,15 +112,12 @@ def _map(kept: _Kept) -> tuple[Float, Float, Float]:
             cut = (outcome.threshold - outcome.null.mean) / unit
             forms[:, j, i] = np.log(part), np.log(seen.std / unit), cut, seen.third / seen.std**3
     fine = np.linspace(*MAGNITUDES, 97), np.linspace(low, high, 61)
-    return *fine, _pearson(*PchipInterpolator(y, PchipInterpolator(x, forms, axis=2)(fine[0]), axis=1)(fine[1]))
-
-
-def _pearson(part: Float, spread: Float, cut: Float, skewness: Float) -> Float:
-    """Return the probability above a cut of a gamma distribution with these moments, or of a normal at low skewness."""
+    part, spread, cut, skewness = PchipInterpolator(y, PchipInterpolator(x, forms, axis=2)(fine[0]), axis=1)(fine[1])
     off = (cut - np.exp(part)) / np.exp(spread)
     shape = 4 / np.maximum(skewness, 1e-4) ** 2
     gamma = special.gammaincc(shape, np.maximum(shape + np.sqrt(shape) * off, 0.0))
-    return np.asarray(np.where(skewness > 1e-4, gamma, special.ndtr(-off)))
+    # At low skewness the distribution is normal.
+    return *fine, np.where(skewness > 1e-4, gamma, special.ndtr(-off))
 
 
 @Chart(

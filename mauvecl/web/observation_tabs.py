@@ -154,7 +154,13 @@ def dynamic_spectrum(closed: ClosedForms, answers: Answers) -> ChartData:
     frames: Frames | None = closed.given.get("frames")
     if frames is None or frames.wavelength_nm is None:
         return ChartData("A light curve has no spectra." if frames else NO_FRAMES)
-    image, nm = _deviations(frames), frames.wavelength_nm
+    nm, columns = frames.wavelength_nm, _means(frames.flux, frames.numbers, MOST_COLUMNS)
+    image = _means(columns.T, np.arange(nm.size), MOST_ROWS)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        image = image - np.nanmedian(image, axis=1, keepdims=True)
+        steps = np.diff(image, axis=1)
+        # Differences of neighbouring columns hold noise alone; 1.4826 makes a median absolute deviation a normal one's.
+        image = image / (1.4826 / np.sqrt(2.0) * np.nanmedian(np.abs(steps), axis=1, keepdims=True))
     reach = max(3.0, float(np.nanpercentile(np.abs(image), 99.5)))
     length = float(minutes(frames, frames.time_s[-1] + frames.cadence_s))
     series: dict[str, Any] = {"dynamic": (image[None], [0.0], [nm[0]], [length], [max(nm[-1] - nm[0], 1.0)])}
@@ -174,17 +180,6 @@ def _shades(colour: str) -> tuple[str, ...]:
     return tuple(
         "#" + "".join(f"{round(value):02x}" for value in row) for row in ends[0] * (1 - steps) + ends[1] * steps
     )
-
-
-def _deviations(frames: Frames) -> Float:
-    """Return spectra less their median in standard deviations, averaged, shape (n_row, n_column); gaps are NaN."""
-    columns = _means(frames.flux, frames.numbers, MOST_COLUMNS)
-    image = _means(columns.T, np.arange(frames.flux.shape[1]), MOST_ROWS)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        image = image - np.nanmedian(image, axis=1, keepdims=True)
-        steps = np.diff(image, axis=1)
-        # Differences of neighbouring columns hold noise alone; 1.4826 makes a median absolute deviation a normal one's.
-        return np.asarray(image / (1.4826 / np.sqrt(2.0) * np.nanmedian(np.abs(steps), axis=1, keepdims=True)))
 
 
 def _means(values: Float, numbers: NDArray[np.int64], most: int) -> Float:

@@ -209,6 +209,10 @@ def make(address: str, port: int, allowed: Sequence[str]) -> Any:
     Raises InputError if the address is invalid or accepts other machines without an origin, and OSError if the port is
     taken.
     """
+
+    def asked_figure(handler: RequestHandler, theme: str, name: str) -> bytes | None:
+        return figure(theme, name, "".join(sorted(set(handler.get_query_argument("log", ""))))[:2])
+
     let_in = hosts(address, port, allowed)
     application = Application(
         [
@@ -422,11 +426,6 @@ def figure(theme: str, name: str, logs: str) -> bytes | None:
         return None
     canvas = Canvas(picture, theme, frozenset(logs))
     return json.dumps({"item": json_item(canvas.plot), "legend": canvas.legend}).encode()
-
-
-def asked_figure(handler: RequestHandler, theme: str, name: str) -> bytes | None:
-    """Return the figure of a request, with some logarithmic axes."""
-    return figure(theme, name, "".join(sorted(set(handler.get_query_argument("log", ""))))[:2])
 
 
 def prepare() -> None:

@@ -282,15 +282,6 @@ def differing(new: BaseModel, old: BaseModel, path: str = "") -> Iterator[tuple[
             yield name, ANYTHING.dump_python(values[0], mode="json", exclude_defaults=True, exclude_none=True)
 
 
-def as_program(verb: str, study: Study) -> str:
-    """Return a question to a verb as a Python program."""
-    data: dict[str, Any] = {}
-    for name, value in keys_used(VERBS[verb], study, Study()):
-        set_key(data, name.split("."), value, name)
-    text = pformat(data, width=100, sort_dicts=False).replace("\n", "\n    ")
-    return PROGRAM.format(verb=verb, data=text, options=OPTIONS.get(verb, ""))
-
-
 def as_command(verb: str, study: Study) -> str:
     """Return a question to a verb as a command, which names a study file if flags cannot say all of it."""
     from_file = ["mauvecl", verb, STUDY_FILE]
@@ -421,6 +412,10 @@ def commands_and_programs(tab: Tab, question: Question, folder: Path) -> list[di
         verb, study = asked_study(name, question.case(folder).study)
         # Paths relative to the study, instead of those on the server.
         data = with_paths(study.model_dump(mode="json"), Study, lambda file: Path(file.name))
-        study = Study.build(data, "page")
-        entries.append({"question": name, "command": as_command(verb, study), "python": as_program(verb, study)})
+        study, keys = Study.build(data, "page"), dict[str, Any]()
+        for key, value in keys_used(VERBS[verb], study, Study()):
+            set_key(keys, key.split("."), value, key)
+        text = pformat(keys, width=100, sort_dicts=False).replace("\n", "\n    ")
+        program = PROGRAM.format(verb=verb, data=text, options=OPTIONS.get(verb, ""))
+        entries.append({"question": name, "command": as_command(verb, study), "python": program})
     return entries
