@@ -313,11 +313,6 @@ def _measure(text: str) -> float | str:
     return text if is_measure(text) else float(text)
 
 
-def read_axes(texts: Sequence[str], name: str) -> list[dict[str, Any]]:
-    """Read several axes."""
-    return [read_axis(text, name) for text in texts]
-
-
 def read_assignment(text: str, name: str, expected: str) -> tuple[str, str]:
     """Read a name and its value, with an equals sign between them."""
     key, _, value = (part.strip() for part in text.rpartition("="))
@@ -335,14 +330,9 @@ def read_line_fluxes(texts: Sequence[str], name: str) -> dict[str, float]:
     return lines
 
 
-def read_gaps(texts: Sequence[str], name: str) -> list[tuple[float, float]]:
-    """Read ranges of time such as 1000:2000."""
-    return [_pair(text, name, "two times in s, such as 1000:2000", "s") for text in texts]
-
-
-def read_wavelengths(texts: Sequence[str], name: str) -> list[tuple[float, float]]:
-    """Read ranges of wavelengths such as 322:368."""
-    return [_pair(text, name, "two wavelengths in nm, such as 322:368", "nm") for text in texts]
+def read_ranges(texts: Sequence[str], name: str, *, expected: str, unit: str) -> list[tuple[float, float]]:
+    """Read ranges, such as 322:368."""
+    return [_pair(text, name, expected, unit) for text in texts]
 
 
 def read_declinations(text: str, name: str) -> tuple[float, float] | str:

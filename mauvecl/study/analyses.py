@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, Self
 
@@ -11,7 +12,7 @@ from mauvecl.host.stars.library import ALIASES
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help, Range, Slider, Unit, Widget
 from mauvecl.schema.physical import DetectorTemperature, Magnitude, Positive, Wavelength
-from mauvecl.schema.section import Section, read_wavelengths, read_words
+from mauvecl.schema.section import Section, read_ranges, read_words
 from mauvecl.study.star import Star
 
 if TYPE_CHECKING:
@@ -330,7 +331,11 @@ class MeasureQuestion(Section):
     skipped_nm: Annotated[
         tuple[tuple[Wavelength, Wavelength], ...],
         Help("Wavelengths that fits leave out, from:to", "as in 322:368"),
-        Flag("--skip", kind=list[str], read=read_wavelengths),
+        Flag(
+            "--skip",
+            kind=list[str],
+            read=partial(read_ranges, expected="two wavelengths in nm, such as 322:368", unit="nm"),
+        ),
         Widget(
             label="Leave out wavelengths",
             hint="Ranges in nm that fits do not use, such as 322:368, or 200:250, 322:368.",

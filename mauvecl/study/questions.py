@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 from mauvecl.schema.errors import InputError, shown
 from mauvecl.schema.fields import Flag, Help, Quantity, Range, Slider, Unit, Widget, first
 from mauvecl.schema.physical import Positive, Probability, Wavelength
-from mauvecl.schema.section import Section, fields_of, read_axes, read_axis, read_frames
+from mauvecl.schema.section import Section, fields_of, read_axis, read_frames
 from mauvecl.study.observation import Observation, SkyLight
 from mauvecl.study.star import Flare, Star
 
@@ -265,7 +265,7 @@ class Sweep(Section):
             "Values of a quantity",
             "as in exposure=5,50,600 or magnitude:4:10:7; several give every combination",
         ),
-        Flag("--sweep", kind=list[str], read=read_axes),
+        Flag("--sweep", kind=list[str], read=lambda texts, name: [read_axis(text, name) for text in texts]),
     ] = ()
 
     @model_validator(mode="after")
