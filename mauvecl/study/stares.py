@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Self, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,55 +37,38 @@ Float = NDArray[np.float64]
 NEGLIGIBLE_CUT_SD = 5.0
 
 
-@dataclass(frozen=True)
-class StarePrior:
-    """A process of exposures as an unknown of a stare.
+def _stare_prior(name: str, prior: Prior, instrument: Instrument) -> tuple[Course, Changing, float, float]:
+    """Return the course of a process of exposures in a stare, what it changes, and its standard deviation and mean.
 
-    The stare's quiescent level is measured in the stare itself, so the mean of the prior is a known factor or shift.
+    The stare's quiescent level is measured in the stare itself, so the mean is a known factor on light or sky, or shift
+    of the temperature in deg C; the standard deviation is relative to it, or in deg C. Raises InputError unless the
+    prior is normal and cut far from its mean.
     """
-
-    course: Course
-    changes: Changing
-    sd: float  # relative to the mean, or deg C
-    mean: float  # known factor on light or sky, or shift of the temperature in deg C
-
-    @classmethod
-    def of(cls, name: str, prior: Prior, instrument: Instrument) -> Self:
-        """Convert the prior of a process. Raises InputError unless it is normal and cut far from its mean."""
-        if not isinstance(prior, Normal) or not prior.is_wide(NEGLIGIBLE_CUT_SD):
-            raise InputError(
-                f"processes.{name} is drawn from a normal distribution in a stare",
-                f"a normal prior whose cuts are {NEGLIGIBLE_CUT_SD:g} sd or more from its mean, or jitters, offsets, "
-                "drifts or cycles in [stare]",
-                key=f"processes.{name}",
-            )
-        process = PROCESSES[name]
-        course: Course = "jitters" if process.when == "frame" else "offsets"
-        if process.of == "dark":
-            return cls(course, "temperature", prior.sd, prior.mean - instrument.temperature_c)
-        at = {"light_loss": instrument.light_loss, "pointing_loss": instrument.pointing_loss}
-        # The factors on light and sky are linear in their values.
-        mean, upper = (1.0 + float(process.change(at, np.array(x))) for x in (prior.mean, prior.mean + prior.sd))
-        return cls(course, process.of, abs(upper - mean) / mean, mean)
-
-    def applied(self, stare: Stare) -> Stare:
-        """Return the stare with the mean of the prior."""
-        if self.changes == "temperature":
-            return replace(stare, temperature_c=stare.temperature_c + self.mean)
-        return replace(stare, **{self.changes: getattr(stare, self.changes) * self.mean})
+    if not isinstance(prior, Normal) or not prior.is_wide(NEGLIGIBLE_CUT_SD):
+        raise InputError(
+            f"processes.{name} is drawn from a normal distribution in a stare",
+            f"a normal prior whose cuts are {NEGLIGIBLE_CUT_SD:g} sd or more from its mean, or jitters, offsets, "
+            "drifts or cycles in [stare]",
+            key=f"processes.{name}",
+        )
+    process = PROCESSES[name]
+    course: Course = "jitters" if process.when == "frame" else "offsets"
+    if process.of == "dark":
+        return course, "temperature", prior.sd, prior.mean - instrument.temperature_c
+    at = {"light_loss": instrument.light_loss, "pointing_loss": instrument.pointing_loss}
+    # The factors on light and sky are linear in their values.
+    mean, upper = (1.0 + float(process.change(at, np.array(x))) for x in (prior.mean, prior.mean + prior.sd))
+    return course, process.of, abs(upper - mean) / mean, mean
 
 
 def stare_of(study: Study, instrument: Instrument) -> Stare:
     """Return the stare of a study. Raises InputError if the stare cannot draw one of the study's processes."""
     q = study.stare
-    priors = [
-        StarePrior.of(name, getattr(study.processes, name), instrument) for name, _ in study.processes.modulations
-    ]
+    priors = [_stare_prior(name, getattr(study.processes, name), instrument) for name, _ in study.processes.modulations]
     spreads: dict[Course, dict[Changing, float]] = {how: dict(getattr(q, how)) for how in COURSES}
-    for prior in priors:
+    for course, changed, sd, _ in priors:
         # Independent normal amplitudes of one change add up to one.
-        given = spreads[prior.course]
-        given[prior.changes] = math.hypot(given.get(prior.changes, 0.0), prior.sd)
+        spreads[course][changed] = math.hypot(spreads[course].get(changed, 0.0), sd)
     spreads = {how: {of: given[of] for of in CHANGING if of in given} for how, given in spreads.items()}
     if study.nuisances.usual:
         spreads = {how: documented | spreads[how] for how, documented in default_spreads().items()}
@@ -103,8 +86,9 @@ def stare_of(study: Study, instrument: Instrument) -> Stare:
             thermal=q.thermal,
             **changes,
         )
-    for prior in priors:
-        stare = prior.applied(stare)
+    for _, changed, _, mean in priors:
+        known: dict[str, Any] = {"temperature_c": stare.temperature_c + mean}
+        stare = replace(stare, **(known if changed == "temperature" else {changed: getattr(stare, changed) * mean}))
     return stare
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from mauvecl.answers.closed_forms import spoken, unknown_cost
 from mauvecl.answers.detect import UNKNOWN_COLUMNS as COLUMNS
 from mauvecl.answers.detect import power
+from mauvecl.answers.signal import simulate
 from mauvecl.charts.chart import (
     SATURATED,
     WAVELENGTH,
@@ -177,13 +178,6 @@ def telescope(closed: ClosedForms, answers: Answers) -> ChartData:
     return ChartData(text, {"star": (nm, quiet), "flare": (nm, flaring)})
 
 
-def observed_table(closed: ClosedForms, answers: Answers) -> Table:
-    """Return one observation with the flare and its components."""
-    from mauvecl.answers.signal import simulate
-
-    return simulate(closed.study, flaring=True).observations[1][2]
-
-
 SPECTRUM = Tab(
     name="spectrum",
     title="Spectrum",
@@ -191,7 +185,8 @@ SPECTRUM = Tab(
     pictures=(recorded, telescope),
     questions=("simulate",),
     files={"observation": None},
-    own_table=observed_table,
+    # One observation with the flare and its components.
+    own_table=lambda closed, answers: simulate(closed.study, flaring=True).observations[1][2],
 )
 
 

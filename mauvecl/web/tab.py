@@ -235,12 +235,6 @@ class Tab:
         headings, cells = without_empty(*shown.texts(FIXED))
         return [headings, *cells]
 
-    def study(self, name: str, closed: ClosedForms, answers: Answers) -> Study:
-        """Return the study that reproduces one of `files`: by default that of the answer it needs."""
-        needed = self.files[name]
-        study: Study = closed.study if needed is None else answers[needed].study
-        return study
-
 
 #: Keys that are stated even at their default, so that readers see what was assumed.
 STATED = ("star", "flare.amplitudes", "observation.exposure_s", "observation.instrument", "sky", "run.fap",
@@ -398,7 +392,8 @@ def as_file(tab: Tab, name: str, ending: str, closed: ClosedForms, answers: Answ
     if not tab.offers(name, answers):
         raise InputError(f"no {name} is computed yet: start a simulation first", key="name")
     if ending == "study":
-        return study_file(tab.study(name, closed, answers), f"mauvecl-{name}")
+        needed = tab.files[name]
+        return study_file(closed.study if needed is None else answers[needed].study, f"mauvecl-{name}")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"mauvecl-{name}.{ending}"
         write_table(tab.table(name, closed, answers), path)
