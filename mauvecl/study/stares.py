@@ -87,8 +87,9 @@ def stare_of(study: Study, instrument: Instrument) -> Stare:
             **changes,
         )
     for _, changed, _, mean in priors:
-        known: dict[str, Any] = {"temperature_c": stare.temperature_c + mean}
-        stare = replace(stare, **(known if changed == "temperature" else {changed: getattr(stare, changed) * mean}))
+        value = stare.temperature_c + mean if changed == "temperature" else getattr(stare, changed) * mean
+        known: dict[str, Any] = {"temperature_c" if changed == "temperature" else changed: value}
+        stare = replace(stare, **known)
     return stare
 
 
