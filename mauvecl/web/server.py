@@ -314,26 +314,6 @@ KINDS = {
     "html": "text/html; charset=utf-8",
     "fits": "application/fits",
 }
-#: Citation, as in the project's file CITATION.cff, which has neither the paper's volume and pages nor an address of
-#: the project.
-BIBTEX = """@software{{mauvecl,
-  author = {{{{The mauvecl developers}}}},
-  title = {{mauvecl: would the Mauve satellite see this stellar flare?}},
-  version = {{{version}}},
-  year = {{2026}}
-}}
-
-@article{{mauvesim,
-  author = {{Saba, A. and Favata, F. and Savini, G. and Tinetti, G. and Bradley, L. and Stotesbury, I. and
-            Tessenyi, M.}},
-  title = {{MauveSim: the instrument simulator software for the Blue Skies Space Mauve satellite}},
-  journal = {{RAS Techniques and Instruments}},
-  year = {{2025}},
-  eprint = {{2502.01389}},
-  archivePrefix = {{arXiv}},
-  url = {{https://arxiv.org/abs/2502.01389}}
-}}
-"""
 _FOLDER = Path(__file__).parent / "assets"
 
 
@@ -360,7 +340,7 @@ def front() -> bytes:
     text = template.render(
         fields=fields, uploads=UPLOADS, examples=EXAMPLES, names=[star.name for star in well_known_stars()],
         mapped=MAPPED, time_units=TIME_UNITS, library=library_names(), tabs=TABS, groups=GROUPS, version=VERSION,
-        bibtex=BIBTEX.format(version=VERSION), titles=TITLES, digest=_digest(),
+        titles=TITLES, digest=_digest(),
         words=json.dumps(_words()).replace("<", "\\u003c"),
     )  # fmt: skip
     return str(text).encode()
