@@ -29,6 +29,8 @@ from mauvecl.schema.physical import (
     DetectorTemperature,
     Exposure,
     Probability,
+    Realisations,
+    Seed,
     SkyBrightness,
     Temperature,
 )
@@ -191,10 +193,9 @@ class SkyLight(Section):
 class Run(Section):
     """Number of realisations, seed, statistics and false-alarm probability."""
 
-    realisations: Annotated[int, Range(1), Help("Noise realisations"), Flag("--realisations", "-n")] = 1_000_000
+    realisations: Annotated[Realisations, Help("Noise realisations"), Flag("--realisations", "-n")] = 1_000_000
     seed: Annotated[
-        int,
-        Range(0, 2**64 - 1),
+        Seed,
         Help("Seed"),
         Flag("--seed"),
         Widget(hint="The same seed gives the same noise, to the bit.", place=3),
