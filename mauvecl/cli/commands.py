@@ -66,10 +66,7 @@ class Command:
 
         verb, entries = self.verb, keys_of(self.verb.keys)
         keywords = keywords_of(entries)
-        flags = {
-            entry[2].parameter: study_option(*entry, keywords[entry[2].parameter], verb.defaults or {})
-            for entry in entries
-        }
+        flags = {entry[2].parameter: study_option(*entry, verb.defaults or {}) for entry in entries}
         kinds = get_type_hints(self.run, localns={"Session": Any}, include_extras=True)
         _, *own = inspect.signature(self.run).parameters.values()
         # Annotations and defaults by parameter.

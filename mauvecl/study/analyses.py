@@ -210,19 +210,13 @@ class ChangeQuestion(Section):
         Days,
         Help("Shortest period"),
         Flag("--shortest-period"),
-        Widget(
-            hint="The first period of the map.",
-            slider=Slider(0.1, 10, 1.1, log=True),
-        ),
+        Widget(hint="The first period of the map.", slider=Slider(0.1, 10, 1.1, log=True)),
     ] = 1.0
     longest_d: Annotated[
         Days,
         Help("Longest period"),
         Flag("--longest-period"),
-        Widget(
-            hint="The last period of the map.",
-            slider=Slider(2, 200, 1.1, log=True),
-        ),
+        Widget(hint="The last period of the map.", slider=Slider(2, 200, 1.1, log=True)),
     ] = 30.0
     steps: Annotated[int, Range(2, 50), Help("Periods and amplitudes of the map, each")] = 6
     period_fap: Annotated[

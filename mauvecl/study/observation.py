@@ -53,11 +53,7 @@ class Observation(Section):
         Exposure,
         Help("Exposure time", "rounded up to whole frames of 5 s"),
         Flag("--exposure", "-t"),
-        Widget(
-            label="Exposure",
-            hint="Time on the star; whole frames of 5 s are added up.",
-            slider=Slider(5, 3600, 5),
-        ),
+        Widget(label="Exposure", hint="Time on the star; whole frames of 5 s are added up.", slider=Slider(5, 3600, 5)),
         Quantity("exposure", "length of the exposure", "exposure (s)"),
     ] = 50.0
     instrument: Annotated[

@@ -56,11 +56,7 @@ class OrbitQuestion(Section):
         str,
         Help("First day or time, UTC"),
         Flag("--start"),
-        Widget(
-            label="First day",
-            hint="The first day of the time that is looked at, UTC.",
-            kind="day",
-        ),
+        Widget(label="First day", hint="The first day of the time that is looked at, UTC.", kind="day"),
     ] = "2027-01-01"
     days: Annotated[
         float,

@@ -213,10 +213,7 @@ class SearchChoice(Section):
         Per,
         Help("Star-time of frames for the false alarms"),
         Flag("--alarms-per"),
-        Widget(
-            label="False alarms per",
-            hint="Observing time of one star to which the number of false alarms refers.",
-        ),
+        Widget(label="False alarms per", hint="Observing time of one star to which the number of false alarms refers."),
     ] = "month"
     null: Annotated[
         Literal["sampled", "counted"],

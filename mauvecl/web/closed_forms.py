@@ -289,24 +289,12 @@ TITLES = {REALISTIC: "realistic: with the usual unknowns", IDEAL: "ideal: everyt
 THROUGHPUT = 0.3
 
 
-@dataclass(frozen=True, eq=False)
-class Chance:
+class Chance(NamedTuple):
     """Chance of detection under one assumption of what is unknown."""
 
     unknown: str  # choice of the field
     value: float  # NaN if there is none
     how: str  # whether it is a closed form or simulated, and its interval; or the reason why there is none
-
-    @property
-    def shown(self) -> dict[str, Any]:
-        """The number as the card shows it."""
-        return {
-            "unknown": self.unknown,
-            "title": TITLES[self.unknown],
-            "shown": chance_text(self.value),
-            "value": None if self.value != self.value else self.value,
-            "interval": self.how,
-        }
 
 
 def chances(closed: ClosedForms, answers: Answers) -> list[Chance]:

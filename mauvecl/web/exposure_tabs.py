@@ -29,7 +29,7 @@ from mauvecl.charts.chart import (
 from mauvecl.charts.detection import roc_columns
 from mauvecl.charts.limits import BUDGET, budget_series
 from mauvecl.detection.requests import statistic_label
-from mauvecl.noise.unknowns import NUISANCES, Nuisance
+from mauvecl.noise.unknowns import NUISANCES
 from mauvecl.schema.columns import View, chance_text, stacked, with_error
 from mauvecl.study.cases import star_column, star_label
 from mauvecl.study.observation import NuisanceChoice
@@ -324,7 +324,9 @@ def costs(closed: ClosedForms) -> tuple[float, list[Row]]:
     """Return the flare's matched S/N with everything known, and with unknowns alone and together."""
     # Without a sky its brightness is no unknown. Those without a default prior are projected out.
     there = {name: row for name, row in NUISANCES.items() if np.any(row.spectrum(closed.quiet))}
-    alone = [NuisanceChoice.model_validate({"usual": False, name: _spread(row)}) for name, row in there.items()]
+    sd = {name: np.inf if row.prior is None else row.prior.sd for name, row in there.items()}
+    spreads = {name: "free" if np.isinf(value) else value for name, value in sd.items()}
+    alone = [NuisanceChoice.model_validate({"usual": False, name: spread}) for name, spread in spreads.items()]
     chosen = {spoken(choice).removeprefix("the "): choice for choice in alone}
     chosen["all the usual together"] = NuisanceChoice()
     if closed.study.nuisances.own:
@@ -335,10 +337,6 @@ def costs(closed: ClosedForms) -> tuple[float, list[Row]]:
         known_snr = cost.known or known_snr
         rows.append((name, cost.plain, cost.marginal))
     return known_snr, rows
-
-
-def _spread(row: Nuisance) -> float | str:
-    return "free" if row.prior is None or np.isinf(row.prior.sd) else row.prior.sd
 
 
 def _bars(canvas: Canvas, source: ColumnDataSource) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any, Literal
 
+import numpy as np
 from bokeh.models import (
     BasicTickFormatter,
     BoxZoomTool,
@@ -38,6 +39,7 @@ from mauvecl.charts.chart import (
     Strips,
     Targets,
 )
+from mauvecl.host.arrays import true_runs
 
 #: Wavelengths that are shown, nm.
 SHOWN_NM = (195.0, 705.0)
@@ -264,10 +266,6 @@ class Canvas:
 
 def strips(wavelength_nm: Any, flags: Any) -> tuple[Any, Any]:
     """Return the ends of runs of flagged pixels, half a pixel beyond each, as columns of `Strips`."""
-    import numpy as np
-
-    from mauvecl.host.arrays import true_runs
-
     first, end = true_runs(flags).T
     half = 0.5 * np.gradient(wavelength_nm)
     return (wavelength_nm - half)[first], (wavelength_nm + half)[end - 1]

@@ -138,7 +138,16 @@ def _with_chance(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, A
     )
     return {
         "headline": _headline(tab, answers) or _estimate(closed, both),
-        "numbers": [chance.shown for chance in both],
+        "numbers": [
+            {
+                "unknown": unknown,
+                "title": TITLES[unknown],
+                "shown": chance_text(value),
+                "value": None if value != value else value,
+                "interval": how,
+            }
+            for unknown, value, how in both
+        ],
         "chosen": q.unknown,
         "shown": chance_text(chosen.value),
         "interval": f"{TITLES[q.unknown]}; {chosen.how}",
