@@ -28,7 +28,11 @@ def study_argument(flags: Collection[str]) -> Any:
     """Return the annotation of the argument that is a study, or in its place what a flag takes."""
     other = next((f", or {what}" for flag, what in PLACES.items() if flag in flags), "")
     described = f"Study (TOML), the ECSV table of an answer{other}; flags override it."
-    argument = typer.Argument(help=described, show_default=False, autocompletion=complete_study)
+    argument = typer.Argument(
+        help=described,
+        show_default=False,
+        autocompletion=lambda incomplete: complete_star(incomplete) if incomplete else _files(incomplete),
+    )
     return Annotated[Path | None, argument]
 
 
@@ -245,11 +249,6 @@ def complete_instrument(incomplete: str) -> list[str]:
     from mauvecl.host.instrument import shipped_names
 
     return [*_continued(incomplete, shipped_names()), *_files(incomplete, (".toml",))]
-
-
-def complete_study(incomplete: str) -> list[str]:
-    """Return files, and names of stars if something is typed."""
-    return complete_star(incomplete) if incomplete else _files(incomplete)
 
 
 #: Functions that complete values, by the keys of flags. Shells complete files by themselves where nothing else is
