@@ -426,10 +426,14 @@ class Case:
     @cached_property
     def stare_expectation(self) -> StareExpectation:
         """Expectation of the stare at the star, with its flares."""
-        from mauvecl.study.stares import expect_stare
+        from mauvecl.flares.frames import StareExpectation
+        from mauvecl.flares.stare import check_contributions, coefficients, temperatures_of
 
-        frame = self.one_frame
-        return expect_stare(self.stare, self.events, frame.quiet, frame.flare_electrons)
+        stare, events, frame = self.stare, self.events, self.one_frame
+        check_contributions(events, stare.start_s, stare.frame_s)
+        kelvin = temperatures_of(events)
+        amplitudes = coefficients(events, stare.start_s, stare.frame_s, kelvin)
+        return StareExpectation(frame.quiet, stare, frame.flare_electrons(kelvin), amplitudes)
 
     @cached_property
     def events(self) -> list[Event]:

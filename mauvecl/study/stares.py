@@ -1,4 +1,4 @@
-"""Expectation of a study's stare at a star: frames, unknown changes, and flares with their sizes."""
+"""Stare of a study at a star: frames, unknown changes, and flares with their sizes."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.flares.energies import EnergyScale, Kind, amplitude_of, amplitude_of_peak
-from mauvecl.flares.frames import StareExpectation
 from mauvecl.flares.settings import Cooling
-from mauvecl.flares.stare import Event, Stare, check_contributions, coefficients, temperatures_of
+from mauvecl.flares.stare import Event, Stare, check_contributions, temperatures_of
 from mauvecl.noise.disturbances import Normal, Prior
 from mauvecl.noise.unknowns import CHANGING, COURSES, PROCESSES, STARE_PROCESSES, Changing, Course, default_spreads
 from mauvecl.schema.errors import InputError, Message
@@ -23,7 +22,6 @@ from mauvecl.study.stare import EventChoice, StareQuestion
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.host.stars.source import Source
     from mauvecl.study.plan import OrbitQuestion
@@ -110,20 +108,6 @@ def _along_orbit(study: Study, frame_s: float, changes: dict[str, Any]) -> Stare
             f"stare.along_orbit needs a single target in orbit.targets, but has {len(targets)}", key="stare.along_orbit"
         )
     return stare_along(o.orbit(), targets[0], o.start, q.duration_s, frame_s=frame_s, limits=o.limits, **changes).stare
-
-
-def expect_stare(
-    stare: Stare, events: Sequence[Event], quiet: Expectation, flare_electrons: Callable[[Float], Float]
-) -> StareExpectation:
-    """Compute the expectation of a stare with its flares, from one quiet frame.
-
-    `flare_electrons` returns the electrons that flares of unit amplitude and some temperatures, K, add to a frame,
-    shape (n_temperature, n_pixel).
-    """
-    check_contributions(events, stare.start_s, stare.frame_s)
-    kelvin = temperatures_of(events)
-    amplitudes = coefficients(events, stare.start_s, stare.frame_s, kelvin)
-    return StareExpectation(quiet, stare, flare_electrons(kelvin), amplitudes)
 
 
 def unused_lines(exposure_s: float, stare: Stare, events: Sequence[Event]) -> list[str]:
