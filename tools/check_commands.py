@@ -176,7 +176,7 @@ def main() -> None:
                 different = differences(TABS[name], state, closed, folder)
                 wrong += bool(different)
                 if different:
-                    print(f"{name} {state.link}\n  {'; '.join(different)}")
+                    print(f"{name} ?{urlencode(state.entered)}\n  {'; '.join(different)}")
         seconds = time.perf_counter() - started
         print(f"{name}: {given.count - wrong} of {given.count} questions agree, {seconds:.0f} s", flush=True)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Collection, Iterable, Mapping
 from typing import Any
-from urllib.parse import parse_qsl, urlencode
+from urllib.parse import parse_qsl
 
 from mauvecl.answers.answer import IF_KNOWN
 from mauvecl.answers.closed_forms import BOTH_CHANCES
@@ -265,13 +265,6 @@ class State:
         return Question(
             values, {name: self.uploads[name] for name in UPLOADS if name in names and self._holds_file(name)}
         )
-
-    # Links
-
-    @property
-    def link(self) -> str:
-        """Return all entries as the query of a URL."""
-        return "?" + urlencode({name: text for name, text in self.entered.items() if text or ENTRIES[name].first})
 
     def follow(self, link: str) -> None:
         """Enter the values of a link, and defaults for all others."""
