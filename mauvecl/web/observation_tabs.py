@@ -296,7 +296,7 @@ def read_observations(question: Question) -> dict[str, Any]:
         if row.spectrum is None:
             stars.append(row.source())
             continue
-        with reported_for("observations", str(row.spectrum)):
+        with reported_for("observations"):
             star = read_limited(files[str(row.spectrum)].content, Source)
         stars.append(star if row.magnitude is None else star.at_magnitude(row.magnitude, row.band))
     return {"frames": tuple(frames), "stars": tuple(stars)}

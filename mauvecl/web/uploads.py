@@ -348,13 +348,13 @@ def read_frames_of(
     if mapping is not None:
         how = mapping.name if mapping.name != file.name else f"mapping-{mapping.name}"
         files[how] = mapping.content
-    with reported_for(key, file.name):
+    with reported_for(key):
         return read_frames_limited(files, how, quality_bits)
 
 
 @contextmanager
-def reported_for(key: str, name: str) -> Iterator[None]:
-    """Raise the errors of a reader as those of a field, with the name of the file."""
+def reported_for(key: str) -> Iterator[None]:
+    """Raise the errors of a reader as those of a field."""
     try:
         yield
     except InputError as error:
