@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 import numpy as np
 
 from mauvecl.noise.drawing import Cumulants, stack_is_exact
-from mauvecl.noise.unknowns import COURSES, PROCESSES, STARE_PROCESSES, Processes
+from mauvecl.noise.unknowns import COURSES, PROCESSES, STARE_PROCESSES, Processes, default_processes
 from mauvecl.schema.columns import Column, percent, short
 from mauvecl.schema.errors import Message, of_kind
 from mauvecl.study.questions import QUANTITIES, Sweep
@@ -292,11 +292,12 @@ class Case:
 
     @cached_property
     def processes(self) -> Processes:
-        """Noise processes to draw."""
-        processes = self.study.processes
-        if self.study.nuisances.usual:
-            return self.study.nuisances.processes(processes, self.instrument.temperature_c)
-        return processes
+        """Noise processes to draw: those given and, with the usual unknowns, those of the documented set."""
+        named = self.study.processes
+        added = default_processes(self.instrument.temperature_c) if self.study.nuisances.usual else {}
+        update = {name: prior for name, prior in added.items() if getattr(named, name) is None}
+        every: Processes = named.model_copy(update=update)
+        return every
 
     @property
     def draw_options(self) -> dict[str, Any]:

@@ -18,8 +18,6 @@ from mauvecl.noise.unknowns import (
     INSTRUMENT_VALUES,
     NUISANCES,
     Comparison,
-    Processes,
-    default_processes,
     values_of,
 )
 from mauvecl.schema.errors import InputError, shortened
@@ -366,15 +364,6 @@ class NuisanceChoice(create_model("_Amplitudes", __base__=Section, **_keys)):  #
     def spreads(self) -> dict[str, float | Literal["free"]]:
         """Return the given standard deviations of amplitudes with built-in spectra."""
         return {name: spread for name in NUISANCES if (spread := getattr(self, name)) is not None}
-
-    def processes(self, named: Processes, temperature_c: float) -> Processes:
-        """Return the processes to draw: those given and, with `usual`, those of the documented set."""
-        if not self.usual:
-            return named
-        added = default_processes(temperature_c)
-        update = {name: prior for name, prior in added.items() if getattr(named, name) is None}
-        every: Processes = named.model_copy(update=update)
-        return every
 
 
 #: Choice of unknowns with which everything but the noise is known.
