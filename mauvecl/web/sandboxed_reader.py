@@ -20,7 +20,6 @@ import numpy as np
 from mauvecl.host.spectra.conversion import ReadSpectrum
 from mauvecl.host.stars.flare_spectra import ObservedFlare
 from mauvecl.host.stars.source import Source
-from mauvecl.observations.frames import Frames
 from mauvecl.schema.errors import InputError
 
 #: Memory of the reading process, MiB: Python with astropy and synphot maps some 400, a spectrum of 4 MiB as text 300.
@@ -34,7 +33,7 @@ TOGETHER = 2
 #: Exit codes of the reading process.
 _REFUSED, _NO_ROOM = 2, 3
 Spectrum = TypeVar("Spectrum", Source, ObservedFlare, ReadSpectrum)
-#: Functions of a path, and of options by name, that read each kind of spectrum, and those that read frames.
+#: Functions of a path, and of options by name, that read each kind of spectrum, frames, and the names of their columns.
 SPECTRA: Mapping[type, str] = {
     Source: "mauvecl.host.stars.source:Source.read",
     ObservedFlare: "mauvecl.host.stars.flare_spectra:ObservedFlare.read",
@@ -42,8 +41,8 @@ SPECTRA: Mapping[type, str] = {
 }
 FRAMES, COLUMNS = (f"mauvecl.observations.frame_files:{name}" for name in ("read_frames", "ColumnNames.read"))
 #: Expected content of an upload if it is too large, and in general: a spectrum, or frames.
-A_SPECTRUM = "a spectrum of some thousand points", "a spectrum as text, ECSV, VOTable or FITS"
-SOME_FRAMES = "fewer frames", "frames as FITS, ECSV or CSV"
+EXPECTED_SPECTRUM = "a spectrum of some thousand points", "a spectrum as text, ECSV, VOTable or FITS"
+EXPECTED_FRAMES = "fewer frames", "frames as FITS, ECSV or CSV"
 _turns = threading.BoundedSemaphore(TOGETHER)
 
 
@@ -53,27 +52,14 @@ def read_limited(content: bytes, kind: type[Spectrum], options: Mapping[str, Any
     Blocks for about a second, most of it for the start of Python: call it from a thread. Raises InputError if it holds
     no usable spectrum, or reading it takes more memory or time than allowed.
     """
-    return kind(**_read(SPECTRA[kind], {"upload": content}, options or {}))
+    return kind(**read_by(SPECTRA[kind], {"upload": content}, options or {}))
 
 
-def read_frames_limited(
-    files: Mapping[str, bytes], mapping: str | None = None, quality_bits: str | None = None
-) -> Frames:
-    """Read frames like `read_frames`, in a process with limited memory and time.
+def read_by(reader: str, files: Mapping[str, bytes], options: Mapping[str, Any]) -> dict[str, Any]:
+    """Read the first of some files, by their names, in a process with limited memory and time.
 
-    `files` holds contents by name: the file of frames first, then the mapping and files that they need.
+    Returns the attributes of the object that the reader returns; a reader of frames may need further files.
     """
-    return Frames(**_read(FRAMES, files, {"mapping": mapping, "quality_bits": quality_bits}))
-
-
-def read_columns_limited(name: str, content: bytes) -> tuple[str, ...]:
-    """Read the names of the columns of a file of frames, in a process with limited memory and time."""
-    names: tuple[str, ...] = _read(COLUMNS, {name: content}, {})["names"]
-    return names
-
-
-def _read(reader: str, files: Mapping[str, bytes], options: Mapping[str, Any]) -> dict[str, Any]:
-    """Run a reading process, and return the attributes of the object that it reads."""
     if not _turns.acquire(timeout=SECONDS):
         raise InputError("too many uploads are read at the same time: try again in a minute", key="upload")
     try:
@@ -100,7 +86,7 @@ def _read_apart(reader: str, files: Mapping[str, bytes], options: Mapping[str, A
     words = json.dumps({"reader": reader, "file": next(iter(files)), "options": dict(options)})
     # A fresh interpreter, as spawn makes one: OpenCL does not survive a fork.
     command = [sys.executable, "-m", "mauvecl.web.sandboxed_reader", str(MEMORY_MIB), str(SECONDS), words]
-    smaller, other = SOME_FRAMES if reader in (FRAMES, COLUMNS) else A_SPECTRUM
+    smaller, other = EXPECTED_FRAMES if reader in (FRAMES, COLUMNS) else EXPECTED_SPECTRUM
     with tempfile.TemporaryDirectory(prefix="mauvecl-upload-") as folder:
         for name, content in files.items():
             (Path(folder) / name).write_bytes(content)

@@ -34,7 +34,7 @@ from mauvecl.schema.errors import InputError, printable, reworded, shortened
 from mauvecl.schema.section import input_error
 from mauvecl.study.analyses import PATHS, CalibrateQuestion, CalibrationObservation
 from mauvecl.web.fields import FIELDS, UPLOADED, UPLOADED_FILE, UPLOADED_UNKNOWN
-from mauvecl.web.sandboxed_reader import Spectrum, read_frames_limited, read_limited
+from mauvecl.web.sandboxed_reader import FRAMES, Spectrum, read_by, read_limited
 
 #: Name of a table of neighbours in its folder.
 NEIGHBOURS_FILE = "neighbours.csv"
@@ -349,7 +349,7 @@ def read_frames_of(
         how = mapping.name if mapping.name != file.name else f"mapping-{mapping.name}"
         files[how] = mapping.content
     with reported_for(key):
-        return read_frames_limited(files, how, quality_bits)
+        return Frames(**read_by(FRAMES, files, {"mapping": how, "quality_bits": quality_bits}))
 
 
 @contextmanager

@@ -32,7 +32,7 @@ from mauvecl.schema.errors import InputError, shortened
 from mauvecl.web.closed_forms import ClosedForms, other_payloads, solved
 from mauvecl.web.fields import FIELDS, field_of, remedies, sentence
 from mauvecl.web.page import TABS, State, asking, card, known, reads_of
-from mauvecl.web.sandboxed_reader import read_columns_limited
+from mauvecl.web.sandboxed_reader import COLUMNS, read_by
 from mauvecl.web.tab import DRAWING, SIMULATIONS, as_file, asked_study, commands_and_programs, study_file, verbs_of
 from mauvecl.web.uploads import RESULTS, UPLOADS
 from mauvecl.web.uploads import UPLOAD_SHELF as UPLOADED
@@ -513,7 +513,8 @@ class Visitor(WebSocketHandler):
         """Send the names of the columns of the visitor's frames; none if they are no table."""
         file, names = UPLOADED.get(self, "upload", "frames"), ()
         if file is not None:
-            names = await asyncio.wrap_future(reading(partial(read_columns_limited, file.name, file.content)))
+            work = reading(partial(read_by, COLUMNS, {file.name: file.content}, {}))
+            names = (await asyncio.wrap_future(work))["names"]
         self.send(n=asked["n"], columns=names)
 
     async def _ask_file(self, asked: dict[str, Any]) -> None:
