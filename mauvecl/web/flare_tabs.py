@@ -458,7 +458,7 @@ MEASUREMENT = Tab(
     files=dict.fromkeys(("measure", "fits", "temperatures", "joint"), "measure"),
     own_view=measured,
     # Measurements along a stare are made on request.
-    some=True,
+    optional=True,
 )
 
 

@@ -236,7 +236,7 @@ ANALYSE = Tab(
     given=read_frames,
     words=name_of("frames", "no file of frames yet"),
     # Some tables exist only for spectra.
-    some=True,
+    optional=True,
 )
 
 
@@ -461,13 +461,13 @@ def expected(closed: ClosedForms, answer: PlanAnswer) -> ChartData:
     return ChartData(f"Expected to be recovered: {'; '.join(parts)}.", {"found": lines})
 
 
-def planned(question: Question) -> str:
+def plan_words(question: Question) -> str:
     """Return the targets, hours and days."""
     return f"{target_words(question)}, {question.hours:g} h each at most"
 
 
 def columns_of_plan(question: Question) -> list[list[str]]:
-    """Return the table of targets; before a plan, which columns it will have."""
+    """Return the targets, and the columns that a plan will have."""
     names = [target["name"] for target in question.targets] or ["each target"]
     headings = [column.heading for column in COLUMNS if column.heading]
     return [headings, *([name, *("·" for _ in headings[1:])] for name in names)]
@@ -482,7 +482,7 @@ PLAN = Tab(
     never=("false_alarms", "as_observed"),
     pictures=(recovered, expected),
     files=dict.fromkeys(("plan", "stars", "energies", "assumptions"), "plan"),
-    words=planned,
+    words=plan_words,
     rows_before=columns_of_plan,
 )
 

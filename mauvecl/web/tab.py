@@ -186,7 +186,7 @@ class Tab:
     #: Tables that can be downloaded, with the simulation that each needs, or none.
     files: Mapping[str, str | None] = field(default_factory=dict)
     own_table: Callable[[ClosedForms, Answers], Table] | None = None  # table of its only file, if no answer has it
-    some: bool = False  # whether some answers lack a table of `files`
+    optional: bool = False  # whether an answer may lack some of `files`
     #: Documents of answers that can be downloaded, by file name, with the simulation that each needs.
     documents: Mapping[str, str] = field(default_factory=dict)
 
@@ -216,7 +216,7 @@ class Tab:
     def offers(self, name: str, answers: Answers) -> bool:
         """Return whether one of `files` can be downloaded: whether the answer it needs is simulated and has it."""
         needed = self.files[name]
-        return needed is None or (needed in answers and not (self.some and name not in answers[needed].tables))
+        return needed is None or (needed in answers and not (self.optional and name not in answers[needed].tables))
 
     def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
         """Return the table of one of `files`."""
