@@ -184,17 +184,6 @@ def _placed(study_file: Path | None, given: dict[str, Any]) -> Path | None:
     return study_file
 
 
-def add_plain_commands() -> None:
-    """Add the commands of verbs without their own function, which compute and print the answer."""
-
-    def ask(session: Session) -> None:
-        session.answer(session.ask())
-
-    for name, verb in VERBS.items():
-        if name not in COMMANDS:
-            command_of(verb)(ask)
-
-
 StoreArgument = Annotated[Path, typer.Argument(help="Store that `mauvecl realise` wrote.")]
 RowsFlag = Annotated[
     str | None,
@@ -448,3 +437,14 @@ def analyse(session: Session) -> None:
     with session.metered("frames") as meter:
         answer = compute(session.study, progress=meter)
     session.answer(answer)
+
+
+def ask(session: Session) -> None:
+    """Compute the answer, and print it."""
+    session.answer(session.ask())
+
+
+# Verbs without a function of their own.
+for one in VERBS.values():
+    if one.name not in COMMANDS:
+        command_of(one)(ask)
