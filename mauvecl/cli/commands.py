@@ -120,7 +120,7 @@ class Command:
         question_values(study, detects={"fap", "realisations"} <= keywords.keys())
         if self.draws:
             question_time(study, insist=how["insist"])
-        with Session(verb.name, study, notes=messages, **how) as session:
+        with Session(verb.name, study, draws=self.draws, notes=messages, **how) as session:
             self.run(session, **values)
 
     def _options(self) -> dict[str, tuple[Any, Any]]:
@@ -395,18 +395,13 @@ def simulate(
 @command_of(VERBS["plan"])
 def plan(session: Session) -> None:
     """Plan a campaign; a report needs matplotlib for PDF, and a closed form needs no pool."""
-    from mauvecl.answers.plan import plan as compute
     from mauvecl.charts.matplotlib import available
 
     if session.study.plan.report == "pdf" and not available():
         session.study = session.study.with_settings(["plan.report=html"])
         session.say(["The report is HTML: matplotlib is missing, `pip install 'mauvecl[plot]'` brings it."])
-    if session.study.plan.completeness == "closed form":
-        with session.metered("targets") as meter:
-            answer = compute(session.study, progress=meter)
-    else:
-        answer = session.ask()
-    session.answer(answer)
+    session.draws = session.study.plan.completeness != "closed form"
+    session.answer(session.ask())
 
 
 @command_of(VERBS["stare"], draws=False, resumes=True)
@@ -429,22 +424,13 @@ def stare(
     session.answer(answer)
 
 
-@command_of(VERBS["analyse"], draws=False)
-def analyse(session: Session) -> None:
-    """Find the flares in observed frames, with progress in frames."""
-    from mauvecl.answers.analyse import analyse as compute
-
-    with session.metered("frames") as meter:
-        answer = compute(session.study, progress=meter)
-    session.answer(answer)
-
-
 def ask(session: Session) -> None:
     """Compute the answer, and print it."""
     session.answer(session.ask())
 
 
-# Verbs without a function of their own.
+# Verbs without a function of their own; an analysis counts frames, and draws nothing.
+command_of(VERBS["analyse"], draws=False)(ask)
 for one in VERBS.values():
     if one.name not in COMMANDS:
         command_of(one)(ask)

@@ -124,6 +124,7 @@ class Session(Options):
 
     verb: str
     study: Study
+    draws: bool  # whether a pool draws
     notes: Sequence[str] = ()  # what the flags did not state, which is printed with the messages of the answer
     files: list[Path] = field(default_factory=list)
     started: float = field(default_factory=time.perf_counter)
@@ -228,12 +229,15 @@ class Session(Options):
         self.files += [made] if isinstance(made, Path) else made
 
     def ask(self) -> Any:
-        """Return the answer of the session's verb to its study; a pool draws if the verb counts something."""
+        """Return the answer of the session's verb to its study, with the progress of what the verb counts."""
         from mauvecl.answers.verbs import VERBS
 
         verb = VERBS[self.verb]
         if not verb.counts:
             return verb.ask(self.study)
+        if not self.draws:
+            with self.metered(verb.counts) as meter:
+                return verb.ask(self.study, progress=meter)
         with self.pool(unit=verb.counts) as engine:
             return verb.ask(self.study, engine, None if verb.counts == "realisations" else self.meter)
 
