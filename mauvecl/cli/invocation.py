@@ -159,23 +159,6 @@ class Session(Options):
         return folder
 
     @contextmanager
-    def pool(self, *, unit: str = "realisations") -> Iterator[Pool]:
-        """Yield the pool of workers, with progress and a checkpoint; interruptions are reported.
-
-        The pool reports its progress in realisations; the caller reports that in another unit to `meter`.
-        """
-        from mauvecl.runs.pool import Pool
-
-        self.meter = self.metered(unit)
-        with self.checkpoint() as checkpoint, ExitStack() as stack:
-            stack.enter_context(self.meter)
-            workers = stack.enter_context(working(self.device, self.cluster))
-            progress = self.meter if unit == "realisations" else None
-            self._pool = Pool(workers, checkpoint=checkpoint, progress=progress, meanwhile=self._load)
-            self.meter.standing = lambda: self._pool.standing
-            yield self._pool
-
-    @contextmanager
     def checkpoint(self) -> Iterator[Checkpoint]:
         """Keep finished parts of the work in the output folder, and report interruptions."""
         from mauvecl.runs.checkpoint import Checkpoint
@@ -238,8 +221,18 @@ class Session(Options):
         if not self.draws:
             with self.metered(verb.counts) as meter:
                 return verb.ask(self.study, progress=meter)
-        with self.pool(unit=verb.counts) as engine:
-            return verb.ask(self.study, engine, None if verb.counts == "realisations" else self.meter)
+        from mauvecl.runs.pool import Pool
+
+        # The pool reports its own progress in realisations.
+        own = verb.counts == "realisations"
+        with (
+            self.checkpoint() as checkpoint,
+            self.metered(verb.counts) as meter,
+            working(self.device, self.cluster) as workers,
+        ):
+            pool = Pool(workers, checkpoint=checkpoint, progress=meter if own else None, meanwhile=self._load)
+            self._pool, meter.standing = pool, lambda: pool.standing
+            return verb.ask(self.study, pool, None if own else meter)
 
     def answer(self, answer: Answer) -> None:
         """Print an answer and write its files."""
