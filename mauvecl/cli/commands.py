@@ -16,6 +16,7 @@ from mauvecl.answers.verbs import DRAWS, FEWER, VERBS, Verb
 from mauvecl.cli.console import Meter, show, show_view
 from mauvecl.cli.flags import (
     HELP_ALL,
+    PLACES,
     RESUMING,
     WORKERS,
     DeviceFlag,
@@ -25,7 +26,6 @@ from mauvecl.cli.flags import (
     QuietFlag,
     ReplaceFlag,
     SetFlag,
-    holds_study,
     is_star,
     option,
     output_option,
@@ -167,13 +167,7 @@ def _placed(study_file: Path | None, given: dict[str, Any]) -> Path | None:
     """Give a file that is no study to the flag that takes such files, and return None in its place."""
     if study_file is None:
         return None
-    others: dict[str, tuple[Callable[[Path], bool], str]] = {
-        "targets": (lambda path: not holds_study(path), "tables of targets"),
-        "data": (lambda path: path.suffix.lower() != ".toml", "observed frames"),
-        "star": (is_star, "stars"),
-        "look_at": (is_star, "targets"),
-    }
-    for key, (applies, plural) in others.items():
+    for key, (_, plural, applies) in PLACES.items():
         if key in given and applies(study_file):
             if given[key]:
                 raise InputError(

@@ -20,13 +20,9 @@ if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
 
 
-#: What the argument of the study may be instead, by the flag of a command that takes it.
-PLACES = {"targets": "a table of targets", "data": "a file of frames", "star": "a star as for --star"}
-
-
 def study_argument(flags: Collection[str]) -> Any:
     """Return the annotation of the argument that is a study, or in its place what a flag takes."""
-    other = next((f", or {what}" for flag, what in PLACES.items() if flag in flags), "")
+    other = next((f", or {what}" for flag, (what, *_) in PLACES.items() if flag in flags and what), "")
     described = f"Study (TOML), the ECSV table of an answer{other}; flags override it."
     argument = typer.Argument(
         help=described,
@@ -209,6 +205,16 @@ def holds_study(file: Path) -> bool:
     from mauvecl.host.tables.files import read_ecsv
 
     return "study" in read_ecsv(file, "table", "a table of targets, or of an answer").meta
+
+
+#: What the argument of the study may be instead, by the flag of a command that takes it: for help, in the plural for
+#: messages, and the function that tells it from a study.
+PLACES: dict[str, tuple[str, str, Callable[[Path], bool]]] = {
+    "targets": ("a table of targets", "tables of targets", lambda path: not holds_study(path)),
+    "data": ("a file of frames", "observed frames", lambda path: path.suffix.lower() != ".toml"),
+    "star": ("a star as for --star", "stars", is_star),
+    "look_at": ("", "targets", is_star),
+}
 
 
 def warn_of_percent(texts: Sequence[str]) -> None:
