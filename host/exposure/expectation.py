@@ -178,7 +178,7 @@ class Expectation(Drawable, ContentEquality):
             bad = ~((values >= 0) & (values <= MAX_PER_FRAME))
             if bad.any():
                 pixel = int(np.argmax(bad))
-                raise InputError.of(name, values[pixel], f"0 to {MAX_PER_FRAME:g}", where=f"pixel {pixel}")
+                raise InputError.of(name, values[pixel], f"between 0 and {MAX_PER_FRAME:g}", where=f"pixel {pixel}")
         object.__setattr__(self, "provenance", dict(self.provenance))
 
     @property

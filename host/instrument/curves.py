@@ -48,7 +48,9 @@ class Curve:
         bad = ~(np.isfinite(value) & (value >= 0))
         if bad.any():
             knot = int(np.argmax(bad))
-            raise InputError.of("value", value[knot], "finite and >= 0", where=f"curve at {wavelength[knot]:g} nm")
+            raise InputError.of(
+                "value", value[knot], "finite and at least 0", where=f"curve at {wavelength[knot]:g} nm"
+            )
 
     @classmethod
     def flat(cls, value: float, source: str = "A: assumed, no source given") -> Curve:

@@ -94,7 +94,7 @@ def spectrum_in(tables: Sequence[SpectrumTable], asked: Sequence[str]) -> RawSpe
     named = [i for i, label in enumerate(labels) if label and label in words]
     by_number = {word: place for word in asked if (place := numbered("table", word)) is not None}
     if any(place >= len(tables) for place in by_number.values()):
-        raise InputError.of("table", max(by_number.values()) + 1, f"1 to {len(tables)}")
+        raise InputError.of("table", max(by_number.values()) + 1, f"between 1 and {len(tables)}")
     named += by_number.values()
     rest = [word for word in asked if word.lower() not in {labels[i] for i in named} and word not in by_number]
     found: list[RawSpectrum] = []
@@ -275,7 +275,7 @@ def _row_asked(identifiers: Sequence[Sequence[str]], asked: Sequence[str], names
     for word in asked:
         if (place := numbered("row", word)) is not None:
             if place >= len(identifiers):
-                raise InputError.of("row", place + 1, f"1 to {len(identifiers)}")
+                raise InputError.of("row", place + 1, f"between 1 and {len(identifiers)}")
             fits = [place]
         else:
             fits = [row for row in fitting if word.strip() in identifiers[row]]

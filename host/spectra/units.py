@@ -75,7 +75,10 @@ def stated_units(
     if len(distinct) > 1:
         next_to = re.search(r"flux\w*\W{0,4}(?:in\W+)?(" + _FLUX.pattern + ")", text, re.IGNORECASE)
         if next_to is None:
-            raise InputError.of("flux_unit", distinct, "one: `flux_unit` says which", where="its header")
+            raise InputError(
+                f"its header names several units of the flux: {', '.join(distinct)}",
+                "`flux_unit` to say which", key="flux_unit",
+            )  # fmt: skip
         distinct = [_spelt(next_to[1].strip())]
     if flux and not distinct and not is_named and (match := _NO_FLUX.search(text)):
         fault = f"its header speaks of {match[1] or match[2]!r}"
@@ -83,7 +86,10 @@ def stated_units(
     rest = re.sub(_FLUX.pattern, " FLUXUNIT ", text)
     lengths = _lengths(rest) if wavelength else []
     if len(lengths) > 1:
-        raise InputError.of("wavelength_unit", lengths, "one: `wavelength_unit` says which", where="its header")
+        raise InputError(
+            f"its header names several units of the wavelength: {', '.join(lengths)}",
+            "`wavelength_unit` to say which", key="wavelength_unit",
+        )  # fmt: skip
     return (lengths[0] if lengths else None), (distinct[0] if distinct else None)
 
 

@@ -56,7 +56,9 @@ def check_points(name: str, wavelength: Float, flux: Float) -> None:
     outside = np.flatnonzero((wavelength < NEAREST_NM) | (wavelength > FARTHEST_NM))
     if outside.size:
         where = f"spectrum {name}, point {outside[0] + 1}"
-        raise InputError.of("wavelength", wavelength[outside[0]], f"{NEAREST_NM:g} to {FARTHEST_NM:g} nm", where=where)
+        raise InputError.of(
+            "wavelength", wavelength[outside[0]], f"between {NEAREST_NM:g} and {FARTHEST_NM:g} nm", where=where
+        )
     close = np.flatnonzero(np.diff(wavelength) < CLOSEST * wavelength[1:])
     if close.size:
         i = int(close[0])

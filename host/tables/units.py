@@ -316,7 +316,7 @@ class TimeSystem:
         header = {str(key).upper(): value for key, value in header.items()}
         at = _number(header, "TIMEPIXR", what)
         if at is not None and not 0.0 <= at <= 1.0:
-            raise InputError.of("TIMEPIXR", at, "0 to 1", where=what)
+            raise InputError.of("TIMEPIXR", at, "between 0 and 1", where=what)
         stated = scale_of(str(header.get("TIMESYS", "")).strip())
         epoch = _reference(header, stated if stated in SCALES.values() else "utc", what)
         # The standard's default is UTC; a header without a reference time does not follow it.

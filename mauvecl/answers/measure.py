@@ -273,7 +273,7 @@ def measure(study: Study, engine: Engine | Pool | None = None, progress: Progres
         Called as ``progress(done, total)`` in flares.
     """
     if study.flare.geometry != "added":
-        raise InputError.of("flare.geometry", "replaces", "'added': fits take light for added")
+        raise InputError.of("flare.geometry", "replaces", "'added', since fits take light for added")
     if study.measure.along_stare:
         check_sweep(study.sweep, study.stare, study.events)
     prepared = cases(study)

@@ -111,7 +111,7 @@ def place_of(x: Expectation, wavelength_nm: float, per: Per) -> int:
         raise InputError(f"S/N per {per!r}", "pixel or element", key="per")
     first, last = float(x.wavelength_nm[0]), float(x.wavelength_nm[-1])
     if not first <= wavelength_nm <= last:
-        raise InputError.of("wavelength", wavelength_nm, f"{first:.1f} to {last:.1f} nm", unit="nm")
+        raise InputError.of("wavelength", wavelength_nm, f"between {first:.1f} and {last:.1f} nm", unit="nm")
     pixel = int(np.argmin(np.abs(x.wavelength_nm - wavelength_nm)))
     return int(x.element[pixel]) if per == "element" else pixel
 

@@ -469,4 +469,4 @@ def name_flag(error: InputError) -> str:
     # The key as written, which may contain blanks, after its location.
     section, _, own = re.escape(key).replace("_", "[_ ]").rpartition(r"\.")
     shown = rf"(?:{section}\.)?{own}" if section else own
-    return re.sub(rf"^(?:[^:=]*: )?{shown} = ", lambda _: f"{flags[0]} ", text)
+    return re.sub(rf"^(?:[^:=]*: )?{shown} (?:= |(?=must be ))", lambda _: f"{flags[0]} ", text)

@@ -235,7 +235,7 @@ def whole(text: str, flag: str, low: int, high: int) -> int:
 
     value = read_count(text, flag)
     if not low <= value <= high:
-        raise refusal(flag, text, f"{low:g} to {high:g}")
+        raise refusal(flag, text, f"between {low} and {high}")
     return value
 
 

@@ -195,7 +195,7 @@ class Hypotheses:
         if self.statistic(statistic).shaped and flare is None:
             flare = template
         if flare is not None and not 0 <= flare < len(self.flares):
-            raise InputError.of("flare", flare, f"0 to {len(self.flares) - 1}")
+            raise InputError.of("flare", flare, f"between 0 and {len(self.flares) - 1}")
 
 
 def fall_between(null: Form, flare: Form) -> float:

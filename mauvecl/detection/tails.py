@@ -233,7 +233,7 @@ def tail(hypotheses: Hypotheses, fap: float, statistic: str, *, template: int = 
         are not marginalised over, more than 30 quiescent exposures are averaged, or the error remains too large.
     """
     if not SMALLEST_FAP <= fap <= 0.1:
-        raise InputError.of("fap", fap, f"{SMALLEST_FAP:g} to 0.1 for importance sampling")
+        raise InputError.of("fap", fap, f"between {SMALLEST_FAP:g} and 0.1 for importance sampling")
     _check(hypotheses)
     how = _Tilt.for_alarms(fap, hypotheses, statistic, template)
     blocks: list[tuple[Float, Float]] = []

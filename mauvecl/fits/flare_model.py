@@ -282,7 +282,7 @@ class FlareModel:
     def _checked(self, temperature_k: float, amplitudes: Sequence[float] | Float) -> Float:
         low, high = np.exp(self.log_k[[0, -1]])
         if not low * (1 - 1e-9) <= temperature_k <= high * (1 + 1e-9):
-            raise InputError.of("temperature_k", temperature_k, f"{low:g} to {high:g}")
+            raise InputError.of("temperature_k", temperature_k, f"between {low:g} and {high:g}")
         linear = np.asarray(amplitudes, np.float64)
         if linear.shape != (len(self.linear),) or not np.isfinite(linear).all():
             raise InputError(

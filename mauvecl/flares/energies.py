@@ -318,7 +318,7 @@ class Rates(ABC):
         if not 0 < low < high < np.inf:
             raise InputError.of("measured_erg", self.measured_erg, "two rising energies above 0", unit="erg")
         if not (np.isfinite(self.scatter_dex) and 0 <= self.scatter_dex <= 3):
-            raise InputError.of("scatter_dex", self.scatter_dex, "0 to 3")
+            raise InputError.of("scatter_dex", self.scatter_dex, "between 0 and 3")
 
     @abstractmethod
     def per_day_above(self, energy_erg: ArrayLike) -> Float:
@@ -496,7 +496,7 @@ def davenport2019(*, mass_msun: float, age_myr: float) -> PowerLaw:
     """
     for name, value, low, high in (("mass_msun", mass_msun, 0.1, 1.5), ("age_myr", age_myr, 1.0, 13_800.0)):
         if not low <= value <= high:
-            raise InputError.of(name, value, f"{low:g} to {high:g}")
+            raise InputError.of(name, value, f"between {low:g} and {high:g}")
     t = float(np.log10(age_myr))
     slope, offset = -0.07 * t + 0.79 * mass_msun - 1.06, 2.01 * t - 25.15 * mass_msun + 33.99
     if slope >= 0:

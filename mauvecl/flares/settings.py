@@ -49,7 +49,7 @@ def check_shape(name: str) -> None:
 def per_day(false_alarms: float, per: Per) -> float:
     """Convert a number of false alarms per unit of time to false alarms per star-day."""
     if per not in DAYS:
-        raise InputError.of("per", per, f"per {', '.join(DAYS)}")
+        raise InputError.of("per", per, f"one of {', '.join(DAYS)}")
     if not (math.isfinite(false_alarms) and false_alarms > 0):
         raise InputError.of("false_alarms", false_alarms, "a number above 0")
     return false_alarms / DAYS[per]

@@ -351,7 +351,7 @@ class Stare:
         set_read_only(self, **own)
         n = self.start_s.size
         if not 1 <= n <= MOST_FRAMES:
-            raise InputError.of("n_frames", n, f"1 to {MOST_FRAMES}")
+            raise InputError.of("n_frames", n, f"between 1 and {MOST_FRAMES}")
         curves = [(unknown.name, unknown.curve) for unknown in self.unknowns]
         for name, values in [*((name, getattr(self, name)) for name in own), *curves]:
             if values.shape != (n,):
@@ -527,7 +527,7 @@ def _starts(duration_s: float, frame_s: float, gaps: Sequence[tuple[float, float
             raise InputError.of("gaps", (first, last), "two times, ascending", unit="s")
         outside &= (start + frame_s <= first + tolerance) | (start >= last - tolerance)
     if not outside.any():
-        raise InputError.of("gaps", gaps, f"gaps that leave a frame of {duration_s:g} s")
+        raise InputError.of("gaps", gaps, f"times that leave a frame of {duration_s:g} s")
     return start[outside]
 
 

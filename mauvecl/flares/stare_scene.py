@@ -81,7 +81,7 @@ class Flares:
         ends += [("flare coefficients", most) for most in _largest(given)] + [("amplitudes", factors.max())]
         for what, end in ends:
             if not 0 <= end <= LARGEST:
-                raise InputError.of(what, end, f"0 to {LARGEST:g}")
+                raise InputError.of(what, end, f"between 0 and {LARGEST:g}")
         return cls(given, factors.astype(np.float32))
 
     @cached_property

@@ -114,11 +114,11 @@ class CosmicRays(AdditiveProcess):
     def _possible(self) -> Self:
         low, high = self.electrons
         if not 1 <= low <= high <= 100_000:
-            raise InputError.of("electrons", (low, high), "1 to 100000, ascending", where="cosmic rays")
+            raise InputError.of("electrons", (low, high), "between 1 and 100000, ascending", where="cosmic rays")
         if self.weights is not None:
             wanted = int(high) - int(low) + 1
             if len(self.weights) != wanted or min(self.weights) < 0 or not sum(self.weights) > 0:
-                raise InputError.of("weights", self.weights, f"{wanted} of 0 and above", where="cosmic rays")
+                raise InputError.of("weights", self.weights, f"{wanted} numbers of at least 0", where="cosmic rays")
         return self
 
     def charge(self, seconds: Annotated[float, Unit("s"), Range(0)]) -> Float:
@@ -300,7 +300,7 @@ class Uniform:
 
     def __post_init__(self) -> None:
         if not self.low <= self.high:
-            raise InputError.of("low", self.low, "low <= high")
+            raise InputError.of("low", self.low, f"at most high = {self.high:g}")
 
     def quantile(self, below: NDArray[np.float64], above: NDArray[np.float64] | None = None) -> Float:
         """Return the quantiles at probabilities `below`; see `Normal.quantile`."""

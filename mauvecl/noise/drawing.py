@@ -327,7 +327,7 @@ class Factors:
             first, last = prior.quantile(np.array([0.0, 1.0]))
             if not (varied.low <= first and last <= varied.high):
                 raise InputError.of(
-                    name, [float(first), float(last)], f"a prior within {varied.low:g} to {varied.high:g}"
+                    name, [float(first), float(last)], f"a prior between {varied.low:g} and {varied.high:g}"
                 )
             tables[row], middle = quantile_table(prior, change)
             centre[factor] *= 1.0 + middle

@@ -47,11 +47,13 @@ class CalibrationFrames:
             )  # fmt: skip
         off = float(np.abs(nm - nominal.wavelength_nm).max())
         if off > nominal.resolution_element_nm:
-            raise InputError.of("wavelength", f"{off:.3g} nm from those of {nominal.name}",
-                                f"at most {nominal.resolution_element_nm:g} nm", where=frames.name)  # fmt: skip
+            raise InputError(
+                f"{frames.name}: the wavelengths are {off:.3g} nm from those of {nominal.name}",
+                f"at most {nominal.resolution_element_nm:g} nm", key="wavelength",
+            )  # fmt: skip
         unit = frames.unit.strip().casefold()
         if unit not in ("dn", "adu", "ct", "count"):
-            raise InputError.of("unit", frames.unit or "none", "raw DN, with bias and dark", where=frames.name)
+            raise InputError.of("unit", frames.unit or "none", "that of raw DN, with bias and dark", where=frames.name)
         if frames.net:
             raise InputError(
                 f"{frames.name}: dark current and bias are subtracted",
@@ -66,10 +68,12 @@ class CalibrationFrames:
         good = (frames.faults == 0) & np.isfinite(temperatures)
         lengths = np.unique(frames.exposure_s[good].round(6))
         if good.sum() < 3 or lengths.size != 1:
-            raise InputError.of("frames", f"{int(good.sum())} good ones of {lengths.size} exposure times",
-                                "at least 3 of one exposure time", where=frames.name)  # fmt: skip
+            raise InputError(f"{frames.name} has {int(good.sum())} good frames of {lengths.size} exposure times",
+                             "at least 3 of one exposure time", key="frames")  # fmt: skip
         if (frames.flux[good] == frames.flux[good][0]).all():
-            raise InputError.of("frames", "all the same", "frames that differ by their noise", where=frames.name)
+            raise InputError(
+                f"{frames.name}: all frames are the same", "frames that differ by their noise", key="frames"
+            )
         return cls(frames.name, frames.flux[good], float(lengths[0]), temperatures[good], star)
 
     @property

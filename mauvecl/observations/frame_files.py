@@ -355,7 +355,11 @@ def _wavelength(file: TableFile, mapping: FrameMapping) -> Values | None:
         path = Path(mapping.wavelength_file)
         with _opened(path, f"file {path.name!r}", None) as other:
             if mapping.wavelength is None and len(other.names) != 1:
-                raise InputError.of("wavelength", None, f"one of {', '.join(other.names)}", where=other.what)
+                raise InputError(
+                    f"{other.what}: no column of wavelengths is named",
+                    f"one of {', '.join(other.names)}",
+                    key="wavelength",
+                )
             found = other.find(mapping.wavelength or other.names[0])
             return Values.of(found.name, found.numbers().ravel(), found.unit, found.what)
     if mapping.wavelength is None:

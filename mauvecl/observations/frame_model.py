@@ -63,8 +63,10 @@ class FrameModel:
             raise InputError.of("unit", frames.unit, accepted)
         exposure = float(np.median(frames.exposure_s))
         if np.ptp(frames.exposure_s) > SAME_EXPOSURE * exposure:
-            raise InputError.of("exposure_s", f"{frames.exposure_s.min():g} to {frames.exposure_s.max():g} s",
-                                "one exposure time for all frames of spectra")  # fmt: skip
+            raise InputError(
+                f"the exposure times range from {frames.exposure_s.min():g} to {frames.exposure_s.max():g} s",
+                "one for all frames", key="exposure_s",
+            )  # fmt: skip
         pixels = _matched(frames.wavelength_nm, quiet.wavelength_nm)
         elements = _matched(frames.wavelength_nm, quiet.element_wavelength_nm)
         if pixels is not None:
@@ -72,10 +74,10 @@ class FrameModel:
         elif elements is not None:
             bins = (~quiet.saturated * (quiet.element == elements[:, None])).astype(np.float64)
         else:
-            raise InputError.of(
-                "wavelength_nm", f"{frames.wavelength_nm.size} values from {frames.wavelength_nm[0]:.1f} nm",
+            raise InputError(
+                f"the spectra have {frames.wavelength_nm.size} wavelengths from {frames.wavelength_nm[0]:.1f} nm",
                 f"the {quiet.wavelength_nm.size} pixels or {quiet.element_wavelength_nm.size} resolution elements of "
-                f"{quiet.instrument}",
+                f"{quiet.instrument}", key="wavelength_nm",
             )  # fmt: skip
         if flux is not None:
             # A flux density is that of a flat spectrum with as many DN in all pixels of the value.
@@ -295,8 +297,9 @@ def clean_spectra(frames: Frames, model: FrameModel) -> CleanedSpectra:
     usable = frames.faults == 0
     fine = np.isfinite(frames.flux[usable]).all(axis=0) & (model.bins.sum(axis=1) > 0)
     if not fine.any() or not usable.any():
-        raise InputError.of("flux", "no pixel that is finite in every frame", "pixels with light in every frame",
-                            where=frames.name)  # fmt: skip
+        raise InputError(
+            f"{frames.name}: no pixel is finite in every frame", "pixels with light in every frame", key="flux"
+        )
     model = model.part(fine)
     assert frames.wavelength_nm is not None
     flux = frames.flux[:, fine]
@@ -304,7 +307,7 @@ def clean_spectra(frames: Frames, model: FrameModel) -> CleanedSpectra:
     flux = flux - model.offset
     good = usable & ~saturated
     if not good.any():
-        raise InputError.of("flux", "saturated pixels in every frame", "frames below saturation", where=frames.name)
+        raise InputError(f"{frames.name}: every frame has saturated pixels", "frames below saturation", key="flux")
     light = np.median(flux[good], axis=0)
     error = None if frames.error is None else frames.error[:, fine]
     stated = np.sqrt(model.variance(light)) if error is None else np.median(error[good], axis=0)

@@ -479,9 +479,9 @@ def barycentric(frames: Frames, target: Target, orbit: Orbit | None = None) -> F
         return frames.with_remarks((f"the times of {name} are barycentric already",))
     if frames.scale not in SCALES.values():
         known = ", ".join(sorted(set(SCALES.values())))
-        raise InputError.of("scale", frames.scale, f"a mapping with scale, one of {known}", where=name)
+        raise InputError.of("scale", frames.scale, f"one of {known}, as a mapping states", where=name)
     if frames.position not in ("GEOCENTER", "TOPOCENTER"):
-        raise InputError.of("position", frames.position, "a mapping with position, TOPOCENTER or GEOCENTER", where=name)
+        raise InputError.of("position", frames.position, "TOPOCENTER or GEOCENTER, as a mapping states", where=name)
     if frames.position == "TOPOCENTER" and orbit is None:
         raise InputError(f"{name}: the orbit of {frames.instrument or 'its satellite'} is not known",
                          "two-line elements in `orbit.tle`", key="orbit.tle")  # fmt: skip

@@ -111,7 +111,7 @@ def recover_periods(
         raise InputError.of("visits", time.size, f"at least {MIN_VISITS}")
     base = float(np.ptp(time))
     if not base > 0:
-        raise InputError.of("time_d", "visits at one time", "visits at different times")
+        raise InputError("all visits have the same time", "visits at different times", key="time_d")
     frequency = _frequencies(base, 1 / (longest_d or max(periods_d)), 1 / (shortest_d or min(periods_d)))
     generator = np.random.default_rng(seed)
 
@@ -142,8 +142,10 @@ def _frequencies(base: float, low: float, high: float) -> Float:
     # Half a resolution beyond the ends, so that periods at the ends can be recovered.
     count = int(np.ceil((high - low) / step)) + OVERSAMPLING + 1
     if count > MAX_FREQUENCIES:
-        expected = f"at most {MAX_FREQUENCIES}: longer periods or a shorter campaign"
-        raise InputError.of("periods", f"{count} frequencies", expected)
+        raise InputError(
+            f"the periods need {count} frequencies",
+            f"at most {MAX_FREQUENCIES}: longer periods or a shorter campaign", key="periods",
+        )  # fmt: skip
     return np.asarray(max(low - 0.5 / base, step) + step * np.arange(count))
 
 
@@ -337,13 +339,17 @@ def line_index(
     inside = share > 0
     good = np.isfinite(light) & np.isfinite(sd) & (sd > 0)
     if not good[..., inside].all():
-        raise InputError.of("flux", "pixels in the band without a finite flux and a positive error", "none of these")
+        raise InputError(
+            "every pixel in the band needs a finite flux and a positive error, but some have none", key="flux"
+        )
     windows = np.zeros(nm.size, np.bool_)
     for start, end in continuum_nm:
         windows |= (nm >= start) & (nm <= end)
     left = good & windows
     if (count := int(left.sum(axis=-1).min(initial=nm.size))) < MIN_CONTINUUM:
-        raise InputError.of("continuum_nm", f"{count} usable pixels", f"at least {MIN_CONTINUUM} in each spectrum")
+        raise InputError(
+            f"the continuum has {count} usable pixels", f"at least {MIN_CONTINUUM} in each spectrum", key="continuum_nm"
+        )
     weight = np.where(left, 1.0 / np.where(left, sd, 1.0) ** 2, 0.0)
     continuum = _integral_of_line(nm - (low + high) / 2, weight, share)
     light, sd = (np.where(left | inside, each, 0.0) for each in (light, sd))

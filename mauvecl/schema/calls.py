@@ -22,7 +22,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_
 
 from pydantic_core import CoreSchema, PydanticCustomError, SchemaValidator, ValidationError, core_schema
 
-from mauvecl.schema.errors import InputError, shown
+from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import is_quantity, is_truth, or_error, without_unit
 
 #: Place of an error inside an alternative of a union.
@@ -253,7 +253,9 @@ class _Parameter:
         place, first = max(faults, key=lambda item: len(item[0]))
         expected = dict.fromkeys(fault["msg"].removeprefix("Input should be ") for at, fault in faults if at == place)
         where = self.name + "".join(f"[{part!r}]" for part in place if part != "[key]")
-        raise InputError(f"{where} = {shown(first['input'])}", " or ".join(expected), key=self.name)
+        refused = InputError.of(where, first["input"], " or ".join(expected))
+        refused.key = self.name
+        raise refused
 
     def annotation(self) -> Any:
         """Return the resolved annotation."""

@@ -95,12 +95,14 @@ class InputError(ValueError):
 
     @classmethod
     def of(cls, key: str, value: Any, expected: str, *, unit: str = "", where: str = "") -> InputError:
-        """Return the error of one value: ``where: key = value unit, expected this``.
+        """Return the error of one value: ``where: key must be expected, not value unit``.
 
         Words such as "flare amplitude" name the parameter `flare_amplitude`; the value is shown on one line, shortened.
         """
         place, after = f"{where}: " if where else "", f" {unit}" if unit else ""
-        return cls(f"{place}{key} = {shown(value)}{after}", expected, key=key.replace(" ", "_"))
+        error = cls(f"{place}{key} must be {expected}, not {shown(value)}{after}", key=key.replace(" ", "_"))
+        error.expected = expected
+        return error
 
 
 def missing_package(package: str, purpose: str, extra: str) -> InputError:

@@ -27,17 +27,17 @@ if TYPE_CHECKING:
     from pydantic import GetCoreSchemaHandler
     from pydantic_core import CoreSchema
 
-#: Words for units in messages.
+#: Words for numbers in units in messages.
 WORDS = {
     "": "a number",
-    "K": "kelvin",
-    "deg_C": "degrees Celsius",
-    "mag": "magnitudes",
-    "mag / arcsec2": "mag/arcsec2",
-    "s": "seconds",
-    "h": "hours",
-    "d": "days",
-    "deg": "degrees",
+    "K": "a number in kelvin",
+    "deg_C": "a number in degrees Celsius",
+    "mag": "a number in magnitudes",
+    "mag / arcsec2": "a number in mag/arcsec2",
+    "s": "a number in seconds",
+    "h": "a number in hours",
+    "d": "a number in days",
+    "deg": "a number in degrees",
     "1 / h": "a number per hour",
     "1 / d": "a number per day",
 }
@@ -108,8 +108,8 @@ def with_unit(text: str, unit: str) -> float | None:
 
 
 def word_of(unit: str) -> str:
-    """Return the words for a unit in a message."""
-    return WORDS.get(unit, unit)
+    """Return the words for a number in a unit in a message."""
+    return WORDS.get(unit, f"a number in {unit}")
 
 
 Metadata = TypeVar("Metadata")
@@ -196,15 +196,17 @@ class Range:
 
     def words(self, unit: str = "", *, whole: bool = False) -> str:
         """Describe the accepted values, for error messages."""
-        noun = "a whole number" if whole else word_of(unit)
+        noun = "a whole number" if whole else "a number"
         low, high = (str(end) if whole else f"{end:g}" for end in (self.low, self.high))
         has_low, has_high = math.isfinite(self.low), math.isfinite(self.high)
         after = f" {WRITTEN.get(unit, unit)}" if unit else ""
         if has_low and has_high and not (self.open_low or self.open_high):
-            return f"{noun} from {low} to {high}" if whole else f"{low} to {high}{after}"
+            return f"{noun} from {low} to {high}" if whole else f"{noun} between {low} and {high}{after}"
         ends = [f"above {low}" if self.open_low else f"of at least {low}"] if has_low else []
         ends += [f"below {high}" if self.open_high else f"up to {high}"] if has_high else []
-        return f"{noun} {' and '.join(ends)}" if ends else noun
+        if ends:
+            return f"{noun} {' and '.join(ends)}{after}"
+        return noun if whole else word_of(unit)
 
 
 def is_truth(value: Any) -> bool:

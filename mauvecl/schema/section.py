@@ -121,7 +121,8 @@ def _key_of(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[st
 
 def _input_error_of(model: type[BaseModel], first: Any) -> InputError:
     path = [str(part) for part in first["loc"]]
-    key, value, message = ".".join(path) or model.__name__.lower(), first.get("input"), first["msg"]
+    key = ".".join(_key_of(model, first["loc"])) or model.__name__.lower()
+    value, message = first.get("input"), first["msg"]
     match first["type"]:
         case "extra_forbidden":
             fields = list(_fields(model, path[:-1]))
@@ -249,10 +250,11 @@ def fields_of(section: type[BaseModel], path: tuple[str, ...] = ()) -> Iterator[
 # Readers of values that are written as text, as on the command line; each receives the value's name for messages.
 
 
-def refusal(name: str, text: str, expected: str, more: str = "") -> InputError:
+def refusal(name: str, text: str, expected: str) -> InputError:
     """Return the error of a value's text; its key is the parameter that a flag sets, or else the value's name."""
-    parameter = name.split()[0].strip("-").replace("-", "_")
-    return InputError(f"{name} {shortened(text)}{more}", expected, key=parameter)
+    error = InputError.of(name, text, expected)
+    error.key = name.split()[0].strip("-").replace("-", "_")
+    return error
 
 
 def read_number(text: str, name: str, unit: str = "") -> float:
@@ -304,7 +306,7 @@ def read_axis(text: str, name: str) -> dict[str, Any]:
     except ValueError as error:
         raise refusal(name, text, "quantity:start:stop:steps, the same with :log, or quantity=a,b,c") from error
     if rest not in ([], ["log"]):
-        raise refusal(name, text, "log or nothing", f" ends in {':'.join(rest)!r}")
+        raise refusal(name, text, "quantity:start:stop:steps with :log or nothing at its end")
     return spaced | {"log": bool(rest)}
 
 
@@ -326,7 +328,7 @@ def read_line_fluxes(texts: Sequence[str], name: str) -> dict[str, float]:
     lines = {}
     for text in texts:
         line, value = read_assignment(text, name, "NAME=FLUX, such as 'Mg II=0.05'")
-        lines[line] = read_number(value, f"{name} {shortened(text)}:")
+        lines[line] = read_number(value, f"{name} {shortened(text)}")
     return lines
 
 

@@ -69,7 +69,7 @@ class Completeness:
         if not ((energy > 0).all() and (np.diff(energy) > 0).all() and np.isfinite(energy).all()):
             raise InputError("the energies of a completeness must be above 0 and ascend", key="energy_erg")
         if not ((p >= 0) & (p <= 1)).all():
-            raise InputError.of("probability", (float(p.min()), float(p.max())), "0 to 1")
+            raise InputError.of("probability", (float(p.min()), float(p.max())), "between 0 and 1")
 
     def at(self, energy_erg: ArrayLike) -> Float:
         """Return the interpolated probability, constant outside the table, shape of the energy."""
@@ -170,7 +170,7 @@ def search_threshold(false_alarms_per_day: Positive, bank: Bank) -> float:
 
     if over(THRESHOLDS[0]) < 0 or over(THRESHOLDS[1]) > 0:
         most, least = (grid.false_alarms_per_second(u) * DAY_S for u in THRESHOLDS)
-        raise InputError.of("false_alarms_per_day", false_alarms_per_day, f"{least:.2g} to {most:.3g}")
+        raise InputError.of("false_alarms_per_day", false_alarms_per_day, f"between {least:.2g} and {most:.3g}")
     return float(optimize.brentq(over, *THRESHOLDS, xtol=1e-9))
 
 

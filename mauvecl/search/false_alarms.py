@@ -339,7 +339,7 @@ class SampledRate:
         """
         low, high = self._ends
         if not low <= threshold <= high:
-            raise InputError.of("threshold", threshold, f"{low:g} to {high:g} for importance sampling")
+            raise InputError.of("threshold", threshold, f"between {low:g} and {high:g} for importance sampling")
         log, error = self.log_rate(threshold)
         reach = float(scipy.special.ndtri(0.5 + CONFIDENCE / 2)) * error
         return Interval(*(float(np.exp(log + d)) for d in (0.0, -reach, reach)))

@@ -50,7 +50,7 @@ class Baseline:
 
     def __post_init__(self) -> None:
         if self.slope and not self.offset:
-            raise InputError.of("slope", self.slope, "no slope without an offset")
+            raise InputError.of("slope", self.slope, "False without an offset")
         if not (np.isfinite(self.window_s) and self.window_s >= 0):
             raise InputError.of("window_s", self.window_s, "a time of at least 0", unit="s")
 

@@ -41,7 +41,7 @@ class CalibrationObservation(Section):
                 key="spectrum",
             )
         if self.magnitude is not None and self.library is None and self.spectrum is None:
-            raise InputError.of("magnitude", self.magnitude, "library or spectrum of the star as well")
+            raise InputError("a magnitude needs the library or spectrum of the star as well", key="magnitude")
         return self
 
     def source(self) -> Source | None:
@@ -242,10 +242,10 @@ class ChangeQuestion(Section):
             if SPECTRUM in self.of:
                 raise InputError("the change 'spectrum' has no file", "`change.file`", key="change.file")
             for key in ("wavelength_unit", "flux_unit", "extend"):
-                if value := getattr(self, key):
-                    raise InputError.of(f"change.{key}", value, "change.file as well")
+                if getattr(self, key):
+                    raise InputError(f"change.{key} needs change.file as well", key=f"change.{key}")
         elif SPECTRUM not in self.of:
-            raise InputError.of("change.file", str(self.file), "the change 'spectrum' in change.of as well")
+            raise InputError("change.file needs the change 'spectrum' in change.of as well", key="change.file")
         return self
 
 

@@ -115,7 +115,7 @@ class BulkQuestion(Section):
         if isinstance(self.frames, str):
             return tuple(range(n_frames))
         if self.frames[-1] >= n_frames:
-            raise InputError.of("bulk.frames", self.frames[-1], f"0 to {n_frames - 1}")
+            raise InputError.of("bulk.frames", self.frames[-1], f"between 0 and {n_frames - 1}")
         return self.frames
 
 

@@ -412,8 +412,8 @@ PRESETS: dict[str, dict[str, str]] = {
 NO_KEYS: Mapping[str, str] = MappingProxyType({})
 #: A remedy in a message, such as `magnitude=7.4`.
 _REMEDY = re.compile(r"`(?P<key>[a-z][\w.]*)(?:=(?P<quote>'?)(?P<value>[^`]*?)(?P=quote))?`")
-#: A value at the beginning of a message, such as fap = 0.001.
-_VALUE = re.compile(r"^(?:page: )?(?P<key>[a-z][\w.]*) = (?P<empty>''(?=,|$))?")
+#: The key of a value at the beginning of a message, such as fap in "fap must be a probability, not 2".
+_VALUE = re.compile(r"^(?:page: )?(?P<key>[a-z][\w.]*)(?= must be | = )")
 #: A flag of the command line.
 _FLAG = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
 #: A key within a message: words of prose hold no underscore.
@@ -436,10 +436,8 @@ def field_of(key: str | None) -> str | None:
 
 def sentence(error: InputError, keys: Mapping[str, str] = NO_KEYS) -> str:
     """Return the message of an error as the page shows it; `keys` maps other names of its keys to fields."""
-    text = _VALUE.sub(
-        lambda match: f"{_label(match['key'], keys)} {'is empty' if match['empty'] else '= '}", str(error)
-    )
-    return note(text.removeprefix("page: "), keys)
+    text = _VALUE.sub(lambda match: _label(match["key"], keys), str(error))
+    return note(re.sub(", not ''$", ", but is empty", text).removeprefix("page: "), keys)
 
 
 def note(text: str, keys: Mapping[str, str] = NO_KEYS) -> str:

@@ -81,7 +81,7 @@ def test_every_unknown_of_a_study_is_tested() -> None:
     for course, names in STARE_CHANGES.items():
         with pytest.raises(InputError) as error:
             asked("stare", {"stare": {course: {"none": 0.1}}})
-        assert all(name in error.value.expected for name in names)
+        assert all(name in str(error.value) for name in names)
 
 
 @pytest.mark.parametrize("name", UNKNOWNS)

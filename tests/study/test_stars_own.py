@@ -7,6 +7,7 @@ import pytest
 from answers import small
 
 from mauvecl import Engine, Instrument, Source, Stares, Study, detect, expect, limit, simulate, stare
+from mauvecl.noise.disturbances import ADDITIVE
 
 PART = {"changes": {"output_min_nm": 300.0, "output_max_nm": 330.0}}
 
@@ -100,7 +101,7 @@ def frames(study: Study, count: int, **how: Any) -> Any:
 
 
 def test_every_process_has_a_prior() -> None:
-    assert {*PRIORS, "cosmic_rays"} == {name for name, _ in Study().processes}
+    assert {*PRIORS, *ADDITIVE} == {name for name, _ in Study().processes}
 
 
 @pytest.mark.parametrize("name", PRIORS)

@@ -72,8 +72,8 @@ async def test_invalid_numbers_are_faults_and_ranges_include_their_ends(talk: Ta
             needed = words["fields"][name] != ""
             assert (found.get(name) == f"nothing is entered, expected {accepted}") == needed, name
     for low, closed, opened, sign in (
-        (True, rf"^(?:a whole number from )?{NUMBER} to ", rf"above {NUMBER}", -1),
-        (False, rf" (?:to|up to) {NUMBER}", rf"below {NUMBER}", 1),
+        (True, rf"(?:from|between) {NUMBER} ", rf"above {NUMBER}", -1),
+        (False, rf" (?:to|and|up to) {NUMBER}", rf"below {NUMBER}", 1),
     ):
         for form, beyond, refused in ((closed, 0, False), (closed, sign, True), (opened, 0, True)):
             ends = {name: at[1] for name, accepted in numbers.items() if (at := re.search(form, accepted))}

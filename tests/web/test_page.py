@@ -155,7 +155,7 @@ def test_visitor_changes_values_and_reads_the_answer(browser: Browser, server: S
     place = "document.querySelector('#plot-excess').getBoundingClientRect().y + scrollY"
     top = page.evaluate(place)
     for label, wrong, right, reported in (
-        ("Magnitude", "99", "8.5", "'99' is out of range, expected -30 to 40 mag"),
+        ("Magnitude", "99", "8.5", "'99' is out of range, expected a number between -30 and 40 mag"),
         ("Magnitude", "7,4", "8.5", "'7,4' is not a number"),
         ("Seed", "", "1", "nothing is entered, expected a whole number"),
         ("Star", "Nowhere", "G2V", "'Nowhere' is unknown"),
