@@ -374,13 +374,13 @@ class Shelf:
 
     def __init__(self, most: int) -> None:
         self.most, self.size = most, 0
-        # By visitor, kind and key: size and value.
-        self._held: OrderedDict[tuple[int, str, Hashable], tuple[int, Any]] = OrderedDict()
+        # Size and value by visitor, kind and key. The visitor itself, since an id is given again when it has left.
+        self._held: OrderedDict[tuple[object, str, Hashable], tuple[int, Any]] = OrderedDict()
         self._lock = threading.Lock()
 
     def keep(self, owner: object, kind: str, key: Hashable, value: object, most: int = 1) -> None:
         """Keep a value for its owner, who has at most `most` of its kind."""
-        size, entry = size_of(value), (id(owner), kind, key)
+        size, entry = size_of(value), (owner, kind, key)
         with self._lock:
             self._remove(entry)
             self._held[entry] = size, value
@@ -393,7 +393,7 @@ class Shelf:
     def get(self, owner: object, kind: str, key: Hashable) -> Any:
         """Return a value, which is used, or None if it is not here any more."""
         with self._lock:
-            if (entry := (id(owner), kind, key)) not in self._held:
+            if (entry := (owner, kind, key)) not in self._held:
                 return None
             self._held.move_to_end(entry)
             return self._held[entry][1]
@@ -409,11 +409,10 @@ class Shelf:
             for entry in self._entries(owner, *which):
                 self._remove(entry)
 
-    def _entries(self, *which: Any) -> list[tuple[int, str, Hashable]]:
-        wanted = (id(which[0]), *which[1:])
-        return [entry for entry in self._held if entry[: len(wanted)] == wanted]
+    def _entries(self, *which: object) -> list[tuple[object, str, Hashable]]:
+        return [entry for entry in self._held if entry[: len(which)] == which]
 
-    def _remove(self, entry: tuple[int, str, Hashable]) -> None:
+    def _remove(self, entry: tuple[object, str, Hashable]) -> None:
         self.size -= self._held.pop(entry, (0, None))[0]
 
 
