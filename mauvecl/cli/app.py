@@ -22,7 +22,7 @@ from typer.main import get_command
 
 from mauvecl.answers.verbs import COMMON, GROUPS, VERBS
 from mauvecl.cli.commands import COMMANDS, export, verify
-from mauvecl.cli.console import EXIT_CODES, Meter, guarded, show, show_view
+from mauvecl.cli.console import EXIT_CODES, Meter, guarded, name_flags_of, show, show_view
 from mauvecl.cli.flags import (
     SHOWS_ALL,
     DeviceFlag,
@@ -377,6 +377,8 @@ app = typer.Typer(
     "\b\nmauvecl detect --star M3V --magnitude 9\nmauvecl detect --help",
     epilog=EXIT_CODES,
 )
+
+name_flags_of(app)
 
 
 def _version(wanted: bool) -> None:

@@ -394,14 +394,20 @@ _REMEDY = re.compile(r"`(?P<name>[a-z][a-z0-9_.]*)(?:=(?P<value>[^`]+))?`")
 #: Parameters with flags of other names that are not keys of the study.
 _OTHERWISE = {"setting": "--set"}
 
+#: The command line whose flags messages name, alone in a list.
+_app: list[typer.Typer] = []
+
+
+def name_flags_of(app: typer.Typer) -> None:
+    """Set the command line whose flags messages name."""
+    _app[:] = [app]
+
 
 def _commands() -> Iterator[Any]:
     """Yield the called command, then all others."""
     from typer.main import get_command
 
-    from mauvecl.cli.app import app
-
-    called: Any = get_command(app)
+    called: Any = get_command(_app[0])
     others = [called]
     for word in sys.argv[1:]:
         called = getattr(called, "commands", {}).get(word, called)
