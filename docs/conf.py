@@ -2,18 +2,22 @@
 
 import os
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import jupyter_client
 from astropy.table import Table
 from pydantic import BaseModel
+from pydantic_core import PydanticUndefined
 from typer.main import get_command
 
 from mauvecl.cli.app import app
 from mauvecl.host import VERSION
 from mauvecl.host.instrument.instrument import Instrument
-from mauvecl.schema.section import keys_of
+from mauvecl.schema.fields import Flag, Help, Range, Unit, as_typed, first, found
+from mauvecl.schema.section import fields_of, model_in
 from mauvecl.study.study import Study
 
 project = "mauvecl"
@@ -79,18 +83,63 @@ def bench_tables() -> None:
         (folder / f"{path.stem}.rst").write_text("\n".join(lines), encoding="utf-8")
 
 
+def reference_of(section: type[BaseModel]) -> Iterator[dict[str, str]]:
+    """Yield the row of each key of a section and of the sections in it, in the order of their declaration."""
+    for path, field in fields_of(section):
+        if (help := first(field, Help)) is None:
+            continue
+        value = field.get_default(call_default_factory=True)
+        reach, unit = first(field, Range) or Range(), (first(field, Unit) or Unit("")).name
+        yield {
+            "path": ".".join(path),
+            "meaning": help.text
+            + (f": {help.choices}" if help.choices else "")
+            + (f", {help.more}" if help.more else ""),
+            "accepted": accepted_words(field.annotation, unit, reach),
+            "default": help.default or ("required" if value is PydanticUndefined else default_text(value)),
+            "flags": ", ".join(name for flag in found(field, Flag) for name in flag.names),
+        }
+
+
+def accepted_words(annotation: Any, unit: str, reach: Range) -> str:
+    """Describe the values of a type in words."""
+    parts = get_args(annotation)
+    if get_origin(annotation) is Annotated:
+        return accepted_words(parts[0], unit, reach)
+    if get_origin(annotation) in (Union, UnionType):
+        return " or ".join(dict.fromkeys(accepted_words(part, unit, reach) for part in parts if part is not NoneType))
+    if get_origin(annotation) is Literal:
+        return ", ".join(map(str, parts))
+    if get_origin(annotation) is tuple:
+        several = parts[-1] is Ellipsis
+        return f"list of {accepted_words(parts[0], unit, reach)}" if several else f"{len(parts)} numbers"
+    if get_origin(annotation) is dict:
+        return f"table of {accepted_words(parts[1], unit, reach)}"
+    if model_in(annotation) is not None:
+        return "table"
+    if annotation in (float, int):
+        return reach.words(unit, whole=annotation is int)
+    return {str: "text", bool: "true or false", Path: "path"}.get(annotation, "file")
+
+
+def default_text(value: Any) -> str:
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(default_text, value))}]"
+    return as_typed(value)
+
+
 def write_keys(section: type[BaseModel], name: str, columns: tuple[str, ...]) -> None:
     """Write the reference of all keys of a section as a table that a page includes."""
     widths = {"meaning": 36, "accepted": 22, "default": 12, "flags": 10}
     lines = [".. list-table::", "   :header-rows: 1", f"   :widths: 20 {' '.join(str(widths[one]) for one in columns)}"]
     lines += ["", "   * - key", *(f"     - {one}" for one in columns)]
-    for key in keys_of(section):
+    for key in reference_of(section):
         lines += [
-            f"   * - .. index:: single: {key.path} ({name.split('_')[0]} key)",
+            f"   * - .. index:: single: {key['path']} ({name.split('_')[0]} key)",
             "",
-            f"       ``{key.path}``",
+            f"       ``{key['path']}``",
             "",
-            *(f"     - {getattr(key, one).replace('*', chr(92) + '*')}" for one in columns),
+            *(f"     - {key[one].replace('*', chr(92) + '*')}" for one in columns),
         ]
     (Path(__file__).parent / "_generated" / f"{name}.rst").write_text("\n".join(lines) + "\n", encoding="utf-8")
 

@@ -103,7 +103,7 @@ def page_tables(tab: Tab, state: State, closed: ClosedForms, folder: Path) -> di
     answers: dict[str, Any] = {}
     pool = Pool(LocalWorkers([None]))
     for name in tab.simulations:
-        answers |= SIMULATIONS[name](state.question(reads_of(name)).study(folder), pool)
+        answers |= SIMULATIONS[name](state.question(reads_of(name)).case(folder).study, pool)
     return {name: tab.table(name, closed, answers) for name in tab.files if tab.offers(name, answers)}
 
 
@@ -176,7 +176,7 @@ def main() -> None:
                 different = differences(TABS[name], state, closed, folder)
                 wrong += bool(different)
                 if different:
-                    print(f"{name} {state.link}\n  {'; '.join(different)}")
+                    print(f"{name} ?{urlencode(state.entered)}\n  {'; '.join(different)}")
         seconds = time.perf_counter() - started
         print(f"{name}: {given.count - wrong} of {given.count} questions agree, {seconds:.0f} s", flush=True)
 

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from html import escape
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -150,13 +151,6 @@ def _pdf(title: str, figures: Callable[[], list[Any]]) -> bytes:
     return made.getvalue()
 
 
-def target_figure(answer: PlanAnswer, k: int) -> Any:
-    """Return the pictures of a target."""
-    figure = new_figure((7.4, 5.4), layout="none")
-    _panels(figure, answer, k)
-    return figure
-
-
 def html_image(draw: Callable[[], Any], text: str) -> str:
     """Return a figure as an image of few colours; nothing if matplotlib is not installed."""
     if not available():
@@ -270,13 +264,14 @@ def _target(answer: PlanAnswer, k: int) -> Any:
         figure.text(1 - margin, y, where, fontsize=6.5, va="top", ha="right", color=NULL)
         y -= 0.018 * len(lines)
     if answer.planned[k].seen_h > 0:
-        _panels(pictures, answer, k)
+        _panels(answer, k, pictures)
     return figure
 
 
-def _panels(figure: Any, answer: PlanAnswer, k: int) -> None:
+def _panels(answer: PlanAnswer, k: int, figure: Any = None) -> Any:
     """Plot daily hours with elongation, monthly hours, and recovered fraction with the rate by energy."""
     target, seen = answer.planned[k], answer.seen
+    figure = new_figure((7.4, 5.4), layout="none") if figure is None else figure
     top, bottom = figure.subplots(2, 1)
     figure.subplots_adjust(**PANELS)
     days = np.arange(len(seen.days))
@@ -293,7 +288,7 @@ def _panels(figure: Any, answer: PlanAnswer, k: int) -> None:
     top.set_title("when it is seen")
     if target.completeness is None:
         bottom.set_visible(False)
-        return
+        return figure
     energy, p = target.completeness.energy_erg, target.completeness.probability
     first = int(np.argmax(p > 0))
     shown = slice(max(first - 4, 0), min(first + 100, energy.size))
@@ -314,6 +309,7 @@ def _panels(figure: Any, answer: PlanAnswer, k: int) -> None:
         often.spines["right"].set_visible(True)
         often.yaxis.label.set_color(COLOURS[4])
         _plain_decades(often.yaxis)
+    return figure
 
 
 def _plain_decades(axis: Any) -> None:
@@ -324,62 +320,29 @@ def _plain_decades(axis: Any) -> None:
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}" if 1e-3 <= value < 1e4 else f"{value:.0e}"))
 
 
-PAGE_STYLE = (
-    "body{font-family:sans-serif;max-width:60em;margin:2em auto;font-size:14px;line-height:1.35}"
-    "table{border-collapse:collapse;margin:1em 0}img{max-width:100%;break-inside:avoid}"
-    "td,th{padding:.2em .7em;text-align:left;border-bottom:1px solid #ccc;vertical-align:top}.from{color:#666}"
-    ".numbers td:nth-child(n+2):not(:last-child),.numbers th:nth-child(n+2):not(:last-child){text-align:right}"
-    "section{break-before:page}h2{break-after:avoid}@media print{body{font-size:11px}}"
-)
-
-
 @document_of("PlanAnswer", "plan.html", when=lambda answer: answer.study.plan.report == "html")
 def plan_html(answer: PlanAnswer) -> bytes:
     """Return the report: summary, a section per target (with pictures if matplotlib is installed), assumptions."""
     from mauvecl.answers.plan import LEGEND, target_lines
 
-    parts = [
-        *_top(f"Mauve: {answer.heading}", "Mauve: yields of a campaign"),
-        f"<p>{escape(answer.heading)}; mauvecl {VERSION}.</p>",
-        html_table(*answer.views[0].texts(), "numbers", link=True),
-        f"<p class=from>{escape(LEGEND)}</p>",
+    pictures = [
         html_image(partial(overview, answer), "flares expected and energies of all targets"),
-        *(f"<p>{escape(message)}</p>" for message in answer.messages),
+        *(
+            html_image(partial(_panels, answer, k), f"hours and energies of {target.name}") if target.seen_h > 0 else ""
+            for k, target in enumerate(answer.planned)
+        ),
     ]
-    for k, target in enumerate(answer.planned):
-        lines = html_table(("", "", "table: column"), target_lines(answer, k))
-        parts.append(f"<section id=target-{k}><h2>{escape(target.name)}</h2>{lines}")
-        if target.seen_h > 0:
-            parts.append(html_image(partial(target_figure, answer, k), f"hours and energies of {target.name}"))
-        parts.append("</section>")
-    table = answer.assumptions
-    rows = [tuple(str(cell) for cell in row) for row in table]
-    parts.append(
-        "<section><h2>What is assumed</h2><p class=from>Rows of assumptions.ecsv.</p>"
-        f"{html_table(table.colnames, rows)}"
-        "</section></html>"
-    )
-    return "\n".join(parts).encode()
+    lines = [target_lines(answer, k) for k in range(len(answer.planned))]
+    return _html("plan", answer=answer, legend=LEGEND, lines=lines, pictures=pictures)
 
 
-def _top(title: str, heading: str) -> tuple[str, str]:
-    """Return the beginning of a page of HTML."""
-    return (
-        f"<!doctype html><html lang=en><meta charset=utf-8><title>{escape(title)}</title>",
-        f"<style>{PAGE_STYLE}</style><h1>{escape(heading)}</h1>",
-    )
+def _html(report: str, **values: Any) -> bytes:
+    """Return a report by its template."""
+    from mako.template import Template
 
-
-def html_table(names: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "", *, link: bool = False) -> str:
-    """Return a table; `link` makes the first cell of row k lead to the section of target k."""
-    head = "".join(f"<th>{escape(name)}</th>" for name in names)
-    body = ""
-    for k, row in enumerate(rows):
-        cells = [escape(cell) for cell in row]
-        if link:
-            cells[0] = f"<a href='#target-{k}'>{cells[0]}</a>"
-        body += "<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
-    return f"<table class='{kind}'><tr>{head}</tr>{body}</table>"
+    how = {"default_filters": ["str", "escape"], "imports": ["from html import escape"], "strict_undefined": True}
+    templates = Template(filename=str(Path(__file__).with_name("reports.html.mako")), **how)
+    return str(templates.get_def(report).render(version=VERSION, **values)).encode()
 
 
 #: Sizes of text on a page of A4: of tables with many columns, and of others.
@@ -402,17 +365,8 @@ def _sections(answer: AnalyseAnswer) -> list[tuple[str, list[str], list[list[str
 @document_of("AnalyseAnswer", "analyse.html", when=lambda answer: answer.study.data.report == "html")
 def analysis_html(answer: AnalyseAnswer) -> bytes:
     """Return the report: messages, tables, remarks, and pictures if matplotlib is installed."""
-    parts = [
-        *_top(title(answer), title(answer)),
-        f"<p>Analysed by mauvecl {VERSION}. {escape(answer.assumed)}</p>",
-        *(f"<p>{escape(text)}</p>" for text in answer.messages),
-    ]
-    for heading, names, cells in _sections(answer):
-        parts.append(f"<h2>{escape(heading)}</h2>{html_table(names, cells) if names else ''}")
-    parts += [f"<p>{escape(text)}</p>" for text in answer.remarks]
-    for name, draw in pictures_of(answer).items():
-        parts.append(html_image(draw, name))
-    return "\n".join([*parts, "</html>"]).encode()
+    pictures = [html_image(draw, name) for name, draw in pictures_of(answer).items()]
+    return _html("analysis", answer=answer, title=title(answer), sections=_sections(answer), pictures=pictures)
 
 
 @document_of("AnalyseAnswer", "analyse.pdf", when=lambda answer: answer.study.data.report == "pdf")

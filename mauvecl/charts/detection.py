@@ -44,12 +44,12 @@ def _few(answer: DetectAnswer) -> First[Shown]:
     return First([star.shown for star in answer.stars], MOST_STARS, "stars")
 
 
-def _alone(outcome: Detection) -> list[Shown]:
-    return [(outcome.quiet.name, outcome, [f"flare {k + 1}" for k in range(len(outcome.flares))])]
-
-
 @picture_of("DetectAnswer", "detection", given=lambda answer: (_few(answer), answer.study.run.fap))
-@picture_of("Detection", "detection", given=lambda outcome: (_alone(outcome),))
+@picture_of(
+    "Detection",
+    "detection",
+    given=lambda outcome: ([(outcome.quiet.name, outcome, [f"flare {k + 1}" for k in range(len(outcome.flares))])],),
+)
 def detection(stars: Sequence[Shown], fap: float = 1e-3) -> Picture:
     """Plot null and flare distributions, with a row per star and a column per statistic."""
     first = stars[0][1]

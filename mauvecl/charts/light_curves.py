@@ -153,9 +153,12 @@ def light_curves(star: StarStare) -> Picture:
     for k, band in enumerate(light.bands):
         series = list[Series](always)
         for number, part in enumerate(gaps):
+            # Means of groups of frames, of which the last may be smaller.
             step = -(-part.size // max(1, MOST_POINTS * part.size // stare.n_frames))
+            edges = np.arange(0, part.size, max(1, step))
             columns = (stare.middle_s / scale, light.flux[:, k] / level[k], light.mean[:, k] / level[k])
-            time, flux, mean = (_binned(values[part], step) for values in columns)
+            sums = (np.add.reduceat(values[part], edges) for values in columns)
+            time, flux, mean = (values / np.diff(np.append(edges, part.size)) for values in sums)
             series += [
                 Dots("simulated frames", "star", size=2, alpha=0.6, listed=not number, at=(time, flux)),
                 Line("star and flares alone", "text", width=1.1, listed=not number, at=(time, mean)),
@@ -248,12 +251,6 @@ def time_unit(duration_s: float) -> tuple[float, str]:
 def _runs(numbers: NDArray[np.int64]) -> list[NDArray[np.intp]]:
     """Return the runs of frames between gaps."""
     return np.split(np.arange(numbers.size), np.flatnonzero(np.diff(numbers) > 1) + 1)
-
-
-def _binned(values: Float, step: int) -> Float:
-    """Average groups of `step` values; the last group may be smaller."""
-    edges = np.arange(0, values.size, max(1, step))
-    return np.asarray(np.add.reduceat(values, edges) / np.diff(np.append(edges, values.size)))
 
 
 #: Title of the light curve.

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mauvecl.charts.chart import WAVELENGTH, Axis, Band, Line, Panel, Picture
+from mauvecl.charts.chart import WAVELENGTH, Axis, Band, Line, Panel, Picture, Targets
 from mauvecl.charts.matplotlib import COLOURS, RANGE_NM, picture_of, styled_picture
 
 if TYPE_CHECKING:
@@ -49,12 +49,9 @@ def expectation(x: Expectation) -> Panel:
 @styled_picture
 def magnitudes(source: Source, values: Sequence[float], band: str = "V") -> Panel:
     """Plot a spectrum at several magnitudes, as the paper's figure of the rescaled HD 37202."""
-    stars = [source.at_magnitude(value, band) for value in values]
-    lines = [
-        Line(f"{band} = {value:g}", colour, at=(star.wavelength_nm, star.flux_flam))
-        for colour, value, star in zip(cycle(COLOURS), values, stars, strict=False)
-    ]
-    return Panel(WAVELENGTH, Axis(FLUX.label, log=True), lines, source.name)
+    stars = [(f"{band} = {value:g}", source.at_magnitude(value, band)) for value in values]
+    lines = Targets(at=[(name, star.wavelength_nm, star.flux_flam) for name, star in stars])
+    return Panel(WAVELENGTH, Axis(FLUX.label, log=True), [lines], source.name)
 
 
 @styled_picture
@@ -91,12 +88,9 @@ def convolved(source: Source, instrument: Instrument) -> Panel:
 def efficiencies(instrument: Instrument) -> Picture:
     """Plot each optical element's efficiency, as the paper's figure of the payload's components."""
     w = np.linspace(*RANGE_NM, 501)
-    lines = [
-        Line(text, colour, at=(w, 100 * getattr(instrument, name).at(w)))
-        for colour, (name, text) in zip(cycle(COLOURS), OPTICS.items(), strict=False)
-    ]
+    lines = Targets(at=[(text, w, 100 * getattr(instrument, name).at(w)) for name, text in OPTICS.items()])
     title = f"{instrument.name}: nominal, some of it assumed"
-    panel = Panel(WAVELENGTH, Axis("efficiency (%)", limits=(0, 105)), lines, title)
+    panel = Panel(WAVELENGTH, Axis("efficiency (%)", limits=(0, 105)), [lines], title)
     return Picture([[panel]], (3.6, 3.4), below=True)
 
 

@@ -21,7 +21,7 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
 from mauvecl.answers.verbs import COMMON, GROUPS, VERBS
-from mauvecl.cli.commands import COMMANDS, add_plain_commands, export, verify
+from mauvecl.cli.commands import COMMANDS, export, verify
 from mauvecl.cli.console import EXIT_CODES, Meter, guarded, name_flags_of, show, show_view
 from mauvecl.cli.flags import (
     SHOWS_ALL,
@@ -302,7 +302,6 @@ def _broken(command: str) -> str:
     return "\n".join(lines)
 
 
-add_plain_commands()
 #: Functions of the commands without a study.
 OTHERS: dict[str, Callable[..., None]] = {
     function.__name__: function for function in (verify, export, serve, devices, selftest, schema)

@@ -16,6 +16,7 @@ from mauvecl.answers.verbs import DRAWS, FEWER, VERBS, Verb
 from mauvecl.cli.console import Meter, show, show_view
 from mauvecl.cli.flags import (
     HELP_ALL,
+    PLACES,
     RESUMING,
     WORKERS,
     DeviceFlag,
@@ -25,12 +26,11 @@ from mauvecl.cli.flags import (
     QuietFlag,
     ReplaceFlag,
     SetFlag,
-    holds_study,
     is_star,
     option,
     output_option,
     study_argument,
-    study_flags,
+    study_option,
     warn_of_percent,
     whole,
 )
@@ -61,14 +61,18 @@ class Command:
 
     def build(self) -> Callable[..., None]:
         """Return the function that typer calls."""
-        verb = self.verb
-        flags = study_flags(*verb.keys, defaults=verb.defaults or {})
+        from mauvecl.study.keywords import keywords_of
+        from mauvecl.study.study import keys_of
+
+        verb, entries = self.verb, keys_of(self.verb.keys)
+        keywords = keywords_of(entries)
+        flags = {entry[2].parameter: study_option(*entry, verb.defaults or {}) for entry in entries}
         kinds = get_type_hints(self.run, localns={"Session": Any}, include_extras=True)
         _, *own = inspect.signature(self.run).parameters.values()
         # Annotations and defaults by parameter.
         options: dict[str, tuple[Any, Any]] = {
             "study_file": (study_argument(flags), None),
-            **{name: (flag.annotation, None) for name, flag in flags.items()},
+            **{name: (annotation, None) for name, (annotation, _) in flags.items()},
             "set": (SetFlag, None),
             **({"paper": (PaperFlag, False)} if verb.accepts("observation.instrument") else {}),
             **{p.name: (kinds[p.name], p.default) for p in own if p.name != "given"},
@@ -79,17 +83,9 @@ class Command:
         def command(study_file: Path | None = None, **values: Any) -> None:
             del values["help_all"]
             given = {name: values.pop(name, None) for name in (*flags, "set", "paper")}
-            amplitudes, errors = given.get("amplitude") or (), list[InputError]()
-            for name, flag in flags.items():
-                if flag.read is not None and given[name] is not None:
-                    try:
-                        given[name] = flag.read(given[name])
-                    except InputError as error:
-                        errors.append(error)
-            if errors:
-                raise together(errors)
+            amplitudes = given.get("amplitude") or ()
+            _read_numbers(given, {name: read for name, (_, read) in flags.items() if read is not None})
             warn_of_percent(amplitudes)
-            keywords = {name: flag.keyword for name, flag in flags.items()}
             self._call(study_file, keywords, given, values, tells_flags="given" in kinds)
 
         parameters = [
@@ -124,7 +120,7 @@ class Command:
         question_values(study, detects={"fap", "realisations"} <= keywords.keys())
         if self.draws:
             question_time(study, insist=how["insist"])
-        with Session(verb.name, study, notes=messages, **how) as session:
+        with Session(verb.name, study, draws=self.draws, notes=messages, **how) as session:
             self.run(session, **values)
 
     def _options(self) -> dict[str, tuple[Any, Any]]:
@@ -154,17 +150,24 @@ def command_of(
     return decorate
 
 
+def _read_numbers(given: dict[str, Any], readers: dict[str, Callable[[Any], Any]]) -> None:
+    """Convert the texts of numbers, in place; raises InputError that names all wrong ones."""
+    errors = []
+    for name, read in readers.items():
+        if given[name] is not None:
+            try:
+                given[name] = read(given[name])
+            except InputError as error:
+                errors.append(error)
+    if errors:
+        raise together(errors)
+
+
 def _placed(study_file: Path | None, given: dict[str, Any]) -> Path | None:
     """Give a file that is no study to the flag that takes such files, and return None in its place."""
     if study_file is None:
         return None
-    others: dict[str, tuple[Callable[[Path], bool], str]] = {
-        "targets": (lambda path: not holds_study(path), "tables of targets"),
-        "data": (lambda path: path.suffix.lower() != ".toml", "observed frames"),
-        "star": (is_star, "stars"),
-        "look_at": (is_star, "targets"),
-    }
-    for key, (applies, plural) in others.items():
+    for key, (_, plural, applies) in PLACES.items():
         if key in given and applies(study_file):
             if given[key]:
                 raise InputError(
@@ -173,17 +176,6 @@ def _placed(study_file: Path | None, given: dict[str, Any]) -> Path | None:
             given[key] = [str(study_file)] if applies is is_star else study_file
             return None
     return study_file
-
-
-def add_plain_commands() -> None:
-    """Add the commands of verbs without their own function, which compute and print the answer."""
-
-    def ask(session: Session) -> None:
-        session.answer(session.ask())
-
-    for name, verb in VERBS.items():
-        if name not in COMMANDS:
-            command_of(verb)(ask)
 
 
 StoreArgument = Annotated[Path, typer.Argument(help="Store that `mauvecl realise` wrote.")]
@@ -243,10 +235,11 @@ def realise(session: Session) -> None:
 
 def _tell(store: Store, place: Path, session: Session) -> None:
     from mauvecl.runs.store import ARRAY_COLUMNS
-    from mauvecl.study.cases import assumption_line, collect_messages
+    from mauvecl.study.cases import assumptions_of, collect_messages
 
     messages = collect_messages([scene.expectation for scene in store.scenes], store.study.processes)
-    assumed = assumption_line(store.study, ("instrument", "sky", "flare", "processes", "seed"))
+    clauses = assumptions_of(store.study, ("instrument", "sky", "flare", "processes", "seed"))
+    assumed = f"Assumed: {'; '.join(clauses)}."
     session.say([*messages, assumed])
     rows = [
         {
@@ -319,20 +312,15 @@ def verify(
         columns, left = bulk.FAULT_COLUMNS, sum(not fault.mended for fault in faults)
         source = "with what was written" if not redraw else "with what the engine draws"
         outcome = f"{len(faults) - left} repaired, {left} left as found." if faults else f"Everything agrees {source}."
-    _print_faults(
-        View(f"Not as it was written: {store}", columns, [asdict(fault) for fault in faults]), outcome, as_json
-    )
+    rows_of_faults = [asdict(fault) for fault in faults]
+    if as_json:
+        print(json.dumps(rows_of_faults, indent=2))
+    else:
+        if faults:
+            show_view(View(f"Not as it was written: {store}", columns, rows_of_faults))
+        show([outcome] if outcome else [])
     if left:
         raise typer.Exit(1)
-
-
-def _print_faults(found: View, outcome: str, as_json: bool) -> None:
-    if as_json:
-        print(json.dumps(found.table, indent=2))
-        return
-    if found.table:
-        show_view(found)
-    show([outcome] if outcome else [])
 
 
 def export(
@@ -401,18 +389,13 @@ def simulate(
 @command_of(VERBS["plan"])
 def plan(session: Session) -> None:
     """Plan a campaign; a report needs matplotlib for PDF, and a closed form needs no pool."""
-    from mauvecl.answers.plan import plan as compute
     from mauvecl.charts.matplotlib import available
 
     if session.study.plan.report == "pdf" and not available():
         session.study = session.study.with_settings(["plan.report=html"])
         session.say(["The report is HTML: matplotlib is missing, `pip install 'mauvecl[plot]'` brings it."])
-    if session.study.plan.completeness == "closed form":
-        with session.metered("targets") as meter:
-            answer = compute(session.study, progress=meter)
-    else:
-        answer = session.ask()
-    session.answer(answer)
+    session.draws = session.study.plan.completeness != "closed form"
+    session.answer(session.ask())
 
 
 @command_of(VERBS["stare"], draws=False, resumes=True)
@@ -435,11 +418,13 @@ def stare(
     session.answer(answer)
 
 
-@command_of(VERBS["analyse"], draws=False)
-def analyse(session: Session) -> None:
-    """Find the flares in observed frames, with progress in frames."""
-    from mauvecl.answers.analyse import analyse as compute
+def ask(session: Session) -> None:
+    """Compute the answer, and print it."""
+    session.answer(session.ask())
 
-    with session.metered("frames") as meter:
-        answer = compute(session.study, progress=meter)
-    session.answer(answer)
+
+# Verbs without a function of their own; an analysis counts frames, and draws nothing.
+command_of(VERBS["analyse"], draws=False)(ask)
+for one in VERBS.values():
+    if one.name not in COMMANDS:
+        command_of(one)(ask)

@@ -132,7 +132,8 @@ def _failed_call(error: OSError) -> int:
     code = _flushed(0)
     if code:
         return code
-    if error.filename is None and _raised_by(error).startswith(PRINTERS):
+    *_, (frame, _) = traceback.walk_tb(error.__traceback__)
+    if error.filename is None and str(frame.f_globals.get("__name__", "")).startswith(PRINTERS):
         # Click writes through its own stream.
         _discard()
         return _not_written(error)
@@ -182,12 +183,6 @@ def _not_written(error: OSError) -> int:
     return _say(
         f"standard output cannot be written ({error.strerror}), expected one with room; files are kept", OUTPUT_FULL
     )
-
-
-def _raised_by(error: BaseException) -> str:
-    """Return the name of the module that raised an exception."""
-    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
-    return str(frames[-1].f_globals.get("__name__", "")) if frames else ""
 
 
 def _discard() -> None:

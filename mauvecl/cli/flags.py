@@ -10,7 +10,7 @@ from functools import partial
 from glob import escape, glob
 from pathlib import Path
 from types import NoneType
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin
 
 import typer
 
@@ -19,17 +19,16 @@ from mauvecl.schema.fields import Flag, Help, Unit, as_typed, first, is_measure
 if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
 
-    from mauvecl.study.keywords import Keyword
-
-#: What the argument of the study may be instead, by the flag of a command that takes it.
-PLACES = {"targets": "a table of targets", "data": "a file of frames", "star": "a star as for --star"}
-
 
 def study_argument(flags: Collection[str]) -> Any:
     """Return the annotation of the argument that is a study, or in its place what a flag takes."""
-    other = next((f", or {what}" for flag, what in PLACES.items() if flag in flags), "")
+    other = next((f", or {what}" for flag, (what, *_) in PLACES.items() if flag in flags and what), "")
     described = f"Study (TOML), the ECSV table of an answer{other}; flags override it."
-    argument = typer.Argument(help=described, show_default=False, autocompletion=complete_study)
+    argument = typer.Argument(
+        help=described,
+        show_default=False,
+        autocompletion=lambda incomplete: complete_star(incomplete) if incomplete else _files(incomplete),
+    )
     return Annotated[Path | None, argument]
 
 
@@ -106,50 +105,43 @@ RESUMING = ("resume", "restart")
 WORKERS = ("device", "cluster", *RESUMING, "insist")
 
 
-class StudyFlag(NamedTuple):
-    """Flag of a key of the study."""
+def study_option(
+    path: str, field: FieldInfo, flag: Flag, defaults: Mapping[str, Any]
+) -> tuple[Any, Callable[[Any], Any] | None]:
+    """Return the annotation of a flag of the study's key for typer, and what converts its texts of numbers, if any.
 
-    keyword: Keyword
-    annotation: Any  # for typer, which leaves numbers as text, so that messages have one style
-    read: Callable[[Any], Any] | None  # converts texts of numbers
-
-
-def study_flags(*keys: str, defaults: Mapping[str, Any]) -> dict[str, StudyFlag]:
-    """Return flags by the names of their parameters, for keys and sections such as ``"observation.exposure_s"``.
-
-    `defaults` holds defaults of a verb that differ from the study's, by key.
+    Typer leaves numbers as text, so that messages have one style. `defaults` holds defaults of a verb that differ from
+    the study's, by key.
     """
     # `mauvecl --help` shows no flags, and starts twice as fast without importing the study.
     from mauvecl.schema.section import read_count, read_number, read_several
     from mauvecl.study.keywords import Keyword
-    from mauvecl.study.study import keys_of
 
-    flags = {}
-    for path, field, flag in keys_of(keys):
-        keyword = Keyword.of(path, field, flag)
-        each = get_args(keyword.kind)[0] if keyword.many else keyword.kind
-        kind, metavar = keyword.kind, {str: "TEXT", Path: "FILE"}.get(each)
-        read: Callable[[Any], Any] | None = None
-        if each in (float, int):
-            kind, metavar = list[str] if keyword.many else str, "NUMBER" if each is float else "INTEGER"
-            one: Callable[..., Any] = partial(read_number, unit=keyword.unit) if each is float else read_count
-            name = flag.names[0]
-            read = partial(read_several, name=name, read=one) if keyword.many else partial(one, name=name)
-        made = option(
-            *flag.names,
-            text=_help(path, field, flag, keyword.kind, defaults),
-            rich_help_panel=path.partition(".")[0].capitalize(),
-            autocompletion=COMPLETIONS.get(path),
-            metavar=f"{metavar},..." if read and keyword.many else metavar,
-        )
-        flags[keyword.name] = StudyFlag(keyword, Annotated[kind | None, made], read)
-    return flags
+    keyword = Keyword.of(path, field, flag)
+    each = get_args(keyword.kind)[0] if keyword.many else keyword.kind
+    kind, metavar = keyword.kind, {str: "TEXT", Path: "FILE"}.get(each)
+    read: Callable[[Any], Any] | None = None
+    if each in (float, int):
+        kind, metavar = list[str] if keyword.many else str, "NUMBER" if each is float else "INTEGER"
+        one: Callable[..., Any] = partial(read_number, unit=keyword.unit) if each is float else read_count
+        name = flag.names[0]
+        read = partial(read_several, name=name, read=one) if keyword.many else partial(one, name=name)
+    made = option(
+        *flag.names,
+        text=_help(path, field, flag, keyword.kind, defaults),
+        rich_help_panel=path.partition(".")[0].capitalize(),
+        autocompletion=COMPLETIONS.get(path),
+        metavar=f"{metavar},..." if read and keyword.many else metavar,
+    )
+    return Annotated[kind | None, made], read
 
 
 def option_of(key: str) -> Any:
     """Return the option of a key's flag, for a verb without a study."""
-    (flag,) = study_flags(key, defaults={}).values()
-    return get_args(flag.annotation)[1]
+    from mauvecl.study.study import keys_of
+
+    (entry,) = keys_of((key,))
+    return get_args(study_option(*entry, {})[0])[1]
 
 
 def _help(path: str, field: FieldInfo, flag: Flag, kind: Any, defaults: Mapping[str, Any]) -> str:
@@ -215,6 +207,16 @@ def holds_study(file: Path) -> bool:
     return "study" in read_ecsv(file, "table", "a table of targets, or of an answer").meta
 
 
+#: What the argument of the study may be instead, by the flag of a command that takes it: for help, in the plural for
+#: messages, and the function that tells it from a study.
+PLACES: dict[str, tuple[str, str, Callable[[Path], bool]]] = {
+    "targets": ("a table of targets", "tables of targets", lambda path: not holds_study(path)),
+    "data": ("a file of frames", "observed frames", lambda path: path.suffix.lower() != ".toml"),
+    "star": ("a star as for --star", "stars", is_star),
+    "look_at": ("", "targets", is_star),
+}
+
+
 def warn_of_percent(texts: Sequence[str]) -> None:
     """Warn of amplitudes that look like a percentage without its sign."""
     from mauvecl.schema.section import read_number
@@ -253,11 +255,6 @@ def complete_instrument(incomplete: str) -> list[str]:
     from mauvecl.host.instrument import shipped_names
 
     return [*_continued(incomplete, shipped_names()), *_files(incomplete, (".toml",))]
-
-
-def complete_study(incomplete: str) -> list[str]:
-    """Return files, and names of stars if something is typed."""
-    return complete_star(incomplete) if incomplete else _files(incomplete)
 
 
 #: Functions that complete values, by the keys of flags. Shells complete files by themselves where nothing else is

@@ -124,6 +124,7 @@ class Session(Options):
 
     verb: str
     study: Study
+    draws: bool  # whether a pool draws
     notes: Sequence[str] = ()  # what the flags did not state, which is printed with the messages of the answer
     files: list[Path] = field(default_factory=list)
     started: float = field(default_factory=time.perf_counter)
@@ -156,23 +157,6 @@ class Session(Options):
         writes_to(folder)
         self._held.enter_context(locked(folder, "output folder"))
         return folder
-
-    @contextmanager
-    def pool(self, *, unit: str = "realisations") -> Iterator[Pool]:
-        """Yield the pool of workers, with progress and a checkpoint; interruptions are reported.
-
-        The pool reports its progress in realisations; the caller reports that in another unit to `meter`.
-        """
-        from mauvecl.runs.pool import Pool
-
-        self.meter = self.metered(unit)
-        with self.checkpoint() as checkpoint, ExitStack() as stack:
-            stack.enter_context(self.meter)
-            workers = stack.enter_context(working(self.device, self.cluster))
-            progress = self.meter if unit == "realisations" else None
-            self._pool = Pool(workers, checkpoint=checkpoint, progress=progress, meanwhile=self._load)
-            self.meter.standing = lambda: self._pool.standing
-            yield self._pool
 
     @contextmanager
     def checkpoint(self) -> Iterator[Checkpoint]:
@@ -228,14 +212,27 @@ class Session(Options):
         self.files += [made] if isinstance(made, Path) else made
 
     def ask(self) -> Any:
-        """Return the answer of the session's verb to its study; a pool draws if the verb counts something."""
+        """Return the answer of the session's verb to its study, with the progress of what the verb counts."""
         from mauvecl.answers.verbs import VERBS
 
         verb = VERBS[self.verb]
         if not verb.counts:
             return verb.ask(self.study)
-        with self.pool(unit=verb.counts) as engine:
-            return verb.ask(self.study, engine, None if verb.counts == "realisations" else self.meter)
+        if not self.draws:
+            with self.metered(verb.counts) as meter:
+                return verb.ask(self.study, progress=meter)
+        from mauvecl.runs.pool import Pool
+
+        # The pool reports its own progress in realisations.
+        own = verb.counts == "realisations"
+        with (
+            self.checkpoint() as checkpoint,
+            self.metered(verb.counts) as meter,
+            working(self.device, self.cluster) as workers,
+        ):
+            pool = Pool(workers, checkpoint=checkpoint, progress=meter if own else None, meanwhile=self._load)
+            self._pool, meter.standing = pool, lambda: pool.standing
+            return verb.ask(self.study, pool, None if own else meter)
 
     def answer(self, answer: Answer) -> None:
         """Print an answer and write its files."""

@@ -198,7 +198,6 @@ class PointingDrifts(Section):
             label="Pointing losses",
             hint="Drifts of the star out of the fibre, each ended by a new acquisition, per hour of good pointing. "
             "Nothing: none. How often they happen is not published.",
-            group="Pointing",
             name="pointing_rate",
             first="",
             unit="per hour",
@@ -212,8 +211,6 @@ class PointingDrifts(Section):
         Widget(
             label="Duration of a loss",
             hint="Mean time from the start of a drift to the new acquisition; an assumption.",
-            group="Pointing",
-            place=1,
             name="pointing_duration",
         ),
     ] = 300.0
@@ -225,8 +222,6 @@ class PointingDrifts(Section):
         Widget(
             label="Depth of a loss",
             hint="Largest share of the light that is lost at the end of a drift; an assumption.",
-            group="Pointing",
-            place=2,
             name="pointing_depth",
             unit="%",
         ),

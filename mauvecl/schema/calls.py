@@ -59,7 +59,7 @@ def schema_of(hint: Any) -> CoreSchema:
     if origin is Literal:
         return core_schema.literal_schema(list(args))
     if origin in LEAVES:
-        return _leaf(*LEAVES[origin])
+        return LEAVES[origin]
     if origin in SEQUENCES or origin is list:
         return _sequence(origin, args)
     if origin in (dict, Mapping):
@@ -107,16 +107,6 @@ def _truth(value: Any) -> bool:
     return bool(value)
 
 
-def _taken_if(accepts: Callable[[Any], bool]) -> Callable[[Any], Any]:
-    """Return a function that returns an accepted value as it is, and raises ValueError for others."""
-
-    def take(value: Any) -> Any:
-        _require(accepts(value))
-        return value
-
-    return take
-
-
 def _array(value: Any) -> Any:
     if is_quantity(value):
         return without_unit(value, "")
@@ -145,14 +135,14 @@ def _mapping(value: Any) -> Any:
     return value
 
 
-#: Annotations of single values: what takes one, and what an error calls it.
-LEAVES: dict[Any, tuple[Callable[[Any], Any], str]] = {
-    float: (_number, "a number"),
-    int: (_whole, "a whole number"),
-    bool: (_truth, "true or false"),
-    str: (_taken_if(lambda value: isinstance(value, str)), "text"),
-    Path: (_taken_if(lambda value: isinstance(value, str | os.PathLike)), "a path"),
-    Callable: (_taken_if(callable), "a function"),
+#: Schemas of annotations of single values.
+LEAVES: dict[Any, CoreSchema] = {
+    float: _leaf(_number, "a number"),
+    int: _leaf(_whole, "a whole number"),
+    bool: _leaf(_truth, "true or false"),
+    str: or_error(core_schema.is_instance_schema(str), "text"),
+    Path: or_error(core_schema.is_instance_schema((str, os.PathLike)), "a path"),
+    Callable: or_error(core_schema.callable_schema(), "a function"),
 }
 
 
@@ -255,25 +245,21 @@ class _Parameter:
         try:
             return self.validate(value)
         except ValidationError as error:
-            raise _input_error(self.name, error) from None
+            faults = [
+                (tuple(part for part in fault["loc"] if part != ALTERNATIVE), fault)
+                for fault in error.errors(include_url=False)
+            ]
+        # The innermost wrong value, with the alternatives that it may be.
+        place, first = max(faults, key=lambda item: len(item[0]))
+        expected = dict.fromkeys(fault["msg"].removeprefix("Input should be ") for at, fault in faults if at == place)
+        where = self.name + "".join(f"[{part!r}]" for part in place if part != "[key]")
+        refused = InputError.of(where, first["input"], " or ".join(expected))
+        refused.key = self.name
+        raise refused
 
     def annotation(self) -> Any:
         """Return the resolved annotation."""
         return eval(self.text, {}, _Names(*self.modules)) if isinstance(self.text, str) else self.text
-
-
-def _input_error(name: str, error: ValidationError) -> InputError:
-    """Return the error of the innermost wrong value, with the alternatives that it may be."""
-    faults = [
-        (tuple(part for part in fault["loc"] if part != ALTERNATIVE), fault)
-        for fault in error.errors(include_url=False)
-    ]
-    place, first = max(faults, key=lambda item: len(item[0]))
-    expected = dict.fromkeys(fault["msg"].removeprefix("Input should be ") for at, fault in faults if at == place)
-    where = name + "".join(f"[{part!r}]" for part in place if part != "[key]")
-    refused = InputError.of(where, first["input"], " or ".join(expected))
-    refused.key = name
-    return refused
 
 
 #: Types of other packages that modules import for type checkers only.

@@ -299,12 +299,11 @@ class OrNone:
         from pydantic_core import core_schema
 
         inner = handler(source)
-        schema = core_schema.no_info_before_validator_function(self._or_none, inner)
+        schema = core_schema.no_info_before_validator_function(
+            lambda value: None if isinstance(value, str) and value.strip().lower() == "none" else value, inner
+        )
         expected = str(inner.get("custom_error_message", "")).removeprefix("Input should be ")
         return or_error(schema, f"{expected or 'a number'}, or none")
-
-    def _or_none(self, value: Any) -> Any:
-        return None if isinstance(value, str) and value.strip().lower() == "none" else value
 
     def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> Any:
         return {"anyOf": [handler(schema), {"const": "none"}]}
@@ -370,6 +369,28 @@ class Quantity:
     name: str
     description: str  # of a column of tables
     label: str  # of an axis, with the unit
+    path: tuple[str, ...] = ()  # sections and key of the study
+    unit: str = ""  # in astropy's notation; empty if dimensionless
+    range: Range | None = None  # None for names instead of numbers
+
+    @property
+    def is_name(self) -> bool:
+        """True if it has names instead of numbers."""
+        return self.range is None
+
+    @property
+    def accepted(self) -> str:
+        """The values in words."""
+        return (self.range or Range()).words(self.unit)
+
+    def checked(self, value: Any) -> float | str:
+        """Return a value in the unit of the quantity; raises InputError if it is outside of the range."""
+        return value if self.range is None else number(self.name.replace("_", " "), value, self.unit, self.range)
+
+    @property
+    def suffix(self) -> str:
+        """Unit that follows a value in a title."""
+        return f" {Unit(self.unit).written}" if self.unit else ""
 
 
 @dataclass(frozen=True)
@@ -386,9 +407,9 @@ class Slider:
 class Widget:
     """Field of the page that sets a key."""
 
-    label: str
     hint: str  # explanation for visitors, in sentences
-    group: str = ""  # heading of the field's group; empty for fields that show at once
+    label: str = ""  # text of the key's help by default
+    group: str = ""  # heading of the field's group; by default that of its section, if fields do not show at once
     place: int = 0  # order within the group; fields of the same place follow the order of the study
     name: str = ""  # name in links; that of the key by default
     first: str | None = None  # text of a new page; the default of the key by default

@@ -1,4 +1,4 @@
-"""Records and sections of a study: validation with errors in one style, their reference, readers of written values."""
+"""Records and sections of a study: validation with errors in one style, and readers of written values."""
 
 from __future__ import annotations
 
@@ -6,9 +6,7 @@ import difflib
 from collections.abc import Callable, Iterator, Sequence
 from decimal import Decimal, InvalidOperation
 from functools import cache
-from pathlib import Path
-from types import NoneType, UnionType
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self, Union, cast, get_args, get_origin
+from typing import TYPE_CHECKING, Any, Self, cast, get_args
 
 from pydantic import (
     BaseModel,
@@ -19,17 +17,12 @@ from pydantic import (
     field_validator,
 )
 from pydantic.fields import FieldInfo
-from pydantic_core import PydanticCustomError, PydanticUndefined
+from pydantic_core import PydanticCustomError
 
 from mauvecl.schema.errors import InputError, shortened, shown, together
 from mauvecl.schema.fields import (
-    Flag,
-    Help,
-    Range,
     Unit,
-    as_typed,
     first,
-    found,
     is_measure,
     is_quantity,
     is_truth,
@@ -249,58 +242,6 @@ def fields_of(section: type[BaseModel], path: tuple[str, ...] = ()) -> Iterator[
             yield from fields_of(inner, (*path, key))
 
 
-class Key(NamedTuple):
-    """Row of the reference."""
-
-    path: str
-    meaning: str
-    accepted: str
-    default: str
-    flags: str
-
-
-def keys_of(section: type[BaseModel]) -> list[Key]:
-    """Return the reference of every key of a section and of the sections in it, in the order of their declaration."""
-    keys = []
-    for path, field in fields_of(section):
-        if (help := first(field, Help)) is None:
-            continue
-        meaning = help.text + (f": {help.choices}" if help.choices else "") + (f", {help.more}" if help.more else "")
-        accepted = _accepted(field.annotation, (first(field, Unit) or Unit("")).name, first(field, Range) or Range())
-        value = field.get_default(call_default_factory=True)
-        default = help.default or ("required" if value is PydanticUndefined else _text(value))
-        flags = ", ".join(name for flag in found(field, Flag) for name in flag.names)
-        keys.append(Key(".".join(path), meaning, accepted, default, flags))
-    return keys
-
-
-def _accepted(annotation: Any, unit: str, reach: Range) -> str:
-    """Describe the values of a type in words."""
-    parts = get_args(annotation)
-    if get_origin(annotation) is Annotated:
-        return _accepted(parts[0], unit, reach)
-    if get_origin(annotation) in (Union, UnionType):
-        return " or ".join(dict.fromkeys(_accepted(part, unit, reach) for part in parts if part is not NoneType))
-    if get_origin(annotation) is Literal:
-        return ", ".join(map(str, parts))
-    if get_origin(annotation) is tuple:
-        several = parts[-1] is Ellipsis
-        return f"list of {_accepted(parts[0], unit, reach)}" if several else f"{len(parts)} numbers"
-    if get_origin(annotation) is dict:
-        return f"table of {_accepted(parts[1], unit, reach)}"
-    if model_in(annotation) is not None:
-        return "table"
-    if annotation in (float, int):
-        return reach.words(unit, whole=annotation is int)
-    return {str: "text", bool: "true or false", Path: "path"}.get(annotation, "file")
-
-
-def _text(value: Any) -> str:
-    if isinstance(value, tuple):
-        return f"[{', '.join(map(_text, value))}]"
-    return as_typed(value)
-
-
 # Readers of values that are written as text, as on the command line; each receives the value's name for messages.
 
 
@@ -369,11 +310,6 @@ def _measure(text: str) -> float | str:
     return text if is_measure(text) else float(text)
 
 
-def read_axes(texts: Sequence[str], name: str) -> list[dict[str, Any]]:
-    """Read several axes."""
-    return [read_axis(text, name) for text in texts]
-
-
 def read_assignment(text: str, name: str, expected: str) -> tuple[str, str]:
     """Read a name and its value, with an equals sign between them."""
     key, _, value = (part.strip() for part in text.rpartition("="))
@@ -391,14 +327,9 @@ def read_line_fluxes(texts: Sequence[str], name: str) -> dict[str, float]:
     return lines
 
 
-def read_gaps(texts: Sequence[str], name: str) -> list[tuple[float, float]]:
-    """Read ranges of time such as 1000:2000."""
-    return [_pair(text, name, "two times in s, such as 1000:2000", "s") for text in texts]
-
-
-def read_wavelengths(texts: Sequence[str], name: str) -> list[tuple[float, float]]:
-    """Read ranges of wavelengths such as 322:368."""
-    return [_pair(text, name, "two wavelengths in nm, such as 322:368", "nm") for text in texts]
+def read_ranges(texts: Sequence[str], name: str, *, expected: str, unit: str) -> list[tuple[float, float]]:
+    """Read ranges, such as 322:368."""
+    return [_pair(text, name, expected, unit) for text in texts]
 
 
 def read_declinations(text: str, name: str) -> tuple[float, float] | str:

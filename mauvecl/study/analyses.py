@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, Self
 
@@ -11,7 +12,7 @@ from mauvecl.host.stars.library import ALIASES
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help, Range, Slider, Unit, Widget
 from mauvecl.schema.physical import DetectorTemperature, Magnitude, Positive, Wavelength
-from mauvecl.schema.section import Section, read_wavelengths, read_words
+from mauvecl.schema.section import Section, read_ranges, read_words
 from mauvecl.study.star import Star
 
 if TYPE_CHECKING:
@@ -66,7 +67,6 @@ class CalibrateQuestion(Section):
             label="Observations",
             hint="A zip archive: a TOML file with [[calibrate.observations]], as for the command line, and the frames, "
             "mappings and spectra that it names.",
-            group="Standards",
             kind="upload",
         ),
     ] = ()
@@ -79,7 +79,6 @@ class CalibrateQuestion(Section):
             label="Intervals of the throughput",
             hint="Intervals of the spline that describes the throughput: more of them follow narrower features, with "
             "larger errors.",
-            group="Standards",
         ),
     ] = 100
     light_error: Annotated[
@@ -90,7 +89,6 @@ class CalibrateQuestion(Section):
         Widget(
             label="Error of the light",
             hint="By how much the light of an observation differs, by pointing.",
-            group="Standards",
             unit="%",
         ),
     ] = 0.0
@@ -103,7 +101,6 @@ class CalibrateQuestion(Section):
             label="Error of the spectra",
             hint="Error of the stars' spectra, at each of 12 wavelengths. Empty: 10 % for one star, fitted if several "
             "disagree.",
-            group="Standards",
             unit="%",
         ),
     ] = None  # fmt: skip
@@ -128,7 +125,6 @@ class ChangeQuestion(Section):
             label="Changes",
             hint="What changes, with commas: lines such as Mg II or 656.5 (nm), balmer jump, colour, and bands such as "
             "200-320 (nm).",
-            group="Change",
             name="changes",
             first=", ".join(DEFAULT_CHANGES),
         ),
@@ -141,7 +137,6 @@ class ChangeQuestion(Section):
             label="Added spectrum",
             hint="Light that a change adds to the star, such as an accretion excess or a companion: the change "
             "“spectrum”.",
-            group="Change",
             name="change_file",
             place=1,
             kind="file",
@@ -204,7 +199,6 @@ class ChangeQuestion(Section):
         Widget(
             label="Visits",
             hint="How many exposures of the star are compared with each other.",
-            group="Change",
             first="20",
             slider=Slider(2, 100, 1),
         ),
@@ -216,23 +210,13 @@ class ChangeQuestion(Section):
         Days,
         Help("Shortest period"),
         Flag("--shortest-period"),
-        Widget(
-            label="Shortest period",
-            hint="The first period of the map.",
-            group="Change",
-            slider=Slider(0.1, 10, 1.1, log=True),
-        ),
+        Widget(hint="The first period of the map.", slider=Slider(0.1, 10, 1.1, log=True)),
     ] = 1.0
     longest_d: Annotated[
         Days,
         Help("Longest period"),
         Flag("--longest-period"),
-        Widget(
-            label="Longest period",
-            hint="The last period of the map.",
-            group="Change",
-            slider=Slider(2, 200, 1.1, log=True),
-        ),
+        Widget(hint="The last period of the map.", slider=Slider(2, 200, 1.1, log=True)),
     ] = 30.0
     steps: Annotated[int, Range(2, 50), Help("Periods and amplitudes of the map, each")] = 6
     period_fap: Annotated[
@@ -276,7 +260,6 @@ class DataChoice(Section):
             label="Frames",
             hint="A light curve or a sequence of spectra: FITS, ECSV or CSV of at most 16 MiB; the command line reads "
             "larger ones. Files of mauvecl, TESS, Kepler and lightkurve need no mapping.",
-            group="Frames",
             name="frames",
             kind="upload",
         ),
@@ -289,8 +272,6 @@ class DataChoice(Section):
             label="Mapping",
             hint="Other files need a short TOML file that names the columns of time, flux and error, such as "
             "time = 'TIME', flux = 'RATE'; the documentation has one for each layout.",
-            group="Frames",
-            place=1,
             kind="upload",
         ),
     ] = None
@@ -307,8 +288,6 @@ class DataChoice(Section):
             hint="Bits of the quality flag that exclude a frame: numbers and names as in Desat,128, or all, or none. "
             "Without them lightkurve's default applies to Kepler and K2, its default without ImpulsiveOutlier to TESS, "
             "and all bits to other files.",
-            group="Frames",
-            place=2,
         ),
     ] = None
     ignore_checksum: Annotated[
@@ -346,11 +325,14 @@ class MeasureQuestion(Section):
     skipped_nm: Annotated[
         tuple[tuple[Wavelength, Wavelength], ...],
         Help("Wavelengths that fits leave out, from:to", "as in 322:368"),
-        Flag("--skip", kind=list[str], read=read_wavelengths),
+        Flag(
+            "--skip",
+            kind=list[str],
+            read=partial(read_ranges, expected="two wavelengths in nm, such as 322:368", unit="nm"),
+        ),
         Widget(
             label="Leave out wavelengths",
             hint="Ranges in nm that fits do not use, such as 322:368, or 200:250, 322:368.",
-            group="Measurement",
             unit="nm",
         ),
     ] = ()
@@ -362,7 +344,6 @@ class MeasureQuestion(Section):
             label="S/N of bins",
             hint="Simulated fits then also measure the flare of a stare of one orbit against time, in bins of frames "
             "in which it reaches this S/N. Nothing: they do not.",
-            group="Measurement",
         ),
     ] = None
     joint_fit: Annotated[
@@ -375,7 +356,6 @@ class MeasureQuestion(Section):
             label="Joint fit",
             hint="Simulated fits then also fit shape and spectrum of the flare to all frames of a stare of one orbit "
             "together: its peak, half-width, amplitude and temperature.",
-            group="Measurement",
         ),
     ] = False
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 import numpy as np
 
 from mauvecl.noise.drawing import Cumulants, stack_is_exact
-from mauvecl.noise.unknowns import COURSES, PROCESSES, STARE_PROCESSES, Processes
+from mauvecl.noise.unknowns import COURSES, PROCESSES, STARE_PROCESSES, Processes, default_processes
 from mauvecl.schema.columns import Column, percent, short
 from mauvecl.schema.errors import Message, of_kind
 from mauvecl.study.questions import QUANTITIES, Sweep
@@ -41,11 +41,6 @@ UNKNOWN_USES: tuple[Use, ...] = ("processes", "nuisances", "stare", "values")
 KNOWN_CHANGES = ("thermal", "variability", "throughput", "sky")
 
 
-def assumption_line(study: Study, uses: Collection[Use], varied: Collection[str] = ()) -> str:
-    """Return one line with the assumptions of a study; see `assumptions_of`."""
-    return f"Assumed: {'; '.join(assumptions_of(study, uses, varied))}."
-
-
 def assumptions_of(study: Study, uses: Collection[Use], varied: Collection[str] = ()) -> list[str]:
     """Return the assumptions of a study about the parts that an answer uses, one clause each.
 
@@ -62,7 +57,10 @@ def assumptions_of(study: Study, uses: Collection[Use], varied: Collection[str] 
         "seed": lambda: f"seed {study.run.seed}",
     }
     stated = {*uses, *(("unknowns",) if {*UNKNOWN_USES} & {*uses} else ())}
-    unused = unused_unknowns(study, uses)
+    # Verbs of an orbit look at targets, not at the study's star.
+    observes = "instrument" in uses and "orbit" not in uses
+    unused = [key for use, keys in _given_unknowns(study).items() if use not in uses for key in keys]
+    unused += [] if observes or all(star.neighbours is None for star in study.star) else ["star.neighbours"]
     ignored = [f"not used: {', '.join(unused)}"] if unused else []
     return [*(words[use]() for use in words if use in stated), *ignored]
 
@@ -115,39 +113,33 @@ def _orbit(study: Study) -> str:
     return f"orbit of {source}; least angles: {', '.join(kept) or 'none'}"
 
 
+def _given_unknowns(study: Study) -> dict[Use, dict[str, str]]:
+    """Return the study's unknowns in words, by the parts that hold them and by key."""
+    n, s, draws = study.nuisances, study.stare, study.unknowns.draws
+    changes = {f"stare.{name}": name for name in KNOWN_CHANGES if getattr(s, name) is not None}
+    changes |= {f"stare.{course}": f"{course} of {', '.join(of)}" for course in COURSES if (of := getattr(s, course))}
+    processes = {name: process for name, process in STARE_PROCESSES.items() if getattr(s, name)}
+    return {
+        "processes": {
+            f"processes.{name}": name.replace("_", " ") for name, value in study.processes if value is not None
+        },
+        "nuisances": {f"nuisances.{name}": name for name in n.spreads()}
+        | {f"nuisances.own.{name}": name for name in n.own},
+        "stare": changes | {f"stare.{name}": f"{process.label} (assumed)" for name, process in processes.items()},
+        "values": {"unknowns.draws": f"{draws} draws of the instrument's unknowns"} if draws else {},
+    }
+
+
 def _unknowns(study: Study, uses: Collection[Use]) -> str:
     """List the unknowns that an answer draws, marginalises over or averages over."""
-    n, s = study.nuisances, study.stare
-    drawn = [name.replace("_", " ") for name, value in study.processes if value is not None and "processes" in uses]
-    if "stare" in uses:
-        drawn += [name for name in KNOWN_CHANGES if getattr(s, name) is not None]
-        drawn += [f"{course} of {', '.join(of)}" for course in COURSES if (of := getattr(s, course))]
-        drawn += [f"{process.label} (assumed)" for name, process in STARE_PROCESSES.items() if getattr(s, name)]
+    given = {use: words.values() for use, words in _given_unknowns(study).items() if use in uses}
     how = {"drawn": {"processes", "stare"}, "marginalised": {"nuisances", "stare"}}
     usual = " and ".join(word for word, of in how.items() if of & {*uses})
-    parts = [f"the usual unknowns {usual}"] if n.usual else []
+    parts = [f"the usual unknowns {usual}"] if study.nuisances.usual else []
+    drawn = [*given.get("processes", ()), *given.get("stare", ())]
     parts += [f"drawn: {', '.join(drawn)}"] if drawn else []
-    named = [*n.spreads(), *n.own] if "nuisances" in uses else []
-    parts += [f"marginalised: {', '.join(named)}"] if named else []
-    if study.unknowns.draws and "values" in uses:
-        parts.append(f"{study.unknowns.draws} draws of the instrument's unknowns")
-    return "; ".join(parts) or "everything known but the noise"
-
-
-def unused_unknowns(study: Study, uses: Collection[Use]) -> list[str]:
-    """Return the keys of the study's unknowns that an answer ignores."""
-    n, s = study.nuisances, study.stare
-    given: dict[Use, list[str]] = {
-        "processes": [f"processes.{name}" for name, value in study.processes if value is not None],
-        "nuisances": [f"nuisances.{name}" for name in n.spreads()] + [f"nuisances.own.{name}" for name in n.own],
-        "stare": [f"stare.{name}" for name in KNOWN_CHANGES if getattr(s, name) is not None]
-        + [f"stare.{name}" for name in (*COURSES, *STARE_PROCESSES) if getattr(s, name)],
-        "values": ["unknowns.draws"] if study.unknowns.draws else [],
-    }
-    # Verbs of an orbit look at targets, not at the study's star.
-    observes = "instrument" in uses and "orbit" not in uses
-    near = [] if observes or all(star.neighbours is None for star in study.star) else ["star.neighbours"]
-    return [key for use, keys in given.items() if use not in uses for key in keys] + near
+    parts += [f"marginalised: {', '.join(named)}"] if (named := given.get("nuisances")) else []
+    return "; ".join([*parts, *given.get("values", ())]) or "everything known but the noise"
 
 
 def star_label(star: Star, x: Expectation) -> str:
@@ -199,6 +191,8 @@ def full_label(name: str, at: Mapping[str, float | str]) -> str:
 WITHOUT_LIGHT = frozenset({"nuisances"})
 #: Number of stars whose spectra a study's cases keep, since a sweep may have any number of them.
 MAX_SOURCES = 16
+#: Values of an observation without changes of its instrument.
+UNCHANGED: dict[str, Any] = {"changes": {}, "temperature_c": None}
 
 
 class Loader:
@@ -212,7 +206,6 @@ class Loader:
         self.sky: Callable[[SkyLight], Sky] = lru_cache(MAX_SOURCES)(lambda light: light.sky())
         self._near: Callable[[Star], Neighbours | None] = lru_cache(MAX_SOURCES)(lambda star: star.near())
         self._instruments: dict[str, Instrument] = {}
-        self._unchanged: dict[str, Instrument] = {}
 
     def neighbours(self, star: Star) -> Neighbours | None:
         """Return the neighbours of a star, which do not depend on its magnitude."""
@@ -220,14 +213,12 @@ class Loader:
 
     def instrument(self, observation: Observation) -> Instrument:
         """Return the instrument of an observation."""
-        key = repr((observation.instrument, observation.temperature_c, sorted(observation.changes.items())))
-        if key not in self._instruments:
-            file = str(observation.instrument)
-            if file not in self._unchanged:
-                unchanged = observation.model_copy(update={"changes": {}, "temperature_c": None})
-                self._unchanged[file] = unchanged.load_instrument()
-            self._instruments[key] = observation.changed(self._unchanged[file])
-        return self._instruments[key]
+        file, kept = observation.instrument, self._instruments
+        key = repr((file, observation.temperature_c, sorted(observation.changes.items())))
+        if key not in kept:
+            kept[file] = kept.get(file) or observation.model_copy(update=UNCHANGED).load_instrument()
+            kept[key] = observation.changed(kept[file])
+        return kept[key]
 
 
 @dataclass(frozen=True, eq=False)
@@ -301,11 +292,12 @@ class Case:
 
     @cached_property
     def processes(self) -> Processes:
-        """Noise processes to draw."""
-        processes = self.study.processes
-        if self.study.nuisances.usual:
-            return self.study.nuisances.processes(processes, self.instrument.temperature_c)
-        return processes
+        """Noise processes to draw: those given and, with the usual unknowns, those of the documented set."""
+        named = self.study.processes
+        added = default_processes(self.instrument.temperature_c) if self.study.nuisances.usual else {}
+        update = {name: prior for name, prior in added.items() if getattr(named, name) is None}
+        every: Processes = named.model_copy(update=update)
+        return every
 
     @property
     def draw_options(self) -> dict[str, Any]:
@@ -435,10 +427,14 @@ class Case:
     @cached_property
     def stare_expectation(self) -> StareExpectation:
         """Expectation of the stare at the star, with its flares."""
-        from mauvecl.study.stares import expect_stare
+        from mauvecl.flares.frames import StareExpectation
+        from mauvecl.flares.stare import check_contributions, coefficients, temperatures_of
 
-        frame = self.one_frame
-        return expect_stare(self.stare, self.events, frame.quiet, frame.flare_electrons)
+        stare, events, frame = self.stare, self.events, self.one_frame
+        check_contributions(events, stare.start_s, stare.frame_s)
+        kelvin = temperatures_of(events)
+        amplitudes = coefficients(events, stare.start_s, stare.frame_s, kelvin)
+        return StareExpectation(frame.quiet, stare, frame.flare_electrons(kelvin), amplitudes)
 
     @cached_property
     def events(self) -> list[Event]:

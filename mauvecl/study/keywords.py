@@ -53,7 +53,9 @@ class Keyword(NamedTuple):
         """Return a list for a single value of a keyword of several values."""
         if not self.many or given is None or isinstance(given, Mapping):
             return given
-        return [given] if _is_single(given) else list(given)
+        # Neither a sequence nor an array.
+        single = isinstance(given, str | Path) or getattr(given, "ndim", 1) == 0 or not hasattr(given, "__len__")
+        return [given] if single else list(given)
 
 
 def keywords_of(fields: Iterable[tuple[str, FieldInfo, Flag]]) -> dict[str, Keyword]:
@@ -77,11 +79,6 @@ def values_of(given: Mapping[str, Any], keywords: Mapping[str, Keyword], where: 
     if given.get("ideal"):
         values["with_unknowns"] = False
     return values | {"paper": given.get("paper")}
-
-
-def _is_single(value: Any) -> bool:
-    """Return whether a value is neither a sequence nor an array."""
-    return isinstance(value, str | Path) or getattr(value, "ndim", 1) == 0 or not hasattr(value, "__len__")
 
 
 def plain_kind(annotation: Any) -> Any:

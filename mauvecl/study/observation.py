@@ -18,8 +18,6 @@ from mauvecl.noise.unknowns import (
     INSTRUMENT_VALUES,
     NUISANCES,
     Comparison,
-    Processes,
-    default_processes,
     values_of,
 )
 from mauvecl.schema.errors import InputError, shortened
@@ -29,6 +27,8 @@ from mauvecl.schema.physical import (
     DetectorTemperature,
     Exposure,
     Probability,
+    Realisations,
+    Seed,
     SkyBrightness,
     Temperature,
 )
@@ -51,12 +51,7 @@ class Observation(Section):
         Exposure,
         Help("Exposure time", "rounded up to whole frames of 5 s"),
         Flag("--exposure", "-t"),
-        Widget(
-            label="Exposure",
-            hint="Time on the star; whole frames of 5 s are added up.",
-            place=1,
-            slider=Slider(5, 3600, 5),
-        ),
+        Widget(label="Exposure", hint="Time on the star; whole frames of 5 s are added up.", slider=Slider(5, 3600, 5)),
         Quantity("exposure", "length of the exposure", "exposure (s)"),
     ] = 50.0
     instrument: Annotated[
@@ -69,7 +64,6 @@ class Observation(Section):
             label="Payload",
             hint="mauve: dark counts are Poisson in electrons, as in physics. mauvesim: Poisson in DN, as in the "
             "MauveSim paper, which makes the dark noise 1.3 times as large.",
-            place=2,
             choices=("mauve", "mauvesim"),
         ),
     ] = DEFAULT_INSTRUMENT
@@ -78,7 +72,6 @@ class Observation(Section):
         Help("Detector temperature", default="the instrument's"),
         Flag("--temperature"),
         Widget(
-            label="Detector temperature",
             hint="The dark current doubles every few degrees.",
             group="Detector",
             placeholder="21, or along the orbit in plans",
@@ -135,8 +128,6 @@ class SkyLight(Section):
         Widget(
             label="Sky brightness",
             hint="Zodiacal light, V magnitudes per square arc second.",
-            group="Sky",
-            place=1,
             name="sky_brightness",
             first=f"{DEFAULT_SKY:g}",
             unit="mag/arcsec²",
@@ -151,15 +142,13 @@ class SkyLight(Section):
         Widget(
             label="Sky target",
             hint="A star by name, such as AU Mic, or coordinates in degrees such as 290.68 +11.12.",
-            group="Sky",
-            place=1,
         ),
     ] = None
     time: Annotated[
         str | None,
         Help("Time of the observation, UTC, with the target"),
         Flag("--time"),
-        Widget(label="Time, UTC", hint="Such as 2026-09-01T12:00.", group="Sky", place=1),
+        Widget(label="Time, UTC", hint="Such as 2026-09-01T12:00."),
     ] = None
     none: Annotated[bool, Help("Whether there is no sky")] = False
 
@@ -197,13 +186,12 @@ class SkyLight(Section):
 class Run(Section):
     """Number of realisations, seed, statistics and false-alarm probability."""
 
-    realisations: Annotated[int, Range(1), Help("Noise realisations"), Flag("--realisations", "-n")] = 1_000_000
+    realisations: Annotated[Realisations, Help("Noise realisations"), Flag("--realisations", "-n")] = 1_000_000
     seed: Annotated[
-        int,
-        Range(0, 2**64 - 1),
+        Seed,
         Help("Seed"),
         Flag("--seed"),
-        Widget(label="Seed", hint="The same seed gives the same noise, to the bit.", group="Detection", place=3),
+        Widget(hint="The same seed gives the same noise, to the bit.", place=3),
     ] = DEFAULT_SEED
     statistics: Annotated[
         tuple[str, ...],
@@ -224,7 +212,6 @@ class Run(Section):
         Widget(
             label="False-alarm probability",
             hint="How often noise alone passes for a flare, per test: it sets the threshold.",
-            group="Detection",
             unit="per test",
             slider=Slider(1e-6, 0.1, 10**0.1, log=True),
         ),
@@ -376,15 +363,6 @@ class NuisanceChoice(create_model("_Amplitudes", __base__=Section, **_keys)):  #
     def spreads(self) -> dict[str, float | Literal["free"]]:
         """Return the given standard deviations of amplitudes with built-in spectra."""
         return {name: spread for name in NUISANCES if (spread := getattr(self, name)) is not None}
-
-    def processes(self, named: Processes, temperature_c: float) -> Processes:
-        """Return the processes to draw: those given and, with `usual`, those of the documented set."""
-        if not self.usual:
-            return named
-        added = default_processes(temperature_c)
-        update = {name: prior for name, prior in added.items() if getattr(named, name) is None}
-        every: Processes = named.model_copy(update=update)
-        return every
 
 
 #: Choice of unknowns with which everything but the noise is known.

@@ -56,13 +56,7 @@ class OrbitQuestion(Section):
         str,
         Help("First day or time, UTC"),
         Flag("--start"),
-        Widget(
-            label="First day",
-            hint="The first day of the time that is looked at, UTC.",
-            group="Campaign",
-            place=1,
-            kind="day",
-        ),
+        Widget(label="First day", hint="The first day of the time that is looked at, UTC.", kind="day"),
     ] = "2027-01-01"
     days: Annotated[
         float,
@@ -73,8 +67,6 @@ class OrbitQuestion(Section):
         Widget(
             label="Days",
             hint="How many days from the first one on are looked at: 365 show every season.",
-            group="Campaign",
-            place=2,
             unit="d",
             most=1000,
             slider=Slider(5, 730, 5),
@@ -249,8 +241,6 @@ class PlanQuestion(Section):
         Widget(
             label="Hours on each target",
             hint="How long each target is observed, at most: never longer than it is seen.",
-            group="Campaign",
-            place=3,
             first="100",
             slider=Slider(10, 1000, 10),
         ),

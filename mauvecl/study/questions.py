@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
 from mauvecl.schema.errors import InputError, shown
-from mauvecl.schema.fields import Flag, Help, Quantity, Range, Slider, Unit, Widget, first, number
+from mauvecl.schema.fields import Flag, Help, Quantity, Range, Slider, Unit, Widget, first
 from mauvecl.schema.physical import Positive, Probability, Wavelength
-from mauvecl.schema.section import Section, fields_of, read_axes, read_axis, read_frames
+from mauvecl.schema.section import Section, fields_of, read_axis, read_frames
 from mauvecl.study.observation import Observation, SkyLight
 from mauvecl.study.star import Flare, Star
 
@@ -22,35 +22,9 @@ if TYPE_CHECKING:
     from mauvecl.study.stare import EventChoice, StareQuestion
 
 
-@dataclass(frozen=True)
-class StudyQuantity(Quantity):
-    """Quantity of a study, with the unit and range of its field."""
-
-    path: tuple[str, ...]  # sections and key
-    unit: str  # in astropy's notation; empty if dimensionless
-    range: Range
-    is_name: bool  # names instead of numbers
-
-    def checked(self, value: Any) -> float | str:
-        """Return a value in the unit of the quantity; raises InputError if it is outside of the range."""
-        return value if self.is_name else number(self.name.replace("_", " "), value, self.unit, self.range)
-
-    @property
-    def suffix(self) -> str:
-        """Unit that follows a value in a title."""
-        return f" {Unit(self.unit).written}" if self.unit else ""
-
-
+#: Quantities that vary, by name, with the unit and range of their fields.
 QUANTITIES = {
-    one.name: StudyQuantity(
-        one.name,
-        one.description,
-        one.label,
-        path,
-        unit=(first(field, Unit) or Unit("")).name,
-        range=first(field, Range) or Range(),
-        is_name=first(field, Range) is None,
-    )
+    one.name: replace(one, path=path, unit=(first(field, Unit) or Unit("")).name, range=first(field, Range))
     for name, section in (("star", Star), ("flare", Flare), ("observation", Observation), ("sky", SkyLight))
     for path, field in fields_of(section, (name,))
     if (one := first(field, Quantity)) is not None
@@ -156,7 +130,6 @@ class LimitQuestion(Section):
             label="Solve for",
             hint="The smallest flare, the faintest star or the shortest exposure that is detected with the wanted "
             "probability; all else is as entered. The tab Limit and map simulates it.",
-            group="Limit",
             first="amplitude",
         ),
     ] = "magnitude"
@@ -194,9 +167,8 @@ class Axis(Section):
         try:
             return given | {key: Unit(quantity.unit).plain(given[key]) for key in keys}
         except ValueError as error:
-            accepted = quantity.range.words(quantity.unit)
             raise InputError(
-                f"a value of the axis {quantity.name!r} must be {accepted}, not {error}", key="values"
+                f"a value of the axis {quantity.name!r} must be {quantity.accepted}, not {error}", key="values"
             ) from error
 
     @model_validator(mode="after")
@@ -216,10 +188,10 @@ class Axis(Section):
                 raise InputError(
                     f"a value of the axis {self.quantity!r} must be {accepted}, not {value!r}", key="values"
                 )
-            if not isinstance(value, str) and value not in quantity.range:
-                accepted = quantity.range.words(quantity.unit)
+            if quantity.range is not None and value not in quantity.range:
                 raise InputError(
-                    f"a value of the axis {self.quantity!r} must be {accepted}, not {shown(value)}", key="values"
+                    f"a value of the axis {self.quantity!r} must be {quantity.accepted}, not {shown(value)}",
+                    key="values",
                 )
         return self
 
@@ -295,7 +267,7 @@ class Sweep(Section):
             "Values of a quantity",
             "as in exposure=5,50,600 or magnitude:4:10:7; several give every combination",
         ),
-        Flag("--sweep", kind=list[str], read=read_axes),
+        Flag("--sweep", kind=list[str], read=lambda texts, name: [read_axis(text, name) for text in texts]),
     ] = ()
 
     @model_validator(mode="after")

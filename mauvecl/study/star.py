@@ -56,7 +56,6 @@ class Star(Section):
         Help("Magnitude", "one for all stars or one each, as in 7,8"),
         Flag("--magnitude", "-m", kind=list[float]),
         Widget(
-            label="Magnitude",
             hint="How bright the star is without the flare, in the band of the next field.",
             first="8.5",
             unit="",
@@ -139,7 +138,6 @@ class Star(Section):
             label="Distance",
             hint="With it, measured flares have luminosities and energies. Nothing: fluxes at the telescope alone.",
             group="Measurement",
-            place=-1,
         ),
     ] = None
     radius_rsun: Annotated[Radius | None, Help("Radius of the star", "for energies"), Flag("--radius")] = None
@@ -168,7 +166,6 @@ class Star(Section):
             hint="Its own row in that table, by name, or its coordinates, such as 290.68 +11.12; needed if the table "
             "has positions but no separations.",
             group="Neighbours",
-            place=1,
         ),
     ] = None
     neighbour_share: Annotated[
@@ -180,7 +177,6 @@ class Star(Section):
             hint="Share of the light of neighbours within 47 arcsec that enters the fibre; an assumption, since it is "
             "not published.",
             group="Neighbours",
-            place=2,
         ),
     ] = 1.0
 
@@ -279,7 +275,6 @@ class FlareLight(Section):
             label="Balmer jump",
             hint="Flux just below 364.6 nm over that just above, by hydrogen recombination: 1 to 4 in most flares. "
             "Nothing: a plain blackbody.",
-            group="Flare's spectrum",
         ),
         Quantity(
             "balmer_jump", "flux of the flare just below the Balmer edge over that just above", "Balmer jump ratio"
@@ -293,7 +288,6 @@ class FlareLight(Section):
         Widget(
             label="Second temperature",
             hint="A second blackbody in the flare, instead of a Balmer jump. Nothing: there is none.",
-            group="Flare's spectrum",
         ),
         Quantity("second_temperature", "temperature of the flare's second blackbody", "second temperature (K)"),
     ] = None
@@ -304,7 +298,6 @@ class FlareLight(Section):
         Widget(
             label="Second area",
             hint="Area at the second temperature over that at the first, if there is one.",
-            group="Flare's spectrum",
             first="0.05",
         ),
         Quantity("second_area", "area of the flare's second blackbody over that of the first", "second area"),
@@ -335,7 +328,6 @@ class FlareLight(Section):
             label="Own flare spectrum",
             hint="Spectrum of an observed or computed flare without its star, in place of a blackbody. The amplitude "
             "scales it.",
-            group="Flare's spectrum",
             name="flare_file",
             place=2,
             kind="file",
@@ -504,7 +496,6 @@ class Flare(Section):
         Help("Flare temperature"),
         Flag("--flare-temperature"),
         Widget(
-            label="Flare temperature",
             hint="The flare shines as a blackbody of this temperature. The hotter, the more of its light is "
             "ultraviolet.",
             group="Flare's spectrum",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, Self
 
@@ -25,7 +26,7 @@ from mauvecl.noise.unknowns import COURSES, STARE_PROCESSES, Changing, NuisanceN
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.fields import Flag, Help, Range, Unit, Widget
 from mauvecl.schema.physical import Amplitude, Duration, Energy, Positive, Temperature, Wavelength
-from mauvecl.schema.section import Section, read_gaps
+from mauvecl.schema.section import Section, read_ranges
 from mauvecl.study.observation import Spread, sd_of
 
 if TYPE_CHECKING:
@@ -50,7 +51,9 @@ class StareQuestion(Section):
         tuple[tuple[float, float], ...],
         Unit("s"),
         Help("Gap without recorded frames, from:to", "as in 1000:2000"),
-        Flag("--gap", kind=list[str], read=read_gaps),
+        Flag(
+            "--gap", kind=list[str], read=partial(read_ranges, expected="two times in s, such as 1000:2000", unit="s")
+        ),
     ] = ()
     orbit_s: Annotated[Duration, Help("Orbital period")] = ORBIT_S
     orbit_gap_s: Annotated[float, Unit("s"), Range(0), Help("Gap at the end of every orbit"), Flag("--orbit-gap")] = 0.0
@@ -204,19 +207,13 @@ class SearchChoice(Section):
         Widget(
             label="False alarms",
             hint="Expected number of detections that are only noise, in the time that the next field states.",
-            group="Search",
         ),
     ] = 1.0
     per: Annotated[
         Per,
         Help("Star-time of frames for the false alarms"),
         Flag("--alarms-per"),
-        Widget(
-            label="False alarms per",
-            hint="Observing time of one star to which the number of false alarms refers.",
-            group="Search",
-            place=1,
-        ),
+        Widget(label="False alarms per", hint="Observing time of one star to which the number of false alarms refers."),
     ] = "month"
     null: Annotated[
         Literal["sampled", "counted"],

@@ -1,18 +1,18 @@
-"""Expectation of a study's stare at a star: frames, unknown changes, and flares with their sizes."""
+"""Stare of a study at a star: frames, unknown changes, and flares with their sizes."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Self
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.flares.energies import EnergyScale, Kind, amplitude_of, amplitude_of_peak
-from mauvecl.flares.frames import StareExpectation
 from mauvecl.flares.settings import Cooling
-from mauvecl.flares.stare import Event, Stare, check_contributions, coefficients, temperatures_of
+from mauvecl.flares.stare import Event, Stare, check_contributions, temperatures_of
 from mauvecl.noise.disturbances import Normal, Prior
 from mauvecl.noise.unknowns import CHANGING, COURSES, PROCESSES, STARE_PROCESSES, Changing, Course, default_spreads
 from mauvecl.schema.errors import InputError, Message
@@ -22,7 +22,6 @@ from mauvecl.study.stare import EventChoice, StareQuestion
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.host.stars.source import Source
     from mauvecl.study.plan import OrbitQuestion
@@ -36,54 +35,37 @@ Float = NDArray[np.float64]
 NEGLIGIBLE_CUT_SD = 5.0
 
 
-@dataclass(frozen=True)
-class StarePrior:
-    """A process of exposures as an unknown of a stare.
+def _stare_prior(name: str, prior: Prior, instrument: Instrument) -> tuple[Course, Changing, float, float]:
+    """Return the course of a process of exposures in a stare, what it changes, and its standard deviation and mean.
 
-    The stare's quiescent level is measured in the stare itself, so the mean of the prior is a known factor or shift.
+    The stare's quiescent level is measured in the stare itself, so the mean is a known factor on light or sky, or shift
+    of the temperature in deg C; the standard deviation is relative to it, or in deg C. Raises InputError unless the
+    prior is normal and cut far from its mean.
     """
-
-    course: Course
-    changes: Changing
-    sd: float  # relative to the mean, or deg C
-    mean: float  # known factor on light or sky, or shift of the temperature in deg C
-
-    @classmethod
-    def of(cls, name: str, prior: Prior, instrument: Instrument) -> Self:
-        """Convert the prior of a process. Raises InputError unless it is normal and cut far from its mean."""
-        if not isinstance(prior, Normal) or not prior.is_wide(NEGLIGIBLE_CUT_SD):
-            raise InputError(
-                f"processes.{name} is drawn from a normal distribution in a stare; give a normal prior whose cuts are "
-                f"{NEGLIGIBLE_CUT_SD:g} sd or more from its mean, or jitters, offsets, drifts or cycles in [stare]",
-                key=f"processes.{name}",
-            )
-        process = PROCESSES[name]
-        course: Course = "jitters" if process.when == "frame" else "offsets"
-        if process.of == "dark":
-            return cls(course, "temperature", prior.sd, prior.mean - instrument.temperature_c)
-        at = {"light_loss": instrument.light_loss, "pointing_loss": instrument.pointing_loss}
-        # The factors on light and sky are linear in their values.
-        mean, upper = (1.0 + float(process.change(at, np.array(x))) for x in (prior.mean, prior.mean + prior.sd))
-        return cls(course, process.of, abs(upper - mean) / mean, mean)
-
-    def applied(self, stare: Stare) -> Stare:
-        """Return the stare with the mean of the prior."""
-        if self.changes == "temperature":
-            return replace(stare, temperature_c=stare.temperature_c + self.mean)
-        return replace(stare, **{self.changes: getattr(stare, self.changes) * self.mean})
+    if not isinstance(prior, Normal) or not prior.is_wide(NEGLIGIBLE_CUT_SD):
+        raise InputError(
+            f"processes.{name} is drawn from a normal distribution in a stare; give a normal prior whose cuts are "
+            f"{NEGLIGIBLE_CUT_SD:g} sd or more from its mean, or jitters, offsets, drifts or cycles in [stare]",
+            key=f"processes.{name}",
+        )
+    process = PROCESSES[name]
+    course: Course = "jitters" if process.when == "frame" else "offsets"
+    if process.of == "dark":
+        return course, "temperature", prior.sd, prior.mean - instrument.temperature_c
+    at = {"light_loss": instrument.light_loss, "pointing_loss": instrument.pointing_loss}
+    # The factors on light and sky are linear in their values.
+    mean, upper = (1.0 + float(process.change(at, np.array(x))) for x in (prior.mean, prior.mean + prior.sd))
+    return course, process.of, abs(upper - mean) / mean, mean
 
 
 def stare_of(study: Study, instrument: Instrument) -> Stare:
     """Return the stare of a study. Raises InputError if the stare cannot draw one of the study's processes."""
     q = study.stare
-    priors = [
-        StarePrior.of(name, getattr(study.processes, name), instrument) for name, _ in study.processes.modulations
-    ]
+    priors = [_stare_prior(name, getattr(study.processes, name), instrument) for name, _ in study.processes.modulations]
     spreads: dict[Course, dict[Changing, float]] = {how: dict(getattr(q, how)) for how in COURSES}
-    for prior in priors:
+    for course, changed, sd, _ in priors:
         # Independent normal amplitudes of one change add up to one.
-        given = spreads[prior.course]
-        given[prior.changes] = math.hypot(given.get(prior.changes, 0.0), prior.sd)
+        spreads[course][changed] = math.hypot(spreads[course].get(changed, 0.0), sd)
     spreads = {how: {of: given[of] for of in CHANGING if of in given} for how, given in spreads.items()}
     if study.nuisances.usual:
         spreads = {how: documented | spreads[how] for how, documented in default_spreads().items()}
@@ -101,8 +83,10 @@ def stare_of(study: Study, instrument: Instrument) -> Stare:
             thermal=q.thermal,
             **changes,
         )
-    for prior in priors:
-        stare = prior.applied(stare)
+    for _, changed, _, mean in priors:
+        value = stare.temperature_c + mean if changed == "temperature" else getattr(stare, changed) * mean
+        known: dict[str, Any] = {"temperature_c" if changed == "temperature" else changed: value}
+        stare = replace(stare, **known)
     return stare
 
 
@@ -123,20 +107,6 @@ def _along_orbit(study: Study, frame_s: float, changes: dict[str, Any]) -> Stare
             f"stare.along_orbit needs a single target in orbit.targets, but has {len(targets)}", key="stare.along_orbit"
         )
     return stare_along(o.orbit(), targets[0], o.start, q.duration_s, frame_s=frame_s, limits=o.limits, **changes).stare
-
-
-def expect_stare(
-    stare: Stare, events: Sequence[Event], quiet: Expectation, flare_electrons: Callable[[Float], Float]
-) -> StareExpectation:
-    """Compute the expectation of a stare with its flares, from one quiet frame.
-
-    `flare_electrons` returns the electrons that flares of unit amplitude and some temperatures, K, add to a frame,
-    shape (n_temperature, n_pixel).
-    """
-    check_contributions(events, stare.start_s, stare.frame_s)
-    kelvin = temperatures_of(events)
-    amplitudes = coefficients(events, stare.start_s, stare.frame_s, kelvin)
-    return StareExpectation(quiet, stare, flare_electrons(kelvin), amplitudes)
 
 
 def unused_lines(exposure_s: float, stare: Stare, events: Sequence[Event]) -> list[str]:
@@ -203,12 +173,7 @@ def energy_of(
     """
     if energy_scale(study, source, kind, event.hottest_k) is None:
         return None
-
-    def scale_of(kelvin: float) -> EnergyScale:
-        scale = energy_scale(study, source, kind, kelvin)
-        assert scale is not None
-        return scale
-
+    scale_of = cast("Callable[[float], EnergyScale]", partial(energy_scale, study, source, kind))
     return event.total_energy(scale_of, temperatures_k)
 
 
@@ -217,19 +182,17 @@ def events_of(study: Study, source: Source) -> list[Event]:
 
     Raises InputError if an energy is given for a star of unknown distance and radius.
     """
-    choices = study.events or _evenly_spaced(study)
+    choices: Sequence[EventChoice] = study.events
+    if not choices:
+        q = study.stare
+        sizes = [{"energy_erg": e} for e in q.energies_erg] or [{"amplitude": a} for a in study.flare.amplitudes]
+        # The time before the first flare equals the spacing.
+        step = q.duration_s / (len(sizes) + 1)
+        choices = [EventChoice(peak_s=step * (n + 1), **size) for n, size in enumerate(sizes)]
     events = [_event(study, choice) for choice in choices]
     # The spectrum of a cooling flare is interpolated between the temperatures of all flares.
     kelvin = temperatures_of(events)
     return [_of_energy(study, source, choice, event, kelvin) for choice, event in zip(choices, events, strict=True)]
-
-
-def _evenly_spaced(study: Study) -> Sequence[EventChoice]:
-    q = study.stare
-    sizes = [{"energy_erg": e} for e in q.energies_erg] or [{"amplitude": a} for a in study.flare.amplitudes]
-    # The time before the first flare equals the spacing.
-    step = q.duration_s / (len(sizes) + 1)
-    return [EventChoice(peak_s=step * (n + 1), **size) for n, size in enumerate(sizes)]
 
 
 def _event(study: Study, choice: EventChoice) -> Event:

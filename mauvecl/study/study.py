@@ -108,23 +108,6 @@ NAMED_FILES = {
 }
 
 
-def with_file_digests(text: str) -> str:
-    """Replace the paths of files in a study's text by names and digests, not by paths."""
-    import tomli_w
-
-    data = tomllib.loads(text)
-    named = _named_files(data)
-    if not named:
-        return text
-    for section, key in named:
-        place, _ = without_columns(Path(section[key]))
-        section[key] = Path(section[key]).name
-        # Keep the answer even if the file no longer exists.
-        with contextlib.suppress(InputError):
-            section[f"{key}_sha256"] = _digest(place)
-    return tomli_w.dumps(data)
-
-
 def _named_files(data: dict[str, Any]) -> list[tuple[dict[str, Any], str]]:
     """List the sections that name one of `NAMED_FILES`, with the key."""
     found = []
@@ -387,11 +370,9 @@ class Study(Section):
         said = Message(f"{few}importance sampling finds them (`tails='sampled'`).", "sampled")
         return self.with_settings(["run.tails=sampled"]), [said]
 
-    def toml(self) -> str:
-        """Return the study as TOML, without sections that have their default values."""
-        import tomli_w
-
-        data = with_paths(self.model_dump(mode="json", exclude_none=True), type(self), Path.resolve)
+    def _stated(self) -> dict[str, Any]:
+        """Return the data of the study's text, without sections that have their default values."""
+        data: dict[str, Any] = with_paths(self.model_dump(mode="json", exclude_none=True), type(self), Path.resolve)
         unused = {"sweep": not self.sweep.axes, "unknowns": not self.unknowns.draws, "signal": self.signal.snr is None}
         fields = type(self).model_fields
         for name in [*data]:
@@ -410,7 +391,13 @@ class Study(Section):
         if "nuisances" in data:
             # Study files have this table even if it is empty.
             data["nuisances"].setdefault("own", {})
-        return tomli_w.dumps(data)
+        return data
+
+    def toml(self) -> str:
+        """Return the study as TOML, without sections that have their default values."""
+        import tomli_w
+
+        return tomli_w.dumps(self._stated())
 
     def __repr__(self) -> str:
         o, swept = self.observation, [axis.quantity for axis in self.sweep.axes]
@@ -426,8 +413,17 @@ class Study(Section):
     __str__ = __repr__
 
     def text(self) -> str:
-        """Return the study as TOML for an answer's table, with spectrum files by name and digest."""
-        return with_file_digests(self.toml())
+        """Return the study as TOML for an answer's table, with files by name and digest instead of their paths."""
+        import tomli_w
+
+        data = self._stated()
+        for section, key in _named_files(data):
+            place, _ = without_columns(Path(section[key]))
+            section[key] = Path(section[key]).name
+            # Keep the answer even if the file no longer exists.
+            with contextlib.suppress(InputError):
+                section[f"{key}_sha256"] = _digest(place)
+        return tomli_w.dumps(data)
 
     def with_instrument(self, changes: Mapping[str, Any]) -> Self:
         """Return a copy with other values of the instrument; see `Instrument.with_`."""

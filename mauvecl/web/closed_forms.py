@@ -21,8 +21,8 @@ from mauvecl.schema.columns import chance_range, chance_text
 from mauvecl.schema.errors import InputError
 from mauvecl.study.analyses import SPECTRUM
 from mauvecl.study.cases import Case, Loader, collect_messages
-from mauvecl.study.study import Study
-from mauvecl.web.fields import FIELDS, IDEAL, REALISTIC, UNKNOWN, WITH_FILE, Choice, Draws, Field, sentence, star_words
+from mauvecl.study.study import Study, set_key
+from mauvecl.web.fields import FIELDS, IDEAL, REALISTIC, UNKNOWN, WITH_FILE, Choice, sentence, star_words
 from mauvecl.web.uploads import write_spectrum, write_table
 
 if TYPE_CHECKING:
@@ -33,13 +33,6 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-#: Fields that set their keys together with the file of another field; units do not, since files are written in nm.
-SET_WITH_FILE = {"flare_file": ("continue_at_k", "flare_quiescent", "as_observed"), "change_file": ("change_band",)}
-#: Fields whose values only apply together with those of others.
-CONDITIONAL = (
-    "sky_brightness", "target", "time", "second_area", "hours", "pointing_rate", "pointing_duration",
-    "pointing_depth", *itertools.chain(*WITH_FILE.values()),
-)  # fmt: skip
 #: Names of uploaded spectra by field, and of a table of neighbours, in the folder of their study.
 SPECTRA = {
     "star": "star.ecsv",
@@ -77,93 +70,82 @@ class Question:
         """True if the visitor's file gives the brightness of the flare, and not the amplitude."""
         return "flare_file" in self.uploads and bool(self.values["as_observed"])
 
-    def study(self, folder: Path | None = None) -> Study:
-        """Return the question as a study; parameters and errors as for `case`."""
-        return self.case(folder).study
-
-    def case(self, folder: Path | None = None) -> Case:
+    def case(self, folder: Path) -> Case:
         """Return the question as a case; a flare that is as bright as observed has the amplitude of its brightness.
 
         The visitor's files are written to the folder for the study to find. Raises InputError for incompatible values.
         """
-        if folder is None and (self.uploads.keys() - {"own_unknown"} or self.neighbours is not None):
-            raise InputError("the visitor's files need a folder", key="folder")
         uploaded = self.uploaded
         # An uploaded spectrum is not read from its file at every change.
         loader = Loader(None if uploaded is None else lambda star: star.applied(uploaded))
         case = Case(Study.build(self._data(folder), "page"), loader=loader)
         return case.at_observed_brightness() if self.as_bright_as_observed else case
 
-    def _data(self, folder: Path | None) -> dict[str, Any]:
+    def _data(self, folder: Path) -> dict[str, Any]:
         """Return the question as the data of a study, whose files are written to a folder."""
         values = self.values
         data: dict[str, Any] = {}
         for name, page_field in FIELDS.items():
-            if page_field.path and name not in CONDITIONAL:
-                self._set_valid(data, name, folder)
-        data["star"] = [self._star(data["star"], folder)]
-        data["sky"] = {
-            "brightness": {"surface_brightness": values["sky_brightness"]},
-            "target and time": {"target": values["target"], "time": values["time"]},
-            "none": {"none": True},
-        }[values["sky"]]
-        if values["second_temperature_k"] is not None:
-            self._set(data, FIELDS["second_area"], values["second_area"])
-        if values["pointing_rate"] is not None:
-            for name in ("pointing_rate", "pointing_duration", "pointing_depth"):
-                self._set(data, FIELDS[name], values[name])
+            if page_field.path and self._applies(name):
+                self._set(data, name, folder)
+        star = {"library": values["star"]}
+        if self.uploaded is not None:
+            star = {"file": str(write_spectrum(self.uploaded, folder, SPECTRA["star"]))}
+        data["star"] = [data["star"] | star]
+        if values["sky"] == "none":
+            data["sky"] = {"none": True}
         if values["lines"]:
             data["flare"].setdefault("spectrum", {})["lines"] = dict(values["lines"])
-        for name in SET_WITH_FILE.keys() & self.uploads.keys():
-            for other in SET_WITH_FILE[name]:
-                self._set_valid(data, other, folder)
         if "change_file" in self.uploads and SPECTRUM not in values["changes"]:
-            self._set(data, FIELDS["changes"], (*values["changes"], SPECTRUM))
+            data["change"]["of"] = (*values["changes"], SPECTRUM)
         points = self.uploads.get("own_unknown", values["own_unknown"])
-        own = {"own": {"points": points}} if points else {}
-        data["nuisances"] = {"usual": values["unknown"] == REALISTIC, "own": own}
-        draws: Draws = values["realisations"]
+        spectra = {"own": {"points": points}} if points else {}
+        data["nuisances"] = {"usual": values["unknown"] == REALISTIC, "own": spectra}
+        number, tails = values["realisations"]
         data["run"] |= {
-            "realisations": draws.number,
-            "tails": draws.tails,
+            "realisations": number,
+            "tails": tails,
             "statistics": list(dict.fromkeys(["chi2", "chi2_element", values["statistic"]])),
         }
         if values["targets"]:
-            data["plan"] = {"targets": list(values["targets"]), "hours": values["hours"]}
+            data.setdefault("plan", {})["targets"] = list(values["targets"])
         return data
 
-    def _star(self, star: dict[str, Any], folder: Path | None) -> dict[str, Any]:
-        """Return the data of a star with its spectrum and neighbours."""
-        if folder is not None and self.neighbours is not None:
-            star["neighbours"] = str(write_table(self.neighbours, folder))
-        if folder is not None and self.uploaded is not None:
-            return star | {"file": str(write_spectrum(self.uploaded, folder, SPECTRA["star"]))}
-        return star | {"library": self.values["star"]}
+    def _applies(self, name: str) -> bool:
+        """Return whether a study has the key of a field, which may depend on the value or file of another field."""
+        values, uploads = self.values, self.uploads
+        conditions: dict[str, bool] = {
+            # Files are written in nm.
+            **dict.fromkeys(itertools.chain(*WITH_FILE.values()), False),
+            **dict.fromkeys(("continue_at_k", "flare_quiescent", "as_observed"), "flare_file" in uploads),
+            "change_band": "change_file" in uploads,
+            "sky_brightness": values["sky"] == "brightness",
+            **dict.fromkeys(("target", "time"), values["sky"] == "target and time"),
+            "second_area": values["second_temperature_k"] is not None,
+            **dict.fromkeys(("pointing_duration", "pointing_depth"), values["pointing_rate"] is not None),
+            "hours": bool(values["targets"]),
+        }
+        return conditions.get(name, True)
 
-    def _set_valid(self, data: dict[str, Any], name: str, folder: Path | None) -> None:
+    def _set(self, data: dict[str, Any], name: str, folder: Path) -> None:
         """Set the key of a field in the data of a study, in place, unless it is empty; its file goes to a folder."""
         page_field, value = FIELDS[name], self.values[name]
         if page_field.kind in ("file", "upload"):
-            if folder is None or name not in self.uploads:
+            upload = self.uploads.get(name)
+            if upload is None:
                 return
-            upload = self.uploads[name]
-            written = (
-                write_spectrum(upload, folder, SPECTRA[name]) if page_field.kind == "file" else upload.written(folder)
+            value = (
+                upload.written(folder) if page_field.kind == "upload" else write_spectrum(upload, folder, SPECTRA[name])
             )
-            value = str(written) if isinstance(written, Path) else written
-        if value is not None:
-            self._set(data, page_field, value)
-
-    @staticmethod
-    def _set(data: dict[str, Any], target: Field, value: Any) -> None:
-        """Set the key of a field in the data of a study, in place."""
-        *sections, key = target.path
-        for section in sections:
-            data = data.setdefault(section, {})
-        if target.scale != 1.0:
-            value = value / target.scale
+        if value is None:
+            return
+        if page_field.kind == "table":
+            value = write_table(value, folder)
+        value = (
+            str(value) if isinstance(value, Path) else value if page_field.scale == 1.0 else value / page_field.scale
+        )
         # A single flare.
-        data[key] = [value] if key == "amplitudes" else value
+        set_key(data, [*page_field.path], [value] if page_field.path[-1] == "amplitudes" else value, name)
 
 
 #: Answers that are simulated, by name: of one question.
@@ -242,11 +224,6 @@ class ClosedForms:
         return ClosedForms(replace(self.question, values={**self.question.values, **question}), case)
 
     @cached_property
-    def light(self) -> tuple[Source, Source]:
-        """The star at the telescope, without and with the flare."""
-        return self.case.source, self.case.flaring(self.case.amplitudes[0])
-
-    @cached_property
     def null(self) -> InterpolatedForm:
         """Distribution of the statistic without a flare, for pictures."""
         return InterpolatedForm(self.odds.null)
@@ -300,17 +277,6 @@ class ClosedForms:
         """Whether closed forms are slow: sums of squares integrated over random factors."""
         return isinstance(self.odds.null, Mixture) and not isinstance(self.odds.null.parts[0], Gaussian)
 
-    @property
-    def excess(self) -> tuple[Float, Float]:
-        """Flare minus quiet in standard deviations of the noise, per pixel and per resolution element."""
-        x = self.quiet
-        rise = np.where(x.saturated, 0.0, self.flare.signal_dn - x.signal_dn)
-        noise2 = np.where(x.saturated, 0.0, x.variance_dn2)
-        pixel = np.divide(rise, np.sqrt(x.variance_dn2))
-        total = x.per_element(noise2)
-        element = np.divide(x.per_element(rise), np.sqrt(total), out=np.zeros(total.size), where=total > 0)
-        return pixel, element
-
 
 def short(value: float) -> str:
     """Format a number with three significant digits and no power of ten."""
@@ -323,24 +289,12 @@ TITLES = {REALISTIC: "realistic: with the usual unknowns", IDEAL: "ideal: everyt
 THROUGHPUT = 0.3
 
 
-@dataclass(frozen=True, eq=False)
-class Chance:
+class Chance(NamedTuple):
     """Chance of detection under one assumption of what is unknown."""
 
     unknown: str  # choice of the field
     value: float  # NaN if there is none
     how: str  # whether it is a closed form or simulated, and its interval; or the reason why there is none
-
-    @property
-    def shown(self) -> dict[str, Any]:
-        """The number as the card shows it."""
-        return {
-            "unknown": self.unknown,
-            "title": TITLES[self.unknown],
-            "shown": chance_text(self.value),
-            "value": None if self.value != self.value else self.value,
-            "interval": self.how,
-        }
 
 
 def chances(closed: ClosedForms, answers: Answers) -> list[Chance]:
@@ -349,25 +303,19 @@ def chances(closed: ClosedForms, answers: Answers) -> list[Chance]:
     for unknown in UNKNOWN:
         try:
             assumed = closed.assuming(unknown)
-            simulated = _simulated_chance(assumed, answers.get("detection" if assumed is closed else OTHER))
-            chance = simulated or Chance(unknown, assumed.chance, f"in closed form{_spread(assumed)}")
+            answer: DetectAnswer | None = answers.get("detection" if assumed is closed else OTHER)
+            if answer is None:
+                chance = Chance(unknown, assumed.chance, f"in closed form{_spread(assumed)}")
+            else:
+                (row,) = (row for row in answer.table if row["statistic"] == closed.question.statistic)
+                drawn = f"of {closed.question.realisations[0]:,} simulated"
+                chance = Chance(unknown, float(row["probability"]), f"{chance_range(row['low'], row['high'])}, {drawn}")
         except InputError as error:
             if unknown == closed.question.unknown:
                 raise
             chance = Chance(unknown, float("nan"), sentence(error))
         all_chances.append(chance)
     return all_chances
-
-
-def _simulated_chance(assumed: ClosedForms, answer: DetectAnswer | None) -> Chance | None:
-    if answer is None:
-        return None
-    question = assumed.question
-    (row,) = (row for row in answer.table if row["statistic"] == question.statistic)
-    number = f"{question.realisations.number:,}"
-    return Chance(
-        question.unknown, float(row["probability"]), f"{chance_range(row['low'], row['high'])}, of {number} simulated"
-    )
 
 
 def _spread(closed: ClosedForms) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 from mauvecl.answers.closed_forms import spoken, unknown_cost
 from mauvecl.answers.detect import UNKNOWN_COLUMNS as COLUMNS
 from mauvecl.answers.detect import power
+from mauvecl.answers.signal import simulate
 from mauvecl.charts.chart import (
     SATURATED,
     WAVELENGTH,
@@ -28,7 +29,7 @@ from mauvecl.charts.chart import (
 from mauvecl.charts.detection import roc_columns
 from mauvecl.charts.limits import BUDGET, budget_series
 from mauvecl.detection.requests import statistic_label
-from mauvecl.noise.unknowns import NUISANCES, Nuisance
+from mauvecl.noise.unknowns import NUISANCES
 from mauvecl.schema.columns import View, chance_text, stacked, with_error
 from mauvecl.study.cases import star_column, star_label
 from mauvecl.study.observation import NuisanceChoice
@@ -54,20 +55,22 @@ def budget(closed: ClosedForms, answers: Answers) -> ChartData:
     return ChartData(f"Most of the noise's power comes from {most.called}: {share:.0f} % over all pixels.", series)
 
 
-class Noise(Tab):
-    """Noise by origin."""
+def budget_table(closed: ClosedForms, answers: Answers) -> Table:
+    """Return the closed-form table of `mauvecl snr`."""
+    study = closed.study
+    parts = [({"star": star_label(study.star[0], closed.quiet)}, closed.quiet.noise_budget())]
+    return stacked([star_column()], parts, realisations=study.run.realisations, study=study.ideal().text())
 
-    name, title = "noise", "Noise"
-    about = "Where the noise comes from, pixel by pixel, without a flare; of pinned scenarios the photons of the star."
-    pictures = (budget,)
-    questions = ("snr",)
-    files = {"noise-budget": None}  # noqa: RUF012
 
-    def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
-        """Return the closed-form table of `mauvecl snr`."""
-        study = closed.study
-        parts = [({"star": star_label(study.star[0], closed.quiet)}, closed.quiet.noise_budget())]
-        return stacked([star_column()], parts, realisations=study.run.realisations, study=study.ideal().text())
+NOISE = Tab(
+    name="noise",
+    title="Noise",
+    about="Where the noise comes from, pixel by pixel, without a flare; of pinned scenarios the photons of the star.",
+    pictures=(budget,),
+    questions=("snr",),
+    files={"noise-budget": None},
+    own_table=budget_table,
+)
 
 
 @Chart(
@@ -100,18 +103,16 @@ def signal_to_noise(closed: ClosedForms, answers: Answers) -> ChartData:
     return ChartData(text, series)
 
 
-class Signal(Tab):
-    """Signal to noise."""
-
-    name, title = "snr", "S/N"
-    about = "How well the star itself is measured, wavelength by wavelength."
-    pictures = (signal_to_noise,)
-    simulations = {"detection": "Simulate"}  # noqa: RUF012
-    questions = ("snr",)
-    files = {"snr": "detection"}  # noqa: RUF012
-
-    def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
-        return answers["snr"].element
+SIGNAL = Tab(
+    name="snr",
+    title="S/N",
+    about="How well the star itself is measured, wavelength by wavelength.",
+    pictures=(signal_to_noise,),
+    simulations={"detection": "Simulate"},
+    questions=("snr",),
+    files={"snr": "detection"},
+    own_table=lambda closed, answers: answers["snr"].element,
+)
 
 
 @Chart(
@@ -166,7 +167,7 @@ def recorded(closed: ClosedForms, answers: Answers) -> ChartData:
 ).data()  # fmt: skip
 def telescope(closed: ClosedForms, answers: Answers) -> ChartData:
     """Return the star's spectrum at the telescope, without and with the flare."""
-    star, flare = closed.light
+    star, flare = closed.case.source, closed.case.flaring(closed.case.amplitudes[0])
     # A jump or line of the flare adds wavelengths.
     nm = flare.wavelength_nm[(flare.wavelength_nm >= 190) & (flare.wavelength_nm <= 710)]
     light = [np.interp(nm, source.wavelength_nm, source.flux_flam) for source in (star, flare)]
@@ -177,20 +178,16 @@ def telescope(closed: ClosedForms, answers: Answers) -> ChartData:
     return ChartData(text, {"star": (nm, quiet), "flare": (nm, flaring)})
 
 
-class Spectrum(Tab):
-    """Tab of spectra."""
-
-    name, title = "spectrum", "Spectrum"
-    about = "What the detector records, and the light that comes to the telescope."
-    pictures = (recorded, telescope)
-    questions = ("simulate",)
-    files = {"observation": None}  # noqa: RUF012
-
-    def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
-        """Return one observation with the flare and its components."""
-        from mauvecl.answers.signal import simulate
-
-        return simulate(closed.study, flaring=True).observations[1][2]
+SPECTRUM = Tab(
+    name="spectrum",
+    title="Spectrum",
+    about="What the detector records, and the light that comes to the telescope.",
+    pictures=(recorded, telescope),
+    questions=("simulate",),
+    files={"observation": None},
+    # One observation with the flare and its components.
+    own_table=lambda closed, answers: simulate(closed.study, flaring=True).observations[1][2],
+)
 
 
 @Chart(
@@ -208,9 +205,13 @@ class Spectrum(Tab):
 def excess(closed: ClosedForms, answers: Answers) -> ChartData:
     """Return the flare minus quiet in standard deviations of the noise."""
     x, saturated = closed.quiet, closed.quiet.saturated | closed.flare.saturated
-    pixel, element = closed.excess
+    rise, noise2 = (
+        np.where(x.saturated, 0.0, values) for values in (closed.flare.signal_dn - x.signal_dn, x.variance_dn2)
+    )
+    noise = np.sqrt(x.per_element(noise2))
+    element = np.divide(x.per_element(rise), noise, out=np.zeros(noise.size), where=noise > 0)
     series: dict[str, Any] = {
-        "pixel": (x.wavelength_nm, pixel),
+        "pixel": (x.wavelength_nm, rise / np.sqrt(x.variance_dn2)),
         "element": (x.element_wavelength_nm, element),
         "noise": ([190.0, 710.0], [-1.96] * 2, [1.96] * 2),
         "saturated": strips(x.wavelength_nm, saturated),
@@ -222,7 +223,6 @@ def excess(closed: ClosedForms, answers: Answers) -> ChartData:
             variance, flare_dn = np.where(saturated, np.inf, x.variance_dn2), closed.flare.recorded_dn - x.recorded_dn
             raw = np.where(saturated, 0.0, raw - unknown.fitted_dn(raw, variance, flare_dn))
             drawn = " The drawn exposure is shown less the levels of what is unknown, fitted to it."
-        noise = np.sqrt(x.per_element(np.where(x.saturated, 0.0, x.variance_dn2)))
         shown = np.divide(x.per_element(raw), noise, out=np.full(noise.size, np.nan), where=noise > 0)
         series["drawn"] = x.element_wavelength_nm, shown
     best, lost = int(np.argmax(element)), int(np.count_nonzero(saturated))
@@ -304,15 +304,15 @@ def trade(closed: ClosedForms, answers: Answers) -> ChartData:
     return ChartData(text, series)
 
 
-class Detection(Tab):
-    """Tab of the detection, the first one."""
-
-    name, title = "detection", "Detection"
-    about = "The flare relative to the noise, and the statistic with and without the flare."
-    pictures = (excess, distributions, trade)
-    simulations = {"detection": "Simulate"}  # noqa: RUF012
-    answer = "detection"
-    files = {"detection": "detection", "roc": "detection"}  # noqa: RUF012
+DETECTION = Tab(
+    name="detection",
+    title="Detection",
+    about="The flare relative to the noise, and the statistic with and without the flare.",
+    pictures=(excess, distributions, trade),
+    simulations={"detection": "Simulate"},
+    answer="detection",
+    files={"detection": "detection", "roc": "detection"},
+)
 
 
 #: Name of an unknown, and the matched S/N plain and marginalised.
@@ -324,7 +324,9 @@ def costs(closed: ClosedForms) -> tuple[float, list[Row]]:
     """Return the flare's matched S/N with everything known, and with unknowns alone and together."""
     # Without a sky its brightness is no unknown. Those without a default prior are projected out.
     there = {name: row for name, row in NUISANCES.items() if np.any(row.spectrum(closed.quiet))}
-    alone = [NuisanceChoice.model_validate({"usual": False, name: _spread(row)}) for name, row in there.items()]
+    sd = {name: np.inf if row.prior is None else row.prior.sd for name, row in there.items()}
+    spreads = {name: "free" if np.isinf(value) else value for name, value in sd.items()}
+    alone = [NuisanceChoice.model_validate({"usual": False, name: spread}) for name, spread in spreads.items()]
     chosen = {spoken(choice).removeprefix("the "): choice for choice in alone}
     chosen["all the usual together"] = NuisanceChoice()
     if closed.study.nuisances.own:
@@ -335,10 +337,6 @@ def costs(closed: ClosedForms) -> tuple[float, list[Row]]:
         known_snr = cost.known or known_snr
         rows.append((name, cost.plain, cost.marginal))
     return known_snr, rows
-
-
-def _spread(row: Nuisance) -> float | str:
-    return "free" if row.prior is None or np.isinf(row.prior.sd) else row.prior.sd
 
 
 def _bars(canvas: Canvas, source: ColumnDataSource) -> None:
@@ -371,22 +369,23 @@ def unknown_costs(closed: ClosedForms, answers: Answers) -> ChartData:
     return ChartData(text, {"bars": bars}, {"y range": {"factors": names}})
 
 
-class Unknown(Tab):
-    """Cost of unknown properties of the instrument."""
+def table_of_costs(closed: ClosedForms, answers: Answers) -> View:
+    """Return the S/N of the flare with each unknown, and the chance to detect it."""
+    known_snr, rows = costs(closed)
+    given: list[Row] = [("nothing: everything is known", known_snr, known_snr), *rows]
+    fap = closed.question.fap
+    table = [
+        {"unknown": name, "plain": plain, "marginalised": marginal, "detected": float(power(marginal, fap))}
+        for name, plain, marginal in given
+    ]
+    return View("", [column for column in COLUMNS if column.name in table[0]], table)
 
-    name, title = "unknowns", "Unknowns"
-    about = (
-        "What it costs not to know the detector's temperature, the light lost, or the sky: a statistic that is blind "
-        "to them sees less of the flare; one that ignores them is fooled by them."
-    )
-    pictures = (unknown_costs,)
 
-    def shown(self, closed: ClosedForms, answers: Answers) -> View:
-        known_snr, rows = costs(closed)
-        given: list[Row] = [("nothing: everything is known", known_snr, known_snr), *rows]
-        fap = closed.question.fap
-        table = [
-            {"unknown": name, "plain": plain, "marginalised": marginal, "detected": float(power(marginal, fap))}
-            for name, plain, marginal in given
-        ]
-        return View(self.title, [column for column in COLUMNS if column.name in table[0]], table)
+UNKNOWN = Tab(
+    name="unknowns",
+    title="Unknowns",
+    about="What it costs not to know the detector's temperature, the light lost, or the sky: a statistic that is blind "
+    "to them sees less of the flare; one that ignores them is fooled by them.",
+    pictures=(unknown_costs,),
+    own_view=table_of_costs,
+)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple, get_args, get_origin
+from typing import Any, Literal, get_args, get_origin
 
 from pydantic.fields import FieldInfo
 
@@ -19,6 +19,7 @@ from mauvecl.host.stars.library import ModelStar, embedded, near_names, spectrum
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.fields import (
     Flag,
+    Help,
     Range,
     Unit,
     Widget,
@@ -127,17 +128,10 @@ def line_fluxes(text: str) -> tuple[tuple[str, float], ...]:
     return fractions
 
 
-class Draws(NamedTuple):
-    """Number of realisations, and whether the tail beyond them is sampled."""
-
-    number: int
-    tails: str
-
-
-def draws(text: str) -> Draws:
-    """Parse a choice such as "100000" or "100000 sampled"."""
+def draws(text: str) -> tuple[int, str]:
+    """Parse the number of realisations, and how the tail is found, such as "100000" or "100000 sampled"."""
     number, _, tails = text.partition(" ")
-    return Draws(int(number), tails or "counted")
+    return int(number), tails or "counted"
 
 
 def star_name(text: str) -> str:
@@ -256,12 +250,22 @@ class Field(Widget):
         return self.own_keys or (".".join(self.path),)
 
 
+#: Headings of fields by the section of their key, unless they state another; fields of other sections show at once.
+HEADINGS = {
+    "flare.spectrum": "Flare's spectrum", "sky": "Sky", "run": "Detection", "limit": "Limit", "search": "Search",
+    "stare.pointing": "Pointing", "orbit": "Campaign", "plan": "Campaign", "measure": "Measurement", "data": "Frames",
+    "calibrate": "Standards", "change": "Change",
+}  # fmt: skip
+
+
 def _field(path: tuple[str, ...], field: FieldInfo, widget: Widget) -> Field:
     """Return the field of a key from its metadata."""
     default, unit = field.get_default(), first(field, Unit) or Unit("")
     text = as_typed(default * widget.scale if isinstance(default, float) else default, truth=("no", "yes"))
     optional = text == "" if widget.first is None else not widget.first
     own = {
+        "label": widget.label or getattr(first(field, Help), "text", ""),
+        "group": widget.group or HEADINGS.get(".".join(path[:-1]), ""),
         "first": text if widget.first is None else widget.first,
         "unit": unit.written if widget.unit is None else widget.unit,
         "read": _reader(field, widget, unit.name, optional=optional),
@@ -419,22 +423,15 @@ _KEY = re.compile(r"(?<![\w.'])(?:[a-z]+\.)*[a-z0-9]+(?:_[a-z0-9]+)+(?![\w.]*')"
 
 @cache
 def _fields() -> dict[str, str]:
-    """Return the field of each key of the study, whole and without its section, and of each own name."""
-    names = {
-        part: name for name, field in FIELDS.items() if field.path for part in (".".join(field.path), field.path[-1])
-    }
-    return names | {name: name for name in FIELDS} | {"tails": "realisations", "plan.targets": "targets"}
-
-
-@cache
-def _flags() -> dict[str, str]:
-    """Return the field of each flag whose key has one."""
+    """Return the field of each key of the study, whole and without its section, of each own name, and of each flag."""
     names = {".".join(field.path): name for name, field in FIELDS.items() if field.path}
-    return {flag: names[key] for key, _, option in keys_of() if key in names for flag in option.names}
+    flags = {flag: names[key] for key, _, option in keys_of() if key in names for flag in option.names}
+    names |= {FIELDS[name].path[-1]: name for name in names.values()}
+    return names | {name: name for name in FIELDS} | flags | {"tails": "realisations", "plan.targets": "targets"}
 
 
 def field_of(key: str | None) -> str | None:
-    """Return the name of the field that sets a key of the study, or None."""
+    """Return the name of the field that sets a key of the study or stands for a flag, or None."""
     return _fields().get(key or "")
 
 
@@ -446,7 +443,7 @@ def sentence(error: InputError, keys: Mapping[str, str] = NO_KEYS) -> str:
 
 def note(text: str, keys: Mapping[str, str] = NO_KEYS) -> str:
     """Return a message with the labels of fields in place of keys and flags."""
-    text = _FLAG.sub(lambda match: f"“{FIELDS[_flags()[match[0]]].label}”" if match[0] in _flags() else match[0], text)
+    text = _FLAG.sub(lambda match: f"“{FIELDS[name].label}”" if (name := field_of(match[0])) else match[0], text)
     text = _REMEDY.sub(lambda match: _remedy(match, keys), text)
     return _KEY.sub(lambda match: _label(match[0], keys), text)
 

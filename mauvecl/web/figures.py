@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any, Literal
 
+import numpy as np
 from bokeh.models import (
     BasicTickFormatter,
     BoxZoomTool,
@@ -38,6 +39,7 @@ from mauvecl.charts.chart import (
     Strips,
     Targets,
 )
+from mauvecl.host.arrays import true_runs
 
 #: Wavelengths that are shown, nm.
 SHOWN_NM = (195.0, 705.0)
@@ -76,7 +78,7 @@ class Canvas:
     """Empty figure of a chart, whose data sources have the names of the chart's data."""
 
     def __init__(self, chart: Chart, theme: str, logs: frozenset[str]) -> None:
-        self.ink, self.pins, self.chart = INKS[theme], PINS[theme], chart
+        self.ink, self.chart = INKS[theme], chart
         offered = {axis.lower() for axis in chart.logs}
         self.logs = logs | {name for name, axis in (("x", chart.x), ("y", chart.y)) if axis.log and name not in offered}
         self.plot = self._frame(chart.x, chart.y)
@@ -85,7 +87,13 @@ class Canvas:
         if chart.x.kind == "wavelength":
             self._mark()
         own = [item for item in chart.series if isinstance(item, Own)]
-        for series in (*(item for item in chart.series if item not in own), *self._pins(), *own):
+        # A line for each scenario that can be pinned is drawn as the series that it repeats.
+        pins = [
+            replace(item, called=f"pinned {k + 1}", name=f"pin {k}", colour=colour, dash=dash, width=2.0, show="pins",
+                    tips=(), listed=False)
+            for k, (colour, dash) in enumerate(PINS[theme]) for item in chart.series if item.key == chart.pins
+        ]  # fmt: skip
+        for series in (*(item for item in chart.series if item not in own), *pins, *own):
             self._add(series)
 
     def _frame(self, x: Axis, y: Axis) -> Any:
@@ -149,22 +157,14 @@ class Canvas:
         self.plot.add_layout(bar, "right")
         return mapper
 
-    def _pins(self) -> list[Series]:
-        """Return a line for each scenario that can be pinned, drawn as the series that it repeats."""
-        repeated = [item for item in self.chart.series if item.key == self.chart.pins]
-        looks = enumerate(self.pins)
-        return [
-            replace(item, called=f"pinned {k + 1}", name=f"pin {k}", colour=colour, dash=dash, width=2.0, show="pins",
-                    tips=(), listed=False)
-            for k, (colour, dash) in looks for item in repeated
-        ]  # fmt: skip
-
     def _add(self, series: Series) -> None:
         """Add a series with its data source, entry of the legend, and tooltip."""
         if isinstance(series, Rule):
-            self._add_rule(series)
-            return
-        if isinstance(series, Listed):
+            # Its position is set later.
+            dimension: Literal["height", "width"] = "height" if series.along == "x" else "width"
+            look: dict[str, Any] = {"line_color": self.ink.get(series.colour, series.colour), "line_dash": series.dash}
+            self.plot.add_layout(Span(dimension=dimension, location=None, name=series.key, **look))
+        if isinstance(series, Rule | Listed):
             self._list(series)
             return
         if isinstance(series, Targets):
@@ -219,13 +219,6 @@ class Canvas:
                 return plot.step(*columns, source=source, mode="center", **line)
         return plot.line(*columns, source=source, **line)
 
-    def _add_rule(self, rule: Rule) -> None:
-        """Add a straight line, whose position is set later."""
-        dimension: Literal["height", "width"] = "height" if rule.along == "x" else "width"
-        look: dict[str, Any] = {"line_color": self.ink.get(rule.colour, rule.colour), "line_dash": rule.dash}
-        self.plot.add_layout(Span(dimension=dimension, location=None, name=rule.key, **look))
-        self._list(rule)
-
     def _list(self, series: Series) -> None:
         """Add an entry to the legend."""
         if series.listed:
@@ -273,10 +266,6 @@ class Canvas:
 
 def strips(wavelength_nm: Any, flags: Any) -> tuple[Any, Any]:
     """Return the ends of runs of flagged pixels, half a pixel beyond each, as columns of `Strips`."""
-    import numpy as np
-
-    from mauvecl.host.arrays import true_runs
-
     first, end = true_runs(flags).T
     half = 0.5 * np.gradient(wavelength_nm)
     return (wavelength_nm - half)[first], (wavelength_nm + half)[end - 1]

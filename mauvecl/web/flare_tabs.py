@@ -112,15 +112,12 @@ def _map(kept: _Kept) -> tuple[Float, Float, Float]:
             cut = (outcome.threshold - outcome.null.mean) / unit
             forms[:, j, i] = np.log(part), np.log(seen.std / unit), cut, seen.third / seen.std**3
     fine = np.linspace(*MAGNITUDES, 97), np.linspace(low, high, 61)
-    return *fine, _pearson(*PchipInterpolator(y, PchipInterpolator(x, forms, axis=2)(fine[0]), axis=1)(fine[1]))
-
-
-def _pearson(part: Float, spread: Float, cut: Float, skewness: Float) -> Float:
-    """Return the probability above a cut of a gamma distribution with these moments, or of a normal at low skewness."""
+    part, spread, cut, skewness = PchipInterpolator(y, PchipInterpolator(x, forms, axis=2)(fine[0]), axis=1)(fine[1])
     off = (cut - np.exp(part)) / np.exp(spread)
     shape = 4 / np.maximum(skewness, 1e-4) ** 2
     gamma = special.gammaincc(shape, np.maximum(shape + np.sqrt(shape) * off, 0.0))
-    return np.asarray(np.where(skewness > 1e-4, gamma, special.ndtr(-off)))
+    # At low skewness the distribution is normal.
+    return *fine, np.where(skewness > 1e-4, gamma, special.ndtr(-off))
 
 
 @Chart(
@@ -258,14 +255,14 @@ def _labels(x: Float, y: Float, p: Float) -> tuple[Any, ...]:
     return tuple(zip(*labels, strict=True)) or ([], [], [])
 
 
-class Limit(Tab):
-    """Tab of limits."""
-
-    verb, title = "limit", "Limit and map"
-    about = "How faint a star and how small a flare one would still see."
-    pictures = (curve, detection_map)
-    simulations = {"limit": "Simulate the limit", "map": "Simulate the map"}  # noqa: RUF012
-    files = {"limit": "limit", "map": "map"}  # noqa: RUF012
+LIMIT = Tab(
+    verb="limit",
+    title="Limit and map",
+    about="How faint a star and how small a flare one would still see.",
+    pictures=(curve, detection_map),
+    simulations={"limit": "Simulate the limit", "map": "Simulate the map"},
+    files={"limit": "limit", "map": "map"},
+)
 
 
 #: Unknowns of an observer, by name on the page, as the study's section of nuisances.
@@ -427,44 +424,42 @@ def course(closed: ClosedForms, answers: Answers) -> ChartData:
     return ChartData(f"One simulated stare: {'; '.join(words)}.", series)
 
 
-class Measurement(Tab):
-    """Measurement of the flare's spectrum."""
+def measured(closed: ClosedForms, answers: Answers) -> View:
+    """Return the errors of each quantity, and the counts of simulated fits."""
+    each, fits = expected(closed), simulated(answers)
+    first = next(iter(each.values()))
+    table = [
+        {"quantity": name, "unit": unit, "truth": value, **dict(zip(each, errors, strict=True))}
+        for name, unit, value, *errors in zip(
+            first.fitted.names,
+            first.fitted.units,
+            first.truth,
+            *(measurement.ahead.errors for measurement in each.values()),
+            strict=True,
+        )
+    ]
+    counted = () if fits is None else ("scatter", "coverage_95")
+    if fits is not None:
+        table = [row | counts for row, counts in zip(table, records(fits.rows()), strict=True)]
+    verb = {column.name: column for column in COLUMNS}
+    errors = [replace(verb["error"], name=name, heading=f"error, {name}") for name in each]
+    columns = [verb["quantity"], verb["unit"], verb["truth"], *errors, *(verb[name] for name in counted)]
+    return View("", columns, table)
 
-    verb = "measure"
+
+MEASUREMENT = Tab(
+    verb="measure",
     # Fits along a flare have no pointing losses.
-    never = ("pointing_rate", "pointing_duration", "pointing_depth")
-    about = (
-        "What is measured of the flare once it is detected: its temperature, size and light, with errors in closed "
-        "form; simulated fits count how often their intervals hold the truth."
-    )
-    pictures = (temperature_errors, region, course)
-    simulations = {"measure": "Simulate fits"}  # noqa: RUF012
-    files = dict.fromkeys(("measure", "fits", "temperatures", "joint"), "measure")
-
-    def offers(self, name: str, answers: Answers) -> bool:
-        # Measurements along a stare are made on request.
-        return super().offers(name, answers) and name in answers["measure"].tables
-
-    def shown(self, closed: ClosedForms, answers: Answers) -> View:
-        each, fits = expected(closed), simulated(answers)
-        first = next(iter(each.values()))
-        table = [
-            {"quantity": name, "unit": unit, "truth": value, **dict(zip(each, errors, strict=True))}
-            for name, unit, value, *errors in zip(
-                first.fitted.names,
-                first.fitted.units,
-                first.truth,
-                *(measurement.ahead.errors for measurement in each.values()),
-                strict=True,
-            )
-        ]
-        counted = () if fits is None else ("scatter", "coverage_95")
-        if fits is not None:
-            table = [row | counts for row, counts in zip(table, records(fits.rows()), strict=True)]
-        verb = {column.name: column for column in COLUMNS}
-        errors = [replace(verb["error"], name=name, heading=f"error, {name}") for name in each]
-        columns = [verb["quantity"], verb["unit"], verb["truth"], *errors, *(verb[name] for name in counted)]
-        return View(self.title, columns, table)
+    never=("pointing_rate", "pointing_duration", "pointing_depth"),
+    about="What is measured of the flare once it is detected: its temperature, size and light, with errors in closed "
+    "form; simulated fits count how often their intervals hold the truth.",
+    pictures=(temperature_errors, region, course),
+    simulations={"measure": "Simulate fits"},
+    files=dict.fromkeys(("measure", "fits", "temperatures", "joint"), "measure"),
+    own_view=measured,
+    # Measurements along a stare are made on request.
+    optional=True,
+)
 
 
 #: Half-widths of the flares: as many as there are lines.
@@ -510,18 +505,17 @@ def shares(closed: ClosedForms, answers: Answers) -> ChartData:
     return ChartData(f"Of flares that peak at {peak} the search finds {'; '.join(parts)}.", series)
 
 
-class Completeness(Tab):
-    """Tab of completeness."""
-
-    name, title = "completeness", "Stare"
-    about = (
-        "One exposure sees a flare at its peak; a stare sees it rise and fade. This tab shows which flares a search of "
-        "one orbit finds at the chosen rate of false alarms, with losses while the star drifts out of the fibre."
-    )
-    pictures = (shares,)
-    chance = False
+COMPLETENESS = Tab(
+    name="completeness",
+    title="Stare",
+    about="One exposure sees a flare at its peak; a stare sees it rise and fade. This tab shows which flares a search "
+    "of one orbit finds at the chosen rate of false alarms, with losses while the star drifts out of the fibre.",
+    pictures=(shares,),
+    chance=False,
     # The picture reads off the share of flares of this size.
-    also = ("amplitude_percent",)
-    simulations = {"completeness": "Inject flares"}  # noqa: RUF012
-    answer, view = "completeness", 1
-    files = {"completeness": "completeness", "limits": "completeness"}  # noqa: RUF012
+    also=("amplitude_percent",),
+    simulations={"completeness": "Inject flares"},
+    answer="completeness",
+    view=1,
+    files={"completeness": "completeness", "limits": "completeness"},
+)

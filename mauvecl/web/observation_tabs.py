@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -38,7 +38,7 @@ from mauvecl.charts.chart import (
 )
 from mauvecl.charts.light_curves import SCATTER, scatter_series
 from mauvecl.host.stars.source import Source
-from mauvecl.schema.columns import View, with_error
+from mauvecl.schema.columns import with_error
 from mauvecl.schema.errors import InputError
 from mauvecl.web.closed_forms import Answers, short
 from mauvecl.web.sandboxed_reader import read_limited
@@ -46,7 +46,6 @@ from mauvecl.web.tab import Tab, target_words
 from mauvecl.web.uploads import MOST_VALUES, VisitorFile, read_frames_of, reported_for
 
 if TYPE_CHECKING:
-    from astropy.table import Table
     from bokeh.models.sources import ColumnDataSource
 
     from mauvecl.answers.analyse import AnalyseAnswer
@@ -155,7 +154,13 @@ def dynamic_spectrum(closed: ClosedForms, answers: Answers) -> ChartData:
     frames: Frames | None = closed.given.get("frames")
     if frames is None or frames.wavelength_nm is None:
         return ChartData("A light curve has no spectra." if frames else NO_FRAMES)
-    image, nm = _deviations(frames), frames.wavelength_nm
+    nm, columns = frames.wavelength_nm, _means(frames.flux, frames.numbers, MOST_COLUMNS)
+    image = _means(columns.T, np.arange(nm.size), MOST_ROWS)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        image = image - np.nanmedian(image, axis=1, keepdims=True)
+        steps = np.diff(image, axis=1)
+        # Differences of neighbouring columns hold noise alone; 1.4826 makes a median absolute deviation a normal one's.
+        image = image / (1.4826 / np.sqrt(2.0) * np.nanmedian(np.abs(steps), axis=1, keepdims=True))
     reach = max(3.0, float(np.nanpercentile(np.abs(image), 99.5)))
     length = float(minutes(frames, frames.time_s[-1] + frames.cadence_s))
     series: dict[str, Any] = {"dynamic": (image[None], [0.0], [nm[0]], [length], [max(nm[-1] - nm[0], 1.0)])}
@@ -175,17 +180,6 @@ def _shades(colour: str) -> tuple[str, ...]:
     return tuple(
         "#" + "".join(f"{round(value):02x}" for value in row) for row in ends[0] * (1 - steps) + ends[1] * steps
     )
-
-
-def _deviations(frames: Frames) -> Float:
-    """Return spectra less their median in standard deviations, averaged, shape (n_row, n_column); gaps are NaN."""
-    columns = _means(frames.flux, frames.numbers, MOST_COLUMNS)
-    image = _means(columns.T, np.arange(frames.flux.shape[1]), MOST_ROWS)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        image = image - np.nanmedian(image, axis=1, keepdims=True)
-        steps = np.diff(image, axis=1)
-        # Differences of neighbouring columns hold noise alone; 1.4826 makes a median absolute deviation a normal one's.
-        return np.asarray(image / (1.4826 / np.sqrt(2.0) * np.nanmedian(np.abs(steps), axis=1, keepdims=True)))
 
 
 def _means(values: Float, numbers: NDArray[np.int64], most: int) -> Float:
@@ -214,42 +208,36 @@ def scatter(closed: ClosedForms, answer: AnalyseAnswer) -> ChartData:
     return ChartData(text, series)
 
 
-class Analyse(Tab):
-    """Flares in observed frames."""
-
-    verb = "analyse"
-    about = (
-        "Flares in your own light curve or spectra: the noise is checked first, and every event has its false-alarm "
-        "rate in the noise as measured. The star's fields are for spectra of Mauve."
+def read_frames(question: Question) -> dict[str, Any]:
+    """Read the frames; raises InputError with the name of the field whose file cannot be read."""
+    if "frames" not in question.uploads:
+        return {}
+    frames = read_frames_of(
+        question.uploads["frames"], question.uploads.get("mapping"), "frames", quality_bits=question.quality_bits
     )
-    chance = False
-    pictures = (light_curve, dynamic_spectrum, scatter)
-    files = dict.fromkeys(("events", "measured", "frames", "noise", "limits", "completeness"), "analyse")
-    documents = {"analyse.html": "analyse"}  # noqa: RUF012
+    if frames.flux.size > MOST_VALUES:
+        raise InputError.of("frames", frames.flux.size, f"at most {MOST_VALUES} values, or the command line")
+    return {"frames": frames}
 
-    def given(self, question: Question) -> dict[str, Any]:
-        """Read the frames; raises InputError with the name of the field whose file cannot be read."""
-        if "frames" not in question.uploads:
-            return {}
-        frames = read_frames_of(
-            question.uploads["frames"], question.uploads.get("mapping"), "frames", quality_bits=question.quality_bits
-        )
-        if frames.flux.size > MOST_VALUES:
-            raise InputError.of("frames", frames.flux.size, f"at most {MOST_VALUES} values, or the command line")
-        return {"frames": frames}
 
-    def words(self, question: Question) -> str:
-        """Return the name of the file."""
-        return question.uploads["frames"].name if "frames" in question.uploads else "no file of frames yet"
+def name_of(field: str, otherwise: str) -> Callable[[Question], str]:
+    """Return the words of a question about a file: its name, or other words without one."""
+    return lambda question: question.uploads[field].name if field in question.uploads else otherwise
 
-    def offers(self, name: str, answers: Answers) -> bool:
-        """Return whether the answer has a table; some exist only for spectra."""
-        return self.answer in answers and name in answers[self.answer].tables
 
-    def shown(self, closed: ClosedForms, answers: Answers) -> View | None:
-        """Return the table of events; without an event, the sentence that says so."""
-        view = super().shown(closed, answers)
-        return view if view is not None and view.columns else None
+ANALYSE = Tab(
+    verb="analyse",
+    about="Flares in your own light curve or spectra: the noise is checked first, and every event has its false-alarm "
+    "rate in the noise as measured. The star's fields are for spectra of Mauve.",
+    chance=False,
+    pictures=(light_curve, dynamic_spectrum, scatter),
+    files=dict.fromkeys(("events", "measured", "frames", "noise", "limits", "completeness"), "analyse"),
+    documents={"analyse.html": "analyse"},
+    given=read_frames,
+    words=name_of("frames", "no file of frames yet"),
+    # Some tables exist only for spectra.
+    optional=True,
+)
 
 
 NO_OBSERVATIONS = "Choose an archive of observations; Calibrate then fits the instrument."
@@ -289,45 +277,41 @@ def photon_transfer(closed: ClosedForms, answer: CalibrateAnswer) -> ChartData:
     return ChartData(text, transfer_series(answer)[0])
 
 
-class Calibrate(Tab):
-    """Instrument fitted to observations of standard stars."""
+def read_observations(question: Question) -> dict[str, Any]:
+    """Read frames and spectra; raises InputError if a file cannot be read."""
+    if "observations" not in question.uploads:
+        return {}
+    archive: Observations = question.uploads["observations"]
+    files = {name: VisitorFile(name, content) for name, content in archive.files.items()}
+    frames, stars = [], []
+    for row in archive.rows:
+        mapping = files[str(row.mapping)] if row.mapping else None
+        frames.append(read_frames_of(files[str(row.frames)], mapping, "observations"))
+        if sum(some.flux.size for some in frames) > MOST_VALUES:
+            raise InputError(
+                f"the archive holds more than {MOST_VALUES} raw values; give fewer, or use the command line",
+                key="observations",
+            )
+        if row.spectrum is None:
+            stars.append(row.source())
+            continue
+        with reported_for("observations"):
+            star = read_limited(files[str(row.spectrum)].content, Source)
+        stars.append(star if row.magnitude is None else star.at_magnitude(row.magnitude, row.band))
+    return {"frames": tuple(frames), "stars": tuple(stars)}
 
-    verb = "calibrate"
-    about = (
-        "The instrument from frames of standard stars and of no light: throughput with its errors, dark current, gain "
-        "and line width, next to the nominal values."
-    )
-    chance = False
-    pictures = (throughput, residuals, photon_transfer)
-    files = dict.fromkeys(("calibrate", "fits", "throughput", "dark"), "calibrate")
-    documents = {"instrument.zip": "calibrate"}  # noqa: RUF012
 
-    def given(self, question: Question) -> dict[str, Any]:
-        """Read frames and spectra; raises InputError if a file cannot be read."""
-        if "observations" not in question.uploads:
-            return {}
-        archive: Observations = question.uploads["observations"]
-        files = {name: VisitorFile(name, content) for name, content in archive.files.items()}
-        frames, stars = [], []
-        for row in archive.rows:
-            mapping = files[str(row.mapping)] if row.mapping else None
-            frames.append(read_frames_of(files[str(row.frames)], mapping, "observations"))
-            if sum(some.flux.size for some in frames) > MOST_VALUES:
-                raise InputError(
-                    f"the archive holds more than {MOST_VALUES} raw values; give fewer, or use the command line",
-                    key="observations",
-                )
-            if row.spectrum is None:
-                stars.append(row.source())
-                continue
-            with reported_for("observations", str(row.spectrum)):
-                star = read_limited(files[str(row.spectrum)].content, Source)
-            stars.append(star if row.magnitude is None else star.at_magnitude(row.magnitude, row.band))
-        return {"frames": tuple(frames), "stars": tuple(stars)}
-
-    def words(self, question: Question) -> str:
-        """Return the name of the archive."""
-        return question.uploads["observations"].name if "observations" in question.uploads else "no observations yet"
+CALIBRATE = Tab(
+    verb="calibrate",
+    about="The instrument from frames of standard stars and of no light: throughput with its errors, dark current, "
+    "gain and line width, next to the nominal values.",
+    chance=False,
+    pictures=(throughput, residuals, photon_transfer),
+    files=dict.fromkeys(("calibrate", "fits", "throughput", "dark"), "calibrate"),
+    documents={"instrument.zip": "calibrate"},
+    given=read_observations,
+    words=name_of("observations", "no observations yet"),
+)
 
 
 def _against_magnitude(name: str, title: str, label: str, units: Mapping[str, float]) -> Chart:
@@ -353,21 +337,20 @@ def _against_magnitude(name: str, title: str, label: str, units: Mapping[str, fl
     return chart.data("change", "Change computes which differences between visits are detected.")(along)
 
 
-class Change(Tab):
-    """Changes between visits."""
-
-    verb = "change"
-    about = "How small a difference between visits is seen: of lines, bands, the Balmer jump and the colour."
-    pictures = (
+CHANGE = Tab(
+    verb="change",
+    about="How small a difference between visits is seen: of lines, bands, the Balmer jump and the colour.",
+    pictures=(
         _against_magnitude(
             "changes", "Smallest change of the star's own light", "% or 0.01 mag", {"": 100, "mag": 100}
         ),
         _against_magnitude("fluxes", "Smallest change of the flux of lines", "erg/s/cm²", {"erg / (s cm2)": 1.0}),
-    )
-    chance = False
+    ),
+    chance=False,
     # Visits are evenly spaced, without an orbit, and the seed is that of periods.
-    never = ("targets", "start", "days", "shortest_d", "longest_d", "seed")
-    files = {"change": "change", "indices": "change"}  # noqa: RUF012
+    never=("targets", "start", "days", "shortest_d", "longest_d", "seed"),
+    files={"change": "change", "indices": "change"},
+)
 
 
 def _cells(canvas: Canvas, source: ColumnDataSource) -> None:
@@ -404,21 +387,21 @@ def recovered_periods(closed: ClosedForms, answer: ChangeAnswer) -> ChartData:
     return ChartData(text, {"cells": (x / wide, x * wide, y / high, y * high, x, y, share)})
 
 
-class Periods(Tab):
-    """Recovered periods."""
-
-    verb, name, title = "change", "periods", "Periods"
-    about = (
-        "Which periods of the star are found in visits to the first target, at times that the orbit allows, by a "
-        "Lomb-Scargle periodogram with a false-alarm probability of 1 %."
-    )
-    pictures = (recovered_periods,)
-    chance = False
-    simulations = {"periods": "Map periods"}  # noqa: RUF012
-    answer, view = "periods", 2
+PERIODS = Tab(
+    verb="change",
+    name="periods",
+    title="Periods",
+    about="Which periods of the star are found in visits to the first target, at times that the orbit allows, by a "
+    "Lomb-Scargle periodogram with a false-alarm probability of 1 %.",
+    pictures=(recovered_periods,),
+    chance=False,
+    simulations={"periods": "Map periods"},
+    answer="periods",
+    view=2,
     # The power is that of differences.
-    never = ("power", "fap")
-    files = {"periods": "periods"}  # noqa: RUF012
+    never=("power", "fap"),
+    files={"periods": "periods"},
+)
 
 
 #: Ends of the axes, erg, the same for all questions.
@@ -477,31 +460,30 @@ def expected(closed: ClosedForms, answer: PlanAnswer) -> ChartData:
     return ChartData(f"Expected to be recovered: {'; '.join(parts)}.", {"found": lines})
 
 
-class Plan(Tab):
-    """Tab of campaigns."""
+def plan_words(question: Question) -> str:
+    """Return the targets, hours and days."""
+    return f"{target_words(question)}, {question.hours:g} h each at most"
 
-    verb = "plan"
-    about = (
-        "What a campaign would find: hours, energies recovered, flares expected. Spectrum and flare rates are those of "
-        "each target's type; completeness is in closed form, and assumptions have a table."
-    )
-    chance = False
+
+def columns_of_plan(question: Question) -> list[list[str]]:
+    """Return the targets, and the columns that a plan will have."""
+    names = [target["name"] for target in question.targets] or ["each target"]
+    headings = [column.heading for column in COLUMNS if column.heading]
+    return [headings, *([name, *("·" for _ in headings[1:])] for name in names)]
+
+
+PLAN = Tab(
+    verb="plan",
+    about="What a campaign would find: hours, energies recovered, flares expected. Spectrum and flare rates are those "
+    "of each target's type; completeness is in closed form, and assumptions have a table.",
+    chance=False,
     # The page has no star-time of a campaign's false alarms: one a month. Flares of all sizes are expected.
-    never = ("false_alarms", "as_observed")
-    pictures = (recovered, expected)
-    files = dict.fromkeys(("plan", "stars", "energies", "assumptions"), "plan")
-
-    def words(self, question: Question) -> str:
-        """Return the targets, hours and days."""
-        return f"{target_words(question)}, {question.hours:g} h each at most"
-
-    def rows(self, closed: ClosedForms, answers: Answers) -> list[list[str]]:
-        """Return the table of targets; before a plan, which columns it will have."""
-        if "plan" in answers:
-            return super().rows(closed, answers)
-        names = [target["name"] for target in closed.question.targets] or ["each target"]
-        headings = [column.heading for column in COLUMNS if column.heading]
-        return [headings, *([name, *("·" for _ in headings[1:])] for name in names)]
+    never=("false_alarms", "as_observed"),
+    pictures=(recovered, expected),
+    files=dict.fromkeys(("plan", "stars", "energies", "assumptions"), "plan"),
+    words=plan_words,
+    rows_before=columns_of_plan,
+)
 
 
 @Chart(
@@ -515,7 +497,7 @@ def hours(closed: ClosedForms, answers: Answers) -> ChartData:
     if "visible" not in answers:
         text = "For each target, how many hours of each day it is seen."
         return ChartData(text, {"hours": [(name, [], []) for name in names]})
-    table = answers["seen"]["by_day"]
+    table = answers["visible"].by_day
     lines, parts = [], []
     for name in names:
         hours = np.asarray(table[np.asarray(table["target"]) == name]["hours"].to_value("h"))
@@ -529,21 +511,15 @@ def hours(closed: ClosedForms, answers: Answers) -> ChartData:
     return ChartData(f"From {question.start} on are seen: {'; '.join(parts)}.", {"hours": lines})
 
 
-class Visibility(Tab):
-    """Tab of the visibility."""
-
-    verb, name, title = "visible", "visibility", "Visibility"
-    about = "When the satellite can look at targets: clear of Earth, Sun, Moon and radiation."
-    chance = False
-    pictures = (hours,)
-    answer = "visible"
-    simulations = {"visible": "Find when"}  # noqa: RUF012
-    view = 1
-    files = {"visible": "visible", "months": "visible", "days": "visible"}  # noqa: RUF012
-
-    def words(self, question: Question) -> str:
-        """Return the targets and days."""
-        return target_words(question)
-
-    def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
-        return answers["seen"][{"visible": "table", "months": "months", "days": "by_day"}[name]]
+VISIBILITY = Tab(
+    verb="visible",
+    name="visibility",
+    title="Visibility",
+    about="When the satellite can look at targets: clear of Earth, Sun, Moon and radiation.",
+    chance=False,
+    pictures=(hours,),
+    simulations={"visible": "Find when"},
+    view=1,
+    files={"visible": "visible", "months": "visible", "days": "visible"},
+    words=target_words,
+)

@@ -6,9 +6,10 @@ text of all fields, their errors, and the question if all are valid.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+import contextlib
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
-from urllib.parse import parse_qsl, urlencode
+from urllib.parse import parse_qsl
 
 from mauvecl.answers.answer import IF_KNOWN
 from mauvecl.answers.closed_forms import BOTH_CHANCES
@@ -22,49 +23,31 @@ from mauvecl.schema.columns import chance_text
 from mauvecl.schema.errors import InputError, of_kind, shortened
 from mauvecl.study.plan import PlanTarget
 from mauvecl.web.closed_forms import OTHER, TITLES, Answers, Chance, ClosedForms, Question, chances, short
-from mauvecl.web.exposure_tabs import Detection, Noise, Signal, Spectrum, Unknown
+from mauvecl.web.exposure_tabs import DETECTION, NOISE, SIGNAL, SPECTRUM, UNKNOWN
 from mauvecl.web.fields import FIELDS, FORMER_VALUES, IDEAL, REALISTIC, UPLOADED, Choice, Field, note, sentence, targets
-from mauvecl.web.flare_tabs import Completeness, Limit, Measurement
-from mauvecl.web.observation_tabs import Analyse, Calibrate, Change, Periods, Plan, Visibility
-from mauvecl.web.tab import SIMULATIONS, Compare, Tab
+from mauvecl.web.flare_tabs import COMPLETENESS, LIMIT, MEASUREMENT
+from mauvecl.web.observation_tabs import ANALYSE, CALIBRATE, CHANGE, PERIODS, PLAN, VISIBILITY
+from mauvecl.web.tab import SIMULATIONS, Tab
 from mauvecl.web.uploads import UPLOADS
 
 #: Tabs with pictures, in the order of their group.
-DRAWN: dict[str, Tab] = {
-    tab.name: tab
-    for tab in (
-        Detection(),
-        Spectrum(),
-        Signal(),
-        Noise(),
-        Limit(),
-        Measurement(),
-        Unknown(),
-        Change(),
-        Periods(),
-        Completeness(),
-        Analyse(),
-        Calibrate(),
-        Visibility(),
-        Plan(),
-    )
-}
-
-
-def _tab_of(verb: str) -> Tab:
-    """Return the tab with the first view of a verb's answer."""
-    made: Tab = type(verb.capitalize(), (Tab,), {"verb": verb})()
-    return made
-
-
-#: All tabs by name, in the order of the page: group by group.
+DRAWN = (DETECTION, SPECTRUM, SIGNAL, NOISE, LIMIT, MEASUREMENT, UNKNOWN, CHANGE, PERIODS, COMPLETENESS, ANALYSE,
+         CALIBRATE, VISIBILITY, PLAN)  # fmt: skip
+#: Tab with pinned scenarios and the history of runs.
+COMPARE = Tab(
+    name="compare",
+    title="Compare",
+    group="tools",
+    about="Scenarios that you have pinned, side by side, and what you have simulated; this browser tab keeps them.",
+)
+#: All tabs by name, in the order of the page: group by group. Verbs without pictures show their first view.
 TABS: dict[str, Tab] = {
     tab.name: tab
     for group in GROUPS
     for tab in (
-        *DRAWN.values(),
-        *(_tab_of(name) for name, verb in VERBS.items() if verb.tab and name not in DRAWN),
-        Compare(),
+        *DRAWN,
+        *(Tab(verb=name) for name, verb in VERBS.items() if verb.tab and name not in {drawn.name for drawn in DRAWN}),
+        COMPARE,
     )
     if tab.group == group
 }
@@ -98,12 +81,22 @@ def card(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
     ``interval`` are of the question's choice; ``facts``, pairs of names and values; ``notes``, pairs of sentences and
     kinds; ``simulated``, names of what is simulated; ``files``, tabs and names of downloads.
     """
-    return {
+    messages = answers[tab.answer].messages if tab.answer in answers else []
+    plain = {
         "chance": tab.chance,
-        **(_with_chance(tab, closed, answers) if tab.chance else _without_chance(tab, closed, answers)),
-        "simulated": sorted(name for name in answers if name not in ("snr", "draw", "seen", OTHER)),
-        "files": _files(answers),
+        "headline": _headline(tab, answers),
+        "numbers": [],
+        "chosen": "",
+        "shown": tab.title,
+        "interval": "",
+        "words": tab.words(closed.question),
+        "facts": [],
+        "notes": _notes(messages),
+        "simulated": sorted(name for name in answers if name not in ("snr", "draw", OTHER)),
+        "files": [f"{each.name} {name}" for each in TABS.values() for name in each.files if each.offers(name, answers)]
+        + [f"{each.name} {name}" for each in TABS.values() for name, of in each.documents.items() if of in answers],
     }
+    return plain | (_with_chance(tab, closed, answers) if tab.chance else {})
 
 
 def _headline(tab: Tab, answers: Answers) -> str:
@@ -126,6 +119,7 @@ def _estimate(closed: ClosedForms, both: list[Chance]) -> str:
 def _with_chance(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
     q, x = closed.question, closed.quiet
     cut, both = closed.odds.threshold, chances(closed, answers)
+    told = [message for name in TOLD if name in answers for message in answers[name].messages]
     (chosen,) = (chance for chance in both if chance.unknown == q.unknown)
     facts = []
     if "detection" in answers:
@@ -144,47 +138,30 @@ def _with_chance(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, A
     )
     return {
         "headline": _headline(tab, answers) or _estimate(closed, both),
-        "numbers": [chance.shown for chance in both],
+        "numbers": [
+            {
+                "unknown": unknown,
+                "title": TITLES[unknown],
+                "shown": chance_text(value),
+                "value": None if value != value else value,
+                "interval": how,
+            }
+            for unknown, value, how in both
+        ],
         "chosen": q.unknown,
         "shown": chance_text(chosen.value),
         "interval": f"{TITLES[q.unknown]}; {chosen.how}",
         "words": words,
         "facts": facts,
-        "notes": _with_kinds(_messages(closed, answers)),
+        # The card shows both chances itself.
+        "notes": _notes(m for m in (*told, *closed.messages) if m not in of_kind(told, BOTH_CHANCES)),
     }
 
 
-def _without_chance(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
-    messages = list(answers[tab.answer].messages) if tab.answer in answers else []
-    return {
-        "headline": _headline(tab, answers),
-        "numbers": [],
-        "chosen": "",
-        "shown": tab.title,
-        "interval": "",
-        "words": tab.words(closed.question),
-        "facts": [],
-        "notes": _with_kinds([m for m in dict.fromkeys(messages) if not m.startswith(NOMINAL)]),
-    }
-
-
-def _files(answers: Answers) -> list[str]:
-    tables = [f"{tab.name} {name}" for tab in TABS.values() for name in tab.files if tab.offers(name, answers)]
-    return tables + [
-        f"{tab.name} {name}" for tab in TABS.values() for name, of in tab.documents.items() if of in answers
-    ]
-
-
-def _with_kinds(messages: list[str]) -> list[tuple[str, str]]:
-    """Return messages, and whether each is a danger to the answer or mere information."""
-    return [(note(m), "danger" if getattr(m, "kind", "") in CHANGING else "info") for m in messages]
-
-
-def _messages(closed: ClosedForms, answers: Answers) -> list[str]:
-    of_answers = [m for name in TOLD if name in answers for m in answers[name].messages]
-    # The card shows both chances itself.
-    both = of_kind(of_answers, BOTH_CHANCES)
-    return [m for m in dict.fromkeys([*of_answers, *closed.messages]) if not m.startswith(NOMINAL) and m not in both]
+def _notes(messages: Iterable[str]) -> list[tuple[str, str]]:
+    """Return messages once each, and whether each is a danger to the answer or mere information."""
+    once = [m for m in dict.fromkeys(messages) if not m.startswith(NOMINAL)]
+    return [(note(m), "danger" if getattr(m, "kind", "") in CHANGING else "info") for m in once]
 
 
 def _several(text: str) -> tuple[str, ...]:
@@ -204,6 +181,9 @@ SEEN = {
     "tab": Field(label="Tab", hint="", first=next(iter(TABS)), read=Choice(tuple(TABS))),
     "simulated": Field(label="Simulated", hint="", first="", read=_several),
 }
+#: All entries of a link, and their values on a new page.
+ENTRIES = FIELDS | SEEN
+FIRST = {name: field.read(field.first) for name, field in ENTRIES.items()}
 
 
 class State:
@@ -213,9 +193,8 @@ class State:
     """
 
     def __init__(self, uploads: Mapping[str, Any] | None = None) -> None:
-        self._fields = FIELDS | SEEN
-        self.entered = {name: field.first for name, field in self._fields.items()}
-        self._values = {name: field.read(field.first) for name, field in self._fields.items()}
+        self.entered = {name: field.first for name, field in ENTRIES.items()}
+        self._values = dict(FIRST)
         self._invalid: dict[str, str] = {}
         self.stray = ""
         self.uploads = dict(uploads or {})
@@ -223,7 +202,7 @@ class State:
     def enter(self, given: Mapping[str, str]) -> None:
         """Enter text into fields."""
         for name, text in given.items():
-            field = self._fields[name]
+            field = ENTRIES[name]
             self.entered[name] = text[: field.characters]
             self._invalid.pop(name, None)
             try:
@@ -258,7 +237,7 @@ class State:
         """Return the values of fields by name; raises InputError if one is invalid."""
         for name in names:
             if name in self._invalid:
-                raise InputError(f"{self._fields[name].label}: {self._invalid[name]}", key=name)
+                raise InputError(f"{ENTRIES[name].label}: {self._invalid[name]}", key=name)
         return {name: self._values[name] for name in names}
 
     def _check(self, name: str) -> None:
@@ -281,20 +260,12 @@ class State:
         """
         faults = self.faults_of(names)
         if faults:
-            all_of_them = "; ".join(f"{self._fields[name].label}: {why}" for name, why in faults.items())
+            all_of_them = "; ".join(f"{ENTRIES[name].label}: {why}" for name, why in faults.items())
             raise InputError(all_of_them, key=next(iter(faults)))
-        first = State()
-        values = {name: (self if name in names else first)._values[name] for name in FIELDS}
+        values = {name: (self._values if name in names else FIRST)[name] for name in FIELDS}
         return Question(
             values, {name: self.uploads[name] for name in UPLOADS if name in names and self._holds_file(name)}
         )
-
-    # Links
-
-    @property
-    def link(self) -> str:
-        """Return all entries as the query of a URL."""
-        return "?" + urlencode({name: text for name, text in self.entered.items() if text or self._fields[name].first})
 
     def follow(self, link: str) -> None:
         """Enter the values of a link, and defaults for all others."""
@@ -303,16 +274,16 @@ class State:
         if len(query) > MOST_LINKED:
             query, self.stray = "", f"The link has more than {MOST_LINKED} characters and was left out."
         pairs = parse_qsl(query, keep_blank_values=True, errors="replace")
-        strange = sorted({name for name, _ in pairs} - set(self._fields))
+        strange = sorted({name for name, _ in pairs} - set(ENTRIES))
         if strange:
             self.stray = f"The link holds {shortened(', '.join(strange))}, which is no field here; it was left out."
-        given = {name: text for name, text in pairs if name in self._fields}
+        given = {name: text for name, text in pairs if name in ENTRIES}
         if given.get("unknown") in FORMER_VALUES["unknown"]:
             self.stray += " The link is of version 1: its payload and unknowns have other names today."
             given |= {
                 name: words.get(given[name], given[name]) for name, words in FORMER_VALUES.items() if name in given
             }
-        first = {name: field.first for name, field in self._fields.items()}
+        first = {name: field.first for name, field in ENTRIES.items()}
         self.enter(first | given)
         for name in SEEN.keys() & self._invalid.keys():
             # The page has no field to correct them.
@@ -326,7 +297,10 @@ def known(state: State) -> dict[str, Any]:
     The star has ``about`` in words, ``given``, texts of fields, and ``offer``, the words of a button that enters them;
     ``targets`` has texts by the columns of the table for each row.
     """
-    return {"star": _star(state.entered["star"]), "targets": [_target(row) for row in _rows(state.entered["targets"])]}
+    rows: tuple[dict[str, Any], ...] = ()
+    with contextlib.suppress(InputError):
+        rows = targets(state.entered["targets"], check=False)
+    return {"star": _star(state.entered["star"]), "targets": list(map(_target, rows))}
 
 
 def _star(text: str) -> dict[str, Any]:
@@ -338,14 +312,6 @@ def _star(text: str) -> dict[str, Any]:
     magnitude = f"{star.known.magnitude:g}"
     given = {"magnitude": magnitude, "band": "V", "target": star.name}
     return {"about": star.known.about, "given": given, "offer": f"Use V = {magnitude}"}
-
-
-def _rows(text: str) -> list[dict[str, Any]]:
-    """Return the rows of a table, without the check of their names."""
-    try:
-        return list(targets(text, check=False))
-    except InputError:
-        return []
 
 
 def _target(row: dict[str, Any]) -> dict[str, str]:

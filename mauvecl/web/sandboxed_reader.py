@@ -11,9 +11,8 @@ import tempfile
 import threading
 from collections.abc import Mapping
 from dataclasses import fields
-from importlib import import_module
-from operator import attrgetter
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, TypeVar
 
 import numpy as np
@@ -21,7 +20,6 @@ import numpy as np
 from mauvecl.host.spectra.conversion import ReadSpectrum
 from mauvecl.host.stars.flare_spectra import ObservedFlare
 from mauvecl.host.stars.source import Source
-from mauvecl.observations.frames import Frames
 from mauvecl.schema.errors import InputError
 
 #: Memory of the reading process, MiB: Python with astropy and synphot maps some 400, a spectrum of 4 MiB as text 300.
@@ -34,25 +32,17 @@ CONTENT_MIB = 64
 TOGETHER = 2
 #: Exit codes of the reading process.
 _REFUSED, _NO_ROOM = 2, 3
-#: Functions that read files, by module: of a path, and of options by name.
-READERS = {
-    "spectrum": ("mauvecl.host.stars.source", "Source.read"),
-    "flare": ("mauvecl.host.stars.flare_spectra", "ObservedFlare.read"),
-    "plain": ("mauvecl.host.spectra.formats", "read_spectrum"),
-    "frames": ("mauvecl.observations.frame_files", "read_frames"),
-    "columns": ("mauvecl.observations.frame_files", "ColumnNames.read"),
-}
-#: Expected content of an upload, by the function that reads it.
-EXPECTED = {
-    **dict.fromkeys(
-        ("spectrum", "flare", "plain"),
-        ("a spectrum of some thousand points", "a spectrum as text, ECSV, VOTable or FITS"),
-    ),
-    **dict.fromkeys(("frames", "columns"), ("fewer frames", "frames as FITS, ECSV or CSV")),
-}
 Spectrum = TypeVar("Spectrum", Source, ObservedFlare, ReadSpectrum)
-#: Reader of each kind of spectrum.
-KINDS: Mapping[type, str] = {Source: "spectrum", ObservedFlare: "flare", ReadSpectrum: "plain"}
+#: Functions of a path, and of options by name, that read each kind of spectrum, frames, and the names of their columns.
+SPECTRA: Mapping[type, str] = {
+    Source: "mauvecl.host.stars.source:Source.read",
+    ObservedFlare: "mauvecl.host.stars.flare_spectra:ObservedFlare.read",
+    ReadSpectrum: "mauvecl.host.spectra.formats:read_spectrum",
+}
+FRAMES, COLUMNS = (f"mauvecl.observations.frame_files:{name}" for name in ("read_frames", "ColumnNames.read"))
+#: Expected content of an upload if it is too large, and in general: a spectrum, or frames.
+EXPECTED_SPECTRUM = "a spectrum of some thousand points", "a spectrum as text, ECSV, VOTable or FITS"
+EXPECTED_FRAMES = "fewer frames", "frames as FITS, ECSV or CSV"
 _turns = threading.BoundedSemaphore(TOGETHER)
 
 
@@ -62,27 +52,14 @@ def read_limited(content: bytes, kind: type[Spectrum], options: Mapping[str, Any
     Blocks for about a second, most of it for the start of Python: call it from a thread. Raises InputError if it holds
     no usable spectrum, or reading it takes more memory or time than allowed.
     """
-    return kind(**_read(KINDS[kind], {"upload": content}, options or {}))
+    return kind(**read_by(SPECTRA[kind], {"upload": content}, options or {}))
 
 
-def read_frames_limited(
-    files: Mapping[str, bytes], mapping: str | None = None, quality_bits: str | None = None
-) -> Frames:
-    """Read frames like `read_frames`, in a process with limited memory and time.
+def read_by(reader: str, files: Mapping[str, bytes], options: Mapping[str, Any]) -> dict[str, Any]:
+    """Read the first of some files, by their names, in a process with limited memory and time.
 
-    `files` holds contents by name: the file of frames first, then the mapping and files that they need.
+    Returns the attributes of the object that the reader returns; a reader of frames may need further files.
     """
-    return Frames(**_read("frames", files, {"mapping": mapping, "quality_bits": quality_bits}))
-
-
-def read_columns_limited(name: str, content: bytes) -> tuple[str, ...]:
-    """Read the names of the columns of a file of frames, in a process with limited memory and time."""
-    names: tuple[str, ...] = _read("columns", {name: content}, {})["names"]
-    return names
-
-
-def _read(reader: str, files: Mapping[str, bytes], options: Mapping[str, Any]) -> dict[str, Any]:
-    """Run a reading process, and return the attributes of the object that it reads."""
     if not _turns.acquire(timeout=SECONDS):
         raise InputError("too many uploads are read at the same time: try again in a minute", key="upload")
     try:
@@ -109,7 +86,7 @@ def _read_apart(reader: str, files: Mapping[str, bytes], options: Mapping[str, A
     words = json.dumps({"reader": reader, "file": next(iter(files)), "options": dict(options)})
     # A fresh interpreter, as spawn makes one: OpenCL does not survive a fork.
     command = [sys.executable, "-m", "mauvecl.web.sandboxed_reader", str(MEMORY_MIB), str(SECONDS), words]
-    smaller, other = EXPECTED[reader]
+    smaller, other = EXPECTED_FRAMES if reader in (FRAMES, COLUMNS) else EXPECTED_SPECTRUM
     with tempfile.TemporaryDirectory(prefix="mauvecl-upload-") as folder:
         for name, content in files.items():
             (Path(folder) / name).write_bytes(content)
@@ -155,9 +132,7 @@ def _main() -> int:
     asked = json.loads(words)
     _limit(int(memory_mib), int(seconds))
     try:
-        module, names = READERS[asked["reader"]]
-        read: Any = attrgetter(names)(import_module(module))
-        content = read(Path(asked["file"]), **asked["options"])
+        content = resolve_name(asked["reader"])(Path(asked["file"]), **asked["options"])
         values = {field.name: getattr(content, field.name) for field in fields(content)}
         arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
         rest = json.dumps({name: value for name, value in values.items() if name not in arrays})

@@ -17,7 +17,7 @@ import tempfile
 import time
 import traceback
 import webbrowser
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,7 +29,7 @@ from tornado.httpserver import HTTPServer
 from tornado.ioloop import PeriodicCallback
 from tornado.iostream import IOStream
 from tornado.routing import Matcher, Rule
-from tornado.web import Application, RequestHandler
+from tornado.web import Application, HTTPError, RequestHandler
 
 from mauvecl.answers.verbs import GROUPS
 from mauvecl.host import VERSION
@@ -107,22 +107,6 @@ def hosts(address: str, port: int, allowed: Iterable[str]) -> frozenset[str]:
     return frozenset(plain(netloc(host, port)) for host in own) | named
 
 
-class RefusalHandler(RequestHandler):
-    """Handler that returns an error message instead of the page."""
-
-    def initialize(self, status: int, why: str) -> None:
-        """Set status and message."""
-        self._status, self._why = status, why
-
-    async def prepare(self) -> None:
-        """Answer any request."""
-        self.set_status(self._status)
-        self.set_header("Content-Type", "text/plain; charset=utf-8")
-        if self._status == 503:
-            self.set_header("Retry-After", "60")
-        await self.finish(f"{self._why}\n")
-
-
 class AccessMatcher(Matcher):
     """Matcher of requests that are rejected, as they do not come from pages of the allowed `hosts`."""
 
@@ -130,26 +114,18 @@ class AccessMatcher(Matcher):
         self._allowed = allowed
 
     def match(self, request: HTTPServerRequest) -> dict[str, Any] | None:
-        """Return the reason for which a request is rejected, or None."""
-        refused = self._foreign(request) or self._too_many(request)
-        return None if refused is None else {"target_kwargs": dict(zip(("status", "why"), refused, strict=True))}
-
-    def _foreign(self, request: HTTPServerRequest) -> tuple[int, str] | None:
-        """Return the error for an unknown host name (DNS rebinding) or another server's page, or None."""
+        """Return status and message for an unknown host name (DNS rebinding) or another server's page, or None."""
+        origins, talks = request.headers.get_list("Origin"), request.path == "/live"
+        status, why = 403, ""
         if [plain(host) for host in request.headers.get_list("Host")] not in [[host] for host in self._allowed]:
-            return 403, "The page is not served under this host name; see `mauvecl serve --allow-origin`."
-        for given in request.headers.get_list("Origin"):
-            if plain(re.sub(r"^https?://", "", given.lower())) not in self._allowed:
-                return 403, "Pages of other servers cannot use this page; see `mauvecl serve --allow-origin`."
-        if request.path == "/live" and not request.headers.get_list("Origin"):
-            return 403, "Expected a connection from the page."
-        return None
-
-    def _too_many(self, request: HTTPServerRequest) -> tuple[int, str] | None:
-        """Return the error if there are too many visitors, or None."""
-        if request.path in ("/", "/live") and len(Visitor.here) >= MAX_VISITORS:
-            return 503, "Too many visitors are here at the moment; please come again in some minutes."
-        return None
+            why = "The page is not served under this host name; see `mauvecl serve --allow-origin`."
+        elif any(plain(re.sub(r"^https?://", "", given.lower())) not in self._allowed for given in origins):
+            why = "Pages of other servers cannot use this page; see `mauvecl serve --allow-origin`."
+        elif talks and not origins:
+            why = "Expected a connection from the page."
+        elif (talks or request.path == "/") and len(Visitor.here) >= MAX_VISITORS:
+            status, why = 503, "Too many visitors are here at the moment; please come again in some minutes."
+        return {"target_kwargs": {"status": status, "why": why}} if why else None
 
 
 class BoundedServer(HTTPServer):
@@ -233,14 +209,18 @@ def make(address: str, port: int, allowed: Sequence[str]) -> Any:
     Raises InputError if the address is invalid or accepts other machines without an origin, and OSError if the port is
     taken.
     """
+
+    def asked_figure(handler: RequestHandler, theme: str, name: str) -> bytes | None:
+        return figure(theme, name, "".join(sorted(set(handler.get_query_argument("log", ""))))[:2])
+
     let_in = hosts(address, port, allowed)
     application = Application(
         [
-            (r"/", FrontHandler),
+            (r"/", ContentHandler, {"content": lambda _: front(), "kind": "html"}),
             (r"/live", Visitor),
-            (r"/figures/([a-z]+)/([a-z]+)\.json", FigureHandler),
-            (r"/(favicon\.svg)", AssetHandler),
-            (r"/assets/([a-z0-9.-]+)", AssetHandler),
+            (r"/figures/([a-z]+)/([a-z]+)\.json", ContentHandler, {"content": asked_figure, "kind": "json"}),
+            (r"/(favicon\.svg)", ContentHandler, {"content": lambda _, name: asset(name)}),
+            (r"/assets/([a-z0-9.-]+)", ContentHandler, {"content": lambda _, name: asset(name)}),
         ],
         websocket_max_message_size=MESSAGE,
         websocket_ping_interval=PING_S,
@@ -334,26 +314,6 @@ KINDS = {
     "html": "text/html; charset=utf-8",
     "fits": "application/fits",
 }
-#: Citation, as in the project's file CITATION.cff, which has neither the paper's volume and pages nor an address of
-#: the project.
-BIBTEX = """@software{{mauvecl,
-  author = {{{{The mauvecl developers}}}},
-  title = {{mauvecl: would the Mauve satellite see this stellar flare?}},
-  version = {{{version}}},
-  year = {{2026}}
-}}
-
-@article{{mauvesim,
-  author = {{Saba, A. and Favata, F. and Savini, G. and Tinetti, G. and Bradley, L. and Stotesbury, I. and
-            Tessenyi, M.}},
-  title = {{MauveSim: the instrument simulator software for the Blue Skies Space Mauve satellite}},
-  journal = {{RAS Techniques and Instruments}},
-  year = {{2025}},
-  eprint = {{2502.01389}},
-  archivePrefix = {{arXiv}},
-  url = {{https://arxiv.org/abs/2502.01389}}
-}}
-"""
 _FOLDER = Path(__file__).parent / "assets"
 
 
@@ -380,7 +340,7 @@ def front() -> bytes:
     text = template.render(
         fields=fields, uploads=UPLOADS, examples=EXAMPLES, names=[star.name for star in well_known_stars()],
         mapped=MAPPED, time_units=TIME_UNITS, library=library_names(), tabs=TABS, groups=GROUPS, version=VERSION,
-        bibtex=BIBTEX.format(version=VERSION), titles=TITLES, digest=_digest(),
+        titles=TITLES, digest=_digest(),
         words=json.dumps(_words()).replace("<", "\\u003c"),
     )  # fmt: skip
     return str(text).encode()
@@ -460,8 +420,28 @@ def prepare() -> None:
             packed(figure(theme, picture.name, usual) or b"")
 
 
-class CompressedHandler(RequestHandler):
+class RefusalHandler(RequestHandler):
+    """Handler that returns an error message instead of the page."""
+
+    def initialize(self, status: int, why: str) -> None:
+        """Set status and message."""
+        self._status, self._why = status, why
+
+    async def prepare(self) -> None:
+        """Answer any request."""
+        self.set_status(self._status)
+        self.set_header("Content-Type", "text/plain; charset=utf-8")
+        if self._status == 503:
+            self.set_header("Retry-After", "60")
+        await self.finish(f"{self._why}\n")
+
+
+class ContentHandler(RequestHandler):
     """Handler of static content."""
+
+    def initialize(self, content: Callable[..., bytes | None], kind: str = "") -> None:
+        """Set the function that returns content for the handler and parts of the address, and its kind."""
+        self._content, self._kind = content, kind
 
     def set_default_headers(self) -> None:
         """Set the headers of every answer."""
@@ -469,17 +449,16 @@ class CompressedHandler(RequestHandler):
         for name, value in HEADERS.items():
             self.set_header(name, value)
 
-    def give(self, content: bytes | None, kind: str, *, keep: bool = False) -> None:
-        """Send content, or status 404 if it is None."""
+    def get(self, *names: str) -> None:
+        """Send content, or status 404 if there is none; a file with its digest in its address never changes."""
+        content = self._content(self, *names)
         if content is None:
-            self.set_status(404)
-            self.set_header("Content-Type", "text/plain; charset=utf-8")
-            self.finish("There is no such page.\n")
-            return
+            raise HTTPError(404)
         small, digest = packed(content)
-        self.set_header("Content-Type", KINDS[kind])
+        # The names of assets end in their kind.
+        self.set_header("Content-Type", KINDS[self._kind or names[0].rpartition(".")[2]])
         self.set_header("Vary", "Accept-Encoding")
-        # A file with its digest in its address never changes.
+        keep = "v" in self.request.arguments and self._kind != "html"
         self.set_header("Cache-Control", "public, max-age=31536000, immutable" if keep else "no-cache")
         self.set_header("Etag", f'"{digest}"')
         if self.check_etag_header():
@@ -492,35 +471,12 @@ class CompressedHandler(RequestHandler):
         self.finish(content)
 
     def compute_etag(self) -> str | None:
-        """Return None, since `give` sets the tag."""
+        """Return None, since `get` sets the tag."""
         return None
 
     def write_error(self, status_code: int, **kwargs: Any) -> None:
         """Send a message without internal details."""
         self.set_header("Content-Type", "text/plain; charset=utf-8")
-        self.finish(f"The page cannot answer this ({status_code}).\n")
-
-
-class FrontHandler(CompressedHandler):
-    """Return the page."""
-
-    def get(self) -> None:
-        """Send the page, which reads the values of a link itself."""
-        self.give(front(), "html")
-
-
-class AssetHandler(CompressedHandler):
-    """Handler of assets."""
-
-    def get(self, name: str) -> None:
-        """Send an asset by name."""
-        self.give(asset(name), name.rpartition(".")[2], keep="v" in self.request.arguments)
-
-
-class FigureHandler(CompressedHandler):
-    """Handler of empty figures."""
-
-    def get(self, theme: str, name: str) -> None:
-        """Send a figure in a theme, with some logarithmic axes."""
-        logs = "".join(sorted(set(self.get_query_argument("log", ""))))[:2]
-        self.give(figure(theme, name, logs), "json", keep="v" in self.request.arguments)
+        self.finish(
+            "There is no such page.\n" if status_code == 404 else f"The page cannot answer this ({status_code}).\n"
+        )

@@ -9,15 +9,14 @@ import shlex
 import tempfile
 import threading
 import zipfile
-from abc import ABC
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
 from pprint import pformat
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
-from pydantic import BaseModel
+from pydantic import BaseModel, TypeAdapter
 
 from mauvecl.answers.verbs import VERBS
 from mauvecl.schema.columns import View, without_empty
@@ -26,7 +25,7 @@ from mauvecl.schema.fields import Flag, found
 from mauvecl.schema.section import read_axis, read_line_fluxes, read_words
 from mauvecl.study.observation import SkyLight
 from mauvecl.study.star import Star
-from mauvecl.study.study import Study, keys_of, with_paths
+from mauvecl.study.study import Study, keys_of, set_key, with_paths
 from mauvecl.web.closed_forms import OTHER
 from mauvecl.web.fields import FIELDS
 
@@ -63,12 +62,6 @@ def _changed(study: Study, **sections: dict[str, Any]) -> Study:
     return study.with_changes(sections, None, "page")
 
 
-def _tabulated(answers: dict[str, Any]) -> dict[str, Any]:
-    """Add the tables of a visibility, which are slow to make and read repeatedly."""
-    answer = answers["visible"]
-    return answers | {"seen": {name: getattr(answer, name) for name in ("table", "months", "by_day")}}
-
-
 @dataclass(frozen=True)
 class Simulation:
     """Question that a button of the page asks."""
@@ -76,8 +69,6 @@ class Simulation:
     # Verbs that answer it, by the names under which the page keeps their answers; the first is the main one.
     verbs: Mapping[str, str]
     asked: Callable[[Study], Study] = lambda study: study  # makes the study that is asked from that of the page
-    # Adds to the answers what the page reads repeatedly.
-    completed: Callable[[dict[str, Any]], dict[str, Any]] = lambda answers: answers
     # Further answers of the main verb by name, with what makes their study; a refused one is left out.
     others: Mapping[str, Callable[[Study], Study]] = field(default_factory=dict)
     needs: str = ""  # field without which it cannot start
@@ -105,7 +96,7 @@ class Simulation:
             except InputError:
                 if name not in self.others:
                     raise
-        return self.completed(answers)
+        return answers
 
 
 def _fits(study: Study) -> Study:
@@ -114,18 +105,16 @@ def _fits(study: Study) -> Study:
     return _changed(study, measure={"fits": min(study.run.realisations, most)})
 
 
-def _other_unknowns(study: Study) -> Study:
-    """Return the study with the usual unknowns if it has none, or without."""
-    return _changed(study, nuisances={"usual": not study.nuisances.usual})
-
-
 #: Simulations that change the study or have another name than their verb.
 _OWN_SIMULATIONS = {
-    "detection": Simulation({"detection": "detect", "snr": "snr"}, others={OTHER: _other_unknowns}),
+    "detection": Simulation(
+        {"detection": "detect", "snr": "snr"},
+        others={OTHER: lambda study: _changed(study, nuisances={"usual": not study.nuisances.usual})},
+    ),
     "map": Simulation({"map": "map"}, _map_around),
     "measure": Simulation({"measure": "measure"}, _fits),
     "completeness": Simulation({"completeness": "inject"}, partial(_changed, injections=INJECTED, search={"nulls": 0})),
-    "visible": Simulation({"visible": "visible"}, completed=_tabulated, needs="targets"),
+    "visible": Simulation({"visible": "visible"}, needs="targets"),
     "plan": Simulation({"plan": "plan"}, needs="targets"),
     "analyse": Simulation({"analyse": "analyse"}, needs="frames"),
     "calibrate": Simulation({"calibrate": "calibrate"}, needs="observations"),
@@ -165,49 +154,50 @@ def target_words(question: Question) -> str:
     return f"{names}; {question.days:g} days from {question.start}"
 
 
-class Tab(ABC):
-    """Tab of the page; a `verb` gives name, title, help, button, answer and file that the tab does not state itself."""
+@dataclass(kw_only=True, eq=False)
+class Tab:
+    """Tab of the page; what a tab with a verb does not state follows from its verb."""
 
-    verb: ClassVar[str] = ""  # name of the verb that it shows, if any
-    name: ClassVar[str]
-    title: ClassVar[str]
-    about: ClassVar[str]  # what it shows, in a sentence
-    pictures: ClassVar[tuple[Chart, ...]] = ()
-    simulations: ClassVar[Mapping[str, str]] = {}  # what can be simulated here, with the label of the button
-    answer: ClassVar[str] = ""  # name of the simulated answer whose table is below the pictures
-    view: ClassVar[int] = 0  # number of that table among the answer's `views`
+    verb: str = ""  # name of the verb that it shows, if any
+    name: str = ""
+    title: str = ""
+    about: str = ""  # what it shows, in a sentence
+    pictures: tuple[Chart, ...] = ()
+    simulations: Mapping[str, str] = field(default_factory=dict)  # what can be simulated here, with labels of buttons
+    answer: str = ""  # name of the simulated answer whose table is below the pictures
+    view: int = 0  # number of that table among the answer's `views`
+    #: Another table below the pictures, and the rows before there is an answer.
+    own_view: Callable[[ClosedForms, Answers], View] | None = None
+    rows_before: Callable[[Question], list[list[str]]] = lambda question: []
     #: Questions of "Share, export, cite": names of simulations or verbs; by default its own simulations.
-    questions: ClassVar[tuple[str, ...]] = ()
+    questions: tuple[str, ...] = ()
     #: Key of `GROUPS` under whose heading it stands; by default that of the verb that answers its first question.
-    group: ClassVar[str]
+    group: str = ""
     #: Whether the chance of detection stands above it, whose fields it then shows.
-    chance: ClassVar[bool] = True
+    chance: bool = True
+    #: Its question in words, if it has no chance.
+    words: Callable[[Question], str] = lambda q: f"{q.star_in_words} of {q.band} = {q.magnitude:g}"
+    #: Reads the visitor's files on a thread of its own, and returns them as arguments of the verb; raises InputError
+    #: with the name of the field whose file cannot be read.
+    given: Callable[[Question], dict[str, Any]] = lambda question: {}
     #: Fields that it reads although its verbs do not take their keys, and those that it does not read.
-    also: ClassVar[tuple[str, ...]] = ()
-    never: ClassVar[tuple[str, ...]] = ()
+    also: tuple[str, ...] = ()
+    never: tuple[str, ...] = ()
     #: Tables that can be downloaded, with the simulation that each needs, or none.
-    files: ClassVar[Mapping[str, str | None]] = {}
+    files: Mapping[str, str | None] = field(default_factory=dict)
+    own_table: Callable[[ClosedForms, Answers], Table] | None = None  # table of its only file, if no answer has it
+    optional: bool = False  # whether an answer may lack some of `files`
     #: Documents of answers that can be downloaded, by file name, with the simulation that each needs.
-    documents: ClassVar[Mapping[str, str]] = {}
+    documents: Mapping[str, str] = field(default_factory=dict)
 
-    def __init_subclass__(cls, **words: Any) -> None:
-        super().__init_subclass__(**words)
-        if cls.verb:
-            cls._follow_verb()
-        if "questions" not in vars(cls):
-            cls.questions = tuple(cls.simulations) or ("detection",)
-        if "group" not in vars(cls):
-            cls.group = VERBS[verbs_of(cls.questions[0])[0]].group
-
-    @classmethod
-    def _follow_verb(cls) -> None:
-        """Set the attributes that the tab does not define from its verb."""
-        verb, title = cls.verb, cls.verb.capitalize()
-        about, *_ = VERBS[verb].help.split("\n")
-        of_verb = {"name": verb, "title": title, "about": about, "simulations": {verb: title}, "answer": verb}
-        for key, value in (of_verb | {"files": {verb: verb}}).items():
-            if key not in vars(cls):
-                setattr(cls, key, value)
+    def __post_init__(self) -> None:
+        if verb := self.verb:
+            title, (about, *_) = verb.capitalize(), VERBS[verb].help.split("\n")
+            of_verb = {"name": verb, "title": title, "about": about, "simulations": {verb: title}, "answer": verb}
+            for key, value in (of_verb | {"files": {verb: verb}}).items():
+                setattr(self, key, getattr(self, key) or value)
+        self.questions = self.questions or tuple(self.simulations) or ("detection",)
+        self.group = self.group or VERBS[verbs_of(self.questions[0])[0]].group
 
     @cached_property
     def reads(self) -> frozenset[str]:
@@ -223,52 +213,27 @@ class Tab(ABC):
         }
         return frozenset(taken | set(self.also)) - set(self.never)
 
-    def given(self, question: Question) -> dict[str, Any]:
-        """Read the visitor's files, and return them as arguments of the verb: by default none.
-
-        Raises InputError with the name of the field whose file cannot be read. Called on a thread of its own.
-        """
-        return {}
-
-    def words(self, question: Question) -> str:
-        """Return the question of a tab without the chance, in words."""
-        return f"{question.star_in_words} of {question.band} = {question.magnitude:g}"
-
     def offers(self, name: str, answers: Answers) -> bool:
-        """Return whether one of `files` can be downloaded; by default, whether the answer it needs is simulated."""
+        """Return whether one of `files` can be downloaded: whether the answer it needs is simulated and has it."""
         needed = self.files[name]
-        return needed is None or needed in answers
+        return needed is None or (needed in answers and not (self.optional and name not in answers[needed].tables))
 
     def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
-        """Return the table of one of `files`: by default that of the answer it needs."""
-        table: Table = answers[str(self.files[name])].tables[name]
+        """Return the table of one of `files`."""
+        table: Table = (
+            answers[str(self.files[name])].tables[name] if self.own_table is None else self.own_table(closed, answers)
+        )
         return table
 
     def rows(self, closed: ClosedForms, answers: Answers) -> list[list[str]]:
         """Return a small table as text with a header row; empty if there is nothing to report."""
-        shown = self.shown(closed, answers)
-        if shown is None:
+        if self.own_view is None and self.answer not in answers:
+            return self.rows_before(closed.question)
+        shown = answers[self.answer].views[self.view] if self.own_view is None else self.own_view(closed, answers)
+        if not shown.columns:
             return []
         headings, cells = without_empty(*shown.texts(FIXED))
         return [headings, *cells]
-
-    def shown(self, closed: ClosedForms, answers: Answers) -> View | None:
-        """Return the table below the pictures: by default a view of the simulated answer, if there is one."""
-        view: View | None = answers[self.answer].views[self.view] if self.answer in answers else None
-        return view
-
-    def study(self, name: str, closed: ClosedForms, answers: Answers) -> Study:
-        """Return the study that reproduces one of `files`: by default that of the answer it needs."""
-        needed = self.files[name]
-        study: Study = closed.study if needed is None else answers[needed].study
-        return study
-
-
-class Compare(Tab):
-    """Pinned scenarios and the history of runs."""
-
-    name, title, group = "compare", "Compare", "tools"
-    about = "Scenarios that you have pinned, side by side, and what you have simulated; this browser tab keeps them."
 
 
 #: Keys that are stated even at their default, so that readers see what was assumed.
@@ -295,6 +260,9 @@ print(next(iter(answer.tables.values())))
 """
 
 
+ANYTHING = TypeAdapter(Any)
+
+
 def differing(new: BaseModel, old: BaseModel, path: str = "") -> Iterator[tuple[str, Any]]:
     """Yield the dotted path and the plain value of each key that has another value in `old`, or is `STATED`."""
     for key, own_field in type(new).model_fields.items():
@@ -304,31 +272,8 @@ def differing(new: BaseModel, old: BaseModel, path: str = "") -> Iterator[tuple[
         if isinstance(values[0], BaseModel) and isinstance(values[1], BaseModel) and not whole:
             yield from differing(*values, f"{name}.")
         elif values[0] is not None and (values[0] != values[1] or name in STATED):
-            yield name, _plain(values[0])
-
-
-def _plain(value: Any) -> Any:
-    """Return a value as TOML can hold it, without the defaults of records."""
-    if isinstance(value, BaseModel):
-        return value.model_dump(mode="json", exclude_defaults=True, exclude_none=True)
-    if isinstance(value, tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    return str(value) if isinstance(value, Path) else value
-
-
-def as_program(verb: str, study: Study) -> str:
-    """Return a question to a verb as a Python program."""
-    data: dict[str, Any] = {}
-    for name, value in keys_used(VERBS[verb], study, Study()):
-        *sections, key = name.split(".")
-        place = data
-        for section in sections:
-            place = place.setdefault(section, {})
-        place[key] = value
-    text = pformat(data, width=100, sort_dicts=False).replace("\n", "\n    ")
-    return PROGRAM.format(verb=verb, data=text, options=OPTIONS.get(verb, ""))
+            # As TOML can hold it, without the defaults of records.
+            yield name, ANYTHING.dump_python(values[0], mode="json", exclude_defaults=True, exclude_none=True)
 
 
 def as_command(verb: str, study: Study) -> str:
@@ -343,7 +288,10 @@ def as_command(verb: str, study: Study) -> str:
         if name == "data.file":
             words.insert(2, value)
         elif name == "star":
-            words += [word for star in value for word in _star_words(star)]
+            for star in value:
+                usual = Star(library=star.get("library"))
+                said = {key: given for key, given in star.items() if given != getattr(usual, key)}
+                words += _words(Star, {"library": star.get("library")} | said)
         elif name == "sky":
             words += ["--sky", "none"] if value.get("none") else _words(SkyLight, value)
         else:
@@ -383,13 +331,6 @@ def _flag_words(name: str, value: Any, verb: Verb) -> list[str]:
     return []
 
 
-def _star_words(star: dict[str, Any]) -> list[str]:
-    """Return the flags of a star of the library."""
-    usual = Star(library=star.get("library"))
-    said = {key: value for key, value in star.items() if value != getattr(usual, key)}
-    return _words(Star, {"library": star.get("library")} | said)
-
-
 def _words(section: type[BaseModel], values: Mapping[str, Any]) -> list[str]:
     """Return the words of the first flags of a section's keys, with their values."""
     names = {key: flags[0].names[0] for key, each in section.model_fields.items() if (flags := found(each, Flag))}
@@ -401,14 +342,13 @@ def _text(value: str | float) -> str:
     return value if isinstance(value, str) else f"{value:.17g}" if float(f"{value:.15g}") != value else f"{value:.15g}"
 
 
-def _key(key: str) -> str:
-    return key if key.isidentifier() and key.isascii() else json.dumps(key)
-
-
 def _toml(value: Any) -> str:
     """Return a value as TOML on one line."""
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{_key(key)} = {_toml(item)}" for key, item in value.items()) + "}"
+        plain = (
+            (key if key.isidentifier() and key.isascii() else json.dumps(key), item) for key, item in value.items()
+        )
+        return "{" + ", ".join(f"{key} = {_toml(item)}" for key, item in plain) + "}"
     if isinstance(value, list):
         return f"[{', '.join(map(_toml, value))}]"
     return json.dumps(value, ensure_ascii=False)
@@ -420,7 +360,9 @@ _drawing = threading.Lock()
 
 def study_file(study: Study, name: str) -> tuple[str, bytes]:
     """Return name and content of the study file, in a zip archive with the visitor's files if there are any."""
-    files, text = visitor_files(study), study.toml()
+    # The visitor's files that the study names, each once.
+    files, text = dict[Path, Path](), study.toml()
+    with_paths(study.model_dump(mode="json"), Study, lambda file: files.setdefault(file, file))
     if not files:
         return f"{name}.toml", text.encode()
     out = io.BytesIO()
@@ -431,13 +373,6 @@ def study_file(study: Study, name: str) -> tuple[str, bytes]:
             text = text.replace(str(file.resolve()), file.name)
         archive.writestr("study.toml", text)
     return f"{name}.zip", out.getvalue()
-
-
-def visitor_files(study: Study) -> list[Path]:
-    """Return the visitor's files that a study names, each once."""
-    files: dict[Path, Path] = {}
-    with_paths(study.model_dump(mode="json"), Study, lambda file: files.setdefault(file, file))
-    return list(files)
 
 
 def as_file(tab: Tab, name: str, ending: str, closed: ClosedForms, answers: Answers) -> tuple[str, bytes]:
@@ -457,7 +392,8 @@ def as_file(tab: Tab, name: str, ending: str, closed: ClosedForms, answers: Answ
     if not tab.offers(name, answers):
         raise InputError(f"no {name} is computed yet: start a simulation first", key="name")
     if ending == "study":
-        return study_file(tab.study(name, closed, answers), f"mauvecl-{name}")
+        needed = tab.files[name]
+        return study_file(closed.study if needed is None else answers[needed].study, f"mauvecl-{name}")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"mauvecl-{name}.{ending}"
         write_table(tab.table(name, closed, answers), path)
@@ -468,9 +404,13 @@ def commands_and_programs(tab: Tab, question: Question, folder: Path) -> list[di
     """Return each of a tab's `questions` as a command and as a Python program; `folder` holds the visitor's files."""
     entries = []
     for name in tab.questions:
-        verb, study = asked_study(name, question.study(folder))
+        verb, study = asked_study(name, question.case(folder).study)
         # Paths relative to the study, instead of those on the server.
         data = with_paths(study.model_dump(mode="json"), Study, lambda file: Path(file.name))
-        study = Study.build(data, "page")
-        entries.append({"question": name, "command": as_command(verb, study), "python": as_program(verb, study)})
+        study, keys = Study.build(data, "page"), dict[str, Any]()
+        for key, value in keys_used(VERBS[verb], study, Study()):
+            set_key(keys, key.split("."), value, key)
+        text = pformat(keys, width=100, sort_dicts=False).replace("\n", "\n    ")
+        program = PROGRAM.format(verb=verb, data=text, options=OPTIONS.get(verb, ""))
+        entries.append({"question": name, "command": as_command(verb, study), "python": program})
     return entries

@@ -17,6 +17,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path, PureWindowsPath
 from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
 from typing import Any
@@ -33,7 +34,7 @@ from mauvecl.schema.errors import InputError, printable, reworded, shortened
 from mauvecl.schema.section import input_error
 from mauvecl.study.analyses import PATHS, CalibrateQuestion, CalibrationObservation
 from mauvecl.web.fields import FIELDS, UPLOADED, UPLOADED_FILE, UPLOADED_UNKNOWN
-from mauvecl.web.sandboxed_reader import Spectrum, read_frames_limited, read_limited
+from mauvecl.web.sandboxed_reader import FRAMES, Spectrum, read_by, read_limited
 
 #: Name of a table of neighbours in its folder.
 NEIGHBOURS_FILE = "neighbours.csv"
@@ -224,39 +225,26 @@ MOST_VALUES = 2**24
 MOST_PAIRS_BYTES, MOST_PAIRS = 2**18, 4000
 
 
-def _star(name: str, content: bytes, **options: Any) -> Source:
-    """Read an untrusted spectrum, packed or not; its format follows from the content, not the name.
+def _spectrum(kind: type[Spectrum], called: str, name: str, content: bytes, **options: Any) -> Spectrum:
+    """Read an untrusted spectrum, packed or not, and name it if `called`; its format follows from the content.
 
     Raises InputError if it holds no usable spectrum. Called on a thread of its own; any other exception is reported to
     the visitor too.
     """
-    return replace(_spectrum(content, Source, options), name=UPLOADED, origin="upload")
-
-
-def _added(name: str, content: bytes, **options: Any) -> Source:
-    """Read a spectrum of light that a change adds."""
-    return replace(_star(name, content, **options), name="added spectrum")
+    spectrum = read_limited(content, kind, options)
+    if spectrum.wavelength_nm.size > MOST_POINTS:
+        raise InputError.of("points", spectrum.wavelength_nm.size, f"at most {MOST_POINTS}")
+    named: Any = {"name": called, "origin": "upload"} if called else {}
+    return replace(spectrum, **named)
 
 
 def _flare(name: str, content: bytes, **options: Any) -> ReadSpectrum:
     """Read the measured range of a flare's spectrum; the study that reads the file continues it."""
-    flare = _spectrum(content, ObservedFlare, options)
+    flare = _spectrum(ObservedFlare, "", name, content, **options)
     low, high = flare.measured_nm
     inside = (flare.wavelength_nm >= low) & (flare.wavelength_nm <= high)
     own = tuple(text for text in flare.messages if text.startswith(f"{flare.name}: "))
     return ReadSpectrum(flare.wavelength_nm[inside], flare.flux_flam[inside], "uploaded flare", "upload", messages=own)
-
-
-def _quiescent(name: str, content: bytes, **options: Any) -> ReadSpectrum:
-    """Read a spectrum of a star without its flare, which may cover any range."""
-    return replace(_spectrum(content, ReadSpectrum, options), name="uploaded star without the flare", origin="upload")
-
-
-def _spectrum(content: bytes, kind: type[Spectrum], options: Mapping[str, Any]) -> Spectrum:
-    spectrum = read_limited(content, kind, options)
-    if spectrum.wavelength_nm.size > MOST_POINTS:
-        raise InputError.of("points", spectrum.wavelength_nm.size, f"at most {MOST_POINTS}")
-    return spectrum
 
 
 def read_pairs(name: str, content: bytes) -> Points:
@@ -321,12 +309,20 @@ class Upload:
 
 #: Files by the field that takes them.
 UPLOADS: Mapping[str, Upload] = {
-    "star": Upload(_star, UPLOADED, options=_options("wavelength_unit", "flux_unit", "extend")),
+    "star": Upload(
+        partial(_spectrum, Source, UPLOADED), UPLOADED, options=_options("wavelength_unit", "flux_unit", "extend")
+    ),
     "flare_file": Upload(
         _flare, options=_options("wavelength_unit", "flux_unit", prefix="flare_") | _options("continue_at_k")
     ),
-    "flare_quiescent": Upload(_quiescent, options=_options("wavelength_unit", "flux_unit", prefix="flare_")),
-    "change_file": Upload(_added, options=_options("wavelength_unit", "flux_unit", "extend", prefix="change_")),
+    "flare_quiescent": Upload(
+        partial(_spectrum, ReadSpectrum, "uploaded star without the flare"),
+        options=_options("wavelength_unit", "flux_unit", prefix="flare_"),
+    ),
+    "change_file": Upload(
+        partial(_spectrum, Source, "added spectrum"),
+        options=_options("wavelength_unit", "flux_unit", "extend", prefix="change_"),
+    ),
     "own_unknown": Upload(read_pairs, UPLOADED_UNKNOWN, most=MOST_PAIRS_BYTES),
     **{
         name: Upload(VisitorFile.of, most=MOST_KEPT_BYTES)
@@ -359,13 +355,13 @@ def read_frames_of(
     if mapping is not None:
         how = mapping.name if mapping.name != file.name else f"mapping-{mapping.name}"
         files[how] = mapping.content
-    with reported_for(key, file.name):
-        return read_frames_limited(files, how, quality_bits)
+    with reported_for(key):
+        return Frames(**read_by(FRAMES, files, {"mapping": how, "quality_bits": quality_bits}))
 
 
 @contextmanager
-def reported_for(key: str, name: str) -> Iterator[None]:
-    """Raise the errors of a reader as those of a field, with the name of the file."""
+def reported_for(key: str) -> Iterator[None]:
+    """Raise the errors of a reader as those of a field."""
     try:
         yield
     except InputError as error:
@@ -385,37 +381,45 @@ class Shelf:
 
     def __init__(self, most: int) -> None:
         self.most, self.size = most, 0
-        self._held: OrderedDict[tuple[int, Hashable], tuple[int, Callable[[], object]]] = OrderedDict()
+        # Size and value by visitor, kind and key. The visitor itself, since an id is given again when it has left.
+        self._held: OrderedDict[tuple[object, str, Hashable], tuple[int, Any]] = OrderedDict()
         self._lock = threading.Lock()
 
-    def keep(self, owner: object, key: Hashable, value: object, drop: Callable[[], object]) -> None:
-        """Count a value that its owner keeps; `drop` is called if it must go."""
-        size = size_of(value)
+    def keep(self, owner: object, kind: str, key: Hashable, value: object, most: int = 1) -> None:
+        """Keep a value for its owner, who has at most `most` of its kind."""
+        size, entry = size_of(value), (owner, kind, key)
         with self._lock:
-            self._remove((id(owner), key))
-            self._held[id(owner), key] = size, drop
+            self._remove(entry)
+            self._held[entry] = size, value
             self.size += size
-            gone = []
+            for old in self._entries(owner, kind)[:-most]:
+                self._remove(old)
             while self.size > self.most and len(self._held) > 1:
-                oldest = next(iter(self._held))
-                gone.append(self._held[oldest][1])
-                self._remove(oldest)
-        for release in gone:
-            release()
+                self._remove(next(iter(self._held)))
 
-    def used(self, owner: object, key: Hashable) -> None:
-        """Note that a value was used."""
+    def get(self, owner: object, kind: str, key: Hashable) -> Any:
+        """Return a value, which is used, or None if it is not here any more."""
         with self._lock:
-            if (id(owner), key) in self._held:
-                self._held.move_to_end((id(owner), key))
+            if (entry := (owner, kind, key)) not in self._held:
+                return None
+            self._held.move_to_end(entry)
+            return self._held[entry][1]
 
-    def leave(self, owner: object) -> None:
-        """Forget the values of an owner."""
+    def of(self, owner: object, kind: str) -> dict[Any, Any]:
+        """Return an owner's values of a kind by key."""
         with self._lock:
-            for entry in [entry for entry in self._held if entry[0] == id(owner)]:
+            return {entry[2]: self._held[entry][1] for entry in self._entries(owner, kind)}
+
+    def drop(self, owner: object, *which: Hashable) -> None:
+        """Drop the values of an owner: all of them, or those of a kind, or of a kind and key."""
+        with self._lock:
+            for entry in self._entries(owner, *which):
                 self._remove(entry)
 
-    def _remove(self, entry: tuple[int, Hashable]) -> None:
+    def _entries(self, *which: object) -> list[tuple[object, str, Hashable]]:
+        return [entry for entry in self._held if entry[: len(which)] == which]
+
+    def _remove(self, entry: tuple[object, str, Hashable]) -> None:
         self.size -= self._held.pop(entry, (0, None))[0]
 
 

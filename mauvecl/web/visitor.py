@@ -13,8 +13,7 @@ import math
 import tempfile
 import threading
 import time
-from collections import OrderedDict
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Hashable
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
@@ -33,7 +32,7 @@ from mauvecl.schema.errors import InputError, shortened
 from mauvecl.web.closed_forms import ClosedForms, other_payloads, solved
 from mauvecl.web.fields import FIELDS, field_of, remedies, sentence
 from mauvecl.web.page import TABS, State, asking, card, known, reads_of
-from mauvecl.web.sandboxed_reader import read_columns_limited
+from mauvecl.web.sandboxed_reader import COLUMNS, read_by
 from mauvecl.web.tab import DRAWING, SIMULATIONS, as_file, asked_study, commands_and_programs, study_file, verbs_of
 from mauvecl.web.uploads import RESULTS, UPLOADS
 from mauvecl.web.uploads import UPLOAD_SHELF as UPLOADED
@@ -156,32 +155,19 @@ class Job:
         self.future.cancel()
 
     @property
-    def counts(self) -> tuple[int, int]:
-        """Return the finished part and the total, or 0 if nothing is counted yet."""
-        if self.unit:
-            return self._counted
-        standing = None if self._pool is None else self._pool.standing
-        return (0, 0) if standing is None else (standing.done, standing.total)
-
-    @property
-    def share(self) -> float:
-        """Return the share that is done."""
-        done, total = self.counts
-        return min(done / total, 1.0) if total else 0.0
-
-    @property
-    def words(self) -> str:
-        """Return the progress in words; the estimated time never rises."""
+    def progress(self) -> tuple[float, str]:
+        """Return the share that is done, and the progress in words; the estimated time never rises."""
         if self._started is None:
-            return "waiting for its turn"
-        (done, total), spent = self.counts, time.monotonic() - self._started
+            return 0.0, "waiting for its turn"
+        standing, spent = None if self._pool is None else self._pool.standing, time.monotonic() - self._started
+        done, total = self._counted if self.unit or standing is None else (standing.done, standing.total)
         if not total:
-            return f"{spent:.0f} s"
-        words = f"{done:,} of {total:,} {self.unit or 'realisations'}"
-        if not 0 < done < total:
-            return f"{words}, {spent:.0f} s"
-        self._left_s = min(self._left_s, spent * (total - done) / done)
-        return f"{words}, about {self._left_s:.0f} s left"
+            return 0.0, f"{spent:.0f} s"
+        words, when = f"{done:,} of {total:,} {self.unit or 'realisations'}", f"{spent:.0f} s"
+        if 0 < done < total:
+            self._left_s = min(self._left_s, spent * (total - done) / done)
+            when = f"about {self._left_s:.0f} s left"
+        return min(done / total, 1.0), f"{words}, {when}"
 
 
 log = logging.getLogger(__name__)
@@ -237,12 +223,7 @@ class Visitor(WebSocketHandler):
         self._solving = 0
         self._tasks: set[asyncio.Task[None]] = set()
         self._coming: dict[str, Any] | None = None
-        self._uploads: dict[str, Any] = {}
         self._digests: dict[str, str] = {}
-        self._given: tuple[tuple[Any, ...], dict[str, Any]] | None = None
-        self._closed: tuple[tuple[Any, ...], ClosedForms] | None = None
-        self._answers: OrderedDict[tuple[str, tuple[Any, ...]], dict[str, Any]] = OrderedDict()
-        self._files: OrderedDict[tuple[Any, ...], tuple[str, bytes]] = OrderedDict()
         self._folder = tempfile.TemporaryDirectory(prefix="mauvecl-page-")
 
     def check_origin(self, origin: str) -> bool:
@@ -262,7 +243,7 @@ class Visitor(WebSocketHandler):
                 job.cancel()
         self._folder.cleanup()
         for shelf in (RESULTS, UPLOADED):
-            shelf.leave(self)
+            shelf.drop(self)
         Visitor.has_left = True
 
     def send(self, content: bytes | None = None, **message: Any) -> None:
@@ -300,7 +281,7 @@ class Visitor(WebSocketHandler):
 
     def state(self, link: str) -> State:
         """Enter values."""
-        state = State(self._uploads)
+        state = State(UPLOADED.of(self, "upload"))
         state.follow(link)
         return state
 
@@ -338,37 +319,35 @@ class Visitor(WebSocketHandler):
 
     def closed(self, state: State, tab: Tab) -> ClosedForms:
         """Return the closed forms of the part of a question that a tab reads; the last ones are cached."""
-        key = self._key(state, tab.reads), tab.chance
-        held = self._closed
-        if held is None or held[0] != key:
-            question = state.question(tab.reads)
-            given = self.given(state, tab)
-            made = ClosedForms.of(question, Path(self._folder.name), chance=tab.chance, given=given)
-            held = self._closed = key, made
-        # Closed forms compute and keep more when they are used.
-        self._shelve("_closed", held)
-        return held[1]
+
+        def make() -> ClosedForms:
+            question, folder = state.question(tab.reads), Path(self._folder.name)
+            return ClosedForms.of(question, folder, chance=tab.chance, given=self.given(state, tab))
+
+        closed: ClosedForms = self._cached("closed", (self._key(state, tab.reads), tab.chance), make)
+        return closed
 
     def given(self, state: State, tab: Tab) -> dict[str, Any]:
         """Return the content of the files that a tab reads; the last ones are cached."""
         key = tab.name, self._key(state, tab.reads & (UPLOADS.keys() | DATA))
-        held = self._given
-        if held is None or held[0] != key:
-            held = self._given = key, tab.given(state.question(tab.reads))
-            self._shelve("_given", held)
-        return held[1]
+        given: dict[str, Any] = self._cached("given", key, lambda: tab.given(state.question(tab.reads)))
+        return given
 
-    def _shelve(self, name: str, value: object) -> None:
-        """Count an attribute among the results of all visitors; it may be reset to None."""
-        RESULTS.keep(self, name, value, partial(setattr, self, name, None))
+    def _cached(self, kind: str, key: Hashable, make: Callable[[], Any], most: int = 1) -> Any:
+        """Return the value of a key; the last `most` of a kind are kept."""
+        value = RESULTS.get(self, kind, key)
+        value = make() if value is None else value
+        # Closed forms compute and keep more when they are used, and are counted again.
+        RESULTS.keep(self, kind, key, value, most)
+        return value
 
     def answers(self, state: State) -> dict[str, Any]:
         """Return the simulated answers that hold for a question, by name."""
         valid: dict[str, Any] = {}
-        for (simulation, key), answers in list(self._answers.items()):
+        for (simulation, key), answers in RESULTS.of(self, "answers").items():
             if key == self._key(state, reads_of(simulation)):
                 valid |= answers
-                RESULTS.used(self, (simulation, key))
+                RESULTS.get(self, "answers", (simulation, key))
         return valid
 
     def _key(self, state: State, names: frozenset[str]) -> tuple[Any, ...]:
@@ -437,11 +416,12 @@ class Visitor(WebSocketHandler):
     def _ask_draw(self, asked: dict[str, Any]) -> None:
         """Draw one exposure with the flare."""
         state, tab = self.state(asked["link"]), tab_of(str(asked.get("tab")))
-        if self._closed is None or self._closed[0] != (self._key(state, tab.reads), tab.chance):
+        key = self._key(state, tab.reads), tab.chance
+        closed: ClosedForms | None = RESULTS.get(self, "closed", key)
+        if closed is None:
             return
         if self._drawing is not None:
             self._drawing.cancel()
-        closed = self._closed[1]
         how = closed.case.draw_options | {"seed": closed.study.run.seed}
         self._drawing = Job(lambda pool: pool.realise(closed.flare, count=1, **how)[0])
 
@@ -451,7 +431,7 @@ class Visitor(WebSocketHandler):
             except (Exception, asyncio.CancelledError):
                 # Another draw took its place, or a simulation reports what is wrong.
                 return
-            if self._closed is not None and self._closed[1] is closed:
+            if RESULTS.get(self, "closed", key) is closed:
                 self.send(n=asked["n"], **shown(tab.name, closed, self.answers(state) | {"draw": drawn}))
 
         self._begin(draw(self._drawing))
@@ -480,13 +460,10 @@ class Visitor(WebSocketHandler):
         done = asyncio.wrap_future(job.future)
         try:
             while not (await asyncio.wait([done], timeout=LOOK_S))[0]:
-                self.send(n=n, progress=job.share, message=job.words)
-            self._answers[key] = done.result()
-            self._answers.move_to_end(key)
-            RESULTS.keep(self, key, self._answers[key], partial(self._answers.pop, key, None))
-            while len(self._answers) > MOST_ANSWERS:
-                self._answers.popitem(last=False)
-            self.send(n=n, ended=f"Done: {job.words}.", kind=kind)
+                share, words = job.progress
+                self.send(n=n, progress=share, message=words)
+            RESULTS.keep(self, "answers", key, done.result(), MOST_ANSWERS)
+            self.send(n=n, ended=f"Done: {job.progress[1]}.", kind=kind)
         except (Cancelled, CancelledError, asyncio.CancelledError):
             self.send(n=n, ended="Cancelled.")
         finally:
@@ -509,7 +486,7 @@ class Visitor(WebSocketHandler):
             self.close(1003, "a message must be a question as the page asks it")
             return
         asked, self._coming = self._coming, None
-        self._uploads.pop(asked["field"], None)
+        UPLOADED.drop(self, "upload", asked["field"])
         state = self.state(asked["link"])
         options = tuple(state.entered[name] for name in UPLOADS[asked["field"]].options.values())
         self._digests[asked["field"]] = hashlib.sha256(content + repr(options).encode()).hexdigest()
@@ -521,8 +498,7 @@ class Visitor(WebSocketHandler):
         reply: dict[str, Any] = {"n": asked["n"], "field": field}
         try:
             work = reading(lambda: upload.read(name, content, state.values_of(names)))
-            self._uploads[field] = await asyncio.wrap_future(work)
-            UPLOADED.keep(self, field, self._uploads[field], partial(self._uploads.pop, field, None))
+            UPLOADED.keep(self, "upload", field, await asyncio.wrap_future(work), len(UPLOADS))
             reply["entered"] = upload.entered
         except InputError as error:
             reply["lacks"] = sentence(error, upload.options)
@@ -535,9 +511,10 @@ class Visitor(WebSocketHandler):
 
     async def _ask_columns(self, asked: dict[str, Any]) -> None:
         """Send the names of the columns of the visitor's frames; none if they are no table."""
-        file, names = self._uploads.get("frames"), ()
+        file, names = UPLOADED.get(self, "upload", "frames"), ()
         if file is not None:
-            names = await asyncio.wrap_future(reading(partial(read_columns_limited, file.name, file.content)))
+            work = reading(partial(read_by, COLUMNS, {file.name: file.content}, {}))
+            names = (await asyncio.wrap_future(work))["names"]
         self.send(n=asked["n"], columns=names)
 
     async def _ask_file(self, asked: dict[str, Any]) -> None:
@@ -555,19 +532,16 @@ class Visitor(WebSocketHandler):
         # A simulation asks what its own answers depend on, which their tables state.
         reads = reads_of(name) if tab not in TABS and name in SIMULATIONS else front.reads
         answers = self.answers(state)
-        which = self._key(state, reads), tab, name, ending, tuple(answers)
-        if which not in self._files:
+
+        def make() -> tuple[str, bytes]:
             if tab in TABS:
-                made = as_file(TABS[tab], name, ending, self.closed(state, front), answers)
-            else:
-                _, study = asked_study(name, state.question(reads).study(Path(self._folder.name)))
-                made = study_file(study, "study")
-            self._files[which] = made
-            RESULTS.keep(self, which, made, partial(self._files.pop, which, None))
-            while len(self._files) > MOST_KEPT:
-                self._files.popitem(last=False)
-            return made
-        return self._files[which]
+                return as_file(TABS[tab], name, ending, self.closed(state, front), answers)
+            _, study = asked_study(name, state.question(reads).case(Path(self._folder.name)).study)
+            return study_file(study, "study")
+
+        which = self._key(state, reads), tab, name, ending, tuple(answers)
+        made: tuple[str, bytes] = self._cached("file", which, make, MOST_KEPT)
+        return made
 
     async def _ask_export(self, asked: dict[str, Any]) -> None:
         """Send a tab's questions as commands and as Python programs."""

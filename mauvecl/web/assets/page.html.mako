@@ -350,7 +350,25 @@ ${actions(tab)}
 <p class="wrong" id="link-lacks" hidden>The link does not hold your file: who opens it needs the file, too. The study holds it.</p>
 <h3>Command line</h3><pre id="as-command" tabindex="0"></pre><button type="button" data-copy="as-command">Copy the command</button>
 <h3>Python</h3><pre id="as-python" tabindex="0"></pre><button type="button" data-copy="as-python">Copy the program</button>
-<h3>Citation</h3><pre id="as-bibtex" tabindex="0">${bibtex}</pre><button type="button" data-copy="as-bibtex">Copy the BibTeX</button>
+<%doc>As in the project's file CITATION.cff, which has neither the paper's volume and pages nor an address of the project.</%doc>\
+<h3>Citation</h3><pre id="as-bibtex" tabindex="0">@software{mauvecl,
+  author = {{The mauvecl developers}},
+  title = {mauvecl: would the Mauve satellite see this stellar flare?},
+  version = {${version}},
+  year = {2026}
+}
+
+@article{mauvesim,
+  author = {Saba, A. and Favata, F. and Savini, G. and Tinetti, G. and Bradley, L. and Stotesbury, I. and
+            Tessenyi, M.},
+  title = {MauveSim: the instrument simulator software for the Blue Skies Space Mauve satellite},
+  journal = {RAS Techniques and Instruments},
+  year = {2025},
+  eprint = {2502.01389},
+  archivePrefix = {arXiv},
+  url = {https://arxiv.org/abs/2502.01389}
+}
+</pre><button type="button" data-copy="as-bibtex">Copy the BibTeX</button>
 <div class="row"><button type="button" data-closes>Close</button></div>
 </dialog>
 <dialog id="about" aria-labelledby="about-head">
