@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mauvecl.observations.event_fits import flares_of
 from mauvecl.observations.event_windows import REACH
 from mauvecl.observations.process import Binned, Process, Steps, criterion_of_process, fit_process
-from mauvecl.observations.process_search import FilterRow, ProcessSearch
+from mauvecl.observations.process_search import ProcessSearch
 from mauvecl.observations.search import Detection, SeriesSurvey
 from mauvecl.schema.physical import DAY_S
 
@@ -323,7 +323,7 @@ def _search_once(part: SeriesSurvey, search: ProcessSearch, light: Float, thresh
     """Return the largest events among the frames that are left, at most one near another."""
     both = np.stack([part.sums, UNCERTAIN * light]) if light.any() else part.sums[None]
     # Local maxima above the threshold, of which there are many where the process does not describe the light.
-    found: list[tuple[FilterRow, NDArray[np.intp], NDArray[np.intp], Float, Float]] = []
+    parts = []
     for row, rho in search.values(both, threshold):
         excess = rho[0] - np.abs(np.where(np.isfinite(rho[1]), rho[1], 0.0)) if len(rho) > 1 else rho[0]
         direction = excess.argmax(axis=0)
@@ -331,22 +331,20 @@ def _search_once(part: SeriesSurvey, search: ProcessSearch, light: Float, thresh
         # Local maxima only: neighbours belong to the same event.
         top = (best >= np.append(best[1:], -np.inf)) & (best >= np.insert(best[:-1], 0, -np.inf))
         onset = np.flatnonzero(top & (best >= threshold))
-        found.append((row, onset, direction[onset], rho[0, direction[onset], onset], best[onset]))
-    which = np.repeat(np.arange(len(found)), [onset.size for _, onset, *_ in found])
-    onsets, directions, values, bests = (np.concatenate([one[k] for one in found]) for k in range(1, 5))
+        along, half_width = direction[onset], np.full(onset.size, row.template.half_width_s)
+        value = rho[0, along, onset]
+        amplitude = value / row.per_amplitude[along, onset]
+        parts.append(np.array([best[onset], value, half_width, search.peak_s(row, onset), along, amplitude]))
+    bests, *others = np.concatenate(parts, axis=1)
     order = np.argsort(bests)[::-1][: 4 * most_events(part.stare.n_frames)]
     scales = min(one.shortest_s for one in part.processes)
     scale = NEAR_SCALES * scales if np.isfinite(scales) else 0.0
     accepted: list[Detection] = []
     peaks, reaches = np.empty((2, order.size))
-    for n, k in enumerate(order):
-        row, onset = found[which[k]][0], onsets[k]
-        peak, half_width = float(search.peak_s(row, np.array([onset]))[0]), row.template.half_width_s
+    for n, (value, half_width, peak, along, amplitude) in enumerate(np.array(others)[:, order].T.tolist()):
         peaks[n], reaches[n] = peak, max(NEAR_WIDTHS * half_width, scale)
         if (np.abs(peak - peaks[:n]) > np.maximum(reaches[n], reaches[:n])).all():
-            along, value = int(directions[k]), float(values[k])
-            amplitude = value / float(row.per_amplitude[along, onset])
-            accepted.append(Detection(value, half_width, peak, along, amplitude, 0, 0))
+            accepted.append(Detection(value, half_width, peak, int(along), amplitude, 0, 0))
     return accepted
 
 

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.arrays import map_in_threads
+from mauvecl.search.search import largest_values
 from mauvecl.search.templates import LEAST_SHARE, Bank, Template
 
 if TYPE_CHECKING:
@@ -50,29 +51,8 @@ MOST_DENSE = 128
 #: Number of frames from which templates share the transforms of light curves, the shortest blocks of these, and the
 #: length of a block in longest kernels of it.
 LEAST_SHARED, LEAST_BLOCK, KERNELS_PER_BLOCK = 2**14, 2**12, 4
-#: Approximate number of values in an array of a batch of light curves.
-BATCH = 2**21
 #: Number of values of light curves below which templates are searched one after another.
 FEW_VALUES = 2**15
-
-
-@dataclass(frozen=True, eq=False)
-class TemplateRow:
-    """Templates of one half-width and phase at all onsets."""
-
-    template: Template
-    phase: int
-    shape: Float  # flux of the template above `NEGLECTED`, shape (n,)
-    first: int  # its first frame, relative to the frame of the peak
-    peaks: NDArray[np.int64]  # frame of the peak at each onset, from the first frame of the stare, including gaps
-
-
-@dataclass(frozen=True, eq=False)
-class FilterRow(TemplateRow):
-    """Templates with their denominators."""
-
-    # Shape (n_direction, n_onset); mean of rho for a flare with unit peak along each direction, zero if not searched.
-    per_amplitude: Float
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,10 +77,15 @@ class SolvedNorms:
 
 
 @dataclass(frozen=True, eq=False)
-class Filter(TemplateRow):
-    """Templates with the norms of each sum, from which their denominators follow."""
+class Filter:
+    """Templates of one half-width and phase at all onsets, with the norms of each sum."""
 
-    norms: tuple[SolvedNorms, ...]  # of each sum
+    template: Template
+    phase: int
+    shape: Float  # flux of the template above `NEGLECTED`, shape (n,)
+    first: int  # its first frame, relative to the frame of the peak
+    peaks: NDArray[np.int64]  # frame of the peak at each onset, from the first frame of the stare, including gaps
+    norms: tuple[SolvedNorms, ...]  # of each sum; they are solved when they are needed
     lost: Float  # shape (n_sum, n_onset); what the unknown level takes from the norms
     weights: Float  # shape (n_direction, n_sum); squared directions of the bank
 
@@ -114,12 +99,15 @@ class Filter(TemplateRow):
         """Onsets at which the norm of at least one sum is not solved, shape (n_onset,)."""
         return np.asarray(np.any([one.unsolved for one in self.norms], axis=0))
 
-    def row(self) -> FilterRow:
-        """Return the denominators as they are solved by now; they are zero where they are not."""
+    @property
+    def per_amplitude(self) -> Float:
+        """Mean of rho for a flare with unit peak along each direction, shape (n_direction, n_onset).
+
+        It is zero where the template is not searched, and where its norm is not solved.
+        """
         norm = self.weights @ np.maximum(np.array([one.norm for one in self.norms]) - self.lost, 0.0)
         tried = (norm >= LEAST_SHARE * self.without_gaps) & ~self.unsolved
-        denominators = np.sqrt(np.where(tried, norm, 0.0))
-        return FilterRow(self.template, self.phase, self.shape, self.first, self.peaks, denominators)
+        return np.sqrt(np.where(tried, norm, 0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,11 +182,11 @@ class ProcessSearch:
         return filters
 
     @cached_property
-    def rows(self) -> list[FilterRow]:
-        """Templates with everything that does not depend on data."""
+    def rows(self) -> list[Filter]:
+        """Templates of which all denominators are solved."""
         for one in self.filters:
             self._solve(one, one.unsolved)
-        return [one.row() for one in self.filters]
+        return self.filters
 
     def scores(self, sums: NDArray[Any]) -> Float:
         """Return C^-1 (sums - level) on the grid of frames with gaps, shape (n_stare, n_sum, n_grid).
@@ -212,46 +200,35 @@ class ProcessSearch:
             scores[:, k, self.at] = covariance.solve(values.T).T - mean[:, None] * level
         return scores
 
-    def values(self, sums: NDArray[Any], above: float | None = None) -> Iterator[tuple[FilterRow, Float]]:
-        """Yield each row with rho, shape (n_stare, n_direction, n_onset); minus infinity if not searched.
+    def values(self, sums: NDArray[Any], above: float | None = None) -> Iterator[tuple[Filter, Float]]:
+        """Yield each template with rho, shape (n_stare, n_direction, n_onset); minus infinity if not searched.
 
         Onsets next to gaps, at which rho of the first light curve cannot exceed a positive threshold `above`, are not
         searched.
         """
-        rows = self.rows if above is None else [None] * len(self.filters)
-        scores = Correlations(self.scores(sums), [(one.shape.size, one.first) for one in self.filters])
-        found = partial(self._values, scores, above)
-        pairs = list(zip(self.filters, rows, strict=True))
-        yield from map_in_threads(lambda pair: found(*pair), pairs, _threads(scores.values.size))
+        filters = self.rows if above is None else self.filters
+        scores = Correlations(self.scores(sums), [(one.shape.size, one.first) for one in filters])
+        yield from map_in_threads(partial(self._values, scores, above), filters, _threads(scores.values.size))
 
-    def _values(
-        self, scores: Correlations, above: float | None, one: Filter, row: FilterRow | None
-    ) -> tuple[FilterRow, Float]:
-        """Return a row, if it is not given, with rho; see `values`."""
+    def _values(self, scores: Correlations, above: float | None, one: Filter) -> tuple[Filter, Float]:
+        """Return a template with rho; see `values`."""
         correlated = scores.of(one.shape, one.first)[..., one.peaks]
         rho = np.einsum("dk,sko->sdo", self.bank.directions, correlated)
-        if row is None:
-            assert above is not None
+        if above is not None:
             # A template of which a smaller share lies in frames is not searched.
             least = np.sqrt(LEAST_SHARE * one.without_gaps)
             self._solve(one, one.unsolved & (rho[0] > above * least).any(axis=0))
-            row = one.row()
-        tried = row.per_amplitude > 0
-        np.divide(rho, row.per_amplitude, out=rho, where=tried)
+        per_amplitude = one.per_amplitude
+        tried = per_amplitude > 0
+        np.divide(rho, per_amplitude, out=rho, where=tried)
         rho[:, ~tried] = -np.inf
-        return row, rho
+        return one, rho
 
     def largest(self, sums: NDArray[Any]) -> Float:
         """Return the largest value of each light curve, shape (n_stare,)."""
-        size = max(1, BATCH // (self.n_grid * sums.shape[2]))
-        best = np.full(len(sums), -np.inf)
-        for first in range(0, len(sums), size):
-            part = slice(first, first + size)
-            for _, rho in self.values(sums[part]):
-                best[part] = np.maximum(best[part], rho.max(axis=(1, 2)))
-        return best
+        return largest_values(self.values, sums, self.n_grid * sums.shape[2])
 
-    def peak_s(self, row: FilterRow, onset: NDArray[np.int64]) -> Float:
+    def peak_s(self, row: Filter, onset: NDArray[np.int64]) -> Float:
         """Return the times of the peaks of templates, from the start of the stare's numbering."""
         frames = self.grid.numbers(self.frames[0] + row.peaks[onset]) + row.template.phases[row.phase]
         return np.asarray(frames * self.bank.frame_s)

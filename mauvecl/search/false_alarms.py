@@ -571,7 +571,7 @@ def _shifted(survey: Survey) -> bool:
     """Return whether unknowns of several standard deviations shift a template's value."""
     if survey.unknowns is None:
         return False
-    return bool(survey.search.largest(survey.unsubtracted(survey.unknowns.extremes)).maximum.max() > MIN_SHIFT)
+    return bool(survey.search.largest(survey.unsubtracted(survey.unknowns.extremes)).max() > MIN_SHIFT)
 
 
 def _shifts(survey: Survey, amplitudes: Float) -> tuple[Float, Float]:

@@ -22,7 +22,7 @@ with flares have less weight (Huber 1964, doi 10.1214/aoms/1177703732), so that 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -51,17 +51,6 @@ Float = NDArray[np.float64]
 BATCH = 2**21
 #: Relative regularisation for curves that are degenerate within a window.
 RIDGE = 1e-11
-
-
-@dataclass(frozen=True, eq=False)
-class LargestValue:
-    """The largest value of each stare and its template; arrays of shape (n_stare,)."""
-
-    maximum: Float  # largest rho
-    peak_s: Float  # from the start of the stare
-    half_width_s: Float
-    temperature: NDArray[np.int64]  # row of the bank's directions
-    amplitude: Float  # of the template's peak, in standard deviations of a frame's sum
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,16 +109,12 @@ class Search:
         """Number of searched templates: half-widths, phases, onsets and temperatures."""
         return len(self.bank.directions) * int(sum(np.count_nonzero(row.per_amplitude) for row in self.grid))
 
-    def largest(self, sums: NDArray[Any]) -> LargestValue:
-        """Return the largest value of each stare and its template.
+    def largest(self, sums: NDArray[Any]) -> Float:
+        """Return the largest value of each stare, shape (n_stare,).
 
         The sums, (n_stare, n_frame, n_sum), have unit covariance in each frame without a flare.
         """
-        size = max(1, BATCH // (self._size * self.bank.directions.shape[1]))
-        parts = [self._largest(sums[i : i + size]) for i in range(0, len(sums), size)]
-        return LargestValue(
-            *(np.concatenate([getattr(p, name) for p in parts]) for name in LargestValue.__annotations__)
-        )
+        return largest_values(self.values, sums, self._size * self.bank.directions.shape[1])
 
     def values(self, sums: NDArray[Any]) -> Iterator[tuple[Row, NDArray[Any]]]:
         """Yield each row with rho, shape (n_stare, n_temperature, n_onset); minus infinity if not searched.
@@ -206,24 +191,6 @@ class Search:
             )
         return sums
 
-    def _largest(self, sums: NDArray[Any]) -> LargestValue:
-        n = len(sums)
-        every = np.arange(n)
-        best = np.full(n, -np.inf)
-        peak, width, amplitude = (np.zeros(n) for _ in range(3))
-        temperature = np.zeros(n, np.int64)
-        for row, rho in self.values(sums):
-            which = rho.reshape(n, -1).argmax(axis=1)
-            value = rho.reshape(n, -1)[every, which]
-            better = value > best
-            direction, onset = np.divmod(which[better], rho.shape[2])
-            best[better] = value[better]
-            peak[better] = (self._first + row.peaks[onset] + row.template.phases[row.phase]) * self.bank.frame_s
-            width[better] = row.template.half_width_s
-            temperature[better] = direction
-            amplitude[better] = value[better] / row.per_amplitude[onset]
-        return LargestValue(best, peak, width, temperature, amplitude)
-
     def _spectra(self, sums: NDArray[Any]) -> list[NDArray[Any]]:
         """Return transforms of the weighted sums times each series, zero in gaps, (n_stare, n_sum, n_frequency)."""
         real = _precision(sums)
@@ -292,6 +259,19 @@ class Search:
             without_gaps = template.detrended(phase, self.bank.baseline.powers)
             tried = left >= LEAST_SHARE * float(without_gaps @ without_gaps) * float(np.median(self._weight[self._at]))
             yield Row(template, phase, peaks, np.sqrt(np.where(tried, left, 0.0)), project)
+
+
+def largest_values(
+    values: Callable[[NDArray[Any]], Iterator[tuple[Any, NDArray[Any]]]], sums: NDArray[Any], size: int
+) -> Float:
+    """Return the largest of the values that a search yields for each stare of `size` values, shape (n_stare,)."""
+    batch = max(1, BATCH // size)
+    best = np.full(len(sums), -np.inf)
+    for first in range(0, len(sums), batch):
+        part = slice(first, first + batch)
+        for _, rho in values(sums[part]):
+            best[part] = np.maximum(best[part], rho.max(axis=(1, 2)))
+    return best
 
 
 def _precision(sums: NDArray[Any]) -> type[np.floating[Any]]:
@@ -547,7 +527,7 @@ class Largest:
 
     def __call__(self, values: NDArray[np.float32], first: int) -> dict[str, NDArray[Any]]:
         """Return the largest values as ``maximum``, shape (n_stare,)."""
-        return {"maximum": self.search.largest(subtract_known(values, self.known, self.trend)).maximum}
+        return {"maximum": self.search.largest(subtract_known(values, self.known, self.trend))}
 
 
 def subtract_known(sums: NDArray[Any], known: NDArray[Any], trend: Trend | None) -> NDArray[np.float32]:

@@ -81,7 +81,7 @@ def test_bank_loses_little_in_time(level):
             if level.offset:
                 left = left - np.polyval(np.polyfit(t.time, left, 1), t.time)
             own.append(np.linalg.norm(left))
-    kept = search.largest(np.array(flares, np.float32)[:, :, None]).maximum / np.array(own)
+    kept = search.largest(np.array(flares, np.float32)[:, :, None]) / np.array(own)
     assert (1 - kept).max() < 0.013
 
 
@@ -96,7 +96,7 @@ def test_largest_value_of_a_day(day):
     rng = np.random.default_rng(18)
     days = 400
     parts = [day.largest(rng.standard_normal((50, 17280, 1), dtype=np.float32)) for _ in range(days // 50)]
-    largest = np.sort(np.concatenate([p.maximum for p in parts]))
+    largest = np.sort(np.concatenate(parts))
     for q, value in ((0.5, 3.73), (0.9, 4.20), (0.99, 4.67)):
         # Of 400 days so many lie below the quantile, within four standard errors, and 0.01 for two decimals.
         spread = 4 * np.sqrt(days * q * (1 - q))
@@ -137,7 +137,7 @@ def test_repeated_estimates_scatter_by_their_errors():
     month = 12 / 365.25
     assert max(tail.log_rate(tail.threshold(month).value)[1] for tail in repeats) < 0.05
     rng, n = np.random.default_rng(9), 5000
-    maxima = search.largest(rng.standard_normal((n, stare.n_frames, 1), dtype=np.float32)).maximum
+    maxima = search.largest(rng.standard_normal((n, stare.n_frames, 1), dtype=np.float32))
     for u in (3.5, 4.0):
         p = np.array([tail.probability[list(tail.thresholds).index(u)] for tail in repeats])
         q = np.mean(maxima > u)
