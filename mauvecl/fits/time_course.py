@@ -19,7 +19,7 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.detection.nuisances import Nuisances, fitted_amplitudes, spectrum_of
-from mauvecl.fits.flare_model import EVERY, Exposures, Ranges, Reduction
+from mauvecl.fits.flare_model import EVERY, Ranges, Reduction
 from mauvecl.fits.profile import remembering
 from mauvecl.fits.spectrum import LEVELS, Measurement, clipped_pixels, fit
 from mauvecl.flares.frames import Components, known_strengths
@@ -608,7 +608,7 @@ def _data(
     skipped_nm: Ranges,
 ) -> _Data:
     # The unknowns are parameters of the stare, so the weights of single frames do not remove them.
-    clipped = clipped_pixels(Exposures(raw, quiet.recorded_dn), quiet, np.arange(len(raw)))
+    clipped = clipped_pixels(raw, quiet)
     reduction = Reduction.of(model, quiet, skipped_nm=skipped_nm, clipped=clipped)
     weights, strengths = reduction.weights, known_strengths(stare, quiet)
     sums = less_known(raw, quiet, strengths, weights)
