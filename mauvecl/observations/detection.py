@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mauvecl.observations.event_fits import flares_of
 from mauvecl.observations.event_windows import REACH
-from mauvecl.observations.process import Binned, Process, Steps, criterion_of_process, fit_process
+from mauvecl.observations.process import UNREPORTED, Binned, Process, Steps, criterion_of_process, fit_process
 from mauvecl.observations.process_search import ProcessSearch
 from mauvecl.observations.search import Detection, SeriesSurvey
 from mauvecl.schema.physical import DAY_S
@@ -60,9 +60,7 @@ NEAR_WIDTHS, NEAR_SCALES = 20.0, 2.0
 STILL_BRIGHT, END_FRAMES = 1.0, 4
 
 
-def fit_processes(
-    survey: SeriesSurvey, taken: Bool, start: SeriesSurvey | None = None, steps: Steps | None = None
-) -> SeriesSurvey:
+def fit_processes(survey: SeriesSurvey, taken: Bool, start: SeriesSurvey | None, steps: Steps) -> SeriesSurvey:
     """Return a survey with the processes that fit its sums and its flux outside the frames of events, `taken`.
 
     `start` is a survey of nearly the same frames with processes, whose terms are kept. `steps` reports each fit.
@@ -80,12 +78,12 @@ def fit_processes(
     flux = processes[0]
     # The flux of a light curve is its only sum.
     if survey.weighted:
-        flux = fitted(survey.flux, survey.flux_variance, None if start is None else start.flux_process)
+        flux = fitted(survey.flux, survey.variance, None if start is None else start.flux_process)
     return replace(survey, processes=processes, flux_process=flux)
 
 
 def fit_quiet_light(
-    survey: SeriesSurvey, guessed: Bool, before: SeriesSurvey | None = None, steps: Steps | None = None
+    survey: SeriesSurvey, guessed: Bool, before: SeriesSurvey | None = None, steps: Steps = UNREPORTED
 ) -> tuple[SeriesSurvey, Bool]:
     """Fit process and events in alternation, from the guess and, if need be, from the events in independent noise.
 
@@ -178,7 +176,9 @@ def _criterion_of(survey: SeriesSurvey, fits: Sequence[EventLight], kept: Bool, 
             noise = (survey.variance + extra)[kept]
             process = fit_process(Binned(start, column, noise, survey.stare.frame_s), process)
             noise = noise * process.excess**2
-        total += criterion_of_process(process, Binned(start, column, noise, survey.stare.frame_s), size)
+        # The excess is in the noise already.
+        data = Binned(start, column, noise, survey.stare.frame_s)
+        total += criterion_of_process(replace(process, excess=1.0), data, size)
     return total
 
 
@@ -199,8 +199,7 @@ def _criterion_alone(survey: SeriesSurvey, event: Detection, size: float, *alter
         values, variance = survey.sums[rows, 0] - light[rows, 0], survey.variance[rows] + extra[rows]
         data = Binned(survey.stare.start_s[rows], values, variance, survey.stare.frame_s)
         process = fit_process(data) if event.last - event.first >= MIN_QUIET else Process((), 1.0)
-        noise = replace(data, variance=variance * process.excess**2)
-        costs.append(PARAMETERS * n_flares * size + criterion_of_process(process, noise, size))
+        costs.append(PARAMETERS * n_flares * size + criterion_of_process(process, data, size))
     return min(costs)
 
 
@@ -213,7 +212,7 @@ def _seen_once(survey: SeriesSurvey) -> bool:
 
 
 def alternate(
-    survey: SeriesSurvey, guessed: Bool, before: SeriesSurvey | None = None, steps: Steps | None = None
+    survey: SeriesSurvey, guessed: Bool, before: SeriesSurvey | None, steps: Steps
 ) -> tuple[SeriesSurvey, Bool]:
     """Fit process and events in alternation; return the survey with processes, and the frames above `PROVISIONAL`.
 
@@ -238,12 +237,12 @@ def alternate(
     return fitted, taken
 
 
-def detect_events(survey: SeriesSurvey, threshold: float, steps: Steps | None = None) -> tuple[list[Detection], Bool]:
+def detect_events(survey: SeriesSurvey, threshold: float, steps: Steps = UNREPORTED) -> tuple[list[Detection], Bool]:
     """Detect events above a threshold, the largest first, and return them in order of time with their frames."""
     # Where the star is constant, or seen for a short time, events may take any number of frames.
     varies_for_days = survey.stare.duration_s > LONG_S and any(process.terms for process in survey.processes)
     for faint in FAINT if varies_for_days else FAINT[:1]:
-        events, taken = _detect_to(survey, threshold, faint, steps or Steps())
+        events, taken = _detect_to(survey, threshold, faint, steps)
         if len(events) <= FEW or taken.mean() <= MOST_TAKEN:
             break
     return events, taken

@@ -15,7 +15,7 @@ from mauvecl.flares.shapes import between, sides
 from mauvecl.host.arrays import map_in_threads
 from mauvecl.observations.event_fits import Fit, Mixture, fit_event, joined, light_of
 from mauvecl.observations.event_windows import GENERAL, LOG_TIME, FittedFlare, Likelihood, Window, log_time
-from mauvecl.observations.process import Steps
+from mauvecl.observations.process import UNREPORTED, Steps
 from mauvecl.observations.search import MIN_BASELINE, Detection, SeriesSurvey
 
 if TYPE_CHECKING:
@@ -193,7 +193,7 @@ def _summed(survey: SeriesSurvey, taken: Bool, level: Float, one: Detection) -> 
     process = survey.flux_process
     begin = max(0, one.first - NEARBY)
     part = slice(begin, one.last + 1 + NEARBY)
-    time, noise = survey.stare.start_s[part], survey.flux_variance[part] * process.excess**2
+    time, noise = survey.stare.start_s[part], survey.variance[part] * process.excess**2
     event = slice(one.first - begin, one.last + 1 - begin)
     photon = survey.photon / survey.scale * np.maximum(flux, 0.0)
     variance = float(counts**2 @ (noise[event] + photon))
@@ -292,13 +292,12 @@ class ObservedEvent:
 
 def measure_events(
     survey: SeriesSurvey, taken: Bool, found: list[Detection], causes: Sequence[Kind] | None = None,
-    steps: Steps | None = None,
+    steps: Steps = UNREPORTED,
 ) -> list[ObservedEvent]:  # fmt: skip
     """Measure detected events in order of time; `taken` are their frames, and `causes` follow from their spectra.
 
     Weaker events next to a step or a dip belong to it. `steps` reports each event.
     """
-    steps = steps or Steps()
     level = survey.flux_level(~taken)
     kinds: Sequence[Kind] = causes or ["flare"] * len(found)
     measured = map_in_threads(lambda k: measure_event(survey, taken, level, found[k], kinds[k]), range(len(found)))

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.flares.stare import Stare, select_frames
-from mauvecl.observations.level import process_level
-from mauvecl.observations.process import Process, Steps, level_fit
+from mauvecl.observations.level import LevelGiven
+from mauvecl.observations.process import UNREPORTED, Process, Steps, level_fit
 from mauvecl.observations.process_search import ProcessSearch
 from mauvecl.schema.physical import DAY_S
 from mauvecl.search.templates import Bank, Baseline, Templates
@@ -60,11 +60,10 @@ class SeriesSurvey:
     templates: Templates
     # Shape (n_frame, n_sum); searched sums: for spectra, sums weighted for flares; for a light curve, its flux.
     sums: Float
-    variance: Float  # shape (n_frame,); variance of the noise of each sum, without the excess of its process
+    variance: Float  # shape (n_frame,); variance of the noise of each sum and of the flux, without their excess
     processes: tuple[Process, ...]  # of the sums, which are independent
     # Shape (n_frame,); flux over `scale`, from which amplitudes and summed durations follow.
     flux: Float
-    flux_variance: Float  # shape (n_frame,); variance of the noise of the flux, without the excess of its process
     flux_process: Process
     scale: float  # typical standard deviation of the flux of a frame, in the unit of the flux
     level: float  # typical quiescent level, in the unit of the flux, to which amplitudes are relative
@@ -88,8 +87,8 @@ class SeriesSurvey:
         )
         net, part = flux[used] / scale, variance[used] / scale**2
         return cls(
-            stare, bank_of(stare, np.ones((1, 1)), shape), templates, net[:, None], part, (WHITE,), net, part, WHITE,
-            scale, typical, photon, frames.time_s[used], counts,
+            stare, bank_of(stare, np.ones((1, 1)), shape), templates, net[:, None], part, (WHITE,), net, WHITE, scale,
+            typical, photon, frames.time_s[used], counts,
         )  # fmt: skip
 
     @cached_property
@@ -100,7 +99,7 @@ class SeriesSurvey:
     def levels(self, quiet: Bool) -> Float:
         """Return the mean of the process of each sum given quiescent frames, shape (n_frame, n_sum)."""
         return np.column_stack([
-            process_level(process, self.stare.start_s, column, self.variance, quiet)
+            LevelGiven(process, self.stare.start_s, self.variance, quiet).of(column)
             for process, column in zip(self.processes, self.sums.T, strict=True)
         ])  # fmt: skip
 
@@ -117,7 +116,7 @@ class SeriesSurvey:
         """
         if quiet.sum() < MIN_BASELINE:
             return np.full(quiet.size, self.level / self.scale)
-        return process_level(self.flux_process, self.stare.start_s, self.flux, self.flux_variance, quiet)
+        return LevelGiven(self.flux_process, self.stare.start_s, self.variance, quiet).of(self.flux)
 
     def inverted(self) -> SeriesSurvey:
         """Return the survey upside down: losses of light become flares."""
@@ -134,7 +133,7 @@ class SeriesSurvey:
         return self._with_frames(select_frames(self.stare, kept), kept)
 
     def _with_frames(self, stare: Stare, chosen: Bool | slice) -> SeriesSurvey:
-        names = ("sums", "variance", "flux", "flux_variance", "time_s")
+        names = ("sums", "variance", "flux", "time_s")
         return replace(self, stare=stare, **{name: getattr(self, name)[chosen] for name in names})
 
 
@@ -150,18 +149,14 @@ def stare_of(frames: Frames, used: Bool) -> Stare:
 
 def bank_of(stare: Stare, directions: Float, shape: Shape) -> Bank:
     """Return the template bank for a stare."""
-    window = max(WINDOW_S, WINDOW_FRAMES * stare.frame_s)
-    return Bank(half_widths(stare), directions, shape, stare.frame_s, Baseline(window_s=window))
-
-
-def half_widths(stare: Stare) -> tuple[float, ...]:
-    """Return the half-widths of a bank for a light curve, s."""
     low = NARROWEST * stare.frame_s
     gaps = np.flatnonzero(np.diff(stare.numbers) * stare.frame_s > DAY_S) + 1
     longest = int(np.diff(np.concatenate([[0], gaps, [stare.n_frames]])).max())
     high = max(low, min(WIDEST * longest * stare.frame_s, WIDEST_S))
     steps = max(1, round(np.log(high / low) / np.log(WIDTH_STEP)) + 1)
-    return tuple(float(w) for w in low * WIDTH_STEP ** np.arange(steps))
+    half_widths = tuple(float(w) for w in low * WIDTH_STEP ** np.arange(steps))
+    window = max(WINDOW_S, WINDOW_FRAMES * stare.frame_s)
+    return Bank(half_widths, directions, shape, stare.frame_s, Baseline(window_s=window))
 
 
 #: Number of alarms from which a rate is estimated, and the smallest and largest number of simulated light curves.
@@ -243,7 +238,7 @@ class SimulatedRate:
 
 
 def simulated_rates(
-    survey: SeriesSurvey, quiet: Bool, rate: float, seed: int, steps: Steps | None = None
+    survey: SeriesSurvey, quiet: Bool, rate: float, seed: int, steps: Steps = UNREPORTED
 ) -> tuple[SimulatedRate, SimulatedRate]:
     """Return the false-alarm rates in light curves of the fitted process, and in those of measured residuals.
 
@@ -252,7 +247,6 @@ def simulated_rates(
     quiescent frames, drawn with replacement (Kuensch 1989, doi 10.1214/aos/1176347265). Enough light curves are drawn
     for `MIN_ALARMS` at the smallest rate of interest, per star-day, up to a limit; `steps` reports each batch.
     """
-    steps = steps or Steps()
     residual = innovations(survey, quiet)
     part = survey.frames(np.arange(survey.stare.n_frames) < MAX_LENGTH)
     n, n_sum = part.sums.shape
@@ -262,7 +256,7 @@ def simulated_rates(
     rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, SIMULATION_KEY]))
     length = max(block_length(column) for column in residual.T)
     covariances = part.search.covariances
-    counts = _mean_counts(survey, quiet)[:n] if survey.counts else None
+    counts = np.maximum(survey.levels(quiet)[:n, 0] * survey.scale * survey.counts, 0.0) if survey.counts else None
     largest: tuple[list[Float], list[Float]] = ([], [])
     batch = max(1, BATCH // (n * n_sum))
     for first in steps.each(range(0, count, batch), -(-count // batch)):
@@ -295,11 +289,6 @@ def largest_dip(survey: SeriesSurvey, quiet: Bool, least: float) -> float:
         for one in (down, down.backwards())
         for _, rho in one.search.values(one.sums[None], least)
     )
-
-
-def _mean_counts(survey: SeriesSurvey, quiet: Bool) -> Float:
-    """Return the mean counts of each frame, shape (n_frame,)."""
-    return np.maximum(survey.levels(quiet)[:, 0] * survey.scale * survey.counts, 0.0)
 
 
 def innovations(survey: SeriesSurvey, quiet: Bool) -> Float:

@@ -29,7 +29,7 @@ from mauvecl.observations.frame_model import (
 from mauvecl.observations.frames import Reason
 from mauvecl.observations.level import QuiescentLevel, guess_flares, single_frames
 from mauvecl.observations.light_curve import check_usable, quiescent_light, searched_among
-from mauvecl.observations.process import Steps
+from mauvecl.observations.process import UNREPORTED, Steps
 from mauvecl.observations.search import MIN_BASELINE, WHITE, Detection, SeriesSurvey, bank_of, stare_of
 from mauvecl.schema.errors import InputError
 from mauvecl.search.templates import TEMPERATURES_K, Templates
@@ -143,7 +143,7 @@ def survey_spectra(
     rank: int,
     seed: int,
     jitters: Mapping[str, float] | None = None,
-    steps: Steps | None = None,
+    steps: Steps = UNREPORTED,
 ) -> tuple[SeriesSurvey, SpectralSeries, QuiescentLevel]:
     """Prepare the search of spectra that is weighted for flares.
 
@@ -163,7 +163,6 @@ def survey_spectra(
     steps : Steps, optional
         Reports fits, searches and draws.
     """
-    steps = steps or Steps()
     fits = steps.part(0.0, 0.9)
     frames = cleaned.frames
     flux, _ = frames.white_light
@@ -192,8 +191,7 @@ def survey_spectra(
     survey = survey.frames(kept)
     series = replace(series, excess=series.excess[used])
     draws = steps.part(0.9, 1.0)
-    level = quiescent_light(frames, flux, frames.error, survey, used, used & ~events, reasons, seed, draws)
-    return survey, series, level
+    return survey, series, quiescent_light(frames, survey, reasons, ~events, seed, draws)
 
 
 def _survey(
@@ -211,8 +209,8 @@ def _survey(
     photon = float(np.average(series.model.gain, weights=lit if lit.any() else None))
     bank = bank_of(stare, templates.directions[list(templates.chosen)], shape)
     return SeriesSurvey(
-        stare, bank, templates, sums[used], variance, (WHITE,) * sums.shape[1], flux[used] / scale, variance, WHITE,
-        scale, level, photon, frames.time_s[used], weighted=True,
+        stare, bank, templates, sums[used], variance, (WHITE,) * sums.shape[1], flux[used] / scale, WHITE, scale, level,
+        photon, frames.time_s[used], weighted=True,
     )  # fmt: skip
 
 
