@@ -141,7 +141,10 @@ def fit_event(window: Window, searched: Shape) -> list[Fit]:
             fits += _several(window, family, several)
     best = max(first.values(), key=lambda grid: float(scipy.special.logsumexp(grid.log)))
     boxes = np.array([grid.box for grid in first.values()])
-    return fits + _single(window, general, *best.best, _wider(boxes))
+    low, high = boxes[..., 0].min(axis=0), boxes[..., 1].max(axis=0)
+    # The range contains all of these, and half as much on each side.
+    wide = np.column_stack([low - (high - low) / 2, high + (high - low) / 2])
+    return fits + _single(window, general, *best.best, wide)
 
 
 def flares_of(survey: SeriesSurvey, taken: Bool, one: Detection) -> tuple[list[FittedFlare], float, float]:
@@ -229,12 +232,6 @@ class Grid:
                 break
             box = new
         return found
-
-
-def _wider(boxes: Float) -> Float:
-    """Return a range that contains others, and half as much on each side."""
-    low, high = boxes[..., 0].min(axis=0), boxes[..., 1].max(axis=0)
-    return np.column_stack([low - (high - low) / 2, high + (high - low) / 2])
 
 
 def _ranges(window: Window) -> Float:

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from itertools import pairwise, product
 from typing import TYPE_CHECKING
 
@@ -53,43 +53,36 @@ GENERAL_WEIGHT = 0.5
 
 
 @dataclass(frozen=True)
-class Rise:
-    """Rise of a flare that ends at the peak."""
+class Half:
+    """Rise of a flare that ends at the peak, or decay that begins there."""
 
-    integral: Callable[[Float], Float]  # of the rise up to a time before the peak
+    integral: Callable[[Float], Float]  # up to a time before the peak, or from a time after the peak on
+    decays: bool = False
 
     def before(self, tau: ArrayLike) -> Float:
         """Return the integral up to tau."""
-        return self.integral(np.minimum(tau, 0.0))
+        return self._rest(tau) if self.decays else self._own(tau)
 
     def after(self, tau: ArrayLike) -> Float:
-        """Return the integral from tau to the peak."""
+        """Return the integral from tau on."""
+        return self._own(tau) if self.decays else self._rest(tau)
+
+    def _own(self, tau: ArrayLike) -> Float:
+        return self.integral(np.maximum(tau, 0.0) if self.decays else np.minimum(tau, 0.0))
+
+    def _rest(self, tau: ArrayLike) -> Float:
+        """Return the integral between the peak and tau."""
         t = np.asarray(tau, np.float64)
-        return self.before(0.0) - self.before(t) if (t < 0).any() else np.zeros(t.shape)
+        shines = t > 0 if self.decays else t < 0
+        return self._own(0.0) - self._own(t) if shines.any() else np.zeros(t.shape)
 
 
-@dataclass(frozen=True)
-class Decay:
-    """Decay of a flare that begins at the peak."""
-
-    integral: Callable[[Float], Float]  # of the decay from a time after the peak on
-
-    def before(self, tau: ArrayLike) -> Float:
-        """Return the integral from the peak to tau."""
-        t = np.asarray(tau, np.float64)
-        return self.after(0.0) - self.after(t) if (t > 0).any() else np.zeros(t.shape)
-
-    def after(self, tau: ArrayLike) -> Float:
-        """Return the integral from tau to the end."""
-        return self.integral(np.maximum(tau, 0.0))
-
-
-def _exponential(rate: float) -> Decay:
+def _exponential(rate: float) -> Half:
     """Return an exponential decay with a rate per half-width."""
-    return Decay(lambda tau: np.asarray(np.exp(-rate * tau) / rate))
+    return Half(lambda tau: np.asarray(np.exp(-rate * tau) / rate), decays=True)
 
 
-def _exponentials(rates: Float) -> tuple[list[Decay], Float]:
+def _exponentials(rates: Float) -> tuple[list[Half], Float]:
     """Return exponentials of few rates, and their weights in those of many, shape (n_rate, n_few).
 
     An exponential is a smooth function of the logarithm of its rate: it is interpolated between Chebyshev points.
@@ -105,9 +98,9 @@ def _exponentials(rates: Float) -> tuple[list[Decay], Float]:
     return [_exponential(float(rate)) for rate in np.exp(points)], np.asarray(weights)
 
 
-def _gaussian_rise(width: float) -> Rise:
+def _gaussian_rise(width: float) -> Half:
     """Return the first half of a Gaussian; the width is from half maximum to maximum, in half-widths."""
-    return Rise(lambda tau: _gaussian_tail(-tau, width))
+    return Half(lambda tau: _gaussian_tail(-tau, width))
 
 
 def _gaussian_tail(tau: Float, width: float) -> Float:
@@ -157,8 +150,9 @@ class Family:
     @cache
     def general(cls) -> Family:
         """Return the general family, the same object in all calls: rises and decays in all combinations."""
-        rises = [Rise(SHAPES["davenport2014"].before), *map(_gaussian_rise, GAUSSIAN_RISES)]
-        fast = [_exponential(Davenport2014.DECAY[0][1]), Decay(lambda tau: _gaussian_tail(tau, GAUSSIAN_DECAY))]
+        rises = [Half(SHAPES["davenport2014"].before), *map(_gaussian_rise, GAUSSIAN_RISES)]
+        gaussian = Half(partial(_gaussian_tail, width=GAUSSIAN_DECAY), decays=True)
+        fast = [_exponential(Davenport2014.DECAY[0][1]), gaussian]
         slow, interpolated = _exponentials(SLOW_RATES)
         choices = [(0.0, 0), *((share, rate) for share in SLOW_SHARES for rate in range(SLOW_RATES.size))]
         # Each share has the same weight: without a slow decay, its rate does not matter.

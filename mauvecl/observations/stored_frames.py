@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +20,6 @@ from mauvecl.host.tables.table import MemoryTable, TableFile, Values
 from mauvecl.observations.frames import MAX_FRAMES, dead_pixel_remarks, live_pixels
 from mauvecl.observations.mapping import FrameMapping
 from mauvecl.schema.errors import InputError
-
-if TYPE_CHECKING:
-    pass
 
 #: Largest number of files in a folder.
 MAX_FILES = 2**20
@@ -226,11 +223,6 @@ class StoredFile(TableFile):
     def _saturated(self, start: int, stop: int) -> NDArray[np.int64]:
         limit = self.stacked * float(self.scene.attributes["saturation_dn"])
         return np.asarray((self._raw(start, stop) >= limit).any(axis=1), np.int64)
-
-
-def is_store(path: Path) -> bool:
-    """Return whether a folder is a Zarr store."""
-    return (path / "zarr.json").is_file()
 
 
 @contextmanager

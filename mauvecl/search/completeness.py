@@ -121,12 +121,12 @@ class Completeness:
         false_alarms_per_day : float
             False alarms per day of frames, which set the threshold.
         bank : Bank, optional
-            Shape, half-widths and baseline; `default_bank` by default.
+            Shape, half-widths and baseline; by default those of a search with one sum per frame.
         law : DurationLaw, optional
         """
         if scale.kind != "bolometric":
             raise InputError.of("kind", scale.kind, "bolometric")
-        law, bank = law or DurationLaw(), bank or default_bank()
+        law, bank = law or DurationLaw(), bank or white_bank(BANK_S, shape_of("davenport2014"), 5.0)
         threshold = search_threshold(false_alarms_per_day, bank)
         widths, gain = _gains(bank.shape, window_s, bank.frame_s)
         # From undetectable energies to those that are always detected.
@@ -147,11 +147,6 @@ class Completeness:
             f"{false_alarms_per_day:g} false alarms a day, stretches of {window_s / 60:.0f} min"
         )
         return cls(10**log_energy, np.clip(probability, 0, 1), "bolometric", how)
-
-
-def default_bank() -> Bank:
-    """Return the bank of a default search with one sum per frame."""
-    return white_bank(BANK_S, shape_of("davenport2014"), 5.0)
 
 
 # A plan asks for the threshold and the gains of each target and each mode of a calibrated throughput.

@@ -375,11 +375,6 @@ class SampledRate:
         return Interval(value, value - reach, value + reach)
 
     @property
-    def lowest(self) -> float:
-        """Smallest threshold at which the rate is known."""
-        return self._ends[0]
-
-    @property
     def _ends(self) -> tuple[float, float]:
         """Range of thresholds: from one step below the lowest trusted one to the highest."""
         return float(self.thresholds[self._trusted][0] - STEP), float(self.thresholds[-1])
@@ -559,19 +554,14 @@ def draw_shifts(survey: Survey, seed: int, part: Survey) -> UnknownShifts:
     covariance = components.jittered_covariance(coefficients, stare)
     variance = np.einsum("dk,ntkl,dl->ntd", rows, covariance, rows, optimize=True) / survey.variance[at, None]
     scales = np.sqrt(np.maximum(variance, 1e-12)).reshape(RATE_DRAWS, -1)
-    if not _shifted(part):
+    known = part.unknowns
+    # Unknowns of several standard deviations may shift a template's value.
+    if known is None or part.search.largest(part.unsubtracted(known.extremes)).max() <= MIN_SHIFT:
         return UnknownShifts(scales, weights / weights.sum(), np.zeros(1), np.ones((RATE_DRAWS, 1)))
     # The same share of draws from both halves.
     some = slice(None, None, ONE_IN)
     weights = weights[some]
     return UnknownShifts(scales[some], weights / weights.sum(), *_shifts(part, z[some]))
-
-
-def _shifted(survey: Survey) -> bool:
-    """Return whether unknowns of several standard deviations shift a template's value."""
-    if survey.unknowns is None:
-        return False
-    return bool(survey.search.largest(survey.unsubtracted(survey.unknowns.extremes)).max() > MIN_SHIFT)
 
 
 def _shifts(survey: Survey, amplitudes: Float) -> tuple[Float, Float]:

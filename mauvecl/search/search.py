@@ -121,7 +121,11 @@ class Search:
 
         Values have the precision of the sums. All stares are processed at once, which suits small numbers of stares.
         """
-        sums = self._checked(sums)
+        expected = (self.stare.n_frames, self.bank.directions.shape[1])
+        if sums.ndim != 3 or sums.shape[1:] != expected:
+            raise InputError(
+                f"sums have the shape {sums.shape}", f"(n_stare, {expected[0]}, {expected[1]})", key="sums"
+            )
         directions = self.bank.directions.astype(_precision(sums))
         for row, correlated in self.correlations(sums):
             tried = row.per_amplitude > 0
@@ -182,14 +186,6 @@ class Search:
     def variance(self) -> Float:
         """Variance of each frame's sums, shape (n_frame,)."""
         return np.asarray(1.0 / self._weight[self._at])
-
-    def _checked(self, sums: NDArray[Any]) -> NDArray[Any]:
-        expected = (self.stare.n_frames, self.bank.directions.shape[1])
-        if sums.ndim != 3 or sums.shape[1:] != expected:
-            raise InputError(
-                f"sums have the shape {sums.shape}", f"(n_stare, {expected[0]}, {expected[1]})", key="sums"
-            )
-        return sums
 
     def _spectra(self, sums: NDArray[Any]) -> list[NDArray[Any]]:
         """Return transforms of the weighted sums times each series, zero in gaps, (n_stare, n_sum, n_frequency)."""
@@ -306,12 +302,6 @@ class Trend:
         """Amplitudes of `REACH` standard deviations, together and each alone, with both signs, (n, n_unknown)."""
         rows = np.vstack([np.eye(len(self.of)), np.ones(len(self.of))])
         return np.asarray(REACH * np.vstack([rows, -rows]))
-
-    @cached_property
-    def is_nonlinear(self) -> bool:
-        """True if the effect of unknowns beyond first order is significant."""
-        nonlinear = self.nonlinear_effect(self.extremes)
-        return bool((np.sum(nonlinear**2 / self.variance[:, None], axis=(1, 2)) > LEAST**2).any())
 
     def effect(self, amplitudes: Float) -> Float:
         """Return the effect of unknowns, (n_stare, n_unknown) in standard deviations, on the sums.
@@ -477,10 +467,13 @@ class Survey:
         of = tuple(unknown.of for unknown in self.stare.unknowns)
         return Trend(self.stare.numbers, self.stare.frame_s, self.variance, of, curves, known, slope)
 
-    @property
+    @cached_property
     def trend(self) -> Trend | None:
         """Effect of the stare's unknowns if it is significant beyond first order, else None."""
-        return self.unknowns if self.unknowns is not None and self.unknowns.is_nonlinear else None
+        if (known := self.unknowns) is None:
+            return None
+        power = np.sum(known.nonlinear_effect(known.extremes) ** 2 / known.variance[:, None], axis=(1, 2))
+        return known if (power > LEAST**2).any() else None
 
     def unsubtracted(self, amplitudes: Float) -> Float:
         """Return the `effect` of unknowns on the sums that is not subtracted before the search."""
