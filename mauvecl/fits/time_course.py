@@ -156,7 +156,30 @@ def measure_along(
         If the frames have another shape, the expectation has several frames, or no bin reaches the S/N.
     """
     raw, stare = checked_frames(frames, quiet, stare)
-    bins = _bins(raw, quiet, model, nuisances, known_strengths(stare, quiet), stare, snr_per_bin, skipped_nm)
+    reduction = Reduction.of(model, quiet, None, nuisances, skipped_nm)
+    sums = less_known(raw, quiet, known_strengths(stare, quiet), reduction.weights)
+    total = np.vstack([np.zeros(sums.shape[1]), np.cumsum(sums, axis=0)])
+    shapes = reduction.hot[::BINS_EVERY] / np.linalg.norm(reduction.hot[::BINS_EVERY], axis=1)[:, None]
+    widths = 2 ** np.arange(int(np.log2(len(raw))) + 1)
+    best = [((total[w:] - total[:-w]) @ shapes.T).max(axis=0) / np.sqrt(w) for w in widths]
+    node = int(np.argmax(np.max(best, axis=0)))
+    light = model.hot[::BINS_EVERY][node]
+    weights = shapes[node] @ reduction.weights
+    # The variance of a frame's value is one plus that of the flare's photons, which is proportional to its light.
+    per_value = float(weights**2 @ (quiet.gain_dn_per_electron * light) / (weights @ light))
+    value = total @ shapes[node]
+    bins = []
+    gaps = np.flatnonzero(np.diff(stare.numbers) > 1) + 1
+    for begin, stop in zip([0, *gaps], [*gaps, len(raw)], strict=True):
+        start = int(begin)
+        for end in range(int(begin) + 1, int(stop) + 1):
+            earliest = max(start, end - MOST_FRAMES_PER_BIN)
+            gain = value[end] - value[earliest:end]
+            variance = np.arange(end - earliest, 0, -1) + per_value * np.maximum(gain, 0.0)
+            reached = np.flatnonzero(gain >= snr_per_bin * np.sqrt(variance))
+            if reached.size:
+                bins.append((earliest + int(reached[-1]), end))
+                start = end
     if not bins:
         raise InputError.of("snr_per_bin", snr_per_bin, "an S/N that a bin of the stare reaches")
     first, end = np.array(bins).T
@@ -242,44 +265,6 @@ def less_known(raw: Float, quiet: Expectation, known: Float, weights: Float) -> 
     means = np.vstack([quiet.net_source_dn, quiet.sky_dn, quiet.dark_dn, quiet.neighbour_dn, quiet.bias_dn])
     strengths = np.column_stack([known, np.ones(len(known))])
     return np.asarray(raw @ weights.T - strengths @ (means @ weights.T))
-
-
-def _bins(
-    raw: Float,
-    quiet: Expectation,
-    model: FlareModel,
-    nuisances: Nuisances | None,
-    strengths: Float,
-    stare: Stare,
-    snr: float,
-    skipped_nm: Ranges,
-) -> list[tuple[int, int]]:
-    """Return first frames and ends of the shortest runs of frames in which a matched filter reaches an S/N."""
-    reduction = Reduction.of(model, quiet, None, nuisances, skipped_nm)
-    sums = less_known(raw, quiet, strengths, reduction.weights)
-    total = np.vstack([np.zeros(sums.shape[1]), np.cumsum(sums, axis=0)])
-    shapes = reduction.hot[::BINS_EVERY] / np.linalg.norm(reduction.hot[::BINS_EVERY], axis=1)[:, None]
-    widths = 2 ** np.arange(int(np.log2(len(raw))) + 1)
-    best = [((total[w:] - total[:-w]) @ shapes.T).max(axis=0) / np.sqrt(w) for w in widths]
-    node = int(np.argmax(np.max(best, axis=0)))
-    light = model.hot[::BINS_EVERY][node]
-    weights = shapes[node] @ reduction.weights
-    # The variance of a frame's value is one plus that of the flare's photons, which is proportional to its light.
-    per_value = float(weights**2 @ (quiet.gain_dn_per_electron * light) / (weights @ light))
-    value = total @ shapes[node]
-    bins = []
-    gaps = np.flatnonzero(np.diff(stare.numbers) > 1) + 1
-    for begin, stop in zip([0, *gaps], [*gaps, len(raw)], strict=True):
-        start = int(begin)
-        for end in range(int(begin) + 1, int(stop) + 1):
-            earliest = max(start, end - MOST_FRAMES_PER_BIN)
-            gain = value[end] - value[earliest:end]
-            variance = np.arange(end - earliest, 0, -1) + per_value * np.maximum(gain, 0.0)
-            reached = np.flatnonzero(gain >= snr * np.sqrt(variance))
-            if reached.size:
-                bins.append((earliest + int(reached[-1]), end))
-                start = end
-    return bins
 
 
 Pair = tuple[Float, Float]

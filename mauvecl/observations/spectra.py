@@ -149,19 +149,8 @@ def survey_spectra(
 
     Slow changes of the dark current and of what else the weights let through are processes of the weighted sums; the
     level of the light in each frame is free, so that pointing losses take no part. The level that is returned is that
-    of the sum over wavelength, with flags of single frames that only the weighted sums show.
-
-    Parameters
-    ----------
-    rank : int
-        Largest number of sums of a frame.
-    seed : int
-        Seed of the standard error of the level.
-    jitters : mapping of str to float, optional
-        Standard deviations of unknowns of each frame, infinite for those that are projected out. Where they do not
-        state it, that of the light is infinite and that of the dark current as measured.
-    steps : Steps, optional
-        Reports fits, searches and draws.
+    of the sum over wavelength, with flags of single frames that only the weighted sums show; its standard error is
+    drawn with the seed. `rank` and `jitters` are those of `analyse_frames`. `steps` reports fits, searches and draws.
     """
     fits = steps.part(0.0, 0.9)
     frames = cleaned.frames
@@ -292,13 +281,9 @@ def _dark_changes(
 ) -> tuple[dict[str, float], float]:
     """Measure changes of the dark current, which is fitted together with the light; both spectra are `shared`.
 
-    Returns
-    -------
-    dict of str to float
-        Standard deviation of the dark current from frame to frame beyond that of noise; infinite if it drifts, and none
-        if it does not change significantly.
-    float
-        Range of nine tenths of slow changes if it drifts, or else 0.
+    The first value is the standard deviation of the dark current from frame to frame beyond that of noise, by name:
+    infinite if it drifts, and none if it does not change significantly. The second is the range of nine tenths of slow
+    changes if it drifts, or else 0.
     """
     amplitudes, covariance = fit_changes(excess, shared, sd)
     amplitude, error = amplitudes[:, 1], float(np.sqrt(covariance[1, 1]))
