@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import median_filter, uniform_filter1d
 
 from mauvecl.flares.shapes import Shape
+from mauvecl.host.arrays import true_runs
 from mauvecl.observations.detection import (
     END_FRAMES,
     LONG_S,
@@ -131,7 +132,7 @@ def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, taken: Bool, steps
             return none
     other, losses = alternate(down, guessed, None, steps)
     # The star is constant between losses, or before and after one; not only before or after a step.
-    returns = np.count_nonzero([last - first >= END_FRAMES for first, last in _runs(~losses)]) > 1
+    returns = np.count_nonzero(np.diff(true_runs(~losses)) > END_FRAMES) > 1
     constant = returns and not other.flux_process.terms and other.flux_process.excess < MOST_EXCESS
     if 0 < losses.mean() < (MOST_LOST_CONSTANT if constant else MOST_LOST):
         # Beside flares in even more frames, the star would be more than its noise.
@@ -164,17 +165,11 @@ def _eclipses(survey: SeriesSurvey, usual: Callable[[], float]) -> Bool:
     whole = replace(survey, processes=fitted.processes, flux_process=fitted.flux_process)
     sigma = uniform_filter1d(whole.along(0, quiet), END_FRAMES)
     # Frames at the ends of the guess that are as bright as the star are searched.
-    for first, last in _runs(guessed):
-        faint = np.flatnonzero(sigma[first : last + 1] < -FAINT)
+    for first, end in true_runs(guessed):
+        faint = first + np.flatnonzero(sigma[first:end] < -FAINT)
         if faint.size:
-            none[max(first, first + faint[0] - END_FRAMES) : min(last, first + faint[-1] + END_FRAMES) + 1] = True
+            none[max(first, faint[0] - END_FRAMES) : min(end, faint[-1] + END_FRAMES + 1)] = True
     return none
-
-
-def _runs(inside: Bool) -> list[tuple[int, int]]:
-    """Return the first and last frame of each run of frames."""
-    edges = np.diff(inside.astype(np.int8), prepend=0, append=0)
-    return list(zip(np.flatnonzero(edges > 0).tolist(), (np.flatnonzero(edges < 0) - 1).tolist(), strict=True))
 
 
 def guess_eclipses(survey: SeriesSurvey) -> Bool:
@@ -232,8 +227,8 @@ def _bright(survey: SeriesSurvey) -> Bool:
     """Return frames far above the level that most frames have, and those after them, as long as flares decay."""
     sigmas = (survey.flux - np.median(survey.flux)) / np.sqrt(survey.variance)
     bright = np.zeros(sigmas.size, np.bool_)
-    for first, last in _runs(sigmas > BRIGHT):
-        bright[max(0, first - BEFORE) : last + 1 + DECAY * (last + 1 - first)] = True
+    for first, end in true_runs(sigmas > BRIGHT):
+        bright[max(0, first - BEFORE) : end + DECAY * (end - first)] = True
     return bright if bright.mean() < MOST_BRIGHT else np.zeros_like(bright)
 
 

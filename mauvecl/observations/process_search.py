@@ -64,7 +64,6 @@ class SolvedNorms:
     diagonal: float  # of C^-1 without gaps and with constant noise
     squares: Float  # squared solution C^-1 s without gaps, from `margin` frames before the template to as many after it
     margin: int
-    frames: NDArray[np.int64]  # shape (n_onset,); frame of the peak on the grid with shortened gaps
     unsolved: Bool  # shape (n_onset,); whether the norm of an onset is still that without gaps
 
     @property
@@ -156,7 +155,6 @@ class ProcessSearch:
         self.at = self.frames - self.frames[0]
         self.n_grid = int(self.at[-1]) + 1
         self._before = before
-        self._norms_of: dict[tuple[float, int, int], SolvedNorms] = {}
 
     @cached_property
     def covariances(self) -> tuple[Covariance, ...]:
@@ -173,11 +171,11 @@ class ProcessSearch:
     @cached_property
     def filters(self) -> list[Filter]:
         """Templates with the denominators that were solved by now."""
-        if self._before is not None:
-            _ = self._before.filters
         _ = self._levels
         templates = [(template, phase) for template in self.bank.templates for phase in range(len(template.phases))]
-        filters = list(map_in_threads(lambda one: self._filter(*one), templates, _threads(self.n_grid)))
+        earlier = self._before.filters if self._before is not None else [None] * len(templates)
+        pairs = list(zip(templates, earlier, strict=True))
+        filters = list(map_in_threads(lambda pair: self._filter(*pair[0], pair[1]), pairs, _threads(self.n_grid)))
         self._before = None
         return filters
 
@@ -233,8 +231,8 @@ class ProcessSearch:
         frames = self.grid.numbers(self.frames[0] + row.peaks[onset]) + row.template.phases[row.phase]
         return np.asarray(frames * self.bank.frame_s)
 
-    def _filter(self, template: Template, phase: int) -> Filter:
-        """Prepare the templates of a half-width and phase."""
+    def _filter(self, template: Template, phase: int, earlier: Filter | None) -> Filter:
+        """Prepare the templates of a half-width and phase, from those of the search `before`, if there is one."""
         whole = template.shapes[phase]
         bright = np.flatnonzero(whole > NEGLECTED * whole.max())
         shape = whole[bright[0] : bright[-1] + 1]
@@ -242,15 +240,12 @@ class ProcessSearch:
         peaks = np.arange(-int(self.frames[0]) % template.stride, self.n_grid, template.stride)
         norms, lost = list[SolvedNorms](), np.zeros((len(self.processes), peaks.size))
         for k, level in enumerate(self._levels):
-            key = (template.half_width_s, phase, k)
             if not self.processes[k].terms:
-                one = self._independent(k, shape, first, peaks)
-            elif self._before is None:
-                one = self._norms(k, shape, first, peaks)
+                norms.append(self._independent(k, shape, first, peaks))
+            elif self._before is None or earlier is None:
+                norms.append(self._norms(k, shape, first, peaks))
             else:
-                one = self._updated(self._before._norms_of[key], shape, first, peaks)
-            self._norms_of[key] = one
-            norms.append(one)
+                norms.append(self._updated(self._before, earlier, k, peaks))
             held = np.zeros(self.n_grid)
             held[self.at] = level
             lost[k] = _correlated(held, shape, first)[peaks] ** 2 / level.sum()
@@ -263,7 +258,7 @@ class ProcessSearch:
         held[self.at] = 1.0 / variance
         norm, typical = _correlated(held, shape**2, first)[peaks], float(np.median(variance))
         unit, solved = float((shape**2).sum() / typical), np.zeros(peaks.size, np.bool_)
-        return SolvedNorms(norm, unit, 1.0 / typical, (shape / typical) ** 2, 0, self.frames[0] + peaks, solved)
+        return SolvedNorms(norm, unit, 1.0 / typical, (shape / typical) ** 2, 0, solved)
 
     def _norms(self, k: int, shape: Float, first: int, peaks: NDArray[np.int64]) -> SolvedNorms:
         """Compute s^T C^-1 s of a sum at peaks that are not next to gaps or ends."""
@@ -294,20 +289,18 @@ class ProcessSearch:
         missing = _correlated(single.astype(np.float64), squares, start)[peaks] / centre
         norm = np.maximum(unit - missing, 0.0)
         norm = norm / np.maximum(1.0 + _correlated(moved, squares, start)[peaks] / unit, 0.1)
-        one = SolvedNorms(norm, unit, centre, squares, margin, self.frames[0] + peaks, np.zeros(peaks.size, np.bool_))
+        one = SolvedNorms(norm, unit, centre, squares, margin, np.zeros(peaks.size, np.bool_))
         return replace(one, unsolved=share[size + peaks] > one.irregular)
 
-    def _updated(self, earlier: SolvedNorms, shape: Float, first: int, peaks: NDArray[np.int64]) -> SolvedNorms:
+    def _updated(self, before: ProcessSearch, earlier: Filter, k: int, peaks: NDArray[np.int64]) -> SolvedNorms:
         """Return earlier norms at peaks, to be solved anew where frames that are missing now contribute to them."""
-        assert self._before is not None
-        before = self._before
         gone = np.zeros(before.n_grid)
         gone[before.at] = 1.0
-        origin = int(self.frames[0] - before.frames[0])
+        origin, norms = int(self.frames[0] - before.frames[0]), earlier.norms[k]
         gone[origin + self.at] = 0.0
-        part = np.searchsorted(earlier.frames, self.frames[0] + peaks)
-        one = replace(earlier, norm=earlier.norm[part], frames=earlier.frames[part], unsolved=earlier.unsolved[part])
-        share = _correlated(gone, earlier.squares, first - earlier.margin)[origin + peaks]
+        part = np.searchsorted(earlier.peaks, origin + peaks)
+        one = replace(norms, norm=norms.norm[part], unsolved=norms.unsolved[part])
+        share = _correlated(gone, norms.squares, earlier.first - norms.margin)[origin + peaks]
         return replace(one, unsolved=one.unsolved | (share > CHANGED * one.irregular))
 
     def _solve(self, one: Filter, chosen: Bool) -> None:

@@ -13,9 +13,9 @@ from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
+from mauvecl.host.arrays import true_runs
 from mauvecl.search.flare_fits import (
     AMPLITUDE,
     KELVIN,
@@ -262,8 +262,8 @@ class _StareSearch:
         evened = left.copy()
         # The baseline under a flare is the median of the surrounding frames without excess noise.
         times = self.sums.edges[:, 0]
-        for (rows,) in scipy.ndimage.find_objects(scipy.ndimage.label(loud)[0]):
-            middle = times[(rows.start + rows.stop) // 2]
+        for first, end in true_runs(loud):
+            rows, middle = slice(first, end), times[(first + end) // 2]
             near = ~loud & (np.abs(times - middle) < self.sums.survey.bank.baseline.window_s / 2 + 1)
             level = np.median(left[near], axis=0) if near.any() else np.zeros(left.shape[1])
             evened[rows] = level + (left[rows] - level) / np.sqrt(excess[rows])[:, None]
