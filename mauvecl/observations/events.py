@@ -234,15 +234,12 @@ def _is_step(window: Window, fits: Sequence[Fit]) -> bool:
     starts = window.edges[(window.middle > inside[0] - np.ptp(inside)) & (window.middle < inside[-1]), 0]
     if not starts.size:
         return False
-    least, plain = np.inf, None
+    scored = []
     for fit in fits:
         one, model = _without_departures(window, fit)
         # Each further flare has three parameters more (Schwarz 1978).
-        chi2 = float(one.chi2(model)) + 3 * (len(fit.flares) - 1) * float(np.log(window.values.size))
-        if chi2 < least:
-            least, plain = chi2, one
-    if plain is None:
-        return False
+        scored.append((float(one.chi2(model)) + 3 * (len(fit.flares) - 1) * float(np.log(window.values.size)), one))
+    least, plain = min(scored, key=lambda pair: pair[0])
     models = (window.middle >= starts[:, None]).astype(np.float64)
     slope = models @ (plain.inverse @ window.values)
     information = np.einsum("ki,ki->k", models @ plain.inverse, models)

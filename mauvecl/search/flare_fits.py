@@ -274,11 +274,6 @@ class Block:
         derivatives = rows.reshape(4, len(theta), -1)
         return derivatives[AMPLITUDE].sum(axis=0), derivatives.T
 
-    def chi2(self, theta: Float) -> float:
-        """Return chi-squared for given parameters."""
-        left = self.data - self.model(theta)[0]
-        return float(left @ left)
-
     def fit(self, theta: Float, held: Held | None = None) -> BlendFit:
         """Fit all flares from a starting point, shape (n_flare, 4), optionally with a constraint."""
         low, high = (np.tile(end, (len(theta), 1)) for end in self.sums.bounds)
@@ -318,8 +313,6 @@ class Block:
         scale = np.ones(theta.shape)
         scale[:, PEAK] = np.exp(start[:, WIDTH])
         dof = self.data.size - self.basis.shape[1] - theta.shape[0] * len(self.sums.free)
-        if not moved.any():
-            return BlendFit(whole(start[moved]), self.chi2(whole(start[moved])), dof, True)
         solution = scipy.optimize.least_squares(
             residual, start[moved], jacobian, bounds=(low[moved], high[moved]), x_scale=scale[moved],
             ftol=CONVERGED, xtol=1e-9, gtol=None, max_nfev=MAX_EVALUATIONS,
