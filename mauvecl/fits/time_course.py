@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from itertools import product
 from typing import TYPE_CHECKING, Annotated, NamedTuple, Self
 
 import numpy as np
@@ -523,7 +524,7 @@ def fit_cooling(
     slopes = scale[:, None] * np.array([quantity.slope(theta, data) for quantity in quantities])[:, free]
     spread = slopes @ covariance @ slopes.T
     sd = np.sqrt(np.diag(spread)) / np.maximum(np.abs(scale), 1e-300)
-    ends = fit.ends_of_all(quantities, estimates, sd, [float(scipy.stats.chi2.ppf(level, 1)) for level in levels])
+    ends = fit.ends(quantities, estimates, sd, [float(scipy.stats.chi2.ppf(level, 1)) for level in levels])
     dof = data.sums.size - free.size - sum(np.isinf(unknown.sd) for unknown in data.unknown)
     empty = np.full(theta.shape, -np.inf)
     without = data.whitening(theta, none=True)
@@ -720,12 +721,11 @@ class _BestFit:
         theta = _solve(data, whitening, theta, free, *limits)
         return cls(data, whitening, theta, free, limits, float(np.sum(data.residuals(theta, whitening) ** 2)))
 
-    def ends_of_all(
-        self, quantities: Sequence[_Quantity], estimates: Float, sd: Float, rises: Sequence[float]
-    ) -> Float:
-        """Return the ends of the intervals of all quantities, shape (2, n_rise, n_quantity); `sd` as for `ends`.
+    def ends(self, quantities: Sequence[_Quantity], estimates: Float, sd: Float, rises: Sequence[float]) -> Float:
+        """Return the ends of the intervals of all quantities, shape (2, n_rise, n_quantity), for rises of chi-squared.
 
-        An energy is a multiple of its fluence.
+        `sd` is the standard deviation of the peak, or of the logarithm of another quantity. An energy is a multiple of
+        its fluence.
         """
         ends = np.full((2, len(rises), len(quantities)), np.nan)
         names = [quantity.name for quantity in quantities]
@@ -733,21 +733,13 @@ class _BestFit:
             if quantity.name.startswith("energy"):
                 fluence = names.index(quantity.name.replace("energy", "fluence"))
                 ends[:, :, q] = estimates[q] / estimates[fluence] * ends[:, :, fluence]
-            else:
-                ends[:, :, q] = self.ends(quantity, float(sd[q]), rises)
-        return ends
-
-    def ends(self, quantity: _Quantity, sd: float, rises: Sequence[float]) -> Float:
-        """Return the ends of a quantity's intervals, shape (2, n_rise), for rises of chi-squared.
-
-        `sd` is the standard deviation of the peak, or of the logarithm of another quantity.
-        """
-        interval_ends = np.empty((2, len(rises)))
-        for side, sign in enumerate((-1.0, 1.0)):
-            for k, rise in enumerate(rises):
+                continue
+            for (side, sign), (k, rise) in product(enumerate((-1.0, 1.0)), enumerate(rises)):
                 end = self._newton_end(quantity, sign, self.chi2 + rise)
-                interval_ends[side, k] = self._root_end(quantity, sign * sd, self.chi2 + rise) if end is None else end
-        return interval_ends
+                if end is None:
+                    end = self._root_end(quantity, sign * float(sd[q]), self.chi2 + rise)
+                ends[side, k, q] = end
+        return ends
 
     def _newton_end(self, quantity: _Quantity, sign: float, allowed: float) -> float | None:
         """Return the end of an interval on one side, or None if Newton's steps do not find it within the limits.

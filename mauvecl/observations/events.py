@@ -308,16 +308,6 @@ def measure_events(
     return events
 
 
-def _near_peak(survey: SeriesSurvey, found: Detection) -> Bool:
-    """Return which frames of an event may be its brightest, of its frames.
-
-    In the sum over wavelength of spectra a drift of the dark current may exceed a flare, but not within its half-width.
-    """
-    start_s, frame_s = survey.stare.start_s[found.first : found.last + 1], survey.stare.frame_s
-    near = np.abs(start_s + frame_s / 2 - found.peak_s) <= found.half_width_s + frame_s
-    return near if survey.weighted and near.any() else np.ones(near.size, np.bool_)
-
-
 def measure_event(
     survey: SeriesSurvey, taken: Bool, level: Float, found: Detection, cause: Kind = "flare"
 ) -> ObservedEvent:
@@ -329,7 +319,10 @@ def measure_event(
     rows = slice(first, last + 1)
     energy = measure_energy(survey, taken, level, found)
     flux, numbers = (survey.flux[rows] - level[rows]) * survey.scale, survey.stare.numbers
-    brightest = first + int(np.argmax(np.where(_near_peak(survey, found), flux, -np.inf)))
+    # In the sum over wavelength of spectra a drift of the dark current may exceed a flare, but not near its peak.
+    near = np.abs(survey.stare.middle_s[rows] - found.peak_s) <= found.half_width_s + survey.stare.frame_s
+    several = flux if not (survey.weighted and near.any()) else np.where(near, flux, -np.inf)
+    brightest = first + int(np.argmax(several))
     around = numbers[max(brightest - 1, 0) : brightest + 2]
     missing_s = (int(np.diff(around).max()) - 1) * survey.stare.frame_s
     ends = (first == 0, last == survey.stare.n_frames - 1)

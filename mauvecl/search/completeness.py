@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Self
 
 import numpy as np
@@ -227,37 +227,24 @@ class InjectedCompleteness:
     sizes: Float  # shape (n_size,)
     amplitudes: Float  # shape (n_half_width, n_size)
     critical: Float  # smallest size that is detected in each draw, shape (n_half_width, n_position, n_draw)
+    completeness: Float = field(init=False)  # detected fraction, shape (n_half_width, n_size)
+    completeness_low: Float = field(init=False)  # ends of its 95 % interval
+    completeness_high: Float = field(init=False)
+
+    def __post_init__(self) -> None:
+        cells = np.empty((3, len(self.half_widths_s), self.sizes.size))
+        for d, s in np.ndindex(cells.shape[1:]):
+            each = np.mean(self.critical[d] <= self.sizes[s], axis=1)
+            # Intervals are those for the effective number of independent draws.
+            fraction, trials = float(each.mean()), self._independent(each, self.count)
+            around = clopper_pearson(round(fraction * trials), trials)
+            cells[:, d, s] = fraction, min(around.low, fraction), max(around.high, fraction)
+        set_read_only(self, completeness=cells[0], completeness_low=cells[1], completeness_high=cells[2])
 
     @property
     def count(self) -> int:
         """Injections per cell."""
         return int(self.critical[0].size)
-
-    @cached_property
-    def _cells(self) -> tuple[Float, Float, Float]:
-        """Detected fractions with the ends of their intervals, for the effective number of independent draws."""
-        cells = np.empty((3, len(self.half_widths_s), self.sizes.size))
-        for d, s in np.ndindex(cells.shape[1:]):
-            each = np.mean(self.critical[d] <= self.sizes[s], axis=1)
-            fraction, trials = float(each.mean()), self._independent(each, self.count)
-            around = clopper_pearson(round(fraction * trials), trials)
-            cells[:, d, s] = fraction, min(around.low, fraction), max(around.high, fraction)
-        return cells[0], cells[1], cells[2]
-
-    @property
-    def completeness(self) -> Float:
-        """Detected fraction, shape (n_half_width, n_size)."""
-        return self._cells[0]
-
-    @property
-    def completeness_low(self) -> Float:
-        """Lower limits of the 95 % intervals of `completeness`."""
-        return self._cells[1]
-
-    @property
-    def completeness_high(self) -> Float:
-        """Upper limits of the 95 % intervals of `completeness`."""
-        return self._cells[2]
 
     @staticmethod
     def _independent(each: Float, count: int) -> int:

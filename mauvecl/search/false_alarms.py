@@ -303,10 +303,10 @@ class SampledRate:
 
     def under(self, shifts: UnknownShifts) -> SampledRate:
         """Return the rate for stares whose noise differs from the noise that the search assumes."""
-        if shifts.is_nominal:
+        shifted = bool(shifts.shifts.any())
+        if np.abs(shifts.scales - 1).max() < NEGLIGIBLE and not shifted:
             return self
         # The rate is tabulated finely enough for linear interpolation.
-        shifted = bool(shifts.shifts.any())
         low, high = self.thresholds[0] / shifts.scales.max(), self.thresholds[-1] / shifts.scales.min()
         # Shifted values exceed a threshold as often as unshifted ones exceed a much lower one.
         fine = np.linspace(0.0 if shifted else low, high, FINE)
@@ -490,11 +490,6 @@ class UnknownShifts:
     weights: Float  # of the draws, sum 1, shape (n_draw,)
     shifts: Float  # means of values, ascending, shape (n_shift,)
     shares: Float  # shares of templates with each mean, shape (n_draw, n_shift)
-
-    @property
-    def is_nominal(self) -> bool:
-        """True if scatter and shift are as the search assumes."""
-        return bool(np.abs(self.scales - 1).max() < NEGLIGIBLE and not self.shifts.any())
 
     def alarm_probability(self, threshold: float, days: float, rate: Callable[[Float], Float]) -> Float:
         """Return the probability of an alarm in each draw of a stare of some star-days, shape (n_draw,).
