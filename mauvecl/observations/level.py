@@ -141,14 +141,12 @@ def _first_faint(flux: Float, start: int, limit: float) -> int:
     return flux.size
 
 
-def quiet_variance(flux: Float, error: Float | None, level: Float, quiet: Bool) -> tuple[Float, float]:
+def quiet_variance(flux: Float, error: Float, level: Float, quiet: Bool) -> tuple[Float, float]:
     """Return the variance of the noise of each frame at its level as stated, and its rise with the flux.
 
     Stated errors often follow the counts of their own frame; what they owe to the difference from the level is taken
-    away. Without stated errors the variance is 1.
+    away.
     """
-    if error is None:
-        return np.ones(flux.size), 0.0
     squared = error**2
     apart = (flux - level)[quiet]
     spread = float(apart @ apart)
