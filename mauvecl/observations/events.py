@@ -13,8 +13,19 @@ from numpy.typing import NDArray
 
 from mauvecl.flares.shapes import between, sides
 from mauvecl.host.arrays import map_in_threads
-from mauvecl.observations.event_fits import Fit, Mixture, fit_event, joined, light_of
-from mauvecl.observations.event_windows import GENERAL, LOG_TIME, FittedFlare, Likelihood, Window, log_time
+from mauvecl.observations.event_fits import (
+    GENERAL,
+    LOG_TIME,
+    Fit,
+    FittedFlare,
+    Likelihood,
+    Mixture,
+    Window,
+    fit_event,
+    joined,
+    light_of,
+    log_time,
+)
 from mauvecl.observations.process import UNREPORTED, Steps
 from mauvecl.observations.search import MIN_BASELINE, Detection, SeriesSurvey
 

@@ -132,8 +132,7 @@ def frames_of(container: Any, mapping: FrameMapping | None = None, *, time: Any 
         mask = np.zeros(container.flux.shape, np.bool_) if masked is None else np.asarray(masked, np.bool_)
         columns: dict[str, Any] = {"time": time, "flux": np.ma.MaskedArray(container.flux.value, mask)}
         if getattr(container, "uncertainty", None) is not None:
-            sd = container.uncertainty.represent_as(StdDevUncertainty)
-            columns["flux_err"] = np.asarray(sd.array, np.float64)
+            columns["flux_err"] = np.asarray(container.uncertainty.represent_as(StdDevUncertainty).array, np.float64)
         nm = container.spectral_axis.to_value("nm", equivalencies=u.spectral())
         columns["wavelength"] = np.tile(nm, (len(columns["flux"]), 1))
         container = Table(
