@@ -273,7 +273,7 @@ def survey_light_curve(
             reasons[used] |= np.where(lost, Reason.LOSS, 0)
             survey = None
             continue
-        level = everywhere(frames, used, survey, survey.flux_level(~taken))
+        level = interpolate_to_all(frames, used, survey, survey.flux_level(~taken))
         sd = np.sqrt(variance) * survey.flux_process.excess
         guessed = np.zeros(flux.size, np.bool_)
         guessed[used] = taken
@@ -358,7 +358,7 @@ def _noise(
     return np.full(flux.size, (spread if spread > 0 else float(np.std(flux[quiet]))) ** 2), 0.0
 
 
-def everywhere(frames: Frames, used: Bool, survey: SeriesSurvey, values: Float) -> Float:
+def interpolate_to_all(frames: Frames, used: Bool, survey: SeriesSurvey, values: Float) -> Float:
     """Return values of the searched frames, `used`, for all frames in the unit of the flux, interpolated between."""
     return np.interp(frames.time_s, frames.time_s[used], values * survey.scale)
 
@@ -382,11 +382,11 @@ def quiescent_light(
 ) -> QuiescentLevel:
     """Return level, its error, and noise of all frames, from those that are searched and `outside` of events."""
     used, process, time = reasons == 0, survey.flux_process, survey.stare.start_s
-    quiet, spread = outside[used], partial(everywhere, frames, used, survey)
+    quiet, for_all = outside[used], partial(interpolate_to_all, frames, used, survey)
     return QuiescentLevel(
-        spread(survey.flux_level(quiet)),
-        spread(level_error(process, time, survey.variance, quiet, seed, steps)),
-        spread(np.sqrt(survey.variance) * process.excess),
+        for_all(survey.flux_level(quiet)),
+        for_all(level_error(process, time, survey.variance, quiet, seed, steps)),
+        for_all(np.sqrt(survey.variance) * process.excess),
         process.excess if frames.error is not None else float("nan"),
         used & outside,
         reasons,

@@ -43,7 +43,6 @@ if TYPE_CHECKING:
 
     from mauvecl.flares.frames import Components
     from mauvecl.flares.stare import Stare
-    from mauvecl.noise.unknowns import Changing
 
 Float = NDArray[np.float64]
 
@@ -417,10 +416,9 @@ class Survey:
         return self.components.means(self.coefficients)
 
     @cached_property
-    def directions(self) -> dict[Changing, Float]:
+    def directions(self) -> dict[str, Float]:
         """Derivatives of the mean sums by star, light, sky and temperature, shape (n_frame, n_sum) each."""
-        directions: dict[Any, Float] = self.components.directions(self.coefficients)
-        return directions
+        return self.components.directions(self.coefficients)
 
     def covariance(self) -> Float:
         """Return the covariance of each frame's sums without a flare, shape (n_frame, n_sum, n_sum)."""
