@@ -40,6 +40,7 @@ from mauvecl import (
     fit,
     fit_two_temperatures,
 )
+from mauvecl.detection.statistics import Linear
 from mauvecl.fits.flare_model import Reduction, derived_values
 from mauvecl.fits.profile import Profile, covariance, with_bounds
 from mauvecl.fits.spectrum import BATCH
@@ -76,11 +77,13 @@ def main() -> None:
         lit = expect(star.flaring(0.5, spectrum=BalmerFlare(9500.0, true_jump)), mauve, exposure=50.0)
         model = FlareModel.of(star, mauve, quiet, jump=jump)
         reduction = Reduction.of(model, quiet, lit.net_source_dn - quiet.net_source_dn)
+        # The sums as statistics, which a device draws by pixel.
+        asked = tuple(Linear(f"sum {k}", weights) for k, weights in enumerate(reduction.weights))
 
-        def sums(count: int, lit=lit, reduction=reduction, model=model) -> None:
+        def sums(count: int, lit=lit, reduction=reduction, model=model, asked=asked) -> None:
             def drawn(start: int) -> np.ndarray:
                 some = {"start": start, "count": min(BLOCK, count - start), "seed": 1}
-                return engine.statistic_values(quiet, [lit], statistics=reduction.statistics, **some)
+                return engine.statistic_values(quiet, [lit], statistics=asked, **some)
 
             # The device draws the next block while this one is fitted.
             with ThreadPoolExecutor(1) as ahead:

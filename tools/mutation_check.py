@@ -377,7 +377,7 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "a level with the stated errors": (
         "test_level_norms_and_covariances_are_those_of_the_matrices",
-        ("noise = variance * process.excess**2\n        self._weights", "noise = variance\n        self._weights"),
+        ("noise = variance * process.excess**2\n        self.weights", "noise = variance\n        self.weights"),
     ),
     "noise that falls with the counts": (
         "test_noise_at_the_level_is_that_of_its_counts",

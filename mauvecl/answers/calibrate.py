@@ -23,7 +23,6 @@ from mauvecl.host.instrument.instrument import FILE_VERSION, Instrument
 from mauvecl.observations.detector import (
     CalibrationFrames,
     DarkFit,
-    MeasuredVariance,
     NoiseModel,
     PhotonTransfer,
     assumed_dark,
@@ -533,7 +532,7 @@ def _observations(
 
 def _variances(
     observations: tuple[CalibrationFrames, ...], dark: DarkFit, nominal: Instrument
-) -> list[MeasuredVariance]:
+) -> list[NDArray[np.float64]]:
     """Measure the variances of all observations, of dark frames apart for each temperature."""
     variances = []
     for observation in observations:

@@ -412,7 +412,7 @@ def _completeness(case: Case, engine: Stares | Pool, report: Callable[[float], N
     values = injected_sizes(case, sizes, star.unit_snr, threshold)
     positions = min(asked.positions, asked.count)
     injections = Injections(
-        survey, 0, asked.half_widths_s, threshold, case.study.run.seed, positions, -(-asked.count // positions),
+        survey, asked.half_widths_s, threshold, case.study.run.seed, positions, -(-asked.count // positions),
         case.study.processes.additive_only,
     )  # fmt: skip
     widths = np.array(injections.half_widths_s)

@@ -25,7 +25,6 @@ import scipy
 from numpy.typing import NDArray
 
 from mauvecl.detection.nuisances import Nuisances, join_names
-from mauvecl.detection.statistics import Linear
 from mauvecl.host.exposure.response import Order, response_matrix
 from mauvecl.host.stars.bands import photons
 from mauvecl.host.stars.flare_spectra import (
@@ -597,11 +596,6 @@ class Reduction(MeanSums):
         unknown = excess_dn @ self.rows.T
         explained = np.einsum("nk,nk->n", unknown, unknown) + np.einsum("nk,nk->n", sums, sums)
         return np.asarray(excess_dn**2 @ inverse - explained)
-
-    @property
-    def statistics(self) -> tuple[Linear, ...]:
-        """User-defined statistics equal to the sums, which a device draws by pixel."""
-        return tuple(Linear(f"sum {k}", weights) for k, weights in enumerate(self.weights))
 
     @property
     def n_used(self) -> int:

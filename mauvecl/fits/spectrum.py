@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import partial
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -43,7 +42,7 @@ from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import Probability, Temperature, Wavelength
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
 
     from astropy.table import Table
 
@@ -240,27 +239,21 @@ def fit(
     >>> [round(float(x), 2) for x in found.estimates[0, :2]]
     [9000.0, 0.5]
     """
-    exposures = checked_exposures(frames, expectation, levels, nuisances)
-
-    reduction_of = partial(Reduction.of, model, expectation, nuisances=nuisances, skipped_nm=skipped_nm)
-    log_k, linear, cut = _pilot(exposures, expectation, model, reduction_of)
-    every = np.arange(len(exposures.raw))
+    problem = _Problem.of(frames, expectation, model, nuisances, levels, skipped_nm)
+    log_k, linear, cut = problem.pilot()
+    near, every = bool(cut.any()), np.arange(len(cut))
     # Exposures with saturated pixels start far from the flare, which decides on the pixels that saturate.
-    saturated = [np.flatnonzero(cut)] * (SATURATED_REFITS if cut.any() else 0)
+    saturated = [np.flatnonzero(cut)] * (SATURATED_REFITS if near else 0)
     for rows in [*saturated, *[every] * (REFITS - 1)]:
-        some_of = replace(exposures, raw=exposures.raw[rows]) if cut.any() else None
-        groups = variance_groups(expectation, model, log_k[rows], linear[rows], reduction_of, nuisances, some_of)
-        for some, reduction in groups:
-            own = rows[some]
-            for batch in _batches(own):
-                profile = Profile(reduction, exposures.sums(reduction, batch))
+        for some, reduction in problem.groups(log_k, linear, rows, near):
+            for batch in _batches(some):
+                profile = Profile(reduction, problem.exposures.sums(reduction, batch))
                 best = with_bounds(reduction, profile.sums, profile.best())
                 log_k[batch], linear[batch] = best.log_k, best.linear
     parts, order = [], []
-    near = exposures if cut.any() else None
-    for some, reduction in variance_groups(expectation, model, log_k, linear, reduction_of, nuisances, near):
+    for some, reduction in problem.groups(log_k, linear, every, near):
         for batch in _batches(some):
-            parts.append(_fitted(exposures, batch, model, reduction, levels))
+            parts.append(problem.measured(batch, reduction, levels))
             order.append(batch)
     return Measurement.joined(parts).rows(np.argsort(np.concatenate(order)))
 
@@ -271,64 +264,146 @@ def _batches(rows: NDArray[np.intp]) -> Iterator[NDArray[np.intp]]:
         yield rows[start : start + BATCH]
 
 
-def checked_exposures(
-    frames: ArrayLike, expectation: Expectation, levels: Sequence[float], nuisances: Nuisances | None
-) -> Exposures:
-    """Return exposures less their mean without a flare; raises InputError as `fit` does."""
-    raw = np.atleast_2d(np.asarray(frames))
-    if raw.ndim != 2 or not len(raw) or raw.shape[1] != expectation.wavelength_nm.size:
-        raise InputError(f"frames of the shape {raw.shape}", f"(n, {expectation.wavelength_nm.size})", key="frames")
-    if raw.dtype.kind not in "iuf" or not np.isfinite(raw).all():
-        raise InputError("frames hold undefined values", "finite numbers", key="frames")
-    if not levels:
-        raise InputError.of("levels", levels, "at least one probability")
-    mean = expectation.recorded_dn if nuisances is None else expectation.recorded_dn + nuisances.mean_dn
-    return Exposures(raw, mean)
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """Exposures, and the model of the flares that are fitted to them."""
+
+    exposures: Exposures
+    quiet: Expectation
+    model: FlareModel
+    nuisances: Nuisances | None
+    skipped_nm: Ranges
+
+    @classmethod
+    def of(
+        cls, frames: ArrayLike, quiet: Expectation, model: FlareModel, nuisances: Nuisances | None,
+        levels: Sequence[float], skipped_nm: Ranges,
+    ) -> Self:  # fmt: skip
+        """Subtract the mean without a flare from exposures; raises InputError as `fit` does."""
+        raw = np.atleast_2d(np.asarray(frames))
+        if raw.ndim != 2 or not len(raw) or raw.shape[1] != quiet.wavelength_nm.size:
+            raise InputError(f"frames of the shape {raw.shape}", f"(n, {quiet.wavelength_nm.size})", key="frames")
+        if raw.dtype.kind not in "iuf" or not np.isfinite(raw).all():
+            raise InputError("frames hold undefined values", "finite numbers", key="frames")
+        if not levels:
+            raise InputError.of("levels", levels, "at least one probability")
+        mean = quiet.recorded_dn if nuisances is None else quiet.recorded_dn + nuisances.mean_dn
+        return cls(Exposures(raw, mean), quiet, model, nuisances, skipped_nm)
+
+    def reduction(
+        self, added_dn: Float | None, highest_dn: Float | None = None, clipped: NDArray[np.bool_] | None = None
+    ) -> Reduction:
+        """Return the reduction of exposures with a flare; see `Reduction.of`."""
+        return Reduction.of(self.model, self.quiet, added_dn, self.nuisances, self.skipped_nm, highest_dn=highest_dn,
+                            clipped=clipped)  # fmt: skip
+
+    def pilot(self) -> tuple[Float, Float, NDArray[np.bool_]]:
+        """Fit all frames with the variance of the quiescent star, and return which have saturated pixels as well.
+
+        Pixels that are near saturation in a frame are not used.
+        """
+        raw, quiet, n = self.exposures.raw, self.quiet, len(self.exposures.raw)
+        log_k, linear, counts = np.empty(n), np.empty((n, len(self.model.linear))), np.zeros(n, np.intp)
+        usual = self.reduction(None)
+        used, ceiling = usual.variance > 0.0, _highest_usable(quiet)
+        for start in range(0, n, BATCH):
+            part = raw[start : start + BATCH]
+            if (part.max(axis=0) > ceiling)[used].any():
+                counts[start : start + BATCH] = (part > ceiling)[:, used].sum(axis=1)
+
+        def best(rows: NDArray[np.intp], reduction: Reduction) -> None:
+            for some in _batches(rows):
+                fit_of_some = Profile(reduction, self.exposures.sums(reduction, some)).best()
+                log_k[some], linear[some] = fit_of_some.log_k, fit_of_some.linear
+
+        best(np.flatnonzero(counts == 0), usual)
+        # Frames with about as many saturated pixels share the pixels that none of them saturates.
+        alike = np.rint(np.log(np.maximum(counts, 1)) / SATURATED_STEP).astype(np.intp)
+        for key in np.unique(alike[counts > 0]):
+            for some in _batches(np.flatnonzero((alike == key) & (counts > 0))):
+                shared = clipped_pixels(raw[some], quiet)
+                if (~shared & used).sum() >= LEAST_SHARED * (used.sum() - counts[some].max()):
+                    best(some, self.reduction(None, clipped=shared))
+                    continue
+                for row in some[:, None]:
+                    best(row, self.reduction(None, clipped=clipped_pixels(raw[row], quiet)))
+        return log_k, linear, counts > 0
+
+    def groups(
+        self, log_k: Float, linear: Float, rows: NDArray[np.intp], near: bool
+    ) -> Iterator[tuple[NDArray[np.intp], Reduction]]:
+        """Yield groups of frames whose fitted flares have nearly the same variance, with their reduction.
+
+        The frames are some `rows` of all, and `near` says whether pixels are near saturation in any of these.
+        """
+        quiet, model, raw, nuisances = self.quiet, self.model, self.exposures.raw, self.nuisances
+        log_k, linear, n_pixel = log_k[rows], linear[rows], quiet.wavelength_nm.size
+        edges = np.linspace(0, n_pixel, VARIANCE_RANGES + 1).astype(np.intp)[:-1]
+        ceiling = _highest_usable(quiet)
+        # Pixels that saturate in every frame have no say.
+        seen = raw[rows].min(axis=0) <= ceiling if near else True
+        relative = seen * quiet.gain_dn_per_electron / quiet.unsaturated_variance_dn2
+        averaged = np.diff(np.append(edges, n_pixel))
+        hot = np.add.reduceat(model.hot * relative, edges, axis=1) / averaged
+        fixed = np.add.reduceat(model.fixed * relative, edges, axis=1) / averaged
+        node = np.rint(np.interp(log_k, model.log_k, np.arange(model.log_k.size))).astype(np.intp)
+        added = linear[:, :1] * hot[node] + linear[:, 1:] @ fixed
+        keys = np.rint(np.log1p(np.maximum(added, -0.9)) / VARIANCE_STEP).astype(np.int64)
+        _, number, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
+        order = np.argsort(number, kind="stable")
+        # Single frames may have all the light that an exposure loses on average.
+        undimmed = 1.0 / min(1.0, nuisances.mean_factor) if nuisances else 1.0
+        for some in np.split(order, np.cumsum(counts)[:-1]):
+            middle = np.mean(log_k[some])
+            mean = linear[some, 0].mean() * model.hot_spline(middle) + linear[some, 1:].mean(axis=0) @ model.fixed
+            highest = undimmed * mean
+            if (quiet.n_frames * quiet.mean_raw_dn + NEAR_GROUP * highest > ceiling).any():
+                each = (linear[k, 0] * model.hot_spline(log_k[k]) + linear[k, 1:] @ model.fixed for k in some)
+                highest = undimmed * np.max(list(each), axis=0) if some.size <= BATCH else NEAR_GROUP * highest
+            own, clipped = rows[some], None
+            if near and (raw[own].max(axis=0) > ceiling).any():
+                clipped = clipped_pixels(raw[own], quiet)
+            yield own, self.reduction(mean, highest, clipped)
+
+    def measured(self, rows: NDArray[np.intp], reduction: Reduction, levels: Sequence[float]) -> Measurement:
+        """Measure the flares of some frames of one variance."""
+        model = self.model
+        sums, rest, light = self.exposures.sums_and_rest(reduction, rows)
+        profile = Profile(reduction, sums, light)
+        at_nodes = profile.gain_at_nodes()
+        best = profile.best(at_nodes)
+        allowed = [float(scipy.stats.chi2.isf(1 - p, 1)) for p in levels]
+        ends = [intervals(model, profile, best, at_nodes, rise) for rise in allowed]
+        low, high = (np.stack([interval[side] for interval in ends]) for side in (0, 1))
+        # Intervals differ from unbounded ones only if they reach a bound.
+        reaches = (low <= np.array(model.bounds)) & np.isfinite(model.bounds)
+        near = np.flatnonzero(reaches.any(axis=(0, 2)) | (best.linear < 0.0).any(axis=1))
+        if near.size:
+            bounded = BoundedProfile(reduction, sums[near], None if light is None else light[near])
+            nodes = bounded.gain_at_nodes()
+            there = bounded.best(nodes)
+            for k, rise in enumerate(allowed):
+                low[k, near], high[k, near] = bounded_intervals(model, bounded, there, nodes, rise)
+            best = best.replaced(near, there)
+        chi2 = rest + (np.einsum("nk,nk->n", sums, sums) - best.gain)
+        dof = reduction.n_used - reduction.n_free - len(model.linear) - 1
+        factor = profile.factor(best.log_k, best.linear)
+        estimates = derived_values(model, best.log_k, best.linear)
+        which, _ = model.sums
+        estimates[:, which] = undimmed(estimates[:, which], factor)
+        return Measurement(
+            model.names, model.units, model.bounds, estimates, covariance(model, reduction, best, factor),
+            tuple(levels), low, high, chi2, np.asarray(scipy.stats.chi2.sf(chi2, dof)), dof, np.sqrt(best.gain),
+            best.log_k, undimmed(best.linear, factor), factor,
+        )  # fmt: skip
 
 
-def _pilot(
-    exposures: Exposures, quiet: Expectation, model: FlareModel, reduction_of: Callable[..., Reduction]
-) -> tuple[Float, Float, NDArray[np.bool_]]:
-    """Fit all frames with the variance of the quiescent star, and return which have saturated pixels as well.
-
-    Pixels that are near saturation in a frame are not used.
-    """
-    n = len(exposures.raw)
-    log_k, linear, counts = np.empty(n), np.empty((n, len(model.linear))), np.zeros(n, np.intp)
-    usual = reduction_of(None)
-    used = usual.variance > 0.0
-    ceiling = _highest_usable(quiet)
-    for start in range(0, n, BATCH):
-        raw = exposures.raw[start : start + BATCH]
-        if (raw.max(axis=0) > ceiling)[used].any():
-            counts[start : start + BATCH] = (raw > ceiling)[:, used].sum(axis=1)
-
-    def best(rows: NDArray[np.intp], reduction: Reduction) -> None:
-        for some in _batches(rows):
-            fit_of_some = Profile(reduction, exposures.sums(reduction, some)).best()
-            log_k[some], linear[some] = fit_of_some.log_k, fit_of_some.linear
-
-    best(np.flatnonzero(counts == 0), usual)
-    # Frames with about as many saturated pixels share the pixels that none of them saturates.
-    alike = np.rint(np.log(np.maximum(counts, 1)) / SATURATED_STEP).astype(np.intp)
-    for key in np.unique(alike[counts > 0]):
-        rows = np.flatnonzero((alike == key) & (counts > 0))
-        for some in _batches(rows):
-            shared = clipped_pixels(exposures, quiet, some)
-            if (~shared & used).sum() >= LEAST_SHARED * (used.sum() - counts[some].max()):
-                best(some, reduction_of(None, clipped=shared))
-                continue
-            for row in some:
-                best(np.array([row]), reduction_of(None, clipped=clipped_pixels(exposures, quiet, np.array([row]))))
-    return log_k, linear, counts > 0
-
-
-def clipped_pixels(exposures: Exposures, quiet: Expectation, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
+def clipped_pixels(raw: NDArray[Any], quiet: Expectation) -> NDArray[np.bool_]:
     """Return which pixels are near saturation in any of some exposures, and their neighbours, shape (n_pixel,).
 
     Neighbours are left out so that the noise of single pixels does not select the pixels of a fit.
     """
-    clipped = (exposures.raw[rows] > _highest_usable(quiet)).any(axis=0)
+    clipped = (raw > _highest_usable(quiet)).any(axis=0)
     return np.convolve(clipped, np.ones(2 * NEIGHBOURS + 1), "same") > 0.5
 
 
@@ -338,82 +413,6 @@ def _highest_usable(quiet: Expectation) -> Float:
     light = quiet.n_frames * np.maximum(quiet.ceiling_dn - quiet.dark_dn - quiet.bias_dn, 0.0)
     sd = np.sqrt((constant + quiet.gain_dn_per_electron * light) / quiet.n_frames)
     return np.asarray(quiet.n_frames * (quiet.ceiling_dn - NEAR_SIGMA * sd))
-
-
-def variance_groups(
-    quiet: Expectation,
-    model: FlareModel,
-    log_k: Float,
-    linear: Float,
-    reduction_of: Callable[..., Reduction],
-    nuisances: Nuisances | None,
-    exposures: Exposures | None,
-) -> Iterator[tuple[NDArray[np.intp], Reduction]]:
-    """Yield groups of frames whose fitted flares have nearly the same variance, with their reduction.
-
-    The exposures are needed if pixels are near saturation in some of them.
-    """
-    n_pixel = quiet.wavelength_nm.size
-    edges = np.linspace(0, n_pixel, VARIANCE_RANGES + 1).astype(np.intp)[:-1]
-    ceiling = _highest_usable(quiet)
-    # Pixels that saturate in every frame have no say.
-    seen = True if exposures is None else exposures.raw.min(axis=0) <= ceiling
-    relative = seen * quiet.gain_dn_per_electron / quiet.unsaturated_variance_dn2
-    averaged = np.diff(np.append(edges, n_pixel))
-    hot = np.add.reduceat(model.hot * relative, edges, axis=1) / averaged
-    fixed = np.add.reduceat(model.fixed * relative, edges, axis=1) / averaged
-    node = np.rint(np.interp(log_k, model.log_k, np.arange(model.log_k.size))).astype(np.intp)
-    added = linear[:, :1] * hot[node] + linear[:, 1:] @ fixed
-    keys = np.rint(np.log1p(np.maximum(added, -0.9)) / VARIANCE_STEP).astype(np.int64)
-    _, number, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
-    order = np.argsort(number, kind="stable")
-    # Single frames may have all the light that an exposure loses on average.
-    undimmed = 1.0 / min(1.0, nuisances.mean_factor) if nuisances else 1.0
-    for rows in np.split(order, np.cumsum(counts)[:-1]):
-        middle = np.mean(log_k[rows])
-        mean = linear[rows, 0].mean() * model.hot_spline(middle) + linear[rows, 1:].mean(axis=0) @ model.fixed
-        highest = undimmed * mean
-        if (quiet.n_frames * quiet.mean_raw_dn + NEAR_GROUP * highest > ceiling).any():
-            each = (linear[k, 0] * model.hot_spline(log_k[k]) + linear[k, 1:] @ model.fixed for k in rows)
-            highest = undimmed * np.max(list(each), axis=0) if rows.size <= BATCH else NEAR_GROUP * highest
-        clipped = None
-        if exposures is not None and (exposures.raw[rows].max(axis=0) > ceiling).any():
-            clipped = clipped_pixels(exposures, quiet, rows)
-        yield rows, reduction_of(mean, highest_dn=highest, clipped=clipped)
-
-
-def _fitted(
-    exposures: Exposures, rows: NDArray[np.intp], model: FlareModel, reduction: Reduction, levels: Sequence[float]
-) -> Measurement:
-    """Measure the flares of some frames of one variance."""
-    sums, rest, light = exposures.sums_and_rest(reduction, rows)
-    profile = Profile(reduction, sums, light)
-    at_nodes = profile.gain_at_nodes()
-    best = profile.best(at_nodes)
-    allowed = [float(scipy.stats.chi2.isf(1 - p, 1)) for p in levels]
-    ends = [intervals(model, profile, best, at_nodes, rise) for rise in allowed]
-    low, high = (np.stack([interval[side] for interval in ends]) for side in (0, 1))
-    # Intervals differ from unbounded ones only if they reach a bound.
-    reaches = (low <= np.array(model.bounds)) & np.isfinite(model.bounds)
-    near = np.flatnonzero(reaches.any(axis=(0, 2)) | (best.linear < 0.0).any(axis=1))
-    if near.size:
-        bounded = BoundedProfile(reduction, sums[near], None if light is None else light[near])
-        nodes = bounded.gain_at_nodes()
-        there = bounded.best(nodes)
-        for k, rise in enumerate(allowed):
-            low[k, near], high[k, near] = bounded_intervals(model, bounded, there, nodes, rise)
-        best = best.replaced(near, there)
-    chi2 = rest + (np.einsum("nk,nk->n", sums, sums) - best.gain)
-    dof = reduction.n_used - reduction.n_free - len(model.linear) - 1
-    factor = profile.factor(best.log_k, best.linear)
-    estimates = derived_values(model, best.log_k, best.linear)
-    which, _ = model.sums
-    estimates[:, which] = undimmed(estimates[:, which], factor)
-    return Measurement(
-        model.names, model.units, model.bounds, estimates, covariance(model, reduction, best, factor), tuple(levels),
-        low, high, chi2, np.asarray(scipy.stats.chi2.sf(chi2, dof)), dof, np.sqrt(best.gain), best.log_k,
-        undimmed(best.linear, factor), factor,
-    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -550,17 +549,13 @@ def fit_two_temperatures(
     if any(derived.ratio is not None for derived in model.derived):
         raise InputError("a model with a Balmer jump", "blackbodies, with lines or without", key="model")
     single = fit(frames, expectation, model, nuisances, levels=levels, skipped_nm=skipped_nm)
-    exposures = checked_exposures(frames, expectation, levels, nuisances)
-
-    reduction_of = partial(Reduction.of, model, expectation, nuisances=nuisances, skipped_nm=skipped_nm)
+    problem = _Problem.of(frames, expectation, model, nuisances, levels, skipped_nm)
     allowed = [float(scipy.stats.chi2.isf(1 - p, 1)) for p in levels]
     parts, order, whole = [], [], TwoTemperatures(model)
     recorded = single.amplitudes * single.factor[:, None]
-    groups = variance_groups(expectation, model, single.log_k, recorded, reduction_of, nuisances, exposures)
-    for rows, reduction in groups:
-        sums, rest, light = exposures.sums_and_rest(reduction, rows)
-        measured = _Search(model, reduction, sums, allowed, light).measured()
-        best, low, high, second, estimates, factor = measured
+    for rows, reduction in problem.groups(single.log_k, recorded, np.arange(len(recorded)), True):
+        sums, rest, light = problem.exposures.sums_and_rest(reduction, rows)
+        best, low, high, second, estimates, factor = _Search(model, reduction, sums, allowed, light).measured()
         chi2 = rest + np.einsum("nk,nk->n", sums, sums) - best.gain
         dof = reduction.n_used - reduction.n_free - len(model.linear) - 3
         check_enough(expectation, reduction.variance > 0.0, len(model.linear) + 3 + reduction.n_free)

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from itertools import product
 from typing import TYPE_CHECKING, Annotated, NamedTuple, Self
 
 import numpy as np
@@ -19,7 +20,7 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.detection.nuisances import Nuisances, fitted_amplitudes, spectrum_of
-from mauvecl.fits.flare_model import EVERY, Exposures, Ranges, Reduction
+from mauvecl.fits.flare_model import EVERY, Ranges, Reduction
 from mauvecl.fits.profile import remembering
 from mauvecl.fits.spectrum import LEVELS, Measurement, clipped_pixels, fit
 from mauvecl.flares.frames import Components, known_strengths
@@ -156,7 +157,30 @@ def measure_along(
         If the frames have another shape, the expectation has several frames, or no bin reaches the S/N.
     """
     raw, stare = checked_frames(frames, quiet, stare)
-    bins = _bins(raw, quiet, model, nuisances, known_strengths(stare, quiet), stare, snr_per_bin, skipped_nm)
+    reduction = Reduction.of(model, quiet, None, nuisances, skipped_nm)
+    sums = less_known(raw, quiet, known_strengths(stare, quiet), reduction.weights)
+    total = np.vstack([np.zeros(sums.shape[1]), np.cumsum(sums, axis=0)])
+    shapes = reduction.hot[::BINS_EVERY] / np.linalg.norm(reduction.hot[::BINS_EVERY], axis=1)[:, None]
+    widths = 2 ** np.arange(int(np.log2(len(raw))) + 1)
+    best = [((total[w:] - total[:-w]) @ shapes.T).max(axis=0) / np.sqrt(w) for w in widths]
+    node = int(np.argmax(np.max(best, axis=0)))
+    light = model.hot[::BINS_EVERY][node]
+    weights = shapes[node] @ reduction.weights
+    # The variance of a frame's value is one plus that of the flare's photons, which is proportional to its light.
+    per_value = float(weights**2 @ (quiet.gain_dn_per_electron * light) / (weights @ light))
+    value = total @ shapes[node]
+    bins = []
+    gaps = np.flatnonzero(np.diff(stare.numbers) > 1) + 1
+    for begin, stop in zip([0, *gaps], [*gaps, len(raw)], strict=True):
+        start = int(begin)
+        for end in range(int(begin) + 1, int(stop) + 1):
+            earliest = max(start, end - MOST_FRAMES_PER_BIN)
+            gain = value[end] - value[earliest:end]
+            variance = np.arange(end - earliest, 0, -1) + per_value * np.maximum(gain, 0.0)
+            reached = np.flatnonzero(gain >= snr_per_bin * np.sqrt(variance))
+            if reached.size:
+                bins.append((earliest + int(reached[-1]), end))
+                start = end
     if not bins:
         raise InputError.of("snr_per_bin", snr_per_bin, "an S/N that a bin of the stare reaches")
     first, end = np.array(bins).T
@@ -242,44 +266,6 @@ def less_known(raw: Float, quiet: Expectation, known: Float, weights: Float) -> 
     means = np.vstack([quiet.net_source_dn, quiet.sky_dn, quiet.dark_dn, quiet.neighbour_dn, quiet.bias_dn])
     strengths = np.column_stack([known, np.ones(len(known))])
     return np.asarray(raw @ weights.T - strengths @ (means @ weights.T))
-
-
-def _bins(
-    raw: Float,
-    quiet: Expectation,
-    model: FlareModel,
-    nuisances: Nuisances | None,
-    strengths: Float,
-    stare: Stare,
-    snr: float,
-    skipped_nm: Ranges,
-) -> list[tuple[int, int]]:
-    """Return first frames and ends of the shortest runs of frames in which a matched filter reaches an S/N."""
-    reduction = Reduction.of(model, quiet, None, nuisances, skipped_nm)
-    sums = less_known(raw, quiet, strengths, reduction.weights)
-    total = np.vstack([np.zeros(sums.shape[1]), np.cumsum(sums, axis=0)])
-    shapes = reduction.hot[::BINS_EVERY] / np.linalg.norm(reduction.hot[::BINS_EVERY], axis=1)[:, None]
-    widths = 2 ** np.arange(int(np.log2(len(raw))) + 1)
-    best = [((total[w:] - total[:-w]) @ shapes.T).max(axis=0) / np.sqrt(w) for w in widths]
-    node = int(np.argmax(np.max(best, axis=0)))
-    light = model.hot[::BINS_EVERY][node]
-    weights = shapes[node] @ reduction.weights
-    # The variance of a frame's value is one plus that of the flare's photons, which is proportional to its light.
-    per_value = float(weights**2 @ (quiet.gain_dn_per_electron * light) / (weights @ light))
-    value = total @ shapes[node]
-    bins = []
-    gaps = np.flatnonzero(np.diff(stare.numbers) > 1) + 1
-    for begin, stop in zip([0, *gaps], [*gaps, len(raw)], strict=True):
-        start = int(begin)
-        for end in range(int(begin) + 1, int(stop) + 1):
-            earliest = max(start, end - MOST_FRAMES_PER_BIN)
-            gain = value[end] - value[earliest:end]
-            variance = np.arange(end - earliest, 0, -1) + per_value * np.maximum(gain, 0.0)
-            reached = np.flatnonzero(gain >= snr * np.sqrt(variance))
-            if reached.size:
-                bins.append((earliest + int(reached[-1]), end))
-                start = end
-    return bins
 
 
 Pair = tuple[Float, Float]
@@ -538,7 +524,7 @@ def fit_cooling(
     slopes = scale[:, None] * np.array([quantity.slope(theta, data) for quantity in quantities])[:, free]
     spread = slopes @ covariance @ slopes.T
     sd = np.sqrt(np.diag(spread)) / np.maximum(np.abs(scale), 1e-300)
-    ends = fit.ends_of_all(quantities, estimates, sd, [float(scipy.stats.chi2.ppf(level, 1)) for level in levels])
+    ends = fit.ends(quantities, estimates, sd, [float(scipy.stats.chi2.ppf(level, 1)) for level in levels])
     dof = data.sums.size - free.size - sum(np.isinf(unknown.sd) for unknown in data.unknown)
     empty = np.full(theta.shape, -np.inf)
     without = data.whitening(theta, none=True)
@@ -608,7 +594,7 @@ def _data(
     skipped_nm: Ranges,
 ) -> _Data:
     # The unknowns are parameters of the stare, so the weights of single frames do not remove them.
-    clipped = clipped_pixels(Exposures(raw, quiet.recorded_dn), quiet, np.arange(len(raw)))
+    clipped = clipped_pixels(raw, quiet)
     reduction = Reduction.of(model, quiet, skipped_nm=skipped_nm, clipped=clipped)
     weights, strengths = reduction.weights, known_strengths(stare, quiet)
     sums = less_known(raw, quiet, strengths, weights)
@@ -735,12 +721,11 @@ class _BestFit:
         theta = _solve(data, whitening, theta, free, *limits)
         return cls(data, whitening, theta, free, limits, float(np.sum(data.residuals(theta, whitening) ** 2)))
 
-    def ends_of_all(
-        self, quantities: Sequence[_Quantity], estimates: Float, sd: Float, rises: Sequence[float]
-    ) -> Float:
-        """Return the ends of the intervals of all quantities, shape (2, n_rise, n_quantity); `sd` as for `ends`.
+    def ends(self, quantities: Sequence[_Quantity], estimates: Float, sd: Float, rises: Sequence[float]) -> Float:
+        """Return the ends of the intervals of all quantities, shape (2, n_rise, n_quantity), for rises of chi-squared.
 
-        An energy is a multiple of its fluence.
+        `sd` is the standard deviation of the peak, or of the logarithm of another quantity. An energy is a multiple of
+        its fluence.
         """
         ends = np.full((2, len(rises), len(quantities)), np.nan)
         names = [quantity.name for quantity in quantities]
@@ -748,21 +733,13 @@ class _BestFit:
             if quantity.name.startswith("energy"):
                 fluence = names.index(quantity.name.replace("energy", "fluence"))
                 ends[:, :, q] = estimates[q] / estimates[fluence] * ends[:, :, fluence]
-            else:
-                ends[:, :, q] = self.ends(quantity, float(sd[q]), rises)
-        return ends
-
-    def ends(self, quantity: _Quantity, sd: float, rises: Sequence[float]) -> Float:
-        """Return the ends of a quantity's intervals, shape (2, n_rise), for rises of chi-squared.
-
-        `sd` is the standard deviation of the peak, or of the logarithm of another quantity.
-        """
-        interval_ends = np.empty((2, len(rises)))
-        for side, sign in enumerate((-1.0, 1.0)):
-            for k, rise in enumerate(rises):
+                continue
+            for (side, sign), (k, rise) in product(enumerate((-1.0, 1.0)), enumerate(rises)):
                 end = self._newton_end(quantity, sign, self.chi2 + rise)
-                interval_ends[side, k] = self._root_end(quantity, sign * sd, self.chi2 + rise) if end is None else end
-        return interval_ends
+                if end is None:
+                    end = self._root_end(quantity, sign * float(sd[q]), self.chi2 + rise)
+                ends[side, k, q] = end
+        return ends
 
     def _newton_end(self, quantity: _Quantity, sign: float, allowed: float) -> float | None:
         """Return the end of an interval on one side, or None if Newton's steps do not find it within the limits.

@@ -20,7 +20,7 @@ from mauvecl.observations.frame_model import CleanedSpectra, FrameModel, clean_s
 from mauvecl.observations.frames import Frames, Reason
 from mauvecl.observations.level import Likeness, QuiescentLevel, Scatter, binned_scatter, likeness
 from mauvecl.observations.light_curve import survey_light_curve
-from mauvecl.observations.process import Steps
+from mauvecl.observations.process import UNREPORTED, Steps
 from mauvecl.observations.search import (
     CHANCE_DIP,
     NO_COLOUR_K,
@@ -87,14 +87,13 @@ class Completeness:
 
 def inject(
     survey: SeriesSurvey, free: NDArray[np.bool_], threshold: float, seed: int, temperature_k: float = NO_COLOUR_K,
-    steps: Steps | None = None,
+    steps: Steps = UNREPORTED,
 ) -> Completeness:  # fmt: skip
     """Inject flares of several half-widths and sizes at random times, and count those that the search detects.
 
     Flares are injected into `free` frames, which belong to no event, and the others are left out of the search. Light
     curves have no colour, and flares in them no temperature. `steps` reports each half-width.
     """
-    steps = steps or Steps()
     every = np.flatnonzero(free)
     rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, INJECTION_KEY]))
     bank, frame_s = survey.bank, survey.stare.frame_s

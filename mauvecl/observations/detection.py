@@ -13,11 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.observations.event_fits import flares_of
-from mauvecl.observations.event_windows import REACH
-from mauvecl.observations.process import Binned, Process, Steps, criterion_of_process, fit_process
-from mauvecl.observations.process_search import FilterRow, ProcessSearch
-from mauvecl.observations.search import Detection, SeriesSurvey
+from mauvecl.observations.event_fits import REACH, flares_of
+from mauvecl.observations.process import UNREPORTED, Binned, Process, Steps, criterion_of_process, fit_process
+from mauvecl.observations.search import Detection, ProcessSearch, SeriesSurvey
 from mauvecl.schema.physical import DAY_S
 
 Float = NDArray[np.float64]
@@ -60,9 +58,7 @@ NEAR_WIDTHS, NEAR_SCALES = 20.0, 2.0
 STILL_BRIGHT, END_FRAMES = 1.0, 4
 
 
-def fit_processes(
-    survey: SeriesSurvey, taken: Bool, start: SeriesSurvey | None = None, steps: Steps | None = None
-) -> SeriesSurvey:
+def fit_processes(survey: SeriesSurvey, taken: Bool, start: SeriesSurvey | None, steps: Steps) -> SeriesSurvey:
     """Return a survey with the processes that fit its sums and its flux outside the frames of events, `taken`.
 
     `start` is a survey of nearly the same frames with processes, whose terms are kept. `steps` reports each fit.
@@ -80,12 +76,12 @@ def fit_processes(
     flux = processes[0]
     # The flux of a light curve is its only sum.
     if survey.weighted:
-        flux = fitted(survey.flux, survey.flux_variance, None if start is None else start.flux_process)
+        flux = fitted(survey.flux, survey.variance, None if start is None else start.flux_process)
     return replace(survey, processes=processes, flux_process=flux)
 
 
 def fit_quiet_light(
-    survey: SeriesSurvey, guessed: Bool, before: SeriesSurvey | None = None, steps: Steps | None = None
+    survey: SeriesSurvey, guessed: Bool, before: SeriesSurvey | None = None, steps: Steps = UNREPORTED
 ) -> tuple[SeriesSurvey, Bool]:
     """Fit process and events in alternation, from the guess and, if need be, from the events in independent noise.
 
@@ -178,7 +174,9 @@ def _criterion_of(survey: SeriesSurvey, fits: Sequence[EventLight], kept: Bool, 
             noise = (survey.variance + extra)[kept]
             process = fit_process(Binned(start, column, noise, survey.stare.frame_s), process)
             noise = noise * process.excess**2
-        total += criterion_of_process(process, Binned(start, column, noise, survey.stare.frame_s), size)
+        # The excess is in the noise already.
+        data = Binned(start, column, noise, survey.stare.frame_s)
+        total += criterion_of_process(replace(process, excess=1.0), data, size)
     return total
 
 
@@ -199,8 +197,7 @@ def _criterion_alone(survey: SeriesSurvey, event: Detection, size: float, *alter
         values, variance = survey.sums[rows, 0] - light[rows, 0], survey.variance[rows] + extra[rows]
         data = Binned(survey.stare.start_s[rows], values, variance, survey.stare.frame_s)
         process = fit_process(data) if event.last - event.first >= MIN_QUIET else Process((), 1.0)
-        noise = replace(data, variance=variance * process.excess**2)
-        costs.append(PARAMETERS * n_flares * size + criterion_of_process(process, noise, size))
+        costs.append(PARAMETERS * n_flares * size + criterion_of_process(process, data, size))
     return min(costs)
 
 
@@ -213,7 +210,7 @@ def _seen_once(survey: SeriesSurvey) -> bool:
 
 
 def alternate(
-    survey: SeriesSurvey, guessed: Bool, before: SeriesSurvey | None = None, steps: Steps | None = None
+    survey: SeriesSurvey, guessed: Bool, before: SeriesSurvey | None, steps: Steps
 ) -> tuple[SeriesSurvey, Bool]:
     """Fit process and events in alternation; return the survey with processes, and the frames above `PROVISIONAL`.
 
@@ -238,12 +235,12 @@ def alternate(
     return fitted, taken
 
 
-def detect_events(survey: SeriesSurvey, threshold: float, steps: Steps | None = None) -> tuple[list[Detection], Bool]:
+def detect_events(survey: SeriesSurvey, threshold: float, steps: Steps = UNREPORTED) -> tuple[list[Detection], Bool]:
     """Detect events above a threshold, the largest first, and return them in order of time with their frames."""
     # Where the star is constant, or seen for a short time, events may take any number of frames.
     varies_for_days = survey.stare.duration_s > LONG_S and any(process.terms for process in survey.processes)
     for faint in FAINT if varies_for_days else FAINT[:1]:
-        events, taken = _detect_to(survey, threshold, faint, steps or Steps())
+        events, taken = _detect_to(survey, threshold, faint, steps)
         if len(events) <= FEW or taken.mean() <= MOST_TAKEN:
             break
     return events, taken
@@ -323,7 +320,7 @@ def _search_once(part: SeriesSurvey, search: ProcessSearch, light: Float, thresh
     """Return the largest events among the frames that are left, at most one near another."""
     both = np.stack([part.sums, UNCERTAIN * light]) if light.any() else part.sums[None]
     # Local maxima above the threshold, of which there are many where the process does not describe the light.
-    found: list[tuple[FilterRow, NDArray[np.intp], NDArray[np.intp], Float, Float]] = []
+    parts = []
     for row, rho in search.values(both, threshold):
         excess = rho[0] - np.abs(np.where(np.isfinite(rho[1]), rho[1], 0.0)) if len(rho) > 1 else rho[0]
         direction = excess.argmax(axis=0)
@@ -331,22 +328,20 @@ def _search_once(part: SeriesSurvey, search: ProcessSearch, light: Float, thresh
         # Local maxima only: neighbours belong to the same event.
         top = (best >= np.append(best[1:], -np.inf)) & (best >= np.insert(best[:-1], 0, -np.inf))
         onset = np.flatnonzero(top & (best >= threshold))
-        found.append((row, onset, direction[onset], rho[0, direction[onset], onset], best[onset]))
-    which = np.repeat(np.arange(len(found)), [onset.size for _, onset, *_ in found])
-    onsets, directions, values, bests = (np.concatenate([one[k] for one in found]) for k in range(1, 5))
+        along, half_width = direction[onset], np.full(onset.size, row.template.half_width_s)
+        value = rho[0, along, onset]
+        amplitude = value / row.per_amplitude[along, onset]
+        parts.append(np.array([best[onset], value, half_width, search.peak_s(row, onset), along, amplitude]))
+    bests, *others = np.concatenate(parts, axis=1)
     order = np.argsort(bests)[::-1][: 4 * most_events(part.stare.n_frames)]
     scales = min(one.shortest_s for one in part.processes)
     scale = NEAR_SCALES * scales if np.isfinite(scales) else 0.0
     accepted: list[Detection] = []
     peaks, reaches = np.empty((2, order.size))
-    for n, k in enumerate(order):
-        row, onset = found[which[k]][0], onsets[k]
-        peak, half_width = float(search.peak_s(row, np.array([onset]))[0]), row.template.half_width_s
+    for n, (value, half_width, peak, along, amplitude) in enumerate(np.array(others)[:, order].T.tolist()):
         peaks[n], reaches[n] = peak, max(NEAR_WIDTHS * half_width, scale)
         if (np.abs(peak - peaks[:n]) > np.maximum(reaches[n], reaches[:n])).all():
-            along, value = int(directions[k]), float(values[k])
-            amplitude = value / float(row.per_amplitude[along, onset])
-            accepted.append(Detection(value, half_width, peak, along, amplitude, 0, 0))
+            accepted.append(Detection(value, half_width, peak, int(along), amplitude, 0, 0))
     return accepted
 
 

@@ -122,17 +122,6 @@ class NoiseModel:
 
 
 @dataclass(frozen=True, eq=False)
-class MeasuredVariance:
-    """Variance of the frames of one observation, for each usable pixel."""
-
-    # variance, light_dn, dark_dn: shape (n_pixel,); of a frame.
-    variance: Float
-    light_dn: Float
-    dark_dn: Float
-    dof: float  # degrees of freedom of each variance
-
-
-@dataclass(frozen=True, eq=False)
 class PhotonTransfer:
     """Fit of measured variances."""
 
@@ -170,11 +159,12 @@ class PhotonTransfer:
         return float(scipy.stats.chi2.sf(self.chi2, self.dof))
 
 
-def measured_variance(raw_dn: Float, light_dn: Float, dark_dn: Float, usable: NDArray[np.bool_]) -> MeasuredVariance:
+def measured_variance(raw_dn: Float, light_dn: Float, dark_dn: Float, usable: NDArray[np.bool_]) -> Float:
     """Measure the variance of frames from differences of consecutive ones, without drifts.
 
     From each difference the best multiples of light and dark, the means of a frame, are subtracted, since jitter of the
-    pointing and of the temperature change all pixels together.
+    pointing and of the temperature change all pixels together. Returned are the variance, light and dark of each usable
+    pixel, and the degrees of freedom of the variance, shape (4, n_pixel).
     """
     # A pixel that never changes is dead.
     usable = usable & np.any(raw_dn != raw_dn[0], axis=0)
@@ -188,21 +178,17 @@ def measured_variance(raw_dn: Float, light_dn: Float, dark_dn: Float, usable: ND
     kept = 1.0 - np.sum(basis**2, axis=1)
     n = len(steps)
     # The mean square of consecutive differences of normal values has this many degrees of freedom (von Neumann 1941).
-    return MeasuredVariance(np.mean(white**2, axis=0) / kept * scale**2 / 2, light, dark, 2 * n**2 / (3 * n - 1))
+    dof = np.full(light.size, 2 * n**2 / (3 * n - 1))
+    return np.array([np.mean(white**2, axis=0) / kept * scale**2 / 2, light, dark, dof])
 
 
-def fit_photon_transfer(
-    measured: Sequence[MeasuredVariance], nominal: Instrument, dark_error_dn: float = 0.0
-) -> PhotonTransfer:
-    """Fit gain, read noise and the unit of dark counts to measured variances, by iterated weighted least squares.
+def fit_photon_transfer(measured: Sequence[Float], nominal: Instrument, dark_error_dn: float = 0.0) -> PhotonTransfer:
+    """Fit gain, read noise and the unit of dark counts to variances of `measured_variance` by weighted least squares.
 
     The nominal values are kept where the data determine none. The standard error of the dark of a mean frame,
     `dark_error_dn`, moves the read noise.
     """
-    variance, light, dark = (
-        np.concatenate([getattr(one, key) for one in measured]) for key in ("variance", "light_dn", "dark_dn")
-    )
-    dof = np.concatenate([np.full(one.variance.size, one.dof) for one in measured])
+    variance, light, dark, dof = np.concatenate(measured, axis=1)
     fits = {}
     for name, column in (("DN", light), ("electrons", light + dark)):
         fixed = dark if name == "DN" else np.zeros_like(dark)

@@ -13,9 +13,20 @@ from numpy.typing import NDArray
 
 from mauvecl.flares.shapes import between, sides
 from mauvecl.host.arrays import map_in_threads
-from mauvecl.observations.event_fits import Fit, Mixture, fit_event, joined, light_of
-from mauvecl.observations.event_windows import GENERAL, LOG_TIME, FittedFlare, Likelihood, Window, log_time
-from mauvecl.observations.process import Steps
+from mauvecl.observations.event_fits import (
+    GENERAL,
+    LOG_TIME,
+    Fit,
+    FittedFlare,
+    Likelihood,
+    Mixture,
+    Window,
+    fit_event,
+    joined,
+    light_of,
+    log_time,
+)
+from mauvecl.observations.process import UNREPORTED, Steps
 from mauvecl.observations.search import MIN_BASELINE, Detection, SeriesSurvey
 
 if TYPE_CHECKING:
@@ -193,7 +204,7 @@ def _summed(survey: SeriesSurvey, taken: Bool, level: Float, one: Detection) -> 
     process = survey.flux_process
     begin = max(0, one.first - NEARBY)
     part = slice(begin, one.last + 1 + NEARBY)
-    time, noise = survey.stare.start_s[part], survey.flux_variance[part] * process.excess**2
+    time, noise = survey.stare.start_s[part], survey.variance[part] * process.excess**2
     event = slice(one.first - begin, one.last + 1 - begin)
     photon = survey.photon / survey.scale * np.maximum(flux, 0.0)
     variance = float(counts**2 @ (noise[event] + photon))
@@ -234,15 +245,12 @@ def _is_step(window: Window, fits: Sequence[Fit]) -> bool:
     starts = window.edges[(window.middle > inside[0] - np.ptp(inside)) & (window.middle < inside[-1]), 0]
     if not starts.size:
         return False
-    least, plain = np.inf, None
+    scored = []
     for fit in fits:
         one, model = _without_departures(window, fit)
         # Each further flare has three parameters more (Schwarz 1978).
-        chi2 = float(one.chi2(model)) + 3 * (len(fit.flares) - 1) * float(np.log(window.values.size))
-        if chi2 < least:
-            least, plain = chi2, one
-    if plain is None:
-        return False
+        scored.append((float(one.chi2(model)) + 3 * (len(fit.flares) - 1) * float(np.log(window.values.size)), one))
+    least, plain = min(scored, key=lambda pair: pair[0])
     models = (window.middle >= starts[:, None]).astype(np.float64)
     slope = models @ (plain.inverse @ window.values)
     information = np.einsum("ki,ki->k", models @ plain.inverse, models)
@@ -292,13 +300,12 @@ class ObservedEvent:
 
 def measure_events(
     survey: SeriesSurvey, taken: Bool, found: list[Detection], causes: Sequence[Kind] | None = None,
-    steps: Steps | None = None,
+    steps: Steps = UNREPORTED,
 ) -> list[ObservedEvent]:  # fmt: skip
     """Measure detected events in order of time; `taken` are their frames, and `causes` follow from their spectra.
 
     Weaker events next to a step or a dip belong to it. `steps` reports each event.
     """
-    steps = steps or Steps()
     level = survey.flux_level(~taken)
     kinds: Sequence[Kind] = causes or ["flare"] * len(found)
     measured = map_in_threads(lambda k: measure_event(survey, taken, level, found[k], kinds[k]), range(len(found)))
@@ -312,16 +319,6 @@ def measure_events(
     return events
 
 
-def _near_peak(survey: SeriesSurvey, found: Detection) -> Bool:
-    """Return which frames of an event may be its brightest, of its frames.
-
-    In the sum over wavelength of spectra a drift of the dark current may exceed a flare, but not within its half-width.
-    """
-    start_s, frame_s = survey.stare.start_s[found.first : found.last + 1], survey.stare.frame_s
-    near = np.abs(start_s + frame_s / 2 - found.peak_s) <= found.half_width_s + frame_s
-    return near if survey.weighted and near.any() else np.ones(near.size, np.bool_)
-
-
 def measure_event(
     survey: SeriesSurvey, taken: Bool, level: Float, found: Detection, cause: Kind = "flare"
 ) -> ObservedEvent:
@@ -333,7 +330,10 @@ def measure_event(
     rows = slice(first, last + 1)
     energy = measure_energy(survey, taken, level, found)
     flux, numbers = (survey.flux[rows] - level[rows]) * survey.scale, survey.stare.numbers
-    brightest = first + int(np.argmax(np.where(_near_peak(survey, found), flux, -np.inf)))
+    # In the sum over wavelength of spectra a drift of the dark current may exceed a flare, but not near its peak.
+    near = np.abs(survey.stare.middle_s[rows] - found.peak_s) <= found.half_width_s + survey.stare.frame_s
+    several = flux if not (survey.weighted and near.any()) else np.where(near, flux, -np.inf)
+    brightest = first + int(np.argmax(several))
     around = numbers[max(brightest - 1, 0) : brightest + 2]
     missing_s = (int(np.diff(around).max()) - 1) * survey.stare.frame_s
     ends = (first == 0, last == survey.stare.n_frames - 1)

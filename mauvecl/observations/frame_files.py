@@ -33,13 +33,12 @@ from mauvecl.host.tables.units import (
     is_dated,
 )
 from mauvecl.observations.frames import ALL_BITS, MAX_FRAMES, Frames, QualityBits, decimal_flags
-from mauvecl.observations.mapping import FrameMapping, recognised, times_of, wanted_columns
+from mauvecl.observations.mapping import KNOWN, FrameMapping, recognised, times_of
 from mauvecl.observations.stored_frames import (
     FolderFile,
     Light,
     PixelStatistics,
     StoredFile,
-    is_store,
     open_hdf5,
     open_store,
     stored_in_fits,
@@ -121,6 +120,7 @@ def frames_of(container: Any, mapping: FrameMapping | None = None, *, time: Any 
         Middles of the frames, for spectra.
     """
     import astropy.units as u
+    from astropy.nddata import StdDevUncertainty
     from astropy.table import Table
 
     if not hasattr(container, "colnames"):
@@ -132,7 +132,7 @@ def frames_of(container: Any, mapping: FrameMapping | None = None, *, time: Any 
         mask = np.zeros(container.flux.shape, np.bool_) if masked is None else np.asarray(masked, np.bool_)
         columns: dict[str, Any] = {"time": time, "flux": np.ma.MaskedArray(container.flux.value, mask)}
         if getattr(container, "uncertainty", None) is not None:
-            columns["flux_err"] = _standard_deviation(container.uncertainty)
+            columns["flux_err"] = np.asarray(container.uncertainty.represent_as(StdDevUncertainty).array, np.float64)
         nm = container.spectral_axis.to_value("nm", equivalencies=u.spectral())
         columns["wavelength"] = np.tile(nm, (len(columns["flux"]), 1))
         container = Table(
@@ -142,13 +142,6 @@ def frames_of(container: Any, mapping: FrameMapping | None = None, *, time: Any 
                                error="flux_err" if "flux_err" in columns else None)  # fmt: skip
     file = MemoryTable(container, type(container).__name__)
     return _frames_in(file, mapping or recognised(file), str(container.meta.get("LABEL", "frames")))
-
-
-def _standard_deviation(uncertainty: Any) -> Float:
-    """Return the standard deviations of an uncertainty of astropy's NDData, without unit."""
-    from astropy.nddata import StdDevUncertainty
-
-    return np.asarray(uncertainty.represent_as(StdDevUncertainty).array, np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,7 +227,7 @@ def _open_frames(
     what = f"file {path.name!r}"
     if path.is_dir():
         what = f"folder {path.name!r}"
-        if is_store(path):
+        if (path / "zarr.json").is_file():
             with open_store(path, name, what) as store:
                 yield store, mapping or store.mapping
         elif mapping is None:
@@ -258,9 +251,11 @@ def _opened(
     large: bool = False,
 ) -> AbstractContextManager[TableFile]:
     """Open a file with frames; only `large` ones may exceed MAUVECL_LARGEST_FILE_MIB."""
+    # Groups of names, of each of which the chosen table has one.
+    wanted = (KNOWN["time"], KNOWN["flux"]) if mapping is None else tuple((each,) for each in mapping.times)
 
     def of_fits(hdus: Any) -> TableFile:
-        return stored_in_fits(FitsTables(hdus, what), name) or FitsTables(hdus, what, name, wanted_columns(mapping))
+        return stored_in_fits(FitsTables(hdus, what), name) or FitsTables(hdus, what, name, wanted)
 
     return open_table(
         path, what, expected=FORMATS, check=check, large=large, of_fits=of_fits,

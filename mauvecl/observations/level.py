@@ -141,14 +141,12 @@ def _first_faint(flux: Float, start: int, limit: float) -> int:
     return flux.size
 
 
-def quiet_variance(flux: Float, error: Float | None, level: Float, quiet: Bool) -> tuple[Float, float]:
+def quiet_variance(flux: Float, error: Float, level: Float, quiet: Bool) -> tuple[Float, float]:
     """Return the variance of the noise of each frame at its level as stated, and its rise with the flux.
 
     Stated errors often follow the counts of their own frame; what they owe to the difference from the level is taken
-    away. Without stated errors the variance is 1.
+    away.
     """
-    if error is None:
-        return np.ones(flux.size), 0.0
     squared = error**2
     apart = (flux - level)[quiet]
     spread = float(apart @ apart)
@@ -159,36 +157,27 @@ def quiet_variance(flux: Float, error: Float | None, level: Float, quiet: Bool) 
     return np.maximum(squared - slope * (flux - level), LEAST_VARIANCE * typical), slope
 
 
-def process_level(process: Process, time_s: Float, values: Float, variance: Float, quiet: Bool) -> Float:
-    """Return the mean of a process at all times given the quiescent values, shape (n,) or (n, k) as `values`."""
-    return LevelGiven(process, time_s, variance, quiet).of(values)
-
-
 class LevelGiven:
     """Means of a process at all times given quiescent values: one factorisation for all values at the same times.
 
-    The variance is that of the noise of each value, without the excess of the process.
+    The variance is that of the noise of each value, without the excess of the process. The sum of the `weights` of the
+    values is the inverse of the variance of the constant level.
     """
 
     def __init__(self, process: Process, time_s: Float, variance: Float, quiet: Bool) -> None:
         self.process, self.quiet = process, quiet
         noise = variance * process.excess**2
-        self._weights = np.where(quiet, 1.0 / noise, 0.0)
+        self.weights = np.where(quiet, 1.0 / noise, 0.0)
         if process.terms:
             # Values without weight have a large variance.
             self._noise = np.where(quiet, noise, NO_WEIGHT**2 * (process.sd**2 + np.median(noise)))
             self._covariance = process.covariance(time_s, self._noise)
-            self._weights = np.where(quiet, self._covariance.solve(quiet.astype(np.float64)), 0.0)
-
-    @property
-    def constant_variance(self) -> float:
-        """Variance of the constant level."""
-        return 1.0 / float(self._weights.sum())
+            self.weights = np.where(quiet, self._covariance.solve(quiet.astype(np.float64)), 0.0)
 
     def of(self, values: Float) -> Float:
         """Return the mean of the process given values, shape (n,) or (n, k) as these."""
         columns = values.reshape(len(values), -1)
-        quiet, weights = self.quiet, self._weights
+        quiet, weights = self.quiet, self.weights
         mean = weights[quiet] @ columns[quiet] / weights.sum()
         if not self.process.terms:
             return np.asarray(np.broadcast_to(mean, columns.shape)).reshape(values.shape)
@@ -197,18 +186,15 @@ class LevelGiven:
         return np.asarray(held - self._noise[:, None] * self._covariance.solve(held) + mean).reshape(values.shape)
 
 
-def level_error(
-    process: Process, time_s: Float, variance: Float, quiet: Bool, seed: int, steps: Steps | None = None
-) -> Float:
+def level_error(process: Process, time_s: Float, variance: Float, quiet: Bool, seed: int, steps: Steps) -> Float:
     """Return the standard error of the mean of a process at all times, shape (n,).
 
     It is the scatter of differences between simulated processes and their means given noisy values (Matheron's rule),
     with that of the constant level. `steps` reports each of these.
     """
-    steps = steps or Steps()
     given = LevelGiven(process, time_s, variance, quiet)
     if not process.terms:
-        return np.full(time_s.size, given.constant_variance**0.5)
+        return np.full(time_s.size, (1.0 / float(given.weights.sum())) ** 0.5)
     noise = variance * process.excess**2
     rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, LEVEL_KEY]))
     tiny = np.full(time_s.size, 1e-9 * (process.sd**2 + float(np.median(noise))))
@@ -407,8 +393,7 @@ def relative_level(time_s: Float, numbers: NDArray[np.int64], flux: Float, frame
         data = binned(light)
         fitted = fit_process(data, each)
         size = float(np.log(data.values.size))
-        noise = replace(data, variance=data.variance * fitted.excess**2)
-        costs.append(2 * n_steps * size + criterion_of_process(fitted, noise, size))
+        costs.append(2 * n_steps * size + criterion_of_process(fitted, data, size))
     level = 1.0 + added / typical
     level = level / np.median(level)
     return level if costs[0] < costs[1] and level.min() > 1 / LARGEST and level.max() < LARGEST else constant

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import median_filter, uniform_filter1d
 
 from mauvecl.flares.shapes import Shape
+from mauvecl.host.arrays import true_runs
 from mauvecl.observations.detection import (
     END_FRAMES,
     LONG_S,
@@ -36,7 +37,7 @@ from mauvecl.observations.level import (
     single_frames,
     spikes,
 )
-from mauvecl.observations.process import Binned, Steps, criterion_of_process, fit_process
+from mauvecl.observations.process import UNREPORTED, Binned, Steps, criterion_of_process, fit_process
 from mauvecl.observations.search import SeriesSurvey, bank_of
 from mauvecl.schema.errors import InputError
 
@@ -91,7 +92,7 @@ class Loss(Shape):
         return np.clip(1.0 - np.asarray(tau, np.float64), 0.0, 2.0)
 
 
-def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, taken: Bool, steps: Steps | None = None) -> Bool:
+def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, taken: Bool, steps: Steps) -> Bool:
     """Return the frames in which light is lost, if losses explain a light curve better than flares do.
 
     Without losses, a star does not flare in many of its frames, keeps its noise, and varies slowly. Where that does not
@@ -101,7 +102,7 @@ def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, taken: Bool, steps
     none, process = np.zeros_like(taken), fitted.flux_process
     rotates = any(term.rotates for term in process.terms)
     slow_s = min(survey.stare.duration_s / 3, SLOW_S)
-    noise = process.excess * float(np.sqrt(np.median(fitted.flux_variance)))
+    noise = process.excess * float(np.sqrt(np.median(fitted.variance)))
     fast = any(
         not term.rotates
         and term.scale_s < slow_s
@@ -131,7 +132,7 @@ def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, taken: Bool, steps
             return none
     other, losses = alternate(down, guessed, None, steps)
     # The star is constant between losses, or before and after one; not only before or after a step.
-    returns = np.count_nonzero([last - first >= END_FRAMES for first, last in _runs(~losses)]) > 1
+    returns = np.count_nonzero(np.diff(true_runs(~losses)) > END_FRAMES) > 1
     constant = returns and not other.flux_process.terms and other.flux_process.excess < MOST_EXCESS
     if 0 < losses.mean() < (MOST_LOST_CONSTANT if constant else MOST_LOST):
         # Beside flares in even more frames, the star would be more than its noise.
@@ -155,9 +156,8 @@ def _eclipses(survey: SeriesSurvey, usual: Callable[[], float]) -> Bool:
     # The light in eclipses may have any smooth shape.
     dim = survey.frames(guessed)
     data = Binned(dim.stare.start_s, dim.sums[:, 0], dim.variance, dim.stare.frame_s)
-    process, size = fit_process(data), float(np.log(guessed.size))
-    dim_light = replace(data, variance=data.variance * process.excess**2)
-    cost = EPHEMERIS * size + criterion_of_process(process, dim_light, size)
+    size = float(np.log(guessed.size))
+    cost = EPHEMERIS * size + criterion_of_process(fit_process(data), data, size)
     if criterion(fitted, light_of_events(fitted, taken), taken) + cost >= usual():
         return none
     quiet = ~guessed
@@ -165,17 +165,11 @@ def _eclipses(survey: SeriesSurvey, usual: Callable[[], float]) -> Bool:
     whole = replace(survey, processes=fitted.processes, flux_process=fitted.flux_process)
     sigma = uniform_filter1d(whole.along(0, quiet), END_FRAMES)
     # Frames at the ends of the guess that are as bright as the star are searched.
-    for first, last in _runs(guessed):
-        faint = np.flatnonzero(sigma[first : last + 1] < -FAINT)
+    for first, end in true_runs(guessed):
+        faint = first + np.flatnonzero(sigma[first:end] < -FAINT)
         if faint.size:
-            none[max(first, first + faint[0] - END_FRAMES) : min(last, first + faint[-1] + END_FRAMES) + 1] = True
+            none[max(first, faint[0] - END_FRAMES) : min(end, faint[-1] + END_FRAMES + 1)] = True
     return none
-
-
-def _runs(inside: Bool) -> list[tuple[int, int]]:
-    """Return the first and last frame of each run of frames."""
-    edges = np.diff(inside.astype(np.int8), prepend=0, append=0)
-    return list(zip(np.flatnonzero(edges > 0).tolist(), (np.flatnonzero(edges < 0) - 1).tolist(), strict=True))
 
 
 def guess_eclipses(survey: SeriesSurvey) -> Bool:
@@ -188,7 +182,7 @@ def guess_eclipses(survey: SeriesSurvey) -> Bool:
 
     time = survey.stare.start_s
     inside = np.zeros(time.size, np.bool_)
-    data = Binned.of(time, survey.flux, survey.flux_variance, survey.stare.frame_s, MOST_BINNED)
+    data = Binned.of(time, survey.flux, survey.variance, survey.stare.frame_s, MOST_BINNED)
     period = max(SHORTEST_PERIOD_S, 2 * data.step_s / ECLIPSES[0])
     grids = []
     while period < data.span_s / 3:
@@ -231,10 +225,10 @@ def _turns(time: Float, period: float, middle: float) -> tuple[Float, Float]:
 
 def _bright(survey: SeriesSurvey) -> Bool:
     """Return frames far above the level that most frames have, and those after them, as long as flares decay."""
-    sigmas = (survey.flux - np.median(survey.flux)) / np.sqrt(survey.flux_variance)
+    sigmas = (survey.flux - np.median(survey.flux)) / np.sqrt(survey.variance)
     bright = np.zeros(sigmas.size, np.bool_)
-    for first, last in _runs(sigmas > BRIGHT):
-        bright[max(0, first - BEFORE) : last + 1 + DECAY * (last + 1 - first)] = True
+    for first, end in true_runs(sigmas > BRIGHT):
+        bright[max(0, first - BEFORE) : end + DECAY * (end - first)] = True
     return bright if bright.mean() < MOST_BRIGHT else np.zeros_like(bright)
 
 
@@ -247,14 +241,13 @@ ROUNDS = 3
 
 
 def survey_light_curve(
-    frames: Frames, shape: Shape, seed: int, steps: Steps | None = None
+    frames: Frames, shape: Shape, seed: int, steps: Steps = UNREPORTED
 ) -> tuple[SeriesSurvey, QuiescentLevel, Frames]:
     """Fit the quiescent light of a light curve, and prepare its search.
 
     Frames of few counts are returned with a remark and without errors. The seed is that of the standard error of the
     level; `steps` reports fits, searches and draws.
     """
-    steps = steps or Steps()
     fits = steps.part(0.0, 0.9)
     frames, counts = _counted(frames)
     flux, error = frames.white_light
@@ -280,7 +273,7 @@ def survey_light_curve(
             reasons[used] |= np.where(lost, Reason.LOSS, 0)
             survey = None
             continue
-        level = level_of(frames, flux, used, survey, ~taken)
+        level = interpolate_to_all(frames, used, survey, survey.flux_level(~taken))
         sd = np.sqrt(variance) * survey.flux_process.excess
         guessed = np.zeros(flux.size, np.bool_)
         guessed[used] = taken
@@ -295,7 +288,7 @@ def survey_light_curve(
     used = reasons == 0
     survey = survey.frames(used[searched_among(survey, frames)])
     last = steps.part(0.9, 1.0)
-    light = quiescent_light(frames, flux, error, survey, used, used & ~guessed, reasons, seed, last)
+    light = quiescent_light(frames, survey, reasons, ~guessed, seed, last)
     return survey, light.times(steps_of_level), frames
 
 
@@ -365,12 +358,9 @@ def _noise(
     return np.full(flux.size, (spread if spread > 0 else float(np.std(flux[quiet]))) ** 2), 0.0
 
 
-def level_of(frames: Frames, flux: Float, used: Bool, survey: SeriesSurvey, quiet: Bool) -> Float:
-    """Return the quiescent level of all frames, shape (n_frame,); between searched frames, `used`, it is interpolated.
-
-    `quiet` are those of the searched frames that belong to no event.
-    """
-    return np.interp(frames.time_s, frames.time_s[used], survey.flux_level(quiet) * survey.scale)
+def interpolate_to_all(frames: Frames, used: Bool, survey: SeriesSurvey, values: Float) -> Float:
+    """Return values of the searched frames, `used`, for all frames in the unit of the flux, interpolated between."""
+    return np.interp(frames.time_s, frames.time_s[used], values * survey.scale)
 
 
 def _single(
@@ -388,23 +378,17 @@ def _single(
 
 
 def quiescent_light(
-    frames: Frames, flux: Float, error: Float | None, survey: SeriesSurvey, used: Bool, quiet: Bool,
-    reasons: NDArray[np.int64], seed: int, steps: Steps,
-) -> QuiescentLevel:  # fmt: skip
-    """Return level, its error, and noise of all frames."""
-    process, time = survey.flux_process, survey.stare.start_s
-    part = quiet[used]
-    level = level_of(frames, flux, used, survey, part)
-
-    def everywhere(values: Float) -> Float:
-        return np.interp(frames.time_s, frames.time_s[used], values * survey.scale)
-
+    frames: Frames, survey: SeriesSurvey, reasons: NDArray[np.int64], outside: Bool, seed: int, steps: Steps
+) -> QuiescentLevel:
+    """Return level, its error, and noise of all frames, from those that are searched and `outside` of events."""
+    used, process, time = reasons == 0, survey.flux_process, survey.stare.start_s
+    quiet, for_all = outside[used], partial(interpolate_to_all, frames, used, survey)
     return QuiescentLevel(
-        level,
-        everywhere(level_error(process, time, survey.flux_variance, part, seed, steps)),
-        everywhere(np.sqrt(survey.flux_variance) * process.excess),
-        process.excess if error is not None else float("nan"),
-        quiet,
+        for_all(survey.flux_level(quiet)),
+        for_all(level_error(process, time, survey.variance, quiet, seed, steps)),
+        for_all(np.sqrt(survey.variance) * process.excess),
+        process.excess if frames.error is not None else float("nan"),
+        used & outside,
         reasons,
         process,
     )

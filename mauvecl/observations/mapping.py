@@ -198,11 +198,6 @@ CHEOPS = "SCI_COR_LIGHTCURVE"
 DATE = "a number or a date such as 2026-03-01T12:00:00"
 
 
-def wanted_columns(mapping: FrameMapping | None) -> tuple[tuple[str, ...], ...]:
-    """Return groups of names, of each of which the chosen table has one."""
-    return (KNOWN["time"], KNOWN["flux"]) if mapping is None else tuple((name,) for name in mapping.times)
-
-
 def recognised(file: TableFile) -> FrameMapping:
     """Return the mapping of a file whose columns have known names."""
     # Of FITS files also images, but no columns of other extensions.

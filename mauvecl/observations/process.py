@@ -58,6 +58,9 @@ class Steps:
         self.reached(1.0)
 
 
+#: Steps of work whose progress nobody follows.
+UNREPORTED = Steps()
+
 Float = NDArray[np.float64]
 Kind = Literal["correlated", "smooth", "rotation", "sharp rotation"]
 
@@ -407,21 +410,17 @@ class Binned:
 
 
 def criterion_of_process(process: Process, data: Binned, size: float) -> float:
-    """Return the Bayesian information criterion of a process for values whose noise has the stated variance.
-
-    A parameter costs `size`.
-    """
-    covariance = process.covariance(data.time_s, data.variance)
+    """Return the Bayesian information criterion of a process, of which a parameter costs `size`."""
+    covariance = process.covariance(data.time_s, data.variance * process.excess**2)
     return process.n_parameters * size - 2 * level_fit(covariance, data.values).log_likelihood
 
 
-def fit_process(data: Binned, start: Process | None = None, steps: Steps | None = None) -> Process:
+def fit_process(data: Binned, start: Process | None = None, steps: Steps = UNREPORTED) -> Process:
     """Fit a process to a light curve without flares.
 
     `start` is a process of nearly the same data, of which the terms are kept. `steps` reports each combination of
     terms.
     """
-    steps = steps or Steps()
     noise = max(data.noise / float(np.sqrt(np.median(data.variance))), 1e-6)
     if start is not None:
         process = _fitted(data, start.terms, np.log(start.excess))[0]

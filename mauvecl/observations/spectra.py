@@ -29,7 +29,7 @@ from mauvecl.observations.frame_model import (
 from mauvecl.observations.frames import Reason
 from mauvecl.observations.level import QuiescentLevel, guess_flares, single_frames
 from mauvecl.observations.light_curve import check_usable, quiescent_light, searched_among
-from mauvecl.observations.process import Steps
+from mauvecl.observations.process import UNREPORTED, Steps
 from mauvecl.observations.search import MIN_BASELINE, WHITE, Detection, SeriesSurvey, bank_of, stare_of
 from mauvecl.schema.errors import InputError
 from mauvecl.search.templates import TEMPERATURES_K, Templates
@@ -143,27 +143,15 @@ def survey_spectra(
     rank: int,
     seed: int,
     jitters: Mapping[str, float] | None = None,
-    steps: Steps | None = None,
+    steps: Steps = UNREPORTED,
 ) -> tuple[SeriesSurvey, SpectralSeries, QuiescentLevel]:
     """Prepare the search of spectra that is weighted for flares.
 
     Slow changes of the dark current and of what else the weights let through are processes of the weighted sums; the
     level of the light in each frame is free, so that pointing losses take no part. The level that is returned is that
-    of the sum over wavelength, with flags of single frames that only the weighted sums show.
-
-    Parameters
-    ----------
-    rank : int
-        Largest number of sums of a frame.
-    seed : int
-        Seed of the standard error of the level.
-    jitters : mapping of str to float, optional
-        Standard deviations of unknowns of each frame, infinite for those that are projected out. Where they do not
-        state it, that of the light is infinite and that of the dark current as measured.
-    steps : Steps, optional
-        Reports fits, searches and draws.
+    of the sum over wavelength, with flags of single frames that only the weighted sums show; its standard error is
+    drawn with the seed. `rank` and `jitters` are those of `analyse_frames`. `steps` reports fits, searches and draws.
     """
-    steps = steps or Steps()
     fits = steps.part(0.0, 0.9)
     frames = cleaned.frames
     flux, _ = frames.white_light
@@ -192,8 +180,7 @@ def survey_spectra(
     survey = survey.frames(kept)
     series = replace(series, excess=series.excess[used])
     draws = steps.part(0.9, 1.0)
-    level = quiescent_light(frames, flux, frames.error, survey, used, used & ~events, reasons, seed, draws)
-    return survey, series, level
+    return survey, series, quiescent_light(frames, survey, reasons, ~events, seed, draws)
 
 
 def _survey(
@@ -211,8 +198,8 @@ def _survey(
     photon = float(np.average(series.model.gain, weights=lit if lit.any() else None))
     bank = bank_of(stare, templates.directions[list(templates.chosen)], shape)
     return SeriesSurvey(
-        stare, bank, templates, sums[used], variance, (WHITE,) * sums.shape[1], flux[used] / scale, variance, WHITE,
-        scale, level, photon, frames.time_s[used], weighted=True,
+        stare, bank, templates, sums[used], variance, (WHITE,) * sums.shape[1], flux[used] / scale, WHITE, scale, level,
+        photon, frames.time_s[used], weighted=True,
     )  # fmt: skip
 
 
@@ -294,13 +281,9 @@ def _dark_changes(
 ) -> tuple[dict[str, float], float]:
     """Measure changes of the dark current, which is fitted together with the light; both spectra are `shared`.
 
-    Returns
-    -------
-    dict of str to float
-        Standard deviation of the dark current from frame to frame beyond that of noise; infinite if it drifts, and none
-        if it does not change significantly.
-    float
-        Range of nine tenths of slow changes if it drifts, or else 0.
+    The first value is the standard deviation of the dark current from frame to frame beyond that of noise, by name:
+    infinite if it drifts, and none if it does not change significantly. The second is the range of nine tenths of slow
+    changes if it drifts, or else 0.
     """
     amplitudes, covariance = fit_changes(excess, shared, sd)
     amplitude, error = amplitudes[:, 1], float(np.sqrt(covariance[1, 1]))

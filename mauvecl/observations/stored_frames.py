@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +20,6 @@ from mauvecl.host.tables.table import MemoryTable, TableFile, Values
 from mauvecl.observations.frames import MAX_FRAMES, dead_pixel_remarks, live_pixels
 from mauvecl.observations.mapping import FrameMapping
 from mauvecl.schema.errors import InputError
-
-if TYPE_CHECKING:
-    pass
 
 #: Largest number of files in a folder.
 MAX_FILES = 2**20
@@ -134,46 +131,42 @@ MAX_PIXELS = 2**20
 EXPECTED = "a file that `mauvecl realise` wrote, whole"
 
 
-@dataclass(frozen=True, eq=False)
-class StoredScene:
-    """Raw spectra with the calibration of their pixels."""
-
-    path: str  # name of the array, such as ``star-1/flare-1``
-    # DN, shape (n_realisation, n_pixel) or (n_realisation, n_frame, n_pixel), read from the file when it is sliced.
-    rows: Any
-    calibration: Mapping[str, Float]  # wavelength, bias, dark, read noise and gain of each pixel and frame
-    # ``exposure_s`` and ``frames`` of an exposure, star, instrument, temperature, saturation, unit of the dark.
-    attributes: Mapping[str, Any]
-    frames: NDArray[np.int64] | None  # shape (n_frame,), or None; numbers of the stored frames of each exposure
-
-
 class StoredFile(TableFile):
     """A scene of a store as frames, one exposure after the other, with and without dark and bias."""
 
-    def __init__(self, scene: StoredScene, what: str) -> None:
-        of = scene.attributes
+    def __init__(
+        self, what: str, path: str, raw: Any, calibration: Mapping[str, Float], of: Mapping[str, Any],
+        numbers: NDArray[np.int64] | None,
+    ) -> None:  # fmt: skip
+        """Take raw spectra with the calibration of their pixels.
+
+        The array `path`, such as ``star-1/flare-1``, has the shape (n_realisation, n_pixel) or (n_realisation, n_frame,
+        n_pixel), in DN, and is read from the file when it is sliced. The calibration is wavelength, bias, dark, read
+        noise and gain of each pixel and frame. Attributes are ``exposure_s`` and ``frames`` of an exposure, star,
+        instrument, temperature, saturation, and unit of the dark; `numbers` are those of the stored frames of each
+        exposure, shape (n_frame,), or None.
+        """
         missing = [key for key in REQUIRED if key not in of]
         if missing:
-            raise InputError(f"{what} does not state {missing[0]} of {scene.path}", "a file of this version of mauvecl",
+            raise InputError(f"{what} does not state {missing[0]} of {path}", "a file of this version of mauvecl",
                              key="file")  # fmt: skip
         super().__init__(what, {"OBJECT": of.get("star", ""), "INSTRUME": of["instrument"]})
-        self.scene = scene
-        numbers = scene.frames
+        self.raw, self.calibration, self.attributes = raw, calibration, of
         self.stacked = int(of["frames"]) if numbers is None else 1
         self.per_row = 1 if numbers is None else numbers.size
         exposure, frame = float(of["exposure_s"]), float(of["exposure_s"]) / int(of["frames"])
-        n = int(scene.rows.shape[0]) * self.per_row
+        n = int(raw.shape[0]) * self.per_row
         if n > MAX_FRAMES:
-            raise InputError(f"{what} holds {n} frames of {scene.path}", f"at most {MAX_FRAMES}", key="frames")
+            raise InputError(f"{what} holds {n} frames of {path}", f"at most {MAX_FRAMES}", key="frames")
         within = np.array([exposure / 2]) if numbers is None else (numbers + 0.5) * frame
         at = np.arange(n)
         each = np.ones(n)
         self.parts = {
             "time": Values.of("time", at // self.per_row * exposure + within[at % self.per_row], "s", what),
             "exposure": Values.of("exposure", each * (exposure if numbers is None else frame), "s", what),
-            "wavelength": Values.of("wavelength", scene.calibration["wavelength_nm"], "nm", what),
+            "wavelength": Values.of("wavelength", calibration["wavelength_nm"], "nm", what),
         }
-        shape = (n, scene.calibration["wavelength_nm"].size)
+        shape = (n, calibration["wavelength_nm"].size)
         self.parts["flux"] = Values("flux", shape, self._flux, "adu", what)
         if self.stacked == 1:
             self.parts["raw"] = Values("raw", shape, self._raw, "adu", what)
@@ -208,29 +201,24 @@ class StoredFile(TableFile):
     def _raw(self, start: int, stop: int) -> Float:
         first, last = start // self.per_row, -(-stop // self.per_row)
         with parsing(self.what, EXPECTED):
-            raw = np.asarray(self.scene.rows[first:last], np.float64).reshape(-1, self.parts["flux"].shape[1])
+            raw = np.asarray(self.raw[first:last], np.float64).reshape(-1, self.parts["flux"].shape[1])
         skipped = first * self.per_row
         return raw[start - skipped : stop - skipped]
 
     def _flux(self, start: int, stop: int) -> Float:
-        of = self.scene.calibration
+        of = self.calibration
         return self._raw(start, stop) - self.stacked * (of["bias_dn"] + of["dark_dn"])
 
     def _error(self, start: int, stop: int) -> Float:
         """Return the noise of dark, readout and rounding, and the Poisson noise of the counts themselves."""
-        of, gain = self.scene.calibration, self.scene.calibration["gain_dn_per_electron"]
+        of, gain = self.calibration, self.calibration["gain_dn_per_electron"]
         light = np.maximum(self._flux(start, stop), 0.0)
-        dark = of["dark_dn"] * (1.0 if self.scene.attributes["dark_unit"] == "DN" else gain)
+        dark = of["dark_dn"] * (1.0 if self.attributes["dark_unit"] == "DN" else gain)
         return np.asarray(np.sqrt(self.stacked * (of["read_noise_dn"] ** 2 + dark + 1 / 12) + gain * light))
 
     def _saturated(self, start: int, stop: int) -> NDArray[np.int64]:
-        limit = self.stacked * float(self.scene.attributes["saturation_dn"])
+        limit = self.stacked * float(self.attributes["saturation_dn"])
         return np.asarray((self._raw(start, stop) >= limit).any(axis=1), np.int64)
-
-
-def is_store(path: Path) -> bool:
-    """Return whether a folder is a Zarr store."""
-    return (path / "zarr.json").is_file()
 
 
 @contextmanager
@@ -274,7 +262,7 @@ def stored_in_fits(file: FitsTables, name: str | None) -> StoredFile | None:
                       "frames": round(header["NFRAMES"] * header["TELAPSE"] / header["EXPTIME"])}  # fmt: skip
         attributes |= {key: header[word] for key, word in (("temperature_c", "CCD-TEMP"), ("saturation_dn", "SATURATE"))
                        if word in header}  # fmt: skip
-        return StoredFile(StoredScene(path, hdu.section, of, attributes, frames), file.what)
+        return StoredFile(file.what, path, hdu.section, of, attributes, frames)
 
 
 def _in_groups(root: Any, name: str | None, what: str) -> StoredFile:
@@ -292,7 +280,7 @@ def _in_groups(root: Any, name: str | None, what: str) -> StoredFile:
             raise InputError(f"{what} holds {largest} pixels", f"at most {MAX_PIXELS}", key="file")
         of = {key: np.asarray(group[key][:], np.float64) for key in names}
         frames = np.asarray(group["frame"][:], np.int64) if "frame" in group else None
-        return StoredFile(StoredScene(path, array, of, dict(group.attrs), frames), what)
+        return StoredFile(what, path, array, of, dict(group.attrs), frames)
 
 
 def _chosen(found: list[str], name: str | None, what: str) -> str:

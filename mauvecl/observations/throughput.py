@@ -116,9 +116,9 @@ class _Linearised:
     prior: Float  # shape (n_parameter,); standard deviations; infinite for free parameters
     penalty: Float  # shape (n_coefficient, n_coefficient)
 
-    def solved(self, smoothing: float, prior: Float | None = None) -> tuple[Float, Float]:
+    def solved(self, smoothing: float) -> tuple[Float, Float]:
         """Return the parameters and their covariance."""
-        covariance = np.linalg.inv(self.normal + self._full(smoothing, self.prior if prior is None else prior))
+        covariance = np.linalg.inv(self.normal + self._full(smoothing, self.prior))
         return np.asarray(covariance @ self.projected), np.asarray(covariance)
 
     def likelihood(self, smoothing: float, prior: Float | None = None) -> float:
@@ -150,29 +150,6 @@ class _Linearised:
             method="bounded",
         )
         return float(np.exp(found.x))
-
-    def goodness(self, found: Float, covariance: Float) -> tuple[float, float]:
-        """Return chi-squared, and the values less the effective number of parameters."""
-        left = self.values - self.design @ found
-        return float(left @ left), float(np.any(self.design != 0, axis=1).sum() - np.sum(covariance * self.normal))
-
-    def scaled(self, found: Float, covariance: Float, smoothing: float, basis: Float) -> Float:
-        """Return the covariance with a smoothing bias as large as that of the fitted curve, on average over pixels."""
-        n = len(self.penalty)
-        pull = np.zeros_like(covariance)
-        pull[:, :n] = smoothing * covariance[:, :n] @ self.penalty
-        noise = covariance - pull @ covariance
-        variance = _diagonal(basis, covariance[:n, :n])
-
-        def mean(values: Float) -> float:
-            return float(np.mean(_diagonal(basis, values[:n, :n]) / variance))
-
-        bias = basis @ (pull @ found)[:n]
-        of_noise, expected = mean(pull @ noise @ pull.T), mean(pull @ noise)
-        if not expected > of_noise:
-            return covariance
-        scale = (float(np.mean(bias**2 / variance)) - of_noise) / (expected - of_noise)
-        return np.asarray(noise + max(scale, 0.0) * pull @ covariance)
 
     @cached_property
     def normal(self) -> Float:
@@ -360,17 +337,10 @@ def fit_throughput(
 ) -> ThroughputFit:
     """Fit the throughput to the mean frames of standard stars.
 
-    With two or more stars the zero point of the wavelengths and the width of the line function are fitted as well.
-
-    Parameters
-    ----------
-    knots : int
-        Number of intervals of the spline.
-    light_error : float
-        Relative standard deviation of the light of an observation, by pointing.
-    spectrum_error : float, optional
-        Relative standard deviation of the stars' spectra at each of `ERROR_KNOTS` knots. By default it is assumed for
-        one star, and fitted for several if they disagree.
+    With two or more stars the zero point of the wavelengths and the width of the line function are fitted as well. The
+    spline has `knots` intervals, and `light_error` is the relative standard deviation of the light of an observation,
+    by pointing; `spectrum_error` is that of the stars' spectra at each of `ERROR_KNOTS` knots. By default it is assumed
+    for one star, and fitted for several if they disagree.
     """
     nm = nominal.wavelength_nm
     model = ThroughputModel(tuple(stars), nominal, dark, transfer, sky, order, *_basis(nm, knots), light_error)
@@ -389,7 +359,7 @@ def fit_throughput(
             f"shifts up to {LIMITS[0]:g} nm and widths within {100 * LIMITS[2]:g} %",
             key="observations",
         )
-    covariance = best.linear.scaled(best.found, best.covariance, best.smoothing, model.basis)
+    covariance = best.scaled(model.basis)
     onto = scipy.linalg.block_diag(model.basis, np.eye(m))
     joint = onto @ covariance[: n + m, : n + m] @ onto.T
     curve = joint[: nm.size, : nm.size]
@@ -440,16 +410,37 @@ class _Solution:
     found: Float
     covariance: Float
 
+    def scaled(self, basis: Float) -> Float:
+        """Return the covariance with a smoothing bias as large as that of the fitted curve, on average over pixels."""
+        penalty, covariance = self.linear.penalty, self.covariance
+        n, pull = len(penalty), np.zeros_like(covariance)
+        pull[:, :n] = self.smoothing * covariance[:, :n] @ penalty
+        noise = covariance - pull @ covariance
+        variance = _diagonal(basis, covariance[:n, :n])
+
+        def mean(values: Float) -> float:
+            return float(np.mean(_diagonal(basis, values[:n, :n]) / variance))
+
+        bias = basis @ (pull @ self.found)[:n]
+        of_noise, expected = mean(pull @ noise @ pull.T), mean(pull @ noise)
+        if not expected > of_noise:
+            return covariance
+        scale = (float(np.mean(bias**2 / variance)) - of_noise) / (expected - of_noise)
+        return np.asarray(noise + max(scale, 0.0) * pull @ covariance)
+
     def pixels(self, model: ThroughputModel) -> _Pixels:
         """Divide the residuals into those that all stars share, and those by which they differ."""
         n_star, n_pixel = model.observed_dn.shape
-        left = (self.linear.values - self.linear.design @ self.found).reshape(n_star, n_pixel)
+        design, covariance = self.linear.design, self.covariance
+        every = self.linear.values - design @ self.found
+        left = every.reshape(n_star, n_pixel)
         # The columns of the spline sum to one.
-        whole = self.linear.design[:, : model.basis.shape[1]].sum(axis=1).reshape(n_star, n_pixel)
+        whole = design[:, : model.basis.shape[1]].sum(axis=1).reshape(n_star, n_pixel)
         information = np.sum(whole**2, axis=0)
         used = information > 0
         shared = np.divide(np.sum(whole * left, axis=0), information, out=np.zeros(n_pixel), where=used)
-        chi2, dof = self.linear.goodness(self.found, self.covariance)
+        chi2 = float(every @ every)
+        dof = float(np.any(design != 0, axis=1).sum() - np.sum(covariance * self.linear.normal))
         of_shared = float(np.sum(shared**2 * information))
         dof_shared = dof - model.usable.sum() + used.sum()
         disagree = n_star > 1 and scipy.stats.chi2.sf(chi2 - of_shared, dof - dof_shared) < REJECTED

@@ -120,7 +120,7 @@ def _key_of(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[st
 
 def _input_error_of(model: type[BaseModel], first: Any) -> InputError:
     path = [str(part) for part in first["loc"]]
-    key = ".".join(_key_of(model, first["loc"])) or model.__name__.lower()
+    key = ".".join(part for part in path if "[" not in part) or model.__name__.lower()
     value, message = first.get("input"), first["msg"]
     match first["type"]:
         case "extra_forbidden":

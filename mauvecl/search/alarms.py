@@ -13,9 +13,9 @@ from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
+from mauvecl.host.arrays import true_runs
 from mauvecl.search.flare_fits import (
     AMPLITUDE,
     KELVIN,
@@ -23,16 +23,15 @@ from mauvecl.search.flare_fits import (
     WIDTH,
     BlendFit,
     Block,
+    Ends,
     Factor,
     FittedFlares,
-    ProfileInterval,
-    SearchedStare,
     SummedStare,
 )
 from mauvecl.search.templates import LEAD, TAIL
 
 if TYPE_CHECKING:
-    from mauvecl.search.search import Row
+    from mauvecl.search.search import Row, Survey
     from mauvecl.search.templates import Templates
 
 Float = NDArray[np.float64]
@@ -91,7 +90,7 @@ class Candidate:
 
 
 def alarms(
-    survey: SearchedStare, templates: Templates, sums: NDArray[Any], threshold: float, energy: Factor | None = None
+    survey: Survey, templates: Templates, sums: NDArray[Any], threshold: float, energy: Factor | None = None
 ) -> list[Alarm]:
     """Detect and fit all flares of a stare in its simulated sums, (n_frame, n_sum), largest statistic first.
 
@@ -151,7 +150,9 @@ class _StareSearch:
         """Yield per row the best value of each onset, its excess over fit residuals, peak time and temperature."""
         light = self.sums.light(self.thetas)
         # Flares at the bounds of the fit may remain in the residuals entirely.
-        wrong = self.sums.light(self.thetas[self._at_end(self.thetas)])
+        low, high = self.sums.bounds
+        at_end = np.minimum(self.thetas - low, high - self.thetas) <= AT_BOUND * (high - low)
+        wrong = self.sums.light(self.thetas[at_end[:, [PEAK, WIDTH]].any(axis=1)])
         both = np.stack([self._evened(self.sums.net - light, light), LEFT_UNSEEN * light + wrong])
         search = self.sums.survey.search
         for row, rho in search.values(both.astype(np.float32)):
@@ -245,12 +246,6 @@ class _StareSearch:
     def _key(block: list[Candidate]) -> tuple[float, ...]:
         return tuple(np.round([candidate.theta for candidate in block], 2).ravel().tolist())
 
-    def _at_end(self, theta: Float) -> NDArray[np.bool_]:
-        """Return which flares peak at an end of the stare or are at an end of the bank, shape (n_flare,)."""
-        low, high = self.sums.bounds
-        at_end: NDArray[np.bool_] = np.minimum(theta - low, high - theta) <= AT_BOUND * (high - low)
-        return np.asarray(at_end[:, [PEAK, WIDTH]].any(axis=1))
-
     def _was_refused(self, peak: float, width: float) -> bool:
         return any(abs(peak - other) <= max(width, wide) and 1 / 3 < width / wide < 3 for other, wide in self.refused)
 
@@ -267,8 +262,8 @@ class _StareSearch:
         evened = left.copy()
         # The baseline under a flare is the median of the surrounding frames without excess noise.
         times = self.sums.edges[:, 0]
-        for (rows,) in scipy.ndimage.find_objects(scipy.ndimage.label(loud)[0]):
-            middle = times[(rows.start + rows.stop) // 2]
+        for first, end in true_runs(loud):
+            rows, middle = slice(first, end), times[(first + end) // 2]
             near = ~loud & (np.abs(times - middle) < self.sums.survey.bank.baseline.window_s / 2 + 1)
             level = np.median(left[near], axis=0) if near.any() else np.zeros(left.shape[1])
             evened[rows] = level + (left[rows] - level) / np.sqrt(excess[rows])[:, None]
@@ -328,6 +323,10 @@ class _StareSearch:
         return min(fits, key=lambda fit: fit.chi2)
 
 
+#: Values, intervals and note of a flare.
+Measured = tuple[FittedFlares, dict[str, tuple[float, float]], str]
+
+
 def _measured_alarms(search: _StareSearch, energy: Factor | None) -> list[Alarm]:
     """Measure all flares of a finished search."""
     measured_alarms = []
@@ -337,11 +336,12 @@ def _measured_alarms(search: _StareSearch, energy: Factor | None) -> list[Alarm]
         better: BlendFit | None = rows.fit(theta)
         while better is not None:
             # If profiling finds a better fit, start again from it.
-            best, measured = better, []
+            best, better, measured = better, None, list[Measured]()
             for j in range(len(block)):
                 gain = rows.without(best, j).chi2 - best.chi2
-                values, better = _measured(rows, best, j, gain, energy)
-                if better is not None:
+                values = _measured(rows, best, j, gain, energy)
+                if isinstance(values, BlendFit):
+                    better = values
                     break
                 measured.append(values)
         for candidate, values in zip(block, measured, strict=True):
@@ -349,21 +349,19 @@ def _measured_alarms(search: _StareSearch, energy: Factor | None) -> list[Alarm]
     return measured_alarms
 
 
-def _measured(
-    rows: Block, best: BlendFit, j: int, gain: float, energy: Factor | None
-) -> tuple[tuple[FittedFlares, dict[str, tuple[float, float]], str], BlendFit | None]:
-    """Return the values, intervals and note of a flare, and a better fit of its block if profiling finds one."""
+def _measured(rows: Block, best: BlendFit, j: int, gain: float, energy: Factor | None) -> Measured | BlendFit:
+    """Measure a flare, or return a better fit of its block if profiling finds one."""
     sums, theta = rows.sums, best.theta[j]
     snr = float(np.sqrt(max(gain, 0.0)))
     if missing := _why_unmeasured(rows, best, j):
         nowhere = dict.fromkeys((*QUANTITIES, "energy"), (np.nan, np.nan))
-        return (replace(UNMEASURED, snr=np.array([snr])), nowhere, f"detected but not measured: {missing}"), None
+        return replace(UNMEASURED, snr=np.array([snr])), nowhere, f"detected but not measured: {missing}"
     area = sums.survey.bank.shape.equivalent_duration
     several = KELVIN in sums.free
     covariance = np.asarray(rows.covariance(best.theta)[j, :, j, :])
     outcome = _intervals(rows, best, j, snr, covariance, energy)
     if isinstance(outcome, BlendFit):
-        return (UNMEASURED, {}, ""), outcome
+        return outcome
     intervals, note = outcome
     duration = np.array([1.0, 0.0, 1.0, 0.0])
     sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
@@ -374,7 +372,7 @@ def _measured(
         kelvin if several else np.nan, kelvin * sd[KELVIN] if several else np.nan,
         amplitude * width * area, amplitude * width * area * sd_duration, snr,
     )  # fmt: skip
-    return (FittedFlares(*(np.array([value]) for value in values)), intervals, note), None
+    return FittedFlares(*(np.array([value]) for value in values)), intervals, note
 
 
 def _why_unmeasured(rows: Block, best: BlendFit, j: int) -> str:
@@ -404,25 +402,25 @@ def _intervals(
         if column == KELVIN and KELVIN not in rows.sums.free:
             intervals[name] = (np.nan, np.nan)
             continue
-        if snr > MAX_PROFILED_SNR:
-            interval = _by_curvature(best.theta[j], covariance, column, factor)
-        else:
-            interval, better = rows.interval(best, j, column, factor, 1.0 + BARTLETT / max(snr, 1.0) ** 2)
-            if better is not None:
-                return better
-        ends = np.array([interval.low, interval.high])
+        interval: Ends | BlendFit = _by_curvature(best.theta[j], covariance, column, factor)
+        if snr <= MAX_PROFILED_SNR:
+            interval = rows.interval(best, j, column, factor, 1.0 + BARTLETT / max(snr, 1.0) ** 2)
+        if isinstance(interval, BlendFit):
+            return interval
+        low, high, is_open = interval
+        ends = np.array([low, high])
         low_end, high_end = ends if column == PEAK else np.exp(ends + offset)
         intervals[name] = (float(low_end), float(high_end))
-        if interval.open_low or interval.open_high:
+        if is_open:
             notes.append(name.rsplit("_", 1)[0].replace("_", " "))
     return intervals, f"the interval of its {' and its '.join(notes)} ends where the fit does" if notes else ""
 
 
-def _by_curvature(theta: Float, covariance: Float, column: int, factor: Factor | None) -> ProfileInterval:
+def _by_curvature(theta: Float, covariance: Float, column: int, factor: Factor | None) -> Ends:
     if factor is None:
         middle, sd = theta[column], np.sqrt(covariance[column, column])
     else:
         value, slope = factor(theta[KELVIN])
         along = np.array([1.0, 0.0, 1.0, slope])
         middle, sd = theta[AMPLITUDE] + theta[WIDTH] + value, np.sqrt(along @ covariance @ along)
-    return ProfileInterval(float(middle - sd), float(middle + sd))
+    return float(middle - sd), float(middle + sd), False

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Self
 
 import numpy as np
@@ -121,12 +121,12 @@ class Completeness:
         false_alarms_per_day : float
             False alarms per day of frames, which set the threshold.
         bank : Bank, optional
-            Shape, half-widths and baseline; `default_bank` by default.
+            Shape, half-widths and baseline; by default those of a search with one sum per frame.
         law : DurationLaw, optional
         """
         if scale.kind != "bolometric":
             raise InputError.of("kind", scale.kind, "bolometric")
-        law, bank = law or DurationLaw(), bank or default_bank()
+        law, bank = law or DurationLaw(), bank or white_bank(BANK_S, shape_of("davenport2014"), 5.0)
         threshold = search_threshold(false_alarms_per_day, bank)
         widths, gain = _gains(bank.shape, window_s, bank.frame_s)
         # From undetectable energies to those that are always detected.
@@ -147,11 +147,6 @@ class Completeness:
             f"{false_alarms_per_day:g} false alarms a day, stretches of {window_s / 60:.0f} min"
         )
         return cls(10**log_energy, np.clip(probability, 0, 1), "bolometric", how)
-
-
-def default_bank() -> Bank:
-    """Return the bank of a default search with one sum per frame."""
-    return white_bank(BANK_S, shape_of("davenport2014"), 5.0)
 
 
 # A plan asks for the threshold and the gains of each target and each mode of a calibrated throughput.
@@ -232,37 +227,24 @@ class InjectedCompleteness:
     sizes: Float  # shape (n_size,)
     amplitudes: Float  # shape (n_half_width, n_size)
     critical: Float  # smallest size that is detected in each draw, shape (n_half_width, n_position, n_draw)
+    completeness: Float = field(init=False)  # detected fraction, shape (n_half_width, n_size)
+    completeness_low: Float = field(init=False)  # ends of its 95 % interval
+    completeness_high: Float = field(init=False)
+
+    def __post_init__(self) -> None:
+        cells = np.empty((3, len(self.half_widths_s), self.sizes.size))
+        for d, s in np.ndindex(cells.shape[1:]):
+            each = np.mean(self.critical[d] <= self.sizes[s], axis=1)
+            # Intervals are those for the effective number of independent draws.
+            fraction, trials = float(each.mean()), self._independent(each, self.count)
+            around = clopper_pearson(round(fraction * trials), trials)
+            cells[:, d, s] = fraction, min(around.low, fraction), max(around.high, fraction)
+        set_read_only(self, completeness=cells[0], completeness_low=cells[1], completeness_high=cells[2])
 
     @property
     def count(self) -> int:
         """Injections per cell."""
         return int(self.critical[0].size)
-
-    @cached_property
-    def _cells(self) -> tuple[Float, Float, Float]:
-        """Detected fractions with the ends of their intervals, for the effective number of independent draws."""
-        cells = np.empty((3, len(self.half_widths_s), self.sizes.size))
-        for d, s in np.ndindex(cells.shape[1:]):
-            each = np.mean(self.critical[d] <= self.sizes[s], axis=1)
-            fraction, trials = float(each.mean()), self._independent(each, self.count)
-            around = clopper_pearson(round(fraction * trials), trials)
-            cells[:, d, s] = fraction, min(around.low, fraction), max(around.high, fraction)
-        return cells[0], cells[1], cells[2]
-
-    @property
-    def completeness(self) -> Float:
-        """Detected fraction, shape (n_half_width, n_size)."""
-        return self._cells[0]
-
-    @property
-    def completeness_low(self) -> Float:
-        """Lower limits of the 95 % intervals of `completeness`."""
-        return self._cells[1]
-
-    @property
-    def completeness_high(self) -> Float:
-        """Upper limits of the 95 % intervals of `completeness`."""
-        return self._cells[2]
 
     @staticmethod
     def _independent(each: Float, count: int) -> int:

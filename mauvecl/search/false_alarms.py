@@ -303,10 +303,10 @@ class SampledRate:
 
     def under(self, shifts: UnknownShifts) -> SampledRate:
         """Return the rate for stares whose noise differs from the noise that the search assumes."""
-        if shifts.is_nominal:
+        shifted = bool(shifts.shifts.any())
+        if np.abs(shifts.scales - 1).max() < NEGLIGIBLE and not shifted:
             return self
         # The rate is tabulated finely enough for linear interpolation.
-        shifted = bool(shifts.shifts.any())
         low, high = self.thresholds[0] / shifts.scales.max(), self.thresholds[-1] / shifts.scales.min()
         # Shifted values exceed a threshold as often as unshifted ones exceed a much lower one.
         fine = np.linspace(0.0 if shifted else low, high, FINE)
@@ -373,11 +373,6 @@ class SampledRate:
         # The rate falls by about a factor exp(-u) per unit of u.
         reach = float(scipy.special.ndtri(0.5 + CONFIDENCE / 2)) * self.log_rate(value)[1] / value
         return Interval(value, value - reach, value + reach)
-
-    @property
-    def lowest(self) -> float:
-        """Smallest threshold at which the rate is known."""
-        return self._ends[0]
 
     @property
     def _ends(self) -> tuple[float, float]:
@@ -496,11 +491,6 @@ class UnknownShifts:
     shifts: Float  # means of values, ascending, shape (n_shift,)
     shares: Float  # shares of templates with each mean, shape (n_draw, n_shift)
 
-    @property
-    def is_nominal(self) -> bool:
-        """True if scatter and shift are as the search assumes."""
-        return bool(np.abs(self.scales - 1).max() < NEGLIGIBLE and not self.shifts.any())
-
     def alarm_probability(self, threshold: float, days: float, rate: Callable[[Float], Float]) -> Float:
         """Return the probability of an alarm in each draw of a stare of some star-days, shape (n_draw,).
 
@@ -559,19 +549,14 @@ def draw_shifts(survey: Survey, seed: int, part: Survey) -> UnknownShifts:
     covariance = components.jittered_covariance(coefficients, stare)
     variance = np.einsum("dk,ntkl,dl->ntd", rows, covariance, rows, optimize=True) / survey.variance[at, None]
     scales = np.sqrt(np.maximum(variance, 1e-12)).reshape(RATE_DRAWS, -1)
-    if not _shifted(part):
+    known = part.unknowns
+    # Unknowns of several standard deviations may shift a template's value.
+    if known is None or part.search.largest(part.unsubtracted(known.extremes)).max() <= MIN_SHIFT:
         return UnknownShifts(scales, weights / weights.sum(), np.zeros(1), np.ones((RATE_DRAWS, 1)))
     # The same share of draws from both halves.
     some = slice(None, None, ONE_IN)
     weights = weights[some]
     return UnknownShifts(scales[some], weights / weights.sum(), *_shifts(part, z[some]))
-
-
-def _shifted(survey: Survey) -> bool:
-    """Return whether unknowns of several standard deviations shift a template's value."""
-    if survey.unknowns is None:
-        return False
-    return bool(survey.search.largest(survey.unsubtracted(survey.unknowns.extremes)).maximum.max() > MIN_SHIFT)
 
 
 def _shifts(survey: Survey, amplitudes: Float) -> tuple[Float, Float]:

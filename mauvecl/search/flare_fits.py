@@ -15,21 +15,20 @@ flares near the threshold are biased high, because noise contributes to their de
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from mauvecl.fits.profile import Profile, remembering
 from mauvecl.flares.shapes import between, sides
 
 if TYPE_CHECKING:
-    from mauvecl.flares.stare import Stare
-    from mauvecl.search.search import Search
+    from mauvecl.search.search import Survey
     from mauvecl.search.templates import Bank, Templates
 
 Float = NDArray[np.float64]
@@ -54,6 +53,8 @@ BETTER = 0.05
 
 #: Logarithm of a factor in a profiled product as a function of log temperature, with its derivative.
 Factor = Callable[[float], tuple[float, float]]
+#: Ends of a 68 % interval, and whether one of them is a bound of the fit.
+Ends = tuple[float, float, bool]
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,16 +70,6 @@ class BlendFit:
     def p_value(self) -> float:
         """Probability of a chi-squared at least as large."""
         return float(scipy.stats.chi2.sf(self.chi2, self.dof)) if self.dof > 0 else float("nan")
-
-
-@dataclass(frozen=True, eq=False)
-class ProfileInterval:
-    """A 68 % interval from the profile likelihood."""
-
-    low: float
-    high: float
-    open_low: bool = False  # the interval ends at a bound of the fit
-    open_high: bool = False
 
 
 @dataclass(frozen=True)
@@ -110,41 +101,11 @@ class Held:
             derivatives[:, self.flare, KELVIN] -= self.factor(theta[self.flare, KELVIN])[1] * tied
 
 
-class SearchedStare(Protocol):
-    """Interface of a stare and its search for fits; the stare is simulated (`search.Survey`) or observed."""
-
-    @property
-    def stare(self) -> Stare:
-        """Times of the frames."""
-
-    @property
-    def bank(self) -> Bank:
-        """Template bank of the search."""
-
-    @property
-    def search(self) -> Search:
-        """Search of the frames."""
-
-    @property
-    def curves(self) -> Float | None:
-        """Baseline curves with unknown amplitudes, shape (n_curve, n_frame)."""
-
-    @property
-    def directions(self) -> Mapping[Any, Float]:
-        """Derivatives of the mean sums by unknown changes, shape (n_frame, n_sum) each."""
-
-    def covariance(self) -> Float:
-        """Return the covariance of each frame's sums without a flare, shape (n_frame, n_sum, n_sum)."""
-
-    def net(self, sums: NDArray[Any]) -> NDArray[np.float32]:
-        """Return sums less their known mean, shape (n_stare, n_frame, n_sum)."""
-
-
 @dataclass(frozen=True, eq=False)
 class SummedStare:
     """The sums of a stare to which flares are fitted."""
 
-    survey: SearchedStare
+    survey: Survey
     templates: Templates
     net: Float  # sums less their known means, shape (n_frame, n_sum)
 
@@ -313,11 +274,6 @@ class Block:
         derivatives = rows.reshape(4, len(theta), -1)
         return derivatives[AMPLITUDE].sum(axis=0), derivatives.T
 
-    def chi2(self, theta: Float) -> float:
-        """Return chi-squared for given parameters."""
-        left = self.data - self.model(theta)[0]
-        return float(left @ left)
-
     def fit(self, theta: Float, held: Held | None = None) -> BlendFit:
         """Fit all flares from a starting point, shape (n_flare, 4), optionally with a constraint."""
         low, high = (np.tile(end, (len(theta), 1)) for end in self.sums.bounds)
@@ -357,8 +313,6 @@ class Block:
         scale = np.ones(theta.shape)
         scale[:, PEAK] = np.exp(start[:, WIDTH])
         dof = self.data.size - self.basis.shape[1] - theta.shape[0] * len(self.sums.free)
-        if not moved.any():
-            return BlendFit(whole(start[moved]), self.chi2(whole(start[moved])), dof, True)
         solution = scipy.optimize.least_squares(
             residual, start[moved], jacobian, bounds=(low[moved], high[moved]), x_scale=scale[moved],
             ftol=CONVERGED, xtol=1e-9, gtol=None, max_nfev=MAX_EVALUATIONS,
@@ -376,10 +330,8 @@ class Block:
         covariance[np.ix_(range(n), free, range(n), free)] = inverse.reshape(n, len(free), n, len(free))
         return covariance
 
-    def interval(
-        self, best: BlendFit, j: int, column: int, factor: Factor | None = None, rises: float = 1.0
-    ) -> tuple[ProfileInterval, BlendFit | None]:
-        """Return the interval of a flare's parameter, and a better fit if profiling finds one.
+    def interval(self, best: BlendFit, j: int, column: int, factor: Factor | None, rises: float) -> Ends | BlendFit:
+        """Return the interval of a flare's parameter from the profile likelihood, or a better fit if that finds one.
 
         With a factor, the interval is that of amplitude x half-width x factor. Chi-squared rises by `rises` at its
         ends.
@@ -406,18 +358,18 @@ class Block:
                 return self.fit(straight if start is None else start, held)
 
             reached, probes = _interval_end(refit, best.chi2, rises, sd * np.sqrt(rises), furthest), list(BEYOND)
-            while probes and reached.better is None and reached.step < furthest:
+            while probes and not isinstance(reached, BlendFit) and reached.step < furthest:
                 # Another optimum may follow beyond a rise.
                 step = min(reached.step * probes.pop(0), furthest)
                 fits = [refit(step, start) for start in (None, reached.theta, theta)]
                 one = min(fits, key=lambda fit: fit.chi2)
                 if one.chi2 - best.chi2 < rises * (1.0 - CLOSE) ** 2:
                     reached = _interval_end(refit, best.chi2, rises, step, furthest, one.theta)
-            if reached.better is not None:
-                return ProfileInterval(np.nan, np.nan), self.fit(reached.better.theta)
+            if isinstance(reached, BlendFit):
+                return self.fit(reached.theta)
             interval_ends.append((float(middle + sign * reached.step), reached.open))
         (low, open_low), (high, open_high) = interval_ends
-        return ProfileInterval(low, high, open_low, open_high), None
+        return low, high, open_low or open_high
 
     def without(self, blended: BlendFit, j: int) -> BlendFit:
         """Fit all flares except flare `j`."""
@@ -435,14 +387,15 @@ class _IntervalEnd:
     step: float  # distance from the best fit
     open: bool  # chi-squared does not rise enough within the range of the fit
     theta: Float  # parameters at the end
-    better: BlendFit | None = None  # fit that is better than the best one, if profiling found one
 
 
 def _interval_end(
     refit: Callable[[float, Float | None], BlendFit], chi2: float, rises: float, step: float, furthest: float,
     start: Float | None = None,
-) -> _IntervalEnd:  # fmt: skip
+) -> _IntervalEnd | BlendFit:  # fmt: skip
     """Return the end of an interval on one side of the best fit, at which chi-squared has risen by `rises`.
+
+    If a fit is better than the best one, it is returned instead.
 
     `refit` returns the best fit at a distance from the best one, from given or extrapolated starting parameters. `step`
     is the first guess of the distance, `furthest` that to the bound of the fit, and `start` the first starting
@@ -454,7 +407,7 @@ def _interval_end(
         step = min(step, furthest)
         fit = refit(step, start)
         if fit.chi2 - chi2 < -BETTER:
-            return _IntervalEnd(step, False, fit.theta, fit)
+            return fit
         root = float(np.sqrt(max(fit.chi2 - chi2, 0.0) / rises))
         if abs(root - 1.0) < CLOSE or (at_end and root < 1.0):
             return _IntervalEnd(step, at_end and root < 1.0 - CLOSE, fit.theta)
@@ -513,19 +466,18 @@ class SingleFlareFit:
         sums: NDArray[Any],
         start_s: Float,
         *,
-        peak_s: ArrayLike,
-        half_width_s: ArrayLike,
-        variance: Float | None = None,
-        curves: Float | None = None,
+        peak_s: Float,
+        half_width_s: Float,
+        variance: Float,
+        curves: Float | None,
     ) -> FittedFlares:
         """Fit one flare to each of several light curves: sums less their known mean, (n, n_frame, n_sum).
 
-        Starting points are the peak and half-width of, for example, the template that detected each flare. The variance
-        of the frames' sums is 1 by default; see `Search` for `curves`.
+        Starting points are the peak and half-width of the template that detected each flare, (n,). The variance is that
+        of the frames' sums; see `Search` for `curves`.
         """
-        n = len(sums)
-        peak, log_width = (np.array(np.broadcast_to(value, n), np.float64) for value in (peak_s, np.log(half_width_s)))
-        several = max(1, int(np.exp(log_width.min()) / self.bank.frame_s / FINE)) if n else 1
+        peak, log_width = peak_s, np.log(half_width_s)
+        several = max(1, int(np.exp(log_width.min()) / self.bank.frame_s / FINE))
         sums, start_s, variance, curves = self._averaged(several, sums, start_s, variance, curves)
         weight, level = self._windows(start_s, peak, np.exp(log_width), variance, curves)
         used = weight.any(axis=0)
@@ -598,15 +550,14 @@ class SingleFlareFit:
         return x, best / length, (2 * amplitude - best) * best / variance
 
     def _averaged(
-        self, several: int, sums: NDArray[Any], start_s: Float, variance: Float | None, curves: Float | None
-    ) -> tuple[NDArray[Any], Float, Float | None, Float | None]:
+        self, several: int, sums: NDArray[Any], start_s: Float, variance: Float, curves: Float | None
+    ) -> tuple[NDArray[Any], Float, Float, Float | None]:
         """Average groups of consecutive frames; incomplete groups at gaps are dropped."""
         if several == 1:
             return sums, start_s, variance, curves
         number = np.rint(start_s / self.bank.frame_s).astype(np.int64)
         _, first, count = np.unique(number // several, return_index=True, return_counts=True)
         rows = first[count == several][:, None] + np.arange(several)
-        variance = np.ones(start_s.size) if variance is None else variance
         mean = np.stack([values[rows].mean(axis=1) for values in sums])
         return (
             mean, start_s[rows[:, 0]], variance[rows].mean(axis=1) / several,
@@ -614,7 +565,7 @@ class SingleFlareFit:
         )  # fmt: skip
 
     def _windows(
-        self, start_s: Float, peak: Float, width: Float, variance: Float | None, curves: Float | None
+        self, start_s: Float, peak: Float, width: Float, variance: Float, curves: Float | None
     ) -> tuple[Float, Float]:
         """Return weights of frames, zero outside the windows, (n, n_frame), and baseline terms, (n, n_frame, p)."""
         n, frame_s = peak.size, self.bank.frame_s
@@ -624,7 +575,7 @@ class SingleFlareFit:
             lead, tail = self.bank.window(float(width[k]))
             since = (start_s - peak[k]) / frame_s
             inside = (since >= -lead - 1) & (since <= tail)
-            weight[k, inside] = 1.0 if variance is None else 1.0 / variance[inside]
+            weight[k, inside] = 1.0 / variance[inside]
             time = since / (lead + tail)
             rows = [time**power for power in self.bank.baseline.powers] + list([] if curves is None else curves)
             for j, row in enumerate(rows):

@@ -25,9 +25,8 @@ from numpy.typing import NDArray
 from mauvecl.flares.frames import STEADY, Components
 from mauvecl.flares.stare import select_frames
 from mauvecl.flares.stare_scene import Method, StaresRequest, method_for
-from mauvecl.noise.unknowns import NONE, Processes
+from mauvecl.noise.unknowns import Processes
 from mauvecl.schema.columns import Column
-from mauvecl.schema.errors import InputError
 from mauvecl.search.search import Search, subtract_known
 
 if TYPE_CHECKING:
@@ -154,10 +153,6 @@ class InjectionSite:
     def weights(self) -> Float:
         """Transposed filters in double precision, shape (n_frame, n_filter)."""
         return np.ascontiguousarray(self.filters.T, np.float64)
-
-    def within(self, first: int) -> InjectionSite:
-        """Return the site in the part of the stare that starts with frame `first`."""
-        return replace(self, first=self.first - first)
 
 
 def sites_of(survey: Survey, widths_s: Sequence[float], peak_s: float, response: Float) -> tuple[InjectionSite, ...]:
@@ -286,20 +281,13 @@ GLOW = 15.0
 class Injections:
     """Flares of one temperature and several half-widths in a stare."""
 
-    survey: Survey
-    flare: int  # index of the flare spectrum in the components
+    survey: Survey  # its components have the spectrum of the flares
     half_widths_s: tuple[float, ...]
     threshold: float
     seed: int
     positions: int  # number of peak times, stratified over the recorded frames
     draws: int  # realisations per position
-    processes: Processes = NONE  # additive ones require frames that are drawn by pixel
-
-    def __post_init__(self) -> None:
-        if not self.half_widths_s or not all(np.isfinite(w) and w > 0 for w in self.half_widths_s):
-            raise InputError.of("half_widths_s", list(self.half_widths_s), "times above 0")
-        if self.positions < 1 or not 1 <= self.draws <= NUMBERS:
-            raise InputError.of("draws", (self.positions, self.draws), f"a position and 1 to {NUMBERS} draws")
+    processes: Processes  # additive ones require frames that are drawn by pixel
 
     @cached_property
     def peaks_s(self) -> Float:
@@ -313,24 +301,21 @@ class Injections:
     @cached_property
     def response(self) -> Float:
         """Mean sums of a frame for a flare of unit amplitude, shape (n_sum,)."""
-        unit = np.zeros(len(STEADY) + self.survey.components.n_flares)
-        unit[: len(STEADY)] = 1.0
-        unit[len(STEADY) + self.flare] = 1.0
-        return self.survey.components.means(unit)
+        return self.survey.components.means(np.ones(len(STEADY) + 1))
 
     @property
     def saturates(self) -> float:
         """Amplitude at which the mean of a used pixel reaches saturation in a frame at the flare's peak."""
         components, light = self.survey.components, float(self.survey.stare.light.max())
-        flare = light * components.mean_dn[len(STEADY) + self.flare] * (components.weights != 0).any(axis=0)
+        flare = light * components.mean_dn[len(STEADY)] * (components.weights != 0).any(axis=0)
         room = components.quiet.highest_dn - components.quiet.mean_raw_dn
         return float(np.min(room[flare > 0] / flare[flare > 0], initial=np.inf))
 
     @cached_property
     def photons(self) -> Float:
         """Root of the covariance that a flare of unit amplitude adds to a frame's sums, shape (n_sum, n_sum)."""
-        with_it, without = np.zeros((2, len(STEADY) + self.survey.components.n_flares))
-        with_it[len(STEADY) + self.flare] = 1.0
+        with_it, without = np.zeros((2, len(STEADY) + 1))
+        with_it[len(STEADY)] = 1.0
         covariance = self.survey.components.covariance(with_it) - self.survey.components.covariance(without)
         values, vectors = np.linalg.eigh(covariance)
         return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
@@ -346,14 +331,10 @@ class Injections:
         """Method of drawing frames."""
         return method_for(self.quiescent, self.survey.stare, self.processes)
 
-    def sites(self, position: int) -> tuple[InjectionSite, ...]:
-        """Return the sites of all half-widths at a peak time."""
-        return sites_of(self.survey, self.half_widths_s, float(self.peaks_s[position]), self.response)
-
     def request(self, position: int, refit: Refit | None = None) -> StaresRequest:
         """Return the request for the critical amplitudes at a peak time and, with `refit`, fits of detected flares."""
         survey = self.survey
-        sites = self.sites(position)
+        sites = sites_of(survey, self.half_widths_s, float(self.peaks_s[position]), self.response)
         # Without templates, one frame is drawn, since requests cannot be empty.
         reached = [site.frames for site in sites if len(site.filters)] or [slice(0, 1)]
         first = min(part.start for part in reached)
@@ -361,7 +342,7 @@ class Injections:
         start = (1 + position) * NUMBERS
         stare = select_frames(survey.stare, window)
         injecting = CriticalAmplitudes(
-            tuple(site.within(first) for site in sites),
+            tuple(replace(site, first=site.first - first) for site in sites),
             self.threshold,
             survey.bank.directions,
             self.response,

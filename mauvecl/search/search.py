@@ -22,7 +22,7 @@ with flares have less weight (Huber 1964, doi 10.1214/aoms/1177703732), so that 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -43,7 +43,6 @@ if TYPE_CHECKING:
 
     from mauvecl.flares.frames import Components
     from mauvecl.flares.stare import Stare
-    from mauvecl.noise.unknowns import Changing
 
 Float = NDArray[np.float64]
 
@@ -51,17 +50,6 @@ Float = NDArray[np.float64]
 BATCH = 2**21
 #: Relative regularisation for curves that are degenerate within a window.
 RIDGE = 1e-11
-
-
-@dataclass(frozen=True, eq=False)
-class LargestValue:
-    """The largest value of each stare and its template; arrays of shape (n_stare,)."""
-
-    maximum: Float  # largest rho
-    peak_s: Float  # from the start of the stare
-    half_width_s: Float
-    temperature: NDArray[np.int64]  # row of the bank's directions
-    amplitude: Float  # of the template's peak, in standard deviations of a frame's sum
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,23 +108,23 @@ class Search:
         """Number of searched templates: half-widths, phases, onsets and temperatures."""
         return len(self.bank.directions) * int(sum(np.count_nonzero(row.per_amplitude) for row in self.grid))
 
-    def largest(self, sums: NDArray[Any]) -> LargestValue:
-        """Return the largest value of each stare and its template.
+    def largest(self, sums: NDArray[Any]) -> Float:
+        """Return the largest value of each stare, shape (n_stare,).
 
         The sums, (n_stare, n_frame, n_sum), have unit covariance in each frame without a flare.
         """
-        size = max(1, BATCH // (self._size * self.bank.directions.shape[1]))
-        parts = [self._largest(sums[i : i + size]) for i in range(0, len(sums), size)]
-        return LargestValue(
-            *(np.concatenate([getattr(p, name) for p in parts]) for name in LargestValue.__annotations__)
-        )
+        return largest_values(self.values, sums, self._size * self.bank.directions.shape[1])
 
     def values(self, sums: NDArray[Any]) -> Iterator[tuple[Row, NDArray[Any]]]:
         """Yield each row with rho, shape (n_stare, n_temperature, n_onset); minus infinity if not searched.
 
         Values have the precision of the sums. All stares are processed at once, which suits small numbers of stares.
         """
-        sums = self._checked(sums)
+        expected = (self.stare.n_frames, self.bank.directions.shape[1])
+        if sums.ndim != 3 or sums.shape[1:] != expected:
+            raise InputError(
+                f"sums must have the shape (n_stare, {expected[0]}, {expected[1]}), not {sums.shape}", key="sums"
+            )
         directions = self.bank.directions.astype(_precision(sums))
         for row, correlated in self.correlations(sums):
             tried = row.per_amplitude > 0
@@ -197,32 +185,6 @@ class Search:
     def variance(self) -> Float:
         """Variance of each frame's sums, shape (n_frame,)."""
         return np.asarray(1.0 / self._weight[self._at])
-
-    def _checked(self, sums: NDArray[Any]) -> NDArray[Any]:
-        expected = (self.stare.n_frames, self.bank.directions.shape[1])
-        if sums.ndim != 3 or sums.shape[1:] != expected:
-            raise InputError(
-                f"sums must have the shape (n_stare, {expected[0]}, {expected[1]}), not {sums.shape}", key="sums"
-            )
-        return sums
-
-    def _largest(self, sums: NDArray[Any]) -> LargestValue:
-        n = len(sums)
-        every = np.arange(n)
-        best = np.full(n, -np.inf)
-        peak, width, amplitude = (np.zeros(n) for _ in range(3))
-        temperature = np.zeros(n, np.int64)
-        for row, rho in self.values(sums):
-            which = rho.reshape(n, -1).argmax(axis=1)
-            value = rho.reshape(n, -1)[every, which]
-            better = value > best
-            direction, onset = np.divmod(which[better], rho.shape[2])
-            best[better] = value[better]
-            peak[better] = (self._first + row.peaks[onset] + row.template.phases[row.phase]) * self.bank.frame_s
-            width[better] = row.template.half_width_s
-            temperature[better] = direction
-            amplitude[better] = value[better] / row.per_amplitude[onset]
-        return LargestValue(best, peak, width, temperature, amplitude)
 
     def _spectra(self, sums: NDArray[Any]) -> list[NDArray[Any]]:
         """Return transforms of the weighted sums times each series, zero in gaps, (n_stare, n_sum, n_frequency)."""
@@ -294,6 +256,19 @@ class Search:
             yield Row(template, phase, peaks, np.sqrt(np.where(tried, left, 0.0)), project)
 
 
+def largest_values(
+    values: Callable[[NDArray[Any]], Iterator[tuple[Any, NDArray[Any]]]], sums: NDArray[Any], size: int
+) -> Float:
+    """Return the largest of the values that a search yields for each stare of `size` values, shape (n_stare,)."""
+    batch = max(1, BATCH // size)
+    best = np.full(len(sums), -np.inf)
+    for first in range(0, len(sums), batch):
+        part = slice(first, first + batch)
+        for _, rho in values(sums[part]):
+            best[part] = np.maximum(best[part], rho.max(axis=(1, 2)))
+    return best
+
+
 def _precision(sums: NDArray[Any]) -> type[np.floating[Any]]:
     """Return the type of computations: double precision for sums in double precision, else single."""
     return np.float64 if sums.dtype == np.float64 else np.float32
@@ -326,12 +301,6 @@ class Trend:
         """Amplitudes of `REACH` standard deviations, together and each alone, with both signs, (n, n_unknown)."""
         rows = np.vstack([np.eye(len(self.of)), np.ones(len(self.of))])
         return np.asarray(REACH * np.vstack([rows, -rows]))
-
-    @cached_property
-    def is_nonlinear(self) -> bool:
-        """True if the effect of unknowns beyond first order is significant."""
-        nonlinear = self.nonlinear_effect(self.extremes)
-        return bool((np.sum(nonlinear**2 / self.variance[:, None], axis=(1, 2)) > LEAST**2).any())
 
     def effect(self, amplitudes: Float) -> Float:
         """Return the effect of unknowns, (n_stare, n_unknown) in standard deviations, on the sums.
@@ -447,10 +416,9 @@ class Survey:
         return self.components.means(self.coefficients)
 
     @cached_property
-    def directions(self) -> dict[Changing, Float]:
+    def directions(self) -> dict[str, Float]:
         """Derivatives of the mean sums by star, light, sky and temperature, shape (n_frame, n_sum) each."""
-        directions: dict[Any, Float] = self.components.directions(self.coefficients)
-        return directions
+        return self.components.directions(self.coefficients)
 
     def covariance(self) -> Float:
         """Return the covariance of each frame's sums without a flare, shape (n_frame, n_sum, n_sum)."""
@@ -497,10 +465,13 @@ class Survey:
         of = tuple(unknown.of for unknown in self.stare.unknowns)
         return Trend(self.stare.numbers, self.stare.frame_s, self.variance, of, curves, known, slope)
 
-    @property
+    @cached_property
     def trend(self) -> Trend | None:
         """Effect of the stare's unknowns if it is significant beyond first order, else None."""
-        return self.unknowns if self.unknowns is not None and self.unknowns.is_nonlinear else None
+        if (known := self.unknowns) is None:
+            return None
+        power = np.sum(known.nonlinear_effect(known.extremes) ** 2 / known.variance[:, None], axis=(1, 2))
+        return known if (power > LEAST**2).any() else None
 
     def unsubtracted(self, amplitudes: Float) -> Float:
         """Return the `effect` of unknowns on the sums that is not subtracted before the search."""
@@ -547,7 +518,7 @@ class Largest:
 
     def __call__(self, values: NDArray[np.float32], first: int) -> dict[str, NDArray[Any]]:
         """Return the largest values as ``maximum``, shape (n_stare,)."""
-        return {"maximum": self.search.largest(subtract_known(values, self.known, self.trend)).maximum}
+        return {"maximum": self.search.largest(subtract_known(values, self.known, self.trend))}
 
 
 def subtract_known(sums: NDArray[Any], known: NDArray[Any], trend: Trend | None) -> NDArray[np.float32]:

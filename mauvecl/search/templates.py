@@ -112,15 +112,14 @@ class Bank:
         """Templates of all half-widths."""
         return tuple(self.template(w) for w in self.half_widths_s)
 
-    def template(self, half_width_s: float, phases: Sequence[float] | None = None) -> Template:
-        """Compute the template of a half-width, by default with one or two phases, depending on the half-width."""
+    def template(self, half_width_s: float) -> Template:
+        """Compute the template of a half-width, with one or two phases, depending on the half-width."""
         frames = half_width_s / self.frame_s
-        if phases is None:
-            phases = (0.25, 0.75) if frames < SUB_FRAME else (0.5,)
+        phases = (0.25, 0.75) if frames < SUB_FRAME else (0.5,)
         lead, tail = self.window(half_width_s)
         edges = np.arange(-lead, tail + 2) * self.frame_s
         shapes = np.array([self.shape.mean_over(edges, p * self.frame_s, half_width_s) for p in phases])
-        return Template(half_width_s, -lead, tuple(phases), shapes, max(1, int(frames / ONSETS)))
+        return Template(half_width_s, -lead, phases, shapes, max(1, int(frames / ONSETS)))
 
     def window(self, half_width_s: float) -> tuple[int, int]:
         """Return the number of frames of the window before and after the peak."""

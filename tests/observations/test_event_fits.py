@@ -13,17 +13,16 @@ from scenes import flare
 from scipy import stats
 
 from mauvecl import SHAPES, Frames, Study, analyse
-from mauvecl.observations import event_windows, events
+from mauvecl.observations import event_fits, events
 from mauvecl.observations import level as levels
 from mauvecl.observations import process as processes
 from mauvecl.observations import search as searches
 from mauvecl.observations.detection import detect_events
-from mauvecl.observations.event_fits import Mixture
 
 
 @pytest.mark.parametrize("mean", [-40.0, -5.0, 0.0, 3.0, 1e4])
 def test_quantiles_are_those_of_a_truncated_normal_distribution(mean: float) -> None:
-    mixture = Mixture(np.log([0.2, 0.8]), np.full(2, mean), np.full(2, 2.0))
+    mixture = event_fits.Mixture(np.log([0.2, 0.8]), np.full(2, mean), np.full(2, 2.0))
     expected = stats.truncnorm(-mean / 2, np.inf, mean, 2.0)
     for probability in (0.025, 0.16, 0.5, 0.84, 0.975):
         assert mixture.quantile(probability) == pytest.approx(float(expected.ppf(probability)), rel=1e-5)
@@ -33,7 +32,7 @@ def test_quantiles_are_those_of_a_truncated_normal_distribution(mean: float) -> 
 def test_quantiles_of_many_parts_are_those_of_their_sum(middle: float) -> None:
     rng = np.random.default_rng(2)
     log_weight, mean, log_sd = rng.normal([0.0, middle, 0.0], [1.0, 2.0, 0.4], (50_000, 3)).T
-    mixture, weight = Mixture(log_weight, mean, np.exp(log_sd)), np.exp(log_weight)
+    mixture, weight = event_fits.Mixture(log_weight, mean, np.exp(log_sd)), np.exp(log_weight)
     shares = (0.025, 0.16, 0.5, 0.84, 0.975)
     none, *above = (weight @ stats.norm.sf(q, mean, np.exp(log_sd)) for q in (0.0, *map(mixture.quantile, shares)))
     assert np.array(above) / none == pytest.approx(1 - np.array(shares), abs=2e-5)
@@ -86,8 +85,8 @@ class Sizes:
 
 def test_general_family_has_the_same_bits_in_each_process() -> None:
     def weights() -> bytes:
-        event_windows.Family.general.cache_clear()
-        return event_windows.Family.general().weights.tobytes()
+        event_fits.Family.general.cache_clear()
+        return event_fits.Family.general().weights.tobytes()
 
     # Weights that depend on ten points in a random order repeat once in thousands of times.
     assert weights() == weights() == weights()
@@ -98,7 +97,7 @@ def test_work_of_an_event_does_not_grow_with_the_light_curve(
     model: processes.Process, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sizes = Sizes(monkeypatch)
-    sizes.watch(event_windows, "_bins", 0)
+    sizes.watch(event_fits, "_bins", 0)
     sizes.watch(processes.Process, "covariance", 1)
     sizes.watch(processes.Process, "times", 1)
     sizes.watch(processes.Process, "at", 1)
@@ -112,7 +111,7 @@ def test_work_of_an_event_does_not_grow_with_the_light_curve(
         work.append(sizes.taken())
     assert work[0]
     assert work[0] == work[1]
-    assert max(size for name, size in work[0] if name != "at") <= 2 * event_windows.WINDOW_FRAMES + 200
+    assert max(size for name, size in work[0] if name != "at") <= 2 * event_fits.WINDOW_FRAMES + 200
     for name in ("summed_s", "summed_error_s", "fitted_s", "low_s", "high_s"):
         assert getattr(measured[1], name) == pytest.approx(getattr(measured[0], name), rel=1e-4)
 
@@ -151,7 +150,7 @@ def test_level_norms_and_covariances_are_those_of_the_matrices(term: processes.P
     inverse = np.linalg.inv(between[np.ix_(quiet, quiet)] + np.diag(noise[quiet]))
     mean = inverse.sum(axis=0) @ values[quiet] / inverse.sum()
     expected = mean + between[:, quiet] @ inverse @ (values[quiet] - mean)
-    found = levels.process_level(model, time, values, variance, quiet)
+    found = levels.LevelGiven(model, time, variance, quiet).of(values)
     np.testing.assert_allclose(found, expected, rtol=1e-8)
     weights = np.where(np.arange(time.size) % 90 < 20, rng.random(time.size), 0.0)
     np.testing.assert_allclose(model.times(time, weights), between @ weights, rtol=1e-9)
