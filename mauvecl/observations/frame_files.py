@@ -298,7 +298,7 @@ class Quantities:
         if 32 * flux.n_rows > (most := limit_bytes("MAUVECL_LARGEST_CONTENT_MIB")):
             raise InputError(
                 f"{file.what} must have at most {most // 32} rows of pixels, but has {flux.n_rows}; "
-                f"MAUVECL_LARGEST_CONTENT_MIB sets the limit",
+                "MAUVECL_LARGEST_CONTENT_MIB sets the limit",
                 key="MAUVECL_LARGEST_CONTENT_MIB",
             )
         return one._of_frames(nm, file.what)
@@ -388,14 +388,14 @@ def _number_of_rows(file: TableFile, found: Quantities) -> int:
     single = found.time if found.wavelength is not None else (*found.time, found.flux)
     if odd := next((one for one in single if len(one.shape) == 2 and one.shape[1] > 1), None):
         raise InputError(
-            f"{what}: {odd.name!r} holds {odd.shape[1]} values in each row; use one, or a mapping that names wavelengths",
+            f"{what}: {odd.name!r} holds {odd.shape[1]} values in each row; give one, or name wavelengths in a mapping",
             key=odd.name,
         )
     if len(found.flux.shape) > 2:
         pixels = " x ".join(map(str, found.flux.shape[1:]))
         raise InputError(
             f"{what}: {found.flux.name!r} holds images of {pixels} pixels, as target pixel files do; "
-            f"give a light curve, such as lightkurve's `to_lightcurve` makes",
+            "give a light curve, such as lightkurve's `to_lightcurve` makes",
             key="flux",
         )
     return n
