@@ -250,7 +250,7 @@ def serve(
         serve(address, number, show=show, allow_origin=allow_origin or ())
     except OSError as error:
         raise InputError(
-            f"port {port} of {shortened(address)} cannot be used ({error.strerror})", "another: --port", key="port"
+            f"port {port} of {shortened(address)} cannot be used ({error.strerror}); give another --port", key="port"
         ) from error
 
 

@@ -216,7 +216,7 @@ def realise(session: Session) -> None:
     place = session.output or Path("mauvecl-frames.zarr")
     one_file = place.suffix in ENDINGS
     if not one_file and place.suffix not in ("", ".zarr"):
-        raise InputError(f"--output {str(place)!r}", f"a name ending in .zarr, {', '.join(ENDINGS)}", key="output")
+        raise InputError.of("output", str(place), f"a name ending in .zarr, {', '.join(ENDINGS)}")
     folder = bulk.unfinished(place) if one_file else place
     question_room(Store(folder, session.study), insist=session.insist)
     with (
@@ -293,9 +293,8 @@ def verify(
     if is_answer(store):
         if repair or redraw or rows is not None:
             raise InputError(
-                f"{str(store)!r} is the folder of an answer",
-                "no --repair, --redraw or --rows, which are for stores: the same command with "
-                "--restart writes the answer again",
+                f"{str(store)!r} is the folder of an answer, but --repair, --redraw and --rows are for stores; "
+                "give the command of the answer with --restart to write it again",
                 key="store",
             )
         faults: Sequence[Any] = verify_answer(store)
@@ -354,7 +353,7 @@ def _rows_of(text: str | None) -> tuple[int, int] | None:
     try:
         return int(first), int(stop)
     except ValueError as error:
-        raise InputError(f"--rows {text!r}", "a range such as 1000:2000", key="rows") from error
+        raise InputError.of("rows", text, "a range such as 1000:2000") from error
 
 
 @command_of(VERBS["limit"])

@@ -92,7 +92,7 @@ def _run(app: typer.Typer) -> int:
     except InputError as error:
         return _say(name_flag(error), BAD_INPUT)
     except MemoryError:
-        return _say("the memory does not suffice for this question, expected a smaller one or more of it", BAD_INPUT)
+        return _say("the memory does not suffice for this question; try a smaller one or use more memory", BAD_INPUT)
     except OSError as error:
         return _failed_call(error)
     except Exception as error:
@@ -143,8 +143,8 @@ def _failed_call(error: OSError) -> int:
     if error.filename is not None:
         name = repr(error.filename if isinstance(error.filename, int) else os.fsdecode(error.filename))
     return _say(
-        f"{printable(name, 200)} cannot be used ({error.strerror or error}), "
-        "expected a place that can; what was written before is kept",
+        f"{printable(name, 200)} cannot be used ({error.strerror or error}); "
+        "give another place (what was written before is kept)",
         BAD_INPUT,
     )
 
@@ -181,7 +181,7 @@ def _flushed(code: int) -> int:
 
 def _not_written(error: OSError) -> int:
     return _say(
-        f"standard output cannot be written ({error.strerror}), expected one with room; files are kept", OUTPUT_FULL
+        f"standard output cannot be written ({error.strerror}); use one with room (files are kept)", OUTPUT_FULL
     )
 
 

@@ -79,8 +79,8 @@ def question_time(study: Study, *, insist: bool) -> None:
     spectra = count * len(study.star) * study.sweep.size * (1 + len(study.flare.amplitudes))
     if spectra >= MOST_SPECTRA and not insist:
         raise InputError(
-            f"realisations = {count:.3g} take {spectra / MOST_SPECTRA:.2g} years on a hundred cores",
-            "fewer; --insist starts them anyway",
+            f"realisations = {count:.3g} take {spectra / MOST_SPECTRA:.2g} years on a hundred cores; give fewer, "
+            "or --insist to start anyway",
             key="realisations",
         )
 
@@ -94,9 +94,8 @@ def question_room(store: Store, *, insist: bool) -> None:
     if store.n_bytes > free:
         rows = free // (store.n_bytes // store.rows)
         raise InputError(
-            f"realisations = {store.rows} take {_size(store.n_bytes)} and {str(store.path)!r} has room "
-            f"for {_size(free)}",
-            f"at most {rows} of them, or another place; --insist starts it anyway",
+            f"realisations = {store.rows} need {_size(store.n_bytes)}, but {str(store.path)!r} has room for "
+            f"{_size(free)}; give at most {rows} or another place, or --insist to start anyway",
             key="realisations",
         )
 

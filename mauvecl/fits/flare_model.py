@@ -273,7 +273,7 @@ class FlareModel:
             None,
         )
         if ratio is None and jump != 1.0:
-            raise InputError(f"jump = {jump:g} of a model without a Balmer continuum", "1", key="jump")
+            raise InputError.of("jump", jump, "1 for a model without a Balmer continuum")
         own = [] if ratio is None else [(jump - 1.0) * amplitude / float(ratio(np.log(temperature_k)))]
         given = np.array([amplitude, *own, *lines], np.float64)
         return self._checked(temperature_k, given)
@@ -284,9 +284,7 @@ class FlareModel:
             raise InputError.of("temperature_k", temperature_k, f"between {low:g} and {high:g}")
         linear = np.asarray(amplitudes, np.float64)
         if linear.shape != (len(self.linear),) or not np.isfinite(linear).all():
-            raise InputError(
-                f"amplitudes of the shape {linear.shape}", f"finite ones of {', '.join(self.linear)}", key="amplitudes"
-            )
+            raise InputError.of("amplitudes", amplitudes, f"finite numbers, one for each of {', '.join(self.linear)}")
         return linear
 
 
@@ -310,7 +308,7 @@ def _flux_ratios(star: Source, band: str, kelvin: Float) -> Float:
     nm = star.wavelength_nm
     light = photons(nm, star.flux_flam, band)
     if not light > 0.0:
-        raise InputError(f"the star has no light in the band {band}", "a star with light in the band", key="band")
+        raise InputError(f"the star must have light in the band {band}, but has none", key="band")
     return np.array([light / photons(nm, blackbody(nm, float(k)), band) for k in kelvin])
 
 
@@ -617,14 +615,12 @@ def spanning_weights(
     kept, whole = np.diag(gram), np.einsum("tp,tp->t", plain, spectra)
     if not (whole > 0.0).all():
         raise InputError(
-            "a component of the flare has no light in the pixels that neither saturate nor are left out",
-            "a model whose components have light there",
-            key="model",
+            "each component of a flare must have light in pixels that neither saturate nor are left out", key="model"
         )
     if not (kept > LEAST_KEPT * whole).all():
         unknown = join_names(nuisances.names) if nuisances else "nothing"
         raise InputError(
-            f"the light of a flare cannot be distinguished from {unknown}", "fewer unknowns", key="nuisances"
+            f"the light of a flare cannot be distinguished from {unknown}; give fewer unknowns", key="nuisances"
         )
     length = np.sqrt(kept)
     values, vectors = np.linalg.eigh(gram / np.outer(length, length))
@@ -717,9 +713,11 @@ def usable_variance(
 def check_enough(quiet: Expectation, used: NDArray[np.bool_], parameters: int) -> None:
     """Raise InputError unless more pixels are used than parameters are fitted."""
     count = int(used.sum())
+    if not count:
+        raise InputError(f"every pixel of {quiet.name} saturates or is left out, but some must count", key="skipped_nm")
     if count <= parameters:
-        fault = f"{count} of {used.size} pixels of {quiet.name} can be used, since others saturate or are left out"
-        expected = f"more than the {parameters} parameters of the fit"
-        if not count:
-            fault, expected = f"every pixel of {quiet.name} saturates or is left out", "some that count"
-        raise InputError(fault, expected, key="skipped_nm")
+        raise InputError(
+            f"the {parameters} parameters of the fit need more pixels of {quiet.name} than the {count} of {used.size} "
+            "that neither saturate nor are left out",
+            key="skipped_nm",
+        )

@@ -282,9 +282,11 @@ class _Problem:
         """Subtract the mean without a flare from exposures; raises InputError as `fit` does."""
         raw = np.atleast_2d(np.asarray(frames))
         if raw.ndim != 2 or not len(raw) or raw.shape[1] != quiet.wavelength_nm.size:
-            raise InputError(f"frames of the shape {raw.shape}", f"(n, {quiet.wavelength_nm.size})", key="frames")
+            raise InputError(
+                f"frames must have the shape (n, {quiet.wavelength_nm.size}), not {raw.shape}", key="frames"
+            )
         if raw.dtype.kind not in "iuf" or not np.isfinite(raw).all():
-            raise InputError("frames hold undefined values", "finite numbers", key="frames")
+            raise InputError("frames must hold finite numbers, but some are undefined", key="frames")
         if not levels:
             raise InputError.of("levels", levels, "at least one probability")
         mean = quiet.recorded_dn if nuisances is None else quiet.recorded_dn + nuisances.mean_dn
@@ -547,7 +549,7 @@ def fit_two_temperatures(
         For a model with a Balmer jump, and as for `fit`.
     """
     if any(derived.ratio is not None for derived in model.derived):
-        raise InputError("a model with a Balmer jump", "blackbodies, with lines or without", key="model")
+        raise InputError("the model must have blackbodies, with or without lines, and no Balmer jump", key="model")
     single = fit(frames, expectation, model, nuisances, levels=levels, skipped_nm=skipped_nm)
     problem = _Problem.of(frames, expectation, model, nuisances, levels, skipped_nm)
     allowed = [float(scipy.stats.chi2.isf(1 - p, 1)) for p in levels]

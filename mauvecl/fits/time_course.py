@@ -191,15 +191,15 @@ def checked_frames(frames: ArrayLike, quiet: Expectation, stare: Stare | None) -
     """Return raw frames of a stare and the stare; raises InputError unless they and the expectation agree."""
     raw = np.asarray(frames, np.float64)
     if raw.ndim != 2:
-        raise InputError(f"frames of the shape {raw.shape}", "two dimensions: frames and pixels", key="frames")
+        raise InputError(f"frames must have two dimensions, frames and pixels, not the shape {raw.shape}", key="frames")
     if stare is None:
         here = quiet.conditions["temperature_c"]
         stare = Stare.of(max(len(raw), 1) * quiet.frame_s, frame_s=quiet.frame_s, temperature_c=here)
     n_pixel = quiet.wavelength_nm.size
     if raw.shape != (stare.n_frames, n_pixel):
-        raise InputError(f"frames of the shape {raw.shape}", f"{(stare.n_frames, n_pixel)}", key="frames")
+        raise InputError(f"frames must have the shape {(stare.n_frames, n_pixel)}, not {raw.shape}", key="frames")
     if not np.isfinite(raw).all():
-        raise InputError("frames hold undefined values", "finite numbers", key="frames")
+        raise InputError("frames must hold finite numbers, but some are undefined", key="frames")
     if quiet.n_frames != 1:
         raise InputError.of("n_frames", quiet.n_frames, "one frame of the quiescent star")
     return raw, stare
@@ -511,7 +511,7 @@ def fit_cooling(
         every pixel is near saturation in a frame.
     """
     if len(model.linear) > 1:
-        raise InputError(f"a model of {', '.join(model.linear)}", "a blackbody alone", key="model")
+        raise InputError(f"the model must be a blackbody alone, but consists of {', '.join(model.linear)}", key="model")
     raw, stare = checked_frames(frames, quiet, stare)
     data = _data(raw, quiet, model, nuisances, stare, shape_of(shape), skipped_nm)
     fit = _BestFit.of(data, _limits(model, stare), peak_s, half_width_s, cooling=cooling)

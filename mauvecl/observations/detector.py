@@ -48,32 +48,33 @@ class CalibrationFrames:
         off = float(np.abs(nm - nominal.wavelength_nm).max())
         if off > nominal.resolution_element_nm:
             raise InputError(
-                f"{frames.name}: the wavelengths are {off:.3g} nm from those of {nominal.name}",
-                f"at most {nominal.resolution_element_nm:g} nm", key="wavelength",
-            )  # fmt: skip
+                f"{frames.name}: the wavelengths must be within {nominal.resolution_element_nm:g} nm of those of "
+                f"{nominal.name}, but differ by {off:.3g} nm",
+                key="wavelength",
+            )
         unit = frames.unit.strip().casefold()
         if unit not in ("dn", "adu", "ct", "count"):
             raise InputError.of("unit", frames.unit or "none", "that of raw DN, with bias and dark", where=frames.name)
         if frames.net:
             raise InputError(
-                f"{frames.name}: dark current and bias are subtracted",
-                "raw DN: read_frames(..., raw=True)", key="frames",
-            )  # fmt: skip
+                f"{frames.name}: dark current and bias are subtracted; use read_frames(..., raw=True)", key="frames"
+            )
         temperatures = frames.temperature_c
         if temperatures is None:
             if temperature_c is None:
-                raise InputError(f"{frames.name}: the temperature of the detector is not stated",
-                                 "a column of temperatures, or temperature_c", key="temperature_c")  # fmt: skip
+                raise InputError(
+                    f"{frames.name} needs a column of detector temperatures, or temperature_c", key="temperature_c"
+                )
             temperatures = np.full(frames.n_frames, temperature_c)
         good = (frames.faults == 0) & np.isfinite(temperatures)
         lengths = np.unique(frames.exposure_s[good].round(6))
         if good.sum() < 3 or lengths.size != 1:
-            raise InputError(f"{frames.name} has {int(good.sum())} good frames of {lengths.size} exposure times",
-                             "at least 3 of one exposure time", key="frames")  # fmt: skip
-        if (frames.flux[good] == frames.flux[good][0]).all():
             raise InputError(
-                f"{frames.name}: all frames are the same", "frames that differ by their noise", key="frames"
+                f"{frames.name} needs at least 3 good frames of one exposure time, not {good.sum()} of {lengths.size}",
+                key="frames",
             )
+        if (frames.flux[good] == frames.flux[good][0]).all():
+            raise InputError(f"{frames.name}: frames must differ by their noise, but all are the same", key="frames")
         return cls(frames.name, frames.flux[good], float(lengths[0]), temperatures[good], star)
 
     @property

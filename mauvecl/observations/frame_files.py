@@ -231,8 +231,9 @@ def _open_frames(
             with open_store(path, name, what) as store:
                 yield store, mapping or store.mapping
         elif mapping is None:
-            expected = "a mapping that says where the quantities of its files are"
-            raise InputError(f"{what} is not a store of spectra", expected, key="mapping")
+            raise InputError(
+                f"{what} is not a store of spectra; give a mapping that says where its quantities are", key="mapping"
+            )
         else:
             open_one = partial(_opened, name=name, check=check)
             yield FolderFile(path, mapping, what, lambda one: open_one(one, f"file {one.name!r}")), mapping
@@ -291,8 +292,8 @@ class Quantities:
             return one
         if 32 * flux.n_rows > (most := limit_bytes("MAUVECL_LARGEST_CONTENT_MIB")):
             raise InputError(
-                f"{file.what} has {flux.n_rows} rows of pixels",
-                f"at most {most // 32}; MAUVECL_LARGEST_CONTENT_MIB sets the limit",
+                f"{file.what} must have at most {most // 32} rows of pixels, but has {flux.n_rows}; "
+                "MAUVECL_LARGEST_CONTENT_MIB sets the limit",
                 key="MAUVECL_LARGEST_CONTENT_MIB",
             )
         return one._of_frames(nm, file.what)
@@ -310,10 +311,11 @@ class Quantities:
         np.add.at(counts, (frame, pixel), 1)
         if (counts != 1).any():
             row, column = np.argwhere(counts != 1)[0]
-            fault = (
-                f"{what}: the frame at {frames[row]} has {counts[row, column]} rows of wavelength {pixels[column]:g}"
+            raise InputError(
+                f"{what}: the frame at {frames[row]} must have one row of wavelength {pixels[column]:g}, "
+                f"not {counts[row, column]}",
+                key="wavelength",
             )
-            raise InputError(fault, "one row for each pixel of each frame", key="wavelength")
         place = np.empty(counts.shape, np.int64)
         place[frame, pixel] = np.arange(key.size)
 
@@ -323,8 +325,7 @@ class Quantities:
         def single(values: Values) -> Values:
             rows = _keys(values)[place]
             if (rows != rows[:, :1]).any():
-                fault = f"{what}: {values.name!r} changes within a frame"
-                raise InputError(fault, "one value for each frame", key=values.name)
+                raise InputError(f"{what}: {values.name!r} must not change within a frame", key=values.name)
             return Values.of(values.name, rows[:, 0], values.unit, what)
 
         error, quality = (one and spectra(one) for one in (self.error, self.quality))
@@ -351,8 +352,7 @@ def _wavelength(file: TableFile, mapping: FrameMapping) -> Values | None:
         with _opened(path, f"file {path.name!r}", None) as other:
             if mapping.wavelength is None and len(other.names) != 1:
                 raise InputError(
-                    f"{other.what}: no column of wavelengths is named",
-                    f"one of {', '.join(other.names)}",
+                    f"{other.what}: no column of wavelengths is named; give one of {', '.join(other.names)}",
                     key="wavelength",
                 )
             found = other.find(mapping.wavelength or other.names[0])
@@ -370,23 +370,29 @@ def _number_of_rows(file: TableFile, found: Quantities) -> int:
     """Return the number of frames before any is read; raise InputError unless all columns have as many."""
     what, n = file.what, found.time[0].n_rows
     if n == 0:
-        raise InputError(f"{what} has no rows", "a row for each frame", key="frames")
+        raise InputError(f"{what} must have a row for each frame, but has no rows", key="frames")
     if n > MAX_FRAMES:
-        raise InputError(f"{what} has {n} rows", f"at most {MAX_FRAMES} frames", key="frames")
+        raise InputError(f"{what} must have at most {MAX_FRAMES} frames, but has {n}", key="frames")
     if found.wavelength is None:
         _check_one_source(file)
     for values in (*found.time, found.flux, found.error, found.quality, found.exposure, found.temperature):
         if values is not None and values.n_rows != n:
-            raise InputError(f"{what}: {values.name!r} has {values.n_rows} rows", f"{n} as the times have",
-                             key=values.name)  # fmt: skip
+            raise InputError(
+                f"{what}: {values.name!r} must have {n} rows, as the times do, but has {values.n_rows}", key=values.name
+            )
     single = found.time if found.wavelength is not None else (*found.time, found.flux)
     if odd := next((one for one in single if len(one.shape) == 2 and one.shape[1] > 1), None):
-        expected = "one, or pixels with a wavelength, which a mapping names"
-        raise InputError(f"{what}: {odd.name!r} holds {odd.shape[1]} values in each row", expected, key=odd.name)
+        raise InputError(
+            f"{what}: {odd.name!r} holds {odd.shape[1]} values in each row; give one, or name wavelengths in a mapping",
+            key=odd.name,
+        )
     if len(found.flux.shape) > 2:
         pixels = " x ".join(map(str, found.flux.shape[1:]))
-        raise InputError(f"{what}: {found.flux.name!r} holds images of {pixels} pixels, as target pixel files do",
-                         "a light curve, such as lightkurve's `to_lightcurve` makes", key="flux")  # fmt: skip
+        raise InputError(
+            f"{what}: {found.flux.name!r} holds images of {pixels} pixels, as target pixel files do; "
+            "give a light curve, such as lightkurve's `to_lightcurve` makes",
+            key="flux",
+        )
     return n
 
 
@@ -443,7 +449,7 @@ def _of_level(light: Float, sd: Float | None, unit: str) -> tuple[Float, Float |
 def _left_out(what: str, kept: NDArray[np.bool_]) -> tuple[str, ...]:
     """Return the remark on rows without a time; raise InputError if no row has one."""
     if not kept.any():
-        raise InputError(f"{what}: no row has a time", "times", key="time")
+        raise InputError(f"{what}: at least one row must have a time, but none has", key="time")
     n_left = int(np.count_nonzero(~kept))
     words = "1 row has no time and was" if n_left == 1 else f"{n_left} rows have no time and were"
     return (f"{what}: {words} left out",) if n_left else ()
@@ -532,8 +538,11 @@ def _check_one_source(file: TableFile) -> None:
         held = sorted({cell for cell in cells if not is_missing(cell)})
         # The filter of ATLAS is called F, as is the light of others.
         if len(held) > 1 and (key_of(name) != "f" or all(map(str.isalpha, held))):
-            fault = f"{file.what} has rows of {len(held)} different {name!r} ({shortened(', '.join(held), 80)})"
-            raise InputError(fault, "the light of one star in one band: divide the table", key="flux")
+            raise InputError(
+                f"{file.what} must hold the light of one star in one band, but has rows of {len(held)} different "
+                f"{name!r} ({shortened(', '.join(held), 80)}); divide the table",
+                key="flux",
+            )
 
 
 def _masked(quality: Values | None, bits: QualityBits) -> Values | None:
@@ -563,19 +572,25 @@ def _light(found: Quantities, mapping: FrameMapping) -> tuple[str, Values, Value
     if error is None:
         return unit, found.flux, None, remarks
     if error.shape != found.flux.shape:
-        raise InputError(f"{error.what}: {error.name!r} has the shape {error.shape}",
-                         f"that of the flux, {found.flux.shape}", key="error")  # fmt: skip
+        raise InputError(
+            f"{error.what}: {error.name!r} must have the shape of the flux, {found.flux.shape}, not {error.shape}",
+            key="error",
+        )
     own = error.unit or unit_in_name(error.name)
     if own and not unit and own.lower() in PARTS_OF_LEVEL:
-        raise InputError(f"{error.what}: {error.name!r} is in {own}, and {found.flux.name!r} is not",
-                         "errors in the unit of the light, or flux_unit = '1' in a mapping if its level is 1",
-                         key="error")  # fmt: skip
+        raise InputError(
+            f"{error.what}: {error.name!r} is in {own}, and {found.flux.name!r} is not; give errors in the unit of "
+            "the light, or flux_unit = '1' in a mapping if its level is 1",
+            key="error",
+        )
     if own and unit and own not in (unit, stated):
         try:
             factor = float(unit_in(own).to(unit_in(unit)))
         except (ValueError, TypeError) as fault:
-            raise InputError(f"{error.what}: {error.name!r} is in {own} and {found.flux.name!r} in {unit}",
-                             "units of the same kind", key="error") from fault  # fmt: skip
+            raise InputError(
+                f"{error.what}: {error.name!r} must have a unit like that of {found.flux.name!r}, {unit}, not {own}",
+                key="error",
+            ) from fault
         error = error.mapped(lambda values: values * factor, unit)
     return unit, found.flux, error, remarks
 
@@ -589,8 +604,9 @@ def _vacuum_nm(wavelength: Values, given: str | None, file: TableFile) -> Float:
     if len(nm.shape) == 2:
         for part in nm.pieces:
             if not np.allclose(nm.rows(part.start, part.stop), rows, rtol=1e-9, atol=0.0):
-                raise InputError(f"{wavelength.what}: the wavelengths change from frame to frame",
-                                 "the same in every frame", key="wavelength")  # fmt: skip
+                raise InputError(
+                    f"{wavelength.what}: the wavelengths must be the same in every frame, but change", key="wavelength"
+                )
     found, _ = vacuum_wavelengths(rows, wavelength.name, "", medium or in_unit, partial(medium_of, file.header))
     return found
 

@@ -64,9 +64,10 @@ class FrameModel:
         exposure = float(np.median(frames.exposure_s))
         if np.ptp(frames.exposure_s) > SAME_EXPOSURE * exposure:
             raise InputError(
-                f"the exposure times range from {frames.exposure_s.min():g} to {frames.exposure_s.max():g} s",
-                "one for all frames", key="exposure_s",
-            )  # fmt: skip
+                f"the exposure times of all frames must be the same, but range from {frames.exposure_s.min():g} to "
+                f"{frames.exposure_s.max():g} s",
+                key="exposure_s",
+            )
         pixels = _matched(frames.wavelength_nm, quiet.wavelength_nm)
         elements = _matched(frames.wavelength_nm, quiet.element_wavelength_nm)
         if pixels is not None:
@@ -75,10 +76,11 @@ class FrameModel:
             bins = (~quiet.saturated * (quiet.element == elements[:, None])).astype(np.float64)
         else:
             raise InputError(
-                f"the spectra have {frames.wavelength_nm.size} wavelengths from {frames.wavelength_nm[0]:.1f} nm",
-                f"the {quiet.wavelength_nm.size} pixels or {quiet.element_wavelength_nm.size} resolution elements of "
-                f"{quiet.instrument}", key="wavelength_nm",
-            )  # fmt: skip
+                f"the spectra must have the {quiet.wavelength_nm.size} pixels or {quiet.element_wavelength_nm.size} "
+                f"resolution elements of {quiet.instrument}, but have {frames.wavelength_nm.size} wavelengths from "
+                f"{frames.wavelength_nm[0]:.1f} nm",
+                key="wavelength_nm",
+            )
         if flux is not None:
             # A flux density is that of a flat spectrum with as many DN in all pixels of the value.
             per_flux = np.divide(1.0, flux_per_dn, out=np.zeros_like(flux_per_dn), where=flux_per_dn > 0)
@@ -297,9 +299,7 @@ def clean_spectra(frames: Frames, model: FrameModel) -> CleanedSpectra:
     usable = frames.faults == 0
     fine = np.isfinite(frames.flux[usable]).all(axis=0) & (model.bins.sum(axis=1) > 0)
     if not fine.any() or not usable.any():
-        raise InputError(
-            f"{frames.name}: no pixel is finite in every frame", "pixels with light in every frame", key="flux"
-        )
+        raise InputError(f"{frames.name}: at least one pixel must be finite in every frame, but none is", key="flux")
     model = model.part(fine)
     assert frames.wavelength_nm is not None
     flux = frames.flux[:, fine]
@@ -307,7 +307,7 @@ def clean_spectra(frames: Frames, model: FrameModel) -> CleanedSpectra:
     flux = flux - model.offset
     good = usable & ~saturated
     if not good.any():
-        raise InputError(f"{frames.name}: every frame has saturated pixels", "frames below saturation", key="flux")
+        raise InputError(f"{frames.name}: at least one frame must be below saturation, but none is", key="flux")
     light = np.median(flux[good], axis=0)
     error = None if frames.error is None else frames.error[:, fine]
     stated = np.sqrt(model.variance(light)) if error is None else np.median(error[good], axis=0)

@@ -435,7 +435,7 @@ def live_pixels(finite: NDArray[np.int64], n_frames: int, name: str) -> NDArray[
     """Return the pixels that are finite in most frames, from the number of frames in which each of them is."""
     live = finite > LIVE_SHARE * n_frames
     if not live.any():
-        raise InputError(f"{name}: no pixel is finite in most frames", "pixels with light", key="flux")
+        raise InputError(f"{name}: at least one pixel must be finite in most frames, but none is", key="flux")
     return np.asarray(live)
 
 
@@ -474,7 +474,7 @@ def barycentric(frames: Frames, target: Target, orbit: Orbit | None = None) -> F
 
     name = frames.name
     if frames.reference_mjd is None:
-        raise InputError(f"{name}: its times have no date", "a mapping with epoch", key="epoch")
+        raise InputError(f"{name}: its times have no date; give a mapping with epoch", key="epoch")
     if frames.position == "BARYCENTER":
         return frames.with_remarks((f"the times of {name} are barycentric already",))
     if frames.scale not in SCALES.values():
@@ -483,8 +483,10 @@ def barycentric(frames: Frames, target: Target, orbit: Orbit | None = None) -> F
     if frames.position not in ("GEOCENTER", "TOPOCENTER"):
         raise InputError.of("position", frames.position, "TOPOCENTER or GEOCENTER, as a mapping states", where=name)
     if frames.position == "TOPOCENTER" and orbit is None:
-        raise InputError(f"{name}: the orbit of {frames.instrument or 'its satellite'} is not known",
-                         "two-line elements in `orbit.tle`", key="orbit.tle")  # fmt: skip
+        raise InputError(
+            f"{name}: the orbit of {frames.instrument or 'its satellite'} needs two-line elements in `orbit.tle`",
+            key="orbit.tle",
+        )
     with offline():
         when = Time(frames.reference_mjd, frames.time_s / DAY_S, format="mjd", scale=frames.scale)
         parts = [when[k : k + PIECE] for k in range(0, frames.n_frames, PIECE)]

@@ -329,11 +329,13 @@ def check_usable(frames: Frames, reasons: NDArray[np.int64]) -> None:
     usable = reasons == 0
     if usable.sum() < MIN_USABLE:
         raise InputError(
-            f"{frames.name} has {usable.sum()} frames without a fault", f"at least {MIN_USABLE}", key="frames"
+            f"{frames.name} needs at least {MIN_USABLE} frames without a fault, but has {usable.sum()}", key="frames"
         )
     flux = frames.white_light[0][usable]
     if np.median(np.abs(np.diff(flux))) <= LEAST_NOISE * np.abs(np.median(flux)) and counts_per_unit(frames) is None:
-        raise InputError(f"{frames.name}: the flux of most frames is the same", "a light curve with noise", key="flux")
+        raise InputError(
+            f"{frames.name} must be a light curve with noise, but the flux of most frames is the same", key="flux"
+        )
 
 
 def _mean(name: str, flux: Float, least: float) -> float:
@@ -342,7 +344,7 @@ def _mean(name: str, flux: Float, least: float) -> float:
     spread = max(PER_MAD * float(np.median(np.abs(flux - middle))), least)
     near = np.abs(flux - middle) <= max(FAR * spread, 1e-12 * abs(middle))
     if (mean := float(flux[near].mean())) == 0.0:
-        raise InputError(f"{name}: the level of its light is zero", "the light of a star", key="flux")
+        raise InputError(f"{name}: the level of the star's light must not be zero", key="flux")
     return mean
 
 

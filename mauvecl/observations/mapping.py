@@ -127,9 +127,9 @@ class FrameMapping(Record):
         given = [self.exposure is not None, self.exposure_s is not None, not isinstance(self.time, str)]
         if sum(given) > 1:
             raise InputError(
-                "the exposure time is given twice", "only one of exposure, exposure_s and two columns of time",
+                "the exposure time is given twice; give only one of exposure, exposure_s and two columns of time",
                 key="exposure",
-            )  # fmt: skip
+            )
         return self
 
     @classmethod
@@ -210,8 +210,11 @@ def recognised(file: TableFile) -> FrameMapping:
             # Dates at the barycentre are those of the light; those at the Sun are seconds from them.
             dated = [name for name in dated if said[name].position == place] or dated
         if len(dated) > 1:
-            fault = f"{file.what}: {len(dated)} columns may be the time: {', '.join(map(shortened, dated))}"
-            raise InputError(fault, "a mapping that names one", key="time")
+            raise InputError(
+                f"{file.what}: {len(dated)} columns may be the time; give a mapping that names one of "
+                f"{', '.join(map(shortened, dated))}",
+                key="time",
+            )
         timed = [name for name in said if re.match(r"t(?:ime)?[\s_.]", name, re.IGNORECASE)]
         columns["time"] = dated[0] if dated else first_of((*OTHER_TIMES, *timed), names, file.what)
     if columns["time"] is None:
@@ -224,12 +227,15 @@ def recognised(file: TableFile) -> FrameMapping:
     errors += [flux.lower().replace("flux_", "flux_err_")] if "flux_" in flux.lower() else []
     columns["error"] = first_of((*errors, "error", "err", "uncertainty", "unc", "sigma"), names, file.what)
     if columns["flux"] is None and (magnitudes := [name for name in names if is_magnitude(name)]):
-        fault = f"{file.what} has magnitudes ({', '.join(map(shortened, magnitudes))}) and no column of linear light"
-        raise InputError(fault, "light in a linear unit, in a column named flux or that a mapping names", key="flux")
+        raise InputError(
+            f"{file.what} has magnitudes ({', '.join(map(shortened, magnitudes))}) and no column of linear light; "
+            "give light in a linear unit, in a column named flux or that a mapping names",
+            key="flux",
+        )
     if columns["time"] is None or columns["flux"] is None:
         raise InputError(
-            f"{file.what} has the columns {shortened(', '.join(file.names), 300)}",
-            "columns named time and flux, or a mapping that names them",
+            f"{file.what} must have columns named time and flux, or a mapping that names them, but has the columns "
+            f"{shortened(', '.join(file.names), 300)}",
             key="mapping",
         )
     if "SPECTRUM" in file.names and "WAVELENGTH/WAVELENGTH" in file.names:
@@ -281,11 +287,11 @@ def _epoch_mjd(said: TimeUnit, stated: TimeSystem, name: str, what: str) -> floa
     if said.epoch_mjd is None or stated.epoch_mjd is None:
         return said.epoch_mjd if stated.epoch_mjd is None else stated.epoch_mjd
     if abs(said.epoch_mjd - stated.epoch_mjd) > 1e-5:
-        fault = (
+        raise InputError(
             f"{what}: {name!r} counts from MJD {said.epoch_mjd:g} by its unit or name and from {stated.epoch_mjd:g} by "
-            "its header"
+            "its header; give one epoch, or a mapping with epoch",
+            key="epoch",
         )
-        raise InputError(fault, "one epoch, or a mapping with epoch", key="epoch")
     return stated.epoch_mjd
 
 
@@ -295,7 +301,7 @@ def _time_unit(
     """Return the unit of times and what it says of their zero: of the mapping, the column, its name, the header."""
     if len({one.unit or unit_in_name(one.name) for one in time}) > 1 and not mapping.time_unit:
         names = " and ".join(repr(one.name) for one in time)
-        raise InputError(f"{file.what}: {names} have different units", "one unit", key="time")
+        raise InputError(f"{file.what}: {names} must have the same unit, but have different units", key="time")
     text = mapping.time_unit or time[0].unit or unit_in_name(time[0].name)
     named = time_in_name(time[0].name)
     said = named if not text else time_unit(text)

@@ -182,7 +182,7 @@ def _terms() -> Any:
         from celerite2 import terms
     except ImportError as error:
         raise InputError(
-            "celerite2 is not installed, which models the light of stars", "pip install celerite2", key="celerite2"
+            "celerite2, which models the light of stars, is not installed; use pip install celerite2", key="celerite2"
         ) from error
     return terms
 

@@ -218,8 +218,9 @@ def _weighted_sums(
     neighbours = np.diff(frames.numbers) == 1
     pairs = np.flatnonzero(quiet[:-1] & quiet[1:] & neighbours)
     if not pairs.size:
-        raise InputError(f"{frames.name} has no neighbouring frames without a flare, from which the noise follows",
-                         "some", key="frames")  # fmt: skip
+        raise InputError(
+            f"{frames.name} needs neighbouring frames without a flare, from which the noise follows", key="frames"
+        )
     assert frames.wavelength_nm is not None
     shared = np.array([unknown["light"], unknown["dark"]])
     noise = measure_noise(excess, pairs, cleaned.stated, shared, frames.wavelength_nm)

@@ -19,7 +19,7 @@ from mauvecl.host.tables.opening import read_table
 from mauvecl.host.tables.table import MemoryTable, TableFile, Values
 from mauvecl.observations.frames import MAX_FRAMES, dead_pixel_remarks, live_pixels
 from mauvecl.observations.mapping import FrameMapping
-from mauvecl.schema.errors import InputError
+from mauvecl.schema.errors import InputError, missing_package
 
 #: Largest number of files in a folder.
 MAX_FILES = 2**20
@@ -47,8 +47,9 @@ class FolderFile(TableFile):
                 if not path.is_dir() and not path.name.startswith(".") and path.suffix != ".toml"
             )  # fmt: skip
         if not 1 <= len(self.paths) <= MAX_FILES:
-            raise InputError(f"{what}: {mapping.files or '*'!r} names {len(self.paths)} files", f"1 to {MAX_FILES}",
-                             key="files")  # fmt: skip
+            raise InputError(
+                f"{what}: {mapping.files or '*'!r} must name 1 to {MAX_FILES} files, not {len(self.paths)}", key="files"
+            )
         with open_file(self.paths[0]) as first:
             self.header = first.header
             self.names_of_first = first.names
@@ -81,8 +82,9 @@ class FolderFile(TableFile):
                 axis = file.axis(name, 1)
             first = first or axis
             if axis.shape != first.shape or not np.allclose(axis.numbers(), first.numbers(), rtol=1e-9, atol=0.0):
-                raise InputError(f"{self.what}: {path.name} has other wavelengths than {self.paths[0].name}",
-                                 "the same in every file", key="wavelength")  # fmt: skip
+                raise InputError(
+                    f"{self.what}: {path.name} must have the wavelengths of {self.paths[0].name}", key="wavelength"
+                )
         assert first is not None
         return first
 
@@ -100,8 +102,10 @@ class FolderFile(TableFile):
         with self.open_file(path) as file:
             found = file.find(name).numbers().ravel()
         if found.size != n:
-            raise InputError(f"{self.what}: {path.name} has {found.size} values of {name!r}",
-                             f"{n} as in {self.paths[0].name}", key=name)  # fmt: skip
+            raise InputError(
+                f"{self.what}: {path.name} needs {n} values of {name!r} as in {self.paths[0].name}, not {found.size}",
+                key=name,
+            )
         return found
 
     def _headers(self) -> Sequence[dict[str, Any]]:
@@ -114,8 +118,9 @@ class FolderFile(TableFile):
     def _keywords(self, keyword: str) -> list[Any]:
         found = [header.get(keyword) for header in self.headers()]
         if None in found:
-            raise InputError(f"{self.what}: {self.paths[found.index(None)].name} has no {keyword}",
-                             "the keyword in every file", key=keyword)  # fmt: skip
+            raise InputError(
+                f"{self.what}: {self.paths[found.index(None)].name} needs the keyword {keyword}", key=keyword
+            )
         return found
 
 
@@ -148,8 +153,7 @@ class StoredFile(TableFile):
         """
         missing = [key for key in REQUIRED if key not in of]
         if missing:
-            raise InputError(f"{what} does not state {missing[0]} of {path}", "a file of this version of mauvecl",
-                             key="file")  # fmt: skip
+            raise InputError(f"{what} lacks {missing[0]} of {path}; give a file of this version of mauvecl", key="file")
         super().__init__(what, {"OBJECT": of.get("star", ""), "INSTRUME": of["instrument"]})
         self.raw, self.calibration, self.attributes = raw, calibration, of
         self.stacked = int(of["frames"]) if numbers is None else 1
@@ -157,7 +161,7 @@ class StoredFile(TableFile):
         exposure, frame = float(of["exposure_s"]), float(of["exposure_s"]) / int(of["frames"])
         n = int(raw.shape[0]) * self.per_row
         if n > MAX_FRAMES:
-            raise InputError(f"{what} holds {n} frames of {path}", f"at most {MAX_FRAMES}", key="frames")
+            raise InputError(f"{what} must hold at most {MAX_FRAMES} frames of {path}, not {n}", key="frames")
         within = np.array([exposure / 2]) if numbers is None else (numbers + 0.5) * frame
         at = np.arange(n)
         each = np.ones(n)
@@ -194,8 +198,10 @@ class StoredFile(TableFile):
     def raw_mapping(self) -> FrameMapping:
         """Paths of the quantities, with counts that have bias and dark current; only those of single frames."""
         if self.stacked > 1:
-            raise InputError(f"{self.what} holds sums of {self.stacked} frames", "single frames: `mauvecl realise "
-                             "--frames all`", key="frames")  # fmt: skip
+            raise InputError(
+                f"{self.what} holds sums of {self.stacked} frames; give single frames: `mauvecl realise --frames all`",
+                key="frames",
+            )
         return self.mapping.model_copy(update={"flux": "raw", "error": None})
 
     def _raw(self, start: int, stop: int) -> Float:
@@ -277,7 +283,7 @@ def _in_groups(root: Any, name: str | None, what: str) -> StoredFile:
         largest = max(int(group[key].size) for key in names)
         if largest > MAX_PIXELS:
             # A header may claim any number.
-            raise InputError(f"{what} holds {largest} pixels", f"at most {MAX_PIXELS}", key="file")
+            raise InputError(f"{what} must hold at most {MAX_PIXELS} pixels, but holds {largest}", key="file")
         of = {key: np.asarray(group[key][:], np.float64) for key in names}
         frames = np.asarray(group["frame"][:], np.int64) if "frame" in group else None
         return StoredFile(what, path, array, of, dict(group.attrs), frames)
@@ -286,10 +292,11 @@ def _in_groups(root: Any, name: str | None, what: str) -> StoredFile:
 def _chosen(found: list[str], name: str | None, what: str) -> str:
     """Return the requested scene, or the only one."""
     if not found:
-        raise InputError(f"{what} holds no spectra", EXPECTED, key="file")
+        raise InputError(f"{what} holds no spectra; give {EXPECTED}", key="file")
     if name is None and len(found) > 1:
-        raise InputError(f"{what} holds {len(found)} arrays ({', '.join(found[:8])})",
-                         f"one: name it as in FILE[{found[-1]}]", key="hdu")  # fmt: skip
+        raise InputError(
+            f"{what} holds {len(found)} arrays ({', '.join(found[:8])}); give one, as in FILE[{found[-1]}]", key="hdu"
+        )
     wanted = name or found[0]
     if wanted not in found:
         raise InputError.of("hdu", wanted, f"one of {', '.join(found[:8])}", where=what)
@@ -302,7 +309,7 @@ def _module(name: str) -> Any:
     try:
         return import_module(name)
     except ImportError as error:
-        raise InputError(f"{name} is missing", "it for stores: pip install 'mauvecl[bulk]'", key=name) from error
+        raise missing_package(name, "a store", "bulk") from error
 
 
 #: Light, errors and quality of frames, and remarks.

@@ -355,8 +355,8 @@ def fit_throughput(
     pixels, shape = best.pixels(model), best.found[n : n + m]
     if (np.abs(shape) > LIMITS[:m]).any():
         raise InputError(
-            "the spectra of the stars do not match a wavelength scale and line width near the nominal ones",
-            f"shifts up to {LIMITS[0]:g} nm and widths within {100 * LIMITS[2]:g} %",
+            "the spectra of the stars must match a wavelength scale and line width near the nominal ones, with shifts "
+            f"up to {LIMITS[0]:g} nm and widths within {100 * LIMITS[2]:g} %, but do not",
             key="observations",
         )
     covariance = best.scaled(model.basis)
@@ -471,8 +471,8 @@ def _iterated(model: ThroughputModel, error: float) -> _Solution:
         if not np.abs(model.basis @ coefficients).max() < LARGEST_LOG:
             break
     raise InputError(
-        "no throughput makes the spectra of the stars those of the frames",
-        "frames of the stated stars, with dark frames if the dark current is not nominal",
+        "no throughput makes the spectra of the stars those of the frames; give frames of the stated stars, with dark "
+        "frames if the dark current is not nominal",
         key="observations",
     )
 

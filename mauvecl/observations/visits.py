@@ -111,7 +111,7 @@ def recover_periods(
         raise InputError.of("visits", time.size, f"at least {MIN_VISITS}")
     base = float(np.ptp(time))
     if not base > 0:
-        raise InputError("all visits have the same time", "visits at different times", key="time_d")
+        raise InputError("visits must have different times, but all have the same", key="time_d")
     frequency = _frequencies(base, 1 / (longest_d or max(periods_d)), 1 / (shortest_d or min(periods_d)))
     generator = np.random.default_rng(seed)
 
@@ -143,9 +143,9 @@ def _frequencies(base: float, low: float, high: float) -> Float:
     count = int(np.ceil((high - low) / step)) + OVERSAMPLING + 1
     if count > MAX_FREQUENCIES:
         raise InputError(
-            f"the periods need {count} frequencies",
-            f"at most {MAX_FREQUENCIES}: longer periods or a shorter campaign", key="periods",
-        )  # fmt: skip
+            f"the periods need {count} frequencies (at most {MAX_FREQUENCIES}); give longer ones or a shorter campaign",
+            key="periods",
+        )
     return np.asarray(max(low - 0.5 / base, step) + step * np.arange(count))
 
 
@@ -348,7 +348,7 @@ def line_index(
     left = good & windows
     if (count := int(left.sum(axis=-1).min(initial=nm.size))) < MIN_CONTINUUM:
         raise InputError(
-            f"the continuum has {count} usable pixels", f"at least {MIN_CONTINUUM} in each spectrum", key="continuum_nm"
+            f"the continuum needs at least {MIN_CONTINUUM} usable pixels per spectrum, not {count}", key="continuum_nm"
         )
     weight = np.where(left, 1.0 / np.where(left, sd, 1.0) ** 2, 0.0)
     continuum = _integral_of_line(nm - (low + high) / 2, weight, share)
@@ -446,7 +446,7 @@ class Change:
             meaning = f"brightening of the light below {COLOUR_NM:g} nm against that above"
         elif words == "spectrum":
             if file is None:
-                raise InputError("the change 'spectrum' has no file", "`change.file`", key="change.file")
+                raise InputError("the change 'spectrum' needs a file; give `change.file`", key="change.file")
             scale = photons(star.wavelength_nm, star.flux_flam, band) / photons(
                 file.wavelength_nm, file.flux_flam, band
             )

@@ -256,7 +256,7 @@ def test_stores_larger_than_the_disk_need_insist(tmp_path: Path) -> None:
     full = shutil.disk_usage(tmp_path)._replace(free=10 << 20)
     with mock.patch.object(shutil, "disk_usage", return_value=full):
         reported = refused(*words, "-n", "100000", "-o", "s.zarr", folder=tmp_path)
-        most = int(re.search(r"expected at most (\d+) of them", reported)[1])
+        most = int(re.search(r"give at most (\d+) or", reported)[1])
         assert "10 MiB" in reported
         assert str(most + 1) in refused(*words, "-n", str(most + 1), "-o", "s.zarr", folder=tmp_path)
         assert not (tmp_path / "s.zarr").exists()
