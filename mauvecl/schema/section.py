@@ -108,12 +108,16 @@ def _key_of(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[st
     """Return the part of an error's location that names a key, with the numbers of entries in lists."""
     path: list[str] = []
     inner: type[BaseModel] | None = model
+    in_table = False
     for part in location:
-        if isinstance(part, str):
+        if in_table:
+            # A table's own names are no fields of a model.
+            in_table = False
+        elif isinstance(part, str):
             if inner is None:
                 break
-            field = inner.model_fields.get(part)
-            inner = None if field is None else model_in(field.annotation)
+            annotation = field.annotation if (field := inner.model_fields.get(part)) else None
+            inner, in_table = model_in(annotation), get_origin(annotation) is dict
         path.append(str(part))
     return tuple(path)
 
