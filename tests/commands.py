@@ -11,6 +11,14 @@ from unittest import mock
 
 from mauvecl.cli.app import main
 
+#: The command line with small shards, so that a run of a second has several; shards change no answer.
+SMALL_SHARDS = [
+    sys.executable,
+    "-c",
+    "import mauvecl.runs.checkpoint as s; s.SHARD_WORK = 2**27; "
+    "s.Checkpoint.__init__.__kwdefaults__['patience_s'] = 0.0; from mauvecl.cli.app import main; main()",
+]
+
 
 @dataclass(frozen=True)
 class Done:

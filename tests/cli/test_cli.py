@@ -5,7 +5,6 @@ import re
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -13,7 +12,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import QTable
-from commands import ended, run, started
+from commands import SMALL_SHARDS, ended, run, started
 from processes import python
 from scenes import paper
 
@@ -233,13 +232,6 @@ def test_plan_is_read_back_from_its_table_and_targets_are_not_an_answer(tmp_path
     run("visible", "targets.ecsv", "--days", "1", "--no-pictures", folder=tmp_path)
 
 
-#: The command line with small shards, so that a run of a second has several; shards change no answer.
-SMALL_SHARDS = [
-    sys.executable,
-    "-c",
-    "import mauvecl.runs.checkpoint as s; s.SHARD_WORK = 2**27; "
-    "s.Checkpoint.__init__.__kwdefaults__['patience_s'] = 0.0; from mauvecl.cli.app import main; main()",
-]
 LONG = ("detect", "--star", "G2V", "-m", "7.4", "--statistic", "chi2", "-n", "100000", "--no-pictures", "-o", "out")
 #: Files of somebody else in the folder of a checkpoint.
 FOREIGN = ("epoch-1.pt", "mine.npz", "deep/keep", ".unfinished-mine")

@@ -20,7 +20,7 @@ import numpy as np
 import psutil
 import pytest
 from answers import N, same, same_snr, small
-from commands import run
+from commands import SMALL_SHARDS, run
 from scenes import flaring_stares, instrument, paper, star
 
 from mauvecl import DaskWorkers, Engine, Expectation, Pool, Stares, bulk, measure
@@ -191,13 +191,9 @@ def test_interrupted_cluster_ends_its_workers(stop: signal.Signals, tmp_path: Pa
 
     Ctrl-C in a terminal reaches the whole process group: workers are not of it, or what they build is cut off aloud.
     """
-    script = (
-        "import mauvecl.runs.checkpoint as s; s.SHARD_WORK = 2**27; "
-        "s.Checkpoint.__init__.__kwdefaults__['patience_s'] = 0.0; from mauvecl.cli.app import main; main()"
-    )
     flags = "--statistic chi2 -n 80000 --no-pictures --fap 0.01 --ideal"
     words = ["detect", "--star", "G2V", "--star", "K3V", "-m", "7.4,3.7", *flags.split()]
-    command = [sys.executable, "-c", script, *words, "--output", "out"]
+    command = [*SMALL_SHARDS, *words, "--output", "out"]
     process = subprocess.Popen(
         [*command, "--cluster", "local:2"],
         cwd=tmp_path,

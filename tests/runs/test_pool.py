@@ -407,8 +407,11 @@ def test_background_work_begins_once_after_the_devices() -> None:
 def test_answers_keep_their_order_and_errors_end_the_rest(engine: Engine) -> None:
     pool = Pool(Shuffled(engine, 1))
     pauses: Sequence[float] = [0.05, 0.0, 0.03, 0.01, 0.02, 0.0]
+    together = threading.Barrier(pool.workers.count)
 
     def slow(number: int) -> int:
+        if number < together.parties:
+            together.wait(10)
         time.sleep(pauses[number])
         return number
 
@@ -423,6 +426,19 @@ def test_answers_keep_their_order_and_errors_end_the_rest(engine: Engine) -> Non
         list(pools.map_in_order(pool, bad, range(6)))
     with pytest.raises(pools.Stopped):
         pool.detect(SCENE[0], SCENE[1:], realisations=N, seed=5)
+
+
+def test_few_answers_are_ahead_of_their_use_and_none_after_it(engine: Engine) -> None:
+    begun: list[int] = []
+    answers = pools.map_in_order(Pool(Shuffled(engine, 1)), begun.append, range(100))
+    for _ in range(5):
+        next(answers)
+    time.sleep(0.05)
+    before = len(begun)
+    assert before < 20
+    answers.close()
+    time.sleep(0.05)
+    assert len(begun) == before
 
 
 def test_progress_that_raises_stops_the_work_ahead_of_it(engine: Engine) -> None:
