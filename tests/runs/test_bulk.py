@@ -3,6 +3,7 @@
 import fcntl
 import json
 import os
+import random
 import shutil
 import signal
 import subprocess
@@ -196,6 +197,29 @@ def described_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[
         monkeypatch.setattr(Store, "scenes", property(lambda self: scenes))
 
     return describe
+
+
+@pytest.mark.long
+def test_random_kills_lose_nothing(
+    tmp_path: Path, painted: dict[str, bytes], described_once: Callable[[Study], None]
+) -> None:
+    """Kill a run at random moments, within about the time that it takes, and resume it; files have the same bits."""
+    described_once(study(1000))
+    path, kills, moments = tmp_path / "frames.zarr", 0, random.Random(5)
+    began = time.monotonic()
+    killed(forked(lambda: bulk.realise(study(1000), path, Painter())))  # type: ignore[arg-type]
+    takes = time.monotonic() - began
+    while kills < 30:
+        if path.exists() and tree(path) == painted:
+            # A store that is finished after many kills: the next one begins.
+            shutil.rmtree(path)
+        child = forked(lambda: bulk.realise(study(1000), path, Painter()))  # type: ignore[arg-type]
+        time.sleep(moments.uniform(0.0, takes))
+        os.kill(child, signal.SIGKILL)
+        kills += killed(child)
+    bulk.realise(study(1000), path, Painter())  # type: ignore[arg-type]
+    assert tree(path) == painted
+    assert bulk.verify(path) == []
 
 
 @pytest.mark.long
