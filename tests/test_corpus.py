@@ -200,6 +200,19 @@ def test_keys_of_entries_are_known() -> None:
     assert sorted({key for _, case in CASES for key in case} - known) == []
 
 
+#: Light curves in text, which are read in pieces where they are large.
+TEXTS = re.compile(r"(text_tables (?!machine-readable|IPAC).*|odd_frames (rows|unusable (text|column)).* csv\d*$)")
+
+
+@pytest.mark.parametrize("case", [pytest.param(case, id=name) for name, case in CASES if TEXTS.match(name)])
+def test_large_tables_are_read_in_pieces_as_they_say(
+    case: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mauvecl.host.tables.opening.LARGE", 0)
+    monkeypatch.setattr("mauvecl.host.tables.opening.PIECE", 200)
+    test_files_are_read_as_they_say(case, tmp_path)
+
+
 @pytest.mark.parametrize("case", [pytest.param(case, id=name) for name, case in CASES])
 def test_files_are_read_as_they_say(case: Case, tmp_path: Path) -> None:
     path = written(case, tmp_path)
