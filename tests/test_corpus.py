@@ -21,7 +21,7 @@ from scenes import instrument, star
 from mauvecl import Source, Study, read_frames
 from mauvecl.host.spectra.formats import read_spectrum
 from mauvecl.host.stars import flare as flare_tables
-from mauvecl.observations.frames import Reason
+from mauvecl.observations import frames as observed
 
 # Astropy warns of the usual units when it writes a VOTable.
 pytestmark = pytest.mark.filterwarnings("ignore:The unit .* has been deprecated in the VOUnit standard")
@@ -56,7 +56,7 @@ def _frames(path: Path, case: Case) -> tuple[str, ...]:
         np.testing.assert_allclose(frames.time_s - frames.time_s[0], time - time[0], atol=case.get("atol", 1e-3))
     else:
         np.testing.assert_allclose(frames.time_s, time, atol=1e-4)
-    faults = {str(k): Reason(int(frames.faults[k])).name for k in np.flatnonzero(frames.faults)}
+    faults = {str(k): observed.Reason(int(frames.faults[k])).name for k in np.flatnonzero(frames.faults)}
     assert faults == case.get("faults", {})
     good = np.ones(frames.n_frames, bool) if case.get("pixels") else frames.faults == 0
     np.testing.assert_allclose(frames.flux[good], flux[good], rtol=case.get("rtol", 1e-9))
@@ -93,7 +93,7 @@ def _summary(path: Path, case: Case) -> tuple[str, ...]:
     median = float(np.nanmedian(frames.flux))
     assert median == pytest.approx(case.get("median", median), rel=1e-3)
     assert "error" not in case or np.median(frames.error) == pytest.approx(case["error"])
-    flagged = np.flatnonzero(frames.faults & Reason.QUALITY)
+    flagged = np.flatnonzero(frames.faults & observed.Reason.QUALITY)
     assert flagged.tolist() == case.get("flagged", flagged.tolist())
     assert flagged.size == case.get("flagged_count", flagged.size)
     usable = frames.flux[frames.faults == 0]

@@ -1,6 +1,7 @@
 """Files larger than memory are read in pieces, in a process whose address space is limited."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,6 @@ from processes import python
 
 from mauvecl import read_frames
 from mauvecl.observations import frame_files
-from mauvecl.observations.mapping import FrameMapping
 
 FRAMES, PIXELS = 65_536, 1024
 #: The address space may grow by this while a file of 256 MiB is read.
@@ -93,7 +93,8 @@ def test_pieces_give_what_the_whole_gives(tmp_path: Path, monkeypatch: pytest.Mo
     columns = {"T": 20.0 * np.arange(n), "QUAL": (np.arange(n) == 7).astype(int), "FLUX": flux, "ERR": error,
                "W": np.tile(np.linspace(250.5, 650.5, 50), (n, 1))}  # fmt: skip
     Table(columns, units={"T": "s", "FLUX": "adu/s", "ERR": "adu/s", "W": "nm"}).write(path)
-    mapping = FrameMapping(time="T", flux="FLUX", error="ERR", quality="QUAL", wavelength="W", exposure_s=18.0)
+    how: dict[str, Any] = {"flux": "FLUX", "error": "ERR", "quality": "QUAL", "wavelength": "W", "exposure_s": 18.0}
+    mapping = frame_files.FrameMapping(time="T", **how)
     whole = read_frames(path, mapping)
     monkeypatch.setattr("mauvecl.host.tables.table.PIECE_BYTES", 8 * 50 * 400)
     monkeypatch.setattr("mauvecl.host.tables.fits_tables.PIECE_BYTES", 0)
