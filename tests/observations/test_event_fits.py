@@ -10,6 +10,7 @@ import pytest
 from celerite2 import terms
 from numpy.typing import NDArray
 from scenes import flare
+from scipy import stats
 
 from mauvecl import SHAPES, Frames, Study, analyse
 from mauvecl.observations import event_windows, events
@@ -17,6 +18,26 @@ from mauvecl.observations import level as levels
 from mauvecl.observations import process as processes
 from mauvecl.observations import search as searches
 from mauvecl.observations.detection import detect_events
+from mauvecl.observations.event_fits import Mixture
+
+
+@pytest.mark.parametrize("mean", [-40.0, -5.0, 0.0, 3.0, 1e4])
+def test_quantiles_are_those_of_a_truncated_normal_distribution(mean: float) -> None:
+    mixture = Mixture(np.log([0.2, 0.8]), np.full(2, mean), np.full(2, 2.0))
+    expected = stats.truncnorm(-mean / 2, np.inf, mean, 2.0)
+    for probability in (0.025, 0.16, 0.5, 0.84, 0.975):
+        assert mixture.quantile(probability) == pytest.approx(float(expected.ppf(probability)), rel=1e-5)
+
+
+@pytest.mark.parametrize("middle", [-3.0, 0.1, 5.0, 300.0])
+def test_quantiles_of_many_parts_are_those_of_their_sum(middle: float) -> None:
+    rng = np.random.default_rng(2)
+    log_weight, mean, log_sd = rng.normal([0.0, middle, 0.0], [1.0, 2.0, 0.4], (50_000, 3)).T
+    mixture, weight = Mixture(log_weight, mean, np.exp(log_sd)), np.exp(log_weight)
+    shares = (0.025, 0.16, 0.5, 0.84, 0.975)
+    none, *above = (weight @ stats.norm.sf(q, mean, np.exp(log_sd)) for q in (0.0, *map(mixture.quantile, shares)))
+    assert np.array(above) / none == pytest.approx(1 - np.array(shares), abs=2e-5)
+
 
 Float = NDArray[np.float64]
 SHAPE = SHAPES["davenport2014"]
