@@ -44,7 +44,6 @@ def said(verb: str, study: Study, engine: Engine, folder: Path) -> list[str]:
 
 
 def hot_star(magnitude: float, low_nm: float, **sections: Any) -> Study:
-    """Return a study of a hot star on part of the pixels."""
     data: dict[str, Any] = {
         "star": [{"library": "A0V", "magnitude": magnitude, "distance_pc": 7.7}],
         "flare": {"amplitudes": [0.01]},

@@ -95,7 +95,6 @@ def test_flags_override_the_study_file(tmp_path: Path) -> None:
 
 
 def part_of(seconds: float, magnitude: float) -> Study:
-    """Return a study of 197 pixels."""
     return Study.build(
         {
             "star": [{"library": "G2V", "magnitude": magnitude}],

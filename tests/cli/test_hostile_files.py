@@ -33,7 +33,6 @@ def test_mutated_files_are_answered_or_refused(fuzz: ModuleType) -> None:
 
 @pytest.fixture(scope="module")
 def intact(fuzz: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Write intact files of every format."""
     folder = tmp_path_factory.mktemp("intact")
     fuzz.make(folder)
     return folder

@@ -22,7 +22,6 @@ def quiet(sunlike: Source, mauve: Instrument) -> Expectation:
 
 
 def kinds(x: Expectation) -> list[str]:
-    """Return what the messages are about, of those that say so."""
     return [one.kind for one in x.messages if hasattr(one, "kind")]
 
 

@@ -22,7 +22,6 @@ KNOWN = Table.read(
 
 
 def target(name: str) -> Any:
-    """Return the target of a name."""
     return visible(Study.build({"orbit": {"targets": [name], "days": 0.1}}, "test")).targets[0]
 
 
@@ -149,7 +148,6 @@ B, C, FAR = "B,12.5,6.9,K5V", "C,47.0,8.0,F5V", "D,47.47,1.0,A0V"
 
 
 def seen(folder: Path, *rows: str, head: str = HEAD, share: float = 1.0) -> Expectation:
-    """Return the expectation of the star with neighbours in a table."""
     (folder / "near.csv").write_text("\n".join((head, *rows)) + "\n")
     star = {"library": "G2V", "magnitude": 7.4, "neighbours": str(folder / "near.csv"), "neighbour_share": share}
     study = {"star": [star], "observation": {"exposure_s": 50.0}}

@@ -89,7 +89,6 @@ def test_frames_of_other_wavelengths_or_units_are_searched_in_white_light() -> N
 
 @cache
 def analysed_counts() -> tuple[Frames, Any]:
-    """Return frames with a flare, and their answer."""
     frames = drawn(np.random.default_rng(4), flare(1800.0, 60.0, 0.5))
     return frames, analyse(STUDY, frames=frames)
 

@@ -58,8 +58,6 @@ def test_two_processes_give_the_answers_of_one(
 
 
 def kill_after(pool: Pool, shards: int, kill: Callable[[], object]) -> threading.Thread:
-    """Kill a process after a number of shards."""
-
     def work() -> None:
         while pool.standing.shards < shards:
             time.sleep(0.005)

@@ -17,7 +17,6 @@ def study(*stars: dict[str, Any], **flare: Any) -> Study:
 
 
 def light(asked: Study) -> list[np.ndarray]:
-    """Return the electrons of each star with its flare."""
     few = asked.with_settings(["run={realisations=500, fap=0.3, statistics=['matched']}"])
     return [one.detection.flares[0].source_electrons for one in detect(few).stars]
 
