@@ -9,7 +9,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from unittest import mock
 
-from mauvecl.cli.app import main
+from mauvecl.cli import app
+
+#: The command line with small shards, so that a run of a second has several; shards change no answer.
+SMALL_SHARDS = [
+    sys.executable,
+    "-c",
+    "import mauvecl.runs.checkpoint as s; s.SHARD_WORK = 2**27; "
+    "s.Checkpoint.__init__.__kwdefaults__['patience_s'] = 0.0; from mauvecl.cli.app import main; main()",
+]
 
 
 @dataclass(frozen=True)
@@ -37,7 +45,7 @@ def ended(*words: str | Path, folder: Path, columns: int = 200) -> tuple[int, st
         mock.patch.dict(os.environ, {"COLUMNS": str(columns)}),
     ):
         try:
-            main()
+            app.main()
         except SystemExit as end:
             code = end.code or 0
     return code, out.getvalue(), reported.getvalue()

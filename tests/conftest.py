@@ -43,7 +43,6 @@ def one_by_one() -> Engine:
 
 @pytest.fixture(scope="session")
 def stares(engine: Engine) -> Stares:
-    """Return stares on the engine's device."""
     return Stares(engine.open_device)
 
 

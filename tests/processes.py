@@ -10,7 +10,12 @@ from tempfile import TemporaryDirectory
 
 
 def python(
-    code: str, *words: str | Path, typed: str | None = None, cache: Path | str | None = None, **environment: str
+    code: str,
+    *words: str | Path,
+    typed: str | None = None,
+    cache: Path | str | None = None,
+    folder: Path | None = None,
+    **environment: str,
 ) -> subprocess.CompletedProcess[str]:
     """Run code, as an argument or typed, which must end without an error; its kernels may have a cache of its own."""
     more = environment | ({} if cache is None else {"MAUVECL_CACHE_DIR": str(cache)})
@@ -18,6 +23,7 @@ def python(
         [sys.executable, *(["-c", code] if typed is None else []), *map(str, words)],
         input=typed,
         env=os.environ | more,
+        cwd=folder,
         capture_output=True,
         text=True,
         timeout=300,

@@ -34,6 +34,16 @@ def refused(key: str | None, *facts: str, expected: str | None = None) -> Iterat
     assert "\n" not in str(error)
 
 
+@contextmanager
+def failed(kind: str, *facts: str) -> Iterator[None]:
+    """Check that the block raises a RuntimeError of a kind, whose sentence gives these facts."""
+    with pytest.raises(RuntimeError) as caught:
+        yield
+    assert caught.value.kind == kind
+    for fact in facts:
+        assert fact in str(caught.value), str(caught.value)
+
+
 def says_what_is_accepted(message: str) -> bool:
     """Return whether the sentence of an error says what is accepted."""
     return bool(re.search(r"\b(expected|needs?|must|may|give|use|try|wait|start|install|did you mean)\b", message))

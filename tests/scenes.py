@@ -86,7 +86,6 @@ def source(library: str = "M3V", magnitude: float = 9.0) -> Source:
 
 @cache
 def quiescent(library: str = "M3V", magnitude: float = 9.0, exposure: float = 50.0) -> Expectation:
-    """Return the expectation of a star on the nominal payload."""
     return expect(source(library, magnitude), "mauvesim", exposure=exposure)
 
 

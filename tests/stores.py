@@ -31,7 +31,6 @@ def study(realisations: int = 300, **sections: Any) -> Study:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Lock a folder as another process that writes to it."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX)
@@ -41,7 +40,6 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def tree(path: Path) -> dict[str, bytes]:
-    """Read every file of a store."""
     found = {str(p.relative_to(path)): p.read_bytes() for p in path.rglob("*") if p.is_file()}
     return {name: text for name, text in found.items() if not Path(name).name.startswith(".")}
 
@@ -81,7 +79,6 @@ def forked(work: Callable[[], object]) -> int:
 
 
 def killed(child: int) -> bool:
-    """Return whether a process ended by SIGKILL."""
     _, status = os.waitpid(child, 0)
     return os.WIFSIGNALED(status)
 

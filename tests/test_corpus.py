@@ -21,7 +21,7 @@ from scenes import instrument, star
 from mauvecl import Source, Study, read_frames
 from mauvecl.host.spectra.formats import read_spectrum
 from mauvecl.host.stars import flare as flare_tables
-from mauvecl.observations.frames import Reason
+from mauvecl.observations import frames as observed
 
 # Astropy warns of the usual units when it writes a VOTable.
 pytestmark = pytest.mark.filterwarnings("ignore:The unit .* has been deprecated in the VOUnit standard")
@@ -56,7 +56,7 @@ def _frames(path: Path, case: Case) -> tuple[str, ...]:
         np.testing.assert_allclose(frames.time_s - frames.time_s[0], time - time[0], atol=case.get("atol", 1e-3))
     else:
         np.testing.assert_allclose(frames.time_s, time, atol=1e-4)
-    faults = {str(k): Reason(int(frames.faults[k])).name for k in np.flatnonzero(frames.faults)}
+    faults = {str(k): observed.Reason(int(frames.faults[k])).name for k in np.flatnonzero(frames.faults)}
     assert faults == case.get("faults", {})
     good = np.ones(frames.n_frames, bool) if case.get("pixels") else frames.faults == 0
     np.testing.assert_allclose(frames.flux[good], flux[good], rtol=case.get("rtol", 1e-9))
@@ -93,7 +93,7 @@ def _summary(path: Path, case: Case) -> tuple[str, ...]:
     median = float(np.nanmedian(frames.flux))
     assert median == pytest.approx(case.get("median", median), rel=1e-3)
     assert "error" not in case or np.median(frames.error) == pytest.approx(case["error"])
-    flagged = np.flatnonzero(frames.faults & Reason.QUALITY)
+    flagged = np.flatnonzero(frames.faults & observed.Reason.QUALITY)
     assert flagged.tolist() == case.get("flagged", flagged.tolist())
     assert flagged.size == case.get("flagged_count", flagged.size)
     usable = frames.flux[frames.faults == 0]
@@ -198,6 +198,19 @@ def test_keys_of_entries_are_known() -> None:
     """Refuse an expectation whose key is spelt wrong, which would expect nothing."""
     known = set(re.findall(r"[\"'](\w+)[\"']", "".join(Path(file).read_text() for file in (__file__, corpus.__file__))))
     assert sorted({key for _, case in CASES for key in case} - known) == []
+
+
+#: Light curves in text, which are read in pieces where they are large.
+TEXTS = re.compile(r"(text_tables (?!machine-readable|IPAC).*|odd_frames (rows|unusable (text|column)).* csv\d*$)")
+
+
+@pytest.mark.parametrize("case", [pytest.param(case, id=name) for name, case in CASES if TEXTS.match(name)])
+def test_large_tables_are_read_in_pieces_as_they_say(
+    case: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mauvecl.host.tables.opening.LARGE", 0)
+    monkeypatch.setattr("mauvecl.host.tables.opening.PIECE", 200)
+    test_files_are_read_as_they_say(case, tmp_path)
 
 
 @pytest.mark.parametrize("case", [pytest.param(case, id=name) for name, case in CASES])

@@ -16,7 +16,7 @@ from typer.main import get_command
 
 import mauvecl
 from mauvecl import Instrument, Study
-from mauvecl.cli.app import app
+from mauvecl.cli import app
 from mauvecl.observations.mapping import FrameMapping
 
 ROOT = Path(__file__).parent.parent
@@ -104,7 +104,7 @@ def test_studies_and_instruments_shown_are_valid() -> None:
 
 
 def test_documented_commands_have_existing_verbs_and_flags() -> None:
-    verbs: Any = get_command(app)
+    verbs: Any = get_command(app.app)
     seen = 0
     for page in all_pages():
         text = page.read_text(encoding="utf-8")

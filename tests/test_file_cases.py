@@ -12,7 +12,7 @@ from astropy.io import fits
 from refusals import refused
 
 from mauvecl import Frames, read_frames
-from mauvecl.observations.frames import Reason
+from mauvecl.observations import frames as observed
 
 DATA = Path(__file__).parent / "data"
 #: Files of the pipelines, with the mask of bits that excludes a frame by lightkurve 2.6 (without 512 for TESS).
@@ -35,7 +35,7 @@ def test_light_curves_of_the_pipelines_are_those_of_astropy(file: str, mask: int
     np.testing.assert_array_equal(found.flux, rows["PDCSAP_FLUX"].astype(float))
     days = found.reference_mjd + found.time_s / 86_400 + 2_400_000.5 - epoch
     np.testing.assert_allclose(days, rows["TIME"], atol=2e-9, rtol=0)
-    np.testing.assert_array_equal(found.faults & Reason.QUALITY != 0, flags & mask != 0)
+    np.testing.assert_array_equal(found.faults & observed.Reason.QUALITY != 0, flags & mask != 0)
     names = [text for text in found.flags if text]
     assert len(names) == np.count_nonzero(flags & mask)
     assert all("(" in text for text in names)

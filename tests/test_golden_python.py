@@ -67,12 +67,10 @@ def plain(value: Any) -> Any:
 
 
 def table(of: Any, *columns: str) -> Answer:
-    """Return columns of a table, by default all."""
     return {name: of[name] for name in columns or of.colnames}
 
 
 def numeric(values: Any) -> bool:
-    """Return whether a value is a number or a list of numbers."""
     return all(isinstance(one, int | float) for one in (values if isinstance(values, list) else [values]))
 
 

@@ -18,7 +18,7 @@ from typer.main import get_command
 
 import mauvecl
 from mauvecl import Instrument, Study
-from mauvecl.cli.app import app
+from mauvecl.cli import app
 from mauvecl.observations.mapping import FrameMapping
 
 FILE = Path(__file__).parent / "data" / "public_interface.txt"
@@ -100,7 +100,7 @@ def python() -> Iterator[str]:
 
 def public_interface() -> list[str]:
     """Return every line, each once, sorted."""
-    lines = {*commands(get_command(app)), *keys(Study, "study"), *keys(Instrument, "instrument")}
+    lines = {*commands(get_command(app.app)), *keys(Study, "study"), *keys(Instrument, "instrument")}
     lines |= {*keys(FrameMapping, "mapping"), *columns(), *python()}
     return sorted(lines)
 

@@ -165,6 +165,14 @@ def make(folder: Path) -> dict[str, Case]:
     cases["targets.csv"] = Case(
         "targets.csv", (("visible", "--targets", "targets.csv", "--no-pictures", "--quiet", "--output", "out"),)
     )
+    # Fewer realisations than the threshold needs: everything is read, and then refused.
+    few = ("detect", *star, "-n", "100", "--tails", "counted", "--no-pictures")
+    for ending, form in (("csv", "ascii.csv"), ("ecsv", "ascii.ecsv"), ("fits", "fits")):
+        name = f"flares.{ending}"
+        Table({"amplitude": [0.1, 0.2], "tstart": [1.0, 2.0]}).write(folder / name, format=form)
+        cases[name] = Case(name, ((*few, "--flares", name),))
+    (folder / "weights.txt").write_text("190 0.5\n400 1\n700 1\n")
+    cases["weights.txt"] = Case("weights.txt", ((*few, "--set", "run.weights.mine='weights.txt'"),))
     return cases | _stores(folder) | _answer(folder)
 
 

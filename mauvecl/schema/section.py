@@ -108,16 +108,12 @@ def _key_of(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[st
     """Return the part of an error's location that names a key, with the numbers of entries in lists."""
     path: list[str] = []
     inner: type[BaseModel] | None = model
-    in_table = False
     for part in location:
-        if in_table:
-            # A table's own names are no fields of a model.
-            in_table = False
-        elif isinstance(part, str):
+        if isinstance(part, str):
             if inner is None:
                 break
-            annotation = field.annotation if (field := inner.model_fields.get(part)) else None
-            inner, in_table = model_in(annotation), get_origin(annotation) is dict
+            field = inner.model_fields.get(part)
+            inner = None if field is None else model_in(field.annotation)
         path.append(str(part))
     return tuple(path)
 
@@ -139,7 +135,7 @@ def _input_error_of(model: type[BaseModel], first: Any) -> InputError:
         case "too_long" | "too_short":
             expected = message.partition("should have ")[2].partition(" after")[0]
         case "truth":
-            expected = "a number or text, not true or false"
+            expected = "a number or text"
         case "path_type":
             expected = "a path"
         case _:
@@ -251,7 +247,7 @@ def fields_of(section: type[BaseModel], path: tuple[str, ...] = ()) -> Iterator[
 
 def refusal(name: str, text: str, expected: str) -> InputError:
     """Return the error of a value's text; its key is the parameter that a flag sets, or else the value's name."""
-    error = InputError.of(name, text, expected)
+    error = InputError.of(name.removesuffix(" ="), text, expected)
     error.key = name.split()[0].strip("-").replace("-", "_")
     return error
 

@@ -19,7 +19,6 @@ SMALL = {
 
 
 def study(**changes):
-    """Return a small question with some sections changed."""
     data = {**SMALL, **{k: {**SMALL.get(k, {}), **v} if isinstance(v, dict) else v for k, v in changes.items()}}
     return Study.build(data, "test")
 

@@ -46,6 +46,12 @@ ASKED: dict[str, tuple[str, dict[str, Any], str]] = {
     "nuisances": ("detect", {"star": "G2V", "magnitude": 7, "amplitude": 0.1, "nuisance": {"dark": 0.1}, "fap": 0.1,
                              "realisations": 2000},
                   "--star G2V -m 7 -a 0.1 --nuisance dark=0.1 --fap 0.1 -n 2000"),
+    "noisy references": (
+        "detect",
+        {"star": "G2V", "magnitude": 7, "amplitude": 0.1, "fap": 0.1, "realisations": 2000, "ideal": True,
+         "statistic": "all", "reference": "stack:3", "variances": "estimated"},
+        "--star G2V -m 7 -a 0.1 --fap 0.1 -n 2000 --ideal --statistic all --reference stack:3 --variances estimated",
+    ),
     "default of the verb": ("snr", {"star": "G2V", "magnitude": 7, "realisations": 1000}, "--star G2V -m 7 -n 1000"),
     "sweep": ("snr", {"star": "G2V", "sweep": "magnitude=6,7", "realisations": 1000},
               "--star G2V --sweep magnitude=6,7 -n 1000"),

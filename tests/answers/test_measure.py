@@ -235,13 +235,6 @@ def test_fits_take_the_factor_on_light_as_it_is_drawn(engine: Engine) -> None:
     assert free == {"light": (0.0, np.inf)}
 
 
-def test_what_is_drawn_and_not_marginalised_is_said(engine: Engine) -> None:
-    settings = ["flare.amplitudes=[0.5]", "processes.pointing_loss={uniform=[0, 0.05]}"]
-    for more, said in (([], True), (["nuisances.light='free'"], False)):
-        answer = measure(drawn_study(*settings, *more, fits=10), engine)
-        assert any("NOT MARGINALISED: light" in text for text in answer.messages) == said
-
-
 def test_hottest_flares_are_measured(engine: Engine) -> None:
     rows = measure(drawn_study("flare.amplitudes=[0.1]", "flare.temperature_k=2e5", fits=20), engine).flares[0].rows()
     assert rows["truth"][0] == 2e5

@@ -20,7 +20,7 @@ G2V = {"star": [{"library": "G2V", "magnitude": 7.4}]}
 TABLES: dict[str, dict[str, Any]] = tomllib.loads(
     (Path(__file__).parents[1] / "data" / "studies" / "messages.toml").read_text(encoding="utf-8")
 )
-SATURATED, PRIORS, OF_PRIORS = (TABLES[name] for name in ("saturated", "priors", "of_priors"))
+SATURATED, PRIORS, OF_PRIORS, KINDS = (TABLES[name] for name in ("saturated", "priors", "of_priors", "kinds"))
 
 
 def map_of(amplitudes: list[float], exposures: list[float]) -> dict[str, Any]:
@@ -38,13 +38,12 @@ def said(verb: str, study: Study, engine: Engine, folder: Path) -> list[str]:
     if verb == "simulate":
         return list(simulate(study, flaring=True).messages)
     try:
-        return list(getattr(mauvecl, verb)(study, Stares() if verb in ("stare", "inject") else engine).messages)
+        return list(getattr(mauvecl, verb)(study, Stares() if verb in ("stare", "inject", "plan") else engine).messages)
     except InputError as refusal:
         return [str(refusal)]
 
 
 def hot_star(magnitude: float, low_nm: float, **sections: Any) -> Study:
-    """Return a study of a hot star on part of the pixels."""
     data: dict[str, Any] = {
         "star": [{"library": "A0V", "magnitude": magnitude, "distance_pc": 7.7}],
         "flare": {"amplitudes": [0.01]},
@@ -103,12 +102,13 @@ def test_prior_that_excludes_the_expectation_is_reported(engine: Engine, tmp_pat
         assert all(name in text for text in found)
 
 
-def test_prior_that_excludes_a_swept_value_is_reported(engine: Engine) -> None:
-    """Use a prior that contains the study's temperature and one of two swept ones."""
-    sweep = {"axes": [{"quantity": "detector_temperature", "values": [20.0, 10.0]}]}
-    prior = {"detector_temperature": {"uniform": [18.0, 22.0]}}
-    (sentence,) = of_kind(detect(small(**G2V, processes=prior, sweep=sweep), engine).messages, "outside the prior")
-    assert "has 10:" in sentence
+@pytest.mark.parametrize("name", [name for name in KINDS if name != "study"])
+def test_messages_are_given_where_they_apply(engine: Engine, tmp_path: Path, name: str) -> None:
+    row = {"less": [], "without": 0, "with": 1} | KINDS[name]
+    study = paper(*KINDS["study"], *row["less"])
+    for asked, count in ((study, row["without"]), (study.with_settings(row["more"]), row["with"])):
+        found = of_kind(said(row["verb"], asked, engine, tmp_path), row["kind"])
+        assert len(found) == count, found
 
 
 UNKNOWN: dict[str, dict[str, Any]] = {
@@ -165,37 +165,9 @@ def test_maps_and_limits_report_a_wrong_sign_as_detect_does(engine: Engine, temp
         assert ["WRONG SIGN" in text for text in found.failed] == [True] * lowered
 
 
-def test_rounding_that_invalidates_closed_forms_is_reported() -> None:
-    asked = paper("star=[{library='G2V', magnitude=12}]")
-    quiet = asked.with_settings(["observation.changes={read_noise_dn=0.1}", "observation.temperature_c=-40"])
-    assert [bool(of_kind(simulate(one).messages, "rounding")) for one in (asked, quiet)] == [False, True]
-
-
-@pytest.mark.parametrize(
-    ("magnitude", "dark"),
-    long_but([(7.4, False), (20.0, False), (24.0, True), (25.0, True)], (20.0, False), (24.0, True)),
-)
-def test_star_without_light_is_reported(magnitude: float, dark: bool) -> None:
-    """Report a star that makes less than one electron in an exposure, since its S/N is 0."""
-    study = paper(f"star=[{{library = 'G2V', magnitude = {magnitude}}}]")
-    assert bool(of_kind(simulate(study).messages, "no light")) == dark
-
-
 def test_json_has_no_nan(tmp_path: Path) -> None:
     """A single fit has a bias and no scatter, which is null and not the number NaN that JSON lacks."""
     words = ("measure", "--star", "M3V", "-m", "7", "-a", "0.5", "--fits", "1", "--no-pictures", "--json")
     rows = json.loads(run(*words, folder=tmp_path).stdout, parse_constant=pytest.fail)["rows"]
     assert {row["scatter"] for row in rows} == {None}
     assert all(np.isfinite(row["bias"]) for row in rows)
-
-
-def test_saturation_of_a_star_and_its_flare_is_one_message() -> None:
-    """A flare that alone saturates has its own, also next to a brighter star of the same name that does, too."""
-    star = "star=[{library='Vega', magnitude=0.03}]"
-    few = ["run.realisations=2000", "run.fap=0.1", "flare.amplitudes=[0.02]", star]
-    both = detect(paper(*few))
-    assert len(of_kind(both.messages, "saturated")) == 1
-    axes = "sweep.axes=[{quantity='magnitude', values=[0.03, 1.5]}]"
-    swept = detect(paper(*few, "flare.amplitudes=[0.5]", axes))
-    assert [one.detection.quiet.saturated.any() for one in swept.stars] == [True, False]
-    assert len(of_kind(swept.messages, "saturated")) == 2

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 from astropy.table import Table
-from commands import run
 from refusals import refused
 
 import mauvecl
@@ -37,17 +36,6 @@ def test_paper_and_ideal_change_the_conventions_alone() -> None:
         assert changed.flare == ASKED.flare
     assert Study().paper().run.statistics == ("chi2", "chi2_element", "matched")
     assert Study.build({"run": {"statistics": ["matched"]}}, "test").paper().run.statistics == ("matched",)
-
-
-def test_flags_ask_as_the_methods_do(tmp_path: Path) -> None:
-    words = ("exposure", "--snr", "10", "--at", "300", "--star", "G2V", "-m", "7.4", "--no-pictures", "-o")
-    for flag in ("paper", "ideal"):
-        few = ("detect", "--star", "G2V", "-m", "7", "-a", "0.1", "-n", "2000", "--fap", "0.1", "--no-pictures", "-o")
-        run(*few, flag, f"--{flag}", folder=tmp_path)
-        study = Study.read(tmp_path / flag / "study.toml")
-        assert study == getattr(study, flag)()
-    run(*words, "of-paper", "--paper", folder=tmp_path)
-    assert Study.read(tmp_path / "of-paper" / "study.toml").observation.instrument == "mauvesim"
 
 
 # The ideal answer

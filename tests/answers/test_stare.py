@@ -133,13 +133,10 @@ def test_saturated_flare_is_reported(stares):
     assert cut.stares[0].staring.quality.sum() == cut.table["saturated_frames"][0]
 
 
-def test_unused_settings_are_reported(stares):
-    reported = stare(SHORT.with_settings(["observation.exposure_s=20", "events=[{peak_s=310}, {peak_s=200}]"]), stares)
-    assert len(of_kind(reported.messages, "not used")) == 1
+def test_flares_outside_the_frames_are_reported(stares):
+    reported = stare(SHORT.with_settings(["events=[{peak_s=310}, {peak_s=200}]"]), stares)
     (line,) = (message for message in reported.messages if "outside the frames" in message)
     assert line.startswith("Flare 1 peaks at 310 s")
-    plain = stare(SHORT.with_settings(["observation.exposure_s=5"]), stares)
-    assert not any("not used" in message or "outside" in message for message in plain.messages)
 
 
 @pytest.mark.long

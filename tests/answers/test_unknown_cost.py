@@ -112,7 +112,7 @@ def test_own_unknowns_are_read_from_files_points_and_flags(tmp_path: Path, engin
         "matched",
         "--ideal",
     ]
-    run("detect", *flags, "--nuisance", "dark=0.1", "--nuisance", "stray.txt=2", "--no-pictures", folder=tmp_path)
+    run("detect", *flags.split(), "--nuisance", "stray.txt=2", "--no-pictures", folder=tmp_path)
     of_flags = Study.read(tmp_path / "mauvecl-detect" / "detection.ecsv")
     kept = asked.nuisances.own["stray"].model_copy(update={"file": tmp_path / "stray.txt"})
     assert of_flags.nuisances == asked.nuisances.model_copy(update={"own": {"stray": kept}})

@@ -69,7 +69,6 @@ def drawn(answer: Any) -> Iterator[tuple[str, Any, Any]]:
 
 
 def shown_ticks(axis: Any) -> list[Text]:
-    """Return the tick labels that lie within the view."""
     low, high = sorted(axis.get_view_interval())
     margin = 1e-9 * (high - low)
     ticks = [*axis.get_major_ticks(), *axis.get_minor_ticks()]

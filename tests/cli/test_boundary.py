@@ -121,7 +121,6 @@ def refused(*words: str, folder: Path) -> str:
      "detect --star G2V -n 5000 --fap .05 --cluster"],
 )  # fmt: skip
 def test_invalid_file_names_exit_with_code_2(words: str, name: str, tmp_path: Path) -> None:
-    """Refuse over-long names, which raised OSError 36."""
     refused(*words.split(), name, folder=tmp_path)
 
 
@@ -206,7 +205,6 @@ def test_only_regular_files_are_read(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_output_that_is_a_folder_is_refused(tmp_path: Path) -> None:
-    """Refuse a folder in place of a file, which raised IsADirectoryError."""
     for name in ("study.toml", "observation-1.fits", "observation-1.ecsv", "run.json"):
         (tmp_path / name / name).mkdir(parents=True)
         refused(*OBSERVE, "-o", name, folder=tmp_path)

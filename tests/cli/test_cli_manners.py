@@ -11,10 +11,10 @@ import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 from commands import started
+from processes import python
 
 import mauvecl
 from mauvecl.cli.console import Meter
@@ -65,12 +65,10 @@ for words in json.loads(sys.argv[1]):
 def test_mistakes_load_no_heavy_package(tmp_path: Path) -> None:
     code = TRIED.replace("HEAVY", repr(HEAVY))
     asked = [["--version"], *map(shlex.split, MISTAKES.strip().splitlines())]
-    done = subprocess.run(
-        [sys.executable, "-c", code, json.dumps(asked)], capture_output=True, text=True, cwd=tmp_path, check=True
-    )
-    reported = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("[")]
+    lines = python(code, json.dumps(asked), folder=tmp_path).stdout.splitlines()
+    reported = [json.loads(line) for line in lines if line.startswith("[")]
     # Nor is all of it looked through for circles at the end, or often before.
-    assert done.stdout.splitlines()[-1] == "frozen True True"
+    assert lines[-1] == "frozen True True"
     assert list(zip(asked, reported, strict=True)) == [
         (words, [0 if words == ["--version"] else 2, []]) for words in asked
     ]
@@ -131,72 +129,46 @@ def test_interrupt_after_any_delay_shows_no_traceback_of_mauvecl(script: bool, t
     assert "mauvecl: interrupted\n" in said
 
 
-@pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Return a clock that a test advances."""
-    found = SimpleNamespace(now=1e6)
-    monkeypatch.setattr(time, "monotonic", lambda: found.now)
-    return found
+CLEARED = "\r\x1b[K"
+#: Work done of a total every ten seconds, and what is shown of it: in a file and, of the last, on a terminal.
+PROGRESS: dict[str, tuple[list[tuple[int, int]], list[str]]] = {
+    # By the rate of the first tile, 1e12 realisations would take 348 000 years.
+    "few": (
+        [(0, 10**12), (1, 10**12), (2, 10**12)],
+        [f"{done} of 1000000000000 realisations, 0.1 a second, time left unknown" for done in (1, 2)],
+    ),
+    "unknown": ([(0, 1000), (2, 1000)], ["2 of 1000 realisations, 0.2 a second, time left unknown"]),
+    "seconds": ([(0, 1000), (100, 1000)], ["100 of 1000 realisations, 10 a second, 90 s left"]),
+    "minutes": ([(0, 1000), (20, 1000)], ["20 of 1000 realisations, 2 a second, 8 min left"]),
+    # A smaller number than before is late: the rate continues from the start.
+    "late": (
+        [(0, 1000), (400, 1000), (390, 1000), (500, 1000)],
+        ["400 of 1000 realisations, 40 a second, 15 s left", "500 of 1000 realisations, 16.7 a second, 30 s left"],
+    ),
+    "next star": (
+        [(0, 1000), (500, 1000), (0, 2000), (1000, 2000)],
+        ["500 of 1000 realisations, 50 a second, 10 s left", "1000 of 2000 realisations, 100 a second, 10 s left"],
+    ),
+    "terminal": (
+        [(0, 1000), (500, 1000), (0, 2000)],
+        [f"{CLEARED}500 of 1000 realisations, 50 a second, 10 s left{CLEARED}"],
+    ),
+}
 
 
-def test_time_left_is_unknown_after_few_realisations(clock: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    """Wait for more than the first tile, by whose rate 1e12 realisations would take 348 000 years."""
-    with Meter() as meter:
-        for done in (0, 1):
-            meter(done, 10**12)
-            clock.now += 11.0
-        meter(2, 10**12)
-    reported = capsys.readouterr().err
-    assert "2 of 1000000000000 realisations" in reported
-    assert "time left unknown" in reported
-    assert not re.search(r"\d s left", reported)
-
-
-@pytest.mark.parametrize(
-    ("done", "left"), [(100, "99 s left"), (20, "9 min left"), (50, "3 min left"), (2, "time left unknown")]
-)
-def test_time_left_is_estimated(done: int, left: str, clock: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    with Meter(unit="cells") as meter:
-        meter(0, 1000)
-        clock.now += 11.0
-        meter(done, 1000)
-    assert capsys.readouterr().err.rstrip().endswith(left)
-
-
-def test_late_progress_is_ignored(clock: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    """Ignore a smaller number than before; the rate continues from the start."""
-    with Meter() as meter:
-        meter(0, 1000)
-        for done in (400, 390, 500):
-            clock.now += 10.0
-            meter(done, 1000)
-    last = capsys.readouterr().err.splitlines()[-1]
-    assert last == "500 of 1000 realisations, 16.7 a second, 30 s left"
-
-
-def test_meter_restarts_for_the_next_star(clock: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    with Meter() as meter:
-        for total in (1000, 2000):
-            meter(0, total)
-            clock.now += 10.0
-            meter(total // 2, total)
-    assert capsys.readouterr().err.splitlines() == [
-        "500 of 1000 realisations, 50 a second, 10 s left",
-        "1000 of 2000 realisations, 100 a second, 10 s left",
-    ]
-
-
-def test_line_on_a_terminal_is_cleared_before_the_next_star(
-    clock: Any, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("name", PROGRESS)
+def test_progress_states_rate_and_time_left(
+    name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    steps, lines = PROGRESS[name]
+    clock = SimpleNamespace(now=1e6)
+    monkeypatch.setattr(time, "monotonic", lambda: clock.now)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: name == "terminal")
     with Meter() as meter:
-        meter(0, 1000)
-        clock.now += 10.0
-        meter(500, 1000)
-        meter(0, 2000)
-    cleared = "\r\x1b[K"
-    assert capsys.readouterr().err == f"{cleared}500 of 1000 realisations, 50 a second, 10 s left{cleared}"
+        for done, total in steps:
+            meter(done, total)
+            clock.now += 10.0
+    assert capsys.readouterr().err.rstrip("\n").split("\n") == lines
 
 
 ROOT = Path(mauvecl.__file__).parent

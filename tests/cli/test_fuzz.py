@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
-import io
 import os
 import resource
 import sys
@@ -182,65 +180,6 @@ def test_verbs_never_crash(folder: Path, verb: str, value: str) -> None:
         "detect": ("detect", "--fap", value or "x", "-o", value),
     }[verb]
     check(folder, *words)
-
-
-def _flares() -> tuple[bytes, ...]:
-    from astropy.table import Table
-
-    table = Table({"amplitude": [0.1, 0.2], "tstart": [1.0, 2.0]})
-    found = []
-    for form in ("ascii.csv", "ascii.ecsv"):
-        content = io.StringIO()
-        table.write(content, format=form)
-        found.append(content.getvalue().encode())
-    packed = io.BytesIO()
-    table.write(packed, format="fits")
-    return *found, packed.getvalue()
-
-
-SPLICES = st.one_of(
-    st.binary(max_size=12),
-    NUMBERS.map(str.encode),
-    st.sampled_from([b"\n", b" ", b"#", b",", b'"', b"'", b"*a", b"&a", b"word", b"1+2j", b"nan", b"1e308"]),
-    st.sampled_from([b"\0" * 100, b"\xff\xfe", b"\x1f\x8b"]),
-)
-
-
-def spoilt(content: bytes, place: float, splice: bytes, cut: int, pack: bool) -> bytes:
-    """Replace some bytes of a good file."""
-    at = int(place * len(content))
-    found = content[:at] + splice + content[at + cut :]
-    return gzip.compress(found)[: -1 if cut == 1 else None] if pack else found
-
-
-SPOILS = {
-    # Headers are longer than numbers.
-    "place": st.one_of(st.floats(0.0, 1.0), st.floats(0.7, 1.0)),
-    "splice": SPLICES,
-    "cut": st.sampled_from([0, 1, 5, 80, 3000]),
-    "pack": st.sampled_from([False, False, False, True]),
-}
-
-
-#: Fewer realisations than the threshold needs: everything is read, and then refused.
-FEW = ("detect", "--star", "G2V", "-m", "8", "-n", "100", "--tails", "counted")
-
-
-@many(25)
-@given(kind=st.integers(0, 2), ending=st.sampled_from([".csv", ".ecsv", ".fits", ".txt"]), **SPOILS)
-def test_flare_tables_never_crash(
-    folder: Path, kind: int, ending: str, place: float, splice: bytes, cut: int, pack: bool
-) -> None:
-    file = folder / f"flares{ending}"
-    file.write_bytes(spoilt(_flares()[kind], place, splice, cut, pack))
-    check(folder, *FEW, "--flares", str(file))
-
-
-@many(25)
-@given(lines=st.lists(st.tuples(NUMBERS, NUMBERS).map(" ".join), max_size=4), junk=st.binary(max_size=8))
-def test_weights_never_crash(folder: Path, lines: list[str], junk: bytes) -> None:
-    (folder / "weights.txt").write_bytes("\n".join(["190 0.5", *lines, "700 1"]).encode() + junk)
-    check(folder, *FEW, "--set", "run.weights.mine='weights.txt'")
 
 
 @many(20)

@@ -21,10 +21,10 @@ from typer.testing import CliRunner
 
 import mauvecl
 from mauvecl import Source, Study
-from mauvecl.cli.app import app
+from mauvecl.cli import app
 
 FILE = Path(__file__).parent.parent / "data" / "flags.json"
-TOP: dict[str, Any] = get_command(app).commands  # type: ignore[attr-defined]
+TOP: dict[str, Any] = get_command(app.app).commands  # type: ignore[attr-defined]
 #: Every verb, and every verb of `library`.
 VERBS: dict[str, Any] = {
     name: verb
@@ -93,9 +93,9 @@ def test_help_has_examples_and_fits_80_columns(name: str, tmp_path: Path, monkey
 
 def test_bare_command_lists_every_command_on_a_line_of_its_own() -> None:
     """Check that the first sentence of each command fits into 80 columns, and that a bare `mauvecl` is no error."""
-    done = CliRunner().invoke(app, [], env={"COLUMNS": "80"})
+    done = CliRunner().invoke(app.app, [], env={"COLUMNS": "80"})
     assert (done.exit_code, done.stderr) == (0, "")
-    assert done.output == CliRunner().invoke(app, ["--help"], env={"COLUMNS": "80"}).output
+    assert done.output == CliRunner().invoke(app.app, ["--help"], env={"COLUMNS": "80"}).output
     lines = done.output.splitlines()
     assert max(map(len, lines)) <= 80
     for name, one in TOP.items():
@@ -106,7 +106,7 @@ def test_bare_command_lists_every_command_on_a_line_of_its_own() -> None:
 @pytest.mark.parametrize("name", [name for name, one in VERBS.items() if "study_file" in {p.name for p in one.params}])
 def test_help_shows_the_common_flags_and_help_all_every_flag(name: str) -> None:
     def listed(flag: str) -> list[str]:
-        shown = CliRunner().invoke(app, [name, flag], env={"COLUMNS": "80"})
+        shown = CliRunner().invoke(app.app, [name, flag], env={"COLUMNS": "80"})
         assert shown.exit_code == 0
         lines = shown.output.splitlines()
         assert max(map(len, lines)) <= 80
@@ -119,7 +119,7 @@ def test_help_shows_the_common_flags_and_help_all_every_flag(name: str) -> None:
 
 
 def test_help_all_groups_flags_by_section() -> None:
-    shown = CliRunner().invoke(app, ["detect", "--help-all"], env={"COLUMNS": "80"}).output
+    shown = CliRunner().invoke(app.app, ["detect", "--help-all"], env={"COLUMNS": "80"}).output
     found = re.findall(r"^(\S.*):$|^  (?:-\w, )?(--[\w-]+)", shown, re.MULTILINE)
     heading, of = "", {}
     for title, flag in found:
@@ -311,7 +311,7 @@ def test_narrow_terminal_truncates_nothing(width: int, tmp_path: Path) -> None:
     words += ["--sweep", "exposure=5,50", "--quiet", "--wide", "--output", str(tmp_path / "out")]
     wide = tables(run(*words, folder=tmp_path).stdout.partition("Assumed:")[0])
     env = {"COLUMNS": str(width), "FORCE_COLOR": "1"}
-    shown = CliRunner().invoke(app, words, env=env).output
+    shown = CliRunner().invoke(app.app, words, env=env).output
     narrow = tables(shown.partition("Assumed:")[0])
     assert "…" not in shown
     assert {cell for row in wide for cell in row} <= {cell for row in narrow for cell in row}
@@ -347,7 +347,7 @@ WIDE = [
 def test_tables_have_one_part_in_80_columns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for words in WIDE:
-        done = CliRunner().invoke(app, [*words, "--no-pictures"], env={"COLUMNS": "80", "FORCE_COLOR": "1"})
+        done = CliRunner().invoke(app.app, [*words, "--no-pictures"], env={"COLUMNS": "80", "FORCE_COLOR": "1"})
         shown = re.sub(r"\x1b\[[0-9;]*m", "", done.output)
         assert "─" in shown, shown
         # A part without a title begins with its headings.
@@ -359,7 +359,7 @@ def test_parts_of_a_table_repeat_only_the_labels(tmp_path: Path) -> None:
     """Print a year in 80 columns: each month occurs once, and each part repeats the names of the targets."""
     words = ["visible", "--look-at", "eps Eri", "--start", "2027-01-01", "--days", "365", "--no-pictures"]
     words += ["--output", str(tmp_path / "out")]
-    shown = CliRunner().invoke(app, words, env={"COLUMNS": "80", "FORCE_COLOR": "1"}).output
+    shown = CliRunner().invoke(app.app, words, env={"COLUMNS": "80", "FORCE_COLOR": "1"}).output
     months = tables(shown.partition("Hours of exposure by month")[2])
     for month in range(1, 13):
         assert sum(f"2027-{month:02d}" in row for row in months) == 1

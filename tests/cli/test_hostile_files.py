@@ -28,12 +28,11 @@ def fuzz() -> ModuleType:
 
 def test_mutated_files_are_answered_or_refused(fuzz: ModuleType) -> None:
     """Mutate each format twice; `python tools/fuzz_files.py` does so two thousand times."""
-    assert [fault for fault in fuzz.run(range(74), 4300) if fault is not None] == []
+    assert [fault for fault in fuzz.run(range(82), 4300) if fault is not None] == []
 
 
 @pytest.fixture(scope="module")
 def intact(fuzz: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Write intact files of every format."""
     folder = tmp_path_factory.mktemp("intact")
     fuzz.make(folder)
     return folder

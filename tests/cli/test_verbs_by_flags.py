@@ -50,7 +50,6 @@ def out(verb: str, tmp_path: Path) -> Path:
 
 
 def assumed(shown: str) -> list[str]:
-    """Return the clauses of the list of assumptions."""
     _, clauses = shown.split("\nAssumed:\n")
     lines = takewhile(lambda line: line.startswith("  "), clauses.splitlines())
     return [clause for line in lines for clause in line.strip().split("; ")]

@@ -1,7 +1,5 @@
 """Values as people write them: with units, in per cent, without a star, and with few realisations."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -50,15 +48,6 @@ def test_flags_take_units(tmp_path: Path) -> None:
     study = Study.read(tmp_path / "mauvecl-simulate" / "study.toml")
     assert (study.star[0].magnitude, study.observation.exposure_s, study.flare.temperature_k) == (9.0, 600.0, 9000.0)
     assert (study.flare.amplitudes, study.sky.surface_brightness) == (pytest.approx((0.24, 0.02)), 22.0)
-
-
-def test_units_are_imported_only_with_a_unit() -> None:
-    """Reading plain numbers must not take the time that importing astropy takes."""
-    code = "import sys; from mauvecl.schema.section import read_number; read_number({!r}, '--exposure', 's'); "
-    code += "print('astropy' in sys.modules)"
-    for text, imported in (("600", "False"), ("10 min", "True")):
-        done = subprocess.run([sys.executable, "-c", code.format(text)], capture_output=True, text=True, check=True)
-        assert done.stdout.strip() == imported
 
 
 def test_amplitudes_like_percentages_have_a_note(tmp_path: Path) -> None:

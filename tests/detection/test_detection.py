@@ -98,16 +98,6 @@ def test_saturated_pixels_are_left_out(engine: Engine) -> None:
     assert abs(mean - dof) < 5 * np.sqrt(2 * dof / 100_000)
 
 
-def test_wider_wings_than_the_grid_are_counted(engine: Engine) -> None:
-    """Count a strong flare beyond the end of the null's grid above every threshold."""
-    quiet, flare = star(magnitude=3.0, amplitudes=(0.24,), payload=instrument(part=True))
-    found = engine.detect(quiet, [flare], realisations=2000, seed=1)
-    assert [p.value for p in found.detection_probability(0.05, "chi2")] == [1.0]
-    own = found.distribution("chi2", 0)
-    assert own.mean == pytest.approx(found.closed_form("chi2", 0).mean, rel=0.02)
-    assert own.far.n == 0
-
-
 @pytest.mark.long
 def test_own_weights_define_a_statistic(engine: Engine) -> None:
     """Give the matched filter as weights, and compare other weights with their normal distribution."""

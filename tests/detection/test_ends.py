@@ -235,7 +235,6 @@ def test_nan_values_are_refused(engine: Engine) -> None:
 
 
 def test_all_statistics_are_tested() -> None:
-    """Check that the studies include every statistic, reference, variance, prior and cosmic rays."""
     hows = [study(number)[1] for number in range(STUDIES)]
     assert {name for how in hows for name in how["statistics"] if isinstance(name, str)} == set(STATISTICS)
     assert {how["comparison"].exposures for how in hows} == {0, 1, 3}

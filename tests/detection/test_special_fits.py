@@ -174,7 +174,6 @@ def test_tilt_of_the_response_tilts_the_flare() -> None:
 
 @cache
 def exposures(library: str, magnitude: float, amplitude: float, kelvin: float, jump: float) -> list[Expectation]:
-    """Return the exposure of a star, and that of its flare."""
     own = star(library, magnitude)
     light = BalmerFlare(kelvin, jump)
     return [expect(one, MAUVE, exposure=50.0) for one in (own, own.flaring(amplitude, spectrum=light))]

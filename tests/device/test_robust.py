@@ -11,7 +11,7 @@ import numpy as np
 import pyopencl as cl
 import pytest
 from processes import python
-from refusals import refused
+from refusals import failed, refused
 
 from mauvecl import Engine
 from mauvecl.device import build, drivers, selftest
@@ -21,10 +21,8 @@ def test_device_is_chosen_by_name_or_number() -> None:
     first = Engine().device
     assert first.default
     assert "Portable" in first.platform
-    with pytest.raises(RuntimeError) as error:
+    with failed("unknown device", first.label):
         Engine(device="no such device")
-    assert error.value.kind == "unknown device"
-    assert first.label in str(error.value)
     assert Engine(device="portable").device == first
     assert Engine(device="0").device == first
 
@@ -64,9 +62,8 @@ def test_no_device_raises(monkeypatch: pytest.MonkeyPatch) -> None:
 
     for empty in (nothing, list):
         monkeypatch.setattr(cl, "get_platforms", empty)
-        with pytest.raises(RuntimeError) as error:
+        with failed("no device"):
             Engine()
-        assert error.value.kind == "no device"
 
 
 @pytest.mark.parametrize("new", [False, True])
@@ -134,15 +131,11 @@ def test_little_memory_shrinks_tiles_without_affecting_results(monkeypatch: pyte
 
 def test_too_little_memory_raises(monkeypatch: pytest.MonkeyPatch) -> None:
     refuse_beyond(monkeypatch, 100)
-    with pytest.raises(RuntimeError) as error:
+    with failed("memory", " 64 realisations"):
         Engine().detect(selftest.toy(), [selftest.toy(flare=0.3)], realisations=20_000, seed=1)
-    assert error.value.kind == "memory"
-    assert " 64 realisations" in str(error.value)
     refuse_beyond(monkeypatch, 100, scenes=True)
-    with pytest.raises(RuntimeError) as error:
+    with failed("memory", "scene"):
         Engine().realise(selftest.toy(), count=1, seed=1)
-    assert error.value.kind == "memory"
-    assert "scene" in str(error.value)
 
 
 def test_other_device_errors_are_not_retried(monkeypatch: pytest.MonkeyPatch) -> None:

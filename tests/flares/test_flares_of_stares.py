@@ -83,7 +83,6 @@ def test_cooling_flare_has_the_light_of_its_temperatures() -> None:
 
 
 def share_within(low_nm: float, high_nm: float, kelvin: float) -> float:
-    """Return the fraction of a blackbody's light between two wavelengths."""
     # 15 / pi^4 times the integral of x^3 / (e^x - 1) over x = h c / (wavelength k T), CODATA 2018.
     ends = [1.438776877e7 / (nm * kelvin) for nm in (high_nm, low_nm)]
     value = quad(lambda x: x**3 / np.expm1(x), ends[0], ends[1], epsabs=0.0, epsrel=1e-12, limit=200)[0]

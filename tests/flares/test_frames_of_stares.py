@@ -12,7 +12,6 @@ from mauvecl import Sinusoid, Stare, Study, stare, visible
 
 
 def points(*values):
-    """Return a curve through some points, as of a study."""
     return Study.build({"stare": {"variability": {"points": values}}}, "test").stare.variability
 
 

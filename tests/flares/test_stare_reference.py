@@ -21,7 +21,6 @@ FIRST, COUNT = 2**32 - 24, 40
 
 
 def pointing(**drifts: float) -> Any:
-    """Return drifts of the pointing, as of a study."""
     return Study.build({"stare": {"pointing": drifts}}, "test").stare.pointing
 
 

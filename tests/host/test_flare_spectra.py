@@ -81,7 +81,6 @@ def test_relative_lines_carry_their_fraction_and_absolute_ones_their_flux() -> N
 
 
 def centre(*lines: str) -> float:
-    """Return the mean wavelength of the light of lines."""
     flare = FlareWithLines(Blackbody(), {}, dict.fromkeys(lines, 1e-13))
     nm = flare.grid(np.linspace(200.0, 700.0, 50_001))
     return float(np.average(nm, weights=flare.flux_at_telescope(nm) * np.gradient(nm)))

@@ -30,18 +30,15 @@ MONTH = {"start": "2026-12-20T06:30", "days": 40.0, "targets": list(NAMES)}
 
 
 def section(**orbit: Any) -> Any:
-    """Return the section of a study that describes the orbit and its times."""
     return Study.build({"orbit": orbit}, "test").orbit
 
 
 def track(**orbit: Any) -> Any:
-    """Return the positions at the times of a study."""
     made = section(**orbit)
     return made.orbit().track(made.times())
 
 
 def seen(**orbit: Any) -> Any:
-    """Return the visibility of the targets of a study."""
     return visible(Study.build({"orbit": orbit}, "test")).visibility
 
 

@@ -24,7 +24,6 @@ from mauvecl.host.stars import additions
 
 @pytest.fixture(autouse=True)
 def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Set a temporary data folder."""
     monkeypatch.setenv("MAUVECL_DATA_DIR", str(tmp_path / "data"))
     return tmp_path / "data" / "stars"
 
@@ -42,7 +41,6 @@ def text_file(path: Path, scale: float = 1.0) -> Path:
 
 
 def archive_file(units: tuple[str, str], **header: Any) -> bytes:
-    """Return a FITS table in the archives' format."""
     columns = [
         fits.Column("WAVELENGTH", "D", unit=units[0], array=10 * WAVELENGTH_NM),
         fits.Column("FLUX", "E", unit=units[1], array=FLUX),
@@ -68,12 +66,10 @@ def not_done(folder: Path, *words: str | Path) -> str:
 
 
 def kept(folder: Path) -> list[str]:
-    """Return the names of the user's own stars."""
     return [one["name"] for one in json.loads(library(folder, "--json")) if one["kept"] == "yours"]
 
 
 def answered(name: str, **star: Any) -> Expectation:
-    """Return the expectation of a star in an answer."""
     return simulate(Study.build({"star": [{"library": name, **star}]}, "test")).inputs[0]
 
 

@@ -20,7 +20,6 @@ def blackbody(nm: np.ndarray, kelvin: float) -> np.ndarray:
 
 
 def ratio(one: Source, other: Source, band: str) -> float:
-    """Return the ratio of the photons of two stars in a band."""
     return float(10 ** (0.4 * (other.magnitude(band) - one.magnitude(band))))
 
 

@@ -21,7 +21,6 @@ TAIL = 5e-3
 
 
 def one_frame(dark: float, photons: float, read: float, *, gain: float = 0.6, pixels: int = 8, **kind) -> Expectation:
-    """Return one frame of equal pixels."""
     x = selftest.toy(pixels, 1, dark=dark, read=read, **({"photon_noise": "poisson"} | kind))
     full = np.ones(pixels)
     return replace(

@@ -89,7 +89,6 @@ def density(prior: Prior) -> tuple[np.ndarray, np.ndarray]:
 
 
 def moments(x: np.ndarray, weight: np.ndarray) -> tuple[float, float, float, float]:
-    """Return mean, standard deviation, skewness and kurtosis."""
     mean = float(weight @ x)
     sd = float(np.sqrt(weight @ (x - mean) ** 2))
     return mean, sd, *(float(weight @ ((x - mean) / sd) ** k) for k in (3, 4))

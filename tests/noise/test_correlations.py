@@ -16,7 +16,6 @@ MIXED = np.array([1500.0 + 7 * g if g >> i & 1 else 300.0 + 11 * g for g in rang
 
 
 def detector(dark: np.ndarray | float, electrons: np.ndarray | float, read: float = 0.7, **changes) -> Expectation:
-    """Return one frame of 64 pixels with given means."""
     x = selftest.toy(64, 1, read=read, **changes)
     ones = np.ones(64)
     return replace(x, dark_dn=dark * ones, source_electrons=electrons * ones, sky_electrons=0 * ones)

@@ -77,7 +77,6 @@ def test_jitter_is_drawn_for_every_frame(engine: Engine) -> None:
 
 
 def test_cosmic_rays_follow_compound_distribution(engine: Engine) -> None:
-    """Compare the number of hit pixels and their charge with the compound distribution."""
     rays = CosmicRays(rate_per_cm2_s=40.0)
     (x,) = star(exposure=5.0)
     clean, hit = (engine.realise(x, count=2000, seed=9, processes=p) for p in (NONE, Processes(cosmic_rays=rays)))
@@ -96,7 +95,6 @@ def test_cosmic_rays_follow_compound_distribution(engine: Engine) -> None:
 
 
 def test_charge_has_moments_of_compound_poisson_sum() -> None:
-    """Compare mean and variance with the rate times the first two moments of one hit."""
     rays = CosmicRays(rate_per_cm2_s=3000.0)
     for seconds in (5.0, 50.0, 600.0):
         p = rays.charge(seconds)
@@ -130,7 +128,6 @@ def test_process_does_not_change_draws_of_others(engine: Engine) -> None:
 @pytest.mark.parametrize("recipe", ["joint", "apart"])
 @pytest.mark.parametrize("name", ["mauvesim", "mauve"])
 def test_components_have_correct_sum_and_moments(engine: Engine, name: str, recipe: str) -> None:
-    """Check that components add up to the engine's count and have their own moments."""
     rays = recipe == "joint"
     sections = {"observation": {"instrument": name, "recipe": recipe}, "run": {"seed": 5}}
     sections |= {"processes": {"cosmic_rays": {}}} if rays else {}

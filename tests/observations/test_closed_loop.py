@@ -13,9 +13,9 @@ from scipy import stats
 from mauvecl import SHAPES, Frames
 from mauvecl.observations import events
 from mauvecl.observations import level as levels
+from mauvecl.observations import search as searches
 from mauvecl.observations.detection import detect_events
 from mauvecl.observations.light_curve import survey_light_curve
-from mauvecl.observations.search import simulated_rates
 
 SHAPE = SHAPES["davenport2014"]
 FRAMES, CADENCE_S, LEVEL, SD = 600, 60.0, 1000.0, 5.0
@@ -34,7 +34,7 @@ def light_curve(rng: np.random.Generator, mean: NDArray[np.float64] | float = LE
 @pytest.fixture(scope="module")
 def threshold() -> float:
     survey = survey_of(light_curve(np.random.default_rng(1)))
-    rates = simulated_rates(survey, np.ones(survey.stare.n_frames, np.bool_), 2.0, 1)
+    rates = searches.simulated_rates(survey, np.ones(survey.stare.n_frames, np.bool_), 2.0, 1)
     return max(rate.threshold(2.0) for rate in rates)
 
 

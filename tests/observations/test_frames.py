@@ -14,7 +14,6 @@ from layouts import documented_files
 
 from mauvecl import Frames, read_frames
 from mauvecl.observations import frame_files
-from mauvecl.observations.mapping import FrameMapping
 
 RNG = np.random.default_rng(29)
 TIME = np.arange(100) * 20.0
@@ -79,7 +78,7 @@ def test_time_series_of_astropy_are_frames() -> None:
 
 def test_binned_time_series_are_frames_through_a_mapping() -> None:
     series = BinnedTimeSeries(time_bin_start=WHEN, time_bin_size=18.0 * u.s, data={"flux": LIGHT[:, 0]})
-    how = FrameMapping(time="time_bin_start", time_at="start", exposure="time_bin_size", flux="flux")
+    how = frame_files.FrameMapping(time="time_bin_start", time_at="start", exposure="time_bin_size", flux="flux")
     frames = frame_files.frames_of(series, how)
     np.testing.assert_allclose(frames.time_s, np.arange(N) * 20.0 + 9.0, atol=2e-5)
     np.testing.assert_allclose(frames.exposure_s, 18.0)

@@ -1,25 +1,24 @@
 """Files larger than memory are read in pieces, in a process whose address space is limited."""
 
-import os
-import subprocess
-import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import Table
+from processes import python
 
-from mauvecl import InputError, read_frames
+from mauvecl import read_frames
 from mauvecl.observations import frame_files
-from mauvecl.observations.mapping import FrameMapping
 
 FRAMES, PIXELS = 65_536, 1024
 #: The address space may grow by this while a file of 256 MiB is read.
 MARGIN_MIB = 96
 #: Light of a frame above that of its pixel.
 PATTERN = np.arange(FRAMES) * 7919 % 101
-CHILD = """
+#: Begin of a process, and its limit.
+PREPARED = """
 import resource, sys
 import astropy.io.fits, astropy.table, astropy.time, scipy.special
 import numpy as np
@@ -27,9 +26,16 @@ from mauvecl.observations.mapping import FrameMapping
 from mauvecl.observations.frame_files import read_frames, reduce_frames
 # OpenBLAS reserves address space at the first large product; reading does not need it.
 np.ones((300, 300)) @ np.ones((300, 300))
+"""
+LIMITED = """
 pages = int(open("/proc/self/statm").read().split()[0])
 limit = pages * resource.getpagesize() + {margin} * 2**20
 resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+"""
+CHILD = (
+    PREPARED
+    + LIMITED
+    + """
 mapping = FrameMapping(time="TIME", time_unit="s", flux="FLUX", wavelength="WAVES", wavelength_unit="nm", exposure_s=5)
 frames = read_frames({path!r}, mapping)
 weights = np.zeros((2, {pixels})); weights[0, 3] = 1.0; weights[1, :2] = 1.0
@@ -38,6 +44,7 @@ print(*frames.remarks, sep=chr(10), file=sys.stderr)
 np.savez({out!r}, white=frames.flux, one=reduced.light_curves[0].flux, two=reduced.light_curves[1].flux,
          mean=reduced.pixels.mean, scatter=reduced.pixels.scatter)
 """
+)
 
 
 def _light() -> np.ndarray:
@@ -66,11 +73,8 @@ def test_a_file_larger_than_memory_is_reduced_in_pieces(write, tmp_path: Path) -
     assert path.stat().st_size > 2.5 * MARGIN_MIB * 2**20
     code = CHILD.format(margin=MARGIN_MIB, path=str(path), out=str(out), pixels=PIXELS)
     limits = {"MAUVECL_LARGEST_CONTENT_MIB": "32", "OPENBLAS_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=os.environ | limits, capture_output=True, text=True, check=False
-    )
+    done = python(code, **limits)
     path.unlink()
-    assert done.returncode == 0, done.stderr
     assert "they were summed over wavelength while they were read" in done.stderr
     found, pixel = np.load(out), np.arange(PIXELS)
     np.testing.assert_allclose(found["white"], PIXELS * PATTERN + pixel.sum())
@@ -89,7 +93,8 @@ def test_pieces_give_what_the_whole_gives(tmp_path: Path, monkeypatch: pytest.Mo
     columns = {"T": 20.0 * np.arange(n), "QUAL": (np.arange(n) == 7).astype(int), "FLUX": flux, "ERR": error,
                "W": np.tile(np.linspace(250.5, 650.5, 50), (n, 1))}  # fmt: skip
     Table(columns, units={"T": "s", "FLUX": "adu/s", "ERR": "adu/s", "W": "nm"}).write(path)
-    mapping = FrameMapping(time="T", flux="FLUX", error="ERR", quality="QUAL", wavelength="W", exposure_s=18.0)
+    how: dict[str, Any] = {"flux": "FLUX", "error": "ERR", "quality": "QUAL", "wavelength": "W", "exposure_s": 18.0}
+    mapping = frame_files.FrameMapping(time="T", **how)
     whole = read_frames(path, mapping)
     monkeypatch.setattr("mauvecl.host.tables.table.PIECE_BYTES", 8 * 50 * 400)
     monkeypatch.setattr("mauvecl.host.tables.fits_tables.PIECE_BYTES", 0)
@@ -108,21 +113,12 @@ def test_pieces_give_what_the_whole_gives(tmp_path: Path, monkeypatch: pytest.Mo
     np.testing.assert_allclose(pixels.stated[6:], np.sqrt((np.delete(error, 7, axis=0)[:, 6:] ** 2).mean(axis=0)))
 
 
-CSV_CHILD = """
-import resource, sys
-import astropy.table, astropy.time, scipy.special
-import numpy as np
-from mauvecl.observations.mapping import FrameMapping
-from mauvecl.observations.frame_files import read_frames
+CSV_CHILD = f"""{PREPARED}
 how = dict(time="time", flux="flux_*", wavelength="names", wavelength_unit="nm")
-read_frames({small!r}, FrameMapping(time_unit="s", **how))
-# OpenBLAS reserves address space at the first large product; reading does not need it.
-np.ones((300, 300)) @ np.ones((300, 300))
-pages = int(open("/proc/self/statm").read().split()[0])
-limit = pages * resource.getpagesize() + {margin} * 2**20
-resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
-frames = read_frames({path!r}, FrameMapping(**how))
-np.savez({out!r}, white=frames.flux, time=frames.time_s)
+read_frames({{small!r}}, FrameMapping(time_unit="s", **how))
+{LIMITED}
+frames = read_frames({{path!r}}, FrameMapping(**how))
+np.savez({{out!r}}, white=frames.flux, time=frames.time_s)
 """
 
 
@@ -146,47 +142,7 @@ def test_a_csv_table_larger_than_memory_is_read_in_pieces(tmp_path: Path) -> Non
     assert path.stat().st_size > margin * 2**20
     code = CSV_CHILD.format(margin=margin, path=str(path), small=str(small), out=str(out))
     limits = {"MAUVECL_LARGEST_CONTENT_MIB": "16", "OPENBLAS_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=os.environ | limits, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
+    python(code, **limits)
     found = np.load(out)
     np.testing.assert_allclose(found["white"], 512 * PATTERN[:n] + np.arange(512).sum())
     np.testing.assert_allclose(found["time"], np.arange(n) * 5.0, atol=1e-3)
-
-
-CELLS = [f"{k},{1000 + k % 7},{'' if k == 33 else 5}" for k in range(60)]
-TABLES = {
-    "plain": ["time,flux,error", *CELLS],
-    "names in a comment": ["# OBJECT = GJ 65", "# time,flux,error", *CELLS],
-    "semicolons": ["time;flux;error", *(row.replace(",", ";") for row in CELLS)],
-    "tabs": ["time\tflux\terror", *(row.replace(",", "\t") for row in CELLS)],
-    "dates": ["time,flux,error", *(f"2026-03-01T00:{k:02d}:00,{1000 + k % 7},5" for k in range(60))],
-    "text among numbers": ["time,flux,error", *CELLS[:-5], "55,bad,5", *CELLS[-4:]],
-    "short row": ["time,flux,error", *CELLS[:-5], "55,1000", *CELLS[-4:]],
-    "long row": ["time,flux,error", *CELLS[:-5], "55,1000,5,6", *CELLS[-4:]],
-    "decimal commas": ["time;flux;error", *(f"{k},5;{1000 + k % 7},0;{'' if k == 33 else 5}" for k in range(60))],
-    "no rows": ["time,flux,error"],
-    "separators at the end": ["time,flux,error", *(f"{line}," for line in CELLS)],
-    "an empty last column": ["time,flux,error,note", *(f"{line}," for line in CELLS)],
-}
-REFUSED = {"text among numbers": "in row 56", "short row": "2 cells in row 56", "long row": "4 cells in row 56",
-           "no rows": "has no rows"}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", TABLES)
-def test_tables_in_pieces_are_those_read_whole(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "table.csv"
-    path.write_text("\n".join(TABLES[name]) + "\n")
-    mapping = FrameMapping(time="time", time_unit=None if name == "dates" else "s", flux="flux", error="error")
-    for large, piece in ((2**40, 2**20), (0, 200)):
-        monkeypatch.setattr("mauvecl.host.tables.opening.LARGE", large)
-        monkeypatch.setattr("mauvecl.host.tables.opening.PIECE", piece)
-        if name in REFUSED:
-            with pytest.raises(InputError, match=REFUSED[name]):
-                read_frames(path, mapping)
-            continue
-        frames = read_frames(path, mapping)
-        assert frames.flux.tolist() == [1000 + k % 7 for k in range(60)]
-        assert frames.name == ("GJ 65" if "comment" in name else "table")
-        assert np.isnan(frames.error).sum() == (name != "dates")

@@ -25,7 +25,6 @@ def found(rng: np.random.Generator, added: Float | float = 0.0, numbers: NDArray
 
 
 def lost(start: int, stop: int, share: float) -> Float:
-    """Return the light lost between two frames."""
     return -share * np.where((np.arange(N) >= start) & (np.arange(N) < stop), 1.0, 0.0)[:, None] * STAR
 
 

@@ -15,10 +15,10 @@ from scipy import stats
 
 from mauvecl import SHAPES, Frames, Study, analyse, read_frames, stare
 from mauvecl.answers.analyse import frame_model
+from mauvecl.observations import frame_model as models
+from mauvecl.observations import search as searches
 from mauvecl.observations import spectra
 from mauvecl.observations.detection import detect_events
-from mauvecl.observations.frame_model import clean_spectra
-from mauvecl.observations.search import simulated_rates
 
 Float = NDArray[np.float64]
 SHAPE = SHAPES["davenport2014"]
@@ -64,7 +64,7 @@ def drawn(rng: np.random.Generator, added: Float | float = 0.0, scale: float | F
 
 
 def prepared(frames: Frames, **how: Any) -> Prepared:
-    cleaned = clean_spectra(frames, model())
+    cleaned = models.clean_spectra(frames, model())
     survey, series, _ = spectra.survey_spectra(cleaned, SHAPE, 3, 1, **how)
     return cleaned, survey, series
 
@@ -72,7 +72,7 @@ def prepared(frames: Frames, **how: Any) -> Prepared:
 @pytest.fixture(scope="module")
 def threshold() -> float:
     survey = prepared(drawn(np.random.default_rng(1)))[1]
-    rates = simulated_rates(survey, np.ones(survey.stare.n_frames, np.bool_), 20.0, 1)
+    rates = searches.simulated_rates(survey, np.ones(survey.stare.n_frames, np.bool_), 20.0, 1)
     return max(rate.threshold(20.0) for rate in rates)
 
 
@@ -89,7 +89,6 @@ def test_frames_of_other_wavelengths_or_units_are_searched_in_white_light() -> N
 
 @cache
 def analysed_counts() -> tuple[Frames, Any]:
-    """Return frames with a flare, and their answer."""
     frames = drawn(np.random.default_rng(4), flare(1800.0, 60.0, 0.5))
     return frames, analyse(STUDY, frames=frames)
 
@@ -195,12 +194,12 @@ def test_cosmic_rays_are_replaced_and_counted_and_flares_are_not() -> None:
     hits = rng.choice(N, 30, replace=False)
     pixels = rng.integers(light().size, size=30)
     flux[hits, pixels] += rng.uniform(12, 80, 30) * sd[pixels]
-    cleaned = clean_spectra(element_frames(flux, clean.error), model())
+    cleaned = models.clean_spectra(element_frames(flux, clean.error), model())
     # Pixels next to one another in time are light, not rays.
     assert cleaned.rays.sum() >= 28
     assert (cleaned.rays[hits] > 0).sum() >= 28
     assert cleaned.rays.sum() <= 31
-    assert clean_spectra(clean, model()).rays.sum() <= 1
+    assert models.clean_spectra(clean, model()).rays.sum() <= 1
     left = np.abs(cleaned.frames.flux - clean.flux)[hits, pixels] / sd[pixels]
     assert np.median(left) < 2.0
 
@@ -232,7 +231,7 @@ def test_counts_with_and_without_bias_and_dark_current_are_distinguished() -> No
         found = frame_model(STUDY, frames)
         assert not isinstance(found, str)
         assert found.raw == (flux is raw)
-        levels.append(float(np.median(clean_spectra(frames, found).frames.white_light[0])))
+        levels.append(float(np.median(models.clean_spectra(frames, found).frames.white_light[0])))
     assert levels[0] == pytest.approx(levels[1], rel=1e-6)
     # The noise of 40 frames is 1 % of the light.
     assert levels[0] == pytest.approx(quiet.light_dn.sum(), rel=0.06)

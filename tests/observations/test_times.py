@@ -12,7 +12,7 @@ from astropy.time import Time
 from scenes import paper
 
 from mauvecl import Frames, Study, analyse, read_frames, visible
-from mauvecl.observations.frames import barycentric
+from mauvecl.observations import frames as observed
 
 RNG = np.random.default_rng(29)
 TIME = np.arange(200) * 30.0 + 15.0
@@ -48,7 +48,7 @@ def _late_s(frames: Frames, start: str) -> np.ndarray:
 
 @pytest.mark.parametrize("start", [NEAR, FAR])
 def test_barycentric_times_of_the_geocentre_are_those_of_erfa(start: str) -> None:
-    found = barycentric(_frames(start, "GEOCENTER"), AU_MIC)
+    found = observed.barycentric(_frames(start, "GEOCENTER"), AU_MIC)
     # A modified Julian date in double precision resolves a microsecond.
     np.testing.assert_allclose(_late_s(found, start), _geocentric_s(start), atol=3e-6)
     assert (found.scale, found.position) == ("tdb", "BARYCENTER")
@@ -57,7 +57,7 @@ def test_barycentric_times_of_the_geocentre_are_those_of_erfa(start: str) -> Non
 
 @pytest.mark.parametrize(("start", "kind"), [(NEAR, "tle"), (FAR, "mean")])
 def test_the_satellites_place_counts_with_its_light_travel_time(start: str, kind: str) -> None:
-    found = barycentric(_frames(start, "TOPOCENTER"), AU_MIC, ORBIT)
+    found = observed.barycentric(_frames(start, "TOPOCENTER"), AU_MIC, ORBIT)
     orbit = {"start": start, "days": TIME.size * 30 / 86_400, "step_s": 30.0}
     grid = Study.build({"orbit": orbit}, "test").orbit.times()
     assert ORBIT.resolved(grid) == kind
@@ -69,9 +69,9 @@ def test_the_satellites_place_counts_with_its_light_travel_time(start: str, kind
 
 
 def test_other_scales_give_the_same_instants() -> None:
-    utc = barycentric(_frames(NEAR, "GEOCENTER"), AU_MIC)
+    utc = observed.barycentric(_frames(NEAR, "GEOCENTER"), AU_MIC)
     tt = Frames.of(TIME, FLUX, reference_mjd=float(Time(NEAR, scale="utc").tt.mjd), scale="tt", position="GEOCENTER")
-    found = barycentric(tt, AU_MIC)
+    found = observed.barycentric(tt, AU_MIC)
     assert (found.reference_mjd - utc.reference_mjd) * 86_400 == pytest.approx(0.0, abs=2e-6)
     np.testing.assert_allclose(found.time_s, utc.time_s, atol=1e-6)
 
@@ -83,12 +83,12 @@ def test_nothing_is_downloaded(monkeypatch: pytest.MonkeyPatch) -> None:
     for place in ("astropy.utils.data.download_file", "astropy.utils.iers.iers.download_file"):
         monkeypatch.setattr(place, download)
     later = Frames.of(TIME, FLUX, reference_mjd=70_000.0, scale="utc", position="TOPOCENTER")
-    assert barycentric(later, AU_MIC, ORBIT).position == "BARYCENTER"
+    assert observed.barycentric(later, AU_MIC, ORBIT).position == "BARYCENTER"
 
 
 def test_barycentric_times_stay_as_they_are() -> None:
-    once = barycentric(_frames(NEAR, "GEOCENTER"), AU_MIC)
-    again = barycentric(once, AU_MIC)
+    once = observed.barycentric(_frames(NEAR, "GEOCENTER"), AU_MIC)
+    again = observed.barycentric(once, AU_MIC)
     np.testing.assert_array_equal(again.time_s, once.time_s)
     assert "barycentric already" in again.remarks[-1]
 

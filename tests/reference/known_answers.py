@@ -16,7 +16,8 @@ sys.path.insert(0, str(Path(__file__).parent.parent))
 
 from reference import stares, statistics
 
-from mauvecl.detection import counts, nuisances, requests, snr
+from mauvecl import Nuisances
+from mauvecl.detection import counts, requests, snr
 from mauvecl.device import selftest
 from mauvecl.flares import stare_scene
 from mauvecl.noise import reference
@@ -33,9 +34,8 @@ def results(name: str, count: int) -> dict[str, NDArray[Any]]:
     scene, both = prepare([quiet], **drawing), prepare([quiet, flare], **drawing)
     index, seed = np.arange(selftest.START, selftest.START + count, dtype=np.uint64), selftest.SEED
     names = selftest.statistics_of(how)
-    hypotheses = requests.Hypotheses(
-        quiet, (flare,), names, both, nuisances=nuisances.as_nuisances(how.get("nuisances"), quiet)
-    )
+    unknown = Nuisances.of(quiet, how["nuisances"]) if how.get("nuisances") else None
+    hypotheses = requests.Hypotheses(quiet, (flare,), names, both, nuisances=unknown)
     plan = requests.plan_channels(hypotheses, range(1), first=True)
     smoothed = statistics.Smoothed.of(hypotheses, plan) if len(plan.scales) else None
     sums = statistics.statistics(both, index, seed, plan, pair="chi2_pair" in names, smoothed=smoothed)

@@ -165,7 +165,6 @@ def sums(scene: StareScene, flares: Flares, numbers: Numbers, frames: Iterable[i
 
 
 def _chain(terms: Iterable[tuple[Floats, Floats]]) -> Floats:
-    """Return the sum of products, added in order."""
     (a, b), *rest = terms
     total = np.asarray(a * b)
     for a, b in rest:

@@ -31,7 +31,6 @@ from mauvecl.runs.store import Store
 
 @pytest.fixture(scope="module")
 def painted(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    """Return the store of an uninterrupted run."""
     path = tmp_path_factory.mktemp("painted") / "frames.zarr"
     bulk.realise(study(1000), path, Painter())  # type: ignore[arg-type]
     return tree(path)
@@ -47,7 +46,6 @@ def original(tmp_path_factory: pytest.TempPathFactory, engine: Engine) -> Path:
 
 @pytest.fixture
 def path(tmp_path: Path, original: Path) -> Path:
-    """Return a copy of the engine's store."""
     return Path(shutil.copytree(original, tmp_path / "frames.zarr"))
 
 

@@ -66,7 +66,6 @@ ROWS = 20
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Return a folder with a store and a file of the user's."""
     bulk.realise(study(ROWS), tmp_path / "s.zarr", PAINTER)
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "mine.txt").write_text("keep me")
@@ -74,7 +73,6 @@ def folder(tmp_path: Path) -> Path:
 
 
 def exported(folder: Path, *words: str) -> str:
-    """Return the refusal of an export."""
     return run("export", "s.zarr", *words, folder=folder, code=2).stderr
 
 

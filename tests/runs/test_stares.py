@@ -2,19 +2,16 @@
 
 import pickle
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import pytest
-from answers import small
 from scenes import FIRST_STARE as START
 from scenes import N_STARES as N
 from scenes import flaring_stares as request
 
 from mauvecl import Engine, LocalWorkers, Pool, Stare, Stares
 from mauvecl.runs import checkpoint as shards
-from mauvecl.runs import pool as pools
 
 pytestmark = pytest.mark.usefixtures("small_shards")
 
@@ -67,31 +64,6 @@ def test_shards_of_stares_join_to_the_same_bits(engine: Engine, method: Any, red
         for name, values in reduction(whole, START).items():
             np.testing.assert_array_equal(found[name], values)
     assert (whole[1] != whole[0]).any()
-
-
-def test_run_of_stares_is_resumed(engine: Engine, tmp_path: Path) -> None:
-    asked, study = request(reduction=Largest()), small()
-
-    class Stopping(LocalWorkers):
-        def __init__(self, shards: int) -> None:
-            super().__init__([None], make=lambda device, progress: engine)
-            self.left = shards
-
-        def submit(self, *given: Any, **more: Any) -> Any:
-            self.left -= 1
-            if self.left < 0:
-                raise pools.Stopped
-            return super().submit(*given, **more)
-
-    with pytest.raises(pools.Stopped), shards.Checkpoint(tmp_path, "inject", study, patience_s=0.0) as kept:
-        Pool(Stopping(3), checkpoint=kept).stares(asked)
-    with shards.Checkpoint(tmp_path, "inject", study, resume=True) as kept:
-        workers = Stopping(99)
-        found = Pool(workers, checkpoint=kept).stares(asked)
-        assert 1 <= kept.resumed < 5
-        assert kept.resumed + 99 - workers.left == 5, "none was drawn twice"
-    for name, values in Pool(Stopping(99)).stares(asked).items():
-        np.testing.assert_array_equal(found[name], values)
 
 
 def test_fingerprints_distinguish_requests_of_stares() -> None:

@@ -37,7 +37,6 @@ PAINTER: Any = Seeded()
 
 @pytest.fixture
 def made(tmp_path: Path) -> Path:
-    """Return a small intact store."""
     path = tmp_path / "frames.zarr"
     bulk.realise(study(), path, PAINTER)
     return path
@@ -45,14 +44,12 @@ def made(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def other(tmp_path: Path) -> Path:
-    """Return the store of the same study with another seed."""
     path = tmp_path / "other.zarr"
     bulk.realise(study(run={"seed": 31}), path, PAINTER)
     return path
 
 
 def relabelled(place: Path, change: Callable[[str], str]) -> None:
-    """Change the study's text in a description."""
     content = json.loads(place.read_text())
     content["attributes"]["study"] = change(content["attributes"]["study"])
     place.write_text(json.dumps(content, indent=2))

@@ -26,7 +26,6 @@ def quiet(magnitude: float) -> Expectation:
 
 
 def flare_dn(stare: Stare, m: FlareModel) -> np.ndarray:
-    """Return the mean DN that the flare adds to each frame."""
     edges = np.column_stack([stare.start_s, stare.start_s + stare.frame_s])
     rise = AMPLITUDE * mauvecl.Event(PEAK_S, HALF_WIDTH_S, AMPLITUDE, KELVIN).form.mean_over(
         edges, PEAK_S, HALF_WIDTH_S
@@ -35,7 +34,6 @@ def flare_dn(stare: Stare, m: FlareModel) -> np.ndarray:
 
 
 def frames(stare: Stare, x: Expectation, flare: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Draw the frames of a stare, as documented for `Stare`."""
     n = stare.n_frames
     change = {of: sd * rng.standard_normal(n) for of, sd in stare.jitters.items()} | {"star": np.zeros(n)}
     for one in stare.unknowns:

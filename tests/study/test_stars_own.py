@@ -7,7 +7,7 @@ import pytest
 from answers import small
 
 from mauvecl import Engine, Instrument, Source, Stares, Study, detect, expect, limit, simulate, stare
-from mauvecl.noise.disturbances import ADDITIVE
+from mauvecl.noise import disturbances
 
 PART = {"changes": {"output_min_nm": 300.0, "output_max_nm": 330.0}}
 
@@ -18,7 +18,6 @@ def study(*stars: dict[str, Any], **flare: Any) -> Study:
 
 
 def light(asked: Study) -> list[np.ndarray]:
-    """Return the electrons of each star with its flare."""
     few = asked.with_settings(["run={realisations=500, fap=0.3, statistics=['matched']}"])
     return [one.detection.flares[0].source_electrons for one in detect(few).stars]
 
@@ -101,7 +100,7 @@ def frames(study: Study, count: int, **how: Any) -> Any:
 
 
 def test_every_process_has_a_prior() -> None:
-    assert {*PRIORS, *ADDITIVE} == {name for name, _ in Study().processes}
+    assert {*PRIORS, *disturbances.ADDITIVE} == {name for name, _ in Study().processes}
 
 
 @pytest.mark.parametrize("name", PRIORS)

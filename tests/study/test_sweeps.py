@@ -75,15 +75,6 @@ def test_sweep_gives_the_expectations_of_each_value(quantity: str, engine: Engin
             assert x.n_frames == y.n_frames
 
 
-@pytest.mark.parametrize(
-    ("processes", "outside"), [({}, False), ({"detector_temperature": {"uniform": [20, 22]}}, True)]
-)
-def test_usual_unknowns_follow_the_swept_detector_temperature(processes: Any, outside: bool, engine: Engine) -> None:
-    axis = {"quantity": "detector_temperature", "values": [-10.0, 10.0]}
-    answer = detect(study([axis], nuisances={"usual": True}, processes=processes), engine)
-    assert any("OUTSIDE THE PRIOR" in message for message in answer.messages) == outside
-
-
 def test_sweep_is_read_back(tmp_path: Any) -> None:
     asked = study([MAGNITUDES, EXPOSURES], "list", unknowns={"draws": 4, "known": ["qe_scale"]})
     path = tmp_path / "study.toml"

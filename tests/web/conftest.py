@@ -27,7 +27,6 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 
 @pytest.fixture(scope="session")
 def words(server: Server) -> dict[str, Any]:
-    """Return what the page tells its script."""
     return server.words()
 
 

@@ -46,7 +46,6 @@ SHOWN = {tab: {*names.split()} for tab, names in tomllib.loads((DATA / "shown.to
 
 
 def valued(data: Any, key: str) -> Any:
-    """Return a value of a study's data by its dotted key, of the first of several."""
     for part in key.split("."):
         data = (data or [{}])[0] if isinstance(data, list) else data
         data = data.get(part) if isinstance(data, dict) else None
@@ -146,7 +145,6 @@ def extracted(content: bytes, folder: Path) -> Path:
 
 
 def answered(folder: Path, command: str) -> dict[str, Table]:
-    """Run a command, and return the tables that it writes."""
     words = shlex.split(command.removeprefix("mauvecl "))
     run(*words, "--no-pictures", "--quiet", "--output", f"out-{len(list(folder.iterdir()))}", folder=folder)
     newest = max(folder.glob("out-*"), key=lambda path: int(path.name[4:]))
@@ -585,7 +583,6 @@ def fits_of(source: Source | None, temperatures: list[float], seed: int) -> byte
 
 
 def standards() -> dict[str, bytes]:
-    """Return the files of a visitor by name."""
     fainter = star("B3V", 5.0)
     table = Table({"wavelength": fainter.wavelength_nm, "flux": fainter.flux_flam})
     table["wavelength"].unit, table["flux"].unit = "nm", "erg / (s cm2 Angstrom)"

@@ -57,7 +57,6 @@ def download(page: Page, label: str) -> bytes:
 
 
 def taken(page: Page) -> bytes:
-    """Return the study from the dialog."""
     page.get_by_role("button", name="Share, export, cite", exact=True).click()
     study = download(page, "Study for the command line")
     page.keyboard.press("Escape")
@@ -65,7 +64,6 @@ def taken(page: Page) -> bytes:
 
 
 def ranges(page: Page, picture: str) -> list[float]:
-    """Return the ends of a picture's axes."""
     plot = f"page.pictures.all.{picture}.figure.plot"
     return list(page.evaluate(f"[{plot}.x_range, {plot}.y_range].flatMap(range => [range.start, range.end])"))
 
@@ -1048,21 +1046,18 @@ class Keys:
         raise AssertionError(f"never at {control}")
 
     def press(self, control: Locator) -> None:
-        """Press a button or go into a field."""
         self.reach(control)
         if control.evaluate("e => e.tagName") != "INPUT":
             self.page.keyboard.press("Enter")
         self.clicks += 1
 
     def choose(self, control: Locator, option: str) -> None:
-        """Choose from a list by its first letter."""
         self.reach(control)
         self.page.keyboard.press(option[0])
         assert control.input_value() == option
         self.clicks += 2
 
     def turn(self, name: str) -> None:
-        """Open a tab with the arrows."""
         self.reach(self.page.locator("[role=tab][aria-selected=true]"))
         for _ in range(self.page.get_by_role("tab").count()):
             if self.page.evaluate("document.activeElement.textContent.trim()") == name:
@@ -1072,7 +1067,6 @@ class Keys:
         self.clicks += 1
 
     def type(self, control: Locator, *lines: str) -> None:
-        """Go into a field and type, each line with Enter."""
         self.press(control)
         for line in lines:
             self.page.keyboard.type(line)

@@ -119,7 +119,6 @@ class Server:
         return asyncio.run(self.got(path, **headers))
 
     def words(self) -> dict[str, Any]:
-        """Return what the page tells its script: fields, tabs and what they read."""
         _, html = self.fetched()
         (text,) = re.findall(r'<script[^>]*type="application/json"[^>]*>(.*?)</script>', html, re.DOTALL)
         return dict(json.loads(text))
@@ -211,7 +210,6 @@ class Talk:
 
 
 def column(drawn: dict[str, Any], picture: str, source: str, name: str) -> Any:
-    """Return a column of a picture's data."""
     packed = drawn["pictures"][picture]["sources"][source][name]
     if not isinstance(packed, dict):
         return packed
@@ -241,7 +239,6 @@ def until(page: Page, true: Callable[[], bool]) -> None:
 
 
 def settled(page: Page) -> None:
-    """Wait until the page shows the answer to what was entered."""
     page.locator("#card[aria-busy=false]").wait_for(state="attached")
     assert not page.faults, page.faults  # type: ignore[attr-defined]
 
