@@ -44,7 +44,7 @@ def check_atom(what: str, fap: float, beyond: float, at: float) -> None:
         exist = f"{fewer}{rounded(more, up=True):g} and more" if more < 1.0 else (fewer.removesuffix(" or ") or "none")
         raise NoThresholdError(
             f"no threshold of {what} has a false-alarm probability of {fap:g}: {100 * at:.3g} % of exposures without a "
-            "flare give one and the same value, as saturated pixels do, and either all of them or none are alarms",
+            "flare give one and the same value, as saturated pixels do, and either all of them or none are alarms; use "
             f"a false-alarm probability that a threshold has: {exist}",
             key="fap",
         )

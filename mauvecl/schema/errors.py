@@ -67,10 +67,8 @@ class InputError(ValueError):
 
     Parameters
     ----------
-    fault : str
-        What is wrong.
-    expected : str, optional
-        What is accepted; ends the sentence.
+    sentence : str
+        What is wrong, with the value and what is accepted.
     key : str, optional
         The parameter, or the key of a study such as ``run.fap``.
 
@@ -78,15 +76,13 @@ class InputError(ValueError):
     ----------
     key : str or None
         The parameter, or the key of a study such as ``run.fap``; None for a fault that is not in one value.
-    expected : str or None
-        What is accepted.
     parts : tuple of InputError
-        The errors of which this one consists, if several values are wrong; key and expected are those of the first.
+        The errors of which this one consists, if several values are wrong; its key is that of the first.
     """
 
-    def __init__(self, fault: str = "", expected: str | None = None, *, key: str | None = None) -> None:
-        super().__init__(f"{fault}, expected {expected}" if expected else fault)
-        self.key, self.expected = key, expected
+    def __init__(self, sentence: str = "", *, key: str | None = None) -> None:
+        super().__init__(sentence)
+        self.key = key
         self.parts: tuple[InputError, ...] = ()
 
     def within(self, place: str) -> InputError:
@@ -100,9 +96,7 @@ class InputError(ValueError):
         Words such as "flare amplitude" name the parameter `flare_amplitude`; the value is shown on one line, shortened.
         """
         place, after = f"{where}: " if where else "", f" {unit}" if unit else ""
-        error = cls(f"{place}{key} must be {expected}, not {shown(value)}{after}", key=key.replace(" ", "_"))
-        error.expected = expected
-        return error
+        return cls(f"{place}{key} must be {expected}, not {shown(value)}{after}", key=key.replace(" ", "_"))
 
 
 def missing_package(package: str, purpose: str, extra: str) -> InputError:
@@ -112,9 +106,7 @@ def missing_package(package: str, purpose: str, extra: str) -> InputError:
 
 def reworded(error: InputError, sentence: str, key: str | None = None) -> InputError:
     """Return the same error with another sentence and, if given, another key."""
-    changed = InputError(sentence, key=key or error.key)
-    changed.expected = error.expected
-    return changed
+    return InputError(sentence, key=key or error.key)
 
 
 def together(errors: Sequence[InputError]) -> InputError:

@@ -204,7 +204,7 @@ def test_frames_that_say_nothing_raise() -> None:
     """The same frames as two observations, and frames without noise."""
     frames = frames_of(truth(), star("A0V", 5.0), [16.0], 20, np.random.default_rng(10))
     stars = (("A0V", 5.0), ("A0V", 5.0))
-    with refused("observations", expected="no other observation"):
+    with refused("observations", "no other observation"):
         calibrate(study_of(stars, dark=False), frames=(frames, frames))
     with refused("frames", "differ by their noise"):
         calibrate(study_of(stars[:1], dark=False), frames=(replace(frames, flux=np.tile(frames.flux[:1], (20, 1))),))

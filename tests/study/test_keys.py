@@ -108,7 +108,7 @@ def test_keys_of_one_kind_share_a_range() -> None:
     assert found == {"K": {(1_000, 200_000)}, "deg_C": {(-40, 65)}}
     prior = "processes.detector_temperature={{normal=[20, 1], between=[{}, {}]}}"
     for low, high in ((-41, 25), (15, 66)):
-        with refused("detector_temperature", expected="between -40 and 65"):
+        with refused("detector_temperature", "between -40 and 65"):
             detect(Study().with_settings(["run.realisations=100000", prior.format(low, high)]))
 
 
