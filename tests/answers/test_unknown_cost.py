@@ -97,21 +97,7 @@ def test_own_unknowns_are_read_from_files_points_and_flags(tmp_path: Path, engin
     again = tmp_path / "elsewhere" / "again.toml"
     again.write_text(asked.toml())
     assert Study.read(again).nuisances == asked.nuisances
-    flags = [
-        "--star",
-        "G2V",
-        "-m",
-        "7.4",
-        "-a",
-        "0.02",
-        "-n",
-        "20000",
-        "--fap",
-        "0.01",
-        "--statistic",
-        "matched",
-        "--ideal",
-    ]
+    flags = "--star G2V -m 7.4 -a 0.02 -n 20000 --fap 0.01 --statistic matched --ideal --nuisance dark=0.1"
     run("detect", *flags.split(), "--nuisance", "stray.txt=2", "--no-pictures", folder=tmp_path)
     of_flags = Study.read(tmp_path / "mauvecl-detect" / "detection.ecsv")
     kept = asked.nuisances.own["stray"].model_copy(update={"file": tmp_path / "stray.txt"})

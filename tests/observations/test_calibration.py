@@ -169,21 +169,6 @@ def test_wrong_spectrum_is_noticed() -> None:
     assert np.abs((f.log_factor - true) / f.error).max() < FAR
 
 
-@pytest.mark.parametrize(
-    ("change", "key"),
-    [
-        ({"unit": "electron"}, "unit"),
-        ({"temperature_c": None}, "temperature_c"),
-        ({"wavelength_nm": NOMINAL.wavelength_nm + 50}, "wavelength"),
-        ({"net": True}, "frames"),
-    ],
-)
-def test_frames_that_cannot_be_calibrated_raise(change: dict[str, Any], key: str) -> None:
-    frames = frames_of(truth(), star("A0V", 5.0), [16.0], 20, np.random.default_rng(6))
-    with refused(key):
-        calibrate(study_of((("A0V", 5.0),), dark=False), frames=(replace(frames, **change),))
-
-
 def test_stored_spectra_are_calibrated_as_raw_counts(tmp_path: Path) -> None:
     """Throughput of a stored star within four of its errors of the nominal one, with which it was drawn."""
     for more in ("-n 40 -t 5 -o single.zarr", "-n 4 -t 50 -o sums.zarr"):
@@ -198,16 +183,6 @@ def test_stored_spectra_are_calibrated_as_raw_counts(tmp_path: Path) -> None:
     net = mauvecl.read_frames(tmp_path / "single.zarr[star-1/quiescent]")
     with refused("frames"):
         calibrate(study_of((("A0V", 5.0),), dark=False), frames=(net,))
-
-
-def test_frames_that_say_nothing_raise() -> None:
-    """The same frames as two observations, and frames without noise."""
-    frames = frames_of(truth(), star("A0V", 5.0), [16.0], 20, np.random.default_rng(10))
-    stars = (("A0V", 5.0), ("A0V", 5.0))
-    with refused("observations", "no other observation"):
-        calibrate(study_of(stars, dark=False), frames=(frames, frames))
-    with refused("frames", "differ by their noise"):
-        calibrate(study_of(stars[:1], dark=False), frames=(replace(frames, flux=np.tile(frames.flux[:1], (20, 1))),))
 
 
 @pytest.mark.long
