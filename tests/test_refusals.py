@@ -95,7 +95,7 @@ def test_each_kind_of_error_has_its_sentence() -> None:
             lambda: Instrument.load("mauvesim").with_(temprature_c=1),
             "mauvesim: unknown key 'temprature_c', did you mean 'temperature_c'?",
         ),
-        (lambda: Source.read("none.txt"), "spectrum file 'none.txt' does not exist, expected a file"),
+        (lambda: Source.read("none.txt"), "spectrum file 'none.txt' does not exist; give the path of a file"),
     ):
         with pytest.raises(InputError) as caught:
             call()
