@@ -26,7 +26,7 @@ from mauvecl.detection.distributions import (
     central_counts,
     clopper_pearson,
 )
-from mauvecl.detection.names import check_atom
+from mauvecl.detection.names import check_atom, least_countable
 from mauvecl.detection.statistics import Differences
 from mauvecl.noise import layout
 from mauvecl.noise.disturbances import ADDITIVE
@@ -233,7 +233,7 @@ def tail(hypotheses: Hypotheses, fap: float, statistic: str, *, template: int = 
     """
     if not SMALLEST_FAP <= fap <= 0.1:
         raise InputError.of("fap", fap, f"between {SMALLEST_FAP:g} and 0.1 for importance sampling")
-    _check(hypotheses)
+    _check(hypotheses, fap)
     how = _Tilt.for_alarms(fap, hypotheses, statistic, template)
     blocks: list[tuple[Float, Float]] = []
     goal = FIRST_REALISATIONS
@@ -255,7 +255,8 @@ def tail(hypotheses: Hypotheses, fap: float, statistic: str, *, template: int = 
         goal *= 2
 
 
-def _check(hypotheses: Hypotheses) -> None:
+def _check(hypotheses: Hypotheses, fap: float) -> None:
+    """Raise InputError if a threshold cannot be sampled, with the realisations from which it can be counted."""
     scene, setting = hypotheses.scene, hypotheses.setting
     reasons = {
         "noise drawn apart": not scene.joint,
@@ -267,8 +268,8 @@ def _check(hypotheses: Hypotheses) -> None:
     for reason, holds in reasons.items():
         if holds:
             raise InputError(
-                f"importance sampling is impossible with {reason}: it needs stacks of joint draws and at most "
-                f"{MAX_AVERAGED} averaged exposures; draw enough realisations instead",
+                f"thresholds cannot be sampled with {reason}; draw at least {least_countable(fap)} realisations, so "
+                f"that they are counted at fap = {fap:g}",
                 key="tails",
             )
 
