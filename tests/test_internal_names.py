@@ -12,7 +12,7 @@ from pathlib import Path
 
 TESTS = Path(__file__).parent
 FILE = TESTS / "data" / "internal_names.toml"
-HEAD = """# Names inside mauvecl that tests import or replace, and why the public interface does not reach what they test.
+HEAD = """# Names inside mauvecl that tests import or replace, and why the public interface does not reach these.
 # `python tests/test_internal_names.py` writes this list; reasons are written by hand.
 
 """
