@@ -204,9 +204,7 @@ def _selected_rows(
         shape = np.shape(cells[-1])
         cells = [np.broadcast_to(cell, shape) if np.shape(cell) == shape[1:] else cell for cell in cells]
     if len({len(cell) for cell in cells}) > 1:
-        raise InputError(
-            f"it needs as many rows of wavelengths as of fluxes, but has {len(cells[0])} for {n}", key="flux"
-        )
+        raise InputError(f"it needs {n} rows of wavelengths, as many as of fluxes, not {len(cells[0])}", key="flux")
     names = [plain(column.name) for column in table.columns]
     is_only = n == 1 and not asked and not table.row_title
     identifiers = [[""]] if is_only else _identifiers(table, {*choice.wavelength, choice.flux}, n)

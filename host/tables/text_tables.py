@@ -331,8 +331,7 @@ class TextRows:
             names, units = self._names_above(n, [*above, *lines[:at]], mark)
         if names or is_row:
             if not names and at:
-                above_it = len(cells[at - 1])
-                fault = f"{self.what} has {n} cells in row 1, but must have {above_it} as in the line above"
+                fault = f"{self.what} has {n} cells in row 1, but must have {len(cells[at - 1])} as in the line above"
                 raise InputError(fault, key="file")
             names = names or [f"col{k + 1}" for k in range(n)]
         else:

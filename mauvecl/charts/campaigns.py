@@ -283,8 +283,7 @@ def _panels(answer: PlanAnswer, k: int, figure: Any = None) -> Any:
     sun = top.twinx()
     sun.plot(days, seen.elongation_deg(k), color=COLOURS[4])
     sun.set(ylabel="angle from the Sun (deg)", ylim=(0, 180))
-    sun.spines["right"].set_visible(True)
-    sun.yaxis.label.set_color(COLOURS[4])
+    _colour_right(sun)
     top.set_title("when it is seen")
     if target.completeness is None:
         bottom.set_visible(False)
@@ -306,10 +305,15 @@ def _panels(answer: PlanAnswer, k: int, figure: Any = None) -> Any:
         used = rate > 0
         often.plot(energy[shown][used], rate[used], color=COLOURS[4])
         often.set(yscale="log", ylabel=f"flares above this energy in {target.hours:.0f} h")
-        often.spines["right"].set_visible(True)
-        often.yaxis.label.set_color(COLOURS[4])
+        _colour_right(often)
         _plain_decades(often.yaxis)
     return figure
+
+
+def _colour_right(axes: Any) -> None:
+    """Show the axis on the right, with its label in the colour of its curve."""
+    axes.spines["right"].set_visible(True)
+    axes.yaxis.label.set_color(COLOURS[4])
 
 
 def _plain_decades(axis: Any) -> None:

@@ -339,17 +339,13 @@ def line_index(
     inside = share > 0
     good = np.isfinite(light) & np.isfinite(sd) & (sd > 0)
     if not good[..., inside].all():
-        raise InputError(
-            "every pixel in the band needs a finite flux and a positive error, but some have none", key="flux"
-        )
+        raise InputError("every pixel in the band needs a finite flux and an error above 0", key="flux")
     windows = np.zeros(nm.size, np.bool_)
     for start, end in continuum_nm:
         windows |= (nm >= start) & (nm <= end)
     left = good & windows
     if (count := int(left.sum(axis=-1).min(initial=nm.size))) < MIN_CONTINUUM:
-        raise InputError(
-            f"the continuum needs at least {MIN_CONTINUUM} usable pixels per spectrum, not {count}", key="continuum_nm"
-        )
+        raise InputError(f"the continuum needs {MIN_CONTINUUM} usable pixels or more, not {count}", key="continuum_nm")
     weight = np.where(left, 1.0 / np.where(left, sd, 1.0) ** 2, 0.0)
     continuum = _integral_of_line(nm - (low + high) / 2, weight, share)
     light, sd = (np.where(left | inside, each, 0.0) for each in (light, sd))
