@@ -478,7 +478,7 @@ def _limit_s() -> float:
     with contextlib.suppress(ValueError):
         if not said or 0 <= float(said) <= 86400:
             return float(said or LIMIT_S)
-    raise InputError.of(LIMIT, said, "1 to 86400 seconds of processor time, or 0 for no limit")
+    raise InputError.of(LIMIT, said, "between 1 and 86400 seconds of processor time, or 0 for no limit")
 
 
 def _try(name: str | None, number: int, device: Any, limit_s: float) -> str | None:
