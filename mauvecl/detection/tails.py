@@ -268,7 +268,7 @@ def _check(hypotheses: Hypotheses, fap: float) -> None:
     for reason, holds in reasons.items():
         if holds:
             raise InputError(
-                f"thresholds cannot be sampled with {reason}; draw at least {least_countable(fap)} realisations, so "
+                f"thresholds cannot be sampled with {reason}; use at least {least_countable(fap)} realisations, so "
                 f"that they are counted at fap = {fap:g}",
                 key="tails",
             )
