@@ -66,7 +66,10 @@ class Command:
 
         verb, entries = self.verb, keys_of(self.verb.keys)
         keywords = keywords_of(entries)
-        flags = {entry[2].parameter: study_option(*entry, verb.defaults or {}) for entry in entries}
+        flags = {
+            flag.parameter: study_option(keywords[flag.parameter], field, flag, verb.defaults or {})
+            for _, field, flag in entries
+        }
         kinds = get_type_hints(self.run, localns={"Session": Any}, include_extras=True)
         _, *own = inspect.signature(self.run).parameters.values()
         # Annotations and defaults by parameter.
@@ -424,6 +427,6 @@ def ask(session: Session) -> None:
 
 # Verbs without a function of their own; an analysis counts frames, and draws nothing.
 command_of(VERBS["analyse"], draws=False)(ask)
-for one in VERBS.values():
-    if one.name not in COMMANDS:
-        command_of(one)(ask)
+for verb in VERBS.values():
+    if verb.name not in COMMANDS:
+        command_of(verb)(ask)

@@ -19,6 +19,8 @@ from mauvecl.schema.fields import Flag, Help, Unit, as_typed, first, is_measure
 if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
 
+    from mauvecl.study.keywords import Keyword
+
 
 def study_argument(flags: Collection[str]) -> Any:
     """Return the annotation of the argument that is a study, or in its place what a flag takes."""
@@ -106,7 +108,7 @@ WORKERS = ("device", "cluster", *RESUMING, "insist")
 
 
 def study_option(
-    path: str, field: FieldInfo, flag: Flag, defaults: Mapping[str, Any]
+    keyword: Keyword, field: FieldInfo, flag: Flag, defaults: Mapping[str, Any]
 ) -> tuple[Any, Callable[[Any], Any] | None]:
     """Return the annotation of a flag of the study's key for typer, and what converts its texts of numbers, if any.
 
@@ -115,9 +117,8 @@ def study_option(
     """
     # `mauvecl --help` shows no flags, and starts twice as fast without importing the study.
     from mauvecl.schema.section import read_count, read_number, read_several
-    from mauvecl.study.keywords import Keyword
 
-    keyword = Keyword.of(path, field, flag)
+    path = f"{keyword.section}.{keyword.key}"
     each = get_args(keyword.kind)[0] if keyword.many else keyword.kind
     kind, metavar = keyword.kind, {str: "TEXT", Path: "FILE"}.get(each)
     read: Callable[[Any], Any] | None = None
@@ -138,10 +139,11 @@ def study_option(
 
 def option_of(key: str) -> Any:
     """Return the option of a key's flag, for a verb without a study."""
+    from mauvecl.study.keywords import Keyword
     from mauvecl.study.study import keys_of
 
-    (entry,) = keys_of((key,))
-    return get_args(study_option(*entry, {})[0])[1]
+    ((path, field, flag),) = keys_of((key,))
+    return get_args(study_option(Keyword.of(path, field, flag), field, flag, {})[0])[1]
 
 
 def _help(path: str, field: FieldInfo, flag: Flag, kind: Any, defaults: Mapping[str, Any]) -> str:

@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Callable, Iterator, Sequence
 from decimal import Decimal, InvalidOperation
 from functools import cache
-from typing import TYPE_CHECKING, Any, Self, cast, get_args
+from typing import TYPE_CHECKING, Any, Self, cast, get_args, get_origin
 
 from pydantic import (
     BaseModel,
@@ -108,19 +108,24 @@ def _key_of(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[st
     """Return the part of an error's location that names a key, with the numbers of entries in lists."""
     path: list[str] = []
     inner: type[BaseModel] | None = model
+    in_table = False
     for part in location:
-        if isinstance(part, str):
+        if in_table:
+            # Names in a table are the user's.
+            in_table = False
+        elif isinstance(part, str):
             if inner is None:
                 break
-            field = inner.model_fields.get(part)
-            inner = None if field is None else model_in(field.annotation)
+            annotation = field.annotation if (field := inner.model_fields.get(part)) else None
+            inner = model_in(annotation)
+            in_table = any(get_origin(kind) is dict for kind in (annotation, *get_args(annotation)))
         path.append(str(part))
     return tuple(path)
 
 
 def _input_error_of(model: type[BaseModel], first: Any) -> InputError:
     path = [str(part) for part in first["loc"]]
-    key = ".".join(part for part in path if "[" not in part) or model.__name__.lower()
+    key = ".".join(_key_of(model, first["loc"])) or model.__name__.lower()
     value, message = first.get("input"), first["msg"]
     match first["type"]:
         case "extra_forbidden":
