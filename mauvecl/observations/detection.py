@@ -13,9 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.observations.event_fits import REACH, flares_of
+from mauvecl.observations.event_fits import flares_of
+from mauvecl.observations.event_windows import REACH
 from mauvecl.observations.process import UNREPORTED, Binned, Process, Steps, criterion_of_process, fit_process
-from mauvecl.observations.search import Detection, ProcessSearch, SeriesSurvey
+from mauvecl.observations.process_search import ProcessSearch
+from mauvecl.observations.search import Detection, SeriesSurvey
 from mauvecl.schema.physical import DAY_S
 
 Float = NDArray[np.float64]

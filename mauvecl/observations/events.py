@@ -13,17 +13,13 @@ from numpy.typing import NDArray
 
 from mauvecl.flares.shapes import between, sides
 from mauvecl.host.arrays import map_in_threads
-from mauvecl.observations.event_fits import (
+from mauvecl.observations.event_fits import Fit, Mixture, fit_event, joined, light_of
+from mauvecl.observations.event_windows import (
     GENERAL,
     LOG_TIME,
-    Fit,
     FittedFlare,
     Likelihood,
-    Mixture,
     Window,
-    fit_event,
-    joined,
-    light_of,
     log_time,
 )
 from mauvecl.observations.process import UNREPORTED, Steps

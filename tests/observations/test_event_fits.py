@@ -13,7 +13,7 @@ from scenes import flare
 from scipy import stats
 
 from mauvecl import SHAPES, Frames, Study, analyse
-from mauvecl.observations import event_fits, events
+from mauvecl.observations import event_fits, event_windows, events
 from mauvecl.observations import level as levels
 from mauvecl.observations import process as processes
 from mauvecl.observations import search as searches
@@ -85,8 +85,8 @@ class Sizes:
 
 def test_general_family_has_the_same_bits_in_each_process() -> None:
     def weights() -> bytes:
-        event_fits.Family.general.cache_clear()
-        return event_fits.Family.general().weights.tobytes()
+        event_windows.Family.general.cache_clear()
+        return event_windows.Family.general().weights.tobytes()
 
     # Weights that depend on ten points in a random order repeat once in thousands of times.
     assert weights() == weights() == weights()
@@ -97,7 +97,7 @@ def test_work_of_an_event_does_not_grow_with_the_light_curve(
     model: processes.Process, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sizes = Sizes(monkeypatch)
-    sizes.watch(event_fits, "_bins", 0)
+    sizes.watch(event_windows, "_bins", 0)
     sizes.watch(processes.Process, "covariance", 1)
     sizes.watch(processes.Process, "times", 1)
     sizes.watch(processes.Process, "at", 1)
@@ -111,7 +111,7 @@ def test_work_of_an_event_does_not_grow_with_the_light_curve(
         work.append(sizes.taken())
     assert work[0]
     assert work[0] == work[1]
-    assert max(size for name, size in work[0] if name != "at") <= 2 * event_fits.WINDOW_FRAMES + 200
+    assert max(size for name, size in work[0] if name != "at") <= 2 * event_windows.WINDOW_FRAMES + 200
     for name in ("summed_s", "summed_error_s", "fitted_s", "low_s", "high_s"):
         assert getattr(measured[1], name) == pytest.approx(getattr(measured[0], name), rel=1e-4)
 

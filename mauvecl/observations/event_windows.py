@@ -1,0 +1,463 @@
+"""Frames around an event, families of flare shapes, and the likelihood of flares that depart from their shape.
+
+Energies are averaged over families of shapes. A shape is a weighted sum of a few parts, so that the fits of all shapes
+of a family follow from those of its parts. The general family has flares with other rises and decays than the published
+shapes.
+
+The light near an event is the level, flares of a known shape, and noise:
+
+    y = level + sum_j A_j s((t - p_j) / w_j) (1 + d(t)) + noise
+
+The level has the covariance of the process of the star. The departure d of a flare from its shape is a Gaussian process
+of standard deviation epsilon in the logarithm of the time from the peak (a model discrepancy as of Kennedy & O'Hagan
+2001, doi 10.1111/1467-9868.00294). It makes the sum of the observed light decide where a flare is bright, and the
+shape where it is not observed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property, partial
+from itertools import pairwise, product
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy
+from numpy.typing import ArrayLike, NDArray
+
+from mauvecl.flares.shapes import SHAPES, Davenport2014, Integrable, Shape, consecutive_integrals
+
+if TYPE_CHECKING:
+    from mauvecl.observations.search import Detection, SeriesSurvey
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+#: Published shapes that are averaged, besides that of the search.
+AVERAGED = ("davenport2014", "tovarmendoza2022")
+#: Departures of flares from their shape that are averaged with equal weights (assumed). A flare of the general family
+#: is never exactly one of its shapes.
+EPSILON, GENERAL_EPSILON = (0.0, 0.02, 0.06, 0.2), (0.04, 0.1, 0.2)
+#: Widths of the Gaussian rises and decays of the general family from half maximum to maximum, in half-widths (assumed).
+GAUSSIAN_RISES, GAUSSIAN_DECAY = (0.15, 0.5, 1.5), 0.5
+#: Shares of slow exponentials in the decay, and their rates, per half-width (assumed; Davenport's are 0.30 and 0.28).
+SLOW_SHARES, SLOW_RATES = (0.08, 0.16, 0.3, 0.45), np.geomspace(0.1, 0.9, 24)
+#: Number of exponentials from which those of all rates are interpolated, to 1e-5 of their peak.
+EXPONENTIALS = 10
+#: Light of a part in a bin, relative to the largest of all parts and bins, below which it is neglected in all nodes.
+DARK = 1e-13
+#: Name of the general family.
+GENERAL = "general"
+#: Prior weight of the general family (assumed); published shapes share the rest.
+GENERAL_WEIGHT = 0.5
+
+
+@dataclass(frozen=True)
+class Half:
+    """Rise of a flare that ends at the peak, or decay that begins there."""
+
+    integral: Callable[[Float], Float]  # up to a time before the peak, or from a time after the peak on
+    decays: bool = False
+
+    def before(self, tau: ArrayLike) -> Float:
+        """Return the integral up to tau."""
+        return self._rest(tau) if self.decays else self._own(tau)
+
+    def after(self, tau: ArrayLike) -> Float:
+        """Return the integral from tau on."""
+        return self._own(tau) if self.decays else self._rest(tau)
+
+    def _own(self, tau: ArrayLike) -> Float:
+        return self.integral(np.maximum(tau, 0.0) if self.decays else np.minimum(tau, 0.0))
+
+    def _rest(self, tau: ArrayLike) -> Float:
+        """Return the integral between the peak and tau."""
+        t = np.asarray(tau, np.float64)
+        shines = t > 0 if self.decays else t < 0
+        return self._own(0.0) - self._own(t) if shines.any() else np.zeros(t.shape)
+
+
+def _exponential(rate: float) -> Half:
+    """Return an exponential decay with a rate per half-width."""
+    return Half(lambda tau: np.asarray(np.exp(-rate * tau) / rate), decays=True)
+
+
+def _exponentials(rates: Float) -> tuple[list[Half], Float]:
+    """Return exponentials of few rates, and their weights in those of many, shape (n_rate, n_few).
+
+    An exponential is a smooth function of the logarithm of its rate: it is interpolated between Chebyshev points.
+    """
+    middle, half = np.log(rates[[0, -1]].prod()) / 2, np.log(rates[-1] / rates[0]) / 2
+    points = middle + half * np.cos(np.pi * np.arange(EXPONENTIALS) / (EXPONENTIALS - 1))
+    # The barycentric weights of Chebyshev points are known (Berrut & Trefethen 2004, doi:10.1137/S0036144502417715,
+    # equation 5.4); scipy would compute them with the points in a random order, which changes the last bits.
+    barycentric = (-1.0) ** np.arange(EXPONENTIALS)
+    barycentric[[0, -1]] /= 2
+    interpolate = scipy.interpolate.BarycentricInterpolator(points, np.eye(EXPONENTIALS), wi=barycentric)
+    weights = interpolate(np.log(rates))
+    return [_exponential(float(rate)) for rate in np.exp(points)], np.asarray(weights)
+
+
+def _gaussian_rise(width: float) -> Half:
+    """Return the first half of a Gaussian; the width is from half maximum to maximum, in half-widths."""
+    return Half(lambda tau: _gaussian_tail(-tau, width))
+
+
+def _gaussian_tail(tau: Float, width: float) -> Float:
+    """Return the integral of a Gaussian from tau to the end, for a half-width at half maximum of `width`."""
+    root = float(np.sqrt(np.log(2)))
+    return np.asarray(np.sqrt(np.pi) / 2 * width / root * scipy.special.erfc(tau * root / width))
+
+
+@dataclass(frozen=True)
+class WeightedSum:
+    """Shape of a family: a weighted sum of its parts."""
+
+    name: str
+    parts: tuple[tuple[float, Integrable], ...]
+
+    def before(self, tau: ArrayLike) -> Float:
+        """Return the integral up to tau."""
+        return np.asarray(sum(weight * part.before(tau) for weight, part in self.parts))
+
+    def after(self, tau: ArrayLike) -> Float:
+        """Return the integral from tau to the end."""
+        return np.asarray(sum(weight * part.after(tau) for weight, part in self.parts))
+
+    @property
+    def equivalent_duration(self) -> float:
+        """Total integral, in half-widths."""
+        return float(self.before(0.0) + self.after(0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Family:
+    """Shapes that are weighted sums of the same parts."""
+
+    name: str
+    parts: tuple[Integrable, ...]
+    weights: Float  # shape (n_shape, n_part)
+    log_prior: Float  # shape (n_shape,); logarithm of the prior weight of each shape in the family
+    epsilon: tuple[float, ...]  # departures from the shapes that are averaged
+    prior: float  # weight of the family
+
+    @classmethod
+    def of(cls, shape: Shape, prior: float) -> Family:
+        """Return the family of a single shape."""
+        return cls(shape.name, (shape,), np.ones((1, 1)), np.zeros(1), EPSILON, prior)
+
+    @classmethod
+    @cache
+    def general(cls) -> Family:
+        """Return the general family, the same object in all calls: rises and decays in all combinations."""
+        rises = [Half(SHAPES["davenport2014"].before), *map(_gaussian_rise, GAUSSIAN_RISES)]
+        gaussian = Half(partial(_gaussian_tail, width=GAUSSIAN_DECAY), decays=True)
+        fast = [_exponential(Davenport2014.DECAY[0][1]), gaussian]
+        slow, interpolated = _exponentials(SLOW_RATES)
+        choices = [(0.0, 0), *((share, rate) for share in SLOW_SHARES for rate in range(SLOW_RATES.size))]
+        # Each share has the same weight: without a slow decay, its rate does not matter.
+        rates = np.array([1.0 if share == 0 else 1 / SLOW_RATES.size for share, _ in choices])
+        prior = np.tile(rates / rates.sum(), len(rises) * len(fast)) / (len(rises) * len(fast))
+        rows = []
+        for rise, start, (share, rate) in product(range(len(rises)), range(len(fast)), choices):
+            row = np.zeros(len(rises) + len(fast) + len(slow))
+            row[rise], row[len(rises) + start] = 1.0, 1.0 - share
+            row[len(rises) + len(fast) :] = share * interpolated[rate]
+            rows.append(row)
+        return cls(GENERAL, (*rises, *fast, *slow), np.array(rows), np.log(prior), GENERAL_EPSILON, GENERAL_WEIGHT)
+
+    @property
+    def durations(self) -> Float:
+        """Equivalent duration of each shape for unit amplitude and half-width."""
+        return np.asarray(self.weights @ [float(part.before(0.0) + part.after(0.0)) for part in self.parts])
+
+    def shape(self, k: int) -> WeightedSum:
+        """Return one of the shapes."""
+        return WeightedSum(self.name, tuple((float(w), part) for w, part in zip(self.weights[k], self.parts,
+                                                                                 strict=True) if w))  # fmt: skip
+
+
+def families(searched: Shape) -> Sequence[Family]:
+    """Return the families that are averaged for a search with some shape, that of many shapes last."""
+    published = {shape.name: shape for shape in (searched, *(SHAPES[name] for name in AVERAGED))}
+    prior = (1 - GENERAL_WEIGHT) / len(published)
+    return [*(Family.of(shape, prior) for shape in published.values()), Family.general()]
+
+
+Profile = Shape | WeightedSum
+
+#: Correlation of departures in the logarithm of 1 + time from the peak in half-widths (assumed).
+LOG_TIME = 0.7
+#: Light that departs where a shape has none, as a share of the amplitude at the peak (assumed); it falls by e in each
+#: half-width.
+FLOOR = 0.1
+#: Half-widths of a shape before and after the peak beyond which it is neglected.
+REACH = (5.0, 80.0)
+#: Largest number of bins in an event, and on each side of it; growth of the bins with the distance from the peak.
+MAX_INSIDE, MAX_OUTSIDE, GROWTH = 160, 80, 6.0
+#: Bins outside are shorter than this share of the shortest time scale of the process.
+SHORT = 0.2
+#: Number of frames on each side of an event that are fitted with it, and the same in lengths of the event: the level of
+#: further ones would lower the variance of its sum by 1 % at most in independent noise, and less in that of a process.
+WINDOW_FRAMES, WINDOW_LENGTHS = 2**15, 100
+
+
+@dataclass(frozen=True)
+class FittedFlare:
+    """Flare fitted to an event."""
+
+    peak_s: float  # in the stare
+    amplitude: float  # relative to the level
+    half_width_s: float
+    equivalent_duration_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """Bins of frames around an event.
+
+    Frames in a bin are consecutive. Values are those of the sum along the direction of the event's template.
+    """
+
+    survey: SeriesSurvey
+    one: Detection
+    edges: Float  # shape (n, 2); start and end of each bin
+    values: Float  # shape (n,)
+    noise: Float  # shape (n,); variance of the mean of each bin's frames
+    frames: NDArray[np.int64]  # shape (n,); number of frames of each bin
+    inside: Bool  # shape (n,); bins of the event
+    scale: float  # value of unit amplitude
+    photon: float  # rise of the variance of a frame with the amplitude
+    quiet_level: float = 1.0  # of the star at the peak, by the frames without events, in units of the survey's level
+
+    @classmethod
+    def of(cls, survey: SeriesSurvey, taken: Bool, one: Detection, direction: int | None = None) -> Window:
+        """Collect the frames of an event, and those around it that belong to no event."""
+        direction = one.direction if direction is None else direction
+        unit = survey.bank.directions[direction]
+        row = survey.templates.chosen[direction]
+        scale = float(np.linalg.norm(survey.templates.directions[row]))
+        photon = float(unit @ survey.templates.noise[row] @ unit)
+        excess = float(unit**2 @ np.array([p.excess for p in survey.processes]) ** 2)
+        frame_s = survey.stare.frame_s
+        peak = one.peak_s / frame_s
+        # Only frames near the event, so that the time does not depend on the length of the light curve.
+        reach = max(WINDOW_FRAMES, WINDOW_LENGTHS * (one.last - one.first + 1))
+        low = max(0, one.first - reach)
+        near = slice(low, one.last + 1 + reach)
+        numbers, along, variance = survey.stare.numbers[near], survey.sums[near] @ unit, survey.variance[near]
+        begin, end = one.first - low, one.last - low
+        inside = np.zeros(along.size, np.bool_)
+        inside[begin : end + 1] = True
+        at = np.flatnonzero(inside | ~taken[near])
+        distance = np.abs(numbers[at] - peak)
+        size = np.ones(at.size)
+        length = numbers[end] - numbers[begin] + 1
+        size[inside[at]] = max(1, int(np.ceil(length / MAX_INSIDE)))
+        shortest = min(process.shortest_s for process in survey.processes)
+        ends = np.where(numbers[at] > peak, distance - (numbers[end] - peak), distance - (peak - numbers[begin]))
+        outer = np.clip(np.maximum(ends, 0.0) / GROWTH, 1.0, max(1.0, SHORT * shortest / frame_s))
+        size[~inside[at]] = np.maximum(np.floor(outer), size.min())[~inside[at]]
+        first = _bins(numbers[at], size, inside[at])
+        count = np.diff(np.append(first, at.size))
+        is_inside = inside[at][first]
+        # As the start of the next frame, to the bit.
+        start, stop = numbers[at[first]] * frame_s, (numbers[at[first + count - 1]] + 1) * frame_s
+        mean = np.add.reduceat(along[at], first) / count
+        noise = np.add.reduceat(variance[at] * excess, first) / count**2
+        # The nearest bins on each side are kept.
+        before = np.flatnonzero(~is_inside & (stop <= survey.stare.start_s[one.first] + frame_s / 2))
+        after = np.flatnonzero(~is_inside & (start >= survey.stare.start_s[one.last] + frame_s / 2))
+        kept = np.sort(np.concatenate([before[-MAX_OUTSIDE:], np.flatnonzero(is_inside), after[:MAX_OUTSIDE]]))
+        return cls(
+            survey, one, np.column_stack([start, stop])[kept], mean[kept], noise[kept], count[kept], is_inside[kept],
+            scale, photon,
+        )  # fmt: skip
+
+    @cached_property
+    def middle(self) -> Float:
+        """Middle of each bin."""
+        return np.asarray(self.edges.mean(axis=1))
+
+    @cached_property
+    def process(self) -> Float:
+        """Covariance of the level in the bins, shape (n, n)."""
+        unit = self.survey.bank.directions[self.one.direction]
+        lags = self.middle[:, None] - self.middle
+        total = np.zeros(lags.shape)
+        for weight, process in zip(unit, self.survey.processes, strict=True):
+            total += weight**2 * process.at(lags)
+        return total
+
+    def model(self, shape: Integrable, peak_s: Float, half_width_s: Float) -> Float:
+        """Return the mean of shapes in the bins, in the unit of the values, (n_shape, n)."""
+        return np.asarray(self.models((shape,), peak_s, half_width_s)[0])
+
+    def models(self, parts: Sequence[Integrable], peak_s: Float, half_width_s: Float) -> Float:
+        """Return the mean of several parts of shapes in the bins, in the unit of the values, (n_part, n_shape, n)."""
+        times, place = self._times
+        peak, width = (np.atleast_1d(one)[:, None] for one in (peak_s, half_width_s))
+        tau = (times - peak) / width
+        # Integrals from the peak. Each side is computed by itself: this dominates the time of a fit.
+        early = tau < 0
+        before, after = tau[early], tau[~early]
+        per_amplitude = self.scale * width / np.diff(self.edges)[:, 0]
+        integral = np.empty(tau.shape)
+        light = np.empty((len(parts), *per_amplitude.shape))
+        for mean, part in zip(light, parts, strict=True):
+            integral[early] = part.before(before) - part.before(0.0)
+            integral[~early] = part.after(0.0) - part.after(after)
+            np.maximum(integral[:, place[1]] - integral[:, place[0]], 0.0, out=mean)
+            mean *= per_amplitude
+        return light
+
+    @cached_property
+    def _times(self) -> tuple[Float, NDArray[np.intp]]:
+        """Edges of bins, of which neighbours share one, and the places of each bin's start and end, shape (2, n)."""
+        times, place = np.unique(self.edges.T.ravel(), return_inverse=True)
+        return times, place.reshape(2, -1)
+
+
+def _bins(numbers: NDArray[np.int64], size: Float, inside: Bool) -> NDArray[np.int64]:
+    """Return the first frame of each bin: a consecutive frame is added to a bin of fewer frames than its own size.
+
+    Sizes are whole numbers that do not both fall and rise within consecutive frames.
+    """
+    breaks = np.diff(numbers, prepend=numbers[:1] - 2) != 1
+    breaks |= np.diff(inside, prepend=inside[:1])
+    sizes = size.astype(np.int64).tolist()
+    firsts = []
+    for begin, end in pairwise([*np.flatnonzero(breaks).tolist(), len(sizes)]):
+        first = begin
+        while first < end:
+            held = min(sizes[first], end - first)
+            while held > 1 and sizes[first + held - 1] < held:
+                held -= 1
+            while first + held < end and sizes[first + held] > held:
+                held += 1
+            firsts.append(first)
+            first += held
+    return np.array(firsts, np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class Likelihood:
+    """Inverse covariance of the values of a window, with the constant level integrated out."""
+
+    window: Window
+    inverse: Float  # shape (n, n)
+    log_factor: float  # of the likelihood, without the constant
+    # Integral of the departures of the flares from their shape, in amplitude x s: its covariance with the values, and
+    # its variance.
+    departure: Float  # shape (n,)
+    variance: float
+    # Weights of the values in the level of the star at the peak, and its variance with a known flare, relative to the
+    # level; zero where the values are not its light.
+    level: Float  # shape (n,)
+    level_variance: float
+
+    @classmethod
+    def of(cls, window: Window, flares: Sequence[FittedFlare], shape: Profile, epsilon: float) -> Likelihood:
+        """Compute the likelihood for the photon noise of some flares and departures from their shape."""
+        n = window.values.size
+        covariance = window.process + np.diag(window.noise)
+        shared, variance = np.zeros(n), 0.0
+        for one in flares:
+            light = one.amplitude * window.model(shape, np.array([one.peak_s]), np.array([one.half_width_s]))[0]
+            covariance += np.diag(window.photon * light / window.scale / window.frames)
+            if epsilon:
+                light = light + _floor(window.middle, one) * window.scale
+                cells, cell_light = _unobserved(window, one, shape)
+                place = log_time(window.middle, one)
+                elsewhere = log_time(cells, one)
+                near = np.exp(-np.abs(place[:, None] - place) / LOG_TIME)
+                covariance += epsilon**2 * light[:, None] * light * near
+                lengths = window.edges[:, 1] - window.edges[:, 0]
+                whole = np.concatenate([light / window.scale * lengths, cell_light])
+                every = np.concatenate([place, elsewhere])
+                shared += epsilon**2 * light * (np.exp(-np.abs(place[:, None] - every) / LOG_TIME) @ whole)
+                variance += epsilon**2 * float(whole @ np.exp(-np.abs(every[:, None] - every) / LOG_TIME) @ whole)
+        factor = scipy.linalg.cholesky(covariance, lower=True)
+        # LAPACK's inverse from a factor, in half the time of a solution for each column; it leaves the upper half.
+        lower = np.tril(scipy.linalg.lapack.dpotri(factor, lower=True)[0])
+        inverse = lower + np.tril(lower, -1).T
+        ones = inverse.sum(axis=1)
+        total = float(ones.sum())
+        level, level_variance = np.zeros(n), 0.0
+        if len(window.survey.bank.directions) == 1:
+            at = int(np.argmin(np.abs(window.middle - window.one.peak_s)))
+            toward = inverse @ window.process[at]
+            rest = 1.0 - float(window.process[at] @ ones)
+            level = (toward + rest * ones / total) / window.scale
+            known = float(window.process[at, at] - window.process[at] @ toward) + rest**2 / total
+            level_variance = max(known, 0.0) / window.scale**2
+        inverse = inverse - ones[:, None] * ones / total
+        log_factor = -float(np.log(np.diag(factor)).sum()) - 0.5 * float(np.log(total))
+        return cls(window, inverse, log_factor, shared, variance, level, level_variance)
+
+    def matched(self, parts: Float, weights: Float, values: Float) -> tuple[Float, Float]:
+        """Return the products of models and values, and of models with themselves, shape (n_shape, n_node).
+
+        Models are sums of parts, shape (n_part, n_node, n), with weights, shape (n_shape, n_part). The first product is
+        zero for models that are constant but for rounding errors, as bright in all bins as the level.
+        """
+        pairs = (weights[:, :, None] * weights[:, None]).reshape(len(weights), -1)
+        # Long before the peak nothing is bright.
+        largest = parts.max(axis=(0, 1))
+        bright = largest >= DARK * largest.max()
+        parts, inverse = parts[:, :, bright], self.inverse[bright]
+        toward, inverse = inverse @ values, inverse[:, bright]
+        weighted = (parts.reshape(-1, len(inverse)) @ inverse).reshape(parts.shape)
+        gram = weighted.transpose(1, 0, 2) @ parts.transpose(1, 2, 0)
+        information = pairs @ gram.reshape(len(gram), -1).T
+        # At least the sum without the level, by the triangle inequality.
+        whole = (np.abs(weights) @ np.sqrt(parts**2 @ np.diag(inverse))) ** 2
+        least = np.maximum(1e-9 * whole, 1e-300)
+        slope = np.where(information > least, weights @ (parts @ toward), 0.0)
+        return slope, np.maximum(information, least)
+
+    def level_without(self, light: Float) -> Float:
+        """Return the level of the star at the peak once the light of flares, shape (n,) or (k, n), is subtracted.
+
+        The tail of a bright flare raises the level of the frames without events. That level is returned only where the
+        values are not the star's light, or where the fitted level is not above zero.
+        """
+        fitted = (self.window.values - light) @ self.level
+        return np.where(fitted > 0, fitted, self.window.quiet_level)
+
+    def log_of(self, model: Float) -> float:
+        """Return the logarithm of the likelihood of a model of shape (n,), without the constant."""
+        return self.log_factor - 0.5 * float(self.chi2(model))
+
+    def chi2(self, model: Float) -> Float:
+        """Return chi-squared of the values with models, of shape (n,) or (k, n), added to the level."""
+        left = self.window.values - model
+        return np.asarray(np.einsum("...i,...i->...", left @ self.inverse, left))
+
+
+def log_time(time_s: Float, one: FittedFlare) -> Float:
+    """Return the logarithm of the time from the peak, in which departures of a flare are correlated."""
+    tau = (time_s - one.peak_s) / one.half_width_s
+    return np.asarray(np.sign(tau) * np.log1p(np.abs(tau)))
+
+
+def _floor(time_s: Float, one: FittedFlare) -> Float:
+    """Return the light of a flare that may be where its shape has none."""
+    return np.asarray(FLOOR * one.amplitude * np.exp(-np.abs(time_s - one.peak_s) / one.half_width_s))
+
+
+def _unobserved(window: Window, one: FittedFlare, shape: Profile) -> tuple[Float, Float]:
+    """Return middles of intervals without bins near a flare, and the light of the flare in them, in amplitude x s."""
+    tau = np.concatenate([-np.geomspace(REACH[0], 0.05, 12), [0.0], np.geomspace(0.05, REACH[1], 24)])
+    edges = np.unique(np.concatenate([one.peak_s + tau * one.half_width_s, window.edges.ravel()]))
+    edges = edges[(edges >= one.peak_s - REACH[0] * one.half_width_s)
+                  & (edges <= one.peak_s + REACH[1] * one.half_width_s)]  # fmt: skip
+    if edges.size < 2:
+        return np.zeros(0), np.zeros(0)
+    middle = (edges[:-1] + edges[1:]) / 2
+    place = np.searchsorted(window.edges[:, 0], middle, side="right") - 1
+    seen = (place >= 0) & (middle < window.edges[np.maximum(place, 0), 1])
+    integrals = consecutive_integrals(shape, (edges - one.peak_s) / one.half_width_s)
+    light = one.amplitude * one.half_width_s * integrals + _floor(middle, one) * np.diff(edges)
+    return middle[~seen], light[~seen]
