@@ -17,7 +17,7 @@ from pathlib import Path
 from astropy.table import Table
 
 from mauvecl.answers.inject import inject
-from mauvecl.device.engine import Stares
+from mauvecl.device.stares import Stares
 from mauvecl.study.study import Study
 
 STAR = {"star": [{"library": "G2V", "magnitude": 7.4}]}

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from mauvecl import Study, analyse, stare
-from mauvecl.device.engine import Stares
+from mauvecl.device.stares import Stares
 from mauvecl.observations.frame_files import read_frames
 
 #: False alarms per star-day, enough to count them in a few star-days.

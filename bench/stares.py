@@ -25,7 +25,7 @@ from astropy.table import Table
 from tables import processor, versions, write
 
 from mauvecl import Instrument, Sky, Source, __version__, expect
-from mauvecl.device.engine import Stares
+from mauvecl.device.stares import Stares
 from mauvecl.flares.frames import Components
 from mauvecl.flares.stare import Stare
 from mauvecl.flares.stare_scene import StaresRequest

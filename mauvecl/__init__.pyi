@@ -24,7 +24,7 @@ from mauvecl.detection.detection import departures as departures
 from mauvecl.detection.nuisances import Nuisances as Nuisances
 from mauvecl.detection.statistics import Linear as Linear
 from mauvecl.device.engine import Engine as Engine
-from mauvecl.device.engine import Stares as Stares
+from mauvecl.device.stares import Stares as Stares
 from mauvecl.fits.flare_model import FlareModel as FlareModel
 from mauvecl.fits.spectrum import fit as fit
 from mauvecl.fits.spectrum import fit_two_temperatures as fit_two_temperatures

@@ -9,7 +9,6 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.tables.fits_tables import text_at
 from mauvecl.host.tables.units import balanced, is_spectral, unit_of
 from mauvecl.schema.errors import InputError
 
@@ -229,6 +228,8 @@ def medium_of(*headers: Mapping[str, Any]) -> Medium | None:
 
     Raises InputError if keywords contradict each other, or one that states the medium has another value.
     """
+    from mauvecl.host.tables.fits_tables import text_at
+
     found: dict[str, Medium] = {}
     for header in headers:
         for key in map(str, header):

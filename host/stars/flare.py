@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from mauvecl.host.stars.bands import photons
 from mauvecl.host.stars.flare_spectra import FlareSpectrum, blackbody
 from mauvecl.host.tables.files import LARGEST, SMALLEST
-from mauvecl.host.tables.opening import read_table
-from mauvecl.host.tables.table import Rows
 from mauvecl.schema.errors import InputError, shortened, shown
 from mauvecl.schema.fields import checked
 from mauvecl.schema.physical import Amplitude, Temperature
@@ -188,6 +186,8 @@ def read_flares(path: str | Path) -> QTable:
         ``amplitude``, and ``start`` and ``stop`` in days of the table's own time system. Columns that are not used are
         named in ``meta["comments"]``.
     """
+    from mauvecl.host.tables.opening import read_table
+
     return flares_of(read_table(path, "flare table"), shortened(Path(path).name))
 
 
@@ -202,6 +202,8 @@ def flares_of(table: Table | Any, name: str = "flare table") -> QTable:
         Name of the table in error messages.
     """
     from astropy.table import QTable, Table
+
+    from mauvecl.host.tables.table import Rows
 
     if not isinstance(table, Table):
         table = Table.from_pandas(table)

@@ -18,7 +18,6 @@ from astropy.constants import c, h, k_B
 from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.host.arrays import ContentEquality, array_cache, set_read_only
-from mauvecl.host.spectra.formats import read_spectrum
 from mauvecl.host.spectra.units import NEEDED_NM
 from mauvecl.host.stars.bands import ANGSTROM
 from mauvecl.host.stars.coverage import check_points
@@ -440,6 +439,8 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
         InputError
             For files that hold no spectra or do not overlap, or a spectrum that does not cover 200-700 nm.
         """
+        from mauvecl.host.spectra.formats import read_spectrum
+
         units: dict[str, Any] = {"wavelength_unit": wavelength_unit, "flux_unit": flux_unit}
         read = read_spectrum(Path(path), **units)
         nm, flux, messages = read.wavelength_nm, read.flux_flam, read.messages

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.host.arrays import ContentEquality, set_read_only
-from mauvecl.host.spectra.formats import read_spectrum
 from mauvecl.host.spectra.units import SPAN_NM
 from mauvecl.host.stars import bands
 from mauvecl.host.stars.coverage import (
@@ -205,6 +204,8 @@ class Source(Drawable, ContentEquality):
         InputError
             If the file is missing, unreadable or holds no usable spectrum, or less than a third of 200-700 nm.
         """
+        from mauvecl.host.spectra.formats import read_spectrum
+
         read = read_spectrum(
             Path(path), wavelength_unit=wavelength_unit, flux_unit=flux_unit, ignore_checksum=ignore_checksum
         )

@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, first_of, reported, share_columns
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection.distributions import Interval
-from mauvecl.device.engine import Stares
+from mauvecl.device.stares import Stares
 from mauvecl.flares.frames import STEADY, Components
 from mauvecl.flares.shapes import shape_of
-from mauvecl.flares.stare_scene import Arrays
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.columns import INTERVAL, Column, View, interval, number, percent, table_of
 from mauvecl.schema.errors import InputError, Message
@@ -36,6 +35,7 @@ from mauvecl.study.study import Study
 if TYPE_CHECKING:
     from astropy.table import QTable
 
+    from mauvecl.detection.snr import Arrays
     from mauvecl.flares.stare_scene import StaresRequest
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.study.stare import Size

@@ -385,7 +385,7 @@ def measured_stare(case: Case, engine: Engine | Pool) -> MeasuredStare:
     processes = study.processes.additive_only
 
     def draw(components: Components) -> Float:
-        from mauvecl.device.engine import Stares
+        from mauvecl.device.stares import Stares
 
         request = StaresRequest(components, stare, 1, seed, staring.flare, start=study.stare.number, method="pixels",
                                 processes=processes)  # fmt: skip

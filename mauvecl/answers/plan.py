@@ -27,7 +27,7 @@ from mauvecl.answers.plan_targets import (
 )
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.answers.visible import VisibleAnswer, assumption_columns, visible
-from mauvecl.device.engine import Stares
+from mauvecl.device.stares import Stares
 from mauvecl.host.orbit.visibility import PARTICLES_SOURCE, THERMAL_SOURCE
 from mauvecl.runs.pool import map_in_order
 from mauvecl.schema.columns import Column, number, percent, records

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from mauvecl.answers.visible import VisibleAnswer
     from mauvecl.detection.nuisances import Nuisances
     from mauvecl.detection.snr import Arrays
-    from mauvecl.device.engine import Stares
+    from mauvecl.device.stares import Stares
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.search.completeness import DurationLaw, Yield
 

@@ -21,7 +21,7 @@ from scipy.interpolate import CubicSpline
 from mauvecl.answers.answer import Answer, InCell, TableOf, first_of, metadata_of, reported
 from mauvecl.answers.inject import survey_star
 from mauvecl.answers.verbs import Progress, by_keywords
-from mauvecl.device.engine import Stares
+from mauvecl.device.stares import Stares
 from mauvecl.flares.energies import Kind
 from mauvecl.flares.frames import Draw, LightCurves, StareExpectation, draw_light_curves
 from mauvecl.flares.stare import Event, coefficients, temperatures_of

@@ -408,7 +408,7 @@ def stare(
 ) -> None:
     """Draw stares on one device, which keeps their frames for a resume."""
     from mauvecl.answers.stare import stare as compute
-    from mauvecl.device.engine import Stares
+    from mauvecl.device.stares import Stares
 
     if given["energy"] and (given["amplitude"] or given["flares"]):
         raise InputError("only one of --energy, --amplitude and --flares may be given", key="energy")

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from mauvecl.host.arrays import ContentEquality
 from mauvecl.host.tables.files import LARGEST, SMALLEST, read_text
-from mauvecl.host.tables.text_tables import columns
 from mauvecl.noise.unknowns import NUISANCES
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened
@@ -280,6 +279,8 @@ def read_spectrum(name: str, path: Path, wavelength_nm: NDArray[np.float64]) -> 
 
 def read_values(what: str, kind: str, path: Path, wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
     """Read values of a file of two columns, and interpolate them to pixels."""
+    from mauvecl.host.tables.text_tables import columns
+
     text = read_text(path, kind if kind == "weights" else "spectrum")
     rows = columns(what, text, f"wavelengths and {kind}", "nm")
     return at_pixels(what, kind, rows, wavelength_nm)

@@ -22,14 +22,15 @@ from scipy import special
 
 from mauvecl.detection.counts import Distribution
 from mauvecl.detection.requests import STATISTICS
-from mauvecl.detection.snr import Counts
+from mauvecl.detection.snr import Arrays, Counts
 from mauvecl.device import drivers
 from mauvecl.device.build import SAME_BITS, DeviceRecord, choose_device
 from mauvecl.device.drivers import DeviceError, kernel_cache
-from mauvecl.device.engine import Engine, Stares, devices
+from mauvecl.device.engine import Engine, devices
+from mauvecl.device.stares import Stares
 from mauvecl.flares.frames import Components
 from mauvecl.flares.stare import Stare
-from mauvecl.flares.stare_scene import Arrays, StaresRequest
+from mauvecl.flares.stare_scene import StaresRequest
 from mauvecl.host import VERSION
 from mauvecl.host.exposure.expectation import Expectation
 from mauvecl.noise import layout, reference

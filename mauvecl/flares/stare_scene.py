@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.detection.requests import Countable
+from mauvecl.detection.snr import Arrays
 from mauvecl.flares.frames import MOST_STATISTICS, STEADY, Components
 from mauvecl.flares.stare import Stare
 from mauvecl.noise import layout
@@ -341,7 +342,6 @@ def _not_joint_error(name: str) -> InputError:
     )
 
 
-Arrays = dict[str, NDArray[Any]]
 Method = Literal["pixels", "cumulants"]
 StareNumber = Annotated[int, Range(0, 2**64 - 1)]
 

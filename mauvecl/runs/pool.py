@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from mauvecl.detection.requests import DetectRequest, RealiseRequest, Shard, SnrRequest
 from mauvecl.detection.snr import Arrays, DetectionSums, SnrSums
-from mauvecl.device.engine import DeviceError, DeviceRecord, Engine, Stares
+from mauvecl.device.engine import DeviceError, DeviceRecord, Engine
 from mauvecl.device.launches import Progress
-from mauvecl.flares.stare_scene import StaresRequest, StareSums
 from mauvecl.host.arrays import map_in_threads
 from mauvecl.runs.checkpoint import Checkpoint, Task, fingerprint, shards
 from mauvecl.schema.calls import validated
@@ -29,6 +28,8 @@ from mauvecl.schema.physical import Realisations
 if TYPE_CHECKING:
     from mauvecl.detection.detection import Detection
     from mauvecl.detection.snr import SnrResult
+    from mauvecl.device.stares import Stares
+    from mauvecl.flares.stare_scene import StaresRequest, StareSums
     from mauvecl.host.exposure.expectation import Expectation
 
 #: Number of failures at a shard after which the run fails; a shrinking cluster may lose several workers at once.
@@ -39,7 +40,7 @@ SHARDS_PER_WORKER = 2
 PREPARED = 1
 
 
-Sums = TypeVar("Sums", DetectionSums, SnrSums, StareSums)
+Sums = TypeVar("Sums", DetectionSums, SnrSums, "StareSums")
 Item = TypeVar("Item")
 Answer = TypeVar("Answer")
 
@@ -247,6 +248,8 @@ class Pool:
 
     def stares(self, request: StaresRequest) -> Arrays:
         """Reduce all stares of a request; see `Stares.reduced`."""
+        from mauvecl.flares.stare_scene import StareSums
+
         return self._add_up(request, StareSums(request)).answer()
 
     def realise(

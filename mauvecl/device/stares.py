@@ -1,0 +1,360 @@
+"""Stares drawn by the kernels of a device, and reduced there or on the host."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.detection.requests import Shard
+from mauvecl.detection.snr import Arrays
+from mauvecl.device.build import Device, Variant
+from mauvecl.device.launches import TILE_BYTES, Launches, Progress, Tile, Tiles, contiguous, padded
+from mauvecl.flares.frames import Components
+from mauvecl.flares.stare import Stare
+from mauvecl.flares.stare_scene import (
+    Flares,
+    KeepStatistics,
+    Method,
+    StareNumber,
+    StareScene,
+    StaresRequest,
+    SumTable,
+    check_sums,
+    joined,
+    padded_frames,
+)
+from mauvecl.noise.unknowns import NONE, Processes
+from mauvecl.schema.calls import validated
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.physical import DEFAULT_SEED, Realisations, Seed
+
+Floats = NDArray[np.float32]
+
+#: Memory of stares that are drawn and reduced at once.
+REDUCED_BYTES = 4 * 2**20
+
+
+@validated
+class Stares:
+    """Simulator of stares on an OpenCL device.
+
+    Parameters
+    ----------
+    device : str or Device, optional
+        Number or name, as for `Engine`, or an open device.
+    progress, tile, width : optional
+        As for `Engine`, in stares instead of realisations.
+    tiles : Tiles, optional
+        Division of the work, instead of `progress` and `tile`.
+
+    Raises
+    ------
+    DeviceError
+        If there is no such device, or its driver does not work.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from mauvecl import Instrument, Source, expect
+    >>> from mauvecl.device.stares import Stares
+    >>> from mauvecl.flares.frames import Components
+    >>> from mauvecl.flares.stare import Stare
+    >>> star, mauve = Source.from_library("G2V").at_magnitude(7.4), Instrument.load("mauve")
+    >>> quiet, flare = (expect(s, mauve, exposure=5.0) for s in (star, star.flaring(1.0)))
+    >>> near_uv = (quiet.wavelength_nm < 360).astype(float)
+    >>> components = Components.of(quiet, [flare], near_uv[None])
+    >>> stare = Stare.of(600.0, jitters={"light": 0.01})
+    >>> y = Stares().frames(components, stare, first=7, count=3, seed=1)
+    >>> y.shape
+    (3, 120, 1)
+    >>> bool((Stares().frames(components, stare, first=8, count=1, seed=1) == y[1]).all())
+    True
+    """
+
+    def __init__(
+        self,
+        device: str | Device | None = None,
+        *,
+        progress: Progress | None = None,
+        tile: int | None = None,
+        width: int | None = None,
+        tiles: Tiles | None = None,
+    ) -> None:
+        self.open_device = device if isinstance(device, Device) else Device(device, width=width)
+        self._tiles = tiles or Tiles(self.open_device, progress=progress, largest=tile)
+
+    def __repr__(self) -> str:
+        return f"<Stares on {self.open_device.record.label}>"
+
+    def frames(
+        self,
+        components: Components,
+        stare: Stare,
+        flare: NDArray[Any] | None = None,
+        *,
+        first: StareNumber = 0,
+        count: Realisations = 1,
+        seed: Seed = DEFAULT_SEED,
+        method: Method = "pixels",
+        amplitudes: NDArray[Any] | None = None,
+        processes: Processes = NONE,
+    ) -> Floats:
+        """Draw the statistics of each frame of stares `first` to `first + count - 1`.
+
+        Parameters
+        ----------
+        components : Components
+        stare : Stare
+        flare : ndarray, shape (n_frame, n_flare) or (count, n_frame, n_flare), optional
+            Amplitude of each flare spectrum in each frame, common to all stares or per stare.
+        first, count : int
+            Range of stares; each stare depends only on the seed and its number.
+        seed : int
+            0 to 2**64 - 1.
+        method : {"pixels", "cumulants"}
+            Draw every pixel, or the sums directly from their cumulants. The conditions of frames are equal for both.
+        amplitudes : ndarray, shape (n_scenario, count) or (n_scenario, 1), optional
+            Factors on `flare`, for several scenarios on common draws.
+        processes : Processes
+            Additive processes, supported by the method "pixels" only; the priors of a stare are its `unknowns`.
+
+        Returns
+        -------
+        ndarray of float32, shape (count, n_frame, n_statistic)
+            Weighted sums over pixels of raw counts minus the quiescent mean; frames of a statistic are contiguous in
+            memory. With `amplitudes`, the shape is (n_scenario, count, n_frame, n_statistic).
+        """
+        _check_last(first, count)
+        flares = Flares.of(components, stare, flare, amplitudes, count)
+        shape = (len(flares.amplitudes), count, components.n_statistics, padded_frames(stare.n_frames))
+        out = np.empty(shape, np.float32)
+        with self._launches(components, stare, flares, seed, method, processes) as launches:
+
+            def work(tile: Tile, done: int) -> None:
+                launches.upload_flares(flares.part(done, tile.wanted), first + done, tile.wanted)
+                launches.draw(tile, out, done)
+
+            self._tiles.for_each(first, count, out[:, 0].nbytes, work)
+        frames = np.moveaxis(out[..., : stare.n_frames], 2, 3)
+        return frames[0] if amplitudes is None else frames
+
+    def reduced(self, request: StaresRequest, shard: Shard | None = None) -> Arrays:
+        """Draw the stares of a request, or of a shard of it, and reduce them a few at a time.
+
+        Parameters
+        ----------
+        request : StaresRequest
+        shard : Shard, optional
+
+        Returns
+        -------
+        dict of str to ndarray
+            Joined results of the request's reduction; for a shard with its ``start``, as `StareSums` requires.
+        """
+        there = shard or Shard(0, request.start, request.realisations)
+        _check_last(there.start, there.count)
+        components, stare, reduction = request.components, request.stare, request.reduction or KeepStatistics()
+        how = (request.seed, request.method, request.processes)
+        scenarios = slice(None) if request.amplitudes is not None else 0
+        parts = list[Arrays]()
+        shape = (components.n_statistics, padded_frames(stare.n_frames))
+        each = 4 * len(request.flares.amplitudes) * shape[0] * shape[1]
+        # Pieces are small enough for a processor's cache; the cumulants need no full vector of long stares.
+        step = 1 if request.method == "cumulants" else self.open_device.width
+        piece = max(step, REDUCED_BYTES // each // step * step)
+        room = np.empty(each * piece // 4, np.float32)
+        glow = np.empty((1, piece, shape[0] + 1, shape[1]) if request.glow else 0, np.float32)
+        with self._launches(components, stare, request.flares, *how) as launches:
+
+            def work(tile: Tile, done: int) -> None:
+                reduced = []
+                for few in tile.pieces(piece):
+                    out = room[: each * few.wanted // 4].reshape(-1, few.wanted, *shape)
+                    first = few.first + few.start
+                    launches.upload_flares(request.flares.part(first - request.start, few.wanted), first, few.wanted)
+                    launches.draw(few, out, 0)
+                    values = np.moveaxis(out[..., : stare.n_frames], 2, 3)[scenarios]
+                    more = []
+                    if request.glow:
+                        launches.glow(few, glow)
+                        more = [np.moveaxis(glow[0, : few.wanted, :, : stare.n_frames], 1, 2)]
+                    reduced.append(dict(reduction(values, first, *more)))
+                # Results are added last, since a tile that fails is drawn again.
+                parts.extend(reduced)
+
+            self._tiles.for_each(there.start, there.count, each, work)
+        arrays = joined(parts, adds=reduction.adds)
+        return arrays | {"start": np.array(there.start)} if shard else arrays
+
+    def _launches(
+        self,
+        components: Components,
+        stare: Stare,
+        flares: Flares,
+        seed: int,
+        method: Method,
+        processes: Processes,
+    ) -> StareLaunches:
+        self.open_device.check_process()
+        scene = _scene_of(components, stare, processes)
+        scene.check(flares)
+        if method == "cumulants":
+            check_sums(scene, flares)
+        return StareLaunches(self.open_device, scene, seed, method)
+
+
+#: Cached because callers draw a few stares of the same star at a time.
+_scene_of = lru_cache(maxsize=4)(StareScene.of)
+
+
+def _check_last(first: int, count: int) -> None:
+    """Raise InputError if the last stare has no number of 64 bits."""
+    if first + count > 2**64:
+        raise InputError.of("first", first, f"at most {2**64 - count} for {count} stares")
+
+
+#: Frames per work-item of the kernels whose lanes are frames.
+FRAMES_EACH = 1024
+#: Cached because callers draw a few stares at a time with the same weights.
+table_of = lru_cache(maxsize=4)(SumTable.of)
+
+
+class StareLaunches(Launches):
+    """Buffers and launches of a stare; the buffers are released at the end of the `with` block."""
+
+    def __init__(self, device: Device, stare: StareScene, seed: int, method: Method) -> None:
+        self._by_sums = method == "cumulants"
+        table = table_of(stare.components) if self._by_sums else None
+        scene = stare.scene
+        variant = replace(
+            device.variant,
+            clip=scene.clip,
+            additive=scene.additive,
+            sums=stare.components.n_statistics,
+            spectra=stare.components.n_flares,
+            unknown_groups=-(-len(stare.kinds) // 4),
+            counts=stare.counts,
+            neighbours=bool(stare.components.quiet.neighbour_electrons.any()),
+            pointing=stare.stare.pointing is not None,
+            fourths=table is not None and table.fourths,
+            jittered=any(stare.stare.jitters.values()),
+            in_time=self._by_sums,
+        )
+        super().__init__(device, scene, variant, seed)
+        self._seed = seed
+        self._held: Any = None
+        self._stare, self._local = stare, (1, 1) if variant.width > 1 else None
+        self._known = [*map(self.upload, (stare.numbers, stare.known, stare.curves, stare.kinds))]
+        if table is None:
+            more = (padded(stare.mixtures), stare.spectra, stare.weights, stare.constants)
+            self._own = [*map(self.upload, more)]
+        else:
+            self._own = [self.upload(table.packed)]
+
+    def __exit__(self, *_: object) -> None:
+        super().__exit__()
+        if self._held is not None:
+            self._held.release()
+
+    def upload_flares(self, flares: Flares, first: int, count: int) -> None:
+        """Upload the flares and the pointing losses of the next `count` stares."""
+        self._scenarios, losses = len(flares.amplitudes), np.zeros(0, np.float32)
+        if self.variant.pointing:
+            losses = self._stare.losses(np.arange(count, dtype=np.uint64) + np.uint64(first), self._seed)
+        self._flares = [
+            self._fill("stare_job", self._stare.stare_struct(flares)),
+            *self._known,
+            self._shared(flares.rows) if self._device.record.kind == "cpu" else self._fill("flares", flares.rows),
+            self._fill("amplitudes", flares.amplitudes),
+            self._fill("losses", losses),
+        ]
+
+    def _shared(self, array: NDArray[Any]) -> Any:
+        """Return a buffer that shares the host's memory, valid until the next flares are uploaded."""
+        if self._held is not None:
+            self._held.release()
+        flags = self._cl.mem_flags
+        self._given = contiguous(array)
+        self._held = self._cl.Buffer(self._device.context, flags.READ_ONLY | flags.USE_HOST_PTR, hostbuf=self._given)
+        return self._held
+
+    def _fill(self, name: str, array: NDArray[Any]) -> Any:
+        """Copy an array to a reused buffer."""
+        data = contiguous(array)
+        buffer = self._scratch(name, data.nbytes)
+        self._cl.enqueue_copy(self._queue, buffer, data)
+        return buffer
+
+    def draw(self, tile: Tile, out: Floats, row: int) -> None:
+        """Draw the statistics of a tile's frames into `out`, in which `row` is the index of the tile's first stare.
+
+        `out` is of float32 and of shape (n_scenario, n_stare, n_statistic, n_padded_frame).
+        """
+        if self._by_sums:
+            self._in_frames("stare_sums", self.variant, self._own, tile, out, row)
+        else:
+            self._by_pixels(tile, out[:, row : row + tile.wanted])
+
+    def _by_pixels(self, tile: Tile, out: Floats) -> None:
+        """Draw pixels, a few frames of all stares at a time."""
+        tile = tile.narrow(self.variant.width)
+        n_frames, each = self._stare.stare.n_frames, self._scenarios * self.variant.sums * tile.size
+        block = max(1, TILE_BYTES // (4 * each))
+        # The number of scenarios is rounded up to a power of two, so that few programs are built.
+        variant = replace(self.variant, scenarios=1 << (self._scenarios - 1).bit_length())
+        kernel = self._device.kernel(("stare", "stare_pixels"), variant, "stare_pixels")
+        for begin in range(0, n_frames, block):
+            size = min(block, n_frames - begin)
+            values = self._scratch("values", 4 * each * size)
+            kernel(
+                self._queue,
+                (tile.size // self.variant.width, size),
+                self._local,
+                *self._arguments,
+                *self._flares,
+                *tile.address(),
+                *tile.rows(),
+                np.uint32(begin),
+                *self._own,
+                np.uint32(tile.size),
+                values,
+            )
+            host = np.empty((size, self._scenarios, self.variant.sums, tile.size), np.float32)
+            self._cl.enqueue_copy(self._queue, host, values)
+            out[..., begin : begin + size] = host[..., tile.start : tile.stop].transpose(1, 3, 2, 0)
+
+    def glow(self, tile: Tile, out: Floats) -> None:
+        """Compute the values with which `Injections` add flares to a tile's frames.
+
+        `out` has the shape (1, n_stare, n_statistic + 1, n_padded_frame).
+        """
+        self._in_frames("stare_glow", replace(self.variant, in_time=True), [], tile, out, 0)
+
+    def _in_frames(self, name: str, variant: Variant, own: list[Any], tile: Tile, out: Floats, row: int) -> None:
+        """Launch a kernel whose lanes are frames."""
+        first, each = tile.first + tile.start, FRAMES_EACH if variant.width > 1 else 1
+        kernel = self._device.kernel(("stare", name), variant, name)
+        # A CPU writes to `out`; a buffer of another device contains only this tile.
+        shares_memory = self._device.record.kind == "cpu"
+        place = (out.shape[1], row) if shares_memory else (tile.wanted, 0)
+        host = out if shares_memory else np.empty((len(out), tile.wanted, *out.shape[2:]), np.float32)
+        with self._output("values", host) as values:
+            kernel(
+                self._queue,
+                (tile.wanted, -(-out.shape[3] // each)),
+                self._local,
+                self._arguments[0],
+                *self._flares,
+                np.uint32(first & 0xFFFFFFFF),
+                np.uint32(first >> 32),
+                np.uint32(each),
+                *own,
+                *map(np.uint32, place),
+                values,
+            )
+        if not shares_memory:
+            out[:, row : row + tile.wanted] = host
