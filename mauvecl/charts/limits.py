@@ -26,7 +26,6 @@ from mauvecl.charts.matplotlib import (
     written,
 )
 from mauvecl.detection.requests import statistic_label
-from mauvecl.fits.flare_model import FlareModel, usable_variance
 from mauvecl.schema.columns import First, note_of
 from mauvecl.study.cases import full_label
 from mauvecl.study.questions import QUANTITIES
@@ -267,6 +266,8 @@ def _few(answer: MeasureAnswer) -> tuple[Any, ...]:
 @picture_of("MeasureAnswer", "fit", given=_few)
 def fits(flares: Sequence[MeasuredFlare]) -> Picture:
     """Plot the first exposure minus unknowns with the fitted flare, and the residuals, with a column per fit."""
+    from mauvecl.fits.flare_model import usable_variance
+
     above, below = list[Panel](), list[Panel]()
     for flare in flares:
         quiet, measurement = flare.quiet, flare.found
@@ -297,6 +298,8 @@ def _each(flares: Sequence[MeasuredFlare], panel: Callable[[MeasuredFlare], Pane
 
 
 def _single(answer: MeasureAnswer) -> tuple[Any, ...]:
+    from mauvecl.fits.flare_model import FlareModel
+
     single = [flare for flare in answer.flares if isinstance(flare.fitted, FlareModel)]
     return (First(single, MOST_FLARES, "flares"),)
 
