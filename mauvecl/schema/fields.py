@@ -292,6 +292,11 @@ class OneOrMore:
         return core_schema.no_info_before_validator_function(listed, handler(source))
 
 
+def says_none(value: Any) -> bool:
+    """Return whether a value is the text ``none``."""
+    return isinstance(value, str) and value.strip().lower() == "none"
+
+
 class OrNone:
     """Number that may be None, for which study files and flags write ``none``."""
 
@@ -300,7 +305,7 @@ class OrNone:
 
         inner = handler(source)
         schema = core_schema.no_info_before_validator_function(
-            lambda value: None if isinstance(value, str) and value.strip().lower() == "none" else value, inner
+            lambda value: None if says_none(value) else value, inner
         )
         expected = str(inner.get("custom_error_message", "")).removeprefix("Input should be ")
         return or_error(schema, f"{expected or 'a number'}, or none")

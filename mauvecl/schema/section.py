@@ -27,6 +27,7 @@ from mauvecl.schema.fields import (
     is_quantity,
     is_truth,
     numbers,
+    says_none,
     with_unit,
 )
 
@@ -339,7 +340,7 @@ def read_ranges(texts: Sequence[str], name: str, *, expected: str, unit: str) ->
 
 def read_declinations(text: str, name: str) -> tuple[float, float] | str:
     """Read a range of declinations such as -46.4:31.8, or none."""
-    if text.strip().lower() == "none":
+    if says_none(text):
         return "none"
     return _pair(text, name, "low:high in degrees, or none", "deg")
 
