@@ -26,9 +26,10 @@ from mauvecl.schema.fields import (
     is_measure,
     is_quantity,
     is_truth,
-    numbers,
     says_none,
     with_unit,
+    without_unit,
+    word_of,
 )
 
 if TYPE_CHECKING:
@@ -192,7 +193,10 @@ def model_in(annotation: Any) -> type[BaseModel] | None:
 def plain(key: str, given: Any, unit: str) -> Any:
     """Convert Quantities, times and coordinates to the numbers and text that a study stores."""
     if is_quantity(given):
-        return numbers(key, given, unit).tolist()
+        try:
+            given = without_unit(given, unit)
+        except ValueError:
+            raise InputError.of(key, given, word_of(unit)) from None
     if isinstance(given, list | tuple) and any(map(is_quantity, given)):
         return [plain(key, item, unit) for item in given]
     if hasattr(given, "tolist"):
