@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import astropy.units as u
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 from scipy.special import erf, ndtr
 
@@ -24,7 +24,7 @@ from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.fields import Help, Range, Unit, whole, word_of
 from mauvecl.schema.physical import DetectorTemperature, Exposure, NotNegative, Positive, Wavelength
-from mauvecl.schema.section import Section, input_error
+from mauvecl.schema.section import Section, built
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -240,10 +240,7 @@ class Instrument(Section):
     @classmethod
     def build(cls, values: dict[str, Any], where: str) -> Instrument:
         """Validate values by name; error messages begin with `where`, such as a file name."""
-        try:
-            return cls.model_validate(values)
-        except ValidationError as error:
-            raise input_error(where, cls, error) from None
+        return built(cls, values, where)
 
     def with_(self, **changes: Any) -> Instrument:
         """Return a copy with changed values, each marked as the user's in `sources`.

@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Callable, Iterator, Sequence
 from decimal import Decimal, InvalidOperation
 from functools import cache
-from typing import TYPE_CHECKING, Any, Self, cast, get_args, get_origin
+from typing import TYPE_CHECKING, Any, Self, TypeVar, cast, get_args, get_origin
 
 from pydantic import (
     BaseModel,
@@ -85,6 +85,17 @@ def holds_truth(given: Any) -> bool:
 
 def _takes_truth(annotation: Any) -> bool:
     return annotation in (bool, Any) or any(map(_takes_truth, get_args(annotation)))
+
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def built(model: type[Model], values: Any, where: str) -> Model:
+    """Validate the values of a model; the message of an error begins with the place where they are."""
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        raise input_error(where, model, error) from None
 
 
 #: Largest number of wrong values that one message names.

@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import ValidationError, field_validator, model_validator
+from pydantic import field_validator, model_validator
 
 from mauvecl.host.orbit import Limits
 from mauvecl.host.tables.names import (
@@ -34,7 +34,7 @@ from mauvecl.schema.physical import (
     RateExponent,
     Share,
 )
-from mauvecl.schema.section import Section, input_error
+from mauvecl.schema.section import Section, built
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -379,10 +379,7 @@ def _target(
         unused += (held,)
     if unused:
         target["unused"] = unused
-    try:
-        PlanTarget.model_validate(target)
-    except ValidationError as error:
-        raise input_error(named, PlanTarget, error) from error
+    built(PlanTarget, target, named)
     return target
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from types import UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, Union, get_args, get_origin
 
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, model_validator
 
 from mauvecl.detection.names import DEFAULT_STATISTICS, countable, least_countable
 from mauvecl.host.instrument import FORMER_NAMES, FORMERLY_MAUVE
@@ -24,7 +24,7 @@ from mauvecl.noise.unknowns import NONE, Processes
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, Message, shortened
 from mauvecl.schema.fields import AnyUnit, Flag, Help, found
-from mauvecl.schema.section import Section, fields_of, input_error
+from mauvecl.schema.section import Section, built, fields_of
 from mauvecl.study.analyses import CalibrateQuestion, ChangeQuestion, DataChoice, MeasureQuestion
 from mauvecl.study.keywords import changes_of, keywords_of, stars_of, values_of
 from mauvecl.study.observation import NuisanceChoice, Observation, Run, SkyLight, Unknowns
@@ -265,10 +265,7 @@ class Study(Section):
     def build(cls, data: dict[str, Any], where: str) -> Self:
         """Validate nested data; raises InputError for the first invalid value."""
         possible(data, where)
-        try:
-            return cls.model_validate(data)
-        except ValidationError as error:
-            raise input_error(where, cls, error) from error
+        return built(cls, data, where)
 
     @classmethod
     def of(cls, **keywords: Any) -> Self:
