@@ -213,8 +213,7 @@ class Instrument(Section):
         Help("Deviations of single pixels from these values"),
     ] = None
     throughput_factor: Annotated[
-        Curve | None,
-        BeforeValidator(partial(_as_curve, unit="")),
+        Efficiency | None,
         Help("Calibrated throughput over that of the curves and losses above, with the end values beyond its knots"),
     ] = None
     throughput_errors: Annotated[
