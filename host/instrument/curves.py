@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -20,11 +21,18 @@ from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range, Unit
 
 
-def _table_and_source(path: str | Path, what: str) -> tuple[Numbers, str]:
-    """Read an ECSV table of numbers, and the origin of its values, "tag: source", from its metadata."""
+@contextmanager
+def _opened(path: str | Path, what: str) -> Iterator[tuple[Numbers, str]]:
+    """Read an ECSV table of numbers, and the origin of its values, "tag: source", from its metadata.
+
+    Errors that are raised in the block begin with the name of the file.
+    """
     table = read_numbers(path, what)
     source = table.meta.get("source", f"assumed, no source in {Path(path).name}")
-    return table, f"{table.meta.get('tag', 'A')}: {source}"
+    try:
+        yield table, f"{table.meta.get('tag', 'A')}: {source}"
+    except InputError as error:
+        raise error.within(f"{what} {path}") from None
 
 
 @dataclass(frozen=True)
@@ -64,22 +72,16 @@ class Curve:
         The table's metadata give the values' origin: `tag` (P, D, C or A) and `source`. Raises InputError if the file
         is missing or is not such a table.
         """
-        table, source = _table_and_source(path, "curve file")
-        if "wavelength" not in table.columns or len(table.columns) != 2:
-            raise InputError(
-                f"curve file {path} must have the columns 'wavelength' and one value, not {', '.join(table.columns)}",
-                key="columns",
-            )
-        name = next(column for column in table.columns if column != "wavelength")
-        try:
+        with _opened(path, "curve file") as (table, source):
+            if "wavelength" not in table.columns or len(table.columns) != 2:
+                raise InputError(
+                    f"the columns must be 'wavelength' and one value, not {', '.join(table.columns)}", key="columns"
+                )
+            (name,) = {*table.columns} - {"wavelength"}
             length = unit_of(table.units["wavelength"]) if table.units["wavelength"] else None
             wavelength = _converted(table["wavelength"], "wavelength", length, [u.nm])
-            # Here A is ampere, not Angstrom.
-            unit = u.Unit(table.units[name].replace("percent", "%"), parse_strict="silent")
-            value = _converted(table[name], name, unit, [u.A / u.W, u.dimensionless_unscaled])
+            value = _converted(table[name], name, _plain_unit(table.units[name]), [u.A / u.W, u.dimensionless_unscaled])
             return cls(tuple(wavelength.tolist()), tuple(value.tolist()), source)
-        except InputError as error:
-            raise error.within(f"curve file {path}") from None
 
     def at(self, wavelength_nm: ArrayLike) -> NDArray[np.float64]:
         """Return the values at wavelengths in nm, shape of `wavelength_nm`; the end values hold beyond the knots."""
@@ -90,12 +92,18 @@ class Curve:
         return len(self.value) == 1 or (self.wavelength_nm[0] <= low_nm and self.wavelength_nm[-1] >= high_nm)
 
 
+def _plain_unit(text: str) -> u.UnitBase:
+    """Return the unit of a text in which A is ampere, not Angstrom."""
+    return u.Unit(text.replace("percent", "%"), parse_strict="silent")
+
+
 def _converted(values: NDArray[np.float64], name: str, unit: u.UnitBase | None, units: list[u.UnitBase]) -> Any:
     """Return a column's numbers in the first of `units` that its unit converts to."""
     for wanted in units:
         if unit is not None and unit.is_equivalent(wanted):
             return (values * unit).to_value(wanted)
-    raise InputError(f"the unit of column {name!r} must be {units[0]}, not {str(unit or '') or 'none'!r}", key=name)
+    expected, given = (str(one or "") or "none" for one in (units[0], unit))
+    raise InputError(f"the unit of column {name!r} must be {expected}, not {given!r}", key=name)
 
 
 Float = NDArray[np.float64]
@@ -178,30 +186,18 @@ class PixelMap(ContentEquality):
     @classmethod
     def read(cls, path: str | Path) -> PixelMap:
         """Read an ECSV table with one row per pixel of the array, in order, and any of the columns of `COLUMNS`."""
-        table, source = _table_and_source(path, "pixel map")
-        unknown = [name for name in table.columns if name not in COLUMNS and name != "pixel"]
-        if unknown or list(table.columns) in ([], ["pixel"]):
-            what = f"the column {unknown[0]!r}" if unknown else "no column of values"
-            raise InputError(f"pixel map {path} has {what}; use some of {', '.join(COLUMNS)}", key="pixel_map")
-        if "pixel" in table.columns and not np.array_equal(table["pixel"], np.arange(table["pixel"].size)):
-            raise InputError(
-                f"pixel map {path}: the column 'pixel' must be 0, 1, 2, ..., every pixel in order", key="pixel"
-            )
-        values = {}
-        for name in table.columns:
-            if name == "pixel":
-                continue
-            unit = u.Unit(table.units[name], parse_strict="silent")
-            if not unit.is_equivalent(COLUMNS[name]):
-                wanted = str(COLUMNS[name]) or "none"
-                raise InputError(
-                    f"pixel map {path}: the unit of {name} must be {wanted}, not {str(unit) or 'none'!r}", key=name
-                )
-            values[name] = table[name]
-        try:
+        with _opened(path, "pixel map") as (table, source):
+            names = [name for name in table.columns if name != "pixel"]
+            unknown = [name for name in names if name not in COLUMNS]
+            if unknown or not names:
+                what = f"the column {unknown[0]!r}" if unknown else "no column of values"
+                raise InputError(f"the table has {what}; use some of {', '.join(COLUMNS)}", key="pixel_map")
+            if "pixel" in table.columns and not np.array_equal(table["pixel"], np.arange(table["pixel"].size)):
+                raise InputError("the column 'pixel' must be 0, 1, 2, ..., every pixel in order", key="pixel")
+            values = {
+                name: _converted(table[name], name, _plain_unit(table.units[name]), [COLUMNS[name]]) for name in names
+            }
             return cls(**values, source=source)
-        except InputError as error:
-            raise error.within(f"pixel map {path}") from None
 
     @classmethod
     def made_up(
@@ -355,21 +351,17 @@ class ThroughputErrors(ContentEquality):
     @classmethod
     def read(cls, path: str | Path) -> ThroughputErrors:
         """Read an ECSV table with the columns wavelength (nm) and mode_1, mode_2 and so on."""
-        table, source = _table_and_source(path, "throughput errors")
-        names = [name for name in table.columns if name.startswith(MODE)]
-        if "wavelength" not in table.columns or not names or len(names) + 1 != len(table.columns):
-            raise InputError(
-                f"throughput errors {path} must have the columns wavelength, {MODE}1, {MODE}2 and so on, not "
-                f"{', '.join(table.columns)}",
-                key="columns",
-            )
-        if table.units["wavelength"] != "nm":
-            raise InputError.of("unit", table.units["wavelength"], "nm", where=f"throughput errors {path}")
-        try:
+        with _opened(path, "throughput errors") as (table, source):
+            names = [name for name in table.columns if name.startswith(MODE)]
+            if "wavelength" not in table.columns or not names or len(names) + 1 != len(table.columns):
+                raise InputError(
+                    f"the columns must be wavelength, {MODE}1, {MODE}2 and so on, not {', '.join(table.columns)}",
+                    key="columns",
+                )
+            if table.units["wavelength"] != "nm":
+                raise InputError.of("unit", table.units["wavelength"], "nm")
             modes = np.array([table[name] for name in names])
             return cls(table["wavelength"], modes, source, table.meta.get("values", {}))
-        except InputError as error:
-            raise error.within(f"throughput errors {path}") from None
 
     @property
     def digest(self) -> str:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import astropy.units as u
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 from scipy.special import erf, ndtr
 
@@ -22,9 +22,9 @@ from mauvecl.host.instrument.curves import MAX_PIXELS, Curve, PixelMap, Throughp
 from mauvecl.host.tables.files import read_text, toml
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened
-from mauvecl.schema.fields import Help, Range, Unit, count, is_quantity, numbers, word_of
+from mauvecl.schema.fields import Help, Range, Unit, whole, word_of
 from mauvecl.schema.physical import DetectorTemperature, Exposure, NotNegative, Positive, Wavelength
-from mauvecl.schema.section import Section, input_error
+from mauvecl.schema.section import Section, built
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -127,7 +127,8 @@ def _read_path(value: Any, kind: type[Curve | PixelMap | ThroughputErrors]) -> A
 Efficiency = Annotated[Curve, BeforeValidator(partial(_as_curve, unit=""))]
 Responsivity = Annotated[Curve, BeforeValidator(partial(_as_curve, unit="A / W"))]
 Loss = Annotated[float, Range(0, 1, open_high=True)]
-Count = Annotated[int, Range(0, 20)]
+Whole = Annotated[int, BeforeValidator(whole)]
+Count = Annotated[Whole, Range(0, 20)]
 #: Width of a line spread function; 0 for none.
 Width = Annotated[float, Unit("nm"), Range(0, 500)]
 Wavelengths = Annotated[ArrayLike, Unit("nm")]
@@ -178,7 +179,7 @@ class Instrument(Section):
     couplings: Annotated[Count, Help("Number of couplings")]
     light_loss: Annotated[Loss, Help("Fraction of the light that is lost elsewhere")]
 
-    pixels: Annotated[int, Range(1, MAX_PIXELS), Help("Number of pixels")]
+    pixels: Annotated[Whole, Range(1, MAX_PIXELS), Help("Number of pixels")]
     pixel_zero_nm: Annotated[float, Unit("nm"), Range(), Help("Wavelength of the centre of pixel 0")]
     dispersion_nm_per_pixel: Annotated[Positive, Unit("nm / pix"), Help("Linear dispersion")]
     output_min_nm: Annotated[Wavelength, Help("Smallest wavelength of the centre of a pixel that is read")]
@@ -189,7 +190,7 @@ class Instrument(Section):
 
     quantum_efficiency_a_per_w: Annotated[Responsivity, Help("Responsivity of the detector, A/W")]
     conversion_uv_per_electron: Annotated[Positive, Unit("uV / electron"), Help("Voltage per electron")]
-    adc_bits: Annotated[int, Range(1, 24), Help("Bits of the converter")]
+    adc_bits: Annotated[Whole, Range(1, 24), Help("Bits of the converter")]
     adc_range_v: Annotated[Positive, Unit("V"), Help("Voltage of the converter's full range")]
     saturation_v: Annotated[Positive, Unit("V"), Help("Voltage at which the detector saturates")]
     temperature_c: Annotated[DetectorTemperature, Help("Temperature of the detector")]
@@ -212,8 +213,7 @@ class Instrument(Section):
         Help("Deviations of single pixels from these values"),
     ] = None
     throughput_factor: Annotated[
-        Curve | None,
-        BeforeValidator(partial(_as_curve, unit="")),
+        Efficiency | None,
         Help("Calibrated throughput over that of the curves and losses above, with the end values beyond its knots"),
     ] = None
     throughput_errors: Annotated[
@@ -239,10 +239,7 @@ class Instrument(Section):
     @classmethod
     def build(cls, values: dict[str, Any], where: str) -> Instrument:
         """Validate values by name; error messages begin with `where`, such as a file name."""
-        try:
-            return cls.model_validate(values)
-        except ValidationError as error:
-            raise input_error(where, cls, error) from None
+        return built(cls, values, where)
 
     def with_(self, **changes: Any) -> Instrument:
         """Return a copy with changed values, each marked as the user's in `sources`.
@@ -254,7 +251,6 @@ class Instrument(Section):
             one number.
         """
         marks = {name: "U: set by the user" for name in changes if name not in LABELS}
-        changes = {name: _counted(name, value) for name, value in changes.items()}
         changed = Instrument.build({**self._values(), **changes}, self.name)
         given = {name: value.source for name in changes if isinstance(value := getattr(changed, name), Curve)}
         own = {name: source for name, source in given.items() if isinstance(changes[name], str | Path)}
@@ -394,10 +390,13 @@ class Instrument(Section):
         last = min((curve.wavelength_nm[-1] for curve in curves), default=self.output_max_nm)
         return first, last
 
-    def _within(self, wavelength_nm: ArrayLike) -> Float:
-        """Return wavelengths; raises InputError outside the curves."""
-        low, high = self.curves_nm
-        return numbers("wavelength_nm", wavelength_nm, "nm", Range(low, high))
+    def _within(self, wavelength_nm: ArrayLike, low: float, high: float) -> Float:
+        """Return wavelengths; raises InputError outside a range."""
+        nm = np.asarray(wavelength_nm, np.float64)
+        outside = ~((nm >= low) & (nm <= high) & np.isfinite(nm))
+        if outside.any():
+            raise InputError.of("wavelength_nm", float(nm[outside][0]), Range(low, high).words("nm"), unit="nm")
+        return nm
 
     def efficiency(self, wavelength_nm: Wavelengths) -> Float:
         """Return the fraction of the light that reaches the detector, without the quantum efficiency.
@@ -417,7 +416,7 @@ class Instrument(Section):
         InputError
             Outside the curves (`curves_nm`).
         """
-        return self._optics(self._within(wavelength_nm))
+        return self._optics(self._within(wavelength_nm, *self.curves_nm))
 
     def _optics(self, wavelength_nm: Float) -> Float:
         losses = (1 - self.coupling_loss) ** self.couplings * (1 - self.light_loss) * (1 - self.pointing_loss)
@@ -446,7 +445,7 @@ class Instrument(Section):
         This is the sensitivity in A/W times the photon's energy divided by the electron's charge. Parameters and errors
         as for `efficiency`.
         """
-        nm = self._within(wavelength_nm)
+        nm = self._within(wavelength_nm, *self.curves_nm)
         return np.asarray(self.quantum_efficiency_a_per_w.at(nm) * (HC_J_NM / nm) / ELECTRON_C)
 
     def throughput(self, wavelength_nm: Wavelengths) -> Float:
@@ -481,7 +480,7 @@ class Instrument(Section):
         held : bool
             Whether to extend a curve beyond its ends by its end value (an assumption) instead of raising InputError.
         """
-        nm = numbers("wavelength_nm", wavelength_nm, "nm", Range(0.0)) if held else self._within(wavelength_nm)
+        nm = self._within(wavelength_nm, *((0.0, np.inf) if held else self.curves_nm))
         per_joule = self._optics(nm) * self.quantum_efficiency_a_per_w.at(nm) / ELECTRON_C
         return self.collecting_area_cm2 * per_joule
 
@@ -517,13 +516,6 @@ class Instrument(Section):
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Instrument) and self.digest == other.digest
-
-
-def _counted(name: str, value: Any) -> Any:
-    """Convert a whole number of any type to an int where the instrument has a count; return other values unchanged."""
-    field = Instrument.model_fields.get(name)
-    is_number = is_quantity(value) or isinstance(value, float | np.number)
-    return count(name, value) if is_number and field is not None and field.annotation is int else value
 
 
 def _from_file(name: str | Path) -> Instrument:

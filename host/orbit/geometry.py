@@ -176,11 +176,6 @@ class TimeGrid:
         """Return a time since the start in ISO 8601, UTC."""
         return utc_text(sum(self.first) + seconds / DAY_S, digits)
 
-    @property
-    def mjd(self) -> float:
-        """Modified Julian date of the start, UTC."""
-        return self.first[0] - 2_400_000.5 + self.first[1]
-
 
 def as_time(midnight: float, days: NDArray[np.float64]) -> Time:
     """Return the times as astropy's; call inside `offline`."""

@@ -107,11 +107,6 @@ class Elements:
         return Satrec.twoline2rv(self.first, self.second, WGS72)
 
     @property
-    def name(self) -> str:
-        """NORAD catalogue number."""
-        return self.first[2:7].strip()
-
-    @property
     def epoch_jd(self) -> float:
         """Epoch as a Julian date, UTC."""
         return float(self.satellite.jdsatepoch + self.satellite.jdsatepochF)

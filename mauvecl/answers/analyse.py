@@ -596,7 +596,7 @@ def analyse(
         # Errors of the star or its neighbours are reported before the search.
         blended_stars(cases(study, swept=False))
     analysis = analyse_frames(
-        frames, false_alarms=search.false_alarms, per=search.per, shape=search.shape, seed=study.run.seed,
+        frames, wanted=search.rate, shape=search.shape, seed=study.run.seed,
         model=model if isinstance(model, FrameModel) else None, rank=search.sums, jitters=search.spreads() or None,
         temperature_k=study.flare.temperature_k, report=_in_frames(progress, frames.n_frames),
     )  # fmt: skip

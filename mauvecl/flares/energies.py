@@ -38,7 +38,7 @@ from mauvecl.host.tables.opening import read_table
 from mauvecl.host.tables.table import Rows
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened
-from mauvecl.schema.fields import Range, Unit, checked
+from mauvecl.schema.fields import Range, Unit
 from mauvecl.schema.physical import Distance, Energy, Positive, Radius, RateExponent, Temperature
 
 if TYPE_CHECKING:
@@ -472,7 +472,6 @@ class RateTable(Rates):
 
 def band_factor(old: str, new: str, flare_k: float = 10_000.0, flare: FlareSpectrum | None = None) -> float:
     """Return the ratio of a flare's energy in a new band to that in an old one; either may be "bolometric"."""
-    flare_k = checked(Temperature, "flare_k", flare_k)
     light = Blackbody(flare_k) if flare is None else flare
 
     def flux(band: str) -> float:
@@ -481,7 +480,12 @@ def band_factor(old: str, new: str, flare_k: float = 10_000.0, flare: FlareSpect
     return 1.0 if old == new else flux(new) / flux(old)
 
 
-def davenport2019(*, mass_msun: float, age_myr: float) -> PowerLaw:
+@validated
+def davenport2019(
+    *,
+    mass_msun: Annotated[float, Unit("solMass"), Range(0.1, 1.5)],
+    age_myr: Annotated[float, Unit("Myr"), Range(1, 13_800)],
+) -> PowerLaw:
     """Return the rates for a mass and an age of Davenport et al. 2019 (arXiv 1901.00890), in the Kepler band.
 
     log10 nu = a log10 E + b, a = -.07 log10 t + .79 m - 1.06, b = 2.01 log10 t - 25.15 m + 33.99. The relation
@@ -494,9 +498,6 @@ def davenport2019(*, mass_msun: float, age_myr: float) -> PowerLaw:
     age_myr : float
         1 to 13 800.
     """
-    for name, value, low, high in (("mass_msun", mass_msun, 0.1, 1.5), ("age_myr", age_myr, 1.0, 13_800.0)):
-        if not low <= value <= high:
-            raise InputError.of(name, value, f"between {low:g} and {high:g}")
     t = float(np.log10(age_myr))
     slope, offset = -0.07 * t + 0.79 * mass_msun - 1.06, 2.01 * t - 25.15 * mass_msun + 33.99
     if slope >= 0:

@@ -9,7 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, Self
 
-from pydantic import model_validator
+from pydantic import AfterValidator, model_validator
 
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
@@ -40,19 +40,15 @@ Per = Literal["day", "month", "year"]
 DAYS: dict[Per, float] = {"day": 1.0, "month": 365.25 / 12, "year": 365.25}
 
 
-def check_shape(name: str) -> None:
-    """Raise InputError if no flare shape has this name."""
+def check_shape(name: str) -> str:
+    """Return the name of a flare shape; raises InputError if no shape has it."""
     if name not in SHAPE_NAMES:
         raise InputError.of("shape", name, f"one of {', '.join(SHAPE_NAMES)}")
+    return name
 
 
-def per_day(false_alarms: float, per: Per) -> float:
-    """Convert a number of false alarms per unit of time to false alarms per star-day."""
-    if per not in DAYS:
-        raise InputError.of("per", per, f"one of {', '.join(DAYS)}")
-    if not (math.isfinite(false_alarms) and false_alarms > 0):
-        raise InputError.of("false_alarms", false_alarms, "a number above 0")
-    return false_alarms / DAYS[per]
+#: Name of a flare shape in a study.
+ShapeName = Annotated[str, AfterValidator(check_shape)]
 
 
 #: Temperatures that differ by less are treated as equal, K.

@@ -371,7 +371,4 @@ SHAPES: dict[str, Shape] = {shape.name: shape for shape in (Davenport2014(), Tov
 
 def shape_of(given: Shape | str) -> Shape:
     """Return a shape by name; a `Shape` is returned unchanged."""
-    if isinstance(given, Shape):
-        return given
-    check_shape(str(given))
-    return SHAPES[str(given)]
+    return given if isinstance(given, Shape) else SHAPES[check_shape(given)]

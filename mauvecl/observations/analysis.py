@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mauvecl.detection.distributions import Interval, clopper_pearson
 from mauvecl.fits.spectrum import Measurement
-from mauvecl.flares.settings import RANK, Per, per_day
+from mauvecl.flares.settings import RANK
 from mauvecl.flares.shapes import shape_of
 from mauvecl.observations.detection import LONG_S, detect_events, most_events
 from mauvecl.observations.events import ObservedEvent, measure_events
@@ -366,8 +366,7 @@ class Analysis:
 def analyse_frames(
     frames: Frames,
     *,
-    false_alarms: float = 1.0,
-    per: Per = "day",
+    wanted: float = 1.0,
     shape: str = "davenport2014",
     seed: int = 1,
     model: FrameModel | None = None,
@@ -378,18 +377,17 @@ def analyse_frames(
 ) -> Analysis:
     """Find the flares in observed frames.
 
-    The `model` is that of the pixels of spectra, which are searched as their sum over wavelength without it; `rank`
-    is the largest number of weighted sums of a spectrum. Standard deviations of light, dark current and sky from
-    frame to frame, `jitters`, are infinite for those that the search leaves out; where they do not state it, that
-    of the light is infinite and that of the dark current as measured. The temperature is that of injected flares in
-    spectra. `report` is called with the share of the work that is done, which rises to 1, and may raise to stop the
-    work.
+    The `wanted` rate is that of false alarms per star-day. The `model` is that of the pixels of spectra, which are
+    searched as their sum over wavelength without it; `rank` is the largest number of weighted sums of a spectrum.
+    Standard deviations of light, dark current and sky from frame to frame, `jitters`, are infinite for those that the
+    search leaves out; where they do not state it, that of the light is infinite and that of the dark current as
+    measured. The temperature is that of injected flares in spectra. `report` is called with the share of the work that
+    is done, which rises to 1, and may raise to stop the work.
     """
     steps = Steps(report)
     level_steps, rate_steps, search_steps, event_steps, injection_steps = (
         steps.part(first, last) for first, last in pairwise(STAGES)
     )
-    wanted = per_day(false_alarms, per)
     if model is None:
         survey, level, frames = survey_light_curve(frames, shape_of(shape), seed, level_steps)
     else:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import builtins
 import inspect
-import operator
 import os
 import sys
 from collections import ChainMap
@@ -23,7 +22,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_
 from pydantic_core import CoreSchema, PydanticCustomError, SchemaValidator, ValidationError, core_schema
 
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import is_quantity, is_truth, or_error, without_unit
+from mauvecl.schema.fields import is_quantity, is_truth, or_error, whole, without_unit
 
 #: Place of an error inside an alternative of a union.
 ALTERNATIVE = "|"
@@ -90,18 +89,6 @@ def _number(value: Any) -> float:
     return plain
 
 
-def _whole(value: Any) -> int:
-    if is_quantity(value):
-        value = without_unit(value, "")
-    _require(not is_truth(value) and not getattr(value, "ndim", 0))
-    try:
-        return operator.index(value)
-    except TypeError:
-        _require(isinstance(value, float) or _kind(value) == "f")
-        _require(float(value).is_integer())
-        return int(value)
-
-
 def _truth(value: Any) -> bool:
     _require(is_truth(value))
     return bool(value)
@@ -138,7 +125,7 @@ def _mapping(value: Any) -> Any:
 #: Schemas of annotations of single values.
 LEAVES: dict[Any, CoreSchema] = {
     float: _leaf(_number, "a number"),
-    int: _leaf(_whole, "a whole number"),
+    int: _leaf(whole, "a whole number"),
     bool: _leaf(_truth, "true or false"),
     str: or_error(core_schema.is_instance_schema(str), "text"),
     Path: or_error(core_schema.is_instance_schema((str, os.PathLike)), "a path"),

@@ -22,8 +22,6 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
     from pydantic import GetCoreSchemaHandler
     from pydantic_core import CoreSchema
 
@@ -220,49 +218,32 @@ def number(what: str, value: Any, unit: str = "", reach: Range | None = None) ->
     Wavelengths may come as frequencies or energies, temperatures on any scale. Raises InputError for other values.
     """
     reach = reach or Range()
-    plain: Any = value if type(value) is float else _plain(what, value, unit, reach)
-    if getattr(plain, "ndim", 0):
-        raise InputError.of(what, value, reach.words(unit))
+    try:
+        plain = without_unit(value, unit) if is_quantity(value) else value
+        if is_truth(plain) or isinstance(plain, str | bytes) or getattr(plain, "ndim", False):
+            raise TypeError("no number")
+        plain = float(plain)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError.of(what, value, reach.words(unit)) from error
     if plain not in reach:
-        raise InputError.of(what, float(plain), reach.words(unit))
-    return float(plain)
-
-
-def numbers(what: str, values: Any, unit: str = "", reach: Range | None = None) -> NDArray[np.float64]:
-    """Return finite numbers in a unit and a closed range, in the shape of `values`; errors as for `number`."""
-    import numpy as np
-
-    reach = reach or Range()
-    plain = _plain(what, values, unit, reach)
-    bad = ~(np.isfinite(plain) & (plain >= reach.low) & (plain <= reach.high))
-    if bad.any():
-        raise InputError.of(what, float(plain[bad][0]), reach.words(unit), unit=unit)
+        raise InputError.of(what, plain, reach.words(unit))
     return plain
 
 
-def count(what: str, value: Any) -> int:
-    """Return a whole number of at least 0, given as an int, a float such as 1e5 or a dimensionless Quantity."""
+def whole(value: Any) -> int:
+    """Return a whole number as an int, from a number such as 1e5 or a Quantity without unit, or raise ValueError."""
+    if is_quantity(value):
+        value = without_unit(value, "")
+    if is_truth(value) or getattr(value, "ndim", False):
+        raise ValueError(value)
     try:
         # Whole numbers beyond 2**53 are no floats.
-        whole = number(what, value) if is_truth(value) else operator.index(value)
+        return operator.index(value)
     except TypeError:
-        whole = number(what, value)
-    if whole != int(whole) or not 0 <= whole < 2**63:
-        raise InputError.of(what, value, "a whole number of at least 0")
-    return int(whole)
-
-
-def _plain(what: str, value: Any, unit: str, reach: Range) -> NDArray[np.float64]:
-    import numpy as np
-
-    try:
-        if is_quantity(value):
-            value = without_unit(value, unit)
-        if isinstance(value, str | bytes) or np.asarray(value).dtype.kind not in "iuf":
-            raise TypeError("no number")
-        return np.asarray(value, np.float64)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise InputError.of(what, value, reach.words(unit)) from error
+        is_float = isinstance(value, float) or getattr(getattr(value, "dtype", None), "kind", "") == "f"
+        if not (is_float and float(value).is_integer()):
+            raise ValueError(value) from None
+        return int(value)
 
 
 class AnyUnit:
@@ -292,6 +273,11 @@ class OneOrMore:
         return core_schema.no_info_before_validator_function(listed, handler(source))
 
 
+def says_none(value: Any) -> bool:
+    """Return whether a value is the text ``none``."""
+    return isinstance(value, str) and value.strip().lower() == "none"
+
+
 class OrNone:
     """Number that may be None, for which study files and flags write ``none``."""
 
@@ -299,9 +285,7 @@ class OrNone:
         from pydantic_core import core_schema
 
         inner = handler(source)
-        schema = core_schema.no_info_before_validator_function(
-            lambda value: None if isinstance(value, str) and value.strip().lower() == "none" else value, inner
-        )
+        schema = core_schema.no_info_before_validator_function(lambda value: None if says_none(value) else value, inner)
         expected = str(inner.get("custom_error_message", "")).removeprefix("Input should be ")
         return or_error(schema, f"{expected or 'a number'}, or none")
 

@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Callable, Iterator, Sequence
 from decimal import Decimal, InvalidOperation
 from functools import cache
-from typing import TYPE_CHECKING, Any, Self, cast, get_args, get_origin
+from typing import TYPE_CHECKING, Any, Self, TypeVar, cast, get_args, get_origin
 
 from pydantic import (
     BaseModel,
@@ -26,8 +26,10 @@ from mauvecl.schema.fields import (
     is_measure,
     is_quantity,
     is_truth,
-    numbers,
+    says_none,
     with_unit,
+    without_unit,
+    word_of,
 )
 
 if TYPE_CHECKING:
@@ -83,6 +85,17 @@ def holds_truth(given: Any) -> bool:
 
 def _takes_truth(annotation: Any) -> bool:
     return annotation in (bool, Any) or any(map(_takes_truth, get_args(annotation)))
+
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def built(model: type[Model], values: Any, where: str) -> Model:
+    """Validate the values of a model; the message of an error begins with the place where they are."""
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        raise input_error(where, model, error) from None
 
 
 #: Largest number of wrong values that one message names.
@@ -154,24 +167,18 @@ def _own_error(model: type[BaseModel], path: list[str], key: str, first: Any) ->
     """Return the error that a validator raised, with the key where its sentence does not name it."""
     inner = first["ctx"]["error"]
     message, field = str(inner), _fields(model, path[:-1]).get(path[-1]) if path else None
-    # A record's own error names the key; that of a single value's validator may not.
-    own = field is None or model_in(field.annotation) is not None or path[-1] in message
+    is_value = field is not None and model_in(field.annotation) is None
     if not isinstance(inner, InputError):
         inner = InputError(message, key=key if path else None)
-    # The message of the value's reader is more precise than its location.
-    found = inner if own else inner.within(key)
-    found.key = _full_key(model, path, inner.key)
-    if field is not None and model_in(field.annotation) is None and isinstance(first.get("input"), dict) and inner.key:
-        # The validator of a table that is no record names a key of it.
-        found.key = ".".join([*path, inner.key]) if found.key == inner.key else found.key
+    name = inner.key
+    # A record's own error names the key; that of a single value's validator may not.
+    found = inner.within(key) if is_value and path[-1] not in message else inner
+    if name is None or path[-1:] == [name]:
+        found.key = ".".join(path) or None
+    elif name in _fields(model, path) or (is_value and isinstance(first.get("input"), dict)):
+        # Validators of records, and of tables that are no records, name a key of them.
+        found.key = ".".join([*path, name])
     return found
-
-
-def _full_key(model: type[BaseModel], path: list[str], inner: str | None) -> str | None:
-    """Return the path of a nested record and the field that its own error names; any other key as it is."""
-    if inner is None or path[-1:] == [inner]:
-        return ".".join(path) or None
-    return ".".join([*path, inner]) if inner in _fields(model, path) else inner
 
 
 def _fields(model: type[BaseModel], path: list[str]) -> Any:
@@ -191,7 +198,10 @@ def model_in(annotation: Any) -> type[BaseModel] | None:
 def plain(key: str, given: Any, unit: str) -> Any:
     """Convert Quantities, times and coordinates to the numbers and text that a study stores."""
     if is_quantity(given):
-        return numbers(key, given, unit).tolist()
+        try:
+            given = without_unit(given, unit)
+        except ValueError:
+            raise InputError.of(key, given, word_of(unit)) from None
     if isinstance(given, list | tuple) and any(map(is_quantity, given)):
         return [plain(key, item, unit) for item in given]
     if hasattr(given, "tolist"):
@@ -245,6 +255,13 @@ def fields_of(section: type[BaseModel], path: tuple[str, ...] = ()) -> Iterator[
         inner = model_in(field.annotation)
         if inner is not None:
             yield from fields_of(inner, (*path, key))
+
+
+def check_different(names: Sequence[str], where: str, key: str) -> None:
+    """Raise InputError if a name is given twice; its sentence begins with where it is."""
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise InputError(f"{where} {shortened(twice)} twice, but each must be given once", key=key)
 
 
 # Readers of values that are written as text, as on the command line; each receives the value's name for messages.
@@ -339,7 +356,7 @@ def read_ranges(texts: Sequence[str], name: str, *, expected: str, unit: str) ->
 
 def read_declinations(text: str, name: str) -> tuple[float, float] | str:
     """Read a range of declinations such as -46.4:31.8, or none."""
-    if text.strip().lower() == "none":
+    if says_none(text):
         return "none"
     return _pair(text, name, "low:high in degrees, or none", "deg")
 

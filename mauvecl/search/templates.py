@@ -48,12 +48,6 @@ class Baseline:
     cycle: bool = False  #: curves of unknown amplitude, such as the orbital thermal cycle
     window_s: float = WINDOW_S  #: of the smallest window; windows hold 5 half-widths before the peak and 10 after
 
-    def __post_init__(self) -> None:
-        if self.slope and not self.offset:
-            raise InputError.of("slope", self.slope, "False without an offset")
-        if not (np.isfinite(self.window_s) and self.window_s >= 0):
-            raise InputError.of("window_s", self.window_s, "a time of at least 0", unit="s")
-
     @property
     def powers(self) -> tuple[int, ...]:
         """Powers of time in the baseline."""
@@ -96,11 +90,6 @@ class Bank:
     baseline: Baseline = Baseline()
 
     def __post_init__(self) -> None:
-        widths = self.half_widths_s
-        if not widths or any(not (np.isfinite(w) and w > 0) for w in widths) or sorted(set(widths)) != list(widths):
-            raise InputError.of("half_widths_s", list(widths), "ascending times above 0")
-        if not (np.isfinite(self.frame_s) and self.frame_s > 0):
-            raise InputError.of("frame_s", self.frame_s, "a time above 0")
         directions = np.atleast_2d(np.array(self.directions, np.float64))
         length = np.linalg.norm(directions, axis=1, keepdims=True)
         if not (length > 0).all():

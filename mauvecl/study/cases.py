@@ -191,8 +191,6 @@ def full_label(name: str, at: Mapping[str, float | str]) -> str:
 WITHOUT_LIGHT = frozenset({"nuisances"})
 #: Number of stars whose spectra a study's cases keep, since a sweep may have any number of them.
 MAX_SOURCES = 16
-#: Values of an observation without changes of its instrument.
-UNCHANGED: dict[str, Any] = {"changes": {}, "temperature_c": None}
 
 
 class Loader:
@@ -213,10 +211,12 @@ class Loader:
 
     def instrument(self, observation: Observation) -> Instrument:
         """Return the instrument of an observation."""
+        from mauvecl.host.instrument.instrument import Instrument
+
         file, kept = observation.instrument, self._instruments
         key = repr((file, observation.temperature_c, sorted(observation.changes.items())))
         if key not in kept:
-            kept[file] = kept.get(file) or observation.model_copy(update=UNCHANGED).load_instrument()
+            kept[file] = kept.get(file) or Instrument.load(file)
             kept[key] = observation.changed(kept[file])
         return kept[key]
 

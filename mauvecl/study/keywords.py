@@ -12,9 +12,8 @@ from mauvecl.host.stars.library import resolve
 from mauvecl.host.tables.files import without_columns
 from mauvecl.noise.unknowns import NUISANCES
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Flag, Unit, first, unit_of
-from mauvecl.schema.physical import SkyBrightness
-from mauvecl.schema.section import read_assignment, read_number
+from mauvecl.schema.fields import Flag, Unit, first
+from mauvecl.schema.section import read_assignment
 from mauvecl.study.star import FILE_KEYS
 
 if TYPE_CHECKING:
@@ -109,10 +108,10 @@ def changes_of(
     given: Mapping[str, Any], keywords: Mapping[str, Keyword], nuisances: NuisanceChoice
 ) -> dict[str, dict[str, Any]]:
     """Return the values that keywords set, by sections of the study; stars have their own function."""
-    changes: dict[str, dict[str, Any]] = {"sky": sky_of(given)}
+    changes: dict[str, dict[str, Any]] = {}
     setting: dict[tuple[str, str], str] = {}
     for name, keyword in keywords.items():
-        if keyword.section not in ("star", "sky") and name != "nuisance":
+        if keyword.section != "star" and name != "nuisance":
             value = given[name]
             if value is not None:
                 other = setting.setdefault((keyword.section, keyword.key), name)
@@ -124,24 +123,6 @@ def changes_of(
     if given.get("nuisance"):
         changes.setdefault("nuisances", {}).update(nuisances_of(nuisances, given["nuisance"]))
     return changes
-
-
-def sky_of(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the data of the sky, of which a brightness may be text."""
-    if "time" not in given:
-        return {}
-    sky: dict[str, Any] = {"target": given["target"], "time": given["time"]}
-    value = given["sky"]
-    if isinstance(value, str) and value.strip().lower() == "none":
-        sky["none"] = True
-    elif isinstance(value, str):
-        try:
-            sky["surface_brightness"] = read_number(value, "sky =", unit_of(SkyBrightness))
-        except ValueError as error:
-            raise InputError.of("sky", value, "a number in V mag/arcsec^2, or none") from error
-    else:
-        sky["surface_brightness"] = value
-    return sky
 
 
 def nuisances_of(nuisances: NuisanceChoice, given: Sequence[str] | Mapping[str, Any]) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from mauvecl.noise.unknowns import (
     values_of,
 )
 from mauvecl.schema.errors import InputError, shortened
-from mauvecl.schema.fields import Flag, Help, Quantity, Range, Slider, Widget
+from mauvecl.schema.fields import Flag, Help, Quantity, Range, Slider, Widget, says_none
 from mauvecl.schema.physical import (
     DEFAULT_SEED,
     DetectorTemperature,
@@ -155,6 +155,9 @@ class SkyLight(Section):
     @model_validator(mode="before")
     @classmethod
     def _default_brightness(cls, given: Any) -> Any:
+        """Set the default brightness of a sky without keys, and no sky for the brightness "none"."""
+        if isinstance(given, dict) and says_none(given.get("surface_brightness")):
+            return given | {"surface_brightness": None, "none": True}
         return given or {"surface_brightness": DEFAULT_SKY}
 
     @model_validator(mode="after")
@@ -176,8 +179,6 @@ class SkyLight(Section):
         """Return the sky for the host."""
         from mauvecl.host.exposure.sky import Sky
 
-        if self.none:
-            return Sky.none()
         if self.target is not None and self.time is not None:
             return Sky.at(self.target, self.time)
         return Sky.none() if self.surface_brightness is None else Sky.of_brightness(self.surface_brightness)

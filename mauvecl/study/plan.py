@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import ValidationError, field_validator, model_validator
+from pydantic import field_validator, model_validator
 
 from mauvecl.host.orbit import Limits
 from mauvecl.host.tables.names import (
@@ -34,7 +34,7 @@ from mauvecl.schema.physical import (
     RateExponent,
     Share,
 )
-from mauvecl.schema.section import Section, input_error
+from mauvecl.schema.section import Section, built, check_different
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -263,10 +263,7 @@ class PlanQuestion(Section):
 
     @model_validator(mode="after")
     def _different_targets(self) -> Self:
-        names = [target.name for target in self.targets]
-        twice = next((name for name in names if names.count(name) > 1), None)
-        if twice is not None:
-            raise InputError(f"the plan has the target {twice!r} twice, but targets must differ", key="targets")
+        check_different([target.name for target in self.targets], "the plan has the target", "targets")
         return self
 
     def law(self) -> DurationLaw:
@@ -287,10 +284,7 @@ def targets_of(orbit: OrbitQuestion, plan: PlanQuestion) -> list[Target]:
         raise InputError(
             "there are no targets; give names or coordinates, such as `orbit.targets='eps Eri'`", key="orbit.targets"
         )
-    names = [target.name for target in targets]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise InputError(f"the target {twice!r} is named twice, but targets must differ", key="orbit.targets")
+    check_different([target.name for target in targets], "the orbit has the target", "orbit.targets")
     return targets
 
 
@@ -379,10 +373,7 @@ def _target(
         unused += (held,)
     if unused:
         target["unused"] = unused
-    try:
-        PlanTarget.model_validate(target)
-    except ValidationError as error:
-        raise input_error(named, PlanTarget, error) from error
+    built(PlanTarget, target, named)
     return target
 
 

@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 from mauvecl.schema.errors import InputError, shown
 from mauvecl.schema.fields import Flag, Help, Quantity, Range, Slider, Unit, Widget, first
 from mauvecl.schema.physical import Positive, Probability, Wavelength
-from mauvecl.schema.section import Section, fields_of, read_axis, read_frames
+from mauvecl.schema.section import Section, check_different, fields_of, read_axis, read_frames
 from mauvecl.study.observation import Observation, SkyLight
 from mauvecl.study.star import Flare, Star
 
@@ -272,10 +272,7 @@ class Sweep(Section):
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
-        names = [axis.quantity for axis in self.axes]
-        twice = next((name for name in names if names.count(name) > 1), None)
-        if twice is not None:
-            raise InputError(f"the sweep has the quantity {twice!r} twice, but its quantities must differ", key="axes")
+        check_different([axis.quantity for axis in self.axes], "the sweep has the quantity", "axes")
         lengths = {axis.quantity: len(axis.points()) for axis in self.axes}
         if self.how == "list" and len(set(lengths.values())) > 1:
             counts = ", ".join(f"{n} of {name}" for name, n in lengths.items())

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from mauvecl.flares.settings import (
+    DAYS,
     HALF_WIDTHS_S,
     ORBIT_S,
     RANK,
@@ -18,8 +19,7 @@ from mauvecl.flares.settings import (
     CoolingLaw,
     Curve,
     Per,
-    check_shape,
-    per_day,
+    ShapeName,
 )
 from mauvecl.noise.disturbances import PointingDrifts
 from mauvecl.noise.unknowns import COURSES, STARE_PROCESSES, Changing, NuisanceName
@@ -40,7 +40,7 @@ ORBIT_FRAMES_S = 5680.0
 
 Spreads = dict[Changing, Positive]
 #: Shape of flares in stares and searches.
-ShapeName = Annotated[str, Help("Shape of flares", choices=", ".join(SHAPE_NAMES)), Flag("--shape")]
+ShapeOfFlares = Annotated[ShapeName, Help("Shape of flares", choices=", ".join(SHAPE_NAMES)), Flag("--shape")]
 
 
 class StareQuestion(Section):
@@ -91,7 +91,7 @@ class StareQuestion(Section):
     ] = None
     number: Annotated[int, Range(0, 2**32 - 1), Help("Number of the drawn stare")] = 0
     half_width_s: Annotated[Duration, Help("Half-width of the flares"), Flag("--half-width")] = 60.0
-    shape: ShapeName = "davenport2014"
+    shape: ShapeOfFlares = "davenport2014"
     energies_erg: Annotated[
         tuple[Energy, ...], Help("Bolometric energy of a flare", "instead of amplitudes"), Flag("--energy")
     ] = ()
@@ -107,7 +107,6 @@ class StareQuestion(Section):
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
-        check_shape(self.shape)
         if self.orbit_gap_s >= self.orbit_s:
             raise InputError(
                 f"stare.orbit_gap_s = {self.orbit_gap_s:g} must be shorter than the orbit of {self.orbit_s:g} s",
@@ -148,7 +147,7 @@ class EventChoice(Section):
     energy: Annotated[Literal["bolometric", "band"], Help("Meaning of the energy")] = "bolometric"
     temperature_k: Annotated[Temperature | None, Help("Temperature", default="the flare's")] = None
     cooling: Annotated[CoolingLaw | None, Help("Exponential cooling from that temperature")] = None
-    shape: Annotated[str | None, Help("Shape", default="the stare's", choices=", ".join(SHAPE_NAMES))] = None
+    shape: Annotated[ShapeName | None, Help("Shape", default="the stare's", choices=", ".join(SHAPE_NAMES))] = None
     shape_file: Annotated[Path | None, Help("File of a shape with two columns, time in half-widths and value")] = None
 
     @model_validator(mode="after")
@@ -159,8 +158,6 @@ class EventChoice(Section):
             raise InputError(f"an event needs only one of {' and '.join(given)}", key=given[0])
         if self.shape is not None and self.shape_file is not None:
             raise InputError("an event needs either shape or shape_file, but has both", key="shape")
-        if self.shape is not None:
-            check_shape(self.shape)
         return self
 
     def load_shape(self, default: str) -> Shape:
@@ -181,7 +178,7 @@ CYCLE_ORBITS = 3.0
 class SearchChoice(Section):
     """Search of a stare for flares, and its rate of false alarms."""
 
-    shape: ShapeName = "davenport2014"
+    shape: ShapeOfFlares = "davenport2014"
     half_widths_s: Annotated[tuple[Duration, ...], Field(min_length=1), Help("Half-widths of the template bank")] = (
         HALF_WIDTHS_S
     )
@@ -225,7 +222,6 @@ class SearchChoice(Section):
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
-        check_shape(self.shape)
         if list(self.half_widths_s) != sorted(set(self.half_widths_s)):
             raise InputError.of("search.half_widths_s", list(self.half_widths_s), "ascending times")
         if self.slope and not self.offset:
@@ -235,7 +231,7 @@ class SearchChoice(Section):
     @property
     def rate(self) -> float:
         """False alarms per star-day."""
-        return per_day(self.false_alarms, self.per)
+        return self.false_alarms / DAYS[self.per]
 
     @property
     def rate_text(self) -> str:

@@ -7,14 +7,14 @@ import hashlib
 import tomllib
 import warnings
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from itertools import chain
 from pathlib import Path
 from types import UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, Union, get_args, get_origin
 
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, model_validator
 
 from mauvecl.detection.names import DEFAULT_STATISTICS, countable, least_countable
 from mauvecl.host.instrument import FORMER_NAMES, FORMERLY_MAUVE
@@ -24,8 +24,8 @@ from mauvecl.noise.unknowns import NONE, Processes
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, Message, shortened
 from mauvecl.schema.fields import AnyUnit, Flag, Help, found
-from mauvecl.schema.section import Section, fields_of, input_error
-from mauvecl.study.analyses import PATHS, CalibrateQuestion, ChangeQuestion, DataChoice, MeasureQuestion
+from mauvecl.schema.section import Section, built, fields_of
+from mauvecl.study.analyses import CalibrateQuestion, ChangeQuestion, DataChoice, MeasureQuestion
 from mauvecl.study.keywords import changes_of, keywords_of, stars_of, values_of
 from mauvecl.study.observation import NuisanceChoice, Observation, Run, SkyLight, Unknowns
 from mauvecl.study.plan import OrbitQuestion, PlanQuestion
@@ -80,44 +80,31 @@ def read_version(data: dict[str, Any], where: str) -> dict[str, Any]:
     return data | {"version": VERSION} | dict(zip(of_defaults, (observation, nuisances, run, plan), strict=True))
 
 
-def with_paths(data: Any, kind: Any, change: Callable[[Path], Path]) -> Any:
-    """Return data of an annotated type, such as a section, with other paths; invalid data are left unchanged."""
+def paths_in(data: Any, kind: Any) -> Iterator[tuple[dict[str, Any], str]]:
+    """Yield each table and key that hold a path as text, in data of an annotated type such as a section."""
     parts = get_args(kind)
-    if kind is Path:
-        return str(change(Path(data))) if isinstance(data, str) else data
-    if isinstance(kind, type) and issubclass(kind, BaseModel) and isinstance(data, dict):
-        kinds = {key: field.annotation for key, field in kind.model_fields.items()}
-        return {key: with_paths(value, kinds.get(key), change) for key, value in data.items()}
-    if get_origin(kind) is tuple and isinstance(data, list):
-        return [with_paths(value, parts[0], change) for value in data]
-    if get_origin(kind) is dict and isinstance(data, dict):
-        return {key: with_paths(value, parts[1], change) for key, value in data.items()}
     if get_origin(kind) in (Union, UnionType):
-        # At most one of the alternatives holds paths.
-        return next((new for part in parts if (new := with_paths(data, part, change)) != data), data)
+        for part in parts:
+            yield from paths_in(data, part)
+    elif get_origin(kind) is tuple and isinstance(data, list):
+        for value in data:
+            yield from paths_in(value, parts[0])
+    elif isinstance(data, dict):
+        kinds = dict.fromkeys(data, parts[1]) if get_origin(kind) is dict else {}
+        if isinstance(kind, type) and issubclass(kind, BaseModel):
+            kinds = {key: field.annotation for key, field in kind.model_fields.items()}
+        for key, value in [*data.items()]:
+            if isinstance(value, str) and kinds.get(key) in (Path, Path | None):
+                yield data, key
+            else:
+                yield from paths_in(value, kinds.get(key))
+
+
+def with_paths(data: Any, kind: Any, change: Callable[[Path], Path]) -> Any:
+    """Change the paths in data of an annotated type, such as a section, in place, and return the data."""
+    for table, key in paths_in(data, kind):
+        table[key] = str(change(Path(table[key])))
     return data
-
-
-#: Keys of files that the study in an answer's table gives by name and digest, by their section.
-NAMED_FILES = {
-    "star": ("file", "neighbours"),
-    "flare.spectrum": ("file", "quiescent"),
-    "data": ("file", "mapping"),
-    "calibrate.observations": PATHS,
-    "change": ("file",),
-}
-
-
-def _named_files(data: dict[str, Any]) -> list[tuple[dict[str, Any], str]]:
-    """List the sections that name one of `NAMED_FILES`, with the key."""
-    found = []
-    for place, keys in NAMED_FILES.items():
-        section: Any = data
-        for part in place.split("."):
-            section = section.get(part) if isinstance(section, dict) else None
-        rows = [row for row in (section if isinstance(section, list) else [section]) if isinstance(row, dict)]
-        found += [(row, key) for row in rows for key in keys if isinstance(row.get(key), str)]
-    return found
 
 
 def locate_files(data: dict[str, Any], table: Path) -> None:
@@ -126,7 +113,7 @@ def locate_files(data: dict[str, Any], table: Path) -> None:
     Searches the table's folder, its parent, the current folder, and the paths in a ``study.toml`` next to the table.
     Raises InputError if no file with the name and digest is found.
     """
-    for section, key in _named_files(data):
+    for section, key in paths_in(data, Study):
         if f"{key}_sha256" not in section:
             continue
         name, digest = Path(section[key]).name, section.pop(f"{key}_sha256")
@@ -149,7 +136,7 @@ def _beside(table: Path, name: str) -> list[Path]:
     if not study.is_file():
         return []
     data = toml(read_text(study, "study file"), "study file 'study.toml'")
-    files = [section[key] for section, key in _named_files(data)]
+    files = [section[key] for section, key in paths_in(data, Study)]
     return [table.parent / file for file in files if Path(file).name == name]
 
 
@@ -278,10 +265,7 @@ class Study(Section):
     def build(cls, data: dict[str, Any], where: str) -> Self:
         """Validate nested data; raises InputError for the first invalid value."""
         possible(data, where)
-        try:
-            return cls.model_validate(data)
-        except ValidationError as error:
-            raise input_error(where, cls, error) from error
+        return built(cls, data, where)
 
     @classmethod
     def of(cls, **keywords: Any) -> Self:
@@ -417,7 +401,7 @@ class Study(Section):
         import tomli_w
 
         data = self._stated()
-        for section, key in _named_files(data):
+        for section, key in paths_in(data, type(self)):
             place, _ = without_columns(Path(section[key]))
             section[key] = Path(section[key]).name
             # Keep the answer even if the file no longer exists.

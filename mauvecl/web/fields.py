@@ -31,6 +31,7 @@ from mauvecl.schema.fields import (
     with_unit,
 )
 from mauvecl.schema.physical import LineFraction
+from mauvecl.schema.section import check_different
 from mauvecl.study.study import keys_of, study_keys
 
 #: Texts of fields with an uploaded file: those that also accept a name or numbers, and all others.
@@ -190,10 +191,7 @@ def targets(text: str, *, check: bool = True) -> tuple[dict[str, Any], ...]:
                 "or coordinates such as 53.23 -9.46",
                 key="targets",
             ) from error
-    names = [row["name"] for row in rows]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise InputError(f"{shortened(twice)} is named twice, but targets must differ", key="targets")
+    check_different([row["name"] for row in rows], "the text has the target", "targets")
     return tuple(rows)
 
 

@@ -23,7 +23,6 @@ from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
 
 from mauvecl.host.spectra.conversion import ReadSpectrum
 from mauvecl.host.stars.flare_spectra import ObservedFlare
@@ -31,7 +30,7 @@ from mauvecl.host.stars.source import Source
 from mauvecl.host.tables.text_tables import columns
 from mauvecl.observations.frames import Frames
 from mauvecl.schema.errors import InputError, printable, reworded, shortened
-from mauvecl.schema.section import input_error
+from mauvecl.schema.section import built
 from mauvecl.study.analyses import PATHS, CalibrateQuestion, CalibrationObservation
 from mauvecl.web.fields import FIELDS, UPLOADED, UPLOADED_FILE, UPLOADED_UNKNOWN
 from mauvecl.web.sandboxed_reader import FRAMES, Spectrum, read_by, read_limited
@@ -163,10 +162,7 @@ def observations_in(files: Mapping[str, bytes]) -> tuple[CalibrationObservation,
                     held = ", ".join(sorted(files))
                     raise InputError(f"the archive needs {shortened(name)}, but holds {held}", key="observations")
                 row[key] = name
-    try:
-        return CalibrateQuestion.model_validate({"observations": rows}).observations
-    except ValidationError as error:
-        raise input_error("the archive", CalibrateQuestion, error) from error
+    return built(CalibrateQuestion, {"observations": rows}, "the archive").observations
 
 
 def _observations(name: str, content: bytes) -> list[dict[str, Any]]:

@@ -2,8 +2,10 @@
 
 from pathlib import Path
 
+import astropy.units as u
 import numpy as np
 import pytest
+from astropy.table import QTable
 from refusals import refused
 
 from mauvecl import Expectation, Instrument, PixelMap, Source, expect
@@ -157,6 +159,8 @@ def test_written_maps_are_read_back(tmp_path: Path) -> None:
     again = PixelMap.read(tmp_path / "map.ecsv")
     assert again.digest == made.digest
     assert again.source == "A: made up, seed 3"
+    QTable({"response": [98.0, 102.0] * u.percent}).write(tmp_path / "percent.ecsv", format="ascii.ecsv")
+    np.testing.assert_allclose(PixelMap.read(tmp_path / "percent.ecsv").response, [0.98, 1.02])
     (tmp_path / "own.toml").write_text('extends = "mauvesim"\nname = "own"\npixel_map = "map.ecsv"\n')
     payload = Instrument.load(tmp_path / "own.toml")
     assert payload.pixel_map.digest == made.digest

@@ -8,6 +8,7 @@ from typing import Any, get_args
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.table import Table
 from refusals import refused
 from study_keys import NUMERIC, ends, fields, metadata, outside, reach
 
@@ -147,6 +148,10 @@ def test_paths_are_relative_to_the_study_file_and_absolute_in_its_text(tmp_path:
     assert str(absolute).count(str(tmp_path / "there" / "f.txt")) == len(keys)
     # Read elsewhere, the text gives the same study.
     assert Study.build(absolute, "elsewhere") == study
+    # An answer's table names the files by their content, and is read next to them.
+    assert (study.text().count("_sha256"), study.text().count(str(tmp_path))) == (len(keys), 0)
+    Table({"x": [1.0]}, meta={"study": study.text()}).write(tmp_path / "there" / "table.ecsv", format="ascii.ecsv")
+    assert Study.read(tmp_path / "there" / "table.ecsv") == study
 
 
 # Older files
