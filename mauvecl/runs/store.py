@@ -11,9 +11,7 @@ import hashlib
 import json
 import os
 import shutil
-import tempfile
 import threading
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -34,6 +32,8 @@ from mauvecl.study.cases import collect_messages as messages_of
 from mauvecl.study.study import Study, read_version
 
 if TYPE_CHECKING:
+    from zarr.storage import MemoryStore
+
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.study.cases import Case
 
@@ -65,49 +65,46 @@ def without(described: dict[str, Any], names: Sequence[str]) -> dict[str, Any]:
     return described | {"attributes": {key: value for key, value in attributes.items() if key not in names}}
 
 
-def describe(study: Study, scenes: Sequence[StoredScene], folder: Path) -> None:
-    """Write groups, descriptions of arrays and calibration of a store to a folder."""
+def describe(study: Study, scenes: Sequence[StoredScene], place: MemoryStore) -> None:
+    """Write groups, descriptions of arrays and calibration of a store to memory."""
     import zarr
     from zarr.codecs import Crc32cCodec
 
     text, rows = study.toml(), study.run.realisations
-    with warnings.catch_warnings():
-        # Zarr warns of an empty folder.
-        warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)
-        root = zarr.open_group(folder, mode="w", zarr_format=3)
-        run: dict[str, Any] = signed(text) | {"seed": study.run.seed, "realisations": rows}
-        root.attrs.update(run | {"mauvecl": VERSION, "draws": COMMON_DRAWS, "throughput": NOMINAL})
-        for scene in scenes:
-            x, group = scene.expectation, root.require_group(scene.group)
-            if scene.name == "quiescent":
-                group.attrs.update({"star": scene.star, **scene.at})
-                group.attrs.update(exposure_attributes(x) | {"messages": messages_of([x])})
-                for name, unit in CALIBRATION.items():
-                    _values(group, name, np.asarray(getattr(x, name)), unit, ["pixel"])
-                if scene.frames is not None:
-                    _values(group, "frame", np.array(scene.frames), "", ["frame"])
-            if study.bulk.components:
-                n = x.n_frames if scene.frames is None else 1
-                gain = n * x.gain_dn_per_electron
-                for name, values in (
-                    ("source", gain * x.source_electrons),
-                    ("sky", gain * x.sky_electrons),
-                    *([("neighbours", gain * x.neighbour_electrons)] if x.neighbour_electrons.any() else []),
-                    ("noise", np.sqrt(x.variance_dn2 * n / x.n_frames)),
-                ):
-                    _values(group, f"{scene.name}-{name}", values, "DN", ["pixel"])
-            dimensions = ["realisation", *(["frame"] if scene.frames is not None else []), "pixel"]
-            array = group.create_array(
-                scene.name,
-                shape=(rows, *scene.row),
-                chunks=(scene.chunk_rows(rows), *scene.row),
-                dtype=scene.dtype,
-                compressors=[Crc32cCodec()],
-                fill_value=0,
-                dimension_names=dimensions,
-            )
-            origin: dict[str, Any] = {"star": scene.star, "provenance": dict(x.provenance)} | signed(text)
-            array.attrs.update(origin | {"units": "DN", "amplitude": scene.amplitude})
+    root = zarr.open_group(place, mode="w", zarr_format=3)
+    run: dict[str, Any] = signed(text) | {"seed": study.run.seed, "realisations": rows}
+    root.attrs.update(run | {"mauvecl": VERSION, "draws": COMMON_DRAWS, "throughput": NOMINAL})
+    for scene in scenes:
+        x, group = scene.expectation, root.require_group(scene.group)
+        if scene.name == "quiescent":
+            group.attrs.update({"star": scene.star, **scene.at})
+            group.attrs.update(exposure_attributes(x) | {"messages": messages_of([x])})
+            for name, unit in CALIBRATION.items():
+                _values(group, name, np.asarray(getattr(x, name)), unit, ["pixel"])
+            if scene.frames is not None:
+                _values(group, "frame", np.array(scene.frames), "", ["frame"])
+        if study.bulk.components:
+            n = x.n_frames if scene.frames is None else 1
+            gain = n * x.gain_dn_per_electron
+            for name, values in (
+                ("source", gain * x.source_electrons),
+                ("sky", gain * x.sky_electrons),
+                *([("neighbours", gain * x.neighbour_electrons)] if x.neighbour_electrons.any() else []),
+                ("noise", np.sqrt(x.variance_dn2 * n / x.n_frames)),
+            ):
+                _values(group, f"{scene.name}-{name}", values, "DN", ["pixel"])
+        dimensions = ["realisation", *(["frame"] if scene.frames is not None else []), "pixel"]
+        array = group.create_array(
+            scene.name,
+            shape=(rows, *scene.row),
+            chunks=(scene.chunk_rows(rows), *scene.row),
+            dtype=scene.dtype,
+            compressors=[Crc32cCodec()],
+            fill_value=0,
+            dimension_names=dimensions,
+        )
+        origin: dict[str, Any] = {"star": scene.star, "provenance": dict(x.provenance)} | signed(text)
+        array.attrs.update(origin | {"units": "DN", "amplitude": scene.amplitude})
 
 
 def exposure_attributes(x: Expectation) -> dict[str, float | str]:
@@ -365,10 +362,11 @@ class Store:
 
     def description(self) -> dict[str, bytes]:
         """Return the content of every file except spectra, by path."""
-        with tempfile.TemporaryDirectory() as folder:
-            describe(self.study, self.scenes, Path(folder))
-            files = [p for p in Path(folder).rglob("*") if p.is_file()]
-            return {str(p.relative_to(folder)): p.read_bytes() for p in files}
+        from zarr.storage import MemoryStore
+
+        files: dict[str, Any] = {}
+        describe(self.study, self.scenes, MemoryStore(files))
+        return {name: content.to_bytes() for name, content in files.items()}
 
     def read_digests(self) -> None:
         """Read the digests of written chunks; incomplete lines are ignored."""
