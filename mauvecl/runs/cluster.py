@@ -9,7 +9,7 @@ import pickle
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -157,7 +157,7 @@ class DaskWorkers:
                     # A task instead of scattered data, since the scheduler can repeat it if its worker is lost. Bytes,
                     # because a worker with other code might read and write a request differently.
                     content, key = pickle.dumps(task.request), f"mauvecl-request-{task.key}-{self._sends}"
-                    request_task = self._client.submit(_keep, content, key=key, workers=attempt.workers)
+                    request_task = self._client.submit(bytes, content, key=key, workers=attempt.workers)
                     self._given[task.key] = request_task, attempt.workers
                     if len(self._given) > MAX_REQUESTS:
                         del self._given[next(iter(self._given))]
@@ -399,15 +399,8 @@ _engine: Engine | None = None
 _one_at_a_time = threading.Lock()
 
 
-def _keep(content: bytes) -> bytes:
-    return content
-
-
-@lru_cache(maxsize=4)
-def _request(content: bytes) -> Countable:
-    # A request keeps what it has computed for earlier shards.
-    request: Countable = pickle.loads(content)
-    return request
+#: Requests by their bytes; each keeps what it has computed for earlier shards.
+_request: Callable[[bytes], Countable] = lru_cache(maxsize=4)(pickle.loads)
 
 
 def _engine_here(device: str | None, threads: int) -> Engine:

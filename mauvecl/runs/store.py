@@ -134,7 +134,7 @@ def study_in(place: Path) -> str | None:
         attributes = json.loads(read_bytes(place, "description"))["attributes"]
         text = attributes["study"]
         return text if signed(text).items() <= attributes.items() else None
-    except (InputError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
         return None
 
 

@@ -353,7 +353,7 @@ def test_counts_of_another_form_raise(begun: Path, engine: Engine) -> None:
     manifest = json.loads(manifest_of(begun))
     old = {key: value for key, value in manifest.items() if key not in ("form", "digest")}
     change(begun, json.dumps(old | {"digest": hashlib.sha256(json.dumps(old, sort_keys=True).encode()).hexdigest()}))
-    with refused("restart", "1", "2", "`restart=True`"):
+    with refused("restart", "form", "`restart=True`"):
         at_work(begun, engine, resume=True)
 
 
