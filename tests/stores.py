@@ -51,20 +51,18 @@ def flip(path: Path, place: int = 100) -> None:
 
 
 class Painter(Engine):
-    """Engine without chance and OpenCL, whose rows contain their number, for tests that fork."""
+    """Engine without chance and OpenCL, whose rows contain their number and the seed, for tests that fork."""
 
     def __init__(self) -> None:
         """Make an engine without a device."""
 
-    def realise(
-        self, x: Any, *, start: int, count: int, seed: int, out: NDArray[Any] | None = None, **how: Any
-    ) -> NDArray[Any]:
+    def realise(self, x: Any, *, start: int, count: int, seed: int, **how: Any) -> NDArray[Any]:
         number = np.arange(start, start + count, dtype=np.uint64)[:, None] * np.uint64(6364136223846793005)
         rows = ((number >> np.uint64(40)) + np.arange(x.wavelength_nm.size, dtype=np.uint64)) % np.uint64(60000)
-        if out is None:
-            return rows.astype(np.uint16)
-        out[:] = rows
-        return out
+        return rows.astype(np.uint16) ^ np.uint16(seed)
+
+
+PAINTER: Any = Painter()
 
 
 def forked(work: Callable[[], object]) -> int:

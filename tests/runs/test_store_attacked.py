@@ -8,31 +8,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from commands import run
-from numpy.typing import NDArray
 from refusals import refused
-from stores import CHUNK, Painter, flip, forked, killed, locked, study, tree
+from stores import CHUNK, PAINTER, flip, forked, killed, locked, study, tree
 
 from mauvecl import bulk
 from mauvecl.runs.store import Store
-
-
-class Seeded(Painter):
-    """Painter of rows that also contain their seed."""
-
-    def realise(
-        self, x: Any, *, start: int, count: int, seed: int, out: NDArray[Any] | None = None, **how: Any
-    ) -> NDArray[Any]:
-        rows = super().realise(x, start=start, count=count, seed=seed) ^ np.uint16(seed)
-        if out is None:
-            return rows
-        out[:] = rows
-        return out
-
-
-PAINTER: Any = Seeded()
 
 
 @pytest.fixture
