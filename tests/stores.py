@@ -2,6 +2,7 @@
 
 import fcntl
 import os
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -79,6 +80,26 @@ def forked(work: Callable[[], object]) -> int:
 def killed(child: int) -> bool:
     _, status = os.waitpid(child, 0)
     return os.WIFSIGNALED(status)
+
+
+def killed_at(step: int, work: Callable[[], object], *calls: tuple[Any, str]) -> bool:
+    """Do work in a child that is killed at one of its calls of some functions; return whether there were so many."""
+    counted = iter(range(step))
+
+    def mortal(real: Callable[..., Any]) -> Callable[..., Any]:
+        def wrapped(*given: Any, **how: Any) -> Any:
+            if next(counted, None) is None:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return real(*given, **how)
+
+        return wrapped
+
+    def run() -> None:
+        for owner, name in calls:
+            setattr(owner, name, mortal(getattr(owner, name)))
+        work()
+
+    return killed(forked(run))
 
 
 def full_after(n_bytes: int, monkeypatch: pytest.MonkeyPatch) -> None:

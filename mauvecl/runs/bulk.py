@@ -302,9 +302,7 @@ def verify(
     Store.open(path)
     with locked(Path(path), "store"):
         store = Store.open(path)
-        first, last = rows or (0, store.rows)
-        if not 0 <= first < last <= store.rows:
-            raise InputError.of("rows", (first, last), f"a range within 0:{store.rows}")
+        first, last = store.range_of(rows)
         files = list(store.files())
         total, there = store.count(first, last), sum(store.owns(key) for key, _ in files)
         if total - there > MAX_MISSING:

@@ -1,6 +1,7 @@
 """Stores of raw spectra: content, verification, and recovery."""
 
 import fcntl
+import itertools
 import json
 import os
 import random
@@ -10,6 +11,7 @@ import subprocess
 import time
 import tomllib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +25,7 @@ from astropy.wcs import WCS
 from commands import run
 from marks import long_but
 from refusals import refused
-from stores import CHUNK, LAST, PAINTER, flip, forked, full_after, killed, study, tree
+from stores import CHUNK, LAST, PAINTER, flip, forked, full_after, killed, killed_at, study, tree
 
 from mauvecl import Engine, Study, bulk
 from mauvecl.runs.store import Store
@@ -204,18 +206,19 @@ def test_random_kills_lose_nothing(
     """Kill a run at random moments, within about the time that it takes, and resume it; files have the same bits."""
     described_once(study(1000))
     path, kills, moments = tmp_path / "frames.zarr", 0, random.Random(5)
+    paint = partial(bulk.realise, study(1000), path, PAINTER)
     began = time.monotonic()
-    killed(forked(lambda: bulk.realise(study(1000), path, PAINTER)))
+    killed(forked(paint))
     takes = time.monotonic() - began
     while kills < 30:
         if path.exists() and tree(path) == painted:
             # A store that is finished after many kills: the next one begins.
             shutil.rmtree(path)
-        child = forked(lambda: bulk.realise(study(1000), path, PAINTER))
+        child = forked(paint)
         time.sleep(moments.uniform(0.0, takes))
         os.kill(child, signal.SIGKILL)
         kills += killed(child)
-    bulk.realise(study(1000), path, PAINTER)
+    paint()
     assert tree(path) == painted
     assert bulk.verify(path) == []
 
@@ -224,33 +227,17 @@ def test_random_kills_lose_nothing(
 def test_kill_at_every_step_of_writing_loses_nothing(tmp_path: Path, described_once: Callable[[Study], None]) -> None:
     """Kill before each fsync, rename and line of digests."""
     described_once(study(200))
-    step = 0
-    while True:
-        path, counted = tmp_path / f"{step}.zarr", iter(range(step + 1))
-
-        def mortal(work: Callable[..., Any], counted: Any = counted, last: int = step) -> Callable[..., Any]:
-            def wrapped(*given: Any) -> Any:
-                if next(counted, last) == last:
-                    os.kill(os.getpid(), signal.SIGKILL)
-                return work(*given)
-
-            return wrapped
-
-        def run(path: Path = path, mortal: Any = mortal) -> None:
-            os.fsync = mortal(os.fsync)
-            Path.replace = mortal(Path.replace)  # type: ignore[method-assign]
-            Store.note = mortal(Store.note)  # type: ignore[method-assign]
-            bulk.realise(study(200), path, PAINTER)
-
-        ended = not killed(forked(run))
-        bulk.realise(study(200), path, PAINTER)
-        if step == 0:
-            first = tree(path)
+    first: dict[str, bytes] = {}
+    for step in itertools.count():
+        path = tmp_path / f"{step}.zarr"
+        paint = partial(bulk.realise, study(200), path, PAINTER)
+        was_killed = killed_at(step, paint, (os, "fsync"), (Path, "replace"), (Store, "note"))
+        paint()
+        first = first or tree(path)
         assert tree(path) == first
         shutil.rmtree(path)
-        if ended:
+        if not was_killed:
             break
-        step += 1
     assert step > 30
 
 
