@@ -473,13 +473,6 @@ def pearson(counts: NDArray[np.int64], probability: NDArray[np.float64]) -> floa
     return 2 * min(upper, 1 - upper)
 
 
-def counts_of(engine: Engine, x: Expectation, realisations: int, recipe: Any) -> tuple[NDArray[np.int64], int]:
-    """Return the histogram of raw counts over all pixels, which are equal, and the count of its first bin."""
-    signal = engine.snr(x, realisations=realisations, seed=SEED, recipe=recipe)
-    first = int(signal.scene.base_dn[0, 0]) - layout.OBSERVER_BINS // 2
-    return signal.counts.pixel.sum(axis=0), first
-
-
 def exact_counts(x: Expectation, first: int) -> NDArray[np.float64]:
     """Return the bins' probabilities for Poisson dark, Gaussian read and photon noise, and rounding."""
     mean, step = x.dark_dn[0], x.dark_step_dn[0]
@@ -497,14 +490,18 @@ def exact_counts(x: Expectation, first: int) -> NDArray[np.float64]:
 
 def chance(engine: Engine) -> Iterator[Check]:
     """Test raw counts of every recipe with Pearson's statistic."""
-    for title, dark, read, recipe in (
+    cases: tuple[tuple[str, float, float, Any], ...] = (
         ("joint draw, dark of 2225", 2225.0, 12.0, "joint"),
         ("joint draw, dark of 30", 30.0, 12.0, "joint"),
         ("alias table, dark of 64", 64.0, 0.8, "apart"),
         ("expansion, dark of 2225", 2225.0, 0.8, "apart"),
-    ):
+    )
+    for title, dark, read, recipe in cases:
         x = toy(512, 1, dark=dark, read=read, light=0.0)
-        counts, first = counts_of(engine, x, 100_000, recipe)
+        signal = engine.snr(x, realisations=100_000, seed=SEED, recipe=recipe)
+        # All pixels are equal.
+        counts = signal.counts.pixel.sum(axis=0)
+        first = int(signal.scene.base_dn[0, 0]) - layout.OBSERVER_BINS // 2
         p = pearson(counts, exact_counts(x, first))
         passed = bool(p > FALSE_FAILURE_PROBABILITY)
         yield Check(f"Pearson, {title}", passed, f"p = {p:.3g} of {counts.sum():.2g} counts")

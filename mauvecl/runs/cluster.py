@@ -339,8 +339,13 @@ def _client(where: str, distributed: Any) -> Iterator[Client]:
 
 
 def _local_cluster(n_workers: int, distributed: Any) -> Any:
-    """Start workers on this machine, each with its share of the cores."""
+    """Start workers on this machine, each with its share of the cores and with temporary certificates."""
     threads = max((os.cpu_count() or 1) // n_workers, 1)
+    try:
+        # A worker executes everything that the scheduler receives, so other users of the machine must not connect.
+        security = distributed.Security.temporary()
+    except ImportError as error:
+        raise missing_package("cryptography", "a cluster of this machine", "cluster") from error
     return distributed.LocalCluster(
         n_workers=n_workers,
         threads_per_worker=1,
@@ -348,7 +353,7 @@ def _local_cluster(n_workers: int, distributed: Any) -> Any:
         host="127.0.0.1",
         dashboard_address=None,
         scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
-        security=_private(distributed),
+        security=security,
         preload=__name__,
         memory_limit=0,
         silence_logs=logging.CRITICAL,
@@ -369,17 +374,6 @@ def _is_address(where: str) -> bool:
 
 #: Schemes of Dask's network protocols.
 SCHEMES = ("tcp", "tls", "ucx", "ucxx", "ws", "wss")
-
-
-def _private(distributed: Any) -> Any:
-    """Make temporary certificates, so that other users of the machine cannot connect.
-
-    A worker executes everything that the scheduler receives, with the rights of the user who started it.
-    """
-    try:
-        return distributed.Security.temporary()
-    except ImportError as error:
-        raise missing_package("cryptography", "a cluster of this machine", "cluster") from error
 
 
 LOGS = ("distributed", *(f"distributed.{part}" for part in ("client", "nanny", "worker", "scheduler", "core")))
