@@ -146,17 +146,13 @@ def fingerprint(request: object) -> str:
 
 
 def _feed(digest: Any, value: Any, leave: tuple[str, ...] = ()) -> None:
-    if is_dataclass(value) and not isinstance(value, type):
+    is_model = isinstance(value, BaseModel)
+    if is_model or (is_dataclass(value) and not isinstance(value, type)):
         digest.update(f"<{type(value).__name__}".encode())
-        for each in fields(value):
-            if each.name not in (*leave, *_DESCRIPTIVE):
-                digest.update(each.name.encode())
-                _feed(digest, getattr(value, each.name))
-    elif isinstance(value, BaseModel):
-        digest.update(f"<{type(value).__name__}".encode())
-        for name in type(value).model_fields:
-            digest.update(name.encode())
-            _feed(digest, getattr(value, name))
+        for name in type(value).model_fields if is_model else (each.name for each in fields(value)):
+            if name not in (*leave, *_DESCRIPTIVE):
+                digest.update(name.encode())
+                _feed(digest, getattr(value, name))
     elif isinstance(value, np.ndarray):
         digest.update(f"<{value.dtype.str}{value.shape}".encode())
         digest.update(np.ascontiguousarray(value).tobytes())

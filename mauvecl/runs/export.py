@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import io
-import os
 import re
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host import VERSION
-from mauvecl.host.tables.files import UNFINISHED, check_folder, parsing, write_whole, writing
+from mauvecl.host.tables.files import check_folder, parsing, write_whole
 from mauvecl.runs.store import CALIBRATION, COMMON_DRAWS, NOMINAL, Store, StoredScene, exposure_attributes
 from mauvecl.schema.errors import InputError, missing_package
 
@@ -113,20 +111,13 @@ def export(selection: Selection, path: str | Path, *, replace: bool = False) -> 
     if path.exists() and not (replace and path.is_file()):
         others = "another name, or `replace=True`" if path.is_file() else "the name of a file"
         raise InputError(f"export {str(path)!r} exists already: use {others}", key="file")
-    if path.suffix != ".fits":
-        # Written to memory first, because the HDF5 library aborts the process on a full disk.
-        packed = io.BytesIO()
+    # Written to memory first, because the HDF5 library aborts the process on a full disk.
+    packed = io.BytesIO()
+    if path.suffix == ".fits":
+        _fits(selection).writeto(packed, checksum=True)
+    else:
         _hdf5(selection, packed)
-        write_whole(path, packed.getbuffer(), shared=True)
-        return path
-    with writing(f"export {str(path)!r}", path, "a writable place with room", key="file"):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=UNFINISHED, dir=path.parent) as folder:
-            temporary = Path(folder) / path.name
-            _fits(selection).writeto(temporary, checksum=True)
-            with temporary.open("rb") as file:
-                os.fsync(file.fileno())
-            temporary.replace(path)
+    write_whole(path, packed.getbuffer(), shared=True)
     return path
 
 
