@@ -2,6 +2,7 @@
 
 import fcntl
 import os
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -51,20 +52,18 @@ def flip(path: Path, place: int = 100) -> None:
 
 
 class Painter(Engine):
-    """Engine without chance and OpenCL, whose rows contain their number, for tests that fork."""
+    """Engine without chance and OpenCL, whose rows contain their number and the seed, for tests that fork."""
 
     def __init__(self) -> None:
         """Make an engine without a device."""
 
-    def realise(
-        self, x: Any, *, start: int, count: int, seed: int, out: NDArray[Any] | None = None, **how: Any
-    ) -> NDArray[Any]:
+    def realise(self, x: Any, *, start: int, count: int, seed: int, **how: Any) -> NDArray[Any]:
         number = np.arange(start, start + count, dtype=np.uint64)[:, None] * np.uint64(6364136223846793005)
         rows = ((number >> np.uint64(40)) + np.arange(x.wavelength_nm.size, dtype=np.uint64)) % np.uint64(60000)
-        if out is None:
-            return rows.astype(np.uint16)
-        out[:] = rows
-        return out
+        return rows.astype(np.uint16) ^ np.uint16(seed)
+
+
+PAINTER: Any = Painter()
 
 
 def forked(work: Callable[[], object]) -> int:
@@ -81,6 +80,26 @@ def forked(work: Callable[[], object]) -> int:
 def killed(child: int) -> bool:
     _, status = os.waitpid(child, 0)
     return os.WIFSIGNALED(status)
+
+
+def killed_at(step: int, work: Callable[[], object], *calls: tuple[Any, str]) -> bool:
+    """Do work in a child that is killed at one of its calls of some functions; return whether there were so many."""
+    counted = iter(range(step))
+
+    def mortal(real: Callable[..., Any]) -> Callable[..., Any]:
+        def wrapped(*given: Any, **how: Any) -> Any:
+            if next(counted, None) is None:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return real(*given, **how)
+
+        return wrapped
+
+    def run() -> None:
+        for owner, name in calls:
+            setattr(owner, name, mortal(getattr(owner, name)))
+        work()
+
+    return killed(forked(run))
 
 
 def full_after(n_bytes: int, monkeypatch: pytest.MonkeyPatch) -> None:

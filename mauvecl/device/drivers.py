@@ -35,7 +35,6 @@ import json
 import os
 import platform
 import re
-import secrets
 import shutil
 import signal
 import subprocess
@@ -53,6 +52,7 @@ from typing import IO, Any, Literal
 from zipfile import BadZipFile, ZipFile
 
 from mauvecl.host import VERSION
+from mauvecl.host.tables.files import write_whole
 from mauvecl.schema.errors import InputError
 
 _PACKAGE = "`apt-get install pocl-opencl-icd` (Debian, Ubuntu) or `dnf install pocl` (Fedora)"
@@ -113,14 +113,8 @@ class KernelCache:
         with ZipFile(packed, "w") as archive:
             for name, content in contents.items():
                 archive.writestr(name, content)
-        new = self.store / f".{key}-{secrets.token_hex(8)}"
-        with contextlib.suppress(OSError):
-            self.store.mkdir(parents=True, exist_ok=True)
-            try:
-                new.write_bytes(packed.getvalue())
-                new.replace(self.store / f"{key}.zip")
-            finally:
-                new.unlink(missing_ok=True)
+        with contextlib.suppress(InputError):
+            write_whole(self.store / f"{key}.zip", packed.getbuffer(), shared=True)
 
     def read_text(self, key: str) -> str | None:
         """Return a stored text, or None."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+import threading
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,7 +18,7 @@ from mauvecl.host.arrays import map_in_threads
 from mauvecl.host.tables.files import UNFINISHED, check_size, read_bytes, write_whole
 from mauvecl.runs.checkpoint import locked
 from mauvecl.runs.export import Selection, export
-from mauvecl.runs.pool import Pool, map_in_order
+from mauvecl.runs.pool import PREPARED, Pool
 from mauvecl.runs.store import (
     CRC_BYTES,
     LATER_ATTRIBUTES,
@@ -40,8 +41,8 @@ if TYPE_CHECKING:
     from mauvecl.device.engine import Engine
 
 
-#: Chunks drawn at once, and threads that write them while the next are drawn.
-CHUNKS_AT_ONCE, WRITERS = 4, 4
+#: Threads that write chunks while others are drawn.
+WRITERS = 4
 #: Largest number of missing chunks that `verify` lists, since a study can ask for any number.
 MAX_MISSING = 100_000
 
@@ -193,40 +194,21 @@ def _fill(store: Store, todo: list[Chunk], engine: Engine | Pool, progress: Prog
     if progress is not None:
         progress(done, total)
 
-    def write(drawn: tuple[Chunk, NDArray[Any]]) -> int:
-        store.write(*drawn)
-        return len(drawn[1])
+    # An engine draws for one thread at a time, a pool for one more than it has workers.
+    n_drawing, stop = (engine.workers.count + PREPARED, engine.stop) if isinstance(engine, Pool) else (1, None)
+    drawing = threading.Semaphore(n_drawing)
 
-    if isinstance(engine, Pool) and engine.workers.count > 1:
-        # A single chunk per request limits the size of transfers.
-        written = map_in_order(engine, lambda chunk: write(next(_drawn(store.study, [chunk], engine))), todo)
-    else:
-        written = map_in_threads(write, _drawn(store.study, todo, engine), WRITERS)
-    with closing(written):
+    def write(chunk: Chunk) -> int:
+        with drawing:
+            rows = draw(store.study, chunk.scene, engine, chunk.start, chunk.stop - chunk.start)
+        store.write(chunk, rows)
+        return len(rows)
+
+    with closing(map_in_threads(write, todo, n_drawing + WRITERS, stop)) as written:
         for rows in written:
             done += rows
             if progress is not None:
                 progress(done, total)
-
-
-def _drawn(study: Study, todo: Sequence[Chunk], engine: Engine | Pool) -> Iterator[tuple[Chunk, NDArray[Any]]]:
-    """Yield chunks and their rows, drawing several neighbouring ones at once."""
-    for block in _blocks(todo, CHUNKS_AT_ONCE):
-        first = block[0].start
-        rows = draw(study, block[0].scene, engine, first, block[-1].stop - first)
-        yield from ((chunk, rows[chunk.start - first : chunk.stop - first]) for chunk in block)
-
-
-def _blocks(chunks: Sequence[Chunk], max_chunks: int) -> Iterator[list[Chunk]]:
-    """Yield blocks of at most `max_chunks` neighbouring chunks of one scene."""
-    block: list[Chunk] = []
-    for chunk in chunks:
-        if block and (len(block) == max_chunks or chunk.scene is not block[0].scene or chunk.start != block[-1].stop):
-            yield block
-            block = []
-        block.append(chunk)
-    if block:
-        yield block
 
 
 @dataclass(frozen=True)
@@ -320,9 +302,7 @@ def verify(
     Store.open(path)
     with locked(Path(path), "store"):
         store = Store.open(path)
-        first, last = rows or (0, store.rows)
-        if not 0 <= first < last <= store.rows:
-            raise InputError.of("rows", (first, last), f"a range within 0:{store.rows}")
+        first, last = store.range_of(rows)
         files = list(store.files())
         total, there = store.count(first, last), sum(store.owns(key) for key, _ in files)
         if total - there > MAX_MISSING:

@@ -24,7 +24,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,7 @@ from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from mauvecl.detection.snr import Arrays
+    from mauvecl.study.study import Study
 
 
 @contextlib.contextmanager
@@ -145,17 +146,13 @@ def fingerprint(request: object) -> str:
 
 
 def _feed(digest: Any, value: Any, leave: tuple[str, ...] = ()) -> None:
-    if is_dataclass(value) and not isinstance(value, type):
+    is_model = isinstance(value, BaseModel)
+    if is_model or (is_dataclass(value) and not isinstance(value, type)):
         digest.update(f"<{type(value).__name__}".encode())
-        for each in fields(value):
-            if each.name not in (*leave, *_DESCRIPTIVE):
-                digest.update(each.name.encode())
-                _feed(digest, getattr(value, each.name))
-    elif isinstance(value, BaseModel):
-        digest.update(f"<{type(value).__name__}".encode())
-        for name in type(value).model_fields:
-            digest.update(name.encode())
-            _feed(digest, getattr(value, name))
+        for name in type(value).model_fields if is_model else (each.name for each in fields(value)):
+            if name not in (*leave, *_DESCRIPTIVE):
+                digest.update(name.encode())
+                _feed(digest, getattr(value, name))
     elif isinstance(value, np.ndarray):
         digest.update(f"<{value.dtype.str}{value.shape}".encode())
         digest.update(np.ascontiguousarray(value).tobytes())
@@ -182,13 +179,6 @@ PATIENCE_S = 20.0
 DIGEST_BYTES = 32
 
 
-class Question(Protocol):
-    """Interface of a study for checkpoints."""
-
-    def toml(self) -> str:
-        """Return the study as TOML."""
-
-
 class Checkpoint:
     """Context manager of the shards of one run in a folder.
 
@@ -209,8 +199,8 @@ class Checkpoint:
 
     Attributes
     ----------
-    resumed, damaged : int
-        Number of shards read from files, and of unusable files.
+    damaged : int
+        Number of unusable files.
     messages : list of str
         Remarks for the user.
     """
@@ -219,7 +209,7 @@ class Checkpoint:
         self,
         folder: Path,
         verb: str,
-        study: Question,
+        study: Study,
         *,
         resume: bool = False,
         restart: bool = False,
@@ -228,7 +218,7 @@ class Checkpoint:
     ) -> None:
         self.parent, self.folder, self.verb, self.study = folder, folder / FOLDER, verb, study
         self._resume, self._restart, self._patience_s, self._is_held = resume, restart, patience_s, held
-        self.resumed = self.damaged = 0
+        self.damaged = 0
         self.messages: list[str] = []
         self._held: list[tuple[str, Arrays]] = []
         self._lock = threading.Lock()
@@ -248,15 +238,11 @@ class Checkpoint:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        try:
+        # An exception of the block is more important than one of writing.
+        with self._stack, contextlib.suppress(InputError):
             if kind is not None:
                 # After an interruption or error, write pending shards unless the run was short.
                 self._write_held()
-        except InputError:
-            # The original exception is more important.
-            pass
-        finally:
-            self._stack.close()
 
     def _look(self) -> None:
         if self._restart:
@@ -278,16 +264,7 @@ class Checkpoint:
             )
             self._write_manifest()
             return
-        form = manifest.get("form", 1)
-        if form != FORM:
-            raise InputError(
-                f"the unfinished run in {str(self.folder)!r} has counts in format {form}, but this version needs "
-                f"format {FORM}: use `restart=True` to discard it",
-                key="restart",
-            )
-        ours = {"mauvecl": VERSION, "verb": self.verb, **self._plain_study()}
-        theirs = {"mauvecl": manifest["mauvecl"], "verb": manifest["verb"], **manifest["study"]}
-        differing = differing_keys(ours, theirs)
+        differing = [key.removeprefix("study.") for key in differing_keys(self._manifest(), manifest)]
         if differing:
             raise InputError(
                 f"the unfinished run in {str(self.folder)!r} differs in {', '.join(differing)}: use the same study, or "
@@ -306,14 +283,11 @@ class Checkpoint:
             if _named(name, body) != digest:
                 raise ValueError
             with np.load(io.BytesIO(body)) as arrays:
-                shard = {key: arrays[key] for key in arrays.files}
+                return dict(arrays)
         except (OSError, ValueError, KeyError, zipfile.BadZipFile):
             with self._lock:
                 self.damaged += 1
             return None
-        with self._lock:
-            self.resumed += 1
-        return shard
 
     def put(self, name: str, shard: Arrays) -> None:
         """Keep a shard, and write it to disk once the run has lasted `patience_s`."""
@@ -367,11 +341,11 @@ class Checkpoint:
         with contextlib.suppress(OSError):
             self.folder.rmdir()
 
-    def _plain_study(self) -> dict[str, object]:
-        return dict(tomllib.loads(self.study.toml()))
+    def _manifest(self) -> dict[str, Any]:
+        return {"mauvecl": VERSION, "form": FORM, "verb": self.verb, "study": tomllib.loads(self.study.toml())}
 
     def _write_manifest(self) -> None:
-        manifest = {"mauvecl": VERSION, "form": FORM, "verb": self.verb, "study": self._plain_study()}
+        manifest = self._manifest()
         text = json.dumps(manifest | {"digest": _digest_of(manifest)}, indent=2)
         write_whole(self.folder / MANIFEST, text.encode())
 
@@ -392,12 +366,12 @@ def kept(checkpoint: Checkpoint | None, question: object, compute: Callable[[], 
 
 
 def _intact(manifest: Path) -> dict[str, Any] | None:
-    """Return the content of a manifest, or None if it is not an intact one of a checkpoint."""
+    """Return the content of a manifest without its digest, or None if it is not an intact one of a checkpoint."""
     try:
         content = json.loads(read_bytes(manifest, "manifest"))
-        is_whole = content["digest"] == _digest_of(content) and isinstance(content["study"], dict)
-        return dict(content) if is_whole and {"mauvecl", "verb"} <= content.keys() else None
-    except (InputError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        is_whole = content.pop("digest") == _digest_of(content) and isinstance(content["study"], dict)
+        return dict(content) if is_whole else None
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
         return None
 
 
@@ -407,5 +381,4 @@ def _named(name: str, body: bytes) -> bytes:
 
 
 def _digest_of(manifest: Mapping[str, object]) -> str:
-    content = {key: value for key, value in manifest.items() if key != "digest"}
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()

@@ -9,7 +9,7 @@ import pickle
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -157,7 +157,7 @@ class DaskWorkers:
                     # A task instead of scattered data, since the scheduler can repeat it if its worker is lost. Bytes,
                     # because a worker with other code might read and write a request differently.
                     content, key = pickle.dumps(task.request), f"mauvecl-request-{task.key}-{self._sends}"
-                    request_task = self._client.submit(_keep, content, key=key, workers=attempt.workers)
+                    request_task = self._client.submit(bytes, content, key=key, workers=attempt.workers)
                     self._given[task.key] = request_task, attempt.workers
                     if len(self._given) > MAX_REQUESTS:
                         del self._given[next(iter(self._given))]
@@ -339,8 +339,13 @@ def _client(where: str, distributed: Any) -> Iterator[Client]:
 
 
 def _local_cluster(n_workers: int, distributed: Any) -> Any:
-    """Start workers on this machine, each with its share of the cores."""
+    """Start workers on this machine, each with its share of the cores and with temporary certificates."""
     threads = max((os.cpu_count() or 1) // n_workers, 1)
+    try:
+        # A worker executes everything that the scheduler receives, so other users of the machine must not connect.
+        security = distributed.Security.temporary()
+    except ImportError as error:
+        raise missing_package("cryptography", "a cluster of this machine", "cluster") from error
     return distributed.LocalCluster(
         n_workers=n_workers,
         threads_per_worker=1,
@@ -348,7 +353,7 @@ def _local_cluster(n_workers: int, distributed: Any) -> Any:
         host="127.0.0.1",
         dashboard_address=None,
         scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
-        security=_private(distributed),
+        security=security,
         preload=__name__,
         memory_limit=0,
         silence_logs=logging.CRITICAL,
@@ -371,17 +376,6 @@ def _is_address(where: str) -> bool:
 SCHEMES = ("tcp", "tls", "ucx", "ucxx", "ws", "wss")
 
 
-def _private(distributed: Any) -> Any:
-    """Make temporary certificates, so that other users of the machine cannot connect.
-
-    A worker executes everything that the scheduler receives, with the rights of the user who started it.
-    """
-    try:
-        return distributed.Security.temporary()
-    except ImportError as error:
-        raise missing_package("cryptography", "a cluster of this machine", "cluster") from error
-
-
 LOGS = ("distributed", *(f"distributed.{part}" for part in ("client", "nanny", "worker", "scheduler", "core")))
 
 # Functions below run on a worker.
@@ -399,15 +393,8 @@ _engine: Engine | None = None
 _one_at_a_time = threading.Lock()
 
 
-def _keep(content: bytes) -> bytes:
-    return content
-
-
-@lru_cache(maxsize=4)
-def _request(content: bytes) -> Countable:
-    # A request keeps what it has computed for earlier shards.
-    request: Countable = pickle.loads(content)
-    return request
+#: Requests by their bytes; each keeps what it has computed for earlier shards.
+_request: Callable[[bytes], Countable] = lru_cache(maxsize=4)(pickle.loads)
 
 
 def _engine_here(device: str | None, threads: int) -> Engine:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import io
-import os
 import re
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host import VERSION
-from mauvecl.host.tables.files import UNFINISHED, check_folder, parsing, write_whole, writing
+from mauvecl.host.tables.files import check_folder, parsing, write_whole
 from mauvecl.runs.store import CALIBRATION, COMMON_DRAWS, NOMINAL, Store, StoredScene, exposure_attributes
 from mauvecl.schema.errors import InputError, missing_package
 
@@ -55,9 +53,7 @@ class Selection:
         InputError
             For an unknown array, an invalid range, a size above `MAX_BYTES`, or missing chunks.
         """
-        first, stop = rows or (0, store.rows)
-        if not 0 <= first < stop <= store.rows:
-            raise InputError.of("rows", (first, stop), f"a range within 0:{store.rows}")
+        first, stop = store.range_of(rows)
         chosen = [store.scene(name) for name in scenes] if scenes else store.scenes
         selection = cls(store, chosen, first, stop)
         size = sum((stop - first) * scene.row_bytes for scene in chosen)
@@ -115,20 +111,13 @@ def export(selection: Selection, path: str | Path, *, replace: bool = False) -> 
     if path.exists() and not (replace and path.is_file()):
         others = "another name, or `replace=True`" if path.is_file() else "the name of a file"
         raise InputError(f"export {str(path)!r} exists already: use {others}", key="file")
-    if path.suffix != ".fits":
-        # Written to memory first, because the HDF5 library aborts the process on a full disk.
-        packed = io.BytesIO()
+    # Written to memory first, because the HDF5 library aborts the process on a full disk.
+    packed = io.BytesIO()
+    if path.suffix == ".fits":
+        _fits(selection).writeto(packed, checksum=True)
+    else:
         _hdf5(selection, packed)
-        write_whole(path, packed.getbuffer(), shared=True)
-        return path
-    with writing(f"export {str(path)!r}", path, "a writable place with room", key="file"):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=UNFINISHED, dir=path.parent) as folder:
-            temporary = Path(folder) / path.name
-            _fits(selection).writeto(temporary, checksum=True)
-            with temporary.open("rb") as file:
-                os.fsync(file.fileno())
-            temporary.replace(path)
+    write_whole(path, packed.getbuffer(), shared=True)
     return path
 
 
@@ -185,11 +174,10 @@ def _image(selection: Selection, scene: StoredScene, table: str) -> ImageHDU:
     header["PS1_0"] = (table, "extension of the coordinates")
     header["PS1_1"] = ("COORDS", "column of the coordinates")
     header["PV1_1"], header["PV1_2"], header["PV1_3"] = 1, 1, 1
-    names = ["realisation"] if scene.frames is None else ["frame", "realisation"]
-    firsts = [selection.first] if scene.frames is None else [0, selection.first]
-    for number, (name, first) in enumerate(zip(names, firsts, strict=True), 2):
+    for number, name in enumerate(scene.dimensions[-2::-1], 2):
+        first = float(selection.first if name == "realisation" else 0)
         header[f"CTYPE{number}"], header[f"CNAME{number}"] = "LINEAR", name
-        header[f"CRPIX{number}"], header[f"CRVAL{number}"], header[f"CDELT{number}"] = 1.0, float(first), 1.0
+        header[f"CRPIX{number}"], header[f"CRVAL{number}"], header[f"CDELT{number}"] = 1.0, first, 1.0
     if scene.frames is not None:
         header["FRAMES"] = (",".join(map(str, scene.frames)), "numbers of the frames along axis 2")
     return hdu
@@ -232,7 +220,6 @@ def _hdf5(selection: Selection, place: io.BytesIO) -> None:
                 group["wavelength_nm"].make_scale("wavelength")
             data = group.create_dataset(scene.name, data=selection.rows(scene), fletcher32=True, chunks=True)
             data.attrs.update({"units": "DN", "amplitude": scene.amplitude})
-            names = ["realisation", *(["frame"] if scene.frames is not None else []), "pixel"]
-            for dimension, name in zip(data.dims, names, strict=True):
+            for dimension, name in zip(data.dims, scene.dimensions, strict=True):
                 dimension.label = name
-            data.dims[len(names) - 1].attach_scale(group["wavelength_nm"])
+            data.dims[data.ndim - 1].attach_scale(group["wavelength_nm"])

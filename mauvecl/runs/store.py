@@ -11,9 +11,7 @@ import hashlib
 import json
 import os
 import shutil
-import tempfile
 import threading
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -35,7 +33,6 @@ from mauvecl.study.study import Study, read_version
 
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
-    from mauvecl.study.cases import Case
 
 #: Units of the calibration per pixel and frame, which each star's group contains.
 CALIBRATION = {
@@ -65,49 +62,39 @@ def without(described: dict[str, Any], names: Sequence[str]) -> dict[str, Any]:
     return described | {"attributes": {key: value for key, value in attributes.items() if key not in names}}
 
 
-def describe(study: Study, scenes: Sequence[StoredScene], folder: Path) -> None:
-    """Write groups, descriptions of arrays and calibration of a store to a folder."""
-    import zarr
+def _describe(root: Any, scene: StoredScene, study: Study) -> None:
+    """Write the description of an array to its group, and with the quiescent array that of the star."""
     from zarr.codecs import Crc32cCodec
 
-    text, rows = study.toml(), study.run.realisations
-    with warnings.catch_warnings():
-        # Zarr warns of an empty folder.
-        warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)
-        root = zarr.open_group(folder, mode="w", zarr_format=3)
-        run: dict[str, Any] = signed(text) | {"seed": study.run.seed, "realisations": rows}
-        root.attrs.update(run | {"mauvecl": VERSION, "draws": COMMON_DRAWS, "throughput": NOMINAL})
-        for scene in scenes:
-            x, group = scene.expectation, root.require_group(scene.group)
-            if scene.name == "quiescent":
-                group.attrs.update({"star": scene.star, **scene.at})
-                group.attrs.update(exposure_attributes(x) | {"messages": messages_of([x])})
-                for name, unit in CALIBRATION.items():
-                    _values(group, name, np.asarray(getattr(x, name)), unit, ["pixel"])
-                if scene.frames is not None:
-                    _values(group, "frame", np.array(scene.frames), "", ["frame"])
-            if study.bulk.components:
-                n = x.n_frames if scene.frames is None else 1
-                gain = n * x.gain_dn_per_electron
-                for name, values in (
-                    ("source", gain * x.source_electrons),
-                    ("sky", gain * x.sky_electrons),
-                    *([("neighbours", gain * x.neighbour_electrons)] if x.neighbour_electrons.any() else []),
-                    ("noise", np.sqrt(x.variance_dn2 * n / x.n_frames)),
-                ):
-                    _values(group, f"{scene.name}-{name}", values, "DN", ["pixel"])
-            dimensions = ["realisation", *(["frame"] if scene.frames is not None else []), "pixel"]
-            array = group.create_array(
-                scene.name,
-                shape=(rows, *scene.row),
-                chunks=(scene.chunk_rows(rows), *scene.row),
-                dtype=scene.dtype,
-                compressors=[Crc32cCodec()],
-                fill_value=0,
-                dimension_names=dimensions,
-            )
-            origin: dict[str, Any] = {"star": scene.star, "provenance": dict(x.provenance)} | signed(text)
-            array.attrs.update(origin | {"units": "DN", "amplitude": scene.amplitude})
+    x, group, signature = scene.expectation, root.require_group(scene.group), signed(study.toml())
+    if scene.name == "quiescent":
+        group.attrs.update({"star": scene.star, **scene.at})
+        group.attrs.update(exposure_attributes(x) | {"messages": messages_of([x])})
+        for name, unit in CALIBRATION.items():
+            _values(group, name, np.asarray(getattr(x, name)), unit, ["pixel"])
+        if scene.frames is not None:
+            _values(group, "frame", np.array(scene.frames), "", ["frame"])
+    if study.bulk.components:
+        n = x.n_frames if scene.frames is None else 1
+        gain = n * x.gain_dn_per_electron
+        for name, values in (
+            ("source", gain * x.source_electrons),
+            ("sky", gain * x.sky_electrons),
+            *([("neighbours", gain * x.neighbour_electrons)] if x.neighbour_electrons.any() else []),
+            ("noise", np.sqrt(x.variance_dn2 * n / x.n_frames)),
+        ):
+            _values(group, f"{scene.name}-{name}", values, "DN", ["pixel"])
+    array = group.create_array(
+        scene.name,
+        shape=(study.run.realisations, *scene.row),
+        chunks=(scene.chunk_rows(study.run.realisations), *scene.row),
+        dtype=scene.dtype,
+        compressors=[Crc32cCodec()],
+        fill_value=0,
+        dimension_names=scene.dimensions,
+    )
+    origin: dict[str, Any] = {"star": scene.star, "provenance": dict(x.provenance)} | signature
+    array.attrs.update(origin | {"units": "DN", "amplitude": scene.amplitude})
 
 
 def exposure_attributes(x: Expectation) -> dict[str, float | str]:
@@ -137,7 +124,7 @@ def study_in(place: Path) -> str | None:
         attributes = json.loads(read_bytes(place, "description"))["attributes"]
         text = attributes["study"]
         return text if signed(text).items() <= attributes.items() else None
-    except (InputError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
         return None
 
 
@@ -169,6 +156,11 @@ class StoredScene:
         return (n_pixel,) if self.frames is None else (len(self.frames), n_pixel)
 
     @property
+    def dimensions(self) -> list[str]:
+        """Names of the array's dimensions."""
+        return ["realisation", *(["frame"] if self.frames is not None else []), "pixel"]
+
+    @property
     def dtype(self) -> np.dtype[Any]:
         """Type of a value: 16 bits for single frames of a 16-bit ADC, 32 bits for sums."""
         x = self.expectation
@@ -193,20 +185,6 @@ ARRAY_COLUMNS = (
     Column("shape", heading="shape", format=lambda shape: " x ".join(map(str, shape))),
     Column("type", heading="type"),
 )
-
-
-def scenes(cases: Sequence[Case]) -> list[StoredScene]:
-    """Return the arrays of the cases of a store: every star and sweep value, without and with each flare."""
-    stored = []
-    for number, case in enumerate(cases, 1):
-        chosen = case.study.bulk.chosen(case.quiet.n_frames)
-        # The amplitude is an attribute of the flare's array.
-        swept = {name: value for name, value in case.at.items() if name != "amplitude"}
-        name = full_label(case.label, swept)
-        stored.append(StoredScene(f"star-{number}", "quiescent", name, 0.0, case.quiet, chosen, swept))
-        for k, (amplitude, x) in enumerate(zip(case.amplitudes, case.flares, strict=True), 1):
-            stored.append(StoredScene(f"star-{number}", f"flare-{k}", name, amplitude, x, chosen, swept))
-    return stored
 
 
 DIGESTS = "digests.txt"
@@ -283,8 +261,17 @@ class Store:
 
     @cached_property
     def scenes(self) -> list[StoredScene]:
-        """Arrays of spectra."""
-        return scenes(cases(self.study))
+        """Arrays of spectra: every star and sweep value, without and with each flare."""
+        stored = []
+        for number, case in enumerate(cases(self.study), 1):
+            chosen = case.study.bulk.chosen(case.quiet.n_frames)
+            # The amplitude is an attribute of the flare's array.
+            swept = {name: value for name, value in case.at.items() if name != "amplitude"}
+            name = full_label(case.label, swept)
+            stored.append(StoredScene(f"star-{number}", "quiescent", name, 0.0, case.quiet, chosen, swept))
+            for k, (amplitude, x) in enumerate(zip(case.amplitudes, case.flares, strict=True), 1):
+                stored.append(StoredScene(f"star-{number}", f"flare-{k}", name, amplitude, x, chosen, swept))
+        return stored
 
     def scene(self, path: str) -> StoredScene:
         """Return an array by path, such as ``star-1/flare-2``."""
@@ -302,6 +289,13 @@ class Store:
     def n_bytes(self) -> int:
         """Size of all spectra, bytes."""
         return sum(self.rows * scene.row_bytes for scene in self.scenes)
+
+    def range_of(self, rows: tuple[int, int] | None) -> tuple[int, int]:
+        """Return a half-open range of realisations, by default all; raises InputError if the store has no such rows."""
+        first, stop = rows or (0, self.rows)
+        if not 0 <= first < stop <= self.rows:
+            raise InputError.of("rows", (first, stop), f"a range within 0:{self.rows}")
+        return first, stop
 
     def chunks(self, first: int = 0, stop: int | None = None) -> Iterator[Chunk]:
         """Yield the chunks of all scenes that contain rows `first` to `stop - 1`; all chunks by default."""
@@ -365,10 +359,15 @@ class Store:
 
     def description(self) -> dict[str, bytes]:
         """Return the content of every file except spectra, by path."""
-        with tempfile.TemporaryDirectory() as folder:
-            describe(self.study, self.scenes, Path(folder))
-            files = [p for p in Path(folder).rglob("*") if p.is_file()]
-            return {str(p.relative_to(folder)): p.read_bytes() for p in files}
+        import zarr
+
+        files: dict[str, Any] = {}
+        root = zarr.open_group(zarr.storage.MemoryStore(files), mode="w", zarr_format=3)
+        run: dict[str, Any] = signed(self.study.toml()) | {"seed": self.study.run.seed, "realisations": self.rows}
+        root.attrs.update(run | {"mauvecl": VERSION, "draws": COMMON_DRAWS, "throughput": NOMINAL})
+        for scene in self.scenes:
+            _describe(root, scene, self.study)
+        return {name: content.to_bytes() for name, content in files.items()}
 
     def read_digests(self) -> None:
         """Read the digests of written chunks; incomplete lines are ignored."""

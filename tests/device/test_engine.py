@@ -192,17 +192,6 @@ def test_moments_of_raw_spectra_follow_model(engine: Engine, payload: str) -> No
     assert abs(ratio.mean() - 1) < 5 * np.sqrt(2 / n / z.size)
 
 
-def test_frames_and_stacks_agree(engine: Engine) -> None:
-    """Compare means and variances of both modes, far from the rails, within 5 standard errors."""
-    (quiet, *_), _ = case("frames")
-    n = 20_000
-    frames, stacked = (engine.realise(quiet, count=n, seed=s, mode=m) for s, m in ((1, "frames"), (2, "stacked")))
-    difference = frames.mean(axis=0) - stacked.mean(axis=0)
-    assert np.abs(difference / np.sqrt(2 * quiet.variance_dn2 / n)).max() < 5.5
-    total = frames.var(axis=0).sum() / stacked.var(axis=0).sum()
-    assert abs(total - 1) < 5 * np.sqrt(4 / n / quiet.wavelength_nm.size)
-
-
 @pytest.mark.long
 def test_neighbours_are_uncorrelated(engine: Engine) -> None:
     """Neighbours in pixel, realisation, seed and frame: |z| < 5 for sums of 3e7 products."""

@@ -134,12 +134,12 @@ def test_run_succeeds_on_full_disk(filled: tuple[Path, str], tmp_path: Path) -> 
 import os
 from pathlib import Path
 os.environ["MAUVECL_BUILD_LIMIT_S"] = "0"
-write_bytes, write_text = Path.write_bytes, Path.write_text
-def full(path, *rest, **more):
-    if "store" in path.parts:
+opened = Path.open
+def full(path, mode="r", *rest, **more):
+    if "store" in path.parts and "w" in mode:
         raise OSError({errno.ENOSPC}, "No space left on device")
-    return (write_bytes if isinstance(rest[0], bytes) else write_text)(path, *rest, **more)
-Path.write_bytes = Path.write_text = full
+    return opened(path, mode, *rest, **more)
+Path.open = full
 """
     assert run(tmp_path, before)["digest"] == filled[1]
     assert files_of(tmp_path) == []

@@ -63,14 +63,18 @@ def test_known_answers_are_those_of_the_numpy_reference() -> None:
 
 def few_cases(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
     """Restrict the self-test to a few cases, since building their kernels is slow."""
-    monkeypatch.setattr(selftest, "CASES", {name: selftest.CASES[name] for name in names})
+    for cases in ("CASES", "STARE_CASES"):
+        monkeypatch.setattr(selftest, cases, {k: v for k, v in getattr(selftest, cases).items() if k in names})
 
 
 # A joint draw and separate ones; square roots, whose errors have one sign, need two cases.
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("weakness", "cases"),
-    [(unfused, ("stack", "priors, frames")), (rough_roots, ("apart, tables", "marginalised, the sky unknown"))],
+    [
+        (unfused, ("stack", "priors, frames", "skewed stares")),
+        (rough_roots, ("apart, tables", "marginalised, the sky unknown")),
+    ],
 )
 def test_weaker_promise_is_checked_and_marked(
     monkeypatch: pytest.MonkeyPatch, weakness: Callable[[str], str], cases: tuple[str, ...]

@@ -1,6 +1,7 @@
 """Stores of raw spectra: content, verification, and recovery."""
 
 import fcntl
+import itertools
 import json
 import os
 import random
@@ -10,6 +11,7 @@ import subprocess
 import time
 import tomllib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +25,7 @@ from astropy.wcs import WCS
 from commands import run
 from marks import long_but
 from refusals import refused
-from stores import CHUNK, LAST, Painter, flip, forked, full_after, killed, study, tree
+from stores import CHUNK, LAST, PAINTER, flip, forked, full_after, killed, killed_at, study, tree
 
 from mauvecl import Engine, Study, bulk
 from mauvecl.runs.store import Store
@@ -32,7 +34,7 @@ from mauvecl.runs.store import Store
 @pytest.fixture(scope="module")
 def painted(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     path = tmp_path_factory.mktemp("painted") / "frames.zarr"
-    bulk.realise(study(1000), path, Painter())  # type: ignore[arg-type]
+    bulk.realise(study(1000), path, PAINTER)
     return tree(path)
 
 
@@ -204,18 +206,19 @@ def test_random_kills_lose_nothing(
     """Kill a run at random moments, within about the time that it takes, and resume it; files have the same bits."""
     described_once(study(1000))
     path, kills, moments = tmp_path / "frames.zarr", 0, random.Random(5)
+    paint = partial(bulk.realise, study(1000), path, PAINTER)
     began = time.monotonic()
-    killed(forked(lambda: bulk.realise(study(1000), path, Painter())))  # type: ignore[arg-type]
+    killed(forked(paint))
     takes = time.monotonic() - began
     while kills < 30:
         if path.exists() and tree(path) == painted:
             # A store that is finished after many kills: the next one begins.
             shutil.rmtree(path)
-        child = forked(lambda: bulk.realise(study(1000), path, Painter()))  # type: ignore[arg-type]
+        child = forked(paint)
         time.sleep(moments.uniform(0.0, takes))
         os.kill(child, signal.SIGKILL)
         kills += killed(child)
-    bulk.realise(study(1000), path, Painter())  # type: ignore[arg-type]
+    paint()
     assert tree(path) == painted
     assert bulk.verify(path) == []
 
@@ -224,33 +227,17 @@ def test_random_kills_lose_nothing(
 def test_kill_at_every_step_of_writing_loses_nothing(tmp_path: Path, described_once: Callable[[Study], None]) -> None:
     """Kill before each fsync, rename and line of digests."""
     described_once(study(200))
-    step = 0
-    while True:
-        path, counted = tmp_path / f"{step}.zarr", iter(range(step + 1))
-
-        def mortal(work: Callable[..., Any], counted: Any = counted, last: int = step) -> Callable[..., Any]:
-            def wrapped(*given: Any) -> Any:
-                if next(counted, last) == last:
-                    os.kill(os.getpid(), signal.SIGKILL)
-                return work(*given)
-
-            return wrapped
-
-        def run(path: Path = path, mortal: Any = mortal) -> None:
-            os.fsync = mortal(os.fsync)
-            Path.replace = mortal(Path.replace)  # type: ignore[method-assign]
-            Store.note = mortal(Store.note)  # type: ignore[method-assign]
-            bulk.realise(study(200), path, Painter())  # type: ignore[arg-type]
-
-        ended = not killed(forked(run))
-        bulk.realise(study(200), path, Painter())  # type: ignore[arg-type]
-        if step == 0:
-            first = tree(path)
+    first: dict[str, bytes] = {}
+    for step in itertools.count():
+        path = tmp_path / f"{step}.zarr"
+        paint = partial(bulk.realise, study(200), path, PAINTER)
+        was_killed = killed_at(step, paint, (os, "fsync"), (Path, "replace"), (Store, "note"))
+        paint()
+        first = first or tree(path)
         assert tree(path) == first
         shutil.rmtree(path)
-        if ended:
+        if not was_killed:
             break
-        step += 1
     assert step > 30
 
 
@@ -261,9 +248,9 @@ def test_full_disk_raises_and_is_resumed(
     with monkeypatch.context() as patch:
         full_after(300_000, patch)
         with refused("file", "No space left on device"):
-            bulk.realise(study(1000), path, Painter())  # type: ignore[arg-type]
+            bulk.realise(study(1000), path, PAINTER)
     assert len(list(path.glob("star-1/*/c/*/0"))) > 5, "what was written before is kept"
-    bulk.realise(study(1000), path, Painter())  # type: ignore[arg-type]
+    bulk.realise(study(1000), path, PAINTER)
     assert tree(path) == painted
 
 
@@ -272,23 +259,23 @@ def test_full_or_read_only_file_system_raises(small_disk: Path, painted: dict[st
     filler = small_disk / "filler"
     filler.write_bytes(bytes(1_400_000))
     with refused("file", "No space left on device"):
-        bulk.realise(study(1000), path, Painter())  # type: ignore[arg-type]
+        bulk.realise(study(1000), path, PAINTER)
     filler.unlink()
     subprocess.run(["mount", "-o", "remount,ro", small_disk], check=True)
     with refused("file", "Read-only file system"):
-        bulk.realise(study(1000), path, Painter())  # type: ignore[arg-type]
+        bulk.realise(study(1000), path, PAINTER)
     with refused("store", "Read-only file system"):
-        bulk.realise(study(1000), small_disk / "other.zarr", Painter())  # type: ignore[arg-type]
+        bulk.realise(study(1000), small_disk / "other.zarr", PAINTER)
     subprocess.run(["mount", "-o", "remount,rw", small_disk], check=True)
-    bulk.realise(study(1000), path, Painter())  # type: ignore[arg-type]
+    bulk.realise(study(1000), path, PAINTER)
     assert tree(path) == painted
 
 
 def test_no_chunk_is_being_written_when_a_stopped_run_has_ended(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, painted: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Stop after the first chunk, while threads write others: the store stays locked until they have ended."""
-    write, is_locked = Store.write, list[bool]()
+    path, write, is_locked = tmp_path / "frames.zarr", Store.write, list[bool]()
 
     def slow(store: Store, chunk: Any, rows: Any) -> None:
         time.sleep(0.2)
@@ -305,25 +292,15 @@ def test_no_chunk_is_being_written_when_a_stopped_run_has_ended(
         if done:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(Store, "write", slow)
-    with pytest.raises(KeyboardInterrupt):
-        bulk.realise(study(1000), tmp_path / "frames.zarr", Painter(), progress=stop)  # type: ignore[arg-type]
+    with monkeypatch.context() as patch:
+        patch.setattr(Store, "write", slow)
+        with pytest.raises(KeyboardInterrupt):
+            bulk.realise(study(1000), path, PAINTER, progress=stop)
     assert all(is_locked)
-    assert len(is_locked) == len(Store.open(tmp_path / "frames.zarr").digests) > 4
-
-
-def test_store_stopped_by_progress_is_resumed(tmp_path: Path, painted: dict[str, bytes]) -> None:
-    path = tmp_path / "frames.zarr"
-
-    def stop(done: int, total: int) -> None:
-        if done > total // 2:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        bulk.realise(study(1000), path, Painter(), progress=stop)  # type: ignore[arg-type]
+    assert len(is_locked) == len(Store.open(path).digests) > 4
     seen: list[int] = []
-    bulk.realise(study(1000), path, Painter(), progress=lambda done, total: seen.append(done))  # type: ignore[arg-type]
-    assert seen[0] > 1000, "it went on from where it was"
+    bulk.realise(study(1000), path, PAINTER, progress=lambda done, total: seen.append(done))
+    assert seen[0] >= 64 * len(is_locked), "it went on from where it was"
     assert seen[-1] == 2000
     assert tree(path) == painted
 

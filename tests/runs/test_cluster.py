@@ -15,6 +15,7 @@ from contextlib import contextmanager, nullcontext, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import psutil
@@ -131,29 +132,12 @@ def test_error_on_a_worker_raises(workers: DaskWorkers) -> None:
     assert pool.standing.retries == 0
 
 
-class Silent:
-    """Dask client that never answers and keeps its futures."""
-
-    cluster, status = None, "running"
-
-    def submit(self, *given: Any, **how: Any) -> Any:
-        return Silent()
-
-    def nthreads(self) -> dict[str, int]:
-        return {"one": 1, "two": 1}
-
-    def add_done_callback(self, call: Any) -> None:
-        pass
-
-    def cancel(self, futures: Any) -> None:
-        raise TimeoutError
-
-
 def test_waiting_threads_are_woken_at_the_end(scene: list[Expectation], monkeypatch: pytest.MonkeyPatch) -> None:
     """Check that threads which wait for shards, spectra or each other end at once, whatever Dask does."""
-    monkeypatch.setattr("mauvecl.runs.cluster._client", lambda where, distributed: nullcontext(Silent()))
-    monkeypatch.setattr(Silent, "run", lambda *given, **how: {}, raising=False)
-    monkeypatch.setattr(Silent, "wait_for_workers", lambda *given, **how: None, raising=False)
+    silent = Mock(cluster=None, status="running", **{"run.return_value": {}, "cancel.side_effect": TimeoutError})
+    silent.nthreads.return_value = {"one": 1, "two": 1}
+    silent.submit.side_effect = lambda *given, **how: Mock()
+    monkeypatch.setattr("mauvecl.runs.cluster._client", lambda where, distributed: nullcontext(silent))
     workers = DaskWorkers("silent")
     monkeypatch.setattr(DaskWorkers, "count", 2)
     pool = Pool(workers)

@@ -10,20 +10,20 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 from answers import N, same, same_snr, small
 from commands import run
 from refusals import failed, refused
-from scenes import instrument, star
+from scenes import FIRST_STARE, N_STARES, flaring_stares, instrument, star
 from stores import flip, full_after
 
 import mauvecl
-from mauvecl import Comparison, DaskWorkers, Detection, Engine, Expectation, Linear, LocalWorkers, Pool, Processes
+from mauvecl import Comparison, DaskWorkers, Detection, Engine, Expectation, Linear, LocalWorkers, Pool, Stare, Stares
 from mauvecl.detection import requests
 from mauvecl.runs import checkpoint as shards
 from mauvecl.runs import pool as pools
@@ -83,17 +83,41 @@ def test_shards_of_every_kind_of_request_join(engine: Engine) -> None:
         "seed": 1,
         "statistics": ("chi2_pair", "matched"),
         "comparison": Comparison.of("stack:3", "estimated"),
-        "processes": Processes(jitter=mauvecl.Uniform(0.0, 0.05)),
+        "processes": mauvecl.Processes(jitter=mauvecl.Uniform(0.0, 0.05)),
     }
     pool = Pool(Shuffled(engine, 4))
     same(pool.detect(quiet, flares, **how), engine.detect(quiet, flares, **how))
     assert pool.standing.of == 2 * 3
 
 
+@dataclass(frozen=True)
+class Largest:
+    """Reduction to the largest value of each stare."""
+
+    adds: ClassVar[bool] = False
+
+    def __call__(self, values: np.ndarray, first: int) -> dict[str, np.ndarray]:
+        largest = values.max(axis=(-2, -1)).reshape(-1, values.shape[-3]).T
+        return {"largest": largest, "number": first + np.arange(len(largest))}
+
+
+@dataclass(frozen=True)
+class Above:
+    """Reduction to the number of frames above a level."""
+
+    level: float
+    adds: ClassVar[bool] = True
+
+    def __call__(self, values: np.ndarray, first: int) -> dict[str, np.ndarray]:
+        return {"frames": np.count_nonzero(values > self.level, axis=(-3, -2))}
+
+
 @pytest.mark.long
-def test_devices_of_different_form_give_one_answer(scene: list[Expectation], engine: Engine) -> None:
-    """Share the work between engines with 16 realisations and with 1 per work-item."""
-    quiet, *flares = scene
+@pytest.mark.parametrize("method", ["pixels", "cumulants"])
+@pytest.mark.parametrize("reduction", [None, Largest(), Above(500.0)])
+def test_shards_of_stares_join_to_the_same_bits(engine: Engine, method: Any, reduction: Any) -> None:
+    """Compare two engines of different form, with requests in the form in which they travel, with one call."""
+    asked = flaring_stares(method, reduction=reduction)
     widths, counted = iter((16, 1)), set()
 
     class Noted(Engine):
@@ -102,10 +126,21 @@ def test_devices_of_different_form_give_one_answer(scene: list[Expectation], eng
             return super().count(*given, **more)
 
     workers = LocalWorkers([None, "0"], make=lambda device, progress: Noted(device, width=next(widths)))
-    found = Pool(workers).detect(quiet, flares, realisations=N, seed=2)
+    pool = Pool(workers)
+    found = pool.stares(pickle.loads(pickle.dumps(asked)))
     workers.close()
     assert len(counted) == 2, "both worked"
-    same(found, engine.detect(quiet, flares, realisations=N, seed=2))
+    assert pool.standing.shards == len(shards.shards(asked)) == 5, "cut at multiples of 64, and where the word ends"
+    whole = Stares(engine.open_device).frames(
+        asked.components, asked.stare, asked.flare, amplitudes=asked.amplitudes,
+        first=FIRST_STARE, count=N_STARES, seed=5, method=method,
+    )  # fmt: skip
+    if reduction is None:
+        np.testing.assert_array_equal(found["values"], np.moveaxis(whole, 0, 1))
+    else:
+        for name, values in reduction(whole, FIRST_STARE).items():
+            np.testing.assert_array_equal(found[name], values)
+    assert (whole[1] != whole[0]).any()
 
 
 class Failing:
@@ -214,7 +249,8 @@ def test_fingerprints_distinguish_requests(scene: list[Expectation]) -> None:
     def asked(flares: Sequence[Expectation] = flares, seed: int = 5, **how: Any) -> requests.DetectRequest:
         return requests.DetectRequest.of(quiet, tuple(flares), N, seed, **{"statistics": ("chi2", "matched")} | how)
 
-    base = asked()
+    base, stares = asked(), flaring_stares()
+    unlit, how = replace(stares, flare=None, amplitudes=None), {"jitters": {"light": 0.01}}
     others = [
         asked(seed=6),
         asked(statistics=("chi2",)),
@@ -222,16 +258,29 @@ def test_fingerprints_distinguish_requests(scene: list[Expectation]) -> None:
         asked(flares[::-1]),
         asked([flares[0], brighter]),
         asked(comparison=Comparison.of("exposure")),
-        asked(processes=Processes(jitter=mauvecl.Uniform(0.0, 0.01))),
+        asked(processes=mauvecl.Processes(jitter=mauvecl.Uniform(0.0, 0.01))),
         asked(mode="frames"),
         *(asked(nuisances={"dark": sd}) for sd in (0.1, 0.2)),
+        stares,
+        replace(stares, seed=6),
+        replace(stares, method="pixels"),
+        replace(stares, stare=Stare.of(30.0, **how, offsets={"temperature": 0.1}, temperature_c=np.nextafter(21, 22))),
+        replace(stares, stare=Stare.of(30.0, **how, offsets={"star": 0.1}, temperature_c=21.0)),
+        replace(stares, components=replace(stares.components, weights=2 * stares.components.weights)),
+        replace(stares, flare=np.nextafter(stares.flare, 9)),
+        replace(stares, amplitudes=stares.amplitudes[:1]),
+        *(replace(stares, reduction=one) for one in (Largest(), Above(1.0), Above(2.0))),
+        # Rows belong to stares: from another first one on they mean something else.
+        replace(stares, start=stares.start + 64),
+        unlit,
     ]
     names = [shards.fingerprint(one) for one in (base, *others)]
     assert len(set(names)) == len(names)
-    assert shards.fingerprint(replace(others[-1])) == names[-1]
     reported = replace(quiet, provenance={"from": "elsewhere"}, messages=())
     for same_one in (replace(base, realisations=7), replace(base, quiet=reported), pickle.loads(pickle.dumps(base))):
         assert shards.fingerprint(same_one) == names[0]
+    assert shards.fingerprint(pickle.loads(pickle.dumps(stares))) == shards.fingerprint(stares)
+    assert shards.fingerprint(replace(unlit, start=0, realisations=7)) == names[-1]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(shards, "FORM", 1)
         assert shards.fingerprint(base) != names[0], "shards of an older form are not read"
@@ -353,7 +402,7 @@ def test_counts_of_another_form_raise(begun: Path, engine: Engine) -> None:
     manifest = json.loads(manifest_of(begun))
     old = {key: value for key, value in manifest.items() if key not in ("form", "digest")}
     change(begun, json.dumps(old | {"digest": hashlib.sha256(json.dumps(old, sort_keys=True).encode()).hexdigest()}))
-    with refused("restart", "1", "2", "`restart=True`"):
+    with refused("restart", "form", "`restart=True`"):
         at_work(begun, engine, resume=True)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from answers import expectations
 from commands import run
-from stores import Painter, study
+from stores import PAINTER, study
 
 from mauvecl import Engine, Study, bulk, read_frames
 from mauvecl.observations import frame_files
@@ -59,7 +59,6 @@ def _written(folder: Path, asked: Study, engine: Engine, ending: str) -> Path:
     return folder / f"frames.{ending}"
 
 
-PAINTER = Painter()
 #: Rows of the store.
 ROWS = 20
 

@@ -1,38 +1,18 @@
 """Stores under attack: wrong studies, other people's files, two processes, absurd sizes."""
 
 import json
-import os
 import shutil
-import signal
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
 from commands import run
-from numpy.typing import NDArray
 from refusals import refused
-from stores import CHUNK, Painter, flip, forked, killed, locked, study, tree
+from stores import CHUNK, PAINTER, flip, killed_at, locked, study, tree
 
 from mauvecl import bulk
 from mauvecl.runs.store import Store
-
-
-class Seeded(Painter):
-    """Painter of rows that also contain their seed."""
-
-    def realise(
-        self, x: Any, *, start: int, count: int, seed: int, out: NDArray[Any] | None = None, **how: Any
-    ) -> NDArray[Any]:
-        rows = super().realise(x, start=start, count=count, seed=seed) ^ np.uint16(seed)
-        if out is None:
-            return rows
-        out[:] = rows
-        return out
-
-
-PAINTER: Any = Seeded()
 
 
 @pytest.fixture
@@ -163,21 +143,9 @@ def test_kill_during_removal_is_recovered(made: Path, tmp_path: Path) -> None:
     other = study(run={"seed": 3})
     bulk.realise(other, tmp_path / "fresh.zarr", PAINTER)
     for step in (0, 3, 9, 14):
-        path, counted = tmp_path / f"{step}.zarr", iter(range(step))
+        path = tmp_path / f"{step}.zarr"
         shutil.copytree(made, path)
-
-        def run(path: Path = path, counted: Any = counted) -> None:
-            unlink = Path.unlink
-
-            def mortal(self: Path, missing_ok: bool = False) -> None:
-                if next(counted, None) is None:
-                    os.kill(os.getpid(), signal.SIGKILL)
-                unlink(self, missing_ok)
-
-            Path.unlink = mortal  # type: ignore[method-assign]
-            bulk.realise(other, path, PAINTER, restart=True)
-
-        assert killed(forked(run))
+        assert killed_at(step, partial(bulk.realise, other, path, PAINTER, restart=True), (Path, "unlink"))
         with refused("store", "run.seed"):
             bulk.realise(other, path, PAINTER)
         bulk.realise(other, path, PAINTER, restart=True)
