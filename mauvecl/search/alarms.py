@@ -97,7 +97,8 @@ def alarms(
     `templates` are those from which the survey's bank and components are made. `energy` returns the logarithm of the
     energy per second of equivalent duration, and its derivative, for the logarithm of the temperature.
     """
-    search = _StareSearch(SummedStare(survey, templates, np.asarray(survey.net(sums[None])[0], np.float64)), threshold)
+    net = np.asarray(survey.frames.net(sums[None])[0], np.float64)
+    search = _StareSearch(SummedStare(survey, templates, net), threshold)
     search.run()
     return sorted(_measured_alarms(search, energy), key=lambda alarm: -alarm.rho)
 
@@ -254,7 +255,7 @@ class _StareSearch:
         if not self.found:
             return left
         noise = self.sums.noise(self.thetas, light)
-        base = self.sums.covariance
+        base = self.sums.survey.covariance
         excess = np.einsum("tkk->t", np.linalg.solve(base, noise)) / base.shape[1]
         loud = excess > 1.01
         if not loud.any():

@@ -23,15 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.flares.frames import STEADY, Components
-from mauvecl.flares.stare import select_frames
 from mauvecl.flares.stare_scene import Method, StaresRequest, method_for
 from mauvecl.noise.unknowns import Processes
 from mauvecl.schema.columns import Column
-from mauvecl.search.search import Search, subtract_known
 
 if TYPE_CHECKING:
     from mauvecl.search.flare_fits import FittedFlares, SingleFlareFit
-    from mauvecl.search.search import Survey, Trend
+    from mauvecl.search.search import Search, SearchedFrames, Survey
     from mauvecl.search.templates import Bank
 
 Float = NDArray[np.float64]
@@ -232,8 +230,7 @@ def _search_near(survey: Survey, reaches: Sequence[_Reach]) -> tuple[Search, int
     part = slice(*(int(k) for k in np.searchsorted(stare.start_s, ends)))
     near = {width for reach in reaches for width in reach.half_widths_s}
     bank = replace(survey.bank, half_widths_s=tuple(sorted(near)))
-    curves = None if survey.curves is None else survey.curves[:, part]
-    return Search(bank, select_frames(stare, part), curves, survey.variance[part]), part.start
+    return survey.frames.part(part).search(bank), part.start
 
 
 def _filters(search: Search, seen: Sequence[_NearbyTemplates]) -> dict[int, tuple[NDArray[np.int64], Single]]:
@@ -340,25 +337,20 @@ class Injections:
         first = min(part.start for part in reached)
         window = slice(first, max(part.stop for part in reached))
         start = (1 + position) * NUMBERS
-        stare = select_frames(survey.stare, window)
+        frames = survey.frames.part(window)
         injecting = CriticalAmplitudes(
             tuple(replace(site, first=site.first - first) for site in sites),
             self.threshold,
             survey.bank.directions,
             self.response,
             self.photons,
-            survey.known[window].astype(np.float32),
-            stare.start_s,
-            stare.frame_s,
-            survey.variance[window],
-            None if survey.curves is None else survey.curves[:, window],
+            replace(frames, known=frames.known.astype(np.float32)),
             start,
             refit,
-            None if survey.trend is None else survey.trend.part(window),
         )
         return StaresRequest(
             self.quiescent,
-            stare,
+            frames.stare,
             self.draws,
             self.seed,
             start=start,
@@ -375,19 +367,14 @@ class CriticalAmplitudes:
 
     adds: ClassVar[bool] = False
 
-    sites: tuple[InjectionSite, ...]  # in these frames
+    sites: tuple[InjectionSite, ...]  # in the frames
     threshold: float
     directions: Float  # of the bank, shape (n_temperature, n_sum)
     response: Float  # see `Injections.response`
     photons: Float  # see `Injections.photons`
-    known: Single  # mean of frames without a flare, shape (n_frame, n_sum)
-    start_s: Float  # shape (n_frame,)
-    frame_s: float
-    variance: Float  # of each frame's sums, as in the search, shape (n_frame,)
-    curves: Float | None  # shape (n_curve, n_frame)
+    frames: SearchedFrames
     start: int  # number of the first stare
     refit: Refit | None = None  # flares to fit
-    trend: Trend | None = None  # effect of unknowns on these frames beyond first order
 
     def __call__(self, values: Single, first: int, glow: Single) -> dict[str, NDArray[Any]]:
         """Return the smallest detected amplitude of each flare, (n_stare, n_half_width), and fits if requested.
@@ -415,15 +402,16 @@ class CriticalAmplitudes:
     def frame_noise(self, values: Single, glow: Single) -> FrameNoise:
         """Prepare the random part of some stares."""
         n_sum = values.shape[2]
-        noise = np.moveaxis(subtract_known(values, self.known, self.trend), 2, 0)
+        noise = np.moveaxis(self.frames.net(values), 2, 0)
         own, light = np.ascontiguousarray(np.moveaxis(glow[:, :, :n_sum], 2, 0)), glow[:, :, n_sum]
         return FrameNoise(_multiple(noise, NOISE_STEP).astype(np.float64), own, light if light.any() else None)
 
     def values(self, site: InjectionSite, drawn: FrameNoise) -> tuple[Single, Single, Single]:
         """Return a, b and c of the module's formula, shapes (n_temperature, n_draw or 1, n_filter)."""
         filters, here, mean = site.weights, site.frames, drawn.mean(site)
-        start, width = self.start_s[here], site.half_width_s
-        shining = (start > site.peak_s - width - self.frame_s) & (start < site.peak_s + GLOW * width)
+        stare, width = self.frames.stare, site.half_width_s
+        since = stare.start_s[here] - site.peak_s
+        shining = (since > -width - stare.frame_s) & (since < GLOW * width)
         ends = np.flatnonzero(shining)[[0, -1]] if shining.any() else np.array([0, -1])
         lit = slice(int(ends[0]), int(ends[1]) + 1)
         own = drawn.own[:, :, here][:, :, lit] * np.sqrt(np.maximum(site.mean[lit], 0))
@@ -476,15 +464,8 @@ class CriticalAmplitudes:
             alarm = value >= self.threshold
             if not alarm.any():
                 continue
-            here, which = site.frames, template[alarm]
-            recovered = refit.fit.run(
-                self.sums(site, drawn, row[alarm])[:, 0],
-                self.start_s[here],
-                peak_s=site.peaks_s[which],
-                half_width_s=site.widths_s[which],
-                variance=self.variance[here],
-                curves=None if self.curves is None else self.curves[:, here],
-            )
+            sums, which = self.sums(site, drawn, row[alarm])[:, 0], template[alarm]
+            recovered = refit.fit.run(sums, self.frames.part(site.frames), site.peaks_s[which], site.widths_s[which])
             for name, values in refit.compared(recovered, row[alarm], site).items():
                 estimates[name][d, alarm] = values
         return estimates
