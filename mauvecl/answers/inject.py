@@ -25,7 +25,7 @@ from mauvecl.schema.physical import DAY_S
 from mauvecl.search.completeness import SMALL, InjectedCompleteness, frame_signal
 from mauvecl.search.false_alarms import consecutive_alarm_rate, counted_threshold, sampled_rate
 from mauvecl.search.flare_fits import SingleFlareFit
-from mauvecl.search.injections import FitAccuracy, Injections, Refit
+from mauvecl.search.injections import ACCURACY_COLUMNS, Injections, Refit, fit_accuracy
 from mauvecl.search.search import Survey
 from mauvecl.search.templates import TEMPERATURES_K, Bank, Templates, frame_nuisances
 from mauvecl.study.cases import Case, cases, collect_messages
@@ -244,7 +244,7 @@ class StarCompleteness(InCell):
     saturates: float  # amplitude at which flares saturate a used pixel, which injections ignore
     in_a_row: float  # false alarms per star-day of the conventional rule in white noise
     injected: InjectedCompleteness
-    fitted: FitAccuracy | None
+    fitted: dict[str, Float] | None  # see `fit_accuracy`; None if no flare is to be fitted
     # Size that is found if everything but the noise is known, over the size that is found: the inverse ratio of the S/N
     # of a frame; NaN if everything is known.
     ideal_share: float
@@ -270,7 +270,7 @@ class StarCompleteness(InCell):
         """Completeness at each half-width and size, and how well the flares are recovered."""
         columns = [column.of(attrgetter("injected")) for column in cell_columns(self.sizes.of)]
         if self.fitted is not None:
-            columns += [column.of(attrgetter("fitted")) for column in FitAccuracy.COLUMNS]
+            columns += [column.of(attrgetter("fitted")) for column in ACCURACY_COLUMNS]
         return table_of(columns, [self])
 
     @property
@@ -434,7 +434,7 @@ def _completeness(case: Case, engine: Stares | Pool, report: Callable[[float], N
         saturates=injections.saturates,
         in_a_row=consecutive_alarm_rate(choice.points, choice.sigma, survey.stare.frame_s),
         injected=InjectedCompleteness(injections.half_widths_s, values, amplitudes, critical),
-        fitted=FitAccuracy.of(parts) if refit.count else None,
+        fitted=fit_accuracy(parts) if refit.count else None,
         ideal_share=_ideal_share(case, star),
     )
 

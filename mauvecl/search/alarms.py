@@ -157,8 +157,7 @@ class _StareSearch:
         both = np.stack([self._evened(self.sums.net - light, light), LEFT_UNSEEN * light + wrong])
         search = self.sums.survey.search
         for row, rho in search.values(both.astype(np.float32)):
-            peaks = search.stare.numbers[0] + row.peaks + row.template.phases[row.phase]
-            peaks = peaks * self.sums.survey.bank.frame_s
+            peaks = search.peaks_s(row)
             rests = np.abs(np.where(np.isfinite(rho[1]), rho[1], 0.0))
             excess = rho[0] - np.maximum(rests, near_share * self._near(peaks, row.template.half_width_s))
             which = excess.argmax(axis=0)

@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,59 +62,46 @@ class Refit:
         }
 
 
-@dataclass(frozen=True, eq=False)
-class FitAccuracy:
-    """Accuracy of fits in each cell; arrays of shape (n_half_width, n_size), NaN without detections.
+#: Columns of the accuracy of fits, for values by name.
+ACCURACY_COLUMNS = (
+    Column("fitted", description="flares that were found and fitted"),
+    Column("energy_ratio", description="recovered over injected energy, median of those found"),
+    Column("energy_ratio_low", description="the same, 16 % quantile"),
+    Column("energy_ratio_high", description="the same, 84 % quantile"),
+    Column("amplitude_ratio", description="recovered over injected amplitude, median"),
+    Column("half_width_ratio", description="recovered over injected half-width, median"),
+    Column("temperature_ratio", description="recovered over injected temperature, median"),
+    Column("peak_offset", description="recovered less injected time of the peak, half-widths, median"),
+    Column("peak_scatter", description="half of the range of the middle 68 % of it, half-widths"),
+    Column("energy_covered", description="share of energies within their own standard error of the injected one"),
+)
 
-    `COLUMNS` are the attributes as columns of a table.
+
+def fit_accuracy(parts: Sequence[Mapping[str, NDArray[Any]]]) -> dict[str, Float]:
+    """Summarise the fits of all positions, arrays by `FIT_QUANTITIES` of shape (n_stare, n_half_width, n_size).
+
+    Values of each cell, by the names of `ACCURACY_COLUMNS`, have the shape (n_half_width, n_size); NaN without
+    detections.
     """
+    each = {name: np.moveaxis(np.concatenate([part[name] for part in parts]), 0, 2) for name in FIT_QUANTITIES}
+    count = np.isfinite(each["energy"]).sum(axis=2)
+    none = count == 0
 
-    fitted: Float
-    energy_ratio: Float
-    energy_ratio_low: Float
-    energy_ratio_high: Float
-    amplitude_ratio: Float
-    half_width_ratio: Float
-    temperature_ratio: Float
-    peak_offset: Float
-    peak_scatter: Float
-    energy_covered: Float
+    def quantile(name: str, q: float) -> Float:
+        blank = ~np.isfinite(each[name]).any(axis=2)
+        filled = np.where(blank[:, :, None], 0.0, each[name])
+        return np.where(blank, np.nan, np.nanquantile(filled, q, axis=2))
 
-    COLUMNS: ClassVar[tuple[Column, ...]] = (
-        Column("fitted", description="flares that were found and fitted"),
-        Column("energy_ratio", description="recovered over injected energy, median of those found"),
-        Column("energy_ratio_low", description="the same, 16 % quantile"),
-        Column("energy_ratio_high", description="the same, 84 % quantile"),
-        Column("amplitude_ratio", description="recovered over injected amplitude, median"),
-        Column("half_width_ratio", description="recovered over injected half-width, median"),
-        Column("temperature_ratio", description="recovered over injected temperature, median"),
-        Column("peak_offset", description="recovered less injected time of the peak, half-widths, median"),
-        Column("peak_scatter", description="half of the range of the middle 68 % of it, half-widths"),
-        Column("energy_covered", description="share of energies within their own standard error of the injected one"),
-    )
-
-    @classmethod
-    def of(cls, parts: Sequence[Mapping[str, NDArray[Any]]]) -> Self:
-        """Summarise the fits of all positions, arrays by `FIT_QUANTITIES` of shape (n_stare, n_half_width, n_size)."""
-        each = {name: np.moveaxis(np.concatenate([part[name] for part in parts]), 0, 2) for name in FIT_QUANTITIES}
-        count = np.isfinite(each["energy"]).sum(axis=2)
-        none = count == 0
-
-        def quantile(name: str, q: float) -> Float:
-            blank = ~np.isfinite(each[name]).any(axis=2)
-            filled = np.where(blank[:, :, None], 0.0, each[name])
-            return np.where(blank, np.nan, np.nanquantile(filled, q, axis=2))
-
-        peak = [quantile("peak", q) for q in (0.16, 0.5, 0.84)]
-        return cls(
-            fitted=count.astype(np.float64),
-            energy_ratio_low=quantile("energy", 0.16),
-            energy_ratio_high=quantile("energy", 0.84),
-            **{f"{name}_ratio": quantile(name, 0.5) for name in ("energy", "amplitude", "half_width", "temperature")},
-            peak_offset=peak[1],
-            peak_scatter=(peak[2] - peak[0]) / 2,
-            energy_covered=np.where(none, np.nan, np.nanmean(np.where(none[:, :, None], 0.0, each["covered"]), axis=2)),
-        )
+    peak = [quantile("peak", q) for q in (0.16, 0.5, 0.84)]
+    return {
+        "fitted": count.astype(np.float64),
+        "energy_ratio_low": quantile("energy", 0.16),
+        "energy_ratio_high": quantile("energy", 0.84),
+        **{f"{name}_ratio": quantile(name, 0.5) for name in ("energy", "amplitude", "half_width", "temperature")},
+        "peak_offset": peak[1],
+        "peak_scatter": (peak[2] - peak[0]) / 2,
+        "energy_covered": np.where(none, np.nan, np.nanmean(np.where(none[:, :, None], 0.0, each["covered"]), axis=2)),
+    }
 
 
 Single = NDArray[np.float32]
@@ -164,25 +151,51 @@ def sites_of(survey: Survey, widths_s: Sequence[float], peak_s: float, response:
     stare = search.stare
     edges = np.column_stack([stare.start_s, stare.start_s + bank.frame_s])
     means = np.array([stare.light * bank.shape.mean_over(edges, peak_s, width) for width in widths_s])
+    near = _near_templates(search, reaches, means, bank.directions @ response)
+    # Flares of several half-widths share templates.
+    place, index = np.unique(np.concatenate([one[0] for one in near]).astype(np.int64), return_inverse=True)
+    numbers, onsets = np.divmod(place, search.n_grid)
+    filters = np.empty((place.size, stare.n_frames), np.float32)
+    for number in np.unique(numbers):
+        mine = numbers == number
+        filters[mine] = np.rint(search.in_time(search.grid[number], onsets[mine]) / STEP) * STEP
+    filter_widths_s = np.array([row.template.half_width_s for row in search.grid])[numbers]
+    sites = []
+    for width, mean, (_, peaks, *counts) in zip(widths_s, means, near, strict=True):
+        mine, index = np.split(index, [peaks.size])
+        own = filters[mine]
+        used = np.flatnonzero(own.any(axis=0))
+        ends = slice(int(used[0]), int(used[-1]) + 1) if used.size else slice(0, 0)
+        own, shape = np.ascontiguousarray(own[:, ends]), mean[ends].astype(np.float32)
+        counted = np.array(counts, np.bool_)
+        sites.append(
+            InjectionSite(width, peak_s, first + ends.start, own, shape, filter_widths_s[mine], peaks, counted)
+        )
+    return tuple(sites)
+
+
+def _near_templates(search: Search, reaches: Sequence[_Reach], means: Float, along: Float) -> list[Float]:
+    """Return the templates that may detect each flare, shape (2 + n_temperature, n_template).
+
+    Rows are the place of a template, its row in the search times `n_grid` plus its onset; its peak time; and whether it
+    counts at each temperature. `means` are those of the flares, and `along` is their light along the bank's directions.
+    """
+    seen: list[list[Float]] = [[] for _ in reaches]
     # A flare's sums are the product of its shape and the response, so that one correlation serves all temperatures.
-    along = (bank.directions @ response)[:, None]
-    seen: list[list[_NearbyTemplates]] = [[] for _ in reaches]
     for number, (row, correlated) in enumerate(search.correlations(means[:, :, None])):
-        times = (stare.numbers[0] + row.peaks + row.template.phases[row.phase]) * bank.frame_s
-        for responses, reach, value in zip(seen, reaches, correlated[:, 0], strict=True):
+        peaks = search.peaks_s(row)
+        for templates, reach, value in zip(seen, reaches, correlated[:, 0], strict=True):
             if row.template.half_width_s in reach.half_widths_s:
-                inside = (times >= reach.first_s) & (times <= reach.last_s) & (row.per_amplitude > 0)
-                onsets = np.flatnonzero(inside)
-                onsets = onsets[(along * value[onsets]).max(axis=0, initial=0) > 0]
-                responses.append(_NearbyTemplates(number, onsets, times[onsets], along * value[onsets]))
-    for responses in seen:
-        largest = max((float(response.values.max(initial=0)) for response in responses), default=0.0)
-        responses[:] = [response.above(OVERLAP * largest) for response in responses]
-    filters = _filters(search, [response for responses in seen for response in responses])
-    return tuple(
-        _site(search, first, width, peak_s, mean, responses, filters)
-        for width, mean, responses in zip(widths_s, means, seen, strict=True)
-    )
+                values = along[:, None] * value
+                inside = (peaks >= reach.first_s) & (peaks <= reach.last_s) & (row.per_amplitude > 0)
+                onsets = np.flatnonzero(inside & (values.max(axis=0) > 0))
+                templates.append(np.vstack([number * search.n_grid + onsets, peaks[onsets], values[:, onsets]]))
+    near = []
+    for templates in seen:
+        every = np.concatenate(templates, axis=1)
+        every[2:] = every[2:] >= OVERLAP * every[2:].max(initial=0)
+        near.append(every[:, every[2:].any(axis=0)])
+    return near
 
 
 @dataclass(frozen=True)
@@ -205,22 +218,6 @@ class _Reach:
         return cls(tuple(near), first, last, first - lead, last + tail + bank.frame_s)
 
 
-@dataclass(frozen=True, eq=False)
-class _NearbyTemplates:
-    """Templates of one row of a search near a flare."""
-
-    row: int
-    onsets: NDArray[np.int64]  # shape (n,)
-    times_s: Float  # peak times, shape (n,)
-    values: NDArray[Any]  # values, or whether they exceed a limit, shape (n_temperature, n)
-
-    def above(self, least: float) -> _NearbyTemplates:
-        """Return the templates that reach a value at any temperature, with `values` true where they reach it."""
-        counts = self.values >= least
-        seen = counts.any(axis=0)
-        return _NearbyTemplates(self.row, self.onsets[seen], self.times_s[seen], counts[:, seen])
-
-
 def _search_near(survey: Survey, reaches: Sequence[_Reach]) -> tuple[Search, int]:
     """Return a search of the frames that templates cover, and the first of these frames."""
     stare = survey.stare
@@ -231,34 +228,6 @@ def _search_near(survey: Survey, reaches: Sequence[_Reach]) -> tuple[Search, int
     near = {width for reach in reaches for width in reach.half_widths_s}
     bank = replace(survey.bank, half_widths_s=tuple(sorted(near)))
     return survey.frames.part(part).search(bank), part.start
-
-
-def _filters(search: Search, seen: Sequence[_NearbyTemplates]) -> dict[int, tuple[NDArray[np.int64], Single]]:
-    """Return for each row the onsets of templates near any flare, ascending, and their filters."""
-    filters = {}
-    for number in sorted({response.row for response in seen}):
-        onsets = np.unique(np.concatenate([response.onsets for response in seen if response.row == number]))
-        in_time = search.in_time(search.grid[number], onsets)
-        filters[number] = onsets, (np.rint(in_time / STEP) * STEP).astype(np.float32)
-    return filters
-
-
-def _site(
-    search: Search, first: int, width_s: float, peak_s: float, mean: Float, seen: Sequence[_NearbyTemplates],
-    filters: dict[int, tuple[NDArray[np.int64], Single]],
-) -> InjectionSite:  # fmt: skip
-    none = np.zeros((0, mean.size), np.float32)
-    own = [filters[response.row][1][np.searchsorted(filters[response.row][0], response.onsets)] for response in seen]
-    weights = np.concatenate([none, *own])
-    used = np.flatnonzero(weights.any(axis=0))
-    ends = slice(int(used[0]), int(used[-1]) + 1) if used.size else slice(0, 0)
-    widths = [np.full(response.onsets.size, search.grid[response.row].template.half_width_s) for response in seen]
-    widths_s = np.concatenate([np.zeros(0), *widths])
-    peaks_s = np.concatenate([np.zeros(0), *(response.times_s for response in seen)])
-    no_counts = np.zeros((len(search.bank.directions), 0), np.bool_)
-    counts = np.concatenate([no_counts, *(response.values for response in seen)], axis=1)
-    shape, filters_here = mean[ends].astype(np.float32), np.ascontiguousarray(weights[:, ends])
-    return InjectionSite(width_s, peak_s, first + ends.start, filters_here, shape, widths_s, peaks_s, counts)
 
 
 #: Number of stares per batch.

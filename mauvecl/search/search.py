@@ -181,6 +181,10 @@ class Search:
         templates[:, reached] = np.where(inside, shape, 0.0)
         return templates
 
+    def peaks_s(self, row: Row) -> Float:
+        """Return the times of the peaks of a row's templates, from the start of the stare, shape (n_onset,)."""
+        return np.asarray((self._first + row.peaks + row.template.phases[row.phase]) * self.bank.frame_s)
+
     @property
     def variance(self) -> Float:
         """Variance of each frame's sums, shape (n_frame,)."""
