@@ -22,9 +22,9 @@ from mauvecl.schema.columns import INTERVAL, Column, View, interval, number, per
 from mauvecl.schema.errors import InputError, Message
 from mauvecl.schema.physical import DAY_S
 from mauvecl.search.completeness import SMALL, InjectedCompleteness, frame_signal
-from mauvecl.search.false_alarms import CountedRate, consecutive_alarm_rate, sampled_rate
+from mauvecl.search.false_alarms import consecutive_alarm_rate, counted_threshold, sampled_rate
 from mauvecl.search.flare_fits import SingleFlareFit
-from mauvecl.search.injections import FitAccuracy, Injections, Refit
+from mauvecl.search.injections import ACCURACY_COLUMNS, Injections, Refit, fit_accuracy
 from mauvecl.search.search import Survey
 from mauvecl.search.templates import TEMPERATURES_K, Bank, Templates, frame_nuisances
 from mauvecl.study.cases import Case, cases, collect_messages
@@ -244,7 +244,7 @@ class StarCompleteness(InCell):
     saturates: float  # amplitude at which flares saturate a used pixel, which injections ignore
     in_a_row: float  # false alarms per star-day of the conventional rule in white noise
     injected: InjectedCompleteness
-    fitted: FitAccuracy | None
+    fitted: dict[str, Float] | None  # see `fit_accuracy`; None if no flare is to be fitted
     # Size that is found if everything but the noise is known, over the size that is found: the inverse ratio of the S/N
     # of a frame; NaN if everything is known.
     ideal_share: float
@@ -270,7 +270,7 @@ class StarCompleteness(InCell):
         """Completeness at each half-width and size, and how well the flares are recovered."""
         columns = [column.of(attrgetter("injected")) for column in cell_columns(self.sizes.of)]
         if self.fitted is not None:
-            columns += [column.of(attrgetter("fitted")) for column in FitAccuracy.COLUMNS]
+            columns += [column.of(attrgetter("fitted")) for column in ACCURACY_COLUMNS]
         return table_of(columns, [self])
 
     @property
@@ -434,7 +434,7 @@ def _completeness(case: Case, engine: Stares | Pool, report: Callable[[float], N
         saturates=injections.saturates,
         in_a_row=consecutive_alarm_rate(choice.points, choice.sigma, survey.stare.frame_s),
         injected=InjectedCompleteness(injections.half_widths_s, values, amplitudes, critical),
-        fitted=FitAccuracy.of(parts) if refit.count else None,
+        fitted=fit_accuracy(parts) if refit.count else None,
         ideal_share=_ideal_share(case, star),
     )
 
@@ -455,32 +455,32 @@ def _false_alarms(case: Case, survey: Survey, engine: Stares | Pool) -> dict[str
     The keys are the fields of `StarCompleteness`.
     """
     choice, seed, days = case.study.search, case.study.run.seed, survey.stare.observed_s / DAY_S
-    drawn = None
+    maxima = np.zeros(0)
     if choice.nulls:
         request = survey.largest_value_request(choice.nulls, seed, case.study.processes.additive_only)
-        drawn = CountedRate(np.sort(_reduced(engine, request)["maximum"]), days)
-    tail = sampled_rate(survey, seed)
-    threshold = (tail if choice.null == "sampled" or drawn is None else drawn).threshold(choice.rate)
+        maxima = np.sort(_reduced(engine, request)["maximum"])
+    tail, n = sampled_rate(survey, seed), maxima.size
+    counted = n and choice.null == "counted"
+    threshold = counted_threshold(maxima, days, choice.rate) if counted else tail.threshold(choice.rate)
     # The comparison with drawn stares has most power where a few in ten have an alarm.
     checked, likely, error = tail.likely
     shifted = tail.shifted and choice.null == "sampled"
     found: dict[str, Any] = {"threshold": threshold, "checked": checked, "shifted": shifted}
-    if drawn is None:
+    if not n:
         nothing = Interval(np.nan, np.nan, np.nan)
         return found | {"simulated": nothing, "asked": np.nan, "alarmed": 0, "expected": np.nan}
-    n = drawn.maxima.size
     # Drawn stares may be longer than those of importance sampling.
     longer = days / tail.days
     none = (1 - likely) ** longer
     reach = DIFFERS * np.hypot(np.sqrt(none * (1 - none) / n), longer * none / (1 - likely) * error)
-    p = float(np.mean(drawn.maxima >= checked))
+    p = float(np.mean(maxima >= checked))
     with np.errstate(divide="ignore"):
         ends = [-np.log1p(-np.clip(x, 0.0, 1.0)) / days for x in (p, p - reach, p + reach)]
         asked = float(-np.log(none) / days)
     return found | {
         "simulated": Interval(*(float(x) for x in ends)),
         "asked": asked,
-        "alarmed": int(np.sum(drawn.maxima >= threshold.value)),
+        "alarmed": int(np.sum(maxima >= threshold.value)),
         "expected": float(n * -np.expm1(-choice.rate * days)),
     }
 

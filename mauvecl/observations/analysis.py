@@ -139,7 +139,7 @@ def _largest_near(
     count, size = peaks.size, amplitudes[:, None, None]
     best = np.full((amplitudes.size, count), -np.inf)
     for row, rho in part.search.values(np.concatenate([part.sums[None], flares, noise])):
-        at = part.search.peak_s(row, np.arange(row.peaks.size))
+        at = part.search.peaks_s(row)
         tried = (row.per_amplitude > 0).any(axis=0)
         for k, peak in enumerate(peaks):
             near = tried & (np.abs(at - peak) <= 2 * (width + part.stare.frame_s) + row.template.half_width_s)

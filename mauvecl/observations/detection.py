@@ -333,7 +333,7 @@ def _search_once(part: SeriesSurvey, search: ProcessSearch, light: Float, thresh
         along, half_width = direction[onset], np.full(onset.size, row.template.half_width_s)
         value = rho[0, along, onset]
         amplitude = value / row.per_amplitude[along, onset]
-        parts.append(np.array([best[onset], value, half_width, search.peak_s(row, onset), along, amplitude]))
+        parts.append(np.array([best[onset], value, half_width, search.peaks_s(row)[onset], along, amplitude]))
     bests, *others = np.concatenate(parts, axis=1)
     order = np.argsort(bests)[::-1][: 4 * most_events(part.stare.n_frames)]
     scales = min(one.shortest_s for one in part.processes)

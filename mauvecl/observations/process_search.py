@@ -226,9 +226,9 @@ class ProcessSearch:
         """Return the largest value of each light curve, shape (n_stare,)."""
         return largest_values(self.values, sums, self.n_grid * sums.shape[2])
 
-    def peak_s(self, row: Filter, onset: NDArray[np.int64]) -> Float:
-        """Return the times of the peaks of templates, from the start of the stare's numbering."""
-        frames = self.grid.numbers(self.frames[0] + row.peaks[onset]) + row.template.phases[row.phase]
+    def peaks_s(self, row: Filter) -> Float:
+        """Return the times of the peaks of a row's templates, from the start of the stare, shape (n_onset,)."""
+        frames = self.grid.numbers(self.frames[0] + row.peaks) + row.template.phases[row.phase]
         return np.asarray(frames * self.bank.frame_s)
 
     def _filter(self, template: Template, phase: int, earlier: Filter | None) -> Filter:

@@ -97,7 +97,8 @@ def alarms(
     `templates` are those from which the survey's bank and components are made. `energy` returns the logarithm of the
     energy per second of equivalent duration, and its derivative, for the logarithm of the temperature.
     """
-    search = _StareSearch(SummedStare(survey, templates, np.asarray(survey.net(sums[None])[0], np.float64)), threshold)
+    net = np.asarray(survey.frames.net(sums[None])[0], np.float64)
+    search = _StareSearch(SummedStare(survey, templates, net), threshold)
     search.run()
     return sorted(_measured_alarms(search, energy), key=lambda alarm: -alarm.rho)
 
@@ -156,8 +157,7 @@ class _StareSearch:
         both = np.stack([self._evened(self.sums.net - light, light), LEFT_UNSEEN * light + wrong])
         search = self.sums.survey.search
         for row, rho in search.values(both.astype(np.float32)):
-            peaks = search.stare.numbers[0] + row.peaks + row.template.phases[row.phase]
-            peaks = peaks * self.sums.survey.bank.frame_s
+            peaks = search.peaks_s(row)
             rests = np.abs(np.where(np.isfinite(rho[1]), rho[1], 0.0))
             excess = rho[0] - np.maximum(rests, near_share * self._near(peaks, row.template.half_width_s))
             which = excess.argmax(axis=0)
@@ -254,7 +254,7 @@ class _StareSearch:
         if not self.found:
             return left
         noise = self.sums.noise(self.thetas, light)
-        base = self.sums.covariance
+        base = self.sums.survey.covariance
         excess = np.einsum("tkk->t", np.linalg.solve(base, noise)) / base.shape[1]
         loud = excess > 1.01
         if not loud.any():

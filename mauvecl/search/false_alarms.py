@@ -45,7 +45,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.detection.distributions import CONFIDENCE, Interval, central_counts, clopper_pearson
+from mauvecl.detection.distributions import CONFIDENCE, Interval, central_counts
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import DAY_S
 from mauvecl.search.search import BATCH
@@ -62,38 +62,23 @@ Float = NDArray[np.float64]
 MIN_ALARMS = 10
 
 
-@dataclass(frozen=True, eq=False)
-class CountedRate:
-    """False-alarm rate from the largest values of stares without a flare."""
+def counted_threshold(maxima: Float, days: float, rate: float) -> Interval:
+    """Return the threshold for a number of false alarms per star-day, with a 95 % interval, from counts.
 
-    maxima: Float  # ascending, shape (n_stare,)
-    days: float  # star-days of each stare
-
-    def rate(self, threshold: float) -> Interval:
-        """Return the false alarms per star-day at a threshold, with a 95 % interval; infinite if all stares alarm."""
-        n = self.maxima.size
-        above = n - int(np.searchsorted(self.maxima, threshold, side="left"))
-        p = clopper_pearson(above, n)
-        with np.errstate(divide="ignore"):
-            values = [float(-np.log1p(-x) / self.days) for x in (p.value, p.low, p.high)]
-        return Interval(*values)
-
-    def threshold(self, rate: float) -> Interval:
-        """Return the threshold for a number of false alarms per star-day, with a 95 % interval.
-
-        Raises InputError if it is expected that fewer than 10 stares alarm, or fewer than 10 do not.
-        """
-        n = self.maxima.size
-        alarmed = -np.expm1(-rate * self.days)
-        if min(alarmed, 1 - alarmed) * n < MIN_ALARMS:
-            raise InputError(
-                f"{rate:g} false alarms per star-day occur in {alarmed * n:.3g} of {n} simulated stares, but a "
-                f"threshold needs at least {MIN_ALARMS} with an alarm and as many without",
-                key="false_alarms",
-            )
-        low, high = central_counts(n, 1 - alarmed)
-        ranks = np.clip([round(n * (1 - alarmed)), low, high], 0, n - 1)
-        return Interval(*(float(self.maxima[k]) for k in ranks))
+    `maxima`, ascending, are the largest values of stares of some star-days without a flare. Raises InputError if it is
+    expected that fewer than 10 stares alarm, or fewer than 10 do not.
+    """
+    n = maxima.size
+    alarmed = -np.expm1(-rate * days)
+    if min(alarmed, 1 - alarmed) * n < MIN_ALARMS:
+        raise InputError(
+            f"{rate:g} false alarms per star-day occur in {alarmed * n:.3g} of {n} simulated stares, but a "
+            f"threshold needs at least {MIN_ALARMS} with an alarm and as many without",
+            key="false_alarms",
+        )
+    low, high = central_counts(n, 1 - alarmed)
+    ranks = np.clip([round(n * (1 - alarmed)), low, high], 0, n - 1)
+    return Interval(*(float(maxima[k]) for k in ranks))
 
 
 def consecutive_alarm_rate(points: int, sigma: float, frame_s: float) -> float:
@@ -332,18 +317,6 @@ class SampledRate:
         at = (threshold - self.thresholds[trusted].mean()) ** np.arange(coefficients.size)
         return float(scipy.special.log_ndtr(-threshold) + at @ coefficients), error
 
-    def rate(self, threshold: float) -> Interval:
-        """Return the false alarms per star-day at a threshold, with a 95 % interval.
-
-        Raises InputError if the threshold is outside the sampled range.
-        """
-        low, high = self._ends
-        if not low <= threshold <= high:
-            raise InputError.of("threshold", threshold, f"between {low:g} and {high:g} for importance sampling")
-        log, error = self.log_rate(threshold)
-        reach = float(scipy.special.ndtri(0.5 + CONFIDENCE / 2)) * error
-        return Interval(*(float(np.exp(log + d)) for d in (0.0, -reach, reach)))
-
     def threshold(self, rate: float) -> Interval:
         """Return the threshold for a number of false alarms per star-day, with a 95 % interval.
 
@@ -360,7 +333,8 @@ class SampledRate:
                 "and window_s)",
                 key="false_alarms",
             )
-        low, high = self._ends
+        # From one step below the lowest trusted threshold.
+        low, high = float(self.thresholds[self._trusted][0] - STEP), float(self.thresholds[-1])
         goal = np.log(rate)
         if not self.log_rate(high)[0] <= goal <= self.log_rate(low)[0]:
             ends = [float(np.exp(self.log_rate(u)[0])) for u in (high, low)]
@@ -373,11 +347,6 @@ class SampledRate:
         # The rate falls by about a factor exp(-u) per unit of u.
         reach = float(scipy.special.ndtri(0.5 + CONFIDENCE / 2)) * self.log_rate(value)[1] / value
         return Interval(value, value - reach, value + reach)
-
-    @property
-    def _ends(self) -> tuple[float, float]:
-        """Range of thresholds: from one step below the lowest trusted one to the highest."""
-        return float(self.thresholds[self._trusted][0] - STEP), float(self.thresholds[-1])
 
 
 def sample_rate(search: Search, *, seed: int, draws: int = DRAWS) -> SampledRate:

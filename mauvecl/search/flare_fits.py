@@ -28,7 +28,7 @@ from mauvecl.fits.profile import Profile, remembering
 from mauvecl.flares.shapes import between, sides
 
 if TYPE_CHECKING:
-    from mauvecl.search.search import Survey
+    from mauvecl.search.search import SearchedFrames, Survey
     from mauvecl.search.templates import Bank, Templates
 
 Float = NDArray[np.float64]
@@ -115,11 +115,6 @@ class SummedStare:
         start = self.survey.stare.start_s
         return np.column_stack([start, start + self.survey.stare.frame_s])
 
-    @cached_property
-    def covariance(self) -> Float:
-        """Covariance of each frame's sums without a flare, shape (n_frame, n_sum, n_sum)."""
-        return self.survey.covariance()
-
     @property
     def free(self) -> list[int]:
         """Columns of fitted parameters."""
@@ -159,7 +154,7 @@ class SummedStare:
 
     def noise(self, theta: Float, light: Float, frames: slice = slice(None)) -> Float:
         """Return the covariance of frames' sums with flares, shape (n_frame, n_sum, n_sum)."""
-        total = self.covariance[frames].copy()
+        total = self.survey.covariance[frames].copy()
         for flare, inside, mean in self._shining(theta, frames):
             total[inside] += mean[:, None, None] * self.templates.noise_of(float(np.exp(flare[KELVIN])))
         jitter = self.survey.stare.light_jitter
@@ -464,21 +459,17 @@ class SingleFlareFit:
     def run(
         self,
         sums: NDArray[Any],
-        start_s: Float,
-        *,
+        frames: SearchedFrames,
         peak_s: Float,
         half_width_s: Float,
-        variance: Float,
-        curves: Float | None,
     ) -> FittedFlares:
-        """Fit one flare to each of several light curves: sums less their known mean, (n, n_frame, n_sum).
+        """Fit one flare to each of several light curves: sums of some frames less their mean, (n, n_frame, n_sum).
 
-        Starting points are the peak and half-width of the template that detected each flare, (n,). The variance is that
-        of the frames' sums; see `Search` for `curves`.
+        Starting points are the peak and half-width of the template that detected each flare, (n,).
         """
         peak, log_width = peak_s, np.log(half_width_s)
         several = max(1, int(np.exp(log_width.min()) / self.bank.frame_s / FINE))
-        sums, start_s, variance, curves = self._averaged(several, sums, start_s, variance, curves)
+        sums, start_s, variance, curves = self._averaged(several, sums, frames)
         weight, level = self._windows(start_s, peak, np.exp(log_width), variance, curves)
         used = weight.any(axis=0)
         weight, level, start_s = weight[:, used], level[:, used], start_s[used]
@@ -550,9 +541,10 @@ class SingleFlareFit:
         return x, best / length, (2 * amplitude - best) * best / variance
 
     def _averaged(
-        self, several: int, sums: NDArray[Any], start_s: Float, variance: Float, curves: Float | None
+        self, several: int, sums: NDArray[Any], frames: SearchedFrames
     ) -> tuple[NDArray[Any], Float, Float, Float | None]:
         """Average groups of consecutive frames; incomplete groups at gaps are dropped."""
+        start_s, variance, curves = frames.stare.start_s, frames.variance, frames.curves
         if several == 1:
             return sums, start_s, variance, curves
         number = np.rint(start_s / self.bank.frame_s).astype(np.int64)

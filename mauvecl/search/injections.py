@@ -17,21 +17,19 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.flares.frames import STEADY, Components
-from mauvecl.flares.stare import select_frames
 from mauvecl.flares.stare_scene import Method, StaresRequest, method_for
 from mauvecl.noise.unknowns import Processes
 from mauvecl.schema.columns import Column
-from mauvecl.search.search import Search, subtract_known
 
 if TYPE_CHECKING:
     from mauvecl.search.flare_fits import FittedFlares, SingleFlareFit
-    from mauvecl.search.search import Survey, Trend
+    from mauvecl.search.search import Search, SearchedFrames, Survey
     from mauvecl.search.templates import Bank
 
 Float = NDArray[np.float64]
@@ -64,59 +62,46 @@ class Refit:
         }
 
 
-@dataclass(frozen=True, eq=False)
-class FitAccuracy:
-    """Accuracy of fits in each cell; arrays of shape (n_half_width, n_size), NaN without detections.
+#: Columns of the accuracy of fits, for values by name.
+ACCURACY_COLUMNS = (
+    Column("fitted", description="flares that were found and fitted"),
+    Column("energy_ratio", description="recovered over injected energy, median of those found"),
+    Column("energy_ratio_low", description="the same, 16 % quantile"),
+    Column("energy_ratio_high", description="the same, 84 % quantile"),
+    Column("amplitude_ratio", description="recovered over injected amplitude, median"),
+    Column("half_width_ratio", description="recovered over injected half-width, median"),
+    Column("temperature_ratio", description="recovered over injected temperature, median"),
+    Column("peak_offset", description="recovered less injected time of the peak, half-widths, median"),
+    Column("peak_scatter", description="half of the range of the middle 68 % of it, half-widths"),
+    Column("energy_covered", description="share of energies within their own standard error of the injected one"),
+)
 
-    `COLUMNS` are the attributes as columns of a table.
+
+def fit_accuracy(parts: Sequence[Mapping[str, NDArray[Any]]]) -> dict[str, Float]:
+    """Summarise the fits of all positions, arrays by `FIT_QUANTITIES` of shape (n_stare, n_half_width, n_size).
+
+    Values of each cell, by the names of `ACCURACY_COLUMNS`, have the shape (n_half_width, n_size); NaN without
+    detections.
     """
+    each = {name: np.moveaxis(np.concatenate([part[name] for part in parts]), 0, 2) for name in FIT_QUANTITIES}
+    count = np.isfinite(each["energy"]).sum(axis=2)
+    none = count == 0
 
-    fitted: Float
-    energy_ratio: Float
-    energy_ratio_low: Float
-    energy_ratio_high: Float
-    amplitude_ratio: Float
-    half_width_ratio: Float
-    temperature_ratio: Float
-    peak_offset: Float
-    peak_scatter: Float
-    energy_covered: Float
+    def quantile(name: str, q: float) -> Float:
+        blank = ~np.isfinite(each[name]).any(axis=2)
+        filled = np.where(blank[:, :, None], 0.0, each[name])
+        return np.where(blank, np.nan, np.nanquantile(filled, q, axis=2))
 
-    COLUMNS: ClassVar[tuple[Column, ...]] = (
-        Column("fitted", description="flares that were found and fitted"),
-        Column("energy_ratio", description="recovered over injected energy, median of those found"),
-        Column("energy_ratio_low", description="the same, 16 % quantile"),
-        Column("energy_ratio_high", description="the same, 84 % quantile"),
-        Column("amplitude_ratio", description="recovered over injected amplitude, median"),
-        Column("half_width_ratio", description="recovered over injected half-width, median"),
-        Column("temperature_ratio", description="recovered over injected temperature, median"),
-        Column("peak_offset", description="recovered less injected time of the peak, half-widths, median"),
-        Column("peak_scatter", description="half of the range of the middle 68 % of it, half-widths"),
-        Column("energy_covered", description="share of energies within their own standard error of the injected one"),
-    )
-
-    @classmethod
-    def of(cls, parts: Sequence[Mapping[str, NDArray[Any]]]) -> Self:
-        """Summarise the fits of all positions, arrays by `FIT_QUANTITIES` of shape (n_stare, n_half_width, n_size)."""
-        each = {name: np.moveaxis(np.concatenate([part[name] for part in parts]), 0, 2) for name in FIT_QUANTITIES}
-        count = np.isfinite(each["energy"]).sum(axis=2)
-        none = count == 0
-
-        def quantile(name: str, q: float) -> Float:
-            blank = ~np.isfinite(each[name]).any(axis=2)
-            filled = np.where(blank[:, :, None], 0.0, each[name])
-            return np.where(blank, np.nan, np.nanquantile(filled, q, axis=2))
-
-        peak = [quantile("peak", q) for q in (0.16, 0.5, 0.84)]
-        return cls(
-            fitted=count.astype(np.float64),
-            energy_ratio_low=quantile("energy", 0.16),
-            energy_ratio_high=quantile("energy", 0.84),
-            **{f"{name}_ratio": quantile(name, 0.5) for name in ("energy", "amplitude", "half_width", "temperature")},
-            peak_offset=peak[1],
-            peak_scatter=(peak[2] - peak[0]) / 2,
-            energy_covered=np.where(none, np.nan, np.nanmean(np.where(none[:, :, None], 0.0, each["covered"]), axis=2)),
-        )
+    peak = [quantile("peak", q) for q in (0.16, 0.5, 0.84)]
+    return {
+        "fitted": count.astype(np.float64),
+        "energy_ratio_low": quantile("energy", 0.16),
+        "energy_ratio_high": quantile("energy", 0.84),
+        **{f"{name}_ratio": quantile(name, 0.5) for name in ("energy", "amplitude", "half_width", "temperature")},
+        "peak_offset": peak[1],
+        "peak_scatter": (peak[2] - peak[0]) / 2,
+        "energy_covered": np.where(none, np.nan, np.nanmean(np.where(none[:, :, None], 0.0, each["covered"]), axis=2)),
+    }
 
 
 Single = NDArray[np.float32]
@@ -166,25 +151,51 @@ def sites_of(survey: Survey, widths_s: Sequence[float], peak_s: float, response:
     stare = search.stare
     edges = np.column_stack([stare.start_s, stare.start_s + bank.frame_s])
     means = np.array([stare.light * bank.shape.mean_over(edges, peak_s, width) for width in widths_s])
+    near = _near_templates(search, reaches, means, bank.directions @ response)
+    # Flares of several half-widths share templates.
+    place, index = np.unique(np.concatenate([one[0] for one in near]).astype(np.int64), return_inverse=True)
+    numbers, onsets = np.divmod(place, search.n_grid)
+    filters = np.empty((place.size, stare.n_frames), np.float32)
+    for number in np.unique(numbers):
+        mine = numbers == number
+        filters[mine] = np.rint(search.in_time(search.grid[number], onsets[mine]) / STEP) * STEP
+    filter_widths_s = np.array([row.template.half_width_s for row in search.grid])[numbers]
+    sites = []
+    for width, mean, (_, peaks, *counts) in zip(widths_s, means, near, strict=True):
+        mine, index = np.split(index, [peaks.size])
+        own = filters[mine]
+        used = np.flatnonzero(own.any(axis=0))
+        ends = slice(int(used[0]), int(used[-1]) + 1) if used.size else slice(0, 0)
+        own, shape = np.ascontiguousarray(own[:, ends]), mean[ends].astype(np.float32)
+        counted = np.array(counts, np.bool_)
+        sites.append(
+            InjectionSite(width, peak_s, first + ends.start, own, shape, filter_widths_s[mine], peaks, counted)
+        )
+    return tuple(sites)
+
+
+def _near_templates(search: Search, reaches: Sequence[_Reach], means: Float, along: Float) -> list[Float]:
+    """Return the templates that may detect each flare, shape (2 + n_temperature, n_template).
+
+    Rows are the place of a template, its row in the search times `n_grid` plus its onset; its peak time; and whether it
+    counts at each temperature. `means` are those of the flares, and `along` is their light along the bank's directions.
+    """
+    seen: list[list[Float]] = [[] for _ in reaches]
     # A flare's sums are the product of its shape and the response, so that one correlation serves all temperatures.
-    along = (bank.directions @ response)[:, None]
-    seen: list[list[_NearbyTemplates]] = [[] for _ in reaches]
     for number, (row, correlated) in enumerate(search.correlations(means[:, :, None])):
-        times = (stare.numbers[0] + row.peaks + row.template.phases[row.phase]) * bank.frame_s
-        for responses, reach, value in zip(seen, reaches, correlated[:, 0], strict=True):
+        peaks = search.peaks_s(row)
+        for templates, reach, value in zip(seen, reaches, correlated[:, 0], strict=True):
             if row.template.half_width_s in reach.half_widths_s:
-                inside = (times >= reach.first_s) & (times <= reach.last_s) & (row.per_amplitude > 0)
-                onsets = np.flatnonzero(inside)
-                onsets = onsets[(along * value[onsets]).max(axis=0, initial=0) > 0]
-                responses.append(_NearbyTemplates(number, onsets, times[onsets], along * value[onsets]))
-    for responses in seen:
-        largest = max((float(response.values.max(initial=0)) for response in responses), default=0.0)
-        responses[:] = [response.above(OVERLAP * largest) for response in responses]
-    filters = _filters(search, [response for responses in seen for response in responses])
-    return tuple(
-        _site(search, first, width, peak_s, mean, responses, filters)
-        for width, mean, responses in zip(widths_s, means, seen, strict=True)
-    )
+                values = along[:, None] * value
+                inside = (peaks >= reach.first_s) & (peaks <= reach.last_s) & (row.per_amplitude > 0)
+                onsets = np.flatnonzero(inside & (values.max(axis=0) > 0))
+                templates.append(np.vstack([number * search.n_grid + onsets, peaks[onsets], values[:, onsets]]))
+    near = []
+    for templates in seen:
+        every = np.concatenate(templates, axis=1)
+        every[2:] = every[2:] >= OVERLAP * every[2:].max(initial=0)
+        near.append(every[:, every[2:].any(axis=0)])
+    return near
 
 
 @dataclass(frozen=True)
@@ -207,22 +218,6 @@ class _Reach:
         return cls(tuple(near), first, last, first - lead, last + tail + bank.frame_s)
 
 
-@dataclass(frozen=True, eq=False)
-class _NearbyTemplates:
-    """Templates of one row of a search near a flare."""
-
-    row: int
-    onsets: NDArray[np.int64]  # shape (n,)
-    times_s: Float  # peak times, shape (n,)
-    values: NDArray[Any]  # values, or whether they exceed a limit, shape (n_temperature, n)
-
-    def above(self, least: float) -> _NearbyTemplates:
-        """Return the templates that reach a value at any temperature, with `values` true where they reach it."""
-        counts = self.values >= least
-        seen = counts.any(axis=0)
-        return _NearbyTemplates(self.row, self.onsets[seen], self.times_s[seen], counts[:, seen])
-
-
 def _search_near(survey: Survey, reaches: Sequence[_Reach]) -> tuple[Search, int]:
     """Return a search of the frames that templates cover, and the first of these frames."""
     stare = survey.stare
@@ -232,36 +227,7 @@ def _search_near(survey: Survey, reaches: Sequence[_Reach]) -> tuple[Search, int
     part = slice(*(int(k) for k in np.searchsorted(stare.start_s, ends)))
     near = {width for reach in reaches for width in reach.half_widths_s}
     bank = replace(survey.bank, half_widths_s=tuple(sorted(near)))
-    curves = None if survey.curves is None else survey.curves[:, part]
-    return Search(bank, select_frames(stare, part), curves, survey.variance[part]), part.start
-
-
-def _filters(search: Search, seen: Sequence[_NearbyTemplates]) -> dict[int, tuple[NDArray[np.int64], Single]]:
-    """Return for each row the onsets of templates near any flare, ascending, and their filters."""
-    filters = {}
-    for number in sorted({response.row for response in seen}):
-        onsets = np.unique(np.concatenate([response.onsets for response in seen if response.row == number]))
-        in_time = search.in_time(search.grid[number], onsets)
-        filters[number] = onsets, (np.rint(in_time / STEP) * STEP).astype(np.float32)
-    return filters
-
-
-def _site(
-    search: Search, first: int, width_s: float, peak_s: float, mean: Float, seen: Sequence[_NearbyTemplates],
-    filters: dict[int, tuple[NDArray[np.int64], Single]],
-) -> InjectionSite:  # fmt: skip
-    none = np.zeros((0, mean.size), np.float32)
-    own = [filters[response.row][1][np.searchsorted(filters[response.row][0], response.onsets)] for response in seen]
-    weights = np.concatenate([none, *own])
-    used = np.flatnonzero(weights.any(axis=0))
-    ends = slice(int(used[0]), int(used[-1]) + 1) if used.size else slice(0, 0)
-    widths = [np.full(response.onsets.size, search.grid[response.row].template.half_width_s) for response in seen]
-    widths_s = np.concatenate([np.zeros(0), *widths])
-    peaks_s = np.concatenate([np.zeros(0), *(response.times_s for response in seen)])
-    no_counts = np.zeros((len(search.bank.directions), 0), np.bool_)
-    counts = np.concatenate([no_counts, *(response.values for response in seen)], axis=1)
-    shape, filters_here = mean[ends].astype(np.float32), np.ascontiguousarray(weights[:, ends])
-    return InjectionSite(width_s, peak_s, first + ends.start, filters_here, shape, widths_s, peaks_s, counts)
+    return survey.frames.part(part).search(bank), part.start
 
 
 #: Number of stares per batch.
@@ -340,25 +306,20 @@ class Injections:
         first = min(part.start for part in reached)
         window = slice(first, max(part.stop for part in reached))
         start = (1 + position) * NUMBERS
-        stare = select_frames(survey.stare, window)
+        frames = survey.frames.part(window)
         injecting = CriticalAmplitudes(
             tuple(replace(site, first=site.first - first) for site in sites),
             self.threshold,
             survey.bank.directions,
             self.response,
             self.photons,
-            survey.known[window].astype(np.float32),
-            stare.start_s,
-            stare.frame_s,
-            survey.variance[window],
-            None if survey.curves is None else survey.curves[:, window],
+            replace(frames, known=frames.known.astype(np.float32)),
             start,
             refit,
-            None if survey.trend is None else survey.trend.part(window),
         )
         return StaresRequest(
             self.quiescent,
-            stare,
+            frames.stare,
             self.draws,
             self.seed,
             start=start,
@@ -375,19 +336,14 @@ class CriticalAmplitudes:
 
     adds: ClassVar[bool] = False
 
-    sites: tuple[InjectionSite, ...]  # in these frames
+    sites: tuple[InjectionSite, ...]  # in the frames
     threshold: float
     directions: Float  # of the bank, shape (n_temperature, n_sum)
     response: Float  # see `Injections.response`
     photons: Float  # see `Injections.photons`
-    known: Single  # mean of frames without a flare, shape (n_frame, n_sum)
-    start_s: Float  # shape (n_frame,)
-    frame_s: float
-    variance: Float  # of each frame's sums, as in the search, shape (n_frame,)
-    curves: Float | None  # shape (n_curve, n_frame)
+    frames: SearchedFrames
     start: int  # number of the first stare
     refit: Refit | None = None  # flares to fit
-    trend: Trend | None = None  # effect of unknowns on these frames beyond first order
 
     def __call__(self, values: Single, first: int, glow: Single) -> dict[str, NDArray[Any]]:
         """Return the smallest detected amplitude of each flare, (n_stare, n_half_width), and fits if requested.
@@ -415,15 +371,16 @@ class CriticalAmplitudes:
     def frame_noise(self, values: Single, glow: Single) -> FrameNoise:
         """Prepare the random part of some stares."""
         n_sum = values.shape[2]
-        noise = np.moveaxis(subtract_known(values, self.known, self.trend), 2, 0)
+        noise = np.moveaxis(self.frames.net(values), 2, 0)
         own, light = np.ascontiguousarray(np.moveaxis(glow[:, :, :n_sum], 2, 0)), glow[:, :, n_sum]
         return FrameNoise(_multiple(noise, NOISE_STEP).astype(np.float64), own, light if light.any() else None)
 
     def values(self, site: InjectionSite, drawn: FrameNoise) -> tuple[Single, Single, Single]:
         """Return a, b and c of the module's formula, shapes (n_temperature, n_draw or 1, n_filter)."""
         filters, here, mean = site.weights, site.frames, drawn.mean(site)
-        start, width = self.start_s[here], site.half_width_s
-        shining = (start > site.peak_s - width - self.frame_s) & (start < site.peak_s + GLOW * width)
+        stare, width = self.frames.stare, site.half_width_s
+        since = stare.start_s[here] - site.peak_s
+        shining = (since > -width - stare.frame_s) & (since < GLOW * width)
         ends = np.flatnonzero(shining)[[0, -1]] if shining.any() else np.array([0, -1])
         lit = slice(int(ends[0]), int(ends[1]) + 1)
         own = drawn.own[:, :, here][:, :, lit] * np.sqrt(np.maximum(site.mean[lit], 0))
@@ -476,15 +433,8 @@ class CriticalAmplitudes:
             alarm = value >= self.threshold
             if not alarm.any():
                 continue
-            here, which = site.frames, template[alarm]
-            recovered = refit.fit.run(
-                self.sums(site, drawn, row[alarm])[:, 0],
-                self.start_s[here],
-                peak_s=site.peaks_s[which],
-                half_width_s=site.widths_s[which],
-                variance=self.variance[here],
-                curves=None if self.curves is None else self.curves[:, here],
-            )
+            sums, which = self.sums(site, drawn, row[alarm])[:, 0], template[alarm]
+            recovered = refit.fit.run(sums, self.frames.part(site.frames), site.peaks_s[which], site.widths_s[which])
             for name, values in refit.compared(recovered, row[alarm], site).items():
                 estimates[name][d, alarm] = values
         return estimates

@@ -181,6 +181,10 @@ class Search:
         templates[:, reached] = np.where(inside, shape, 0.0)
         return templates
 
+    def peaks_s(self, row: Row) -> Float:
+        """Return the times of the peaks of a row's templates, from the start of the stare, shape (n_onset,)."""
+        return np.asarray((self._first + row.peaks + row.template.phases[row.phase]) * self.bank.frame_s)
+
     @property
     def variance(self) -> Float:
         """Variance of each frame's sums, shape (n_frame,)."""
@@ -398,6 +402,33 @@ MIN_CURVE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
+class SearchedFrames:
+    """Frames of a stare, and what their search takes for known."""
+
+    stare: Stare
+    known: NDArray[Any]  # mean of each frame's sums without a flare, shape (n_frame, n_sum)
+    variance: Float  # of each frame's sums, shape (n_frame,)
+    curves: Float | None  # of unknown amplitude, shape (n_curve, n_frame)
+    trend: Trend | None  # effect of the stare's unknowns if it is significant beyond first order
+
+    def part(self, window: slice) -> SearchedFrames:
+        """Return consecutive frames of these."""
+        curves = None if self.curves is None else self.curves[:, window]
+        trend = None if self.trend is None else self.trend.part(window)
+        stare = select_frames(self.stare, window)
+        return SearchedFrames(stare, self.known[window], self.variance[window], curves, trend)
+
+    def search(self, bank: Bank) -> Search:
+        """Return the search of the frames with a bank."""
+        return Search(bank, self.stare, self.curves, self.variance)
+
+    def net(self, sums: NDArray[Any]) -> NDArray[np.float32]:
+        """Subtract from simulated sums their known mean and the fitted trend, shape (n_stare, n_frame, n_sum)."""
+        left = sums - self.known
+        return np.asarray(left if self.trend is None else self.trend.subtracted(left), np.float32)
+
+
+@dataclass(frozen=True, eq=False)
 class Survey:
     """Stare at a star and its search."""
 
@@ -420,15 +451,15 @@ class Survey:
         """Derivatives of the mean sums by star, light, sky and temperature, shape (n_frame, n_sum) each."""
         return self.components.directions(self.coefficients)
 
+    @cached_property
     def covariance(self) -> Float:
-        """Return the covariance of each frame's sums without a flare, shape (n_frame, n_sum, n_sum)."""
+        """Covariance of each frame's sums without a flare, shape (n_frame, n_sum, n_sum)."""
         return self.components.jittered_covariance(self.coefficients, self.stare)
 
     @cached_property
     def variance(self) -> Float:
         """Variance of each frame's sums that the search assumes, averaged over sums, shape (n_frame,)."""
-        covariance = self.covariance()
-        return np.asarray(np.einsum("tkk->t", covariance) / covariance.shape[1])
+        return np.asarray(np.einsum("tkk->t", self.covariance) / self.covariance.shape[1])
 
     @cached_property
     def curves(self) -> Float | None:
@@ -448,9 +479,14 @@ class Survey:
         return np.array(curves).reshape(len(curves), self.stare.n_frames)
 
     @cached_property
+    def frames(self) -> SearchedFrames:
+        """Frames of the stare with what the search knows of them."""
+        return SearchedFrames(self.stare, self.known, self.variance, self.curves, self.trend)
+
+    @cached_property
     def search(self) -> Search:
         """Search of the stare's frames."""
-        return Search(self.bank, self.stare, self.curves, self.variance)
+        return self.frames.search(self.bank)
 
     @cached_property
     def unknowns(self) -> Trend | None:
@@ -480,14 +516,9 @@ class Survey:
         moved = self.unknowns.effect(amplitudes)
         return moved if self.trend is None else self.trend.subtracted(moved)
 
-    def net(self, sums: NDArray[Any]) -> NDArray[np.float32]:
-        """Subtract from simulated sums their known mean and the fitted trend, shape (n_stare, n_frame, n_sum)."""
-        return subtract_known(sums, self.known, self.trend)
-
     def largest_value_request(self, count: int, seed: int, processes: Processes = NONE) -> StaresRequest:
         """Return the request for the largest values of stares without a flare."""
-        largest = Largest(self.bank, self.stare, self.curves, self.variance, self.known, self.trend)
-        method = method_for(self.components, self.stare, processes)
+        method, largest = method_for(self.components, self.stare, processes), Largest(self.bank, self.frames)
         return StaresRequest(
             self.components, self.stare, count, seed, method=method, processes=processes, reduction=largest
         )
@@ -505,23 +536,13 @@ class Largest:
     adds: ClassVar[bool] = False
 
     bank: Bank
-    stare: Stare
-    curves: Float | None
-    variance: Float
-    known: Float
-    trend: Trend | None = None
+    frames: SearchedFrames
 
     @cached_property
     def search(self) -> Search:
-        """Search of the stare's frames."""
-        return Search(self.bank, self.stare, self.curves, self.variance)
+        """Search of the frames, made once for all launches."""
+        return self.frames.search(self.bank)
 
     def __call__(self, values: NDArray[np.float32], first: int) -> dict[str, NDArray[Any]]:
         """Return the largest values as ``maximum``, shape (n_stare,)."""
-        return {"maximum": self.search.largest(subtract_known(values, self.known, self.trend))}
-
-
-def subtract_known(sums: NDArray[Any], known: NDArray[Any], trend: Trend | None) -> NDArray[np.float32]:
-    """Subtract from simulated sums, (n_stare, n_frame, n_sum), their known mean and, if given, the fitted trend."""
-    left = sums - known
-    return np.asarray(left if trend is None else trend.subtracted(left), np.float32)
+        return {"maximum": self.search.largest(self.frames.net(values))}

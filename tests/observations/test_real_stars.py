@@ -118,7 +118,7 @@ def test_statistics_have_unit_variance_over_gaps_and_changing_noise(
         # Longer gaps hide the peaks of short templates.
         assert tried.size > n // row.template.stride - (90 if taken else 45)
         for onset in rng.choice(tried, min(40, tried.size), replace=False):
-            peak = search.peak_s(row, np.array([onset]))[0]
+            peak = search.peaks_s(row)[onset]
             shape = flare(search.stare.middle_s, 120.0, peak, row.template.half_width_s)
             assert row.per_amplitude[0, onset] == pytest.approx(np.sqrt(shape @ dense @ shape), rel=tolerance)
 
