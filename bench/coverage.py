@@ -97,7 +97,7 @@ def curvature(quiet, model: FlareModel, kelvin: float, linear: np.ndarray, unkno
     for there in (log_k - step, log_k, log_k + step):
         components = np.vstack([reduction.spline(there), reduction.fixed])
         best = np.linalg.lstsq(components.T, signal, rcond=None)[0]
-        values.append(derived_values(model, np.array([there]), best[None])[0])
+        values.append(derived_values(model, np.array([there]), best[None], np.ones(1))[0])
     second = np.abs(values[0] + values[2] - 2 * values[1]) / 2
     return second / error.errors
 

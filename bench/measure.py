@@ -56,7 +56,7 @@ def estimate(values: np.ndarray, model: FlareModel, reduction: Reduction) -> Non
     for start in range(0, len(sums), BATCH):
         profile = Profile(reduction, sums[start : start + BATCH])
         best = with_bounds(reduction, profile.sums, profile.best())
-        derived_values(model, best.log_k, best.linear)
+        derived_values(model, best.log_k, best.linear, np.ones(1))
         covariance(model, reduction, best, profile.factor(best.log_k, best.linear))
 
 

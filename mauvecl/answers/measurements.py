@@ -19,8 +19,7 @@ from mauvecl.fits.spectrum import (
     TwoTemperatures,
     fit,
     fit_two_temperatures,
-    forecast,
-    forecast_two_temperatures,
+    forecast_model,
 )
 from mauvecl.fits.time_course import MeasuredBins, cooling_course, cooling_event, fit_bins, fit_cooling, measure_along
 from mauvecl.flares.settings import Cooling
@@ -156,11 +155,11 @@ class ExpectedMeasurement(InCell):
 
         Errors of a flare that leaves too few pixels below saturation are undefined.
         """
-        log_k, linear = self.perfect.log_k[0], self.perfect.amplitudes[0]
+        kelvin, linear = np.exp(self.perfect.log_k[0]), self.perfect.amplitudes[0]
 
         def at(factor: float) -> Forecast:
             try:
-                return forecast_model(self.quiet, self.fitted, log_k, factor * linear, unknown, self.skipped_nm)
+                return forecast_model(self.quiet, self.fitted, kelvin, factor * linear, unknown, self.skipped_nm)
             except InputError:
                 return replace(self.ahead, errors=np.full_like(self.ahead.errors, np.nan))
 
@@ -224,20 +223,6 @@ def fit_model(
     return fit(frames, quiet, model, unknown, skipped_nm=skipped_nm)
 
 
-def forecast_model(
-    quiet: Expectation,
-    model: FlareModel | TwoTemperatures,
-    log_k: Float,
-    linear: Float,
-    unknown: Nuisances | None,
-    skipped_nm: Ranges = (),
-) -> Forecast:
-    """Return the errors of a model of one or two temperatures, for parameters of a `Measurement`."""
-    if isinstance(model, TwoTemperatures):
-        return forecast_two_temperatures(quiet, model.single, np.exp(log_k), linear, unknown, skipped_nm)
-    return forecast(quiet, model, float(np.exp(log_k)), linear, unknown, skipped_nm=skipped_nm)
-
-
 def model_of(case: Case, *, jump: bool = False, lines: tuple[str, ...] = ()) -> FlareModel:
     """Return the model of a blackbody at the star of a case, with a Balmer continuum and lines if they are fitted."""
     study, star = case.study, case.star
@@ -284,7 +269,7 @@ def expected_measurements(
     for name, model in (models or models_of(case)).items():
         perfect = fit_model(_mean_exposure(quiet, lit, unknown), quiet, model, unknown, skipped)
         known, ahead = (
-            forecast_model(quiet, model, perfect.log_k[0], perfect.amplitudes[0], nuisances, lost)
+            forecast_model(quiet, model, np.exp(perfect.log_k[0]), perfect.amplitudes[0], nuisances, lost)
             for nuisances in (None, unknown)
         )
         true = np.array([truth.value(quantity) for quantity in model.names])

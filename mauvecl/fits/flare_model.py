@@ -73,6 +73,8 @@ class Derived:
     # Shape (n_node,); the quantity is `offset` plus amplitude 1 over amplitude 0 times this.
     ratio: Float | None = None
     offset: float = 1.0
+    # Value of a quantity that the model holds.
+    held: float | None = None
 
     @property
     def bound(self) -> float:
@@ -261,7 +263,7 @@ class FlareModel:
     def values(self, temperature_k: Temperature, amplitudes: Sequence[float] | Float) -> dict[str, float]:
         """Return the reported quantities of a flare, by name."""
         linear = self._checked(temperature_k, amplitudes)
-        values = derived_values(self, np.array([np.log(temperature_k)]), linear[None])[0]
+        values = derived_values(self, np.array([np.log(temperature_k)]), linear[None], np.ones(1))[0]
         return dict(zip(self.names, values.tolist(), strict=True))
 
     def amplitudes(
@@ -288,14 +290,18 @@ class FlareModel:
         return linear
 
 
-def derived_values(model: FlareModel, log_k: Float, linear: Float) -> Float:
-    """Return the reported quantities, shape (n, n_derived), of temperatures (n,) and amplitudes (n, n_linear)."""
+def derived_values(model: FlareModel, log_k: Float, linear: Float, factor: Float) -> Float:
+    """Return the reported quantities of flares, shape (n, n_derived).
+
+    Temperatures have the shape (n,), amplitudes of the recorded light (n, n_linear), and factors by which it was
+    dimmed (n,).
+    """
     values = np.empty((log_k.size, len(model.derived)))
     which, spline = model.sums
-    values[:, which] = np.einsum("nql,nl->nq", spline(log_k), linear)
+    values[:, which] = undimmed(np.einsum("nql,nl->nq", spline(log_k), linear), factor)
     for q in np.flatnonzero(~which):
         derived, ratio = model.derived[q], model.splines[q]
-        values[:, q] = np.exp(log_k)
+        values[:, q] = np.exp(log_k) if derived.held is None else derived.held
         if ratio is not None:
             positive = linear[:, 0] > 0.0
             over = np.divide(linear[:, 1], linear[:, 0], out=np.full(log_k.size, np.nan), where=positive)
@@ -542,6 +548,12 @@ class MeanSums:
     def spline(self) -> scipy.interpolate.CubicSpline:
         """Sums of the blackbody over log temperature."""
         return scipy.interpolate.CubicSpline(self.log_k, self.hot)
+
+    def with_second(self, log_k: float, end: int) -> Self:
+        """Return the response below node `end`, with a blackbody of a second temperature as another component."""
+        light = None if self.light is None else self.light.with_second(log_k, end)
+        fixed = np.vstack([self.spline(log_k), self.fixed])
+        return replace(self, hot=self.hot[:end], fixed=fixed, log_k=self.log_k[:end], light=light)
 
 
 @dataclass(frozen=True, eq=False)

@@ -91,6 +91,10 @@ class Profile:
         self.nodes = reduction.log_k
         self.hot = reduction.spline
 
+    def rows(self, rows: NDArray[np.intp]) -> tuple[MeanSums, Float, Float | None]:
+        """Return what makes a profile of some of the frames."""
+        return self.reduction, self.sums[rows], None if self.light is None else self.light[rows]
+
     def parts(self, log_k: Float) -> tuple[Float, Float, Float]:
         """Return the blackbody's amplitude without bounds, its variance, and its sums, at temperatures (n, ...)."""
         hot = self.hot(log_k)
@@ -233,8 +237,12 @@ def ends_of_quantities(
     )
     columns: list[tuple[Float, Float]] = []
     for derived, spline, (first, times) in zip(model.derived, model.splines, model.multiples, strict=True):
-        own = columns[first] if first < len(columns) else None
-        low, high = own or (kelvin if spline is None else ends(derived, spline))
+        if first < len(columns):
+            low, high = columns[first]
+        elif spline is not None:
+            low, high = ends(derived, spline)
+        else:
+            low, high = kelvin if derived.held is None else np.full((2, log_low.size), derived.held)
         # Light that contradicts every factor above zero limits nothing.
         none = low > high
         low, high = np.where(none, -np.inf, low), np.where(none, np.inf, high)
@@ -521,36 +529,49 @@ def _ratio_interval(profile: Profile, per: Float, hot: Float, least_gain: Float)
     return 1.0 + extreme(low, np.minimum), 1.0 + extreme(high, np.maximum)
 
 
-def covariance(model: FlareModel, reduction: MeanSums, best: BestFit, factor: Float) -> Float:
+@dataclass(frozen=True, eq=False)
+class Slopes:
+    """Derivatives with respect to a parameter of n fits."""
+
+    sums: Float  # shape (n, n_sum)
+    quantities: Float  # shape (n, n_derived), as they are recorded
+    light: Float  # shape (n,); of the sum of the factor on light
+
+
+def covariance(
+    model: FlareModel, reduction: MeanSums, best: BestFit, factor: Float, other: Slopes | None = None
+) -> Float:
     """Return the covariance of quantities from the Fisher information at the fit, (n, n_derived, n_derived).
 
-    The parameters are the amplitudes as they are recorded and the log temperature, and the factor on all light if it is
-    unknown. The result is NaN if a flare adds no light, or if its temperature and amplitudes are degenerate.
+    The parameters are the amplitudes as they are recorded, the log temperature, an `other` one, and the factor on all
+    light if it is unknown. The result is NaN if a flare adds no light, or if its parameters are degenerate.
     """
-    hot, slope = reduction.spline(best.log_k), reduction.spline(best.log_k, 1)
-    n, m = best.linear.shape
-    jacobian = np.zeros((n, m + 1, hot.shape[1]))
-    jacobian[:, 0], jacobian[:, 1:m] = hot, reduction.fixed
-    jacobian[:, m] = best.linear[:, :1] * slope
+    log_k, linear, light = best.log_k, best.linear, reduction.light
+    fixed = np.broadcast_to(reduction.fixed, (log_k.size, *reduction.fixed.shape))
+    columns = [reduction.spline(log_k)[:, None], fixed, (linear[:, :1] * reduction.spline(log_k, 1))[:, None]]
+    gradients = [gradient_of(model, log_k, linear)]
+    if other is not None:
+        columns.append(other.sums[:, None])
+        gradients.append(other.quantities[:, :, None])
+    jacobian, gradient = np.concatenate(columns, axis=1), np.concatenate(gradients, axis=2)
     information = jacobian @ jacobian.transpose(0, 2, 1)
     scale = np.sqrt(np.einsum("nii->ni", information))
     good = (scale > 0.0).all(axis=1)
     scale[~good] = 1.0
     normal = information / scale[:, :, None] / scale[:, None, :]
     good &= np.linalg.eigvalsh(normal)[:, 0] > 1e-13
-    normal[~good] = np.eye(m + 1)
+    normal[~good] = np.eye(normal.shape[1])
     inverse = np.linalg.inv(normal) / scale[:, :, None] / scale[:, None, :]
     inverse[~good] = np.nan
-    log_k, linear, light = best.log_k, best.linear, reduction.light
-    gradient = gradient_of(model, log_k, linear)
     if light is None:
         return np.asarray(gradient @ inverse @ gradient.transpose(0, 2, 1))
     over = np.where(factor > 0.0, factor, np.nan)
     which, _ = model.sums
     gradient[:, which] /= over[:, None, None]
     # The best factor follows the amplitudes and the temperature, and scatters about that.
-    by_factor = np.where(which, -derived_values(model, log_k, linear) / over[:, None] ** 2, 0.0)
-    follows = -np.column_stack([light.weights_of(log_k), linear[:, 0] * light.spline(log_k, 1) / light.scale])
+    by_factor = np.where(which, -derived_values(model, log_k, linear, over) / over[:, None], 0.0)
+    slopes = [linear[:, 0] * light.spline(log_k, 1)] + ([] if other is None else [other.light])
+    follows = -np.column_stack([light.weights_of(log_k), *(slope / light.scale for slope in slopes)])
     gradient += by_factor[:, :, None] * follows[:, None, :]
     own = by_factor[:, :, None] * by_factor[:, None, :] / light.scale**2
     return np.asarray(gradient @ inverse @ gradient.transpose(0, 2, 1) + own)
@@ -566,7 +587,7 @@ def gradient_of(model: FlareModel, log_k: Float, linear: Float) -> Float:
     for q in np.flatnonzero(~which):
         ratio = model.splines[q]
         if ratio is None:
-            gradient[:, q, m] = np.exp(log_k)
+            gradient[:, q, m] = np.exp(log_k) if model.derived[q].held is None else 0.0
             continue
         amplitude = np.where(linear[:, 0] > 0, linear[:, 0], np.nan)
         gradient[:, q, 0] = -ratio(log_k) * linear[:, 1] / amplitude**2
@@ -755,11 +776,11 @@ class BoundedProfile(Profile):
         low, high = self.nodes[0], self.nodes[-1]
         step = float(self.nodes[1] - self.nodes[0])
         beside = np.clip(x[moving, None] + BESIDE * step * np.array([-1.0, 0.0, 1.0]), low, high)
-        gain = BoundedProfile(self.reduction, self.sums[moving]).gain(beside)
+        gain = BoundedProfile(*self.rows(moving)).gain(beside)
         rising = moving[gain.max(axis=1) > gain[:, 1] + LEAST_RISE]
         if not rising.size:
             return x
-        own, best = BoundedProfile(self.reduction, self.sums[rising]), x[rising]
+        own, best = BoundedProfile(*self.rows(rising)), x[rising]
         for _ in range(CLIMBS):
             there = np.clip(best[:, None] + step * np.linspace(-1.0, 1.0, 9), low, high)
             best = there[np.arange(best.size), np.argmax(own.gain(there), axis=1)]

@@ -31,6 +31,7 @@ from mauvecl.fits.profile import (
     BestFit,
     BoundedProfile,
     Profile,
+    Slopes,
     bounded_intervals,
     covariance,
     intervals,
@@ -126,14 +127,15 @@ class Measurement:
         return np.asarray((self.low <= self.bounds) != np.isinf(self.high))
 
     @classmethod
-    def joined(cls, parts: Sequence[Self]) -> Self:
-        """Return the measurements of several batches of frames as one."""
+    def joined(cls, parts: Sequence[Self], numbers: Sequence[ArrayLike] | None = None) -> Self:
+        """Return the measurements of several batches of frames as one, in the order of the frames' numbers if given."""
         values: dict[str, Any] = {field.name: getattr(parts[0], field.name) for field in fields(cls)}
         for name, value in values.items():
             if isinstance(value, np.ndarray):
                 axis = 1 if name in ("low", "high") else 0
                 values[name] = np.concatenate([getattr(part, name) for part in parts], axis)
-        return cls(**values | {"dof": min(part.dof for part in parts)})
+        every = cls(**values | {"dof": min(part.dof for part in parts)})
+        return every if numbers is None else every.rows(np.argsort(np.concatenate(numbers)))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return all arrays that depend on the frames, for files; the inverse of `of_arrays`."""
@@ -253,9 +255,9 @@ def fit(
     parts, order = [], []
     for some, reduction in problem.groups(log_k, linear, every, near):
         for batch in _batches(some):
-            parts.append(problem.measured(batch, reduction, levels))
+            parts.append(problem.measured(batch, reduction))
             order.append(batch)
-    return Measurement.joined(parts).rows(np.argsort(np.concatenate(order)))
+    return Measurement.joined(parts, order)
 
 
 def _batches(rows: NDArray[np.intp]) -> Iterator[NDArray[np.intp]]:
@@ -272,6 +274,7 @@ class _Problem:
     quiet: Expectation
     model: FlareModel
     nuisances: Nuisances | None
+    levels: tuple[float, ...]
     skipped_nm: Ranges
 
     @classmethod
@@ -290,7 +293,12 @@ class _Problem:
         if not levels:
             raise InputError.of("levels", levels, "at least one probability")
         mean = quiet.recorded_dn if nuisances is None else quiet.recorded_dn + nuisances.mean_dn
-        return cls(Exposures(raw, mean), quiet, model, nuisances, skipped_nm)
+        return cls(Exposures(raw, mean), quiet, model, nuisances, tuple(levels), skipped_nm)
+
+    @property
+    def rises(self) -> list[float]:
+        """Rises of chi-squared at the ends of intervals of each level."""
+        return [float(scipy.stats.chi2.isf(1 - level, 1)) for level in self.levels]
 
     def reduction(
         self, added_dn: Float | None, highest_dn: Float | None = None, clipped: NDArray[np.bool_] | None = None
@@ -367,36 +375,52 @@ class _Problem:
                 clipped = clipped_pixels(raw[own], quiet)
             yield own, self.reduction(mean, highest, clipped)
 
-    def measured(self, rows: NDArray[np.intp], reduction: Reduction, levels: Sequence[float]) -> Measurement:
+    def measured(self, rows: NDArray[np.intp], reduction: Reduction) -> Measurement:
         """Measure the flares of some frames of one variance."""
         model = self.model
         sums, rest, light = self.exposures.sums_and_rest(reduction, rows)
         profile = Profile(reduction, sums, light)
         at_nodes = profile.gain_at_nodes()
         best = profile.best(at_nodes)
-        allowed = [float(scipy.stats.chi2.isf(1 - p, 1)) for p in levels]
-        ends = [intervals(model, profile, best, at_nodes, rise) for rise in allowed]
+        ends = [intervals(model, profile, best, at_nodes, rise) for rise in self.rises]
         low, high = (np.stack([interval[side] for interval in ends]) for side in (0, 1))
         # Intervals differ from unbounded ones only if they reach a bound.
         reaches = (low <= np.array(model.bounds)) & np.isfinite(model.bounds)
         near = np.flatnonzero(reaches.any(axis=(0, 2)) | (best.linear < 0.0).any(axis=1))
         if near.size:
-            bounded = BoundedProfile(reduction, sums[near], None if light is None else light[near])
+            bounded = BoundedProfile(*profile.rows(near))
             nodes = bounded.gain_at_nodes()
             there = bounded.best(nodes)
-            for k, rise in enumerate(allowed):
+            for k, rise in enumerate(self.rises):
                 low[k, near], high[k, near] = bounded_intervals(model, bounded, there, nodes, rise)
             best = best.replaced(near, there)
-        chi2 = rest + (np.einsum("nk,nk->n", sums, sums) - best.gain)
-        dof = reduction.n_used - reduction.n_free - len(model.linear) - 1
-        factor = profile.factor(best.log_k, best.linear)
-        estimates = derived_values(model, best.log_k, best.linear)
-        which, _ = model.sums
-        estimates[:, which] = undimmed(estimates[:, which], factor)
+        return self.measurement(model, reduction, profile, best, rest, (low, high))
+
+    def measurement(
+        self,
+        model: FlareModel,
+        reduction: Reduction,
+        profile: Profile,
+        best: BestFit,
+        rest: Float,
+        ends: tuple[Float, Float],
+        second: tuple[float, Slopes] | None = None,
+    ) -> Measurement:
+        """Return the measurement of best fits with the ends of their intervals.
+
+        `rest` is chi-squared without what the sums explain. A second blackbody is given by its log temperature and the
+        derivatives with respect to it.
+        """
+        chi2 = rest + (np.einsum("nk,nk->n", profile.sums, profile.sums) - best.gain)
+        dof = reduction.n_used - reduction.n_free - len(model.linear) - (1 if second is None else 2)
+        factor, log_k = profile.factor(best.log_k, best.linear), best.log_k
+        spread = covariance(model, profile.reduction, best, factor, None if second is None else second[1])
+        if second is not None:
+            log_k = np.column_stack([log_k, np.full(log_k.size, second[0])])
         return Measurement(
-            model.names, model.units, model.bounds, estimates, covariance(model, reduction, best, factor),
-            tuple(levels), low, high, chi2, np.asarray(scipy.stats.chi2.sf(chi2, dof)), dof, np.sqrt(best.gain),
-            best.log_k, undimmed(best.linear, factor), factor,
+            model.names, model.units, model.bounds, derived_values(model, best.log_k, best.linear, factor), spread,
+            self.levels, *ends, chi2, np.asarray(scipy.stats.chi2.sf(chi2, dof)), dof, np.sqrt(best.gain), log_k,
+            undimmed(best.linear, factor), factor,
         )  # fmt: skip
 
 
@@ -470,16 +494,36 @@ def forecast(
     InputError
         If the model cannot describe the flare, or the flare is degenerate with the unknowns.
     """
+    return forecast_model(expectation, model, temperature_k, amplitudes, nuisances, skipped_nm)
+
+
+def forecast_model(
+    expectation: Expectation,
+    model: FlareModel | TwoTemperatures,
+    temperature_k: Any,
+    amplitudes: Sequence[float] | Float,
+    nuisances: Nuisances | None = None,
+    skipped_nm: Ranges = (),
+) -> Forecast:
+    """Forecast the errors of a model of one temperature, or of two, which are undefined without light of both.
+
+    Parameters are those of `forecast`.
+    """
     factor = nuisances.mean_factor if nuisances else 1.0
     # The flare as it is recorded.
+    linear = factor * np.asarray(amplitudes, np.float64)[None]
+    log_k, single = np.log(np.atleast_1d(temperature_k)), model.single if isinstance(model, TwoTemperatures) else model
     counts = factor * model.counts(temperature_k, amplitudes)
-    log_k, linear = np.array([np.log(temperature_k)]), factor * np.asarray(amplitudes, np.float64)[None]
-    reduction = Reduction.of(model, expectation, counts, nuisances, skipped_nm, highest_dn=counts / min(1.0, factor))
-    sums = linear[0] @ np.vstack([reduction.spline(log_k), reduction.fixed])
-    best = BestFit(log_k, linear, np.array([sums @ sums]))
-    spread = covariance(model, reduction, best, np.array([factor]))[0]
-    values = derived_values(model, log_k, linear / factor)[0]
-    return Forecast(model.names, model.units, values, np.sqrt(np.diag(spread)), spread, float(np.linalg.norm(sums)))
+    reduction = Reduction.of(single, expectation, counts, nuisances, skipped_nm, highest_dn=counts / min(1.0, factor))
+    one, own, slopes = single, reduction, None
+    if isinstance(model, TwoTemperatures):
+        second, log_k = float(log_k[1]), log_k[:1]
+        one, own = model.at(second), model.reduction_at(second, reduction)
+        slopes = model.slopes(second, reduction, log_k, linear)
+    sums = linear[0] @ np.vstack([own.spline(log_k), own.fixed])
+    spread = covariance(one, own, BestFit(log_k, linear, np.array([sums @ sums])), np.array([factor]), slopes)[0]
+    values = derived_values(one, log_k, linear, np.array([factor]))[0]
+    return Forecast(one.names, one.units, values, np.sqrt(np.diag(spread)), spread, float(np.linalg.norm(sums)))
 
 
 #: Number of second temperatures per node of the model, in steps of 0.6 %.
@@ -501,20 +545,62 @@ class TwoTemperatures:
         """Names of the reported quantities."""
         return (*self.single.names, "second temperature", "second area")
 
-    @property
-    def units(self) -> tuple[str, ...]:
-        """Units of the reported quantities."""
-        return (*self.single.units, "K", "")
-
-    @property
-    def bounds(self) -> tuple[float, ...]:
-        """Smallest possible values of the reported quantities."""
-        return (*self.single.bounds, -np.inf, 0.0)
-
     def counts(self, temperatures_k: Float, amplitudes: Sequence[float] | Float) -> Float:
         """Return the mean DN that a flare adds to each pixel, of the lower and the second temperature, (n_pixel,)."""
         lower, second = np.asarray(temperatures_k, np.float64)
-        return with_second(self.single, float(np.log(second))).counts(float(lower), amplitudes)
+        return self.at(float(np.log(second))).counts(float(lower), amplitudes)
+
+    @property
+    def _bolometric(self) -> scipy.interpolate.CubicSpline:
+        """Bolometric flux of a blackbody of amplitude 1, and of other components."""
+        spline = self.single.splines[self.single.names.index("flux bolometric")]
+        assert spline is not None
+        return spline
+
+    def _end(self, log_k: float) -> int:
+        """Return the number of nodes that are at least `APART` nodes below a temperature."""
+        nodes = self.single.log_k
+        return int(np.searchsorted(nodes, log_k - APART * (nodes[1] - nodes[0]) + 1e-9))
+
+    def at(self, log_k: float) -> FlareModel:
+        """Return a model of lower temperatures with a blackbody of a second temperature as another component."""
+        single, end = self.single, self._end(log_k)
+
+        def area(x: Float | float) -> Float:
+            # The ratio of the flux at the telescope to that at the surface is proportional to the area.
+            return np.asarray(self._bolometric(x)[..., 0] / np.exp(4 * x))
+
+        def both(derived: Derived, spline: scipy.interpolate.CubicSpline | None) -> Derived:
+            if derived.factors is None or spline is None:
+                return derived
+            return replace(derived, factors=np.insert(derived.factors[:end], 1, spline(log_k)[0], axis=1))
+
+        kelvin = Derived("second temperature", "K", "temperature of the second blackbody", held=float(np.exp(log_k)))
+        share = Derived("second area", "", "area at the second temperature over that at the first",
+                        ratio=area(log_k) / area(single.log_k[:end]), offset=0.0)  # fmt: skip
+        return FlareModel(
+            single.log_k[:end], single.hot[:end], np.vstack([single.hot_spline(log_k), single.fixed]),
+            (single.linear[0], "second", *single.linear[1:]),
+            (*map(both, single.derived, single.splines), kelvin, share),
+        )  # fmt: skip
+
+    def reduction_at(self, log_k: float, reduction: Reduction) -> Reduction:
+        """Return the response to the flares of `at`, from that of the model of one blackbody."""
+        return reduction.with_second(log_k, self._end(log_k))
+
+    def slopes(self, log_k: float, reduction: Reduction, lower: Float, linear: Float) -> Slopes:
+        """Return derivatives with respect to a second log temperature of flares with lower ones, (n,), and amplitudes.
+
+        The reduction is that of the model of one blackbody.
+        """
+        model, amplitude = self.at(log_k), linear[:, 1]
+        quantities = np.zeros((amplitude.size, len(model.derived)))
+        quantities[:, model.sums[0]] = amplitude[:, None] * self.single.sums[1](log_k, 1)[:, 0]
+        quantities[:, -2] = np.exp(log_k)
+        areas = derived_values(model, lower, linear, np.ones(1))[:, -1]
+        quantities[:, -1] = areas * (self._bolometric(log_k, 1)[0] / self._bolometric(log_k)[0] - 4.0)
+        light = np.zeros(1) if reduction.light is None else reduction.light.spline(log_k, 1)
+        return Slopes(amplitude[:, None] * reduction.spline(log_k, 1), quantities, amplitude * light)
 
 
 @validated
@@ -552,100 +638,33 @@ def fit_two_temperatures(
         raise InputError("the model must have blackbodies, with or without lines, and no Balmer jump", key="model")
     single = fit(frames, expectation, model, nuisances, levels=levels, skipped_nm=skipped_nm)
     problem = _Problem.of(frames, expectation, model, nuisances, levels, skipped_nm)
-    allowed = [float(scipy.stats.chi2.isf(1 - p, 1)) for p in levels]
-    parts, order, whole = [], [], TwoTemperatures(model)
+    parts, order, two = [], [], TwoTemperatures(model)
     recorded = single.amplitudes * single.factor[:, None]
     for rows, reduction in problem.groups(single.log_k, recorded, np.arange(len(recorded)), True):
-        sums, rest, light = problem.exposures.sums_and_rest(reduction, rows)
-        best, low, high, second, estimates, factor = _Search(model, reduction, sums, allowed, light).measured()
-        chi2 = rest + np.einsum("nk,nk->n", sums, sums) - best.gain
-        dof = reduction.n_used - reduction.n_free - len(model.linear) - 3
         check_enough(expectation, reduction.variance > 0.0, len(model.linear) + 3 + reduction.n_free)
-        spread = _covariance(model, reduction, best, second, estimates, factor)
-        parts.append(
-            Measurement(
-                whole.names, whole.units, whole.bounds, estimates, spread, tuple(levels), low, high, chi2,
-                np.asarray(scipy.stats.chi2.sf(chi2, dof)), dof, np.sqrt(best.gain),
-                np.column_stack([best.log_k, second]), undimmed(best.linear, factor), factor,
-            )
-        )  # fmt: skip
-        order.append(rows)
-    return Measurement.joined(parts).rows(np.argsort(np.concatenate(order)))
-
-
-def forecast_two_temperatures(
-    expectation: Expectation,
-    model: FlareModel,
-    temperatures_k: Float,
-    amplitudes: Float,
-    nuisances: Nuisances | None = None,
-    skipped_nm: Ranges = (),
-) -> Forecast:
-    """Return the errors with which a flare of two temperatures will be measured, as `forecast`.
-
-    Undefined where one of the blackbodies adds no light.
-    """
-    factor = nuisances.mean_factor if nuisances else 1.0
-    whole, log_k, linear = TwoTemperatures(model), np.log(temperatures_k), factor * np.asarray(amplitudes)[None]
-    counts = whole.counts(temperatures_k, linear[0])
-    reduction = Reduction.of(model, expectation, counts, nuisances, skipped_nm, highest_dn=counts / min(1.0, factor))
-    values = derived_values(with_second(model, float(log_k[1])), log_k[:1], linear / factor)
-    values = np.insert(values, -1, temperatures_k[1], axis=1)
-    sums = linear[0] @ np.vstack([reduction.spline(log_k), reduction.fixed])
-    best = BestFit(log_k[:1], linear, np.array([sums @ sums]))
-    spread = _covariance(model, reduction, best, log_k[1:], values, np.array([factor]))[0]
-    errors = np.sqrt(np.diag(spread))
-    return Forecast(whole.names, whole.units, values[0], errors, spread, float(np.linalg.norm(sums)))
-
-
-def with_second(model: FlareModel, log_k: float) -> FlareModel:
-    """Return a model of lower temperatures with a blackbody of a second temperature as another component."""
-    end = _lower(model.log_k, log_k)
-    bolometric = model.splines[model.names.index("flux bolometric")]
-    assert bolometric is not None
-
-    def area(x: Float | float) -> Float:
-        # The ratio of the flux at the telescope to that at the surface is proportional to the area.
-        return np.asarray(bolometric(x)[..., 0] / np.exp(4 * x))
-
-    def both(derived: Derived, spline: scipy.interpolate.CubicSpline | None) -> Derived:
-        if derived.factors is None or spline is None:
-            return derived
-        return replace(derived, factors=np.insert(derived.factors[:end], 1, spline(log_k)[0], axis=1))
-
-    share = Derived("second area", "", "area at the second temperature over that at the first",
-                    ratio=area(log_k) / area(model.log_k[:end]), offset=0.0)  # fmt: skip
-    return FlareModel(
-        model.log_k[:end], model.hot[:end], np.vstack([model.hot_spline(log_k), model.fixed]),
-        (model.linear[0], "second", *model.linear[1:]),
-        (*map(both, model.derived, model.splines), share),
-    )  # fmt: skip
-
-
-def _lower(nodes: Float, log_k: float) -> int:
-    """Return the number of nodes that are at least `APART` nodes below a temperature."""
-    return int(np.searchsorted(nodes, log_k - APART * (nodes[1] - nodes[0]) + 1e-9))
+        sums, rest, light = problem.exposures.sums_and_rest(reduction, rows)
+        for here, log_k, profile, best, ends in _Search(two, reduction, sums, problem.rises, light).fits():
+            second = log_k, two.slopes(log_k, reduction, best.log_k, best.linear)
+            parts.append(problem.measurement(two.at(log_k), reduction, profile, best, rest[here], ends, second))
+            order.append(rows[here])
+    return Measurement.joined(parts, order)
 
 
 class _Search:
     """Fit of exposures with a common variance over second temperatures."""
 
     def __init__(
-        self, model: FlareModel, reduction: Reduction, sums: Float, allowed: list[float], light: Float | None
+        self, model: TwoTemperatures, reduction: Reduction, sums: Float, allowed: list[float], light: Float | None
     ) -> None:
         self._model, self._reduction, self._sums, self._allowed = model, reduction, sums, allowed
         self._light = light
-        first, last = model.log_k[2 * APART], model.log_k[-1]
+        nodes = reduction.log_k
         #: Second log temperatures that may be tried.
-        self._grid = np.linspace(first, last, PER_NODE * (model.log_k.size - 1 - 2 * APART) + 1)
+        self._grid = np.linspace(nodes[2 * APART], nodes[-1], PER_NODE * (nodes.size - 1 - 2 * APART) + 1)
         self._gain = np.full((len(sums), self._grid.size), -np.inf)
 
     def _profile(self, node: int, rows: NDArray[np.intp]) -> BoundedProfile:
-        r, end = self._reduction, _lower(self._reduction.log_k, self._grid[node])
-        second = float(self._grid[node])
-        fixed = np.vstack([r.spline(second), r.fixed])
-        factor = None if r.light is None else r.light.with_second(second, end)
-        own = replace(r, hot=r.hot[:end], fixed=fixed, log_k=r.log_k[:end], light=factor)
+        own = self._model.reduction_at(float(self._grid[node]), self._reduction)
         return BoundedProfile(own, self._sums[rows], None if self._light is None else self._light[rows])
 
     def _evaluate(self, wanted: NDArray[np.bool_]) -> None:
@@ -671,41 +690,43 @@ class _Search:
                 fine[np.arange(n), np.rint(low + share * (high - low)).astype(np.intp)] = True
             self._evaluate(fine)
 
-    def measured(self) -> tuple[BestFit, Float, Float, Float, Float, Float]:
-        """Return best fits, intervals (n_level, n, n_derived), second log temperatures, estimates, and factors."""
+    def fits(self) -> Iterator[tuple[NDArray[np.intp], float, BoundedProfile, BestFit, tuple[Float, Float]]]:
+        """Yield exposures with the same best second temperature, and their fits.
+
+        These are the numbers of the exposures, the logarithm of the temperature, the profile at it, the best fits, and
+        the ends of intervals, (n_level, n, n_derived).
+        """
         self._evaluate_intervals()
-        n = len(self._gain)
+        low, high = self._intervals()
         best_node = self._gain.argmax(axis=1)
+        for node in np.unique(best_node):
+            rows = np.flatnonzero(best_node == node)
+            profile = self._profile(int(node), rows)
+            best = replace(profile.best(profile.gain_at_nodes()), gain=self._gain[rows, node])
+            yield rows, float(self._grid[node]), profile, best, (low[:, rows], high[:, rows])
+
+    def _intervals(self) -> tuple[Float, Float]:
+        """Return the ends of intervals, which are the outermost ones at all second temperatures."""
         gain = self._gain.max(axis=1)
-        q = len(self._model.derived) + 2
-        lows, highs = np.full((len(self._allowed), n, q), np.inf), np.full((len(self._allowed), n, q), -np.inf)
-        log_k, linear = np.empty(n), np.empty((n, len(self._model.linear) + 1))
-        estimates, factor = np.empty((n, q)), np.ones(n)
+        shape = len(self._allowed), gain.size, len(self._model.names)
+        lows, highs = np.full(shape, np.inf), np.full(shape, -np.inf)
         for node in np.flatnonzero((self._gain >= gain[:, None] - max(self._allowed)).any(axis=0)):
             rows = np.flatnonzero(self._gain[:, node] >= gain - max(self._allowed))
-            profile, model = self._profile(int(node), rows), with_second(self._model, float(self._grid[node]))
+            profile, model = self._profile(int(node), rows), self._model.at(float(self._grid[node]))
             at_nodes = profile.gain_at_nodes()
             own = profile.best(at_nodes)
-            here = np.flatnonzero(best_node[rows] == node)
-            log_k[rows[here]], linear[rows[here]] = own.log_k[here], own.linear[here]
-            values = derived_values(model, own.log_k[here], own.linear[here])
-            factor[rows[here]] = profile.factor(own.log_k, own.linear)[here]
-            values[:, model.sums[0]] = undimmed(values[:, model.sums[0]], factor[rows[here]])
-            estimates[rows[here]] = np.insert(values, q - 2, np.exp(self._grid[node]), axis=1)
             for k, rise in enumerate(self._allowed):
                 there = np.flatnonzero(own.gain >= gain[rows] - rise)
                 if not there.size:
                     continue
-                some = self._profile(int(node), rows[there])
                 limit = BestFit(own.log_k[there], own.linear[there], gain[rows[there]])
-                ends = bounded_intervals(model, some, limit, at_nodes[there], rise)
-                for bounds, end, which in ((lows, ends[0], np.minimum), (highs, ends[1], np.maximum)):
-                    columns = np.delete(np.arange(q), q - 2)
-                    bounds[k][np.ix_(rows[there], columns)] = which(bounds[k][np.ix_(rows[there], columns)], end)
+                some = BoundedProfile(*profile.rows(there))
+                low, high = bounded_intervals(model, some, limit, at_nodes[there], rise)
+                lows[k, rows[there]] = np.minimum(lows[k, rows[there]], low)
+                highs[k, rows[there]] = np.maximum(highs[k, rows[there]], high)
         for k, rise in enumerate(self._allowed):
-            lows[k, :, q - 2], highs[k, :, q - 2] = self._second_ends(gain, rise)
-        best = BestFit(log_k, linear, gain)
-        return best, lows, highs, self._grid[best_node], estimates, factor
+            lows[k, :, -2], highs[k, :, -2] = self._second_ends(gain, rise)
+        return lows, highs
 
     def _second_ends(self, gain: Float, allowed: float) -> tuple[Float, Float]:
         """Return the ends of the second temperature's interval, interpolated between the tried nodes."""
@@ -721,55 +742,3 @@ class _Search:
             if b < tried.size - 1:
                 high[k] = np.exp(np.interp(0.0, [root[b], root[b + 1]], [x[b], x[b + 1]]))
         return low, high
-
-
-def _covariance(
-    model: FlareModel, reduction: Reduction, best: BestFit, second: Float, estimates: Float, factor: Float
-) -> Float:
-    """Return the covariance of quantities, (n, n_derived + 2, n_derived + 2), from the Fisher information."""
-    n, m = best.linear.shape
-    a, b = best.linear[:, 0], best.linear[:, 1]
-    columns = [reduction.spline(best.log_k), reduction.spline(second)]
-    columns += [np.tile(row, (n, 1)) for row in reduction.fixed]
-    columns += [a[:, None] * reduction.spline(best.log_k, 1), b[:, None] * reduction.spline(second, 1)]
-    jacobian = np.stack(columns, axis=1)
-    gradient, by_factor = _gradient(model, best, second, estimates, np.where(factor > 0.0, factor, np.nan))
-    own = np.zeros((n, by_factor.shape[1], by_factor.shape[1]))
-    if reduction.light is not None:
-        light = reduction.light
-        weights = [light.spline(best.log_k), light.spline(second), *(np.full(n, value) for value in light.fixed)]
-        weights += [a * light.spline(best.log_k, 1), b * light.spline(second, 1)]
-        gradient -= by_factor[:, :, None] * np.stack(weights, axis=1)[:, None, :] / light.scale
-        own = by_factor[:, :, None] * by_factor[:, None, :] / light.scale**2
-    information = np.einsum("nik,njk->nij", jacobian, jacobian)
-    good = (best.linear > 0).all(axis=1)
-    information[~good] = np.eye(m + 2)
-    inverse = np.linalg.pinv(information, rcond=1e-14, hermitian=True)
-    inverse[~good] = np.nan
-    spread = np.einsum("nqi,nij,nrj->nqr", np.nan_to_num(gradient), inverse, np.nan_to_num(gradient))
-    return np.asarray(spread + np.nan_to_num(own))
-
-
-def _gradient(model: FlareModel, best: BestFit, second: Float, estimates: Float, over: Float) -> tuple[Float, Float]:
-    """Return derivatives of quantities by amplitudes and log temperatures, and by the factor on all light, `over`."""
-    (n, m), a, b = best.linear.shape, best.linear[:, 0], best.linear[:, 1]
-    gradient, by_factor = np.zeros((n, len(model.derived) + 2, m + 2)), np.zeros((n, len(model.derived) + 2))
-    for q, (derived, spline) in enumerate(zip(model.derived, model.splines, strict=True)):
-        if spline is None or derived.factors is None:
-            gradient[:, q, m] = np.exp(best.log_k)
-            continue
-        here, there = spline(best.log_k), spline(second)
-        gradient[:, q, 0], gradient[:, q, 1], gradient[:, q, 2:m] = here[:, 0], there[:, 0], here[:, 1:]
-        gradient[:, q, m] = spline(best.log_k, 1)[:, 0] * a
-        gradient[:, q, m + 1] = spline(second, 1)[:, 0] * b
-        gradient[:, q] /= over[:, None]
-        by_factor[:, q] = -estimates[:, q] / over
-    gradient[:, -2, m + 1] = np.exp(second)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        areas = estimates[:, -1]
-        bolometric = model.splines[model.names.index("flux bolometric")]
-        assert bolometric is not None
-        slopes = [4.0 - bolometric(x, 1)[:, 0] / bolometric(x)[:, 0] for x in (best.log_k, second)]
-        gradient[:, -1, 0], gradient[:, -1, 1] = -areas / a, areas / b
-        gradient[:, -1, m], gradient[:, -1, m + 1] = areas * slopes[0], -areas * slopes[1]
-    return gradient, by_factor

@@ -236,8 +236,7 @@ def fit_bins(
         added = np.array([raw[first[k] : end[k]].sum(axis=0) for k in rows])
         own = unknown if unknown.names else None
         parts.append(fit(added, stacked, model.stacked(n, light), own, levels=levels, skipped_nm=skipped_nm))
-    order = np.argsort(np.concatenate(list(alike.values())))
-    measurement = Measurement.joined(parts).rows(order)
+    measurement = Measurement.joined(parts, list(alike.values()))
     return MeasuredBins(first, count, stare.start_s[first], stare.start_s[end - 1] + stare.frame_s, measurement)
 
 

@@ -431,8 +431,8 @@ def measured(closed: ClosedForms, answers: Answers) -> View:
     table = [
         {"quantity": name, "unit": unit, "truth": value, **dict(zip(each, errors, strict=True))}
         for name, unit, value, *errors in zip(
-            first.fitted.names,
-            first.fitted.units,
+            first.ahead.names,
+            first.ahead.units,
             first.truth,
             *(measurement.ahead.errors for measurement in each.values()),
             strict=True,

@@ -251,7 +251,7 @@ def expectations() -> tuple[Expectation, Expectation, Expectation]:
 
 
 @cache
-def model(**how: bool) -> FlareModel:
+def model(**how: Any) -> FlareModel:
     return FlareModel.of(star(), MAUVE, expectations()[0], distance_pc=5.0, **how)
 
 
@@ -271,6 +271,9 @@ def test_two_temperatures_are_recovered_without_noise() -> None:
     grid = FLARE.grid(np.linspace(200.0, 700.0, 2001))
     scale = best["flux bolometric"] / FLARE.bolometric_flux()
     assert best["flux 200-700 nm"] == pytest.approx(10 * scale * np.trapezoid(FLARE.flux(grid), grid), rel=0.03)
+    # A line that the flare lacks hardly changes the errors.
+    lined = mauvecl.fit_two_temperatures(two.recorded_dn, quiet, model(lines=("H alpha",)))
+    assert lined.errors[0, [0, 1, -2, -1]] == pytest.approx(found.errors[0, [0, 1, -2, -1]], rel=0.1)
 
 
 @pytest.mark.long
