@@ -326,17 +326,15 @@ class _Neighbours(Rows):
     def _stated(self, name: str) -> tuple[Float, tuple[str, ...]]:
         stated, key = getattr(self.table[name], "unit", None) is not None, key_of(name)
         if not stated and key == "_r":
-            raise self.error(
-                f"the column {name} states no unit",
-                "a table with units (ECSV, FITS, VOTable), or the column separation, arcsec", name,
-            )  # fmt: skip
+            remedy = "use a table with units (ECSV, FITS, VOTable), or the column separation, arcsec"
+            raise self.error(f"the column {name} states no unit; {remedy}", name)
         factor = 1.0 if stated else {"deg": 3600.0}.get(UNSTATED.get(key, ""), 1.0)
         values = np.array([self._given(name, row, self.number(name, row, "arcsec")) for row in range(self.n)]) * factor
         negative = ~(values >= 0)
         if negative.any():
             row = int(np.argmax(negative))
             text = self.text(name, row)
-            raise self.error(f"row {row + 1} has {name} = {text}", "an angle of 0 and above", name)
+            raise self.error(f"{name} in row {row + 1} must be 0 or above, not {text}", name)
         note = f"Separations are the column {name} of {self.named}, read as degrees since it states no unit."
         return values, (note,) if not stated and key == "dist" else ()
 
@@ -352,7 +350,7 @@ class _Neighbours(Rows):
 
     def _given(self, name: str, row: int, value: float | None) -> float:
         if value is None:
-            raise self.error(f"row {row + 1} has no {name}", "one", name)
+            raise self.error(f"row {row + 1} needs a {name}", name)
         return value
 
 

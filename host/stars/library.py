@@ -118,7 +118,7 @@ def _described(path: Path) -> OwnStar | None:
 
 
 def _read(path: Path) -> Table:
-    return read_ecsv(path, "kept star", "the file as it was kept: `mauvecl library remove` takes it away")
+    return read_ecsv(path, "kept star", "use `mauvecl library remove` to take it away")
 
 
 def spectrum(star: OwnStar) -> tuple[np.ndarray, np.ndarray]:

@@ -79,9 +79,7 @@ class Selection:
 
         place = self.store.path / scene.path
         check_folder(place, "file")
-        with parsing(
-            f"array {scene.path} of store {str(self.store.path)!r}", "an intact one: `mauvecl verify` checks it"
-        ):
+        with parsing(f"array {scene.path} of store {str(self.store.path)!r}", "use `mauvecl verify` to check it"):
             rows = np.asarray(zarr.open_array(place, mode="r")[self.first : self.stop])
         if rows.shape != (self.stop - self.first, *scene.row) or rows.dtype != scene.dtype:
             raise InputError(
@@ -121,7 +119,7 @@ def export(selection: Selection, path: str | Path, *, replace: bool = False) -> 
         _hdf5(selection, packed)
         write_whole(path, packed.getbuffer(), shared=True)
         return path
-    with writing(f"export {str(path)!r}", path, "a writable place with room", key="file"):
+    with writing(f"export {str(path)!r}", "use a writable place with room", key="file"):
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=UNFINISHED, dir=path.parent) as folder:
             temporary = Path(folder) / path.name
