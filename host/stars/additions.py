@@ -19,7 +19,7 @@ from urllib.parse import urljoin, urlsplit
 
 from mauvecl.host import VERSION
 from mauvecl.host.stars.coverage import check_covers
-from mauvecl.host.stars.library import OwnStar, embedded, find, folder, kept, spectrum_digest
+from mauvecl.host.stars.library import OwnStar, embedded, find, folder, kept
 from mauvecl.host.stars.source import Source
 from mauvecl.host.tables.files import limit_bytes, read_bytes, without_columns, write_whole
 from mauvecl.schema.errors import InputError
@@ -86,7 +86,7 @@ def _kept_table(source: Source) -> Table:
     table = Table({"wavelength": source.wavelength_nm, "flux": source.flux_flam})
     table["wavelength"].unit, table["flux"].unit = "nm", "erg / (s cm2 Angstrom)"
     table.meta |= {
-        "spectrum_sha256": spectrum_digest(source.wavelength_nm, source.flux_flam),
+        "spectrum_sha256": source.digest,
         "kept_utc": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "dereddened": any("dereddened" in note for note in source.notes),
         "notes": list(source.notes),

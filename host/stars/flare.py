@@ -144,8 +144,6 @@ def _photons_in_band(
         raise InputError(f"the flare, {spectrum.describe()}, needs light in the band {band} to be scaled", key="band")
     if geometry == "added":
         return star, hot, None
-    if geometry != "replaces":
-        raise InputError.of("flare geometry", geometry, "'added' or 'replaces'")
     if photosphere_temperature_k is None:
         raise InputError(
             "flare geometry 'replaces' needs a photosphere temperature, in K", key="photosphere_temperature"

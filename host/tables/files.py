@@ -190,27 +190,22 @@ def lines_in(file: IO[str], what: str) -> Iterator[str]:
         number += 1
 
 
-def packed(start: bytes) -> bool:
-    """Return whether content is compressed by gzip, bzip2 or xz, by its first bytes."""
-    return start.startswith((b"\x1f\x8b", b"BZh", b"\xfd7zXZ\x00"))
+#: Names and decompressors of compressed content by its first bytes.
+PACKED: dict[bytes, tuple[str, Callable[[], Any]]] = {
+    b"\x1f\x8b": ("gzip", lambda: zlib.decompressobj(wbits=31)), b"BZh": ("bzip2", bz2.BZ2Decompressor),
+    b"\xfd7zXZ\x00": ("xz", lambda: lzma.LZMADecompressor(memlimit=XZ_MEMORY)),
+}  # fmt: skip
 
 
 def unpacked(content: bytes, what: str) -> bytes:
     """Unpack content that is compressed by gzip, bzip2 or xz; return other content unchanged.
 
-    Raises InputError if it unpacks to more than the limit or is damaged; `what` names it in messages.
+    It is unpacked in pieces, to detect decompression bombs early; several streams may follow one another. Raises
+    InputError if it unpacks to more than the limit or is damaged; `what` names it in messages.
     """
-    if content[:2] == b"\x1f\x8b":
-        return _unpack(content, lambda: zlib.decompressobj(wbits=31), "gzip", what)
-    if content[:3] == b"BZh":
-        return _unpack(content, bz2.BZ2Decompressor, "bzip2", what)
-    if content[:6] == b"\xfd7zXZ\x00":
-        return _unpack(content, lambda: lzma.LZMADecompressor(memlimit=XZ_MEMORY), "xz", what)
-    return content
-
-
-def _unpack(content: bytes, start: Callable[[], Any], form: str, what: str) -> bytes:
-    """Unpack in pieces, to detect decompression bombs early; several streams may follow one another."""
+    form, start = next((how for mark, how in PACKED.items() if content.startswith(mark)), ("", None))
+    if start is None:
+        return content
     most = limit_bytes("MAUVECL_LARGEST_CONTENT_MIB")
     pieces: list[bytes] = []
     size = 0

@@ -42,9 +42,9 @@ def check_sizes(content: FileContent) -> None:
     place = 0
     for number in range(MAX_EXTENSIONS + 1):
         if content[place : place + 8] not in (b"SIMPLE  ", b"XTENSION"):
-            if len(content) - place > MAX_AFTER:
+            if content.size - place > MAX_AFTER:
                 # astropy would search all of it for the end of a header.
-                fault = f"it has {len(content) - place} bytes after its extension {number - 1}"
+                fault = f"it has {content.size - place} bytes after its extension {number - 1}"
                 raise InputError(f"{fault}, but may have at most {MAX_AFTER}", key="file")
             return
         if number == MAX_EXTENSIONS:
@@ -72,8 +72,8 @@ def check_sizes(content: FileContent) -> None:
         if min([extra, groups, *axes]) < 0 or abs(bits) > 64 or not 0 <= fields <= MAX_FIELDS:
             raise InputError(f"its header {number} has impossible sizes; {WHOLE}", key="file")
         size = abs(bits) // 8 * groups * (extra + math.prod(axes) if axes else 0)
-        if start + size > len(content):
-            present = max(0, len(content) - start)
+        if start + size > content.size:
+            present = max(0, content.size - start)
             fault = f"it is truncated: its extension {number} must have {size} bytes, of which {present} are present"
             raise InputError(fault, key="file")
         place = start + -(-size // BLOCK) * BLOCK
@@ -122,10 +122,10 @@ def check_extensions(hdus: Any) -> None:
             fault = f"its extension {number} has a table compressed by `fpack`; use the file after `funpack`"
             raise InputError(fault, key="file")
         names = hdu.columns.names
-        if odd := next((name for name in names if name is not None and names.count(name) > 1), None):
+        if odd := next((name for name in names if name is None or names.count(name) > 1), ""):
             fault = f"its extension {number} has several columns named {odd!r}; give each another name"
             raise InputError(fault, key="columns")
-        if None in names:
+        if odd is None:
             fault = f"its extension {number} has an empty TTYPE{names.index(None) + 1}; give each column a name"
             raise InputError(fault, key="columns")
         size = sum(np.dtype(column.format.recformat).itemsize for column in hdu.columns)
@@ -156,9 +156,6 @@ class FileContent:
     def __init__(self, file: IO[bytes]) -> None:
         self.file = file
         self.size = file.seek(0, io.SEEK_END)
-
-    def __len__(self) -> int:
-        return self.size
 
     def __getitem__(self, part: slice) -> bytes:
         self.file.seek(part.start)

@@ -16,12 +16,12 @@ import numpy as np
 
 from mauvecl.host.tables.files import (
     MOST_HEADER,
+    PACKED,
     as_text,
     check_size,
     limit_bytes,
     lines_in,
     open_regular,
-    packed,
     parsing,
     read_bytes,
     reading,
@@ -96,10 +96,8 @@ class LargeTable(TableFile):
 
     def _side_by_side(self, pattern: str) -> Values | None:
         names = self.matching(pattern)
-        if not names or any(self.row[name].kind != "f" for name in names):
-            return super()._side_by_side(pattern)
         units = {self.table.find(name).unit for name in names}
-        if len(units) > 1:
+        if len(units) != 1 or any(self.row[name].kind != "f" for name in names):
             return super()._side_by_side(pattern)
 
         def read(start: int, stop: int) -> Any:
@@ -222,7 +220,7 @@ def open_content(path: Path, what: str, kind: str, *, large: bool = False) -> It
         start = raw.read(4096)
         raw.seek(0)
         form = form_of(start)
-        if form in ("FITS", "HDF5") or (large and form in ("text", "ECSV") and not packed(start)):
+        if form in ("FITS", "HDF5") or (large and form in ("text", "ECSV") and not start.startswith((*PACKED,))):
             yield Content(form, raw)
             return
         content = unpacked(read_bytes(path, kind), what)
