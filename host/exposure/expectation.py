@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import astropy.units as u
 import numpy as np
@@ -41,7 +41,6 @@ CUT_SIGMA = 8.0
 MAX_FRAMES = 2**24
 #: Definition of the signal: the star alone ("net"), or the star and the zodiacal light, as in the MauveSim paper.
 Signal = Literal["net", "paper"]
-SIGNALS: tuple[Signal, ...] = get_args(Signal)
 
 #: Columns of the table of noise by origin.
 BUDGET_COLUMNS = (
@@ -160,8 +159,6 @@ class Expectation(Drawable, ContentEquality):
         )
 
     def __post_init__(self) -> None:
-        if self.signal not in SIGNALS:
-            raise InputError.of("signal", self.signal, "'net' or 'paper'")
         if not self.neighbour_electrons.size:
             object.__setattr__(self, "neighbour_electrons", np.zeros(self.wavelength_nm.shape))
         for each in fields(self):

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import lru_cache
-from typing import TYPE_CHECKING, Literal, cast, get_args
+from typing import TYPE_CHECKING, Literal, cast
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss, legvander
@@ -85,7 +85,8 @@ def electrons_per_second(
         )
     if nodes.size <= MATRIX_NODES:
         return cast(Float, response_matrix(instrument, nodes, order) @ flux)
-    by_light = _by_light(instrument, order)
+    # Efficiencies act at the wavelength of the light, or else at that of the pixel.
+    by_light = instrument if order == "physical" else None
     landing = _line_landing(LineSpread.of(instrument), _knots(by_light))
     gathered = np.zeros(landing.shape[1])
     for part in _gathering(LineSpread.of(instrument), nodes, by_light):
@@ -96,7 +97,7 @@ def electrons_per_second(
 
 @lru_cache(maxsize=8)
 def _response(instrument: Instrument, nodes: bytes, order: Order) -> csr_array:
-    by_light = _by_light(instrument, order)
+    by_light = instrument if order == "physical" else None
     matrix = _product(LineSpread.of(instrument), nodes, by_light)
     if by_light:
         return matrix
@@ -115,13 +116,6 @@ def _product(line: LineSpread, nodes: bytes, by_light: Instrument | None) -> csr
     for part in more:
         gathering = gathering + part
     return _read_only(csr_array(_line_landing(line, _knots(by_light)) @ gathering))
-
-
-def _by_light(instrument: Instrument, order: Order) -> Instrument | None:
-    """Return the instrument whose efficiencies act at the wavelength of the light; None in the paper's order."""
-    if order not in get_args(Order):
-        raise InputError.of("order", order, "'paper' or 'physical'")
-    return instrument if order == "physical" else None
 
 
 def _efficiencies(instrument: Instrument) -> Float:

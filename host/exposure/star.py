@@ -187,24 +187,24 @@ def _nearest(values: Sequence[tuple[str, float]], wanted: float) -> tuple[str, f
     return min(values, key=lambda colour: abs(colour[1] - wanted))
 
 
-def _typed() -> list[str]:
-    """Return the names of the embedded spectra that represent a spectral type."""
-    table = library_table()
-    return [str(row["name"]) for row in table if row["kept"] == "embedded" and row["name"] == row["spectral_type"]]
-
-
 @cache
-def _temperatures() -> tuple[tuple[str, float], ...]:
+def _typical() -> list[Source]:
+    """Return the embedded spectra that represent a spectral type."""
+    named = [
+        str(row["name"]) for row in library_table() if row["kept"] == "embedded" and row["name"] == row["spectral_type"]
+    ]
+    return [Source.from_library(name) for name in named]
+
+
+def _temperatures() -> list[tuple[str, float]]:
     """Return the logarithms of the temperatures of typical spectra."""
-    named = ((name, Source.from_library(name).temperature_k) for name in _typed())
-    return tuple((name, float(np.log(kelvin))) for name, kelvin in named if kelvin is not None)
+    return [(star.name, float(np.log(star.temperature_k))) for star in _typical() if star.temperature_k is not None]
 
 
 @cache
-def _colours() -> tuple[tuple[str, float], ...]:
+def _colours() -> list[tuple[str, float]]:
     """Return the Gaia colours BP - RP of typical spectra, by synthetic photometry."""
-    stars = ((name, Source.from_library(name)) for name in _typed())
-    return tuple((name, star.magnitude("Gaia BP") - star.magnitude("Gaia RP")) for name, star in stars)
+    return [(star.name, star.magnitude("Gaia BP") - star.magnitude("Gaia RP")) for star in _typical()]
 
 
 #: Names of columns: those of the Gaia archive, astroquery, VizieR and CDS X-Match, and plain ones.
@@ -230,8 +230,6 @@ COLOURS = ("bp_rp", "bp-rp", "bprp")
 KNOWN = (*STARS, *SEPARATIONS, *RIGHT_ASCENSIONS, *DECLINATIONS, *MAGNITUDES, *BANDS, *TYPES, *FILES, *TEMPERATURES,
          *COLOURS)  # fmt: skip
 _KEYS = {key_of(name) for name in KNOWN} | {key_of("target_separation")}
-#: Units of separations without a stated unit: ADQL's DISTANCE is in degrees.
-UNSTATED = {"dist": "deg"}
 #: Largest number of rows; a fibre holds far fewer stars.
 MOST_ROWS = 100_000
 
@@ -326,19 +324,19 @@ class _Neighbours(Rows):
     def _stated(self, name: str) -> tuple[Float, tuple[str, ...]]:
         stated, key = getattr(self.table[name], "unit", None) is not None, key_of(name)
         if not stated and key == "_r":
-            raise self.error(
-                f"the column {name} states no unit",
-                "a table with units (ECSV, FITS, VOTable), or the column separation, arcsec", name,
-            )  # fmt: skip
-        factor = 1.0 if stated else {"deg": 3600.0}.get(UNSTATED.get(key, ""), 1.0)
-        values = np.array([self._given(name, row, self.number(name, row, "arcsec")) for row in range(self.n)]) * factor
+            remedy = "use a table with units (ECSV, FITS, VOTable), or the column separation, arcsec"
+            raise self.error(f"the column {name} states no unit; {remedy}", name)
+        # ADQL's DISTANCE is in degrees.
+        degrees = key == "dist" and not stated
+        values = np.array([self._given(name, row, self.number(name, row, "arcsec")) for row in range(self.n)])
+        values *= 3600.0 if degrees else 1.0
         negative = ~(values >= 0)
         if negative.any():
             row = int(np.argmax(negative))
             text = self.text(name, row)
-            raise self.error(f"row {row + 1} has {name} = {text}", "an angle of 0 and above", name)
+            raise self.error(f"{name} in row {row + 1} must be 0 or above, not {text}", name)
         note = f"Separations are the column {name} of {self.named}, read as degrees since it states no unit."
-        return values, (note,) if not stated and key == "dist" else ()
+        return values, (note,) if degrees else ()
 
     def _from_positions(self, ra: str, dec: str, own: int | None, target: str) -> Float:
         from astropy.coordinates import angular_separation
@@ -352,7 +350,7 @@ class _Neighbours(Rows):
 
     def _given(self, name: str, row: int, value: float | None) -> float:
         if value is None:
-            raise self.error(f"row {row + 1} has no {name}", "one", name)
+            raise self.error(f"row {row + 1} needs a {name}", name)
         return value
 
 

@@ -317,16 +317,8 @@ def as_typed(name: str, kind: str, place: int, names: Sequence[str] = ()) -> str
     return f"FILE[{word}]" if typed and alone else f"FILE[{kind} {place + 1}]"
 
 
-@dataclass(frozen=True)
-class Choice:
-    """Indices of the columns of a spectrum: one wavelength or both edges of each bin, and the flux."""
-
-    wavelength: tuple[int, ...]
-    flux: int
-
-
-def choose(names: Sequence[str], roles: Sequence[Role], asked: Sequence[str] = ()) -> Choice:
-    """Choose the columns of wavelength and flux, of which the user may name one or both."""
+def choose(names: Sequence[str], roles: Sequence[Role], asked: Sequence[str] = ()) -> tuple[tuple[int, ...], int]:
+    """Choose the columns of wavelength, or of both edges of each bin, and of flux, of which the user may name some."""
     wanted = [_named(name, names) for name in asked]
     if len(wanted) > 2:
         raise InputError.of("columns", asked, "one flux, and one wavelength at most")
@@ -337,7 +329,7 @@ def choose(names: Sequence[str], roles: Sequence[Role], asked: Sequence[str] = (
     rest = [i for i in wanted if i not in wavelength]
     if len(rest) > 1:
         raise InputError.of("columns", asked, "one flux, and one wavelength at most")
-    return Choice(wavelength, rest[0] if rest else _flux(names, roles, wavelength))
+    return wavelength, rest[0] if rest else _flux(names, roles, wavelength)
 
 
 def _named(name: str, names: Sequence[str]) -> int:

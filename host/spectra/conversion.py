@@ -16,7 +16,7 @@ import astropy.units as u
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.spectra.columns import Choice, Role, as_typed, choose, listed, numbered, plain, role_of
+from mauvecl.host.spectra.columns import Role, as_typed, choose, listed, numbered, plain, role_of
 from mauvecl.host.spectra.units import Medium, check_assumed_unit, unit_and_medium, vacuum_wavelengths
 from mauvecl.host.tables.names import divided_unit
 from mauvecl.host.tables.table import Values, marks_in, without_indefinite
@@ -134,19 +134,19 @@ def _spectrum_of(table: SpectrumTable, asked: Sequence[str]) -> RawSpectrum:
     # Words that do not name a column may name a row.
     rest = [word for word in asked if plain(word) not in known]
     try:
-        choice = choose(names, roles, [word for word in asked if plain(word) in known])
+        axes, light = choose(names, roles, [word for word in asked if plain(word) in known])
     except InputError as error:
         raise (_no_such(rest[0], names) if rest else error) from error
     messages = []
-    if len(choice.wavelength) == 2:
-        edges = " and ".join(names[i] for i in choice.wavelength)
-        if len({roles[i].unit for i in choice.wavelength}) > 1:
+    if len(axes) == 2:
+        edges = " and ".join(names[i] for i in axes)
+        if len({roles[i].unit for i in axes}) > 1:
             raise InputError.of("wavelength_unit", edges, "one unit")
         messages.append(f"its wavelengths are the middles of bins, from {edges}")
-    chosen = [table.columns[i] for i in (*choice.wavelength, choice.flux)]
+    chosen = [table.columns[i] for i in (*axes, light)]
     cells = [column.cells for column in chosen]
     if _holds_arrays(cells[-1]):
-        rows, identifier, said = _selected_rows(table, choice, cells, rest)
+        rows, identifier, said = _selected_rows(table, {*axes, light}, cells, rest)
         messages += said
         if table.row_title and identifier:
             table = replace(table, name=table.row_title.format(identifier[:30]))
@@ -157,10 +157,9 @@ def _spectrum_of(table: SpectrumTable, asked: Sequence[str]) -> RawSpectrum:
     segments = [_segment(row, [column.name.strip() for column in chosen]) for row in rows]
     if sum(flux.size for _, flux in segments) < 2:
         raise InputError("it must have at least two points to be a spectrum", key="flux")
-    axis, flux_role = roles[choice.wavelength[0]], roles[choice.flux]
     return RawSpectrum(
-        segments, table, chosen[0].name, chosen[-1].name, axis, flux_role, (*table.messages, *messages),
-    )  # fmt: skip
+        segments, table, chosen[0].name, chosen[-1].name, roles[axes[0]], roles[light], (*table.messages, *messages)
+    )
 
 
 def _segment(cells: Sequence[Any], names: Sequence[str]) -> tuple[Float, Float]:
@@ -192,7 +191,7 @@ def _no_such(word: str, names: Sequence[str]) -> InputError:
 
 
 def _selected_rows(
-    table: SpectrumTable, choice: Choice, cells: list[Any], asked: Sequence[str]
+    table: SpectrumTable, chosen: set[int], cells: list[Any], asked: Sequence[str]
 ) -> tuple[list[list[Any]], str, tuple[str, ...]]:
     """Return the selected row, or all rows if they are segments of one spectrum, the name of one, and messages.
 
@@ -207,7 +206,7 @@ def _selected_rows(
         raise InputError(f"it needs {n} rows of wavelengths, as many as of fluxes, not {len(cells[0])}", key="flux")
     names = [plain(column.name) for column in table.columns]
     is_only = n == 1 and not asked and not table.row_title
-    identifiers = [[""]] if is_only else _identifiers(table, {*choice.wavelength, choice.flux}, n)
+    identifiers = [[""]] if is_only else _identifiers(table, chosen, n)
     identifier = ""
     messages: tuple[str, ...] = ()
     if n > 1 and not asked and set(names) & set(SEGMENTS):
@@ -242,16 +241,11 @@ def _arrays(cells: list[Any], step: Any, first: int) -> list[Any]:
     *axes, flux = (np.ma.asanyarray(cell).squeeze() for cell in cells)
     if flux.ndim != 1:
         raise InputError(f"its row must hold one spectrum, but the flux has the shape {flux.shape}", key="flux")
-    if axes[0].size == 1 < flux.size:
-        if step is None:
-            raise InputError(
-                f"its row needs as many wavelengths as fluxes, or a step, but has one for {flux.size}", key="flux"
-            )
+    if axes[0].size == 1 < flux.size and step is not None:
         axes = [float(axes[0]) + float(np.ravel(step)[0]) * (np.arange(flux.size) - first)]
     if any(axis.shape != flux.shape for axis in axes):
-        raise InputError(
-            f"its row needs as many wavelengths as fluxes, but has {axes[0].size} for {flux.size}", key="flux"
-        )
+        fault = f"its row needs as many wavelengths as fluxes, or a step, but has {axes[0].size} for {flux.size}"
+        raise InputError(fault, key="flux")
     return [*axes, flux]
 
 

@@ -19,10 +19,11 @@ import numpy as np
 from mauvecl.host.spectra.columns import AXES, Role, divided, is_unit, listed, role_of, words_of
 from mauvecl.host.spectra.conversion import ReadSpectrum, SpectrumTable, converted, spectrum_in
 from mauvecl.host.spectra.units import medium_of, stated_units
-from mauvecl.host.tables.files import check_size, parse_ecsv, parsing, without_columns
+from mauvecl.host.tables.files import check_size, parsing, reading, without_columns
 from mauvecl.host.tables.fits_tables import (
     FLUX_UNITS,
     WAVE_UNITS,
+    WHOLE,
     FitsTables,
     axis_of,
     is_spectrum_image,
@@ -30,13 +31,12 @@ from mauvecl.host.tables.fits_tables import (
     multispec_axis,
     open_fits,
     paired_images,
-    reading,
     rows_of,
     spextool_spectra,
     text_at,
     unit_at,
 )
-from mauvecl.host.tables.opening import Content, check_form, open_content, votables
+from mauvecl.host.tables.opening import Content, open_content, text_in, votables
 from mauvecl.host.tables.table import MemoryTable, Values
 from mauvecl.host.tables.text_tables import (
     PROSE,
@@ -46,7 +46,6 @@ from mauvecl.host.tables.text_tables import (
     is_described,
     keywords_of,
     numbered_names,
-    text_of,
     text_table,
 )
 from mauvecl.host.tables.units import is_stated, time_in_name
@@ -237,7 +236,7 @@ def fits_tables(
     Raises InputError if the content is not FITS, is truncated, contradicts its checksums, or has no tables or images.
     """
     hdus = open_fits(file, check=check)
-    with reading("it"):
+    with reading("it", WHOLE):
         return _Reader(hdus, name, origin, asked).tables()
 
 
@@ -438,7 +437,7 @@ def read_spectrum(
     try:
         # Overflows become infinities, which the check of points rejects.
         with (
-            parsing("it", "a spectrum"),
+            parsing("it", "give a spectrum"),
             open_content(place, "it", "spectrum file") as content,
             np.errstate(all="ignore"),
         ):
@@ -459,17 +458,14 @@ def _tables(
     if content.form == "FITS":
         return fits_tables(content.file, name, origin, asked, check)
     if content.form == "VOTable":
-        tables = enumerate(votables(content.bytes, "it", "a spectrum"), 1)
+        tables = enumerate(votables(content.bytes, "it"), 1)
         return [_in_memory(one, name, origin, str(one.header.get("name") or one.header.get("ID") or number))
                 for number, one in tables]  # fmt: skip
-    check_form(content, "it", "a spectrum in text, ECSV, FITS or VOTable")
-    text = text_of(content.bytes)
-    if content.form == "ECSV":
-        table = MemoryTable(parse_ecsv(text, "it"), "it")
+    text = text_in(content, "it")
+    if content.form == "ECSV" or is_described(text):
+        table = MemoryTable(text_table(text, "it", commas=False), "it")
         own = table.header.get("name")
         return [_in_memory(table, own.strip()[:80] if isinstance(own, str) and own.strip() else name, origin)]
-    if is_described(text):
-        return [_in_memory(MemoryTable(text_table(text, "it", False, "a spectrum"), "it"), name, origin)]
     return [table_of_text(text, name, f"text {origin}", asked, *units)]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import hashlib
 import io
@@ -18,10 +19,10 @@ from urllib.parse import urljoin, urlsplit
 
 from mauvecl.host import VERSION
 from mauvecl.host.stars.coverage import check_covers
-from mauvecl.host.stars.library import OwnStar, embedded, find, folder, kept, spectrum_digest
+from mauvecl.host.stars.library import OwnStar, embedded, find, folder, kept
 from mauvecl.host.stars.source import Source
-from mauvecl.host.tables.files import limit_bytes, parsing, read_bytes, without_columns, write_whole
-from mauvecl.schema.errors import InputError, shortened
+from mauvecl.host.tables.files import limit_bytes, read_bytes, without_columns, write_whole
+from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -85,7 +86,7 @@ def _kept_table(source: Source) -> Table:
     table = Table({"wavelength": source.wavelength_nm, "flux": source.flux_flam})
     table["wavelength"].unit, table["flux"].unit = "nm", "erg / (s cm2 Angstrom)"
     table.meta |= {
-        "spectrum_sha256": spectrum_digest(source.wavelength_nm, source.flux_flam),
+        "spectrum_sha256": source.digest,
         "kept_utc": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "dereddened": any("dereddened" in note for note in source.notes),
         "notes": list(source.notes),
@@ -264,7 +265,8 @@ def _folder(address: str) -> str:
 
 def _check_address(address: str) -> None:
     """Raise InputError unless the address is a URL of a supported scheme."""
-    with parsing(f"address {shortened(address)}", "one such as https://host/folder/"):
+    is_address = False
+    with contextlib.suppress(ValueError):
         parts = urlsplit(address)
         is_address = parts.scheme in SCHEMES and bool(parts.hostname) and parts.port != 0
     if not (is_address and address.isprintable() and " " not in address):

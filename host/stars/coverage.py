@@ -43,28 +43,16 @@ def check_points(name: str, wavelength: Float, flux: Float) -> None:
     if wavelength.ndim != 1 or wavelength.shape != flux.shape or wavelength.size < 2:
         fault = f"spectrum {name} has {wavelength.shape} wavelengths and {flux.shape} fluxes"
         raise InputError(f"{fault}, but needs two equal columns of at least two points", key="flux")
-    bad = np.flatnonzero(~(np.isfinite(wavelength) & (wavelength > 0.0)))
-    if bad.size:
-        raise InputError.of(
-            "wavelength", wavelength[bad[0]], "a finite number above 0", where=f"spectrum {name}, point {bad[0] + 1}"
-        )
-    back = np.flatnonzero(np.diff(wavelength) <= 0)
+    outside = np.flatnonzero(~((wavelength >= NEAREST_NM) & (wavelength <= FARTHEST_NM)))
+    if outside.size:
+        where, accepted = f"spectrum {name}, point {outside[0] + 1}", f"between {NEAREST_NM:g} and {FARTHEST_NM:g} nm"
+        raise InputError.of("wavelength", wavelength[outside[0]], accepted, where=where)
+    back = np.flatnonzero(np.diff(wavelength) < CLOSEST * wavelength[1:])
     if back.size:
         i = int(back[0])
-        pair = f"{wavelength[i + 1]:g} nm at point {i + 2} follows {wavelength[i]:g} nm"
-        raise InputError(f"spectrum {name}: wavelengths must increase, but {pair}", key="wavelength")
-    outside = np.flatnonzero((wavelength < NEAREST_NM) | (wavelength > FARTHEST_NM))
-    if outside.size:
-        where = f"spectrum {name}, point {outside[0] + 1}"
-        raise InputError.of(
-            "wavelength", wavelength[outside[0]], f"between {NEAREST_NM:g} and {FARTHEST_NM:g} nm", where=where
-        )
-    close = np.flatnonzero(np.diff(wavelength) < CLOSEST * wavelength[1:])
-    if close.size:
-        i = int(close[0])
-        first, second = (float(end) for end in wavelength[i : i + 2])
-        pair = f"{first!r} and {second!r} nm at points {i + 1} and {i + 2}"
-        raise InputError(f"spectrum {name}: {pair} must differ by {CLOSEST:g} of their value", key="wavelength")
+        pair = f"{float(wavelength[i + 1])!r} nm at point {i + 2} follows {float(wavelength[i])!r} nm"
+        fault = f"spectrum {name}: wavelengths must increase, by at least {CLOSEST:g} of their value"
+        raise InputError(f"{fault}, but {pair}", key="wavelength")
     # Undefined ends are cut later.
     largest = float(np.abs(flux[np.isfinite(flux)]).max(initial=0.0))
     if largest and not FAINTEST <= largest <= BRIGHTEST:

@@ -142,8 +142,6 @@ def _photons_in_band(
         raise InputError(f"the flare, {spectrum.describe()}, needs light in the band {band} to be scaled", key="band")
     if geometry == "added":
         return star, hot, None
-    if geometry != "replaces":
-        raise InputError.of("flare geometry", geometry, "'added' or 'replaces'")
     if photosphere_temperature_k is None:
         raise InputError(
             "flare geometry 'replaces' needs a photosphere temperature, in K", key="photosphere_temperature"
@@ -210,23 +208,22 @@ def flares_of(table: Table | Any, name: str = "flare table") -> QTable:
     rows = Rows(table, name, "amplitude")
     amplitude, start, stop = map(rows.first, (AMPLITUDES, STARTS, STOPS))
     if amplitude is None:
-        raise rows.error(
-            f"has the columns {shown(', '.join(rows.names), 300)}", f"one named {', '.join(AMPLITUDES)}", "amplitude"
-        )
+        names = shown(", ".join(rows.names), 300)
+        raise rows.error(f"it has the columns {names}, but needs one named {', '.join(AMPLITUDES)}", "amplitude")
     columns = {"amplitude": (amplitude, "1"), "start": (start, "d"), "stop": (stop, "d")}
     cells = [[rows.number(held, row, unit) for held, unit in columns.values()] for row in range(rows.n)]
     # AltaiPony's tables have an empty row for a star without flares.
     filled = [row for row, values in enumerate(cells) if any(value is not None for value in values)]
     if not 0 < len(filled) <= MAX_FLARES:
-        raise rows.error(f"holds {len(filled)} flares", f"1 to {MAX_FLARES}", "amplitude")
+        raise rows.error(f"it must have 1 to {MAX_FLARES} flares, not {len(filled)}", "amplitude")
     for row in filled:
         value = cells[row][0]
         if value is None or not SMALLEST <= value <= LARGEST:
-            shown_value = "no amplitude" if value is None else f"an amplitude of {value:g}"
-            raise rows.error(f"row {row + 1} has {shown_value}", "a relative rise above 0", "amplitude")
+            given = "an empty cell" if value is None else f"{value:g}"
+            raise rows.error(f"the amplitude in row {row + 1} must be a rise above 0, not {given}", "amplitude")
         begin, end = cells[row][1:]
         if begin is not None and end is not None and end < begin:
-            raise rows.error(f"row {row + 1} begins at {begin:.10g} d and ends at {end:.10g} d", "a later end", "stop")
+            raise rows.error(f"row {row + 1} ends at {end:.10g} d, but must end after {begin:.10g} d", "stop")
     flares = QTable({"amplitude": [cells[row][0] for row in filled]})
     for place, (title, (held, unit)) in enumerate(columns.items()):
         if place and held is not None:

@@ -118,7 +118,7 @@ def _described(path: Path) -> OwnStar | None:
 
 
 def _read(path: Path) -> Table:
-    return read_ecsv(path, "kept star", "the file as it was kept: `mauvecl library remove` takes it away")
+    return read_ecsv(path, "kept star", "use `mauvecl library remove` to take it away")
 
 
 def spectrum(star: OwnStar) -> tuple[np.ndarray, np.ndarray]:
@@ -318,17 +318,11 @@ def embedded(name: str) -> dict[str, str] | None:
 
 
 @lru_cache(8)
-def spectrum_table(file: str) -> Numbers:
-    """Read a library spectrum with the columns wavelength (nm) and flux (erg s-1 cm-2 A-1)."""
-    return _numbers("spectra", file)
+def spectrum_table(file: str, folder: str = "spectra") -> Numbers:
+    """Read a library spectrum with the columns wavelength (nm) and flux (erg s-1 cm-2 A-1).
 
-
-def band_table(file: str) -> Numbers:
-    """Read a photometric band with the columns wavelength (nm) and throughput (per photon)."""
-    return _numbers("bands", file)
-
-
-def _numbers(folder: str, file: str) -> Numbers:
+    In the folder ``bands`` is the throughput per photon of each band in place of a flux.
+    """
     return parse_numbers(library_text(folder, file), f"library file {file}")
 
 

@@ -27,17 +27,17 @@ if TYPE_CHECKING:
     from astropy.table import Table
     from numpy.typing import NDArray
 
-#: Prefix of files that are being written.
-UNFINISHED = ".unfinished-"
+#: Prefix of files that are being written, and what to do on a full or read-only disk.
+UNFINISHED, NO_ROOM = ".unfinished-", "use a writable disk with room; what was written before is kept"
 
 
 @contextlib.contextmanager
-def writing(what: str, path: Path, expected: str, *, key: str) -> Iterator[None]:
+def writing(what: str, remedy: str, *, key: str) -> Iterator[None]:
     """Convert failures of the operating system in the block to an InputError that `what` cannot be written."""
     try:
         yield
     except OSError as error:
-        raise InputError(f"{what} cannot be written ({error.strerror or error}); use {expected}", key=key) from error
+        raise InputError(f"{what} cannot be written ({error.strerror or error}); {remedy}", key=key) from error
 
 
 def write_whole(path: Path, *parts: bytes | memoryview, shared: bool = False) -> None:
@@ -60,7 +60,7 @@ def write_whole(path: Path, *parts: bytes | memoryview, shared: bool = False) ->
     except BaseException:
         with contextlib.suppress(OSError):
             unfinished.unlink(missing_ok=True)
-        with writing(repr(str(path)), path, "a writable disk with room; what was written before is kept", key="file"):
+        with writing(repr(str(path)), NO_ROOM, key="file"):
             raise
 
 
@@ -190,27 +190,22 @@ def lines_in(file: IO[str], what: str) -> Iterator[str]:
         number += 1
 
 
-def packed(start: bytes) -> bool:
-    """Return whether content is compressed by gzip, bzip2 or xz, by its first bytes."""
-    return start.startswith((b"\x1f\x8b", b"BZh", b"\xfd7zXZ\x00"))
+#: Names and decompressors of compressed content by its first bytes.
+PACKED: dict[bytes, tuple[str, Callable[[], Any]]] = {
+    b"\x1f\x8b": ("gzip", lambda: zlib.decompressobj(wbits=31)), b"BZh": ("bzip2", bz2.BZ2Decompressor),
+    b"\xfd7zXZ\x00": ("xz", lambda: lzma.LZMADecompressor(memlimit=XZ_MEMORY)),
+}  # fmt: skip
 
 
 def unpacked(content: bytes, what: str) -> bytes:
     """Unpack content that is compressed by gzip, bzip2 or xz; return other content unchanged.
 
-    Raises InputError if it unpacks to more than the limit or is damaged; `what` names it in messages.
+    It is unpacked in pieces, to detect decompression bombs early; several streams may follow one another. Raises
+    InputError if it unpacks to more than the limit or is damaged; `what` names it in messages.
     """
-    if content[:2] == b"\x1f\x8b":
-        return _unpack(content, lambda: zlib.decompressobj(wbits=31), "gzip", what)
-    if content[:3] == b"BZh":
-        return _unpack(content, bz2.BZ2Decompressor, "bzip2", what)
-    if content[:6] == b"\xfd7zXZ\x00":
-        return _unpack(content, lambda: lzma.LZMADecompressor(memlimit=XZ_MEMORY), "xz", what)
-    return content
-
-
-def _unpack(content: bytes, start: Callable[[], Any], form: str, what: str) -> bytes:
-    """Unpack in pieces, to detect decompression bombs early; several streams may follow one another."""
+    form, start = next((how for mark, how in PACKED.items() if content.startswith(mark)), ("", None))
+    if start is None:
+        return content
     most = limit_bytes("MAUVECL_LARGEST_CONTENT_MIB")
     pieces: list[bytes] = []
     size = 0
@@ -253,12 +248,12 @@ MOST_PARTS = 512
 
 
 @contextlib.contextmanager
-def parsing(what: str, expected: str) -> Iterator[None]:
+def parsing(what: str, remedy: str) -> Iterator[None]:
     """Convert any exception of a parser of foreign content to InputError with a one-sentence message.
 
     Parsers of TOML, YAML, FITS and tables raise many kinds of exceptions on damaged content: their own, those of Python
-    (RecursionError, OverflowError) and of NumPy (MemoryError for sizes that a header claims). `what` describes the
-    content and includes its name.
+    (RecursionError, OverflowError) and of NumPy (MemoryError for sizes that a header claims). The message begins with
+    `what`, the name of the content, and ends with the remedy.
     """
     try:
         yield
@@ -271,8 +266,18 @@ def parsing(what: str, expected: str) -> Iterator[None]:
     except Exception as error:
         # Other libraries' messages are for their programmers, but may state the place.
         place = PLACE.search(str(error))
-        fault = f"{what} cannot be read{f' ({place[0]})' if place else ''}"
-        raise InputError(f"{fault}; it must be {expected}", key="file") from error
+        raise InputError(f"{what} cannot be read{f' ({place[0]})' if place else ''}; {remedy}", key="file") from error
+
+
+@contextlib.contextmanager
+def reading(what: str, remedy: str) -> Iterator[None]:
+    """Convert any exception of a reader of astropy to InputError, and silence its warnings.
+
+    astropy warns of many headers that it can read.
+    """
+    with parsing(what, remedy), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
 
 
 def read_text(path: Path, what: str) -> str:
@@ -281,11 +286,21 @@ def read_text(path: Path, what: str) -> str:
 
 
 def as_text(content: bytes, what: str) -> str:
-    """Decode UTF-8; raise InputError whose message begins with `what` if the bytes are not UTF-8."""
+    """Decode text in UTF-8 or, with a byte-order mark, UTF-16; raise InputError that begins with `what` if it is none.
+
+    Editors on Windows start a file with a byte-order mark.
+    """
     try:
-        return content.decode("utf-8-sig")
+        text = content.decode("utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"{what} must be text in UTF-8, but its byte {error.start + 1} is not", key="file") from error
+        if b"\0" in content[:4096]:
+            raise InputError(f"{what} must be text, but holds null bytes", key="file") from error
+        line, odd = content[: error.start].count(b"\n") + 1, content[error.start]
+        fault = f"{what} must be text in UTF-8, but its byte 0x{odd:02x} in line {line} is not: save it as UTF-8"
+        raise InputError(fault, key="file") from error
+    if "\0" in text:
+        raise InputError(f"{what} must be text, but holds null bytes", key="file")
+    return text
 
 
 def is_file(path: Path) -> bool:
@@ -302,7 +317,7 @@ def toml(text: str, what: str) -> dict[str, Any]:
     if parts > MOST_PARTS:
         # The memory of Python's parser grows with the square of this number.
         raise InputError(f"{what} has a key of {parts} parts, but may have at most {MOST_PARTS}", key="file")
-    with parsing(what, "TOML"):
+    with parsing(what, "give TOML"):
         try:
             tree = tomllib.loads(text)
         except tomllib.TOMLDecodeError as error:
@@ -313,7 +328,7 @@ def toml(text: str, what: str) -> dict[str, Any]:
 
 def json_data(text: str, what: str) -> Any:
     """Parse JSON; raise InputError if it is invalid or nested too deeply."""
-    with parsing(what, "JSON"):
+    with parsing(what, "give JSON"):
         return json.loads(text)
 
 
@@ -383,16 +398,17 @@ MOST_HEADER = 256 * 2**10
 _QUOTED, _OPEN = re.compile(r'(?:^|(?<=[,;|\t ]))"(?:[^"]|"")*"(?=[,;|\t ]|$)'), re.compile(r'(?:^|[,;|\t ])"')
 
 
-def read_ecsv(path: str | Path, what: str, expected: str = "an ECSV table") -> Table:
+def read_ecsv(path: str | Path, what: str, remedy: str = "give an ECSV table") -> Table:
     """Read an ECSV file.
 
-    Raises InputError if the file is missing, is not an ECSV table, or would expand far beyond its size.
+    Raises InputError, which ends with the remedy, if the file is missing, is not an ECSV table, or would expand far
+    beyond its size.
     """
-    return parse_ecsv(*_text_and_name(path, what), expected)
+    return parse_ecsv(*_text_and_name(path, what), remedy)
 
 
-def parse_ecsv(text: str, what: str, expected: str = "an ECSV table") -> Table:
-    """Parse ECSV text; `what` says where it is from and `expected` what it should be, for messages."""
+def parse_ecsv(text: str, what: str, remedy: str = "give an ECSV table") -> Table:
+    """Parse ECSV text, as `read_ecsv`; `what` says where it is from."""
     # These imports are slow and only needed here.
     from astropy.table import Table
 
@@ -403,9 +419,7 @@ def parse_ecsv(text: str, what: str, expected: str = "an ECSV table") -> Table:
     check_cells([line for line in lines if not line.startswith("#")], what)
     # Those of lightkurve have times in the days of the missions.
     with_mission_formats()
-    with parsing(what, expected), warnings.catch_warnings():
-        # astropy warns of many headers that it can read.
-        warnings.simplefilter("ignore")
+    with reading(what, remedy):
         # Passed as lines, because astropy takes a text of one line for a file name.
         return Table.read([*lines, ""], format="ascii.ecsv")
 
@@ -493,7 +507,7 @@ def check_header(lines: list[str], what: str) -> None:
             sizes[id(node)] = min(1 + sum(map(values, flat)), MOST_VALUES)
         return sizes[id(node)]
 
-    with parsing(what, "an ECSV table"):
+    with parsing(what, "give an ECSV table"):
         root = yaml.compose("\n".join(header[1:]), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
         unfolded = 0 if root is None else values(root)
     if unfolded >= MOST_VALUES:

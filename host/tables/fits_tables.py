@@ -5,18 +5,17 @@ from __future__ import annotations
 import io
 import math
 import re
-import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from functools import partial
 from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.tables.files import limit_bytes, parsing
+from mauvecl.host.tables.files import limit_bytes, parsing, reading
 from mauvecl.host.tables.names import matched
 from mauvecl.host.tables.table import PIECE_BYTES, TableFile, Values
+from mauvecl.host.tables.units import SCALES
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
@@ -28,7 +27,7 @@ BLOCK, MAX_CARDS, MAX_EXTENSIONS = 2880, 100_000, 1000
 MAX_FIELDS = 999
 #: Largest number of bytes after the last extension.
 MAX_AFTER = 2**20
-WHOLE = "a whole FITS file"
+WHOLE = "give a whole FITS file"
 #: astropy's classes of extensions whose headers it cannot interpret.
 DAMAGED = ("_ValidHDU", "_NonstandardHDU", "_CorruptedHDU")
 #: Bytes that are summed at a time.
@@ -43,9 +42,9 @@ def check_sizes(content: FileContent) -> None:
     place = 0
     for number in range(MAX_EXTENSIONS + 1):
         if content[place : place + 8] not in (b"SIMPLE  ", b"XTENSION"):
-            if len(content) - place > MAX_AFTER:
+            if content.size - place > MAX_AFTER:
                 # astropy would search all of it for the end of a header.
-                fault = f"it has {len(content) - place} bytes after its extension {number - 1}"
+                fault = f"it has {content.size - place} bytes after its extension {number - 1}"
                 raise InputError(f"{fault}, but may have at most {MAX_AFTER}", key="file")
             return
         if number == MAX_EXTENSIONS:
@@ -55,7 +54,7 @@ def check_sizes(content: FileContent) -> None:
         while content[at : at + 8] != b"END     ":
             card = content[at : at + 80]
             if len(card) < 80 or at - place > 80 * MAX_CARDS:
-                raise InputError(f"its header {number} has no end; give {WHOLE}", key="file")
+                raise InputError(f"its header {number} has no end; {WHOLE}", key="file")
             cards.setdefault(card[:8].strip(), card[10:].split(b"/")[0].strip())
             at += 80
         start = place + -(-(at + 80 - place) // BLOCK) * BLOCK
@@ -66,30 +65,19 @@ def check_sizes(content: FileContent) -> None:
                 for k, d in ((b"BITPIX", b""), (b"PCOUNT", b"0"), (b"GCOUNT", b"1"), (b"TFIELDS", b"0"))
             )
         except (KeyError, ValueError) as error:
-            raise InputError(f"its header {number} has sizes that are not numbers; give {WHOLE}", key="file") from error
+            raise InputError(f"its header {number} has sizes that are not numbers; {WHOLE}", key="file") from error
         if axes[:1] == [0] and len(axes) > 1:
             # Random groups.
             axes = axes[1:]
         if min([extra, groups, *axes]) < 0 or abs(bits) > 64 or not 0 <= fields <= MAX_FIELDS:
-            raise InputError(f"its header {number} has impossible sizes; give {WHOLE}", key="file")
+            raise InputError(f"its header {number} has impossible sizes; {WHOLE}", key="file")
         size = abs(bits) // 8 * groups * (extra + math.prod(axes) if axes else 0)
-        if start + size > len(content):
-            present = max(0, len(content) - start)
+        if start + size > content.size:
+            present = max(0, content.size - start)
             fault = f"it is truncated: its extension {number} must have {size} bytes, of which {present} are present"
             raise InputError(fault, key="file")
         place = start + -(-size // BLOCK) * BLOCK
     raise InputError(f"it must have at most {MAX_EXTENSIONS} extensions", key="file")
-
-
-@contextmanager
-def reading(what: str) -> Iterator[None]:
-    """Convert any fault of astropy's reader to InputError, and keep its warnings quiet.
-
-    astropy warns of the headers of old archive files that it can read.
-    """
-    with parsing(what, WHOLE), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield
 
 
 def open_fits(file: IO[bytes], what: str = "", *, check: bool = True) -> fits.HDUList:
@@ -100,21 +88,19 @@ def open_fits(file: IO[bytes], what: str = "", *, check: bool = True) -> fits.HD
     from astropy.io import fits
 
     content = FileContent(file)
+    whole: dict[str, Any] = {"mode": "readonly", "memmap": False, "lazy_load_hdus": False}
     try:
-        check_sizes(content)
-        file.seek(0)
-        with reading("it"):
-            hdus = fits.open(file, mode="readonly", memmap=False, lazy_load_hdus=False, disable_image_compression=True)
-        with reading("it"):
-            check_extensions(hdus)
-        if check:
-            check_sums(hdus, content)
-        packed = [hdu for hdu in hdus if text_at(hdu.header, "ZIMAGE") == "True"]
-        if packed:
-            check_images(packed)
+        with reading("it", WHOLE):
+            check_sizes(content)
             file.seek(0)
-            with reading("it"):
-                hdus = fits.open(file, mode="readonly", memmap=False, lazy_load_hdus=False)
+            hdus = fits.open(file, **whole, disable_image_compression=True)
+            check_extensions(hdus)
+            if check:
+                check_sums(hdus, content)
+            if packed := [hdu for hdu in hdus if text_at(hdu.header, "ZIMAGE") == "True"]:
+                check_images(packed)
+                file.seek(0)
+                hdus = fits.open(file, **whole)
     except InputError as error:
         raise (error.within(what) if what else error) from error
     return hdus
@@ -129,36 +115,35 @@ def check_extensions(hdus: Any) -> None:
 
     for number, hdu in enumerate(hdus):
         if type(hdu).__name__ in DAMAGED or (number > 0 and "SIMPLE" in hdu.header):
-            raise InputError(f"its extension {number} has a damaged header; give {WHOLE}", key="file")
+            raise InputError(f"its extension {number} has a damaged header; {WHOLE}", key="file")
         if not isinstance(hdu, fits.BinTableHDU):
             continue
         if text_at(hdu.header, "ZTABLE") == "True":
             fault = f"its extension {number} has a table compressed by `fpack`; use the file after `funpack`"
             raise InputError(fault, key="file")
         names = hdu.columns.names
-        if odd := next((name for name in names if name is not None and names.count(name) > 1), None):
+        if odd := next((name for name in names if name is None or names.count(name) > 1), ""):
             fault = f"its extension {number} has several columns named {odd!r}; give each another name"
             raise InputError(fault, key="columns")
-        if None in names:
+        if odd is None:
             fault = f"its extension {number} has an empty TTYPE{names.index(None) + 1}; give each column a name"
             raise InputError(fault, key="columns")
         size = sum(np.dtype(column.format.recformat).itemsize for column in hdu.columns)
         if size != hdu.header["NAXIS1"]:
             fault = f"its extension {number} has rows of {hdu.header['NAXIS1']} bytes, whose columns take {size}"
-            raise InputError(f"{fault}; give {WHOLE}", key="file")
+            raise InputError(f"{fault}; {WHOLE}", key="file")
 
 
 def check_images(packed: Sequence[Any]) -> None:
     """Raise InputError for images in compressed tiles (standard 4.0, section 10.1) that are large or damaged."""
     most = limit_bytes("MAUVECL_LARGEST_CONTENT_MIB")
     for hdu in packed:
-        with reading("it"):
-            header = hdu.header
-            axes = [int(header[f"ZNAXIS{k + 1}"]) for k in range(int(header["ZNAXIS"]))]
-            tiles = [int(header.get(f"ZTILE{k + 1}", axes[0] if k == 0 else 1)) for k in range(len(axes))]
-            size = abs(int(header["ZBITPIX"])) // 8 * max(math.prod(axes), math.prod(tiles))
+        header = hdu.header
+        axes = [int(header[f"ZNAXIS{k + 1}"]) for k in range(int(header["ZNAXIS"]))]
+        tiles = [int(header.get(f"ZTILE{k + 1}", axes[0] if k == 0 else 1)) for k in range(len(axes))]
+        size = abs(int(header["ZBITPIX"])) // 8 * max(math.prod(axes), math.prod(tiles))
         if min(*axes, *tiles) < 1:
-            fault = f"it has a compressed image of {axes} pixels in tiles of {tiles}; give {WHOLE}"
+            fault = f"it has a compressed image of {axes} pixels in tiles of {tiles}; {WHOLE}"
             raise InputError(fault, key="file")
         if size > most:
             fault = f"its compressed image must unpack to at most {most >> 20} MiB"
@@ -171,9 +156,6 @@ class FileContent:
     def __init__(self, file: IO[bytes]) -> None:
         self.file = file
         self.size = file.seek(0, io.SEEK_END)
-
-    def __len__(self) -> int:
-        return self.size
 
     def __getitem__(self, part: slice) -> bytes:
         self.file.seek(part.start)
@@ -438,7 +420,7 @@ def multispec_axis(header: Any, n: int) -> Values:
     """
     rows = []
     for text in re.findall(r"spec\d+\s*=\s*\"([^\"]*)\"", _attributes(header, 2)):
-        with parsing("it", "attributes of IRAF's multispec system"):
+        with parsing("it", "give whole attributes of IRAF's multispec system"):
             _, _, kind, first, step, _, redshift = map(float, text.split()[:7])
         if kind not in (0.0, 1.0):
             fault = f"its wavelengths of the type {kind:g} in IRAF's multispec system must be linear or logarithmic"
@@ -462,8 +444,10 @@ def _iraf_unit(header: Any) -> str:
     return "" if match is None else match[1] or match[2]
 
 
-#: Scales that astropy writes for a column of times (TCTYPn), which then holds two parts of a Julian date.
-SCALES = ("UTC", "TAI", "TT", "TDB", "TCG", "TCB", "UT1")
+def _time_scale(header: Any, number: int) -> str:
+    """Return the scale of a column in which astropy writes times as two parts of a Julian date (TCTYPn), or nothing."""
+    scale = str(header.get(f"TCTYP{number}", ""))
+    return scale.upper() if scale.lower() in SCALES.values() else ""
 
 
 class FitsTables(TableFile):
@@ -496,8 +480,7 @@ class FitsTables(TableFile):
             header |= dict(hdus[self.chosen].header)
         super().__init__(what, header)
         for k in range(1, 1 + len(hdus[self.chosen].columns) if self.chosen is not None else 1):
-            scale = str(header.get(f"TCTYP{k}", "")).upper()
-            if scale in SCALES and str(header.get(f"TFORM{k}", "")) == "2D":
+            if (scale := _time_scale(header, k)) and str(header.get(f"TFORM{k}", "")) == "2D":
                 self.header |= {"MJDREFI": 0, "MJDREFF": 0.0, "TIMESYS": scale,
                                 "TREFPOS": header.get(f"TRPOS{k}", header.get("TREFPOS", ""))}  # fmt: skip
 
@@ -575,7 +558,7 @@ class FitsTables(TableFile):
         shape = tuple(hdu.shape)
 
         def read(start: int, stop: int) -> Any:
-            with reading(self.what):
+            with reading(self.what, WHOLE):
                 return hdu.section[start:stop]
 
         return Values(self._label(number), shape, read, text_at(hdu.header, "BUNIT"), self.what)
@@ -596,10 +579,11 @@ class FitsTables(TableFile):
         if is_whole and size > limit_bytes("MAUVECL_LARGEST_FILE_MIB"):
             fault = f"{self.what}: the table {self._label(number)} has text or columns of variable length"
             raise InputError(f"{fault} and {size >> 20} MiB; use columns of fixed length", key="hdu")
-        pair = str(self.header.get(f"TCTYP{hdu.columns.names.index(found.name) + 1}", "")).upper() in SCALES
+        place = hdu.columns.names.index(found.name) + 1
+        pair = _time_scale(self.header, place)
 
         def read(start: int, stop: int) -> Any:
-            with reading(self.what):
+            with reading(self.what, WHOLE):
                 values = column_values(hdu.data[start:stop] if small else _piece(hdu, start, stop), found)
             if pair and values.ndim == 2 and number == self.chosen:
                 return (values[:, 0] - 2_400_000.5) + values[:, 1]
@@ -607,7 +591,7 @@ class FitsTables(TableFile):
 
         one = np.shape(read(0, min(1, n_rows)))
         width = 0 if small else 2 * int(hdu.header["NAXIS1"])
-        ucd = text_at(hdu.header, f"TUCD{hdu.columns.names.index(found.name) + 1}")
+        ucd = text_at(hdu.header, f"TUCD{place}")
         return Values(found.name, (n_rows, *one[1:]), read, str(found.unit or "").strip(), self.what, width, ucd)
 
 

@@ -6,7 +6,6 @@ import io
 import itertools
 import re
 import tempfile
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
@@ -17,19 +16,21 @@ import numpy as np
 
 from mauvecl.host.tables.files import (
     MOST_HEADER,
+    PACKED,
+    as_text,
     check_size,
     limit_bytes,
     lines_in,
     open_regular,
-    packed,
     parsing,
     read_bytes,
+    reading,
     unpacked,
 )
-from mauvecl.host.tables.fits_tables import FitsTables, open_fits, reading
+from mauvecl.host.tables.fits_tables import WHOLE, FitsTables, open_fits
 from mauvecl.host.tables.names import matched
 from mauvecl.host.tables.table import REMARKS, MemoryTable, TableFile, Values
-from mauvecl.host.tables.text_tables import Layout, TextRows, text_of, text_table
+from mauvecl.host.tables.text_tables import Layout, TextRows, text_table
 from mauvecl.schema.errors import InputError, shortened
 
 if TYPE_CHECKING:
@@ -95,10 +96,8 @@ class LargeTable(TableFile):
 
     def _side_by_side(self, pattern: str) -> Values | None:
         names = self.matching(pattern)
-        if not names or any(self.row[name].kind != "f" for name in names):
-            return super()._side_by_side(pattern)
         units = {self.table.find(name).unit for name in names}
-        if len(units) > 1:
+        if len(units) != 1 or any(self.row[name].kind != "f" for name in names):
             return super()._side_by_side(pattern)
 
         def read(start: int, stop: int) -> Any:
@@ -118,12 +117,11 @@ def _numbers(values: Values) -> bool:
 
 
 @contextmanager
-def open_large(file: IO[bytes], what: str, commas: bool, expected: str) -> Iterator[LargeTable]:
+def open_large(file: IO[bytes], what: str, commas: bool) -> Iterator[LargeTable]:
     """Open a text table of any size; its text is UTF-8."""
     text = io.TextIOWrapper(file, encoding="utf-8-sig")
     try:
-        pieces = _pieces(text, what, commas, expected)
-        table = LargeTable(pieces, what)
+        table = LargeTable(_pieces(text, what, commas), what)
     except UnicodeDecodeError as error:
         raise InputError(f"{what} must be text in UTF-8", key="file") from error
     with table.file:
@@ -131,7 +129,7 @@ def open_large(file: IO[bytes], what: str, commas: bool, expected: str) -> Itera
     text.detach()
 
 
-def _pieces(text: IO[str], what: str, commas: bool, expected: str) -> Iterator[Any]:
+def _pieces(text: IO[str], what: str, commas: bool) -> Iterator[Any]:
     """Yield tables of consecutive rows, of which the first has the keywords of comments above them."""
     lines = lines_in(text, what)
     line = next(lines, "")
@@ -151,7 +149,7 @@ def _pieces(text: IO[str], what: str, commas: bool, expected: str) -> Iterator[A
         if line and size < PIECE:
             continue
         if head:
-            piece = text_table("".join([*head, *kept]), what, commas, expected)
+            piece = text_table("".join([*head, *kept]), what, commas)
             # Its first line has the names.
             kept, head = [], head if first else [*head, kept[0]]
         else:
@@ -176,7 +174,8 @@ def _check_head(size: int, what: str) -> None:
         raise InputError(fault, key="file")
 
 
-FORMATS = "CSV, ECSV, FITS or VOTable"
+#: What a file must be, for messages.
+FORMATS = "must be text such as CSV, ECSV, FITS or VOTable"
 Form = Literal["FITS", "HDF5", "VOTable", "XML", "ECSV", "text"]
 
 
@@ -221,7 +220,7 @@ def open_content(path: Path, what: str, kind: str, *, large: bool = False) -> It
         start = raw.read(4096)
         raw.seek(0)
         form = form_of(start)
-        if form in ("FITS", "HDF5") or (large and form in ("text", "ECSV") and not packed(start)):
+        if form in ("FITS", "HDF5") or (large and form in ("text", "ECSV") and not start.startswith((*PACKED,))):
             yield Content(form, raw)
             return
         content = unpacked(read_bytes(path, kind), what)
@@ -234,58 +233,46 @@ def open_table(
     what: str,
     kind: str = "file",
     *,
-    expected: str = FORMATS,
     check: bool = True,
     large: bool = False,
-    of_fits: Callable[[Any], TableFile] | None = None,
-    of_hdf5: Callable[[IO[bytes]], AbstractContextManager[TableFile]] | None = None,
+    of_fits: Callable[[Any, str], TableFile] = FitsTables,
+    of_hdf5: Callable[[IO[bytes], str], AbstractContextManager[TableFile]] | None = None,
 ) -> Iterator[TableFile]:
     """Open the table in a file: text, ECSV, FITS or VOTable, packed by gzip, bzip2 or xz or not.
 
     Parameters
     ----------
-    what, kind, expected : str
-        The file, the kind of file, and what it should be, for messages.
+    what, kind : str
+        The file, and the kind of file, for messages.
     check : bool
         Whether to verify the checksums of a FITS file that can be read whole.
     large : bool
         Whether the file may exceed MAUVECL_LARGEST_FILE_MIB, if it can be read in pieces.
     of_fits, of_hdf5 : callable, optional
-        Functions that make tables of an open FITS file, by default of its first table, and of an HDF5 file.
+        Functions that make tables of an open FITS file, by default of its first table, and of an HDF5 file; the second
+        argument is `what`.
     """
     commas = bool({".csv", ".tsv"} & {suffix.lower() for suffix in path.suffixes[-2:]})
     with open_content(path, what, kind, large=large) as content:
         if content.form == "FITS":
             check &= content.size <= limit_bytes("MAUVECL_LARGEST_FILE_MIB")
             with open_fits(content.file, what, check=check) as hdus:
-                with reading(what):
-                    found = FitsTables(hdus, what) if of_fits is None else of_fits(hdus)
+                with reading(what, WHOLE):
+                    found = of_fits(hdus, what)
                 yield _filled(found)
         elif content.form == "HDF5" and of_hdf5 is not None:
-            with of_hdf5(content.file) as stored:
+            with of_hdf5(content.file, what) as stored:
                 yield stored
         elif content.form in ("text", "ECSV") and content.size > LARGE:
             content.file.seek(0)
-            with open_large(content.file, what, commas, expected) as table:
+            with open_large(content.file, what, commas) as table:
                 yield table
+        elif content.form == "VOTable":
+            if (first := next(votables(content.bytes, what), None)) is None:
+                raise InputError(f"{what} has no table, but needs one", key="file")
+            yield _filled(first)
         else:
-            yield _filled(_in_memory(content, what, commas, expected))
-
-
-def _in_memory(content: Content, what: str, commas: bool, expected: str) -> MemoryTable:
-    if content.form == "VOTable":
-        found = next(votables(content.bytes, what, expected), None)
-        if found is None:
-            raise InputError(f"{what} has no table, but needs one", key="file")
-        return found
-    check_form(content, what, expected)
-    try:
-        text = text_of(content.bytes)
-    except InputError as error:
-        raise error.within(what) from error
-    if not text.strip():
-        raise InputError(f"{what} is empty, but must be {expected}", key="file")
-    return MemoryTable(text_table(text, what, commas, expected), what)
+            yield _filled(MemoryTable(text_table(text_in(content, what), what, commas), what))
 
 
 #: Forms of files that are not read, by their first bytes.
@@ -302,37 +289,43 @@ FOREIGN = {
 }  # fmt: skip
 
 
-def check_form(content: Content, what: str, expected: str) -> None:
-    """Raise InputError for forms that are not read, such as JSON, or a page that says that a file is missing."""
-    start = content.bytes[:512]
-    tar = "a TAR archive" if start[257:262] == b"ustar" else ""
-    marks = b"".join(start.split())
+def text_in(content: Content, what: str) -> str:
+    """Return the text of a file.
+
+    Raises InputError for forms that are not read, such as JSON, or a page that says that a file is missing.
+    """
+    whole = content.bytes
+    tar = "a TAR archive" if whole[257:262] == b"ustar" else ""
+    marks = b"".join(whole[:512].split())
     if foreign := tar or next((form for mark, form in FOREIGN.items() if marks.startswith(mark)), ""):
-        raise InputError(f"{what} must be {expected}, but is {foreign}", key="file")
+        raise InputError(f"{what} is {foreign}, but {FORMATS}", key="file")
     if content.form == "XML":
-        start = content.bytes[:4096].lstrip(b"\xef\xbb\xbf \t\r\n")[:20]
-        fault = f"a page or XML that begins with {shortened(start.decode('ascii', 'replace'))}"
-        raise InputError(f"{what} must be {expected}, but is {fault}", key="file")
+        start = whole[:4096].lstrip(b"\xef\xbb\xbf \t\r\n")[:20]
+        fault = f"{what} is a page or XML that begins with {shortened(start.decode('ascii', 'replace'))}"
+        raise InputError(f"{fault}, but {FORMATS}", key="file")
+    text = as_text(whole, what)
+    if not text.strip():
+        raise InputError(f"{what} is empty, but {FORMATS}", key="file")
+    return text
 
 
-def votables(content: bytes, what: str, expected: str) -> Iterator[MemoryTable]:
+def votables(content: bytes, what: str) -> Iterator[MemoryTable]:
     """Yield the tables of a VOTable, whose parameters and systems of times and coordinates are keywords."""
     from astropy.io import votable
 
     if b"<!ENTITY" in content or b"<!DOCTYPE" in content:
         raise InputError(f"{what} must be a VOTable without entities", key="file")
-    with parsing(what, "a complete VOTable"), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with reading(what, "give a whole VOTable"):
         file = votable.parse(io.BytesIO(content), verify="ignore")
     status = {info.value: info.content for part in file.resources for info in part.infos if info.name == "QUERY_STATUS"}
     if "ERROR" in status:
         said = shortened(str(status["ERROR"] or "without a reason"))
-        fault = f"the answer to a query that failed: {said}"
-        raise InputError(f"{what} must be {expected}, but is {fault}", key="file")
+        fault = f"{what} is the answer to a query that failed: {said}"
+        raise InputError(f"{fault}; give that of one that succeeds", key="file")
     shared = {str(one.name or one.ID): one.value for resource in file.resources for one in resource.params}
     shared |= _systems(file)
     for table in file.iter_tables():
-        with parsing(what, expected):
+        with parsing(what, "give a whole VOTable"):
             for field in table.fields:
                 field.name = field.name or field.ID
             read = table.to_table(use_names_over_ids=True)

@@ -438,8 +438,8 @@ class Rows:
         except ValueError:
             value = np.nan
         if not (np.isfinite(value) and above < value):
-            expected = "a number" if np.isinf(above) else f"a number above {above:g}"
-            raise self.error(f"row {row + 1} has {name} = {shortened(text)}", expected, name)
+            wanted = "a number" if np.isinf(above) else f"a number above {above:g}"
+            raise self.error(f"{name} in row {row + 1} must be {wanted}, not {shortened(text)}", name)
         return value
 
     def degrees(self, name: str, row: int, *, right_ascension: bool) -> float | None:
@@ -451,20 +451,19 @@ class Rows:
         try:
             return angle(text, unit, right_ascension=right_ascension)
         except InputError as error:
-            raise InputError(f"{self.named}: {name} in row {row + 1}: {error}", key=self.key or name) from error
+            raise self.error(f"{name} in row {row + 1}: {error}", name) from error
         except ValueError as error:
-            expected = "degrees, or sexagesimal text such as 10h30m00s or 10:30:00"
-            raise self.error(f"row {row + 1} has {name} = {shortened(text)}", expected, name) from error
+            wanted = "degrees, or sexagesimal text such as 10h30m00s or 10:30:00"
+            raise self.error(f"{name} in row {row + 1} must be {wanted}, not {shortened(text)}", name) from error
 
     def _unit_of_angles(self, name: str) -> str:
         """Return the unit of a column of angles; raise InputError for another, or for coordinates in FK4."""
         if old := next(filter(_OLD_SYSTEM.search, self._system(name)), None):
-            expected = "right ascension and declination in ICRS or FK5 of J2000"
-            raise self.error(f"its coordinates are in {old}", expected, name)
+            raise self.error(f"its coordinates are in {old}; use those in ICRS or FK5 of J2000", name)
         stated = getattr(self.table[name], "unit", None)
         unit = angle_unit_in_name(name) if stated is None else angle_unit(str(stated))
         if unit is None:
-            raise self.error(f"{name} has the unit {shortened(str(stated))}", "an angle", name)
+            raise self.error(f"the unit of {name} must be one of angles, not {shortened(str(stated))}", name)
         return unit
 
     def _system(self, name: str) -> list[str]:
@@ -483,9 +482,9 @@ class Rows:
         words = f"column of {self.named} is" if len(names) == 1 else f"columns of {self.named} are"
         return (*said, f"{len(names)} {words} not used: {printable(', '.join(names), 200)}.") if names else said
 
-    def error(self, fault: str, expected: str, name: str) -> InputError:
-        """Return the error of a column or cell."""
-        return InputError(f"{self.named}: {fault}; give {expected}", key=self.key or name)
+    def error(self, sentence: str, name: str) -> InputError:
+        """Return the error of a column or of a cell in it."""
+        return InputError(f"{self.named}: {sentence}", key=self.key or name)
 
     def _ratio(self, name: str, unit: str) -> float:
         """Return the factor from the unit of a column to another."""
@@ -505,11 +504,8 @@ class Rows:
                     f"{stated!r} in the name of the column {name!r} of {self.named} is read as no unit."
                 )
                 return 1.0
-            raise self.error(
-                f"{name} has the unit {shortened(stated)}",
-                f"a unit such as {'%' if unit == '1' else unit}",
-                name,
-            ) from error
+            usual = "%" if unit == "1" else unit
+            raise self.error(f"{name} must have a unit such as {usual}, not {shortened(stated)}", name) from error
 
 
 #: Keywords and columns of the system of coordinates, and words for those that are not right ascensions of J2000.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import csv
 import re
-import warnings
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.tables.files import check_cells, parse_ecsv, parsing, read_text
+from mauvecl.host.tables.files import check_cells, parse_ecsv, parsing, read_text, reading
 from mauvecl.host.tables.names import in_brackets, is_missing
 from mauvecl.host.tables.table import REMARKS, Values, is_known, number_in, plain_numbers, unit_in, unquoted
 from mauvecl.host.tables.units import is_dated, is_stated, time_unit, unit_of
@@ -65,7 +64,7 @@ def columns(what: str, text: str, expected: str, unit: str = "") -> NDArray[np.f
     The first column of the result is in `unit`, as is that of the text unless its header states another one. `what` and
     `expected` are the text and its two columns, for messages.
     """
-    with parsing(what, f"two columns of numbers: {expected}"):
+    with parsing(what, f"give two columns of numbers: {expected}"):
         try:
             lines = NumberLines(text, expected)
             if odd := next((len(cells) for cells in lines.cells if len(cells) != 2), 0):
@@ -93,23 +92,6 @@ def _in_unit(values: NDArray[np.float64], header: str, unit: str) -> NDArray[np.
     if len(said) > 1:
         raise InputError(f"its header must state one unit, not {' and '.join(said.values())}", key="unit")
     return np.asarray((values * next(iter(said), u.Unit(unit))).to_value(unit, u.spectral()))
-
-
-def text_of(content: bytes) -> str:
-    """Decode text in UTF-8 or, with a byte-order mark, UTF-16."""
-    # Editors on Windows start a file with a byte-order mark.
-    code = "utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
-    try:
-        text = content.decode(code)
-    except UnicodeDecodeError as error:
-        if b"\0" in content[:4096]:
-            raise InputError("it must be text, but holds null bytes", key="file") from error
-        line, odd = content[: error.start].count(b"\n") + 1, content[error.start]
-        fault = f"it must be text in UTF-8, but its byte 0x{odd:02x} in line {line} is not: save it as UTF-8"
-        raise InputError(fault, key="file") from error
-    if "\0" in text:
-        raise InputError("it must be text, but holds null bytes", key="file")
-    return text
 
 
 class NumberLines:
@@ -389,9 +371,9 @@ class TextRows:
                 raise InputError(fault, key="file")
 
 
-def text_table(text: str, what: str, commas: bool, expected: str = "CSV or ECSV") -> Table:
+def text_table(text: str, what: str, commas: bool) -> Table:
     """Parse a table from text: ECSV, those of IPAC and CDS, and rows that marks or blanks divide into texts."""
-    if text.startswith("# %ECSV"):
+    if re.match(r"\s*#\s*%ECSV", text):
         return parse_ecsv(text, what)
     form = _known_form(text)
     if form is None:
@@ -400,8 +382,7 @@ def text_table(text: str, what: str, commas: bool, expected: str = "CSV or ECSV"
 
     lines = text.splitlines()
     check_cells(lines, what)
-    with parsing(what, expected), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with reading(what, "give a whole table"):
         # Of an empty line astropy makes a row without values.
         return Table.read([line for line in lines if line.strip()], format=form)
 
@@ -452,7 +433,7 @@ def _split(lines: Sequence[str], mark: str) -> list[list[str]]:
         # Marks around a line enclose it; one at its end alone may follow an empty cell.
         lines = [re.sub(r"^\s*\|(.*)\|\s*$", r"\1", line) for line in lines]
     if any('"' in line for line in lines):
-        with parsing("it", "text"):
+        with parsing("it", "give text"):
             quoted = csv.reader((line.strip(" ") for line in lines), delimiter=mark or " ", skipinitialspace=True)
             return [list(map(unquoted, row)) for row in quoted]
     if not mark:

@@ -385,7 +385,7 @@ def make_folder(path: Path) -> Path:
     """Make a folder; raises InputError if it cannot be made or written to."""
     if path.exists() and not path.is_dir():
         raise InputError(f"output folder {str(path)!r} is a file: give the name of a folder", key="output")
-    with writing(f"output folder {str(path)!r}", path, "a writable one", key="output"):
+    with writing(f"output folder {str(path)!r}", "use a writable one", key="output"):
         path.mkdir(parents=True, exist_ok=True)
         probe = path / ".mauvecl-probe"
         probe.write_text("")

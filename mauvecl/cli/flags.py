@@ -206,7 +206,7 @@ def holds_study(file: Path) -> bool:
         return suffix not in (".csv", ".vot", ".votable", ".xml", ".fits", ".fit")
     from mauvecl.host.tables.files import read_ecsv
 
-    return "study" in read_ecsv(file, "table", "a table of targets, or of an answer").meta
+    return "study" in read_ecsv(file, "table", "give a table of targets, or of an answer").meta
 
 
 #: What the argument of the study may be instead, by the flag of a command that takes it: for help, in the plural for

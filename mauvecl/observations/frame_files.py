@@ -57,7 +57,7 @@ def _keys(values: Values) -> NDArray[Any]:
 
 Float = NDArray[np.float64]
 
-FORMATS = "FITS, HDF5, ECSV, CSV, a Zarr store or a folder of spectra"
+FORMATS = "give FITS, HDF5, ECSV, CSV, a Zarr store or a folder of spectra"
 #: Columns of bands and of stars, of which a light curve has one.
 GROUPS = ("band", "filter", "filt", "passband", "bandpass", "filtercode", "phot_filter", "source_id", "tic",
           "tic_id", "ticid", "kic", "kepid", "epic", "object", "target", "star", "f")  # fmt: skip
@@ -255,13 +255,11 @@ def _opened(
     # Groups of names, of each of which the chosen table has one.
     wanted = (KNOWN["time"], KNOWN["flux"]) if mapping is None else tuple((each,) for each in mapping.times)
 
-    def of_fits(hdus: Any) -> TableFile:
+    def of_fits(hdus: Any, what: str) -> TableFile:
         return stored_in_fits(FitsTables(hdus, what), name) or FitsTables(hdus, what, name, wanted)
 
-    return open_table(
-        path, what, expected=FORMATS, check=check, large=large, of_fits=of_fits,
-        of_hdf5=lambda file: open_hdf5(file, name, what),
-    )  # fmt: skip
+    hdf5 = partial(open_hdf5, name=name)
+    return open_table(path, what, check=check, large=large, of_fits=of_fits, of_hdf5=hdf5)
 
 
 @dataclass(frozen=True, eq=False)

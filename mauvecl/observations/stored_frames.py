@@ -133,7 +133,7 @@ MAPPING = {"time": "time", "flux": "flux", "error": "error", "quality": "quality
 REQUIRED = ("exposure_s", "frames", "instrument", "dark_unit", "saturation_dn")
 #: Largest number of pixels of a spectrum.
 MAX_PIXELS = 2**20
-EXPECTED = "a file that `mauvecl realise` wrote, whole"
+WHOLE = "give a whole file that `mauvecl realise` wrote"
 
 
 class StoredFile(TableFile):
@@ -206,7 +206,7 @@ class StoredFile(TableFile):
 
     def _raw(self, start: int, stop: int) -> Float:
         first, last = start // self.per_row, -(-stop // self.per_row)
-        with parsing(self.what, EXPECTED):
+        with parsing(self.what, WHOLE):
             raw = np.asarray(self.raw[first:last], np.float64).reshape(-1, self.parts["flux"].shape[1])
         skipped = first * self.per_row
         return raw[start - skipped : stop - skipped]
@@ -232,16 +232,16 @@ def open_store(path: Path, name: str | None, what: str) -> Iterator[StoredFile]:
     """Open a scene of a Zarr store."""
     zarr = _module("zarr")
     check_folder(path, "file")
-    with parsing(what, EXPECTED):
+    with parsing(what, WHOLE):
         group = zarr.open_group(path, mode="r")
     yield _in_groups(group, name, what)
 
 
 @contextmanager
-def open_hdf5(file: IO[bytes], name: str | None, what: str) -> Iterator[StoredFile]:
+def open_hdf5(file: IO[bytes], what: str, name: str | None) -> Iterator[StoredFile]:
     """Open a scene of an HDF5 file."""
     h5py = _module("h5py")
-    with parsing(what, EXPECTED):
+    with parsing(what, WHOLE):
         opened = h5py.File(file, "r")
     with opened:
         yield _in_groups(opened, name, what)
@@ -257,7 +257,7 @@ def stored_in_fits(file: FitsTables, name: str | None) -> StoredFile | None:
     path = _chosen(list(names), name, file.what)
     hdu = scenes[names[path]]
     header = hdu.header
-    with parsing(file.what, EXPECTED):
+    with parsing(file.what, WHOLE):
         table = hdus[str(header["PS1_0"])].data
         of = {key.lower(): np.asarray(table[key][0], np.float64).ravel() for key in table.columns.names}
         of["wavelength_nm"] = of.pop("coords")
@@ -273,7 +273,7 @@ def stored_in_fits(file: FitsTables, name: str | None) -> StoredFile | None:
 
 def _in_groups(root: Any, name: str | None, what: str) -> StoredFile:
     """Return a scene in the groups of a Zarr store or an HDF5 file, which have the same layout."""
-    with parsing(what, EXPECTED):
+    with parsing(what, WHOLE):
         found = [f"{star}/{scene}" for star in sorted(root) if star.startswith("star-") for scene in sorted(root[star])
                  if scene == "quiescent" or (scene.startswith("flare-") and scene[6:].isdigit())]  # fmt: skip
         path = _chosen(sorted(found, key=lambda one: "flare" in one), name, what)
@@ -292,7 +292,7 @@ def _in_groups(root: Any, name: str | None, what: str) -> StoredFile:
 def _chosen(found: list[str], name: str | None, what: str) -> str:
     """Return the requested scene, or the only one."""
     if not found:
-        raise InputError(f"{what} holds no spectra; give {EXPECTED}", key="file")
+        raise InputError(f"{what} holds no spectra; {WHOLE}", key="file")
     if name is None and len(found) > 1:
         raise InputError(
             f"{what} holds {len(found)} arrays ({', '.join(found[:8])}); give one, as in FILE[{found[-1]}]", key="hdu"

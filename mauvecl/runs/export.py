@@ -75,9 +75,7 @@ class Selection:
 
         place = self.store.path / scene.path
         check_folder(place, "file")
-        with parsing(
-            f"array {scene.path} of store {str(self.store.path)!r}", "an intact one: `mauvecl verify` checks it"
-        ):
+        with parsing(f"array {scene.path} of store {str(self.store.path)!r}", "use `mauvecl verify` to check it"):
             rows = np.asarray(zarr.open_array(place, mode="r")[self.first : self.stop])
         if rows.shape != (self.stop - self.first, *scene.row) or rows.dtype != scene.dtype:
             raise InputError(

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host import VERSION
-from mauvecl.host.tables.files import UNFINISHED, read_bytes, toml, write_whole, writing
+from mauvecl.host.tables.files import NO_ROOM, UNFINISHED, read_bytes, toml, write_whole, writing
 from mauvecl.runs.checkpoint import differing_keys
 from mauvecl.schema.columns import Column, percent
 from mauvecl.schema.errors import InputError, missing_package
@@ -391,7 +391,7 @@ class Store:
         # A single short write at the end. A line that a full disk cut short is terminated first.
         with (
             self._listing,
-            writing(what, self.path, "a writable disk with room; what was written before is kept", key="store"),
+            writing(what, NO_ROOM, key="store"),
             (self.path / chunk.scene.path / DIGESTS).open("a+b", buffering=0) as file,
         ):
             file.seek(0, 2)

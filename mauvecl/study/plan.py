@@ -383,7 +383,7 @@ def _check_band(rows: Rows, column: str | None, row: int) -> None:
         return
     bands = (band_in_name(column), rows.text(rows.first(BANDS), row))
     if odd := next((band for band in bands if band and not re.fullmatch(r"(?i)(?:johnson[\s_]*)?v", band)), None):
-        raise rows.error(f"row {row + 1} has {column} in the band {shortened(odd)}", "a magnitude in V", column)
+        raise rows.error(f"row {row + 1} has {column} in the band {shortened(odd)}; give a magnitude in V", column)
 
 
 def _coordinates(rows: Rows, columns: dict[str, str | None], row: int, target: dict[str, Any]) -> str | None:
@@ -404,7 +404,7 @@ def _coordinates(rows: Rows, columns: dict[str, str | None], row: int, target: d
         other = None if again in (None, ra) else rows.degrees(again, row, right_ascension=True)
         if other is not None and east is not None and abs((other - east + 180) % 360 - 180) > 0.1:
             fault = f"row {row + 1} has {ra} = {rows.text(ra, row)} and {again} = {rows.text(again, row)}, which differ"
-            raise rows.error(fault, "numbers in degrees, or only one of these columns", ra)
+            raise rows.error(f"{fault}; give numbers in degrees, or only one of these columns", ra)
         return f"{east!r} {north!r}"
     if "coordinates" not in target and name_key(name := target.get("name", "")) not in by_key():
         for column in filter(None, (ra, columns["coordinates"])):
@@ -412,8 +412,8 @@ def _coordinates(rows: Rows, columns: dict[str, str | None], row: int, target: d
             # The cell says that a coordinate, or a pair of them, is not a number, instead of being empty.
             if text.strip().lower() == "nan" or is_missing_position(text):
                 fault = f"row {row + 1} has no coordinates ({column} = {' '.join(text.split())}), and {shortened(name)}"
-                expected = "its coordinates, or a name of the list"
-                raise rows.error(f"{fault} is not in the embedded list", expected, column)
+                remedy = "give its coordinates, or a name of the list"
+                raise rows.error(f"{fault} is not in the embedded list; {remedy}", column)
     return None
 
 

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
 def read_embedded_study(path: Path) -> str:
     """Return the text of the study in an answer's metadata."""
-    study = read_ecsv(path, "study", "an answer's ECSV table").meta.get("study")
+    study = read_ecsv(path, "study", "give an answer's ECSV table").meta.get("study")
     if not isinstance(study, str):
         raise InputError(f"{path.name} contains no study; give an answer's ECSV table", key="study")
     return study
@@ -146,7 +146,7 @@ def _digest(file: Path) -> str:
 
 def parse_toml_value(text: str) -> Any:
     """Parse a TOML value; a bare word is text."""
-    with parsing(f"value {shortened(text)}", "a TOML value"):
+    with parsing(f"value {shortened(text)}", "give a TOML value"):
         try:
             parsed = tomllib.loads(f"value = {text}")
         except tomllib.TOMLDecodeError:
