@@ -43,7 +43,7 @@ from mauvecl.schema.errors import InputError
 from mauvecl.web.closed_forms import Answers, short
 from mauvecl.web.sandboxed_reader import read_limited
 from mauvecl.web.tab import Tab, target_words
-from mauvecl.web.uploads import MOST_VALUES, VisitorFile, read_frames_of, reported_for
+from mauvecl.web.uploads import MOST_VALUES, VisitorFile, read_frames_of
 
 if TYPE_CHECKING:
     from bokeh.models.sources import ColumnDataSource
@@ -209,11 +209,9 @@ def scatter(closed: ClosedForms, answer: AnalyseAnswer) -> ChartData:
 
 
 def read_frames(question: Question) -> dict[str, Any]:
-    """Read the frames; raises InputError with the name of the field whose file cannot be read."""
-    if "frames" not in question.uploads:
-        return {}
+    """Read the frames."""
     frames = read_frames_of(
-        question.uploads["frames"], question.uploads.get("mapping"), "frames", quality_bits=question.quality_bits
+        question.uploads["frames"], question.uploads.get("mapping"), quality_bits=question.quality_bits
     )
     if frames.flux.size > MOST_VALUES:
         raise InputError.of("frames", frames.flux.size, f"at most {MOST_VALUES} values, or the command line")
@@ -233,6 +231,7 @@ ANALYSE = Tab(
     pictures=(light_curve, dynamic_spectrum, scatter),
     files=dict.fromkeys(("events", "measured", "frames", "noise", "limits", "completeness"), "analyse"),
     documents={"analyse.html": "analyse"},
+    needs="frames",
     given=read_frames,
     words=name_of("frames", "no file of frames yet"),
     # Some tables exist only for spectra.
@@ -278,15 +277,13 @@ def photon_transfer(closed: ClosedForms, answer: CalibrateAnswer) -> ChartData:
 
 
 def read_observations(question: Question) -> dict[str, Any]:
-    """Read frames and spectra; raises InputError if a file cannot be read."""
-    if "observations" not in question.uploads:
-        return {}
+    """Read frames and spectra."""
     archive: Observations = question.uploads["observations"]
     files = {name: VisitorFile(name, content) for name, content in archive.files.items()}
     frames, stars = [], []
     for row in archive.rows:
         mapping = files[str(row.mapping)] if row.mapping else None
-        frames.append(read_frames_of(files[str(row.frames)], mapping, "observations"))
+        frames.append(read_frames_of(files[str(row.frames)], mapping))
         if sum(some.flux.size for some in frames) > MOST_VALUES:
             raise InputError(
                 f"the archive holds more than {MOST_VALUES} raw values; give fewer, or use the command line",
@@ -295,8 +292,7 @@ def read_observations(question: Question) -> dict[str, Any]:
         if row.spectrum is None:
             stars.append(row.source())
             continue
-        with reported_for("observations"):
-            star = read_limited(files[str(row.spectrum)].content, Source)
+        star = read_limited(files[str(row.spectrum)].content, Source)
         stars.append(star if row.magnitude is None else star.at_magnitude(row.magnitude, row.band))
     return {"frames": tuple(frames), "stars": tuple(stars)}
 
@@ -309,6 +305,7 @@ CALIBRATE = Tab(
     pictures=(throughput, residuals, photon_transfer),
     files=dict.fromkeys(("calibrate", "fits", "throughput", "dark"), "calibrate"),
     documents={"instrument.zip": "calibrate"},
+    needs="observations",
     given=read_observations,
     words=name_of("observations", "no observations yet"),
 )
@@ -396,6 +393,7 @@ PERIODS = Tab(
     pictures=(recovered_periods,),
     chance=False,
     simulations={"periods": "Map periods"},
+    needs="targets",
     answer="periods",
     view=2,
     # The power is that of differences.
@@ -483,6 +481,7 @@ PLAN = Tab(
     files=dict.fromkeys(("plan", "stars", "energies", "assumptions"), "plan"),
     words=plan_words,
     rows_before=columns_of_plan,
+    needs="targets",
 )
 
 
@@ -519,6 +518,7 @@ VISIBILITY = Tab(
     chance=False,
     pictures=(hours,),
     simulations={"visible": "Find when"},
+    needs="targets",
     view=1,
     files={"visible": "visible", "months": "visible", "days": "visible"},
     words=target_words,

@@ -40,8 +40,7 @@ from mauvecl.study.plan import TARGET_COLUMNS
 from mauvecl.web import fields
 from mauvecl.web.closed_forms import TITLES, ClosedForms
 from mauvecl.web.figures import INKS, PINS, Canvas
-from mauvecl.web.page import SEEN, TABS, State, reads_of
-from mauvecl.web.tab import SIMULATIONS
+from mauvecl.web.page import SEEN, SIMULATIONS, TABS, State, reads_of
 from mauvecl.web.uploads import EXAMPLES, MAPPED, TIME_UNITS, UPLOADS
 from mauvecl.web.visitor import UNUSED, Job, Visitor, limit_arenas, reading, release_memory, shown
 
@@ -372,7 +371,7 @@ def _words() -> dict[str, Any]:
         },
         "withFile": fields.WITH_FILE,
         "columns": sorted({*KNOWN}),
-        "needs": {name: simulation.needs for name, simulation in SIMULATIONS.items() if simulation.needs},
+        "needs": {name: tab.needs for name, tab in SIMULATIONS.items() if tab.needs},
         "under": fields.ASKED_UNDER,
         "presets": fields.PRESETS,
         "seen": {name: field.first for name, field in SEEN.items()},

@@ -14,8 +14,7 @@ import tomllib
 import zipfile
 import zlib
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path, PureWindowsPath
@@ -30,7 +29,7 @@ from mauvecl.host.stars.flare_spectra import ObservedFlare
 from mauvecl.host.stars.source import Source
 from mauvecl.host.tables.text_tables import columns
 from mauvecl.observations.frames import Frames
-from mauvecl.schema.errors import InputError, printable, reworded, shortened
+from mauvecl.schema.errors import InputError, printable, shortened
 from mauvecl.schema.section import input_error
 from mauvecl.study.analyses import PATHS, CalibrateQuestion, CalibrationObservation
 from mauvecl.web.fields import FIELDS, UPLOADED, UPLOADED_FILE, UPLOADED_UNKNOWN
@@ -343,29 +342,14 @@ EXAMPLES: Mapping[str, tuple[str, str]] = {
 }
 
 
-def read_frames_of(
-    file: VisitorFile, mapping: VisitorFile | None, key: str, *, quality_bits: str | None = None
-) -> Frames:
-    """Read the frames of a visitor's file, through a mapping if there is one, without those of the quality bits.
-
-    Raises InputError with the name of the field if it holds no frames.
-    """
+def read_frames_of(file: VisitorFile, mapping: VisitorFile | None, *, quality_bits: str | None = None) -> Frames:
+    """Read the frames of a visitor's file, through a mapping if there is one, without those of the quality bits."""
     files = {file.name: file.content}
     how = None
     if mapping is not None:
         how = mapping.name if mapping.name != file.name else f"mapping-{mapping.name}"
         files[how] = mapping.content
-    with reported_for(key):
-        return Frames(**read_by(FRAMES, files, {"mapping": how, "quality_bits": quality_bits}))
-
-
-@contextmanager
-def reported_for(key: str) -> Iterator[None]:
-    """Raise the errors of a reader as those of a field."""
-    try:
-        yield
-    except InputError as error:
-        raise reworded(error, str(error), key) from error
+    return Frames(**read_by(FRAMES, files, {"mapping": how, "quality_bits": quality_bits}))
 
 
 #: Bytes of closed forms, answers and files that the server keeps for all visitors together, and of their uploads.
