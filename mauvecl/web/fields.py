@@ -16,7 +16,7 @@ from pydantic.fields import FieldInfo
 from mauvecl.detection.requests import STATISTICS
 from mauvecl.host.instrument import FORMER_NAMES, FORMERLY_MAUVE
 from mauvecl.host.stars.library import ModelStar, embedded, near_names, spectrum_name
-from mauvecl.schema.errors import InputError, shortened
+from mauvecl.schema.errors import SUBJECT, InputError, shortened
 from mauvecl.schema.fields import (
     Flag,
     Help,
@@ -413,8 +413,6 @@ PRESETS: dict[str, dict[str, str]] = {
 NO_KEYS: Mapping[str, str] = MappingProxyType({})
 #: A remedy in a message, such as `magnitude=7.4`.
 _REMEDY = re.compile(r"`(?P<key>[a-z][\w.]*)(?:=(?P<quote>'?)(?P<value>[^`]*?)(?P=quote))?`")
-#: The key of a value at the beginning of a message, such as fap in "fap must be a probability, not 2".
-_VALUE = re.compile(r"^(?:page: )?(?P<key>[a-z][\w.]*)(?= must be | = )")
 #: A flag of the command line.
 _FLAG = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
 #: A key within a message: words of prose hold no underscore.
@@ -437,7 +435,7 @@ def field_of(key: str | None) -> str | None:
 
 def sentence(error: InputError, keys: Mapping[str, str] = NO_KEYS) -> str:
     """Return the message of an error as the page shows it; `keys` maps other names of its keys to fields."""
-    text = _VALUE.sub(lambda match: _label(match["key"], keys), str(error))
+    text = SUBJECT.sub(lambda m: f"{m['place'] or ''}{_label(m['key'], keys)} {m['verb']}", str(error))
     return note(re.sub(", not ''$", ", but is empty", text).removeprefix("page: "), keys)
 
 

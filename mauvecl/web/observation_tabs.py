@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from bokeh.models import FixedTicker, HoverTool, LinearColorMapper
-from bokeh.palettes import diverging_palette
+from bokeh.palettes import interp_palette
 from numpy.typing import NDArray
 
 from mauvecl.answers.plan import COLUMNS
@@ -65,8 +65,8 @@ Float = NDArray[np.float64]
 MOST_POINTS, MOST_COLUMNS, MOST_ROWS = 8000, 600, 300
 #: Verdicts on events, with their colours.
 VERDICTS = {"detected": "star", "candidate": "drawn", "rejected": "own", "undecided": "dark"}
-#: Colours of the dynamic spectrum.
-BLUE, RED = "#0072B2", "#D55E00"
+#: Colours of the dynamic spectrum, from low to high.
+BLUE, MIDDLE, RED = "#0072B2", "#F7F7F7", "#D55E00"
 NO_FRAMES = "Choose a file of frames: a light curve or a sequence of spectra."
 
 
@@ -133,7 +133,7 @@ def _summary(rows: Any, analysis: Analysis) -> str:
 
 
 def _image(canvas: Canvas, source: ColumnDataSource) -> None:
-    colours = diverging_palette(_shades(BLUE), _shades(RED), 255)
+    colours = interp_palette((BLUE, MIDDLE, RED), 255)
     mapper = LinearColorMapper(palette=colours, name="deviation", low=-5, high=5, nan_color=canvas.ink["grid"])
     image = canvas.plot.image("image", "x", "y", "dw", "dh", source=source, color_mapper=mapper)
     shown = [("standard deviations", "@image{0.0}"), ("minute", "$x{0.0}"), ("nm", "$y{0.0}")]
@@ -171,15 +171,6 @@ def dynamic_spectrum(closed: ClosedForms, answers: Answers) -> ChartData:
         series["marks"] = [list(map(float, x)) for x in ends], [[above, above]] * len(ends)
     text = f"{frames.n_frames} spectra of {nm.size} pixels, {nm[0]:.0f} to {nm[-1]:.0f} nm."
     return ChartData(text, series, {"deviation": {"low": -reach, "high": reach}})
-
-
-def _shades(colour: str) -> tuple[str, ...]:
-    """Return shades from a colour to white."""
-    ends = np.array([[int(colour[k : k + 2], 16) for k in (1, 3, 5)], [247, 247, 247]])
-    steps = np.linspace(0.0, 1.0, 128)[:, None]
-    return tuple(
-        "#" + "".join(f"{round(value):02x}" for value in row) for row in ends[0] * (1 - steps) + ends[1] * steps
-    )
 
 
 def _means(values: Float, numbers: NDArray[np.int64], most: int) -> Float:
