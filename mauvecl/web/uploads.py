@@ -27,12 +27,12 @@ from pydantic import ValidationError
 from mauvecl.host.spectra.conversion import ReadSpectrum
 from mauvecl.host.stars.flare_spectra import ObservedFlare
 from mauvecl.host.stars.source import Source
-from mauvecl.host.tables.text_tables import columns
+from mauvecl.host.tables.text_tables import text_of
 from mauvecl.observations.frames import Frames
 from mauvecl.schema.errors import InputError, printable, shortened
 from mauvecl.schema.section import input_error
 from mauvecl.study.analyses import PATHS, CalibrateQuestion, CalibrationObservation
-from mauvecl.web.fields import FIELDS, UPLOADED, UPLOADED_FILE, UPLOADED_UNKNOWN
+from mauvecl.web.fields import FIELDS, UPLOADED, UPLOADED_FILE, UPLOADED_UNKNOWN, read_points
 from mauvecl.web.sandboxed_reader import FRAMES, Spectrum, read_by, read_limited
 
 #: Name of a table of neighbours in its folder.
@@ -212,16 +212,14 @@ def write_spectrum(source: Source | ReadSpectrum, folder: Path, name: str) -> Pa
     return content_folder(folder, content, write) / name
 
 
-Points = tuple[tuple[float, float], ...]
 #: Largest size of an upload, bytes, and largest number of points of its spectrum.
 MOST_UPLOADED, MOST_POINTS = 4 * 2**20, 200_000
 #: Largest size of a file that is kept unread, such as frames; a day of resolution elements takes some 8 MiB.
 MOST_KEPT_BYTES = 16 * 2**20
 #: Largest number of values of frames that an answer reads: the spectra of a day.
 MOST_VALUES = 2**24
-
-#: Largest size and number of rows of an unknown spectrum, which the study in every table contains.
-MOST_PAIRS_BYTES, MOST_PAIRS = 2**18, 4000
+#: Largest size of an unknown spectrum.
+MOST_PAIRS_BYTES = 2**18
 
 
 def _spectrum(kind: type[Spectrum], called: str, name: str, content: bytes, **options: Any) -> Spectrum:
@@ -244,22 +242,6 @@ def _flare(name: str, content: bytes, **options: Any) -> ReadSpectrum:
     inside = (flare.wavelength_nm >= low) & (flare.wavelength_nm <= high)
     own = tuple(text for text in flare.messages if text.startswith(f"{flare.name}: "))
     return ReadSpectrum(flare.wavelength_nm[inside], flare.flux_flam[inside], "uploaded flare", "upload", messages=own)
-
-
-def read_pairs(name: str, content: bytes) -> Points:
-    """Read the spectrum of a nuisance parameter: text with two columns, nm and DN of the exposure."""
-    try:
-        text = content.decode("utf-8")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{shortened(name)} must be text with two columns, nm and DN", key="upload") from error
-    pairs = columns(f"upload {shortened(name)}", text, "nm and DN", "nm")
-    if not 2 <= len(pairs) <= MOST_PAIRS:
-        raise InputError(
-            f"{shortened(name)} must have 2 to {MOST_PAIRS} rows of nm and DN, but has {len(pairs)}", key="upload"
-        )
-    if not np.isfinite(pairs).all() or (np.diff(pairs[:, 0]) <= 0).any():
-        raise InputError(f"{shortened(name)} must have rows in ascending order of nm", key="upload")
-    return tuple((float(nm), float(dn)) for nm, dn in pairs)
 
 
 @dataclass(frozen=True)
@@ -322,7 +304,11 @@ UPLOADS: Mapping[str, Upload] = {
         partial(_spectrum, Source, "added spectrum"),
         options=_options("wavelength_unit", "flux_unit", "extend", prefix="change_"),
     ),
-    "own_unknown": Upload(read_pairs, UPLOADED_UNKNOWN, most=MOST_PAIRS_BYTES),
+    "own_unknown": Upload(
+        lambda name, content: read_points(text_of(content), f"upload {shortened(name)}"),
+        UPLOADED_UNKNOWN,
+        most=MOST_PAIRS_BYTES,
+    ),
     **{
         name: Upload(VisitorFile.of, most=MOST_KEPT_BYTES)
         for name, page_field in FIELDS.items()
