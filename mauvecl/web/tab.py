@@ -23,7 +23,6 @@ from mauvecl.schema.columns import View, without_empty
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, found
 from mauvecl.schema.section import read_axis, read_line_fluxes, read_words
-from mauvecl.study.observation import SkyLight
 from mauvecl.study.star import Star
 from mauvecl.study.study import Study, keys_of, set_key, with_paths
 from mauvecl.web.closed_forms import OTHER
@@ -267,9 +266,9 @@ def as_command(verb: str, study: Study) -> str:
             for star in value:
                 usual = Star(library=star.get("library"))
                 said = {key: given for key, given in star.items() if given != getattr(usual, key)}
-                words += _words(Star, {"library": star.get("library")} | said)
+                words += _flag_words("star", {"library": usual.library} | said, question)
         elif name == "sky":
-            words += ["--sky", "none"] if value.get("none") else _words(SkyLight, value)
+            words += ["--sky", "none"] if value.get("none") else _flag_words("sky", value, question)
         else:
             words += _flag_words(name, value, question) or ["--set", f"{name}={_toml(value)}"]
     long = any(len(word) > MOST_CHARACTERS for word in words)
@@ -290,7 +289,9 @@ def keys_used(verb: Verb, study: Study, base: Study) -> Iterator[tuple[str, Any]
 
 
 def _flag_words(name: str, value: Any, verb: Verb) -> list[str]:
-    """Return the words of a key's flag, or none if the verb has no flag that takes such a value."""
+    """Return the words of the flag of a key, or of each key of a star or sky; none if no flag takes such a value."""
+    if name in ("star", "sky"):
+        return [word for key, inner in value.items() for word in _flag_words(f"{name}.{key}", inner, verb)]
     for flag in (flag for key, _, flag in keys_of() if key == name and verb.accepts(name)):
         if isinstance(value, bool) and flag.read is None:
             on, _, off = flag.names[0].partition("/")
@@ -300,17 +301,11 @@ def _flag_words(name: str, value: Any, verb: Verb) -> list[str]:
         if flag.read is read_axis and "start" in value:
             spaced = [value["quantity"], *(_text(value[key]) for key in ("start", "stop", "steps"))]
             return [flag.names[0], ":".join(spaced + ["log"] * value.get("log", False))]
-        if flag.read in (None, read_words) and flag.kind in (None, str, list[str]):
+        if flag.read in (None, read_words):
             values = value if isinstance(value, list) else [value]
             if all(isinstance(item, str | int | float) for item in values):
                 return [word for item in values for word in (flag.names[0], _text(item))]
     return []
-
-
-def _words(section: type[BaseModel], values: Mapping[str, Any]) -> list[str]:
-    """Return the words of the first flags of a section's keys, with their values."""
-    names = {key: flags[0].names[0] for key, each in section.model_fields.items() if (flags := found(each, Flag))}
-    return [word for key, value in values.items() if key in names for word in (names[key], _text(value))]
 
 
 def _text(value: str | float) -> str:
