@@ -283,7 +283,7 @@ def read_observations(question: Question) -> dict[str, Any]:
         if row.spectrum is None:
             stars.append(row.source())
             continue
-        star = read_limited(files[str(row.spectrum)].content, Source)
+        star = read_limited(Source, Source.read, {"upload": files[str(row.spectrum)].content})
         stars.append(star if row.magnitude is None else star.at_magnitude(row.magnitude, row.band))
     return {"frames": tuple(frames), "stars": tuple(stars)}
 

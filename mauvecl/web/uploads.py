@@ -19,21 +19,25 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path, PureWindowsPath
 from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from pydantic import ValidationError
 
 from mauvecl.host.spectra.conversion import ReadSpectrum
+from mauvecl.host.spectra.formats import read_spectrum
 from mauvecl.host.stars.flare_spectra import ObservedFlare
 from mauvecl.host.stars.source import Source
 from mauvecl.host.tables.text_tables import text_of
+from mauvecl.observations.frame_files import read_frames
 from mauvecl.observations.frames import Frames
 from mauvecl.schema.errors import InputError, printable, shortened
 from mauvecl.schema.section import input_error
 from mauvecl.study.analyses import PATHS, CalibrateQuestion, CalibrationObservation
 from mauvecl.web.fields import FIELDS, UPLOADED, UPLOADED_FILE, UPLOADED_UNKNOWN, read_points
-from mauvecl.web.sandboxed_reader import FRAMES, Spectrum, read_by, read_limited
+from mauvecl.web.sandboxed_reader import read_limited
+
+Spectrum = TypeVar("Spectrum", Source, ObservedFlare, ReadSpectrum)
 
 #: Name of a table of neighbours in its folder.
 NEIGHBOURS_FILE = "neighbours.csv"
@@ -222,13 +226,15 @@ MOST_VALUES = 2**24
 MOST_PAIRS_BYTES = 2**18
 
 
-def _spectrum(kind: type[Spectrum], called: str, name: str, content: bytes, **options: Any) -> Spectrum:
+def _spectrum(
+    kind: type[Spectrum], reader: Callable[..., Spectrum], called: str, name: str, content: bytes, **options: Any
+) -> Spectrum:
     """Read an untrusted spectrum, packed or not, and name it if `called`; its format follows from the content.
 
     Raises InputError if it holds no usable spectrum. Called on a thread of its own; any other exception is reported to
     the visitor too.
     """
-    spectrum = read_limited(content, kind, options)
+    spectrum = read_limited(kind, reader, {"upload": content}, **options)
     if spectrum.wavelength_nm.size > MOST_POINTS:
         raise InputError.of("points", spectrum.wavelength_nm.size, f"at most {MOST_POINTS}")
     named: Any = {"name": called, "origin": "upload"} if called else {}
@@ -237,7 +243,7 @@ def _spectrum(kind: type[Spectrum], called: str, name: str, content: bytes, **op
 
 def _flare(name: str, content: bytes, **options: Any) -> ReadSpectrum:
     """Read the measured range of a flare's spectrum; the study that reads the file continues it."""
-    flare = _spectrum(ObservedFlare, "", name, content, **options)
+    flare = _spectrum(ObservedFlare, ObservedFlare.read, "", name, content, **options)
     low, high = flare.measured_nm
     inside = (flare.wavelength_nm >= low) & (flare.wavelength_nm <= high)
     own = tuple(text for text in flare.messages if text.startswith(f"{flare.name}: "))
@@ -291,17 +297,19 @@ class Upload:
 #: Files by the field that takes them.
 UPLOADS: Mapping[str, Upload] = {
     "star": Upload(
-        partial(_spectrum, Source, UPLOADED), UPLOADED, options=_options("wavelength_unit", "flux_unit", "extend")
+        partial(_spectrum, Source, Source.read, UPLOADED),
+        UPLOADED,
+        options=_options("wavelength_unit", "flux_unit", "extend"),
     ),
     "flare_file": Upload(
         _flare, options=_options("wavelength_unit", "flux_unit", prefix="flare_") | _options("continue_at_k")
     ),
     "flare_quiescent": Upload(
-        partial(_spectrum, ReadSpectrum, "uploaded star without the flare"),
+        partial(_spectrum, ReadSpectrum, read_spectrum, "uploaded star without the flare"),
         options=_options("wavelength_unit", "flux_unit", prefix="flare_"),
     ),
     "change_file": Upload(
-        partial(_spectrum, Source, "added spectrum"),
+        partial(_spectrum, Source, Source.read, "added spectrum"),
         options=_options("wavelength_unit", "flux_unit", "extend", prefix="change_"),
     ),
     "own_unknown": Upload(
@@ -335,7 +343,7 @@ def read_frames_of(file: VisitorFile, mapping: VisitorFile | None, *, quality_bi
     if mapping is not None:
         how = mapping.name if mapping.name != file.name else f"mapping-{mapping.name}"
         files[how] = mapping.content
-    return Frames(**read_by(FRAMES, files, {"mapping": how, "quality_bits": quality_bits}))
+    return read_limited(Frames, read_frames, files, mapping=how, quality_bits=quality_bits)
 
 
 #: Bytes of closed forms, answers and files that the server keeps for all visitors together, and of their uploads.

@@ -27,12 +27,13 @@ from mauvecl.answers.verbs import VERBS
 from mauvecl.device.drivers import DeviceError
 from mauvecl.device.engine import Engine
 from mauvecl.host import VERSION
+from mauvecl.observations.frame_files import ColumnNames
 from mauvecl.runs.pool import LocalWorkers, Pool, Stopped
 from mauvecl.schema.errors import InputError, reworded, shortened
 from mauvecl.web.closed_forms import ClosedForms, other_payloads, solved
 from mauvecl.web.fields import FIELDS, field_of, remedies, sentence
 from mauvecl.web.page import SIMULATIONS, TABS, State, card, known, reads_of
-from mauvecl.web.sandboxed_reader import COLUMNS, read_by
+from mauvecl.web.sandboxed_reader import read_limited
 from mauvecl.web.tab import DRAWN_UNITS, QUESTIONS, as_file, commands_and_programs, simulate, study_file
 from mauvecl.web.uploads import RESULTS, UPLOADS
 from mauvecl.web.uploads import UPLOAD_SHELF as UPLOADED
@@ -522,8 +523,8 @@ class Visitor(WebSocketHandler):
         """Send the names of the columns of the visitor's frames; none if they are no table."""
         file, names = UPLOADED.get(self, "upload", "frames"), ()
         if file is not None:
-            work = reading(partial(read_by, COLUMNS, {file.name: file.content}, {}))
-            names = (await asyncio.wrap_future(work))["names"]
+            work = reading(partial(read_limited, ColumnNames, ColumnNames.read, {file.name: file.content}))
+            names = (await asyncio.wrap_future(work)).names
         self.send(n=asked["n"], columns=names)
 
     async def _ask_file(self, asked: dict[str, Any]) -> None:
