@@ -10,7 +10,6 @@ import re
 import sys
 import tempfile
 import threading
-import tomllib
 import zipfile
 import zlib
 from collections import OrderedDict
@@ -28,7 +27,7 @@ from mauvecl.host.spectra.conversion import ReadSpectrum
 from mauvecl.host.spectra.formats import read_spectrum
 from mauvecl.host.stars.flare_spectra import ObservedFlare
 from mauvecl.host.stars.source import Source
-from mauvecl.host.tables.text_tables import text_of
+from mauvecl.host.tables.files import as_text, toml
 from mauvecl.observations.frame_files import read_frames
 from mauvecl.observations.frames import Frames
 from mauvecl.schema.errors import InputError, printable, shortened
@@ -178,10 +177,7 @@ def _observations(name: str, content: bytes) -> list[dict[str, Any]]:
         raise InputError(
             f"{shortened(name)} must be TOML of at most {MOST_TOML_BYTES // 2**10} KiB", key="observations"
         )
-    try:
-        study = tomllib.loads(content.decode("utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"{shortened(name)} must be valid TOML, but is not ({error})", key="observations") from error
+    study = toml(as_text(content, shortened(name)), shortened(name))
     section = study.get("calibrate")
     if not isinstance(section, dict) or "observations" not in section:
         return []
@@ -271,8 +267,9 @@ class VisitorFile:
         return home / self.name
 
 
-def _options(*names: str, prefix: str = "") -> dict[str, str]:
-    return {name: f"{prefix}{name}" for name in names}
+def _options(*names: str) -> dict[str, str]:
+    """Return fields that say how a file is read, by the reader's names, which are those of their keys."""
+    return {FIELDS[name].path[-1]: name for name in names}
 
 
 @dataclass(frozen=True)
@@ -282,7 +279,7 @@ class Upload:
     reader: Callable[..., Any]  # of its name and content, and of options by name
     entered: str = UPLOADED_FILE  # text of the field that stands for the file
     most: int = MOST_UPLOADED  # largest number of bytes
-    options: Mapping[str, str] = field(default_factory=dict)  # fields that say how it is read, by the reader's names
+    options: Mapping[str, str] = field(default_factory=dict)  # see `_options`
 
     def read(self, name: str, content: bytes, values: Mapping[str, Any]) -> Any:
         """Read an untrusted file with the values of fields; raises InputError if it is too large or unusable."""
@@ -301,19 +298,17 @@ UPLOADS: Mapping[str, Upload] = {
         UPLOADED,
         options=_options("wavelength_unit", "flux_unit", "extend"),
     ),
-    "flare_file": Upload(
-        _flare, options=_options("wavelength_unit", "flux_unit", prefix="flare_") | _options("continue_at_k")
-    ),
+    "flare_file": Upload(_flare, options=_options("flare_wavelength_unit", "flare_flux_unit", "continue_at_k")),
     "flare_quiescent": Upload(
         partial(_spectrum, ReadSpectrum, read_spectrum, "uploaded star without the flare"),
-        options=_options("wavelength_unit", "flux_unit", prefix="flare_"),
+        options=_options("flare_wavelength_unit", "flare_flux_unit"),
     ),
     "change_file": Upload(
         partial(_spectrum, Source, Source.read, "added spectrum"),
-        options=_options("wavelength_unit", "flux_unit", "extend", prefix="change_"),
+        options=_options("change_wavelength_unit", "change_flux_unit", "change_extend"),
     ),
     "own_unknown": Upload(
-        lambda name, content: read_points(text_of(content), f"upload {shortened(name)}"),
+        lambda name, content: read_points(as_text(content, shortened(name)), shortened(name)),
         UPLOADED_UNKNOWN,
         most=MOST_PAIRS_BYTES,
     ),
