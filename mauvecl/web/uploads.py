@@ -11,7 +11,6 @@ import sys
 import tempfile
 import threading
 import zipfile
-import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field, replace
@@ -27,7 +26,7 @@ from mauvecl.host.spectra.conversion import ReadSpectrum
 from mauvecl.host.spectra.formats import read_spectrum
 from mauvecl.host.stars.flare_spectra import ObservedFlare
 from mauvecl.host.stars.source import Source
-from mauvecl.host.tables.files import as_text, toml
+from mauvecl.host.tables.files import as_text, parsing, toml
 from mauvecl.observations.frame_files import read_frames
 from mauvecl.observations.frames import Frames
 from mauvecl.schema.errors import InputError, printable, shortened
@@ -98,32 +97,24 @@ def unpacked(content: bytes) -> dict[str, bytes]:
     Hidden files, which some systems add, are left out. Raises InputError if the content is not a zip archive, is
     damaged, encrypted or too large, or contains a name that is not a plain one in a folder of the archive.
     """
-    try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            entries = {entry: _name(entry.filename) for entry in archive.infolist() if not entry.is_dir()}
-            entries = {entry: name for entry, name in entries.items() if not name.startswith(".")}
-            if len(entries) > MOST_FILES or sum(entry.file_size for entry in entries) > MOST_BYTES:
-                raise InputError(
-                    f"the archive must hold at most {MOST_FILES} files of {MOST_BYTES // 2**20} MiB in all",
-                    key="observations",
-                )
-            if any(entry.compress_type not in BOUNDED for entry in entries):
-                raise InputError(
-                    "the archive is packed in an unusual way; use a zip archive with deflate", key="observations"
-                )
-            files = {}
-            for entry, name in entries.items():
-                # A stated size that is too small ends the reading, and the checksum then differs.
-                with archive.open(entry) as file:
-                    files[name] = file.read(entry.file_size)
-    except InputError:
-        raise
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, OSError, ValueError) as error:
-        raise InputError(
-            f"the observations are no sound zip archive ({error}); give a TOML file and the files that it names in a "
-            "zip archive without a password",
-            key="observations",
-        ) from error
+    expected = "a TOML file and the files that it names, in a sound zip archive without a password"
+    with parsing("the archive", expected), zipfile.ZipFile(io.BytesIO(content)) as archive:
+        entries = {entry: _name(entry.filename) for entry in archive.infolist() if not entry.is_dir()}
+        entries = {entry: name for entry, name in entries.items() if not name.startswith(".")}
+        if len(entries) > MOST_FILES or sum(entry.file_size for entry in entries) > MOST_BYTES:
+            raise InputError(
+                f"the archive must hold at most {MOST_FILES} files of {MOST_BYTES // 2**20} MiB in all",
+                key="observations",
+            )
+        if any(entry.compress_type not in BOUNDED for entry in entries):
+            raise InputError(
+                "the archive is packed in an unusual way; use a zip archive with deflate", key="observations"
+            )
+        files = {}
+        for entry, name in entries.items():
+            # A stated size that is too small ends the reading, and the checksum then differs.
+            with archive.open(entry) as file:
+                files[name] = file.read(entry.file_size)
     if len(files) < len(entries):
         raise InputError("two files of the archive have the same name, but names must differ", key="observations")
     return files
