@@ -30,7 +30,7 @@ from mauvecl.schema.errors import InputError
 from mauvecl.web.closed_forms import ClosedForms, Question
 from mauvecl.web.fields import FIELDS, UPLOADED_FILE, Choice, Number
 from mauvecl.web.page import TABS, State, reads_of
-from mauvecl.web.tab import SIMULATIONS, Tab, commands_and_programs
+from mauvecl.web.tab import Tab, commands_and_programs, simulate
 
 #: Names of the commands' files, where they are not those of the page.
 WRITTEN = {"observation": "observation-2", "snr": "snr-element"}
@@ -103,7 +103,7 @@ def page_tables(tab: Tab, state: State, closed: ClosedForms, folder: Path) -> di
     answers: dict[str, Any] = {}
     pool = Pool(LocalWorkers([None]))
     for name in tab.simulations:
-        answers |= SIMULATIONS[name](state.question(reads_of(name)).case(folder).study, pool)
+        answers |= simulate(name, state.question(reads_of(name)).case(folder).study, pool)
     return {name: tab.table(name, closed, answers) for name in tab.files if tab.offers(name, answers)}
 
 

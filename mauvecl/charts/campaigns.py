@@ -89,14 +89,8 @@ COLOURS_KEPT = 64
 PANELS = {"left": 0.085, "right": 0.905, "top": 0.955, "bottom": 0.09, "hspace": 0.5}
 
 
-@picture_of("PlanAnswer", "plan")
 def overview(answer: PlanAnswer) -> Picture:
     """Plot each target's expected number of flares with the range of 95 % of campaigns, and E50 to E90."""
-    return _overview(answer)
-
-
-def _overview(answer: PlanAnswer) -> Picture:
-    """Return each target's expected number of flares with the range of 95 % of campaigns, and E50 to E90."""
     planned, left, right = answer.planned, list[Series](), list[Series]()
     ends = [(target.energy_at(0.5), target.energy_at(0.9)) for target in planned]
     for k, target in enumerate(planned):
@@ -117,6 +111,10 @@ def _overview(answer: PlanAnswer) -> Picture:
         Panel(Axis("bolometric energy (erg)", log=True, limits=decades), y, right, "recovered in 50 % (dot) to 90 %"),
     ]
     return Picture([row], (7.4, 0.24 * len(planned) + 1.5), share_y=True)
+
+
+# Reports draw it in figures of their own.
+picture_of("PlanAnswer", "plan")(overview)
 
 
 def _bar(colour: str, ends: tuple[float, float], k: int) -> Line:
@@ -230,7 +228,7 @@ def _summary(answer: PlanAnswer) -> list[Any]:
         around = {"width_ratios": [margin, 1 - 2 * margin, margin]}
         heights = [1 - top, height / PAGE[1], top - height / PAGE[1]]
         part = sheets.pages[-1].subfigures(3, 3, height_ratios=heights, **around)[1, 1]
-        draw_picture(_overview(answer), part)
+        draw_picture(overview(answer), part)
         part.subplots_adjust(left=0.2, right=0.98, bottom=0.6 / height, top=1 - 0.3 / height)
     for message in answer.messages:
         sheets.line([(0.0, message)], 8)
@@ -330,7 +328,7 @@ def plan_html(answer: PlanAnswer) -> bytes:
     from mauvecl.answers.plan import LEGEND, target_lines
 
     pictures = [
-        html_image(partial(overview, answer), "flares expected and energies of all targets"),
+        html_image(lambda: draw_picture(overview(answer)), "flares expected and energies of all targets"),
         *(
             html_image(partial(_panels, answer, k), f"hours and energies of {target.name}") if target.seen_h > 0 else ""
             for k, target in enumerate(answer.planned)

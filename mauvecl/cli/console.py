@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from mauvecl.schema.columns import INTERVAL, View, without_empty
-from mauvecl.schema.errors import InputError, printable
+from mauvecl.schema.errors import SUBJECT, InputError, printable
 
 if TYPE_CHECKING:
     import typer
@@ -470,9 +470,7 @@ def name_flag(error: InputError) -> str:
         for word in sys.argv[1:]
         for flag in flags
     )
-    if not any(given):
+    begin = SUBJECT.match(text)
+    if begin is None or begin["key"].replace(" ", "_") not in (key, key.rpartition(".")[2]) or not any(given):
         return text
-    # The key as written, which may contain blanks, after its location.
-    section, _, own = re.escape(key).replace("_", "[_ ]").rpartition(r"\.")
-    shown = rf"(?:{section}\.)?{own}" if section else own
-    return re.sub(rf"^(?:[^:=]*: )?{shown} (?:= |(?=must be ))", lambda _: f"{flags[0]} ", text)
+    return f"{flags[0]} {begin['verb'].removeprefix('= ')}{text[begin.end() :]}"

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from typing import Any
+
+#: How a message on one value begins, as `InputError.of` writes it: its place and its key, and what follows them.
+SUBJECT = re.compile(r"^(?P<place>[^:=]*: )?(?P<key>[a-z][\w. ]*?) (?P<verb>= |must be )")
 
 
 class Message(str):

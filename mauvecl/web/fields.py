@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import itertools
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -11,12 +10,14 @@ from functools import cache
 from types import MappingProxyType
 from typing import Any, Literal, get_args, get_origin
 
+import numpy as np
 from pydantic.fields import FieldInfo
 
 from mauvecl.detection.requests import STATISTICS
 from mauvecl.host.instrument import FORMER_NAMES, FORMERLY_MAUVE
 from mauvecl.host.stars.library import ModelStar, embedded, near_names, spectrum_name
-from mauvecl.schema.errors import InputError, shortened
+from mauvecl.host.tables.text_tables import columns, text_table
+from mauvecl.schema.errors import SUBJECT, InputError, shortened
 from mauvecl.schema.fields import (
     Flag,
     Help,
@@ -53,6 +54,8 @@ MOST_CHARACTERS = 200
 MOST_TARGETS = 30
 #: Largest number of characters of a table of neighbours, which is a part of links.
 MOST_TABLE = 3000
+#: Largest number of points of an unknown spectrum, which the study in every table contains.
+MOST_POINTS = 4000
 
 
 @dataclass(frozen=True)
@@ -99,22 +102,22 @@ class Choice:
         return self.made(text)
 
 
-def points(text: str) -> tuple[tuple[float, float], ...] | None:
-    """Parse a spectrum as pairs of nm and DN of the exposure; None for an uploaded one."""
-    if text == UPLOADED_UNKNOWN:
-        return None
-    number = Number(Range(-1e30, 1e30))
-    pairs = [pair.split() for pair in text.split(",") if text.strip()]
-    if any(len(pair) != 2 for pair in pairs):
+def read_points(text: str, what: str) -> tuple[tuple[float, float], ...]:
+    """Read the spectrum of a nuisance parameter: lines of nm and DN of the exposure; `what` names it in messages."""
+    points = columns(what, text, "nm and DN", "nm")
+    if not 2 <= len(points) <= MOST_POINTS:
         raise InputError(
-            f"{shortened(text)} is not a spectrum: give pairs of nm and DN with commas between them", key="own_unknown"
+            f"{what} must have 2 to {MOST_POINTS} pairs of nm and DN, but has {len(points)}", key="own_unknown"
         )
-    spectrum = tuple((float(number(nm)), float(number(dn))) for nm, dn in pairs)
-    if any(low >= high for (low, _), (high, _) in itertools.pairwise(spectrum)):
-        raise InputError(
-            f"{shortened(text)} does not ascend in nm: give pairs of nm and DN in ascending order", key="own_unknown"
-        )
-    return spectrum
+    if not np.isfinite(points).all() or (np.diff(points[:, 0]) <= 0).any():
+        raise InputError(f"{what} must have pairs in ascending order of nm", key="own_unknown")
+    return tuple((float(nm), float(dn)) for nm, dn in points)
+
+
+def typed_points(text: str) -> tuple[tuple[float, float], ...]:
+    """Parse a spectrum as pairs of nm and DN with commas between them; no points for an uploaded one."""
+    typed = text.strip() and text != UPLOADED_UNKNOWN
+    return read_points(text.replace(",", "\n"), shortened(text)) if typed else ()
 
 
 def line_fluxes(text: str) -> tuple[tuple[str, float], ...]:
@@ -164,7 +167,6 @@ def targets(text: str, *, check: bool = True) -> tuple[dict[str, Any], ...]:
 
     With a check their positions must be known, and all must differ.
     """
-    from mauvecl.host.tables.text_tables import text_table
     from mauvecl.study.plan import PlanTarget, targets_in
 
     lines = [line.strip() for line in text.splitlines() if line.strip()]
@@ -198,7 +200,6 @@ def targets(text: str, *, check: bool = True) -> tuple[dict[str, Any], ...]:
 def neighbours(text: str) -> str | None:
     """Check that a text is a CSV table of neighbours without names of files, and return it; None for nothing."""
     from mauvecl.host.exposure.star import FILES
-    from mauvecl.host.tables.text_tables import text_table
 
     if not text.strip():
         return None
@@ -331,7 +332,7 @@ _OWN_FIELDS = {
         own_keys=("nuisances.usual",),
     ),
     "own_unknown": Field(
-        label="Own unknown spectrum", first="", read=points,
+        label="Own unknown spectrum", first="", read=typed_points,
         hint="Something else of known shape and unknown strength, such as stray light: pairs of nm and DN, as in "
         "200 1, 450 3, 700 1, or a file of two columns.", group="Unknown", place=1, own_keys=("nuisances.own",),
         placeholder="200 1, 450 3, 700 1",
@@ -411,8 +412,6 @@ PRESETS: dict[str, dict[str, str]] = {
 NO_KEYS: Mapping[str, str] = MappingProxyType({})
 #: A remedy in a message, such as `magnitude=7.4`.
 _REMEDY = re.compile(r"`(?P<key>[a-z][\w.]*)(?:=(?P<quote>'?)(?P<value>[^`]*?)(?P=quote))?`")
-#: The key of a value at the beginning of a message, such as fap in "fap must be a probability, not 2".
-_VALUE = re.compile(r"^(?:page: )?(?P<key>[a-z][\w.]*)(?= must be | = )")
 #: A flag of the command line.
 _FLAG = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
 #: A key within a message: words of prose hold no underscore.
@@ -435,7 +434,7 @@ def field_of(key: str | None) -> str | None:
 
 def sentence(error: InputError, keys: Mapping[str, str] = NO_KEYS) -> str:
     """Return the message of an error as the page shows it; `keys` maps other names of its keys to fields."""
-    text = _VALUE.sub(lambda match: _label(match["key"], keys), str(error))
+    text = SUBJECT.sub(lambda m: f"{m['place'] or ''}{_label(m['key'], keys)} {m['verb']}", str(error))
     return note(re.sub(", not ''$", ", but is empty", text).removeprefix("page: "), keys)
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from bokeh.models import FixedTicker, HoverTool, LinearColorMapper
-from bokeh.palettes import diverging_palette
+from bokeh.palettes import interp_palette
 from numpy.typing import NDArray
 
 from mauvecl.answers.plan import COLUMNS
@@ -43,7 +43,7 @@ from mauvecl.schema.errors import InputError
 from mauvecl.web.closed_forms import Answers, short
 from mauvecl.web.sandboxed_reader import read_limited
 from mauvecl.web.tab import Tab, target_words
-from mauvecl.web.uploads import MOST_VALUES, VisitorFile, read_frames_of, reported_for
+from mauvecl.web.uploads import MOST_VALUES, VisitorFile, read_frames_of
 
 if TYPE_CHECKING:
     from bokeh.models.sources import ColumnDataSource
@@ -65,8 +65,8 @@ Float = NDArray[np.float64]
 MOST_POINTS, MOST_COLUMNS, MOST_ROWS = 8000, 600, 300
 #: Verdicts on events, with their colours.
 VERDICTS = {"detected": "star", "candidate": "drawn", "rejected": "own", "undecided": "dark"}
-#: Colours of the dynamic spectrum.
-BLUE, RED = "#0072B2", "#D55E00"
+#: Colours of the dynamic spectrum, from low to high.
+BLUE, MIDDLE, RED = "#0072B2", "#F7F7F7", "#D55E00"
 NO_FRAMES = "Choose a file of frames: a light curve or a sequence of spectra."
 
 
@@ -133,7 +133,7 @@ def _summary(rows: Any, analysis: Analysis) -> str:
 
 
 def _image(canvas: Canvas, source: ColumnDataSource) -> None:
-    colours = diverging_palette(_shades(BLUE), _shades(RED), 255)
+    colours = interp_palette((BLUE, MIDDLE, RED), 255)
     mapper = LinearColorMapper(palette=colours, name="deviation", low=-5, high=5, nan_color=canvas.ink["grid"])
     image = canvas.plot.image("image", "x", "y", "dw", "dh", source=source, color_mapper=mapper)
     shown = [("standard deviations", "@image{0.0}"), ("minute", "$x{0.0}"), ("nm", "$y{0.0}")]
@@ -173,15 +173,6 @@ def dynamic_spectrum(closed: ClosedForms, answers: Answers) -> ChartData:
     return ChartData(text, series, {"deviation": {"low": -reach, "high": reach}})
 
 
-def _shades(colour: str) -> tuple[str, ...]:
-    """Return shades from a colour to white."""
-    ends = np.array([[int(colour[k : k + 2], 16) for k in (1, 3, 5)], [247, 247, 247]])
-    steps = np.linspace(0.0, 1.0, 128)[:, None]
-    return tuple(
-        "#" + "".join(f"{round(value):02x}" for value in row) for row in ends[0] * (1 - steps) + ends[1] * steps
-    )
-
-
 def _means(values: Float, numbers: NDArray[np.int64], most: int) -> Float:
     """Return the means of rows by their number, at most `most`; rows that do not exist are NaN."""
     bins = numbers // -(-(int(numbers[-1]) + 1) // most)
@@ -209,11 +200,9 @@ def scatter(closed: ClosedForms, answer: AnalyseAnswer) -> ChartData:
 
 
 def read_frames(question: Question) -> dict[str, Any]:
-    """Read the frames; raises InputError with the name of the field whose file cannot be read."""
-    if "frames" not in question.uploads:
-        return {}
+    """Read the frames."""
     frames = read_frames_of(
-        question.uploads["frames"], question.uploads.get("mapping"), "frames", quality_bits=question.quality_bits
+        question.uploads["frames"], question.uploads.get("mapping"), quality_bits=question.quality_bits
     )
     if frames.flux.size > MOST_VALUES:
         raise InputError.of("frames", frames.flux.size, f"at most {MOST_VALUES} values, or the command line")
@@ -233,6 +222,7 @@ ANALYSE = Tab(
     pictures=(light_curve, dynamic_spectrum, scatter),
     files=dict.fromkeys(("events", "measured", "frames", "noise", "limits", "completeness"), "analyse"),
     documents={"analyse.html": "analyse"},
+    needs="frames",
     given=read_frames,
     words=name_of("frames", "no file of frames yet"),
     # Some tables exist only for spectra.
@@ -278,15 +268,13 @@ def photon_transfer(closed: ClosedForms, answer: CalibrateAnswer) -> ChartData:
 
 
 def read_observations(question: Question) -> dict[str, Any]:
-    """Read frames and spectra; raises InputError if a file cannot be read."""
-    if "observations" not in question.uploads:
-        return {}
+    """Read frames and spectra."""
     archive: Observations = question.uploads["observations"]
     files = {name: VisitorFile(name, content) for name, content in archive.files.items()}
     frames, stars = [], []
     for row in archive.rows:
         mapping = files[str(row.mapping)] if row.mapping else None
-        frames.append(read_frames_of(files[str(row.frames)], mapping, "observations"))
+        frames.append(read_frames_of(files[str(row.frames)], mapping))
         if sum(some.flux.size for some in frames) > MOST_VALUES:
             raise InputError(
                 f"the archive holds more than {MOST_VALUES} raw values; give fewer, or use the command line",
@@ -295,8 +283,7 @@ def read_observations(question: Question) -> dict[str, Any]:
         if row.spectrum is None:
             stars.append(row.source())
             continue
-        with reported_for("observations"):
-            star = read_limited(files[str(row.spectrum)].content, Source)
+        star = read_limited(Source, Source.read, {"upload": files[str(row.spectrum)].content})
         stars.append(star if row.magnitude is None else star.at_magnitude(row.magnitude, row.band))
     return {"frames": tuple(frames), "stars": tuple(stars)}
 
@@ -309,6 +296,7 @@ CALIBRATE = Tab(
     pictures=(throughput, residuals, photon_transfer),
     files=dict.fromkeys(("calibrate", "fits", "throughput", "dark"), "calibrate"),
     documents={"instrument.zip": "calibrate"},
+    needs="observations",
     given=read_observations,
     words=name_of("observations", "no observations yet"),
 )
@@ -396,6 +384,7 @@ PERIODS = Tab(
     pictures=(recovered_periods,),
     chance=False,
     simulations={"periods": "Map periods"},
+    needs="targets",
     answer="periods",
     view=2,
     # The power is that of differences.
@@ -483,6 +472,7 @@ PLAN = Tab(
     files=dict.fromkeys(("plan", "stars", "energies", "assumptions"), "plan"),
     words=plan_words,
     rows_before=columns_of_plan,
+    needs="targets",
 )
 
 
@@ -519,6 +509,7 @@ VISIBILITY = Tab(
     chance=False,
     pictures=(hours,),
     simulations={"visible": "Find when"},
+    needs="targets",
     view=1,
     files={"visible": "visible", "months": "visible", "days": "visible"},
     words=target_words,

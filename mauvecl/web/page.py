@@ -27,7 +27,7 @@ from mauvecl.web.exposure_tabs import DETECTION, NOISE, SIGNAL, SPECTRUM, UNKNOW
 from mauvecl.web.fields import FIELDS, FORMER_VALUES, IDEAL, REALISTIC, UPLOADED, Choice, Field, note, sentence, targets
 from mauvecl.web.flare_tabs import COMPLETENESS, LIMIT, MEASUREMENT
 from mauvecl.web.observation_tabs import ANALYSE, CALIBRATE, CHANGE, PERIODS, PLAN, VISIBILITY
-from mauvecl.web.tab import SIMULATIONS, Tab
+from mauvecl.web.tab import Tab
 from mauvecl.web.uploads import UPLOADS
 
 #: Tabs with pictures, in the order of their group.
@@ -53,14 +53,13 @@ TABS: dict[str, Tab] = {
 }
 
 
-def asking(simulation: str) -> Tab:
-    """Return the tab whose button starts a simulation."""
-    return next(tab for tab in TABS.values() if simulation in tab.simulations)
+#: Questions that a button starts to simulate, with the first tab that has it.
+SIMULATIONS = {name: tab for tab in reversed(TABS.values()) for name in tab.simulations}
 
 
 def reads_of(simulation: str) -> frozenset[str]:
     """Return the fields on which the answers of a simulation depend."""
-    return asking(simulation).reads_of(simulation)
+    return SIMULATIONS[simulation].reads_of(simulation)
 
 
 #: Part of the message about the throughput, which the page shows once.
@@ -232,13 +231,6 @@ class State:
                 except InputError as error:
                     faults[name] = sentence(error)
         return faults
-
-    def values_of(self, names: Collection[str]) -> dict[str, Any]:
-        """Return the values of fields by name; raises InputError if one is invalid."""
-        for name in names:
-            if name in self._invalid:
-                raise InputError(f"{ENTRIES[name].label}: {self._invalid[name]}", key=name)
-        return {name: self._values[name] for name in names}
 
     def _check(self, name: str) -> None:
         """Raise InputError for a value that cannot be together with those of other fields."""

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from pathlib import Path
 from pkgutil import resolve_name
@@ -17,9 +17,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from mauvecl.host.spectra.conversion import ReadSpectrum
-from mauvecl.host.stars.flare_spectra import ObservedFlare
-from mauvecl.host.stars.source import Source
 from mauvecl.schema.errors import InputError
 
 #: Memory of the reading process, MiB: Python with astropy and synphot maps some 400, a spectrum of 4 MiB as text 300.
@@ -32,33 +29,19 @@ CONTENT_MIB = 64
 TOGETHER = 2
 #: Exit codes of the reading process.
 _REFUSED, _NO_ROOM = 2, 3
-Spectrum = TypeVar("Spectrum", Source, ObservedFlare, ReadSpectrum)
-#: Functions of a path, and of options by name, that read each kind of spectrum, frames, and the names of their columns.
-SPECTRA: Mapping[type, str] = {
-    Source: "mauvecl.host.stars.source:Source.read",
-    ObservedFlare: "mauvecl.host.stars.flare_spectra:ObservedFlare.read",
-    ReadSpectrum: "mauvecl.host.spectra.formats:read_spectrum",
-}
-FRAMES, COLUMNS = (f"mauvecl.observations.frame_files:{name}" for name in ("read_frames", "ColumnNames.read"))
+T = TypeVar("T")
 #: Expected content of an upload if it is too large, and in general: a spectrum, or frames.
 EXPECTED_SPECTRUM = "a spectrum of some thousand points", "a spectrum as text, ECSV, VOTable or FITS"
 EXPECTED_FRAMES = "fewer frames", "frames as FITS, ECSV or CSV"
 _turns = threading.BoundedSemaphore(TOGETHER)
 
 
-def read_limited(content: bytes, kind: type[Spectrum], options: Mapping[str, Any] | None = None) -> Spectrum:
-    """Read a spectrum from the bytes of a file, like its `read`, in a process with limited memory and time.
-
-    Blocks for about a second, most of it for the start of Python: call it from a thread. Raises InputError if it holds
-    no usable spectrum, or reading it takes more memory or time than allowed.
-    """
-    return kind(**read_by(SPECTRA[kind], {"upload": content}, options or {}))
-
-
-def read_by(reader: str, files: Mapping[str, bytes], options: Mapping[str, Any]) -> dict[str, Any]:
+def read_limited(kind: Callable[..., T], reader: Callable[..., T], files: Mapping[str, bytes], **options: Any) -> T:
     """Read the first of some files, by their names, in a process with limited memory and time.
 
-    Returns the attributes of the object that the reader returns; a reader of frames may need further files.
+    The reader, a function of a path and of options, may need the other files; it returns a dataclass of this kind.
+    Blocks for about a second, most of it for the start of Python: call it from a thread. Raises InputError if the file
+    is unusable, or reading it takes more memory or time than allowed.
     """
     if not _turns.acquire(timeout=SECONDS):
         raise InputError("too many uploads are read at the same time: try again in a minute", key="upload")
@@ -68,12 +51,11 @@ def read_by(reader: str, files: Mapping[str, bytes], options: Mapping[str, Any])
         _turns.release()
     with np.load(io.BytesIO(answer), allow_pickle=False) as read:
         words = json.loads(str(read["words"]))
-        return {name: tuple(value) if isinstance(value, list) else value for name, value in words.items()} | {
-            name: read[name] for name in read.files if name != "words"
-        }
+        values = {name: tuple(value) if isinstance(value, list) else value for name, value in words.items()}
+        return kind(**values, **{name: read[name] for name in read.files if name != "words"})
 
 
-def _read_apart(reader: str, files: Mapping[str, bytes], options: Mapping[str, Any]) -> bytes:
+def _read_apart(reader: Callable[..., Any], files: Mapping[str, bytes], options: dict[str, Any]) -> bytes:
     """Run the reading process and return its output."""
     environment = os.environ | {
         # One thread of a numerical library needs no stacks of many.
@@ -83,10 +65,11 @@ def _read_apart(reader: str, files: Mapping[str, bytes], options: Mapping[str, A
         # The reading process starts in another folder than that of the package.
         "PYTHONPATH": os.pathsep.join(filter(None, (str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH")))),
     }
-    words = json.dumps({"reader": reader, "file": next(iter(files)), "options": dict(options)})
+    named = f"{reader.__module__}:{reader.__qualname__}"
+    words = json.dumps({"reader": named, "file": next(iter(files)), "options": options})
     # A fresh interpreter, as spawn makes one: OpenCL does not survive a fork.
     command = [sys.executable, "-m", "mauvecl.web.sandboxed_reader", str(MEMORY_MIB), str(SECONDS), words]
-    smaller, other = EXPECTED_FRAMES if reader in (FRAMES, COLUMNS) else EXPECTED_SPECTRUM
+    smaller, other = EXPECTED_FRAMES if named.startswith("mauvecl.observations.") else EXPECTED_SPECTRUM
     with tempfile.TemporaryDirectory(prefix="mauvecl-upload-") as folder:
         for name, content in files.items():
             (Path(folder) / name).write_bytes(content)

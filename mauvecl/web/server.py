@@ -40,8 +40,7 @@ from mauvecl.study.plan import TARGET_COLUMNS
 from mauvecl.web import fields
 from mauvecl.web.closed_forms import TITLES, ClosedForms
 from mauvecl.web.figures import INKS, PINS, Canvas
-from mauvecl.web.page import SEEN, TABS, State, reads_of
-from mauvecl.web.tab import SIMULATIONS
+from mauvecl.web.page import SEEN, SIMULATIONS, TABS, State, reads_of
 from mauvecl.web.uploads import EXAMPLES, MAPPED, TIME_UNITS, UPLOADS
 from mauvecl.web.visitor import UNUSED, Job, Visitor, limit_arenas, reading, release_memory, shown
 
@@ -372,7 +371,7 @@ def _words() -> dict[str, Any]:
         },
         "withFile": fields.WITH_FILE,
         "columns": sorted({*KNOWN}),
-        "needs": {name: simulation.needs for name, simulation in SIMULATIONS.items() if simulation.needs},
+        "needs": {name: tab.needs for name, tab in SIMULATIONS.items() if tab.needs},
         "under": fields.ASKED_UNDER,
         "presets": fields.PRESETS,
         "seen": {name: field.first for name, field in SEEN.items()},
@@ -454,25 +453,20 @@ class ContentHandler(RequestHandler):
         content = self._content(self, *names)
         if content is None:
             raise HTTPError(404)
-        small, digest = packed(content)
+        small, self._digest = packed(content)
         # The names of assets end in their kind.
         self.set_header("Content-Type", KINDS[self._kind or names[0].rpartition(".")[2]])
         self.set_header("Vary", "Accept-Encoding")
         keep = "v" in self.request.arguments and self._kind != "html"
         self.set_header("Cache-Control", "public, max-age=31536000, immutable" if keep else "no-cache")
-        self.set_header("Etag", f'"{digest}"')
-        if self.check_etag_header():
-            self.set_status(304)
-            self.finish()
-            return
         if "gzip" in self.request.headers.get("Accept-Encoding", ""):
             self.set_header("Content-Encoding", "gzip")
             content = small
         self.finish(content)
 
-    def compute_etag(self) -> str | None:
-        """Return None, since `get` sets the tag."""
-        return None
+    def compute_etag(self) -> str:
+        """Return the tag of the content, for which tornado sends status 304 if the browser has it."""
+        return f'"{self._digest}"'
 
     def write_error(self, status_code: int, **kwargs: Any) -> None:
         """Send a message without internal details."""

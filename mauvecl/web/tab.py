@@ -1,4 +1,4 @@
-"""Tabs of the page: the simulations that they start, their base class, and the tables and commands that they offer."""
+"""Tabs of the page: the questions that they ask, their base class, and the tables and commands that they offer."""
 
 from __future__ import annotations
 
@@ -23,7 +23,6 @@ from mauvecl.schema.columns import View, without_empty
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, found
 from mauvecl.schema.section import read_axis, read_line_fluxes, read_words
-from mauvecl.study.observation import SkyLight
 from mauvecl.study.star import Star
 from mauvecl.study.study import Study, keys_of, set_key, with_paths
 from mauvecl.web.closed_forms import OTHER
@@ -63,40 +62,14 @@ def _changed(study: Study, **sections: dict[str, Any]) -> Study:
 
 
 @dataclass(frozen=True)
-class Simulation:
-    """Question that a button of the page asks."""
+class Asked:
+    """What a question of the page asks."""
 
-    # Verbs that answer it, by the names under which the page keeps their answers; the first is the main one.
-    verbs: Mapping[str, str]
-    asked: Callable[[Study], Study] = lambda study: study  # makes the study that is asked from that of the page
-    # Further answers of the main verb by name, with what makes their study; a refused one is left out.
+    #: Verbs that answer it. The page keeps the answer of the first under the question's name, others under their own.
+    verbs: tuple[str, ...]
+    study: Callable[[Study], Study] = lambda study: study  # makes the study that is asked from that of the page
+    # Further answers of the first verb by name, with what makes their study; a refused one is left out.
     others: Mapping[str, Callable[[Study], Study]] = field(default_factory=dict)
-    needs: str = ""  # field without which it cannot start
-
-    def __call__(
-        self,
-        study: Study,
-        pool: Pool,
-        progress: Callable[[int, int], None] | None = None,
-        *,
-        given: Mapping[str, Any] | None = None,
-    ) -> dict[str, Any]:
-        """Return the answers by name; the main verb reports its progress and takes the contents of files."""
-        asked = self.asked(study)
-        main = next(iter(self.verbs.values()))
-        wanted = [(name, verb, asked) for name, verb in self.verbs.items()]
-        wanted += [(name, main, change(asked)) for name, change in self.others.items()]
-        counted = sum(VERBS[verb].counts == "realisations" for _, verb, _ in wanted)
-        if counted > 1:
-            pool.expect(counted * asked.run.realisations)
-        answers: dict[str, Any] = {}
-        for name, verb, question in wanted:
-            try:
-                answers[name] = VERBS[verb].ask(question, pool, progress, **(given or {} if verb == main else {}))
-            except InputError:
-                if name not in self.others:
-                    raise
-        return answers
 
 
 def _fits(study: Study) -> Study:
@@ -105,43 +78,45 @@ def _fits(study: Study) -> Study:
     return _changed(study, measure={"fits": min(study.run.realisations, most)})
 
 
-#: Simulations that change the study or have another name than their verb.
-_OWN_SIMULATIONS = {
-    "detection": Simulation(
-        {"detection": "detect", "snr": "snr"},
+#: What a question of the page asks, by name: that of a verb, unless it changes the study or has a name of its own.
+QUESTIONS = {name: Asked((name,)) for name in VERBS} | {
+    "detection": Asked(
+        ("detect", "snr"),
         others={OTHER: lambda study: _changed(study, nuisances={"usual": not study.nuisances.usual})},
     ),
-    "map": Simulation({"map": "map"}, _map_around),
-    "measure": Simulation({"measure": "measure"}, _fits),
-    "completeness": Simulation({"completeness": "inject"}, partial(_changed, injections=INJECTED, search={"nulls": 0})),
-    "visible": Simulation({"visible": "visible"}, needs="targets"),
-    "plan": Simulation({"plan": "plan"}, needs="targets"),
-    "analyse": Simulation({"analyse": "analyse"}, needs="frames"),
-    "calibrate": Simulation({"calibrate": "calibrate"}, needs="observations"),
-    "periods": Simulation({"periods": "change"}, partial(_changed, change={"periods": True}), needs="targets"),
+    "map": Asked(("map",), _map_around),
+    "measure": Asked(("measure",), _fits),
+    "completeness": Asked(("inject",), partial(_changed, injections=INJECTED, search={"nulls": 0})),
+    "periods": Asked(("change",), partial(_changed, change={"periods": True})),
 }
-#: All simulations by name: those above, and the verbs that have a tab.
-SIMULATIONS = {name: Simulation({name: name}) for name, verb in VERBS.items() if verb.tab} | _OWN_SIMULATIONS
+#: What verbs count that use the pool's devices.
+DRAWN_UNITS = ("realisations", "steps", "cells")
 
 
-def simulation_of(name: str) -> Simulation:
-    """Return the simulation of a name, or the verb of that name as one."""
-    return SIMULATIONS.get(name) or Simulation({name: name})
-
-
-def asked_study(name: str, study: Study) -> tuple[str, Study]:
-    """Return the verb of a simulation, with its study derived from the page's."""
-    simulation = simulation_of(name)
-    return next(iter(simulation.verbs.values())), simulation.asked(study)
-
-
-def verbs_of(name: str) -> tuple[str, ...]:
-    """Return the verbs that answer a simulation."""
-    return tuple(simulation_of(name).verbs.values())
-
-
-#: Simulations that use the pool's devices.
-DRAWING = {"detection", "map"} | {name for name in SIMULATIONS.keys() - _OWN_SIMULATIONS.keys() if VERBS[name].counts}
+def simulate(
+    name: str,
+    study: Study,
+    pool: Pool,
+    progress: Callable[[int, int], None] | None = None,
+    *,
+    given: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Return the answers to a question by name; its first verb reports its progress and takes the contents of files."""
+    question = QUESTIONS[name]
+    asked, (main, *more) = question.study(study), question.verbs
+    wanted = [(name, main, asked), *((verb, verb, asked) for verb in more)]
+    wanted += [(other, main, change(asked)) for other, change in question.others.items()]
+    counted = sum(VERBS[verb].counts == "realisations" for _, verb, _ in wanted)
+    if counted > 1:
+        pool.expect(counted * asked.run.realisations)
+    answers: dict[str, Any] = {}
+    for called, verb, of in wanted:
+        try:
+            answers[called] = VERBS[verb].ask(of, pool, progress, **(given or {} if verb == main else {}))
+        except InputError:
+            if called not in question.others:
+                raise
+    return answers
 
 
 #: Columns that the page does not show: its question has one star and one flare.
@@ -164,12 +139,13 @@ class Tab:
     about: str = ""  # what it shows, in a sentence
     pictures: tuple[Chart, ...] = ()
     simulations: Mapping[str, str] = field(default_factory=dict)  # what can be simulated here, with labels of buttons
+    needs: str = ""  # field without which no simulation of it can start
     answer: str = ""  # name of the simulated answer whose table is below the pictures
     view: int = 0  # number of that table among the answer's `views`
     #: Another table below the pictures, and the rows before there is an answer.
     own_view: Callable[[ClosedForms, Answers], View] | None = None
     rows_before: Callable[[Question], list[list[str]]] = lambda question: []
-    #: Questions of "Share, export, cite": names of simulations or verbs; by default its own simulations.
+    #: Questions of "Share, export, cite"; by default its own simulations.
     questions: tuple[str, ...] = ()
     #: Key of `GROUPS` under whose heading it stands; by default that of the verb that answers its first question.
     group: str = ""
@@ -177,8 +153,7 @@ class Tab:
     chance: bool = True
     #: Its question in words, if it has no chance.
     words: Callable[[Question], str] = lambda q: f"{q.star_in_words} of {q.band} = {q.magnitude:g}"
-    #: Reads the visitor's files on a thread of its own, and returns them as arguments of the verb; raises InputError
-    #: with the name of the field whose file cannot be read.
+    #: Reads the file of the field that it `needs` on a thread of its own, and returns arguments of the verb.
     given: Callable[[Question], dict[str, Any]] = lambda question: {}
     #: Fields that it reads although its verbs do not take their keys, and those that it does not read.
     also: tuple[str, ...] = ()
@@ -197,7 +172,7 @@ class Tab:
             for key, value in (of_verb | {"files": {verb: verb}}).items():
                 setattr(self, key, getattr(self, key) or value)
         self.questions = self.questions or tuple(self.simulations) or ("detection",)
-        self.group = self.group or VERBS[verbs_of(self.questions[0])[0]].group
+        self.group = self.group or VERBS[QUESTIONS[self.questions[0]].verbs[0]].group
 
     @cached_property
     def reads(self) -> frozenset[str]:
@@ -206,8 +181,8 @@ class Tab:
         return self.reads_of(*self.questions, *self.simulations, *above)
 
     def reads_of(self, *questions: str) -> frozenset[str]:
-        """Return the fields on which simulations or verbs depend, by the keys that the flags of their verbs set."""
-        verbs = [VERBS[verb] for question in questions for verb in verbs_of(question)]
+        """Return the fields on which questions depend, by the keys that the flags of their verbs set."""
+        verbs = [VERBS[verb] for question in questions for verb in QUESTIONS[question].verbs]
         taken = {
             name for name, field in FIELDS.items() if any(verb.accepts(key) for verb in verbs for key in field.keys)
         }
@@ -291,9 +266,9 @@ def as_command(verb: str, study: Study) -> str:
             for star in value:
                 usual = Star(library=star.get("library"))
                 said = {key: given for key, given in star.items() if given != getattr(usual, key)}
-                words += _words(Star, {"library": star.get("library")} | said)
+                words += _flag_words("star", {"library": usual.library} | said, question)
         elif name == "sky":
-            words += ["--sky", "none"] if value.get("none") else _words(SkyLight, value)
+            words += ["--sky", "none"] if value.get("none") else _flag_words("sky", value, question)
         else:
             words += _flag_words(name, value, question) or ["--set", f"{name}={_toml(value)}"]
     long = any(len(word) > MOST_CHARACTERS for word in words)
@@ -314,7 +289,9 @@ def keys_used(verb: Verb, study: Study, base: Study) -> Iterator[tuple[str, Any]
 
 
 def _flag_words(name: str, value: Any, verb: Verb) -> list[str]:
-    """Return the words of a key's flag, or none if the verb has no flag that takes such a value."""
+    """Return the words of the flag of a key, or of each key of a star or sky; none if no flag takes such a value."""
+    if name in ("star", "sky"):
+        return [word for key, inner in value.items() for word in _flag_words(f"{name}.{key}", inner, verb)]
     for flag in (flag for key, _, flag in keys_of() if key == name and verb.accepts(name)):
         if isinstance(value, bool) and flag.read is None:
             on, _, off = flag.names[0].partition("/")
@@ -324,17 +301,11 @@ def _flag_words(name: str, value: Any, verb: Verb) -> list[str]:
         if flag.read is read_axis and "start" in value:
             spaced = [value["quantity"], *(_text(value[key]) for key in ("start", "stop", "steps"))]
             return [flag.names[0], ":".join(spaced + ["log"] * value.get("log", False))]
-        if flag.read in (None, read_words) and flag.kind in (None, str, list[str]):
+        if flag.read in (None, read_words):
             values = value if isinstance(value, list) else [value]
             if all(isinstance(item, str | int | float) for item in values):
                 return [word for item in values for word in (flag.names[0], _text(item))]
     return []
-
-
-def _words(section: type[BaseModel], values: Mapping[str, Any]) -> list[str]:
-    """Return the words of the first flags of a section's keys, with their values."""
-    names = {key: flags[0].names[0] for key, each in section.model_fields.items() if (flags := found(each, Flag))}
-    return [word for key, value in values.items() if key in names for word in (names[key], _text(value))]
 
 
 def _text(value: str | float) -> str:
@@ -404,7 +375,7 @@ def commands_and_programs(tab: Tab, question: Question, folder: Path) -> list[di
     """Return each of a tab's `questions` as a command and as a Python program; `folder` holds the visitor's files."""
     entries = []
     for name in tab.questions:
-        verb, study = asked_study(name, question.case(folder).study)
+        (verb, *_), study = QUESTIONS[name].verbs, QUESTIONS[name].study(question.case(folder).study)
         # Paths relative to the study, instead of those on the server.
         data = with_paths(study.model_dump(mode="json"), Study, lambda file: Path(file.name))
         study, keys = Study.build(data, "page"), dict[str, Any]()

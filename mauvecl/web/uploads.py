@@ -10,30 +10,31 @@ import re
 import sys
 import tempfile
 import threading
-import tomllib
 import zipfile
-import zlib
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path, PureWindowsPath
 from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from mauvecl.host.spectra.conversion import ReadSpectrum
+from mauvecl.host.spectra.formats import read_spectrum
 from mauvecl.host.stars.flare_spectra import ObservedFlare
 from mauvecl.host.stars.source import Source
-from mauvecl.host.tables.text_tables import columns
+from mauvecl.host.tables.files import as_text, parsing, toml
+from mauvecl.observations.frame_files import read_frames
 from mauvecl.observations.frames import Frames
-from mauvecl.schema.errors import InputError, printable, reworded, shortened
+from mauvecl.schema.errors import InputError, printable, shortened
 from mauvecl.schema.section import built
 from mauvecl.study.analyses import PATHS, CalibrateQuestion, CalibrationObservation
-from mauvecl.web.fields import FIELDS, UPLOADED, UPLOADED_FILE, UPLOADED_UNKNOWN
-from mauvecl.web.sandboxed_reader import FRAMES, Spectrum, read_by, read_limited
+from mauvecl.web.fields import FIELDS, UPLOADED, UPLOADED_FILE, UPLOADED_UNKNOWN, read_points
+from mauvecl.web.sandboxed_reader import read_limited
+
+Spectrum = TypeVar("Spectrum", Source, ObservedFlare, ReadSpectrum)
 
 #: Name of a table of neighbours in its folder.
 NEIGHBOURS_FILE = "neighbours.csv"
@@ -95,32 +96,24 @@ def unpacked(content: bytes) -> dict[str, bytes]:
     Hidden files, which some systems add, are left out. Raises InputError if the content is not a zip archive, is
     damaged, encrypted or too large, or contains a name that is not a plain one in a folder of the archive.
     """
-    try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            entries = {entry: _name(entry.filename) for entry in archive.infolist() if not entry.is_dir()}
-            entries = {entry: name for entry, name in entries.items() if not name.startswith(".")}
-            if len(entries) > MOST_FILES or sum(entry.file_size for entry in entries) > MOST_BYTES:
-                raise InputError(
-                    f"the archive must hold at most {MOST_FILES} files of {MOST_BYTES // 2**20} MiB in all",
-                    key="observations",
-                )
-            if any(entry.compress_type not in BOUNDED for entry in entries):
-                raise InputError(
-                    "the archive is packed in an unusual way; use a zip archive with deflate", key="observations"
-                )
-            files = {}
-            for entry, name in entries.items():
-                # A stated size that is too small ends the reading, and the checksum then differs.
-                with archive.open(entry) as file:
-                    files[name] = file.read(entry.file_size)
-    except InputError:
-        raise
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, OSError, ValueError) as error:
-        raise InputError(
-            f"the observations are no sound zip archive ({error}); give a TOML file and the files that it names in a "
-            "zip archive without a password",
-            key="observations",
-        ) from error
+    expected = "a TOML file and the files that it names, in a sound zip archive without a password"
+    with parsing("the archive", expected), zipfile.ZipFile(io.BytesIO(content)) as archive:
+        entries = {entry: _name(entry.filename) for entry in archive.infolist() if not entry.is_dir()}
+        entries = {entry: name for entry, name in entries.items() if not name.startswith(".")}
+        if len(entries) > MOST_FILES or sum(entry.file_size for entry in entries) > MOST_BYTES:
+            raise InputError(
+                f"the archive must hold at most {MOST_FILES} files of {MOST_BYTES // 2**20} MiB in all",
+                key="observations",
+            )
+        if any(entry.compress_type not in BOUNDED for entry in entries):
+            raise InputError(
+                "the archive is packed in an unusual way; use a zip archive with deflate", key="observations"
+            )
+        files = {}
+        for entry, name in entries.items():
+            # A stated size that is too small ends the reading, and the checksum then differs.
+            with archive.open(entry) as file:
+                files[name] = file.read(entry.file_size)
     if len(files) < len(entries):
         raise InputError("two files of the archive have the same name, but names must differ", key="observations")
     return files
@@ -171,10 +164,7 @@ def _observations(name: str, content: bytes) -> list[dict[str, Any]]:
         raise InputError(
             f"{shortened(name)} must be TOML of at most {MOST_TOML_BYTES // 2**10} KiB", key="observations"
         )
-    try:
-        study = tomllib.loads(content.decode("utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"{shortened(name)} must be valid TOML, but is not ({error})", key="observations") from error
+    study = toml(as_text(content, shortened(name)), shortened(name))
     section = study.get("calibrate")
     if not isinstance(section, dict) or "observations" not in section:
         return []
@@ -209,25 +199,25 @@ def write_spectrum(source: Source | ReadSpectrum, folder: Path, name: str) -> Pa
     return content_folder(folder, content, write) / name
 
 
-Points = tuple[tuple[float, float], ...]
 #: Largest size of an upload, bytes, and largest number of points of its spectrum.
 MOST_UPLOADED, MOST_POINTS = 4 * 2**20, 200_000
 #: Largest size of a file that is kept unread, such as frames; a day of resolution elements takes some 8 MiB.
 MOST_KEPT_BYTES = 16 * 2**20
 #: Largest number of values of frames that an answer reads: the spectra of a day.
 MOST_VALUES = 2**24
+#: Largest size of an unknown spectrum.
+MOST_PAIRS_BYTES = 2**18
 
-#: Largest size and number of rows of an unknown spectrum, which the study in every table contains.
-MOST_PAIRS_BYTES, MOST_PAIRS = 2**18, 4000
 
-
-def _spectrum(kind: type[Spectrum], called: str, name: str, content: bytes, **options: Any) -> Spectrum:
+def _spectrum(
+    kind: type[Spectrum], reader: Callable[..., Spectrum], called: str, name: str, content: bytes, **options: Any
+) -> Spectrum:
     """Read an untrusted spectrum, packed or not, and name it if `called`; its format follows from the content.
 
     Raises InputError if it holds no usable spectrum. Called on a thread of its own; any other exception is reported to
     the visitor too.
     """
-    spectrum = read_limited(content, kind, options)
+    spectrum = read_limited(kind, reader, {"upload": content}, **options)
     if spectrum.wavelength_nm.size > MOST_POINTS:
         raise InputError.of("points", spectrum.wavelength_nm.size, f"at most {MOST_POINTS}")
     named: Any = {"name": called, "origin": "upload"} if called else {}
@@ -236,27 +226,11 @@ def _spectrum(kind: type[Spectrum], called: str, name: str, content: bytes, **op
 
 def _flare(name: str, content: bytes, **options: Any) -> ReadSpectrum:
     """Read the measured range of a flare's spectrum; the study that reads the file continues it."""
-    flare = _spectrum(ObservedFlare, "", name, content, **options)
+    flare = _spectrum(ObservedFlare, ObservedFlare.read, "", name, content, **options)
     low, high = flare.measured_nm
     inside = (flare.wavelength_nm >= low) & (flare.wavelength_nm <= high)
     own = tuple(text for text in flare.messages if text.startswith(f"{flare.name}: "))
     return ReadSpectrum(flare.wavelength_nm[inside], flare.flux_flam[inside], "uploaded flare", "upload", messages=own)
-
-
-def read_pairs(name: str, content: bytes) -> Points:
-    """Read the spectrum of a nuisance parameter: text with two columns, nm and DN of the exposure."""
-    try:
-        text = content.decode("utf-8")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{shortened(name)} must be text with two columns, nm and DN", key="upload") from error
-    pairs = columns(f"upload {shortened(name)}", text, "nm and DN", "nm")
-    if not 2 <= len(pairs) <= MOST_PAIRS:
-        raise InputError(
-            f"{shortened(name)} must have 2 to {MOST_PAIRS} rows of nm and DN, but has {len(pairs)}", key="upload"
-        )
-    if not np.isfinite(pairs).all() or (np.diff(pairs[:, 0]) <= 0).any():
-        raise InputError(f"{shortened(name)} must have rows in ascending order of nm", key="upload")
-    return tuple((float(nm), float(dn)) for nm, dn in pairs)
 
 
 @dataclass(frozen=True)
@@ -280,8 +254,9 @@ class VisitorFile:
         return home / self.name
 
 
-def _options(*names: str, prefix: str = "") -> dict[str, str]:
-    return {name: f"{prefix}{name}" for name in names}
+def _options(*names: str) -> dict[str, str]:
+    """Return fields that say how a file is read, by the reader's names, which are those of their keys."""
+    return {FIELDS[name].path[-1]: name for name in names}
 
 
 @dataclass(frozen=True)
@@ -291,7 +266,7 @@ class Upload:
     reader: Callable[..., Any]  # of its name and content, and of options by name
     entered: str = UPLOADED_FILE  # text of the field that stands for the file
     most: int = MOST_UPLOADED  # largest number of bytes
-    options: Mapping[str, str] = field(default_factory=dict)  # fields that say how it is read, by the reader's names
+    options: Mapping[str, str] = field(default_factory=dict)  # see `_options`
 
     def read(self, name: str, content: bytes, values: Mapping[str, Any]) -> Any:
         """Read an untrusted file with the values of fields; raises InputError if it is too large or unusable."""
@@ -306,20 +281,24 @@ class Upload:
 #: Files by the field that takes them.
 UPLOADS: Mapping[str, Upload] = {
     "star": Upload(
-        partial(_spectrum, Source, UPLOADED), UPLOADED, options=_options("wavelength_unit", "flux_unit", "extend")
+        partial(_spectrum, Source, Source.read, UPLOADED),
+        UPLOADED,
+        options=_options("wavelength_unit", "flux_unit", "extend"),
     ),
-    "flare_file": Upload(
-        _flare, options=_options("wavelength_unit", "flux_unit", prefix="flare_") | _options("continue_at_k")
-    ),
+    "flare_file": Upload(_flare, options=_options("flare_wavelength_unit", "flare_flux_unit", "continue_at_k")),
     "flare_quiescent": Upload(
-        partial(_spectrum, ReadSpectrum, "uploaded star without the flare"),
-        options=_options("wavelength_unit", "flux_unit", prefix="flare_"),
+        partial(_spectrum, ReadSpectrum, read_spectrum, "uploaded star without the flare"),
+        options=_options("flare_wavelength_unit", "flare_flux_unit"),
     ),
     "change_file": Upload(
-        partial(_spectrum, Source, "added spectrum"),
-        options=_options("wavelength_unit", "flux_unit", "extend", prefix="change_"),
+        partial(_spectrum, Source, Source.read, "added spectrum"),
+        options=_options("change_wavelength_unit", "change_flux_unit", "change_extend"),
     ),
-    "own_unknown": Upload(read_pairs, UPLOADED_UNKNOWN, most=MOST_PAIRS_BYTES),
+    "own_unknown": Upload(
+        lambda name, content: read_points(as_text(content, shortened(name)), shortened(name)),
+        UPLOADED_UNKNOWN,
+        most=MOST_PAIRS_BYTES,
+    ),
     **{
         name: Upload(VisitorFile.of, most=MOST_KEPT_BYTES)
         for name, page_field in FIELDS.items()
@@ -339,29 +318,14 @@ EXAMPLES: Mapping[str, tuple[str, str]] = {
 }
 
 
-def read_frames_of(
-    file: VisitorFile, mapping: VisitorFile | None, key: str, *, quality_bits: str | None = None
-) -> Frames:
-    """Read the frames of a visitor's file, through a mapping if there is one, without those of the quality bits.
-
-    Raises InputError with the name of the field if it holds no frames.
-    """
+def read_frames_of(file: VisitorFile, mapping: VisitorFile | None, *, quality_bits: str | None = None) -> Frames:
+    """Read the frames of a visitor's file, through a mapping if there is one, without those of the quality bits."""
     files = {file.name: file.content}
     how = None
     if mapping is not None:
         how = mapping.name if mapping.name != file.name else f"mapping-{mapping.name}"
         files[how] = mapping.content
-    with reported_for(key):
-        return Frames(**read_by(FRAMES, files, {"mapping": how, "quality_bits": quality_bits}))
-
-
-@contextmanager
-def reported_for(key: str) -> Iterator[None]:
-    """Raise the errors of a reader as those of a field."""
-    try:
-        yield
-    except InputError as error:
-        raise reworded(error, str(error), key) from error
+    return read_limited(Frames, read_frames, files, mapping=how, quality_bits=quality_bits)
 
 
 #: Bytes of closed forms, answers and files that the server keeps for all visitors together, and of their uploads.

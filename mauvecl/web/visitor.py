@@ -27,13 +27,14 @@ from mauvecl.answers.verbs import VERBS
 from mauvecl.device.drivers import DeviceError
 from mauvecl.device.engine import Engine
 from mauvecl.host import VERSION
+from mauvecl.observations.frame_files import ColumnNames
 from mauvecl.runs.pool import LocalWorkers, Pool, Stopped
-from mauvecl.schema.errors import InputError, shortened
+from mauvecl.schema.errors import InputError, reworded, shortened
 from mauvecl.web.closed_forms import ClosedForms, other_payloads, solved
 from mauvecl.web.fields import FIELDS, field_of, remedies, sentence
-from mauvecl.web.page import TABS, State, asking, card, known, reads_of
-from mauvecl.web.sandboxed_reader import COLUMNS, read_by
-from mauvecl.web.tab import DRAWING, SIMULATIONS, as_file, asked_study, commands_and_programs, study_file, verbs_of
+from mauvecl.web.page import SIMULATIONS, TABS, State, card, known, reads_of
+from mauvecl.web.sandboxed_reader import read_limited
+from mauvecl.web.tab import DRAWN_UNITS, QUESTIONS, as_file, commands_and_programs, simulate, study_file
 from mauvecl.web.uploads import RESULTS, UPLOADS
 from mauvecl.web.uploads import UPLOAD_SHELF as UPLOADED
 
@@ -329,8 +330,16 @@ class Visitor(WebSocketHandler):
 
     def given(self, state: State, tab: Tab) -> dict[str, Any]:
         """Return the content of the files that a tab reads; the last ones are cached."""
+
+        def read() -> dict[str, Any]:
+            question = state.question(tab.reads)
+            try:
+                return tab.given(question) if tab.needs in question.uploads else {}
+            except InputError as error:
+                raise reworded(error, str(error), tab.needs) from error
+
         key = tab.name, self._key(state, tab.reads & (UPLOADS.keys() | DATA))
-        given: dict[str, Any] = self._cached("given", key, lambda: tab.given(state.question(tab.reads)))
+        given: dict[str, Any] = self._cached("given", key, read)
         return given
 
     def _cached(self, kind: str, key: Hashable, make: Callable[[], Any], most: int = 1) -> Any:
@@ -446,17 +455,18 @@ class Visitor(WebSocketHandler):
 
     async def _simulate(self, n: int, kind: str, state: State) -> None:
         key = kind, self._key(state, reads_of(kind))
-        question, tab = state.question(reads_of(kind)), asking(kind)
+        question, tab = state.question(reads_of(kind)), SIMULATIONS[kind]
         given = await self._in_thread(partial(self.given, state, tab))
         made = partial(ClosedForms.of, question, Path(self._folder.name), chance=tab.chance, given=given)
         closed = await self._in_thread(made)
         if self.job is not None:
             raise InputError("a simulation is running already: wait until it ends", key="simulate")
+        main, *more = QUESTIONS[kind].verbs
+        unit = VERBS[main].counts
         # Several verbs count the realisations of all in the pool.
-        verbs = verbs_of(kind)
-        unit = VERBS[verbs[0]].counts if len(verbs) == 1 else ""
-        work = partial(SIMULATIONS[kind], closed.study, given=closed.given)
-        job = self.job = Job(work, kind in DRAWING, unit)
+        job = self.job = Job(
+            partial(simulate, kind, closed.study, given=closed.given), unit in DRAWN_UNITS, "" if more else unit
+        )
         done = asyncio.wrap_future(job.future)
         try:
             while not (await asyncio.wait([done], timeout=LOOK_S))[0]:
@@ -497,7 +507,7 @@ class Visitor(WebSocketHandler):
         names = tuple(upload.options.values())
         reply: dict[str, Any] = {"n": asked["n"], "field": field}
         try:
-            work = reading(lambda: upload.read(name, content, state.values_of(names)))
+            work = reading(lambda: upload.read(name, content, state.question(names).values))
             UPLOADED.keep(self, "upload", field, await asyncio.wrap_future(work), len(UPLOADS))
             reply["entered"] = upload.entered
         except InputError as error:
@@ -513,8 +523,8 @@ class Visitor(WebSocketHandler):
         """Send the names of the columns of the visitor's frames; none if they are no table."""
         file, names = UPLOADED.get(self, "upload", "frames"), ()
         if file is not None:
-            work = reading(partial(read_by, COLUMNS, {file.name: file.content}, {}))
-            names = (await asyncio.wrap_future(work))["names"]
+            work = reading(partial(read_limited, ColumnNames, ColumnNames.read, {file.name: file.content}))
+            names = (await asyncio.wrap_future(work)).names
         self.send(n=asked["n"], columns=names)
 
     async def _ask_file(self, asked: dict[str, Any]) -> None:
@@ -536,8 +546,8 @@ class Visitor(WebSocketHandler):
         def make() -> tuple[str, bytes]:
             if tab in TABS:
                 return as_file(TABS[tab], name, ending, self.closed(state, front), answers)
-            _, study = asked_study(name, state.question(reads).case(Path(self._folder.name)).study)
-            return study_file(study, "study")
+            study = state.question(reads).case(Path(self._folder.name)).study
+            return study_file(QUESTIONS[name].study(study), "study")
 
         which = self._key(state, reads), tab, name, ending, tuple(answers)
         made: tuple[str, bytes] = self._cached("file", which, make, MOST_KEPT)

@@ -269,26 +269,29 @@ def test_stores_larger_than_the_disk_need_insist(tmp_path: Path) -> None:
 def test_uploads_are_read_in_a_limited_process(tmp_path: Path) -> None:
     from mauvecl.web import sandboxed_reader
 
+    def read(content: bytes) -> Source:
+        return sandboxed_reader.read_limited(Source, Source.read, {"upload": content})
+
     write_star(tmp_path / "star.txt")
     content = (tmp_path / "star.txt").read_bytes()
-    assert sandboxed_reader.read_limited(content, Source).digest == Source.read(tmp_path / "star.txt").digest
+    assert read(content).digest == Source.read(tmp_path / "star.txt").digest
     with pytest.raises(InputError):
-        sandboxed_reader.read_limited(b"200 a\n300 b\n", Source)
+        read(b"200 a\n300 b\n")
     # Limits hold in the other process, whatever is read there.
     with mock.patch.object(sandboxed_reader, "MEMORY_MIB", 64), refused_by_key("upload"):
-        sandboxed_reader.read_limited(b"".join(b"%f 1e-12\n" % nm for nm in np.linspace(170.0, 800.0, 150_000)), Source)
+        read(b"".join(b"%f 1e-12\n" % nm for nm in np.linspace(170.0, 800.0, 150_000)))
     started = time.monotonic()
     with mock.patch.object(sandboxed_reader, "SECONDS", 0.05), refused_by_key("upload", "0.05 s"):
         # Python itself takes longer to start.
-        sandboxed_reader.read_limited(content, Source)
+        read(content)
     with refused_by_key("upload", "64 MiB"):
-        sandboxed_reader.read_limited(gzip.compress(bytes(70 << 20)), Source)
+        read(gzip.compress(bytes(70 << 20)))
     assert time.monotonic() - started < 10.0
     with mock.patch.object(sandboxed_reader, "SECONDS", 0):
         turns = [sandboxed_reader._turns.acquire() for _ in range(sandboxed_reader.TOGETHER)]
         try:
             with refused_by_key("upload"):
-                sandboxed_reader.read_limited(content, Source)
+                read(content)
         finally:
             for _ in turns:
                 sandboxed_reader._turns.release()

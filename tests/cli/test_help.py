@@ -282,7 +282,7 @@ def test_given_star_becomes_the_star_of_the_study(tmp_path: Path) -> None:
         assert (star.library or (star.file and star.file.name), star.magnitude) == (given, 8.0)
     # A study is still one, whatever it is called.
     (tmp_path / "mauvecl-exposure" / "study.toml").rename(tmp_path / "study")
-    assert "star V = 8" in run("exposure", "study", "--no-pictures", folder=tmp_path).stdout
+    assert "star V = 9" in run("exposure", "study", "-m", "9", "--no-pictures", folder=tmp_path).stdout
 
 
 @pytest.mark.parametrize("name", ["ad leo", "Proxima", "YZ CMi", "GJ 388", "Barnard's star"])

@@ -9,8 +9,6 @@ from refusals import refused
 
 from mauvecl import Study
 
-FAST = ("exposure", "--snr", "10", "--at", "300", "--no-pictures")
-
 
 def build(section: str, **values: object) -> Study:
     return Study.build({"star": [{"library": "G2V"} | values]} if section == "star" else {section: values}, "test")
@@ -58,13 +56,6 @@ def test_amplitudes_like_percentages_have_a_note(tmp_path: Path) -> None:
     assert Study.read(tmp_path / "mauvecl-simulate" / "study.toml").flare.amplitudes == (24.0,)
     for text in ("0.24", "2400%"):
         assert "is a rise" not in run(*words, text, folder=tmp_path).stderr
-
-
-def test_a_study_has_its_star(tmp_path: Path) -> None:
-    run(*FAST, "-s", "K5V", "-m", "8", folder=tmp_path)
-    run(*FAST, "mauvecl-exposure/study.toml", "-m", "9", "-o", "again", folder=tmp_path)
-    (star,) = Study.read(tmp_path / "again" / "study.toml").star
-    assert (star.library, star.magnitude) == ("K5V", 9.0)
 
 
 @pytest.mark.long

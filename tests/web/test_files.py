@@ -658,6 +658,7 @@ BROKEN: list[tuple[dict[str, bytes | None], str]] = [
     ({"standards.toml": STUDY.encode() * 40}, ""),
     ({"standards.toml": STUDY.encode() + b"\nodd = 1\n"}, "odd"),
     ({"standards.toml": b"a = " + b"[" * 10_000}, ""),
+    ({"standards.toml": b".".join([b"a"] * 50_000) + b" = 1"}, "parts"),
     ({"standards.toml": STUDY.encode() + b"#" * 2**18}, ""),
 ]
 NUMBERS = zipped({"a.csv": b"1" * 999})
