@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, fields
 from functools import cached_property
+from itertools import product
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -24,7 +25,6 @@ from mauvecl.detection.statistics import (
     Linear,
     LinearStatistic,
     Matched,
-    QuadraticStatistic,
     Setting,
     Statistic,
     UvExcess,
@@ -154,20 +154,17 @@ class Hypotheses:
     def lowered(self) -> tuple[Message, ...]:
         """Sentences on weighted sums that a flare lowers, so that it is never detected however bright it is."""
         sentences = []
-        for name in self.statistics:
-            if not isinstance(self.statistic(name), LinearStatistic):
-                continue
-            for k, flare in enumerate(self.flares):
-                falls = self.fall(name, k)
-                if falls:
-                    matched = Matched().closed_form(self.setting, flare, flare)
-                    how = "marginalised over unknowns, " if self.nuisances else ""
-                    text = (
-                        f"WRONG SIGN: {how}{name} falls by {falls:.3g} standard deviations with flare {k + 1} of "
-                        f"{self.quiet.name}, and only higher values are alarms: its detection probability says nothing "
-                        f"of the flare, which matched has at {matched.mean / matched.std:.3g}."
-                    )
-                    sentences.append(Message(text, "wrong sign"))
+        for name, (k, flare) in product(self.statistics, enumerate(self.flares)):
+            falls = self.fall(name, k)
+            if falls:
+                matched = Matched().closed_form(self.setting, flare, flare)
+                how = "marginalised over unknowns, " if self.nuisances else ""
+                text = (
+                    f"WRONG SIGN: {how}{name} falls by {falls:.3g} standard deviations with flare {k + 1} of "
+                    f"{self.quiet.name}, and only higher values are alarms: its detection probability says nothing of "
+                    f"the flare, which matched has at {matched.mean / matched.std:.3g}."
+                )
+                sentences.append(Message(text, "wrong sign"))
         return tuple(sentences)
 
     def fall(self, statistic: str, flare: int) -> float:
@@ -285,7 +282,7 @@ def _rows(hypotheses: Hypotheses, asked: Sequence[Statistic], batch: Sequence[in
                 if isinstance(statistic, LinearStatistic):
                     weights = statistic.weights_per_dn(hypotheses.setting, looked_for)
                     weighted.add(statistic.name, scenario, flare, weights)
-                elif isinstance(statistic, QuadraticStatistic) and statistic.kernel_sum is not None:
+                elif isinstance(statistic, Chi2):
                     for number, own in enumerate(statistic.subtracted_rows(hypotheses.setting)):
                         weighted.add(statistic.name, scenario, number, own)
                 elif isinstance(statistic, Paper):
@@ -396,21 +393,17 @@ class Countable:
         words = {name: how.pop(name) for name in DrawingOptions.__annotations__ if name in how}
         return cls(*what, **how | {"drawing": Drawing(**words)})
 
+    def __post_init__(self) -> None:
+        check_last(self.start, self.realisations)
+
     def __getstate__(self) -> dict[str, Any]:
         """Return the state to pickle: request fields only, no caches."""
         return {each.name: getattr(self, each.name) for each in fields(self)}  # type: ignore[arg-type]
 
 
-class _RealisationRequest(Countable):
-    """Base class of requests for realisations."""
-
-    def __post_init__(self) -> None:
-        check_last(self.start, self.realisations)
-
-
 @validated
 @dataclass(frozen=True, eq=False)
-class DetectRequest(_RealisationRequest):
+class DetectRequest(Countable):
     """Arguments of `Engine.detect`."""
 
     quiet: Expectation
@@ -459,7 +452,7 @@ class DetectRequest(_RealisationRequest):
 
 @validated
 @dataclass(frozen=True, eq=False)
-class SnrRequest(_RealisationRequest):
+class SnrRequest(Countable):
     """Arguments of `Engine.snr`."""
 
     expectation: Expectation
@@ -481,7 +474,7 @@ class SnrRequest(_RealisationRequest):
 
 @validated
 @dataclass(frozen=True, eq=False)
-class RealiseRequest(_RealisationRequest):
+class RealiseRequest(Countable):
     """Arguments of `Engine.realise`, computed as a single shard, so callers limit the number of realisations."""
 
     expectation: Expectation
