@@ -97,8 +97,10 @@ class Hypotheses:
     def __post_init__(self) -> None:
         self._chosen = statistics_by_name(self.asked)
         self.statistics = tuple(self._chosen)
-        drawn = FactorDistributions.of(self.scene) if self.nuisances else None
-        self.setting = Setting(self.quiet, self.scene.used, self.scene.comparison, self.flares, self.nuisances, drawn)
+        scene, drawn = self.scene, None
+        if self.nuisances:
+            drawn = FactorDistributions.of(scene.modulations, scene.priors, scene.medians, scene.n_frames)
+        self.setting = Setting(self.quiet, scene.used, scene.comparison, self.flares, self.nuisances, drawn)
         shaped = next((name for name, statistic in self._chosen.items() if statistic.shaped), None)
         if shaped is not None and not self.flares:
             raise InputError(f"the statistic {shaped!r} needs at least one flare, but none is given", key="flares")
@@ -425,8 +427,8 @@ class DetectRequest(Countable):
     def hypotheses(self) -> Hypotheses:
         """Scene and statistics of the request."""
         scene = prepare([self.quiet, *self.flares], self.drawing, comparison=self.comparison)
-        nuisances = as_nuisances(self.nuisances, self.quiet)
-        return Hypotheses(self.quiet, self.flares, self.statistics, scene, nuisances=nuisances)
+        assert not isinstance(self.nuisances, Mapping)
+        return Hypotheses(self.quiet, self.flares, self.statistics, scene, nuisances=self.nuisances)
 
     @cached_property
     def plans(self) -> list[tuple[ChannelPlan, Scene]]:
