@@ -7,7 +7,7 @@ device, and more than once; `sums` adds them up.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, fields
 from functools import cached_property
 from itertools import product
@@ -245,53 +245,34 @@ class ChannelPlan:
         return len(FIXED_STATISTICS) * len(self.linear_end) + len(self.weights) + len(self.scales)
 
 
-@dataclass(eq=False)
-class _Rows:
-    """Rows of weights of one kind, ordered by scenario."""
-
-    rows: list[NDArray[np.float64]] = field(default_factory=list)
-    ends: list[int] = field(default_factory=list)  # one past the last row of each scenario
-    pixels_end: list[int] = field(default_factory=list)  # one past the last row with weights per pixel
-    index: dict[tuple[str, int, int], int] = field(default_factory=dict)  # by statistic, scenario and template
-
-    def add(self, statistic: str, scenario: int, flare: int, row: NDArray[np.float64]) -> None:
-        self.index[statistic, scenario, flare] = len(self.rows)
-        self.rows.append(row)
-
-    def end_pixels(self) -> None:
-        """End the rows of a scenario with weights per pixel."""
-        self.pixels_end.append(len(self.rows))
-
-    def end(self) -> None:
-        """End a scenario."""
-        if len(self.pixels_end) == len(self.ends):
-            self.end_pixels()
-        self.ends.append(len(self.rows))
+#: Rows of weights by statistic, scenario and template, ordered by scenario.
+Rows = dict[tuple[str, int, int], NDArray[np.float64]]
 
 
-def _rows(hypotheses: Hypotheses, asked: Sequence[Statistic], batch: Sequence[int]) -> tuple[_Rows, _Rows]:
+def _rows(hypotheses: Hypotheses, asked: Sequence[Statistic], batch: Sequence[int]) -> tuple[Rows, Rows]:
     """Return the weights of sums over pixels, and the scales of the paper's statistic, in the kernel's order."""
-    weighted, smoothed = _Rows(), _Rows()
+    weighted, smoothed = Rows(), Rows()
     for scenario in range(1 + len(batch)):
         # Quiescent draws are compared with every flare's template, draws of a flare only with its own.
         shapes = [flare for i, flare in enumerate(batch) if scenario in (0, i + 1)]
         # Shaped statistics come first, since the kernel fuses the first row, and sums over elements last.
         for statistic in sorted(asked, key=lambda s: (s.by_element, not s.shaped)):
-            if statistic.by_element:
-                weighted.end_pixels()
+            name, setting = statistic.name, hypotheses.setting
             for flare in shapes if statistic.shaped else [0]:
-                looked_for = hypotheses.shape(statistic.name, flare)
+                looked_for = hypotheses.shape(name, flare)
                 if isinstance(statistic, LinearStatistic):
-                    weights = statistic.weights_per_dn(hypotheses.setting, looked_for)
-                    weighted.add(statistic.name, scenario, flare, weights)
+                    weighted[name, scenario, flare] = statistic.weights_per_dn(setting, looked_for)
                 elif isinstance(statistic, Chi2):
-                    for number, own in enumerate(statistic.subtracted_rows(hypotheses.setting)):
-                        weighted.add(statistic.name, scenario, number, own)
+                    weighted |= {(name, scenario, k): own for k, own in enumerate(statistic.subtracted_rows(setting))}
                 elif isinstance(statistic, Paper):
-                    smoothed.add(statistic.name, scenario, flare, statistic.scale(hypotheses.setting, looked_for))
-        weighted.end()
-        smoothed.end()
+                    smoothed[name, scenario, flare] = statistic.scale(setting, looked_for)
     return weighted, smoothed
+
+
+def _per_scenario(keys: Iterable[tuple[str, int, int]], n_scenario: int) -> NDArray[np.uint32]:
+    """Return the number of rows of each scenario."""
+    scenarios = np.array([scenario for _, scenario, _ in keys], int)
+    return np.bincount(scenarios, minlength=n_scenario).astype(np.uint32)
 
 
 def plan_channels(hypotheses: Hypotheses, batch: Sequence[int], *, first: bool) -> ChannelPlan:
@@ -302,21 +283,19 @@ def plan_channels(hypotheses: Hypotheses, batch: Sequence[int], *, first: bool) 
     asked = [hypotheses.statistic(name) for name in hypotheses.statistics]
     weighted, smoothed = _rows(hypotheses, asked, batch)
     n_scenario, fixed = 1 + len(batch), len(FIXED_STATISTICS)
+    channels = {key: fixed * n_scenario + number for number, key in enumerate([*weighted, *smoothed])}
 
-    def row(statistic: Statistic, scenario: int, flare: int) -> int:
+    def channel_of(statistic: Statistic, scenario: int, flare: int) -> int:
         if statistic.kernel_sum is not None:
             return fixed * scenario + FIXED_STATISTICS.index(statistic.kernel_sum)
-        where = statistic.name, scenario, flare if statistic.shaped else 0
-        if isinstance(statistic, LinearStatistic):
-            return fixed * n_scenario + weighted.index[where]
-        return fixed * n_scenario + len(weighted.rows) + smoothed.index[where]
+        return channels[statistic.name, scenario, flare if statistic.shaped else 0]
 
-    nuisances = hypotheses.setting.nuisances
     subtractions = []
-    for statistic in asked if nuisances else []:
-        for scenario in range(n_scenario) if statistic.kernel_sum is not None else []:
-            begin = fixed * n_scenario + weighted.index[statistic.name, scenario, 0]
-            subtractions.append((row(statistic, scenario, 0), begin, begin + len(nuisances.names if nuisances else ())))
+    n_subtracted = len(hypotheses.nuisances.names) if hypotheses.nuisances else 0
+    sums = [statistic for statistic in asked if isinstance(statistic, Chi2)] if n_subtracted else []
+    for chi2, scenario in product(sums, range(n_scenario)):
+        begin = channels[chi2.name, scenario, 0]
+        subtractions.append((channel_of(chi2, scenario, 0), begin, begin + n_subtracted))
     grids: list[Grid] = []
     keys: list[Key] = []
 
@@ -326,19 +305,23 @@ def plan_channels(hypotheses: Hypotheses, batch: Sequence[int], *, first: bool) 
 
     for statistic in asked:
         if first and not statistic.shaped:
-            add(statistic, "null", 0, row(statistic, 0, 0), hypotheses.closed_form(statistic.name))
+            add(statistic, "null", 0, channel_of(statistic, 0, 0), hypotheses.closed_form(statistic.name))
         for i, flare in enumerate(batch):
             null = hypotheses.closed_form(statistic.name, template=flare)
             if statistic.shaped:
-                add(statistic, "null", flare, row(statistic, 0, flare), null)
-            channel = row(statistic, i + 1, flare)
+                add(statistic, "null", flare, channel_of(statistic, 0, flare), null)
+            channel = channel_of(statistic, i + 1, flare)
             add(statistic, "flare_on_null_grid", flare, channel, null)
             add(statistic, "flare", flare, channel, hypotheses.closed_form(statistic.name, flare))
-    weights = np.zeros((len(weighted.rows), len(hypotheses.scene.pixels)), np.float32)
-    weights[:, : hypotheses.scene.n_pixel] = np.array(weighted.rows).reshape(len(weights), hypotheses.scene.n_pixel)
-    scales = np.array(smoothed.rows, np.float32) if smoothed.rows else np.zeros((0, 1), np.float32)
-    ends = (np.array(ends, np.uint32) for ends in (weighted.ends, weighted.pixels_end, smoothed.ends))
-    linear_end, pixels_end, scale_end = ends
+    weights = np.zeros((len(weighted), len(hypotheses.scene.pixels)), np.float32)
+    for own, padded in zip(weighted.values(), weights, strict=True):
+        padded[: own.size] = own
+    scales = np.array([*smoothed.values()], np.float32) if smoothed else np.zeros((0, 1), np.float32)
+    linear_end, scale_end = (
+        np.cumsum(_per_scenario(rows, n_scenario), dtype=np.uint32) for rows in (weighted, smoothed)
+    )
+    of_elements = [key for key in weighted if hypotheses.statistic(key[0]).by_element]
+    pixels_end = linear_end - _per_scenario(of_elements, n_scenario)
     taken = np.array(subtractions, np.uint32).reshape(len(subtractions), 3).T
     return ChannelPlan(weights, linear_end, pixels_end, scales, scale_end, grids, keys, taken)
 
