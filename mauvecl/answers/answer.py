@@ -271,7 +271,7 @@ class Answer(Drawable, ContentEquality):
         return [
             *(write_table(table, place / name) for name, table in self.files.items()),
             *(write_document(content, place / name) for name, content in self.documents.items()),
-            write_study(self.study.toml(), place),
+            write_document(self.study.toml().encode, place / "study.toml"),
         ]
 
     @property
@@ -446,11 +446,6 @@ def write_document(content: Callable[[], bytes], path: Path) -> Path:
     """Write a file from a function that returns its bytes; errors as for `write_table`."""
     write_whole(path, content())
     return path
-
-
-def write_study(text: str, folder: Path) -> Path:
-    """Write the text of a study; errors as for `write_table`."""
-    return write_document(text.encode, folder / "study.toml")
 
 
 def write_record(

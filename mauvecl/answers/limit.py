@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from operator import attrgetter
 from threading import Lock
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -47,24 +47,17 @@ if TYPE_CHECKING:
     from mauvecl.host.instrument.instrument import Instrument
 
 
-class Assumption(NamedTuple):
-    """Uncertain value of the payload with both ends of its range (documentation: what is nominal)."""
+def assumptions(nominal: Instrument) -> Iterator[tuple[str, dict[str, Mapping[str, Any]]]]:
+    """Yield the names of the payload's uncertain values, and changes of the instrument by the ends of their ranges.
 
-    name: str
-    ends: tuple[str, str]
-    changes: tuple[Mapping[str, Any], Mapping[str, Any]]
-
-
-def assumptions(nominal: Instrument) -> list[Assumption]:
-    """Return the uncertain values of the payload and their ranges; normal priors extend to one standard deviation."""
-    rows, values = list[Assumption](), values_of(nominal)
+    Normal priors extend to one standard deviation (documentation: what is nominal).
+    """
+    values = values_of(nominal)
     for name, prior in Unknowns().priors(nominal).items():
         ends = (prior.low, prior.high) if isinstance(prior, Uniform) else (prior.mean - prior.sd, prior.mean + prior.sd)
         value = values[name]
-        low, high = (value.changes(nominal, float(f"{end:.12g}")) for end in ends)
-        rows.append(Assumption(value.label, (f"{ends[0]:g}", f"{ends[1]:g}"), (low, high)))
-    units = ("DN", "electrons")
-    return [*rows, Assumption("dark counts are Poisson in", units, ({"dark_unit": units[0]}, {"dark_unit": units[1]}))]
+        yield value.label, {f"{end:g}": value.changes(nominal, float(f"{end:.12g}")) for end in ends}
+    yield "dark counts are Poisson in", {unit: {"dark_unit": unit} for unit in ("DN", "electrons")}
 
 
 @validated
@@ -115,11 +108,11 @@ def _moves(case: Case, statistic: str) -> Iterator[dict[str, Any]]:
     """Yield the change of a limit with each assumption at both ends of its range, by the names of columns."""
     nominal = LimitSearch(case, statistic).root()
     limit = {"star": case.star.library or str(case.star.file), "amplitude": case.amplitudes[0], "statistic": statistic}
-    for name, (low_end, high_end), changes in assumptions(case.instrument):
-        changed = (replace(case, study=case.study.with_instrument(change)) for change in changes)
+    for name, ends in assumptions(case.instrument):
+        changed = (replace(case, study=case.study.with_instrument(change)) for change in ends.values())
         low, high = (LimitSearch(each, statistic).root(near=nominal) for each in changed)
-        ends = {"low_end": low_end, "high_end": high_end, "at_low_end": low, "at_high_end": high}
-        yield limit | ends | {"assumption": name, "nominal": nominal, "span": abs(high - low)}
+        of_ends = dict(zip(("low_end", "high_end"), ends, strict=True)) | {"at_low_end": low, "at_high_end": high}
+        yield limit | of_ends | {"assumption": name, "nominal": nominal, "span": abs(high - low)}
 
 
 #: Steps in which the progress of a limit is reported, since its number of simulations is not known beforehand.

@@ -33,7 +33,7 @@ from mauvecl.runs.pool import map_in_order
 from mauvecl.schema.columns import Column, number, percent, records
 from mauvecl.schema.errors import InputError, Message, of_kind, printable, together
 from mauvecl.schema.physical import DAY_S
-from mauvecl.search.completeness import Completeness, Yield, recovered_per_day
+from mauvecl.search.completeness import Yield, recovered_per_day
 from mauvecl.study.cases import SATURATED, Case, collect_messages
 from mauvecl.study.study import Study
 
@@ -342,7 +342,6 @@ def plan(
     if progress is not None:
         progress(0, len(stars))
     seen = visible(study)
-    months = seen.visibility.by_month()
     along = OrbitConditions.along(seen.visibility.track) if study.plan.along_orbit else None
     base = Case(study)
 
@@ -350,14 +349,8 @@ def plan(
         for k, (text, star) in enumerate(zip(study.plan.targets, stars, strict=True)):
             yield k, observe(base, text, star, seen, k, along)
 
-    def planned_for(item: tuple[int, TargetObservation]) -> Planned:
-        k, target = item
-        its = None
-        if target.window_s > 0:
-            its = completeness(target) if target.signal_per_frame > 0 else NOTHING
-        return _planned(seen, k, target, its, months)
-
     # With a pool, the noise of a target is drawn while the threshold of the next one is sampled.
+    planned_for = partial(_planned, seen, seen.visibility.by_month(), completeness)
     planned = tuple(reported(map_in_order(engine, planned_for, observations()), len(stars), progress))
     return PlanAnswer(study, seen, planned)
 
@@ -390,10 +383,17 @@ def _stars_of(study: Study) -> list[Star]:
 
 
 def _planned(
-    seen: VisibleAnswer, k: int, target: TargetObservation, its: Completeness | None, months: tuple[list[str], Any]
+    seen: VisibleAnswer,
+    months: tuple[list[str], Any],
+    completeness: CompletenessOf,
+    item: tuple[int, TargetObservation],
 ) -> Planned:
-    """Return the plan of target number `k`; its completeness is None if no frames follow each other."""
-    study, exposed, (names, hours) = seen.study, float(seen.visibility.hours[k]), months
+    """Return the plan of a target, given its number and observation, and the hours of all targets by month."""
+    study, (k, target) = seen.study, item
+    its = None
+    if target.window_s > 0:
+        its = completeness(target) if target.signal_per_frame > 0 else NOTHING
+    exposed, (names, hours) = float(seen.visibility.hours[k]), months
     observed = exposed if study.plan.hours is None else min(exposed, study.plan.hours)
     days = observed * 3600 / DAY_S
     # The months in which it is seen for the most hours, in order.

@@ -111,14 +111,10 @@ class TargetObservation:
 
         What is unknown in each frame is marginalised over; slower changes are left to the level of the search.
         """
-        return self._signal(frame_nuisances(self.quiet, self.case.stare))
+        return self.signal_with(frame_nuisances(self.quiet, self.case.stare))
 
-    @cached_property
-    def ideal_signal_per_frame(self) -> float:
-        """The same if everything but the noise is known."""
-        return self._signal(None)
-
-    def _signal(self, unknown: Nuisances | None) -> float:
+    def signal_with(self, unknown: Nuisances | None) -> float:
+        """Return the S/N of such a frame with other unknowns, or with everything but the noise known."""
         (flare,) = self.case.expect(self.case.flaring(SMALL))
         added = [process.variance_dn2(self.quiet) for process in self.case.study.processes.additive.values()]
         hits = np.sum(added, axis=0) if added else None
@@ -183,7 +179,7 @@ def closed_form(observation: TargetObservation, *, known: bool = False) -> Compl
     `known` takes everything but the noise as known.
     """
     study = observation.case.study
-    signal = observation.ideal_signal_per_frame if known else observation.signal_per_frame
+    signal = observation.signal_with(None) if known else observation.signal_per_frame
     return Completeness.of_search(
         signal, observation.scale, window_s=observation.window_s, false_alarms_per_day=study.search.rate,
         bank=study.search.white_bank(observation.quiet.frame_s), law=study.plan.law(),

@@ -260,7 +260,7 @@ class Session(Options):
 
     def _leave_all(self, answer: Answer) -> None:
         """Write tables, documents and pictures of an answer, its study and the run record; remove the checkpoint."""
-        from mauvecl.answers.answer import write_document, write_record, write_study, write_table
+        from mauvecl.answers.answer import write_document, write_record, write_table
         from mauvecl.charts.matplotlib import available
 
         for name, table in answer.files.items():
@@ -274,7 +274,7 @@ class Session(Options):
             self.say(["No pictures: matplotlib is missing, `pip install 'mauvecl[plot]'` brings it."])
         study = answer.study
         if self.folder / "study.toml" not in self.files:
-            self.leave(lambda: write_study(study.toml(), self.folder))
+            self.leave(partial(write_document, study.toml().encode, self.folder / "study.toml"))
         seconds, messages = time.perf_counter() - self.started, [*answer.messages, *answer.remarks]
         how: dict[str, Any] = {"pool": self._pool, "opened": self.opened, "seconds": seconds, "messages": messages}
         # Only a complete answer replaces another's files.

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.linalg import orth, solve_triangular
 
 from mauvecl.detection.distributions import QuadraticForm
-from mauvecl.detection.statistics import Differences, QuadraticStatistic, Setting, Tilt
+from mauvecl.detection.statistics import Differences, Setting, Statistic, Tilt
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 GROUP_WIDTH = 0.005
 
 
-class Chi2(QuadraticStatistic):
+class Chi2(Statistic):
     """Sum over pixels of the squared difference divided by its variance."""
 
     name = "chi2"
@@ -97,8 +97,12 @@ class Chi2(QuadraticStatistic):
         return np.asarray(total - subtracted)
 
     def subtracted_rows(self, setting: Setting) -> Float:
+        """Return the weights per DN of the sums whose squares marginalisation subtracts, shape (k, n_pixel).
+
+        The weights apply to used pixels. They are equal within an element if the statistic is `by_element`.
+        """
         if not setting.nuisances:
-            return super().subtracted_rows(setting)
+            return np.zeros((0, setting.used.size))
         model = self._grouped(setting, self.variance(setting) * setting.used)
         return self._per_pixel(setting, setting.nuisances.rows(model, self._spectra(setting)))
 
@@ -109,6 +113,7 @@ class Chi2(QuadraticStatistic):
         return Tilt(directions, np.ones(directions.shape[0]))
 
     def square_weights(self, setting: Setting, flare: Expectation | None = None) -> Float:
+        """Return the coefficient of each pixel's squared difference, per DN^2, shape (n_pixel,)."""
         model = self._grouped(setting, self.variance(setting) * setting.used)
         inverse = np.divide(1.0, model, out=np.zeros_like(model), where=model > 0)
         weights = self._per_pixel(setting, inverse) - np.sum(self.subtracted_rows(setting) ** 2, axis=0)
@@ -326,7 +331,7 @@ def _rows(n: int, sigma: float) -> csr_array:
     return csr_array(gaussian_filter1d(np.eye(n), sigma, axis=0, mode="nearest"))
 
 
-class Paper(QuadraticStatistic):
+class Paper(Statistic):
     """Sum of (F - Q)^2 / F of smoothed spectra, where F is an exposure with a flare and Q one without."""
 
     name = "paper"
@@ -363,4 +368,5 @@ class Paper(QuadraticStatistic):
         return Tilt(modes * sd / np.sqrt(square)[:, None], square)
 
     def square_weights(self, setting: Setting, flare: Expectation | None = None) -> Float:
+        """Return the coefficients as `Chi2.square_weights` does."""
         return np.asarray(self.scale(setting, flare) @ self.smoothing(setting).rows ** 2)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl.detection.chi2 import Smoothing
+from mauvecl.detection.chi2 import Chi2, Paper, Smoothing
 from mauvecl.detection.counts import Distribution, TailSamples, Tally
 from mauvecl.detection.distributions import (
     CONFIDENCE,
@@ -24,7 +24,7 @@ from mauvecl.detection.distributions import (
 )
 from mauvecl.detection.names import NoThresholdError, Tails, check_atom, check_fap, countable
 from mauvecl.detection.requests import ChannelPlan, Hypotheses, Key
-from mauvecl.detection.statistics import Differences, LinearStatistic, QuadraticStatistic
+from mauvecl.detection.statistics import Differences, LinearStatistic
 from mauvecl.detection.tails import Tail, tail
 from mauvecl.host.arrays import ContentEquality
 from mauvecl.noise.disturbances import ADDITIVE
@@ -183,7 +183,7 @@ def _skewed_fap(detection: Detection, statistic: str, template: int, null: Form,
         # Edgeworth series (Abramowitz & Stegun 26.2.48).
         series = skew * (z**2 - 1) / 6 + excess * (z**3 - 3 * z) / 24 + skew**2 * (z**5 - 10 * z**3 + 15 * z) / 72
         return float(null.sf(cut) + np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi) * series)
-    assert isinstance(kind, QuadraticStatistic)
+    assert isinstance(kind, Chi2 | Paper)
     # The square of a skewed variable has more variance and skew than that of a normal one.
     weights = kind.square_weights(detection.setting, flare)
     second = null.std**2

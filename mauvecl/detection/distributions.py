@@ -96,37 +96,27 @@ def detection_interval(above: Sequence[float], trials: int, fap: float, correlat
     of the same correlation. With fewer than ten detections or misses, Clopper and Pearson's interval replaces
     Jeffreys's.
     """
-    above_cut, few, many = above
-    tail = (1.0 - CONFIDENCE) / 2.0
-    middle, lower, upper = (_probit((k + 0.5) / (trials + 1.0)) for k in (above_cut, few, many))
+    middle, lower, upper = special.ndtri([(k + 0.5) / (trials + 1.0) for k in above]).tolist()
+    above_cut, missed, tail = above[0], trials - above[0], (1.0 - CONFIDENCE) / 2.0
     # For small counts Jeffreys's interval undercovers; Clopper and Pearson's never does.
-    more = 0.5 if min(above_cut, trials - above_cut) >= FEW else 0.0
-    low = _beta(above_cut + more, trials - above_cut + 1.0 - more, tail) if above_cut else -np.inf
-    high = _beta(above_cut + 1.0 - more, trials - above_cut + more, 1.0 - tail) if above_cut < trials else np.inf
+    more = 0.5 if min(above_cut, missed) >= FEW else 0.0
+    low = float(special.ndtri(special.betaincinv(above_cut + more, missed + 1.0 - more, tail)))
+    high = float(special.ndtri(special.betaincinv(above_cut + 1.0 - more, missed + more, 1.0 - tail)))
     shared = _exceedance_correlation(fap, float(special.ndtr(middle)), correlation)
-    below = _combined(middle - low, middle - lower, shared) if above_cut else np.inf
-    beyond = _combined(high - middle, upper - middle, shared) if above_cut < trials else np.inf
-    ends = (float(special.ndtr(end)) for end in (middle - below, middle + beyond))
-    value = above_cut / trials
-    return Interval(value, min(next(ends), value), max(next(ends), value))
 
+    def combined(sd: float, other: float) -> float:
+        return float(np.sqrt(max(sd**2 + other**2 - 2.0 * shared * sd * other, 0.0)))
 
-def _probit(p: float | np.float64) -> float:
-    return float(special.ndtri(p))
-
-
-def _beta(a: float, b: float, probability: float) -> float:
-    """Return a quantile of a beta distribution on the scale of normal quantiles."""
-    return _probit(float(special.betaincinv(a, b, probability)))
-
-
-def _combined(sd: float, other: float, shared: float) -> float:
-    return float(np.sqrt(max(sd**2 + other**2 - 2.0 * shared * sd * other, 0.0)))
+    below = combined(middle - low, middle - lower) if above_cut else np.inf
+    beyond = combined(high - middle, upper - middle) if missed else np.inf
+    value, ends = above_cut / trials, special.ndtr([middle - below, middle + beyond]).tolist()
+    return Interval(value, min(ends[0], value), max(ends[1], value))
 
 
 def _exceedance_correlation(fap: float, probability: float, correlation: float) -> float:
     """Return the correlation of threshold crossings without and with a flare, for two normals."""
-    both = _orthant(_probit(1.0 - fap), _probit(1.0 - probability), min(max(correlation, 0.0), 1.0))
+    h, k = special.ndtri([1.0 - fap, 1.0 - probability]).tolist()
+    both = _orthant(h, k, min(max(correlation, 0.0), 1.0))
     spread = np.sqrt(fap * (1.0 - fap) * probability * (1.0 - probability))
     return float((both - fap * probability) / spread)
 

@@ -7,9 +7,10 @@ device, and more than once; `sums` adds them up.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, fields
 from functools import cached_property
+from itertools import product
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -24,7 +25,6 @@ from mauvecl.detection.statistics import (
     Linear,
     LinearStatistic,
     Matched,
-    QuadraticStatistic,
     Setting,
     Statistic,
     UvExcess,
@@ -97,8 +97,10 @@ class Hypotheses:
     def __post_init__(self) -> None:
         self._chosen = statistics_by_name(self.asked)
         self.statistics = tuple(self._chosen)
-        drawn = FactorDistributions.of(self.scene) if self.nuisances else None
-        self.setting = Setting(self.quiet, self.scene.used, self.scene.comparison, self.flares, self.nuisances, drawn)
+        scene, drawn = self.scene, None
+        if self.nuisances:
+            drawn = FactorDistributions.of(scene.modulations, scene.priors, scene.medians, scene.n_frames)
+        self.setting = Setting(self.quiet, scene.used, scene.comparison, self.flares, self.nuisances, drawn)
         shaped = next((name for name, statistic in self._chosen.items() if statistic.shaped), None)
         if shaped is not None and not self.flares:
             raise InputError(f"the statistic {shaped!r} needs at least one flare, but none is given", key="flares")
@@ -154,20 +156,17 @@ class Hypotheses:
     def lowered(self) -> tuple[Message, ...]:
         """Sentences on weighted sums that a flare lowers, so that it is never detected however bright it is."""
         sentences = []
-        for name in self.statistics:
-            if not isinstance(self.statistic(name), LinearStatistic):
-                continue
-            for k, flare in enumerate(self.flares):
-                falls = self.fall(name, k)
-                if falls:
-                    matched = Matched().closed_form(self.setting, flare, flare)
-                    how = "marginalised over unknowns, " if self.nuisances else ""
-                    text = (
-                        f"WRONG SIGN: {how}{name} falls by {falls:.3g} standard deviations with flare {k + 1} of "
-                        f"{self.quiet.name}, and only higher values are alarms: its detection probability says nothing "
-                        f"of the flare, which matched has at {matched.mean / matched.std:.3g}."
-                    )
-                    sentences.append(Message(text, "wrong sign"))
+        for name, (k, flare) in product(self.statistics, enumerate(self.flares)):
+            falls = self.fall(name, k)
+            if falls:
+                matched = Matched().closed_form(self.setting, flare, flare)
+                how = "marginalised over unknowns, " if self.nuisances else ""
+                text = (
+                    f"WRONG SIGN: {how}{name} falls by {falls:.3g} standard deviations with flare {k + 1} of "
+                    f"{self.quiet.name}, and only higher values are alarms: its detection probability says nothing of "
+                    f"the flare, which matched has at {matched.mean / matched.std:.3g}."
+                )
+                sentences.append(Message(text, "wrong sign"))
         return tuple(sentences)
 
     def fall(self, statistic: str, flare: int) -> float:
@@ -246,53 +245,34 @@ class ChannelPlan:
         return len(FIXED_STATISTICS) * len(self.linear_end) + len(self.weights) + len(self.scales)
 
 
-@dataclass(eq=False)
-class _Rows:
-    """Rows of weights of one kind, ordered by scenario."""
-
-    rows: list[NDArray[np.float64]] = field(default_factory=list)
-    ends: list[int] = field(default_factory=list)  # one past the last row of each scenario
-    pixels_end: list[int] = field(default_factory=list)  # one past the last row with weights per pixel
-    index: dict[tuple[str, int, int], int] = field(default_factory=dict)  # by statistic, scenario and template
-
-    def add(self, statistic: str, scenario: int, flare: int, row: NDArray[np.float64]) -> None:
-        self.index[statistic, scenario, flare] = len(self.rows)
-        self.rows.append(row)
-
-    def end_pixels(self) -> None:
-        """End the rows of a scenario with weights per pixel."""
-        self.pixels_end.append(len(self.rows))
-
-    def end(self) -> None:
-        """End a scenario."""
-        if len(self.pixels_end) == len(self.ends):
-            self.end_pixels()
-        self.ends.append(len(self.rows))
+#: Rows of weights by statistic, scenario and template, ordered by scenario.
+Rows = dict[tuple[str, int, int], NDArray[np.float64]]
 
 
-def _rows(hypotheses: Hypotheses, asked: Sequence[Statistic], batch: Sequence[int]) -> tuple[_Rows, _Rows]:
+def _rows(hypotheses: Hypotheses, asked: Sequence[Statistic], batch: Sequence[int]) -> tuple[Rows, Rows]:
     """Return the weights of sums over pixels, and the scales of the paper's statistic, in the kernel's order."""
-    weighted, smoothed = _Rows(), _Rows()
+    weighted, smoothed = Rows(), Rows()
     for scenario in range(1 + len(batch)):
         # Quiescent draws are compared with every flare's template, draws of a flare only with its own.
         shapes = [flare for i, flare in enumerate(batch) if scenario in (0, i + 1)]
         # Shaped statistics come first, since the kernel fuses the first row, and sums over elements last.
         for statistic in sorted(asked, key=lambda s: (s.by_element, not s.shaped)):
-            if statistic.by_element:
-                weighted.end_pixels()
+            name, setting = statistic.name, hypotheses.setting
             for flare in shapes if statistic.shaped else [0]:
-                looked_for = hypotheses.shape(statistic.name, flare)
+                looked_for = hypotheses.shape(name, flare)
                 if isinstance(statistic, LinearStatistic):
-                    weights = statistic.weights_per_dn(hypotheses.setting, looked_for)
-                    weighted.add(statistic.name, scenario, flare, weights)
-                elif isinstance(statistic, QuadraticStatistic) and statistic.kernel_sum is not None:
-                    for number, own in enumerate(statistic.subtracted_rows(hypotheses.setting)):
-                        weighted.add(statistic.name, scenario, number, own)
+                    weighted[name, scenario, flare] = statistic.weights_per_dn(setting, looked_for)
+                elif isinstance(statistic, Chi2):
+                    weighted |= {(name, scenario, k): own for k, own in enumerate(statistic.subtracted_rows(setting))}
                 elif isinstance(statistic, Paper):
-                    smoothed.add(statistic.name, scenario, flare, statistic.scale(hypotheses.setting, looked_for))
-        weighted.end()
-        smoothed.end()
+                    smoothed[name, scenario, flare] = statistic.scale(setting, looked_for)
     return weighted, smoothed
+
+
+def _per_scenario(keys: Iterable[tuple[str, int, int]], n_scenario: int) -> NDArray[np.uint32]:
+    """Return the number of rows of each scenario."""
+    scenarios = np.array([scenario for _, scenario, _ in keys], int)
+    return np.bincount(scenarios, minlength=n_scenario).astype(np.uint32)
 
 
 def plan_channels(hypotheses: Hypotheses, batch: Sequence[int], *, first: bool) -> ChannelPlan:
@@ -303,21 +283,19 @@ def plan_channels(hypotheses: Hypotheses, batch: Sequence[int], *, first: bool) 
     asked = [hypotheses.statistic(name) for name in hypotheses.statistics]
     weighted, smoothed = _rows(hypotheses, asked, batch)
     n_scenario, fixed = 1 + len(batch), len(FIXED_STATISTICS)
+    channels = {key: fixed * n_scenario + number for number, key in enumerate([*weighted, *smoothed])}
 
-    def row(statistic: Statistic, scenario: int, flare: int) -> int:
+    def channel_of(statistic: Statistic, scenario: int, flare: int) -> int:
         if statistic.kernel_sum is not None:
             return fixed * scenario + FIXED_STATISTICS.index(statistic.kernel_sum)
-        where = statistic.name, scenario, flare if statistic.shaped else 0
-        if isinstance(statistic, LinearStatistic):
-            return fixed * n_scenario + weighted.index[where]
-        return fixed * n_scenario + len(weighted.rows) + smoothed.index[where]
+        return channels[statistic.name, scenario, flare if statistic.shaped else 0]
 
-    nuisances = hypotheses.setting.nuisances
     subtractions = []
-    for statistic in asked if nuisances else []:
-        for scenario in range(n_scenario) if statistic.kernel_sum is not None else []:
-            begin = fixed * n_scenario + weighted.index[statistic.name, scenario, 0]
-            subtractions.append((row(statistic, scenario, 0), begin, begin + len(nuisances.names if nuisances else ())))
+    n_subtracted = len(hypotheses.nuisances.names) if hypotheses.nuisances else 0
+    sums = [statistic for statistic in asked if isinstance(statistic, Chi2)] if n_subtracted else []
+    for chi2, scenario in product(sums, range(n_scenario)):
+        begin = channels[chi2.name, scenario, 0]
+        subtractions.append((channel_of(chi2, scenario, 0), begin, begin + n_subtracted))
     grids: list[Grid] = []
     keys: list[Key] = []
 
@@ -327,19 +305,23 @@ def plan_channels(hypotheses: Hypotheses, batch: Sequence[int], *, first: bool) 
 
     for statistic in asked:
         if first and not statistic.shaped:
-            add(statistic, "null", 0, row(statistic, 0, 0), hypotheses.closed_form(statistic.name))
+            add(statistic, "null", 0, channel_of(statistic, 0, 0), hypotheses.closed_form(statistic.name))
         for i, flare in enumerate(batch):
             null = hypotheses.closed_form(statistic.name, template=flare)
             if statistic.shaped:
-                add(statistic, "null", flare, row(statistic, 0, flare), null)
-            channel = row(statistic, i + 1, flare)
+                add(statistic, "null", flare, channel_of(statistic, 0, flare), null)
+            channel = channel_of(statistic, i + 1, flare)
             add(statistic, "flare_on_null_grid", flare, channel, null)
             add(statistic, "flare", flare, channel, hypotheses.closed_form(statistic.name, flare))
-    weights = np.zeros((len(weighted.rows), len(hypotheses.scene.pixels)), np.float32)
-    weights[:, : hypotheses.scene.n_pixel] = np.array(weighted.rows).reshape(len(weights), hypotheses.scene.n_pixel)
-    scales = np.array(smoothed.rows, np.float32) if smoothed.rows else np.zeros((0, 1), np.float32)
-    ends = (np.array(ends, np.uint32) for ends in (weighted.ends, weighted.pixels_end, smoothed.ends))
-    linear_end, pixels_end, scale_end = ends
+    weights = np.zeros((len(weighted), len(hypotheses.scene.pixels)), np.float32)
+    for own, padded in zip(weighted.values(), weights, strict=True):
+        padded[: own.size] = own
+    scales = np.array([*smoothed.values()], np.float32) if smoothed else np.zeros((0, 1), np.float32)
+    linear_end, scale_end = (
+        np.cumsum(_per_scenario(rows, n_scenario), dtype=np.uint32) for rows in (weighted, smoothed)
+    )
+    of_elements = [key for key in weighted if hypotheses.statistic(key[0]).by_element]
+    pixels_end = linear_end - _per_scenario(of_elements, n_scenario)
     taken = np.array(subtractions, np.uint32).reshape(len(subtractions), 3).T
     return ChannelPlan(weights, linear_end, pixels_end, scales, scale_end, grids, keys, taken)
 
@@ -396,21 +378,17 @@ class Countable:
         words = {name: how.pop(name) for name in DrawingOptions.__annotations__ if name in how}
         return cls(*what, **how | {"drawing": Drawing(**words)})
 
+    def __post_init__(self) -> None:
+        check_last(self.start, self.realisations)
+
     def __getstate__(self) -> dict[str, Any]:
         """Return the state to pickle: request fields only, no caches."""
         return {each.name: getattr(self, each.name) for each in fields(self)}  # type: ignore[arg-type]
 
 
-class _RealisationRequest(Countable):
-    """Base class of requests for realisations."""
-
-    def __post_init__(self) -> None:
-        check_last(self.start, self.realisations)
-
-
 @validated
 @dataclass(frozen=True, eq=False)
-class DetectRequest(_RealisationRequest):
+class DetectRequest(Countable):
     """Arguments of `Engine.detect`."""
 
     quiet: Expectation
@@ -432,8 +410,8 @@ class DetectRequest(_RealisationRequest):
     def hypotheses(self) -> Hypotheses:
         """Scene and statistics of the request."""
         scene = prepare([self.quiet, *self.flares], self.drawing, comparison=self.comparison)
-        nuisances = as_nuisances(self.nuisances, self.quiet)
-        return Hypotheses(self.quiet, self.flares, self.statistics, scene, nuisances=nuisances)
+        assert not isinstance(self.nuisances, Mapping)
+        return Hypotheses(self.quiet, self.flares, self.statistics, scene, nuisances=self.nuisances)
 
     @cached_property
     def plans(self) -> list[tuple[ChannelPlan, Scene]]:
@@ -459,7 +437,7 @@ class DetectRequest(_RealisationRequest):
 
 @validated
 @dataclass(frozen=True, eq=False)
-class SnrRequest(_RealisationRequest):
+class SnrRequest(Countable):
     """Arguments of `Engine.snr`."""
 
     expectation: Expectation
@@ -481,7 +459,7 @@ class SnrRequest(_RealisationRequest):
 
 @validated
 @dataclass(frozen=True, eq=False)
-class RealiseRequest(_RealisationRequest):
+class RealiseRequest(Countable):
     """Arguments of `Engine.realise`, computed as a single shard, so callers limit the number of realisations."""
 
     expectation: Expectation

@@ -37,7 +37,7 @@ class Setting:
     nuisances: Nuisances | None = None  # parameters that statistics marginalise over
     # Random factors over which closed forms of marginalised statistics integrate.
     drawn: FactorDistributions | None = None
-    _cache: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
+    _cache: dict[tuple[str, int], Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __getstate__(self) -> dict[str, Any]:
         # Keys of the cache hold identities of objects, which are valid in this process only.
@@ -53,11 +53,12 @@ class Setting:
         """Whether closed forms integrate over the drawn factors."""
         return bool(self.nuisances and self.drawn and not self.comparison.exposures)
 
-    def cached(self, name: str, make: Callable[[], T]) -> T:
-        """Cache an expensive intermediate result."""
-        if name not in self._cache:
-            self._cache[name] = make()
-        return cast("T", self._cache[name])
+    def cached(self, name: str, make: Callable[[], T], flare: Expectation | None = None) -> T:
+        """Cache an expensive intermediate result, of a flare if it depends on one."""
+        # The cached value holds the flare, so that no other object can get its identity.
+        if (name, id(flare)) not in self._cache:
+            self._cache[name, id(flare)] = flare, make()
+        return cast("T", self._cache[name, id(flare)][1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,10 +158,7 @@ class Statistic(ABC):
             null = self.closed_form(setting, setting.quiet, template)
             return null, null.isf(fap)
 
-        if self.shaped:
-            null, threshold = null_and_threshold()
-        else:
-            null, threshold = setting.cached(f"null of {self.name} at {fap!r}", null_and_threshold)
+        null, threshold = setting.cached(f"null of {self.name} at {fap!r}", null_and_threshold, template)
         return DetectionForms(null, self.closed_form(setting, flare, template), threshold)
 
     def integrate_drawn(
@@ -244,11 +242,7 @@ class LinearStatistic(Statistic):
         Plain weights w search for the spectrum V w. Marginalised weights are C^-1 V w (generalised least squares),
         which for the matched filter is C^-1 delta. Raises InputError if the nuisance spectra span V w.
         """
-        # The cached value holds the flare, so that no other object can get its identity.
-        made = setting.cached(
-            f"weights of {self.name} for {id(flare)}", lambda: (flare, self._weights_per_dn(setting, flare))
-        )
-        return made[1]
+        return setting.cached(f"weights of {self.name}", lambda: self._weights_per_dn(setting, flare), flare)
 
     def _weights_per_dn(self, setting: Setting, flare: Expectation | None) -> Float:
         weights = self.plain_weights(setting, flare)
@@ -310,21 +304,6 @@ class LinearStatistic(Statistic):
         along = self.weights_per_dn(setting, flare) * np.sqrt(self.variance(setting))
         length = float(np.linalg.norm(along))
         return Tilt((along / length)[None], per_sigma=1.0 if setting.comparison.estimated else length)
-
-
-class QuadraticStatistic(Statistic):
-    """A sum of squares of the differences, a generalised chi-squared variable for Gaussian noise."""
-
-    @abstractmethod
-    def square_weights(self, setting: Setting, flare: Expectation | None = None) -> Float:
-        """Return the coefficient of each pixel's squared difference, per DN^2, shape (n_pixel,)."""
-
-    def subtracted_rows(self, setting: Setting) -> Float:
-        """Return the weights per DN of the sums whose squares marginalisation subtracts, shape (k, n_pixel).
-
-        The weights apply to used pixels. They are equal within an element if the statistic is `by_element`.
-        """
-        return np.zeros((0, setting.used.size))
 
 
 #: Range of `uv_excess`, nm.

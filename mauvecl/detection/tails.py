@@ -400,17 +400,11 @@ def _block(
         excess = _excess(scene, z + move / root)
     subtracted = [_excess(scene, other - added * move / root) for other in others]
     mean = added * np.sum(subtracted, axis=0) if subtracted else np.zeros_like(excess)
-    return _value(hypotheses, statistic, template, excess, mean), logs
-
-
-def _value(hypotheses: Hypotheses, statistic: str, template: int, excess: Float, mean: Float) -> Float:
-    """Return the statistic of draws from observed and subtracted counts, DN above the reference, shape (n, n_pixel)."""
-    scene, kind = hypotheses.scene, hypotheses.statistic(statistic)
-    x, added = excess - mean, kind.added_variance(hypotheses.setting)
-    variance = np.broadcast_to(kind.variance(hypotheses.setting), x.shape)
+    variance = np.broadcast_to(kind.variance(hypotheses.setting), excess.shape)
     if scene.comparison.estimated:
         variance = _estimated(scene, excess) + added * _estimated(scene, mean)
-    return kind.values(hypotheses.setting, x, variance, hypotheses.shape(statistic, template))
+    shape = hypotheses.shape(statistic, template)
+    return kind.values(hypotheses.setting, excess - mean, variance, shape), logs
 
 
 def _estimated(scene: Scene, excess: Float) -> Float:

@@ -25,7 +25,7 @@ from mauvecl.flares.frames import MOST_STATISTICS, STEADY, Components
 from mauvecl.flares.stare import Stare
 from mauvecl.noise import layout
 from mauvecl.noise.disturbances import ADDITIVE
-from mauvecl.noise.drawing import Cumulants, expansion_error, joint_is_exact
+from mauvecl.noise.drawing import Cumulants, joint_is_exact, truncation_distance
 from mauvecl.noise.scene import Scene, padded, prepare
 from mauvecl.noise.unknowns import NONE, Processes
 from mauvecl.schema.calls import validated
@@ -560,7 +560,7 @@ def _fourths_are_needed(components: Components) -> bool:
     """
     shapes = _over_sd(components)
     least = 5.0 * np.sqrt(2.0 * CLASSES) / FRAMES_TO_NOTICE
-    beyond = expansion_error(shapes, fourth_power=False)
+    beyond = truncation_distance(shapes, fourth_power=False)
     if (beyond > least).any():
         row = int(np.argmax(beyond))
         raise InputError(

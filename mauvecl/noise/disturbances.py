@@ -376,7 +376,10 @@ def _from_study(given: Any) -> Prior:
         return given
     for kind, form in _FORMS.items():
         if isinstance(given, Mapping) and {key for key in given if given[key] is not None} == form.keys():
-            return kind(*(value for key, n in form.items() for value in _values(key, given[key], n)))
+            for key, n in form.items():
+                if not isinstance(given[key], list | tuple) or len(given[key]) != n:
+                    raise InputError.of(key, given[key], f"{n} numbers")
+            return kind(*(_number(value) for key in form for value in given[key]))
     keys = [key for form in _FORMS.values() for key in form]
     if isinstance(given, Mapping) and (other := next((key for key in given if key not in keys), None)):
         raise InputError(f"unknown key {other!r} of a prior; use some of {', '.join(keys)}", key=other)
@@ -385,17 +388,11 @@ def _from_study(given: Any) -> Prior:
     )
 
 
-def _values(key: str, given: Any, n: int) -> list[float]:
-    if not isinstance(given, list | tuple) or len(given) != n:
-        raise InputError.of(key, given, f"{n} numbers")
-    # Numbers in quotes are accepted, as in other fields.
-    return [float(value) if isinstance(value, int) or _is_number(value) else value for value in given]
-
-
-def _is_number(text: Any) -> bool:
+def _number(value: Any) -> Any:
+    """Convert a number in quotes, which other fields accept as well; return others unchanged."""
     with contextlib.suppress(ValueError):
-        return isinstance(text, str) and float(text) is not None
-    return False
+        return float(value) if isinstance(value, str) else value
+    return value
 
 
 def _to_study(prior: Prior) -> dict[str, tuple[float, ...]]:

@@ -100,14 +100,14 @@ class Cumulants:
         )
         return third, fourth, fifth
 
-    def over_sd(self, last: int) -> list[Float]:
-        """Return standardised cumulants from the third to order `last`, by products, which are faster than powers."""
+    def over_sd(self) -> list[Float]:
+        """Return the standardised third to seventh cumulants, by products, which are faster than powers."""
         sd = np.sqrt(self.variance)
         each = np.divide(1.0, sd, out=np.zeros_like(sd), where=sd > 0)
         light, dark = self.photon_step * each, self.dark_step * each
         of_light, of_dark = self.photons * light**2, self.dark_dn * each * dark
         bounds = []
-        for _ in range(3, last + 1):
+        for _ in range(3, 8):
             of_light, of_dark = of_light * light, of_dark * dark
             bounds.append(of_light + of_dark)
         return bounds
@@ -136,19 +136,15 @@ def is_noticeable(distance: Float, variance: Float) -> NDArray[np.bool_]:
     return np.asarray(distance * DRAWS_TO_NOTICE > 5.0 * np.sqrt(2.0 * steps))
 
 
-def truncation_distance(c: Cumulants, *, fourth_power: bool, varying: bool = False) -> Float:
+def truncation_distance(over_sd: Sequence[Float], *, fourth_power: bool, varying: bool = False) -> Float:
     """Estimate Pearson's distance between a draw and its polynomial from the next terms, shape (n_pixel,).
 
-    A term a He_k(z) changes the density by a He_(k + 1)(z) times the normal's, and the squares of these integrate to
-    a^2 (k + 1)!. Rounding to whole DN can only reduce the distance. `fourth_power` tells whether the polynomial
-    includes z^4, and `varying` selects the kernels' polynomial for factors on light and dark instead of `polynomial`;
-    without the fourth power, it has no terms of gamma_5.
+    `over_sd` holds the draw's standardised third to seventh cumulants. A term a He_k(z) changes the density by a
+    He_(k + 1)(z) times the normal's, and the squares of these integrate to a^2 (k + 1)!. Rounding to whole DN can only
+    reduce the distance. `fourth_power` tells whether the polynomial includes z^4, and `varying` selects the kernels'
+    polynomial for factors on light and dark instead of `polynomial`; without the fourth power, it has no terms of
+    gamma_5.
     """
-    return expansion_error(c.over_sd(7), fourth_power=fourth_power, varying=varying)
-
-
-def expansion_error(over_sd: Sequence[Float], *, fourth_power: bool, varying: bool = False) -> Float:
-    """Compute `truncation_distance` from the standardised third to seventh cumulants."""
     g3, g4, g5, g6, g7 = over_sd
     g3_3 = g3 * g3 * g3
     g3_4 = g3_3 * g3
@@ -169,14 +165,15 @@ def joint_is_exact(c: Cumulants) -> NDArray[np.bool_]:
     """Return the pixels whose noise can be drawn from one normal, shape (n_pixel,)."""
     step = np.maximum(np.where(c.dark_dn > 0, c.dark_step, 0.0), np.where(c.photons > 0, c.photon_step, 0.0))
     smooth = np.sqrt(c.gaussian) >= SMOOTH_STEPS * step
-    return np.asarray(
-        smooth & (c.over_sd(3)[0] <= MAX_SKEW) & ~is_noticeable(truncation_distance(c, fourth_power=True), c.variance)
-    )
+    over_sd = c.over_sd()
+    cut_off = is_noticeable(truncation_distance(over_sd, fourth_power=True), c.variance)
+    return np.asarray(smooth & (over_sd[0] <= MAX_SKEW) & ~cut_off)
 
 
 def needs_fourth_power(c: Cumulants, *, varying: bool = False) -> bool:
     """Return whether omitting the fourth power of the polynomial is noticeable; see `truncation_distance`."""
-    return bool(is_noticeable(truncation_distance(c, fourth_power=False, varying=varying), c.variance).any())
+    distance = truncation_distance(c.over_sd(), fourth_power=False, varying=varying)
+    return bool(is_noticeable(distance, c.variance).any())
 
 
 def stack_is_exact(c: Cumulants, x: Expectation) -> NDArray[np.bool_]:

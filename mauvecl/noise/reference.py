@@ -303,11 +303,11 @@ def components(
     parts = {name: np.zeros(scene.n_pixel) for name in names}
     raw = np.zeros(scene.n_pixel)
     for start in range(0, scene.n_draws, FRAMES_AT_ONCE):
-        frames = np.arange(start, min(start + FRAMES_AT_ONCE, scene.n_draws))
+        frames = range(start, min(start + FRAMES_AT_ONCE, scene.n_draws))
         one = _Parts(x, scene, realisation, frames, seed)
         for name, part in zip(names, one.all(), strict=True):
             parts[name] += part.sum(axis=1)
-        raw += frames.size * scene.base_dn[0] + one.recorded.sum(axis=1)
+        raw += len(frames) * scene.base_dn[0] + one.recorded.sum(axis=1)
     parts["bias"] = np.asarray(x.n_frames * x.bias_dn)
     values = {"wavelength": x.wavelength_nm, "raw": raw} | parts
     values["digitisation"] = raw - sum(parts.values())
@@ -322,12 +322,10 @@ def components(
 class _Parts:
     """Draws of several frames, or of the sum of all frames, in DN; arrays have the shape (n_pixel, n_draw)."""
 
-    def __init__(self, x: Expectation, scene: Scene, realisation: int, frames: NDArray[np.int64], seed: int) -> None:
+    def __init__(self, x: Expectation, scene: Scene, realisation: int, drawn_frames: range, seed: int) -> None:
         self.x, self.scene = x, scene
         self.each = x.n_frames // scene.n_draws  # frames in one draw
-        index = np.full(frames.size, realisation, np.uint64)
-        each_frame = [factors(scene, index[:1], frame, seed) for frame in frames.tolist()]
-        changes = [np.concatenate(factor) for factor in zip(*each_frame, strict=True)]
+        index, frames, changes = _all_frames(scene, np.array([realisation], np.uint64), drawn_frames, seed)
         self.light, self.warm, self.glow = (
             (1.0 + change.astype(np.float64)) * middle for change, middle in zip(changes, scene.medians, strict=True)
         )

@@ -114,35 +114,28 @@ class FactorDistributions:
     spreads: Mapping[str, FactorDistribution]
 
     @classmethod
-    def of(cls, scene: Scene) -> FactorDistributions | None:
-        """Return the distributions of a scene, or None if it draws no factors."""
-        medians = dict(zip(SIGNAL_PARTS, scene.medians, strict=True))
-        return cls._of(scene.modulations, scene.priors, medians, scene.n_frames)
-
-    @classmethod
     def from_processes(cls, processes: Processes, quiet: Expectation) -> FactorDistributions | None:
         """Return the distributions of processes for a star, or None if they draw no factors."""
-        if not processes.modulations:
-            return None
         factors = Factors.of(processes, quiet.conditions)
-        return cls._of(processes.modulations, factors.tables, factors.medians, quiet.n_frames)
+        return cls.of(processes.modulations, factors.tables, tuple(factors.medians.values()), quiet.n_frames)
 
     @classmethod
-    def _of(
+    def of(
         cls,
         modulations: Sequence[tuple[str, SignalPart]],
         tables: NDArray[np.float32],
-        medians: Mapping[SignalPart, float],
+        medians: tuple[float, ...],
         n_frames: int,
     ) -> FactorDistributions | None:
-        spreads: dict[SignalPart, list[FactorDistribution]] = {}
+        """Return the distributions of drawn factors, or None without any; parameters as the fields of `Scene`."""
+        at_median, spreads = dict(zip(SIGNAL_PARTS, medians, strict=True)), dict[SignalPart, list[FactorDistribution]]()
         for (name, factor), table in zip(modulations, tables, strict=True):
             # Relative to the factor at the median, as the table is.
             spread = FactorDistribution(1.0 + quantile_at_score(table, SCORE), WEIGHTS)
             if PROCESSES[name].when == "frame" and n_frames > 1:
                 spread = _normal(spread.mean, spread.sd / np.sqrt(n_frames))
             spreads.setdefault(factor, []).append(spread)
-        return cls({name: _product(ones, medians[name]) for name, ones in spreads.items()}) if spreads else None
+        return cls({name: _product(ones, at_median[name]) for name, ones in spreads.items()}) if spreads else None
 
     def nodes(self, x: Expectation, *, weighted: bool) -> tuple[list[Node], Float]:
         """Return the nodes over which a statistic of an exposure is integrated, and spectra of normal amplitudes.
@@ -492,7 +485,7 @@ class _PerScenario:
         if not comparison.exposures:
             fraction[:] = np.rint(mean_sum) - mean_sum
         level["shift"] = layout.MAGIC - whole
-        variance = variance_factor(comparison) * reference.variance_dn2
+        variance = (1.0 + comparison.added_variance) * reference.variance_dn2
         level["inverse_variance"] = used / variance
         level["twice"] = 2.0 * fraction * level["inverse_variance"]
         edge["base"], edge["whole"] = base, whole
@@ -505,11 +498,6 @@ class _PerScenario:
         with np.errstate(divide="ignore"):
             edge["inverse_element_variance"][ends] = np.where(element_variance > 0, 1.0 / element_variance, 0.0)
         edge["element_offset"][ends] = np.bincount(x.element, fraction * used)
-
-
-def variance_factor(comparison: Comparison) -> float:
-    """Return the factor by which the noise of the subtracted reference increases the null's variance."""
-    return 1.0 + comparison.added_variance
 
 
 def _job(
@@ -529,7 +517,7 @@ def _job(
     job["draw_count"], job["frame_count"] = quiet.n_frames if method.frames else 1, quiet.n_frames
     job["first_frame"], job["first_group"] = drawing.first_frame, first_group
     job["reference_count"], job["reference_weight"] = comparison.exposures, comparison.added_variance
-    job["pair_scale"] = variance_factor(comparison) / 2.0
+    job["pair_scale"] = (1.0 + comparison.added_variance) / 2.0
     for name, process in drawing.processes.additive.items():
         table = alias_table_of(process.charge(method.each * quiet.frame_s))
         job[f"{name}_table"] = sum(t.entries.size for t in tables)

@@ -492,7 +492,15 @@ class Comparison:
             ``"template"`` for the expectation, ``"exposure"`` for one exposure, ``"stack:n"`` for n exposures.
         variances : {"model", "estimated"}
         """
-        return cls(_exposures(reference), variances == "estimated")
+        word, colon, number = reference.partition(":")
+        if not colon and word in ("template", "exposure"):
+            exposures = int(word == "exposure")
+        elif word == "stack" and number.isdecimal() and 1 <= int(number) <= MAX_EXPOSURES:
+            exposures = int(number)
+        else:
+            expected = f"'template', 'exposure' or 'stack:n' with n from 1 to {MAX_EXPOSURES}"
+            raise InputError.of("reference", reference, expected)
+        return cls(exposures, variances == "estimated")
 
     @property
     def added_variance(self) -> float:
@@ -503,15 +511,6 @@ class Comparison:
     def plain(self) -> bool:
         """True if the comparison uses only the expectation and the variances of the model."""
         return not (self.exposures or self.estimated)
-
-
-def _exposures(reference: str) -> int:
-    word, colon, number = reference.partition(":")
-    if not colon and word in ("template", "exposure"):
-        return int(word == "exposure")
-    if word == "stack" and number.isdecimal() and 1 <= int(number) <= MAX_EXPOSURES:
-        return int(number)
-    raise InputError.of("reference", reference, f"'template', 'exposure' or 'stack:n' with n from 1 to {MAX_EXPOSURES}")
 
 
 #: Comparison with the expectation by the model's variances.
