@@ -16,9 +16,9 @@ from scipy import special
 
 from mauvecl.host.arrays import ContentEquality, true_runs
 from mauvecl.host.exposure import DEFAULT_SKY
+from mauvecl.host.exposure.neighbours import Neighbours
 from mauvecl.host.exposure.response import Order, electrons_per_second, negative_means_message
 from mauvecl.host.exposure.sky import Sky
-from mauvecl.host.exposure.star import Neighbours
 from mauvecl.host.instrument import DEFAULT_INSTRUMENT
 from mauvecl.host.instrument.instrument import Instrument, LineSpread
 from mauvecl.host.spectra.units import SPAN_NM

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, overload
 
 from mauvecl.host import VERSION
 from mauvecl.host.arrays import ContentEquality
-from mauvecl.host.exposure.star import rate_of
+from mauvecl.host.exposure.neighbours import rate_of
 from mauvecl.host.instrument import shipped_names
 from mauvecl.host.tables.files import check_size, json_text, open_regular, read_text, write_whole, writing
 from mauvecl.schema.calls import validated
@@ -499,7 +499,7 @@ def write_record(
 
 def _devices(devices: Sequence[DeviceRecord], kernels: str) -> dict[str, Any]:
     """Return what a run record says of the devices, with the outcome of the self-test on each if it was run."""
-    from mauvecl.device.selftest import read_outcome
+    from mauvecl.device.build import read_outcome
 
     missing = "not run on this device and version: mauvecl selftest"
     outcomes = [read_outcome(device) or missing for device in devices]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import json
 import os
 import shutil
 import sys
@@ -53,6 +54,22 @@ class DeviceRecord:
     @property
     def label(self) -> str:
         return f"{self.platform}: {self.name}"
+
+
+def write_outcome(device: DeviceRecord, record: dict[str, Any]) -> None:
+    """Write the outcome of the self-test on a device to the kernel cache."""
+    kernel_cache().write_text(_outcome_key(device), json.dumps(record))
+
+
+def read_outcome(device: DeviceRecord) -> dict[str, Any] | None:
+    """Return the latest outcome of the self-test on a device, or None."""
+    text = kernel_cache().read_text(_outcome_key(device))
+    return None if text is None else dict(json.loads(text))
+
+
+def _outcome_key(device: DeviceRecord) -> str:
+    said = f"selftest {VERSION} {device.label} {device.driver}"
+    return hashlib.sha256(said.encode()).hexdigest()[:32]
 
 
 @dataclass(frozen=True)

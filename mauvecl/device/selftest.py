@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
 import resource
 import signal
 import sys
@@ -24,8 +23,8 @@ from mauvecl.detection.counts import Distribution
 from mauvecl.detection.requests import STATISTICS
 from mauvecl.detection.snr import Arrays, Counts
 from mauvecl.device import drivers
-from mauvecl.device.build import SAME_BITS, DeviceRecord, choose_device
-from mauvecl.device.drivers import DeviceError, kernel_cache
+from mauvecl.device.build import SAME_BITS, DeviceRecord, choose_device, write_outcome
+from mauvecl.device.drivers import DeviceError
 from mauvecl.device.engine import Engine, devices
 from mauvecl.device.stares import Stares
 from mauvecl.flares.frames import Components
@@ -75,7 +74,7 @@ CHECK_COLUMNS = (
 )
 
 
-def write_outcome(device: DeviceRecord, checks: Sequence[Check], seconds: float) -> None:
+def record_outcome(device: DeviceRecord, checks: Sequence[Check], seconds: float) -> None:
     """Write the outcome to the kernel cache, for run records of the same device, driver and version."""
     record = {
         "mauvecl": VERSION,
@@ -85,18 +84,7 @@ def write_outcome(device: DeviceRecord, checks: Sequence[Check], seconds: float)
         "passed": all(check.passed for check in checks),
         "checks": [asdict(check) for check in checks],
     }
-    kernel_cache().write_text(_key(device), json.dumps(record))
-
-
-def read_outcome(device: DeviceRecord) -> dict[str, Any] | None:
-    """Return the latest outcome for a device, or None."""
-    text = kernel_cache().read_text(_key(device))
-    return None if text is None else dict(json.loads(text))
-
-
-def _key(device: DeviceRecord) -> str:
-    said = f"selftest {VERSION} {device.label} {device.driver}"
-    return hashlib.sha256(said.encode()).hexdigest()[:32]
+    write_outcome(device, record)
 
 
 def toy(

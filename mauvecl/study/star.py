@@ -29,7 +29,7 @@ from mauvecl.schema.physical import (
 from mauvecl.schema.section import Section, read_line_fluxes
 
 if TYPE_CHECKING:
-    from mauvecl.host.exposure.star import Neighbours
+    from mauvecl.host.exposure.neighbours import Neighbours
     from mauvecl.host.stars.flare_spectra import FlareSpectrum
     from mauvecl.host.stars.source import Source
 
@@ -221,7 +221,8 @@ class Star(Section):
         """Read the star's neighbours, or return None if it has none."""
         if self.neighbours is None:
             return None
-        from mauvecl.host.exposure.star import Neighbours, read_neighbours
+        from mauvecl.host.exposure.neighbour_tables import read_neighbours
+        from mauvecl.host.exposure.neighbours import Neighbours
 
         stars, notes = read_neighbours(self.neighbours, self.neighbours_of)
         return Neighbours(stars, self.neighbour_share, notes)

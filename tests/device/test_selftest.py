@@ -124,7 +124,7 @@ def test_selftest_command_reports_and_records_outcome(tmp_path: Path, monkeypatc
     """Check table, file, exit codes 0 and 1 (failed check), and the outcome in later run records."""
     # A separate store keeps these invented outcomes out of the user's.
     store = drivers.KernelCache(tmp_path, tmp_path)
-    monkeypatch.setattr("mauvecl.device.selftest.kernel_cache", lambda: store)
+    monkeypatch.setattr("mauvecl.device.build.kernel_cache", lambda: store)
     checks = [selftest.Check("one thing", True, "as it should be")]
     monkeypatch.setattr(selftest, "run", lambda engine: checks)
     good = run("selftest", "--quiet", "--output", tmp_path, folder=tmp_path).stdout
