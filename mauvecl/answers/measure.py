@@ -16,13 +16,10 @@ from numpy.typing import NDArray
 
 from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf, reported
 from mauvecl.answers.measurements import (
-    JOINT_COLUMNS,
     ExpectedMeasurement,
-    MeasuredStare,
     expected_measurements,
     fit_model,
     matched_filter,
-    measured_stare,
 )
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection.distributions import Interval, clopper_pearson
@@ -30,7 +27,6 @@ from mauvecl.detection.nuisances import join_names
 from mauvecl.device.engine import Engine
 from mauvecl.fits.flare_model import usable_variance
 from mauvecl.fits.spectrum import LEVELS, Measurement
-from mauvecl.fits.time_course import MeasuredBins
 from mauvecl.noise.scene import FactorDistributions
 from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool, map_in_order
@@ -41,6 +37,7 @@ from mauvecl.study.questions import check_sweep
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
+    from mauvecl.answers.measured_stares import MeasuredStare
     from mauvecl.detection.snr import Arrays
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.study.cases import Use
@@ -183,9 +180,26 @@ def _quantity_columns(answer: MeasureAnswer) -> tuple[Column, ...]:
     return (amplitude_column(), MODEL_COLUMN, *COLUMNS[:place], *by_throughput, *COLUMNS[place:])
 
 
+#: Columns of joint fits of shape and spectrum.
+JOINT_COLUMNS = (
+    Column("quantity", "joint.found.names", "", "what is measured", "quantity"),
+    Column("unit", "joint.found.units", "", "of truth, estimate and intervals", "unit"),
+    Column("truth", "joint.truth", "", "true value; undefined where the flare has none", "truth", number(".4g")),
+    Column("estimate", lambda row: row.joint.found.estimates[0], "", "of maximum likelihood", "estimate", ".4g"),
+    Column("error", lambda row: row.joint.found.errors[0], "", "its standard error", "error", ".2g"),
+    Column("low_68", lambda row: row.joint.found.low[0, 0], "",
+           "lower end of its 68 % interval; infinite if there is none"),
+    Column("high_68", lambda row: row.joint.found.high[0, 0], "", "higher end"),
+    Column("low_95", lambda row: row.joint.found.low[1, 0], "", "lower end of its 95 % interval", "95 % from", ".4g"),
+    Column("high_95", lambda row: row.joint.found.high[1, 0], "", "higher end", "to", ".4g"),
+    Column("p_value", "joint.found.p_value", "",
+           "probability of a chi-squared of the fit at least as large where the model is right"),
+)  # fmt: skip
+
+
 def _bin_columns(stare: MeasuredStare) -> list[Column]:
     """Return the columns of measurements along a stare."""
-    assert isinstance(stare.drawn, MeasuredBins)
+    assert stare.drawn is not None
     columns = [column.of(attrgetter("drawn")) for column in stare.drawn.columns]
     exact = Column("temperature_without_noise", lambda row: row.perfect.found.estimates[:, 0], "K",
                    "temperature fitted to the means of these frames", "without noise", ".0f")  # fmt: skip
@@ -227,7 +241,7 @@ class MeasureAnswer(Answer):
     @property
     def binned(self) -> list[MeasuredStare]:
         """Stares in which some bin has the requested S/N."""
-        return [stare for stare in self.stares if isinstance(stare.drawn, MeasuredBins)]
+        return [stare for stare in self.stares if stare.drawn is not None]
 
     @property
     def headline(self) -> str:
@@ -284,9 +298,14 @@ def measure(study: Study, engine: Engine | Pool | None = None, progress: Progres
     asked = [(case, *flare, engine) for case in prepared for flare in zip(case.amplitudes, case.flares, strict=True)]
     measured = reported(map_in_order(engine, lambda row: _measured(*row), asked), len(asked), progress)
     flares = list(chain.from_iterable(measured))
-    stares = [measured_stare(case, engine) for case in prepared if study.measure.along_stare]
+    stares = []
+    if study.measure.along_stare:
+        # Single exposures do not need the modules of stares.
+        from mauvecl.answers.measured_stares import measured_stare
+
+        stares = [measured_stare(case, engine) for case in prepared]
     messages = collect_messages(expectations)
-    messages += [stare.drawn for stare in stares if isinstance(stare.drawn, str)]
+    messages += [stare.unmeasured for stare in stares if stare.unmeasured]
     messages += dict.fromkeys(line for case in prepared for line in _not_marginalised(case))
     return MeasureAnswer(study, flares, [*messages, *_faint(flares), *_wrong(flares)], stares)
 

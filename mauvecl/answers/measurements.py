@@ -1,4 +1,4 @@
-"""Measurements of flares that are expected or simulated, in single frames and along stares."""
+"""Measurements of flares that are expected or simulated, in single exposures."""
 
 from __future__ import annotations
 
@@ -21,9 +21,6 @@ from mauvecl.fits.spectrum import (
     fit_two_temperatures,
     forecast_model,
 )
-from mauvecl.fits.time_course import MeasuredBins, cooling_course, cooling_event, fit_bins, fit_cooling, measure_along
-from mauvecl.flares.settings import Cooling
-from mauvecl.flares.stare_scene import StaresRequest
 from mauvecl.host.arrays import true_runs
 from mauvecl.host.stars.bands import photons
 from mauvecl.host.stars.flare_spectra import (
@@ -35,18 +32,11 @@ from mauvecl.host.stars.flare_spectra import (
     FlareWithLines,
     TwoBlackbodies,
 )
-from mauvecl.runs.checkpoint import kept
-from mauvecl.runs.pool import Pool
-from mauvecl.schema.columns import Column, number
 from mauvecl.schema.errors import InputError
 from mauvecl.study.analyses import fitted_models
 
 if TYPE_CHECKING:
     from mauvecl.detection.nuisances import Nuisances
-    from mauvecl.device.engine import Engine
-    from mauvecl.fits.time_course import CoolingCourse
-    from mauvecl.flares.frames import Components, StareExpectation
-    from mauvecl.flares.stare import Event
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.host.stars.flare_spectra import FlareSpectrum
     from mauvecl.host.stars.source import Source
@@ -316,100 +306,3 @@ def matched_filter(
         weights = weights - (rows @ delta) @ rows
     power = float(weights @ delta)
     return (weights / np.sqrt(power), float(np.sqrt(power))) if power > 0 else (weights, 0.0)
-
-
-JOINT_COLUMNS = (
-    Column("quantity", "joint.found.names", "", "what is measured", "quantity"),
-    Column("unit", "joint.found.units", "", "of truth, estimate and intervals", "unit"),
-    Column("truth", "joint.truth", "", "true value; undefined where the flare has none", "truth", number(".4g")),
-    Column("estimate", lambda row: row.joint.found.estimates[0], "", "of maximum likelihood", "estimate", ".4g"),
-    Column("error", lambda row: row.joint.found.errors[0], "", "its standard error", "error", ".2g"),
-    Column("low_68", lambda row: row.joint.found.low[0, 0], "",
-           "lower end of its 68 % interval; infinite if there is none"),
-    Column("high_68", lambda row: row.joint.found.high[0, 0], "", "higher end"),
-    Column("low_95", lambda row: row.joint.found.low[1, 0], "", "lower end of its 95 % interval", "95 % from", ".4g"),
-    Column("high_95", lambda row: row.joint.found.high[1, 0], "", "higher end", "to", ".4g"),
-    Column("p_value", "joint.found.p_value", "",
-           "probability of a chi-squared of the fit at least as large where the model is right"),
-)  # fmt: skip
-
-
-@dataclass(frozen=True, eq=False)
-class JointFit:
-    """Fit of shape and spectrum to all frames, with the drawn flare."""
-
-    found: Measurement
-    truth: Float  # shape (n_derived,)
-    true: CoolingCourse
-    fitted: CoolingCourse
-
-
-@dataclass(frozen=True, eq=False)
-class MeasuredStare(InCell):
-    """Flares of a simulated stare, measured in bins of frames with one model, and by a joint fit."""
-
-    model: str
-    staring: StareExpectation
-    events: tuple[Event, ...]
-    drawn: MeasuredBins | str | None  # a sentence if no bin reaches the S/N
-    perfect: MeasuredBins | None  # the same bins without noise
-    joint: JointFit | None
-
-
-def measured_stare(case: Case, engine: Engine | Pool) -> MeasuredStare:
-    """Draw the stare of a case, and measure its flares."""
-    study, asked = case.study, case.study.measure
-    staring, events = case.stare_expectation, case.events
-    if asked.joint_fit and len(events) != 1:
-        raise InputError(
-            f"a joint fit needs a stare with a single flare, but it has {len(events)}", key="measure.joint_fit"
-        )
-    quiet, stare, seed = staring.quiet, staring.stare, study.run.seed
-    name, model = last_of_one_temperature(models_of(case.one_frame))
-    unknown = case.unknowns_of_fits(quiet, stare)
-    processes = study.processes.additive_only
-
-    def draw(components: Components) -> Float:
-        from mauvecl.device.stares import Stares
-
-        request = StaresRequest(components, stare, 1, seed, staring.flare, start=study.stare.number, method="pixels",
-                                processes=processes)  # fmt: skip
-        reduced = engine.stares if isinstance(engine, Pool) else Stares(engine.open_device).reduced
-        return np.asarray(reduced(request)["values"][0], np.float64)
-
-    checkpoint = engine.checkpoint if isinstance(engine, Pool) else None
-    depends_on = ("pixels", quiet, staring.flare_electrons, stare, staring.flare, study.stare.number, seed, processes)
-    raw = kept(checkpoint, depends_on, lambda: {"frames": staring.raw(draw)})["frames"]
-    where = case.label, case.at, name, staring, tuple(events)
-    joint = _joint_fit(case, raw, unknown) if asked.joint_fit else None
-    if asked.snr_per_bin is None:
-        return MeasuredStare(*where, None, None, joint)
-    try:
-        bins = measure_along(raw, quiet, model, unknown, snr_per_bin=asked.snr_per_bin, stare=stare,
-                             skipped_nm=asked.skipped_nm)  # fmt: skip
-    except InputError as error:
-        sentence = f"No flare of {case.label} is measured along the stare: {error}."
-        return MeasuredStare(*where, sentence, None, joint)
-    perfect = fit_bins(
-        staring.mean_raw, quiet, model, unknown, stare, bins.first, bins.count, skipped_nm=asked.skipped_nm
-    )
-    return MeasuredStare(*where, bins, perfect, joint)
-
-
-def _joint_fit(case: Case, raw: Float, unknown: Nuisances | None) -> JointFit:
-    """Fit a blackbody to the one flare of a stare; the search for the best fit starts from the true flare."""
-    staring, (event,), model = case.stare_expectation, case.events, model_of(case.one_frame)
-    quiet, stare, skipped = staring.quiet, staring.stare, case.study.measure.skipped_nm
-    measurement = fit_cooling(
-        raw, quiet, model, unknown, peak_s=event.peak_s, half_width_s=event.half_width_s, shape=event.form,
-        cooling=isinstance(event.temperature, Cooling), stare=stare, skipped_nm=skipped,
-    )  # fmt: skip
-    true, fitted = (
-        cooling_course(flare_event, measurement, raw, quiet, model, stare, skipped)
-        for flare_event in (event, cooling_event(measurement, event.form))
-    )
-    truth = true.values
-    if not case.study.flare.is_blackbody:
-        # Only the shape is that of the model.
-        truth = np.where(np.arange(truth.size) < 2, truth, np.nan)
-    return JointFit(measurement, truth, true, fitted)

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from mauvecl.answers.limit import LimitAnswer
     from mauvecl.answers.map import MapAnswer
     from mauvecl.answers.measure import MeasureAnswer, MeasuredFlare
-    from mauvecl.answers.measurements import JointFit, MeasuredStare
+    from mauvecl.answers.measured_stares import JointFit, MeasuredStare
     from mauvecl.answers.signal import ExposureAnswer, SnrAnswer
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.study.study import Study
@@ -371,7 +371,6 @@ def temperatures(star: MeasuredStare) -> Picture:
     """
     drawn, perfect, rows = star.drawn, star.perfect, list[list[Panel]]()
     assert drawn is not None
-    assert not isinstance(drawn, str)
     assert perfect is not None
     measurement = drawn.found
     size = "area" if "area" in measurement.names else "amplitude"

@@ -37,7 +37,6 @@ from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from mauvecl.detection.snr import Arrays
-    from mauvecl.study.study import Study
 
 
 @contextlib.contextmanager
@@ -188,6 +187,7 @@ class Checkpoint:
         Existing output folder of the run.
     verb : str
     study : Study
+        Any object with a method `toml`; checkpoints do not know the sections of a study.
     resume : bool
         Whether to continue an unfinished run.
     restart : bool
@@ -209,7 +209,7 @@ class Checkpoint:
         self,
         folder: Path,
         verb: str,
-        study: Study,
+        study: Any,
         *,
         resume: bool = False,
         restart: bool = False,

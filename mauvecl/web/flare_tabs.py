@@ -410,8 +410,8 @@ def course(closed: ClosedForms, answers: Answers) -> ChartData:
             measurement.names[:4], measurement.units, measurement.estimates[0], measurement.errors[0], strict=False
         )
         words += [f"{name} {short(best)} +- {short(error)} {unit}".strip() for name, unit, best, error in each]
-    if isinstance(stare_fit.drawn, str):
-        words.append(stare_fit.drawn)
+    if stare_fit.unmeasured:
+        words.append(stare_fit.unmeasured)
     elif stare_fit.drawn is not None:
         bins = stare_fit.drawn
         x, kelvin = (bins.start_s + bins.end_s) / 2, bins.found.estimates[:, 0]
