@@ -18,13 +18,13 @@ from typer.main import get_command
 
 import mauvecl
 from mauvecl import Instrument, Study
+from mauvecl.answers.verbs import VERBS
 from mauvecl.cli import app
 from mauvecl.observations.mapping import FrameMapping
 
 FILE = Path(__file__).parent / "data" / "public_interface.txt"
 #: What is listed, with the least number of lines; fewer would mean that the listing lost sight of something.
 LEAST = {"command": 500, "study": 150, "instrument": 30, "mapping": 10, "column": 300, "python": 300}
-#: Older names of functions.
 #: Classes that functions make, or that files fill: their constructors are not public.
 MADE = {"Detection", "Expectation", "Frames", "Instrument", "Source", "Study"}
 
@@ -49,13 +49,14 @@ def keys(section: Any, kind: str) -> Iterator[str]:
 
 
 def columns() -> Iterator[str]:
-    """Yield each column that a table can have, by the answer or the package that declares it."""
+    """Yield each column that a table can have, by the module of a verb or the package that declares it."""
+    verbs = {verb.module for verb in VERBS.values()}
     for package in ("answers", "detection", "flares", "fits", "search", "noise", "runs"):
         home = import_module(f"mauvecl.{package}")
         for found in pkgutil.walk_packages(home.__path__, f"{home.__name__}."):
             module = import_module(found.name)
             where = found.name.removeprefix("mauvecl.")
-            where = where if package == "answers" else package
+            where = where if where in verbs else package
             for declared in vars(module).values():
                 if isinstance(declared, tuple) and declared and all(type(one).__name__ == "Column" for one in declared):
                     for one in declared:
