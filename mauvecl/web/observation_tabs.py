@@ -449,11 +449,6 @@ def expected(closed: ClosedForms, answer: PlanAnswer) -> ChartData:
     return ChartData(f"Expected to be recovered: {'; '.join(parts)}.", {"found": lines})
 
 
-def plan_words(question: Question) -> str:
-    """Return the targets, hours and days."""
-    return f"{target_words(question)}, {question.hours:g} h each at most"
-
-
 def columns_of_plan(question: Question) -> list[list[str]]:
     """Return the targets, and the columns that a plan will have."""
     names = [target["name"] for target in question.targets] or ["each target"]
@@ -470,7 +465,7 @@ PLAN = Tab(
     never=("false_alarms", "as_observed"),
     pictures=(recovered, expected),
     files=dict.fromkeys(("plan", "stars", "energies", "assumptions"), "plan"),
-    words=plan_words,
+    words=lambda question: f"{target_words(question)}, {question.hours:g} h each at most",
     rows_before=columns_of_plan,
     needs="targets",
 )
