@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 import warnings
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin
 
 import typer
 
+from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help, Unit, as_typed, first, is_measure
 
 if TYPE_CHECKING:
@@ -190,12 +190,13 @@ def is_star(given: Path) -> bool:
 
 def _is_toml(file: Path) -> bool:
     """Return whether a file contains TOML, that is a study, regardless of its name."""
-    from mauvecl.host.tables.files import read_bytes
+    from mauvecl.host.tables.files import as_text, read_bytes, toml
 
     try:
-        tomllib.loads(read_bytes(file, "file")[:1_000_000].decode())
-    except (ValueError, RecursionError):
-        return False
+        toml(as_text(read_bytes(file, "file")[:1_000_000], "file"), "file")
+    except InputError as error:
+        # A key that has a value which no study may have is for the study to report.
+        return error.key not in ("file", None)
     return True
 
 

@@ -43,7 +43,7 @@ from mauvecl.schema.errors import InputError
 from mauvecl.web.closed_forms import Answers, short
 from mauvecl.web.sandboxed_reader import read_limited
 from mauvecl.web.tab import Tab, target_words
-from mauvecl.web.uploads import MOST_VALUES, VisitorFile, read_frames_of
+from mauvecl.web.uploads import MOST_VALUES, VisitorFile, read_frames_of, unpacked
 
 if TYPE_CHECKING:
     from bokeh.models.sources import ColumnDataSource
@@ -270,7 +270,7 @@ def photon_transfer(closed: ClosedForms, answer: CalibrateAnswer) -> ChartData:
 def read_observations(question: Question) -> dict[str, Any]:
     """Read frames and spectra."""
     archive: Observations = question.uploads["observations"]
-    files = {name: VisitorFile(name, content) for name, content in archive.files.items()}
+    files = {name: VisitorFile(name, content) for name, content in unpacked(archive.content).items()}
     frames, stars = [], []
     for row in archive.rows:
         mapping = files[str(row.mapping)] if row.mapping else None
@@ -449,11 +449,6 @@ def expected(closed: ClosedForms, answer: PlanAnswer) -> ChartData:
     return ChartData(f"Expected to be recovered: {'; '.join(parts)}.", {"found": lines})
 
 
-def plan_words(question: Question) -> str:
-    """Return the targets, hours and days."""
-    return f"{target_words(question)}, {question.hours:g} h each at most"
-
-
 def columns_of_plan(question: Question) -> list[list[str]]:
     """Return the targets, and the columns that a plan will have."""
     names = [target["name"] for target in question.targets] or ["each target"]
@@ -470,7 +465,7 @@ PLAN = Tab(
     never=("false_alarms", "as_observed"),
     pictures=(recovered, expected),
     files=dict.fromkeys(("plan", "stars", "energies", "assumptions"), "plan"),
-    words=plan_words,
+    words=lambda question: f"{target_words(question)}, {question.hours:g} h each at most",
     rows_before=columns_of_plan,
     needs="targets",
 )

@@ -40,12 +40,13 @@ Spectrum = TypeVar("Spectrum", Source, ObservedFlare, ReadSpectrum)
 NEIGHBOURS_FILE = "neighbours.csv"
 
 
-def content_folder(folder: Path, content: bytes, fill: Callable[[Path], object]) -> Path:
-    """Return the subfolder for some content, named after its digest; the first call fills it."""
+def content_folder(folder: Path, content: bytes, files: Callable[[], Mapping[str, bytes]]) -> Path:
+    """Return the subfolder for some content, named after its digest; the first call writes its files."""
     home = folder / hashlib.sha256(content).hexdigest()
     if not home.exists():
         new = Path(tempfile.mkdtemp(dir=folder))
-        fill(new)
+        for name, file in files().items():
+            (new / name).write_bytes(file)
         # Another thread may have been faster; the visitor's folder is removed as a whole.
         with contextlib.suppress(OSError):
             new.rename(home)
@@ -73,19 +74,9 @@ class Observations:
         """Keep an archive of observations; raises InputError if it lacks a file."""
         return cls(printable(name, MOST_NAME), content, observations_in(unpacked(content)))
 
-    @property
-    def files(self) -> dict[str, bytes]:
-        """Contents by name without folders, unpacked on each call since they are large."""
-        return unpacked(self.content)
-
     def written(self, folder: Path) -> list[dict[str, Any]]:
         """Write the files below a folder, once, and return the observations with their paths."""
-
-        def unpack(new: Path) -> None:
-            for name, content in self.files.items():
-                (new / name).write_bytes(content)
-
-        home = content_folder(folder, self.content, unpack)
+        home = content_folder(folder, self.content, lambda: unpacked(self.content))
         data = (row.model_dump(exclude_none=True) for row in self.rows)
         return [row | {key: str(home / row[key]) for key in PATHS if key in row} for row in data]
 
@@ -181,22 +172,23 @@ def _observations(name: str, content: bytes) -> list[dict[str, Any]]:
 
 def write_table(text: str, folder: Path) -> Path:
     """Write a table of neighbours to a file, once per text, and return its path."""
-    home = content_folder(folder, text.encode(), lambda new: (new / NEIGHBOURS_FILE).write_text(text))
-    return home / NEIGHBOURS_FILE
+    return content_folder(folder, text.encode(), lambda: {NEIGHBOURS_FILE: text.encode()}) / NEIGHBOURS_FILE
 
 
 def write_spectrum(source: Source | ReadSpectrum, folder: Path, name: str) -> Path:
     """Write an uploaded spectrum to a file of this name without loss, once per spectrum, and return its path."""
     from astropy.table import Table
 
-    def write(new: Path) -> None:
+    def files() -> dict[str, bytes]:
         table = Table({"wavelength": source.wavelength_nm, "flux": source.flux_flam})
         table["wavelength"].unit, table["flux"].unit = "nm", "erg / (s cm2 Angstrom)"
         table.meta |= {"name": source.name, "told": list(source.messages)}
-        table.write(new / name, format="ascii.ecsv")
+        text = io.StringIO()
+        table.write(text, format="ascii.ecsv")
+        return {name: text.getvalue().encode()}
 
     content = name.encode() + source.wavelength_nm.tobytes() + source.flux_flam.tobytes()
-    return content_folder(folder, content, write) / name
+    return content_folder(folder, content, files) / name
 
 
 #: Largest size of an upload, bytes, and largest number of points of its spectrum.
@@ -248,10 +240,8 @@ class VisitorFile:
 
     def written(self, folder: Path) -> Path:
         """Write the file below a folder, once, and return its path."""
-        home = content_folder(
-            folder, self.name.encode() + self.content, lambda new: (new / self.name).write_bytes(self.content)
-        )
-        return home / self.name
+        content = self.name.encode() + self.content
+        return content_folder(folder, content, lambda: {self.name: self.content}) / self.name
 
 
 def _options(*names: str) -> dict[str, str]:

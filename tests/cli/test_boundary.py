@@ -160,8 +160,9 @@ def test_extreme_numbers_in_instruments_raise(tmp_path: Path) -> None:
 )
 def test_deep_nesting_is_refused(text: str, tmp_path: Path) -> None:
     """Refuse keys of 50 000 parts, which raised RecursionError or took 3.8 GB."""
-    (tmp_path / "deep.toml").write_text(text)
-    refused("simulate", "deep.toml", folder=tmp_path)
+    for name in ("deep.toml", "deep"):
+        (tmp_path / name).write_text(text)
+        refused("simulate", name, folder=tmp_path)
     refused(*OBSERVE, "--instrument", "deep.toml", folder=tmp_path)
     refused(*OBSERVE, "--set", text.replace("a = ", "run.fap="), folder=tmp_path)
 
