@@ -28,7 +28,7 @@ from mauvecl.detection.requests import STATISTICS
 from mauvecl.runs.pool import LocalWorkers, Pool
 from mauvecl.schema.errors import InputError
 from mauvecl.web.closed_forms import ClosedForms, Question
-from mauvecl.web.fields import FIELDS, UPLOADED_FILE, Choice, Number
+from mauvecl.web.fields import FIELDS, IDEAL, UPLOADED_FILE, Choice, Number
 from mauvecl.web.page import TABS, State, reads_of
 from mauvecl.web.tab import Tab, commands_and_programs, simulate
 
@@ -76,7 +76,7 @@ def random_link(generator: np.random.Generator) -> str:
         entered["second_temperature_k"] = ""
     entered["shortest_d"], entered["longest_d"] = sorted((entered["shortest_d"], entered["longest_d"]), key=float)
     if STATISTICS[entered["statistic"]].paired or entered["statistic"] == "paper":
-        entered |= {"unknown": "nothing", "own_unknown": ""}
+        entered |= {"unknown": IDEAL, "own_unknown": ""}
     return "?" + urlencode(entered)
 
 

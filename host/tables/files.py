@@ -312,11 +312,8 @@ def is_file(path: Path) -> bool:
 
 
 def toml(text: str, what: str) -> dict[str, Any]:
-    """Parse TOML; raise InputError if it is invalid, or as `possible`."""
-    parts = max(part.count(".") for part in re.split(r"[=,{}\[\]\n#]", text))
-    if parts > MOST_PARTS:
-        # The memory of Python's parser grows with the square of this number.
-        raise InputError(f"{what} has a key of {parts} parts, but may have at most {MOST_PARTS}", key="file")
+    """Parse TOML; raise InputError if it is invalid, or as `check_keys` and `possible`."""
+    check_keys(text, what)
     with parsing(what, "give TOML"):
         try:
             tree = tomllib.loads(text)
@@ -324,6 +321,14 @@ def toml(text: str, what: str) -> dict[str, Any]:
             raise InputError(f"{what} must be valid TOML: {printable(str(error), 160)}", key="file") from error
     possible(tree, what)
     return tree
+
+
+def check_keys(text: str, what: str) -> None:
+    """Raise InputError for TOML with a key of too many parts."""
+    parts = 1 + max(part.count(".") for part in re.split(r"[=,{}\[\]\n#]", text))
+    if parts > MOST_PARTS:
+        # The memory of Python's parser grows with the square of this number.
+        raise InputError(f"{what} has a key of {parts} parts, but may have at most {MOST_PARTS}", key="file")
 
 
 def json_data(text: str, what: str) -> Any:

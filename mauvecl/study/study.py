@@ -19,7 +19,16 @@ from pydantic import BaseModel, Field, model_validator
 from mauvecl.detection.names import DEFAULT_STATISTICS, countable, least_countable
 from mauvecl.host.instrument import FORMER_NAMES, FORMERLY_MAUVE
 from mauvecl.host.orbit import Limits
-from mauvecl.host.tables.files import parsing, possible, read_bytes, read_ecsv, read_text, toml, without_columns
+from mauvecl.host.tables.files import (
+    check_keys,
+    parsing,
+    possible,
+    read_bytes,
+    read_ecsv,
+    read_text,
+    toml,
+    without_columns,
+)
 from mauvecl.noise.unknowns import NONE, Processes
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, Message, shortened
@@ -146,6 +155,7 @@ def _digest(file: Path) -> str:
 
 def parse_toml_value(text: str) -> Any:
     """Parse a TOML value; a bare word is text."""
+    check_keys(text, f"value {shortened(text)}")
     with parsing(f"value {shortened(text)}", "give a TOML value"):
         try:
             parsed = tomllib.loads(f"value = {text}")
