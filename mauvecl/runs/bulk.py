@@ -7,6 +7,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -303,12 +304,12 @@ def verify(
     with locked(Path(path), "store"):
         store = Store.open(path)
         first, last = store.range_of(rows)
-        files = list(store.files())
-        total, there = store.count(first, last), sum(store.owns(key) for key, _ in files)
-        if total - there > MAX_MISSING:
+        total = store.count(first, last)
+        missing = (chunk for chunk in store.chunks(first, last) if not (store.path / chunk.key).exists())
+        if sum(1 for _ in islice(missing, MAX_MISSING + 1)) > MAX_MISSING:
             raise InputError(
-                f"store {str(store.path)!r} holds {there} of {total} chunks, but at most {MAX_MISSING} may be missing: "
-                "choose `rows`, or draw them with `mauvecl realise --resume`",
+                f"at most {MAX_MISSING} of the {total} chunks of store {str(store.path)!r} may be missing: choose `rows`, "
+                "or draw them with `mauvecl realise --resume`",
                 key="rows",
             )
         faults = list(_faults_of_description(store, repair))
@@ -320,7 +321,7 @@ def verify(
                 progress(number + 1, total)
         if repair:
             store.sort_digests()
-        faults += [Fault(key, "not of this store", False) for key, own in files if not own]
+        faults += [Fault(key, "not of this store", False) for key, own in store.files() if not own]
     return faults
 
 
