@@ -308,8 +308,8 @@ def verify(
         missing = (chunk for chunk in store.chunks(first, last) if not (store.path / chunk.key).exists())
         if sum(1 for _ in islice(missing, MAX_MISSING + 1)) > MAX_MISSING:
             raise InputError(
-                f"at most {MAX_MISSING} of the {total} chunks of store {str(store.path)!r} may be missing: choose `rows`, "
-                "or draw them with `mauvecl realise --resume`",
+                f"at most {MAX_MISSING} of the {total} chunks of store {str(store.path)!r} may be missing: choose "
+                "`rows`, or draw them with `mauvecl realise --resume`",
                 key="rows",
             )
         faults = list(_faults_of_description(store, repair))
