@@ -33,6 +33,11 @@ QUICK: dict[str, list[str]] = {
 }  # fmt: skip
 
 
+def detected(engine: Any, scene: list[Expectation], n: int = N, **how: Any) -> Detection:
+    """Ask an engine or a pool for the detection of the flares of a star."""
+    return engine.detect(scene[0], scene[1:], realisations=n, **{"seed": 5} | how)
+
+
 def same(ours: Detection, theirs: Detection) -> None:
     """Check that every count, sum and extreme is equal to the bit."""
     assert ours._distributions.keys() == theirs._distributions.keys()

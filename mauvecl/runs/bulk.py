@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import threading
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -113,11 +114,8 @@ def realise(
     InputError
         If the folder contains other files, is being written by another process, or cannot be written.
     """
-    store = Store(Path(path), study)
-    store.make_folder()
-    with locked(store.path, "store"):
-        _complete(store, engine, resume, restart, progress)
-    return store
+    with _completed(Store(Path(path), study), engine, resume, restart, progress) as store:
+        return store
 
 
 @validated
@@ -140,14 +138,11 @@ def realise_file(
         raise InputError(
             f"{str(file)!r} exists already: use another name, or `restart=True` to replace it", key="restart"
         )
-    store = Store(unfinished(file), study)
-    store.make_folder()
-    with locked(store.path, "store"):
-        _complete(store, engine, resume, restart, progress)
+    with _completed(Store(unfinished(file), study), engine, resume, restart, progress) as store:
         export(Selection.of(store), file, replace=restart)
         store.clear()
         store.path.rmdir()
-    return store
+        return store
 
 
 @validated
@@ -156,21 +151,27 @@ def unfinished(file: Path) -> Path:
     return file.with_name(f"{UNFINISHED}{file.name}.zarr")
 
 
-def _complete(store: Store, engine: Engine | Pool, resume: bool, restart: bool, progress: Progress | None) -> None:
-    """Draw the missing chunks of a store that this process has locked."""
-    if restart and any(store.path.iterdir()):
-        Store.open(store.path).clear()
-    begun = (store.path / "zarr.json").exists()
-    store.make()
-    todo = [chunk for chunk in store.chunks() if not store.has(chunk)]
-    if begun and not resume and todo:
-        raise InputError(
-            f"store {str(store.path)!r} holds {store.count() - len(todo)} of {store.count()} chunks: use `resume=True` "
-            "to draw the others, or another place",
-            key="resume",
-        )
-    _fill(store, todo, engine, progress)
-    store.sort_digests()
+@contextmanager
+def _completed(
+    store: Store, engine: Engine | Pool, resume: bool, restart: bool, progress: Progress | None
+) -> Iterator[Store]:
+    """Lock a store, draw its missing chunks, and yield it."""
+    store.make_folder()
+    with locked(store.path, "store"):
+        if restart and any(store.path.iterdir()):
+            Store.open(store.path).clear()
+        begun = (store.path / "zarr.json").exists()
+        store.make()
+        todo = [chunk for chunk in store.chunks() if not store.has(chunk)]
+        if begun and not resume and todo:
+            raise InputError(
+                f"store {str(store.path)!r} holds {store.count() - len(todo)} of {store.count()} chunks: use "
+                "`resume=True` to draw the others, or another place",
+                key="resume",
+            )
+        _fill(store, todo, engine, progress)
+        store.sort_digests()
+        yield store
 
 
 @validated
@@ -303,12 +304,12 @@ def verify(
     with locked(Path(path), "store"):
         store = Store.open(path)
         first, last = store.range_of(rows)
-        files = list(store.files())
-        total, there = store.count(first, last), sum(store.owns(key) for key, _ in files)
-        if total - there > MAX_MISSING:
+        total = store.count(first, last)
+        missing = (chunk for chunk in store.chunks(first, last) if not (store.path / chunk.key).exists())
+        if sum(1 for _ in islice(missing, MAX_MISSING + 1)) > MAX_MISSING:
             raise InputError(
-                f"store {str(store.path)!r} holds {there} of {total} chunks, but at most {MAX_MISSING} may be missing: "
-                "choose `rows`, or draw them with `mauvecl realise --resume`",
+                f"at most {MAX_MISSING} of the {total} chunks of store {str(store.path)!r} may be missing: choose "
+                "`rows`, or draw them with `mauvecl realise --resume`",
                 key="rows",
             )
         faults = list(_faults_of_description(store, repair))
@@ -320,7 +321,7 @@ def verify(
                 progress(number + 1, total)
         if repair:
             store.sort_digests()
-        faults += [Fault(key, "not of this store", False) for key, own in files if not own]
+        faults += [Fault(key, "not of this store", False) for key, own in store.files() if not own]
     return faults
 
 
@@ -343,9 +344,7 @@ def _fault(store: Store, chunk: Chunk, engine: Engine | Pool | None, repair: boo
         if drawn == store.digests[chunk.key]:
             return None
         seen = "differs"
-    if repair and seen == "unlisted" and digest((store.path / chunk.key).read_bytes()) == drawn:
-        store.note(chunk, drawn)
-    elif repair:
+    if repair:
         store.write(chunk, rows)
     return Fault(chunk.key, seen, repair)
 

@@ -28,6 +28,8 @@ FILE = Path(selftest.__file__).parent / "known_answers.npz"
 
 def results(name: str, count: int) -> dict[str, NDArray[Any]]:
     """Return what `selftest.results` gives on a device."""
+    if name in selftest.STARE_CASES:
+        return stare_results(name, count)
     options, how = selftest.CASES[name]
     quiet, flare = selftest.toy(**options), selftest.toy(flare=0.3, **options)
     drawing = {key: value for key, value in how.items() if key != "nuisances"}
@@ -63,7 +65,7 @@ def fast(values: NDArray[np.float32], plan: requests.ChannelPlan) -> NDArray[np.
 
 
 def stare_results(name: str, count: int) -> dict[str, NDArray[np.float32]]:
-    """Return what `selftest.stare_results` gives on a device."""
+    """Return the results of a case of stares."""
     components, stare, given = selftest.stare_case(name, count)
     index, seed = np.arange(selftest.START, selftest.START + count, dtype=np.uint64), selftest.SEED
     flares, frames = stare_scene.Flares.of(components, stare, given, None, count), range(stare.n_frames)
@@ -77,8 +79,7 @@ def stare_results(name: str, count: int) -> dict[str, NDArray[np.float32]]:
 
 def every_result(count: int) -> dict[str, NDArray[Any]]:
     """Return all results by the names of case and part."""
-    made = [(name, results(name, count)) for name in selftest.CASES]
-    made += [(name, stare_results(name, count)) for name in selftest.STARE_CASES]
+    made = ((name, results(name, count)) for name in (*selftest.CASES, *selftest.STARE_CASES))
     return {f"{name}: {part}": array for name, parts in made for part, array in parts.items()}
 
 

@@ -20,7 +20,7 @@ from unittest.mock import Mock
 import numpy as np
 import psutil
 import pytest
-from answers import N, same, same_snr, small
+from answers import N, detected, same, same_snr, small
 from commands import SMALL_SHARDS, run
 from refusals import failed
 from scenes import flaring_stares, instrument, paper, star
@@ -42,11 +42,10 @@ def workers() -> Iterator[DaskWorkers]:
 def test_two_processes_give_the_answers_of_one(
     workers: DaskWorkers, engine: Engine, scene: list[Expectation], tmp_path: Path
 ) -> None:
-    quiet, *flares = scene
     pool = Pool(workers)
     assert workers.count == 2
-    same(pool.detect(quiet, flares, realisations=N, seed=5), engine.detect(quiet, flares, realisations=N, seed=5))
-    same_snr(pool.snr(quiet, realisations=N, seed=5), engine.snr(quiet, realisations=N, seed=5))
+    same(detected(pool, scene), detected(engine, scene))
+    same_snr(*(one.snr(scene[0], realisations=N, seed=5) for one in (pool, engine)))
     assert pool.standing.shards == 16
     assert [device.name for device in pool.devices] == [engine.device.name] * 2
     stares = flaring_stares()
@@ -72,7 +71,6 @@ def kill_after(pool: Pool, shards: int, kill: Callable[[], object]) -> threading
 
 def test_killed_worker_is_replaced(workers: DaskWorkers, engine: Engine, scene: list[Expectation]) -> None:
     """Kill a counting process: another one counts its shard, and the answer has the same bits."""
-    quiet, *flares = scene
     n, pids, killed = 150_000, workers._client.run(os.getpid), list[int]()
     pool = Pool(workers)
 
@@ -82,9 +80,9 @@ def test_killed_worker_is_replaced(workers: DaskWorkers, engine: Engine, scene: 
         os.kill(busy[0], signal.SIGKILL)
 
     killer = kill_after(pool, 10, kill_a_busy_one)
-    found = pool.detect(quiet, flares, realisations=n, seed=6)
+    found = detected(pool, scene, n)
     killer.join()
-    same(found, engine.detect(quiet, flares, realisations=n, seed=6))
+    same(found, detected(engine, scene, n))
     assert killed[0] not in workers._client.run(os.getpid).values()
     assert pool.standing.retries >= 1, "the shard in its hands was counted again"
 
@@ -149,7 +147,7 @@ def test_waiting_threads_are_woken_at_the_end(scene: list[Expectation], monkeypa
         except BaseException as error:
             ended.append(type(error))
 
-    detect = partial(pool.detect, scene[0], scene[1:], realisations=N, seed=1)
+    detect = partial(detected, pool, scene)
     works = [
         detect,
         lambda: pool.realise(scene[0], start=0, count=3, seed=1),
@@ -260,7 +258,6 @@ if not hasattr(cluster, "changed"):
 def test_shards_of_workers_with_other_code_are_drawn_again(
     change: str, scheduler_file: str, tmp_path: Path, engine: Engine, scene: list[Expectation]
 ) -> None:
-    quiet, *flares = scene
     (tmp_path / "other_code.py").write_text(PRELOAD.format(change=OTHER_CODE[change]))
     n = 200_000
     workers = DaskWorkers(scheduler_file)
@@ -271,14 +268,14 @@ def test_shards_of_workers_with_other_code_are_drawn_again(
     other = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         workers._client.wait_for_workers(2, timeout=60)
-        found = pool.detect(quiet, flares, realisations=n, seed=6)
+        found = detected(pool, scene, n)
         assert len(workers._strangers) == 1
         assert pool.standing.retries >= 1
     finally:
         other.terminate()
         other.wait(20)
         workers.close()
-    same(found, engine.detect(quiet, flares, realisations=n, seed=6))
+    same(found, detected(engine, scene, n))
 
 
 def test_cluster_of_workers_with_other_code_raises(
@@ -288,7 +285,7 @@ def test_cluster_of_workers_with_other_code_raises(
     workers = DaskWorkers(scheduler_file)
     monkeypatch.setattr("mauvecl.runs.cluster.code_identity", lambda: ("1.0.0", "another"))
     with pytest.raises(RuntimeError, match="workers with other code"):
-        Pool(workers).detect(scene[0], scene[1:], realisations=N, seed=1)
+        detected(Pool(workers), scene)
     workers.close()
 
 
@@ -307,30 +304,28 @@ def test_shards_whose_workers_have_left_are_sent_to_others(
     tmp_path: Path, engine: Engine, scene: list[Expectation], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Restrict shards to a worker that ends and is replaced under another address."""
-    quiet, *flares = scene
     with by_hand(tmp_path) as (_, file), watched(file, monkeypatch) as workers:
         pool = Pool(workers)
         (pid,) = workers._client.run(os.getpid).values()
 
         kill_after(pool, 5, lambda: os.kill(pid, signal.SIGKILL))
-        found = pool.detect(quiet, flares, realisations=150_000, seed=6)
-    same(found, engine.detect(quiet, flares, realisations=150_000, seed=6))
+        found = detected(pool, scene, 150_000)
+    same(found, detected(engine, scene, 150_000))
 
 
 def test_shards_whose_request_has_left_are_sent_again(
     scheduler_file: str, engine: Engine, scene: list[Expectation], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Restrict a request to a worker that has left, and only the first of the shards that need it."""
-    quiet, *flares = scene
     with watched(scheduler_file, monkeypatch) as workers:
         allowed = iter([["tcp://127.0.0.1:2"]])
         monkeypatch.setattr(workers, "_ours", lambda: next(allowed, None))
         pool = Pool(workers)
         late = threading.Timer(60, pool.stop)
         late.start()
-        found = pool.detect(quiet, flares, realisations=50_000, seed=6)
+        found = detected(pool, scene, 50_000)
         late.cancel()
-    same(found, engine.detect(quiet, flares, realisations=50_000, seed=6))
+    same(found, detected(engine, scene, 50_000))
 
 
 class Leaves:
@@ -371,13 +366,12 @@ def test_end_during_a_transfer_is_noticed(
 
     workers._client.submit = lose_the_first
     if kind is Leaves:
-        found = pool.detect(scene[0], scene[1:], realisations=N, seed=1)
+        same(detected(pool, scene), detected(engine, scene))
         assert given[0].asked == 3
         assert pool.standing.retries == 1
-        same(found, engine.detect(scene[0], scene[1:], realisations=N, seed=1))
     else:
         with failed("lost"):
-            pool.detect(scene[0], scene[1:], realisations=N, seed=1)
+            detected(pool, scene)
     workers.close()
 
 
@@ -429,6 +423,6 @@ def test_lost_scheduler_raises(tmp_path: Path, scene: list[Expectation]) -> None
 
         kill_after(pool, 5, scheduler.kill)
         with failed("lost"):
-            pool.detect(scene[0], scene[1:], realisations=1_000_000, seed=1)
+            detected(pool, scene, 1_000_000)
         workers.stop()
         workers.close()

@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
-from answers import N, same, same_snr, small
+from answers import N, detected, same, same_snr, small
 from commands import run
 from refusals import failed, refused
 from scenes import FIRST_STARE, N_STARES, flaring_stares, instrument, star
@@ -61,32 +61,26 @@ class Shuffled(LocalWorkers):
 def test_order_of_shards_does_not_affect_the_answer(engine: Engine, scene: list[Expectation], start: int) -> None:
     quiet, *flares = scene
     own = Linear("own", np.linspace(0.0, 1.0, quiet.wavelength_nm.size))
-    how: dict[str, Any] = {"realisations": N, "seed": 5, "start": start, "statistics": ("chi2", "matched", own)}
+    how: dict[str, Any] = {"start": start, "statistics": ("chi2", "matched", own)}
     pool = Pool(Shuffled(engine, 3))
-    same(pool.detect(quiet, flares, **how), engine.detect(quiet, flares, **how))
-    assert (
-        pool.standing.shards
-        == pool.standing.of
-        == len(shards.shards(requests.DetectRequest(quiet, tuple(flares), N, 5, ("chi2",), start=start)))
-    )
-    same_snr(
-        pool.snr(quiet, realisations=N, seed=5, start=start), engine.snr(quiet, realisations=N, seed=5, start=start)
-    )
+    same(detected(pool, scene, **how), detected(engine, scene, **how))
+    n_shards = len(shards.shards(requests.DetectRequest(quiet, tuple(flares), N, 5, ("chi2",), start=start)))
+    assert pool.standing.shards == pool.standing.of == n_shards
+    same_snr(*(one.snr(quiet, realisations=N, seed=5, start=start) for one in (pool, engine)))
 
 
 @pytest.mark.long
 def test_shards_of_every_kind_of_request_join(engine: Engine) -> None:
     """Include requests with several launches and all arguments."""
-    quiet, *flares = star(amplitudes=tuple(np.linspace(0.01, 0.3, 17)), payload=instrument(part=True))
+    scene = star(amplitudes=tuple(np.linspace(0.01, 0.3, 17)), payload=instrument(part=True))
     how: dict[str, Any] = {
-        "realisations": 9000,
-        "seed": 1,
+        "n": 9000,
         "statistics": ("chi2_pair", "matched"),
         "comparison": Comparison.of("stack:3", "estimated"),
         "processes": mauvecl.Processes(jitter=mauvecl.Uniform(0.0, 0.05)),
     }
     pool = Pool(Shuffled(engine, 4))
-    same(pool.detect(quiet, flares, **how), engine.detect(quiet, flares, **how))
+    same(detected(pool, scene, **how), detected(engine, scene, **how))
     assert pool.standing.of == 2 * 3
 
 
@@ -160,7 +154,6 @@ class Failing:
 
 
 def test_failed_launch_is_repeated(engine: Engine, scene: list[Expectation]) -> None:
-    quiet, *flares = scene
     calls: list[int] = []
     made: list[int] = []
 
@@ -169,14 +162,13 @@ def test_failed_launch_is_repeated(engine: Engine, scene: list[Expectation]) -> 
         return Failing(engine, {2, 5, 6}, calls)
 
     pool = Pool(LocalWorkers([None], make=make))
-    same(pool.detect(quiet, flares, realisations=N, seed=5), engine.detect(quiet, flares, realisations=N, seed=5))
+    same(detected(pool, scene), detected(engine, scene))
     assert pool.standing.retries == 3
     assert len(made) == 4, "each time with a new context"
 
 
 def test_closed_workers_end_every_wait(engine: Engine, scene: list[Expectation]) -> None:
     """Close workers while a pool waits for a shard that is counted and for another behind it, its last."""
-    quiet, *flares = scene
     begun, free = threading.Event(), threading.Event()
 
     class Held(Failing):
@@ -190,7 +182,7 @@ def test_closed_workers_end_every_wait(engine: Engine, scene: list[Expectation])
 
     def ask() -> None:
         try:
-            Pool(workers).detect(quiet, flares, realisations=8192, seed=5)
+            detected(Pool(workers), scene, 8192)
         except (pools.Stopped, RuntimeError) as end:
             ends.append(end)
 
@@ -209,10 +201,9 @@ def test_closed_workers_end_every_wait(engine: Engine, scene: list[Expectation])
 
 
 def test_device_that_always_fails_raises(engine: Engine, scene: list[Expectation]) -> None:
-    quiet, *flares = scene
     pool = Pool(LocalWorkers([None], make=lambda device, progress: Failing(engine, set(range(99)), [])))  # type: ignore[return-value, arg-type]
     with failed("failed", "realisations 0 to 4095 failed 8 times", "OUT_OF_RESOURCES"):
-        pool.detect(quiet, flares, realisations=N, seed=5)
+        detected(pool, scene)
 
 
 AXES = {"x": {"quantity": "magnitude", "values": [6, 8, 10]}, "y": {"quantity": "amplitude", "values": [0.05, 0.2]}}
@@ -315,10 +306,9 @@ def interrupting(after: int) -> Callable[[int, int], None]:
 
 def at_work(folder: Path, engine: Engine, progress: Any = None, study: mauvecl.Study | None = None, **how: Any) -> Any:
     """Ask for a detection whose shards are kept; return it, the pool and the checkpoint."""
-    quiet, *flares = SCENE
     with shards.Checkpoint(folder, "detect", study or small(), patience_s=0.0, **how) as checkpoint:
         pool = Pool(LocalWorkers([None], make=lambda d, progress: engine), checkpoint=checkpoint, progress=progress)
-        return pool.detect(quiet, flares, realisations=N, seed=5), pool, checkpoint
+        return detected(pool, SCENE), pool, checkpoint
 
 
 #: Of all runs below.
@@ -328,7 +318,7 @@ SCENE = star(amplitudes=(0.05, 0.24), payload=instrument(part=True))
 @pytest.fixture(scope="module")
 def whole(engine: Engine) -> Detection:
     """Return the answer of a run that nothing interrupts."""
-    return engine.detect(SCENE[0], SCENE[1:], realisations=N, seed=5)
+    return detected(engine, SCENE)
 
 
 @pytest.fixture
@@ -409,7 +399,7 @@ def test_counts_of_another_form_raise(begun: Path, engine: Engine) -> None:
 def test_short_runs_leave_no_files(tmp_path: Path, engine: Engine) -> None:
     with shards.Checkpoint(tmp_path, "detect", small()) as checkpoint:
         pool = Pool(LocalWorkers([None], make=lambda d, progress: engine), checkpoint=checkpoint)
-        pool.detect(SCENE[0], SCENE[1:], realisations=N, seed=5)
+        detected(pool, SCENE)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -445,7 +435,7 @@ def test_background_work_begins_once_after_the_devices() -> None:
     pool = Pool(LocalWorkers(), meanwhile=lambda: begun.append(pool.standing.of))
     assert begun == []
     for _ in range(2):
-        pool.detect(SCENE[0], SCENE[1:], realisations=N, seed=5)
+        detected(pool, SCENE)
     (of,) = begun
     assert of > 0
 
@@ -471,7 +461,7 @@ def test_answers_keep_their_order_and_errors_end_the_rest(engine: Engine) -> Non
     with refused("number", "2"):
         list(pools.map_in_order(pool, bad, range(6)))
     with pytest.raises(pools.Stopped):
-        pool.detect(SCENE[0], SCENE[1:], realisations=N, seed=5)
+        detected(pool, SCENE)
 
 
 def test_few_answers_are_ahead_of_their_use_and_none_after_it(engine: Engine) -> None:
@@ -498,7 +488,7 @@ def test_progress_that_raises_stops_the_work_ahead_of_it(engine: Engine) -> None
         mauvecl.map(small(map=AXES), pool, progress)
     except ArithmeticError:
         with pytest.raises(pools.Stopped):
-            pool.detect(SCENE[0], SCENE[1:], realisations=N, seed=5)
+            detected(pool, SCENE)
     else:
         pytest.fail("the progress was not asked")
 
