@@ -184,10 +184,9 @@ class Statistic(ABC):
         if priors:
             rows = np.vstack([rows, others.finite(others.spectra)])
         means, variances = changes_of(observed)
-        amounts = np.array([node.amounts for node in nodes])
         moved = Differences(seen.mean, seen.variance, scatter=rows)
-        parts = self.moved_forms(setting, moved, amounts, means * setting.used, variances, flare)
-        return parts[0] if len(parts) == 1 else Mixture(tuple(parts), np.array([node.probability for node in nodes]))
+        parts = self.moved_forms(setting, moved, nodes.amounts, means * setting.used, variances, flare)
+        return parts[0] if len(parts) == 1 else Mixture(tuple(parts), nodes.probability)
 
     def moved_forms(
         self,
