@@ -188,7 +188,6 @@ class Chi2Pair(Chi2):
     label: ClassVar[str] = "χ² against a noisy exposure"
     kernel_sum: ClassVar[str | None] = "chi2_pair"
     paired: ClassVar[bool] = True
-    marginal: ClassVar[bool] = False
 
 
 Float = NDArray[np.float64]
@@ -342,7 +341,6 @@ class Paper(Statistic):
     label: ClassVar[str] = "the paper's sum on smoothed spectra"
     shaped: ClassVar[bool] = True
     paired: ClassVar[bool] = True
-    marginal: ClassVar[bool] = False
 
     def smoothing(self, setting: Setting) -> Smoothing:
         """Return the paper's smoothing of the used pixels."""

@@ -111,14 +111,12 @@ class Statistic(ABC):
     label: ClassVar[str]
     #: Whether the statistic uses a flare as template, so that each flare has its own null distribution.
     shaped: ClassVar[bool] = False
-    #: Whether the reference is always one noisy quiescent exposure.
+    #: Whether the reference is always one noisy quiescent exposure, which excludes marginalising over unknowns.
     paired: ClassVar[bool] = False
     #: Name of the sum that kernels always compute (`layout.FIXED_STATISTICS`); None if the statistic has weights.
     kernel_sum: ClassVar[str | None] = None
     #: Whether the statistic uses sums over resolution elements instead of pixels.
     by_element: ClassVar[bool] = False
-    #: Whether the statistic can be marginalised over nuisance parameters.
-    marginal: ClassVar[bool] = True
 
     def added_variance(self, setting: Setting) -> float:
         """Return the variance of the subtracted reference relative to that of one exposure."""
@@ -130,8 +128,8 @@ class Statistic(ABC):
 
     def check(self, setting: Setting) -> None:
         """Raise InputError if the statistic is undefined in this setting."""
-        if setting.nuisances and (setting.comparison.estimated or not self.marginal):
-            why = "with estimated variances" if self.marginal else "which compares with one noisy exposure"
+        if setting.nuisances and (setting.comparison.estimated or self.paired):
+            why = "which compares with one noisy exposure" if self.paired else "with estimated variances"
             raise InputError(
                 f"statistic {self.name!r} {why} cannot be marginalised over {join_names(setting.nuisances.names)}; use "
                 "no unknowns, as with `nuisances.usual=false`, or another statistic by the model's variances",
