@@ -152,11 +152,9 @@ class Statistic(ABC):
         """Return the closed forms without and with a flare, and the threshold at a false-alarm probability."""
         template = flare if self.shaped else None
 
-        def null_and_threshold() -> tuple[Form, float]:
-            null = self.closed_form(setting, setting.quiet, template)
-            return null, null.isf(fap)
-
-        null, threshold = setting.cached(f"null of {self.name} at {fap!r}", null_and_threshold, template)
+        quiet = setting.quiet
+        null = setting.cached(f"null of {self.name}", lambda: self.closed_form(setting, quiet, template), template)
+        threshold = setting.cached(f"threshold of {self.name} at {fap!r}", lambda: null.isf(fap), template)
         return DetectionForms(null, self.closed_form(setting, flare, template), threshold)
 
     def integrate_drawn(
