@@ -228,11 +228,11 @@ class SnrResult(Drawable, ContentEquality):
         rows = []
         for which in range(len(expected)):
             filled, counts = self.counts.filled(kind, which)
-            middle, share = snr(which, filled + 0.5), counts / self.counts.n
-            mean = share @ middle
+            middle = snr(which, filled + 0.5)
+            mean = counts @ middle / self.counts.n
             edges = np.column_stack([snr(which, filled), snr(which, filled + 1)]).ravel()
             quantiles = np.interp(np.array(PERCENTAGES) / 100, steps_of(counts) / self.counts.n, edges)
-            rows.append((mean, np.sqrt(share @ (middle - mean) ** 2), *quantiles))
+            rows.append((mean, np.sqrt(counts @ (middle - mean) ** 2 / self.counts.n), *quantiles))
         names = ("mean", "std", *(f"q{percentage:g}" for percentage in PERCENTAGES))
         return {"wavelength": wavelength_nm, "expected": expected} | dict(zip(names, np.array(rows).T, strict=True))
 
