@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -194,8 +194,7 @@ class SnrResult(Drawable, ContentEquality):
             return np.asarray(np.divide(net - sky[which], np.sqrt(noise2), out=np.zeros_like(net), where=noise2 > 0))
 
         low, high = self.counts.clipped.T / (self.counts.n * x.n_frames)
-        values = self._values("pixel", x.wavelength_nm, x.snr(), snr) | {"clipped_low": low, "clipped_high": high}
-        return self._table((*COLUMNS, *CLIPPED_COLUMNS), values)
+        return self._table("pixel", x.wavelength_nm, x.snr(), snr, clipped_low=low, clipped_high=high)
 
     @property
     def element(self) -> QTable:
@@ -207,24 +206,20 @@ class SnrResult(Drawable, ContentEquality):
         def snr(which: int, place: NDArray[np.number]) -> NDArray[np.float64]:
             return np.asarray(self.elements["centre"][which] + step[which] * (place - 0.5))
 
-        return self._table(COLUMNS, self._values("element", x.element_wavelength_nm, x.snr_per_element(), snr))
+        return self._table("element", x.element_wavelength_nm, x.snr_per_element(), snr)
 
     def _line(self) -> str:
         return f"of {self.expectation.name!r}, {self.counts.n} realisations"
 
-    def _table(self, columns: Iterable[Column], values: Mapping[str, NDArray[np.float64]]) -> QTable:
-        x = self.expectation
-        about = {"exposure_s": x.exposure_s, "name": x.name, "signal": x.signal}
-        return table_of(columns, [values], realisations=self.counts.n, **about)
-
-    def _values(
+    def _table(
         self,
         kind: str,
         wavelength_nm: NDArray[np.float64],
         expected: NDArray[np.float64],
         snr: Callable[[int, NDArray[np.number]], NDArray[np.float64]],
-    ) -> dict[str, NDArray[np.float64]]:
-        """Return the columns of pixels or elements by name; `snr` converts fractional bin numbers to ratios."""
+        **clipped: NDArray[np.float64],
+    ) -> QTable:
+        """Return the table of pixels or elements; `snr` converts fractional bin numbers to ratios."""
         rows = []
         for which in range(len(expected)):
             filled, counts = self.counts.filled(kind, which)
@@ -234,7 +229,10 @@ class SnrResult(Drawable, ContentEquality):
             quantiles = np.interp(np.array(PERCENTAGES) / 100, steps_of(counts) / self.counts.n, edges)
             rows.append((mean, np.sqrt(counts @ (middle - mean) ** 2 / self.counts.n), *quantiles))
         names = ("mean", "std", *(f"q{percentage:g}" for percentage in PERCENTAGES))
-        return {"wavelength": wavelength_nm, "expected": expected} | dict(zip(names, np.array(rows).T, strict=True))
+        values = {"wavelength": wavelength_nm, "expected": expected} | dict(zip(names, np.array(rows).T, strict=True))
+        x, columns = self.expectation, (*COLUMNS, *CLIPPED_COLUMNS) if clipped else COLUMNS
+        about = {"exposure_s": x.exposure_s, "name": x.name, "signal": x.signal}
+        return table_of(columns, [values | clipped], realisations=self.counts.n, **about)
 
 
 def steps_of(counts: NDArray[np.int64]) -> NDArray[np.int64]:
