@@ -228,7 +228,7 @@ MUTATIONS: dict[str, Mutation] = {
         ("low + int(inside[0]))", "low + int(inside[0]) + 1)"),
     ),
     "two streams alike": (
-        "test_streams_are_distinct_bytes",
+        "test_draws_have_different_counters",
         ('\n    "dark": 1,', '\n    "dark": 0,'),
     ),
     "priors' tables too coarse at their ends": (

@@ -107,8 +107,6 @@ def snr_at(x: Expectation, wavelength_nm: float, per: Per = "element") -> float:
 
 def place_of(x: Expectation, wavelength_nm: float, per: Per) -> int:
     """Return the index of the pixel or element at a wavelength; raises InputError outside the spectrum."""
-    if per not in ("pixel", "element"):
-        raise InputError.of("per", per, "'pixel' or 'element'")
     first, last = float(x.wavelength_nm[0]), float(x.wavelength_nm[-1])
     if not first <= wavelength_nm <= last:
         raise InputError.of("wavelength", wavelength_nm, f"between {first:.1f} and {last:.1f} nm", unit="nm")

@@ -188,7 +188,6 @@ class Chi2Pair(Chi2):
     label: ClassVar[str] = "χ² against a noisy exposure"
     kernel_sum: ClassVar[str | None] = "chi2_pair"
     paired: ClassVar[bool] = True
-    marginal: ClassVar[bool] = False
 
 
 Float = NDArray[np.float64]
@@ -255,10 +254,6 @@ class Smoothing:
 
     def form(self, scale: Float, delta: Float, variance: Float) -> QuadraticForm:
         """Return the distribution of the sum for Gaussian noise with a mean and variance per pixel."""
-        if not delta.any():
-            weight = np.linalg.eigvalsh(self._covariance(scale, variance))
-            weight = weight[weight > MIN_MODE_VARIANCE * weight[-1]]
-            return QuadraticForm(weight, np.zeros(weight.size))
         weight, vectors = self._eigenmodes(scale, variance)
         return QuadraticForm(weight, (np.sqrt(scale) * (self.weights @ delta)) @ vectors / np.sqrt(weight))
 
@@ -269,14 +264,11 @@ class Smoothing:
 
     def _eigenmodes(self, scale: Float, variance: Float) -> tuple[Float, Float]:
         """Return the variances of the modes, and their weights per centre, shape (n_centre, n_mode)."""
-        values, vectors = np.linalg.eigh(self._covariance(scale, variance))
+        # The covariance of the smoothed values times the roots of their factors.
+        half = self.weights * np.sqrt(scale)[:, None]
+        values, vectors = np.linalg.eigh(((half * variance) @ half.T).toarray())
         large = values > MIN_MODE_VARIANCE * values[-1]
         return values[large], vectors[:, large]
-
-    def _covariance(self, scale: Float, variance: Float) -> Float:
-        """Return the covariance of the smoothed values times the roots of their factors."""
-        half = self.weights * np.sqrt(scale)[:, None]
-        return np.asarray(((half * variance) @ half.T).toarray())
 
     def bands(self, n_padded: int, chunk: int) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
         """Return the weights of unfinished centres per chunk of pixels, and the number of centres each chunk finishes.
@@ -342,7 +334,6 @@ class Paper(Statistic):
     label: ClassVar[str] = "the paper's sum on smoothed spectra"
     shaped: ClassVar[bool] = True
     paired: ClassVar[bool] = True
-    marginal: ClassVar[bool] = False
 
     def smoothing(self, setting: Setting) -> Smoothing:
         """Return the paper's smoothing of the used pixels."""

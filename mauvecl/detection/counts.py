@@ -292,6 +292,7 @@ class Distribution:
     @cached_property
     def _moments(self) -> tuple[Fraction, Fraction]:
         """Exact mean and variance of all values."""
+        self.refuse_undefined()
         total, squares = Fraction(self.far.first, 2**UNIT_BITS), Fraction(self.far.second, 2 ** (2 * UNIT_BITS))
         inside = self.n - self.far.n
         if inside:
@@ -312,20 +313,12 @@ class Distribution:
     @property
     def mean(self) -> float:
         """Mean of the statistic."""
-        self.refuse_undefined()
-        if self.far.n:
-            return float(self._moments[0])
-        return self.centre + self.step * (self.first / self.n)
+        return float(self._moments[0])
 
     @property
     def std(self) -> float:
         """Standard deviation of the statistic."""
-        self.refuse_undefined()
-        if self.far.n:
-            return math.sqrt(self._moments[1])
-        # Integer arithmetic keeps the precision of a narrow distribution far from the centre.
-        variance = (self.second * self.n - self.first**2) / self.n**2
-        return self.step * float(np.sqrt(variance))
+        return math.sqrt(self._moments[1])
 
     def edge(self, index: NDArray[np.intp]) -> NDArray[np.float64]:
         """Return the lower edges of fine bins."""
@@ -337,17 +330,13 @@ class Distribution:
     def bins(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
         """Lower edges, upper edges and counts of all filled bins, ascending; each shape (m,)."""
         self.refuse_undefined()
-        filled, counts = self.filled, self.filled_counts
-        lower, upper = self.edge(filled), self.edge(filled + 1)
-        if not self.far.n:
-            return lower, upper, counts
         ends = self.edge(np.array([FIRST_BIN, LAST_BIN + 1])) if math.isfinite(self.step) else np.full(2, np.inf)
         far_lower, far_upper = self.far.edges(*ends)
         place = int(np.count_nonzero(~is_above(self.far.keys)))
         return (
-            np.insert(far_lower, place, lower),
-            np.insert(far_upper, place, upper),
-            np.insert(self.far.counts, place, counts),
+            np.insert(far_lower, place, self.edge(self.filled)),
+            np.insert(far_upper, place, self.edge(self.filled + 1)),
+            np.insert(self.far.counts, place, self.filled_counts),
         )
 
     def above(self, value: float) -> float:

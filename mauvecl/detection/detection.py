@@ -397,10 +397,14 @@ class Detection(Drawable, ContentEquality, Hypotheses):
         template : int
             Index of the flare that shaped statistics use as template, for the null distribution.
         """
+        return self._at(self._key(statistic, flare, template))
+
+    def _key(self, statistic: str, flare: int | None, template: int) -> Key:
+        """Return the key of a distribution; parameters as for `distribution`."""
         self._check(statistic, flare, template)
-        if flare is None:
-            return self._at(self._null_key(statistic, template))
-        return self._at((statistic, "flare", flare))
+        if flare is not None:
+            return statistic, "flare", flare
+        return statistic, "null", template if self.statistic(statistic).shaped else 0
 
     def _at(self, key: Key) -> Distribution:
         """Return a counted distribution; raises InputError if values are not finite."""
@@ -444,7 +448,7 @@ class Detection(Drawable, ContentEquality, Hypotheses):
         sampled = self.tail(fap, statistic, template=template)
         if sampled is not None:
             return sampled.threshold
-        null = self._at(self._null_key(statistic, template))
+        null = self.distribution(statistic, template=template)
         n_low, n_high = central_counts(null.n, fap)
         wanted = (int(np.floor(fap * null.n * (1 + 1e-12))), n_high, max(n_low - 1, 0))
         # The lowest edges of the null's bins with few enough counts above.
@@ -455,11 +459,10 @@ class Detection(Drawable, ContentEquality, Hypotheses):
 
     def tail(self, fap: float, statistic: str = "chi2", *, template: int = 0) -> Tail | None:
         """Return the importance sampling behind a threshold, or None if realisations were counted."""
-        self._check(statistic, None, template)
+        key = (*self._key(statistic, None, template), fap)
         check_fap(fap, self.realisations, self.tails)
         if countable(fap, self.realisations):
             return None
-        key = (*self._null_key(statistic, template), fap)
         if key not in self._tails:
             self._tails[key] = tail(self, fap, statistic, template=template, seed=self.seed)
         return self._tails[key]
@@ -491,7 +494,7 @@ class Detection(Drawable, ContentEquality, Hypotheses):
             shared = 0.0
             if countable(fap, self.realisations) and counted.std > 0:
                 # A flare only adds uncorrelated noise; tilted draws are independent of the flare's.
-                shared = min(self._at(self._null_key(statistic, flare)).std / counted.std, 1.0)
+                shared = min(self.distribution(statistic, template=flare).std / counted.std, 1.0)
             probabilities.append(detection_interval(above, counted.n, fap, shared))
         return probabilities
 
@@ -529,15 +532,14 @@ class Detection(Drawable, ContentEquality, Hypotheses):
         QTable
             ``realisation`` and ``value``, the most extreme first.
         """
-        self._check(statistic, flare, template)
-        key: Key = (statistic, "flare", flare) if flare is not None else self._null_key(statistic, template)
+        key = self._key(statistic, flare, template)
         self._at(key)
         return table_of(TAIL_COLUMNS, [self._samples[key]])
 
     def roc(self, statistic: str = "chi2", flare: int = 0) -> Roc:
         """Return the ROC curve and the area under it."""
         self._check(statistic, flare)
-        null = self._at(self._null_key(statistic, flare))
+        null = self.distribution(statistic, template=flare)
         return Roc.of(null, self._at((statistic, "flare_on_null_grid", flare)))
 
     def plot(self, path: str | Path | None = None, *, fap: float = 1e-3, ax: Any = None) -> Any:
@@ -587,9 +589,6 @@ class Detection(Drawable, ContentEquality, Hypotheses):
             "closed_form_threshold": limit,
             "fap_error": float(fap_error),
         }
-
-    def _null_key(self, statistic: str, template: int) -> Key:
-        return statistic, "null", template if self.statistic(statistic).shaped else 0
 
 
 def _detected(probability: float, threshold: float) -> str:

@@ -338,13 +338,8 @@ class QuadraticForm:
         """
         if value <= 0.0:
             return 1.0
-        if self._equal:
-            if not self.shift.any():
-                return float(special.chdtrc(self.weight.size, value))
-            # scipy.stats takes a second to import, and most studies do not need it.
-            from scipy.stats import ncx2
-
-            return float(ncx2.sf(value, self.weight.size, np.sum(self.shift**2)))
+        if self._chi_squared:
+            return float(special.chdtrc(self.weight.size, value))
         if self.effective_terms >= MANY:
             if abs(value - self.mean) <= NEAR * self.std:
                 u, size, phase = self._near
@@ -383,7 +378,7 @@ class QuadraticForm:
 
     def isf(self, probability: float) -> float:
         """Return the value that is exceeded with a probability in (0, 1)."""
-        if self._equal and not self.shift.any():
+        if self._chi_squared:
             return float(special.chdtri(self.weight.size, probability))
         if self.effective_terms >= MANY and RARE < probability < 1.0 - RARE:
             from scipy.optimize import brentq
@@ -395,9 +390,9 @@ class QuadraticForm:
         return self._squares.unit * self._squares.quantile(wanted, upper=upper)
 
     @cached_property
-    def _equal(self) -> bool:
-        """Whether all weights are 1, as of a chi-squared variable."""
-        return bool(np.all(self.weight == 1.0))
+    def _chi_squared(self) -> bool:
+        """Whether this is a central chi-squared variable of as many degrees of freedom as terms."""
+        return bool(np.all(self.weight == 1.0)) and not self.shift.any()
 
 
 @dataclass(frozen=True)

@@ -70,8 +70,6 @@ def check_fap(fap: float, realisations: int, tails: Tails = "counted") -> None:
     """Raise InputError if `fap` is not a probability, or is too small for counted tails."""
     if not 0.0 < fap < 1.0:
         raise InputError.of("fap", fap, "a probability between 0 and 1")
-    if tails not in ("counted", "sampled"):
-        raise InputError.of("tails", tails, "'counted' or 'sampled'")
     if tails == "counted" and not countable(fap, realisations):
         raise InputError(
             f"fap = {fap:g} leaves {fap * realisations:.3g} of {realisations} realisations beyond the threshold, but "

@@ -99,28 +99,24 @@ class Nuisances(ContentEquality):
         InputError
             If a name has no spectrum, or a spectrum is zero everywhere.
         """
-        own = own or {}
+        own, shape = own or {}, quiet.wavelength_nm.shape
         spectra, of_flare = [], []
         for name in sd:
             row = None if name in own else NUISANCES.get(name)
-            shape = quiet.wavelength_nm.shape
             of_flare.append(np.zeros(shape) if row is None or row.of_flare is None else row.of_flare(quiet))
-            if name in own:
-                spectrum = np.asarray(own[name], np.float64)
-                if spectrum.shape != quiet.wavelength_nm.shape:
-                    raise InputError(
-                        f"the spectrum of the unknown {name!r} must have one value for each of the "
-                        f"{quiet.wavelength_nm.size} pixels, but has the shape {spectrum.shape}",
-                        key="own",
-                    )
-            else:
-                spectrum = spectrum_of(name, quiet)
+            spectrum = np.asarray(own[name], np.float64) if name in own else spectrum_of(name, quiet)
+            if spectrum.shape != shape:
+                raise InputError(
+                    f"the spectrum of the unknown {name!r} must have one value for each of the {shape[0]} pixels, but "
+                    f"has the shape {spectrum.shape}",
+                    key="own",
+                )
             if not spectrum.any():
                 raise InputError(
                     f"the unknown {name!r} must change pixels of {quiet.name}, but changes none", key="own"
                 )
             spectra.append(spectrum)
-        rows, light = (np.reshape(each, (len(sd), quiet.wavelength_nm.size)) for each in (spectra, of_flare))
+        rows, light = (np.reshape(each, (len(sd), *shape)) for each in (spectra, of_flare))
         return cls(tuple(sd), rows, np.array(list(sd.values()), np.float64), light)
 
     def _line(self) -> str:

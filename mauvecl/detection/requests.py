@@ -92,7 +92,6 @@ class Hypotheses:
     statistics: tuple[str, ...] = field(init=False)  # names of the statistics
     setting: Setting = field(init=False, repr=False)
     _chosen: dict[str, Statistic] = field(init=False, repr=False)
-    _forms: dict[tuple[str, int | None, int], Form] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         self._chosen = statistics_by_name(self.asked)
@@ -178,13 +177,11 @@ class Hypotheses:
     def closed_form(self, statistic: str, flare: int | None = None, *, template: int = 0) -> Form:
         """Return a statistic's distribution for Gaussian noise; parameters as for `Detection.distribution`."""
         self._check(statistic, flare, template)
+        observed = self.quiet if flare is None else self.flares[flare]
         # Only the nulls of shaped statistics depend on the template.
-        key = statistic, flare, template if flare is None and self.statistic(statistic).shaped else 0
-        if key not in self._forms:
-            observed = self.quiet if flare is None else self.flares[flare]
-            looked_for = self.shape(statistic, template if flare is None else flare)
-            self._forms[key] = self.statistic(statistic).closed_form(self.setting, observed, looked_for)
-        return self._forms[key]
+        looked_for = self.shape(statistic, template if flare is None else flare)
+        kind, name = self.statistic(statistic), f"form of {statistic} with flare {flare}"
+        return self.setting.cached(name, lambda: kind.closed_form(self.setting, observed, looked_for), looked_for)
 
     def dof(self, statistic: str) -> int:
         """Return the degrees of freedom without a flare: pixels, resolution elements, or one."""

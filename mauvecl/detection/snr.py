@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -142,10 +142,6 @@ class Counts:
         if outside.size:
             self.far[kind].count(which * (2 * MAX_BIN) + MAX_BIN + outside)
 
-    def outlying(self, kind: str) -> NDArray[np.int64]:
-        """Return the pixels or elements with values outside the dense bins."""
-        return np.unique(self.far[kind].keys // (2 * MAX_BIN))
-
     def filled(self, kind: str, which: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the filled bins of a pixel or element, ascending, with 0 at the expected value, and their counts."""
         dense = (self.pixel if kind == "pixel" else self.element)[which]
@@ -190,7 +186,7 @@ class SnrResult(Drawable, ContentEquality):
         x, seen = self.expectation, self.observers[: self.scene.n_pixel]
         width, sky = 2.0 ** seen["bin_shift"].astype(float), x.subtracted_dn
 
-        def snr(which: NDArray[np.intp], place: NDArray[np.number]) -> NDArray[np.float64]:
+        def snr(which: int, place: NDArray[np.number]) -> NDArray[np.float64]:
             # A bin contains the whole DN from its lower edge up to the next.
             dn = width[which] * place - 0.5
             net = dn + seen["net_offset"].astype(float)[which]
@@ -198,8 +194,7 @@ class SnrResult(Drawable, ContentEquality):
             return np.asarray(np.divide(net - sky[which], np.sqrt(noise2), out=np.zeros_like(net), where=noise2 > 0))
 
         low, high = self.counts.clipped.T / (self.counts.n * x.n_frames)
-        values = self._values("pixel", x.wavelength_nm, x.snr(), snr) | {"clipped_low": low, "clipped_high": high}
-        return self._table((*COLUMNS, *CLIPPED_COLUMNS), values)
+        return self._table("pixel", x.wavelength_nm, x.snr(), snr, clipped_low=low, clipped_high=high)
 
     @property
     def element(self) -> QTable:
@@ -208,56 +203,36 @@ class SnrResult(Drawable, ContentEquality):
         per_unit = self.elements["bins_per_unit"]
         step = np.divide(1.0, per_unit, out=np.zeros(len(per_unit)), where=per_unit > 0)
 
-        def snr(which: NDArray[np.intp], place: NDArray[np.number]) -> NDArray[np.float64]:
+        def snr(which: int, place: NDArray[np.number]) -> NDArray[np.float64]:
             return np.asarray(self.elements["centre"][which] + step[which] * (place - 0.5))
 
-        return self._table(COLUMNS, self._values("element", x.element_wavelength_nm, x.snr_per_element(), snr))
+        return self._table("element", x.element_wavelength_nm, x.snr_per_element(), snr)
 
     def _line(self) -> str:
         return f"of {self.expectation.name!r}, {self.counts.n} realisations"
 
-    def _table(self, columns: Iterable[Column], values: Mapping[str, NDArray[np.float64]]) -> QTable:
-        x = self.expectation
-        about = {"exposure_s": x.exposure_s, "name": x.name, "signal": x.signal}
-        return table_of(columns, [values], realisations=self.counts.n, **about)
-
-    def _values(
+    def _table(
         self,
         kind: str,
         wavelength_nm: NDArray[np.float64],
         expected: NDArray[np.float64],
-        snr: Callable[[NDArray[np.intp], NDArray[np.number]], NDArray[np.float64]],
-    ) -> dict[str, NDArray[np.float64]]:
-        """Return the columns of pixels or elements by name; `snr` converts fractional bin numbers to ratios."""
-        counts = self.counts.pixel if kind == "pixel" else self.counts.element
-        numbers = np.arange(layout.OBSERVER_BINS + 1) - layout.OBSERVER_BINS // 2
-        every = np.arange(len(counts))[:, None]
-        centres, edges = snr(every, numbers[:-1] + 0.5), snr(every, numbers)
-        share = counts / self.counts.n
-        mean = np.sum(share * centres, axis=1)
-        std = np.sqrt(np.sum(share * (centres - mean[:, None]) ** 2, axis=1))
-        cumulative = np.concatenate([np.zeros((len(counts), 1)), np.cumsum(counts, axis=1)], axis=1) / self.counts.n
-        outlying = self.counts.outlying(kind)
-        quantiles = np.array([
-            np.zeros(len(PERCENTAGES)) if i in outlying else _quantiles(c, e)
-            for i, (c, e) in enumerate(zip(cumulative, edges, strict=True))
-        ])  # fmt: skip
-        for i in outlying:
-            filled, held = self.counts.filled(kind, i)
-            middle = snr(i, filled + 0.5)
-            mean[i] = held @ middle / self.counts.n
-            std[i] = np.sqrt(held @ (middle - mean[i]) ** 2 / self.counts.n)
-            ends = np.column_stack([snr(i, filled), snr(i, filled + 1)]).ravel()
-            quantiles[i] = np.interp(np.array(PERCENTAGES) / 100, steps_of(held) / self.counts.n, ends)
-        values = {"wavelength": wavelength_nm, "expected": expected, "mean": mean, "std": std}
-        return values | {f"q{percentage:g}": quantiles[:, i] for i, percentage in enumerate(PERCENTAGES)}
-
-
-def _quantiles(cumulative: NDArray[np.float64], edges: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the quantiles of a histogram, interpolated linearly within bins."""
-    filled = np.flatnonzero(np.diff(cumulative))
-    span = slice(filled[0], filled[-1] + 2)
-    return np.asarray(np.interp(np.array(PERCENTAGES) / 100, cumulative[span], edges[span]))
+        snr: Callable[[int, NDArray[np.number]], NDArray[np.float64]],
+        **clipped: NDArray[np.float64],
+    ) -> QTable:
+        """Return the table of pixels or elements; `snr` converts fractional bin numbers to ratios."""
+        rows = []
+        for which in range(len(expected)):
+            filled, counts = self.counts.filled(kind, which)
+            middle = snr(which, filled + 0.5)
+            mean = counts @ middle / self.counts.n
+            edges = np.column_stack([snr(which, filled), snr(which, filled + 1)]).ravel()
+            quantiles = np.interp(np.array(PERCENTAGES) / 100, steps_of(counts) / self.counts.n, edges)
+            rows.append((mean, np.sqrt(counts @ (middle - mean) ** 2 / self.counts.n), *quantiles))
+        names = ("mean", "std", *(f"q{percentage:g}" for percentage in PERCENTAGES))
+        values = {"wavelength": wavelength_nm, "expected": expected} | dict(zip(names, np.array(rows).T, strict=True))
+        x, columns = self.expectation, (*COLUMNS, *CLIPPED_COLUMNS) if clipped else COLUMNS
+        about = {"exposure_s": x.exposure_s, "name": x.name, "signal": x.signal}
+        return table_of(columns, [values | clipped], realisations=self.counts.n, **about)
 
 
 def steps_of(counts: NDArray[np.int64]) -> NDArray[np.int64]:

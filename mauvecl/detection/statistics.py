@@ -111,14 +111,12 @@ class Statistic(ABC):
     label: ClassVar[str]
     #: Whether the statistic uses a flare as template, so that each flare has its own null distribution.
     shaped: ClassVar[bool] = False
-    #: Whether the reference is always one noisy quiescent exposure.
+    #: Whether the reference is always one noisy quiescent exposure, which excludes marginalising over unknowns.
     paired: ClassVar[bool] = False
     #: Name of the sum that kernels always compute (`layout.FIXED_STATISTICS`); None if the statistic has weights.
     kernel_sum: ClassVar[str | None] = None
     #: Whether the statistic uses sums over resolution elements instead of pixels.
     by_element: ClassVar[bool] = False
-    #: Whether the statistic can be marginalised over nuisance parameters.
-    marginal: ClassVar[bool] = True
 
     def added_variance(self, setting: Setting) -> float:
         """Return the variance of the subtracted reference relative to that of one exposure."""
@@ -130,8 +128,8 @@ class Statistic(ABC):
 
     def check(self, setting: Setting) -> None:
         """Raise InputError if the statistic is undefined in this setting."""
-        if setting.nuisances and (setting.comparison.estimated or not self.marginal):
-            why = "with estimated variances" if self.marginal else "which compares with one noisy exposure"
+        if setting.nuisances and (setting.comparison.estimated or self.paired):
+            why = "which compares with one noisy exposure" if self.paired else "with estimated variances"
             raise InputError(
                 f"statistic {self.name!r} {why} cannot be marginalised over {join_names(setting.nuisances.names)}; use "
                 "no unknowns, as with `nuisances.usual=false`, or another statistic by the model's variances",
@@ -154,11 +152,9 @@ class Statistic(ABC):
         """Return the closed forms without and with a flare, and the threshold at a false-alarm probability."""
         template = flare if self.shaped else None
 
-        def null_and_threshold() -> tuple[Form, float]:
-            null = self.closed_form(setting, setting.quiet, template)
-            return null, null.isf(fap)
-
-        null, threshold = setting.cached(f"null of {self.name} at {fap!r}", null_and_threshold, template)
+        quiet = setting.quiet
+        null = setting.cached(f"null of {self.name}", lambda: self.closed_form(setting, quiet, template), template)
+        threshold = setting.cached(f"threshold of {self.name} at {fap!r}", lambda: null.isf(fap), template)
         return DetectionForms(null, self.closed_form(setting, flare, template), threshold)
 
     def integrate_drawn(
@@ -184,10 +180,9 @@ class Statistic(ABC):
         if priors:
             rows = np.vstack([rows, others.finite(others.spectra)])
         means, variances = changes_of(observed)
-        amounts = np.array([node.amounts for node in nodes])
         moved = Differences(seen.mean, seen.variance, scatter=rows)
-        parts = self.moved_forms(setting, moved, amounts, means * setting.used, variances, flare)
-        return parts[0] if len(parts) == 1 else Mixture(tuple(parts), np.array([node.probability for node in nodes]))
+        parts = self.moved_forms(setting, moved, nodes.amounts, means * setting.used, variances, flare)
+        return parts[0] if len(parts) == 1 else Mixture(tuple(parts), nodes.probability)
 
     def moved_forms(
         self,

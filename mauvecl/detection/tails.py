@@ -330,8 +330,7 @@ class _Tilt:
             chance = null.weights * [part.sf(goal) for part in parts]
             chance = chance / chance.sum()
             nodes = setting.drawn.nodes(hypotheses.quiet, weighted=tilt.square is None)[0]
-            for name in nodes[0].scores:
-                score = np.array([node.scores[name] for node in nodes])
+            for name, score in nodes.scores.items():
                 mean = float(chance @ score)
                 scores[name] = mean, max(float(np.sqrt(chance @ (score - mean) ** 2)), 1.0)
         if tilt.square is None:

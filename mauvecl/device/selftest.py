@@ -378,7 +378,7 @@ def _drawing(how: dict[str, Any]) -> dict[str, Any]:
 
 def statistics_of(how: dict[str, Any], names: tuple[str, ...] = tuple(STATISTICS)) -> tuple[str, ...]:
     """Return the statistics of a case; if it marginalises, only those that support this."""
-    return tuple(n for n in names if STATISTICS[n].marginal) if "nuisances" in how else names
+    return tuple(n for n in names if not STATISTICS[n].paired) if "nuisances" in how else names
 
 
 def digest(array: NDArray[Any]) -> str:

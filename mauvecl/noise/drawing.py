@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
-from typing import TYPE_CHECKING, Literal, Self, TypedDict, cast, get_args
+from typing import TYPE_CHECKING, Literal, Self, TypedDict, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from mauvecl.noise import layout
 from mauvecl.noise.disturbances import Prior
 from mauvecl.noise.unknowns import NONE, PROCESSES, SIGNAL_PARTS, Conditions, Processes, SignalPart
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
@@ -236,6 +237,7 @@ class DrawingOptions(TypedDict, total=False):
     first_frame: int
 
 
+@validated
 @dataclass(frozen=True)
 class Drawing:
     """Options for the drawing of realisations."""
@@ -249,12 +251,6 @@ class Drawing:
     processes: Processes = NONE  # optional noise processes
     # Number of the first frame. Frame k of an exposure is drawn with an expectation of one frame and ``first_frame=k``.
     first_frame: int = 0
-
-    def __post_init__(self) -> None:
-        for name, value, choices in (("mode", self.mode, get_args(Mode)), ("recipe", self.recipe, get_args(Recipe))):
-            if value not in choices:
-                a, b, c = map(repr, choices)
-                raise InputError.of(name, value, f"{a}, {b} or {c}")
 
     @property
     def options(self) -> DrawingOptions:

@@ -55,43 +55,30 @@ STRAIGHT = 0.01
 class FactorDistribution:
     """Distribution of a factor as quadrature nodes."""
 
-    values: Float  # shape (n,)
-    weights: Float  # shape (n,), sum one
+    values: Float  # at the scores `SCORE`, whose probabilities are `WEIGHTS`
 
     @property
     def mean(self) -> float:
-        return float(self.weights @ self.values)
+        return float(WEIGHTS @ self.values)
 
     @property
     def sd(self) -> float:
-        return float(np.sqrt(self.weights @ (self.values - self.mean) ** 2))
+        return float(np.sqrt(WEIGHTS @ (self.values - self.mean) ** 2))
 
     @property
     def normal(self) -> bool:
         """True if the factor is a linear function of a normal score."""
-        if self.values.size == 1:
-            return True
         off = self.values - self.mean - self.sd * SCORE
-        return float(np.sqrt(self.weights @ off**2)) <= STRAIGHT * self.sd
+        return float(np.sqrt(WEIGHTS @ off**2)) <= STRAIGHT * self.sd
 
 
-UNIT_FACTOR = FactorDistribution(np.ones(1), np.ones(1))
+@dataclass(frozen=True, eq=False)
+class Nodes:
+    """Quadrature nodes: sets of factors on dark, light and sky."""
 
-
-@dataclass(frozen=True)
-class Node:
-    """Quadrature node: a set of factors on dark, light and sky."""
-
-    probability: float
-    dark: float
-    light: float
-    sky: float
-    scores: dict[str, float]  # normal score of each factor
-
-    @property
-    def amounts(self) -> tuple[float, float, float]:
-        """Amounts of the changes of `changes_of`."""
-        return self.light - 1.0, self.light * (self.sky - 1.0), self.dark - 1.0
+    probability: Float  # shape (n,)
+    amounts: Float  # amounts of the changes of `changes_of`, shape (n, 3)
+    scores: dict[str, Float]  # normal scores of each factor, shape (n,)
 
 
 def changes_of(x: Expectation) -> tuple[Float, Float]:
@@ -131,13 +118,13 @@ class FactorDistributions:
         at_median, spreads = dict(zip(SIGNAL_PARTS, medians, strict=True)), dict[SignalPart, list[FactorDistribution]]()
         for (name, factor), table in zip(modulations, tables, strict=True):
             # Relative to the factor at the median, as the table is.
-            spread = FactorDistribution(1.0 + quantile_at_score(table, SCORE), WEIGHTS)
+            spread = FactorDistribution(1.0 + quantile_at_score(table, SCORE))
             if PROCESSES[name].when == "frame" and n_frames > 1:
                 spread = _normal(spread.mean, spread.sd / np.sqrt(n_frames))
             spreads.setdefault(factor, []).append(spread)
         return cls({name: _product(ones, at_median[name]) for name, ones in spreads.items()}) if spreads else None
 
-    def nodes(self, x: Expectation, *, weighted: bool) -> tuple[list[Node], Float]:
+    def nodes(self, x: Expectation, *, weighted: bool) -> tuple[Nodes, Float]:
         """Return the nodes over which a statistic of an exposure is integrated, and spectra of normal amplitudes.
 
         Factors that are treated as normal amplitudes have spectra, DN per standard deviation, (k, n_pixel). `weighted`
@@ -149,7 +136,10 @@ class FactorDistributions:
         every, few = 1 if weighted else COARSE, np.polynomial.hermite_e.hermegauss(FEW)
         score, weight = SCORE[::every], WEIGHTS[::every] / WEIGHTS[::every].sum()
         for name, (part, variance) in moved.items():
-            spread = self.spreads.get(name, UNIT_FACTOR)
+            spread = self.spreads.get(name)
+            if spread is None:
+                grids.append([(1.0, 1.0, 0.0)])
+                continue
             if spread.normal and (spread.sd * variance <= VARIANCE_FRACTION[weighted] * x.variance_dn2).all():
                 if spread.sd:
                     rows.append(spread.sd * part)
@@ -158,15 +148,15 @@ class FactorDistributions:
             values = np.interp(score, SCORE, spread.values)
             grids.append(list(zip(weight.tolist(), values.tolist(), score.tolist(), strict=True)))
             score, weight = few[0], few[1] / few[1].sum()
-        nodes = []
-        for chosen in product(*grids):
-            weights, (dark, light, sky), scores = zip(*chosen, strict=True)
-            nodes.append(Node(math.prod(weights), dark, light, sky, dict(zip(moved, scores, strict=True))))
+        # Each of shape (n_factor, n).
+        weights, (dark, light, sky), scores = np.ascontiguousarray(np.array([*product(*grids)]).T)
+        amounts = np.column_stack([light - 1.0, light * (sky - 1.0), dark - 1.0])
+        nodes = Nodes(math.prod(weights), amounts, dict(zip(moved, scores, strict=True)))
         return nodes, np.array(rows).reshape(len(rows), x.variance_dn2.size)
 
 
 def _normal(mean: float, sd: float) -> FactorDistribution:
-    return FactorDistribution(mean + sd * SCORE, WEIGHTS)
+    return FactorDistribution(mean + sd * SCORE)
 
 
 def quantile_at_score(table: NDArray[np.float32], score: Float) -> Float:
@@ -179,7 +169,7 @@ def quantile_at_score(table: NDArray[np.float32], score: Float) -> Float:
 def _product(ones: list[FactorDistribution], median: float) -> FactorDistribution:
     """Return the distribution of a product of independent factors, which is normal if there are several."""
     if len(ones) == 1:
-        return FactorDistribution(median * ones[0].values, ones[0].weights)
+        return FactorDistribution(median * ones[0].values)
     mean = np.prod([prior.mean for prior in ones])
     square = np.prod([prior.mean**2 + prior.sd**2 for prior in ones])
     return _normal(float(median * mean), float(median * np.sqrt(square - mean**2)))

@@ -338,7 +338,7 @@ class Case:
         The factor on all light has the mean and, unless the study states another, the standard deviation of what is
         drawn; those of a stare are of the stare. The documented set leaves the star's own level free as well.
         """
-        from mauvecl.noise.scene import FactorDistributions
+        from mauvecl.noise.scene import WEIGHTS, FactorDistributions
 
         quiet = self.quiet if quiet is None else quiet
         unknown, given = self.unknowns(quiet), self.study.nuisances.light
@@ -357,7 +357,7 @@ class Case:
         unknown = unknown.with_prior("light", light.mean - 1.0, light.sd)
         if light.normal:
             return unknown
-        return replace(unknown, factor_prior=np.array([(light.values - light.mean) / light.sd, light.weights]))
+        return replace(unknown, factor_prior=np.array([(light.values - light.mean) / light.sd, WEIGHTS]))
 
     def detect_options(self, quiet: Expectation | None = None) -> dict[str, Any]:
         """Return all arguments of `Engine.detect` except expectations and seed; `quiet` as for `unknowns`."""

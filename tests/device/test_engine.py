@@ -122,7 +122,7 @@ def test_statistics_equal_reference(any_width: Engine, name: str, more: dict[str
     if "nuisances" in more:
         # Of those that can be marginalised, `uv_excess` would be degenerate with a flat dark and the star's light.
         own = Linear("own", np.linspace(0.0, 1.0, quiet.wavelength_nm.size))
-        names = (*(one for one in names if requests.STATISTICS[one].marginal and one != "uv_excess"), own)
+        names = (*(one for one in names if not requests.STATISTICS[one].paired and one != "uv_excess"), own)
     kind = {"statistics": names, "start": START, "seed": SEED, **how, **more}
     asked = requests.DetectRequest.of(quiet, tuple(flares), INDEX.size, **kind).hypotheses
     plan = requests.plan_channels(asked, range(len(flares)), first=True)

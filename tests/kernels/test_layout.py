@@ -12,8 +12,3 @@ def test_every_offset_on_the_device(probes: Probes) -> None:
         expected += [offset for _, offset in dtype.fields.values()] + [dtype.itemsize]
     out = probes.run("probe_layout", 1, np.zeros(len(expected), np.uint32))
     np.testing.assert_array_equal(out, expected)
-
-
-def test_streams_are_distinct_bytes() -> None:
-    assert len(set(layout.STREAMS.values())) == len(layout.STREAMS)
-    assert all(0 <= stream < 256 for stream in layout.STREAMS.values())
