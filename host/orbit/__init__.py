@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import model_serializer, model_validator
 
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Flag, Help, OrNone, Range, Unit
+from mauvecl.schema.fields import Flag, Help, OrNone, Range, Unit, as_typed
 from mauvecl.schema.section import Section, read_declinations
 
 #: Angle between two directions; None for no limit.
@@ -78,7 +78,8 @@ class Limits(Section):
     @property
     def assumptions(self) -> list[tuple[str, str, str]]:
         """Name, value and source of each limit in force."""
-        return [(name, _text(value), SOURCES[name]) for name, value in self if value not in (None, ())]
+        limits = [(name, value) for name, value in self if value not in (None, ())]
+        return [(name, as_typed(value).replace(",", " "), SOURCES[name]) for name, value in limits]
 
 
 _UVEX = "assumption, borrowed from UVEX (m4opt's definition of that mission); Mauve's own is not public"
@@ -95,9 +96,3 @@ SOURCES = {
     "shortest_s": "assumption: no time is lost to pointing and acquisition",
     "duty_cycle": "assumption: the whole window is exposed; the share that Mauve reaches is not public",
 }
-
-
-def _text(value: object) -> str:
-    if isinstance(value, tuple):
-        return " ".join(_text(item) for item in value)
-    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -305,12 +305,9 @@ def formula_grid(*, magnitude: bool = True, exposure_s: float | None = None) -> 
 
 def check_sweep(sweep: Sweep, stare: StareQuestion, events: Sequence[EventChoice]) -> None:
     """Raise InputError if a swept quantity has no effect on the stare."""
-    sizes = ("amplitude", "peak", "equivalent_duration_s", "energy_erg")
     fixed = {
         "exposure": True,
-        "amplitude": bool(stare.energies_erg)
-        if not events
-        else all(any(getattr(event, size) is not None for size in sizes) for event in events),
+        "amplitude": all(event.sizes for event in events) if events else bool(stare.energies_erg),
         "flare_temperature": bool(events) and all(event.temperature_k is not None for event in events),
     }
     for axis in sweep.axes:
