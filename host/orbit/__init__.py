@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import model_serializer, model_validator
@@ -64,10 +63,8 @@ class Limits(Section):
             low, high = self.declination_deg
             if not -90 <= low < high <= 90:
                 raise InputError.of("declination_deg", (low, high), "two rising values within -90 to 90")
-        if self.anomaly and (
-            len(self.anomaly) < 3 or not all(math.isfinite(angle) for corner in self.anomaly for angle in corner)
-        ):
-            raise InputError.of("anomaly", self.anomaly, "a polygon of at least 3 finite corners")
+        if 0 < len(self.anomaly) < 3:
+            raise InputError.of("anomaly", self.anomaly, "a polygon of at least 3 corners")
         return self
 
     @model_serializer(mode="plain")

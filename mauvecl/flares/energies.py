@@ -308,7 +308,7 @@ class Rates(ABC):
     band: str = "Kepler"  # name of the band of the energies, or "bolometric"
     source: str = "given"
     measured_erg: tuple[float, float] = ENERGIES  # range in which it was measured; it is extrapolated outside
-    scatter_dex: float = 0.0  # standard deviation of the logarithm of a single star's rate
+    scatter_dex: Annotated[float, Range(0, 3)] = 0.0  # standard deviation of the logarithm of a single star's rate
     # Energy of the flares' isotropic light; equivalent duration times the star's luminosity in the band (Davenport); or
     # the bolometric energy of a patch of 10 000 K seen face-on (Shibayama). `of_light` converts to the first.
     definition: Definition = "light"
@@ -317,8 +317,6 @@ class Rates(ABC):
         low, high = self.measured_erg
         if not 0 < low < high < np.inf:
             raise InputError.of("measured_erg", self.measured_erg, "two rising energies above 0", unit="erg")
-        if not (np.isfinite(self.scatter_dex) and 0 <= self.scatter_dex <= 3):
-            raise InputError.of("scatter_dex", self.scatter_dex, "between 0 and 3")
 
     @abstractmethod
     def per_day_above(self, energy_erg: ArrayLike) -> Float:

@@ -19,7 +19,7 @@ from mauvecl.host.orbit.geometry import TimeGrid, sunlight
 from mauvecl.host.orbit.orbit import Orbit, Target, Track
 from mauvecl.host.orbit.visibility import Particles, Thermal, Visibility
 from mauvecl.noise.disturbances import PointingDrifts
-from mauvecl.noise.unknowns import CHANGING, STARE_CHANGES, Changing
+from mauvecl.noise.unknowns import STARE_CHANGES, Changing
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range, Unit
@@ -290,8 +290,6 @@ class StareUnknown:
 
     def __post_init__(self) -> None:
         set_read_only(self, curve=self.curve)
-        if self.of not in CHANGING:
-            raise InputError.of("of", self.of, f"one of {', '.join(CHANGING)}")
         _check_spread(self.name, self.of, self.sd)
 
 

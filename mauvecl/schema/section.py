@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import difflib
 from collections.abc import Callable, Iterator, Sequence
 from decimal import Decimal, InvalidOperation
@@ -196,7 +197,11 @@ def model_in(annotation: Any) -> type[BaseModel] | None:
 
 
 def plain(key: str, given: Any, unit: str) -> Any:
-    """Convert Quantities, times and coordinates to the numbers and text that a study stores."""
+    """Convert Quantities, dates, times and coordinates to the numbers and text that a study stores."""
+    if isinstance(given, datetime.datetime) and given.tzinfo is not None:
+        given = given.astimezone(datetime.UTC).replace(tzinfo=None)
+    if isinstance(given, datetime.date):
+        return given.isoformat()
     if is_quantity(given):
         try:
             given = without_unit(given, unit)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import datetime
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import field_validator, model_validator
+from pydantic import model_validator
 
 from mauvecl.host.orbit import Limits
 from mauvecl.host.tables.names import (
@@ -86,14 +85,6 @@ class OrbitQuestion(Section):
         bool, Help("Ask SIMBAD for names that are not embedded", "needs mauvecl[names]"), Flag("--simbad")
     ] = False
     limits: Limits = Limits()
-
-    @field_validator("start", mode="before")
-    @classmethod
-    def _as_text(cls, given: Any) -> Any:
-        """Convert TOML's date and time types to text."""
-        if isinstance(given, datetime.datetime) and given.tzinfo is not None:
-            given = given.astimezone(datetime.UTC).replace(tzinfo=None)
-        return given.isoformat() if isinstance(given, datetime.date) else given
 
     def orbit(self) -> Orbit:
         """Load the orbit."""
