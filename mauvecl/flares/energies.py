@@ -38,7 +38,7 @@ from mauvecl.host.tables.opening import read_table
 from mauvecl.host.tables.table import Rows
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened
-from mauvecl.schema.fields import Range, Unit
+from mauvecl.schema.fields import Range, Unit, checked
 from mauvecl.schema.physical import Distance, Energy, Positive, Radius, RateExponent, Temperature
 
 if TYPE_CHECKING:
@@ -470,7 +470,7 @@ class RateTable(Rates):
 
 def band_factor(old: str, new: str, flare_k: float = 10_000.0, flare: FlareSpectrum | None = None) -> float:
     """Return the ratio of a flare's energy in a new band to that in an old one; either may be "bolometric"."""
-    light = Blackbody(flare_k) if flare is None else flare
+    light = Blackbody(checked(Temperature, "flare_k", flare_k)) if flare is None else flare
 
     def flux(band: str) -> float:
         return light.bolometric_flux() if band == BOLOMETRIC else flux_in_band(band, light)

@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 ORBIT_FRAMES_S = 5680.0
 
 
+#: Known changes during a stare.
+KNOWN_CHANGES = ("thermal", "variability", "throughput", "sky")
 Spreads = dict[Changing, Positive]
 #: Shape of flares in stares and searches.
 ShapeOfFlares = Annotated[ShapeName, Help("Shape of flares", choices=", ".join(SHAPE_NAMES)), Flag("--shape")]
