@@ -253,7 +253,7 @@ class PlanQuestion(Section):
 
     @model_validator(mode="after")
     def _different_targets(self) -> Self:
-        check_different([target.name for target in self.targets], "the plan has the target", "targets")
+        check_different([target.name for target in self.targets], "the plan's target", "targets")
         return self
 
     def law(self) -> DurationLaw:
@@ -274,7 +274,7 @@ def targets_of(orbit: OrbitQuestion, plan: PlanQuestion) -> list[Target]:
         raise InputError(
             "there are no targets; give names or coordinates, such as `orbit.targets='eps Eri'`", key="orbit.targets"
         )
-    check_different([target.name for target in targets], "the orbit has the target", "orbit.targets")
+    check_different([target.name for target in targets], "the target", "orbit.targets")
     return targets
 
 

@@ -272,7 +272,7 @@ class Sweep(Section):
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
-        check_different([axis.quantity for axis in self.axes], "the sweep has the quantity", "axes")
+        check_different([axis.quantity for axis in self.axes], "the sweep's quantity", "axes")
         lengths = {axis.quantity: len(axis.points()) for axis in self.axes}
         if self.how == "list" and len(set(lengths.values())) > 1:
             counts = ", ".join(f"{n} of {name}" for name, n in lengths.items())
