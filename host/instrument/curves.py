@@ -238,9 +238,6 @@ class PixelMap(ContentEquality):
                 table[name].unit = None if unit == u.dimensionless_unscaled else unit
         table.write(path, format="ascii.ecsv", overwrite=True)
 
-    def _line(self) -> str:
-        return f"of {self.size} pixels, {self.source}"
-
     def over(self, name: str, chosen: slice, nominal: float) -> Float:
         """Return a column over a range of pixels: factors times `nominal`, or the values that replace it."""
         values = getattr(self, name)
@@ -372,9 +369,6 @@ class ThroughputErrors(ContentEquality):
     def __repr__(self) -> str:
         # The instrument's digest is computed from representations.
         return f"ThroughputErrors({self.digest})"
-
-    def _line(self) -> str:
-        return f"{len(self.modes)} modes, {self.source}"
 
     def at(self, wavelength_nm: ArrayLike) -> Float:
         """Return the modes at wavelengths in nm, one row per mode."""

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import model_serializer, model_validator
 
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Flag, Help, OrNone, Range, Unit
+from mauvecl.schema.fields import Flag, Help, OrNone, Range, Unit, as_typed
 from mauvecl.schema.section import Section, read_declinations
 
 #: Angle between two directions; None for no limit.
@@ -64,10 +63,8 @@ class Limits(Section):
             low, high = self.declination_deg
             if not -90 <= low < high <= 90:
                 raise InputError.of("declination_deg", (low, high), "two rising values within -90 to 90")
-        if self.anomaly and (
-            len(self.anomaly) < 3 or not all(math.isfinite(angle) for corner in self.anomaly for angle in corner)
-        ):
-            raise InputError.of("anomaly", self.anomaly, "a polygon of at least 3 finite corners")
+        if 0 < len(self.anomaly) < 3:
+            raise InputError.of("anomaly", self.anomaly, "a polygon of at least 3 corners")
         return self
 
     @model_serializer(mode="plain")
@@ -78,7 +75,8 @@ class Limits(Section):
     @property
     def assumptions(self) -> list[tuple[str, str, str]]:
         """Name, value and source of each limit in force."""
-        return [(name, _text(value), SOURCES[name]) for name, value in self if value not in (None, ())]
+        limits = [(name, value) for name, value in self if value not in (None, ())]
+        return [(name, as_typed(value).replace(",", " "), SOURCES[name]) for name, value in limits]
 
 
 _UVEX = "assumption, borrowed from UVEX (m4opt's definition of that mission); Mauve's own is not public"
@@ -95,9 +93,3 @@ SOURCES = {
     "shortest_s": "assumption: no time is lost to pointing and acquisition",
     "duty_cycle": "assumption: the whole window is exposed; the share that Mauve reaches is not public",
 }
-
-
-def _text(value: object) -> str:
-    if isinstance(value, tuple):
-        return " ".join(_text(item) for item in value)
-    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -34,6 +34,7 @@ from mauvecl.host.stars.library import by_key, library_text, name_key, near_name
 from mauvecl.host.tables.files import parse_ecsv, read_text
 from mauvecl.host.tables.names import EXPECTED_POSITION, is_missing_position
 from mauvecl.host.tables.units import offline
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, printable, shortened
 from mauvecl.schema.physical import DAY_S
 
@@ -175,6 +176,7 @@ AT_EPOCH_KM, PER_DAY_KM = 1.0, 2.0
 DRAG_SHARE = 0.5
 
 
+@validated
 @dataclass(frozen=True)
 class Orbit:
     """The satellite's orbit and its propagation.
@@ -190,10 +192,6 @@ class Orbit:
 
     elements: Elements = field(default_factory=Elements.embedded)
     kind: Kind = "auto"
-
-    def __post_init__(self) -> None:
-        if self.kind not in ("auto", "tle", "mean"):
-            raise InputError.of("kind", self.kind, "auto, tle or mean")
 
     @classmethod
     def load(cls, file: str | Path | None = None, kind: Kind = "auto") -> Orbit:

@@ -211,7 +211,7 @@ def rates_of(text: PlanTarget, observation: TargetObservation) -> tuple[Rates | 
     try:
         rates = text.distribution(observation.target.spectral_type or "")
     except InputError as error:
-        if any(getattr(text, name) is not None for name in ("mass_msun", "alpha", "rates_file", "rates")):
+        if text.given_rates:
             raise
         return None, str(error)
     if rates.definition == "light":

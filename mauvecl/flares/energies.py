@@ -38,7 +38,7 @@ from mauvecl.host.tables.opening import read_table
 from mauvecl.host.tables.table import Rows
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened
-from mauvecl.schema.fields import Range, Unit
+from mauvecl.schema.fields import Range, Unit, checked
 from mauvecl.schema.physical import Distance, Energy, Positive, Radius, RateExponent, Temperature
 
 if TYPE_CHECKING:
@@ -308,7 +308,7 @@ class Rates(ABC):
     band: str = "Kepler"  # name of the band of the energies, or "bolometric"
     source: str = "given"
     measured_erg: tuple[float, float] = ENERGIES  # range in which it was measured; it is extrapolated outside
-    scatter_dex: float = 0.0  # standard deviation of the logarithm of a single star's rate
+    scatter_dex: Annotated[float, Range(0, 3)] = 0.0  # standard deviation of the logarithm of a single star's rate
     # Energy of the flares' isotropic light; equivalent duration times the star's luminosity in the band (Davenport); or
     # the bolometric energy of a patch of 10 000 K seen face-on (Shibayama). `of_light` converts to the first.
     definition: Definition = "light"
@@ -317,8 +317,6 @@ class Rates(ABC):
         low, high = self.measured_erg
         if not 0 < low < high < np.inf:
             raise InputError.of("measured_erg", self.measured_erg, "two rising energies above 0", unit="erg")
-        if not (np.isfinite(self.scatter_dex) and 0 <= self.scatter_dex <= 3):
-            raise InputError.of("scatter_dex", self.scatter_dex, "between 0 and 3")
 
     @abstractmethod
     def per_day_above(self, energy_erg: ArrayLike) -> Float:
@@ -472,7 +470,7 @@ class RateTable(Rates):
 
 def band_factor(old: str, new: str, flare_k: float = 10_000.0, flare: FlareSpectrum | None = None) -> float:
     """Return the ratio of a flare's energy in a new band to that in an old one; either may be "bolometric"."""
-    light = Blackbody(flare_k) if flare is None else flare
+    light = Blackbody(checked(Temperature, "flare_k", flare_k)) if flare is None else flare
 
     def flux(band: str) -> float:
         return light.bolometric_flux() if band == BOLOMETRIC else flux_in_band(band, light)

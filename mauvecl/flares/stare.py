@@ -19,7 +19,7 @@ from mauvecl.host.orbit.geometry import TimeGrid, sunlight
 from mauvecl.host.orbit.orbit import Orbit, Target, Track
 from mauvecl.host.orbit.visibility import Particles, Thermal, Visibility
 from mauvecl.noise.disturbances import PointingDrifts
-from mauvecl.noise.unknowns import CHANGING, STARE_CHANGES, Changing
+from mauvecl.noise.unknowns import STARE_CHANGES, Changing
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range, Unit
@@ -290,8 +290,6 @@ class StareUnknown:
 
     def __post_init__(self) -> None:
         set_read_only(self, curve=self.curve)
-        if self.of not in CHANGING:
-            raise InputError.of("of", self.of, f"one of {', '.join(CHANGING)}")
         _check_spread(self.name, self.of, self.sd)
 
 
@@ -625,8 +623,7 @@ def stare_along(
             raise InputError.of(name, unknowns[name], "none, since the orbit gives it")
     place = target if isinstance(target, Target) else Target.of(target)
     thermal, particles = thermal or Thermal(), particles or Particles()
-    count = int(np.ceil(duration_s / frame_s * (1 - 1e-12)))
-    times = TimeGrid(start, count * frame_s / DAY_S, frame_s)
+    times = TimeGrid(start, duration_s / DAY_S, frame_s)
     track = orbit.track(times)
     visible = Visibility.of(track, place.direction[None], limits)
     seen = visible.seen[:, 0]
@@ -637,7 +634,7 @@ def stare_along(
             key="target",
         )
     # All but the temperature follow from a stare without gaps.
-    whole = Stare.of(count * frame_s, frame_s=frame_s, **unknowns)
+    whole = Stare.of(times.n * frame_s, frame_s=frame_s, **unknowns)
     temperature = _temperature(orbit, track, thermal)
     stare = select_frames(replace(whole, temperature_c=temperature), seen)
     hits = particles.rate_per_cm2_s(track)[seen]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import difflib
 from collections.abc import Callable, Iterator, Sequence
 from decimal import Decimal, InvalidOperation
@@ -196,7 +197,11 @@ def model_in(annotation: Any) -> type[BaseModel] | None:
 
 
 def plain(key: str, given: Any, unit: str) -> Any:
-    """Convert Quantities, times and coordinates to the numbers and text that a study stores."""
+    """Convert Quantities, dates, times and coordinates to the numbers and text that a study stores."""
+    if isinstance(given, datetime.datetime) and given.tzinfo is not None:
+        given = given.astimezone(datetime.UTC).replace(tzinfo=None)
+    if isinstance(given, datetime.date):
+        return given.isoformat()
     if is_quantity(given):
         try:
             given = without_unit(given, unit)
@@ -257,11 +262,11 @@ def fields_of(section: type[BaseModel], path: tuple[str, ...] = ()) -> Iterator[
             yield from fields_of(inner, (*path, key))
 
 
-def check_different(names: Sequence[str], where: str, key: str) -> None:
-    """Raise InputError if a name is given twice; its sentence begins with where it is."""
+def check_different(names: Sequence[str], what: str, key: str) -> None:
+    """Raise InputError if a name is given twice; its sentence begins with what is named."""
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
-        raise InputError(f"{where} {shortened(twice)} twice, but each must be given once", key=key)
+        raise InputError(f"{what} {shortened(twice)} is named twice, but must be given once", key=key)
 
 
 # Readers of values that are written as text, as on the command line; each receives the value's name for messages.

@@ -16,6 +16,7 @@ from mauvecl.schema.columns import Column, percent, short
 from mauvecl.schema.errors import Message, of_kind
 from mauvecl.study.questions import QUANTITIES, Sweep
 from mauvecl.study.star import Star
+from mauvecl.study.stare import KNOWN_CHANGES
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -37,8 +38,6 @@ Use = Literal["instrument", "sky", "flare", "orbit", "processes", "nuisances", "
 #: Parts that hold unknowns: processes of draws, nuisance parameters of statistics, changes during a stare, and
 #: instrument values that are averaged over.
 UNKNOWN_USES: tuple[Use, ...] = ("processes", "nuisances", "stare", "values")
-#: Known changes during a stare.
-KNOWN_CHANGES = ("thermal", "variability", "throughput", "sky")
 
 
 def assumptions_of(study: Study, uses: Collection[Use], varied: Collection[str] = ()) -> list[str]:

@@ -154,9 +154,8 @@ def stars_of(
     changed = {
         key: value for key, value in of_stars.items() if value is not None and key not in ("library", "magnitude")
     }
-    of_files = {key: value for key, value in changed.items() if key in FILE_KEYS}
-    same = {key: value for key, value in changed.items() if key not in FILE_KEYS}
-    if not (names or magnitudes or same or of_files):
+    of_files = [key for key in changed if key in FILE_KEYS]
+    if not (names or magnitudes or changed):
         return None
     if not (names or own):
         # Those of the default study are not meant.
@@ -178,10 +177,9 @@ def stars_of(
             entry["magnitude"] = value
     if of_files and not any("file" in entry for entry in data):
         named = " and ".join(f"`{key}`" for key in of_files)
-        raise InputError(
-            f"{named} needs a spectrum file among the stars: `star='my-star.txt'`", key=next(iter(of_files))
-        )
-    return [entry | same | (of_files if "file" in entry else {}) for entry in data]
+        raise InputError(f"{named} needs a spectrum file among the stars: `star='my-star.txt'`", key=of_files[0])
+    same = {key: value for key, value in changed.items() if key not in FILE_KEYS}
+    return [entry | (changed if "file" in entry else same) for entry in data]
 
 
 def is_there(name: str) -> bool:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import datetime
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import field_validator, model_validator
+from pydantic import model_validator
 
 from mauvecl.host.orbit import Limits
 from mauvecl.host.tables.names import (
@@ -87,14 +86,6 @@ class OrbitQuestion(Section):
     ] = False
     limits: Limits = Limits()
 
-    @field_validator("start", mode="before")
-    @classmethod
-    def _as_text(cls, given: Any) -> Any:
-        """Convert TOML's date and time types to text."""
-        if isinstance(given, datetime.datetime) and given.tzinfo is not None:
-            given = given.astimezone(datetime.UTC).replace(tzinfo=None)
-        return given.isoformat() if isinstance(given, datetime.date) else given
-
     def orbit(self) -> Orbit:
         """Load the orbit."""
         from mauvecl.host.orbit.orbit import Orbit
@@ -164,18 +155,17 @@ class PlanTarget(Section):
                     f"{self.name} needs all of {', '.join(names)} or none, but has only {' and '.join(given)}",
                     key=given[0],
                 )
-        ways = [
-            name
-            for name, key in (("rates", "rates"), ("mass and age", "mass_msun"), ("alpha", "alpha"),
-                              ("rates_file", "rates_file"))
-            if getattr(self, key) is not None
-        ]  # fmt: skip
-        if len(ways) > 1:
+        if len(ways := self.given_rates) > 1:
             raise InputError(
                 f"{self.name} needs its flare rates in one way only, but has them by {' and by '.join(ways)}",
                 key="rates",
             )
         return self
+
+    @property
+    def given_rates(self) -> list[str]:
+        """Keys of the given flare rates, of which a target has at most one; the mass has an age."""
+        return [key for key in ("rates", "mass_msun", "alpha", "rates_file") if getattr(self, key) is not None]
 
     def target(self, simbad: bool) -> Target:
         """Look up the target; given coordinates replace those of its name."""
@@ -201,7 +191,7 @@ class PlanTarget(Section):
 
     def distribution(self, spectral_type: str) -> Rates:
         """Return the flare rates; raises InputError if none are given and the spectral type has no preset."""
-        from mauvecl.flares.energies import BOLOMETRIC, EXPONENTS, PowerLaw, RateTable, davenport2019, preset
+        from mauvecl.flares.energies import BOLOMETRIC, EXPONENTS, TYPICAL, PowerLaw, RateTable, davenport2019, preset
 
         if self.mass_msun is not None and self.age_myr is not None:
             return davenport2019(mass_msun=self.mass_msun, age_myr=self.age_myr)
@@ -210,7 +200,7 @@ class PlanTarget(Section):
         if self.rates_file is not None:
             return RateTable.read(self.rates_file, self.rates_band)
         kind = self.rates or spectral_type.strip()[:1].upper()
-        if kind not in ("G", "K", "M", "sunlike"):
+        if kind not in (*TYPICAL, "sunlike"):
             alpha = EXPONENTS.get(kind)
             exception = "" if alpha is None else f" except for an exponent of {alpha} (Althukair & Tsiklauri 2023)"
             raise InputError(
@@ -263,7 +253,7 @@ class PlanQuestion(Section):
 
     @model_validator(mode="after")
     def _different_targets(self) -> Self:
-        check_different([target.name for target in self.targets], "the plan has the target", "targets")
+        check_different([target.name for target in self.targets], "the plan's target", "targets")
         return self
 
     def law(self) -> DurationLaw:
@@ -284,7 +274,7 @@ def targets_of(orbit: OrbitQuestion, plan: PlanQuestion) -> list[Target]:
         raise InputError(
             "there are no targets; give names or coordinates, such as `orbit.targets='eps Eri'`", key="orbit.targets"
         )
-    check_different([target.name for target in targets], "the orbit has the target", "orbit.targets")
+    check_different([target.name for target in targets], "the target", "orbit.targets")
     return targets
 
 

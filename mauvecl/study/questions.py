@@ -272,7 +272,7 @@ class Sweep(Section):
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
-        check_different([axis.quantity for axis in self.axes], "the sweep has the quantity", "axes")
+        check_different([axis.quantity for axis in self.axes], "the sweep's quantity", "axes")
         lengths = {axis.quantity: len(axis.points()) for axis in self.axes}
         if self.how == "list" and len(set(lengths.values())) > 1:
             counts = ", ".join(f"{n} of {name}" for name, n in lengths.items())
@@ -305,12 +305,9 @@ def formula_grid(*, magnitude: bool = True, exposure_s: float | None = None) -> 
 
 def check_sweep(sweep: Sweep, stare: StareQuestion, events: Sequence[EventChoice]) -> None:
     """Raise InputError if a swept quantity has no effect on the stare."""
-    sizes = ("amplitude", "peak", "equivalent_duration_s", "energy_erg")
     fixed = {
         "exposure": True,
-        "amplitude": bool(stare.energies_erg)
-        if not events
-        else all(any(getattr(event, size) is not None for size in sizes) for event in events),
+        "amplitude": all(event.sizes for event in events) if events else bool(stare.energies_erg),
         "flare_temperature": bool(events) and all(event.temperature_k is not None for event in events),
     }
     for axis in sweep.axes:

@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 ORBIT_FRAMES_S = 5680.0
 
 
+#: Known changes during a stare.
+KNOWN_CHANGES = ("thermal", "variability", "throughput", "sky")
 Spreads = dict[Changing, Positive]
 #: Shape of flares in stares and searches.
 ShapeOfFlares = Annotated[ShapeName, Help("Shape of flares", choices=", ".join(SHAPE_NAMES)), Flag("--shape")]
@@ -152,13 +154,17 @@ class EventChoice(Section):
 
     @model_validator(mode="after")
     def _one_size(self) -> Self:
-        sizes = ("amplitude", "peak", "equivalent_duration_s", "energy_erg")
-        given = [name for name in sizes if getattr(self, name) is not None]
-        if len(given) > 1:
+        if len(given := self.sizes) > 1:
             raise InputError(f"an event needs only one of {' and '.join(given)}", key=given[0])
         if self.shape is not None and self.shape_file is not None:
             raise InputError("an event needs either shape or shape_file, but has both", key="shape")
         return self
+
+    @property
+    def sizes(self) -> list[str]:
+        """Keys of the given sizes, at most one."""
+        keys = ("amplitude", "peak", "equivalent_duration_s", "energy_erg")
+        return [key for key in keys if getattr(self, key) is not None]
 
     def load_shape(self, default: str) -> Shape:
         """Return the shape, or the published shape named `default` if none is given."""

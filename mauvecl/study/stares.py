@@ -17,7 +17,7 @@ from mauvecl.noise.disturbances import Normal, Prior
 from mauvecl.noise.unknowns import CHANGING, COURSES, PROCESSES, STARE_PROCESSES, Changing, Course, default_spreads
 from mauvecl.schema.errors import InputError, Message
 from mauvecl.schema.physical import DAY_S
-from mauvecl.study.stare import EventChoice, StareQuestion
+from mauvecl.study.stare import KNOWN_CHANGES, EventChoice, StareQuestion
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -70,8 +70,8 @@ def stare_of(study: Study, instrument: Instrument) -> Stare:
     if study.nuisances.usual:
         spreads = {how: documented | spreads[how] for how, documented in default_spreads().items()}
 
-    changes: dict[str, Any] = {name: getattr(q, name) for name in ("variability", "throughput", "sky")} | spreads
-    changes |= {"orbit_s": q.orbit_s} | {name: getattr(q, name) for name in STARE_PROCESSES}
+    names = (*KNOWN_CHANGES, *STARE_PROCESSES, "orbit_s")
+    changes: dict[str, Any] = {name: getattr(q, name) for name in names} | spreads
     if q.along_orbit:
         stare = _along_orbit(study, instrument.frame_s, changes)
     else:
@@ -80,7 +80,6 @@ def stare_of(study: Study, instrument: Instrument) -> Stare:
             frame_s=instrument.frame_s,
             gaps=q.all_gaps(),
             temperature_c=instrument.temperature_c,
-            thermal=q.thermal,
             **changes,
         )
     for _, changed, _, mean in priors:

@@ -193,7 +193,7 @@ def targets(text: str, *, check: bool = True) -> tuple[dict[str, Any], ...]:
                 "or coordinates such as 53.23 -9.46",
                 key="targets",
             ) from error
-    check_different([row["name"] for row in rows], "the text has the target", "targets")
+    check_different([row["name"] for row in rows], "the target", "targets")
     return tuple(rows)
 
 
