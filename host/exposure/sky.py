@@ -97,10 +97,9 @@ def parse_position(target: SkyCoord | str) -> SkyCoord:
                 raise
             expected = f"a name such as {', '.join(near_names(target, stars_only=True))}, or {expected}"
             raise InputError.of("target", target, expected) from error
-    if isinstance(target, SkyCoord | BaseCoordinateFrame):
-        position = SkyCoord(target)
-    else:
+    if not isinstance(target, SkyCoord | BaseCoordinateFrame):
         raise InputError.of("target", target, expected)
+    position = SkyCoord(target)
     if not position.isscalar:
         raise InputError(f"target must be a single position, but holds {position.size} positions", key="target")
     angles = position.spherical

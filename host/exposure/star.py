@@ -122,11 +122,7 @@ class Neighbours:
 
     def within(self, instrument: Instrument) -> list[Neighbour]:
         """Return the neighbours within the radius of the fibre."""
-        return [
-            neighbour
-            for neighbour in self.stars
-            if neighbour.separation_arcsec <= instrument.field_of_view_radius_arcsec
-        ]
+        return [star for star in self.stars if star.separation_arcsec <= instrument.field_of_view_radius_arcsec]
 
     def electrons_per_second(self, instrument: Instrument, order: Order = "paper") -> Float:
         """Return the mean electrons per second of all neighbours in the fibre, shape (n_pixel,)."""

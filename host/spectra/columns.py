@@ -316,8 +316,6 @@ def as_typed(name: str, kind: str, place: int, names: Sequence[str] = ()) -> str
 def choose(names: Sequence[str], roles: Sequence[Role], asked: Sequence[str] = ()) -> tuple[tuple[int, ...], int]:
     """Choose the columns of wavelength, or of both edges of each bin, and of flux, of which the user may name some."""
     wanted = [_named(name, names) for name in asked]
-    if len(wanted) > 2:
-        raise InputError.of("columns", asked, "one flux, and one wavelength at most")
     axes = [i for i in wanted if roles[i].kind in AXES]
     if len(wanted) == 2 and not axes:
         axes = wanted[:1]
