@@ -438,9 +438,8 @@ def read_numbers(path: str | Path, what: str) -> Numbers:
 
 def _text_and_name(path: str | Path, what: str) -> tuple[str, str]:
     """Read the text of a file, and return it with the file's name for messages."""
-    path = Path(path)
     named = f"{what} {shortened(str(path))}"
-    return as_text(unpacked(read_bytes(path, what), named), named), named
+    return as_text(unpacked(read_bytes(Path(path), what), named), named), named
 
 
 def parse_numbers(text: str, what: str) -> Numbers:
