@@ -373,7 +373,7 @@ class TextRows:
 
 def text_table(text: str, what: str, commas: bool) -> Table:
     """Parse a table from text: ECSV, those of IPAC and CDS, and rows that marks or blanks divide into texts."""
-    if re.match(r"\s*#\s*%ECSV", text):
+    if re.match(r"\s*# %ECSV", text):
         return parse_ecsv(text, what)
     form = _known_form(text)
     if form is None:
