@@ -16,7 +16,7 @@ from scipy import special
 
 from mauvecl.host.arrays import ContentEquality, true_runs
 from mauvecl.host.exposure import DEFAULT_SKY
-from mauvecl.host.exposure.neighbours import Neighbours
+from mauvecl.host.exposure.neighbours import Neighbours, check_level
 from mauvecl.host.exposure.response import Order, electrons_per_second, negative_means_message
 from mauvecl.host.exposure.sky import Sky
 from mauvecl.host.instrument import DEFAULT_INSTRUMENT
@@ -585,12 +585,7 @@ def _usable(source: Source, instrument: Instrument) -> Source:
     low, high = instrument.output_min_nm, instrument.output_max_nm
     first, last = source.measured_nm or (float(source.wavelength_nm[0]), float(source.wavelength_nm[-1]))
     check_covers(source.name, (first, last), (low, high), f"{instrument.name}'s output range ")
-    if source.unscaled:
-        raise InputError(
-            f"the spectrum of {source.name} is not as bright as the star is seen: {source.unscaled}; give a magnitude "
-            "as well",
-            key="magnitude",
-        )
+    check_level(source, source.name, "magnitude")
     return continued_to_reach(source, instrument)
 
 

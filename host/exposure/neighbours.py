@@ -86,13 +86,15 @@ class Neighbour:
                 star = star.at_magnitude(self.magnitude, known_band(self.band))
             except InputError as error:
                 raise error.within(f"neighbour {self.name}, {self.separation_arcsec:.3g} arcsec away") from error
-        if star.unscaled:
-            raise InputError(
-                f"the spectrum of neighbour {self.name} is not as bright as the star is seen: {star.unscaled}; give a "
-                "magnitude as well",
-                key="neighbours",
-            )
+        check_level(star, f"neighbour {self.name}", "neighbours")
         return star
+
+
+def check_level(source: Source, name: str, key: str) -> None:
+    """Raise InputError, which calls a star by `name`, if its spectrum is not as bright as the star is seen."""
+    if source.unscaled:
+        fault = f"the spectrum of {name} is not as bright as the star is seen: {source.unscaled}"
+        raise InputError(f"{fault}; give a magnitude as well", key=key)
 
 
 @validated
@@ -106,11 +108,7 @@ class Neighbours:
 
     def within(self, instrument: Instrument) -> list[Neighbour]:
         """Return the neighbours within the radius of the fibre."""
-        return [
-            neighbour
-            for neighbour in self.stars
-            if neighbour.separation_arcsec <= instrument.field_of_view_radius_arcsec
-        ]
+        return [star for star in self.stars if star.separation_arcsec <= instrument.field_of_view_radius_arcsec]
 
     def electrons_per_second(self, instrument: Instrument, order: Order = "paper") -> Float:
         """Return the mean electrons per second of all neighbours in the fibre, shape (n_pixel,)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from dataclasses import dataclass
 from functools import lru_cache
@@ -65,18 +66,13 @@ def parse_time(time: Time | str) -> Time:
     from astropy.time import Time
 
     expected = "a UTC time such as '2026-03-01T12:00:00'"
-    if isinstance(time, str):
-        try:
-            moment = Time(time.strip().removesuffix("Z"), scale="utc")
-        except ValueError:
-            raise InputError.of("time", time, expected) from None
-    elif isinstance(time, Time):
-        moment = time
-    else:
-        raise InputError.of("time", time, expected)
-    if not moment.isscalar:
+    moment = time
+    if isinstance(moment, str):
+        with contextlib.suppress(ValueError):
+            moment = Time(moment.strip().removesuffix("Z"), scale="utc")
+    if isinstance(moment, Time) and not moment.isscalar:
         raise InputError(f"time must be a single time, but holds {moment.size} times", key="time")
-    if np.ma.is_masked(moment.jd) or not np.isfinite(moment.jd):
+    if not isinstance(moment, Time) or np.ma.is_masked(moment.jd) or not np.isfinite(moment.jd):
         raise InputError.of("time", time, expected)
     year = float(moment.decimalyear)
     if not YEARS[0] <= year < YEARS[1]:
@@ -101,10 +97,9 @@ def parse_position(target: SkyCoord | str) -> SkyCoord:
                 raise
             expected = f"a name such as {', '.join(near_names(target, stars_only=True))}, or {expected}"
             raise InputError.of("target", target, expected) from error
-    if isinstance(target, SkyCoord | BaseCoordinateFrame):
-        position = SkyCoord(target)
-    else:
+    if not isinstance(target, SkyCoord | BaseCoordinateFrame):
         raise InputError.of("target", target, expected)
+    position = SkyCoord(target)
     if not position.isscalar:
         raise InputError(f"target must be a single position, but holds {position.size} positions", key="target")
     angles = position.spherical

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
 
+from mauvecl.host.tables.names import key_of
 from mauvecl.host.tables.units import NO_FLUX, SCALE, FluxKind, balanced, flux_kind, is_spectral, is_stated, unit_of
 from mauvecl.schema.errors import InputError, shortened
 
@@ -292,11 +293,6 @@ TYPED = re.compile(r"[^\[\],\"'\s](?:[^\[\],\"'\n\r\t]{0,38}[^\[\],\"'\s])?")
 AXES = ("wavelength", "lower edge", "upper edge")
 
 
-def plain(name: str) -> str:
-    """Normalise a column's name for comparison: lower case, without quotes and repeated blanks."""
-    return " ".join(name.strip().strip("\"'").lower().split())
-
-
 def numbered(kind: str, word: str) -> int | None:
     """Return the index in a word such as ``row 3``, or None."""
     match = re.fullmatch(rf"{kind}\s+(\d{{1,9}})", word.strip(), re.IGNORECASE)
@@ -313,15 +309,13 @@ def as_typed(name: str, kind: str, place: int, names: Sequence[str] = ()) -> str
     """Return ``FILE[name]`` for a message, or ``FILE[row 3]`` where the name cannot be typed or is not the only one."""
     word = name.strip()
     typed = TYPED.fullmatch(word) is not None and word.isprintable()
-    alone = sum(plain(one) == plain(word) for one in names) < 2
+    alone = sum(key_of(one) == key_of(word) for one in names) < 2
     return f"FILE[{word}]" if typed and alone else f"FILE[{kind} {place + 1}]"
 
 
 def choose(names: Sequence[str], roles: Sequence[Role], asked: Sequence[str] = ()) -> tuple[tuple[int, ...], int]:
     """Choose the columns of wavelength, or of both edges of each bin, and of flux, of which the user may name some."""
     wanted = [_named(name, names) for name in asked]
-    if len(wanted) > 2:
-        raise InputError.of("columns", asked, "one flux, and one wavelength at most")
     axes = [i for i in wanted if roles[i].kind in AXES]
     if len(wanted) == 2 and not axes:
         axes = wanted[:1]
@@ -336,7 +330,7 @@ def _named(name: str, names: Sequence[str]) -> int:
     indices = [i for i, one in enumerate(names) if one.strip() == name]
     if not indices and (place := numbered("column", name)) is not None and place < len(names):
         return place
-    indices = indices or [i for i, one in enumerate(names) if plain(one) == plain(name)]
+    indices = indices or [i for i, one in enumerate(names) if key_of(one) == key_of(name)]
     if len(indices) != 1:
         fault = f"{'several columns are' if indices else 'no column is'} named {shortened(name)}"
         raise InputError(f"{fault}; give one of {listed(names)}", key="columns")

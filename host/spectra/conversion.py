@@ -16,9 +16,9 @@ import astropy.units as u
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.spectra.columns import Role, as_typed, choose, listed, numbered, plain, role_of
+from mauvecl.host.spectra.columns import Role, as_typed, choose, listed, numbered, role_of
 from mauvecl.host.spectra.units import Medium, check_assumed_unit, unit_and_medium, vacuum_wavelengths
-from mauvecl.host.tables.names import divided_unit
+from mauvecl.host.tables.names import divided_unit, key_of
 from mauvecl.host.tables.table import Values, marks_in, without_indefinite
 from mauvecl.host.tables.units import flux_kind, is_spectral, is_stated, linear, unit_of
 from mauvecl.schema.errors import InputError
@@ -130,11 +130,11 @@ def spectrum_in(tables: Sequence[SpectrumTable], asked: Sequence[str]) -> RawSpe
 def _spectrum_of(table: SpectrumTable, asked: Sequence[str]) -> RawSpectrum:
     names = [column.name for column in table.columns]
     roles = table.roles
-    known = {plain(name) for name in names} | {plain(f"column {place + 1}") for place in range(len(names))}
+    known = {key_of(name) for name in names} | {key_of(f"column {place + 1}") for place in range(len(names))}
     # Words that do not name a column may name a row.
-    rest = [word for word in asked if plain(word) not in known]
+    rest = [word for word in asked if key_of(word) not in known]
     try:
-        axes, light = choose(names, roles, [word for word in asked if plain(word) in known])
+        axes, light = choose(names, roles, [word for word in asked if key_of(word) in known])
     except InputError as error:
         raise (_no_such(rest[0], names) if rest else error) from error
     messages = []
@@ -204,7 +204,7 @@ def _selected_rows(
         cells = [np.broadcast_to(cell, shape) if np.shape(cell) == shape[1:] else cell for cell in cells]
     if len({len(cell) for cell in cells}) > 1:
         raise InputError(f"it needs {n} rows of wavelengths, as many as of fluxes, not {len(cells[0])}", key="flux")
-    names = [plain(column.name) for column in table.columns]
+    names = [key_of(column.name) for column in table.columns]
     is_only = n == 1 and not asked and not table.row_title
     identifiers = [[""]] if is_only else _identifiers(table, chosen, n)
     identifier = ""

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -139,7 +139,10 @@ def _table_of_arrays(
 
 def _names(lines: NumberLines) -> tuple[list[str], list[str]]:
     """Return the names of columns and the units below them; empty if there are none."""
-    if numbered := _numbered(lines):
+    # Lines such as "column 2: flux"; columns without such a line are named by number.
+    found = numbered_names((line for line, _ in lines.header), lines.n)
+    numbered = [found.get(k, str(k + 1)) for k in range(lines.n)]
+    if len(found) > 1 and _recognised(numbered):
         return numbered, []
     rows = {k: cells for k, (line, _) in enumerate(lines.header) if (cells := divided_names(line, lines.n))}
     # The last of the lines that name most columns.
@@ -189,13 +192,6 @@ def _units(lines: NumberLines, names_at: int) -> list[str]:
     return []
 
 
-def _numbered(lines: NumberLines) -> list[str]:
-    """Return names from lines such as "column 2: flux"; columns without such a line are named by number."""
-    found = numbered_names((line for line, _ in lines.header), lines.n)
-    names = [found.get(k, str(k + 1)) for k in range(lines.n)]
-    return names if len(found) > 1 and _recognised(names) else []
-
-
 def _of_another_length(lines: NumberLines) -> list[str]:
     """Return the names of a line with fewer cells than the rows, for the columns from the left.
 
@@ -228,20 +224,8 @@ FITS_UNITS = ("Angstrom", "erg / (s cm2 Angstrom)")
 _REMARKS = ("COMMENT", "HISTORY", "DESCRIP")
 
 
-def fits_tables(
-    file: IO[bytes], name: str, origin: str, asked: Sequence[str], check: bool = True
-) -> list[SpectrumTable]:
-    """Read the tables of a FITS file, including images of spectra.
-
-    Raises InputError if the content is not FITS, is truncated, contradicts its checksums, or has no tables or images.
-    """
-    hdus = open_fits(file, check=check)
-    with reading("it", WHOLE):
-        return _Reader(hdus, name, origin, asked).tables()
-
-
 class _Reader:
-    """Reader of the extensions of an open file."""
+    """Reader of the tables of an open FITS file, including images of spectra."""
 
     def __init__(self, hdus: Any, name: str, origin: str, asked: Sequence[str]) -> None:
         self.hdus, self.name, self.origin, self.asked = hdus, name, origin, asked
@@ -249,6 +233,7 @@ class _Reader:
         self.primary = hdus[0].header
 
     def tables(self) -> list[SpectrumTable]:
+        """Return the tables that may have the spectrum; raise InputError if there is none."""
         from astropy.io import fits
 
         pairs = paired_images(self.hdus)
@@ -367,23 +352,22 @@ class _Reader:
                 columns.append(Values.of("order", np.array(orders)))
             return self._table(header, columns, self._label(number, hdu), row_names=orders)
         flux, names, note = rows_of(hdu, text_at(self.primary, "TELESCOP"), bool(self.asked))
-        system = text_at(header, "CTYPE1").upper()
-        if system.endswith("-TAB") or system.startswith("MULTISPE"):
-            axis = self.file.tabulated(header) if "-" in system else multispec_axis(header, flux.shape[-1])
-            columns = [axis, Values.of("flux", flux, text_at(header, "BUNIT"))]
-            return self._table(header, columns, self._label(number, hdu), notes=note, row_names=names)
+        n, system, remarks = flux.shape[-1], text_at(header, "CTYPE1").upper(), ""
+        is_bare = not {"CRVAL1", "COEFF0"} & {*header, *self.primary}
+        if system.endswith("-TAB"):
+            axis = self.file.tabulated(header)
+        elif system.startswith("MULTISPE"):
+            axis = multispec_axis(header, n)
+        elif is_bare and (beside := self._axis_beside(n)) is not None:
+            axis = beside
+        else:
+            values, unit, kind, notes = axis_of(header, self.primary, n)
+            axis, note = Values.of("wavelength", values, unit), (*notes, *note)
+            remarks = "\nair wavelength" if kind == "AWAV" else "\nvacuum" if kind == "WAVE" else ""
         # SDSS-I/II writes erg/cm/s/Ang for erg/cm2/s/Ang.
         flux_unit = re.sub(r"erg/cm/s/", "erg/cm2/s/", unit_at(FLUX_UNITS, header, self.primary))
-        is_bare = not {"CRVAL1", "COEFF0"} & {*header, *self.primary}
-        if is_bare and (beside := self._axis_beside(flux.shape[-1])) is not None:
-            columns = [beside, Values.of("flux", flux, flux_unit)]
-            return self._table(header, columns, self._label(number, hdu), notes=note, row_names=names)
-        axis, unit, kind, notes = axis_of(header, self.primary, flux.shape[-1])
-        columns = [Values.of("wavelength", axis, unit), Values.of("flux", flux, flux_unit)]
-        remarks = "\nair wavelength" if kind == "AWAV" else "\nvacuum" if kind == "WAVE" else ""
-        return self._table(
-            header, columns, self._label(number, hdu), remarks=remarks, notes=(*notes, *note), row_names=names
-        )
+        columns = [axis, Values.of("flux", flux, flux_unit)]
+        return self._table(header, columns, self._label(number, hdu), remarks=remarks, notes=note, row_names=names)
 
     def _of_pair(self, arm: str, axis: Any, flux: Any, rows: Sequence[str]) -> SpectrumTable:
         """Return the table of an image of fluxes whose wavelengths are in another image (DESI, PFS, APOGEE)."""
@@ -456,7 +440,9 @@ def _tables(
     content: Content, name: str, origin: str, asked: Sequence[str], units: tuple[bool, bool], check: bool
 ) -> list[SpectrumTable]:
     if content.form == "FITS":
-        return fits_tables(content.file, name, origin, asked, check)
+        hdus = open_fits(content.file, check=check)
+        with reading("it", WHOLE):
+            return _Reader(hdus, name, origin, asked).tables()
     if content.form == "VOTable":
         tables = enumerate(votables(content.bytes, "it"), 1)
         return [_in_memory(one, name, origin, str(one.header.get("name") or one.header.get("ID") or number))

@@ -82,19 +82,9 @@ def scale(name: str, system: System = "catalogue") -> str:
 
 @array_cache(256)
 def magnitude(wavelength_nm: Float, flux_flam: Float, name: str = "V", system: System = "catalogue") -> float:
-    """Return the synthetic magnitude in a band.
+    """Return the synthetic magnitude of a flux, erg s-1 cm-2 A-1, in the band of a name or alias.
 
     Raises InputError if the spectrum does not cover the band or has no light in it.
-
-    Parameters
-    ----------
-    wavelength_nm : ndarray, shape (n,)
-    flux_flam : ndarray, shape (n,)
-        Flux density, erg s-1 cm-2 A-1.
-    name : str
-        Name or alias of the band.
-    system : {"catalogue", "vega", "ab"}
-        The system of catalogues in the band (the band holds its zero point and source), Vega at zero, or AB.
     """
     chosen = _covered(wavelength_nm, name)
     grid = np.union1d(wavelength_nm, chosen.wavelength_nm) * 10.0

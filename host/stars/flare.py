@@ -35,22 +35,9 @@ def with_flare(
 ) -> tuple[Float, Float]:
     """Return wavelengths and flux of a flaring star, each of shape (n,); the spectrum may need more wavelengths.
 
-    Parameters
-    ----------
-    wavelength_nm, flux_flam : ndarray, shape (n,)
-        The quiescent star, erg s-1 cm-2 A-1.
-    amplitude : float
-        Relative rise of the photons in the band: 0.24 is 24 %.
-    spectrum : FlareSpectrum
-        The light of the flare, B.
-    band : str
-        Band in which the amplitude is measured.
-    geometry : {"added", "replaces"}
-        With ``added``, the flux is F + k B, as in the paper. With ``replaces``, a region of filling factor
-        f = A / (R - 1) replaces photosphere: F (1 - f) + f R (N_F / N_B) B, where N are photons in the band and R is
-        the ratio of the surface fluxes of flare and photosphere there.
-    photosphere_temperature_k : float, optional
-        Temperature of the photosphere, which ``replaces`` requires.
+    The flux is F + k B, as in the paper, if the light B of the flare is ``added`` to the star's, F. If it ``replaces``
+    photosphere in a region of filling factor f = A / (R - 1), it is F (1 - f) + f R (N_F / N_B) B, where A is the
+    amplitude, N are photons in the band and R is the ratio of the surface fluxes of flare and photosphere there.
     """
     checked(Amplitude, "flare amplitude", amplitude)
     star, hot, ratio = _photons_in_band(wavelength_nm, flux_flam, spectrum, band, geometry, photosphere_temperature_k)

@@ -42,9 +42,7 @@ SAME_NM = 1e-6
 EDGE_WIDTH_NM = 1e-3
 #: Full width at half maximum of the triangular profile of a line, nm: far below the resolution, 10.5 nm.
 LINE_WIDTH_NM = 0.1
-#: Range of the continuum to which relative line fluxes refer, nm.
-LINE_RANGE_NM = (200.0, 700.0)
-#: Points of the integral over that range.
+#: Points of the integral of a continuum over 200-700 nm, to which relative line fluxes refer.
 RANGE_POINTS = 5001
 #: Vacuum wavelengths of lines, nm (NIST Atomic Spectra Database).
 LINES_NM = {
@@ -307,7 +305,7 @@ class FlareWithLines(FlareSpectrum):
 
     @property
     def continuum_flux(self) -> float:
-        at = self.continuum.grid(np.linspace(*LINE_RANGE_NM, RANGE_POINTS))
+        at = self.continuum.grid(np.linspace(*NEEDED_NM, RANGE_POINTS))
         return 10.0 * float(np.trapezoid(self.continuum.flux(at), at))
 
     def flux(self, wavelength_nm: Wavelengths) -> Float:
@@ -490,7 +488,7 @@ def _continued(name: str, nm: Float, flux: Float, kelvin: float) -> tuple[Float,
     steps = np.log(CONTINUED_RATIO)
     for first in (True, False):
         end = nm[0] if first else nm[-1]
-        if (first and end <= min(low, NEEDED_NM[0])) or (not first and end >= high):
+        if (end <= NEEDED_NM[0]) if first else (end >= high):
             continue
         join = nm <= end + JOIN_NM if first else nm >= end - JOIN_NM
         body = blackbody(nm[join], kelvin)
@@ -499,8 +497,6 @@ def _continued(name: str, nm: Float, flux: Float, kelvin: float) -> tuple[Float,
         scale = float(
             flux[join][0] / body[0] if alone else np.trapezoid(flux[join], nm[join]) / np.trapezoid(body, nm[join])
         )
-        if first and end <= NEEDED_NM[0]:
-            continue
         if not scale > 0.0:
             raise InputError(
                 f"the flare spectrum {name} has no light near {end:g} nm, but needs some to scale a blackbody to",

@@ -96,8 +96,8 @@ def limit_bytes(variable: str) -> int:
     return int(text) << 20
 
 
-#: Largest number of characters of a line of text.
-LONGEST_LINE = 2**17
+#: Largest number of characters of a line of text, and of bytes of a store's JSON.
+LONGEST_LINE, MOST_JSON = 2**17, 16 << 20
 
 
 def open_regular(path: Path, what: str) -> io.BufferedReader:
@@ -137,9 +137,8 @@ def read_bytes(path: Path, what: str) -> bytes:
         except OSError as error:
             shown = shortened(str(path))
             raise InputError(f"{what} {shown} must be readable, but is not ({error.strerror})", key="file") from error
-    if len(content) > most:
-        # It has grown since its size was read, or the system gives it none, as below /proc.
-        raise _too_large(path, what)
+    # It may have grown since its size was read, or the system gives it none, as below /proc.
+    _limited(len(content), path, what)
     return content
 
 
@@ -149,32 +148,29 @@ def check_size(path: Path, what: str, most: int | None = None) -> int:
     Raises InputError if it exceeds `most` bytes, by default MAUVECL_LARGEST_FILE_MIB, or as `open_regular`.
     """
     with open_regular(path, what) as file:
-        size = os.fstat(file.fileno()).st_size
-    if size > (limit_bytes("MAUVECL_LARGEST_FILE_MIB") if most is None else most):
-        raise _too_large(path, what, most)
+        return _limited(os.fstat(file.fileno()).st_size, path, what, most)
+
+
+def _limited(size: int, path: Path, what: str, most: int | None = None) -> int:
+    """Return the size of a file in bytes; raise InputError as `check_size` if it is too large."""
+    limit = "MAUVECL_LARGEST_FILE_MIB"
+    largest = limit_bytes(limit) if most is None else most
+    if size > largest:
+        fault = f"{what} {shortened(str(path))} must have at most {largest >> 20} MiB"
+        raise InputError(fault if most else f"{fault}; {limit} sets the limit", key="file" if most else limit)
     return size
 
 
-def _too_large(path: Path, what: str, most: int | None = None) -> InputError:
-    """Return the error of a file with more bytes than `most`, by default MAUVECL_LARGEST_FILE_MIB."""
-    largest = limit_bytes("MAUVECL_LARGEST_FILE_MIB") if most is None else most
-    limit = "; MAUVECL_LARGEST_FILE_MIB sets the limit" if most is None else ""
-    return InputError(
-        f"{what} {shortened(str(path))} must have at most {largest >> 20} MiB{limit}",
-        key="MAUVECL_LARGEST_FILE_MIB" if most is None else "file",
-    )
-
-
-def check_folder(path: Path, what: str, most_json: int = 16 << 20) -> None:
+def check_folder(path: Path, what: str) -> None:
     """Check the files of a folder before another library reads them.
 
     Raises InputError for anything but regular files and folders, a file above MAUVECL_LARGEST_FILE_MIB, or JSON of more
-    than `most_json` bytes.
+    than `MOST_JSON` bytes.
     """
     for folder, _, names in os.walk(path):
         for name in names:
             file = Path(folder) / name
-            check_size(file, what, most_json if name.endswith(".json") else None)
+            check_size(file, what, MOST_JSON if name.endswith(".json") else None)
 
 
 def lines_in(file: IO[str], what: str) -> Iterator[str]:
@@ -182,12 +178,10 @@ def lines_in(file: IO[str], what: str) -> Iterator[str]:
 
     Raises InputError for a line of more than `LONGEST_LINE` characters, of which no more is read.
     """
-    number = 1
-    while line := file.readline(LONGEST_LINE + 2):
+    for number, line in enumerate(iter(lambda: file.readline(LONGEST_LINE + 2), ""), 1):
         if len(line.rstrip("\r\n")) > LONGEST_LINE:
             raise InputError(f"{what} must have at most {LONGEST_LINE} characters in line {number}", key="file")
         yield line
-        number += 1
 
 
 #: Names and decompressors of compressed content by its first bytes.
@@ -449,9 +443,8 @@ def read_numbers(path: str | Path, what: str) -> Numbers:
 
 def _text_and_name(path: str | Path, what: str) -> tuple[str, str]:
     """Read the text of a file, and return it with the file's name for messages."""
-    path = Path(path)
     named = f"{what} {shortened(str(path))}"
-    return as_text(unpacked(read_bytes(path, what), named), named), named
+    return as_text(unpacked(read_bytes(Path(path), what), named), named), named
 
 
 def parse_numbers(text: str, what: str) -> Numbers:

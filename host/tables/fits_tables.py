@@ -12,7 +12,7 @@ from typing import IO, TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.tables.files import limit_bytes, parsing, reading
+from mauvecl.host.tables.files import limit_bytes, reading
 from mauvecl.host.tables.names import matched
 from mauvecl.host.tables.table import PIECE_BYTES, TableFile, Values
 from mauvecl.host.tables.units import SCALES
@@ -420,8 +420,7 @@ def multispec_axis(header: Any, n: int) -> Values:
     """
     rows = []
     for text in re.findall(r"spec\d+\s*=\s*\"([^\"]*)\"", _attributes(header, 2)):
-        with parsing("it", "give whole attributes of IRAF's multispec system"):
-            _, _, kind, first, step, _, redshift = map(float, text.split()[:7])
+        _, _, kind, first, step, _, redshift = map(float, text.split()[:7])
         if kind not in (0.0, 1.0):
             fault = f"its wavelengths of the type {kind:g} in IRAF's multispec system must be linear or logarithmic"
             raise InputError(f"{fault}, as IRAF's `dispcor` makes them", key="CTYPE1")

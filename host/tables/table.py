@@ -134,14 +134,9 @@ class Values:
         return self.shape[0] if self.shape else 0
 
     @property
-    def piece_rows(self) -> int:
-        """Number of rows of a piece."""
-        return max(1, PIECE_BYTES // max(1, self.row_bytes, 8 * int(np.prod(self.shape[1:]))))
-
-    @property
     def pieces(self) -> list[slice]:
         """Rows of each piece."""
-        step = self.piece_rows
+        step = max(1, PIECE_BYTES // max(1, self.row_bytes, 8 * int(np.prod(self.shape[1:]))))
         return [slice(k, min(k + step, self.n_rows)) for k in range(0, self.n_rows, step)]
 
     def rows(self, start: int, stop: int, expected: str = "a number") -> Float:
@@ -362,10 +357,9 @@ class MemoryTable(TableFile):
         if title is None:
             return None
         column = self.table[title]
-        if isinstance(column, TimeDelta):
-            return Values.of(name, np.asarray(np.ma.filled(column.to_value("d"), np.nan)), "d", self.what)
-        if isinstance(column, Time):
-            return Values.of(name, np.asarray(np.ma.filled(column.mjd, np.nan)), "d", self.what)
+        if isinstance(column, Time | TimeDelta):
+            days = column.mjd if isinstance(column, Time) else column.to_value("d")
+            return Values.of(name, np.asarray(np.ma.filled(days, np.nan)), "d", self.what)
         ucd, description = str((column.info.meta or {}).get("ucd", "")), column.info.description or ""
         unit = getattr(column, "unit", None)
         return Values.of(name, getattr(column, "value", column), unit, self.what, ucd, description)
@@ -381,8 +375,7 @@ class Rows:
         self.table, self.named, self.key, self.n = _with_coordinates(table), named, key, len(table)
         self._ignored: list[str] = []
         # Columns are read, and their units parsed, once.
-        self.texts, self._numbers = cache(self._texts), cache(self._numbers_of)
-        self._angles, self._factor = cache(self._unit_of_angles), cache(self._ratio)
+        self.texts, self._angles, self._factor = cache(self._texts), cache(self._unit_of_angles), cache(self._ratio)
 
     @cached_property
     def names(self) -> list[str]:
@@ -397,24 +390,14 @@ class Rows:
         """Return the text of a cell; empty for a missing one."""
         return "" if name is None else self.texts(name)[row]
 
-    def _cells(self, name: str) -> Any:
-        return np.ma.asarray(getattr(self.table[name], "value", self.table[name]))
-
     def _texts(self, name: str) -> list[str]:
-        """Return the texts of a column."""
-        values = self._cells(name)
-        cells = [
-            "" if cell is None or cell is np.ma.masked else
+        """Return the texts of a column; numbers of single precision are those that the file holds, not the shortest."""
+        cells = np.ma.asarray(getattr(self.table[name], "value", self.table[name])).tolist()
+        texts = [
             (cell.decode("utf-8", "replace") if isinstance(cell, bytes) else str(cell)).strip()
-            for cell in (values.tolist() if values.dtype.kind in "SUO" else values)
-        ]  # fmt: skip
-        return ["" if is_missing(text) else text for text in cells]
-
-    def _numbers_of(self, name: str) -> list[float] | None:
-        """Return the numbers of a column as the table holds them, or None if it holds texts."""
-        values = self._cells(name)
-        numeric = values.dtype.kind in "iuf" and values.ndim == 1
-        return np.ma.filled(values.astype(np.float64), np.nan).tolist() if numeric else None
+            for cell in ("" if cell is None else cell for cell in cells)
+        ]
+        return ["" if is_missing(text) else text for text in texts]
 
     def unit(self, name: str) -> str:
         """Return the unit of a column as the table states it, or in its name, as in ``distance (pc)``; or nothing."""
@@ -429,10 +412,8 @@ class Rows:
         text = self.text(name, row)
         if name is None or not text:
             return None
-        numbers = self._numbers(name)
         try:
-            # Numbers of single precision are those that the file holds, not their shortest text.
-            value = (number_in(text) if numbers is None else numbers[row]) * self._factor(name, unit)
+            value = number_in(text) * self._factor(name, unit)
         except InputError:
             raise
         except ValueError:

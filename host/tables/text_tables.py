@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.tables.files import check_cells, parse_ecsv, parsing, read_text, reading
-from mauvecl.host.tables.names import in_brackets, is_missing
+from mauvecl.host.tables.names import angle_unit, in_brackets, is_missing
 from mauvecl.host.tables.table import REMARKS, Values, is_known, number_in, plain_numbers, unit_in, unquoted
 from mauvecl.host.tables.units import is_dated, is_stated, time_unit, unit_of
 from mauvecl.schema.errors import InputError, shortened
@@ -373,7 +373,7 @@ class TextRows:
 
 def text_table(text: str, what: str, commas: bool) -> Table:
     """Parse a table from text: ECSV, those of IPAC and CDS, and rows that marks or blanks divide into texts."""
-    if re.match(r"\s*#\s*%ECSV", text):
+    if re.match(r"\s*# %ECSV", text):
         return parse_ecsv(text, what)
     form = _known_form(text)
     if form is None:
@@ -531,8 +531,6 @@ def _are_units(cells: list[str], below: list[str]) -> bool:
 
 
 def _is_unit(text: str) -> bool:
-    from mauvecl.host.tables.names import angle_unit
-
     plain = in_brackets(text)
     return is_stated(text) and (time_unit(plain) is not None or angle_unit(plain) is not None or is_known(text))
 
