@@ -10,7 +10,6 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.detection.distributions import Interval, clopper_pearson
 from mauvecl.fits.spectrum import Measurement
 from mauvecl.flares.settings import RANK, Per, per_day
 from mauvecl.flares.shapes import shape_of
@@ -41,6 +40,7 @@ from mauvecl.observations.spectra import (
     survey_spectra,
 )
 from mauvecl.schema.physical import DAY_S
+from mauvecl.search.completeness import size_at
 
 Float = NDArray[np.float64]
 
@@ -65,24 +65,11 @@ class Completeness:
     detected: NDArray[np.int64]  # shape (n_width, n_size)
     injected: int  # number of injections per cell
 
-    def interval(self, width: int, size: int) -> Interval:
-        """Return the completeness of a cell with its 95 % interval."""
-        return clopper_pearson(int(self.detected[width, size]), self.injected)
-
     def limit(self, width: int, power: float = POWER) -> float:
-        """Return the equivalent duration of flares that are detected with a probability; NaN if none is.
-
-        Interpolated in the logarithm between the sizes.
-        """
-        share = np.maximum.accumulate(self.detected[width] / self.injected)
-        if share[-1] < power:
-            return float("nan")
-        k = int(np.argmax(share >= power))
-        logs = np.log(self.equivalent_durations_s[width])
-        if k == 0:
-            return float(np.exp(logs[0]))
-        part = (power - share[k - 1]) / (share[k] - share[k - 1])
-        return float(np.exp(logs[k - 1] + part * (logs[k] - logs[k - 1])))
+        """Return the equivalent duration of flares that are detected with a probability; NaN if none is."""
+        shares = np.maximum.accumulate(self.detected[width]) / self.injected
+        found = size_at(self.equivalent_durations_s[width], shares, power)
+        return found if np.isfinite(found) else float("nan")
 
 
 def inject(
