@@ -33,7 +33,6 @@ from mauvecl.search.templates import LEAD, TAIL
 
 if TYPE_CHECKING:
     from mauvecl.search.search import Row, Survey
-    from mauvecl.search.templates import Templates
 
 Float = NDArray[np.float64]
 
@@ -90,16 +89,14 @@ class Candidate:
     template: tuple[float, float]  # peak time and half-width of the template, s
 
 
-def alarms(
-    survey: Survey, templates: Templates, sums: NDArray[Any], threshold: float, energy: Factor | None = None
-) -> list[Alarm]:
+def alarms(survey: Survey, sums: NDArray[Any], threshold: float, energy: Factor | None = None) -> list[Alarm]:
     """Detect and fit all flares of a stare in its simulated sums, (n_frame, n_sum), largest statistic first.
 
-    `templates` are those from which the survey's bank and components are made. `energy` returns the logarithm of the
-    energy per second of equivalent duration, and its derivative, for the logarithm of the temperature.
+    `energy` returns the logarithm of the energy per second of equivalent duration, and its derivative, for the
+    logarithm of the temperature.
     """
     net = np.asarray(survey.frames.net(sums[None])[0], np.float64)
-    search = _StareSearch(SummedStare(survey, templates, net), threshold)
+    search = _StareSearch(SummedStare(survey, net), threshold)
     search.run()
     return sorted(_measured_alarms(search, energy), key=lambda alarm: -alarm.rho)
 
@@ -167,7 +164,7 @@ class _StareSearch:
 
     def _candidate(self, rho: float, peak: float, row: Row, onset: int, direction: int) -> Candidate:
         """Return a candidate with the parameters of its template."""
-        templates, width = self.sums.templates, row.template.half_width_s
+        templates, width = self.sums.survey.templates, row.template.half_width_s
         size = float(np.linalg.norm(templates.directions[templates.chosen[direction]]))
         amplitude = max(rho / float(row.per_amplitude[onset]), 1e-3) / size
         kelvin = templates.temperatures_k[templates.chosen[direction]]

@@ -110,7 +110,6 @@ class SummedStare:
     """The sums of a stare to which flares are fitted."""
 
     survey: Survey
-    templates: Templates
     net: Float  # sums less their known means, shape (n_frame, n_sum)
 
     @cached_property
@@ -122,12 +121,12 @@ class SummedStare:
     @property
     def free(self) -> list[int]:
         """Columns of fitted parameters."""
-        return [AMPLITUDE, PEAK, WIDTH, *([KELVIN] if len(self.templates.temperatures_k) > 1 else [])]
+        return [AMPLITUDE, PEAK, WIDTH, *([KELVIN] if len(self.survey.templates.temperatures_k) > 1 else [])]
 
     @cached_property
     def bounds(self) -> tuple[Float, Float]:
         """Bounds of a flare's parameters, from the stare, the bank and the templates, shape (4,) each."""
-        widths, kelvin = self.survey.bank.half_widths_s, self.templates.mean_sums.log_k
+        widths, kelvin = self.survey.bank.half_widths_s, self.survey.templates.mean_sums.log_k
         first, last = self.edges[0, 0], self.edges[-1, 1]
         narrow, wide = np.log(widths[0] / BEYOND_BANK), np.log(widths[-1] * BEYOND_BANK)
         low, high = LOG_AMPLITUDES
@@ -148,14 +147,14 @@ class SummedStare:
         """Return the mean sums of flares in some frames, shape (n_frame, n_sum)."""
         total = np.zeros_like(self.net)[frames]
         for flare, inside, mean in self._shining(theta, frames):
-            total[inside] += mean[:, None] * self.templates.mean_sums.spline(flare[KELVIN])
+            total[inside] += mean[:, None] * self.survey.templates.mean_sums.spline(flare[KELVIN])
         return total
 
     def noise(self, theta: Float, light: Float, frames: slice = slice(None)) -> Float:
         """Return the covariance of frames' sums with flares, shape (n_frame, n_sum, n_sum)."""
         total = self.survey.covariance[frames].copy()
         for flare, inside, mean in self._shining(theta, frames):
-            total[inside] += mean[:, None, None] * self.templates.noise_of(float(np.exp(flare[KELVIN])))
+            total[inside] += mean[:, None, None] * self.survey.templates.noise_of(float(np.exp(flare[KELVIN])))
         jitter = self.survey.stare.light_jitter
         if jitter and len(theta):
             # Star and flare light jitter together; the star's jitter is already in the covariance.
@@ -246,7 +245,7 @@ class Block:
     def model(self, theta: Float) -> tuple[Float, Float]:
         """Return the whitened flux less its projection on the baseline, (n_row,), and derivatives, (n_row, n, 4)."""
         times, (first, last) = self._times
-        shape, spline = self.sums.survey.bank.shape, self.sums.templates.mean_sums.spline
+        shape, spline = self.sums.survey.bank.shape, self.sums.survey.templates.mean_sums.spline
         light, length = self.sums.survey.stare.light[self.used], times[last] - times[first]
         width = np.exp(theta[:, WIDTH, None])
         tau = (times - theta[:, PEAK, None]) / width  # (n_flare, n_time)
