@@ -85,10 +85,10 @@ def inject(
     rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, INJECTION_KEY]))
     bank, frame_s = survey.bank, survey.stare.frame_s
     widths = np.geomspace(bank.half_widths_s[0], bank.half_widths_s[-1], WIDTHS)
-    kelvin = np.array(survey.templates.temperatures_k)
-    direction = survey.templates.directions[int(np.argmin(np.abs(np.log(kelvin / temperature_k))))]
+    kelvin = survey.templates.nearest(temperature_k)
+    direction = survey.templates.directions[kelvin]
     # Photon noise of a flare of unit amplitude.
-    own_noise = np.linalg.cholesky(survey.templates.noise_of(temperature_k) + 1e-300 * np.eye(direction.size))
+    own_noise = np.linalg.cholesky(survey.templates.noise[kelvin] + 1e-300 * np.eye(direction.size))
     size_of = float(np.linalg.norm(direction))
     durations = np.zeros((WIDTHS, SIZES))
     detected = np.zeros((WIDTHS, SIZES), np.int64)

@@ -152,9 +152,9 @@ class SummedStare:
 
     def noise(self, theta: Float, light: Float, frames: slice = slice(None)) -> Float:
         """Return the covariance of frames' sums with flares, shape (n_frame, n_sum, n_sum)."""
-        total = self.survey.covariance[frames].copy()
+        total, templates = self.survey.covariance[frames].copy(), self.survey.templates
         for flare, inside, mean in self._shining(theta, frames):
-            total[inside] += mean[:, None, None] * self.survey.templates.noise_of(float(np.exp(flare[KELVIN])))
+            total[inside] += mean[:, None, None] * templates.noise[templates.nearest(float(np.exp(flare[KELVIN])))]
         jitter = self.survey.stare.light_jitter
         if jitter and len(theta):
             # Star and flare light jitter together; the star's jitter is already in the covariance.

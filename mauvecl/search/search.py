@@ -453,12 +453,17 @@ class Survey:
         """Derivatives of the mean sums by star, light, sky and temperature, shape (n_frame, n_sum) each."""
         return self.components.directions(self.coefficients)
 
+    @cached_property
+    def response(self) -> Float:
+        """Mean sums of a frame for the first flare component at unit amplitude, shape (n_sum,)."""
+        unit = np.zeros(len(STEADY) + self.components.n_flares)
+        unit[: len(STEADY) + 1] = 1.0
+        return self.components.means(unit)
+
     @property
     def unit_snr(self) -> float:
         """S/N of one frame for the first flare component at constant unit amplitude and known baseline."""
-        unit = np.zeros(len(STEADY) + self.components.n_flares)
-        unit[: len(STEADY) + 1] = 1.0
-        return float(np.linalg.norm(self.components.means(unit)))
+        return float(np.linalg.norm(self.response))
 
     @cached_property
     def covariance(self) -> Float:

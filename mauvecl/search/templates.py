@@ -242,9 +242,9 @@ class Templates:
         """Share of the S/N that is lost by reducing frames to sums, shape (n_temperature,)."""
         return np.asarray(1.0 - np.linalg.norm(self.directions, axis=1) / self.best)
 
-    def noise_of(self, kelvin: float) -> Float:
-        """Return the covariance added by the photon noise of a flare of the nearest temperature, (n_sum, n_sum)."""
-        return np.asarray(self.noise[int(np.argmin(np.abs(np.log(np.array(self.temperatures_k) / kelvin))))])
+    def nearest(self, kelvin: float) -> int:
+        """Return the row of the temperature that is nearest to another one."""
+        return int(np.argmin(np.abs(np.log(np.array(self.temperatures_k) / kelvin))))
 
 
 def frame_nuisances(quiet: Expectation, stare: Stare, more: Mapping[str, float] | None = None) -> Nuisances | None:
