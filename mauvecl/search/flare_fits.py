@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from mauvecl.fits.profile import Profile, remembering
 from mauvecl.flares.shapes import between, sides
+from mauvecl.search.templates import REACH
 
 if TYPE_CHECKING:
     from mauvecl.search.search import SearchedFrames, Survey
@@ -37,9 +38,8 @@ Float = NDArray[np.float64]
 AMPLITUDE, PEAK, WIDTH, KELVIN = range(4)
 #: Factor by which fitted half-widths may exceed the range of the bank.
 BEYOND_BANK = 1.25
-#: Half-widths before and after a peak within which flares overlap, and beyond which their flux is neglected.
+#: Half-widths before and after a peak within which flares overlap.
 OVERLAP_BEFORE, OVERLAP_AFTER = 2.0, 10.0
-LIGHT_BEFORE, LIGHT_AFTER = 5.0, 80.0
 #: Bounds of log amplitude.
 LOG_AMPLITUDES = (-27.0, 14.0)
 #: Relative change of chi-squared at which a fit has converged, and its largest number of evaluations.
@@ -167,7 +167,7 @@ class SummedStare:
         """Yield the flares that contribute to some frames, the affected frames, and the mean amplitude in them."""
         first, last, _ = frames.indices(len(self.net))
         peak, width = theta[:, PEAK], np.exp(theta[:, WIDTH])
-        starts, stops = self.overlapping(peak - LIGHT_BEFORE * width, peak + LIGHT_AFTER * width)
+        starts, stops = self.overlapping(peak - REACH[0] * width, peak + REACH[1] * width)
         for flare, start, stop in zip(theta, np.maximum(starts, first), np.minimum(stops, last), strict=True):
             if start < stop:
                 mean = np.exp(flare[AMPLITUDE]) * self.mean(flare, slice(start, stop))

@@ -31,6 +31,8 @@ Float = NDArray[np.float64]
 
 #: Shortest window before and after a peak, in half-widths of the template.
 LEAD, TAIL = 5.0, 10.0
+#: Half-widths before and after a peak beyond which the light of a flare is neglected.
+REACH = (5.0, 80.0)
 #: Smallest number of onsets per half-width.
 ONSETS = 10
 #: Half-width in frames below which two onsets per frame are searched.
