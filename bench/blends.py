@@ -14,11 +14,12 @@ from functools import cached_property
 
 import numpy as np
 
-from mauvecl.answers.inject import StarSurvey, survey_star
+from mauvecl.answers.inject import survey_star
 from mauvecl.answers.stare import _log_energy
 from mauvecl.flares.stare import Event, coefficients
 from mauvecl.search.alarms import Alarm, alarms
 from mauvecl.search.flare_fits import Factor
+from mauvecl.search.search import Survey
 from mauvecl.study.cases import Case
 from mauvecl.study.study import Study
 
@@ -34,25 +35,25 @@ class Known:
     case: Case
 
     @property
-    def surveyed(self) -> StarSurvey:
+    def survey(self) -> Survey:
         """The star's search."""
         return survey_star(self.case)
 
     @cached_property
     def log_energy(self) -> Factor | None:
         """As `stare` has it."""
-        return _log_energy(self.case, self.surveyed.templates.temperatures_k)
+        return _log_energy(self.case, self.survey.templates.temperatures_k)
 
 
 def found(known: Known, events: list[Event], seed: int) -> list[Alarm]:
     """Return the alarms of one stare with normal noise."""
-    survey = known.surveyed.survey
+    survey = known.survey
     stare, components = survey.stare, survey.components
     coefs = components.coefficients(stare, coefficients(events, stare.start_s, stare.frame_s, np.array([10_000.0])))
     scatter = np.linalg.cholesky(components.covariance(coefs))
     normal = np.random.Generator(np.random.Philox(seed)).standard_normal((stare.n_frames, 3))
     sums = components.means(coefs) + np.einsum("tij,tj->ti", scatter, normal)
-    return alarms(survey, known.surveyed.templates, sums, THRESHOLD, known.log_energy)
+    return alarms(survey, sums, THRESHOLD, known.log_energy)
 
 
 def coverage(known: Known, count: int, snrs: tuple[float, ...] = (6.0, 8.0, 15.0, 30.0)) -> None:
@@ -68,7 +69,7 @@ def coverage(known: Known, count: int, snrs: tuple[float, ...] = (6.0, 8.0, 15.0
         for seed in range(FIRST_SEED, FIRST_SEED + count):
             rng = np.random.Generator(np.random.Philox([seed, int(snr)]))
             width, peak = 10 ** rng.uniform(np.log10(25), np.log10(250)), rng.uniform(2000, 3500)
-            amplitude = snr / known.surveyed.unit_snr / np.sqrt(SQUARE * width / 5.0)
+            amplitude = snr / known.survey.unit_snr / np.sqrt(SQUARE * width / 5.0)
             event = Event(float(peak), float(width), float(amplitude))
             near = [
                 a for a in found(known, [event], seed)
@@ -96,7 +97,7 @@ def coverage(known: Known, count: int, snrs: tuple[float, ...] = (6.0, 8.0, 15.0
 def pairs(known: Known, count: int, snrs: tuple[float, ...] = (15.0, 40.0, 100.0)) -> None:
     """Print how two equal flares come back, by separation in half-widths (60 s) and S/N."""
     for snr in snrs:
-        amplitude = snr / known.surveyed.unit_snr / np.sqrt(SQUARE * 60.0 / 5.0)
+        amplitude = snr / known.survey.unit_snr / np.sqrt(SQUARE * 60.0 / 5.0)
         for apart in (0.25, 0.5, 1.0, 2.0, 5.0, 15.0):
             two, ratios, others = 0, [], 0
             for seed in range(count):

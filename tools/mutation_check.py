@@ -323,7 +323,7 @@ MUTATIONS: dict[str, Mutation] = {
     # Fits of events.
     "intervals of events that are not truncated at zero": (
         "test_quantiles_are_those_of_a_truncated_normal_distribution[0.0]",
-        ("else goal * (1 - probability)", "else 1 - probability"),
+        ("goal = _log_above(0.0, *held, 0.0) + float", "goal = float"),
     ),
     "a flare added to the level of its star": (
         "test_flare_brighter_than_its_window_has_its_energy",

@@ -15,7 +15,7 @@ from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, first_of, 
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection.distributions import Interval
 from mauvecl.device.stares import Stares
-from mauvecl.flares.frames import STEADY, Components
+from mauvecl.flares.frames import Components
 from mauvecl.flares.shapes import shape_of
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.columns import INTERVAL, Column, View, interval, number, percent, table_of
@@ -44,30 +44,8 @@ if TYPE_CHECKING:
 DEFAULT_RANGE = (0.3, 3.0)
 
 
-@dataclass(frozen=True, eq=False)
-class StarSurvey:
-    """A star of a study with its search."""
-
-    quiet: Expectation  # of one frame
-    templates: Templates
-    survey: Survey  # its only flare component is the study's flare
-
-    @property
-    def fit(self) -> SingleFlareFit:
-        """Fit of detected flares."""
-        return SingleFlareFit(self.survey.bank, self.templates)
-
-    @property
-    def unit_snr(self) -> float:
-        """S/N of one frame for the study's flare at constant unit amplitude and known baseline."""
-        x = self.survey.components
-        unit = np.zeros(len(STEADY) + x.n_flares)
-        unit[: len(STEADY) + 1] = 1.0
-        return float(np.linalg.norm(x.means(unit)))
-
-
-def survey_star(case: Case) -> StarSurvey:
-    """Build the search of a case's stare."""
+def survey_star(case: Case) -> Survey:
+    """Build the search of a case's stare; its only flare component is the study's flare."""
     frame, stare, choice, flare = case.one_frame, case.stare, case.study.search, case.study.flare
     own = frame.flare_electrons((flare.temperature_k,))
     # Templates are blackbodies if the study's flare has no temperature to vary.
@@ -81,10 +59,10 @@ def survey_star(case: Case) -> StarSurvey:
     bank = Bank(
         choice.half_widths_s, templates.directions[list(templates.chosen)], shape_of(choice.shape), stare.frame_s, level
     )
-    survey = Survey(Components(quiet, own, templates.weights), stare, bank)
+    survey = Survey(Components(quiet, own, templates.weights), stare, bank, templates)
     if level.cycle and not len(survey.curves if survey.curves is not None else ()):
         raise InputError("search.cycle needs an unknown cycle of the stare: stare.cycles", key="search.cycle")
-    return StarSurvey(quiet, templates, survey)
+    return survey
 
 
 @dataclass(frozen=True)
@@ -129,7 +107,7 @@ class Sizes:
 def injected_sizes(case: Case, sizes: Sizes, unit_snr: float, threshold: float) -> NDArray[np.float64]:
     """Return the sizes of injected flares, ascending; by default around a completeness of one half.
 
-    `unit_snr` and `threshold` are those of the star's `StarSurvey` and its search.
+    `unit_snr` and `threshold` are those of the star's survey.
     """
     asked = case.study.injections
     widths = np.array([asked.half_width_low_s, asked.half_width_high_s])
@@ -218,12 +196,12 @@ SEARCH_COLUMNS = (
     Column("alarmed", "", "", "drawn stares with a false alarm at the threshold"),
     Column("alarmed_expected", "expected", "", "how many should have one"),
     Column("in_a_row", "", "", "false alarms per star-day of the common rule, white noise"),
-    Column("templates", "surveyed.survey.search.n_filters", "", "templates of the bank", "templates"),
-    Column("sums", "surveyed.survey.components.n_statistics", "", "weighted sums of a frame",
+    Column("templates", "survey.search.n_filters", "", "templates of the bank", "templates"),
+    Column("sums", "survey.components.n_statistics", "", "weighted sums of a frame",
            "sums of a frame", detail=True),
-    Column("spectral_loss", lambda row: float(row.surveyed.templates.loss.max()), "",
+    Column("spectral_loss", lambda row: float(row.survey.templates.loss.max()), "",
            "largest share of S/N lost because only these sums are searched"),
-    Column("star_days", lambda row: row.surveyed.survey.stare.observed_s / DAY_S, "", "star-days of a stare"),
+    Column("star_days", lambda row: row.survey.stare.observed_s / DAY_S, "", "star-days of a stare"),
 )  # fmt: skip
 
 
@@ -231,7 +209,7 @@ SEARCH_COLUMNS = (
 class StarCompleteness(InCell):
     """Completeness at one star in one cell of the sweep."""
 
-    surveyed: StarSurvey
+    survey: Survey
     sizes: Sizes
     threshold: Interval
     # False alarms per star-day of drawn stares at `checked`, with 4 standard errors; NaN if none are drawn.
@@ -304,7 +282,7 @@ class StarCompleteness(InCell):
 
 
 def _share(answer: InjectAnswer) -> tuple[Column, ...]:
-    return share_columns(answer.study, "surveyed.quiet.target_share")
+    return share_columns(answer.study, "survey.components.quiet.target_share")
 
 
 def _search(answer: InjectAnswer) -> dict[str, object]:
@@ -361,7 +339,7 @@ class InjectAnswer(Answer):
 
     @property
     def inputs(self) -> list[Expectation]:
-        return [star.surveyed.quiet for star in self.stars]
+        return [star.survey.components.quiet for star in self.stars]
 
 
 @by_keywords
@@ -406,10 +384,10 @@ def inject(study: Study, engine: Stares | Pool | None = None, progress: Progress
 
 def _completeness(case: Case, engine: Stares | Pool, report: Callable[[float], None]) -> StarCompleteness:
     """Inject flares into the stare of a case and search for them; `report` receives the share that is done."""
-    choice, asked, star = case.study.search, case.study.injections, survey_star(case)
-    survey, found = star.survey, _false_alarms(case, star.survey, engine)
+    choice, asked, survey = case.study.search, case.study.injections, survey_star(case)
+    found = _false_alarms(case, survey, engine)
     sizes, threshold = Sizes.chosen(case), found["threshold"].value
-    values = injected_sizes(case, sizes, star.unit_snr, threshold)
+    values = injected_sizes(case, sizes, survey.unit_snr, threshold)
     positions = min(asked.positions, asked.count)
     injections = Injections(
         survey, asked.half_widths_s, threshold, case.study.run.seed, positions, -(-asked.count // positions),
@@ -417,7 +395,8 @@ def _completeness(case: Case, engine: Stares | Pool, report: Callable[[float], N
     )  # fmt: skip
     widths = np.array(injections.half_widths_s)
     amplitudes = np.asarray(sizes.amplitude(values[None], widths[:, None]))
-    refit = Refit(star.fit, amplitudes, case.study.flare.temperature_k, -(-asked.fitted // positions))
+    fit, fitted = SingleFlareFit(survey.bank, survey.templates), -(-asked.fitted // positions)
+    refit = Refit(fit, amplitudes, case.study.flare.temperature_k, fitted)
 
     def at_one_peak(position: int) -> Arrays:
         return _reduced(engine, injections.request(position, refit if refit.count else None))
@@ -428,25 +407,25 @@ def _completeness(case: Case, engine: Stares | Pool, report: Callable[[float], N
     return StarCompleteness(
         case.label,
         case.at,
-        star,
+        survey,
         sizes,
         **found,
         saturates=injections.saturates,
         in_a_row=consecutive_alarm_rate(choice.points, choice.sigma, survey.stare.frame_s),
         injected=InjectedCompleteness(injections.half_widths_s, values, amplitudes, critical),
         fitted=fit_accuracy(parts) if refit.count else None,
-        ideal_share=_ideal_share(case, star),
+        ideal_share=_ideal_share(case, survey),
     )
 
 
-def _ideal_share(case: Case, star: StarSurvey) -> float:
+def _ideal_share(case: Case, survey: Survey) -> float:
     """Return the S/N of a frame over that with everything but the noise known, or NaN if it is known."""
     if not any(case.stare.jitters.values()):
         return float("nan")
     frame = case.one_frame
     (flare,) = frame.expect(frame.flaring(SMALL))
-    known = frame_signal(star.quiet, flare, SMALL)
-    return star.unit_snr / known if known > 0 else float("nan")
+    known = frame_signal(survey.components.quiet, flare, SMALL)
+    return survey.unit_snr / known if known > 0 else float("nan")
 
 
 def _false_alarms(case: Case, survey: Survey, engine: Stares | Pool) -> dict[str, Any]:

@@ -509,8 +509,8 @@ def _search(case: Case, draw: Draw, checkpoint: Checkpoint | None) -> SearchResu
     """Search the stare of a case for flares, or return a message if no search is possible."""
     study, staring = case.study, case.stare_expectation
     try:
-        star = survey_star(case)
-        survey = replace(star.survey, components=staring.components(star.templates.weights))
+        survey = survey_star(case)
+        survey = replace(survey, components=staring.components(survey.templates.weights))
 
         def computed() -> Arrays:
             tail = sampled_rate(survey, study.run.seed)
@@ -520,8 +520,8 @@ def _search(case: Case, draw: Draw, checkpoint: Checkpoint | None) -> SearchResu
         threshold = float(tail["threshold"])
     except InputError as error:
         return Message(f"{case.label} is not searched: {error}.", "not searched")
-    scale = _log_energy(case, star.templates.temperatures_k)
-    raised = alarms(survey, star.templates, draw(survey.components), threshold, scale)
+    scale = _log_energy(case, survey.templates.temperatures_k)
+    raised = alarms(survey, draw(survey.components), threshold, scale)
     return SearchResult(threshold, [_found_flare(case, alarm) for alarm in raised], bool(tail["shifted"]))
 
 

@@ -10,7 +10,6 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.detection.distributions import Interval, clopper_pearson
 from mauvecl.fits.spectrum import Measurement
 from mauvecl.flares.settings import RANK
 from mauvecl.flares.shapes import shape_of
@@ -41,6 +40,7 @@ from mauvecl.observations.spectra import (
     survey_spectra,
 )
 from mauvecl.schema.physical import DAY_S
+from mauvecl.search.completeness import size_at
 
 Float = NDArray[np.float64]
 
@@ -65,24 +65,11 @@ class Completeness:
     detected: NDArray[np.int64]  # shape (n_width, n_size)
     injected: int  # number of injections per cell
 
-    def interval(self, width: int, size: int) -> Interval:
-        """Return the completeness of a cell with its 95 % interval."""
-        return clopper_pearson(int(self.detected[width, size]), self.injected)
-
     def limit(self, width: int, power: float = POWER) -> float:
-        """Return the equivalent duration of flares that are detected with a probability; NaN if none is.
-
-        Interpolated in the logarithm between the sizes.
-        """
-        share = np.maximum.accumulate(self.detected[width] / self.injected)
-        if share[-1] < power:
-            return float("nan")
-        k = int(np.argmax(share >= power))
-        logs = np.log(self.equivalent_durations_s[width])
-        if k == 0:
-            return float(np.exp(logs[0]))
-        part = (power - share[k - 1]) / (share[k] - share[k - 1])
-        return float(np.exp(logs[k - 1] + part * (logs[k] - logs[k - 1])))
+        """Return the equivalent duration of flares that are detected with a probability; NaN if none is."""
+        shares = np.maximum.accumulate(self.detected[width]) / self.injected
+        found = size_at(self.equivalent_durations_s[width], shares, power)
+        return found if np.isfinite(found) else float("nan")
 
 
 def inject(
@@ -98,10 +85,10 @@ def inject(
     rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, INJECTION_KEY]))
     bank, frame_s = survey.bank, survey.stare.frame_s
     widths = np.geomspace(bank.half_widths_s[0], bank.half_widths_s[-1], WIDTHS)
-    kelvin = np.array(survey.templates.temperatures_k)
-    direction = survey.templates.directions[int(np.argmin(np.abs(np.log(kelvin / temperature_k))))]
+    kelvin = survey.templates.nearest(temperature_k)
+    direction = survey.templates.directions[kelvin]
     # Photon noise of a flare of unit amplitude.
-    own_noise = np.linalg.cholesky(survey.templates.noise_of(temperature_k) + 1e-300 * np.eye(direction.size))
+    own_noise = np.linalg.cholesky(survey.templates.noise[kelvin] + 1e-300 * np.eye(direction.size))
     size_of = float(np.linalg.norm(direction))
     durations = np.zeros((WIDTHS, SIZES))
     detected = np.zeros((WIDTHS, SIZES), np.int64)

@@ -41,8 +41,6 @@ MAX_LOG_AMPLITUDE = 5.0
 REFINEMENTS = 6
 #: First range of the peak, in half-widths of the template, and factor on the half-width.
 PEAK_RANGE, WIDTH_RANGE = 2.5, 6.0
-#: Standard deviations below zero of a whole mixture from which logarithms of its probabilities are computed.
-FAR_BELOW = 10.0
 #: Departure with which further flares of an event are searched, the fall of chi-squared that they need, and the
 #: largest number.
 FURTHER_EPSILON, FURTHER_GAIN, MAX_FLARES = 0.2, 36.0, 6
@@ -87,23 +85,15 @@ class Mixture:
 
     def quantile(self, probability: float) -> float:
         """Return a quantile of the part above zero."""
-        log, mean, sd = self._cells
-        # Logarithms only where all is far below zero: they take longer.
-        above = _log_above if (mean / sd).max() < -FAR_BELOW else _above
-        held = (log if above is _log_above else np.exp(log), mean, sd)
-        goal = above(0.0, *held, 0.0)
-        goal = goal + float(np.log1p(-probability)) if above is _log_above else goal * (1 - probability)
+        held = self._cells
+        _, mean, sd = held
+        goal = _log_above(0.0, *held, 0.0) + float(np.log1p(-probability))
         high = max(float((mean + 10 * sd).max()), float(sd.max()))
         if np.isinf(high):
             # Frames without weight do not limit it.
             return high
         # `brentq` keeps its function until the next collection of garbage, but not the arrays.
-        return float(scipy.optimize.brentq(above, 0.0, high, args=(*held, goal), xtol=1e-9 * high))
-
-
-def _above(x: float, weight: Float, mean: Float, sd: Float, goal: float) -> float:
-    """Return the probability of a mixture above x, less a goal."""
-    return float(weight @ scipy.special.ndtr((mean - x) / sd)) - goal
+        return float(scipy.optimize.brentq(_log_above, 0.0, high, args=(*held, goal), xtol=1e-9 * high))
 
 
 def _log_above(x: float, log_weight: Float, mean: Float, sd: Float, goal: float) -> float:

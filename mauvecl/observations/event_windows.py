@@ -27,6 +27,7 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.flares.shapes import SHAPES, Davenport2014, Integrable, Shape, consecutive_integrals
+from mauvecl.search.templates import REACH
 
 if TYPE_CHECKING:
     from mauvecl.observations.search import Detection, SeriesSurvey
@@ -192,8 +193,6 @@ LOG_TIME = 0.7
 #: Light that departs where a shape has none, as a share of the amplitude at the peak (assumed); it falls by e in each
 #: half-width.
 FLOOR = 0.1
-#: Half-widths of a shape before and after the peak beyond which it is neglected.
-REACH = (5.0, 80.0)
 #: Largest number of bins in an event, and on each side of it; growth of the bins with the distance from the peak.
 MAX_INSIDE, MAX_OUTSIDE, GROWTH = 160, 80, 6.0
 #: Bins outside are shorter than this share of the shortest time scale of the process.

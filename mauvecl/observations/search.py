@@ -182,14 +182,9 @@ class SimulatedRate:
     heavy: bool = False  # whether the tail may fall more slowly than that of normal noise
 
     @property
-    def total(self) -> float:
-        """Star-days of all light curves."""
-        return self.largest.size * self.days
-
-    @property
     def smallest(self) -> float:
         """Smallest rate that the light curves show."""
-        return MIN_ALARMS / self.total
+        return MIN_ALARMS / (self.largest.size * self.days)
 
     def rate(self, threshold: float) -> float:
         """Return the events per star-day above a threshold, at the upper end of its 68 % interval.
@@ -199,29 +194,23 @@ class SimulatedRate:
         return float(np.exp(self._log_rate(threshold)))
 
     def _log_rate(self, threshold: float) -> float:
+        from scipy.special import log_ndtr
         from scipy.stats import beta
 
         n = self.largest.size
         anchor = float(self.largest[-min(n, MIN_ALARMS)])
-        at = min(threshold, anchor)
-        above = int(np.count_nonzero(self.largest > at))
+        above = int(np.count_nonzero(self.largest > min(threshold, anchor)))
         if above == n:
             return float(np.inf)
-        share = float(beta.ppf(UPPER, above + 1, n - above))
-        rate = float(np.log(-np.log1p(-share) / self.days))
-        return rate if threshold <= anchor else rate - self._fall(anchor, threshold)
-
-    def _fall(self, anchor: float, threshold: float) -> float:
-        """Return the fall of the logarithm of the rate from the largest simulated values to a threshold."""
-        from scipy.special import log_ndtr
-
-        normal = float(log_ndtr(-anchor) - log_ndtr(-threshold))
-        if not self.heavy:
-            return normal
-        beyond = self.largest[self.largest > anchor] - anchor
-        # The exponential that fits the largest values best (Pickands 1975, doi 10.1214/aos/1176343003), or a normal
-        # tail if it falls more slowly.
-        return min(normal, (threshold - anchor) / float(beyond.mean())) if beyond.size else normal
+        rate = float(np.log(-np.log1p(-float(beta.ppf(UPPER, above + 1, n - above))) / self.days))
+        if threshold <= anchor:
+            return rate
+        fall = float(log_ndtr(-anchor) - log_ndtr(-threshold))
+        if self.heavy and above:
+            # The exponential that fits the largest values best (Pickands 1975, doi 10.1214/aos/1176343003), or a normal
+            # tail if it falls more slowly.
+            fall = min(fall, (threshold - anchor) / float((self.largest[-above:] - anchor).mean()))
+        return rate - fall
 
     def threshold(self, rate: float) -> float:
         """Return the threshold above which the rate of events per star-day is at most `rate`."""

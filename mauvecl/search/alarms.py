@@ -26,13 +26,13 @@ from mauvecl.search.flare_fits import (
     Ends,
     Factor,
     FittedFlares,
+    Quantity,
     SummedStare,
 )
 from mauvecl.search.templates import LEAD, TAIL
 
 if TYPE_CHECKING:
     from mauvecl.search.search import Row, Survey
-    from mauvecl.search.templates import Templates
 
 Float = NDArray[np.float64]
 
@@ -89,16 +89,14 @@ class Candidate:
     template: tuple[float, float]  # peak time and half-width of the template, s
 
 
-def alarms(
-    survey: Survey, templates: Templates, sums: NDArray[Any], threshold: float, energy: Factor | None = None
-) -> list[Alarm]:
+def alarms(survey: Survey, sums: NDArray[Any], threshold: float, energy: Factor | None = None) -> list[Alarm]:
     """Detect and fit all flares of a stare in its simulated sums, (n_frame, n_sum), largest statistic first.
 
-    `templates` are those from which the survey's bank and components are made. `energy` returns the logarithm of the
-    energy per second of equivalent duration, and its derivative, for the logarithm of the temperature.
+    `energy` returns the logarithm of the energy per second of equivalent duration, and its derivative, for the
+    logarithm of the temperature.
     """
     net = np.asarray(survey.frames.net(sums[None])[0], np.float64)
-    search = _StareSearch(SummedStare(survey, templates, net), threshold)
+    search = _StareSearch(SummedStare(survey, net), threshold)
     search.run()
     return sorted(_measured_alarms(search, energy), key=lambda alarm: -alarm.rho)
 
@@ -166,7 +164,7 @@ class _StareSearch:
 
     def _candidate(self, rho: float, peak: float, row: Row, onset: int, direction: int) -> Candidate:
         """Return a candidate with the parameters of its template."""
-        templates, width = self.sums.templates, row.template.half_width_s
+        templates, width = self.sums.survey.templates, row.template.half_width_s
         size = float(np.linalg.norm(templates.directions[templates.chosen[direction]]))
         amplitude = max(rho / float(row.per_amplitude[onset]), 1e-3) / size
         kelvin = templates.temperatures_k[templates.chosen[direction]]
@@ -190,7 +188,7 @@ class _StareSearch:
             if self._was_refused(peak, width):
                 continue
             lead, tail = (frames * bank.frame_s for frames in bank.window(width))
-            window = sums.frames(peak - lead, peak + tail)
+            window = slice(*sums.overlapping(peak - lead, peak + tail))
             waits = waiting[window].any()
             waiting[window] = True
             if not waits:
@@ -356,23 +354,12 @@ def _measured(rows: Block, best: BlendFit, j: int, gain: float, energy: Factor |
     if missing := _why_unmeasured(rows, best, j):
         nowhere = dict.fromkeys((*QUANTITIES, "energy"), (np.nan, np.nan))
         return replace(UNMEASURED, snr=np.array([snr])), nowhere, f"detected but not measured: {missing}"
-    area = sums.survey.bank.shape.equivalent_duration
-    several = KELVIN in sums.free
     covariance = np.asarray(rows.covariance(best.theta)[j, :, j, :])
     outcome = _intervals(rows, best, j, snr, covariance, energy)
     if isinstance(outcome, BlendFit):
         return outcome
-    intervals, note = outcome
-    duration = np.array([1.0, 0.0, 1.0, 0.0])
-    sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    sd_duration = float(np.sqrt(max(duration @ covariance @ duration, 0.0)))
-    amplitude, width, kelvin = np.exp(theta[[AMPLITUDE, WIDTH, KELVIN]])
-    values = (
-        theta[PEAK], sd[PEAK], amplitude, amplitude * sd[AMPLITUDE], width, width * sd[WIDTH],
-        kelvin if several else np.nan, kelvin * sd[KELVIN] if several else np.nan,
-        amplitude * width * area, amplitude * width * area * sd_duration, snr,
-    )  # fmt: skip
-    return FittedFlares(*(np.array([value]) for value in values)), intervals, note
+    area, coloured = sums.survey.bank.shape.equivalent_duration, KELVIN in sums.free
+    return FittedFlares.of(theta[None], covariance[None], area, np.array([snr]), coloured=coloured), *outcome
 
 
 def _why_unmeasured(rows: Block, best: BlendFit, j: int) -> str:
@@ -391,36 +378,28 @@ def _intervals(
 ) -> tuple[dict[str, tuple[float, float]], str] | BlendFit:
     """Return the intervals of a flare's values and a note, or a better fit of its block if profiling finds one."""
     area = np.log(rows.sums.survey.bank.shape.equivalent_duration)
-    factors: dict[str, tuple[int, Factor | None, float]] = {
-        "peak_s": (PEAK, None, 0.0), "amplitude": (AMPLITUDE, None, 0.0), "half_width_s": (WIDTH, None, 0.0),
-        "temperature_k": (KELVIN, None, 0.0), "equivalent_duration_s": (AMPLITUDE, lambda _: (0.0, 0.0), area),
+    quantities = {
+        "peak_s": Quantity(PEAK), "amplitude": Quantity(AMPLITUDE), "half_width_s": Quantity(WIDTH),
+        "temperature_k": Quantity(KELVIN), "equivalent_duration_s": Quantity(AMPLITUDE, lambda _: (0.0, 0.0)),
     }  # fmt: skip
     if energy is not None:
-        factors["energy"] = (AMPLITUDE, energy, area)
+        quantities["energy"] = Quantity(AMPLITUDE, energy)
     intervals, notes = {"energy": (np.nan, np.nan)}, []
-    for name, (column, factor, offset) in factors.items():
-        if column == KELVIN and KELVIN not in rows.sums.free:
+    for name, quantity in quantities.items():
+        if quantity.column == KELVIN and KELVIN not in rows.sums.free:
             intervals[name] = (np.nan, np.nan)
             continue
-        interval: Ends | BlendFit = _by_curvature(best.theta[j], covariance, column, factor)
+        middle, slope = quantity.of(best.theta[j])
+        sd = float(np.sqrt(slope @ covariance @ slope))
+        interval: Ends | BlendFit = middle - sd, middle + sd, False
         if snr <= MAX_PROFILED_SNR:
-            interval = rows.interval(best, j, column, factor, 1.0 + BARTLETT / max(snr, 1.0) ** 2)
+            interval = rows.interval(best, j, quantity, 1.0 + BARTLETT / max(snr, 1.0) ** 2)
         if isinstance(interval, BlendFit):
             return interval
-        low, high, is_open = interval
-        ends = np.array([low, high])
-        low_end, high_end = ends if column == PEAK else np.exp(ends + offset)
-        intervals[name] = (float(low_end), float(high_end))
+        ends, is_open = np.array(interval[:2]), interval[2]
+        if quantity.column != PEAK:
+            ends = np.exp(ends if quantity.factor is None else ends + area)
+        intervals[name] = (float(ends[0]), float(ends[1]))
         if is_open:
             notes.append(name.rsplit("_", 1)[0].replace("_", " "))
     return intervals, f"the interval of its {' and its '.join(notes)} ends where the fit does" if notes else ""
-
-
-def _by_curvature(theta: Float, covariance: Float, column: int, factor: Factor | None) -> Ends:
-    if factor is None:
-        middle, sd = theta[column], np.sqrt(covariance[column, column])
-    else:
-        value, slope = factor(theta[KELVIN])
-        along = np.array([1.0, 0.0, 1.0, slope])
-        middle, sd = theta[AMPLITUDE] + theta[WIDTH] + value, np.sqrt(along @ covariance @ along)
-    return float(middle - sd), float(middle + sd), False

@@ -82,14 +82,7 @@ class Completeness:
 
     def energy_at(self, probability: float) -> float:
         """Return the energy above which the probability is reached, erg; infinite if it never is."""
-        reached = self.probability >= probability
-        if not reached[-1]:
-            return float("inf")
-        if reached.all():
-            return float(self.energy_erg[0])
-        first = int(np.flatnonzero(~reached)[-1])
-        around = slice(first, first + 2)
-        return float(10 ** np.interp(probability, self.probability[around], np.log10(self.energy_erg[around])))
+        return size_at(self.energy_erg, self.probability, probability)
 
     @classmethod
     @validated
@@ -147,6 +140,17 @@ class Completeness:
             f"{false_alarms_per_day:g} false alarms a day, stretches of {window_s / 60:.0f} min"
         )
         return cls(10**log_energy, np.clip(probability, 0, 1), "bolometric", how)
+
+
+def size_at(sizes: Float, shares: Float, wanted: float) -> float:
+    """Return the size above which a share of flares is found, between ascending sizes; infinite if it never is."""
+    missed = np.flatnonzero(shares < wanted)
+    if not missed.size:
+        return float(sizes[0])
+    if missed[-1] == sizes.size - 1:
+        return float("inf")
+    around = slice(missed[-1], missed[-1] + 2)
+    return float(np.exp(np.interp(wanted, shares[around], np.log(sizes[around]))))
 
 
 # A plan asks for the threshold and the gains of each target and each mode of a calibrated throughput.

@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import scipy
@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from mauvecl.fits.profile import Profile, remembering
 from mauvecl.flares.shapes import between, sides
+from mauvecl.search.templates import REACH
 
 if TYPE_CHECKING:
     from mauvecl.search.search import SearchedFrames, Survey
@@ -37,9 +38,8 @@ Float = NDArray[np.float64]
 AMPLITUDE, PEAK, WIDTH, KELVIN = range(4)
 #: Factor by which fitted half-widths may exceed the range of the bank.
 BEYOND_BANK = 1.25
-#: Half-widths before and after a peak within which flares overlap, and beyond which their flux is neglected.
+#: Half-widths before and after a peak within which flares overlap.
 OVERLAP_BEFORE, OVERLAP_AFTER = 2.0, 10.0
-LIGHT_BEFORE, LIGHT_AFTER = 5.0, 80.0
 #: Bounds of log amplitude.
 LOG_AMPLITUDES = (-27.0, 14.0)
 #: Relative change of chi-squared at which a fit has converged, and its largest number of evaluations.
@@ -73,32 +73,36 @@ class BlendFit:
 
 
 @dataclass(frozen=True)
+class Quantity:
+    """Parameter of a flare or, with a factor, the logarithm of amplitude x half-width x factor."""
+
+    column: int  # of the parameter that varies to hold the quantity: its own, or the amplitude
+    factor: Factor | None = None
+
+    def of(self, flare: Float) -> tuple[float, Float]:
+        """Return the value for a flare's parameters, shape (4,), and its derivatives."""
+        if self.factor is None:
+            return float(flare[self.column]), np.eye(4)[self.column]
+        value, slope = self.factor(float(flare[KELVIN]))
+        return float(flare[AMPLITUDE] + flare[WIDTH] + value), np.array([1.0, 0.0, 1.0, slope])
+
+
+@dataclass(frozen=True)
 class Held:
-    """Constraint of a fit: a parameter of a flare, or with a factor the log of amplitude x half-width x factor."""
+    """Constraint of a fit: the value of a quantity of a flare."""
 
     flare: int
-    column: int
+    quantity: Quantity
     value: float
-    factor: Factor | None
-
-    @property
-    def place(self) -> tuple[int, int]:
-        """Flare and column of the parameter that follows from the constraint."""
-        return self.flare, self.column if self.factor is None else AMPLITUDE
 
     def apply(self, theta: Float) -> None:
         """Set the parameter that follows from the others."""
-        others = 0.0
-        if self.factor is not None:
-            others = theta[self.flare, WIDTH] + self.factor(theta[self.flare, KELVIN])[0]
-        theta[self.place] = self.value - others
+        theta[self.flare, self.quantity.column] += self.value - self.quantity.of(theta[self.flare])[0]
 
     def tie(self, derivatives: Float, theta: Float) -> None:
         """Add to derivatives by the others, (n_row, n_flare, 4), their effect through this parameter."""
-        if self.factor is not None:
-            tied = derivatives[:, self.flare, AMPLITUDE].copy()
-            derivatives[:, self.flare, WIDTH] -= tied
-            derivatives[:, self.flare, KELVIN] -= self.factor(theta[self.flare, KELVIN])[1] * tied
+        slope = self.quantity.of(theta[self.flare])[1]
+        derivatives[:, self.flare] -= derivatives[:, self.flare, self.quantity.column, None] * slope
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +110,6 @@ class SummedStare:
     """The sums of a stare to which flares are fitted."""
 
     survey: Survey
-    templates: Templates
     net: Float  # sums less their known means, shape (n_frame, n_sum)
 
     @cached_property
@@ -118,23 +121,18 @@ class SummedStare:
     @property
     def free(self) -> list[int]:
         """Columns of fitted parameters."""
-        return [AMPLITUDE, PEAK, WIDTH, *([KELVIN] if len(self.templates.temperatures_k) > 1 else [])]
+        return [AMPLITUDE, PEAK, WIDTH, *([KELVIN] if len(self.survey.templates.temperatures_k) > 1 else [])]
 
     @cached_property
     def bounds(self) -> tuple[Float, Float]:
         """Bounds of a flare's parameters, from the stare, the bank and the templates, shape (4,) each."""
-        widths, kelvin = self.survey.bank.half_widths_s, self.templates.mean_sums.log_k
+        widths, kelvin = self.survey.bank.half_widths_s, self.survey.templates.mean_sums.log_k
         first, last = self.edges[0, 0], self.edges[-1, 1]
         narrow, wide = np.log(widths[0] / BEYOND_BANK), np.log(widths[-1] * BEYOND_BANK)
         low, high = LOG_AMPLITUDES
         return np.array([low, first, narrow, kelvin[0]]), np.array([high, last, wide, kelvin[-1]])
 
-    def frames(self, first_s: float, last_s: float) -> slice:
-        """Return the frames that overlap a time interval."""
-        first, stop = self._overlapping(first_s, last_s)
-        return slice(int(first), int(stop))
-
-    def _overlapping(self, first_s: Any, last_s: Any) -> tuple[Any, Any]:
+    def overlapping(self, first_s: Any, last_s: Any) -> tuple[Any, Any]:
         """Return the first frame that overlaps each time interval, and the first one after it."""
         start = self.survey.stare.start_s
         return np.searchsorted(start, first_s - self.survey.stare.frame_s), np.searchsorted(start, last_s)
@@ -149,14 +147,14 @@ class SummedStare:
         """Return the mean sums of flares in some frames, shape (n_frame, n_sum)."""
         total = np.zeros_like(self.net)[frames]
         for flare, inside, mean in self._shining(theta, frames):
-            total[inside] += mean[:, None] * self.templates.mean_sums.spline(flare[KELVIN])
+            total[inside] += mean[:, None] * self.survey.templates.mean_sums.spline(flare[KELVIN])
         return total
 
     def noise(self, theta: Float, light: Float, frames: slice = slice(None)) -> Float:
         """Return the covariance of frames' sums with flares, shape (n_frame, n_sum, n_sum)."""
-        total = self.survey.covariance[frames].copy()
+        total, templates = self.survey.covariance[frames].copy(), self.survey.templates
         for flare, inside, mean in self._shining(theta, frames):
-            total[inside] += mean[:, None, None] * self.templates.noise_of(float(np.exp(flare[KELVIN])))
+            total[inside] += mean[:, None, None] * templates.noise[templates.nearest(float(np.exp(flare[KELVIN])))]
         jitter = self.survey.stare.light_jitter
         if jitter and len(theta):
             # Star and flare light jitter together; the star's jitter is already in the covariance.
@@ -169,7 +167,7 @@ class SummedStare:
         """Yield the flares that contribute to some frames, the affected frames, and the mean amplitude in them."""
         first, last, _ = frames.indices(len(self.net))
         peak, width = theta[:, PEAK], np.exp(theta[:, WIDTH])
-        starts, stops = self._overlapping(peak - LIGHT_BEFORE * width, peak + LIGHT_AFTER * width)
+        starts, stops = self.overlapping(peak - REACH[0] * width, peak + REACH[1] * width)
         for flare, start, stop in zip(theta, np.maximum(starts, first), np.minimum(stops, last), strict=True):
             if start < stop:
                 mean = np.exp(flare[AMPLITUDE]) * self.mean(flare, slice(start, stop))
@@ -191,7 +189,7 @@ class SummedStare:
         windows = [self.window(flare) for flare in inside]
         used = np.zeros(len(self.net), np.bool_)
         for first, last in windows:
-            used[self.frames(first, last)] = True
+            used[slice(*self.overlapping(first, last))] = True
         there = np.flatnonzero(used)
         span = slice(int(there[0]), int(there[-1]) + 1)
         light = self.light(every, span)
@@ -247,7 +245,7 @@ class Block:
     def model(self, theta: Float) -> tuple[Float, Float]:
         """Return the whitened flux less its projection on the baseline, (n_row,), and derivatives, (n_row, n, 4)."""
         times, (first, last) = self._times
-        shape, spline = self.sums.survey.bank.shape, self.sums.templates.mean_sums.spline
+        shape, spline = self.sums.survey.bank.shape, self.sums.survey.templates.mean_sums.spline
         light, length = self.sums.survey.stare.light[self.used], times[last] - times[first]
         width = np.exp(theta[:, WIDTH, None])
         tau = (times - theta[:, PEAK, None]) / width  # (n_flare, n_time)
@@ -275,7 +273,7 @@ class Block:
         moved = np.zeros(theta.shape, np.bool_)
         moved[:, self.sums.free] = True
         if held is not None:
-            moved[held.place] = False
+            moved[held.flare, held.quantity.column] = False
         margin = 1e-9 * (high - low)
         start = np.clip(theta, low + margin, high - margin)
 
@@ -325,21 +323,16 @@ class Block:
         covariance[np.ix_(range(n), free, range(n), free)] = inverse.reshape(n, len(free), n, len(free))
         return covariance
 
-    def interval(self, best: BlendFit, j: int, column: int, factor: Factor | None, rises: float) -> Ends | BlendFit:
-        """Return the interval of a flare's parameter from the profile likelihood, or a better fit if that finds one.
+    def interval(self, best: BlendFit, j: int, quantity: Quantity, rises: float) -> Ends | BlendFit:
+        """Return the interval of a flare's quantity from the profile likelihood, or a better fit if that finds one.
 
-        With a factor, the interval is that of amplitude x half-width x factor. Chi-squared rises by `rises` at its
-        ends.
+        Chi-squared rises by `rises` at its ends.
         """
         covariance, theta = self.covariance(best.theta), best.theta
-        weights = np.zeros(theta.shape)
-        if factor is None:
-            weights[j, column], middle = 1.0, theta[j, column]
-            ends = self.sums.bounds[0][column], self.sums.bounds[1][column]
-        else:
-            value, slope = factor(theta[j, KELVIN])
-            weights[j, [AMPLITUDE, WIDTH, KELVIN]] = 1.0, 1.0, slope
-            middle, ends = theta[j, AMPLITUDE] + theta[j, WIDTH] + value, (-np.inf, np.inf)
+        weights, ends = np.zeros(theta.shape), (-np.inf, np.inf)
+        middle, weights[j] = quantity.of(theta[j])
+        if quantity.factor is None:
+            ends = self.sums.bounds[0][quantity.column], self.sums.bounds[1][quantity.column]
         along = np.einsum("iajb,jb->ia", covariance, weights)
         variance = float(np.sum(weights * along))
         sd = np.sqrt(variance) if variance > 0 else 1e-3
@@ -349,7 +342,7 @@ class Block:
 
             def refit(step: float, start: Float | None, sign: float = sign) -> BlendFit:
                 straight = theta + along * sign * step / variance if variance > 0 else theta
-                held = Held(j, column, float(middle + sign * step), factor)
+                held = Held(j, quantity, float(middle + sign * step))
                 return self.fit(straight if start is None else start, held)
 
             reached, probes = _interval_end(refit, best.chi2, rises, sd * np.sqrt(rises), furthest), list(BEYOND)
@@ -448,6 +441,23 @@ class FittedFlares:
     equivalent_duration_error_s: Float
     snr: Float
 
+    @classmethod
+    def of(cls, theta: Float, covariance: Float, area: float, snr: Float, *, coloured: bool) -> Self:
+        """Return the values and errors of parameters, (n, 4), with covariances (n, 4, 4).
+
+        `area` is the equivalent duration of the shape; flares have a temperature if they are `coloured`.
+        """
+        sd = np.sqrt(np.maximum(np.einsum("nii->ni", covariance), 0.0))
+        both = np.array([1.0, 0.0, 1.0, 0.0])
+        sd_duration = np.sqrt(np.maximum(np.einsum("i,nij,j->n", both, covariance, both), 0.0))
+        amplitude, width, kelvin = np.exp(theta[:, [AMPLITUDE, WIDTH, KELVIN]]).T
+        kelvin = kelvin if coloured else np.full(len(theta), np.nan)
+        duration = amplitude * width * area
+        return cls(
+            theta[:, PEAK], sd[:, PEAK], amplitude, amplitude * sd[:, AMPLITUDE], width, width * sd[:, WIDTH],
+            kelvin, kelvin * sd[:, KELVIN], duration, duration * sd_duration, snr,
+        )  # fmt: skip
+
 
 @dataclass(frozen=True, eq=False)
 class SingleFlareFit:
@@ -526,7 +536,14 @@ class SingleFlareFit:
             if not going.any():
                 break
         information, _ = self._normal(products, amplitude, log_kelvin)
-        return self._with_errors(peak, log_width, log_kelvin, amplitude, gain, information)
+        covariance, n_free = np.zeros((n, 4, 4)), 4 if self.templates.coloured else 3
+        covariance[:, :n_free, :n_free] = np.linalg.pinv(information[:, :n_free, :n_free], hermitian=True)
+        # The peak is in half-widths.
+        scale = np.where(np.arange(4) == PEAK, np.exp(log_width)[:, None], 1.0)
+        covariance *= scale[:, :, None] * scale[:, None, :]
+        theta = np.column_stack([np.log(amplitude), peak, log_width, log_kelvin])
+        area, snr = self.bank.shape.equivalent_duration, np.sqrt(np.maximum(gain, 0.0))
+        return FittedFlares.of(theta, covariance, area, snr, coloured=self.templates.coloured)
 
     def _brightest(self, products: tuple[Float, Float]) -> tuple[Float, Float, Float]:
         """Return log temperature, amplitude and fall of chi-squared of the best fits of given shapes."""
@@ -595,24 +612,6 @@ class SingleFlareFit:
         information[blind] = 0
         np.einsum("nii->ni", information)[blind] = 1.0
         return information, pull
-
-    def _with_errors(
-        self, peak: Float, log_width: Float, log_kelvin: Float, amplitude: Float, gain: Float, information: Float
-    ) -> FittedFlares:
-        width, kelvin = np.exp(log_width), np.exp(log_kelvin)
-        coloured = self.templates.coloured
-        if not coloured:
-            information = information[:, :3, :3]
-        covariance = np.linalg.pinv(information, hermitian=True)
-        error = np.sqrt(np.maximum(np.einsum("nii->ni", covariance), 0.0))
-        both = np.sqrt(np.maximum(covariance[:, 0, 0] + covariance[:, 2, 2] + 2 * covariance[:, 0, 2], 0.0))
-        duration = amplitude * width * self.bank.shape.equivalent_duration
-        none = np.full(peak.size, np.nan)
-        return FittedFlares(
-            peak, width * error[:, 1], amplitude, amplitude * error[:, 0], width, width * error[:, 2],
-            kelvin if coloured else none, kelvin * error[:, 3] if coloured else none,
-            duration, duration * both, np.sqrt(np.maximum(gain, 0.0)),
-        )  # fmt: skip
 
 
 def _remove_baseline(values: Float, weight: Float, level: Float) -> Float:

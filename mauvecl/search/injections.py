@@ -140,18 +140,15 @@ class InjectionSite:
         return np.ascontiguousarray(self.filters.T, np.float64)
 
 
-def sites_of(survey: Survey, widths_s: Sequence[float], peak_s: float, response: Float) -> tuple[InjectionSite, ...]:
-    """Return the sites of flares of several half-widths that peak at one time.
-
-    `response`, (n_sum,), holds the mean sums of a frame for a flare of unit amplitude.
-    """
+def sites_of(survey: Survey, widths_s: Sequence[float], peak_s: float) -> tuple[InjectionSite, ...]:
+    """Return the sites of flares of several half-widths that peak at one time."""
     bank = survey.bank
     reaches = [_Reach.of(bank, width, peak_s) for width in widths_s]
     search, first = _search_near(survey, reaches)
     stare = search.stare
     edges = np.column_stack([stare.start_s, stare.start_s + bank.frame_s])
     means = np.array([stare.light * bank.shape.mean_over(edges, peak_s, width) for width in widths_s])
-    near = _near_templates(search, reaches, means, bank.directions @ response)
+    near = _near_templates(search, reaches, means, bank.directions @ survey.response)
     # Flares of several half-widths share templates.
     place, index = np.unique(np.concatenate([one[0] for one in near]).astype(np.int64), return_inverse=True)
     numbers, onsets = np.divmod(place, search.n_grid)
@@ -264,11 +261,6 @@ class Injections:
         frame = np.minimum(along.astype(np.int64), stare.n_frames - 1)
         return np.asarray(stare.start_s[frame] + (along - frame) * stare.frame_s)
 
-    @cached_property
-    def response(self) -> Float:
-        """Mean sums of a frame for a flare of unit amplitude, shape (n_sum,)."""
-        return self.survey.components.means(np.ones(len(STEADY) + 1))
-
     @property
     def saturates(self) -> float:
         """Amplitude at which the mean of a used pixel reaches saturation in a frame at the flare's peak."""
@@ -300,7 +292,7 @@ class Injections:
     def request(self, position: int, refit: Refit | None = None) -> StaresRequest:
         """Return the request for the critical amplitudes at a peak time and, with `refit`, fits of detected flares."""
         survey = self.survey
-        sites = sites_of(survey, self.half_widths_s, float(self.peaks_s[position]), self.response)
+        sites = sites_of(survey, self.half_widths_s, float(self.peaks_s[position]))
         # Without templates, one frame is drawn, since requests cannot be empty.
         reached = [site.frames for site in sites if len(site.filters)] or [slice(0, 1)]
         first = min(part.start for part in reached)
@@ -311,7 +303,7 @@ class Injections:
             tuple(replace(site, first=site.first - first) for site in sites),
             self.threshold,
             survey.bank.directions,
-            self.response,
+            survey.response,
             self.photons,
             replace(frames, known=frames.known.astype(np.float32)),
             start,
@@ -339,7 +331,7 @@ class CriticalAmplitudes:
     sites: tuple[InjectionSite, ...]  # in the frames
     threshold: float
     directions: Float  # of the bank, shape (n_temperature, n_sum)
-    response: Float  # see `Injections.response`
+    response: Float  # see `Survey.response`
     photons: Float  # see `Injections.photons`
     frames: SearchedFrames
     start: int  # number of the first stare

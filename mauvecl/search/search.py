@@ -31,12 +31,13 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from mauvecl.flares.frames import STEADY
 from mauvecl.flares.stare import select_frames
 from mauvecl.flares.stare_scene import StaresRequest, method_for
 from mauvecl.noise.unknowns import NONE, Changing, Processes
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import DAY_S
-from mauvecl.search.templates import LEAST_SHARE, Bank, Template
+from mauvecl.search.templates import LEAST_SHARE, Bank, Template, Templates
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -432,9 +433,10 @@ class SearchedFrames:
 class Survey:
     """Stare at a star and its search."""
 
-    components: Components  # with the weights of `Templates`
+    components: Components  # with the weights of the templates
     stare: Stare
     bank: Bank
+    templates: Templates  # from which bank and components are made
 
     @cached_property
     def coefficients(self) -> Float:
@@ -450,6 +452,18 @@ class Survey:
     def directions(self) -> dict[str, Float]:
         """Derivatives of the mean sums by star, light, sky and temperature, shape (n_frame, n_sum) each."""
         return self.components.directions(self.coefficients)
+
+    @cached_property
+    def response(self) -> Float:
+        """Mean sums of a frame for the first flare component at unit amplitude, shape (n_sum,)."""
+        unit = np.zeros(len(STEADY) + self.components.n_flares)
+        unit[: len(STEADY) + 1] = 1.0
+        return self.components.means(unit)
+
+    @property
+    def unit_snr(self) -> float:
+        """S/N of one frame for the first flare component at constant unit amplitude and known baseline."""
+        return float(np.linalg.norm(self.response))
 
     @cached_property
     def covariance(self) -> Float:

@@ -31,6 +31,8 @@ Float = NDArray[np.float64]
 
 #: Shortest window before and after a peak, in half-widths of the template.
 LEAD, TAIL = 5.0, 10.0
+#: Half-widths before and after a peak beyond which the light of a flare is neglected.
+REACH = (5.0, 80.0)
 #: Smallest number of onsets per half-width.
 ONSETS = 10
 #: Half-width in frames below which two onsets per frame are searched.
@@ -231,9 +233,9 @@ class Templates:
         """Share of the S/N that is lost by reducing frames to sums, shape (n_temperature,)."""
         return np.asarray(1.0 - np.linalg.norm(self.directions, axis=1) / self.best)
 
-    def noise_of(self, kelvin: float) -> Float:
-        """Return the covariance added by the photon noise of a flare of the nearest temperature, (n_sum, n_sum)."""
-        return np.asarray(self.noise[int(np.argmin(np.abs(np.log(np.array(self.temperatures_k) / kelvin))))])
+    def nearest(self, kelvin: float) -> int:
+        """Return the row of the temperature that is nearest to another one."""
+        return int(np.argmin(np.abs(np.log(np.array(self.temperatures_k) / kelvin))))
 
 
 def frame_nuisances(quiet: Expectation, stare: Stare, more: Mapping[str, float] | None = None) -> Nuisances | None:

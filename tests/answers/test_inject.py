@@ -44,15 +44,13 @@ def test_tables_are_consistent(found):
     # Size and amplitude are the same flare.
     scale = star.sizes.per_unit
     assert cells["amplitude"] * cells["half_width"].value * scale == pytest.approx(cells["size"].value, rel=1e-12)
-    ratio = star.fitted.energy_ratio[:, -1]
+    ratio = star.fitted["energy_ratio"][:, -1]
     assert ratio == pytest.approx(np.ones(3), abs=0.25)
     row = found.search[0]
     assert row["threshold_low"] < row["threshold"] < row["threshold_high"]
     assert row["in_a_row"] == pytest.approx(4.245e-5, rel=1e-3)
     assert row["alarmed"] == np.sum(found.stars[0].alarmed) <= 30
-    assert row["alarmed_expected"] == pytest.approx(
-        30 * -np.expm1(-found.stars[0].surveyed.survey.stare.observed_s / 86_400)
-    )
+    assert row["alarmed_expected"] == pytest.approx(30 * -np.expm1(-found.stars[0].survey.stare.observed_s / 86_400))
     assert not of_kind(found.messages, "false alarms")
     assert Study.build(tomllib.loads(found.study.toml()), "text") == found.study
 
@@ -101,7 +99,7 @@ def test_temperature_drift_hides_no_flare(stares):
     for k in (None, 0, 1):
         half = [star.injected.limit(0.5, k).value for star in (plain, drifting)]
         assert half[1] == pytest.approx(half[0], rel=0.03)
-    ratios = [star.fitted.energy_ratio[:, -1] for star in (plain, drifting)]
+    ratios = [star.fitted["energy_ratio"][:, -1] for star in (plain, drifting)]
     assert ratios[1] == pytest.approx(ratios[0], abs=0.02)
     assert drifting.threshold.value == pytest.approx(plain.threshold.value, abs=0.05)
 

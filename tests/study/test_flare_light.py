@@ -121,7 +121,7 @@ def test_search_injects_the_flare_of_the_file() -> None:
     """Templates are those of a blackbody for a file, and of the spectrum otherwise; the file has more ultraviolet."""
     few = ["stare.duration_s=2000", "injections={count=20, sizes=2, widths=2, fitted=0}", "search.nulls=0"]
     found = {
-        name: mauvecl.inject(study_of(name).with_settings(few)).stars[0].surveyed
+        name: mauvecl.inject(study_of(name).with_settings(few)).stars[0].survey
         for name in ("blackbody", "file", "jump")
     }
     np.testing.assert_array_equal(found["file"].templates.directions, found["blackbody"].templates.directions)
