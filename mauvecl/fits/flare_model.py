@@ -377,25 +377,26 @@ def _derived_at_distance(
     return derived
 
 
-#: Shares of a prior in the variance of a ratio at which thresholds are computed, and steps of their bisection.
-SHARES, HALVINGS = np.linspace(0.0, 1.0, 65), 40
+#: Shares of a prior in the variance of a ratio at which thresholds are computed, and their largest root.
+SHARES, LARGEST = np.linspace(0.0, 1.0, 65), 10.0
 
 
 @lru_cache(maxsize=16)
 def _thresholds(prior: bytes, allowed: float) -> Float:
     """Return squared thresholds at `SHARES` that deviations exceed as often as normal ones exceed `allowed`."""
     deviation, weight = np.frombuffer(prior).reshape(2, -1)
-    # A small normal part keeps the distribution continuous.
-    normal = np.sqrt(np.maximum(1.0 - SHARES, 1e-4))[:, None]
-    moved = np.sqrt(SHARES)[:, None] * deviation
     level = 2.0 * scipy.special.ndtr(np.sqrt(allowed)) - 1.0
-    low, high = np.zeros(SHARES.size), np.full(SHARES.size, 10.0)
-    for _ in range(HALVINGS):
-        middle = ((low + high) / 2.0)[:, None]
-        inside = scipy.special.ndtr((middle - moved) / normal) - scipy.special.ndtr((-middle - moved) / normal)
-        enough = inside @ weight >= level
-        low, high = np.where(enough, low, middle[:, 0]), np.where(enough, middle[:, 0], high)
-    return np.asarray(((low + high) / 2.0) ** 2)
+
+    def beyond(root: float, share: float) -> float:
+        # A small normal part keeps the distribution continuous.
+        normal, moved = np.sqrt(max(1.0 - share, 1e-4)), np.sqrt(share) * deviation
+        inside = scipy.special.ndtr((root - moved) / normal) - scipy.special.ndtr((-root - moved) / normal)
+        return float(inside @ weight) - level
+
+    return np.array([
+        scipy.optimize.brentq(beyond, 0.0, LARGEST, args=(share,)) if beyond(LARGEST, share) > 0.0 else LARGEST
+        for share in SHARES
+    ]) ** 2  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -604,8 +605,7 @@ class Reduction(MeanSums):
         used = self.variance > 0.0
         inverse = np.divide(1.0, self.variance, out=np.zeros_like(self.variance), where=used)
         unknown = excess_dn @ self.rows.T
-        explained = np.einsum("nk,nk->n", unknown, unknown) + np.einsum("nk,nk->n", sums, sums)
-        return np.asarray(excess_dn**2 @ inverse - explained)
+        return np.asarray(excess_dn**2 @ inverse - np.vecdot(unknown, unknown) - np.vecdot(sums, sums))
 
     @property
     def n_used(self) -> int:
