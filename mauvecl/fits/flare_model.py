@@ -155,11 +155,7 @@ class FlareModel:
             For an unknown name, an impossible value, or a spectrum that does not cover the band.
         """
         chosen = [EmissionLine.named(name) for name in lines]
-        for low, high in bands_nm:
-            if not GRID_NM[0] <= low < high <= GRID_NM[-1]:
-                raise InputError.of(
-                    "bands_nm", (low, high), f"ascending wavelengths within {GRID_NM[0]:g}-{GRID_NM[-1]:g}"
-                )
+        _check_bands(bands_nm)
         kelvin = np.geomspace(*TEMPERATURES_K, NODES)
         nodes = [BalmerFlare().nodes_nm, np.ravel(bands_nm), *(line.nodes_nm for line in chosen)]
         grid = np.unique(np.concatenate([GRID_NM, *nodes]))
@@ -176,16 +172,12 @@ class FlareModel:
         light = [(f"{low:g}-{high:g} nm", _between(grid, fluxes, low, high)) for low, high in bands_nm]
         balmer = BalmerFlare(10_000.0, 2.0, electron_temperature_k)
         whole = [(balmer.bolometric_flux() - STEFAN_BOLTZMANN * 1e16) / float(balmer.edge_flux)] if jump else []
-        every = np.concatenate([scale * STEFAN_BOLTZMANN * kelvin**4, whole, np.ones(len(chosen))])
-        light.append(("bolometric", every))
+        bodies_flux = scale * STEFAN_BOLTZMANN * kelvin**4
+        light.append(("bolometric", np.concatenate([bodies_flux, whole, np.ones(len(chosen))])))
         derived = _derived(kelvin, scale, names, light)
         if distance_pc is not None:
             derived += _derived_at_distance(scale, names, light, quiet.exposure_s, distance_pc, radius_rsun)
-        log_k = np.log(kelvin)
-        while np.exp(log_k[-1]) > TEMPERATURES_K[1]:
-            # The exponential of the last node is a temperature that is accepted.
-            log_k[-1] = np.nextafter(log_k[-1], 0.0)
-        return cls(log_k, counts[:NODES], counts[NODES:], names, tuple(derived))
+        return cls(_accepted_logs(kelvin), counts[:NODES], counts[NODES:], names, tuple(derived))
 
     def stacked(self, n: int, light: float = 1.0) -> Self:
         """Return the model of exposures that are n times as long, with a known factor on all light.
@@ -307,6 +299,22 @@ def derived_values(model: FlareModel, log_k: Float, linear: Float, factor: Float
             over = np.divide(linear[:, 1], linear[:, 0], out=np.full(log_k.size, np.nan), where=positive)
             values[:, q] = derived.offset + ratio(log_k) * over
     return values
+
+
+def _check_bands(bands_nm: Ranges) -> None:
+    """Raise InputError unless the ranges of wavelength are ascending and within the model's grid."""
+    for low, high in bands_nm:
+        if not GRID_NM[0] <= low < high <= GRID_NM[-1]:
+            expected = f"ascending wavelengths within {GRID_NM[0]:g}-{GRID_NM[-1]:g}"
+            raise InputError.of("bands_nm", (low, high), expected)
+
+
+def _accepted_logs(kelvin: Float) -> Float:
+    """Return the logarithms of the nodes; the exponential of the last one is a temperature that is accepted."""
+    log_k = np.log(kelvin)
+    while np.exp(log_k[-1]) > TEMPERATURES_K[1]:
+        log_k[-1] = np.nextafter(log_k[-1], 0.0)
+    return log_k
 
 
 def _flux_ratios(star: Source, band: str, kelvin: Float) -> Float:
