@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import chain
 from operator import attrgetter
@@ -337,9 +337,11 @@ def _measured(case: Case, amplitude: float, flare: Expectation, engine: Engine |
     selected = np.concatenate([arrays["detected"] for arrays in parts])
     measured = []
     for k, forecast in enumerate(expected):
-        own = [{key.removeprefix(f"{k} "): x for key, x in part.items() if key.startswith(f"{k} ")} for part in parts]
-        about: dict[str, Any] = {name: getattr(forecast.fitted, name) for name in ("names", "units", "bounds")}
-        found = Measurement.joined([Measurement.of_arrays(arrays, levels=LEVELS, **about) for arrays in own])
+        own: list[dict[str, Any]] = [
+            {key.removeprefix(f"{k} "): x for key, x in part.items() if key.startswith(f"{k} ")} for part in parts
+        ]
+        batches = [replace(forecast.perfect, **arrays | {"dof": int(arrays["dof"])}) for arrays in own]
+        found = Measurement.joined(batches)
         measured.append(MeasuredFlare(**vars(forecast), found=found, selected=selected, frame=parts[0]["first"]))
     return measured
 

@@ -155,11 +155,7 @@ class FlareModel:
             For an unknown name, an impossible value, or a spectrum that does not cover the band.
         """
         chosen = [EmissionLine.named(name) for name in lines]
-        for low, high in bands_nm:
-            if not GRID_NM[0] <= low < high <= GRID_NM[-1]:
-                raise InputError.of(
-                    "bands_nm", (low, high), f"ascending wavelengths within {GRID_NM[0]:g}-{GRID_NM[-1]:g}"
-                )
+        _check_bands(bands_nm)
         kelvin = np.geomspace(*TEMPERATURES_K, NODES)
         nodes = [BalmerFlare().nodes_nm, np.ravel(bands_nm), *(line.nodes_nm for line in chosen)]
         grid = np.unique(np.concatenate([GRID_NM, *nodes]))
@@ -176,16 +172,12 @@ class FlareModel:
         light = [(f"{low:g}-{high:g} nm", _between(grid, fluxes, low, high)) for low, high in bands_nm]
         balmer = BalmerFlare(10_000.0, 2.0, electron_temperature_k)
         whole = [(balmer.bolometric_flux() - STEFAN_BOLTZMANN * 1e16) / float(balmer.edge_flux)] if jump else []
-        every = np.concatenate([scale * STEFAN_BOLTZMANN * kelvin**4, whole, np.ones(len(chosen))])
-        light.append(("bolometric", every))
+        bodies_flux = scale * STEFAN_BOLTZMANN * kelvin**4
+        light.append(("bolometric", np.concatenate([bodies_flux, whole, np.ones(len(chosen))])))
         derived = _derived(kelvin, scale, names, light)
         if distance_pc is not None:
             derived += _derived_at_distance(scale, names, light, quiet.exposure_s, distance_pc, radius_rsun)
-        log_k = np.log(kelvin)
-        while np.exp(log_k[-1]) > TEMPERATURES_K[1]:
-            # The exponential of the last node is a temperature that is accepted.
-            log_k[-1] = np.nextafter(log_k[-1], 0.0)
-        return cls(log_k, counts[:NODES], counts[NODES:], names, tuple(derived))
+        return cls(_accepted_logs(kelvin), counts[:NODES], counts[NODES:], names, tuple(derived))
 
     def stacked(self, n: int, light: float = 1.0) -> Self:
         """Return the model of exposures that are n times as long, with a known factor on all light.
@@ -309,6 +301,22 @@ def derived_values(model: FlareModel, log_k: Float, linear: Float, factor: Float
     return values
 
 
+def _check_bands(bands_nm: Ranges) -> None:
+    """Raise InputError unless the ranges of wavelength are ascending and within the model's grid."""
+    for low, high in bands_nm:
+        if not GRID_NM[0] <= low < high <= GRID_NM[-1]:
+            expected = f"ascending wavelengths within {GRID_NM[0]:g}-{GRID_NM[-1]:g}"
+            raise InputError.of("bands_nm", (low, high), expected)
+
+
+def _accepted_logs(kelvin: Float) -> Float:
+    """Return the logarithms of the nodes; the exponential of the last one is a temperature that is accepted."""
+    log_k = np.log(kelvin)
+    while np.exp(log_k[-1]) > TEMPERATURES_K[1]:
+        log_k[-1] = np.nextafter(log_k[-1], 0.0)
+    return log_k
+
+
 def _flux_ratios(star: Source, band: str, kelvin: Float) -> Float:
     """Return flux at the telescope over that at the surface of flares with an amplitude of one, shape of `kelvin`."""
     nm = star.wavelength_nm
@@ -377,25 +385,26 @@ def _derived_at_distance(
     return derived
 
 
-#: Shares of a prior in the variance of a ratio at which thresholds are computed, and steps of their bisection.
-SHARES, HALVINGS = np.linspace(0.0, 1.0, 65), 40
+#: Shares of a prior in the variance of a ratio at which thresholds are computed, and their largest root.
+SHARES, LARGEST = np.linspace(0.0, 1.0, 65), 10.0
 
 
 @lru_cache(maxsize=16)
 def _thresholds(prior: bytes, allowed: float) -> Float:
     """Return squared thresholds at `SHARES` that deviations exceed as often as normal ones exceed `allowed`."""
     deviation, weight = np.frombuffer(prior).reshape(2, -1)
-    # A small normal part keeps the distribution continuous.
-    normal = np.sqrt(np.maximum(1.0 - SHARES, 1e-4))[:, None]
-    moved = np.sqrt(SHARES)[:, None] * deviation
     level = 2.0 * scipy.special.ndtr(np.sqrt(allowed)) - 1.0
-    low, high = np.zeros(SHARES.size), np.full(SHARES.size, 10.0)
-    for _ in range(HALVINGS):
-        middle = ((low + high) / 2.0)[:, None]
-        inside = scipy.special.ndtr((middle - moved) / normal) - scipy.special.ndtr((-middle - moved) / normal)
-        enough = inside @ weight >= level
-        low, high = np.where(enough, low, middle[:, 0]), np.where(enough, middle[:, 0], high)
-    return np.asarray(((low + high) / 2.0) ** 2)
+
+    def beyond(root: float, share: float) -> float:
+        # A small normal part keeps the distribution continuous.
+        normal, moved = np.sqrt(max(1.0 - share, 1e-4)), np.sqrt(share) * deviation
+        inside = scipy.special.ndtr((root - moved) / normal) - scipy.special.ndtr((-root - moved) / normal)
+        return float(inside @ weight) - level
+
+    return np.array([
+        scipy.optimize.brentq(beyond, 0.0, LARGEST, args=(share,)) if beyond(LARGEST, share) > 0.0 else LARGEST
+        for share in SHARES
+    ]) ** 2  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -604,8 +613,7 @@ class Reduction(MeanSums):
         used = self.variance > 0.0
         inverse = np.divide(1.0, self.variance, out=np.zeros_like(self.variance), where=used)
         unknown = excess_dn @ self.rows.T
-        explained = np.einsum("nk,nk->n", unknown, unknown) + np.einsum("nk,nk->n", sums, sums)
-        return np.asarray(excess_dn**2 @ inverse - explained)
+        return np.asarray(excess_dn**2 @ inverse - np.vecdot(unknown, unknown) - np.vecdot(sums, sums))
 
     @property
     def n_used(self) -> int:

@@ -88,6 +88,8 @@ class Profile:
         self._basis, self._inverse = reduction.basis
         self.along = sums @ self._basis.T
         self.rest = sums - self.along @ self._basis
+        #: Decrease of chi-squared by the fixed components alone, shape (n,).
+        self.base = np.vecdot(self.along, self.along)
         self.nodes = reduction.log_k
         self.hot = reduction.spline
 
@@ -99,9 +101,23 @@ class Profile:
         """Return the blackbody's amplitude without bounds, its variance, and its sums, at temperatures (n, ...)."""
         hot = self.hot(log_k)
         free = self.free(hot)
-        power = np.einsum("...k,...k->...", free, free)
-        rest = self.rest.reshape(self.rest.shape[:1] + (1,) * (log_k.ndim - 1) + self.rest.shape[1:])
-        return np.einsum("...k,...k->...", free, rest) / power, 1.0 / power, hot
+        power = np.vecdot(free, free)
+        return np.vecdot(free, _for_samples(self.rest, log_k)) / power, 1.0 / power, hot
+
+    def products(self, log_k: Float) -> Products:
+        """Return the inner products at temperatures (n, ...), or (1, ...) if common to all frames."""
+        hot, fixed = self.hot(log_k), self.reduction.fixed
+        if log_k.shape[0] == 1:
+            along = np.tensordot(self.sums, hot[0], (1, -1))
+        else:
+            along = np.einsum("n...k,nk->n...", hot, self.sums)
+        return Products(
+            along,
+            np.einsum("...k,...k->...", hot, hot),
+            np.moveaxis(hot @ fixed.T, -1, 0),
+            (fixed @ self.sums.T).reshape(len(fixed), len(self.sums), *(1,) * (log_k.ndim - 1)),
+            fixed @ fixed.T,
+        )
 
     def free(self, hot: Float) -> Float:
         """Return sums less their projections on the fixed components."""
@@ -110,20 +126,18 @@ class Profile:
     def gain(self, log_k: Float) -> Float:
         """Return the decrease of chi-squared by a flare of temperatures (n, ...) with a positive blackbody."""
         amplitude, variance, _ = self.parts(log_k)
-        base = np.einsum("nk,nk->n", self.along, self.along).reshape((-1,) + (1,) * (log_k.ndim - 1))
-        return np.asarray(base + np.maximum(amplitude, 0.0) ** 2 / variance)
+        return np.asarray(_for_samples(self.base, log_k) + np.maximum(amplitude, 0.0) ** 2 / variance)
 
     def gain_at_nodes(self) -> Float:
         """Return `gain` at the temperatures of the model, shape (n, n_node)."""
         product = self.rest @ self.reduction.directions[0].T
-        return np.asarray(np.maximum(product, 0.0) ** 2 + np.einsum("nk,nk->n", self.along, self.along)[:, None])
+        return np.asarray(np.maximum(product, 0.0) ** 2 + self.base[:, None])
 
     def linear(self, log_k: Float, amplitude: Float, hot: Float) -> Float:
         """Return all amplitudes, shape (n, ..., n_linear), for a given amplitude of the blackbody."""
         if not len(self._basis):
             return amplitude[..., None]
-        along = self.along.reshape(self.along.shape[:1] + (1,) * (log_k.ndim - 1) + self.along.shape[1:])
-        others = (along - amplitude[..., None] * (hot @ self._basis.T)) @ self._inverse.T
+        others = (_for_samples(self.along, log_k) - amplitude[..., None] * (hot @ self._basis.T)) @ self._inverse.T
         return np.concatenate([amplitude[..., None], others], axis=-1)
 
     def factor(self, log_k: Float, linear: Float) -> Float:
@@ -141,7 +155,7 @@ class Profile:
         units, cubics = self.reduction.directions
         node = np.argmax(np.maximum(self.rest @ units.T, 0.0) if at_nodes is None else at_nodes, axis=1)
         interval = np.minimum(node, self.nodes.size - 2)
-        falling = np.einsum("nk,nk->n", self.rest, cubics[interval, 2]) < 0.0
+        falling = np.vecdot(self.rest, cubics[interval, 2]) < 0.0
         interval = np.where(falling, np.maximum(node - 1, 0), interval)
         c = np.einsum("npk,nk->pn", cubics[interval], self.rest)
         span = self.nodes[interval + 1] - self.nodes[interval]
@@ -154,8 +168,7 @@ class Profile:
         """Return the best fits at temperatures (n,)."""
         amplitude, variance, hot = self.parts(log_k)
         positive = np.maximum(amplitude, 0.0)
-        gain = np.einsum("nk,nk->n", self.along, self.along) + positive**2 / variance
-        return BestFit(log_k, self.linear(log_k, positive, hot), gain)
+        return BestFit(log_k, self.linear(log_k, positive, hot), self.base + positive**2 / variance)
 
     def ends(self, best: BestFit, at_nodes: Float, allowed: float) -> tuple[Float, Float]:
         """Return the log temperatures at which chi-squared has risen by `allowed`, low and high, each (n,).
@@ -203,6 +216,11 @@ class Profile:
         return x
 
 
+def _for_samples(values: Float, log_k: Float) -> Float:
+    """Return values of frames, shape (n, k) or (n,), with axes for samples of temperatures, (n, ...)."""
+    return np.expand_dims(values, tuple(range(1, log_k.ndim)))
+
+
 def intervals(
     model: FlareModel, profile: Profile, best: BestFit, at_nodes: Float, allowed: float
 ) -> tuple[Float, Float]:
@@ -213,13 +231,13 @@ def intervals(
     low, high = profile.ends(best, at_nodes, allowed)
     x, closed = temperature_samples(profile, low, high), ~np.isnan(low) & ~np.isnan(high)
     amplitude, variance, hot = profile.parts(x)
-    spent = best.gain[:, None] - np.einsum("nk,nk->n", profile.along, profile.along)[:, None] - amplitude**2 / variance
+    spent = (best.gain - profile.base)[:, None] - amplitude**2 / variance
     samples = _Samples(profile, x, profile.linear(x, amplitude, hot), variance, hot, allowed - spent, allowed, closed)
 
     def ends(derived: Derived, spline: CubicSpline) -> tuple[Float, Float]:
         if derived.ratio is None:
             return samples.interval(spline)
-        return _ratio_interval(profile, spline(x), hot, best.gain - allowed)
+        return _ratio_interval(profile.products(x), spline(x), best.gain - allowed)
 
     return ends_of_quantities(model, low, high, ends)
 
@@ -328,13 +346,13 @@ def ratio_at(profile: Profile, spline: CubicSpline, log_k: Float, linear: Float,
         if not len(basis):
             return factors[..., 0], factors[..., 1:]
         others = factors[..., 1:] @ inverse
-        return factors[..., 0] - np.einsum("nsk,nsk->ns", others, hot @ basis.T), others
+        return factors[..., 0] - np.vecdot(others, hot @ basis.T), others
 
     def covariance(slopes: tuple[Float, Float], other: tuple[Float, Float]) -> Float:
-        return np.asarray(slopes[0] * other[0] * variance + np.einsum("nsk,nsk->ns", slopes[1], other[1]))
+        return np.asarray(slopes[0] * other[0] * variance + np.vecdot(slopes[1], other[1]))
 
     factors = spline(log_k)
-    value, own = np.einsum("nsl,nsl->ns", factors, linear), parts(factors)
+    value, own = np.vecdot(factors, linear), parts(factors)
     light = profile.reduction.light
     if light is None:
         return Ratio(value, np.ones_like(value), covariance(own, own), np.zeros_like(value), np.zeros_like(value))
@@ -378,19 +396,20 @@ class _Thresholds:
         hot = profile.hot(x)
         body = profile.free(hot)
         body /= np.linalg.norm(body, axis=1)[:, None]
-        mean = profile.along[rows] @ basis + _dot(profile.rest[rows], body)[:, None] * body
+        mean = profile.along[rows] @ basis + np.vecdot(profile.rest[rows], body)[:, None] * body
         mean += (moved / np.linalg.norm(there, axis=1))[:, None] * there
-        amplitude = _dot(mean, body) / _dot(hot, body)
+        amplitude = np.vecdot(mean, body) / np.vecdot(hot, body)
         others = (mean @ basis.T - amplitude[:, None] * (hot @ basis.T)) @ inverse.T
         # The gradient of the quantity: that at this temperature, and along the change of the mean with temperature.
         slope = reduction.spline(x, 1)
         change = profile.free(slope)
-        change -= _dot(change, body)[:, None] * body
-        steeper = _dot(self._spline(x, 1), np.column_stack([amplitude, others])) - amplitude * _dot(there, slope)
-        power = amplitude * _dot(change, change)
+        change -= np.vecdot(change, body)[:, None] * body
+        steeper = np.vecdot(self._spline(x, 1), np.column_stack([amplitude, others]))
+        steeper -= amplitude * np.vecdot(there, slope)
+        power = amplitude * np.vecdot(change, change)
         normal = there + np.divide(steeper, power, out=np.zeros_like(power), where=power > 0.0)[:, None] * change
         normal /= np.linalg.norm(normal, axis=1)[:, None]
-        value = _dot(mean, there)
+        value = np.vecdot(mean, there)
         fixed = np.broadcast_to(reduction.fixed[:, None], (len(reduction.fixed), *there.shape))
         changes = np.linalg.qr(np.dstack([normal, slope, hot, *fixed, reduction.spline(x, 2)]))[0][:, :, 1:]
         sums = np.concatenate([mean[:, None], normal[:, None], changes.transpose(0, 2, 1)], axis=1)
@@ -462,19 +481,14 @@ def _likelihood_ratio(light: Float, away: Float) -> Float:
     return np.asarray(np.maximum(free**2 - p0**2 + h0**2, 0.0))
 
 
-def _dot(a: Float, b: Float) -> Float:
-    """Return the products of vectors (n, k)."""
-    return np.asarray(np.einsum("nk,nk->n", a, b))
-
-
 def _held_direction(reduction: MeanSums, spline: CubicSpline, log_k: Float) -> Float:
     """Return directions at temperatures (n,) whose product with the sums is a quantity's best value, (n, n_sum)."""
     (basis, inverse), hot, factors = reduction.basis, reduction.spline(log_k), spline(log_k)
     along = hot @ basis.T
     body = hot - along @ basis
     others = factors[:, 1:] @ inverse
-    slope = factors[:, 0] - np.einsum("nk,nk->n", others, along)
-    return np.asarray((slope / np.einsum("nk,nk->n", body, body))[:, None] * body + others @ basis)
+    slope = factors[:, 0] - np.vecdot(others, along)
+    return np.asarray((slope / np.vecdot(body, body))[:, None] * body + others @ basis)
 
 
 @cache
@@ -500,20 +514,10 @@ def extreme(values: Float, which: Callable[..., Float]) -> Float:
     return np.asarray(sign * (middle + rise))
 
 
-def _ratio_interval(profile: Profile, per: Float, hot: Float, least_gain: Float) -> tuple[Float, Float]:
+def _ratio_interval(products: Products, per: Float, least_gain: Float) -> tuple[Float, Float]:
     """Return the interval of 1 + per x (amplitude 1) / (amplitude 0): Fieller's at each temperature, then the hull."""
-    fixed = profile.reduction.fixed
-    others = np.linalg.qr(fixed[1:].T)[0].T if len(fixed) > 1 else np.zeros((0, fixed.shape[1]))
-
-    def less(values: Float) -> Float:
-        return values - (values @ others.T) @ others
-
-    y, t = less(profile.sums), less(hot)
-    f = less(fixed[0]) / per[..., None]
-    explained = np.einsum("nk,nk->n", profile.sums @ others.T, profile.sums @ others.T)
-    least = (least_gain - explained)[:, None]
-    yt, yf = np.einsum("nk,nsk->ns", y, t), np.einsum("nk,nsk->ns", y, f)
-    tt, tf, ff = (np.einsum("nsk,nsk->ns", a, b) for a, b in ((t, t), (t, f), (f, f)))
+    yt, yf, tt, tf, ff, explained, _ = products.less_lines(list(range(1, len(products.gram))), per)
+    least = least_gain[:, None] - explained
     # (yt + r yf)^2 >= least |t + r f|^2, where r is the jump less one and the blackbody is positive.
     a, b, c = yf**2 - least * ff, yt * yf - least * tf, yt**2 - least * tt
     inside = b**2 - a * c
@@ -639,6 +643,25 @@ class Products:
         amplitude = (self.along - np.sum(self.cross[which] * alone, axis=0)) / power
         return Face(some, inverse, alone - amplitude * share, gain + amplitude**2 * power, amplitude, power, share)
 
+    def less_lines(self, lines: list[int], per: Float) -> tuple[Float, Float, Float, Float, Float, Float, list[Float]]:
+        """Return products of sums y, blackbody t and recombination f less their projections on some lines.
+
+        Recombination, the fixed component 0, is divided by `per`. After yt, yf, tt, tf and ff follow the decrease of
+        chi-squared by the lines, and the lines' amplitudes in each of y, t and f.
+        """
+        inverse = np.linalg.inv(self.gram[np.ix_(lines, lines)])
+        y, t, f = self.fixed[lines], self.cross[lines], self.gram[lines, 0].reshape(-1, 1, 1) / per
+        by = [np.tensordot(inverse, each, 1) for each in (y, t, f)]
+
+        def less(whole: Float, one: Float, other: Float) -> Float:
+            return np.asarray(whole - np.sum(one * other, axis=0))
+
+        return (
+            less(self.along, t, by[0]), less(self.fixed[0] / per, f, by[0]), less(self.power, t, by[1]),
+            less(self.cross[0] / per, f, by[1]), less(self.gram[0, 0] / per**2, f, by[2]),
+            np.sum(y * by[0], axis=0), by,
+        )  # fmt: skip
+
 
 @dataclass(frozen=True, eq=False)
 class Face:
@@ -693,22 +716,6 @@ class Face:
 
 class BoundedProfile(Profile):
     """Profile likelihood of the temperature for the sums of some frames, with amplitudes of at least zero."""
-
-    def products(self, log_k: Float) -> Products:
-        """Return the inner products at temperatures (n, ...), or (1, ...) if common to all frames."""
-        hot, fixed = self.hot(log_k), self.reduction.fixed
-        ones = (1,) * (log_k.ndim - 1)
-        if log_k.shape[0] == 1:
-            along = np.tensordot(self.sums, hot[0], (1, -1))
-        else:
-            along = np.einsum("n...k,nk->n...", hot, self.sums)
-        return Products(
-            along,
-            np.einsum("...k,...k->...", hot, hot),
-            np.moveaxis(hot @ fixed.T, -1, 0),
-            (fixed @ self.sums.T).reshape(len(fixed), len(self.sums), *ones),
-            fixed @ fixed.T,
-        )
 
     def solutions(self, log_k: Float) -> Iterator[Face]:
         """Yield the unbounded fit of each face at temperatures (n, ...), or (1, ...) if common to all frames."""
@@ -824,7 +831,7 @@ def bounded_intervals(
             if light is None or not light.prior.size:
                 return linear_ends
             factor = profile.factor(best.log_k, best.linear)
-            value = np.einsum("nl,nl->n", spline(best.log_k), best.linear) / factor
+            value = np.vecdot(spline(best.log_k), best.linear) / factor
             moved = light.change(value, factor, linear_ends[1] - linear_ends[0], allowed)
             return _linear_ends(faces, factors, least - moved[:, None], of_light)
         lowest, highest = _ratio_ends(products, faces, spline(x), least)
@@ -882,7 +889,7 @@ def _linear_ends(
 
 
 def _ratio_ends(products: Products, faces: list[Face], per: Float, least: Float) -> tuple[Float, Float]:
-    """Return the ends of per x (fixed component 0) / (blackbody); see `profile._ratio_interval`."""
+    """Return the ends of per x (fixed component 0) / (blackbody); see `_ratio_interval`."""
     lows, highs = np.full(per.shape, np.inf), np.full(per.shape, -np.inf)
     for face in faces:
         if 0 not in face.some or face.amplitude is None:
@@ -894,19 +901,8 @@ def _ratio_ends(products: Products, faces: list[Face], per: Float, least: Float)
                 # Without a blackbody the light is recombination, or there is none, which every ratio allows.
                 np.copyto(highs, np.inf, where=allowed)
             continue
-        lines = list(face.some[1:])
-        inverse = np.linalg.inv(products.gram[np.ix_(lines, lines)])
-        y, t = products.fixed[lines], products.cross[lines]
-        f = products.gram[lines, 0].reshape(-1, 1, 1) / per
-        # Products of sums, blackbody and recombination less their projections on the lines.
-        by_y, by_t, by_f = (np.tensordot(inverse, each, 1) for each in (y, t, f))
-        yt, tt = products.along - np.sum(t * by_y, axis=0), products.power - np.sum(t * by_t, axis=0)
-        yf = products.fixed[0] / per - np.sum(f * by_y, axis=0)
-        tf, ff = (
-            products.cross[0] / per - np.sum(f * by_t, axis=0),
-            products.gram[0, 0] / per**2 - np.sum(f * by_f, axis=0),
-        )
-        rest = least - np.sum(y * by_y, axis=0)
+        yt, yf, tt, tf, ff, explained, (by_y, by_t, by_f) = products.less_lines(list(face.some[1:]), per)
+        rest = least - explained
         # (yt + r yf)^2 = rest |t + r f|^2 at the ends r.
         a, b, c = yf**2 - rest * ff, yt * yf - rest * tf, yt**2 - rest * tt
         root = np.sqrt(np.where(b**2 >= a * c, b**2 - a * c, np.nan))

@@ -7,7 +7,7 @@ higher one.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Self
 
@@ -138,23 +138,9 @@ class Measurement:
         return every if numbers is None else every.rows(np.argsort(np.concatenate(numbers)))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return all arrays that depend on the frames, for files; the inverse of `of_arrays`."""
+        """Return all arrays that depend on the frames, for files."""
         values = {field.name: np.asarray(getattr(self, field.name)) for field in fields(self)}
         return {name: value for name, value in values.items() if name not in ("names", "units", "bounds", "levels")}
-
-    @classmethod
-    def of_arrays(
-        cls,
-        arrays: Mapping[str, NDArray[Any]],
-        levels: Sequence[float],
-        *,
-        names: tuple[str, ...],
-        units: tuple[str, ...],
-        bounds: tuple[float, ...],
-    ) -> Self:
-        """Return a measurement from its `arrays`, levels of intervals, and the quantities that were measured."""
-        given: dict[str, Any] = {**arrays, "dof": int(arrays["dof"])}
-        return cls(names, units, bounds, levels=tuple(levels), **given)
 
     def rows(self, which: NDArray[Any]) -> Self:
         """Return the measurements of some frames, by number or mask."""
@@ -411,7 +397,7 @@ class _Problem:
         `rest` is chi-squared without what the sums explain. A second blackbody is given by its log temperature and the
         derivatives with respect to it.
         """
-        chi2 = rest + (np.einsum("nk,nk->n", profile.sums, profile.sums) - best.gain)
+        chi2 = rest + np.vecdot(profile.sums, profile.sums) - best.gain
         dof = reduction.n_used - reduction.n_free - len(model.linear) - (1 if second is None else 2)
         factor, log_k = profile.factor(best.log_k, best.linear), best.log_k
         spread = covariance(model, profile.reduction, best, factor, None if second is None else second[1])

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from itertools import product
 from typing import TYPE_CHECKING, Annotated, NamedTuple, Self
 
@@ -661,23 +661,29 @@ def _limits(model: FlareModel, stare: Stare) -> tuple[Float, Float]:
     return low, high
 
 
-def _solve(data: _Data, whitening: _Whitening, theta: Float, free: NDArray[np.intp], low: Float, high: Float) -> Float:
-    """Return the least-squares parameters; fixed ones are unchanged."""
+def _least_squares(
+    start: Float, free: NDArray[np.intp], limits: tuple[Float, Float], residuals: Callable[[Float], Float],
+    jacobian: Callable[[Float], Float], *, width_s: float, xtol: float = 1e-8,
+) -> tuple[Float, float]:  # fmt: skip
+    """Return the parameters of the smallest chi-squared, of which some are `free`, and chi-squared.
+
+    The functions take all parameters, and the second returns derivatives by the free ones.
+    """
 
     def with_free(values: Float) -> Float:
-        there = theta.copy()
+        there = start.copy()
         there[free] = values
         return there
 
-    def residuals(values: Float) -> Float:
-        return data.residuals(with_free(values), whitening)
+    def of_free(function: Callable[[Float], Float]) -> Callable[[Float], Float]:
+        return lambda values: function(with_free(values))
 
-    def jacobian(values: Float) -> Float:
-        return data.jacobian(with_free(values), whitening)[:, free]
-
-    low, high, scale = low[free], high[free], np.where(free == 0, np.exp(theta[1]), 1.0)
-    start = np.clip(theta[free], low + 1e-9, high - 1e-9)
-    return with_free(scipy.optimize.least_squares(residuals, start, jacobian, bounds=(low, high), x_scale=scale).x)
+    low, high = (end[free] for end in limits)
+    first, scale = np.clip(start[free], low + 1e-9, high - 1e-9), np.where(free == 0, width_s, 1.0)
+    solution = scipy.optimize.least_squares(
+        of_free(residuals), first, of_free(jacobian), bounds=(low, high), x_scale=scale, xtol=xtol
+    )
+    return with_free(solution.x), 2 * float(solution.cost)
 
 
 def _quantities(data: _Data, stare: Stare, cooling: bool) -> list[_Quantity]:
@@ -714,11 +720,15 @@ class _BestFit:
         free = np.arange(len(PARAMETERS) if cooling else 4)
         whitening = data.whitening(None)
         theta = np.clip(_start(data, whitening, peak_s, half_width_s, cooling), *limits)
-        for _ in range(REFITS):
-            theta = _solve(data, whitening, theta, free, *limits)
-            whitening = data.whitening(theta)
-        theta = _solve(data, whitening, theta, free, *limits)
-        return cls(data, whitening, theta, free, limits, float(np.sum(data.residuals(theta, whitening) ** 2)))
+
+        def jacobian(values: Float) -> Float:
+            return data.jacobian(values, whitening)[:, free]
+
+        for refits in range(REFITS + 1):
+            whitening = data.whitening(theta) if refits else whitening
+            residuals = partial(data.residuals, whitening=whitening)
+            theta, chi2 = _least_squares(theta, free, limits, residuals, jacobian, width_s=np.exp(theta[1]))
+        return cls(data, whitening, theta, free, limits, chi2)
 
     def ends(self, quantities: Sequence[_Quantity], estimates: Float, sd: Float, rises: Sequence[float]) -> Float:
         """Return the ends of the intervals of all quantities, shape (2, n_rise, n_quantity), for rises of chi-squared.
@@ -809,26 +819,17 @@ class _BestFit:
     ) -> tuple[Float, float]:
         """Fit the other parameters from a starting point with a changed quantity; return them and chi-squared."""
 
-        def with_rest(values: Float) -> Float:
-            trial = there.copy()
-            trial[rest] = values
+        def held(trial: Float) -> Float:
             trial = self._held(quantity, log_factor, trial)
             trial[4] = min(trial[4], 0.0)
             return trial
 
-        def residuals(values: Float) -> Float:
-            return self.data.residuals(with_rest(values), self.whitening)
-
-        def jacobian(values: Float) -> Float:
-            trial = with_rest(values)
+        def jacobian(trial: Float) -> Float:
+            trial = held(trial)
             each, slope = self.data.jacobian(trial, self.whitening), quantity.slope(trial, self.data)
             return np.asarray(each[:, rest] - np.outer(each[:, quantity.place], slope[rest] / slope[quantity.place]))
 
-        low, high = (end[rest] for end in self.limits)
-        solution = scipy.optimize.least_squares(
-            residuals, np.clip(there[rest], low + 1e-9, high - 1e-9), jacobian, bounds=(low, high),
-            x_scale=np.where(rest == 0, np.exp(self.theta[1]), 1.0), xtol=1e-6, ftol=1e-8,
+        return _least_squares(
+            there, rest, self.limits, lambda trial: self.data.residuals(held(trial), self.whitening), jacobian,
+            width_s=np.exp(self.theta[1]), xtol=1e-6,
         )  # fmt: skip
-        fitted = there.copy()
-        fitted[rest] = solution.x
-        return fitted, 2 * float(solution.cost)

@@ -381,31 +381,35 @@ def analyse_frames(
         cleaned = clean_spectra(frames, model)
         frames = cleaned.frames
         survey, series, level = survey_spectra(cleaned, shape_of(shape), rank, seed, jitters, level_steps)
-    flux, error = frames.white_light
-    rates = simulated_rates(survey, level.quiet[level.used], wanted, seed, rate_steps)
-    threshold, candidates = (max(one.threshold(each) for one in rates) for each in (wanted, max(wanted, CANDIDATES)))
-    dip = largest_dip(survey, level.quiet[level.used], candidates)
-    if -np.expm1(-max(one.rate(dip) for one in rates) * survey.stare.observed_s / DAY_S) < CHANCE_DIP:
-        threshold = max(threshold, dip)
+    rates, threshold, candidates, dip = _thresholds(survey, level.quiet[level.used], wanted, seed, rate_steps)
     detected, taken = detect_events(survey, candidates, search_steps)
     seen = [] if model is None else [event_spectrum(survey, series, taken, one) for one in detected]
     events = measure_events(survey, taken, detected, [one.cause for one in seen], event_steps)
-    spectra = None
-    if model is not None:
-        flares = [
-            measure_flare(survey, series, taken, one) if event.kind == "flare" else f"its kind is {event.kind}"
-            for event, one in zip(events, detected, strict=True)
-        ]
-        spectra = SpectralAnalysis(cleaned, series, seen, flares)
+    spectra = None if model is None else SpectralAnalysis(cleaned, series, seen, [
+        measure_flare(survey, series, taken, one) if event.kind == "flare" else f"its kind is {event.kind}"
+        for event, one in zip(events, detected, strict=True)
+    ])  # fmt: skip
     quiet = ~taken
     residual = innovations(survey, quiet)
     middle = survey.bank.directions[len(survey.bank.directions) // 2]
     numbers = survey.stare.numbers[quiet]
     return Analysis(
-        frames, flux, error, level, survey, wanted, *rates, threshold, candidates, dip, events,
-        inject(survey, ~taken, threshold, seed, temperature_k, injection_steps),
+        frames, *frames.white_light, level, survey, wanted, *rates, threshold, candidates, dip, events,
+        inject(survey, quiet, threshold, seed, temperature_k, injection_steps),
         binned_scatter(numbers, residual @ middle), residual, quiet, likeness(numbers, residual), spectra,
     )  # fmt: skip
+
+
+def _thresholds(
+    survey: SeriesSurvey, quiet: NDArray[np.bool_], wanted: float, seed: int, steps: Steps
+) -> tuple[tuple[SimulatedRate, SimulatedRate], float, float, float]:
+    """Return simulated rates of false alarms, the thresholds of events and of candidates, and the largest dip."""
+    rates = simulated_rates(survey, quiet, wanted, seed, steps)
+    threshold, candidates = (max(one.threshold(each) for one in rates) for each in (wanted, max(wanted, CANDIDATES)))
+    dip = largest_dip(survey, quiet, candidates)
+    if -np.expm1(-max(one.rate(dip) for one in rates) * survey.stare.observed_s / DAY_S) < CHANCE_DIP:
+        threshold = max(threshold, dip)
+    return rates, threshold, candidates, dip
 
 
 def _spectral_messages(spectra: SpectralAnalysis) -> list[str]:

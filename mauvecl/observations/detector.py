@@ -245,17 +245,13 @@ class DarkFit:
     """Dark current as level_p exp(slope (T - reference)), and bias."""
 
     reference_c: float  # temperature at which the levels hold
-    # level_dn_per_s, level_error: shape (n_pixel,).
-    level_dn_per_s: Float
-    level_error: Float
+    level_dn_per_s: Float  # shape (n_pixel,)
     # bias_dn, bias_error: shape (n_pixel,); the error is 0 if the bias is assumed.
     bias_dn: Float
     bias_error: Float
     covariance: Float  # shape (n_pixel, 2, 2); of bias and level of each pixel, independent between pixels
     shared: Float  # shape (3, 3); covariance of bias, level and slope of the mean pixel, which all pixels share
-    # slope_per_c, slope_error: common to all pixels; the error is 0 if the slope is assumed.
-    slope_per_c: float
-    slope_error: float
+    slope_per_c: float  # common to all pixels
     # pixel_slope_per_c, pixel_slope_error: shape (n_pixel,); of each pixel alone; NaN if it is not determined.
     pixel_slope_per_c: Float
     pixel_slope_error: Float
@@ -269,6 +265,16 @@ class DarkFit:
     def p_value(self) -> float:
         """Probability of a chi-squared at least as large."""
         return float(scipy.stats.chi2.sf(self.chi2, self.dof))
+
+    @property
+    def level_error(self) -> Float:
+        """Standard errors of the levels, shape (n_pixel,)."""
+        return np.asarray(np.sqrt(self.covariance[:, 1, 1]))
+
+    @property
+    def slope_error(self) -> float:
+        """Standard error of the slope; 0 if it is assumed."""
+        return float(np.sqrt(self.shared[2, 2]))
 
     def growth(self, temperature_c: Float) -> Float:
         """Return the dark current at temperatures over that at the reference."""
@@ -292,13 +298,11 @@ def assumed_dark(nominal: Instrument, n_pixel: int) -> DarkFit:
     return DarkFit(
         reference_c=nominal.temperature_c,
         level_dn_per_s=level,
-        level_error=zero,
         bias_dn=nominal.per_pixel("bias_dn", nominal.bias_dn),
         bias_error=zero,
         covariance=np.zeros((n_pixel, 2, 2)),
         shared=np.diag([0.0, (ASSUMED_DARK_ERROR * level.mean()) ** 2, 0.0]),
         slope_per_c=nominal.dark_slope_per_c,
-        slope_error=0.0,
         pixel_slope_per_c=nothing,
         pixel_slope_error=nothing,
         chi2=np.nan,
@@ -341,29 +345,24 @@ def fit_dark(dark: Sequence[CalibrationFrames], nominal: Instrument, noise: Nois
     bias = found[0] if by_pixel else bias
     covariance = np.zeros((n_pixel, 2, 2))
     covariance[:, -len(used) :, -len(used) :] = errors
-    pixel_slope, pixel_error = np.full((2, n_pixel), np.nan)
+    change, error = np.full((2, n_pixel), np.nan)
     if fits_slope:
         found, errors = _fit_pixels(columns[:, [*used, 2]], 1.0 / typical, values, noise, (seconds, level))
-        pixel_slope, pixel_error = slope + found[-1] / level, np.sqrt(errors[:, -1, -1]) / np.abs(level)
-    scatter = float(np.sum(((pixel_slope - slope) / pixel_error) ** 2))
+        change, error = found[-1] / level, np.sqrt(errors[:, -1, -1]) / np.abs(level)
     mean = seconds[:, None] * level
-    chi2 = float(np.sum((raw - bias - mean) ** 2 / noise.variance(0.0, mean)))
-    dof = raw.size - len(used) * n_pixel - int(fits_slope) - int(fits_bias and not by_pixel)
     return DarkFit(
         reference_c=reference,
         level_dn_per_s=level,
-        level_error=np.sqrt(covariance[:, 1, 1]),
         bias_dn=bias,
         bias_error=np.sqrt(covariance[:, 0, 0]) if by_pixel else np.full(n_pixel, np.sqrt(shared[0, 0])),
         covariance=covariance,
         shared=shared,
         slope_per_c=slope,
-        slope_error=float(np.sqrt(shared[2, 2])),
-        pixel_slope_per_c=pixel_slope,
-        pixel_slope_error=pixel_error,
-        chi2=chi2,
-        dof=dof,
-        slopes_p_value=float(scipy.stats.chi2.sf(scatter, n_pixel - 1)),
+        pixel_slope_per_c=slope + change,
+        pixel_slope_error=error,
+        chi2=float(np.sum((raw - bias - mean) ** 2 / noise.variance(0.0, mean))),
+        dof=raw.size - len(used) * n_pixel - int(fits_slope) - int(fits_bias and not by_pixel),
+        slopes_p_value=float(scipy.stats.chi2.sf(np.sum((change / error) ** 2), n_pixel - 1)),
         assumed=(*(() if fits_slope else ("dark slope",)), *(() if fits_bias else ("bias",))),
     )
 

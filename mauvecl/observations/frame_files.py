@@ -465,11 +465,8 @@ def _frames_in(
     bits = QualityBits.of(file.header, mapping.quality_bits, what)
     wavelength = None if found.wavelength is None else _vacuum_nm(found.wavelength, mapping.wavelength_unit, file)
     light, sd, flags, unit, more = _read_light(file, found, mapping, bits, read)
-    if len(light.shape) == 1:
-        wavelength = None
-    remarks += more
     kept = np.isfinite(time)
-    remarks += _left_out(what, kept)
+    remarks += (*more, *_left_out(what, kept))
     temperature = _temperature_c(file, found, mapping, n)
     made = Frames.of(
         time[kept],
@@ -480,7 +477,7 @@ def _frames_in(
         quality_mask=bits.mask,
         mission=bits.mission,
         name=mapping.name or str(file.header.get("OBJECT", "") or file.header.get("star", "") or stem),
-        wavelength_nm=wavelength,
+        wavelength_nm=wavelength if light.ndim == 2 else None,
         temperature_c=None if temperature is None else temperature[kept],
         unit=unit,
         instrument=str(file.header.get("INSTRUME", "") or file.header.get("TELESCOP", "")).strip(),

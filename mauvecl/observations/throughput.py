@@ -359,27 +359,32 @@ def fit_throughput(
             f"up to {LIMITS[0]:g} nm and widths within {100 * LIMITS[2]:g} %, but do not",
             key="observations",
         )
-    covariance = best.scaled(model.basis)
-    onto = scipy.linalg.block_diag(model.basis, np.eye(m))
-    joint = onto @ covariance[: n + m, : n + m] @ onto.T
-    curve = joint[: nm.size, : nm.size]
-    curve += np.diag(pixels.variance)
-    if not several and spectrum_error is None:
-        # One star cannot tell errors of its spectrum from the throughput.
-        error = ONE_STAR_ERROR
-        curve += error**2 * _linear_basis(nm) @ _linear_basis(nm).T
-    # Counts determine the product of gain and throughput.
-    curve += transfer.relative_gain_error**2
+    # One star cannot tell errors of its spectrum from the throughput.
+    apart = 0.0 if several or spectrum_error is not None else ONE_STAR_ERROR
+    joint = _joint_covariance(model, best, pixels, apart)
     log_factor = model.basis @ best.found[:n] + pixels.log_factor
     light = model.light_dn(log_factor, shape)
     sd = np.sqrt(model.variance_dn2(light) + np.diagonal(model.dark_covariance, axis1=1, axis2=2).T)
     residual = np.where(model.usable, (model.observed_dn - light) / sd, np.nan)
     assumed = [*(() if m else ("wavelength zero point",)), *(() if m == 4 else ("line width",)),
                *(() if several else ("errors of the star's spectrum",))]  # fmt: skip
-    errors = np.sqrt(np.diag(covariance))[n : n + m]
+    errors = np.sqrt(np.diag(joint))[nm.size :]
     shift, stretch, width, change = _shape_values(shape, errors, nominal.gaussian_fwhm_nm)
     return ThroughputFit(nm, log_factor, joint, shift, stretch, width, change, residual, pixels.chi2, pixels.dof,
-                         best.smoothing, error, pixels.structure, tuple(assumed))  # fmt: skip
+                         best.smoothing, apart or error, pixels.structure, tuple(assumed))  # fmt: skip
+
+
+def _joint_covariance(model: ThroughputModel, best: _Solution, pixels: _Pixels, spectrum_error: float) -> Float:
+    """Return the covariance of the log throughput at the pixels and of the shape, with what the fit does not know.
+
+    That is the gain, since counts determine its product with the throughput, and errors of spectra apart from the fit.
+    """
+    n, nm = model.basis.shape[1] + model.n_shape, model.nominal.wavelength_nm
+    onto = scipy.linalg.block_diag(model.basis, np.eye(model.n_shape))
+    joint = np.asarray(onto @ best.scaled(model.basis)[:n, :n] @ onto.T)
+    errors = spectrum_error * _linear_basis(nm)
+    joint[: nm.size, : nm.size] += np.diag(pixels.variance) + errors @ errors.T + model.transfer.relative_gain_error**2
+    return joint
 
 
 def _shape_values(shape: Float, errors: Float, fwhm_nm: float) -> list[Value | None]:
