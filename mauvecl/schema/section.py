@@ -154,7 +154,7 @@ def _input_error_of(model: type[BaseModel], first: Any) -> InputError:
         case "too_long" | "too_short":
             expected = message.partition("should have ")[2].partition(" after")[0]
         case "truth":
-            expected = "a number or text"
+            expected = "a number or text" if is_truth(value) else "free of true and false"
         case "path_type":
             expected = "a path"
         case _:
