@@ -391,8 +391,7 @@ def analyse_frames(
     ])  # fmt: skip
     quiet = ~taken
     residual = innovations(survey, quiet)
-    middle = survey.bank.directions[len(survey.bank.directions) // 2]
-    numbers = survey.stare.numbers[quiet]
+    numbers, middle = survey.stare.numbers[quiet], survey.bank.directions[len(survey.bank.directions) // 2]
     return Analysis(
         frames, *frames.white_light, level, survey, wanted, *rates, threshold, candidates, dip, events,
         inject(survey, quiet, threshold, seed, temperature_k, injection_steps),

@@ -326,15 +326,14 @@ def fit_dark(dark: Sequence[CalibrationFrames], nominal: Instrument, noise: Nois
     reference, spread = float(temperature.mean()), float(np.ptp(temperature))
     offset = temperature - reference
     fits_slope, by_pixel = spread >= SLOPE_RANGE_C, float(exposure.max() / exposure.min()) >= EXPOSURE_RATIO
-    fits_bias = by_pixel or spread >= BIAS_RANGE_C
-    bias = nominal.per_pixel("bias_dn", nominal.bias_dn)
+    shares_bias = not by_pixel and spread >= BIAS_RANGE_C
+    fits_bias = by_pixel or shares_bias
 
     # The mean pixel gives what all pixels share: bias, slope, and their errors.
     free = np.array([fits_bias, True, fits_slope])
     common, shared, typical = _mean_dark(raw, exposure, offset, free, nominal, noise)
     slope = float(common[2])
-    if fits_bias and not by_pixel:
-        bias = np.full(n_pixel, common[0])
+    bias = np.full(n_pixel, common[0]) if shares_bias else nominal.per_pixel("bias_dn", nominal.bias_dn)
 
     # With the slope known, each pixel is linear in its level and bias.
     seconds = exposure * np.exp(slope * offset)
@@ -361,7 +360,7 @@ def fit_dark(dark: Sequence[CalibrationFrames], nominal: Instrument, noise: Nois
         pixel_slope_per_c=slope + change,
         pixel_slope_error=error,
         chi2=float(np.sum((raw - bias - mean) ** 2 / noise.variance(0.0, mean))),
-        dof=raw.size - len(used) * n_pixel - int(fits_slope) - int(fits_bias and not by_pixel),
+        dof=raw.size - len(used) * n_pixel - int(fits_slope) - int(shares_bias),
         slopes_p_value=float(scipy.stats.chi2.sf(np.sum((change / error) ** 2), n_pixel - 1)),
         assumed=(*(() if fits_slope else ("dark slope",)), *(() if fits_bias else ("bias",))),
     )

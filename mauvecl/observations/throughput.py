@@ -368,10 +368,9 @@ def fit_throughput(
     residual = np.where(model.usable, (model.observed_dn - light) / sd, np.nan)
     assumed = [*(() if m else ("wavelength zero point",)), *(() if m == 4 else ("line width",)),
                *(() if several else ("errors of the star's spectrum",))]  # fmt: skip
-    errors = np.sqrt(np.diag(joint))[nm.size :]
-    shift, stretch, width, change = _shape_values(shape, errors, nominal.gaussian_fwhm_nm)
-    return ThroughputFit(nm, log_factor, joint, shift, stretch, width, change, residual, pixels.chi2, pixels.dof,
-                         best.smoothing, apart or error, pixels.structure, tuple(assumed))  # fmt: skip
+    values = _shape_values(shape, np.sqrt(np.diag(joint))[nm.size :], nominal.gaussian_fwhm_nm)
+    return ThroughputFit(nm, log_factor, joint, *values, residual, pixels.chi2, pixels.dof, best.smoothing,
+                         apart or error, pixels.structure, tuple(assumed))  # fmt: skip
 
 
 def _joint_covariance(model: ThroughputModel, best: _Solution, pixels: _Pixels, spectrum_error: float) -> Float:
@@ -387,11 +386,15 @@ def _joint_covariance(model: ThroughputModel, best: _Solution, pixels: _Pixels, 
     return joint
 
 
-def _shape_values(shape: Float, errors: Float, fwhm_nm: float) -> list[Value | None]:
+def _shape_values(
+    shape: Float, errors: Float, fwhm_nm: float
+) -> tuple[Value | None, Value | None, Value | None, Value | None]:
     """Return shift, stretch, width and change of the width of the wavelengths, None for those that are not fitted."""
-    scale = [1.0, 1.0, fwhm_nm, fwhm_nm]
-    values = [Value(scale[k] * float(shape[k] + (k == 2)), scale[k] * float(errors[k])) for k in range(shape.size)]
-    return [*values, *[None] * (4 - shape.size)]
+
+    def value(k: int, scale: float) -> Value | None:
+        return Value(scale * float(shape[k] + (k == 2)), scale * float(errors[k])) if k < shape.size else None
+
+    return value(0, 1.0), value(1, 1.0), value(2, fwhm_nm), value(3, fwhm_nm)
 
 
 @dataclass(frozen=True, eq=False)
