@@ -249,10 +249,11 @@ class _Parameter:
         return eval(self.text, {}, _Names(*self.modules)) if isinstance(self.text, str) else self.text
 
 
-#: Types of other packages that modules import for type checkers only.
+#: Types that modules import for type checkers only, and that are not public.
 FOREIGN = {
     "ArrayLike": "numpy.typing:ArrayLike",
     "NDArray": "numpy.typing:NDArray",
+    "StaresRequest": "mauvecl.flares.stare_scene:StaresRequest",
     "SkyCoord": "astropy.coordinates:SkyCoord",
     "Time": "astropy.time:Time",
     "np": "numpy",
