@@ -411,7 +411,8 @@ class _Thresholds:
         normal /= np.linalg.norm(normal, axis=1)[:, None]
         value = np.vecdot(mean, there)
         fixed = np.broadcast_to(reduction.fixed[:, None], (len(reduction.fixed), *there.shape))
-        changes = np.linalg.qr(np.dstack([normal, slope, hot, *fixed, reduction.spline(x, 2)]))[0][:, :, 1:]
+        changes = np.linalg.qr(np.dstack([slope, hot, *fixed, reduction.spline(x, 2)]))[0]
+        changes = _orthogonal_to(normal, changes)
         sums = np.concatenate([mean[:, None], normal[:, None], changes.transpose(0, 2, 1)], axis=1)
         noise, z = _noise(changes.shape[2]), np.sqrt(allowed)
         distances = ALONG * np.arange(0.5, (z + BEYOND) / ALONG)
@@ -428,6 +429,15 @@ class _Thresholds:
             away[:, 0] -= value[some, None] * self._scale[node]
             root[some] = np.sqrt(_likelihood_ratio(light, draws @ away))
         return _as_probable(root, out, z) ** 2
+
+
+def _orthogonal_to(normal: Float, directions: Float) -> Float:
+    """Return orthonormal directions of a space, (n, k, n_direction), less a unit vector in it, (n, k)."""
+    along = normal[:, None] @ directions
+    # The largest component comes first, so that rounding does not decide on the sign of the reflection.
+    order = (np.abs(along).argmax(axis=2)[:, :, None] + np.arange(along.shape[2])) % along.shape[2]
+    along, directions = (np.take_along_axis(values, order, axis=2) for values in (along, directions))
+    return np.asarray(directions @ np.linalg.qr(along.transpose(0, 2, 1), mode="complete")[0][:, :, 1:])
 
 
 def _nodes_around(nodes: Float, x: Float, error: Float) -> NDArray[np.intp]:

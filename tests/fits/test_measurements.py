@@ -363,6 +363,22 @@ def test_intervals_of_a_bent_quantity_cover(snr: float, library: str, v: float, 
     assert_covered(inside, n, 0.94, 0.96, 1e-4)
 
 
+@pytest.mark.parametrize(
+    ("snr", "library", "v", "kelvin", "jump"), [(5.0, "M3V", 9.0, 1e4, 2.0), (10.0, "K3V", 5.0, 1.2e4, 2.5)]
+)
+def test_rounding_moves_no_interval(snr: float, library: str, v: float, kelvin: float, jump: float) -> None:
+    """Change frames of faint flares by one unit in the last place; ends once moved by up to a factor of eight."""
+    x = quiet(library, v)
+    own, unknown = FlareModel.of(star(library, v), MAUVE, x, jump=True), free(x, sky=0.1)
+    amplitudes = own.amplitudes(kelvin, 0.1, jump=jump)
+    for _ in range(8):
+        amplitudes *= snr / forecast(x, own, kelvin, amplitudes, unknown).snr
+    raw = drawn(x, own.counts(kelvin, amplitudes), 300, 9000, unknown)
+    one, other = (fit(frames, x, own, unknown) for frames in (raw, np.nextafter(raw, np.inf)))
+    for name in ("low", "high"):
+        np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=1e-5, atol=0)
+
+
 def test_multiples_of_a_quantity_have_its_intervals() -> None:
     """Compare luminosities and energies with fluxes, of flares with intervals inside and at bounds."""
     x, m = quiet(), model(jump=True, distance_pc=5.0, radius_rsun=0.4)
