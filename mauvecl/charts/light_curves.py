@@ -106,7 +106,7 @@ def energies(answer: InjectAnswer) -> Picture:
     def panel(star: Any) -> Panel:
         x, y, meshes = np.array(star.injected.half_widths_s), star.injected.sizes, list[Series]()
         if x.size > 1:
-            at = _edges(x), _edges(y), np.log10(star.fitted.energy_ratio.T)
+            at = _edges(x), _edges(y), np.log10(star.fitted["energy_ratio"].T)
             label = "recovered / injected energy (dex)"
             meshes.append(Mesh(label, low=-0.3, high=0.3, palette="RdBu_r", at=at))
         return Panel(HALF_WIDTH, Axis(SIZES[star.sizes.of], log=True), meshes, star.title, _empty_in_grey)

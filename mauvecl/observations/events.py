@@ -22,7 +22,7 @@ from mauvecl.observations.event_windows import (
     Window,
     log_time,
 )
-from mauvecl.observations.process import UNREPORTED, Steps
+from mauvecl.observations.progress import UNREPORTED, Steps
 from mauvecl.observations.search import MIN_BASELINE, Detection, SeriesSurvey
 
 if TYPE_CHECKING:

@@ -37,7 +37,8 @@ from mauvecl.observations.level import (
     single_frames,
     spikes,
 )
-from mauvecl.observations.process import UNREPORTED, Binned, Steps, criterion_of_process, fit_process
+from mauvecl.observations.process import Binned, criterion_of_process, fit_process
+from mauvecl.observations.progress import UNREPORTED, Steps
 from mauvecl.observations.search import SeriesSurvey, bank_of
 from mauvecl.schema.errors import InputError
 

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from mauvecl.flares.stare import Stare, select_frames
 from mauvecl.observations.level import LevelGiven
-from mauvecl.observations.process import UNREPORTED, Process, Steps, level_fit
+from mauvecl.observations.process import Process, level_fit
 from mauvecl.observations.process_search import ProcessSearch
+from mauvecl.observations.progress import UNREPORTED, Steps
 from mauvecl.schema.physical import DAY_S
 from mauvecl.search.templates import Bank, Baseline, Templates
 

@@ -87,8 +87,8 @@ def unpacked(content: bytes) -> dict[str, bytes]:
     Hidden files, which some systems add, are left out. Raises InputError if the content is not a zip archive, is
     damaged, encrypted or too large, or contains a name that is not a plain one in a folder of the archive.
     """
-    expected = "a TOML file and the files that it names, in a sound zip archive without a password"
-    with parsing("the archive", expected), zipfile.ZipFile(io.BytesIO(content)) as archive:
+    remedy = "give a TOML file and the files that it names, in a sound zip archive without a password"
+    with parsing("the archive", remedy), zipfile.ZipFile(io.BytesIO(content)) as archive:
         entries = {entry: _name(entry.filename) for entry in archive.infolist() if not entry.is_dir()}
         entries = {entry: name for entry, name in entries.items() if not name.startswith(".")}
         if len(entries) > MOST_FILES or sum(entry.file_size for entry in entries) > MOST_BYTES:

@@ -304,7 +304,7 @@ def test_detection_rate_follows_the_signal_to_noise() -> None:
         peak = rng.uniform(900, 2700)
         _, survey, _ = prepared(drawn(rng, flare(peak, row.template.half_width_s, size)))
         best, rho = max(survey.search.values(survey.sums[None]), key=lambda pair: pair[1].max())
-        at = survey.search.peak_s(best, rho[0].max(axis=0).argmax(keepdims=True))[0]
+        at = survey.search.peaks_s(best)[rho[0].max(axis=0).argmax()]
         seen += rho.max() >= above and abs(at - peak) < 120
     expected = stats.norm.sf(-0.5)
     low, high = stats.binom.ppf([0.0005, 0.9995], number, [expected - 0.03, expected + 0.12])
