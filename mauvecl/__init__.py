@@ -11,8 +11,8 @@ import sys
 if sys.argv[:1] == ["-m"] or (sys.argv and os.path.basename(sys.argv[0]) == __name__):
 
     def _without_traceback(kind, error, trace, otherwise=sys.excepthook):  # type: ignore[no-untyped-def]
-        # Python wraps what `__set_name__` raises while a class is made.
-        if issubclass(kind, KeyboardInterrupt) or isinstance(error.__cause__, KeyboardInterrupt):
+        # Python wraps what `__set_name__` raises while a class is made, and pydantic what interrupts its builders.
+        if issubclass(kind, KeyboardInterrupt) or "KeyboardInterrupt" in f"{error!r} {error.__cause__!r}":
             print(f"{__name__}: interrupted", file=sys.stderr)
         else:
             otherwise(kind, error, trace)

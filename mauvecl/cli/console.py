@@ -112,7 +112,8 @@ def _failed(error: Exception) -> int:
         if flag in GONE:
             text = f"the flag {flag} has gone: {GONE[flag]}"
         return _say(text.splitlines()[0] if text else "", BAD_INPUT) if text.strip() else BAD_INPUT
-    if type(error).__name__ == "Abort" or isinstance(error.__cause__, KeyboardInterrupt):
+    # Python wraps an interrupt while a class is made, and pydantic one of its builders.
+    if type(error).__name__ == "Abort" or "KeyboardInterrupt" in f"{error!r} {error.__cause__!r}":
         return _say("interrupted", INTERRUPTED)
     # Imported here, because verbs that draw nothing do not need it.
     program = sys.modules.get("mauvecl.device.build")

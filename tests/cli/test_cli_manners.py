@@ -74,29 +74,36 @@ def test_mistakes_load_no_heavy_package(tmp_path: Path) -> None:
     ]
 
 
+#: Modules during whose import a command is interrupted, and code that wraps the interrupt in another error.
+IMPORTED = ("importlib", "typing", "__future__", "mauvecl.schema.errors", "typer")
+WRAPPED = (
+    "type(str(), (), dict(name=Named()))",
+    "real('pydantic_core').SchemaValidator(dict(type='literal', expected=[Named()]))",
+)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(
     "started", [["-m", "mauvecl"], ["-c", "import sys; sys.argv[0] = 'mauvecl'; import mauvecl.cli.app"]]
 )
 @pytest.mark.parametrize(
-    ("module", "in_class"),
-    [*((name, False) for name in ("importlib", "typing", "__future__", "mauvecl.schema.errors", "typer")),
-     ("importlib", True), ("typer", True)],
+    ("module", "within"),
+    [*((name, "Named().__set_name__(None, str())") for name in IMPORTED),
+     *(("importlib", wrapped) for wrapped in WRAPPED), *(("typer", wrapped) for wrapped in WRAPPED)],
 )  # fmt: skip
-def test_interrupt_during_imports_prints_one_line(
-    started: list[str], module: str, in_class: bool, tmp_path: Path
-) -> None:
-    """Interrupt a command while a module is imported, also in a class that names its attributes."""
+def test_interrupt_during_imports_prints_one_line(started: list[str], module: str, within: str, tmp_path: Path) -> None:
+    """Interrupt a command while a module is imported, also where Python or pydantic wraps the interrupt."""
     (tmp_path / "sitecustomize.py").write_text(
         "import builtins, os, signal\n"
         "real = builtins.__import__\n"
         "class Named:\n"
         "    def __set_name__(self, owner, name):\n"
         "        os.kill(os.getpid(), signal.SIGINT)\n"
+        "    __repr__ = lambda self: self.__set_name__(None, str())\n"
         "def imported(name, within=None, *given, **how):\n"
         f"    if name == {module!r} and (within or {{}}).get('__name__', '').startswith('mauvecl'):\n"
         "        builtins.__import__ = real\n"
-        f"        {'type(str(), (), dict(name=Named()))' if in_class else 'os.kill(os.getpid(), signal.SIGINT)'}\n"
+        f"        {within}\n"
         "    return real(name, within, *given, **how)\n"
         "builtins.__import__ = imported\n"
     )
@@ -105,7 +112,7 @@ def test_interrupt_during_imports_prints_one_line(
         [sys.executable, *started, "schema"], env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True
     )
     assert done.stderr == "mauvecl: interrupted\n"
-    assert done.returncode in ((-2, 130, 1) if in_class else (-2, 130))
+    assert done.returncode in ((-2, 130, 1) if within in WRAPPED else (-2, 130))
 
 
 @pytest.mark.long
