@@ -481,6 +481,14 @@ MUTATIONS: dict[str, Mutation] = {
             "photons = 0.0 * level[",
         ),
     ),
+    "noise of a faint flare in a direction that rounding chooses": (
+        "test_rounding_moves_no_interval[5.0-M3V-9.0-10000.0-2.0]",
+        (
+            "np.dstack([slope, hot, *fixed, reduction.spline(x, 2)]))[0]",
+            "np.dstack([normal, slope, hot, *fixed, reduction.spline(x, 2)]))[0][:, :, 1:]",
+        ),
+        ("        changes = _orthogonal_to(normal, changes)\n", ""),
+    ),
     "one star without errors of its spectrum": (
         "test_one_star_determines_throughput_alone",
         ("errors = spectrum_error * _linear_basis(nm)", "errors = 0.0 * _linear_basis(nm)"),
