@@ -61,8 +61,11 @@ def helioecliptic(target: SkyCoord | str, time: Time | str) -> HelioEcliptic:
         return HelioEcliptic(abs(difference), abs(float(star.lat.deg)), float(star.separation(sun).deg))
 
 
-def parse_time(time: Time | str) -> Time:
-    """Return a single finite time between 1990 and 2100; text is ISO 8601, UTC. Call inside `offline`."""
+def parse_time(time: Time | str, name: str = "time") -> Time:
+    """Return a single finite time between 1990 and 2100; text is ISO 8601, UTC. Call inside `offline`.
+
+    The time is called `name` in errors.
+    """
     from astropy.time import Time
 
     expected = "a UTC time such as '2026-03-01T12:00:00'"
@@ -71,12 +74,12 @@ def parse_time(time: Time | str) -> Time:
         with contextlib.suppress(ValueError):
             moment = Time(moment.strip().removesuffix("Z"), scale="utc")
     if isinstance(moment, Time) and not moment.isscalar:
-        raise InputError(f"time must be a single time, but holds {moment.size} times", key="time")
+        raise InputError(f"{name} must be a single time, but holds {moment.size} times", key=name)
     if not isinstance(moment, Time) or np.ma.is_masked(moment.jd) or not np.isfinite(moment.jd):
-        raise InputError.of("time", time, expected)
+        raise InputError.of(name, time, expected)
     year = float(moment.decimalyear)
     if not YEARS[0] <= year < YEARS[1]:
-        raise InputError.of("time", moment.utc.isot, f"between {YEARS[0]} and {YEARS[1]}")
+        raise InputError.of(name, moment.utc.isot, f"between {YEARS[0]} and {YEARS[1]}")
     return moment
 
 

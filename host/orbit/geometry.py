@@ -151,7 +151,7 @@ class TimeGrid:
     def first(self) -> tuple[float, float]:
         """Julian date of the start, UTC: the preceding midnight and the fraction of the day."""
         with offline():
-            time = parse_time(self.start)
+            time = parse_time(self.start, "start")
             day, rest = float(time.utc.jd1), float(time.utc.jd2)
         midnight = np.floor(day - 0.5) + 0.5
         fraction = (day - midnight) + rest
