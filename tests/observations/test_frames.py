@@ -39,6 +39,14 @@ def test_numbers_follow_the_cadence_over_gaps_and_slow_changes_of_the_times() ->
     np.testing.assert_array_equal(Frames.of(time, RNG.normal(0, 1, n)).numbers, numbers)
 
 
+@pytest.mark.parametrize("before", ["", "\n\n", " \n", "\ufeff\n"])
+def test_empty_lines_before_a_header_keep_its_units(before: str, tmp_path: Path) -> None:
+    table = Table({"time": TIME / 60, "flux": FLUX}, units={"time": "min"})
+    table.write(tmp_path / "plain.ecsv", format="ascii.ecsv")
+    (tmp_path / "frames.ecsv").write_text(before + (tmp_path / "plain.ecsv").read_text())
+    np.testing.assert_allclose(read_frames(tmp_path / "frames.ecsv").time_s, TIME)
+
+
 def test_faults_of_the_file_are_reasons() -> None:
     flux, error, quality = FLUX.copy(), ERROR.copy(), np.zeros(100)
     flux[3], error[5], quality[7] = np.nan, -1.0, 4
