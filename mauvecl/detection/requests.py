@@ -310,9 +310,7 @@ def plan_channels(hypotheses: Hypotheses, batch: Sequence[int], *, first: bool) 
             channel = channel_of(statistic, i + 1, flare)
             add(statistic, "flare_on_null_grid", flare, channel, null)
             add(statistic, "flare", flare, channel, hypotheses.closed_form(statistic.name, flare))
-    weights = np.zeros((len(weighted), len(hypotheses.scene.pixels)), np.float32)
-    for own, padded in zip(weighted.values(), weights, strict=True):
-        padded[: own.size] = own
+    weights = _padded([*weighted.values()], len(hypotheses.scene.pixels))
     scales = np.array([*smoothed.values()], np.float32) if smoothed else np.zeros((0, 1), np.float32)
     linear_end, scale_end = (
         np.cumsum(_per_scenario(rows, n_scenario), dtype=np.uint32) for rows in (weighted, smoothed)
@@ -321,6 +319,14 @@ def plan_channels(hypotheses: Hypotheses, batch: Sequence[int], *, first: bool) 
     pixels_end = linear_end - _per_scenario(of_elements, n_scenario)
     taken = np.array(subtractions, np.uint32).reshape(len(subtractions), 3).T
     return ChannelPlan(weights, linear_end, pixels_end, scales, scale_end, grids, keys, taken)
+
+
+def _padded(rows: Sequence[NDArray[Any]], size: int) -> NDArray[np.float32]:
+    """Return rows of one value per pixel, continued by zeros to a size, shape (n_row, size)."""
+    padded = np.zeros((len(rows), size), np.float32)
+    for row, values in zip(padded, rows, strict=True):
+        row[: values.size] = values
+    return padded
 
 
 @dataclass(frozen=True)

@@ -354,15 +354,13 @@ def prepare(
     quiet = scenarios[0]
     factors = Factors.of(drawing.processes, quiet.conditions)
     method = choose_method(scenarios, drawing, factors)
-    compared = np.zeros(len(scenarios), np.uint32) if references is None else np.array(references, np.uint32)
-    used = ~np.any([scenarios[t].saturated for t in np.unique(compared)], axis=0)
+    compared, used = _compared(scenarios, references)
     tables = list[AliasTable]()
     darks, dark_dn = _dark_counts(quiet, method, tables)
     arrays = _PerScenario.empty(scenarios, method, comparison, modulated=bool(drawing.processes.modulations))
     for k, x in enumerate(scenarios):
         arrays.fill_draw(k, x, method, factors, dark_dn, tables)
         arrays.fill_comparison(k, x, scenarios[compared[k]], method, comparison, used)
-    job = _job(scenarios, drawing, method, comparison, first_group, tables)
     return Scene(
         n_pixel=used.size,
         n_frames=quiet.n_frames,
@@ -372,7 +370,7 @@ def prepare(
         photons=method.photons,
         clip=method.each == 1,
         modulations=drawing.processes.modulations,
-        job=job,
+        job=_job(scenarios, drawing, method, comparison, first_group, tables),
         pixels=detector_pixels(quiet, used),
         dark_counts=darks,
         tables=np.concatenate([np.zeros(0, np.uint32), *(t.entries for t in tables)]).astype(np.uint32),
@@ -383,6 +381,14 @@ def prepare(
         used=used,
         **vars(arrays),
     )
+
+
+def _compared(
+    scenarios: Sequence[Expectation], references: Sequence[int] | None
+) -> tuple[NDArray[np.uint32], NDArray[np.bool_]]:
+    """Return the number of each scenario's reference, and the pixels that no reference saturates."""
+    compared = np.zeros(len(scenarios), np.uint32) if references is None else np.array(references, np.uint32)
+    return compared, ~np.any([scenarios[t].saturated for t in np.unique(compared)], axis=0)
 
 
 def _dark_counts(quiet: Expectation, method: DrawMethod, tables: list[AliasTable]) -> tuple[NDArray[np.void], Float]:
