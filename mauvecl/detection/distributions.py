@@ -391,7 +391,7 @@ class QuadraticForm:
 
     @cached_property
     def _chi_squared(self) -> bool:
-        """Whether this is a central chi-squared variable of as many degrees of freedom as terms."""
+        """True for a central chi-squared variable with as many degrees of freedom as terms."""
         return bool(np.all(self.weight == 1.0)) and not self.shift.any()
 
 

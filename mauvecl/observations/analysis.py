@@ -23,6 +23,7 @@ from mauvecl.observations.progress import UNREPORTED, Steps
 from mauvecl.observations.search import (
     CHANCE_DIP,
     NO_COLOUR_K,
+    Detection,
     SeriesSurvey,
     SimulatedRate,
     innovations,
@@ -385,18 +386,32 @@ def analyse_frames(
     detected, taken = detect_events(survey, candidates, search_steps)
     seen = [] if model is None else [event_spectrum(survey, series, taken, one) for one in detected]
     events = measure_events(survey, taken, detected, [one.cause for one in seen], event_steps)
-    spectra = None if model is None else SpectralAnalysis(cleaned, series, seen, [
-        measure_flare(survey, series, taken, one) if event.kind == "flare" else f"its kind is {event.kind}"
-        for event, one in zip(events, detected, strict=True)
-    ])  # fmt: skip
+    spectra = None
+    if model is not None:
+        spectra = SpectralAnalysis(cleaned, series, seen, _measured_flares(survey, series, taken, detected, events))
     quiet = ~taken
     residual = innovations(survey, quiet)
-    numbers, middle = survey.stare.numbers[quiet], survey.bank.directions[len(survey.bank.directions) // 2]
+    middle = survey.bank.directions[len(survey.bank.directions) // 2]
+    numbers = survey.stare.numbers[quiet]
     return Analysis(
         frames, *frames.white_light, level, survey, wanted, *rates, threshold, candidates, dip, events,
         inject(survey, quiet, threshold, seed, temperature_k, injection_steps),
         binned_scatter(numbers, residual @ middle), residual, quiet, likeness(numbers, residual), spectra,
     )  # fmt: skip
+
+
+def _measured_flares(
+    survey: SeriesSurvey,
+    series: SpectralSeries,
+    taken: NDArray[np.bool_],
+    detected: list[Detection],
+    events: list[ObservedEvent],
+) -> list[Measurement | str]:
+    """Return the measurement of each event's spectra, or why there is none."""
+    return [
+        measure_flare(survey, series, taken, one) if event.kind == "flare" else f"its kind is {event.kind}"
+        for event, one in zip(events, detected, strict=True)
+    ]
 
 
 def _thresholds(

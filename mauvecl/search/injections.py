@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -150,34 +150,49 @@ def sites_of(survey: Survey, widths_s: Sequence[float], peak_s: float) -> tuple[
     means = np.array([stare.light * bank.shape.mean_over(edges, peak_s, width) for width in widths_s])
     near = _near_templates(search, reaches, means, bank.directions @ survey.response)
     # Flares of several half-widths share templates.
-    place, index = np.unique(np.concatenate([one[0] for one in near]).astype(np.int64), return_inverse=True)
-    numbers, onsets = np.divmod(place, search.n_grid)
-    filters = np.empty((place.size, stare.n_frames), np.float32)
+    places, index = np.unique(np.concatenate([templates.places for templates in near]), return_inverse=True)
+    numbers, onsets = np.divmod(places, search.n_grid)
+    filters = np.empty((places.size, stare.n_frames), np.float32)
     for number in np.unique(numbers):
         mine = numbers == number
         filters[mine] = np.rint(search.in_time(search.grid[number], onsets[mine]) / STEP) * STEP
     filter_widths_s = np.array([row.template.half_width_s for row in search.grid])[numbers]
     sites = []
-    for width, mean, (_, peaks, *counts) in zip(widths_s, means, near, strict=True):
-        mine, index = np.split(index, [peaks.size])
+    for width, mean, templates in zip(widths_s, means, near, strict=True):
+        mine, index = np.split(index, [templates.places.size])
         own = filters[mine]
         used = np.flatnonzero(own.any(axis=0))
         ends = slice(int(used[0]), int(used[-1]) + 1) if used.size else slice(0, 0)
         own, shape = np.ascontiguousarray(own[:, ends]), mean[ends].astype(np.float32)
-        counted = np.array(counts, np.bool_)
         sites.append(
-            InjectionSite(width, peak_s, first + ends.start, own, shape, filter_widths_s[mine], peaks, counted)
+            InjectionSite(
+                width,
+                peak_s,
+                first + ends.start,
+                own,
+                shape,
+                filter_widths_s[mine],
+                templates.peaks_s,
+                templates.counts,
+            )
         )
     return tuple(sites)
 
 
-def _near_templates(search: Search, reaches: Sequence[_Reach], means: Float, along: Float) -> list[Float]:
-    """Return the templates that may detect each flare, shape (2 + n_temperature, n_template).
+class _NearTemplates(NamedTuple):
+    """Templates that may detect a flare."""
 
-    Rows are the place of a template, its row in the search times `n_grid` plus its onset; its peak time; and whether it
-    counts at each temperature. `means` are those of the flares, and `along` is their light along the bank's directions.
+    places: NDArray[np.int64]  # row in the search times `n_grid`, plus the onset; shape (n_template,)
+    peaks_s: Float  # shape (n_template,)
+    counts: NDArray[np.bool_]  # whether they count as a detection, shape (n_temperature, n_template)
+
+
+def _near_templates(search: Search, reaches: Sequence[_Reach], means: Float, along: Float) -> list[_NearTemplates]:
+    """Return the templates that may detect each flare.
+
+    `means` are those of the flares, and `along` is their light along the bank's directions.
     """
-    seen: list[list[Float]] = [[] for _ in reaches]
+    seen: list[list[tuple[NDArray[np.int64], Float, Float]]] = [[] for _ in reaches]
     # A flare's sums are the product of its shape and the response, so that one correlation serves all temperatures.
     for number, (row, correlated) in enumerate(search.correlations(means[:, :, None])):
         peaks = search.peaks_s(row)
@@ -186,12 +201,13 @@ def _near_templates(search: Search, reaches: Sequence[_Reach], means: Float, alo
                 values = along[:, None] * value
                 inside = (peaks >= reach.first_s) & (peaks <= reach.last_s) & (row.per_amplitude > 0)
                 onsets = np.flatnonzero(inside & (values.max(axis=0) > 0))
-                templates.append(np.vstack([number * search.n_grid + onsets, peaks[onsets], values[:, onsets]]))
+                templates.append((number * search.n_grid + onsets, peaks[onsets], values[:, onsets]))
     near = []
     for templates in seen:
-        every = np.concatenate(templates, axis=1)
-        every[2:] = every[2:] >= OVERLAP * every[2:].max(initial=0)
-        near.append(every[:, every[2:].any(axis=0)])
+        places, times, values = (np.concatenate(part, axis=-1) for part in zip(*templates, strict=True))
+        counts = values >= OVERLAP * values.max(initial=0)
+        used = counts.any(axis=0)
+        near.append(_NearTemplates(places[used], times[used], counts[:, used]))
     return near
 
 

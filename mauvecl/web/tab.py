@@ -62,8 +62,8 @@ def _changed(study: Study, **sections: dict[str, Any]) -> Study:
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What a question of the page asks."""
+class Simulation:
+    """Verbs that answer a question of the page, and the studies that they are asked."""
 
     #: Verbs that answer it. The page keeps the answer of the first under the question's name, others under their own.
     verbs: tuple[str, ...]
@@ -78,16 +78,16 @@ def _fits(study: Study) -> Study:
     return _changed(study, measure={"fits": min(study.run.realisations, most)})
 
 
-#: What a question of the page asks, by name: that of a verb, unless it changes the study or has a name of its own.
-QUESTIONS = {name: Asked((name,)) for name in VERBS} | {
-    "detection": Asked(
+#: Simulations by the name of their question: that of the verb, unless it changes the study or has another name.
+QUESTIONS = {name: Simulation((name,)) for name in VERBS} | {
+    "detection": Simulation(
         ("detect", "snr"),
         others={OTHER: lambda study: _changed(study, nuisances={"usual": not study.nuisances.usual})},
     ),
-    "map": Asked(("map",), _map_around),
-    "measure": Asked(("measure",), _fits),
-    "completeness": Asked(("inject",), partial(_changed, injections=INJECTED, search={"nulls": 0})),
-    "periods": Asked(("change",), partial(_changed, change={"periods": True})),
+    "map": Simulation(("map",), _map_around),
+    "measure": Simulation(("measure",), _fits),
+    "completeness": Simulation(("inject",), partial(_changed, injections=INJECTED, search={"nulls": 0})),
+    "periods": Simulation(("change",), partial(_changed, change={"periods": True})),
 }
 #: What verbs count that use the pool's devices.
 DRAWN_UNITS = ("realisations", "steps", "cells")
