@@ -25,10 +25,8 @@ from mauvecl.host.tables.fits_tables import (
     WAVE_UNITS,
     WHOLE,
     FitsTables,
-    axis_of,
     is_spectrum_image,
     is_survey_image,
-    multispec_axis,
     open_fits,
     paired_images,
     rows_of,
@@ -323,7 +321,7 @@ class _Reader:
         """Return the images with an axis of wavelengths, and the faults of others."""
         images, errors = [], []
         for number, hdu in enumerate(self.hdus):
-            if is_spectrum_image(hdu, text_at(hdu.header, "EXTNAME")):
+            if is_spectrum_image(hdu):
                 try:
                     images.append(self._of_image(number, hdu))
                 except InputError as error:
@@ -352,18 +350,11 @@ class _Reader:
                 columns.append(Values.of("order", np.array(orders)))
             return self._table(header, columns, self._label(number, hdu), row_names=orders)
         flux, names, note = rows_of(hdu, text_at(self.primary, "TELESCOP"), bool(self.asked))
-        n, system, remarks = flux.shape[-1], text_at(header, "CTYPE1").upper(), ""
-        is_bare = not {"CRVAL1", "COEFF0"} & {*header, *self.primary}
-        if system.endswith("-TAB"):
-            axis = self.file.tabulated(header)
-        elif system.startswith("MULTISPE"):
-            axis = multispec_axis(header, n)
-        elif is_bare and (beside := self._axis_beside(n)) is not None:
-            axis = beside
-        else:
-            values, unit, kind, notes = axis_of(header, self.primary, n)
-            axis, note = Values.of("wavelength", values, unit), (*notes, *note)
-            remarks = "\nair wavelength" if kind == "AWAV" else "\nvacuum" if kind == "WAVE" else ""
+        is_bare = not {"CRVAL1", "COEFF0", "PS1_0", "WAT2_001"} & {*header, *self.primary}
+        axis, remarks = self._axis_beside(flux.shape[-1]) if is_bare else None, ""
+        if axis is None:
+            found, notes = self.file.wavelengths(number)
+            axis, note, remarks = replace(found, name="wavelength"), (*notes, *note), f"\n{found.name}"
         # SDSS-I/II writes erg/cm/s/Ang for erg/cm2/s/Ang.
         flux_unit = re.sub(r"erg/cm/s/", "erg/cm2/s/", unit_at(FLUX_UNITS, header, self.primary))
         columns = [axis, Values.of("flux", flux, flux_unit)]

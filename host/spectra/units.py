@@ -195,19 +195,11 @@ def check_assumed_unit(values: Float, unit: str) -> None:
 
 Medium = Literal["air", "vacuum"]
 
-#: Keywords that name the medium: of IRAF (AIRORVAC), MAST, surveys and users; and those that are true for one medium.
-NAMED = ("AIRORVAC", "WAVEMED", "WAVETYPE", "MEDIUM", "WAVEREF", "WLTYPE", "LAMTYPE", "AIR_VAC", "AIRVAC", "VACORAIR",
-         "VAC_AIR", "WAVELENGTH_MEDIUM", "WAVELENGTH_TYPE")  # fmt: skip
-LOGICAL: dict[str, Medium] = {
-    **dict.fromkeys(
-        ("VACUUM", "VACWAVE", "VACLAM", "ISVAC", "INVAC", "IN_VACUUM", "VAC", "WAVE_VAC", "WAVEVAC", "VACWL"), "vacuum"
-    ),
-    **dict.fromkeys(("AIR", "AIRWAVE", "AIRLAM", "ISAIR", "IN_AIR", "WAVE_AIR", "WAVEAIR", "AIRWL"), "air"),
-}
-#: Other keywords, by words in their names: ``WAVSYS = 'air'``, ``REFFRAME``; and, if true or false, ``WAVAIR = T``.
-_LIKE_NAMED = re.compile(r"WAV|LAM|WL|DISP|MEDI|REFFRAME|WCSNAME|SPECTRAL")
-_LIKE_LOGICAL = re.compile(r"(?=.*(?:WAV|LAM|WL|SPEC|DISP)).*?(AIR|VAC)(?!RO)")
-_OTHER: dict[Medium, Medium] = {"air": "vacuum", "vacuum": "air"}
+#: Names of keywords whose value is a medium: of IRAF (AIRORVAC), MAST, surveys and users, as in ``WAVSYS = 'air'``.
+_NAMED = re.compile(r"WAV|LAM|WL|DISP|MEDI|REFFRAME|WCSNAME|SPECTRAL|AIR(?:_|OR)?VAC|VAC(?:_|OR)?AIR")
+#: Names of keywords that are true or false, as in ``VACUUM = T``: those of a medium alone, and those of wavelengths.
+_LOGICAL = re.compile(r"(?:IS|IN_?)?(AIR|VAC)(?:UUM)?|(?=.*(?:WAV|LAM|WL|SPEC|DISP)).*?(AIR|VAC)(?!RO).*")
+_MEDIUM = re.compile(r"(?:in |standard )?(air|vac\w*)(?: wavelengths?)?(?:\s*[,;(].*)?")
 _TRUE, _FALSE = ("true", "t", "yes", "y", "1", "1.0"), ("false", "f", "no", "n", "0", "0.0")
 
 #: Words for air, including those of IVOA's UCD (em.wl;obs.atmos) and of FITS (AWAV).
@@ -246,29 +238,18 @@ def medium_of(*headers: Mapping[str, Any]) -> Medium | None:
 
 def _stated(name: str, text: str) -> Medium | None:
     """Return the medium that a keyword's value states; None for no value, and for words on something else."""
-    word: Medium | None = (
-        "vacuum" if re.match(r"vac", text) else "air" if re.match(r"(?:in |standard )?air", text) else None
-    )
     if re.fullmatch(r"T?CTYPE?\d*|\d*CTYP\d+", name):
         # The standard's name of wavelengths in air (Greisen et al. 2006); in tables WAVE is a usual name as well.
         return "air" if text.startswith("awav") else None
-    is_like = re.fullmatch(r"(?:in |standard )?(?:air|vac(?:uum)?)(?:\s*[,;(].*)?", text) and _LIKE_NAMED.search(name)
-    if name in NAMED or (name in LOGICAL and word is not None) or is_like:
-        return word
-    like = _LIKE_LOGICAL.match(name)
-    if name not in LOGICAL and like is not None and text in (*_TRUE, *_FALSE):
-        said: Medium = "air" if like[1] == "AIR" else "vacuum"
-        return said if text in _TRUE else _OTHER[said]
-    if name not in LOGICAL:
-        return None
-    if text in _TRUE:
-        return LOGICAL[name]
-    if text in _FALSE:
-        return _OTHER[LOGICAL[name]]
-    if not text or name in ("AIR", "VAC"):
-        # Some observatories keep a pressure or a pump under these names.
-        return None
-    raise InputError.of(name, text, "true or false, or air or vacuum", where="its header")
+    word, logical = _MEDIUM.fullmatch(text), _LOGICAL.fullmatch(name)
+    if word and (logical or _NAMED.search(name)):
+        return "air" if word[1] == "air" else "vacuum"
+    if logical and text in (*_TRUE, *_FALSE):
+        return "air" if ("AIR" in logical.groups()) == (text in _TRUE) else "vacuum"
+    # Some observatories keep a pressure or a pump under AIR and VAC.
+    if logical and logical[1] and text and name not in ("AIR", "VAC"):
+        raise InputError.of(name, text, "true or false, or air or vacuum", where="its header")
+    return None
 
 
 def unit_and_medium(unit: str) -> tuple[str | None, Medium | None]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bz2
 import contextlib
+import gzip
 import io
 import json
 import lzma
@@ -15,7 +16,7 @@ import stat
 import tomllib
 import warnings
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -81,8 +82,6 @@ def _finite(value: Any) -> Any:
 LIMITS = {"MAUVECL_LARGEST_FILE_MIB": 256, "MAUVECL_LARGEST_CONTENT_MIB": 512}
 #: Bytes unpacked at a time.
 PIECE = 1 << 20
-#: Memory for unpacking xz, in addition to its output; the highest preset needs 65 MiB.
-XZ_MEMORY = 128 << 20
 
 
 def limit_bytes(variable: str) -> int:
@@ -184,45 +183,31 @@ def lines_in(file: IO[str], what: str) -> Iterator[str]:
         yield line
 
 
-#: Names and decompressors of compressed content by its first bytes.
-PACKED: dict[bytes, tuple[str, Callable[[], Any]]] = {
-    b"\x1f\x8b": ("gzip", lambda: zlib.decompressobj(wbits=31)), b"BZh": ("bzip2", bz2.BZ2Decompressor),
-    b"\xfd7zXZ\x00": ("xz", lambda: lzma.LZMADecompressor(memlimit=XZ_MEMORY)),
-}  # fmt: skip
+#: Names of compressions and functions that open their files, by the first bytes of these.
+PACKED = {b"\x1f\x8b": ("gzip", gzip.open), b"BZh": ("bzip2", bz2.open), b"\xfd7zXZ\x00": ("xz", lzma.open)}
 
 
 def unpacked(content: bytes, what: str) -> bytes:
     """Unpack content that is compressed by gzip, bzip2 or xz; return other content unchanged.
 
-    It is unpacked in pieces, to detect decompression bombs early; several streams may follow one another. Raises
-    InputError if it unpacks to more than the limit or is damaged; `what` names it in messages.
+    It is unpacked in pieces, to detect decompression bombs early. Raises InputError if it unpacks to more than the
+    limit or is damaged; `what` names it in messages.
     """
-    form, start = next((how for mark, how in PACKED.items() if content.startswith(mark)), ("", None))
-    if start is None:
+    form, opened = next((how for mark, how in PACKED.items() if content.startswith(mark)), ("", None))
+    if opened is None:
         return content
-    most = limit_bytes("MAUVECL_LARGEST_CONTENT_MIB")
-    pieces: list[bytes] = []
-    size = 0
+    limit = "MAUVECL_LARGEST_CONTENT_MIB"
+    most, found = limit_bytes(limit), bytearray()
     try:
-        while content:
-            stream = start()
-            waiting = content
-            while not stream.eof:
-                piece = stream.decompress(waiting, PIECE)
-                # zlib returns unused input; the other decompressors keep it.
-                waiting = getattr(stream, "unconsumed_tail", b"")
-                size += len(piece)
-                if size > most:
-                    limit = "MAUVECL_LARGEST_CONTENT_MIB"
+        with opened(io.BytesIO(content)) as file:
+            while piece := file.read(PIECE):
+                found += piece
+                if len(found) > most:
                     fault = f"{what} must unpack to at most {most >> 20} MiB; {limit} sets the limit"
                     raise InputError(fault, key=limit)
-                pieces.append(piece)
-                if not piece and not waiting and not stream.eof and getattr(stream, "needs_input", True):
-                    raise EOFError("it ends too early")
-            content = stream.unused_data.lstrip(b"\0")
     except (OSError, EOFError, zlib.error, lzma.LZMAError, MemoryError) as error:
         raise InputError(f"{what} is damaged {form}; give a whole file", key="file") from error
-    return b"".join(pieces)
+    return bytes(found)
 
 
 #: Range of absolute values of numbers from users, apart from 0; products of several stay within double precision.

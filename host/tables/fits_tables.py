@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mauvecl.host.tables.files import limit_bytes, reading
 from mauvecl.host.tables.names import matched
-from mauvecl.host.tables.table import PIECE_BYTES, TableFile, Values
+from mauvecl.host.tables.table import PIECE_BYTES, TableFile, Values, number_in
 from mauvecl.host.tables.units import SCALES
 from mauvecl.schema.errors import InputError
 
@@ -47,8 +47,6 @@ def check_sizes(content: FileContent) -> None:
                 fault = f"it has {content.size - place} bytes after its extension {number - 1}"
                 raise InputError(f"{fault}, but may have at most {MAX_AFTER}", key="file")
             return
-        if number == MAX_EXTENSIONS:
-            break
         cards: dict[bytes, bytes] = {}
         at = place
         while content[at : at + 8] != b"END     ":
@@ -122,12 +120,9 @@ def check_extensions(hdus: Any) -> None:
             fault = f"its extension {number} has a table compressed by `fpack`; use the file after `funpack`"
             raise InputError(fault, key="file")
         names = hdu.columns.names
-        if odd := next((name for name in names if name is None or names.count(name) > 1), ""):
-            fault = f"its extension {number} has several columns named {odd!r}; give each another name"
-            raise InputError(fault, key="columns")
-        if odd is None:
-            fault = f"its extension {number} has an empty TTYPE{names.index(None) + 1}; give each column a name"
-            raise InputError(fault, key="columns")
+        if (odd := next((name for name in names if name is None or names.count(name) > 1), "")) != "":
+            fault = f"an empty TTYPE{names.index(None) + 1}" if odd is None else f"several columns named {odd!r}"
+            raise InputError(f"its extension {number} has {fault}; give each column a name of its own", key="columns")
         size = sum(np.dtype(column.format.recformat).itemsize for column in hdu.columns)
         if size != hdu.header["NAXIS1"]:
             fault = f"its extension {number} has rows of {hdu.header['NAXIS1']} bytes, whose columns take {size}"
@@ -230,10 +225,9 @@ def column_values(data: Any, column: Any) -> Any:
     integer, the first being the most significant.
     """
     stored: NDArray[Any] = np.asarray(data.view(np.ndarray)[column.name])
-    scale, zero = (
-        float(value) if value not in (None, "") else plain for value, plain in ((column.bscale, 1), (column.bzero, 0))
-    )
-    if (scale, zero) != (1.0, 0.0) and stored.dtype.kind in "iuf":
+    kind, null = stored.dtype.kind, "" if column.null is None else str(column.null).strip()
+    scale, zero = float(column.bscale or 1.0), float(column.bzero or 0.0)
+    if (scale, zero) != (1.0, 0.0) and kind in "iuf":
         # astropy cannot scale integers of 64 bits by fractions.
         values: Any = stored * scale + zero
     else:
@@ -241,21 +235,12 @@ def column_values(data: Any, column: Any) -> Any:
     if str(column.format).strip().upper().rstrip("0123456789").endswith("X") and np.ndim(values) == 2:
         weights = 1 << np.arange(values.shape[1] - 1, -1, -1, dtype=np.int64)
         return values.astype(np.int64) @ weights
-    if column.null is None or (isinstance(column.null, str) and not column.null.strip()):
+    if not null or kind not in "SUiuf" or stored.shape != np.shape(values):
         return values
-    if stored.dtype.kind in "SU":
-        text = np.char.strip(stored.astype(str))
-        return (
-            np.ma.masked_array(values, text == str(column.null).strip()) if np.shape(values) == text.shape else values
-        )
-    if stored.dtype.kind not in "iuf" or stored.shape != np.shape(values):
-        return values
-    try:
-        null = float(column.null)
-    except (TypeError, ValueError):
-        return values
+    if kind in "SU":
+        return np.ma.masked_array(values, np.char.strip(stored.astype(str)) == null)
     # Single precision rounds the values but not the mark in the header.
-    same = stored == null if stored.dtype.kind in "iu" else np.isclose(stored, null, rtol=1e-6, atol=0.0)
+    same = np.isclose(stored, number_in(null), rtol=1e-6 if kind == "f" else 0.0, atol=0.0)
     return np.ma.masked_array(values, same)
 
 
@@ -269,9 +254,10 @@ _AXIS_NAMES = {"AWAV": "air wavelength", "WAVE": "vacuum wavelength"}
 MAX_PLANES = 6
 
 
-def is_spectrum_image(hdu: Any, label: str) -> bool:
+def is_spectrum_image(hdu: Any) -> bool:
     """Return whether an extension is an image that may contain fluxes."""
-    return bool(getattr(hdu, "is_image", False) and hdu.header.get("NAXIS", 0) and not _NO_FLUX.search(label))
+    is_filled = getattr(hdu, "is_image", False) and hdu.header.get("NAXIS", 0)
+    return bool(is_filled and not _NO_FLUX.search(text_at(hdu.header, "EXTNAME")))
 
 
 def paired_images(hdus: Any) -> list[tuple[str, Any, Any]]:
@@ -288,12 +274,8 @@ def paired_images(hdus: Any) -> list[tuple[str, Any, Any]]:
         fluxes = [named[one] for kind in _FLUX_NAMES if (one := f"{arm}_{kind}".lstrip("_")) in named]
         if not arm and not fluxes and name != "LAMBDA":
             # An image of as many pixels without wavelengths of its own, such as the first of the file.
-            alike = [
-                one
-                for one in hdus
-                if is_spectrum_image(one, text_at(one.header, "EXTNAME")) and "CRVAL1" not in one.header
-            ]
-            fluxes = [one for one in alike if one.header.get("NAXIS1") == hdu.header.get("NAXIS1")]
+            alike = [one for one in hdus if one.header.get("NAXIS1") == hdu.header.get("NAXIS1")]
+            fluxes = [one for one in alike if is_spectrum_image(one) and "CRVAL1" not in one.header]
         if len(fluxes) == 1:
             pairs.append((arm, hdu, fluxes[0]))
     return pairs
@@ -369,9 +351,9 @@ AXIS_TYPES = ("", "WAVE", "AWAV", "FREQ", "ENER", "LINEAR", "LAMBDA", "WAVELENGT
 AXIS_BEGINNINGS = ("WAVELEN", "LAM", "ANGSTROM", "ALOG")
 
 
-def axis_of(header: Any, primary: Any, n: int) -> tuple[Any, str | None, str, tuple[str, ...]]:
+def axis_of(header: Any, primary: Any) -> tuple[Any, str | None, str, tuple[str, ...]]:
     """Return the values of an image's first axis, their unit, their kind (WAVE, AWAV, ...) and notes."""
-    number = partial(_number_at, (header, primary))
+    number, n = partial(_number_at, (header, primary)), int(header["NAXIS1"])
     first, slope = number("COEFF0"), number("COEFF1")
     if first is not None and slope is not None and 1.0 < first < 6.0:
         return 10.0 ** (first + slope * np.arange(n)), "Angstrom", "", ("wavelengths from COEFF0 and COEFF1",)
@@ -412,7 +394,7 @@ def axis_of(header: Any, primary: Any, n: int) -> tuple[Any, str | None, str, tu
         return 10.0**value, unit, name, ("wavelengths from logarithms to base ten",)
 
 
-def multispec_axis(header: Any, n: int) -> Values:
+def multispec_axis(header: Any) -> Values:
     """Return the wavelengths of each row of an image of IRAF's multispec system; raise InputError if they are curved.
 
     An attribute has aperture, beam, type (0 linear, 1 logarithmic), first wavelength, step, number of pixels and
@@ -424,7 +406,7 @@ def multispec_axis(header: Any, n: int) -> Values:
         if kind not in (0.0, 1.0):
             fault = f"its wavelengths of the type {kind:g} in IRAF's multispec system must be linear or logarithmic"
             raise InputError(f"{fault}, as IRAF's `dispcor` makes them", key="CTYPE1")
-        values = first + step * np.arange(n)
+        values = first + step * np.arange(int(header["NAXIS1"]))
         rows.append((10.0**values if kind else values) / (1.0 + redshift))
     if len(rows) != int(header.get("NAXIS2", 1)):
         raise InputError(f"its attributes WAT2 must describe each row, but describe {len(rows)}", key="CTYPE1")
@@ -461,24 +443,19 @@ class FitsTables(TableFile):
     ) -> None:
         self.hdus = hdus
         self.tables = [k for k, one in enumerate(hdus) if hasattr(one, "columns") and not one.is_image]
-        self.images = [
-            k for k, one in enumerate(hdus) if getattr(one, "is_image", False) and one.header.get("NAXIS", 0)
-        ]
+        self.images = [k for k, one in enumerate(hdus) if getattr(one, "is_image", False) and one.header.get("NAXIS")]
         columns = {k: {str(name).lower() for name in hdus[k].columns.names} for k in self.tables}
         fitting = [k for k in self.tables if all(columns[k] & {name.lower() for name in names} for names in wanted)]
-        self.chosen = next(iter(fitting or self.tables), None)
-        header = dict(hdus[0].header)
-        if hdu is not None:
-            at = self._number(hdu)
-            if at is None:
-                held = ", ".join(self._label(k) for k in range(len(hdus)))
-                raise InputError.of("hdu", hdu, f"one of {held}", where=what)
-            self.chosen = at if at in self.tables else self.chosen
-            header |= dict(hdus[at].header)
-        if self.chosen is not None:
-            header |= dict(hdus[self.chosen].header)
+        at = None if hdu is None else self._number(hdu)
+        if hdu is not None and at is None:
+            held = ", ".join(self._label(k) for k in range(len(hdus)))
+            raise InputError.of("hdu", hdu, f"one of {held}", where=what)
+        self.chosen = at if at in self.tables else next(iter(fitting or self.tables), None)
+        header: dict[str, Any] = {}
+        for number in (0, at, self.chosen):
+            header |= {} if number is None else dict(hdus[number].header)
         super().__init__(what, header)
-        for k in range(1, 1 + len(hdus[self.chosen].columns) if self.chosen is not None else 1):
+        for k in range(1, 1 + len(self.columns)):
             if (scale := _time_scale(header, k)) and str(header.get(f"TFORM{k}", "")) == "2D":
                 self.header |= {"MJDREFI": 0, "MJDREFF": 0.0, "TIMESYS": scale,
                                 "TREFPOS": header.get(f"TRPOS{k}", header.get("TREFPOS", ""))}  # fmt: skip
@@ -515,31 +492,35 @@ class FitsTables(TableFile):
         at = self._number(name)
         if at not in self.images:
             raise InputError.of("flux", name, "an image, whose header has the coordinates", where=self.what)
-        header = self.hdus[at].header
-        n = int(header[f"NAXIS{dimension}"])
-        if dimension == 2:
+        if dimension == 1:
             try:
-                first, step, reference = (float(header[f"{key}2"]) for key in ("CRVAL", "CDELT", "CRPIX"))
-            except (KeyError, ValueError) as error:
-                fault = f"{self.what}: the image {name!r} needs the times of its rows: CRVAL2, CDELT2 and CRPIX2"
-                raise InputError(fault, key="time") from error
-            return Values.of(name, first + step * (np.arange(1, n + 1) - reference), header.get("CUNIT2"), self.what)
-        if text_at(header, "CTYPE1").upper().endswith("-TAB"):
-            return self.tabulated(header)
-        try:
-            values, unit, kind, _ = axis_of(header, self.hdus[0].header, n)
-        except InputError as error:
-            raise error.within(self.what) from error
-        return Values.of(_AXIS_NAMES.get(kind, "wavelength"), values, unit, self.what)
+                return self.wavelengths(at)[0]
+            except InputError as error:
+                raise error.within(self.what) from error
+        header = self.hdus[at].header
+        first, step, reference = (_number_at([header], f"{key}2") for key in ("CRVAL", "CDELT", "CRPIX"))
+        if first is None or step is None or reference is None:
+            fault = f"{self.what}: the image {name!r} needs the times of its rows: CRVAL2, CDELT2 and CRPIX2"
+            raise InputError(fault, key="time")
+        times = first + step * (np.arange(1, int(header["NAXIS2"]) + 1) - reference)
+        return Values.of(name, times, header.get("CUNIT2"), self.what)
 
-    def tabulated(self, header: Any) -> Values:
-        """Return an axis that refers to the column of a table (-TAB, FITS standard 4.0, section 8.3)."""
-        found = self.named(f"{text_at(header, 'PS1_0')}/{text_at(header, 'PS1_1')}")
-        if found is None:
-            fault = f"{self.what} lacks the table of its wavelengths: it needs the column that PS1_0 and PS1_1 name"
-            raise InputError(fault, key="wavelength")
-        kind, unit = text_at(header, "CTYPE1").upper()[:4], found.unit or header.get("CUNIT1")
-        return Values.of(_AXIS_NAMES.get(kind, "wavelength"), found.numbers().ravel(), unit, self.what)
+    def wavelengths(self, number: int) -> tuple[Values, tuple[str, ...]]:
+        """Return the wavelengths of the pixels of an image, whose name may say their medium, and notes."""
+        header, notes = self.hdus[number].header, ()
+        kind = text_at(header, "CTYPE1").upper()
+        if kind.startswith("MULTISPE"):
+            return multispec_axis(header), ()
+        if kind.endswith("-TAB"):
+            # The axis refers to the column of a table (FITS standard 4.0, section 8.3).
+            found = self.named(f"{text_at(header, 'PS1_0')}/{text_at(header, 'PS1_1')}")
+            if found is None:
+                fault = "it lacks the table of its wavelengths: it needs the column that PS1_0 and PS1_1 name"
+                raise InputError(fault, key="wavelength")
+            kind, values, unit = kind[:4], found.numbers().ravel(), found.unit or header.get("CUNIT1")
+        else:
+            values, unit, kind, notes = axis_of(header, self.hdus[0].header)
+        return Values.of(_AXIS_NAMES.get(kind, "wavelength"), values, unit, self.what), notes
 
     def _label(self, number: int) -> str:
         return str(self.hdus[number].name) or str(number)
@@ -603,6 +584,4 @@ def _piece(hdu: Any, start: int, stop: int) -> Any:
     raw = place["file"].read((stop - start) * width)
     header = hdu.header.copy()
     header["NAXIS2"] = stop - start
-    for key in ("CHECKSUM", "DATASUM"):
-        header.remove(key, ignore_missing=True)
     return fits.BinTableHDU.fromstring(header.tostring().encode() + raw + b"\0" * (-len(raw) % BLOCK)).data
