@@ -247,12 +247,15 @@ def _folder(case: Case, folder: Path) -> Path:
 
 def written(case: Case, folder: Path) -> Path:
     """Write the file of a case, with the changes of its bytes, and return its path; a stored file is where it is."""
-    if "folder" in case:
-        return CORPUS.parent / case["folder"] / case["file"]
+    stored = CORPUS.parent / case.get("folder", "") / case.get("file", "")
+    if "folder" in case and "edits" not in case:
+        return stored
     if "per_frame" in case:
         return _folder(case, folder)
     kind, _, packing = case["form"].partition(".")
-    if "text" in case:
+    if "folder" in case:
+        content = stored.read_bytes()
+    elif "text" in case:
         content = case["text"].lstrip("\n").encode()
     else:
         content = value(case["raw"]) if "raw" in case else WRITERS[kind](case)
@@ -264,7 +267,7 @@ def written(case: Case, folder: Path) -> Path:
         content = content.decode().encode(case["encoding"])
     content = PACKERS[packing](content)
     content = content[: round(len(content) * case.get("share", 1))]
-    path = folder / case.get("file", f"a.{case['form']}")
+    path = folder / Path(case.get("file", f"a.{case['form']}")).name
     path.write_bytes(content)
     for name, text in case.get("beside", {}).items():
         (folder / name).write_text(text)

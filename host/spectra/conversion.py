@@ -90,16 +90,19 @@ def spectrum_in(tables: Sequence[SpectrumTable], asked: Sequence[str]) -> RawSpe
     if not tables:
         raise InputError("it has no table, but needs one with a wavelength and a flux", key="table")
     labels = [table.label.strip().lower() for table in tables]
-    words = {word.lower() for word in asked}
-    named = [i for i, label in enumerate(labels) if label and label in words]
-    by_number = {word: place for word in asked if (place := numbered("table", word)) is not None}
-    if any(place >= len(tables) for place in by_number.values()):
-        raise InputError.of("table", max(by_number.values()) + 1, f"between 1 and {len(tables)}")
-    named += by_number.values()
-    rest = [word for word in asked if word.lower() not in {labels[i] for i in named} and word not in by_number]
+    named: list[int] = []
+    rest: list[str] = []
+    for word in asked:
+        fits = [i for i, label in enumerate(labels) if label == word.lower()]
+        if (place := numbered("table", word)) is not None:
+            if place >= len(tables):
+                raise InputError.of("table", place + 1, f"between 1 and {len(tables)}")
+            fits = [place]
+        named += fits
+        rest += [] if fits else [word]
     found: list[RawSpectrum] = []
     errors: list[InputError] = []
-    for table in [tables[i] for i in named] or tables:
+    for table in [tables[i] for i in dict.fromkeys(named)] or tables:
         try:
             found.append(_spectrum_of(table, rest))
         except InputError as error:
@@ -198,26 +201,24 @@ def _selected_rows(
     The cells are those of the chosen columns; wavelengths of shape (n,) apply to all rows of fluxes of shape (n_row,
     n). The user's words in `asked` may name a row.
     """
-    n = len(cells[-1])
-    if np.ndim(cells[-1]) == 2:
-        shape = np.shape(cells[-1])
+    n, shape = len(cells[-1]), np.shape(cells[-1])
+    if len(shape) == 2:
         cells = [np.broadcast_to(cell, shape) if np.shape(cell) == shape[1:] else cell for cell in cells]
     if len({len(cell) for cell in cells}) > 1:
         raise InputError(f"it needs {n} rows of wavelengths, as many as of fluxes, not {len(cells[0])}", key="flux")
-    names = [key_of(column.name) for column in table.columns]
-    is_only = n == 1 and not asked and not table.row_title
-    identifiers = [[""]] if is_only else _identifiers(table, chosen, n)
+    held = {key_of(column.name): column for column in reversed(table.columns)}
+    identifiers = _identifiers(table, chosen, n)
     identifier = ""
     messages: tuple[str, ...] = ()
-    if n > 1 and not asked and set(names) & set(SEGMENTS):
+    if n > 1 and not asked and {*held} & {*SEGMENTS}:
         rows = list(range(n))
-        labels = [identifiers[row][0] if identifiers[row] else str(row + 1) for row in rows]
+        labels = [(identifiers[row] or [str(row + 1)])[0] for row in rows]
         messages = (f"its {n} segments ({listed(labels)}) are joined",)
     else:
-        rows = [_row_asked(identifiers, asked, names)]
+        rows = [_row_asked(identifiers, asked, [*held])]
         identifier = (identifiers[rows[0]] or [""])[0]
     steps, starts, lengths, weights = (
-        next((c.cells for c, name in zip(table.columns, names, strict=True) if name in wanted), None)
+        next((held[name].cells for name in wanted if name in held), None)
         for wanted in (STEPS, STARTS, LENGTHS, WEIGHTS)
     )
     found = []
@@ -239,12 +240,10 @@ def _selected_rows(
 def _arrays(cells: list[Any], step: Any, first: int) -> list[Any]:
     """Return a row's cells as arrays of equal length; a step and the start, at point `first`, are expanded."""
     *axes, flux = (np.ma.asanyarray(cell).squeeze() for cell in cells)
-    if flux.ndim != 1:
-        raise InputError(f"its row must hold one spectrum, but the flux has the shape {flux.shape}", key="flux")
-    if axes[0].size == 1 < flux.size and step is not None:
+    if flux.ndim == 1 and axes[0].size == 1 < flux.size and step is not None:
         axes = [float(axes[0]) + float(np.ravel(step)[0]) * (np.arange(flux.size) - first)]
-    if any(axis.shape != flux.shape for axis in axes):
-        fault = f"its row needs as many wavelengths as fluxes, or a step, but has {axes[0].size} for {flux.size}"
+    if flux.ndim != 1 or any(axis.shape != flux.shape for axis in axes):
+        fault = f"its row needs as many wavelengths as fluxes, or a step, but has {axes[0].shape} for {flux.shape}"
         raise InputError(fault, key="flux")
     return [*axes, flux]
 
@@ -257,8 +256,7 @@ def _identifiers(table: SpectrumTable, without: set[int], n: int) -> list[list[s
             continue
         values = column.cells
         if np.shape(values) == (n,) and np.asarray(values).dtype.kind in "SUiuO" and np.ndim(values[0]) == 0:
-            texts = (one.decode(errors="replace") if isinstance(one, bytes) else str(one) for one in values)
-            columns.append([text.strip() for text in texts])
+            columns.append(column.texts() or [str(one) for one in values])
     columns.sort(key=lambda texts: len(set(texts)) < n)
     return [[texts[row] for texts in columns] for row in range(n)]
 
@@ -270,20 +268,18 @@ def _row_asked(identifiers: Sequence[Sequence[str]], asked: Sequence[str], names
         if (place := numbered("row", word)) is not None:
             if place >= len(identifiers):
                 raise InputError.of("row", place + 1, f"between 1 and {len(identifiers)}")
-            fits = [place]
+            fitting = [row for row in fitting if row == place]
         else:
-            fits = [row for row in fitting if word.strip() in identifiers[row]]
-        if not fits:
+            fitting = [row for row in fitting if word.strip() in identifiers[row]]
+        if not fitting:
             raise _no_such(word, names)
-        fitting = [row for row in fitting if row in fits]
     if len(fitting) == 1:
         return fitting[0]
-    labels = [identifiers[row][0] if identifiers[row] and identifiers[row][0] else f"row {row + 1}" for row in fitting]
+    labels = [(identifiers[row] or [""])[0] or f"row {row + 1}" for row in fitting]
     if len(set(labels)) < len(labels):
         labels = [f"row {row + 1}" for row in fitting]
     fault = f"{len(fitting)} spectra are in it, one in each row ({listed(labels)})"
-    first = as_typed((labels or ["row 1"])[0], "row", (fitting or [0])[0], labels)
-    raise InputError(f"{fault}; give one as in {first}", key="rows")
+    raise InputError(f"{fault}; give one as in {as_typed(labels[0], 'row', fitting[0], labels)}", key="rows")
 
 
 #: Range of decimal logarithms of any wavelength in nm, Angstrom, um or Hz, and of any flux.

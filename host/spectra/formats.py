@@ -35,7 +35,7 @@ from mauvecl.host.tables.fits_tables import (
     unit_at,
 )
 from mauvecl.host.tables.opening import Content, open_content, text_in, votables
-from mauvecl.host.tables.table import MemoryTable, Values
+from mauvecl.host.tables.table import MemoryTable, Values, number_in
 from mauvecl.host.tables.text_tables import (
     PROSE,
     NumberLines,
@@ -67,9 +67,9 @@ def table_of_text(
     searched in the header if requested.
     """
     lines = NumberLines(text, "wavelength and flux")
-    names, units = _names(lines)
     if lines.holds_arrays:
-        return _table_of_arrays(lines, names, units, name, origin)
+        return _table_of_arrays(MemoryTable(text_table(text, "it", commas=True), "it"), name, origin)
+    names, units = _names(lines)
     columns = [
         lines.column(k, names[k] if names else str(k + 1), units[k] if units else "")
         for k in range(lines.n if names else max(lines.n, 2))
@@ -113,26 +113,27 @@ def _with_units_of(remarks: str, roles: Sequence[Role], wavelength: bool, flux: 
     return [role if role.unit else replace(role, unit=unit) for role, unit in zip(roles, units, strict=True)]
 
 
-def _table_of_arrays(
-    lines: NumberLines, names: Sequence[str], units: Sequence[str], name: str, origin: str
-) -> SpectrumTable:
+def _table_of_arrays(file: MemoryTable, name: str, origin: str) -> SpectrumTable:
     """Return a table whose cells contain arrays, with a spectrum per row, as in Gaia's files."""
-    if not names:
-        # Gaia's files have no column of wavelengths.
-        names = next((cells for line, _ in lines.header if len(cells := line.split(",")) == lines.n), [])
-    if not names:
-        raise InputError("its cells contain arrays, so its first line must name the columns", key="columns")
-    columns = [lines.column(k, names[k].strip(), units[k] if units else "") for k in range(lines.n)]
+    columns = [_with_arrays(file.find(one)) for one in file.names]
     known = {column.name.lower(): column for column in columns}
-    if "source_id" not in known or "wavelength" in known or "flux" not in known:
-        return SpectrumTable(columns, name, origin, implied_units=TEXT_UNITS, remarks=lines.comments)
-    if np.shape(known["flux"].cells)[-1:] == GAIA_NM.shape:
-        flux = replace(known["flux"], unit=GAIA_FLUX)
-        columns = [known["source_id"], Values.of("wavelength", GAIA_NM, "nm"), flux]
+    if not {"source_id", "flux"} <= {*known} or "wavelength" in known or known["flux"].shape[1:] != GAIA_NM.shape:
+        return SpectrumTable(columns, name, origin, implied_units=TEXT_UNITS)
+    columns = [known["source_id"], Values.of("wavelength", GAIA_NM, "nm"), replace(known["flux"], unit=GAIA_FLUX)]
     return SpectrumTable(
         columns, name, f"{origin}, Gaia DR3 sampled XP spectrum", row_title="Gaia DR3 {}",
         notes=("wavelengths 336 + 2 i nm, W m-2 nm-1: Gaia DR3's documentation",),
     )  # fmt: skip
+
+
+def _with_arrays(column: Values) -> Values:
+    """Return a column of texts such as ``(1.0, 2.0)`` as arrays, and others unchanged."""
+    texts = column.cells.tolist()
+    if not all(text[:1] in ("(", "[") for text in texts):
+        return column
+    rows = [np.array([number_in(one) for one in re.split(r"\s*,\s*|\s+", text.strip("()[] \t"))]) for text in texts]
+    is_image = len({row.size for row in rows}) == 1
+    return Values.of(column.name, np.array(rows) if is_image else np.array([*rows, None], object)[:-1], column.unit)
 
 
 def _names(lines: NumberLines) -> tuple[list[str], list[str]]:

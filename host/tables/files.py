@@ -110,11 +110,10 @@ def open_regular(path: Path, what: str) -> io.BufferedReader:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except FileNotFoundError as error:
         raise InputError(f"{what} {shown} does not exist; give the path of a file", key="file") from error
-    except OSError as error:
-        raise InputError(f"{what} {shown} must be readable, but is not ({error.strerror})", key="file") from error
-    except ValueError as error:
-        # Null bytes, and characters that file names cannot contain.
-        raise InputError(f"{what} {shown} is not a path ({error}); give that of a file", key="file") from error
+    except (OSError, ValueError) as error:
+        # Null bytes, and characters that file names cannot contain, are errors of value.
+        fault = f"{what} {shown} cannot be opened ({getattr(error, 'strerror', error)})"
+        raise InputError(f"{fault}; give the path of a file", key="file") from error
     mode = os.fstat(descriptor).st_mode
     if not stat.S_ISREG(mode):
         os.close(descriptor)
@@ -175,12 +174,15 @@ def check_folder(path: Path, what: str) -> None:
 def lines_in(file: IO[str], what: str) -> Iterator[str]:
     """Yield the lines of a text, with their ends.
 
-    Raises InputError for a line of more than `LONGEST_LINE` characters, of which no more is read.
+    Raises InputError for a line of more than `LONGEST_LINE` characters, of which no more is read, or not in UTF-8.
     """
-    for number, line in enumerate(iter(lambda: file.readline(LONGEST_LINE + 2), ""), 1):
-        if len(line.rstrip("\r\n")) > LONGEST_LINE:
-            raise InputError(f"{what} must have at most {LONGEST_LINE} characters in line {number}", key="file")
-        yield line
+    try:
+        for number, line in enumerate(iter(lambda: file.readline(LONGEST_LINE + 2), ""), 1):
+            if len(line.rstrip("\r\n")) > LONGEST_LINE:
+                raise InputError(f"{what} must have at most {LONGEST_LINE} characters in line {number}", key="file")
+            yield line
+    except UnicodeDecodeError as error:
+        raise InputError(f"{what} must be text in UTF-8", key="file") from error
 
 
 #: Names of compressions and functions that open their files, by the first bytes of these.
@@ -284,10 +286,7 @@ def as_text(content: bytes, what: str) -> str:
 
 def is_file(path: Path) -> bool:
     """Return whether a path exists and is not a folder; False for impossible paths."""
-    try:
-        return path.exists() and not path.is_dir()
-    except (OSError, ValueError):
-        return False
+    return os.path.exists(path) and not os.path.isdir(path)
 
 
 def toml(text: str, what: str) -> dict[str, Any]:
@@ -316,30 +315,27 @@ def json_data(text: str, what: str) -> Any:
         return json.loads(text)
 
 
-def possible(data: Any, what: str) -> None:
-    """Check nested data for values that are impossible in any study or instrument.
+def possible(data: Any, what: str, key: str = "", depth: int = 0) -> None:
+    """Check nested data, which have a key at a depth, for values that are impossible in any study or instrument.
 
     Raises InputError for a number beyond `SMALLEST` to `LARGEST` (energies in erg: `LARGEST_ERG`),
     an integer beyond 64 bits, text that is too long or contains impossible characters, or nesting that is too deep.
     """
-    waiting: list[tuple[str, Any, int]] = [("", data, 0)]
-    while waiting:
-        key, value, depth = waiting.pop()
-        energy = key in ENERGIES or any(part.endswith(ERG) for part in key.split("."))
-        fault = _fault(value, LARGEST_ERG if energy else LARGEST)
-        if depth > DEEPEST:
-            fault = f"must be nested at most {DEEPEST} deep"
-            key = shortened(key, 40)
-        if fault:
-            named = printable(key, 80)
-            raise InputError(f"{what}: {named or 'the value'} {fault}", key=named or None)
-        if isinstance(value, Mapping):
-            for name, item in value.items():
-                if isinstance(name, str) and (bad := _fault(name)):
-                    raise InputError(f"{what}: a key {bad}", key=printable(name, 80))
-                waiting.append((f"{key}.{name}" if key else str(name), item, depth + 1))
-        elif isinstance(value, list | tuple):
-            waiting += [(f"{key}.{i}", item, depth + 1) for i, item in enumerate(value)]
+    is_energy = key in ENERGIES or any(part.endswith(ERG) for part in key.split("."))
+    fault = _fault(data, LARGEST_ERG if is_energy else LARGEST)
+    if depth > DEEPEST:
+        fault = f"must be nested at most {DEEPEST} deep"
+    if fault:
+        named = printable(key, 80)
+        raise InputError(f"{what}: {named or 'the value'} {fault}", key=named or None)
+    if isinstance(data, Mapping):
+        for name, item in data.items():
+            if isinstance(name, str) and (bad := _fault(name)):
+                raise InputError(f"{what}: a key {bad}", key=printable(name, 80))
+            possible(item, what, f"{key}.{name}" if key else str(name), depth + 1)
+    elif isinstance(data, list | tuple):
+        for i, item in enumerate(data):
+            possible(item, what, f"{key}.{i}", depth + 1)
 
 
 def _fault(value: Any, largest: float = LARGEST) -> str | None:

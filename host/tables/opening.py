@@ -8,7 +8,7 @@ import re
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Literal
 
@@ -30,7 +30,7 @@ from mauvecl.host.tables.files import (
 from mauvecl.host.tables.fits_tables import WHOLE, FitsTables, open_fits
 from mauvecl.host.tables.names import matched
 from mauvecl.host.tables.table import REMARKS, MemoryTable, TableFile, Values
-from mauvecl.host.tables.text_tables import Layout, TextRows, text_table
+from mauvecl.host.tables.text_tables import Layout, rows_of_text, text_table
 from mauvecl.schema.errors import InputError, shortened
 
 if TYPE_CHECKING:
@@ -46,36 +46,32 @@ CELL = 40
 class LargeTable(TableFile):
     """Rows of a text table in a temporary file, which disappears with this object."""
 
-    def __init__(self, pieces: Iterator[Any], what: str) -> None:
+    def __init__(self, pieces: Iterator[Any], what: str, file: IO[bytes]) -> None:
         first = MemoryTable(next(pieces), what)
         # One row has the names and units.
-        self.table, self.n_rows = MemoryTable(first.table[:1], what), 0
+        self.table, self.n_rows, self.file = MemoryTable(first.table[:1], what), 0, file
         super().__init__(what, first.header, first.remarks)
         self.row = np.dtype([(name, "f8" if _numbers(first.find(name)) else f"U{CELL}") for name in first.names])
-        self.file = tempfile.TemporaryFile()  # noqa: SIM115
-        self._keep(first)
+        tables = itertools.chain([first], (MemoryTable(piece, what) for piece in pieces))
         del first
-        for piece in pieces:
-            self._keep(MemoryTable(piece, what))
+        for table in tables:
+            rows = np.zeros(len(table.table), self.row)
+            for name in self.names:
+                rows[name] = self._cells(table.find(name), self.row[name].kind == "f")
+            rows.tofile(self.file)
+            self.n_rows += len(rows)
 
-    def _keep(self, piece: MemoryTable) -> None:
-        n, first = len(piece.table), self.n_rows
-        rows = np.zeros(n, self.row)
-        for name in self.names:
-            column = piece.find(name)
+    def _cells(self, column: Values, are_numbers: bool) -> Any:
+        """Return the next rows of a column as numbers or short texts."""
+        if are_numbers:
             # Messages count rows from the start of the file.
-            read = lambda start, stop, column=column: column.read(start - first, stop - first)  # noqa: E731
-            values = Values(name, (n,), read, what=self.what)
-            if self.row[name].kind == "f":
-                rows[name] = values.rows(first, first + n)
-                continue
-            texts = column.texts() or [str(one) for one in column.numbers().tolist()]
-            if any(len(text) > CELL for text in texts):
-                fault = f"{self.what}: {name!r} must hold numbers or dates, but a cell has more than {CELL} characters"
-                raise InputError(fault, key=name)
-            rows[name] = texts
-        rows.tofile(self.file)
-        self.n_rows += n
+            held = replace(column, read=lambda start, stop: column.cells)
+            return held.rows(self.n_rows, self.n_rows + column.n_rows)
+        texts = column.texts() or [str(one) for one in column.numbers().tolist()]
+        if any(len(text) > CELL for text in texts):
+            fault = f"{self.what}: {column.name!r} must hold numbers or dates"
+            raise InputError(f"{fault}, but a cell has more than {CELL} characters", key=column.name)
+        return texts
 
     @property
     def names(self) -> list[str]:
@@ -95,16 +91,15 @@ class LargeTable(TableFile):
                       self.table.find(name).unit, self.what, self.row.itemsize)  # fmt: skip
 
     def _side_by_side(self, pattern: str) -> Values | None:
-        names = self.matching(pattern)
-        units = {self.table.find(name).unit for name in names}
-        if len(units) != 1 or any(self.row[name].kind != "f" for name in names):
-            return super()._side_by_side(pattern)
+        found, names = super()._side_by_side(pattern), self.matching(pattern)
+        if found is None or any(self.row[name].kind != "f" for name in names):
+            return found
 
         def read(start: int, stop: int) -> Any:
             rows = self._rows(start, stop)
             return np.column_stack([rows[name] for name in names])
 
-        return Values(pattern, (self.n_rows, len(names)), read, units.pop(), self.what, self.row.itemsize)
+        return replace(found, read=read, row_bytes=self.row.itemsize)
 
 
 def _numbers(values: Values) -> bool:
@@ -114,19 +109,6 @@ def _numbers(values: Values) -> bool:
     except InputError:
         return False
     return True
-
-
-@contextmanager
-def open_large(file: IO[bytes], what: str, commas: bool) -> Iterator[LargeTable]:
-    """Open a text table of any size; its text is UTF-8."""
-    text = io.TextIOWrapper(file, encoding="utf-8-sig")
-    try:
-        table = LargeTable(_pieces(text, what, commas), what)
-    except UnicodeDecodeError as error:
-        raise InputError(f"{what} must be text in UTF-8", key="file") from error
-    with table.file:
-        yield table
-    text.detach()
 
 
 def _pieces(text: IO[str], what: str, commas: bool) -> Iterator[Any]:
@@ -153,12 +135,11 @@ def _pieces(text: IO[str], what: str, commas: bool) -> Iterator[Any]:
             # Its first line has the names.
             kept, head = [], head if first else [*head, kept[0]]
         else:
-            rows = TextRows("".join(kept), what, commas, layout, first)
-            piece = rows.table()
+            piece, found = rows_of_text("".join(kept), what, commas, layout, first)
             if not len(piece) and not first:
                 _check_head(size, what)
                 continue
-            kept, layout = [], rows.layout
+            kept, layout = [], found
         size = 0
         if len(piece):
             first += len(piece)
@@ -265,8 +246,8 @@ def open_table(
                 yield stored
         elif content.form in ("text", "ECSV") and content.size > LARGE:
             content.file.seek(0)
-            with open_large(content.file, what, commas) as table:
-                yield table
+            with io.TextIOWrapper(content.file, "utf-8-sig") as text, tempfile.TemporaryFile() as rows:
+                yield LargeTable(_pieces(text, what, commas), what, rows)
         elif content.form == "VOTable":
             if (first := next(votables(content.bytes, what), None)) is None:
                 raise InputError(f"{what} has no table, but needs one", key="file")

@@ -159,12 +159,11 @@ class Values:
 
     def texts(self) -> list[str] | None:
         """Return the rows as texts, or None if they are numbers."""
-        if self.n_rows and np.ma.asarray(self.read(0, 1)).dtype.kind not in "OUS":
-            return None
-        if not self.n_rows:
-            return []
-        pieces = [np.ma.asarray(self.read(part.start, part.stop)) for part in self.pieces]
-        values: Any = pieces[0] if len(pieces) == 1 else np.ma.concatenate(pieces)  # type: ignore[no-untyped-call]
+        first: Any = np.ma.asarray(self.read(0, 1))
+        if first.dtype.kind not in "OUS":
+            return None if self.n_rows else []
+        pieces = [self.read(part.start, part.stop) for part in self.pieces] or [first]
+        values: Any = np.ma.concatenate(pieces)  # type: ignore[no-untyped-call]
         if values.dtype.kind == "O" and all(isinstance(one, str) for one in values):
             values = values.astype(str)
         if values.dtype.kind not in "US":
@@ -179,12 +178,10 @@ class Values:
     def _stacked(self, values: Any) -> Any:
         """Return arrays of variable length as rows, if all have the same length."""
         try:
-            lengths = {np.shape(one) for one in values}
-        except ValueError:
-            lengths = set()
-        if len(lengths) != 1:
-            raise InputError(f"{self.what}: the rows of {self.name!r} must have the same length", key=self.name)
-        return np.ma.asarray(np.stack([np.asarray(one) for one in values]) if len(values) else values.astype(float))
+            return np.ma.asarray(np.stack([np.asarray(one) for one in values]))
+        except ValueError as error:
+            fault = f"{self.what}: the rows of {self.name!r} must have the same length"
+            raise InputError(fault, key=self.name) from error
 
     def _parsed(self, values: Any, start: int, expected: str) -> Float:
         """Return texts as numbers; raises InputError that names the first text that is not a number."""
@@ -412,10 +409,9 @@ class Rows:
         text = self.text(name, row)
         if name is None or not text:
             return None
+        factor = self._factor(name, unit)
         try:
-            value = number_in(text) * self._factor(name, unit)
-        except InputError:
-            raise
+            value = number_in(text) * factor
         except ValueError:
             value = np.nan
         if not (np.isfinite(value) and above < value):
@@ -504,28 +500,23 @@ def _with_coordinates(table: Table) -> Table:
     names = table.colnames
     place = next((one for one in names if hasattr(table[one], "icrs")), None)
     pair = next(([one, dec] for one in names if one.endswith(".ra") and (dec := f"{one[:-2]}dec") in names), [])
-    if (place or pair) and not {*_PARTS} & {*names}:
-        table = table.copy()
-        if pair:
-            table.rename_columns(pair, [*_PARTS])
-        else:
-            table["ra"], table["dec"] = table[place].icrs.ra.deg, table[place].icrs.dec.deg
-            table.remove_column(place)
-    parts = [name for names in _PARTS.values() for name in names]
-    if not {*parts} <= {*table.colnames} or {*_PARTS} & {*table.colnames}:
+    parts = [name for titles in _PARTS.values() for name in titles]
+    if {*_PARTS} & {*names} or not (place or pair or {*parts} <= {*names}):
         return table
     table = table.copy()
-    signs = table["DE-"] if "DE-" in table.colnames else [""] * len(table)
-    for title, names in _PARTS.items():
-        rows = zip(*(table[name] for name in names), strict=True)
-        texts = ["" if np.ma.masked in row else " ".join(map(str, row)) for row in rows]
-        if title == "dec":
-            texts = [
-                f"{'-' if '-' in str(sign) else ''}{text}" if text else ""
-                for sign, text in zip(signs, texts, strict=True)
-            ]
-        table[title] = texts
-    table.remove_columns([name for name in (*parts, "DE-") if name in table.colnames])
+    if pair:
+        table.rename_columns(pair, [*_PARTS])
+        return table
+    if place:
+        table["ra"], table["dec"] = table[place].icrs.ra.deg, table[place].icrs.dec.deg
+        table.remove_column(place)
+        return table
+    for title, titles in _PARTS.items():
+        rows = list(zip(*(table[name] for name in titles), strict=True))
+        signs = map(str, table["DE-"]) if title == "dec" and "DE-" in names else [""] * len(rows)
+        table[title] = ["" if np.ma.masked in row else ("-" if sign.strip() == "-" else "") + " ".join(map(str, row))
+                        for sign, row in zip(signs, rows, strict=True)]  # fmt: skip
+    table.remove_columns([name for name in (*parts, "DE-") if name in names])
     return table
 
 

@@ -122,7 +122,7 @@ class NumberLines:
         self.cells = self._divided([line for _, line in found])
         #: Number of columns, and whether their cells contain arrays.
         self.n = len(self.cells[0])
-        self.holds_arrays = any(map(_is_array, self.cells[0]))
+        self.holds_arrays = any(cell[:1] in ("(", "[") for cell in self.cells[0])
 
     @property
     def comments(self) -> str:
@@ -149,9 +149,8 @@ class NumberLines:
         return cells
 
     def column(self, place: int, name: str, unit: str = "") -> Values:
-        """Return a column of numbers; of arrays or texts if there are arrays in the first row."""
-        read = self._texts_or_arrays if self.holds_arrays else self._numbers
-        return Values(name, (len(self.cells),), partial(read, place), unit)
+        """Return a column of numbers."""
+        return Values(name, (len(self.cells),), partial(self._numbers, place), unit)
 
     def _numbers(self, place: int, start: int, stop: int) -> Any:
         rows = self.cells[start:stop]
@@ -169,32 +168,10 @@ class NumberLines:
                 raise InputError(f"{fault}, but must hold {self.expected}", key="columns") from error
         return values
 
-    def _texts_or_arrays(self, place: int, start: int, stop: int) -> Any:
-        cells = [cells[place] if place < len(cells) else "" for cells in self.cells[start:stop]]
-        if not any(map(_is_array, cells)):
-            return np.array(cells)
-        arrays = [_array(cell) for cell in cells]
-        if len({array.size for array in arrays}) == 1:
-            return np.array(arrays)
-        values = np.empty(len(arrays), object)
-        values[:] = arrays
-        return values
-
 
 def _remark(line: str) -> str:
     """Return a comment without the mark at its start."""
     return line.strip().lstrip("#%!;/\\| ")
-
-
-def _is_array(cell: str) -> bool:
-    return cell.strip()[:1] in ("(", "[")
-
-
-def _array(cell: str) -> NDArray[np.float64]:
-    try:
-        return np.array([number_in(one) for one in re.split(r"\s*,\s*|\s+", cell.strip("()[] \t"))])
-    except ValueError as error:
-        raise InputError.of("cell", cell, "an array of numbers") from error
 
 
 def _first_row(lines: Sequence[tuple[int, str]]) -> float:
@@ -236,139 +213,125 @@ class Layout:
     trailing: bool  # whether a mark ends the rows
 
 
-class TextRows:
-    """Names, units and rows of a text table, whose cells are texts.
+def rows_of_text(
+    text: str, what: str, commas: bool, layout: Layout | None = None, first: int = 0
+) -> tuple[Table, Layout]:
+    """Parse a text table whose cells stay texts, with the keywords of its comments, and return its layout as well.
 
     The first line names the columns, unless it has numbers and dates only; then the last comment above it may do so,
     and otherwise columns are called col1, col2 and so on. Lines above the names without a mark are a title. Units, and
     dashes, may stand below the names. If nothing else shows how, cells are divided at `commas`.
 
-    A text that continues a table has rows only: its layout is `like` that of the `first` rows above it, which messages
-    count.
+    A text that continues a table has rows only, with the `layout` of the `first` rows above it, which messages count.
     """
+    lines = [line for line in text.splitlines() if not _RULE.fullmatch(line)]
+    n_marked = next((k for k, line in enumerate(lines) if not re.match(r"c(?:\s+[a-z]|\s*$)", line, re.I)), 0)
+    if n_marked > 1:
+        # Fortran's mark of comments, in the header of BRITE's light curves. Rows have numbers after a letter.
+        lines[:n_marked] = [f"#{line[1:]}" for line in lines[:n_marked]]
+    check_cells([line for line in lines if line[0] != "#"], what)
+    mark = layout.mark if layout else _mark([line for line in lines if line.lstrip()[0] != "#"], commas)
+    # SIMBAD calls its first column #, as wide as its number of stars.
+    marked = re.compile(rf"\s*{re.escape(mark)}" if mark in (";", "|") else r"(?!)")
+    is_comment = [bool(_COMMENT.match(line)) and not marked.match(line.removeprefix("#")) for line in lines]
+    data = [line for line, comment in zip(lines, is_comment, strict=True) if not comment]
+    comments = [line for line, comment in zip(lines, is_comment, strict=True) if comment]
+    cells = _with_dates(_split(data, mark))
+    if layout is None:
+        n_above = next((k for k, comment in enumerate(is_comment) if not comment), len(lines))
+        layout, cells = _divided(cells, [_remark(line) for line in lines[:n_above]], data, mark, what)
+    elif layout.trailing:
+        cells = [row[:-1] for row in cells]
+    if layout.decimal:
+        cells = _with_points(cells)
+    return _table_of_cells(cells, layout, comments, what, first), layout
 
-    def __init__(self, text: str, what: str, commas: bool, like: Layout | None = None, first: int = 0) -> None:
-        self.what, self.first = what, first
-        lines = [line for line in text.splitlines() if not _RULE.fullmatch(line)]
-        n_marked = next((k for k, line in enumerate(lines) if not re.match(r"c(?:\s+[a-z]|\s*$)", line, re.I)), 0)
-        if n_marked > 1:
-            # Fortran's mark of comments, in the header of BRITE's light curves. Rows have numbers after a letter.
-            lines[:n_marked] = [f"#{line[1:]}" for line in lines[:n_marked]]
-        check_cells([line for line in lines if line[0] != "#"], what)
-        mark = _mark([line for line in lines if line.lstrip()[0] != "#"], commas) if like is None else like.mark
-        # SIMBAD calls its first column #, as wide as its number of stars.
-        is_comment = [
-            _COMMENT.match(line) is not None
-            and line.lstrip()[0] != mark
-            and not (mark == "|" and re.match(r"#\s*\|", line))
-            for line in lines
-        ]
-        data = [line for line, comment in zip(lines, is_comment, strict=True) if not comment]
-        self.comments = [line for line, comment in zip(lines, is_comment, strict=True) if comment]
-        cells = _with_dates(_split(data, mark))
-        if like is None:
-            n_above = next((k for k, comment in enumerate(is_comment) if not comment), len(lines))
-            self.layout, self.cells = self._divided(cells, data, [_remark(line) for line in lines[:n_above]], mark)
-        else:
-            self.layout, self.cells = like, [row[:-1] for row in cells] if like.trailing else cells
-        if self.layout.decimal:
-            self.cells = _with_points(self.cells)
-        self._check()
 
-    def table(self) -> Table:
-        """Return the cells as a table of texts, with the keywords of comments."""
-        from astropy.table import Table
+def _table_of_cells(cells: list[list[str]], layout: Layout, comments: list[str], what: str, first: int) -> Table:
+    """Return cells as a table; raise InputError for the first row with another number of cells than columns."""
+    from astropy.table import Table
 
-        names, units = self.layout.names, self.layout.units
-        held = zip(*self.cells, strict=True) if self.cells else ((),) * len(names)
-        table = Table({name: np.array(one, str) for name, one in zip(names, held, strict=True)})
-        table.meta |= {"comments": self.comments} | keywords_of(self.comments)
-        if any(map(_AT_START.search, self.comments)):
-            table.meta.setdefault("TIMEPIXR", 0.0)
-        if self.layout.decimal:
-            table.meta[REMARKS] = (DECIMAL_COMMAS,)
-        for name, unit in zip(names, units, strict=False):
-            if unit:
-                table[name].unit = unit
-        return table
+    n = len(layout.names)
+    if odd := next(((number, len(row)) for number, row in enumerate(cells, first + 1) if len(row) != n), None):
+        # The file may be cut short.
+        fault = f"{what} has {odd[1]} cells in row {odd[0]}, but must have {n} as in the first line"
+        raise InputError(fault, key="file")
+    columns = zip(*cells, strict=True) if cells else ((),) * n
+    table = Table({name: np.array(one, str) for name, one in zip(layout.names, columns, strict=True)})
+    table.meta |= {"comments": comments} | keywords_of(comments)
+    if any(map(_AT_START.search, comments)):
+        table.meta.setdefault("TIMEPIXR", 0.0)
+    if layout.decimal:
+        table.meta[REMARKS] = (DECIMAL_COMMAS,)
+    for name, unit in zip(layout.names, layout.units, strict=False):
+        table[name].unit = unit or None
+    return table
 
-    def _divided(
-        self, cells: list[list[str]], lines: list[str], above: list[str], mark: str
-    ) -> tuple[Layout, list[list[str]]]:
-        """Find names and units, and return them with the rows."""
-        if not cells:
-            return Layout(mark, False, (), (), False), []
-        at = self._first_of_width(cells, mark)
-        head, rows = cells[at], cells[at + 1 :]
-        # The last mark ends the lines, unless it is that of an empty column which has a name.
-        trailing = bool(mark and rows) and not any(row[-1] for row in rows)
-        trailing = trailing and (not head[-1] or len(rows[0]) > len(head))
-        if trailing:
-            cells = [*cells[:at], head if head[-1] else head[:-1], *(row[:-1] for row in rows)]
-        n = len(cells[at])
-        units: list[str] = []
-        is_row = all(_is_cell_of_row(cell) for cell in cells[at])
-        names: list[str] = []
-        if is_row or any(map(_is_finite, cells[at])) or _are_dashes(cells[at : at + 1]):
-            names, units = self._names_above(n, [*above, *lines[:at]], mark)
-        if names or is_row:
-            if not names and at:
-                fault = f"{self.what} has {n} cells in row 1, but must have {len(cells[at - 1])} as in the line above"
-                raise InputError(fault, key="file")
-            names = names or [f"col{k + 1}" for k in range(n)]
-        else:
-            names, at = cells[at], at + 1
-        if _are_dashes(cells[at + 1 : at + 2]) and not any(map(_is_finite, cells[at])):
-            # VizieR writes units and dashes below the names.
-            units, at = cells[at], at + 2
-        elif _are_dashes(cells[at : at + 1]):
-            at += 1
-        elif len(cells) > at + 1 and _are_units(cells[at], cells[at + 1]):
-            units, at = cells[at], at + 1
-        if not mark and all(name.endswith(",") for name in names[:-1]):
-            # Commas divide the names and blanks the rows.
-            names = [name.rstrip(",") for name in names]
-        names, rows = _distinct(names), cells[at:]
-        decimal = _has_decimal_commas(rows, self.what)
-        if all(map(_RDB.fullmatch, units)):
-            units = []
-        plain = (in_brackets(unit.strip("\"'")) for unit in units)
-        return Layout(
-            mark, decimal, tuple(names), tuple(unit if is_stated(unit) else "" for unit in plain), trailing
-        ), rows
 
-    @staticmethod
-    def _first_of_width(cells: list[list[str]], mark: str) -> int:
-        """Return the place of the first line that has a cell for each column."""
-        if mark:
-            # A title has no mark.
-            return next((k for k, row in enumerate(cells) if len(row) > 1), 0)
-        (n, _), *_ = Counter(len(row) for row in cells).most_common(1)
-        return next(k for k, row in enumerate(cells) if len(row) == n)
+def _divided(
+    cells: list[list[str]], above: list[str], lines: list[str], mark: str, what: str
+) -> tuple[Layout, list[list[str]]]:
+    """Find the names and units of columns, and return them with the rows."""
+    if not cells:
+        return Layout(mark, False, (), (), False), []
+    at = _first_of_width(cells, mark)
+    head, rows = cells[at], cells[at + 1 :]
+    # The last mark ends the lines, unless it is that of an empty column which has a name.
+    trailing = bool(mark and rows) and not any(row[-1] for row in rows)
+    trailing = trailing and (not head[-1] or len(rows[0]) > len(head))
+    if trailing:
+        cells = [*cells[:at], head if head[-1] else head[:-1], *(row[:-1] for row in rows)]
+    n = len(cells[at])
+    is_row = all(map(_is_cell_of_row, cells[at]))
+    names: list[str] = []
+    units: list[str] = []
+    if is_row or any(map(_is_finite, cells[at])) or _are_dashes(cells[at]):
+        names, units = _names_above(n, [*above, *lines[:at]], mark)
+    if is_row and not names and at:
+        fault = f"{what} has {n} cells in row 1, but must have {len(cells[at - 1])} as in the line above"
+        raise InputError(fault, key="file")
+    if is_row:
+        names = names or [f"col{k + 1}" for k in range(n)]
+    elif not names:
+        names, at = cells[at], at + 1
+    first, second = [*cells[at : at + 2], [], []][:2]
+    if _are_dashes(second) and not any(map(_is_finite, first)):
+        # VizieR writes units and dashes below the names.
+        units, at = first, at + 2
+    elif _are_dashes(first):
+        at += 1
+    elif second and _are_units(first, second):
+        units, at = first, at + 1
+    if not mark and all(name.endswith(",") for name in names[:-1]):
+        # Commas divide the names and blanks the rows.
+        names = [name.rstrip(",") for name in names]
+    if all(map(_RDB.fullmatch, units)):
+        units = []
+    plain = [in_brackets(unit.strip("\"'")) for unit in units]
+    stated = tuple(unit if is_stated(unit) else "" for unit in plain)
+    decimal = _has_decimal_commas(cells[at:], what)
+    return Layout(mark, decimal, tuple(_distinct(names)), stated, trailing), cells[at:]
 
-    def _names_above(self, n: int, above: list[str], mark: str) -> tuple[list[str], list[str]]:
-        """Return the names in the last line above the rows, and the units in it or below it; empty without names."""
-        if n < 2:
-            return [], []
-        numbered = numbered_names((line for line in above if line.lower().startswith("col")), n)
-        if len(numbered) > 1:
-            return [numbered.get(k, f"col{k + 1}") for k in range(n)], []
-        found = [
-            cells for line in above[-2:] if (cells := divided_names(line, n, mark)) and not keywords_of([f"#{line}"])
-        ]
-        if len(found) == 2 and all(_is_unit(cell) for cell in found[1] if is_stated(cell)):
-            return found[0], found[1]
-        last = above[-1:] and divided_names(above[-1], n, mark)
-        return (found[-1], []) if last and found and found[-1] == last else ([], [])
 
-    def _check(self) -> None:
-        """Raise InputError for the first row with another number of cells than there are columns."""
-        n = len(self.layout.names)
-        for number, row in enumerate(self.cells, self.first + 1):
-            if len(row) != n:
-                # The file may be cut short.
-                fault = f"{self.what} has {len(row)} cells in row {number}, but must have {n} as in the first line"
-                raise InputError(fault, key="file")
+def _first_of_width(cells: list[list[str]], mark: str) -> int:
+    """Return the place of the first line that has a cell for each column."""
+    if mark:
+        # A title has no mark.
+        return next((k for k, row in enumerate(cells) if len(row) > 1), 0)
+    widths = [len(row) for row in cells]
+    return widths.index(Counter(widths).most_common(1)[0][0])
+
+
+def _names_above(n: int, above: list[str], mark: str) -> tuple[list[str], list[str]]:
+    """Return the names in the last line above the rows, and the units in it or below it; empty without names."""
+    numbered = numbered_names((line for line in above if line.lower().startswith("col")), n)
+    if len(numbered) > 1:
+        return [numbered.get(k, f"col{k + 1}") for k in range(n)], []
+    last = ["", "", *above][-2:]
+    names, units = ([] if keywords_of([f"#{line}"]) else divided_names(line, n, mark) for line in last)
+    if names and units and all(_is_unit(cell) for cell in units if is_stated(cell)):
+        return names, units
+    return units, []
 
 
 def text_table(text: str, what: str, commas: bool) -> Table:
@@ -377,7 +340,7 @@ def text_table(text: str, what: str, commas: bool) -> Table:
         return parse_ecsv(text, what)
     form = _known_form(text)
     if form is None:
-        return TextRows(text, what, commas).table()
+        return rows_of_text(text, what, commas)[0]
     from astropy.table import Table
 
     lines = text.splitlines()
@@ -517,9 +480,9 @@ def _is_finite(cell: str) -> bool:
         return _DECIMAL_COMMA.fullmatch(cell) is not None
 
 
-def _are_dashes(rows: Iterable[list[str]]) -> bool:
-    """Return whether there is a row, and its cells are dashes."""
-    return any(any(row) and all(re.fullmatch(r":?[-=]*:?", cell) for cell in row) for row in rows)
+def _are_dashes(row: list[str]) -> bool:
+    """Return whether the cells of a row are dashes."""
+    return any(row) and all(re.fullmatch(r":?[-=]*:?", cell) for cell in row)
 
 
 def _are_units(cells: list[str], below: list[str]) -> bool:

@@ -40,13 +40,22 @@ def intact(fuzz: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def place(intact: Path, tmp_path: Path) -> Path:
-    """Return a folder with links to the intact files, of which a test replaces some."""
+    """Return a folder with links to the intact files, of which a test replaces some, and what only these tests need."""
     for path in intact.rglob("*"):
         there = tmp_path / path.relative_to(intact)
         if path.is_dir():
             there.mkdir(exist_ok=True)
         else:
             os.link(path, there)
+    mapping = (tmp_path / "wcs.toml").read_text().replace('wavelength = "wcs"', 'wavelength_file = "nm.csv"')
+    (tmp_path / "named.toml").write_text(f'{mapping}wavelength_unit = "Angstrom"\n')
+    Table({"nm": np.linspace(2505.0, 6505.0, 6)}).write(tmp_path / "nm.csv", format="ascii.csv")
+    names = [path.name for path in sorted((tmp_path / "spectra").glob("*.fits"))]
+    Table({"file": names, "T": np.arange(len(names)) * 20.0}).write(tmp_path / "times.csv")
+    (tmp_path / "listed.toml").write_text(
+        'table = "../times.csv"\ntime = "T"\ntime_unit = "s"\nflux = "FLUX"\nflux_unit = "adu/s"\nerror = "ERR"\n'
+        'exposure_s = 18.0\nwavelength = "W"\nwavelength_unit = "Angstrom"\n'
+    )
     return tmp_path
 
 
@@ -88,31 +97,17 @@ READERS, VERIFIED = ({name: (file, tuple(shlex.split(words))) for name, (file, w
                      for kind in ("read", "verified"))  # fmt: skip
 
 
-def prepare(place: Path) -> None:
-    """Write what only these tests need: wavelengths in a file, and a table of the files of a folder."""
-    mapping = (place / "wcs.toml").read_text().replace('wavelength = "wcs"', 'wavelength_file = "nm.csv"')
-    (place / "named.toml").write_text(f'{mapping}wavelength_unit = "Angstrom"\n')
-    Table({"nm": np.linspace(2505.0, 6505.0, 6)}).write(place / "nm.csv", format="ascii.csv")
-    names = [path.name for path in sorted((place / "spectra").glob("*.fits"))]
-    Table({"file": names, "T": np.arange(len(names)) * 20.0}).write(place / "times.csv")
-    (place / "listed.toml").write_text(
-        'table = "../times.csv"\ntime = "T"\ntime_unit = "s"\nflux = "FLUX"\nflux_unit = "adu/s"\nerror = "ERR"\n'
-        'exposure_s = 18.0\nwavelength = "W"\nwavelength_unit = "Angstrom"\n'
-    )
-
-
-def outcome(fuzz: ModuleType, words: tuple[str, ...], place: Path, codes: tuple[int, ...]) -> tuple[str, str]:
-    """Run a command within its limits; return what is wrong with its outcome, and its messages."""
+def logged(fuzz: ModuleType, words: tuple[str, ...], place: Path, *codes: int) -> str:
+    """Run a command within its limits, check that it ends with one of some codes, and return its messages."""
     code, out, log = fuzz.ended(list(words), place, fuzz.limited, {"MAUVECL_DATA_DIR": str(place / "d")})
-    return fuzz.fault_of(code, out, log, codes), out + log
+    assert fuzz.fault_of(code, out, log, codes) == "", out + log
+    return out + log
 
 
 @pytest.mark.parametrize("reader", READERS)
 def test_intact_files_are_read(reader: str, place: Path, fuzz: ModuleType) -> None:
     """Check that the refusals below are not those of something else."""
-    prepare(place)
-    fault, log = outcome(fuzz, READERS[reader][1], place, (0,))
-    assert fault == "", log
+    logged(fuzz, READERS[reader][1], place, 0)
 
 
 @pytest.mark.parametrize("replace", REPLACED)
@@ -120,11 +115,9 @@ def test_intact_files_are_read(reader: str, place: Path, fuzz: ModuleType) -> No
 def test_no_file_is_read_without_end(
     reader: str, replace: Callable[[Path], None], place: Path, fuzz: ModuleType
 ) -> None:
-    prepare(place)
     file, words = (READERS | VERIFIED)[reader]
     replace(place / file)
-    fault, log = outcome(fuzz, words, place, (1, 2) if reader in VERIFIED else (2,))
-    assert fault == "", log
+    logged(fuzz, words, place, *((1, 2) if reader in VERIFIED else (2,)))
 
 
 @pytest.mark.parametrize("replace", [one_line, many_comments])
@@ -132,18 +125,15 @@ def test_no_file_is_read_without_end(
 def test_lines_have_a_bound(name: str, replace: Callable[[Path], None], place: Path, fuzz: ModuleType) -> None:
     """Read tables that are large enough for pieces, whose line or header has no end."""
     replace(place / name)
-    fault, log = outcome(fuzz, (*ANALYSE, name, "--mapping", "m.toml"), place, (2,))
-    assert fault == "", log
-    assert "characters" in log
+    assert "characters" in logged(fuzz, (*ANALYSE, name, "--mapping", "m.toml"), place, 2)
 
 
 def test_descriptions_nested_deeply_are_refused(place: Path, fuzz: ModuleType) -> None:
     path = place / "frames.zarr/star-1/quiescent/zarr.json"
     path.unlink()
     path.write_text('{"a":' * 100_000 + "1" + "}" * 100_000)
-    for words, codes in ((("verify", "frames.zarr"), (1,)), (("export", "frames.zarr", "n.h5"), (2,))):
-        fault, log = outcome(fuzz, words, place, codes)
-        assert fault == "", log
+    logged(fuzz, ("verify", "frames.zarr"), place, 1)
+    logged(fuzz, ("export", "frames.zarr", "n.h5"), place, 2)
 
 
 @pytest.mark.parametrize("after", [0, GIB])
@@ -157,8 +147,7 @@ def test_frames_of_many_gibibytes_are_refused_before_they_are_read(after: int, p
     header = content[: -(-rows * width // 2880) * -2880]
     size = len(header) - -claimed * width // 2880 * 2880 + after
     sparse(place / "f.fits", header.replace(card, f"NAXIS2  = {claimed:20d}".encode()), size)
-    fault, log = outcome(fuzz, READERS["frames in FITS"][1], place, (2,))
-    assert fault == "", log
+    log = logged(fuzz, READERS["frames in FITS"][1], place, 2)
     assert (f"{after} bytes after" if after else f"frames, but has {claimed}") in log
 
 
@@ -171,11 +160,8 @@ def test_sizes_that_an_hdf5_file_claims_are_refused(key: str, place: Path, fuzz:
     name.write_bytes(content)
     with h5py.File(name, "r+") as file:
         group, old = file["star-1"], file["star-1"][key]
-        shape = (10**11, *old.shape[1:])
-        attributes = dict(old.attrs)
+        kept = {k: v for k, v in old.attrs.items() if k in ("units", "amplitude")}
+        rest, dtype = old.shape[1:], old.dtype
         del group[key]
-        made = group.create_dataset(key, shape, old.dtype, chunks=(1000, *old.shape[1:]), fillvalue=1)
-        made.attrs.update({k: v for k, v in attributes.items() if k in ("units", "amplitude")})
-    fault, log = outcome(fuzz, (*ANALYSE, "frames.h5[star-1/quiescent]"), place, (2,))
-    assert fault == "", log
-    assert str(10**11) in log
+        group.create_dataset(key, (10**11, *rest), dtype, chunks=(1000, *rest), fillvalue=1).attrs.update(kept)
+    assert str(10**11) in logged(fuzz, (*ANALYSE, "frames.h5[star-1/quiescent]"), place, 2)

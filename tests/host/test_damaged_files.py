@@ -1,10 +1,9 @@
-"""Files that are packed, cut, damaged, too large or no files at all; suggestions of messages can be typed."""
+"""Files that are packed, cut, damaged, too large or no files at all."""
 
 import bz2
 import gzip
 import lzma
 import os
-import re
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.io import fits
-from astropy.table import Table
 from corpus import CORPUS, cases, written
 from refusals import refused
 
@@ -29,27 +27,19 @@ def noisy_text(n: int) -> bytes:
     return "\n".join(f"{a:.9g} {b:.9e}" for a, b in zip(np.linspace(180.0, 1100.0, n), flux, strict=True)).encode()
 
 
-@pytest.mark.long
 @PACKERS
-def test_compressed_files_of_several_streams_are_unpacked(pack: Callable[[bytes], bytes], tmp_path: Path) -> None:
-    content = noisy_text(60_000)
-    half = len(content) // 2
-    for name, packed in (
-        ("plain", content),
-        ("one", pack(content)),
-        ("two", pack(content[:half]) + pack(content[half:])),
-    ):
-        (tmp_path / name).write_bytes(packed)
-    assert len({Source.read(tmp_path / name).digest for name in ("plain", "one", "two")}) == 1
-
-
-@PACKERS
-def test_truncated_files_raise(pack: Callable[[bytes], bytes], tmp_path: Path) -> None:
-    packed = pack(noisy_text(4000))
+def test_packed_files_are_whole_or_refused(pack: Callable[[bytes], bytes], tmp_path: Path) -> None:
+    content, path = noisy_text(4000), tmp_path / "star"
+    digests = set()
+    for whole in (content, pack(content), pack(content[:9000]) + pack(content[9000:])):
+        path.write_bytes(whole)
+        digests.add(Source.read(path).digest)
+    assert len(digests) == 1
+    packed = pack(content)
     for size in (8, len(packed) // 2, len(packed) - 1):
-        (tmp_path / "cut").write_bytes(packed[:size])
+        path.write_bytes(packed[:size])
         with refused("file"):
-            Source.read(tmp_path / "cut")
+            Source.read(path)
 
 
 @pytest.mark.long
@@ -136,35 +126,3 @@ def test_checksums_are_verified(tmp_path: Path) -> None:
         without[at : at + 80] = b"COMMENT".ljust(80)
     path.write_bytes(bytes(without))
     assert Source.read(path).digest == digest
-
-
-def with_units(table: Table) -> Table:
-    table["wavelength"].unit, table["flux"].unit = "nm", "erg / (s cm2 Angstrom)"
-    return table
-
-
-@pytest.mark.parametrize("names", [
-    ["a, b", "c"], ["GJ 65 [A]", "GJ 65 [B]"], ["x" * 60, "y" * 60], ['"q"', "r"], [" ", "s"], ["two words", "t"],
-    ["twice", "twice"],
-])  # fmt: skip
-def test_suggested_row_is_accepted(names: list[str], tmp_path: Path) -> None:
-    flux = np.ones((len(names), NM.size)) * np.arange(1, len(names) + 1)[:, None]
-    table = Table({"name": names, "wavelength": np.tile(NM, (len(names), 1)), "flux": flux})
-    with_units(table).write(tmp_path / "a.fits")
-    suggestion_is_accepted(tmp_path / "a.fits")
-
-
-@pytest.mark.parametrize("names", [["A,B", "C"], ["A", "B"]])
-def test_suggested_table_is_accepted(names: list[str], tmp_path: Path) -> None:
-    table = with_units(Table({"wavelength": NM, "flux": np.ones(NM.size)}))
-    hdus = [fits.BinTableHDU(table, name=name) for name in names]
-    fits.HDUList([fits.PrimaryHDU(), *hdus]).writeto(tmp_path / "a.fits")
-    suggestion_is_accepted(tmp_path / "a.fits")
-
-
-def suggestion_is_accepted(path: Path) -> None:
-    with pytest.raises(InputError) as error:
-        Source.read(path)
-    suggested = re.search(r"FILE(\[[^\]]*\])", str(error.value))
-    assert suggested is not None, error.value
-    assert Source.read(f"{path}{suggested[1]}").flux_flam.max() == 1.0
