@@ -31,12 +31,13 @@ def true_runs(flags: NDArray[np.bool_]) -> NDArray[np.intp]:
     return np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]))).reshape(-1, 2)
 
 
-class _Arguments:
-    """Arguments that compare by the digest of their bytes; the values are released after the call."""
+class _Digest(bytes):
+    """Digest of arguments, by which these compare; they are released after the call."""
 
-    __slots__ = ("digest", "values")
+    arguments: Any = None
 
-    def __init__(self, values: tuple[Any, ...]) -> None:
+    @classmethod
+    def of(cls, values: Iterable[Any]) -> _Digest:
         hashed = hashlib.sha256()
         for value in values:
             if isinstance(value, np.ndarray):
@@ -44,13 +45,7 @@ class _Arguments:
                 hashed.update(np.ascontiguousarray(value).data)
             else:
                 hashed.update(repr(value).encode())
-        self.values, self.digest = values, hashed.digest()
-
-    def __hash__(self) -> int:
-        return hash(self.digest)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Arguments) and self.digest == other.digest
+        return cls(hashed.digest())
 
 
 def array_cache(maxsize: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
@@ -61,8 +56,8 @@ def array_cache(maxsize: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
         @lru_cache(maxsize=maxsize)
-        def computed(given: _Arguments) -> R:
-            (arguments, named), given.values = given.values, ()
+        def computed(given: _Digest) -> R:
+            (arguments, named), given.arguments = given.arguments, None
             value = function(*arguments, **named)
             if isinstance(value, np.ndarray):
                 value.setflags(write=False)
@@ -70,8 +65,8 @@ def array_cache(maxsize: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
 
         @wraps(function)
         def wrapper(*arguments: P.args, **named: P.kwargs) -> R:
-            given = _Arguments((*arguments, *sorted(named.items())))
-            given.values = arguments, named
+            given = _Digest.of((*arguments, *sorted(named.items())))
+            given.arguments = arguments, named
             return computed(given)
 
         return wrapper

@@ -14,17 +14,14 @@ def documented_files(folder: Path) -> None:
     time, nm = np.arange(30) * 5.0 + 2.5, np.array([300.25, 400.25, 500.25, 600.25])
     counts = 100.0 + np.arange(120.0).reshape(30, 4)
     sigma, mjd = 0.1 * counts, 61_100 + time / 86_400
-    table = Table({"TIME": time, "COUNTS": counts, "SIGMA": sigma, "FLAG": 0 * time, "EXPTIME": np.full(30, 5.0),
-                   "CCDTEMP": np.full(30, 21.0), "LAMBDA": np.tile(nm, (30, 1))})  # fmt: skip
+    columns = {"TIME": time, "COUNTS": counts, "SIGMA": sigma, "FLAG": 0 * time, "EXPTIME": np.full(30, 5.0),
+               "CCDTEMP": np.full(30, 21.0), "LAMBDA": np.tile(nm, (30, 1))}  # fmt: skip
     units = {"TIME": "s", "COUNTS": "adu/s", "SIGMA": "adu/s", "EXPTIME": "s", "CCDTEMP": "deg_C", "LAMBDA": "nm"}
-    for name, unit in units.items():
-        table[name].unit = unit
+    table = Table(columns, units=units)
     table.write(folder / "night.fits")
-    images = [fits.ImageHDU(counts, name="COUNTS"), fits.ImageHDU(sigma, name="SIGMA")]
-    for image in images:
-        image.header["BUNIT"] = "adu/s"
-    times = fits.table_to_hdu(table[["TIME"]])
-    times.name = "TIMES"
+    unit = fits.Header({"BUNIT": "adu/s"})
+    images = [fits.ImageHDU(columns[name], unit, name) for name in ("COUNTS", "SIGMA")]
+    times = fits.BinTableHDU(table[["TIME"]], name="TIMES")
     fits.HDUList([fits.PrimaryHDU(), *images, times]).writeto(folder / "images.fits")
     air = u.Quantity(nm, "nm").to_value("AA") / 1.00028
     Table({"wavelength": air}).write(folder / "wavelengths.csv")

@@ -174,10 +174,8 @@ def _kind_of(words: Sequence[str]) -> tuple[Kind, int]:
 
 
 def _flux_score(words: Sequence[str], has: set[str]) -> int:
-    if has - {"flux", "total", "weak flux", "vacuum", "air", "neutral"}:
-        score = 3
-    else:
-        score = 5 if words in (("flux",), ("fluxes",)) else 4
+    others = has - {"flux", "total", "weak flux", "vacuum", "air", "neutral"}
+    score = 3 if others else 5 if words in (("flux",), ("fluxes",)) else 4
     return score if has & {"flux", "total"} else score - 2
 
 
@@ -185,10 +183,8 @@ def _axis_score(words: Sequence[str], has: set[str]) -> int:
     # A "w" may be a weight.
     if words == ("w",):
         return 0
-    score = 4 if "wave" in has else 2
-    if has - {"wave", "other axis", "vacuum", "air", "neutral"}:
-        score -= 2
-    return score - 1 if "air" in has else score
+    others = has - {"wave", "other axis", "vacuum", "air", "neutral"}
+    return (4 if "wave" in has else 2) - (2 if others else 0) - (1 if "air" in has else 0)
 
 
 @lru_cache(maxsize=1024)
@@ -316,9 +312,7 @@ def as_typed(name: str, kind: str, place: int, names: Sequence[str] = ()) -> str
 def choose(names: Sequence[str], roles: Sequence[Role], asked: Sequence[str] = ()) -> tuple[tuple[int, ...], int]:
     """Choose the columns of wavelength, or of both edges of each bin, and of flux, of which the user may name some."""
     wanted = [_named(name, names) for name in asked]
-    axes = [i for i in wanted if roles[i].kind in AXES]
-    if len(wanted) == 2 and not axes:
-        axes = wanted[:1]
+    axes = [i for i in wanted if roles[i].kind in AXES] or (wanted[:1] if len(wanted) == 2 else [])
     wavelength = (axes[0],) if axes else _wavelength(names, roles)
     rest = [i for i in wanted if i not in wavelength]
     if len(rest) > 1:
@@ -338,9 +332,9 @@ def _named(name: str, names: Sequence[str]) -> int:
 
 
 def _wavelength(names: Sequence[str], roles: Sequence[Role]) -> tuple[int, ...]:
-    if best := _best([(role.score, i) for i, role in enumerate(roles) if role.kind == "wavelength"]):
+    best, low, high = (_best(kind, roles) for kind in AXES)
+    if best:
         return (_only("wavelength", names, best),)
-    low, high = ([i for i, role in enumerate(roles) if role.kind == f"{side} edge"] for side in ("lower", "upper"))
     if low or high:
         return _only("lower edge of the bins", names, low), _only("upper edge of the bins", names, high)
     fault = f"no column is recognised as the wavelength among {listed(names) or 'none'}"
@@ -349,9 +343,8 @@ def _wavelength(names: Sequence[str], roles: Sequence[Role]) -> tuple[int, ...]:
 
 def _flux(names: Sequence[str], roles: Sequence[Role], wavelength: tuple[int, ...]) -> int:
     rest = [i for i in range(len(names)) if i not in wavelength]
-    for kind in ("flux", "model"):
-        if best := _best([(roles[i].score, i) for i in rest if roles[i].kind == kind]):
-            return _only("flux", names, best)
+    if best := _best("flux", roles, wavelength) or _best("model", roles, wavelength):
+        return _only("flux", names, best)
     unknown = [i for i in rest if roles[i].kind == "unknown"]
     if len(rest) == len(unknown) == 1:
         return unknown[0]
@@ -361,9 +354,11 @@ def _flux(names: Sequence[str], roles: Sequence[Role], wavelength: tuple[int, ..
     raise InputError(f"{fault}; give the column as in {as_typed(names[shown], 'column', shown, names)}", key="columns")
 
 
-def _best(scored: list[tuple[int, int]]) -> list[int]:
-    most = max((score for score, _ in scored), default=0)
-    return [i for score, i in scored if score == most]
+def _best(kind: str, roles: Sequence[Role], without: Sequence[int] = ()) -> list[int]:
+    """Return the columns of a kind that have the highest score."""
+    found = [i for i, role in enumerate(roles) if role.kind == kind and i not in without]
+    most = max((roles[i].score for i in found), default=0)
+    return [i for i in found if roles[i].score == most]
 
 
 def _only(what: str, names: Sequence[str], indices: Sequence[int]) -> int:

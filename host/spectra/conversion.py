@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import astropy.units as u
@@ -37,8 +38,8 @@ class SpectrumTable:
     implied_units: tuple[str, str] | None = None
     #: Text of the header that may mention air, the star's surface or its dust.
     remarks: str = ""
-    #: Function that returns the medium of the wavelengths that keywords state.
-    medium: Callable[[], Medium | None] = lambda: None
+    #: Headers whose keywords may state the medium of the wavelengths.
+    headers: Sequence[Mapping[str, Any]] = ()
     notes: tuple[str, ...] = ()
     messages: tuple[str, ...] = ()
     #: Group; tables of the same group are parts of one spectrum.
@@ -59,6 +60,7 @@ class SpectrumTable:
 
 
 Float = NDArray[np.float64]
+FLAM = u.erg / (u.s * u.cm**2 * u.AA)
 
 #: Columns whose presence shows that rows are parts of one spectrum: detector segments and echelle orders.
 SEGMENTS = ("segment", "sporder", "order", "stripe")
@@ -168,11 +170,9 @@ def _spectrum_of(table: SpectrumTable, asked: Sequence[str]) -> RawSpectrum:
 def _segment(cells: Sequence[Any], names: Sequence[str]) -> tuple[Float, Float]:
     """Return the wavelengths, or the middles of bins, and the fluxes of one row or of whole columns."""
     *axes, flux = (_numbers(cell, name) for cell, name in zip(cells, names, strict=True))
-    for array, name in ((axes[0], names[0]), (flux, names[-1])):
-        if array.ndim != 1:
-            raise InputError(f"column {name} must hold one spectrum, but has the shape {array.shape}", key=name)
-    if axes[0].size != flux.size:
-        raise InputError(f"it needs as many wavelengths as fluxes, but has {axes[0].size} for {flux.size}", key="flux")
+    if flux.ndim != 1 or axes[0].shape != flux.shape:
+        fault = f"it needs one spectrum with as many wavelengths as fluxes, but has {axes[0].shape} for {flux.shape}"
+        raise InputError(fault, key="flux")
     return sum(axes[1:], axes[0]) / len(axes), flux
 
 
@@ -325,27 +325,27 @@ def converted(raw: RawSpectrum, wavelength_unit: Any = None, flux_unit: Any = No
     flux = _scale("flux", raw.flux_name, raw.flux_role, flux_unit, implied[1])
     messages += [*axis.messages, *flux.messages]
     if axis.is_assumed:
-        check_assumed_unit(axis.linear_values(np.concatenate([values for values, _ in raw.segments])), axis.name)
+        check_assumed_unit(axis.linear_values(np.concatenate([values for values, _ in raw.segments])), str(axis.unit))
+    marks, said = marks_in(np.concatenate([fluxes for _, fluxes in raw.segments]), "fluxes")
+    messages += said
     segments = []
-    for values, fluxes in _without_marks(raw.segments, messages):
-        nm, kept = _in_nm(values, fluxes, axis)
+    for values, fluxes in raw.segments:
+        nm, kept = _in_nm(values, np.where(np.isin(fluxes, marks), np.nan, fluxes), axis)
         order = slice(None, None, -1 if nm.size > 1 and nm[0] > nm[-1] else 1)
-        segments.append((nm[order], _in_flam(kept, nm, flux)[order]))
+        flam = flux.to(FLAM, kept, u.spectral_density(u.Quantity(nm, u.nm)))
+        segments.append((nm[order], flam[order]))
     nm, flam = _joined(segments, messages)
     if flux.is_assumed:
         _check_assumed_flux(flam, raw)
-    nm, said = vacuum_wavelengths(nm, raw.wavelength_name, raw.table.remarks, medium or in_unit, raw.table.medium)
-    messages += said
+    remarks, unscaled, notes = raw.table.remarks, raw.table.unscaled, raw.table.notes
+    nm, added = vacuum_wavelengths(nm, raw.wavelength_name, remarks, medium or in_unit, raw.table.headers)
+    messages += added
     nm, flam = _merged(nm, flam, messages)
-    unscaled = raw.table.unscaled or (
-        "its header says that it is the flux at the star's surface"
-        if re.search(r"surface\s+flux", raw.table.remarks, re.I)
-        else ""
-    )
-    notes = raw.table.notes
-    if re.search(r"dereddened", raw.table.remarks, re.I) and not any("dereddened" in note for note in notes):
+    if re.search(r"surface\s+flux", remarks, re.I):
+        unscaled = unscaled or "its header says that it is the flux at the star's surface"
+    if re.search(r"dereddened", remarks, re.I) and not any("dereddened" in note for note in notes):
         notes += ("dereddened, as its header says: counts need it reddened again",)
-    return ReadSpectrum(nm, flam, raw.table.name, raw.table.origin, notes, tuple(messages), unscaled, axis.name)
+    return ReadSpectrum(nm, flam, raw.table.name, raw.table.origin, notes, tuple(messages), unscaled, str(axis.unit))
 
 
 @dataclass(frozen=True)
@@ -357,9 +357,10 @@ class _Scale:
     messages: tuple[str, ...]
     linear_values: Callable[[Float], Float]
 
-    @property
-    def name(self) -> str:
-        return str(linear(self.unit))
+    def to(self, unit: Any, values: Float, equivalencies: Any) -> Float:
+        """Return the column's numbers in a unit."""
+        quantity = u.Quantity(self.linear_values(values), self.unit)
+        return np.asarray(quantity.to_value(unit, equivalencies), np.float64)
 
 
 def _scale(what: str, column: str, role: Role, asked: Any, implied: str | None) -> _Scale:
@@ -385,15 +386,15 @@ def _scale(what: str, column: str, role: Role, asked: Any, implied: str | None) 
     elif not is_spectral(unit):
         raise InputError.of("wavelength_unit", str(unit), "a length or a frequency")
     base = role.logarithm or ("10" if is_bare_logarithm or str(unit).startswith("dex") else "")
+    linear_values: Callable[[Float], Float] = np.asarray
     if base:
-        values, power = "wavelengths" if what == "wavelength" else "fluxes", "e" if base == "e" else "ten"
-        messages.append(f"its {values} are logarithms ({column}), raised to powers of {power}")
-        limits = LOG_WAVELENGTHS if what == "wavelength" else LOG_FLUXES
-        return _Scale(linear(unit), is_assumed, tuple(messages), lambda x: _power(x, base, limits, column))
-    if unit is not linear(unit):
+        values, limits = ("wavelengths", LOG_WAVELENGTHS) if what == "wavelength" else ("fluxes", LOG_FLUXES)
+        messages.append(f"its {values} are logarithms ({column}), raised to powers of {'e' if base == 'e' else 'ten'}")
+        linear_values = partial(_power, base=base, limits=limits, column=column)
+    elif unit is not linear(unit):
         messages.append(f"its magnitudes ({unit}) are converted to fluxes")
-        return _Scale(linear(unit), is_assumed, tuple(messages), unit.to_physical)
-    return _Scale(unit, is_assumed, tuple(messages), lambda x: x)
+        linear_values = unit.to_physical
+    return _Scale(linear(unit), is_assumed, tuple(messages), linear_values)
 
 
 def _stated(what: str, column: str, stated: str | None, asked: Any) -> tuple[Any, list[str]]:
@@ -418,8 +419,7 @@ def _power(values: Float, base: str, limits: tuple[float, float], column: str) -
         low, high = values[np.isfinite(values)].min(), values[np.isfinite(values)].max()
         fault = f"column {column} is named as a logarithm and holds {low:g} to {high:g}"
         raise InputError(f"{fault}, but must hold logarithms from {limits[0]:g} to {limits[1]:g}", key=column)
-    with np.errstate(over="ignore"):
-        return np.asarray(10.0**logarithms)
+    return np.asarray(10.0**logarithms)
 
 
 def _check_flux_unit(unit: Any, role: Role) -> None:
@@ -439,31 +439,14 @@ def _check_flux_unit(unit: Any, role: Role) -> None:
     raise InputError(fault, key="flux_unit")
 
 
-def _without_marks(segments: list[tuple[Float, Float]], messages: list[str]) -> list[tuple[Float, Float]]:
-    """Return segments whose fluxes are undefined where they have the mark of a missing value."""
-    marks, said = marks_in(np.concatenate([one for _, one in segments]), "fluxes")
-    messages += said
-    return [(values, np.where(np.isin(one, marks), np.nan, one)) for values, one in segments] if marks else segments
-
-
 def _in_nm(values: Float, flux: Float, scale: _Scale) -> tuple[Float, Float]:
     """Return wavelengths in nm, and the fluxes of points with a wavelength."""
-    with np.errstate(all="ignore"):
-        nm = np.asarray(u.Quantity(scale.linear_values(values), scale.unit).to_value(u.nm, u.spectral()), np.float64)
+    nm = scale.to(u.nm, values, u.spectral())
     bad = np.flatnonzero(~np.isfinite(nm))
-    if bad.size == 0:
-        return nm, flux
-    if bad.size < nm.size and not np.isfinite(flux[bad]).any():
-        # A row without wavelength or flux is not a point.
-        return np.delete(nm, bad), np.delete(flux, bad)
-    raise InputError.of("wavelength", nm[bad[0]], "a finite number", where=f"point {bad[0] + 1}")
-
-
-def _in_flam(flux: Float, nm: Float, scale: _Scale) -> Float:
-    flam = u.erg / (u.s * u.cm**2 * u.AA)
-    with np.errstate(all="ignore"):
-        quantity = u.Quantity(scale.linear_values(flux), scale.unit)
-        return np.asarray(quantity.to_value(flam, u.spectral_density(u.Quantity(nm, u.nm))), np.float64)
+    if bad.size and (bad.size == nm.size or np.isfinite(flux[bad]).any()):
+        raise InputError.of("wavelength", nm[bad[0]], "a finite number", where=f"point {bad[0] + 1}")
+    # A row without wavelength or flux is not a point.
+    return np.delete(nm, bad), np.delete(flux, bad)
 
 
 def _joined(segments: list[tuple[Float, Float]], messages: list[str]) -> tuple[Float, Float]:
@@ -477,8 +460,8 @@ def _joined(segments: list[tuple[Float, Float]], messages: list[str]) -> tuple[F
         if more[0] <= nm[-1]:
             middle = (more[0] + nm[-1]) / 2
             messages.append(f"two segments overlap at {more[0]:g}-{nm[-1]:g} nm and are cut at {middle:g} nm")
-            nm, flux = nm[nm <= middle], flux[: int(np.count_nonzero(nm <= middle))]
-            more, added = more[more > middle], added[added.size - int(np.count_nonzero(more > middle)) :]
+            below, above = nm <= middle, more > middle
+            nm, flux, more, added = nm[below], flux[below], more[above], added[above]
         nm, flux = np.append(nm, more), np.append(flux, added)
     return nm, flux
 
@@ -507,8 +490,7 @@ def _merged(nm: Float, flux: Float, messages: list[str]) -> tuple[Float, Float]:
     kept, first, count = np.unique(nm, return_index=True, return_counts=True)
     total = np.add.reduceat(flux, first)
     least, most = np.minimum.reduceat(flux, first), np.maximum.reduceat(flux, first)
-    with np.errstate(invalid="ignore"):
-        unequal = int(np.count_nonzero(most - least > 1e-9 * np.abs(most)))
+    unequal = int(np.count_nonzero(most - least > 1e-9 * np.abs(most)))
     shown = f"; {unequal} of them differ in flux and are averaged" if unequal else ", equal in flux"
     messages.append(f"{int((count > 1).sum())} wavelengths that occur more than once are merged{shown}")
     return kept, np.where(count > 1, total / count, flux[first])

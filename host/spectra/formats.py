@@ -10,7 +10,6 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,34 +17,13 @@ import numpy as np
 
 from mauvecl.host.spectra.columns import AXES, Role, divided, is_unit, listed, role_of, words_of
 from mauvecl.host.spectra.conversion import ReadSpectrum, SpectrumTable, converted, spectrum_in
-from mauvecl.host.spectra.units import medium_of, stated_units
+from mauvecl.host.spectra.units import stated_units
+from mauvecl.host.tables import fits_tables, text_tables
 from mauvecl.host.tables.files import check_size, parsing, reading, without_columns
-from mauvecl.host.tables.fits_tables import (
-    FLUX_UNITS,
-    WAVE_UNITS,
-    WHOLE,
-    FitsTables,
-    is_spectrum_image,
-    is_survey_image,
-    open_fits,
-    paired_images,
-    rows_of,
-    spextool_spectra,
-    text_at,
-    unit_at,
-)
+from mauvecl.host.tables.fits_tables import FLUX_UNITS, WAVE_UNITS, FitsTables, open_fits, text_at, unit_at
 from mauvecl.host.tables.opening import Content, open_content, text_in, votables
 from mauvecl.host.tables.table import MemoryTable, Values, number_in
-from mauvecl.host.tables.text_tables import (
-    PROSE,
-    NumberLines,
-    bracketed,
-    divided_names,
-    is_described,
-    keywords_of,
-    numbered_names,
-    text_table,
-)
+from mauvecl.host.tables.text_tables import NumberLines, divided_names, keywords_of, text_table
 from mauvecl.host.tables.units import is_stated, time_in_name
 from mauvecl.schema.errors import InputError, shortened
 
@@ -84,7 +62,7 @@ def table_of_text(
     keywords = keywords_of([f"# {line}" for line, _ in lines.header])
     return SpectrumTable(
         columns, name, origin, implied_units=TEXT_UNITS, remarks=lines.comments, messages=tuple(lines.messages),
-        medium=partial(medium_of, keywords), known_roles=roles,
+        headers=(keywords,), known_roles=roles,
     )  # fmt: skip
 
 
@@ -139,7 +117,7 @@ def _with_arrays(column: Values) -> Values:
 def _names(lines: NumberLines) -> tuple[list[str], list[str]]:
     """Return the names of columns and the units below them; empty if there are none."""
     # Lines such as "column 2: flux"; columns without such a line are named by number.
-    found = numbered_names((line for line, _ in lines.header), lines.n)
+    found = text_tables.numbered_names((line for line, _ in lines.header), lines.n)
     numbered = [found.get(k, str(k + 1)) for k in range(lines.n)]
     if len(found) > 1 and _recognised(numbered):
         return numbered, []
@@ -198,8 +176,8 @@ def _of_another_length(lines: NumberLines) -> list[str]:
     """
     for line, is_comment in reversed(lines.header):
         cells = [cell.strip("\"' ") for cell in re.split(r"[,;\t|]", line)]
-        cells = cells if len(cells) > 1 else bracketed(line)
-        if not all(cells) or PROSE.search(line) or not 1 < len(cells) <= lines.n + 8:
+        cells = cells if len(cells) > 1 else text_tables.bracketed(line)
+        if not all(cells) or text_tables.PROSE.search(line) or not 1 < len(cells) <= lines.n + 8:
             continue
         kinds = [role_of(cell).kind if words_of(divided(cell)[0]) else "unknown" for cell in cells]
         if "flux" not in kinds or not any(kind in AXES for kind in kinds):
@@ -233,18 +211,12 @@ class _Reader:
 
     def tables(self) -> list[SpectrumTable]:
         """Return the tables that may have the spectrum; raise InputError if there is none."""
-        from astropy.io import fits
-
-        pairs = paired_images(self.hdus)
+        pairs = fits_tables.paired_images(self.hdus)
         if pairs:
             rows = self._row_names()
             return [self._of_pair(*pair, rows) for pair in pairs]
-        tables = [
-            self._of_table(number, hdu)
-            for number, hdu in enumerate(self.hdus)
-            if isinstance(hdu, fits.BinTableHDU | fits.TableHDU)
-        ]
-        if is_survey_image(self.hdus[0], text_at(self.primary, "TELESCOP")):
+        tables = [self._of_table(number, self.hdus[number]) for number in self.file.tables]
+        if fits_tables.is_survey_image(self.hdus[0], text_at(self.primary, "TELESCOP")):
             # SDSS keeps lines and redshifts of the spectrum in tables.
             return [self._of_image(0, self.hdus[0])]
         kinds = [{role.kind for role in table.roles} for table in tables]
@@ -277,7 +249,7 @@ class _Reader:
             label,
             FITS_UNITS,
             remarks=self._remarks(header) + more.pop("remarks", ""),
-            medium=partial(medium_of, self.primary, header),
+            headers=(self.primary, header),
             notes=(*self._notes(header), *more.pop("notes", ())),
             # LAMOST DR5, "Data production description", section 1: fluxes are calibrated relatively.
             unscaled="LAMOST calibrates fluxes relative to each other" if is_relative else "",
@@ -309,20 +281,22 @@ class _Reader:
         flux, wave = (unit_at(keys, self.primary, header) for keys in (FLUX_UNITS, WAVE_UNITS))
         whole = dict.fromkeys(("flux", "model"), flux) | dict.fromkeys(AXES, wave)
         columns = []
-        for title in map(str, hdu.columns.names):
-            column = self.file.column(number, title)
-            assert column is not None
-            role = role_of(title)
+        for column in self._columns(number):
+            role = role_of(column.name)
             own = column.unit or role.unit
             columns.append(column if own else replace(column, unit=whole.get(role.kind, "")))
         ucds = " ".join(column.ucd for column in columns if column.ucd)
         return self._table(header, columns, self._label(number, hdu), remarks=f"\n{ucds}")
 
+    def _columns(self, number: int) -> list[Values]:
+        found = [self.file.column(number, str(title)) for title in self.hdus[number].columns.names]
+        return [one for one in found if one is not None]
+
     def _images(self) -> tuple[list[SpectrumTable], list[InputError]]:
         """Return the images with an axis of wavelengths, and the faults of others."""
         images, errors = [], []
         for number, hdu in enumerate(self.hdus):
-            if is_spectrum_image(hdu):
+            if fits_tables.is_spectrum_image(hdu):
                 try:
                     images.append(self._of_image(number, hdu))
                 except InputError as error:
@@ -332,25 +306,20 @@ class _Reader:
 
     def _axis_beside(self, n: int) -> Values | None:
         """Return the only column of wavelengths in a table that has one for each of `n` pixels, or None."""
-        held = [
-            self.file.column(number, str(title))
-            for number in self.file.tables
-            for title in self.hdus[number].columns.names
-            if role_of(str(title)).kind == "wavelength"
-        ]
-        axes = [one for one in held if one is not None and np.prod(one.shape) == n]
+        held = [one for number in self.file.tables for one in self._columns(number)]
+        axes = [one for one in held if role_of(one.name).kind == "wavelength" and np.prod(one.shape) == n]
         return Values.of(axes[0].name, axes[0].numbers().ravel(), axes[0].unit) if len(axes) == 1 else None
 
     def _of_image(self, number: int, hdu: Any) -> SpectrumTable:
         header = hdu.header
-        if (found := spextool_spectra(header, hdu.data)) is not None:
+        if (found := fits_tables.spextool_spectra(header, hdu.data)) is not None:
             wave, light, orders = found
             columns = [Values.of("wavelength", wave if len(wave) > 1 else wave[0], text_at(header, "XUNITS")),
                        Values.of("flux", light if len(light) > 1 else light[0], text_at(header, "YUNITS"))]  # fmt: skip
             if int(header["NAPS"]) == 1:
                 columns.append(Values.of("order", np.array(orders)))
             return self._table(header, columns, self._label(number, hdu), row_names=orders)
-        flux, names, note = rows_of(hdu, text_at(self.primary, "TELESCOP"), bool(self.asked))
+        flux, names, note = fits_tables.rows_of(hdu, text_at(self.primary, "TELESCOP"), bool(self.asked))
         is_bare = not {"CRVAL1", "COEFF0", "PS1_0", "WAT2_001"} & {*header, *self.primary}
         axis, remarks = self._axis_beside(flux.shape[-1]) if is_bare else None, ""
         if axis is None:
@@ -371,10 +340,8 @@ class _Reader:
 
     def _row_names(self) -> tuple[str, ...]:
         """Return the targets of the rows of images, from a fibre map (DESI data model, coadd: FIBERMAP)."""
-        for hdu in self.hdus:
-            if text_at(hdu.header, "EXTNAME").upper() == "FIBERMAP" and "TARGETID" in getattr(hdu.columns, "names", ()):
-                return tuple(str(one) for one in hdu.data.field("TARGETID"))
-        return ()
+        found = self.file.named("FIBERMAP/TARGETID")
+        return () if found is None else tuple(map(str, found.cells.tolist()))
 
 
 #: Largest number and length of messages in the table of a kept star, and length of the remarks on columns.
@@ -433,14 +400,14 @@ def _tables(
 ) -> list[SpectrumTable]:
     if content.form == "FITS":
         hdus = open_fits(content.file, check=check)
-        with reading("it", WHOLE):
+        with reading("it", fits_tables.WHOLE):
             return _Reader(hdus, name, origin, asked).tables()
     if content.form == "VOTable":
         tables = enumerate(votables(content.bytes, "it"), 1)
         return [_in_memory(one, name, origin, str(one.header.get("name") or one.header.get("ID") or number))
                 for number, one in tables]  # fmt: skip
     text = text_in(content, "it")
-    if content.form == "ECSV" or is_described(text):
+    if content.form == "ECSV" or text_tables.is_described(text):
         table = MemoryTable(text_table(text, "it", commas=False), "it")
         own = table.header.get("name")
         return [_in_memory(table, own.strip()[:80] if isinstance(own, str) and own.strip() else name, origin)]
@@ -453,7 +420,7 @@ def _in_memory(file: MemoryTable, name: str, origin: str, label: str = "") -> Sp
     said = [f"{one.ucd} {one.description}" for one in columns]
     return SpectrumTable(
         columns, name, origin, label, remarks="\n".join((*_texts(file.header.get("comments")), *said))[:MAX_REMARKS],
-        medium=partial(medium_of, file.header), messages=_texts(file.header.get("told")),
+        headers=(file.header,), messages=_texts(file.header.get("told")),
     )  # fmt: skip
 
 

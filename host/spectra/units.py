@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -141,9 +141,8 @@ def measured_part(nm: Float) -> float:
     """Return the fraction of `NEEDED_NM` that wavelengths cover, without gaps."""
     if nm.size < 2:
         return 0.0
-    inside = np.clip(nm, *NEEDED_NM)
-    steps = np.diff(nm)
-    return float(np.diff(inside)[~is_gap(steps)].sum() / (NEEDED_NM[1] - NEEDED_NM[0]))
+    steps = np.diff(np.clip(nm, *NEEDED_NM))[~is_gap(np.diff(nm))]
+    return float(steps.sum() / (NEEDED_NM[1] - NEEDED_NM[0]))
 
 
 def is_gap(steps: Float) -> NDArray[np.bool_]:
@@ -215,7 +214,7 @@ _CONVERTED = tuple(
 _VACUUM = re.compile(r"(?:\b|_)vac(?:uum)?(?:\b|_)|\bvacuum", re.IGNORECASE)
 
 
-def medium_of(*headers: Mapping[str, Any]) -> Medium | None:
+def medium_of(headers: Sequence[Mapping[str, Any]]) -> Medium | None:
     """Return the medium of wavelengths that keywords of headers state, or None.
 
     Raises InputError if keywords contradict each other, or one that states the medium has another value.
@@ -261,16 +260,16 @@ def unit_and_medium(unit: str) -> tuple[str | None, Medium | None]:
 
 
 def vacuum_wavelengths(
-    nm: Float, column: str, remarks: str, given: Medium | None, keyword: Callable[[], Medium | None]
+    nm: Float, column: str, remarks: str, given: Medium | None, headers: Sequence[Mapping[str, Any]]
 ) -> tuple[Float, tuple[str, ...]]:
     """Return vacuum wavelengths, nm, and messages about them.
 
-    The medium is what the user or the unit gives, else what the name of the column says, else what the function
-    `keyword` finds in keywords, else what the remarks of the file's header say.
+    The medium is what the user or the unit gives, else what the name of the column says, else what the keywords of
+    headers say, else what the remarks of the file's header say.
     """
     messages: tuple[str, ...] = ()
     named, said = _words(column), _words(remarks)
-    medium = given or (named if named != "both" else None) or keyword() or (said if said != "both" else None)
+    medium = given or (named if named != "both" else None) or medium_of(headers) or (said if said != "both" else None)
     if medium is None and "both" in (named, said):
         messages = ("its header speaks of air and of vacuum: ASSUMED vacuum; `wavelength_unit='nm air'` says air",)
     if medium != "air":
@@ -283,7 +282,7 @@ def _words(text: str) -> Medium | Literal["both"] | None:
     for pattern, medium in _CONVERTED:
         # Wavelengths that were converted are in the second medium.
         text = pattern.sub(f" in {medium} ", text)
-    air, vacuum = bool(_AIR.search(text)), bool(_VACUUM.search(text))
+    air, vacuum = _AIR.search(text), _VACUUM.search(text)
     return "both" if air and vacuum else "air" if air else "vacuum" if vacuum else None
 
 

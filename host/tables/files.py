@@ -474,23 +474,17 @@ def check_header(lines: list[str], what: str) -> None:
         raise InputError(f"{what} must have a header of at most {MOST_HEADER} characters, not {size}", key="file")
     if not any("*" in line for line in header):
         return
-    sizes: dict[int, int] = {}
-
-    def values(node: Any) -> int:
-        # An alias repeats an object, which is counted once and multiplied.
-        if id(node) not in sizes:
-            # A node that contains itself would never end.
-            sizes[id(node)] = MOST_VALUES
-            inner = node.value if isinstance(node.value, list) else []
-            flat = [one for pair in inner for one in (pair if isinstance(pair, tuple) else (pair,))]
-            sizes[id(node)] = min(1 + sum(map(values, flat)), MOST_VALUES)
-        return sizes[id(node)]
-
     with parsing(what, "give an ECSV table"):
         root = yaml.compose("\n".join(header[1:]), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
-        unfolded = 0 if root is None else values(root)
-    if unfolded >= MOST_VALUES:
-        raise InputError(f"{what} must have a header that expands to fewer than {MOST_VALUES} values", key="file")
+    # An alias repeats a node, also one that contains itself.
+    count, waiting = 0, [root]
+    while waiting:
+        inner = getattr(waiting.pop(), "value", None)
+        for one in inner if isinstance(inner, list) else ():
+            waiting += one if isinstance(one, tuple) else (one,)
+        count += 1
+        if count + len(waiting) >= MOST_VALUES:
+            raise InputError(f"{what} must have a header that expands to fewer than {MOST_VALUES} values", key="file")
 
 
 def check_cells(lines: list[str], what: str) -> None:

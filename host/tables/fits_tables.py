@@ -34,23 +34,22 @@ DAMAGED = ("_ValidHDU", "_NonstandardHDU", "_CorruptedHDU")
 PIECE = 2**12 * BLOCK
 
 
-def check_sizes(content: FileContent) -> None:
+def check_sizes(file: IO[bytes]) -> None:
     """Raise InputError for headers whose sizes are impossible or larger than the file.
 
     astropy's reader would never end for a negative size.
     """
-    place = 0
+    place, length = 0, file.seek(0, io.SEEK_END)
     for number in range(MAX_EXTENSIONS + 1):
-        if content[place : place + 8] not in (b"SIMPLE  ", b"XTENSION"):
-            if content.size - place > MAX_AFTER:
+        if _bytes_at(file, place, place + 8) not in (b"SIMPLE  ", b"XTENSION"):
+            if length - place > MAX_AFTER:
                 # astropy would search all of it for the end of a header.
-                fault = f"it has {content.size - place} bytes after its extension {number - 1}"
+                fault = f"it has {length - place} bytes after its extension {number - 1}"
                 raise InputError(f"{fault}, but may have at most {MAX_AFTER}", key="file")
             return
         cards: dict[bytes, bytes] = {}
         at = place
-        while content[at : at + 8] != b"END     ":
-            card = content[at : at + 80]
+        while (card := _bytes_at(file, at, at + 80))[:8] != b"END     ":
             if len(card) < 80 or at - place > 80 * MAX_CARDS:
                 raise InputError(f"its header {number} has no end; {WHOLE}", key="file")
             cards.setdefault(card[:8].strip(), card[10:].split(b"/")[0].strip())
@@ -70,8 +69,8 @@ def check_sizes(content: FileContent) -> None:
         if min([extra, groups, *axes]) < 0 or abs(bits) > 64 or not 0 <= fields <= MAX_FIELDS:
             raise InputError(f"its header {number} has impossible sizes; {WHOLE}", key="file")
         size = abs(bits) // 8 * groups * (extra + math.prod(axes) if axes else 0)
-        if start + size > content.size:
-            present = max(0, content.size - start)
+        if start + size > length:
+            present = max(0, length - start)
             fault = f"it is truncated: its extension {number} must have {size} bytes, of which {present} are present"
             raise InputError(fault, key="file")
         place = start + -(-size // BLOCK) * BLOCK
@@ -85,16 +84,15 @@ def open_fits(file: IO[bytes], what: str = "", *, check: bool = True) -> fits.HD
     """
     from astropy.io import fits
 
-    content = FileContent(file)
     whole: dict[str, Any] = {"mode": "readonly", "memmap": False, "lazy_load_hdus": False}
     try:
         with reading("it", WHOLE):
-            check_sizes(content)
+            check_sizes(file)
             file.seek(0)
             hdus = fits.open(file, **whole, disable_image_compression=True)
             check_extensions(hdus)
             if check:
-                check_sums(hdus, content)
+                check_sums(hdus, file)
             if packed := [hdu for hdu in hdus if text_at(hdu.header, "ZIMAGE") == "True"]:
                 check_images(packed)
                 file.seek(0)
@@ -145,19 +143,12 @@ def check_images(packed: Sequence[Any]) -> None:
             raise InputError(f"{fault}; MAUVECL_LARGEST_CONTENT_MIB sets the limit", key="file")
 
 
-class FileContent:
-    """Bytes of a file that are read on access."""
-
-    def __init__(self, file: IO[bytes]) -> None:
-        self.file = file
-        self.size = file.seek(0, io.SEEK_END)
-
-    def __getitem__(self, part: slice) -> bytes:
-        self.file.seek(part.start)
-        return self.file.read(part.stop - part.start)
+def _bytes_at(file: IO[bytes], start: int, stop: int) -> bytes:
+    file.seek(start)
+    return file.read(stop - start)
 
 
-def check_sums(hdus: Any, content: FileContent) -> None:
+def check_sums(hdus: Any, file: IO[bytes]) -> None:
     """Raise InputError if DATASUM or CHECKSUM (FITS standard 4.0, section 4.4.2.7) contradict the bytes.
 
     The sum of all words of a header and its data is zero, as is the complement of zero, with or without DATASUM.
@@ -169,31 +160,24 @@ def check_sums(hdus: Any, content: FileContent) -> None:
             continue
         place = hdu.fileinfo()
         header, data = place["hdrLoc"], place["datLoc"]
-        data_sum = _sum(content, data, data + place["datSpan"])
-        if stated["DATASUM"].isdigit() and int(stated["DATASUM"]) % 0xFFFFFFFF != data_sum % 0xFFFFFFFF:
-            raise _damaged("DATASUM", "data are", number)
+        data_sum, key = _sum(file, data, data + place["datSpan"]), ""
+        if stated["DATASUM"].isdigit() and (int(stated["DATASUM"]) - data_sum) % 0xFFFFFFFF:
+            key = "DATASUM"
         # A blank value is that of a sum which is not defined; one of zeros is that before the sum was computed.
-        if len(stated["CHECKSUM"]) == 16 and set(stated["CHECKSUM"]) != {"0"}:
-            total = data_sum + _sum(content, header, data)
-            if total % 0xFFFFFFFF:
-                raise _damaged("CHECKSUM", "header or data are", number)
+        elif len(stated["CHECKSUM"]) == 16 and set(stated["CHECKSUM"]) != {"0"}:
+            key = "CHECKSUM" if (data_sum + _sum(file, header, data)) % 0xFFFFFFFF else ""
+        if key:
+            fault = f"it differs from its {key} in extension {number}: it is damaged or was edited"
+            remedy = "use the file as it was written, or `ignore_checksum=True` after an intended change"
+            raise InputError(f"{fault}; {remedy}", key=key)
 
 
-def _damaged(key: str, part: str, number: int) -> InputError:
-    fault = f"it differs from its {key} in extension {number}: its {part} damaged or were edited"
-    remedy = "use the file as it was written, or `ignore_checksum=True` after an intended change"
-    return InputError(f"{fault}; {remedy}", key=key)
-
-
-def _sum(content: FileContent, start: int, stop: int) -> int:
-    """Return the sum of the 32-bit words of a part of a file, with carries; see appendix J of the standard."""
+def _sum(file: IO[bytes], start: int, stop: int) -> int:
+    """Return the sum of the 32-bit words of a part of a file, whose carries appendix J of the standard adds to it."""
     total = 0
     for place in range(start, stop, PIECE):
-        part = content[place : min(place + PIECE, stop)]
-        words = np.frombuffer(part + b"\0" * (-len(part) % 4), ">u4")
-        total += int(words.sum(dtype=np.uint64))
-    while total > 0xFFFFFFFF:
-        total = (total & 0xFFFFFFFF) + (total >> 32)
+        part = _bytes_at(file, place, min(place + PIECE, stop))
+        total += int(np.frombuffer(part + b"\0" * (-len(part) % 4), ">u4").sum(dtype=np.uint64))
     return total
 
 

@@ -14,19 +14,7 @@ from typing import IO, TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from mauvecl.host.tables.files import (
-    MOST_HEADER,
-    PACKED,
-    as_text,
-    check_size,
-    limit_bytes,
-    lines_in,
-    open_regular,
-    parsing,
-    read_bytes,
-    reading,
-    unpacked,
-)
+from mauvecl.host.tables import files
 from mauvecl.host.tables.fits_tables import WHOLE, FitsTables, open_fits
 from mauvecl.host.tables.names import matched
 from mauvecl.host.tables.table import REMARKS, MemoryTable, TableFile, Values
@@ -87,7 +75,8 @@ class LargeTable(TableFile):
         found = matched(name, self.names, self.what)
         if found is None:
             return None
-        return Values(name, (self.n_rows,), lambda start, stop: self._rows(start, stop)[found],
+        # A copy, since a column of a piece would keep the whole piece.
+        return Values(name, (self.n_rows,), lambda start, stop: self._rows(start, stop)[found].copy(),
                       self.table.find(name).unit, self.what, self.row.itemsize)  # fmt: skip
 
     def _side_by_side(self, pattern: str) -> Values | None:
@@ -113,7 +102,7 @@ def _numbers(values: Values) -> bool:
 
 def _pieces(text: IO[str], what: str, commas: bool) -> Iterator[Any]:
     """Yield tables of consecutive rows, of which the first has the keywords of comments above them."""
-    lines = lines_in(text, what)
+    lines = files.lines_in(text, what)
     line = next(lines, "")
     head: list[str] = []
     size = 0
@@ -150,8 +139,8 @@ def _pieces(text: IO[str], what: str, commas: bool) -> Iterator[Any]:
 
 def _check_head(size: int, what: str) -> None:
     """Raise InputError for more than `MOST_HEADER` characters above the rows."""
-    if size > MOST_HEADER:
-        fault = f"{what} must have at most {MOST_HEADER} characters of comments and empty lines before its rows"
+    if size > files.MOST_HEADER:
+        fault = f"{what} must have at most {files.MOST_HEADER} characters of comments and empty lines before its rows"
         raise InputError(fault, key="file")
 
 
@@ -196,15 +185,15 @@ class Content:
 def open_content(path: Path, what: str, kind: str, *, large: bool = False) -> Iterator[Content]:
     """Open a file within limits of size, and recognise its form by its first bytes; see `open_table`."""
     if not large:
-        check_size(path, kind)
-    with open_regular(path, kind) as raw:
+        files.check_size(path, kind)
+    with files.open_regular(path, kind) as raw:
         start = raw.read(4096)
         raw.seek(0)
         form = form_of(start)
-        if form in ("FITS", "HDF5") or (large and form in ("text", "ECSV") and not start.startswith((*PACKED,))):
+        if form in ("FITS", "HDF5") or (large and form in ("text", "ECSV") and not start.startswith((*files.PACKED,))):
             yield Content(form, raw)
             return
-        content = unpacked(read_bytes(path, kind), what)
+        content = files.unpacked(files.read_bytes(path, kind), what)
         yield Content(form_of(content[:4096]), io.BytesIO(content))
 
 
@@ -236,9 +225,9 @@ def open_table(
     commas = bool({".csv", ".tsv"} & {suffix.lower() for suffix in path.suffixes[-2:]})
     with open_content(path, what, kind, large=large) as content:
         if content.form == "FITS":
-            check &= content.size <= limit_bytes("MAUVECL_LARGEST_FILE_MIB")
+            check &= content.size <= files.limit_bytes("MAUVECL_LARGEST_FILE_MIB")
             with open_fits(content.file, what, check=check) as hdus:
-                with reading(what, WHOLE):
+                with files.reading(what, WHOLE):
                     found = of_fits(hdus, what)
                 yield _filled(found)
         elif content.form == "HDF5" and of_hdf5 is not None:
@@ -284,7 +273,7 @@ def text_in(content: Content, what: str) -> str:
         start = whole[:4096].lstrip(b"\xef\xbb\xbf \t\r\n")[:20]
         fault = f"{what} is a page or XML that begins with {shortened(start.decode('ascii', 'replace'))}"
         raise InputError(f"{fault}, but {FORMATS}", key="file")
-    text = as_text(whole, what)
+    text = files.as_text(whole, what)
     if not text.strip():
         raise InputError(f"{what} is empty, but {FORMATS}", key="file")
     return text
@@ -296,7 +285,7 @@ def votables(content: bytes, what: str) -> Iterator[MemoryTable]:
 
     if b"<!ENTITY" in content or b"<!DOCTYPE" in content:
         raise InputError(f"{what} must be a VOTable without entities", key="file")
-    with reading(what, "give a whole VOTable"):
+    with files.reading(what, "give a whole VOTable"):
         file = votable.parse(io.BytesIO(content), verify="ignore")
     status = {info.value: info.content for part in file.resources for info in part.infos if info.name == "QUERY_STATUS"}
     if "ERROR" in status:
@@ -306,7 +295,7 @@ def votables(content: bytes, what: str) -> Iterator[MemoryTable]:
     shared = {str(one.name or one.ID): one.value for resource in file.resources for one in resource.params}
     shared |= _systems(file)
     for table in file.iter_tables():
-        with parsing(what, "give a whole VOTable"):
+        with files.parsing(what, "give a whole VOTable"):
             for field in table.fields:
                 field.name = field.name or field.ID
             read = table.to_table(use_names_over_ids=True)

@@ -104,22 +104,21 @@ class NumberLines:
         self.expected = expected
         #: Lines above the rows without their marks, and all comments, and whether each is one.
         self.header: list[tuple[str, bool]] = []
+        #: Number and text of the line of each row.
+        self.lines: list[tuple[int, str]] = []
         numbered = [(number, line) for number, line in enumerate(text.splitlines(), 1) if not _RULE.fullmatch(line)]
         comments = {number for number, line in numbered if _COMMENT.match(line) and not _BARRED.match(line)}
         start = _first_row([(number, line) for number, line in numbered if number not in comments])
-        found: list[tuple[int, str]] = []
         for number, line in numbered:
-            if number in comments and not (line.lstrip()[0] == "|" and found):
+            if number in comments and not (line.lstrip()[0] == "|" and self.lines):
                 self.header.append((_remark(line), True))
             elif number < start:
                 self.header.append((line.split("#", 1)[0].rstrip(), False))
             else:
-                found.append((number, line.split("#", 1)[0].strip()))
-        if not found:
+                self.lines.append((number, line.split("#", 1)[0].strip()))
+        if not self.lines:
             raise InputError(f"it contains no numbers, but needs two columns: {expected}", key="columns")
-        #: Number and text of the line of each row, and its cells.
-        self.lines = found
-        self.cells = self._divided([line for _, line in found])
+        self.cells = self._divided([line for _, line in self.lines])
         #: Number of columns, and whether their cells contain arrays.
         self.n = len(self.cells[0])
         self.holds_arrays = any(cell[:1] in ("(", "[") for cell in self.cells[0])
@@ -137,13 +136,8 @@ class NumberLines:
             cells = _with_points(cells)
         #: Messages on how the rows are read.
         self.messages = [DECIMAL_COMMAS] if decimal else []
-        sample = cells[:SAMPLE]
-        if (
-            mark == ","
-            and len(cells) > 1
-            and all(len(row) > 1 and re.fullmatch(r"\d+", row[1]) for row in sample)
-            and (not any("." in cell for row in sample for cell in row))
-        ):
+        are_whole = all(len(row) > 1 and row[1].isdecimal() and "." not in "".join(row) for row in cells[:SAMPLE])
+        if mark == "," and len(cells) > 1 and are_whole:
             fault = f"its line {shortened(lines[0], 60)} may hold decimal commas or columns; use decimal points"
             raise InputError(fault, key="columns")
         return cells
@@ -164,8 +158,9 @@ class NumberLines:
             except (IndexError, ValueError) as error:
                 number, line = self.lines[start + k]
                 n = "one column" if len(cells) == 1 else f"{len(cells)} columns"
-                fault = f"line {number}: {shortened(line, 60)} {'is not numeric' if len(cells) > place else f'has {n}'}"
-                raise InputError(f"{fault}, but must hold {self.expected}", key="columns") from error
+                fault = "is not numeric" if len(cells) > place else f"has {n}"
+                fault = f"line {number}: {shortened(line, 60)} {fault}, but must hold {self.expected}"
+                raise InputError(fault, key="columns") from error
         return values
 
 
@@ -184,8 +179,7 @@ def _first_row(lines: Sequence[tuple[int, str]]) -> float:
         starting.append(number)
         cells = re.split(r"[\s;|]+", line.strip())
         cells = line.split(",") if len(cells) == 1 else cells
-        below = lines[place + 1 :]
-        if below and all(map(str.isdecimal, cells)) and int(cells[0][:9]) == len(below):
+        if all(map(str.isdecimal, cells)) and int(cells[0][:9]) == len(lines) - place - 1 > 0:
             # The numbers of rows and of other columns, as in POLARBASE's spectra.
             continue
         # A line of a preamble, such as "2 columns" or "912 s", has no second number.

@@ -147,7 +147,7 @@ def _linear_unit(name: str, text: str, expected: str) -> u.UnitBase:
                 found = u.CompositeUnit(scale, [u.Unit(spelling)], [1]) if scale != 1.0 else u.Unit(spelling)
         except (ValueError, TypeError, OverflowError, RecursionError):
             continue
-        if per_wavenumber and any(found.is_equivalent(one) for one in (u.W / u.m, u.photon / u.s / u.m)):
+        if per_wavenumber and found.is_equivalent((u.W / u.m, u.photon / u.s / u.m)):
             # Per frequency, which is the wavenumber times the speed of light; astropy reduces cm-2 / cm-1 to cm-1.
             return found / u.CompositeUnit(299_792_458.0, [u.m, u.s], [1, -1])
         return found
@@ -181,16 +181,13 @@ def flux_kind(unit: Any) -> FluxKind:
     import astropy.units as u
 
     unit = linear(unit)
-    area = u.m**2
-    per_area = (u.W / area, u.photon / u.s / area)
-    densities = [one / per for one in per_area for per in (u.m, u.Hz)]
-    if any(unit.is_equivalent(one) for one in densities):
+    per_area = (u.W / u.m**2, u.photon / (u.s * u.m**2))
+    densities = tuple(one / per for one in per_area for per in (u.m, u.Hz))
+    if unit.is_equivalent(densities):
         return "density"
-    if any(unit.is_equivalent(one) for one in per_area):
+    if unit.is_equivalent(per_area):
         return "total"
-    if any((unit * u.sr).is_equivalent(one) for one in (*densities, *per_area)):
-        return "surface brightness"
-    return "other"
+    return "surface brightness" if (unit * u.sr).is_equivalent(densities + per_area) else "other"
 
 
 Float = NDArray[np.float64]

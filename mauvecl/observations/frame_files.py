@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.host.spectra.columns import words_of
-from mauvecl.host.spectra.units import medium_of, unit_and_medium, vacuum_wavelengths
+from mauvecl.host.spectra.units import unit_and_medium, vacuum_wavelengths
 from mauvecl.host.tables.files import limit_bytes, parsing, without_columns
 from mauvecl.host.tables.fits_tables import FitsTables
 from mauvecl.host.tables.names import is_magnitude, is_missing, key_of
@@ -602,7 +602,7 @@ def _vacuum_nm(wavelength: Values, given: str | None, file: TableFile) -> Float:
                 raise InputError(
                     f"{wavelength.what}: the wavelengths must be the same in every frame, but change", key="wavelength"
                 )
-    found, _ = vacuum_wavelengths(rows, wavelength.name, "", medium or in_unit, partial(medium_of, file.header))
+    found, _ = vacuum_wavelengths(rows, wavelength.name, "", medium or in_unit, (file.header,))
     return found
 
 

@@ -1,6 +1,7 @@
 """Unmodified files of the archives are read as by hand; those that are refused are in the corpus."""
 
 import csv
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,80 +15,41 @@ from refusals import refused
 from mauvecl import Instrument, Source, expect
 
 HERE = Path(__file__).parents[1] / "data" / "spectra"
+ENTRIES = tomllib.loads((CORPUS / "archive_files.toml").read_text(encoding="utf-8"))
+RIGHT, SHORT = ([pytest.param(one, id=one["file"]) for one in ENTRIES[key]] for key in ("right", "short"))
 ANGSTROM = {"wavelength_unit": "Angstrom"}
-SUN_V = -26.76  # Willmer 2018, ApJS 236, 47
 
 
-def by_hand(name: str, wavelength: str = "WAVELENGTH", flux: str = "FLUX") -> tuple[np.ndarray, np.ndarray]:
-    """Read a FITS table's columns, Angstrom and erg s-1 cm-2 A-1, by astropy alone."""
-    with fits.open(HERE / name) as hdus:
-        data = hdus[1].data
-        return np.array(data[wavelength], float), np.array(data[flux], float)
-
-
-def text_by_hand(name: str, skip: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    rows = [line.split()[:2] for line in (HERE / name).read_text().splitlines()[skip:]]
-    values = np.array(rows, float)
+def by_hand(name: str, flux: str = "FLUX", skip: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Read a file's wavelengths and fluxes, Angstrom and erg s-1 cm-2 A-1, by astropy, or as text."""
+    if ".fits" in name:
+        with fits.open(HERE / name) as hdus:
+            return np.array(hdus[1].data["WAVELENGTH"], float), np.array(hdus[1].data[flux], float)
+    text = (HERE / name).read_text()
+    if name.endswith(".csv"):
+        # Gaia's fluxes at 336 + 2 i nm, W m-2 nm-1, which are 100 erg s-1 cm-2 A-1.
+        row = next(row for row in csv.DictReader(text.splitlines()) if row["source_id"] == "4")
+        return 3360.0 + 20.0 * np.arange(343), 100.0 * np.array(row["flux"].strip("()").split(","), float)
+    values = np.array([line.split()[:2] for line in text.splitlines()[skip:]], float)
     return values[:, 0], values[:, 1]
 
 
-def gaia_by_hand(name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Read a row's fluxes at 336 + 2 i nm, W m-2 nm-1, which are 100 erg s-1 cm-2 A-1."""
-    with (HERE / name.split("[")[0]).open() as file:
-        row = next(row for row in csv.DictReader(file) if row["source_id"] == "4")
-    return 3360.0 + 20.0 * np.arange(343), 100.0 * np.array([float(one) for one in row["flux"].strip("()").split(",")])
-
-
-#: File, options, how it is read by hand, and its V by SIMBAD or the paper named above; None where it has none.
-RIGHT: list[tuple[str, dict[str, Any], Any, float | None]] = [
-    ("18sco_stis_004.fits", {}, by_hand, 5.50),
-    ("hd60753_stis_004.fits", {}, by_hand, 6.68),
-    ("bd_75d325_stis_001.fits.gz", {}, by_hand, 9.55),
-    ("sun_reference_stis_002.fits", {}, by_hand, SUN_V),
-    ("sun_kurucz93.fits", {}, by_hand, SUN_V),
-    ("10lac_stis_001.txt", ANGSTROM, text_by_hand, 4.88),
-    ("h_stis_ngsl_hd095735_v2.txtA", ANGSTROM, text_by_hand, None),
-    ("ckp00_5750.fits[g45]", {}, lambda name: by_hand(name.split("[")[0], flux="g45"), None),
-    ("vb8_stiswfcnic_004.fits", {"extend": "M3V"}, by_hand, 16.80),
-    ("wasp-96_estimate_sed.txt", ANGSTROM | {"extend": "G8V"}, lambda name: text_by_hand(name, 1), None),
-    ("ADLeo_912s.dat", {"extend": "M3V"}, lambda name: text_by_hand(name, 2), None),
-    ("XP_SAMPLED_RAW_dr3int6.csv[4]", {"extend": "K5V"}, gaia_by_hand, None),
-]
-#: Words of messages on these files.
-MESSAGES = {
-    "18sco_stis_004.fits": ["its own points cover 171.042-31891.2 nm"],
-    "sun_reference_stis_002.fits": ["its own points cover 119.5-2695.74 nm"],
-    "vb8_stiswfcnic_004.fits": [
-        "its own points cover 290.033-2497.72 nm, 82% of 200-700 nm", "113 of its 1349 points",
-        "below 290.033 nm it is continued by M3V",
-    ],
-    "10lac_stis_001.txt": ["ASSUMED: flux in erg", "merged; 11 of them differ"],
-    "h_stis_ngsl_hd095735_v2.txtA": ["130 of its 2242 points"],
-}  # fmt: skip
-REFUSED = [case["file"] for _, case in cases(CORPUS / "archive_files.toml")]
-#: Files that are read and hold less than the nominal instrument's range.
-SHORT = [
-    ("vb8_stiswfcnic_004.fits", {}, ("extend", "VB8", "290.033-2497.72", "200-700")),
-    ("ADLeo_912s.dat", {}, ("extend", "100.36-444.015", "200-700")),
-    ("wasp-96_estimate_sed.txt", ANGSTROM, ("extend", "198.005-606.715", "200-700")),
-    ("XP_SAMPLED_RAW_dr3int6.csv[6]", {}, ("extend", "DR3", "6", "336-1020")),
-]
-
-
 def test_every_file_is_tried() -> None:
-    tried = {name.split("[")[0] for name in (*REFUSED, *(entry[0] for entry in (*RIGHT, *SHORT)))}
+    held = [case for _, case in cases(CORPUS / "archive_files.toml")] + ENTRIES["right"] + ENTRIES["short"]
+    tried = {case["file"].split("[")[0] for case in held}
     assert tried == {path.name for path in HERE.iterdir() if path.suffix != ".md"}
 
 
 # Astropy, by which files are read by hand, warns of a header with null values of real columns.
 @pytest.mark.filterwarnings("ignore:Invalid keyword for column.*TNULLn")
-@pytest.mark.parametrize(("name", "options", "read", "v"), RIGHT, ids=[entry[0] for entry in RIGHT])
-def test_archive_files_are_read(name: str, options: dict[str, Any], read: Any, v: float | None) -> None:
-    star = Source.read(HERE / name, **options)
-    angstrom, flux = read(name)
+@pytest.mark.parametrize("entry", RIGHT)
+def test_archive_files_are_read(entry: dict[str, Any]) -> None:
+    options = entry.get("options", {})
+    star = Source.read(HERE / entry["file"], **options)
+    angstrom, flux = by_hand(entry["file"].split("[")[0], **entry.get("how", {}))
     assert np.isfinite(star.flux_flam).all()
-    assert all(any(words in text for text in star.messages) for words in MESSAGES.get(name, ())), star.messages
-    assert len(star.messages) == 1 or name not in ("18sco_stis_004.fits", "sun_reference_stis_002.fits")
+    assert all(any(words in text for text in star.messages) for words in entry.get("messages", ())), star.messages
+    assert len(star.messages) == entry.get("n_messages", len(star.messages))
     # Points that stand once and have a flux are there as they stand, to the rounding of the unit.
     once = np.isfinite(flux) & np.isin(angstrom, np.unique(angstrom)[np.unique(angstrom, return_counts=True)[1] == 1])
     inside = once & (angstrom > 2000.0) & (angstrom < 7000.0)
@@ -95,18 +57,18 @@ def test_archive_files_are_read(name: str, options: dict[str, Any], read: Any, v
     place = np.searchsorted(star.wavelength_nm, angstrom[inside] / 10.0 * (1 - 1e-12))
     np.testing.assert_allclose(star.wavelength_nm[place], angstrom[inside] / 10.0, rtol=1e-12)
     np.testing.assert_allclose(star.flux_flam[place], flux[inside], rtol=1e-12)
-    if v is not None:
+    if "v" in entry:
         # Zero points of V differ by 0.03 mag; the M7 dwarf varies, and catalogues with it.
-        assert star.magnitude("V") == pytest.approx(v, abs=0.15 if "extend" in options else 0.06)
+        assert star.magnitude("V") == pytest.approx(entry["v"], abs=0.15 if "extend" in options else 0.06)
     messages = expect(star.at_magnitude(8.0), Instrument.load("mauvesim"), exposure=50.0).messages
     assert all(any(text in message for message in messages) for text in star.messages)
 
 
-@pytest.mark.parametrize(("name", "options", "sentence"), SHORT, ids=[entry[0] for entry in SHORT])
-def test_short_spectra_need_an_extension(name: str, options: dict[str, Any], sentence: tuple[str, ...]) -> None:
-    star = Source.read(HERE / name, **options)
+@pytest.mark.parametrize("entry", SHORT)
+def test_short_spectra_need_an_extension(entry: dict[str, Any]) -> None:
+    star = Source.read(HERE / entry["file"], **entry.get("options", {}))
     assert any(text.startswith("its own points cover") for text in star.messages)
-    with refused(*sentence):
+    with refused(*entry["refused"]):
         expect(replace(star, unscaled=""), Instrument.load("mauvesim"), exposure=5.0)
 
 

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from astropy.io import fits
 from corpus import CORPUS, cases, written
 from refusals import refused
 
@@ -106,23 +105,3 @@ def test_damaged_files_raise_or_are_read(name: str, tmp_path: Path) -> None:
             Source.read(path)
         except InputError as error:
             assert "\n" not in str(error)  # noqa: PT017
-
-
-def test_checksums_are_verified(tmp_path: Path) -> None:
-    """Damage a byte of the data and of the header; files without checksums are read as before."""
-    path = written(CASES["spectrum_files FITS table plain fits"] | {"checksum": True}, tmp_path)
-    whole, digest = path.read_bytes(), Source.read(path).digest
-    with fits.open(path) as hdus:
-        start, header = hdus[1].fileinfo()["datLoc"], hdus[1].fileinfo()["hdrLoc"]
-    for place, key in ((start + 8 * 2 * 100 + 13, "DATASUM"), (whole.index(b"FLAM", header), "CHECKSUM")):
-        damaged = bytearray(whole)
-        damaged[place] ^= 1
-        path.write_bytes(bytes(damaged))
-        with refused(key):
-            Source.read(path)
-    without = bytearray(whole)
-    for key in (b"CHECKSUM=", b"DATASUM ="):
-        at = without.index(key, header)
-        without[at : at + 80] = b"COMMENT".ljust(80)
-    path.write_bytes(bytes(without))
-    assert Source.read(path).digest == digest
