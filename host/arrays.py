@@ -147,16 +147,9 @@ def map_in_threads(
 ) -> Generator[Answer]:
     """Apply a function to items in several threads and yield the results in the order of the items.
 
-    At most one result for each thread waits to be yielded, so that the memory stays limited.
-
-    Parameters
-    ----------
-    work : callable
-    items : iterable
-    number : int, optional
-        Number of threads, by default that of the cores, up to `MOST_THREADS`; one works in the caller's thread.
-    stop : callable, optional
-        Ends work in progress if it fails, or if its caller needs no more results; without it, that work is awaited.
+    At most one result for each thread waits to be yielded, so that the memory stays limited. The number of threads is
+    by default that of the cores, up to `MOST_THREADS`; one works in the caller's thread. `stop` ends work in progress
+    if it fails, or if its caller needs no more results; without it, that work is awaited.
     """
     number = number or min(os.cpu_count() or 1, MOST_THREADS)
     if number == 1:

@@ -137,17 +137,13 @@ def columns_of(case: Case) -> Case:
 def _text(case: Case) -> bytes:
     columns, mark, units = columns_of(case), case.get("mark", ","), case.get("units", {})
     names = [f"{name} [{units[name]}]" if name in units else name for name in columns]
-    head = mark.join(f'"{name}"' if mark in name else name for name in names)
+    head = case.get("head", mark.join(f'"{name}"' if mark in name else name for name in names))
+    if case["form"].startswith("below"):
+        head = f"{mark.join(columns)}\n{mark.join(units.get(name, '') for name in columns)}"
     cells = [["" if one is np.ma.masked else str(one) for one in column] for column in columns.values()]
     rows = map(mark.join, zip(*cells, strict=True))
     remarks = [f"# {key} = {one}" for key, one in case.get("header", {}).items()]
-    return "\n".join([*remarks, *filter(None, [case.get("head", head)]), *rows, ""]).encode()
-
-
-def _units_below(case: Case) -> bytes:
-    mark, names = case.get("mark", ","), columns_of(case)
-    below = mark.join(case["units"].get(name, "") for name in names)
-    return _text(case | {"head": f"{mark.join(names)}\n{below}"})
+    return "\n".join([*remarks, *filter(None, [head]), *rows, ""]).encode()
 
 
 def _table(case: Case) -> Table:
@@ -217,7 +213,7 @@ def _fits(case: Case) -> bytes:
     return out.getvalue()
 
 
-WRITERS = {"csv": _text, "txt": _text, "below": _units_below, "ecsv": _ecsv, "vot": _votable, "fits": _fits}
+WRITERS = {"csv": _text, "txt": _text, "below": _text, "ecsv": _ecsv, "vot": _votable, "fits": _fits}
 PACKERS = {"": bytes, "gz": gzip.compress, "bz2": bz2.compress, "xz": lzma.compress}
 
 

@@ -48,14 +48,9 @@ def table_of_text(
     if lines.holds_arrays:
         return _table_of_arrays(MemoryTable(text_table(text, "it", commas=True), "it"), name, origin)
     names, units = _names(lines)
-    columns = [
-        lines.column(k, names[k] if names else str(k + 1), units[k] if units else "")
-        for k in range(lines.n if names else max(lines.n, 2))
-    ]
-    if names:
-        roles = [role_of(one.name, one.unit) for one in columns]
-    else:
-        roles = _roles_by_number(lines.n, asked, lines.messages)
+    titles = names or [str(k + 1) for k in range(max(lines.n, 2))]
+    columns = [lines.column(k, title, units[k] if units else "") for k, title in enumerate(titles)]
+    roles = [role_of(one.name, one.unit) for one in columns] if names else _roles_by_number(lines, asked)
     if [one.name for one in columns[:2]] == ["wavelength", "flux"] and np.array_equal(columns[0].numbers(), GAIA_NM):
         roles = [replace(roles[0], unit="nm"), replace(roles[1], unit=GAIA_FLUX), *roles[2:]]
     roles = _with_units_of(lines.comments, roles, wavelength, flux, is_named=bool(names))
@@ -66,14 +61,15 @@ def table_of_text(
     )  # fmt: skip
 
 
-def _roles_by_number(n: int, asked: Sequence[str], messages: list[str]) -> list[Role]:
+def _roles_by_number(lines: NumberLines, asked: Sequence[str]) -> list[Role]:
     """Return the roles of columns without names: the first two are the spectrum, or those selected by the user."""
+    n = lines.n
     indices = [int(one) - 1 for one in asked if one.isascii() and one.isdigit() and 1 <= int(one[:6]) <= n]
     if len(indices) != len(asked) or len(indices) > 2:
         raise InputError.of("columns", asked, f"their numbers, 1 to {n}")
     if not asked and n > 2:
-        messages.append(f"the first two of its {n} columns are used, which have no names")
-    wave, value = (0, 1) if not indices else (0, indices[0]) if len(indices) == 1 else (indices[0], indices[1])
+        lines.messages.append(f"the first two of its {n} columns are used, which have no names")
+    wave, value = indices if len(indices) == 2 else (0, *(indices or [1]))
     roles = {wave: Role("wavelength", 1), value: Role("flux", 1)}
     return [roles.get(k, Role("unknown")) for k in range(max(n, 2))]
 
@@ -323,8 +319,8 @@ class _Reader:
         is_bare = not {"CRVAL1", "COEFF0", "PS1_0", "WAT2_001"} & {*header, *self.primary}
         axis, remarks = self._axis_beside(flux.shape[-1]) if is_bare else None, ""
         if axis is None:
-            found, notes = self.file.wavelengths(number)
-            axis, note, remarks = replace(found, name="wavelength"), (*notes, *note), f"\n{found.name}"
+            own, notes = self.file.wavelengths(number)
+            axis, note, remarks = replace(own, name="wavelength"), (*notes, *note), f"\n{own.name}"
         # SDSS-I/II writes erg/cm/s/Ang for erg/cm2/s/Ang.
         flux_unit = re.sub(r"erg/cm/s/", "erg/cm2/s/", unit_at(FLUX_UNITS, header, self.primary))
         columns = [axis, Values.of("flux", flux, flux_unit)]
@@ -357,23 +353,13 @@ def read_spectrum(
 ) -> ReadSpectrum:
     """Read a spectrum from text, ECSV, VOTable or FITS, which may be compressed by gzip, bzip2 or xz.
 
-    Parameters
-    ----------
-    path : Path
-        May end in words that select one of several spectra: a column, ``grid.fits[g45]``, two columns, an extension,
-        the identifier of a row, or ``row 3``. Text without stated units is in nm and erg s-1 cm-2 A-1 (the paper's
-        rule), FITS in Angstrom and erg s-1 cm-2 A-1, which `ReadSpectrum.messages` reports. ECSV and VOTable must
-        state their units.
-    wavelength_unit, flux_unit : str or Unit, optional
-        Units that override those of the file; a unit of wavelength may end in " air" or " vacuum".
-    ignore_checksum : bool
-        Whether a FITS file is read that its CHECKSUM or DATASUM contradicts.
+    The path may end in words that select one of several spectra: a column, ``grid.fits[g45]``, two columns, an
+    extension, the identifier of a row, or ``row 3``. Text without stated units is in nm and erg s-1 cm-2 A-1 (the
+    paper's rule), FITS in Angstrom and erg s-1 cm-2 A-1, which `ReadSpectrum.messages` reports; ECSV and VOTable must
+    state their units. Given units override those of the file; one of wavelength may end in " air" or " vacuum". With
+    `ignore_checksum`, a FITS file is read that its CHECKSUM or DATASUM contradicts.
     """
-    try:
-        place, asked = without_columns(path)
-    except (OSError, ValueError):
-        # `check_size` reports what is wrong with the name.
-        place, asked = Path(path), ()
+    place, asked = without_columns(path)
     check_size(place, "spectrum file")
     shown = place.name if len(place.name) <= 80 else shortened(place.name)
     units = (wavelength_unit is None, flux_unit is None)

@@ -173,23 +173,17 @@ def check_assumed_unit(values: Float, unit: str) -> None:
     if not finite.size or factor is None:
         return
     low, high = float(finite.min()), float(finite.max())
-    own = _part(low * factor, high * factor)
-    other = likely_unit(low, high, unit)
+    own, other = _part(low * factor, high * factor), likely_unit(low, high, unit)
     elsewhere = 0.0 if other is None else _part(low * _USUAL_UNITS[other], high * _USUAL_UNITS[other])
-    if own < MIN_MEASURED and other is not None:
-        fault = f"look like {other}; give their unit: `wavelength_unit={other!r}`"
-    elif other is not None and elsewhere >= max(own, 1.0 - 1e-9):
-        fault = f"cover {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm in {other} as well as in {unit}"
-        fault += f"; give their unit: `wavelength_unit={unit!r}` or `wavelength_unit={other!r}`"
-    elif own < MIN_MEASURED:
-        fault = f"would hold {own:.0%} of {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm in {unit}"
-        fault += ", but must hold at least a third: `wavelength_unit` names their unit"
-    elif low * factor < PLAUSIBLE_NM[0] or high * factor > PLAUSIBLE_NM[1]:
-        fault = f"would extend beyond {PLAUSIBLE_NM[0]:g}-{PLAUSIBLE_NM[1]:g} nm in {unit}"
-        fault += "; give their unit: `wavelength_unit` names it"
-    else:
+    is_plausible = own >= MIN_MEASURED and low * factor >= PLAUSIBLE_NM[0] and high * factor <= PLAUSIBLE_NM[1]
+    if is_plausible and (other is None or elsewhere < max(own, 1.0 - 1e-9)):
         return
-    raise InputError(f"wavelengths from {low:g} to {high:g} without a stated unit {fault}", key="wavelength_unit")
+    fault = f"wavelengths from {low:g} to {high:g} without a stated unit"
+    needed, remedy = f"of {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm", "give their unit: `wavelength_unit"
+    if other is None:
+        raise InputError(f"{fault} cover {own:.0%} {needed} in {unit}; {remedy}` names it", key="wavelength_unit")
+    fault += f" look like {other}, in which they cover {elsewhere:.0%} {needed}, and {own:.0%} in {unit}"
+    raise InputError(f"{fault}; {remedy}={other!r}` or `wavelength_unit={unit!r}`", key="wavelength_unit")
 
 
 Medium = Literal["air", "vacuum"]

@@ -16,7 +16,7 @@ import stat
 import tomllib
 import warnings
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -186,7 +186,9 @@ def lines_in(file: IO[str], what: str) -> Iterator[str]:
 
 
 #: Names of compressions and functions that open their files, by the first bytes of these.
-PACKED = {b"\x1f\x8b": ("gzip", gzip.open), b"BZh": ("bzip2", bz2.open), b"\xfd7zXZ\x00": ("xz", lzma.open)}
+PACKED: dict[bytes, tuple[str, Callable[[Any], Any]]] = {
+    b"\x1f\x8b": ("gzip", gzip.open), b"BZh": ("bzip2", bz2.open), b"\xfd7zXZ\x00": ("xz", lzma.open),
+}  # fmt: skip
 
 
 def unpacked(content: bytes, what: str) -> bytes:
@@ -365,7 +367,7 @@ def without_columns(path: str | Path) -> tuple[Path, tuple[str, ...]]:
     """
     text = str(path)
     match = re.fullmatch(r"(?s)(.+?)\[([^\[\]]*)\]", text)
-    if match is None or Path(text).is_file():
+    if match is None or os.path.isfile(text):
         return Path(text), ()
     return Path(match[1]), tuple(one.strip() for one in match[2].split(",") if one.strip())
 

@@ -491,7 +491,7 @@ class FitsTables(TableFile):
 
     def wavelengths(self, number: int) -> tuple[Values, tuple[str, ...]]:
         """Return the wavelengths of the pixels of an image, whose name may say their medium, and notes."""
-        header, notes = self.hdus[number].header, ()
+        header, notes = self.hdus[number].header, tuple[str, ...]()
         kind = text_at(header, "CTYPE1").upper()
         if kind.startswith("MULTISPE"):
             return multispec_axis(header), ()

@@ -210,17 +210,9 @@ def open_table(
 ) -> Iterator[TableFile]:
     """Open the table in a file: text, ECSV, FITS or VOTable, packed by gzip, bzip2 or xz or not.
 
-    Parameters
-    ----------
-    what, kind : str
-        The file, and the kind of file, for messages.
-    check : bool
-        Whether to verify the checksums of a FITS file that can be read whole.
-    large : bool
-        Whether the file may exceed MAUVECL_LARGEST_FILE_MIB, if it can be read in pieces.
-    of_fits, of_hdf5 : callable, optional
-        Functions that make tables of an open FITS file, by default of its first table, and of an HDF5 file; the second
-        argument is `what`.
+    For messages, `what` and `kind` are the file and its kind. A FITS file that can be read whole has its checksums
+    verified (`check`). A `large` file, which can be read in pieces, may exceed MAUVECL_LARGEST_FILE_MIB. Functions of
+    the open file and of `what` make tables of FITS (`of_fits`, by default of the first table) and HDF5 (`of_hdf5`).
     """
     commas = bool({".csv", ".tsv"} & {suffix.lower() for suffix in path.suffixes[-2:]})
     with open_content(path, what, kind, large=large) as content:

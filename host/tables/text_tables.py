@@ -481,15 +481,14 @@ def _are_dashes(row: list[str]) -> bool:
 
 def _are_units(cells: list[str], below: list[str]) -> bool:
     """Return whether the cells below the names of columns are units of the numbers below them."""
-    pairs = [(cell, number) for cell, number in zip(cells, below, strict=False) if _is_finite(number)]
-    return not any(_is_cell_of_row(cell) and not is_missing(cell) for cell in cells) and any(
-        _is_unit(in_brackets(cell)) for cell, _ in pairs
-    )
+    above = [cell for cell, number in zip(cells, below, strict=False) if _is_finite(number)]
+    is_row = any(_is_cell_of_row(cell) and not is_missing(cell) for cell in cells)
+    return not is_row and any(map(_is_unit, above))
 
 
 def _is_unit(text: str) -> bool:
     plain = in_brackets(text)
-    return is_stated(text) and (time_unit(plain) is not None or angle_unit(plain) is not None or is_known(text))
+    return is_stated(plain) and (time_unit(plain) is not None or angle_unit(plain) is not None or is_known(plain))
 
 
 #: A line on one column: ``column 2: flux``, ``(3) error``, ``column1 = HJD / Heliocentric Julian Date``.

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.tables.names import MISSING_WORDS, divided_unit, is_missing
+from mauvecl.host.tables.names import MISSING_WORDS, divided_unit, in_brackets, is_missing
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.physical import DAY_S
 
@@ -85,9 +85,7 @@ def unit_of(text: str) -> u.UnitBase | u.function.FunctionUnitBase:
     """
     import astropy.units as u
 
-    name = re.sub("[{}]", "", _LATEX.sub(" ", text.translate(_TYPOGRAPHY))).strip().strip("'\"").strip()
-    if name[:1] == "[" and name[-1:] == "]":
-        name = name[1:-1].strip()
+    name = in_brackets(re.sub("[{}]", "", _LATEX.sub(" ", text.translate(_TYPOGRAPHY))).strip().strip("'\""))
     if _AB.fullmatch(name):
         return u.ABmag
     if _ST.fullmatch(name):

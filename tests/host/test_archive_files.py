@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from astropy.io import fits
-from corpus import CORPUS, cases
+from corpus import CORPUS, cases, written
 from refusals import refused
 
 from mauvecl import Instrument, Source, expect
@@ -92,10 +92,11 @@ def test_messages_of_the_star_that_continues_a_spectrum() -> None:
         assert all(f"in M4V, {text}" in star.messages for text in noisy)
 
 
-def test_surface_or_relative_fluxes_need_a_magnitude() -> None:
+def test_surface_or_relative_fluxes_need_a_magnitude(tmp_path: Path) -> None:
     mauve = Instrument.load("mauvesim")
-    for name, options in (("ckp00_5750.fits[g45]", {}), ("h_stis_ngsl_hd095735_v2.txtA", ANGSTROM)):
-        star = Source.read(HERE / name, **options)
+    lamost = written(dict(cases(CORPUS / "surveys.toml"))["surveys LAMOST table of DR8 fits"], tmp_path)
+    model, ngsl = HERE / "ckp00_5750.fits[g45]", HERE / "h_stis_ngsl_hd095735_v2.txtA"
+    for star in (Source.read(model), Source.read(ngsl, **ANGSTROM), Source.read(lamost, extend="K5V")):
         with refused("magnitude"):
             expect(star, mauve, exposure=5.0)
         assert expect(star.at_magnitude(7.5), mauve, exposure=5.0).signal_dn.max() > 0

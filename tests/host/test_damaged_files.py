@@ -17,7 +17,6 @@ from mauvecl import InputError, Source
 
 CASES = dict(cases(CORPUS / "spectrum_files.toml"))
 PACKERS = pytest.mark.parametrize("pack", [gzip.compress, bz2.compress, lzma.compress])
-NM = np.linspace(200.0, 1100.0, 100)
 
 
 def noisy_text(n: int) -> bytes:

@@ -1,4 +1,4 @@
-"""Spectra of arrays and of tables at random, and of surveys; named cases are in tests/data/corpus.
+"""Spectra of arrays and of tables at random; named cases are in tests/data/corpus.
 
 A file is read right or refused in one sentence.
 """
@@ -13,11 +13,10 @@ import pytest
 from corpus import CORPUS, FLUX, NM, cases, per, written
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from refusals import refused
 
-from mauvecl import InputError, Instrument, Source, expect
+from mauvecl import InputError, Source
 
-CASES = dict(cases(CORPUS / "surveys.toml")) | dict(cases(CORPUS / "spectrum_files.toml"))
+CASES = dict(cases(CORPUS / "spectrum_files.toml"))
 ANGSTROM = 10 * NM
 
 
@@ -51,14 +50,6 @@ def test_units_may_be_those_of_astropy(tmp_path: Path) -> None:
 @pytest.mark.parametrize("order", [slice(None), slice(None, None, -1)])
 def test_frequencies_of_arrays_may_rise_or_fall(order: slice) -> None:
     assert is_right(Source.from_arrays((NM * u.nm).to(u.Hz, u.spectral())[order], (per("Jy") * u.Jy)[order]))
-
-
-def test_relative_fluxes_of_lamost_need_a_magnitude(tmp_path: Path) -> None:
-    star = Source.read(written(CASES["surveys LAMOST table of DR8 fits"], tmp_path), extend="K5V")
-    mauve = Instrument.load("mauvesim")
-    with refused("magnitude", "LAMOST"):
-        expect(star, mauve, exposure=5.0)
-    assert expect(star.at_magnitude(8.0), mauve, exposure=5.0).signal_dn.max() > 0
 
 
 #: Columns that are not taken for the flux.
