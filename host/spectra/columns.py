@@ -93,16 +93,11 @@ class Role:
     """Role of a column as inferred from its name, unit and UCD."""
 
     kind: Kind
-    #: Score of the name for the kind, comparable among columns of one kind.
-    score: int = 0
-    #: Base of the logarithm, "10" or "e", if the column contains logarithms; otherwise empty.
-    logarithm: str = ""
-    #: Whether the flux is multiplied by its wavelength or frequency according to the name.
-    total: bool = False
-    #: Whether a flux is one per frequency according to its name.
-    per_frequency: bool = False
-    #: Stated unit, or the unit in the name, as in ``flux_W_m2_nm`` or ``wave [nm]``.
-    unit: str | None = None
+    score: int = 0  # score of the name for the kind, comparable among columns of one kind
+    logarithm: str = ""  # base of the logarithm, "10" or "e", if the column contains logarithms; otherwise empty
+    total: bool = False  # whether the flux is multiplied by its wavelength or frequency according to the name
+    per_frequency: bool = False  # whether a flux is one per frequency according to its name
+    unit: str | None = None  # stated unit, or the unit in the name, as in ``flux_W_m2_nm`` or ``wave [nm]``
 
 
 @lru_cache(maxsize=1024)

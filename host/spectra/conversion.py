@@ -32,26 +32,18 @@ class SpectrumTable:
     columns: Sequence[Values]
     name: str
     origin: str
-    #: Name by which users select it among the tables of a file.
-    label: str = ""
+    label: str = ""  # name by which users select it among the tables of a file
     #: Units of wavelength and flux that the format implies if none is stated.
     implied_units: tuple[str, str] | None = None
-    #: Text of the header that may mention air, the star's surface or its dust.
-    remarks: str = ""
-    #: Headers whose keywords may state the medium of the wavelengths.
-    headers: Sequence[Mapping[str, Any]] = ()
+    remarks: str = ""  # text of the header that may mention air, the star's surface or its dust
+    headers: Sequence[Mapping[str, Any]] = ()  # whose keywords may state the medium of the wavelengths
     notes: tuple[str, ...] = ()
     messages: tuple[str, ...] = ()
-    #: Group; tables of the same group are parts of one spectrum.
-    group: str | None = None
-    #: Reason why fluxes need a magnitude; empty if they are those at the telescope.
-    unscaled: str = ""
-    #: Identifiers of its rows, if stored in another table.
-    row_names: Sequence[str] = ()
-    #: Format of a spectrum's name from the identifier of its row, as in ``Gaia DR3 {}``.
-    row_title: str = ""
-    #: Roles of the columns, if known from more than their names, units and descriptors.
-    known_roles: Sequence[Role] = ()
+    group: str | None = None  # tables of the same group are parts of one spectrum
+    unscaled: str = ""  # reason why fluxes need a magnitude; empty if they are those at the telescope
+    row_names: Sequence[str] = ()  # identifiers of its rows, if stored in another table
+    row_title: str = ""  # format of a spectrum's name from the identifier of its row, as in ``Gaia DR3 {}``
+    known_roles: Sequence[Role] = ()  # roles of the columns, if known from more than their names, units and descriptors
 
     @property
     def roles(self) -> Sequence[Role]:
@@ -77,8 +69,7 @@ WEIGHTS = ("dq_wgt",)
 class RawSpectrum:
     """Spectrum in the units of its file."""
 
-    #: Wavelengths and fluxes of each segment, shape (n,) each.
-    segments: list[tuple[Float, Float]]
+    segments: list[tuple[Float, Float]]  # wavelengths and fluxes of each segment, shape (n,) each
     table: SpectrumTable
     wavelength_name: str
     flux_name: str
@@ -299,10 +290,8 @@ class ReadSpectrum:
     flux_flam: Float  # shape (n,)
     name: str
     origin: str
-    #: Remarks for run records.
-    notes: tuple[str, ...] = ()
-    #: Assumptions, conversions and mergers, which answers must report.
-    messages: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # remarks for run records
+    messages: tuple[str, ...] = ()  # assumptions, conversions and mergers, which answers must report
     #: Reason why the flux is not that at the telescope, so that a magnitude is needed; otherwise empty.
     unscaled: str = ""
     #: Unit of the wavelengths in the file.

@@ -411,8 +411,7 @@ class Numbers:
     """Table of numbers."""
 
     columns: dict[str, NDArray[np.float64]]  # shape (n,) each
-    #: Units of the columns; empty for a column without one.
-    units: dict[str, str]
+    units: dict[str, str]  # units of the columns; empty for a column without one
     meta: dict[str, Any]
 
     def __getitem__(self, name: str) -> NDArray[np.float64]:

@@ -146,7 +146,6 @@ def is_magnitude(name: str) -> bool:
 #: Signs, quotes and blanks of typeset text, which are read as those of a keyboard.
 _TYPESET = str.maketrans("−–—‐‑‒﹣－＋º˚′’ʹ″”ʺ，；：ʰᵐˢᵈ", "--------+°°'''\"\"\",;:hmsd", "\u200b\u200e\u200f\ufeff")
 _NUMBER = r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?"
-_PLAIN = re.compile(_NUMBER)
 _LABEL = re.compile(r"\b(?:ra|dec|de|icrs|j2000(?:\.0)?)\b\s*[=:]?", re.IGNORECASE)
 #: Units of angles by the words of tables and users; sexagesimal forms as VizieR names them.
 ANGLES = {
@@ -228,14 +227,12 @@ def angle(text: str, unit: str = "", *, right_ascension: bool, pair: int = 3) ->
     if re.match(r"[+-]?0\d{3}", plain):
         # Hours or degrees and minutes without a mark between them, as in J0042-0300.
         raise ValueError(text)
-    if _PLAIN.fullmatch(plain):
-        # Astropy's angles take 50 us each.
-        value = float(plain) if unit in ("", "deg") else _degrees(Angle(float(plain), unit))
-    elif match := re.fullmatch(rf"({_NUMBER})\s*([a-zA-Z°'\"]+)", plain):
-        stated = angle_unit(match[2])
+    if match := re.fullmatch(rf"({_NUMBER})\s*([a-zA-Z°'\"]*)", plain):
+        stated = angle_unit(match[2]) if match[2] else unit or "deg"
         if stated is None:
             raise ValueError(text)
-        value = _degrees(Angle(float(match[1]), stated))
+        # Astropy's angles take 50 us each.
+        value = float(match[1]) if stated == "deg" else _degrees(Angle(float(match[1]), stated))
     elif re.fullmatch(r"[+-]?\d+(?::\d+){0,1}:\d+(?:\.\d*)?", plain) or (
         re.fullmatch(r"[+-]?\d+ \d+ \d+(?:\.\d*)?", plain) and pair == 3
     ):

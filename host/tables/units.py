@@ -30,15 +30,9 @@ _DENSITIES = {
     "fnu": "erg / (s cm2 Hz)",
     "photlam": "photon / (s cm2 Angstrom)",
     "photnu": "photon / (s cm2 Hz)",
-    "jy": "Jy",
-    "mjy": "mJy",
-    "ujy": "uJy",
-    "njy": "nJy",
     # As in Spextool's documentation.
     "wm-2um-1": "W / (m2 um)",
-    "jansky": "Jy",
-    "janskys": "Jy",
-}
+} | {"jansky": "Jy", "janskys": "Jy", "jy": "Jy", "mjy": "mJy", "ujy": "uJy", "njy": "nJy"}
 # Lower-case spellings and astropy's names; astropy parses A as ampere.
 _SPELLINGS = {
     "Angstrom": "a aa ang angs angstrom angstroms angstroem angstroems ångström ångströms å",
@@ -191,16 +185,8 @@ def flux_kind(unit: Any) -> FluxKind:
 Float = NDArray[np.float64]
 
 #: Epochs by name, as modified Julian dates: of TESS and Kepler (their archive manuals), GPS and Unix seconds.
-EPOCHS_MJD = {
-    "mjd": 0.0,
-    "rjd": -0.5,
-    "jd": -2_400_000.5,
-    "bjd": -2_400_000.5,
-    "btjd": 56_999.5,
-    "bkjd": 54_832.5,
-    "gps": 44_244.0,
-    "unix": 40_587.0,
-}
+EPOCHS_MJD = {"mjd": 0.0, "rjd": -0.5, "jd": -2_400_000.5, "bjd": -2_400_000.5, "btjd": 56_999.5, "bkjd": 54_832.5,
+              "gps": 44_244.0, "unix": 40_587.0}  # fmt: skip
 #: Days of Julian dates by other names: heliocentric, barycentric, and those of CoRoT (N2 data description).
 #: TJD is that of NASA (JD - 2440000.5) or of TESS.
 _DAYS = EPOCHS_MJD | {"hjd": -2_400_000.5, "gjd": -2_400_000.5, "bmjd": 0.0, "mbjd": 0.0, "hmjd": 0.0, "mhjd": 0.0,
@@ -313,14 +299,20 @@ class TimeSystem:
         if at is not None and not 0.0 <= at <= 1.0:
             raise InputError.of("TIMEPIXR", at, "between 0 and 1", where=what)
         stated = scale_of(str(header.get("TIMESYS", "")).strip())
-        epoch = _reference(header, stated if stated in SCALES.values() else "utc", what)
+        references = ((_split(header, name, what), zero) for name, zero in REFERENCES.items())
+        epoch = next((value + zero for value, zero in references if value is not None), None)
+        if epoch is None and (date := str(header.get("DATEREF", "") or "").strip()):
+            epoch = float(mjd_of([date], stated if stated in SCALES.values() else "utc", "DATEREF", what)[0])
         # The standard's default is UTC; a header without a reference time does not follow it.
         default = "utc" if any(key.startswith(("MJDREF", "DATEREF")) for key in header) else ""
         position = str(header.get("TREFPOS", "") or header.get("TIMEREF", "")).strip()
         offset = sum(_split(header, key, what) or 0.0 for key in OFFSETS)
         unit = str(header.get("TIMEUNIT", "") or "").strip()
+        # TREFDIR names two keywords, of longitude and latitude.
+        first, _, second = str(header.get("TREFDIR", "")).partition(",")
+        ra, dec = (_number(header, key.strip(), what) for key in (first, second))
         return cls(epoch, stated, "" if stated else default, position_of(position), unit, 0.5 if at is None else at,
-                   offset, _direction(header, what))  # fmt: skip
+                   offset, None if ra is None or dec is None else (ra, dec))  # fmt: skip
 
     def offset_in(self, unit: Any, what: str) -> float:
         """Return the offset in the unit of the times; raise InputError if its own unit cannot be known."""
@@ -367,22 +359,6 @@ def _split(header: Mapping[str, Any], name: str, what: str) -> float | None:
     if parts != [None, None]:
         return sum(part or 0.0 for part in parts)
     return _number(header, name, what)
-
-
-def _reference(header: Mapping[str, Any], scale: str, what: str) -> float | None:
-    for name, zero in REFERENCES.items():
-        value = _split(header, name, what)
-        if value is not None:
-            return value + zero
-    date = str(header.get("DATEREF", "") or "").strip()
-    return float(mjd_of([date], scale, "DATEREF", what)[0]) if date else None
-
-
-def _direction(header: Mapping[str, Any], what: str) -> tuple[float, float] | None:
-    """Return the direction that TREFDIR names by two keywords, of longitude and latitude."""
-    first, _, second = (part.strip() for part in str(header.get("TREFDIR", "")).partition(","))
-    ra, dec = (_number(header, key, what) for key in (first, second))
-    return None if ra is None or dec is None else (ra, dec)
 
 
 @contextmanager

@@ -67,13 +67,7 @@ def sparse(path: Path, start: bytes = b"", size: int = 8 * GIB) -> None:
         file.truncate(size)
 
 
-def fifo(path: Path) -> None:
-    path.unlink(missing_ok=True)
-    os.mkfifo(path)
-
-
 def endless(path: Path) -> None:
-    path.unlink(missing_ok=True)
     path.symlink_to("/dev/zero")
 
 
@@ -89,7 +83,7 @@ def many_comments(path: Path) -> None:
     path.write_bytes((first if first.startswith(b"#") else b"") + b"# nothing\n" * (10 * 2**20))
 
 
-REPLACED: tuple[Callable[[Path], None], ...] = (sparse, fifo, endless)
+REPLACED: tuple[Callable[[Path], None], ...] = (sparse, os.mkfifo, endless)
 ANALYSE = ("analyse", "--no-pictures", "--quiet", "--output", "out")
 TABLE = tomllib.loads((ROOT / "tests" / "data" / "hostile.toml").read_text(encoding="utf-8"))
 #: What reads a file, and what finds it at fault: the file, and the command.
@@ -116,6 +110,7 @@ def test_no_file_is_read_without_end(
     reader: str, replace: Callable[[Path], None], place: Path, fuzz: ModuleType
 ) -> None:
     file, words = (READERS | VERIFIED)[reader]
+    (place / file).unlink()
     replace(place / file)
     logged(fuzz, words, place, *((1, 2) if reader in VERIFIED else (2,)))
 
