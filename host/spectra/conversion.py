@@ -141,7 +141,7 @@ def _spectrum_of(table: SpectrumTable, asked: Sequence[str]) -> RawSpectrum:
         messages.append(f"its wavelengths are the middles of bins, from {edges}")
     chosen = [table.columns[i] for i in (*axes, light)]
     cells = [column.cells for column in chosen]
-    if _holds_arrays(cells[-1]):
+    if np.ndim(cells[-1]) > 1 or any(np.ndim(cell) > 0 for cell in cells[-1][:1]):
         rows, identifier, said = _selected_rows(table, {*axes, light}, cells, rest)
         messages += said
         if table.row_title and identifier:
@@ -172,11 +172,6 @@ def _numbers(cells: Any, name: str) -> Float:
     if np.asanyarray(cells).dtype.kind == "b":
         raise InputError(f"{name} must hold real numbers, not true and false", key=name)
     return without_indefinite(Values.of(name, cells, what="its table").numbers())
-
-
-def _holds_arrays(cells: Any) -> bool:
-    """Return whether each cell of a column contains an array."""
-    return np.ndim(cells) > 1 or (np.asarray(cells).dtype == object and len(cells) > 0 and np.ndim(cells[0]) > 0)
 
 
 def _no_such(word: str, names: Sequence[str]) -> InputError:

@@ -263,10 +263,8 @@ class _Reader:
         return "\n".join(texts)[:100_000]
 
     def _notes(self, header: Any) -> tuple[str, ...]:
-        notes = []
-        for key in ("DATAQUAL", "OFFSETPX"):
-            if value := text_at(self.primary, key) or text_at(header, key):
-                notes.append(f"{key} = {value[:60]}")
+        stated = {key: text_at(self.primary, key) or text_at(header, key) for key in ("DATAQUAL", "OFFSETPX")}
+        notes = [f"{key} = {text[:60]}" for key, text in stated.items() if text]
         if "lowlib" in self.origin.lower():
             notes.append("dereddened and at zero velocity: counts need it reddened again")
         return tuple(notes)
@@ -370,15 +368,12 @@ def read_spectrum(
             open_content(place, "it", "spectrum file") as content,
             np.errstate(all="ignore"),
         ):
-            tables = _tables(content, _stem(place.name), f"file {shown}", asked, units, not ignore_checksum)
+            # The name without the extensions of compression and format.
+            stem = re.sub(r"\.(gz|bz2|xz)$", "", place.name, flags=re.I).rsplit(".", 1)[0][:80]
+            tables = _tables(content, stem or place.name, f"file {shown}", asked, units, not ignore_checksum)
             return converted(spectrum_in(tables, asked), wavelength_unit, flux_unit)
     except InputError as error:
         raise error.within(shown) from error
-
-
-def _stem(name: str) -> str:
-    """Return a file's name without the extensions of compression and format."""
-    return re.sub(r"\.(gz|bz2|xz)$", "", name, flags=re.I).rsplit(".", 1)[0][:80] or name
 
 
 def _tables(
@@ -412,6 +407,5 @@ def _in_memory(file: MemoryTable, name: str, origin: str, label: str = "") -> Sp
 
 def _texts(given: Any) -> tuple[str, ...]:
     """Return the short texts of a list; an empty tuple for anything else."""
-    if not isinstance(given, list):
-        return ()
-    return tuple(one for one in given[:MAX_NOTES] if isinstance(one, str) and len(one) <= MAX_NOTE_LENGTH)
+    held = given[:MAX_NOTES] if isinstance(given, list) else ()
+    return tuple(one for one in held if isinstance(one, str) and len(one) <= MAX_NOTE_LENGTH)

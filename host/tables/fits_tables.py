@@ -344,8 +344,7 @@ def axis_of(header: Any, primary: Any) -> tuple[Any, str | None, str, tuple[str,
     start, step = number("CRVAL1"), number("CD1_1", "CDELT1")
     if start is None or step is None or step == 0:
         raise InputError("its image needs wavelengths of its pixels: CRVAL1, and CDELT1 or CD1_1", key="CRVAL1")
-    if number("CDELT1") is not None and number("CD1_1") is None and (scale := number("PC1_1")) is not None:
-        step *= scale
+    step *= number("PC1_1") or 1.0 if number("CD1_1") is None else 1.0
     # A missing CRPIX1 is 0 by the FITS standard, but archives' spectra without it start at their first pixel.
     reference = number("CRPIX1")
     pixel = np.arange(1, n + 1) - (1.0 if reference is None else reference)

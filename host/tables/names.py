@@ -180,13 +180,6 @@ def angle_unit(text: str) -> str | None:
     return "hourangle" if unit == u.hourangle else str(unit) if unit.is_equivalent(u.deg) else None
 
 
-def angle_unit_in_name(name: str) -> str:
-    """Return the unit in the name of a column, as in ``ra_hours`` or ``dec [rad]``; empty if there is none."""
-    base, unit = divided_unit(name)
-    tail = re.split(r"[\s_.]+", base)[1:]
-    return next((found for text in (unit, *tail[-1:]) if text and (found := angle_unit(text))), "")
-
-
 def position(text: str) -> tuple[float, float]:
     """Return right ascension and declination in degrees.
 

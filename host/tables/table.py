@@ -14,17 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.tables.names import (
-    ANGLES,
-    angle,
-    angle_unit,
-    angle_unit_in_name,
-    divided_unit,
-    first_of,
-    is_missing,
-    key_of,
-    matched,
-)
+from mauvecl.host.tables.names import ANGLES, angle, angle_unit, divided_unit, first_of, is_missing, key_of, matched
 from mauvecl.host.tables.units import time_unit, unit_of
 from mauvecl.schema.errors import InputError, printable, shortened
 
@@ -275,11 +265,9 @@ class TableFile(ABC):
         """Return the columns as a table of astropy, masked where they are undefined."""
         from astropy.table import MaskedColumn, Table
 
-        columns = []
-        for name in self.columns:
-            values = self.find(name)
-            cells = np.ma.array(values.read(0, values.n_rows), copy=True)
-            columns.append(MaskedColumn(cells, name, unit=values.unit or None))
+        found = {name: self.find(name) for name in self.columns}
+        columns = [MaskedColumn(np.ma.array(one.cells, copy=True), name, unit=one.unit or None)
+                   for name, one in found.items()]  # fmt: skip
         return Table(columns, meta=self.header)
 
     @abstractmethod
@@ -438,7 +426,10 @@ class Rows:
         if old := next(filter(_OLD_SYSTEM.search, self._system(name)), None):
             raise self.error(f"its coordinates are in {old}; use those in ICRS or FK5 of J2000", name)
         stated = getattr(self.table[name], "unit", None)
-        unit = angle_unit_in_name(name) if stated is None else angle_unit(str(stated))
+        # A name may end in a unit, as in ``ra_hours`` and ``dec [rad]``.
+        words = [divided_unit(name)[1], *re.split(r"[\s_.]+", divided_unit(name)[0])[1:][-1:]]
+        named = next((found for word in words if word and (found := angle_unit(word))), "")
+        unit = named if stated is None else angle_unit(str(stated))
         if unit is None:
             raise self.error(f"the unit of {name} must be one of angles, not {shortened(str(stated))}", name)
         return unit

@@ -3,21 +3,20 @@
 A file is read right or refused in one sentence.
 """
 
-import re
+import tomllib
 from pathlib import Path
 from typing import Any
 
 import astropy.units as u
 import numpy as np
 import pytest
-from corpus import CORPUS, FLUX, NM, cases, per, written
+from corpus import CORPUS, FLUX, NM, cases, per, value, written
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from mauvecl import InputError, Source
 
 CASES = dict(cases(CORPUS / "spectrum_files.toml"))
-ANGSTROM = 10 * NM
 
 
 def is_right(star: Source) -> bool:
@@ -52,44 +51,22 @@ def test_frequencies_of_arrays_may_rise_or_fall(order: slice) -> None:
     assert is_right(Source.from_arrays((NM * u.nm).to(u.Hz, u.spectral())[order], (per("Jy") * u.Jy)[order]))
 
 
+RANDOM = tomllib.loads((CORPUS / "spectrum_files.toml").read_text(encoding="utf-8"))["random"]
+WAVES, FLUXES = ({name: value(text) for name, text in RANDOM[key].items()} for key in ("waves", "fluxes"))
 #: Columns that are not taken for the flux.
 NOT_FLUX = [case["head"].split(",")[0] for name, case in CASES.items() if " a column that is no flux " in name]
-WAVES = {
-    "nm": NM,
-    "Wavelength (nm)": NM,
-    "wave[Angstrom]": ANGSTROM,
-    "lambda_A": ANGSTROM,
-    "log10(wave/AA)": np.log10(ANGSTROM),
-    "freq_Hz": (NM * u.nm).to_value(u.Hz, u.spectral()),
-    "wavenumber (cm-1)": 1e7 / NM,
-    "wavelength in microns": NM / 1000,
-}
-FLUXES = dict.fromkeys(("flux_flam", "flux(erg/s/cm2/A)", "Flam", "flux", "F_lambda"), FLUX) | {
-    "Flux [W/m2/nm]": FLUX / 100,
-    "log10(flux) (erg/s/cm2/A)": np.log10(FLUX),
-    "lamFlam (erg/s/cm2)": FLUX * ANGSTROM,
-    "log_flux": np.log10(FLUX),
-    "fnu_jy": per("Jy"),
-}
-EXTRAS = [*NOT_FLUX, "wave_lo", "wave_hi", "flux_2", "observed_flux", "model_flux", "w_max"]
 AT_RANDOM = settings(
     max_examples=150, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
-
-
-PROSE = """vacuum wavelengths; Fluxes calibrated; sky subtracted; error estimates; wavelength flux; V = 7.3 mag; log g
-S/N 100; wavelength calibration; resolution 5 nm; flux/continuum; best fit; A star; A0 V; W UMa; M dwarf
-Wavelengths: vacuum; Flux: erg/s/cm2/A; Wavelength: nm; units nm, FLAM; See Smith, 2003; col1 wavelength
-column 2: flux; nm flam; mean error; min max; wavelength range 170-1000 nm; HST STIS; bin width 2 nm
-no errors given; flux density; AB; redshift 0.0; x y; 2 columns; distance 10 pc; counts to flux; 912 s
-Teff 5777; wave, flux; Wavelength (nm) Flux (erg/s/cm2/A)"""
 
 
 @pytest.mark.long
 @given(
     wave=st.sampled_from(sorted(WAVES)),
     flux=st.sampled_from(sorted(FLUXES)),
-    extras=st.lists(st.tuples(st.sampled_from(EXTRAS), st.booleans()), max_size=5, unique_by=lambda one: one[0]),
+    extras=st.lists(
+        st.tuples(st.sampled_from(NOT_FLUX + RANDOM["extras"]), st.booleans()), max_size=5, unique_by=lambda one: one[0]
+    ),
     order=st.randoms(use_true_random=False),
     mark=st.sampled_from([",", "\t", " ", ";"]),
     remark=st.sampled_from(["", "# "]),
@@ -103,13 +80,13 @@ def test_any_table_is_read_correctly_or_raises(
     columns += [(name, 0.3 * k * FLUX if like else NM + 3.0 * k) for k, (name, like) in enumerate(extras, 1)]
     order.shuffle(columns)
     # Without another column of light there is nothing to ask.
-    may_raise = {"flux_2", "observed_flux", "model_flux", "w_max", "wave_lo", "wave_hi", "foo"} & {*dict(extras)}
+    may_raise = {"foo", *RANDOM["extras"]} & {*dict(extras)}
     is_right_or_raises(tmp_path, prose + remark + mark.join(dict(columns)), mark, dict(columns), bool(may_raise))
 
 
 @pytest.mark.long
 @given(
-    lines=st.lists(st.sampled_from(re.split(r"; |\n", PROSE)), min_size=1, max_size=3, unique=True),
+    lines=st.lists(st.sampled_from(RANDOM["prose"]), min_size=1, max_size=3, unique=True),
     remark=st.sampled_from(["# ", "% ", "! ", ";", ""]),
     mark=st.sampled_from([" ", "\t", ",", "  "]),
     columns=st.sampled_from([{"0": NM, "1": FLUX}, {"0": NM, "1": FLUX, "2": 0.03 * FLUX}]),
