@@ -391,7 +391,6 @@ def read_ecsv(path: str | Path, what: str, remedy: str = "give an ECSV table") -
 
 def parse_ecsv(text: str, what: str, remedy: str = "give an ECSV table") -> Table:
     """Parse ECSV text, as `read_ecsv`; `what` says where it is from."""
-    # These imports are slow and only needed here.
     from astropy.table import Table
 
     from mauvecl.host.tables.units import with_mission_formats

@@ -21,10 +21,10 @@ from mauvecl.schema.errors import InputError
 if TYPE_CHECKING:
     from astropy.io import fits
 
-#: Bytes of a block (FITS standard 4.0, section 3.1), and largest numbers of cards of a header and of extensions.
-BLOCK, MAX_CARDS, MAX_EXTENSIONS = 2880, 100_000, 1000
-#: Largest number of columns (section 7.2.1).
-MAX_FIELDS = 999
+#: Bytes of a block (FITS standard 4.0, section 3.1).
+BLOCK = 2880
+#: Largest numbers of cards of a header, of extensions and of columns (section 7.2.1).
+MAX_CARDS, MAX_EXTENSIONS, MAX_FIELDS = 100_000, 1000, 999
 #: Largest number of bytes after the last extension.
 MAX_AFTER = 2**20
 WHOLE = "give a whole FITS file"

@@ -187,7 +187,6 @@ def position(text: str) -> tuple[float, float]:
     Raises InputError for any other text, and for angles out of range.
     """
     plain = " ".join(_LABEL.sub(" ", text.translate(_TYPESET)).strip().strip("()[]").split())
-    unknown = InputError.of("target", text, EXPECTED_POSITION)
     if plain.count(",") + plain.count(";") == 1:
         parts = re.split(r"\s*[,;]\s*", plain)
     elif match := re.fullmatch(r"([^-+\s][^-+]*(?:[eE][-+]\d[^-+]*)?)\s*((?<![eE])[-+].*)", plain):
@@ -196,14 +195,12 @@ def position(text: str) -> tuple[float, float]:
         words = plain.split()
         half = len(words) // 2
         parts = [" ".join(words[:half]), " ".join(words[half:])] if len(words) in (2, 6) else []
-    if len(parts) != 2:
-        raise unknown
     try:
         ra, dec = (angle(part, right_ascension=k == 0, pair=len(parts[1 - k].split())) for k, part in enumerate(parts))
     except InputError as error:
         raise error.within(f"target = {shortened(text)}, read as right ascension and declination") from error
     except ValueError:
-        raise unknown from None
+        raise InputError.of("target", text, EXPECTED_POSITION) from None
     return ra, dec
 
 
