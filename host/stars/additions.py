@@ -62,7 +62,7 @@ def add(
     path, _ = without_columns(path)
     content = read_bytes(path, "spectrum file")
     source = Source.read(given, wavelength_unit=wavelength_unit, flux_unit=flux_unit, extend=extend)
-    check_covers(source.name, source.measured_nm or (source.wavelength_nm[0], source.wavelength_nm[-1]))
+    check_covers(source)
     name = (name or source.name).strip()
     place = _place_of(name, replace=replace)
     table = _kept_table(source)

@@ -14,6 +14,7 @@ from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from mauvecl.host.instrument.instrument import LineSpread
+    from mauvecl.host.stars.source import Source
 
 Float = NDArray[np.float64]
 
@@ -71,13 +72,12 @@ def check_measured(name: str, wavelength: Float, unit: str = "nm") -> None:
     raise InputError(f"{fault}, but needs at least a third, which `extend` can continue{meant}", key="extend")
 
 
-def check_covers(
-    name: str, span_nm: tuple[float, float], needed_nm: tuple[float, float] = NEEDED_NM, of: str = ""
-) -> None:
-    """Raise InputError if a spectrum's range does not cover that of the pixels."""
-    if span_nm[0] > needed_nm[0] or span_nm[1] < needed_nm[1]:
+def check_covers(source: Source, needed_nm: tuple[float, float] = NEEDED_NM, of: str = "") -> None:
+    """Raise InputError if the measured range of a source does not cover that of the pixels."""
+    low, high = source.measured_nm or source.wavelength_nm[[0, -1]]
+    if low > needed_nm[0] or high < needed_nm[1]:
         needed = f"at least {of}{needed_nm[0]:g}-{needed_nm[1]:g} nm"
-        fault = f"spectrum {name} must span {needed}, not {span_nm[0]:g}-{span_nm[1]:g} nm"
+        fault = f"spectrum {source.name} must span {needed}, not {low:g}-{high:g} nm"
         raise InputError(f"{fault}: `extend` continues it by a library spectrum", key="extend")
 
 
