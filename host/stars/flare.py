@@ -47,20 +47,15 @@ def with_flare(
         lines = spectrum.flux_at_telescope(grid)
         rise = photons(grid, lines, band) / star
         if rise > amplitude:
-            raise InputError(
-                f"flare amplitude must be at least {rise:g}, the rise by its lines in {band}, not {amplitude:g}",
-                key="flare_amplitude",
-            )
+            fault = f"flare amplitude must be at least {rise:g}, the rise by its lines in {band}, not {amplitude:g}"
+            raise InputError(fault, key="flare_amplitude")
         return grid, quiescent + lines + (amplitude - rise) * star / hot * body
     if ratio is None:
         return grid, quiescent + amplitude * star / hot * body
     filling = amplitude / (ratio - 1.0)
     if filling > 1.0:
-        raise InputError(
-            f"flare amplitude must be at most {ratio - 1.0:.3g} at {spectrum.describe()}, not {amplitude:g}, which "
-            f"needs {filling:.2f} of the star's disc",
-            key="flare_amplitude",
-        )
+        fault = f"flare amplitude must be at most {ratio - 1.0:.3g} at {spectrum.describe()}, not {amplitude:g}"
+        raise InputError(f"{fault}, which needs {filling:.2f} of the star's disc", key="flare_amplitude")
     return grid, quiescent * (1.0 - filling) + filling * ratio * star / hot * body
 
 
@@ -101,11 +96,8 @@ def added_light(
 def check_scales(spectrum: FlareSpectrum) -> None:
     """Raise InputError if some lines of a flare do not scale with its amplitude."""
     if spectrum.fixed_lines:
-        raise InputError(
-            f"the lines of a flare of {spectrum.describe()} must be given as a fraction of its continuum to scale "
-            "with its amplitude",
-            key="lines",
-        )
+        needed = "must be given as a fraction of its continuum to scale with its amplitude"
+        raise InputError(f"the lines of a flare of {spectrum.describe()} {needed}", key="lines")
 
 
 def _photons_in_band(
@@ -130,22 +122,17 @@ def _photons_in_band(
     if geometry == "added":
         return star, hot, None
     if photosphere_temperature_k is None:
-        raise InputError(
-            "flare geometry 'replaces' needs a photosphere temperature, in K", key="photosphere_temperature"
-        )
+        fault = "flare geometry 'replaces' needs a photosphere temperature, in K"
+        raise InputError(fault, key="photosphere_temperature")
     if not spectrum.surface or spectrum.fixed_lines:
-        raise InputError(
-            f"flare geometry must be 'added' with {spectrum.describe()}, since its surface flux is unknown",
-            key="flare_geometry",
-        )
+        fault = f"flare geometry must be 'added' with {spectrum.describe()}, since its surface flux is unknown"
+        raise InputError(fault, key="flare_geometry")
     checked(Temperature, "photosphere temperature", photosphere_temperature_k)
     ratio = hot / photons(wavelength_nm, blackbody(wavelength_nm, photosphere_temperature_k), band)
     if ratio <= 1.0:
-        raise InputError(
-            f"flare temperature must be above the {photosphere_temperature_k:g} K of the photosphere that it replaces, "
-            f"not {spectrum.describe()}",
-            key="flare_temperature",
-        )
+        photosphere = f"the {photosphere_temperature_k:g} K of the photosphere that it replaces"
+        fault = f"flare temperature must be above {photosphere}, not {spectrum.describe()}"
+        raise InputError(fault, key="flare_temperature")
     return star, hot, ratio
 
 
@@ -200,21 +187,19 @@ def flares_of(table: Table | Any, name: str = "flare table") -> QTable:
     columns = {"amplitude": (amplitude, "1"), "start": (start, "d"), "stop": (stop, "d")}
     cells = [[rows.number(held, row, unit) for held, unit in columns.values()] for row in range(rows.n)]
     # AltaiPony's tables have an empty row for a star without flares.
-    filled = [row for row, values in enumerate(cells) if any(value is not None for value in values)]
+    filled = [(row, *values) for row, values in enumerate(cells, 1) if any(value is not None for value in values)]
     if not 0 < len(filled) <= MAX_FLARES:
         raise rows.error(f"it must have 1 to {MAX_FLARES} flares, not {len(filled)}", "amplitude")
-    for row in filled:
-        value = cells[row][0]
+    for row, value, begin, end in filled:
         if value is None or not SMALLEST <= value <= LARGEST:
             given = "an empty cell" if value is None else f"{value:g}"
-            raise rows.error(f"the amplitude in row {row + 1} must be a rise above 0, not {given}", "amplitude")
-        begin, end = cells[row][1:]
+            raise rows.error(f"the amplitude in row {row} must be a rise above 0, not {given}", "amplitude")
         if begin is not None and end is not None and end < begin:
-            raise rows.error(f"row {row + 1} ends at {end:.10g} d, but must end after {begin:.10g} d", "stop")
-    flares = QTable({"amplitude": [cells[row][0] for row in filled]})
-    for place, (title, (held, unit)) in enumerate(columns.items()):
-        if place and held is not None:
-            flares[title] = np.array([cells[row][place] for row in filled], float)
+            raise rows.error(f"row {row} ends at {end:.10g} d, but must end after {begin:.10g} d", "stop")
+    flares = QTable({"amplitude": [value for _, value, *_ in filled]})
+    for place, (title, (held, unit)) in enumerate(columns.items(), 1):
+        if title != "amplitude" and held is not None:
+            flares[title] = np.array([values[place] for values in filled], float)
             flares[title].unit = unit
     flares.meta["comments"] = list(rows.unused([name for name in rows.names if name not in (amplitude, start, stop)]))
     flares["amplitude"].info.description = "relative rise above the quiescent flux, in the band of the light curve"

@@ -63,7 +63,7 @@ PIVOT_NM = 550.0
 @validated
 @dataclass(frozen=True, eq=False)
 class Source(Drawable, ContentEquality):
-    """A stellar spectrum at the telescope.
+    """A stellar spectrum at the telescope; raises InputError if the arrays do not hold one.
 
     Attributes
     ----------
@@ -88,11 +88,6 @@ class Source(Drawable, ContentEquality):
         Reason why the flux is not that at the telescope, so that a magnitude is needed; empty otherwise.
     temperature_k : float, optional
         Temperature of the photosphere, which flares with ``geometry="replaces"`` need; None if unknown.
-
-    Raises
-    ------
-    InputError
-        If the arrays do not hold such a spectrum.
 
     Examples
     --------
@@ -179,7 +174,8 @@ class Source(Drawable, ContentEquality):
         """Read a spectrum from a file of text, ECSV, VOTable or FITS.
 
         `messages` lists assumptions and changes. Undefined ends beyond 200-700 nm are dropped. Dark ends within
-        180-750 nm are continued at their level.
+        180-750 nm are continued at their level. Raises InputError if the file is missing, unreadable or holds no usable
+        spectrum, or less than a third of 200-700 nm.
 
         Parameters
         ----------
@@ -191,11 +187,6 @@ class Source(Drawable, ContentEquality):
             Library spectrum that continues the file's beyond its end, scaled to match at the join.
         ignore_checksum : bool
             Whether a FITS file is read that its CHECKSUM or DATASUM contradicts.
-
-        Raises
-        ------
-        InputError
-            If the file is missing, unreadable or holds no usable spectrum, or less than a third of 200-700 nm.
         """
         from mauvecl.host.spectra.formats import read_spectrum
 
@@ -218,10 +209,8 @@ class Source(Drawable, ContentEquality):
         messages += remarks(wavelength, flux)
         if extend is not None:
             other = cls.from_library(extend) if isinstance(extend, str) else extend
-            wavelength, flux, added = extended(
-                name, wavelength, flux, other.name, other.wavelength_nm, other.flux_flam,
-                ultraviolet=other.messages if isinstance(extend, str) else (),
-            )  # fmt: skip
+            ultraviolet = other.messages if isinstance(extend, str) else ()
+            wavelength, flux, added = extended(name, wavelength, flux, other, ultraviolet=ultraviolet)
             messages += added
         check_flux(name, wavelength, flux)
         measured = (float(wavelength[0]), float(wavelength[-1]))
@@ -358,18 +347,13 @@ class Source(Drawable, ContentEquality):
         return f"<b>{html.escape(self.name)}</b>, {span}{notes}"
 
     def magnitude(self, band: str = "V", system: bands.System = "catalogue") -> float:
-        """Return the synthetic magnitude in a band.
+        """Return the synthetic magnitude in a band; raises InputError if the measured spectrum does not cover it.
 
         Parameters
         ----------
         band : str
         system : {"catalogue", "vega", "ab"}
             The system of catalogues in the band, Vega at zero in every band, or AB.
-
-        Raises
-        ------
-        InputError
-            If the measured spectrum does not cover the band.
         """
         low, high = self.measured_nm or (0.0, np.inf)
         # Continued ends are assumptions, so they do not count.
@@ -443,6 +427,8 @@ class Source(Drawable, ContentEquality):
     def reddened(self, ebv: Reddening, *, rv: float = 3.1, law: Literal["G23", "F19", "CCM89"] = "G23") -> Self:
         """Return the star reddened by dust (needs the extra ``extinction``).
 
+        Raises InputError if the law does not cover 180-750 nm, or the extra is missing.
+
         Parameters
         ----------
         ebv : Quantity or float in mag
@@ -451,11 +437,6 @@ class Source(Drawable, ContentEquality):
             A_V / E(B-V).
         law : {"G23", "F19", "CCM89"}
             Extinction law of dust_extinction.
-
-        Raises
-        ------
-        InputError
-            If the law does not cover 180-750 nm, or the extra is missing.
         """
         try:
             from dust_extinction import parameter_averages
