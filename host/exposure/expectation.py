@@ -417,6 +417,8 @@ def expect(
 ) -> Expectation:
     """Compute the expectation of an exposure: means and noise per pixel, without drawing anything.
 
+    Raises InputError if the source does not cover the output range, or its flux has no absolute scale.
+
     Parameters
     ----------
     source : Source or str
@@ -435,11 +437,6 @@ def expect(
         Whether the signal in an S/N is the star alone, or includes the zodiacal light as in the MauveSim paper.
     neighbours : Neighbours, optional
         Other stars in the fibre; none by default.
-
-    Raises
-    ------
-    InputError
-        If the source does not cover the output range, or its flux has no absolute scale.
 
     Examples
     --------

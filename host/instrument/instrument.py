@@ -379,7 +379,7 @@ class Instrument(Section):
     def efficiency(self, wavelength_nm: Wavelengths) -> Float:
         """Return the fraction of the light that reaches the detector, without the quantum efficiency.
 
-        This is the paper's efficiency times (1 - pointing_loss).
+        This is the paper's efficiency times (1 - pointing_loss). Raises InputError outside the curves (`curves_nm`).
 
         Parameters
         ----------
@@ -388,11 +388,6 @@ class Instrument(Section):
         Returns
         -------
         ndarray, shape of `wavelength_nm`
-
-        Raises
-        ------
-        InputError
-            Outside the curves (`curves_nm`).
         """
         return self._optics(self._within(wavelength_nm, *self.curves_nm))
 

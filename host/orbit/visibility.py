@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.arrays import true_runs
-from mauvecl.host.exposure.sky import HelioEcliptic, zodiacal_brightness
+from mauvecl.host.exposure.sky import zodiacal_brightness
 from mauvecl.host.orbit import Limits, geometry
 from mauvecl.host.orbit.geometry import Bodies, Flags, TimeGrid, Vectors, unit
 from mauvecl.host.orbit.orbit import Orbit, Track
@@ -138,7 +138,7 @@ def zodiacal_light(bodies: Bodies, target: NDArray[np.float64]) -> NDArray[np.fl
     light = np.full(len(flat), np.nan)
     for k, away in enumerate(elongation_deg(bodies.sun, target)):
         with contextlib.suppress(InputError):
-            light[k] = zodiacal_brightness(HelioEcliptic(float(difference[k]), abs(latitude), float(away)))
+            light[k] = zodiacal_brightness(float(difference[k]), abs(latitude), float(away))
     return light
 
 
