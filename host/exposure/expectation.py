@@ -451,15 +451,15 @@ def expect(
     source = listed_star(source) if isinstance(source, str) else source
     instrument = instrument if isinstance(instrument, Instrument) else Instrument.load(instrument)
     sky = sky if isinstance(sky, Sky) else Sky.of_brightness(DEFAULT_SKY if sky is None else sky)
-    # The margin makes 0.1 + 0.2 s three frames of 0.1 s despite rounding.
-    n_frames = max(1, int(np.ceil(exposure / instrument.frame_s * (1 - 1e-12))))
-    if n_frames > MAX_FRAMES:
-        raise InputError.of("exposure", exposure, f"at most {MAX_FRAMES} frames of {instrument.frame_s:g} s", unit="s")
+    n_frames = _whole_frames(exposure, instrument.frame_s)
     source = _usable(source, instrument)
     zodiacal = sky.spectrum(instrument.field_of_view_arcsec2)
     electrons = _electrons_per_frame(source, instrument, order)
     nothing = np.zeros(electrons.shape)
     near = nothing if neighbours is None else instrument.frame_s * neighbours.electrons_per_second(instrument, order)
+    asked: dict[str, str] = {"order": order, "signal": signal, "requested exposure": f"{exposure:g} s"}
+    asked["exposure"] = f"{n_frames} x {instrument.frame_s:g} s"
+    asked |= {} if neighbours is None else neighbours.provenance(instrument)
     x = Expectation(
         **_detector(instrument),
         source_electrons=_faint_enough(np.maximum(electrons, 0.0), source.name),
@@ -468,24 +468,23 @@ def expect(
         n_frames=n_frames,
         signal=signal,
         name=source.name,
-        provenance=_provenance(source, instrument, sky, zodiacal)
-        | {
-            "order": order,
-            "signal": signal,
-            "requested exposure": f"{exposure:g} s",
-            "exposure": f"{n_frames} x {instrument.frame_s:g} s",
-        }
-        | ({} if neighbours is None else neighbours.provenance(instrument)),
+        provenance=_provenance(source, instrument, sky, zodiacal) | asked,
     )
     drawn = np.sqrt(x.variance_dn2) / (n_frames * x.gain_dn_per_electron)
-    messages = (
-        *_saturation(x),
-        *(f"{source.name}: {text}." for text in source.messages),
-        *(() if neighbours is None else neighbours.messages(source.name, instrument)),
-        *negative_means_message(source, instrument, electrons, drawn, order),
-        *_remarks(x, exposure, source, instrument),
-    )
-    return replace(x, messages=messages)
+    messages = [*_saturation(x), *(f"{source.name}: {text}." for text in source.messages)]
+    messages += [] if neighbours is None else neighbours.messages(source.name, instrument)
+    messages += negative_means_message(source, instrument, electrons, drawn, order)
+    messages += _remarks(x, exposure, source, instrument)
+    return replace(x, messages=tuple(messages))
+
+
+def _whole_frames(exposure_s: float, frame_s: float) -> int:
+    """Return the number of frames of an exposure, rounded up; raises InputError if they are too many."""
+    # The margin makes 0.1 + 0.2 s three frames of 0.1 s despite rounding.
+    n_frames = max(1, int(np.ceil(exposure_s / frame_s * (1 - 1e-12))))
+    if n_frames > MAX_FRAMES:
+        raise InputError.of("exposure", exposure_s, f"at most {MAX_FRAMES} frames of {frame_s:g} s", unit="s")
+    return n_frames
 
 
 def _electrons_per_frame(light: Source, instrument: Instrument, order: Order) -> Float:
