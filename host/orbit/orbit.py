@@ -415,8 +415,8 @@ def _from_simbad(text: str, name: str | None) -> Target:
     star = {name: value if value == value else None for name, value in records(table)[0].items()}
     if star["ra"] is None or star["dec"] is None:
         raise InputError(f"target {shortened(text)} has no coordinates in SIMBAD; give another name", key="target")
-    distance = 1000 / star["plx_value"] if (star["plx_value"] or 0.0) > 0 else None
-    kind = (star["sp_type"] or "").strip() or None
+    parallax, kind = star["plx_value"], (star["sp_type"] or "").strip() or None
+    distance = 1000 / parallax if parallax is not None and parallax > 0 else None
     return Target(name or text.strip(), star["ra"], star["dec"], "SIMBAD", distance, star["V"], kind)
 
 
