@@ -38,15 +38,14 @@ FILE_VERSION = 2
 MAX_EXTENDED = 16
 
 
-def read_values(
+def read_entries(
     path: Path, files: Mapping[str, type[Curve | PixelMap | ThroughputErrors]]
-) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return the values and sources of a file, completed by those of the file that it extends.
+) -> dict[str, tuple[Any, str]]:
+    """Return the values and sources of a file, merged over those of the file that it extends.
 
     Values of the classes in `files` may be paths, relative to their file.
     """
-    values: dict[str, Any] = {}
-    sources: dict[str, str] = {}
+    entries: dict[str, tuple[Any, str]] = {}
     for _ in range(MAX_EXTENDED):
         content = toml(read_text(path, "instrument file"), f"instrument file {shortened(str(path))}")
         version, extended = content.pop("version", None), content.pop("extends", None)
@@ -55,11 +54,9 @@ def read_values(
         if "sources" in content:
             fault = f"{path.name}: unknown key 'sources'; give each value's source in the value's own table"
             raise InputError(fault, key="sources")
-        for name, entry in content.items():
-            if name not in values:
-                values[name], sources[name] = _entry(name, entry, path, files.get(name))
+        entries = {name: _entry(name, entry, path, files.get(name)) for name, entry in content.items()} | entries
         if extended is None:
-            return values, sources
+            return entries
         if version is None and extended == "mauve":
             extended = FORMERLY_MAUVE
             warnings.warn(
@@ -88,8 +85,10 @@ def _entry(
         source = f"{tag}: {entry.get('source', f'no source in {path.name}')}"
         entry = entry["value"]
     if kind is not None and isinstance(entry, str):
-        entry = kind.read(path.parent / entry)
-        source = entry.source
+        read = kind.read(path.parent / entry)
+        return read, read.source
+    if kind is Curve and isinstance(entry, int | float) and not isinstance(entry, bool):
+        return Curve.flat(float(entry), source), source
     return entry, source
 
 
@@ -243,13 +242,17 @@ class Instrument(Section):
             Values by name: Quantities, or plain numbers in the unit of the name. A curve may be a `Curve`, a path or
             one number.
         """
-        changed = Instrument.build({**dict(self), **changes}, self.name)
+        changed = Instrument.build({**self._values(), **changes}, self.name)
         marks = {name: "U: set by the user" for name in changes if name not in LABELS}
         for name, given in changes.items():
             if isinstance(given, str | Path) and isinstance(curve := getattr(changed, name), Curve):
                 marks[name] = curve.source
         sources = {**self.sources, **changes.get("sources", {}), **marks}
         return changed.model_copy(update={"sources": sources})
+
+    def _values(self) -> dict[str, Any]:
+        # Iterating over the instrument would yield its cached properties as well.
+        return {name: getattr(self, name) for name in type(self).model_fields}
 
     @model_validator(mode="after")
     def _consistent(self) -> Instrument:
@@ -472,7 +475,7 @@ class Instrument(Section):
         """SHA-256 of all values that affect a measurement, so without names and sources."""
         values = {
             name: (value.wavelength_nm, value.value) if isinstance(value, Curve) else value
-            for name, value in self
+            for name, value in self._values().items()
             # Files without a calibration keep the digest that they had before there was one.
             if name not in LABELS and not (name.startswith("throughput_") and not value)
         }
@@ -493,9 +496,10 @@ class Instrument(Section):
 
 def _from_file(name: str | Path) -> Instrument:
     path = instrument_path(name, Path())
-    values, sources = read_values(path, FILES)
-    own_sources = {name: source for name, source in sources.items() if name not in LABELS}
-    return Instrument.build({**values, "sources": own_sources}, path.name)
+    entries = read_entries(path, FILES)
+    values: dict[str, Any] = {name: value for name, (value, _) in entries.items()}
+    values["sources"] = {name: source for name, (_, source) in entries.items() if name not in LABELS}
+    return Instrument.build(values, path.name)
 
 
 _embedded = cache(_from_file)

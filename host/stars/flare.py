@@ -24,14 +24,13 @@ Float = NDArray[np.float64]
 
 
 def with_flare(
-    wavelength_nm: Float,
+    nm: Float,
     flux_flam: Float,
-    *,
     amplitude: float,
     spectrum: FlareSpectrum,
     band: str,
     geometry: Geometry,
-    photosphere_temperature_k: float | None,
+    photosphere_k: float | None,
 ) -> tuple[Float, Float]:
     """Return wavelengths and flux of a flaring star, each of shape (n,); the spectrum may need more wavelengths.
 
@@ -40,8 +39,9 @@ def with_flare(
     amplitude, N are photons in the band and R is the ratio of the surface fluxes of flare and photosphere there.
     """
     checked(Amplitude, "flare amplitude", amplitude)
-    star, hot, ratio = _photons_in_band(wavelength_nm, flux_flam, spectrum, band, geometry, photosphere_temperature_k)
-    grid, quiescent = _on_grid(wavelength_nm, flux_flam, spectrum)
+    light = added_light(nm, flux_flam, spectrum, band, geometry, photosphere_k)
+    star, hot, ratio = light.star, light.flare, light.ratio
+    grid, quiescent = _on_grid(nm, flux_flam, spectrum)
     body = spectrum.flux(grid)
     if spectrum.fixed_lines:
         lines = spectrum.flux_at_telescope(grid)
@@ -59,38 +59,29 @@ def with_flare(
     return grid, quiescent * (1.0 - filling) + filling * ratio * star / hot * body
 
 
-def _on_grid(wavelength_nm: Float, flux_flam: Float, spectrum: FlareSpectrum) -> tuple[Float, Float]:
+def _on_grid(nm: Float, flux_flam: Float, spectrum: FlareSpectrum) -> tuple[Float, Float]:
     """Return wavelengths that resolve both star and flare, and the star's flux there."""
-    grid = spectrum.grid(wavelength_nm)
-    return grid, flux_flam if grid is wavelength_nm else np.interp(grid, wavelength_nm, flux_flam)
+    grid = spectrum.grid(nm)
+    return grid, flux_flam if grid is nm else np.interp(grid, nm, flux_flam)
 
 
 @dataclass(frozen=True)
 class AddedLight:
     """Light that a flare of amplitude 1 adds to a star: `hot` times its spectrum less `lost` of the star."""
 
-    hot: float  # multiple of the flare spectrum's flux
-    lost: float  # share of the star's own light
+    star: float  # photons of the star in the band in which the amplitude is measured
+    flare: float  # photons of the flare's spectrum there
+    ratio: float | None = None  # surface flux of the flare there over that of the photosphere that it replaces
 
+    @property
+    def hot(self) -> float:
+        """Multiple of the flare spectrum's flux."""
+        return (1.0 if self.ratio is None else self.ratio / (self.ratio - 1.0)) * self.star / self.flare
 
-def added_light(
-    wavelength_nm: Float,
-    flux_flam: Float,
-    *,
-    spectrum: FlareSpectrum,
-    band: str,
-    geometry: Geometry,
-    photosphere_temperature_k: float | None,
-) -> AddedLight:
-    """Return the light of a flare of amplitude 1, with the arguments and errors of `with_flare`.
-
-    `with_flare` adds it times the amplitude, whose largest value it checks. Lines must scale with the amplitude.
-    """
-    check_scales(spectrum)
-    star, hot, ratio = _photons_in_band(wavelength_nm, flux_flam, spectrum, band, geometry, photosphere_temperature_k)
-    if ratio is None:
-        return AddedLight(star / hot, 0.0)
-    return AddedLight(ratio / (ratio - 1.0) * star / hot, 1.0 / (ratio - 1.0))
+    @property
+    def lost(self) -> float:
+        """Share of the star's own light."""
+        return 0.0 if self.ratio is None else 1.0 / (self.ratio - 1.0)
 
 
 def check_scales(spectrum: FlareSpectrum) -> None:
@@ -100,19 +91,14 @@ def check_scales(spectrum: FlareSpectrum) -> None:
         raise InputError(f"the lines of a flare of {spectrum.describe()} {needed}", key="lines")
 
 
-def _photons_in_band(
-    wavelength_nm: Float,
-    flux_flam: Float,
-    spectrum: FlareSpectrum,
-    band: str,
-    geometry: Geometry,
-    photosphere_temperature_k: float | None,
-) -> tuple[float, float, float | None]:
-    """Return photons in the band in which amplitudes are measured, of the star and of the flare's spectrum.
+def added_light(
+    nm: Float, flux_flam: Float, spectrum: FlareSpectrum, band: str, geometry: Geometry, photosphere_k: float | None
+) -> AddedLight:
+    """Return the light of a flare of amplitude 1, without lines of a fixed flux; see `with_flare`.
 
-    The last value is the ratio of the surface fluxes of flare and photosphere; None if no photosphere is replaced.
+    `with_flare` adds it times the amplitude, whose largest value it checks.
     """
-    grid, quiescent = _on_grid(wavelength_nm, flux_flam, spectrum)
+    grid, quiescent = _on_grid(nm, flux_flam, spectrum)
     star = photons(grid, quiescent, band)
     if not star > 0.0:
         raise InputError(f"the star must have light in the band {band}, but has none", key="band")
@@ -120,20 +106,20 @@ def _photons_in_band(
     if not hot > 0.0:
         raise InputError(f"the flare, {spectrum.describe()}, needs light in the band {band} to be scaled", key="band")
     if geometry == "added":
-        return star, hot, None
-    if photosphere_temperature_k is None:
+        return AddedLight(star, hot)
+    if photosphere_k is None:
         fault = "flare geometry 'replaces' needs a photosphere temperature, in K"
         raise InputError(fault, key="photosphere_temperature")
     if not spectrum.surface or spectrum.fixed_lines:
         fault = f"flare geometry must be 'added' with {spectrum.describe()}, since its surface flux is unknown"
         raise InputError(fault, key="flare_geometry")
-    checked(Temperature, "photosphere temperature", photosphere_temperature_k)
-    ratio = hot / photons(wavelength_nm, blackbody(wavelength_nm, photosphere_temperature_k), band)
+    checked(Temperature, "photosphere temperature", photosphere_k)
+    ratio = hot / photons(nm, blackbody(nm, photosphere_k), band)
     if ratio <= 1.0:
-        photosphere = f"the {photosphere_temperature_k:g} K of the photosphere that it replaces"
+        photosphere = f"the {photosphere_k:g} K of the photosphere that it replaces"
         fault = f"flare temperature must be above {photosphere}, not {spectrum.describe()}"
         raise InputError(fault, key="flare_temperature")
-    return star, hot, ratio
+    return AddedLight(star, hot, ratio)
 
 
 #: Names of the column of the relative rise above the quiescent flux; AltaiPony's first.

@@ -404,25 +404,12 @@ class Source(Drawable, ContentEquality):
         """
         light = Blackbody(temperature) if spectrum is None else spectrum
         photosphere = self.temperature_k if photosphere_temperature is None else photosphere_temperature
-        nm, flux = with_flare(
-            self.wavelength_nm,
-            self.flux_flam,
-            amplitude=amplitude,
-            spectrum=light,
-            band=band,
-            geometry=geometry,
-            photosphere_temperature_k=photosphere,
-        )
+        nm, flux = with_flare(self.wavelength_nm, self.flux_flam, amplitude, light, band, geometry, photosphere)
         title = f"flare of {100 * amplitude:g} % in {bands.band(band).name} at {light.describe()}, {geometry}"
         if geometry == "replaces":
             title += f" photosphere of {photosphere:g} K"
-        return replace(
-            self,
-            wavelength_nm=nm,
-            flux_flam=flux,
-            history=(*self.history, title),
-            messages=(*self.messages, *light.messages),
-        )
+        history, messages = (*self.history, title), (*self.messages, *light.messages)
+        return replace(self, wavelength_nm=nm, flux_flam=flux, history=history, messages=messages)
 
     def reddened(self, ebv: Reddening, *, rv: float = 3.1, law: Literal["G23", "F19", "CCM89"] = "G23") -> Self:
         """Return the star reddened by dust (needs the extra ``extinction``).
