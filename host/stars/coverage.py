@@ -209,6 +209,14 @@ def attached(values: Float, more: Float | float, before: bool) -> Float:
     return np.append(more, values) if before else np.append(values, more)
 
 
+def supplemented(nm: Float, others: Float, apart_nm: float) -> Float:
+    """Return wavelengths supplemented by those others within their range that are not next to one of them."""
+    inside = others[(others > nm[0]) & (others < nm[-1])]
+    after = np.searchsorted(nm, inside)
+    alone = np.minimum(nm[after] - inside, inside - nm[after - 1]) > apart_nm
+    return np.union1d(nm, inside[alone]) if alone.any() else nm
+
+
 def means(wavelength: Float, flux: Float, edges: Float) -> Float:
     """Return the mean fluxes between edges of a piecewise linear flux, shape (n_edge - 1,)."""
     grid = np.union1d(wavelength, edges)

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from mauvecl.host.arrays import ContentEquality, array_cache, set_read_only
 from mauvecl.host.spectra.units import NEEDED_NM
 from mauvecl.host.stars.bands import ANGSTROM
-from mauvecl.host.stars.coverage import attached, check_points
+from mauvecl.host.stars.coverage import attached, check_points, supplemented
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range, Unit, number
@@ -110,12 +110,8 @@ class FlareSpectrum:
 
     def grid(self, wavelength_nm: Float) -> Float:
         """Return wavelengths supplemented by the nodes of the spectrum, nm."""
-        nodes = self.nodes_nm
-        inside = nodes[(nodes > wavelength_nm[0]) & (nodes < wavelength_nm[-1])]
         # A node next to a wavelength would only add rounding errors.
-        after = np.searchsorted(wavelength_nm, inside)
-        alone = np.minimum(wavelength_nm[after] - inside, inside - wavelength_nm[after - 1]) > SAME_NM
-        return np.union1d(wavelength_nm, inside[alone]) if alone.any() else wavelength_nm
+        return supplemented(wavelength_nm, self.nodes_nm, SAME_NM)
 
     def describe(self) -> str:
         """Return the spectrum in a few words."""

@@ -25,6 +25,7 @@ from mauvecl.host.stars.coverage import (
     extended,
     means,
     remarks,
+    supplemented,
     without_undefined_ends,
 )
 from mauvecl.host.stars.flare import Geometry, with_flare
@@ -285,13 +286,8 @@ class Source(Drawable, ContentEquality):
         own = spectrum.waveset
         if own is None:
             raise InputError(f"{name} defines no wavelengths; use a spectrum with a waveset", key="spectrum")
-        grid = np.arange(160.0, 1150.0, 0.5)
-        nm = np.unique(own.to_value(u.nm))
-        inside = grid[(grid > nm[0]) & (grid < nm[-1])]
-        # A grid point within 1e-3 nm of one of the spectrum's own adds no information.
-        at = np.searchsorted(nm, inside)
-        alone = np.minimum(inside - nm[at - 1], nm[at] - inside) > 1e-3
-        grid = np.union1d(nm, inside[alone])
+        # A point of the grid within 1e-3 nm of one of the spectrum's own adds no information.
+        grid = supplemented(np.unique(own.to_value(u.nm)), np.arange(160.0, 1150.0, 0.5), 1e-3)
         flux = spectrum(grid * u.nm, flux_unit=FLAM).value
         return cls.from_arrays(grid, flux, name=name, origin=f"synphot {type(spectrum).__name__}")
 
