@@ -96,7 +96,7 @@ def test_coarse_spectrum_is_continued_from_its_last_point_if_asked() -> None:
         ObservedFlare.from_arrays(*coarse)
     flare = ObservedFlare.from_arrays(*coarse, continue_at_k=8000.0)
     assert flare.measured_nm == (150.0, 500.0)
-    assert "8000 K continues it" in flare.messages[0]
+    assert "8000 K continues it" in flare.messages[-1]
     far = blackbody(np.array([500.0, flare.wavelength_nm[-1]]), 8000.0)
     assert flare.flux_flam[-1] == pytest.approx(3.0 * far[1] / far[0])
 
