@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -42,20 +42,20 @@ MAX_FRAMES = 2**24
 #: Definition of the signal: the star alone ("net"), or the star and the zodiacal light, as in the MauveSim paper.
 Signal = Literal["net", "paper"]
 
+#: Origins of noise: name, heading and description of their columns.
+ORIGINS = (
+    ("source_photon", "source photons", "photon noise of the star, rms"),
+    ("zodiacal_photon", "zodiacal photons", "photon noise of the zodiacal light, rms"),
+    ("neighbour_photon", "neighbours' photons", "photon noise of neighbours in the fibre, rms"),
+    ("dark", "dark", "noise of the dark current, rms"),
+    ("read", "read", "read noise, rms"),
+    ("total", "total", "all of them in quadrature, without the ADC's rounding"),
+)
 #: Columns of the table of noise by origin.
 BUDGET_COLUMNS = (
     Column("wavelength", unit="nm", description="vacuum wavelength, the middle of the pixel or element", heading="nm",
            format=".1f"),
-    Column("source_photon", unit="DN", description="photon noise of the star, rms", heading="source photons",
-           format=".2f"),
-    Column("zodiacal_photon", unit="DN", description="photon noise of the zodiacal light, rms",
-           heading="zodiacal photons", format=".2f"),
-    Column("neighbour_photon", unit="DN", description="photon noise of neighbours in the fibre, rms",
-           heading="neighbours' photons", format=".2f"),
-    Column("dark", unit="DN", description="noise of the dark current, rms", heading="dark", format=".2f"),
-    Column("read", unit="DN", description="read noise, rms", heading="read", format=".2f"),
-    Column("total", unit="DN", description="all of them in quadrature, without the ADC's rounding", heading="total",
-           format=".2f"),
+    *(Column(name, unit="DN", description=text, heading=heading, format=".2f") for name, heading, text in ORIGINS),
 )  # fmt: skip
 
 
@@ -359,20 +359,15 @@ class Expectation(Drawable, ContentEquality):
         n, gain = self.n_frames, self.gain_dn_per_electron
         # Fraction of the light that saturation leaves.
         passed = np.divide(self.recorded_light_dn, self.light_dn, out=np.ones_like(gain), where=self.light_dn > 0)
-        variances = {
-            "source_photon": n * gain**2 * self.source_electrons * passed,
-            "zodiacal_photon": n * gain**2 * self.sky_electrons * passed,
-            "neighbour_photon": n * gain**2 * self.neighbour_electrons * passed,
-            "dark": n * self.dark_variance_dn2,
-            "read": n * self.read_noise_dn**2,
-            "total": self._noise_dn2,
-        }
-        noise = {name: np.sqrt(variance) for name, variance in variances.items()}
-        about = {"exposure_s": self.exposure_s, "name": self.name}
+        light = self.source_electrons, self.sky_electrons, self.neighbour_electrons
+        variances = [n * gain**2 * electrons * passed for electrons in light]
+        variances += [n * self.dark_variance_dn2, n * self.read_noise_dn**2, self._noise_dn2]
+        noise = {name: np.sqrt(variance) for (name, *_), variance in zip(ORIGINS, variances, strict=True)}
         columns = [
             column for column in BUDGET_COLUMNS if column.name != "neighbour_photon" or self.neighbour_electrons.any()
         ]
-        return table_of(columns, [{"wavelength": self.wavelength_nm} | noise], **about)
+        row = {"wavelength": self.wavelength_nm} | noise
+        return table_of(columns, [row], exposure_s=self.exposure_s, name=self.name)
 
     @property
     def ceiling_dn(self) -> float:
@@ -400,15 +395,8 @@ class Expectation(Drawable, ContentEquality):
 #: Largest electrons or DN per pixel and frame, far beyond any detector.
 MAX_PER_FRAME = 1e12
 #: Arrays with one value per pixel, from 0 to `MAX_PER_FRAME`.
-PER_PIXEL = (
-    "source_electrons",
-    "sky_electrons",
-    "neighbour_electrons",
-    "dark_dn",
-    "bias_dn",
-    "read_noise_dn",
-    "gain_dn_per_electron",
-)
+PER_PIXEL = ("source_electrons", "sky_electrons", "neighbour_electrons", "dark_dn", "bias_dn", "read_noise_dn",
+             "gain_dn_per_electron")  # fmt: skip
 
 
 def _ratio(signal: Float, variance: Float) -> Float:
@@ -429,6 +417,8 @@ def expect(
 ) -> Expectation:
     """Compute the expectation of an exposure: means and noise per pixel, without drawing anything.
 
+    Raises InputError if the source does not cover the output range, or its flux has no absolute scale.
+
     Parameters
     ----------
     source : Source or str
@@ -448,11 +438,6 @@ def expect(
     neighbours : Neighbours, optional
         Other stars in the fibre; none by default.
 
-    Raises
-    ------
-    InputError
-        If the source does not cover the output range, or its flux has no absolute scale.
-
     Examples
     --------
     >>> from mauvecl import Instrument, Sky, Source, expect
@@ -466,31 +451,40 @@ def expect(
     source = listed_star(source) if isinstance(source, str) else source
     instrument = instrument if isinstance(instrument, Instrument) else Instrument.load(instrument)
     sky = sky if isinstance(sky, Sky) else Sky.of_brightness(DEFAULT_SKY if sky is None else sky)
-    # The margin makes 0.1 + 0.2 s three frames of 0.1 s despite rounding.
-    n_frames = max(1, int(np.ceil(exposure / instrument.frame_s * (1 - 1e-12))))
-    if n_frames > MAX_FRAMES:
-        raise InputError.of("exposure", exposure, f"at most {MAX_FRAMES} frames of {instrument.frame_s:g} s", unit="s")
+    n_frames = _whole_frames(exposure, instrument.frame_s)
     source = _usable(source, instrument)
     zodiacal = sky.spectrum(instrument.field_of_view_arcsec2)
-    near = None
-    provenance = _provenance(source, instrument, sky, zodiacal) | {
-        "order": order,
-        "signal": signal,
-        "requested exposure": f"{exposure:g} s",
-        "exposure": f"{n_frames} x {instrument.frame_s:g} s",
-    }
-    if neighbours is not None:
-        near = instrument.frame_s * neighbours.electrons_per_second(instrument, order)
-        provenance |= neighbours.provenance(instrument)
     electrons = _electrons_per_frame(source, instrument, order)
-    sky_electrons = None if zodiacal is None else _electrons_per_frame(zodiacal, instrument, order)
-    plain = _expected(instrument, n_frames, electrons, sky_electrons, near, source.name, signal, provenance)
-    messages = [*_saturation(plain), *(f"{source.name}: {text}." for text in source.messages)]
-    if neighbours is not None:
-        messages += neighbours.messages(source.name, instrument)
-    drawn = np.sqrt(plain.variance_dn2) / (n_frames * plain.gain_dn_per_electron)
+    nothing = np.zeros(electrons.shape)
+    near = nothing if neighbours is None else instrument.frame_s * neighbours.electrons_per_second(instrument, order)
+    asked: dict[str, str] = {"order": order, "signal": signal, "requested exposure": f"{exposure:g} s"}
+    asked["exposure"] = f"{n_frames} x {instrument.frame_s:g} s"
+    asked |= {} if neighbours is None else neighbours.provenance(instrument)
+    x = Expectation(
+        **_detector(instrument),
+        source_electrons=_faint_enough(np.maximum(electrons, 0.0), source.name),
+        sky_electrons=nothing if zodiacal is None else _electrons_per_frame(zodiacal, instrument, order).clip(0.0),
+        neighbour_electrons=_faint_enough(near, "a neighbour"),
+        n_frames=n_frames,
+        signal=signal,
+        name=source.name,
+        provenance=_provenance(source, instrument, sky, zodiacal) | asked,
+    )
+    drawn = np.sqrt(x.variance_dn2) / (n_frames * x.gain_dn_per_electron)
+    messages = [*_saturation(x), *(f"{source.name}: {text}." for text in source.messages)]
+    messages += [] if neighbours is None else neighbours.messages(source.name, instrument)
     messages += negative_means_message(source, instrument, electrons, drawn, order)
-    return replace(plain, messages=(*messages, *_remarks(plain, exposure, source, instrument)))
+    messages += _remarks(x, exposure, source, instrument)
+    return replace(x, messages=tuple(messages))
+
+
+def _whole_frames(exposure_s: float, frame_s: float) -> int:
+    """Return the number of frames of an exposure, rounded up; raises InputError if they are too many."""
+    # The margin makes 0.1 + 0.2 s three frames of 0.1 s despite rounding.
+    n_frames = max(1, int(np.ceil(exposure_s / frame_s * (1 - 1e-12))))
+    if n_frames > MAX_FRAMES:
+        raise InputError.of("exposure", exposure_s, f"at most {MAX_FRAMES} frames of {frame_s:g} s", unit="s")
+    return n_frames
 
 
 def _electrons_per_frame(light: Source, instrument: Instrument, order: Order) -> Float:
@@ -499,45 +493,24 @@ def _electrons_per_frame(light: Source, instrument: Instrument, order: Order) ->
     return rate * instrument.frame_s * instrument.per_pixel("response", 1.0)
 
 
-def _expected(
-    instrument: Instrument, n_frames: int, source: Float, sky: Float | None, near: Float | None,
-    name: str, signal: Signal, provenance: Mapping[str, str],
-) -> Expectation:  # fmt: skip
-    """Return the expectation of some frames.
-
-    Parameters
-    ----------
-    source, sky, near : ndarray, shape (n_pixel,)
-        Mean electrons of a frame from the source, the sky and neighbours; those below zero count as zero.
-    """
-    element, element_wavelength = _elements(instrument)
-    nothing = np.zeros(instrument.wavelength_nm.size)
-    return Expectation(
-        wavelength_nm=instrument.wavelength_nm,
-        source_electrons=_faint_enough(np.maximum(source, 0.0), name),
-        sky_electrons=nothing if sky is None else np.maximum(sky, 0.0),
-        dark_dn=instrument.per_pixel("dark", instrument.dark_dn_per_s * instrument.frame_s),
-        dark_unit=instrument.dark_unit,
-        bias_dn=instrument.per_pixel("bias_dn", instrument.bias_dn),
-        read_noise_dn=instrument.per_pixel("read_noise_dn", instrument.read_noise_dn),
-        gain_dn_per_electron=instrument.per_pixel("gain", instrument.gain_dn_per_electron),
-        n_frames=n_frames,
-        frame_s=instrument.frame_s,
-        element=element,
-        element_wavelength_nm=element_wavelength,
-        photon_noise=instrument.photon_noise,
-        signal=signal,
-        adc_max_dn=instrument.adc_max_dn,
-        saturation_dn=instrument.saturation_dn,
-        neighbour_electrons=nothing if near is None else _faint_enough(near, "a neighbour"),
-        conditions={
-            key: getattr(instrument, key)
-            for key in ("temperature_c", "dark_slope_per_c", "light_loss", "pointing_loss")
-        },
-        name=name,
-        instrument=instrument.name,
-        provenance=provenance,
-    )
+def _detector(instrument: Instrument) -> dict[str, Any]:
+    """Return the fields of an expectation that follow from the instrument alone."""
+    same = ("wavelength_nm", "dark_unit", "frame_s", "photon_noise", "adc_max_dn", "saturation_dn")
+    conditions = ("temperature_c", "dark_slope_per_c", "light_loss", "pointing_loss")
+    width = instrument.resolution_element_nm
+    bins = np.floor((instrument.wavelength_nm - instrument.output_min_nm) / width)
+    # An array that starts above the output range leaves the first bins empty.
+    held, element = np.unique(bins, return_inverse=True)
+    return {name: getattr(instrument, name) for name in same} | {
+        "dark_dn": instrument.per_pixel("dark", instrument.dark_dn_per_s * instrument.frame_s),
+        "bias_dn": instrument.per_pixel("bias_dn", instrument.bias_dn),
+        "read_noise_dn": instrument.per_pixel("read_noise_dn", instrument.read_noise_dn),
+        "gain_dn_per_electron": instrument.per_pixel("gain", instrument.gain_dn_per_electron),
+        "element": element.astype(np.int32),
+        "element_wavelength_nm": instrument.output_min_nm + (held + 0.5) * width,
+        "conditions": {name: getattr(instrument, name) for name in conditions},
+        "instrument": instrument.name,
+    }
 
 
 def _provenance(source: Source, instrument: Instrument, sky: Sky, zodiacal: Source | None) -> dict[str, str]:
@@ -557,34 +530,26 @@ def _provenance(source: Source, instrument: Instrument, sky: Sky, zodiacal: Sour
     }
 
 
-def _remarks(x: Expectation, exposure: float, source: Source, instrument: Instrument) -> list[str]:
-    """Return messages on signal and exposure, and on what source and instrument assume."""
-    messages: list[str] = []
+def _remarks(x: Expectation, exposure: float, source: Source, instrument: Instrument) -> Iterator[str]:
+    """Yield messages on signal and exposure, and on what source and instrument assume."""
     if x.signal == "paper" and x.sky_electrons.any():
-        messages.append(Message("S/N counts the zodiacal light as signal, as the MauveSim paper does.", "paper signal"))
-    if x.n_frames * x.frame_s > exposure * (1 + 1e-9):
-        text = (
-            f"The exposure of {exposure:g} s is rounded up to {x.exposure_s:g} s, "
-            f"{x.n_frames} frame{'s' if x.n_frames > 1 else ''} of {x.frame_s:g} s."
-        )
-        messages.append(Message(text, "rounded up"))
+        yield Message("S/N counts the zodiacal light as signal, as the MauveSim paper does.", "paper signal")
+    if x.exposure_s > exposure * (1 + 1e-9):
+        frames = f"{x.n_frames} frame{'s' if x.n_frames > 1 else ''} of {x.frame_s:g} s"
+        text = f"The exposure of {exposure:g} s is rounded up to {x.exposure_s:g} s, {frames}."
+        yield Message(text, "rounded up")
     if any(note.startswith("dereddened") for note in source.notes) and not any("redden" in h for h in source.history):
-        messages.append(
+        yield (
             f"{source.name} was dereddened by its archive: it is brighter in the ultraviolet than as observed, unless "
             "it is reddened again (ebv)."
         )
-    if instrument.notice:
-        messages.append(instrument.notice)
-    if source.scale:
-        messages.append(source.scale)
-    return messages
+    yield from filter(None, (instrument.notice, source.scale))
 
 
 def _usable(source: Source, instrument: Instrument) -> Source:
     """Return a source with continued ends; raises InputError unless it covers the output range and has a scale."""
-    low, high = instrument.output_min_nm, instrument.output_max_nm
-    first, last = source.measured_nm or (float(source.wavelength_nm[0]), float(source.wavelength_nm[-1]))
-    check_covers(source.name, (first, last), (low, high), f"{instrument.name}'s output range ")
+    needed_nm = (instrument.output_min_nm, instrument.output_max_nm)
+    check_covers(source, needed_nm, f"{instrument.name}'s output range ")
     check_level(source, source.name, "magnitude")
     return continued_to_reach(source, instrument)
 
@@ -599,15 +564,6 @@ def continued_to_reach(source: Source, instrument: Instrument) -> Source:
     if not messages:
         return source
     return replace(source, wavelength_nm=nm, flux_flam=flux, messages=(*source.messages, *messages))
-
-
-def _elements(instrument: Instrument) -> tuple[NDArray[np.int32], Float]:
-    """Return each pixel's resolution element, and the centres of those that hold a pixel."""
-    width = instrument.resolution_element_nm
-    bins = np.floor((instrument.wavelength_nm - instrument.output_min_nm) / width)
-    # An array that starts above the output range leaves the first bins empty.
-    held, element = np.unique(bins, return_inverse=True)
-    return element.astype(np.int32), instrument.output_min_nm + (held + 0.5) * width
 
 
 #: Fraction of exposures with a clipped frame from which a message reports it.
@@ -630,31 +586,29 @@ def _safe_frame_s(x: Expectation) -> float:
     return float(np.floor(x.longest_safe_frame_s * 1000) / 1000)
 
 
-def _saturation(x: Expectation) -> tuple[str, ...]:
+def _saturation(x: Expectation) -> list[str]:
     """Return the message on saturation, if any."""
-    cut = x.cut_share
-    touched = float(-np.expm1(x.n_frames * np.sum(np.log1p(-np.minimum(cut, 1 - 1e-16)))))
+    touched = float(-np.expm1(x.n_frames * np.sum(np.log1p(-np.minimum(x.cut_share, 1 - 1e-16)))))
     if not x.saturated.any() and touched < REPORTED_CLIPPING:
-        return ()
+        return []
     safe_s = _safe_frame_s(x)
     flares = [text for text in x.provenance.get("source history", "").split("; ") if text.startswith("flare")]
     name = f"{x.name} with a {flares[-1].removesuffix(', added')}" if flares else x.name
-    if not x.saturated.any():
-        text = (
-            f"SATURATED at times: pixels of {name} come near {x.ceiling_dn:.0f} DN, and reach it in "
-            f"{100 * touched:.3g} % of exposures; in frames of up to {safe_s:g} s none does on average."
-        )
-        return (Message(text, "saturated"),)
-    # First and last wavelength of each run of saturated pixels.
-    runs = [f"{x.wavelength_nm[a]:.1f}-{x.wavelength_nm[b - 1]:.1f}" for a, b in true_runs(x.saturated)]
-    where = ", ".join(runs)
-    if len(runs) > MOST_RUNS:
-        where = f"{len(runs)} intervals between {runs[0].partition('-')[0]} and {runs[-1].partition('-')[2]}"
     text = (
-        f"SATURATED: {int(x.saturated.sum())} of {x.saturated.size} pixels of {name} at {where} nm reach "
-        f"{x.ceiling_dn:.0f} DN in a {x.frame_s:g} s frame; the longest safe frame is {safe_s:g} s."
+        f"SATURATED at times: pixels of {name} come near {x.ceiling_dn:.0f} DN, and reach it in "
+        f"{100 * touched:.3g} % of exposures; in frames of up to {safe_s:g} s none does on average."
     )
-    return (Message(text, "saturated"),)
+    if x.saturated.any():
+        # First and last wavelength of each run of saturated pixels.
+        runs = [f"{x.wavelength_nm[a]:.1f}-{x.wavelength_nm[b - 1]:.1f}" for a, b in true_runs(x.saturated)]
+        where = ", ".join(runs)
+        if len(runs) > MOST_RUNS:
+            where = f"{len(runs)} intervals between {runs[0].partition('-')[0]} and {runs[-1].partition('-')[2]}"
+        text = (
+            f"SATURATED: {int(x.saturated.sum())} of {x.saturated.size} pixels of {name} at {where} nm reach "
+            f"{x.ceiling_dn:.0f} DN in a {x.frame_s:g} s frame; the longest safe frame is {safe_s:g} s."
+        )
+    return [Message(text, "saturated")]
 
 
 def _faint_enough(electrons: Float, name: str) -> Float:

@@ -29,17 +29,8 @@ from mauvecl.schema.errors import InputError, shortened, shown
 Float = NDArray[np.float64]
 
 #: Names of columns: those of the Gaia archive, astroquery, VizieR and CDS X-Match, and plain ones.
-SEPARATIONS = (
-    "separation",
-    "separation_arcsec",
-    "sep",
-    "sep_arcsec",
-    "angdist",
-    "dstarcsec",
-    "target_separation (deg)",
-    "dist",
-    "_r",
-)
+SEPARATIONS = ("separation", "separation_arcsec", "sep", "sep_arcsec", "angdist", "dstarcsec",
+               "target_separation (deg)", "dist", "_r")  # fmt: skip
 #: Columns of magnitudes, with their bands; the first that a row has counts. Gmag is Gaia's in VizieR.
 MAGNITUDES = {"magnitude": "", "mag": "", "v": "V", "vmag": "V", "flux_v": "V", "phot_g_mean_mag": "Gaia G",
               "gmag": "Gaia G"}  # fmt: skip
@@ -96,11 +87,7 @@ class _Neighbours(Rows):
         """Columns of magnitudes, and their bands."""
         held = [(self.first((name,)), name, band) for name, band in MAGNITUDES.items()]
         # Gmag is Gaia's in VizieR, gmag that of other surveys.
-        return [
-            (column, band)
-            for column, name, band in held
-            if column is not None and not (name == "gmag" and column != "Gmag")
-        ]
+        return [(column, band) for column, name, band in held if column and (name != "gmag" or column == "Gmag")]
 
     @cached_property
     def band(self) -> str | None:
@@ -126,20 +113,16 @@ class _Neighbours(Rows):
             return self._from_positions(ra, dec, own, target), ()
         name = self.first(SEPARATIONS)
         if name is None:
-            columns = f"{self.named} has the columns {shown(', '.join(self.names), 300)}"
-            if ra is None:
-                raise InputError(f"{columns}, but needs separation (arcsec), or ra and dec", key="neighbours")
-            raise InputError(
-                f"{columns} and no position of the star itself, but needs separation (arcsec), or star.neighbours_of: "
-                "the star's own row by name, or its coordinates",
-                key="neighbours_of",
-            )
+            fault = f"{self.named} has the columns {shown(', '.join(self.names), 300)}"
+            needed, key = "separation (arcsec), or ra and dec", "neighbours"
+            if ra is not None:
+                fault += " and no position of the star itself"
+                own_place = "star.neighbours_of: the star's own row by name, or its coordinates"
+                needed, key = f"separation (arcsec), or {own_place}", "neighbours_of"
+            raise InputError(f"{fault}, but needs {needed}", key=key)
         if target is not None and own is None:
-            raise InputError(
-                f"{self.named} has no row named {shortened(target)}, and no positions; give the name of a row, which "
-                "is then left out",
-                key="neighbours_of",
-            )
+            fault = f"{self.named} has no row named {shortened(target)}, and no positions"
+            raise InputError(f"{fault}; give the name of a row, which is then left out", key="neighbours_of")
         return self._stated(name)
 
     def _stated(self, name: str) -> tuple[Float, tuple[str, ...]]:
@@ -151,11 +134,9 @@ class _Neighbours(Rows):
         degrees = key == "dist" and not stated
         values = np.array([self._given(name, row, self.number(name, row, "arcsec")) for row in range(self.n)])
         values *= 3600.0 if degrees else 1.0
-        negative = ~(values >= 0)
-        if negative.any():
+        if (negative := ~(values >= 0)).any():
             row = int(np.argmax(negative))
-            text = self.text(name, row)
-            raise self.error(f"{name} in row {row + 1} must be 0 or above, not {text}", name)
+            raise self.error(f"{name} in row {row + 1} must be 0 or above, not {self.text(name, row)}", name)
         note = f"Separations are the column {name} of {self.named}, read as degrees since it states no unit."
         return values, (note,) if degrees else ()
 
@@ -180,9 +161,7 @@ def _coordinates(text: str, named: str) -> tuple[float, float]:
     try:
         place = parse_position(text)
     except InputError as error:
-        raise InputError(
-            f"{named} has no row named {shortened(text)}, and it is not a position; give the name of the star's own "
-            "row, or coordinates such as '290.68 +11.12'",
-            key="neighbours_of",
-        ) from error
+        fault = f"{named} has no row named {shortened(text)}, and it is not a position"
+        remedy = "give the name of the star's own row, or coordinates such as '290.68 +11.12'"
+        raise InputError(f"{fault}; {remedy}", key="neighbours_of") from error
     return float(place.ra.rad), float(place.dec.rad)

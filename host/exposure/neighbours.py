@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache
 from pathlib import Path
@@ -57,35 +56,32 @@ class Neighbour:
             nearest = nearest_spectrum(self.spectral_type)
             return nearest, f"of type {self.spectral_type}: {nearest}, the nearest type of the library"
         if self.temperature_k is not None:
-            nearest, kelvin = _nearest(_temperatures(), np.log(self.temperature_k))
-            text = f"of {self.temperature_k:.0f} K: {nearest} ({np.exp(kelvin):.0f} K), the nearest of the library"
-            return nearest, text
+            wanted = self.temperature_k
+            nearest, (kelvin, _) = min(_typical().items(), key=lambda item: abs(np.log(item[1][0] / wanted)))
+            return nearest, f"of {wanted:.0f} K: {nearest} ({kelvin:.0f} K), the nearest of the library"
         if self.bp_rp is not None:
-            nearest, colour = _nearest(_colours(), self.bp_rp)
-            text = f"of BP - RP = {self.bp_rp:.2f}: {nearest} ({colour:.2f}), the nearest colour of the library"
-            return nearest, text
-        raise InputError(
-            f"neighbour {self.name}, {self.separation_arcsec:.3g} arcsec away, needs a spectral type, spectrum file, "
-            "temperature or colour, since its light enters the fibre",
-            key="neighbours",
-        )
+            wanted = self.bp_rp
+            nearest, (_, colour) = min(_typical().items(), key=lambda item: abs(item[1][1] - wanted))
+            return nearest, f"of BP - RP = {wanted:.2f}: {nearest} ({colour:.2f}), the nearest colour of the library"
+        needed = "needs a spectral type, spectrum file, temperature or colour, since its light enters the fibre"
+        raise InputError(f"{self._place} {needed}", key="neighbours")
+
+    @property
+    def _place(self) -> str:
+        return f"neighbour {self.name}, {self.separation_arcsec:.3g} arcsec away"
 
     @cached_property
     def source(self) -> Source:
         """Spectrum at the telescope. Raises InputError if spectrum or magnitude is unknown."""
         name, _ = self.spectrum
         if self.magnitude is None and self.file is None:
-            raise InputError(
-                f"neighbour {self.name}, {self.separation_arcsec:.3g} arcsec away, needs a magnitude, since its light "
-                "enters the fibre",
-                key="neighbours",
-            )
+            raise InputError(f"{self._place}, needs a magnitude, since its light enters the fibre", key="neighbours")
         star = Source.from_library(name) if self.file is None else Source.read(self.file)
         if self.magnitude is not None:
             try:
                 star = star.at_magnitude(self.magnitude, known_band(self.band))
             except InputError as error:
-                raise error.within(f"neighbour {self.name}, {self.separation_arcsec:.3g} arcsec away") from error
+                raise error.within(self._place) from error
         check_level(star, f"neighbour {self.name}", "neighbours")
         return star
 
@@ -130,17 +126,14 @@ class Neighbours:
         beyond = f"{_stars(outside)} beyond {'does' if outside == 1 else 'do'} not enter"
         if not inside:
             return [f"NEIGHBOURS of {target}: none within {radius:g} arcsec; {beyond}.", *self.notes]
-        names = ", ".join(
-            f"{neighbour.name} at {neighbour.separation_arcsec:.3g} arcsec" for neighbour in inside[:MOST_NAMED]
-        )
+        named = [f"{star.name} at {star.separation_arcsec:.3g} arcsec" for star in inside[:MOST_NAMED]]
         more = len(inside) - MOST_NAMED
         text = (
             f"NEIGHBOURS of {target}: the light of {_stars(len(inside))} within {radius:g} arcsec is in the fibre "
-            f"({names}{f' and {more} more' if more > 0 else ''}); assumption: {100 * self.share:g} % of it enters"
+            f"({', '.join(named)}{f' and {more} more' if more > 0 else ''}); assumption: {100 * self.share:g} % of it "
+            "enters"
         )
-        chosen = [
-            f"Light of {neighbour.name}, {neighbour.spectrum[1]}." for neighbour in inside if neighbour.spectrum[1]
-        ]
+        chosen = [f"Light of {star.name}, {star.spectrum[1]}." for star in inside if star.spectrum[1]]
         if len(chosen) > MOST_NAMED:
             chosen = [*chosen[:MOST_NAMED], f"Spectra of {len(chosen) - MOST_NAMED} more neighbours are chosen alike."]
         same = [
@@ -167,25 +160,10 @@ def _stars(n: int) -> str:
     return "1 star" if n == 1 else f"{n} stars"
 
 
-def _nearest(values: Sequence[tuple[str, float]], wanted: float) -> tuple[str, float]:
-    return min(values, key=lambda colour: abs(colour[1] - wanted))
-
-
 @cache
-def _typical() -> list[Source]:
-    """Return the embedded spectra that represent a spectral type."""
-    named = [
-        str(row["name"]) for row in library_table() if row["kept"] == "embedded" and row["name"] == row["spectral_type"]
-    ]
-    return [Source.from_library(name) for name in named]
-
-
-def _temperatures() -> list[tuple[str, float]]:
-    """Return the logarithms of the temperatures of typical spectra."""
-    return [(star.name, float(np.log(star.temperature_k))) for star in _typical() if star.temperature_k is not None]
-
-
-@cache
-def _colours() -> list[tuple[str, float]]:
-    """Return the Gaia colours BP - RP of typical spectra, by synthetic photometry."""
-    return [(star.name, star.magnitude("Gaia BP") - star.magnitude("Gaia RP")) for star in _typical()]
+def _typical() -> dict[str, tuple[float, float]]:
+    """Return temperature and synthetic Gaia colour BP - RP of the embedded spectra that represent a spectral type."""
+    rows = [row for row in library_table() if row["kept"] == "embedded" and row["name"] == row["spectral_type"]]
+    stars = [Source.from_library(str(row["name"])) for row in rows]
+    colours = [star.magnitude("Gaia BP") - star.magnitude("Gaia RP") for star in stars]
+    return {star.name: (star.temperature_k or np.nan, colour) for star, colour in zip(stars, colours, strict=True)}

@@ -80,9 +80,8 @@ def electrons_per_second(
     nodes = _nodes(wavelength_nm)
     flux = np.asarray(flux_flam, np.float64)
     if flux.shape != nodes.shape:
-        raise InputError(
-            f"flux needs one value per wavelength, but has {flux.size} values for {nodes.size} wavelengths", key="flux"
-        )
+        fault = f"flux needs one value per wavelength, but has {flux.size} values for {nodes.size} wavelengths"
+        raise InputError(fault, key="flux")
     if nodes.size <= MATRIX_NODES:
         return cast(Float, response_matrix(instrument, nodes, order) @ flux)
     # Efficiencies act at the wavelength of the light, or else at that of the pixel.
@@ -127,7 +126,8 @@ def _efficiencies(instrument: Instrument) -> Float:
 @lru_cache(maxsize=24)
 def _line_landing(line: LineSpread, knots: tuple[float, ...]) -> csr_array:
     """Return the fraction of the light at each panel node that falls on each pixel, shape (n_pixel, n_panel_node)."""
-    nodes = _panel_nodes(line.panel_edges(np.array(knots)))
+    edges = line.panel_edges(np.array(knots))
+    nodes = np.ravel(edges[:-1, None] + np.diff(edges)[:, None] * (1 + leggauss(PANEL_NODES)[0]) / 2)
     centres = np.array(line.centres)
     first = np.searchsorted(nodes, centres - line.reach)
     count = np.searchsorted(nodes, centres + line.reach) - first
@@ -199,12 +199,6 @@ def _legendre_to_lagrange() -> Float:
     return np.asarray((degree[:, None] + 0.5) * legvander(x, PANEL_NODES - 1).T * weight)
 
 
-def _panel_nodes(edges: Float) -> Float:
-    """Return the Gauss-Legendre nodes of all panels in order, shape (n_panel * PANEL_NODES,)."""
-    x, _ = leggauss(PANEL_NODES)
-    return np.asarray(edges[:-1, None] + np.diff(edges)[:, None] * (1 + x) / 2).ravel()
-
-
 def _knots(by_light: Instrument | None) -> tuple[float, ...]:
     """Return the wavelengths at which the instrument's curves make the integrand's slope jump."""
     return by_light.knots_nm if by_light else ()
@@ -213,9 +207,8 @@ def _knots(by_light: Instrument | None) -> tuple[float, ...]:
 def _nodes(wavelength_nm: ArrayLike) -> Float:
     nodes = np.ascontiguousarray(wavelength_nm, np.float64)
     if nodes.ndim != 1 or nodes.size < 2 or not np.isfinite(nodes).all() or not (np.diff(nodes) > 0).all():
-        raise InputError(
-            "a spectrum must have at least two finite, strictly increasing wavelengths, in nm", key="wavelength_nm"
-        )
+        fault = "a spectrum must have at least two finite, strictly increasing wavelengths, in nm"
+        raise InputError(fault, key="wavelength_nm")
     return nodes
 
 
@@ -255,12 +248,10 @@ def negative_means_message(
     worst = int(np.argmin(electrons + MAX_SIGMA_BELOW_ZERO * error))
     nm = instrument.wavelength_nm
     if electrons[worst] < -MAX_SIGMA_BELOW_ZERO * error[worst]:
-        raise InputError(
-            f"the spectrum of {source.name} must be of non-negative light, but gives a mean of {electrons[worst]:.3g} "
-            f"electrons per frame at {nm[worst]:.1f} nm, beyond {MAX_SIGMA_BELOW_ZERO:g} times its error of "
-            f"{error[worst]:.2g}: bin the spectrum (`bin_nm`) or correct it",
-            key="bin_nm",
-        )
+        mean = f"{electrons[worst]:.3g} electrons per frame at {nm[worst]:.1f} nm"
+        fault = f"the spectrum of {source.name} must be of non-negative light, but gives a mean of {mean}"
+        error_of_it = f"beyond {MAX_SIGMA_BELOW_ZERO:g} times its error of {error[worst]:.2g}"
+        raise InputError(f"{fault}, {error_of_it}: bin the spectrum (`bin_nm`) or correct it", key="bin_nm")
     return (
         f"{source.name}: the means of {int(below.sum())} of {below.size} pixels, from {nm[below][0]:.1f} to "
         f"{nm[below][-1]:.1f} nm, lie below zero, within their error (measured noise of the spectrum), and are "

@@ -30,19 +30,11 @@ if TYPE_CHECKING:
 YEARS = (1990, 2100)
 
 
-@dataclass(frozen=True)
-class HelioEcliptic:
-    """Ecliptic position relative to the Sun."""
+def helioecliptic(target: SkyCoord | str, time: Time | str) -> tuple[float, float, float]:
+    """Return a target's position relative to the Sun in the true geocentric ecliptic of date, deg.
 
-    longitude_deg: float  # absolute difference of the target's and the Sun's ecliptic longitudes, 0-180
-    latitude_deg: float  # absolute ecliptic latitude, 0-90
-    separation_deg: float  # angle between target and Sun
-
-
-def helioecliptic(target: SkyCoord | str, time: Time | str) -> HelioEcliptic:
-    """Return the helio-ecliptic coordinates of a target, in the true geocentric ecliptic of date.
-
-    The arguments are those of `Sky.at`.
+    It is the absolute difference of their longitudes, 0-180, the absolute latitude, and the angle between them. The
+    arguments are those of `Sky.at`.
     """
     with offline():
         from astropy.coordinates import GeocentricTrueEcliptic, get_sun
@@ -54,11 +46,10 @@ def helioecliptic(target: SkyCoord | str, time: Time | str) -> HelioEcliptic:
         try:
             star = position.transform_to(frame)
         except Exception:  # frames that cannot be transformed (AltAz without a location) raise many kinds
-            raise InputError(
-                f"target in the frame {position.frame.name!r} cannot be turned to the ecliptic; use ICRS", key="target"
-            ) from None
+            fault = f"target in the frame {position.frame.name!r} cannot be turned to the ecliptic; use ICRS"
+            raise InputError(fault, key="target") from None
         difference = float((star.lon - sun.lon).wrap_at("180d").deg)
-        return HelioEcliptic(abs(difference), abs(float(star.lat.deg)), float(star.separation(sun).deg))
+        return abs(difference), abs(float(star.lat.deg)), float(star.separation(sun).deg)
 
 
 def parse_time(time: Time | str, name: str = "time") -> Time:
@@ -158,7 +149,8 @@ class Sky:
 
         The table has a cell every 15 deg. Magnitudes are interpolated bilinearly, or taken from the nearest cell as in
         the paper. Cells in the solar avoidance zone have no value: the other corners share their weight, which makes
-        the sky next to the zone up to 0.4 mag too faint (0.1 DN/s per pixel).
+        the sky next to the zone up to 0.4 mag too faint (0.1 DN/s per pixel). Raises InputError if the nearest cell is
+        in the zone.
 
         Parameters
         ----------
@@ -168,19 +160,13 @@ class Sky:
         time : Time or str
             Single time in 1990-2100; a string is ISO 8601, UTC.
         lookup : {"bilinear", "nearest"}
-
-        Raises
-        ------
-        InputError
-            If the nearest cell is in the solar avoidance zone.
         """
-        place = helioecliptic(target, time)
-        brightness = zodiacal_brightness(place, lookup)
+        longitude, latitude, separation = helioecliptic(target, time)
+        brightness = zodiacal_brightness(longitude, latitude, separation, lookup)
         return cls(
             brightness,
-            f"zodiacal light V = {brightness:.2f} mag/arcsec2 at helio-ecliptic longitude "
-            f"{place.longitude_deg:.1f} deg, latitude {place.latitude_deg:.1f} deg, "
-            f"{place.separation_deg:.1f} deg from the Sun ({lookup})",
+            f"zodiacal light V = {brightness:.2f} mag/arcsec2 at helio-ecliptic longitude {longitude:.1f} deg, "
+            f"latitude {latitude:.1f} deg, {separation:.1f} deg from the Sun ({lookup})",
         )
 
     def total_magnitude(self, field_of_view_arcsec2: SolidAngle) -> float | None:
@@ -230,22 +216,22 @@ def zodiacal_table() -> NDArray[np.float64]:
     return np.stack([np.ma.filled(np.ma.asarray(table[name], np.float64), np.nan) for name in names], axis=1)
 
 
-def zodiacal_brightness(place: HelioEcliptic, lookup: Lookup = "bilinear") -> float:
-    """Return the surface brightness of the zodiacal light, V mag arcsec^-2 (see `Sky.at`).
+def zodiacal_brightness(
+    longitude_deg: float, latitude_deg: float, separation_deg: float, lookup: Lookup = "bilinear"
+) -> float:
+    """Return the surface brightness of the zodiacal light at a position of `helioecliptic`, V mag arcsec^-2.
 
     Raises InputError if the nearest cell (of two equally near, the one farther from the Sun) is in the solar avoidance
     zone.
     """
     table = zodiacal_table()
-    row, column = place.longitude_deg / STEP_DEG, place.latitude_deg / STEP_DEG
+    row, column = longitude_deg / STEP_DEG, latitude_deg / STEP_DEG
     nearest = float(table[int(np.floor(row + 0.5)), int(np.floor(column + 0.5))])
     if np.isnan(nearest):
-        raise InputError(
-            f"the Sun is {place.separation_deg:.1f} deg from the target (helio-ecliptic longitude "
-            f"{place.longitude_deg:.1f} deg, latitude {place.latitude_deg:.1f} deg), which must be outside the zone "
-            "of solar avoidance, some 50 deg",
-            key="target",
-        )
+        place = f"helio-ecliptic longitude {longitude_deg:.1f} deg, latitude {latitude_deg:.1f} deg"
+        fault = f"the Sun is {separation_deg:.1f} deg from the target ({place})"
+        needed = "which must be outside the zone of solar avoidance, some 50 deg"
+        raise InputError(f"{fault}, {needed}", key="target")
     if lookup == "nearest":
         return nearest
     i, j = (min(int(at), size - 2) for at, size in zip((row, column), table.shape, strict=True))

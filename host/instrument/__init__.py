@@ -47,14 +47,8 @@ def instrument_path(name: str | Path, folder: Path) -> Path:
     if path.is_dir():
         raise InputError(f"instrument {shortened(str(path))} is a folder; give a name or a TOML file", key="instrument")
     if path.suffix == ".toml":
-        raise InputError(
-            f"instrument file {shortened(str(path))} does not exist; give the name of an instrument or the path of a "
-            "TOML file",
-            key="instrument",
-        )
+        remedy = "give the name of an instrument or the path of a TOML file"
+        raise InputError(f"instrument file {shortened(str(path))} does not exist; {remedy}", key="instrument")
     near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.0)[0]
-    raise InputError(
-        f"instrument {shortened(str(name))} is unknown; use {' or '.join(names)} (nearest: {near!r}) or the path of a "
-        "TOML file",
-        key="instrument",
-    )
+    remedy = f"use {' or '.join(names)} (nearest: {near!r}) or the path of a TOML file"
+    raise InputError(f"instrument {shortened(str(name))} is unknown; {remedy}", key="instrument")

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import astropy.units as u
 import numpy as np
@@ -19,6 +19,8 @@ from mauvecl.host.tables.units import unit_of
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range, Unit
+
+Float = NDArray[np.float64]
 
 
 @contextmanager
@@ -46,19 +48,14 @@ class Curve:
     def __post_init__(self) -> None:
         wavelength, value = np.asarray(self.wavelength_nm, np.float64), np.asarray(self.value, np.float64)
         if wavelength.ndim != 1 or wavelength.size == 0 or wavelength.shape != value.shape:
-            raise InputError(
-                f"the curve needs one value per wavelength, but has {wavelength.size} wavelengths "
-                f"and {value.size} values",
-                key="value",
-            )
+            sizes = f"{wavelength.size} wavelengths and {value.size} values"
+            raise InputError(f"the curve needs one value per wavelength, but has {sizes}", key="value")
         if not (np.isfinite(wavelength).all() and (np.diff(wavelength) > 0).all()):
             raise InputError("the wavelengths of the curve must be finite and strictly increasing", key="wavelength_nm")
         bad = ~(np.isfinite(value) & (value >= 0))
         if bad.any():
-            knot = int(np.argmax(bad))
-            raise InputError.of(
-                "value", value[knot], "finite and at least 0", where=f"curve at {wavelength[knot]:g} nm"
-            )
+            where = f"curve at {wavelength[bad][0]:g} nm"
+            raise InputError.of("value", value[bad][0], "finite and at least 0", where=where)
 
     @classmethod
     def flat(cls, value: float, source: str = "A: assumed, no source given") -> Curve:
@@ -74,16 +71,14 @@ class Curve:
         """
         with _opened(path, "curve file") as (table, source):
             if "wavelength" not in table.columns or len(table.columns) != 2:
-                raise InputError(
-                    f"the columns must be 'wavelength' and one value, not {', '.join(table.columns)}", key="columns"
-                )
+                fault = f"the columns must be 'wavelength' and one value, not {', '.join(table.columns)}"
+                raise InputError(fault, key="columns")
             (name,) = {*table.columns} - {"wavelength"}
-            length = unit_of(table.units["wavelength"]) if table.units["wavelength"] else None
-            wavelength = _converted(table["wavelength"], "wavelength", length, [u.nm])
-            value = _converted(table[name], name, _plain_unit(table.units[name]), [u.A / u.W, u.dimensionless_unscaled])
+            wavelength = _converted(table, "wavelength", u.nm)
+            value = _converted(table, name, u.A / u.W, u.dimensionless_unscaled)
             return cls(tuple(wavelength.tolist()), tuple(value.tolist()), source)
 
-    def at(self, wavelength_nm: ArrayLike) -> NDArray[np.float64]:
+    def at(self, wavelength_nm: ArrayLike) -> Float:
         """Return the values at wavelengths in nm, shape of `wavelength_nm`; the end values hold beyond the knots."""
         return np.asarray(np.interp(np.asarray(wavelength_nm, np.float64), self.wavelength_nm, self.value))
 
@@ -92,21 +87,17 @@ class Curve:
         return len(self.value) == 1 or (self.wavelength_nm[0] <= low_nm and self.wavelength_nm[-1] >= high_nm)
 
 
-def _plain_unit(text: str) -> u.UnitBase:
-    """Return the unit of a text in which A is ampere, not Angstrom."""
-    return u.Unit(text.replace("percent", "%"), parse_strict="silent")
-
-
-def _converted(values: NDArray[np.float64], name: str, unit: u.UnitBase | None, units: list[u.UnitBase]) -> Any:
+def _converted(table: Numbers, name: str, *units: u.UnitBase) -> Float:
     """Return a column's numbers in the first of `units` that its unit converts to."""
+    text = table.units[name]
+    # A is ampere, except in a length.
+    unit = unit_of(text) if text and units == (u.nm,) else u.Unit(text.replace("percent", "%"), parse_strict="silent")
     for wanted in units:
-        if unit is not None and unit.is_equivalent(wanted):
-            return (values * unit).to_value(wanted)
-    expected, given = (str(one or "") or "none" for one in (units[0], unit))
+        if unit.is_equivalent(wanted):
+            return np.asarray((table[name] * unit).to_value(wanted))
+    expected, given = (str(one) or "none" for one in (units[0], unit))
     raise InputError(f"the unit of column {name!r} must be {expected}, not {given!r}", key=name)
 
-
-Float = NDArray[np.float64]
 
 #: Largest number of pixels of an array.
 MAX_PIXELS = 65_536
@@ -150,9 +141,8 @@ class PixelMap(ContentEquality):
                 continue
             values = np.asarray(getattr(self, name), np.float64)
             if values.ndim != 1:
-                raise InputError(
-                    f"{name} of the pixel map must have one value per pixel, not the shape {values.shape}", key=name
-                )
+                fault = f"{name} of the pixel map must have one value per pixel, not the shape {values.shape}"
+                raise InputError(fault, key=name)
             bad = ~(np.isfinite(values) & (values > 0 if name == "gain" else values >= 0))
             if bad.any():
                 pixel, above = int(np.argmax(bad)), "above 0" if name == "gain" else "0 or more"
@@ -160,10 +150,8 @@ class PixelMap(ContentEquality):
             set_read_only(self, **{name: values})
             sizes.add(values.size)
         if len(sizes) != 1:
-            raise InputError(
-                f"the columns of the pixel map must have the same length, but have {sorted(sizes) or 'no'} pixels",
-                key="pixel_map",
-            )
+            fault = f"the columns of the pixel map must have the same length, but have {sorted(sizes) or 'no'} pixels"
+            raise InputError(fault, key="pixel_map")
 
     @property
     def size(self) -> int:
@@ -194,10 +182,7 @@ class PixelMap(ContentEquality):
                 raise InputError(f"the table has {what}; use some of {', '.join(COLUMNS)}", key="pixel_map")
             if "pixel" in table.columns and not np.array_equal(table["pixel"], np.arange(table["pixel"].size)):
                 raise InputError("the column 'pixel' must be 0, 1, 2, ..., every pixel in order", key="pixel")
-            values = {
-                name: _converted(table[name], name, _plain_unit(table.units[name]), [COLUMNS[name]]) for name in names
-            }
-            return cls(**values, source=source)
+            return cls(**{name: _converted(table, name, COLUMNS[name]) for name in names}, source=source)
 
     @classmethod
     def made_up(
@@ -295,21 +280,12 @@ class ThroughputErrors(ContentEquality):
         if modes.ndim != 2 or modes.shape[1] != nm.size or not np.isfinite(modes).all():
             raise InputError.of("modes", modes.shape, f"finite values of the shape (n_mode, {nm.size})")
         set_read_only(self, wavelength_nm=nm, modes=modes)
-        others: object = self.values
-        if not isinstance(others, Mapping) or not set(others) <= set(CALIBRATED):
-            raise InputError.of("values", others, f"some of {', '.join(CALIBRATED)}")
-        for name, changes in others.items():
-            given = np.asarray(changes)
-            if (
-                given.ndim != 1
-                or given.size > len(modes)
-                or given.dtype.kind not in "fi"
-                or not np.isfinite(given).all()
-            ):
-                raise InputError.of(
-                    f"values.{name}", changes, f"at most {len(modes)} finite numbers, one for each mode"
-                )
-        object.__setattr__(self, "values", {name: tuple(map(float, changes)) for name, changes in others.items()})
+        if not set(self.values) <= set(CALIBRATED):
+            raise InputError.of("values", self.values, f"some of {', '.join(CALIBRATED)}")
+        for name, changes in self.values.items():
+            if len(changes) > len(modes) or not np.isfinite(changes).all():
+                expected = f"at most {len(modes)} finite numbers, one for each mode"
+                raise InputError.of(f"values.{name}", changes, expected)
 
     @classmethod
     def of_covariance(
@@ -351,10 +327,8 @@ class ThroughputErrors(ContentEquality):
         with _opened(path, "throughput errors") as (table, source):
             names = [name for name in table.columns if name.startswith(MODE)]
             if "wavelength" not in table.columns or not names or len(names) + 1 != len(table.columns):
-                raise InputError(
-                    f"the columns must be wavelength, {MODE}1, {MODE}2 and so on, not {', '.join(table.columns)}",
-                    key="columns",
-                )
+                fault = f"the columns must be wavelength, {MODE}1, {MODE}2 and so on, not {', '.join(table.columns)}"
+                raise InputError(fault, key="columns")
             if table.units["wavelength"] != "nm":
                 raise InputError.of("unit", table.units["wavelength"], "nm")
             modes = np.array([table[name] for name in names])

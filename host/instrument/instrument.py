@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
-from scipy.special import erf, ndtr
+from scipy.special import ndtr
 
 from mauvecl.host.instrument import FORMERLY_MAUVE, instrument_path, shipped_names
 from mauvecl.host.instrument.curves import MAX_PIXELS, Curve, PixelMap, ThroughputErrors
@@ -34,32 +34,29 @@ if TYPE_CHECKING:
 TAGS = ("P", "D", "C", "A", "U")
 #: Version of instrument files; files without one are of version 1.
 FILE_VERSION = 2
-#: Largest number of files in a chain in which each extends the next.
+#: Largest number of files of which each extends the next.
 MAX_EXTENDED = 16
 
 
-def read_values(
-    path: Path, files: Mapping[str, type[Curve | PixelMap | ThroughputErrors]], seen: tuple[Path, ...] = ()
-) -> tuple[dict[str, Any], dict[str, str]]:
+def read_entries(
+    path: Path, files: Mapping[str, type[Curve | PixelMap | ThroughputErrors]]
+) -> dict[str, tuple[Any, str]]:
     """Return the values and sources of a file, merged over those of the file that it extends.
 
-    Values of the classes in `files` may be paths, relative to the file; `seen` are the files that extend this one.
+    Values of the classes in `files` may be paths, relative to their file.
     """
-    if path.resolve() in seen:
-        raise InputError(f"{path.name} extends itself; the chain of files must end", key="extends")
-    if len(seen) == MAX_EXTENDED:
-        raise InputError(
-            f"{path.name} ends a chain of {MAX_EXTENDED} files that extend another; the chain must be shorter",
-            key="extends",
-        )
-    content = toml(read_text(path, "instrument file"), f"instrument file {shortened(str(path))}")
-    values: dict[str, Any] = {}
-    sources: dict[str, str] = {}
-    version = content.pop("version", None)
-    if version not in (None, FILE_VERSION):
-        raise InputError.of("version", version, f"{FILE_VERSION}, or none in files of version 1", where=path.name)
-    if "extends" in content:
-        extended = content.pop("extends")
+    entries: dict[str, tuple[Any, str]] = {}
+    for _ in range(MAX_EXTENDED):
+        content = toml(read_text(path, "instrument file"), f"instrument file {shortened(str(path))}")
+        version, extended = content.pop("version", None), content.pop("extends", None)
+        if version not in (None, FILE_VERSION):
+            raise InputError.of("version", version, f"{FILE_VERSION}, or none in files of version 1", where=path.name)
+        if "sources" in content:
+            fault = f"{path.name}: unknown key 'sources'; give each value's source in the value's own table"
+            raise InputError(fault, key="sources")
+        entries = {name: _entry(name, entry, path, files.get(name)) for name, entry in content.items()} | entries
+        if extended is None:
+            return entries
         if version is None and extended == "mauve":
             extended = FORMERLY_MAUVE
             warnings.warn(
@@ -67,14 +64,9 @@ def read_values(
                 f"`version = {FILE_VERSION}` it extends the one that counts electrons.",
                 stacklevel=2,
             )
-        values, sources = read_values(instrument_path(extended, path.parent), files, (*seen, path.resolve()))
-    for name, entry in content.items():
-        if name == "sources":
-            raise InputError(
-                f"{path.name}: unknown key 'sources'; give each value's source in the value's own table", key="sources"
-            )
-        values[name], sources[name] = _entry(name, entry, path, files.get(name))
-    return values, sources
+        path = instrument_path(extended, path.parent)
+    fault = f"{path.name} is extended by {MAX_EXTENDED} files one after another, or by itself; the chain must end"
+    raise InputError(fault, key="extends")
 
 
 def _entry(
@@ -250,14 +242,16 @@ class Instrument(Section):
             Values by name: Quantities, or plain numbers in the unit of the name. A curve may be a `Curve`, a path or
             one number.
         """
-        marks = {name: "U: set by the user" for name in changes if name not in LABELS}
         changed = Instrument.build({**self._values(), **changes}, self.name)
-        given = {name: value.source for name in changes if isinstance(value := getattr(changed, name), Curve)}
-        own = {name: source for name, source in given.items() if isinstance(changes[name], str | Path)}
-        sources = {**self.sources, **changes.get("sources", {}), **marks, **own}
+        marks = {name: "U: set by the user" for name in changes if name not in LABELS}
+        for name, given in changes.items():
+            if isinstance(given, str | Path) and isinstance(curve := getattr(changed, name), Curve):
+                marks[name] = curve.source
+        sources = {**self.sources, **changes.get("sources", {}), **marks}
         return changed.model_copy(update={"sources": sources})
 
     def _values(self) -> dict[str, Any]:
+        # Iterating over the instrument would yield its cached properties as well.
         return {name: getattr(self, name) for name in type(self).model_fields}
 
     @model_validator(mode="after")
@@ -266,36 +260,27 @@ class Instrument(Section):
         if not high > low:
             raise InputError.of("output_max_nm", high, f"more than output_min_nm = {low:g}")
         if self.wavelength_nm.size == 0:
-            raise InputError(
-                f"the output range {low:g}-{high:g} nm needs at least one pixel, but holds none", key="output_min_nm"
-            )
+            fault = f"the output range {low:g}-{high:g} nm needs at least one pixel, but holds none"
+            raise InputError(fault, key="output_min_nm")
         self._check_curves(low, high)
         if self.top_hat_width_nm == self.gaussian_fwhm_nm == 0:
-            raise InputError(
-                "top_hat_width_nm and gaussian_fwhm_nm are both 0, but at least one of them must be above 0",
-                key="top_hat_width_nm",
-            )
+            fault = "top_hat_width_nm and gaussian_fwhm_nm are both 0, but at least one of them must be above 0"
+            raise InputError(fault, key="top_hat_width_nm")
         for name in ("top_hat_width_nm", "gaussian_fwhm_nm"):
             # A width far below a pixel has no effect, but costs time and digits.
             if 0 < getattr(self, name) < 0.1:
                 raise InputError.of(name, getattr(self, name), "0 (none) or at least 0.1")
         if self.resolution_element_nm < self.dispersion_nm_per_pixel:
-            raise InputError.of(
-                "resolution_element_nm",
-                self.resolution_element_nm,
-                f"at least a pixel ({self.dispersion_nm_per_pixel:g})",
-            )
+            expected = f"at least a pixel ({self.dispersion_nm_per_pixel:g})"
+            raise InputError.of("resolution_element_nm", self.resolution_element_nm, expected)
         if self.bias_dn >= min(self.saturation_dn, self.adc_max_dn):
             raise InputError.of("bias_dn", self.bias_dn, "below saturation")
         if self.pixel_map is not None and self.pixel_map.size != self.pixels:
-            raise InputError(
-                f"pixel_map must have the array's {self.pixels} pixels, not {self.pixel_map.size}", key="pixel_map"
-            )
+            fault = f"pixel_map must have the array's {self.pixels} pixels, not {self.pixel_map.size}"
+            raise InputError(fault, key="pixel_map")
         modes = 0 if self.throughput_errors is None else len(self.throughput_errors.modes)
-        if len(self.throughput_amplitudes) > modes:
-            raise InputError.of(
-                "throughput_amplitudes", len(self.throughput_amplitudes), f"at most {modes}, one for each mode"
-            )
+        if (given := len(self.throughput_amplitudes)) > modes:
+            raise InputError.of("throughput_amplitudes", given, f"at most {modes}, one for each mode")
         if not (self.throughput(self.wavelength_nm) * self.per_pixel("response", 1.0) > 0).any():
             dark = [name for name in CURVES if not (getattr(self, name).at(self.wavelength_nm) > 0).any()]
             what = f"{' and '.join(dark) or 'the throughput'} = 0 from {low:g} to {high:g} nm, and all S/N are 0"
@@ -311,16 +296,12 @@ class Instrument(Section):
         for name in CURVES:
             curve: Curve = getattr(self, name)
             if not curve.covers(low, high):
-                raise InputError(
-                    f"{name} must cover at least the output range {low:g}-{high:g} nm, but covers "
-                    f"{curve.wavelength_nm[0]:g}-{curve.wavelength_nm[-1]:g} nm",
-                    key=name,
-                )
+                covered = f"{curve.wavelength_nm[0]:g}-{curve.wavelength_nm[-1]:g} nm"
+                fault = f"{name} must cover at least the output range {low:g}-{high:g} nm, but covers {covered}"
+                raise InputError(fault, key=name)
         if (most := float(self.quantum_efficiency(self.wavelength_nm).max())) > 1:
-            raise InputError(
-                f"quantum_efficiency_a_per_w must correspond to at most 1 electron per photon, not {most:.3g}",
-                key="quantum_efficiency_a_per_w",
-            )
+            fault = f"quantum_efficiency_a_per_w must correspond to at most 1 electron per photon, not {most:.3g}"
+            raise InputError(fault, key="quantum_efficiency_a_per_w")
 
     @cached_property
     def wavelength_nm(self) -> Float:
@@ -401,7 +382,7 @@ class Instrument(Section):
     def efficiency(self, wavelength_nm: Wavelengths) -> Float:
         """Return the fraction of the light that reaches the detector, without the quantum efficiency.
 
-        This is the paper's efficiency times (1 - pointing_loss).
+        This is the paper's efficiency times (1 - pointing_loss). Raises InputError outside the curves (`curves_nm`).
 
         Parameters
         ----------
@@ -410,11 +391,6 @@ class Instrument(Section):
         Returns
         -------
         ndarray, shape of `wavelength_nm`
-
-        Raises
-        ------
-        InputError
-            Outside the curves (`curves_nm`).
         """
         return self._optics(self._within(wavelength_nm, *self.curves_nm))
 
@@ -520,9 +496,10 @@ class Instrument(Section):
 
 def _from_file(name: str | Path) -> Instrument:
     path = instrument_path(name, Path())
-    values, sources = read_values(path, FILES)
-    own_sources = {name: source for name, source in sources.items() if name not in LABELS}
-    return Instrument.build({**values, "sources": own_sources}, path.name)
+    entries = read_entries(path, FILES)
+    values: dict[str, Any] = {name: value for name, (value, _) in entries.items()}
+    values["sources"] = {name: source for name, (_, source) in entries.items() if name not in LABELS}
+    return Instrument.build(values, path.name)
 
 
 _embedded = cache(_from_file)
@@ -574,17 +551,6 @@ class LineSpread:
         """Integral of the square of the line spread function averaged over a pixel, nm^-1."""
         offset = np.linspace(-self.reach, self.reach, 4001)
         return float(np.trapezoid((self.landing(offset) / self.pixel) ** 2, offset))
-
-    def density(self, offset_nm: ArrayLike) -> Float:
-        """Return the line spread function, nm^-1, normalised to unit integral."""
-        x = np.asarray(offset_nm, np.float64)
-        if self.top_hat == 0:
-            return np.asarray(np.exp(-0.5 * (x / self.sigma) ** 2) / (self.sigma * np.sqrt(2 * np.pi)))
-        half = self.top_hat / 2
-        if self.sigma == 0:
-            return np.where(np.abs(x) <= half, 1 / self.top_hat, 0.0)
-        scale = self.sigma * np.sqrt(2)
-        return np.asarray((erf((x + half) / scale) - erf((x - half) / scale)) / (2 * self.top_hat))
 
     def landing(self, offset_nm: Float) -> Float:
         """Return the fraction of a line's light that falls on a pixel whose centre is `offset_nm` from the line."""

@@ -35,6 +35,7 @@ from mauvecl.host.tables.files import parse_ecsv, read_text
 from mauvecl.host.tables.names import EXPECTED_POSITION, is_missing_position
 from mauvecl.host.tables.units import offline
 from mauvecl.schema.calls import validated
+from mauvecl.schema.columns import records
 from mauvecl.schema.errors import InputError, printable, shortened
 from mauvecl.schema.physical import DAY_S
 
@@ -58,17 +59,12 @@ class Elements:
         for number, line in enumerate((self.first, self.second), 1):
             _check(line, number)
         if self.first[2:7] != self.second[2:7]:
-            raise InputError(
-                f"both lines of the orbital elements must be of one satellite, but are of "
-                f"{self.first[2:7]!r} and {self.second[2:7]!r}",
-                key="elements",
-            )
+            both = f"{self.first[2:7]!r} and {self.second[2:7]!r}"
+            fault = f"both lines of the orbital elements must be of one satellite, but are of {both}"
+            raise InputError(fault, key="elements")
         if self.satellite.error:
-            raise InputError(
-                f"orbital elements {shortened(self.second)} must be those of an orbit around the Earth, but SGP4 "
-                f"refuses them (error {self.satellite.error})",
-                key="elements",
-            )
+            fault = f"orbital elements {shortened(self.second)} must be those of an orbit around the Earth"
+            raise InputError(f"{fault}, but SGP4 refuses them (error {self.satellite.error})", key="elements")
 
     @classmethod
     def read(cls, path: str | Path) -> Elements:
@@ -133,21 +129,12 @@ class Elements:
         return float((GRAVITY / (2 * np.pi / self.period_s) ** 2) ** (1 / 3))
 
     @property
-    def node_drift_deg_per_day(self) -> float:
-        """Eastward drift of the node due to J2; the mean Sun moves by 0.98565 deg per day."""
-        return float(np.degrees(-1.5 * self._oblate * np.cos(self.satellite.inclo)) * DAY_S)
-
-    @property
     def latitude_rate_deg_per_day(self) -> float:
-        """Rate of the mean argument of latitude: mean motion plus the drift of the perigee."""
-        perigee = 0.75 * self._oblate * (5 * np.cos(self.satellite.inclo) ** 2 - 1)
+        """Rate of the mean argument of latitude: mean motion plus the secular drift of the perigee due to J2."""
+        semi_latus_km = self.axis_km * (1 - self.satellite.ecco**2)
+        oblate = 2 * np.pi / self.period_s * J2 * (RADIUS_KM / semi_latus_km) ** 2
+        perigee = 0.75 * oblate * (5 * np.cos(self.satellite.inclo) ** 2 - 1)
         return 360.0 * self.revolutions_per_day + float(np.degrees(perigee)) * DAY_S
-
-    @property
-    def _oblate(self) -> float:
-        """Common factor of the secular J2 rates, rad/s, with p the semi-latus rectum."""
-        p = self.axis_km * (1 - self.satellite.ecco**2)
-        return float(2 * np.pi / self.period_s * J2 * (RADIUS_KM / p) ** 2)
 
 
 def _check(line: str, number: int) -> None:
@@ -156,10 +143,8 @@ def _check(line: str, number: int) -> None:
         raise InputError.of("elements", line, f"line {number} with 69 characters")
     checksum = sum(int(c) if c.isdigit() else c == "-" for c in line[:68]) % 10
     if line[68] != str(checksum):
-        raise InputError(
-            f"orbital elements {shortened(line)} must end in the checksum {checksum}, not {line[68]!r}; one is wrong",
-            key="elements",
-        )
+        fault = f"orbital elements {shortened(line)} must end in the checksum {checksum}, not {line[68]!r}"
+        raise InputError(f"{fault}; one is wrong", key="elements")
 
 
 Kind = Literal["auto", "tle", "mean"]
@@ -265,12 +250,9 @@ class Orbit:
         error, position, velocity = self.elements.satellite.sgp4_array(midnight, days)
         if np.any(error):
             first = int(np.argmax(error != 0))
-            raise InputError(
-                f"orbital elements of epoch {self.elements.epoch} cannot be followed to "
-                f"{utc_text(float(midnight[first] + days[first]))} (SGP4 error {int(error[first])}): "
-                "give newer ones, or use the mean orbit",
-                key="elements",
-            )
+            end = f"{utc_text(float(midnight[first] + days[first]))} (SGP4 error {int(error[first])})"
+            fault = f"orbital elements of epoch {self.elements.epoch} cannot be followed to {end}"
+            raise InputError(f"{fault}: give newer ones, or use the mean orbit", key="elements")
         return np.asarray(position), np.asarray(velocity)
 
     def _mean(
@@ -280,29 +262,18 @@ class Orbit:
         e, since = self.elements, (midnight - self.elements.epoch_jd) + days
         node = e.satellite.nodeo + 2 * np.pi / 365.2421897 * since
         along = e.satellite.argpo + e.satellite.mo + np.radians(e.latitude_rate_deg_per_day) * since
-        return circular(e.axis_km, e.satellite.inclo, node, along)
+        c, s = np.cos(e.satellite.inclo), np.sin(e.satellite.inclo)
+        ascending = np.stack([np.cos(node), np.sin(node), np.zeros_like(node)], axis=1)
+        north = np.stack([-c * np.sin(node), c * np.cos(node), np.full_like(node, s)], axis=1)
+        cosine, sine = np.cos(along)[:, None], np.sin(along)[:, None]
+        speed = float(np.sqrt(GRAVITY / e.axis_km))
+        return e.axis_km * (cosine * ascending + sine * north), speed * (cosine * north - sine * ascending)
 
 
 @lru_cache(maxsize=1)
 def _track(orbit: Orbit, times: TimeGrid) -> Track:
     midnight, days = times.julian
     return Track(orbit, times, *orbit.states(midnight, days, orbit.resolved(times)))
-
-
-def circular(
-    axis_km: float, inclination_rad: float, node_rad: NDArray[np.float64] | float, along_rad: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return positions (km) and velocities (km/s) in a circular orbit, shape (n, 3) each.
-
-    `node_rad` is the right ascension of the ascending node, `along_rad` the argument of latitude, shape (n,).
-    """
-    node = np.broadcast_to(node_rad, along_rad.shape)
-    ascending = np.stack([np.cos(node), np.sin(node), np.zeros_like(node)], axis=1)
-    c, s = np.cos(inclination_rad), np.sin(inclination_rad)
-    north = np.stack([-c * np.sin(node), c * np.cos(node), np.full_like(node, s)], axis=1)
-    cosine, sine = np.cos(along_rad)[:, None], np.sin(along_rad)[:, None]
-    speed = float(np.sqrt(GRAVITY / axis_km))
-    return axis_km * (cosine * ascending + sine * north), speed * (cosine * north - sine * ascending)
 
 
 @dataclass(frozen=True, eq=False)
@@ -354,12 +325,6 @@ class Track:
         sun = np.radians(280.46646 + 0.98564736 * (midnight - 2_451_545.0 + days))
         return np.asarray((np.degrees(ascending + np.pi - sun) / 15.0 + 12.0) % 24.0)
 
-    @property
-    def period_s(self) -> float:
-        """Period of a circular orbit at the mean distance, s."""
-        axis = float(np.linalg.norm(self.of_date_km, axis=1).mean())
-        return float(2 * np.pi * np.sqrt(axis**3 / GRAVITY))
-
 
 #: Timeout of a SIMBAD query, s.
 TIMEOUT_S = 10.0
@@ -400,11 +365,8 @@ class Target:
             if simbad:
                 return _from_simbad(text, name)
             like = ", ".join(near_names(text, stars_only=True))
-            raise InputError(
-                f"target {shortened(text)} is not in the embedded list; give a name such as {like}, coordinates such "
-                "as '290.0 -11.2', or `simbad=True` to ask SIMBAD",
-                key="target",
-            )
+            remedy = f"give a name such as {like}, coordinates such as '290.0 -11.2', or `simbad=True` to ask SIMBAD"
+            raise InputError(f"target {shortened(text)} is not in the embedded list; {remedy}", key="target")
         with offline():
             place = parse_position(text).icrs
         return cls(name or text.strip(), float(place.ra.deg), float(place.dec.deg), "given")
@@ -438,34 +400,24 @@ def _from_simbad(text: str, name: str | None) -> Target:
     try:
         from astroquery.simbad import Simbad
     except ImportError:
-        raise InputError(
-            f"target {shortened(text)} is not in the embedded list and astroquery is missing; give coordinates, or "
-            "`pip install 'mauvecl[names]'`",
-            key="target",
-        ) from None
+        fault = f"target {shortened(text)} is not in the embedded list and astroquery is missing"
+        raise InputError(f"{fault}; give coordinates, or `pip install 'mauvecl[names]'`", key="target") from None
     query = SIMBAD_QUERY.format(text.strip().replace("'", "''"))
     try:
         table = _within(TIMEOUT_S, lambda: Simbad.query_tap(query))
     except Exception as error:  # astroquery raises many kinds for a network failure
-        raise InputError(
-            f"target {shortened(text)} is not in the embedded list and SIMBAD did not answer within {TIMEOUT_S:g} s "
-            f"({type(error).__name__}); this needs a network, or give coordinates",
-            key="target",
-        ) from error
+        fault = f"target {shortened(text)} is not in the embedded list and SIMBAD did not answer within {TIMEOUT_S:g} s"
+        remedy = "this needs a network, or give coordinates"
+        raise InputError(f"{fault} ({type(error).__name__}); {remedy}", key="target") from error
     if table is None or len(table) == 0:
         raise InputError(f"SIMBAD knows no target {shortened(text)}; give another name, or coordinates", key="target")
-    row = table[0]
-
-    def number(column: str) -> float | None:
-        value = row[column]
-        return None if np.ma.is_masked(value) or not np.isfinite(float(value)) else float(value)
-
-    parallax, ra, dec = number("plx_value"), number("ra"), number("dec")
-    if ra is None or dec is None:
+    # NaN differs from itself.
+    star = {name: value if value == value else None for name, value in records(table)[0].items()}
+    if star["ra"] is None or star["dec"] is None:
         raise InputError(f"target {shortened(text)} has no coordinates in SIMBAD; give another name", key="target")
-    distance = None if parallax is None or parallax <= 0 else 1000 / parallax
-    kind = None if np.ma.is_masked(row["sp_type"]) else str(row["sp_type"]).strip() or None
-    return Target(name or text.strip(), ra, dec, "SIMBAD", distance, number("V"), kind)
+    parallax, kind = star["plx_value"], (star["sp_type"] or "").strip() or None
+    distance = 1000 / parallax if parallax is not None and parallax > 0 else None
+    return Target(name or text.strip(), star["ra"], star["dec"], "SIMBAD", distance, star["V"], kind)
 
 
 def _within(seconds: float, ask: Callable[[], Any]) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.arrays import true_runs
-from mauvecl.host.exposure.sky import HelioEcliptic, zodiacal_brightness
+from mauvecl.host.exposure.sky import zodiacal_brightness
 from mauvecl.host.orbit import Limits, geometry
 from mauvecl.host.orbit.geometry import Bodies, Flags, TimeGrid, Vectors, unit
 from mauvecl.host.orbit.orbit import Orbit, Track
@@ -134,15 +135,11 @@ def zodiacal_light(bodies: Bodies, target: NDArray[np.float64]) -> NDArray[np.fl
     size = float(np.linalg.norm(along))
     # At the pole the longitude is arbitrary.
     difference = np.degrees(np.arccos(np.clip(flat @ along / size, -1, 1))) if size > 1e-9 else np.zeros(len(flat))
-    positions = zip(difference, elongation_deg(bodies.sun, target), strict=True)
-    return np.array([_brightness(HelioEcliptic(float(x), abs(latitude), float(away))) for x, away in positions])
-
-
-def _brightness(place: HelioEcliptic) -> float:
-    try:
-        return zodiacal_brightness(place)
-    except InputError:
-        return float("nan")
+    light = np.full(len(flat), np.nan)
+    for k, away in enumerate(elongation_deg(bodies.sun, target)):
+        with contextlib.suppress(InputError):
+            light[k] = zodiacal_brightness(float(difference[k]), abs(latitude), float(away))
+    return light
 
 
 #: A limit as a function of a slice of steps that returns which targets are allowed, shape (steps or 1, k or 1).

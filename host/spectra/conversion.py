@@ -289,8 +289,8 @@ class ReadSpectrum:
     messages: tuple[str, ...] = ()  # assumptions, conversions and mergers, which answers must report
     #: Reason why the flux is not that at the telescope, so that a magnitude is needed; otherwise empty.
     unscaled: str = ""
-    #: Unit of the wavelengths in the file.
-    axis_unit: str = "nm"
+    #: Unit of the wavelengths in the file; empty for arrays.
+    axis_unit: str = ""
 
 
 def converted(raw: RawSpectrum, wavelength_unit: Any = None, flux_unit: Any = None) -> ReadSpectrum:

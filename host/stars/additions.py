@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import IO, TYPE_CHECKING
+from typing import TYPE_CHECKING
 from urllib.parse import urljoin, urlsplit
 
 from mauvecl.host import VERSION
@@ -40,6 +40,9 @@ def add(
 ) -> OwnStar:
     """Keep a spectrum from a file under a name.
 
+    Raises InputError if the file holds no usable spectrum, the name is taken or invalid, or the folder cannot be
+    written.
+
     Parameters
     ----------
     path : str or Path
@@ -52,17 +55,12 @@ def add(
         Whether to replace a kept star of the same name.
     wavelength_unit, flux_unit, extend : str, optional
         As for `Source.read`.
-
-    Raises
-    ------
-    InputError
-        If the file holds no usable spectrum, the name is taken or invalid, or the folder cannot be written.
     """
     given = path
     path, _ = without_columns(path)
     content = read_bytes(path, "spectrum file")
     source = Source.read(given, wavelength_unit=wavelength_unit, flux_unit=flux_unit, extend=extend)
-    check_covers(source.name, source.measured_nm or (source.wavelength_nm[0], source.wavelength_nm[-1]))
+    check_covers(source)
     name = (name or source.name).strip()
     place = _place_of(name, replace=replace)
     table = _kept_table(source)
@@ -197,6 +195,8 @@ def fetch(
 ) -> OwnStar:
     """Download a star from a public collection and keep it.
 
+    Raises InputError if the network fails, the star is unknown, or its file holds no usable spectrum.
+
     Parameters
     ----------
     name : str
@@ -208,41 +208,28 @@ def fetch(
     show_progress : bool
     extend : str, optional
         Library spectrum that continues the star's beyond its end.
-
-    Raises
-    ------
-    InputError
-        If the network fails, the star is unknown, or its file holds no usable spectrum.
     """
     star, chosen = _star_and_collections(name, base)
     for collection in chosen:
-        address = base or collection.base
         try:
-            _check_address(address)
-            url = urljoin(_folder(address), collection.file_of(star, partial(_listing, address)))
-            downloaded = _download(url, show_progress)
+            address = _folder(base or collection.base)
+            url = urljoin(address, collection.file_of(star, partial(_listing, address)))
+            content = _download(url, limit_bytes("MAUVECL_LARGEST_FILE_MIB"), show_progress)
         except FileNotFoundError:
             continue
-        file = url.rsplit("/", 1)[1]
-        # Messages and notes use the archive's file name.
-        local = downloaded.rename(downloaded.with_name(f"{downloaded.name}-{file}"))
-        try:
-            title = f"{collection.title}; {collection.citation}; {url}"
-            return add(local, star, origin=title, replace=replace, extend=extend)
-        except InputError as error:
-            raise InputError(
-                f"the file downloaded from {url} must be a whole, usable spectrum, but is not "
-                f"({str(error).replace(local.name, file)})",
-                key="base",
-            ) from error
-        finally:
-            local.unlink(missing_ok=True)
-    where = " or ".join(c.title for c in chosen)
-    raise InputError(
-        f"no star {star!r} is in {where}; give the name that it has there, such as HD 37202, or bring the file: "
-        "mauvecl library add",
-        key="name",
-    )
+        with tempfile.TemporaryDirectory(prefix="mauvecl-fetch-") as place:
+            # Messages and notes use the archive's file name.
+            local = Path(place) / url.rsplit("/", 1)[1]
+            local.write_bytes(content)
+            try:
+                title = f"{collection.title}; {collection.citation}; {url}"
+                return add(local, star, origin=title, replace=replace, extend=extend)
+            except InputError as error:
+                fault = f"the file downloaded from {url} must be a whole, usable spectrum, but is not ({error})"
+                raise InputError(fault, key="base") from error
+    fault = f"no star {star!r} is in {' or '.join(collection.title for collection in chosen)}"
+    remedy = "give the name that it has there, such as HD 37202, or bring the file: mauvecl library add"
+    raise InputError(f"{fault}; {remedy}", key="name")
 
 
 def _star_and_collections(name: str, base: str | None) -> tuple[str, list[Collection]]:
@@ -260,88 +247,68 @@ def _star_and_collections(name: str, base: str | None) -> tuple[str, list[Collec
 
 
 def _folder(address: str) -> str:
-    return address if address.endswith("/") else address + "/"
-
-
-def _check_address(address: str) -> None:
-    """Raise InputError unless the address is a URL of a supported scheme."""
+    """Return an address that ends in a slash; raises InputError unless it is a URL of a supported scheme."""
     is_address = False
     with contextlib.suppress(ValueError):
         parts = urlsplit(address)
         is_address = parts.scheme in SCHEMES and bool(parts.hostname) and parts.port != 0
     if not (is_address and address.isprintable() and " " not in address):
         raise InputError.of("base", address, "one such as https://host/folder/")
+    return address if address.endswith("/") else address + "/"
 
 
-def _download(url: str, show_progress: bool, max_bytes: int | None = None) -> Path:
+def _download(url: str, max_bytes: int, show_progress: bool) -> bytes:
     """Download a file within limits of size and time; raises FileNotFoundError if the server has none."""
     # Imported here because TLS is slow to import and most runs download nothing.
     import http.client
     import urllib.error
 
-    max_bytes = limit_bytes("MAUVECL_LARGEST_FILE_MIB") if max_bytes is None else max_bytes
-    descriptor, name = tempfile.mkstemp(prefix="mauvecl-fetch-")
     try:
-        with open(descriptor, "wb") as file:
-            _receive(url, file, max_bytes, show_progress)
-        return Path(name)
-    except BaseException as error:
-        Path(name).unlink(missing_ok=True)
-        if isinstance(error, InputError):
-            raise
-        if isinstance(error, urllib.error.HTTPError):
-            if error.code in (403, 404, 410):
-                # Object stores answer 403 for a missing file.
-                raise FileNotFoundError(url) from error
-            raise InputError(f"{url} answers {error.code} {error.reason}: try again later", key="base") from error
-        if not isinstance(error, OSError | ValueError | http.client.HTTPException):
-            raise
+        return _received(url, max_bytes, show_progress)
+    except InputError:
+        raise
+    except urllib.error.HTTPError as error:
+        if error.code in (403, 404, 410):
+            # Object stores answer 403 for a missing file.
+            raise FileNotFoundError(url) from error
+        raise InputError(f"{url} answers {error.code} {error.reason}: try again later", key="base") from error
+    except (OSError, ValueError, http.client.HTTPException) as error:
         # Invalid host names raise ValueError (IDNA codec), malformed responses HTTPException.
-        reason = getattr(error, "reason", error)
-        raise InputError(
-            f"{url} cannot be reached ({reason}); without a network give the file: mauvecl library add "
-            f"{url.rsplit('/', 1)[1] or 'FILE'}",
-            key="base",
-        ) from error
+        fault = f"{url} cannot be reached ({getattr(error, 'reason', error)})"
+        remedy = f"without a network give the file: mauvecl library add {url.rsplit('/', 1)[1] or 'FILE'}"
+        raise InputError(f"{fault}; {remedy}", key="base") from error
 
 
-def _receive(url: str, file: IO[bytes], max_bytes: int, show_progress: bool) -> None:
-    """Write a response in pieces, since a server may state no size or a wrong one and never stop sending."""
+def _received(url: str, max_bytes: int, show_progress: bool) -> bytes:
+    """Return a response, read in pieces, since a server may state no size or a wrong one and never stop sending."""
     import urllib.request
 
     from astropy.utils.console import ProgressBarOrSpinner
 
-    latest, got = time.monotonic() + MAX_DOWNLOAD_S, 0
+    latest, content = time.monotonic() + MAX_DOWNLOAD_S, bytearray()
     request = urllib.request.Request(url, headers={"User-Agent": f"mauvecl/{VERSION}"})
     with urllib.request.urlopen(request, timeout=TIMEOUT_S) as answer:
         length = answer.headers.get("Content-Length", "")
         size = int(length) if length.isascii() and length.isdigit() and len(length) < 20 else None
         shown = sys.stderr if show_progress else io.StringIO()
         with ProgressBarOrSpinner(size, f"Fetching {url}", file=shown) as bar:
-            while (size is None or size <= max_bytes) and (piece := answer.read1(1 << 16)):
-                file.write(piece)
-                got += len(piece)
-                bar.update(got)
-                if got > max_bytes:
-                    size = got
+            while max(size or 0, len(content)) <= max_bytes and (piece := answer.read1(1 << 16)):
+                content += piece
+                bar.update(len(content))
                 if time.monotonic() > latest:
-                    raise InputError(
-                        f"the download of {url} takes more than {MAX_DOWNLOAD_S:.0f} s: try again later", key="base"
-                    )
-    if size is not None and size > max_bytes:
-        raise InputError(
-            f"{url} has more than {max_bytes >> 20} MiB; MAUVECL_LARGEST_FILE_MIB may set a higher limit for files",
-            key="MAUVECL_LARGEST_FILE_MIB",
-        )
-    if size is not None and got < size:
-        raise InputError(f"the download of {url} ended early ({got} of {size} bytes received): try again", key="base")
+                    fault = f"the download of {url} takes more than {MAX_DOWNLOAD_S:.0f} s: try again later"
+                    raise InputError(fault, key="base")
+    if max(size or 0, len(content)) > max_bytes:
+        limit = "MAUVECL_LARGEST_FILE_MIB"
+        fault = f"{url} has more than {max_bytes >> 20} MiB; {limit} may set a higher limit for files"
+        raise InputError(fault, key=limit)
+    if size is not None and len(content) < size:
+        fault = f"the download of {url} ended early ({len(content)} of {size} bytes received): try again"
+        raise InputError(fault, key="base")
+    return bytes(content)
 
 
 def _listing(address: str, below: str) -> list[str]:
     """Return the names of the files to which a server's page of a folder links."""
-    page = _download(urljoin(_folder(address), below), False, MAX_LISTING_BYTES)
-    try:
-        text = page.read_text(encoding="utf-8", errors="replace")
-    finally:
-        page.unlink(missing_ok=True)
+    text = _download(urljoin(address, below), MAX_LISTING_BYTES, False).decode("utf-8", "replace")
     return [link.rsplit("/", 1)[-1] for link in re.findall(r'href="([^"?#]+)"', text, flags=re.IGNORECASE)]

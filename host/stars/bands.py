@@ -118,16 +118,12 @@ def _covered(wavelength_nm: Float, name: str) -> Band:
     """Return a band; raises InputError if the spectrum does not cover it."""
     chosen = band(name)
     inside = (chosen.wavelength_nm >= wavelength_nm[0]) & (chosen.wavelength_nm <= wavelength_nm[-1])
-    share = np.trapezoid(chosen.throughput * inside, chosen.wavelength_nm) / np.trapezoid(
-        chosen.throughput, chosen.wavelength_nm
-    )
+    seen, whole = np.trapezoid([chosen.throughput * inside, chosen.throughput], chosen.wavelength_nm)
+    share = seen / whole
     if share < COVERAGE:
-        raise InputError(
-            f"the spectrum must cover {COVERAGE:.0%} of the band {chosen.name} "
-            f"({chosen.wavelength_nm[0]:.0f}-{chosen.wavelength_nm[-1]:.0f} nm), but covers {share:.0%} "
-            f"({wavelength_nm[0]:.0f}-{wavelength_nm[-1]:.0f} nm)",
-            key="band",
-        )
+        band_nm, own_nm = (f"({nm[0]:.0f}-{nm[-1]:.0f} nm)" for nm in (chosen.wavelength_nm, wavelength_nm))
+        needed = f"{COVERAGE:.0%} of the band {chosen.name} {band_nm}"
+        raise InputError(f"the spectrum must cover {needed}, but covers {share:.0%} {own_nm}", key="band")
     return chosen
 
 

@@ -14,6 +14,7 @@ from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from mauvecl.host.instrument.instrument import LineSpread
+    from mauvecl.host.stars.source import Source
 
 Float = NDArray[np.float64]
 
@@ -71,13 +72,12 @@ def check_measured(name: str, wavelength: Float, unit: str = "nm") -> None:
     raise InputError(f"{fault}, but needs at least a third, which `extend` can continue{meant}", key="extend")
 
 
-def check_covers(
-    name: str, span_nm: tuple[float, float], needed_nm: tuple[float, float] = NEEDED_NM, of: str = ""
-) -> None:
-    """Raise InputError if a spectrum's range does not cover that of the pixels."""
-    if span_nm[0] > needed_nm[0] or span_nm[1] < needed_nm[1]:
+def check_covers(source: Source, needed_nm: tuple[float, float] = NEEDED_NM, of: str = "") -> None:
+    """Raise InputError if the measured range of a source does not cover that of the pixels."""
+    low, high = source.measured_nm or source.wavelength_nm[[0, -1]]
+    if low > needed_nm[0] or high < needed_nm[1]:
         needed = f"at least {of}{needed_nm[0]:g}-{needed_nm[1]:g} nm"
-        fault = f"spectrum {name} must span {needed}, not {span_nm[0]:g}-{span_nm[1]:g} nm"
+        fault = f"spectrum {source.name} must span {needed}, not {low:g}-{high:g} nm"
         raise InputError(f"{fault}: `extend` continues it by a library spectrum", key="extend")
 
 
@@ -108,9 +108,8 @@ def check_flux(name: str, wavelength: Float, flux: Float) -> None:
     bad = np.flatnonzero(~np.isfinite(flux))
     if bad.size:
         i = int(bad[0])
-        raise InputError.of(
-            "flux", flux[i], "a finite number", where=f"spectrum {name}, point {i + 1} at {wavelength[i]:g} nm"
-        )
+        where = f"spectrum {name}, point {i + 1} at {wavelength[i]:g} nm"
+        raise InputError.of("flux", flux[i], "a finite number", where=where)
     inside = (wavelength >= NEEDED_NM[0]) & (wavelength <= NEEDED_NM[1])
     most, least = (float(f(flux[inside])) if inside.any() else 0.0 for f in (np.max, np.min))
     if max(abs(most), abs(least)) > BRIGHTEST or 0.0 < most < FAINTEST:
@@ -147,13 +146,9 @@ def remarks(wavelength: Float, flux: Float) -> tuple[str, ...]:
         where = ", ".join(f"{nm[a]:.1f}-{nm[b - 1]:.1f}" for a, b in runs[:3])
         messages.append(f"its flux is exactly zero at {where} nm: no data, or no light")
     steps = np.diff(nm)
-    if steps.size:
-        wide = np.flatnonzero(is_gap(steps))
-        if wide.size:
-            i = int(wide[np.argmax(steps[wide])])
-            messages.append(
-                f"it has no point between {nm[i]:.1f} and {nm[i + 1]:.1f} nm, where a straight line is taken"
-            )
+    if steps.size and (wide := is_gap(steps)).any():
+        i = int(np.argmax(np.where(wide, steps, 0.0)))
+        messages.append(f"it has no point between {nm[i]:.1f} and {nm[i + 1]:.1f} nm, where a straight line is taken")
     return tuple(messages)
 
 
@@ -184,19 +179,19 @@ def continued(
     if wavelength[0] <= span[0] and wavelength[-1] >= span[1]:
         return wavelength, flux, ()
     messages = []
-    brightest = _brightest(wavelength, flux, needed_nm)
-    for is_blue in (True, False):
-        end, goal = (wavelength[0], span[0]) if is_blue else (wavelength[-1], span[1])
-        if (end <= goal) if is_blue else (end >= goal):
+    edges = np.arange(needed_nm[0], needed_nm[1] + 0.1, ELEMENT_NM)
+    brightest = max(float(means(wavelength, flux, edges).max()), np.finfo(float).tiny)
+    for side, sign, word in ((0, 1, "starts"), (-1, -1, "ends")):
+        end, goal = wavelength[side], span[side]
+        if sign * (end - goal) <= 0:
             continue
         near = np.abs(wavelength - end) <= END_NM
         level = max(float(flux[near].mean()), 0.0)
         # Light in the outermost pixel from beyond the end.
-        beyond = end - needed_nm[0] if is_blue else needed_nm[1] - end
+        beyond = sign * (end - needed_nm[side])
         share = float((line or _nominal_line()).below(np.array([beyond]))[0]) * level / brightest
         if dark_only and (beyond > 0 or share > MAX_CONTINUED):
             continue
-        word = "starts" if is_blue else "ends"
         if share > MAX_CONTINUED:
             invented = f"{share:.1%} of the brightest pixel's light would be invented"
             fault = f"spectrum {name} must reach {goal:g} nm, but {word} at {end:g} nm, where it is bright: {invented}"
@@ -205,19 +200,21 @@ def continued(
             f"it {word} at {end:g} nm and is continued to {goal:g} nm at its end's level, {level:.3g}: at most "
             f"{100 * share:.2g} % of the brightest pixel's light"
         )
-        wavelength, flux = _attached(wavelength, goal, is_blue), _attached(flux, level, is_blue)
+        wavelength, flux = attached(wavelength, goal, side == 0), attached(flux, level, side == 0)
     return wavelength, flux, tuple(messages)
 
 
-def _attached(values: Float, more: Float | float, before: bool) -> Float:
+def attached(values: Float, more: Float | float, before: bool) -> Float:
     """Return values with more of them before or after."""
     return np.append(more, values) if before else np.append(values, more)
 
 
-def _brightest(wavelength: Float, flux: Float, needed_nm: tuple[float, float]) -> float:
-    """Return the largest mean flux of a resolution element in a range."""
-    edges = np.arange(needed_nm[0], needed_nm[1] + 0.1, ELEMENT_NM)
-    return max(float(means(wavelength, flux, edges).max()), np.finfo(float).tiny)
+def supplemented(nm: Float, others: Float, apart_nm: float) -> Float:
+    """Return wavelengths supplemented by those others within their range that are not next to one of them."""
+    inside = others[(others > nm[0]) & (others < nm[-1])]
+    after = np.searchsorted(nm, inside)
+    alone = np.minimum(nm[after] - inside, inside - nm[after - 1]) > apart_nm
+    return np.union1d(nm, inside[alone]) if alone.any() else nm
 
 
 def means(wavelength: Float, flux: Float, edges: Float) -> Float:
@@ -230,16 +227,9 @@ def means(wavelength: Float, flux: Float, edges: Float) -> Float:
 
 
 def extended(
-    name: str,
-    wavelength: Float,
-    flux: Float,
-    extension: str,
-    beyond: Float,
-    shape: Float,
-    *,
-    ultraviolet: tuple[str, ...] = (),
+    name: str, wavelength: Float, flux: Float, other: Source, *, ultraviolet: tuple[str, ...] = ()
 ) -> tuple[Float, Float, tuple[str, ...]]:
-    """Continue a spectrum by a longer one, `extension`, scaled at the join, and return messages.
+    """Continue a spectrum by a longer one, scaled at the join, and return messages.
 
     The messages on the ultraviolet of the other spectrum are returned if it continues the spectrum to the blue. Raises
     InputError if less than a third of 200-700 nm is measured, or a spectrum has no light at a join.
@@ -253,45 +243,39 @@ def extended(
     check_measured(name, wavelength)
     for blue in (True, False):
         end = float(wavelength[0] if blue else wavelength[-1])
-        more = beyond < end if blue else beyond > end
+        more = other.wavelength_nm < end if blue else other.wavelength_nm > end
         if not more.any():
             continue
-        join, own, other = _join(name, wavelength, flux, extension, beyond, shape, blue)
-        added = shape[more] * (own / other)
+        join, scale = _join(name, wavelength, flux, other, blue)
         messages.append(
-            f"{'below' if blue else 'above'} {end:g} nm it is continued by {extension}, scaled by {own / other:.4g} to "
+            f"{'below' if blue else 'above'} {end:g} nm it is continued by {other.name}, scaled by {scale:.4g} to "
             f"agree at {join[0]:g}-{join[1]:g} nm"
         )
         if blue:
-            messages += [f"in {extension}, {message}" for message in ultraviolet]
-        wavelength, flux = _attached(wavelength, beyond[more], blue), _attached(flux, added, blue)
-    return wavelength, flux, tuple(messages) or (f"its extension {extension} reaches no farther and is not used",)
+            messages += [f"in {other.name}, {message}" for message in ultraviolet]
+        wavelength = attached(wavelength, other.wavelength_nm[more], blue)
+        flux = attached(flux, other.flux_flam[more] * scale, blue)
+    return wavelength, flux, tuple(messages) or (f"its extension {other.name} reaches no farther and is not used",)
 
 
-def _join(
-    name: str, wavelength: Float, flux: Float, extension: str, beyond: Float, shape: Float, blue: bool
-) -> tuple[Float, float, float]:
-    """Return the range in which two spectra are compared, widened by the noise of the first, and their means."""
-    low, high = max(wavelength[0], beyond[0]), min(wavelength[-1], beyond[-1])
+def _join(name: str, wavelength: Float, flux: Float, other: Source, blue: bool) -> tuple[Float, float]:
+    """Return the range in which two spectra are compared, widened by the noise of the first, and their ratio there."""
+    both = f"spectrum {name} and its extension {other.name}"
+    low, high = max(wavelength[0], other.wavelength_nm[0]), min(wavelength[-1], other.wavelength_nm[-1])
     if not low < high:
-        raise InputError(
-            f"spectrum {name} and its extension {extension} must overlap, but span "
-            f"{wavelength[0]:g}-{wavelength[-1]:g} nm and {beyond[0]:g}-{beyond[-1]:g} nm",
-            key="extend",
-        )
+        spans = (f"{nm[0]:g}-{nm[-1]:g} nm" for nm in (wavelength, other.wavelength_nm))
+        raise InputError(f"{both} must overlap, but span {' and '.join(spans)}", key="extend")
     noise = point_noise(flux)
     for width in JOIN_NM * 2.0 ** np.arange(6):
         join = np.clip([low, low + width] if blue else [high - width, high], low, high)
-        own, other = (float(means(x, y, join)[0]) for x, y in ((wavelength, flux), (beyond, shape)))
+        pairs = ((wavelength, flux), (other.wavelength_nm, other.flux_flam))
+        own, others = (float(means(nm, light, join)[0]) for nm, light in pairs)
         near = (wavelength >= join[0]) & (wavelength <= join[1])
         error = float(np.sqrt(np.sum(noise[near] ** 2))) / max(int(near.sum()), 1)
-        if own > MIN_JOIN_SNR * error and other > 0.0 and np.isfinite(own / other):
-            return join, own, other
-    raise InputError(
-        f"spectrum {name} and its extension {extension} must both have light to scale by, but have mean fluxes of "
-        f"{own:g} and {other:g} at {join[0]:g}-{join[1]:g} nm",
-        key="extend",
-    )
+        if own > MIN_JOIN_SNR * error and others > 0.0 and np.isfinite(own / others):
+            return join, own / others
+    fault = f"{both} must both have light to scale by, but have mean fluxes of {own:g} and {others:g}"
+    raise InputError(f"{fault} at {join[0]:g}-{join[1]:g} nm", key="extend")
 
 
 def point_noise(flux_flam: Float) -> Float:

@@ -24,14 +24,13 @@ Float = NDArray[np.float64]
 
 
 def with_flare(
-    wavelength_nm: Float,
+    nm: Float,
     flux_flam: Float,
-    *,
     amplitude: float,
     spectrum: FlareSpectrum,
     band: str,
     geometry: Geometry,
-    photosphere_temperature_k: float | None,
+    photosphere_k: float | None,
 ) -> tuple[Float, Float]:
     """Return wavelengths and flux of a flaring star, each of shape (n,); the spectrum may need more wavelengths.
 
@@ -40,87 +39,66 @@ def with_flare(
     amplitude, N are photons in the band and R is the ratio of the surface fluxes of flare and photosphere there.
     """
     checked(Amplitude, "flare amplitude", amplitude)
-    star, hot, ratio = _photons_in_band(wavelength_nm, flux_flam, spectrum, band, geometry, photosphere_temperature_k)
-    grid, quiescent = _on_grid(wavelength_nm, flux_flam, spectrum)
+    light = added_light(nm, flux_flam, spectrum, band, geometry, photosphere_k)
+    star, hot, ratio = light.star, light.flare, light.ratio
+    grid, quiescent = _on_grid(nm, flux_flam, spectrum)
     body = spectrum.flux(grid)
     if spectrum.fixed_lines:
         lines = spectrum.flux_at_telescope(grid)
         rise = photons(grid, lines, band) / star
         if rise > amplitude:
-            raise InputError(
-                f"flare amplitude must be at least {rise:g}, the rise by its lines in {band}, not {amplitude:g}",
-                key="flare_amplitude",
-            )
+            fault = f"flare amplitude must be at least {rise:g}, the rise by its lines in {band}, not {amplitude:g}"
+            raise InputError(fault, key="flare_amplitude")
         return grid, quiescent + lines + (amplitude - rise) * star / hot * body
     if ratio is None:
         return grid, quiescent + amplitude * star / hot * body
     filling = amplitude / (ratio - 1.0)
     if filling > 1.0:
-        raise InputError(
-            f"flare amplitude must be at most {ratio - 1.0:.3g} at {spectrum.describe()}, not {amplitude:g}, which "
-            f"needs {filling:.2f} of the star's disc",
-            key="flare_amplitude",
-        )
+        fault = f"flare amplitude must be at most {ratio - 1.0:.3g} at {spectrum.describe()}, not {amplitude:g}"
+        raise InputError(f"{fault}, which needs {filling:.2f} of the star's disc", key="flare_amplitude")
     return grid, quiescent * (1.0 - filling) + filling * ratio * star / hot * body
 
 
-def _on_grid(wavelength_nm: Float, flux_flam: Float, spectrum: FlareSpectrum) -> tuple[Float, Float]:
+def _on_grid(nm: Float, flux_flam: Float, spectrum: FlareSpectrum) -> tuple[Float, Float]:
     """Return wavelengths that resolve both star and flare, and the star's flux there."""
-    grid = spectrum.grid(wavelength_nm)
-    return grid, flux_flam if grid is wavelength_nm else np.interp(grid, wavelength_nm, flux_flam)
+    grid = spectrum.grid(nm)
+    return grid, flux_flam if grid is nm else np.interp(grid, nm, flux_flam)
 
 
 @dataclass(frozen=True)
 class AddedLight:
     """Light that a flare of amplitude 1 adds to a star: `hot` times its spectrum less `lost` of the star."""
 
-    hot: float  # multiple of the flare spectrum's flux
-    lost: float  # share of the star's own light
+    star: float  # photons of the star in the band in which the amplitude is measured
+    flare: float  # photons of the flare's spectrum there
+    ratio: float | None = None  # surface flux of the flare there over that of the photosphere that it replaces
 
+    @property
+    def hot(self) -> float:
+        """Multiple of the flare spectrum's flux."""
+        return (1.0 if self.ratio is None else self.ratio / (self.ratio - 1.0)) * self.star / self.flare
 
-def added_light(
-    wavelength_nm: Float,
-    flux_flam: Float,
-    *,
-    spectrum: FlareSpectrum,
-    band: str,
-    geometry: Geometry,
-    photosphere_temperature_k: float | None,
-) -> AddedLight:
-    """Return the light of a flare of amplitude 1, with the arguments and errors of `with_flare`.
-
-    `with_flare` adds it times the amplitude, whose largest value it checks. Lines must scale with the amplitude.
-    """
-    check_scales(spectrum)
-    star, hot, ratio = _photons_in_band(wavelength_nm, flux_flam, spectrum, band, geometry, photosphere_temperature_k)
-    if ratio is None:
-        return AddedLight(star / hot, 0.0)
-    return AddedLight(ratio / (ratio - 1.0) * star / hot, 1.0 / (ratio - 1.0))
+    @property
+    def lost(self) -> float:
+        """Share of the star's own light."""
+        return 0.0 if self.ratio is None else 1.0 / (self.ratio - 1.0)
 
 
 def check_scales(spectrum: FlareSpectrum) -> None:
     """Raise InputError if some lines of a flare do not scale with its amplitude."""
     if spectrum.fixed_lines:
-        raise InputError(
-            f"the lines of a flare of {spectrum.describe()} must be given as a fraction of its continuum to scale "
-            "with its amplitude",
-            key="lines",
-        )
+        needed = "must be given as a fraction of its continuum to scale with its amplitude"
+        raise InputError(f"the lines of a flare of {spectrum.describe()} {needed}", key="lines")
 
 
-def _photons_in_band(
-    wavelength_nm: Float,
-    flux_flam: Float,
-    spectrum: FlareSpectrum,
-    band: str,
-    geometry: Geometry,
-    photosphere_temperature_k: float | None,
-) -> tuple[float, float, float | None]:
-    """Return photons in the band in which amplitudes are measured, of the star and of the flare's spectrum.
+def added_light(
+    nm: Float, flux_flam: Float, spectrum: FlareSpectrum, band: str, geometry: Geometry, photosphere_k: float | None
+) -> AddedLight:
+    """Return the light of a flare of amplitude 1, without lines of a fixed flux; see `with_flare`.
 
-    The last value is the ratio of the surface fluxes of flare and photosphere; None if no photosphere is replaced.
+    `with_flare` adds it times the amplitude, whose largest value it checks.
     """
-    grid, quiescent = _on_grid(wavelength_nm, flux_flam, spectrum)
+    grid, quiescent = _on_grid(nm, flux_flam, spectrum)
     star = photons(grid, quiescent, band)
     if not star > 0.0:
         raise InputError(f"the star must have light in the band {band}, but has none", key="band")
@@ -128,25 +106,20 @@ def _photons_in_band(
     if not hot > 0.0:
         raise InputError(f"the flare, {spectrum.describe()}, needs light in the band {band} to be scaled", key="band")
     if geometry == "added":
-        return star, hot, None
-    if photosphere_temperature_k is None:
-        raise InputError(
-            "flare geometry 'replaces' needs a photosphere temperature, in K", key="photosphere_temperature"
-        )
+        return AddedLight(star, hot)
+    if photosphere_k is None:
+        fault = "flare geometry 'replaces' needs a photosphere temperature, in K"
+        raise InputError(fault, key="photosphere_temperature")
     if not spectrum.surface or spectrum.fixed_lines:
-        raise InputError(
-            f"flare geometry must be 'added' with {spectrum.describe()}, since its surface flux is unknown",
-            key="flare_geometry",
-        )
-    checked(Temperature, "photosphere temperature", photosphere_temperature_k)
-    ratio = hot / photons(wavelength_nm, blackbody(wavelength_nm, photosphere_temperature_k), band)
+        fault = f"flare geometry must be 'added' with {spectrum.describe()}, since its surface flux is unknown"
+        raise InputError(fault, key="flare_geometry")
+    checked(Temperature, "photosphere temperature", photosphere_k)
+    ratio = hot / photons(nm, blackbody(nm, photosphere_k), band)
     if ratio <= 1.0:
-        raise InputError(
-            f"flare temperature must be above the {photosphere_temperature_k:g} K of the photosphere that it replaces, "
-            f"not {spectrum.describe()}",
-            key="flare_temperature",
-        )
-    return star, hot, ratio
+        photosphere = f"the {photosphere_k:g} K of the photosphere that it replaces"
+        fault = f"flare temperature must be above {photosphere}, not {spectrum.describe()}"
+        raise InputError(fault, key="flare_temperature")
+    return AddedLight(star, hot, ratio)
 
 
 #: Names of the column of the relative rise above the quiescent flux; AltaiPony's first.
@@ -200,21 +173,19 @@ def flares_of(table: Table | Any, name: str = "flare table") -> QTable:
     columns = {"amplitude": (amplitude, "1"), "start": (start, "d"), "stop": (stop, "d")}
     cells = [[rows.number(held, row, unit) for held, unit in columns.values()] for row in range(rows.n)]
     # AltaiPony's tables have an empty row for a star without flares.
-    filled = [row for row, values in enumerate(cells) if any(value is not None for value in values)]
+    filled = [(row, *values) for row, values in enumerate(cells, 1) if any(value is not None for value in values)]
     if not 0 < len(filled) <= MAX_FLARES:
         raise rows.error(f"it must have 1 to {MAX_FLARES} flares, not {len(filled)}", "amplitude")
-    for row in filled:
-        value = cells[row][0]
+    for row, value, begin, end in filled:
         if value is None or not SMALLEST <= value <= LARGEST:
             given = "an empty cell" if value is None else f"{value:g}"
-            raise rows.error(f"the amplitude in row {row + 1} must be a rise above 0, not {given}", "amplitude")
-        begin, end = cells[row][1:]
+            raise rows.error(f"the amplitude in row {row} must be a rise above 0, not {given}", "amplitude")
         if begin is not None and end is not None and end < begin:
-            raise rows.error(f"row {row + 1} ends at {end:.10g} d, but must end after {begin:.10g} d", "stop")
-    flares = QTable({"amplitude": [cells[row][0] for row in filled]})
-    for place, (title, (held, unit)) in enumerate(columns.items()):
-        if place and held is not None:
-            flares[title] = np.array([cells[row][place] for row in filled], float)
+            raise rows.error(f"row {row} ends at {end:.10g} d, but must end after {begin:.10g} d", "stop")
+    flares = QTable({"amplitude": [value for _, value, *_ in filled]})
+    for place, (title, (held, unit)) in enumerate(columns.items(), 1):
+        if title != "amplitude" and held is not None:
+            flares[title] = np.array([values[place] for values in filled], float)
             flares[title].unit = unit
     flares.meta["comments"] = list(rows.unused([name for name in rows.names if name not in (amplitude, start, stop)]))
     flares["amplitude"].info.description = "relative rise above the quiescent flux, in the band of the light curve"

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from mauvecl.host.arrays import ContentEquality, array_cache, set_read_only
 from mauvecl.host.spectra.units import NEEDED_NM
 from mauvecl.host.stars.bands import ANGSTROM
-from mauvecl.host.stars.coverage import check_points
+from mauvecl.host.stars.coverage import attached, check_points, supplemented
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range, Unit, number
@@ -110,12 +110,8 @@ class FlareSpectrum:
 
     def grid(self, wavelength_nm: Float) -> Float:
         """Return wavelengths supplemented by the nodes of the spectrum, nm."""
-        nodes = self.nodes_nm
-        inside = nodes[(nodes > wavelength_nm[0]) & (nodes < wavelength_nm[-1])]
         # A node next to a wavelength would only add rounding errors.
-        after = np.searchsorted(wavelength_nm, inside)
-        alone = np.minimum(wavelength_nm[after] - inside, inside - wavelength_nm[after - 1]) > SAME_NM
-        return np.union1d(wavelength_nm, inside[alone]) if alone.any() else wavelength_nm
+        return supplemented(wavelength_nm, self.nodes_nm, SAME_NM)
 
     def describe(self) -> str:
         """Return the spectrum in a few words."""
@@ -328,10 +324,8 @@ class FlareWithLines(FlareSpectrum):
 
 
 def _sum_of_lines(fluxes: Mapping[str, float], wavelength_nm: Float) -> Float:
-    total = np.zeros(np.shape(wavelength_nm))
-    for name, value in fluxes.items():
-        total += value * EmissionLine.named(name).profile(wavelength_nm)
-    return total
+    lines = (value * EmissionLine.named(name).profile(wavelength_nm) for name, value in fluxes.items())
+    return sum(lines, np.zeros(np.shape(wavelength_nm)))
 
 
 @validated
@@ -361,17 +355,15 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
         check_points(self.name, self.wavelength_nm, self.flux_flam)
         ends = float(self.wavelength_nm[0]), float(self.wavelength_nm[-1])
         if ends[0] > NEEDED_NM[0] or ends[1] < NEEDED_NM[1]:
-            raise InputError(
-                f"the flare spectrum {self.name} must cover {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm, but covers "
-                f"{ends[0]:g}-{ends[1]:g} nm; give the temperature of a blackbody that continues it",
-                key="continue_at_k",
-            )
+            needed = f"{NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm, but covers {ends[0]:g}-{ends[1]:g} nm"
+            fault = f"the flare spectrum {self.name} must cover {needed}"
+            remedy = "give the temperature of a blackbody that continues it"
+            raise InputError(f"{fault}; {remedy}", key="continue_at_k")
         if self.measured_nm == (0.0, 0.0):
             object.__setattr__(self, "measured_nm", ends)
         if not self.bolometric_flux() > 0.0:
-            raise InputError(
-                f"the flare spectrum {self.name} needs a total flux above 0, not {self.bolometric_flux():g}", key="flux"
-            )
+            fault = f"the flare spectrum {self.name} needs a total flux above 0, not {self.bolometric_flux():g}"
+            raise InputError(fault, key="flux")
 
     @classmethod
     def from_arrays(
@@ -403,10 +395,8 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
             messages += (f"The flare spectrum {name} is interpolated in its gaps at {', '.join(gaps)} nm",)
         if continue_at_k is not None:
             nm, flux = _continued(name, nm, flux, continue_at_k)
-            messages += (
-                f"The flare spectrum {name} covers {measured[0]:g}-{measured[1]:g} nm; a blackbody of "
-                f"{continue_at_k:g} K continues it",
-            )
+            covered = f"The flare spectrum {name} covers {measured[0]:g}-{measured[1]:g} nm"
+            messages += (f"{covered}; a blackbody of {continue_at_k:g} K continues it",)
         return cls(nm, flux, name, measured, messages)
 
     @classmethod
@@ -421,6 +411,9 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
     ) -> Self:
         """Read the spectrum of a flare, and subtract its star's quiescent spectrum from it.
 
+        Raises InputError for files that hold no spectra or do not overlap, or a spectrum that does not cover 200-700
+        nm.
+
         Parameters
         ----------
         path : str or Path
@@ -431,11 +424,6 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
             Override what both files state.
         continue_at_k : float, optional
             Temperature of the blackbody that continues the spectrum where it ends.
-
-        Raises
-        ------
-        InputError
-            For files that hold no spectra or do not overlap, or a spectrum that does not cover 200-700 nm.
         """
         from mauvecl.host.spectra.formats import read_spectrum
 
@@ -446,24 +434,18 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
             star = read_spectrum(Path(quiescent), **units)
             inside = (nm >= star.wavelength_nm[0]) & (nm <= star.wavelength_nm[-1])
             if inside.sum() < 2:
-                raise InputError(
-                    f"the spectra {read.name} and {star.name} must be of the same star, but do not overlap",
-                    key="quiescent",
-                )
+                fault = f"the spectra {read.name} and {star.name} must be of the same star, but do not overlap"
+                raise InputError(fault, key="quiescent")
             nm, messages = nm[inside], (*messages, *star.messages)
             quiet = np.interp(nm, star.wavelength_nm, star.flux_flam)
             flux = flux[inside] - quiet
             left, rounding = np.trapezoid([flux, ROUNDING * np.abs(quiet)], nm)
             if not left > rounding:
-                raise InputError(
-                    f"the spectrum {read.name} must be brighter than {star.name}, which is subtracted from it: give "
-                    "the star with its flare, and the same star without it",
-                    key="quiescent",
-                )
-        return cls.from_arrays(
-            nm, flux, name=read.name, continue_at_k=continue_at_k,
-            messages=tuple(f"{read.name}: {text}" for text in messages),
-        )  # fmt: skip
+                fault = f"the spectrum {read.name} must be brighter than {star.name}, which is subtracted from it"
+                remedy = "give the star with its flare, and the same star without it"
+                raise InputError(f"{fault}: {remedy}", key="quiescent")
+        own = tuple(f"{read.name}: {text}" for text in messages)
+        return cls.from_arrays(nm, flux, name=read.name, continue_at_k=continue_at_k, messages=own)
 
     @property
     def nodes_nm(self) -> Float:  # type: ignore[override]
@@ -486,26 +468,21 @@ def _continued(name: str, nm: Float, flux: Float, kelvin: float) -> tuple[Float,
     """Continue a spectrum at both ends by a blackbody that has the mean flux of the last 20 nm there."""
     low, high = CONTINUED_NM
     steps = np.log(CONTINUED_RATIO)
-    for first in (True, False):
-        end = nm[0] if first else nm[-1]
-        if (end <= NEEDED_NM[0]) if first else (end >= high):
+    for blue in (True, False):
+        end = nm[0] if blue else nm[-1]
+        if (end <= NEEDED_NM[0]) if blue else (end >= high):
             continue
-        join = nm <= end + JOIN_NM if first else nm >= end - JOIN_NM
+        join = np.abs(nm - end) <= JOIN_NM
         body = blackbody(nm[join], kelvin)
         # A coarse spectrum may have its last point alone within that width.
         alone = body.size == 1
-        scale = float(
-            flux[join][0] / body[0] if alone else np.trapezoid(flux[join], nm[join]) / np.trapezoid(body, nm[join])
-        )
+        own, model = (light[0] if alone else np.trapezoid(light, nm[join]) for light in (flux[join], body))
+        scale = float(own / model)
         if not scale > 0.0:
-            raise InputError(
-                f"the flare spectrum {name} has no light near {end:g} nm, but needs some to scale a blackbody to",
-                key="continue_at_k",
-            )
-        if first:
-            added = np.exp(np.arange(np.log(low), np.log(end), steps))
-            nm, flux = np.concatenate([added, nm]), np.concatenate([scale * blackbody(added, kelvin), flux])
-        else:
+            fault = f"the flare spectrum {name} has no light near {end:g} nm, but needs some to scale a blackbody to"
+            raise InputError(fault, key="continue_at_k")
+        added = np.exp(np.arange(np.log(low), np.log(end), steps))
+        if not blue:
             added = np.append(np.exp(np.arange(np.log(end) + steps, np.log(high), steps)), high)
-            nm, flux = np.concatenate([nm, added]), np.concatenate([flux, scale * blackbody(added, kelvin)])
+        nm, flux = attached(nm, added, blue), attached(flux, scale * blackbody(added, kelvin), blue)
     return nm, flux

@@ -6,13 +6,14 @@ and the digest of its spectrum, which is verified at every reading.
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import difflib
 import hashlib
 import os
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from importlib import resources
 from pathlib import Path
@@ -127,40 +128,30 @@ def spectrum(star: OwnStar) -> tuple[np.ndarray, np.ndarray]:
 
     table = _read(star.path)
     wavelength, flux = (np.asarray(table[name], float) for name in ("wavelength", "flux"))
-    if spectrum_digest(wavelength, flux) != table.meta["spectrum_sha256"]:
-        raise InputError(
-            f"kept star {star.name!r} must be unchanged, but its digest differs: add or fetch it again", key="name"
-        )
+    if hashlib.sha256(wavelength.tobytes() + flux.tobytes()).hexdigest() != table.meta["spectrum_sha256"]:
+        fault = f"kept star {star.name!r} must be unchanged, but its digest differs: add or fetch it again"
+        raise InputError(fault, key="name")
     return wavelength, flux
-
-
-def spectrum_digest(wavelength: np.ndarray, flux: np.ndarray) -> str:
-    """Return the SHA-256 of wavelengths and fluxes, in hexadecimal."""
-    return hashlib.sha256(wavelength.tobytes() + flux.tobytes()).hexdigest()
 
 
 def remove(name: str) -> None:
     """Delete a kept star; raises InputError for an unknown name."""
     wanted = name.strip().casefold()
-    paths = sorted(folder().glob("*.ecsv"))
+    names = {path: _named(path) for path in sorted(folder().glob("*.ecsv"))}
+    found = [path for path, own in names.items() if own == wanted]
     # A damaged file has no name but that of the file.
     stem = re.sub(r"[^a-z0-9.+-]", "_", wanted)
-    found = [path for path in paths if _named(path) == wanted] or [
-        path for path in paths if path.stem.casefold() == stem and _named(path) is None
-    ]
-    if found:
-        found[0].unlink()
-        return
-    names = ", ".join(star.name for star in kept()) or "no star is kept"
-    raise InputError.of("name", name, f"one of: {names}")
+    found += [path for path, own in names.items() if own is None and path.stem.casefold() == stem]
+    if not found:
+        raise InputError.of("name", name, f"one of: {', '.join(star.name for star in kept()) or 'no star is kept'}")
+    found[0].unlink()
 
 
 def _named(path: Path) -> str | None:
-    try:
-        described = _described(path)
-    except InputError:
-        return None
-    return None if described is None else described.name.casefold()
+    with contextlib.suppress(InputError):
+        if (star := _described(path)) is not None:
+            return star.name.casefold()
+    return None
 
 
 #: Abbreviations of Greek letters in catalogues.
@@ -245,14 +236,9 @@ def _keys() -> dict[str, str]:
     return keys
 
 
-def entries() -> list[dict[str, str]]:
-    """Return the index entries of all embedded spectra."""
-    return list(_index().values())
-
-
 def library_names() -> list[str]:
     """Return the distinct names of all embedded spectra: types, aliases and stars."""
-    each = [entry[column] for entry in entries() for column in ("name", "alias", "star")]
+    each = [entry[column] for entry in _index().values() for column in ("name", "alias", "star")]
     # A collection's name in front of a type says nothing that the type does not.
     return [name for name in dict.fromkeys(each) if name and not name.startswith("Pickles ")]
 
@@ -290,21 +276,17 @@ def library_table() -> Table:
         Columns name, alias, spectral_type, star, origin, citation, licence, treatment, uv_quality and kept. All are
         text; the last is "embedded" or "yours".
     """
-    from astropy.table import Table
+    from astropy.table import Table, vstack
 
     table = Table.read(library_text("index.ecsv"), format="ascii.ecsv")
-    # The reader masks empty text.
-    table = table.filled("")
     table.remove_columns(["file", "source_file"])
     table["kept"] = "embedded"
-    for star in kept():
-        row = dict.fromkeys(table.colnames, "") | {"name": star.name, "star": star.name, "origin": star.origin}
-        row |= {"treatment": "; ".join(star.notes), "kept": "yours"}
-        for name in table.colnames:
-            # A column of dtype str is only as wide as its longest entry.
-            table[name] = table[name].astype(object)
-        table.add_row(row)
-    return table
+    own = [
+        {"name": star.name, "star": star.name, "origin": star.origin, "treatment": "; ".join(star.notes),
+         "kept": "yours"} for star in kept()
+    ]  # fmt: skip
+    # Empty text of the file, and what is not known of own stars, is masked.
+    return vstack([table, Table(own)] if own else [table]).filled("")
 
 
 def embedded(name: str) -> dict[str, str] | None:
@@ -339,17 +321,11 @@ def subtype(spectral_type: str) -> float:
     return 10.0 * CLASSES.index(matched[1]) + (5.0 if matched[2] is None else float(matched[2]))
 
 
-def as_type(text: str) -> str | None:
-    """Return the spectral type of a dwarf or subgiant that a text names, as in "M3.5V" for "m3.5", or None."""
-    found = re.fullmatch(rf"d?([{CLASSES}])(\d(?:\.\d+)?)(IV|V)?", "".join(text.split()), flags=re.IGNORECASE)
-    return None if found is None else f"{found[1]}{found[2]}{found[3] or 'V'}".upper()
-
-
 def nearest_spectrum(spectral_type: str) -> str:
     """Return the name of the embedded spectrum of the nearest type; the first in the library if there are several."""
     wanted = subtype(spectral_type)
-    names = [(entry["name"], entry["spectral_type"]) for entry in entries() if _TYPE.match(entry["spectral_type"])]
-    return min(names, key=lambda entry: abs(subtype(entry[1]) - wanted))[0]
+    typed = [entry for entry in _index().values() if _TYPE.match(entry["spectral_type"])]
+    return min(typed, key=lambda entry: abs(subtype(entry["spectral_type"]) - wanted))["name"]
 
 
 @dataclass(frozen=True)
@@ -357,14 +333,15 @@ class NamedStar:
     """Star or spectral type that was found by name."""
 
     name: str
-    spectrum: str | None  # name of its own spectrum, in the library or among the user's
-    known: WellKnown | None  # its entry in the list of well-known stars
+    known: WellKnown | None = None  # its entry in the list of well-known stars
+    # Its own spectrum, if any: a formula, a star of the user, or an entry of the library's index.
+    light: ModelStar | OwnStar | Mapping[str, str] | None = None
 
     @property
     def nearest(self) -> str:
-        """Library spectrum that represents it: its own, or that of the nearest type."""
-        if self.spectrum is not None:
-            return self.spectrum
+        """Name of its own spectrum, or of that of the nearest type in the library."""
+        if self.light is not None:
+            return self.light["name"] if isinstance(self.light, Mapping) else self.light.name
         return nearest_spectrum(self.name if self.known is None else self.known.spectral_type)
 
 
@@ -376,32 +353,27 @@ def resolve(text: str, *, own: bool = True) -> NamedStar | None:
     """
     model = ModelStar.named(text)
     if model is not None:
-        return NamedStar(model.name, model.name, None)
-    entry, star = embedded(text), by_key().get(name_key(text))
-    if entry is None and star is not None:
-        # The library has the star under another of its names.
-        entries = (embedded(name) for name in (star.name, *star.others))
-        entry = next((entry for entry in entries if entry is not None), None)
-    mine = find(text) if own and entry is None else None
-    spectrum = entry["name"] if entry is not None else None if mine is None else mine.name
+        return NamedStar(model.name, light=model)
+    star = by_key().get(name_key(text))
+    # The library may have the star under another of its names.
+    entries = map(embedded, (text,) if star is None else (text, star.name, *star.others))
+    light = next(filter(None, entries), None) or (find(text) if own else None)
     if star is not None:
-        return NamedStar(star.name, spectrum, star)
-    if spectrum is not None:
-        return NamedStar(spectrum, spectrum, None)
-    spectral_type = as_type(text)
-    return None if spectral_type is None else NamedStar(spectral_type, None, None)
+        return NamedStar(star.name, star, light)
+    if light is not None:
+        named = NamedStar("", light=light)
+        return replace(named, name=named.nearest)
+    # Types of dwarfs and subgiants, such as "m3.5" for M3.5V.
+    found = re.fullmatch(rf"d?([{CLASSES}])(\d(?:\.\d+)?)(IV|V)?", "".join(text.split()), flags=re.IGNORECASE)
+    return None if found is None else NamedStar(f"{found[1]}{found[2]}{found[3] or 'V'}".upper())
 
 
-def spectrum_name(text: str, key: str = "star", *, own: bool = True) -> str:
-    """Return the name of the spectrum of a star: its own, or that of the nearest type of the library.
-
-    Raises InputError, with this key, for an unknown star; the message proposes similar names. The user's own stars are
-    searched if `own` is true.
-    """
+def named_star(text: str, key: str = "star", *, own: bool = True) -> NamedStar:
+    """Return what `resolve` finds; raise InputError, with this key and similar names, for an unknown star."""
     star = resolve(text, own=own)
     if star is None:
         raise InputError(f"star {text.strip()!r} is unknown; try a name such as {', '.join(near_names(text))}", key=key)
-    return star.nearest
+    return star
 
 
 def listed_values(name: str) -> dict[str, float]:
@@ -424,7 +396,7 @@ def listed_note(name: str, **used: float | None) -> str:
     if star is None:
         return ""
     texts = []
-    if star.spectrum is None:
+    if star.light is None:
         wanted = star.name if star.known is None else star.known.spectral_type
         exact = star.nearest == wanted
         texts.append(f"spectrum of {f'type {wanted}' if exact else f'{star.nearest}, the nearest to type {wanted}'}")
@@ -433,7 +405,7 @@ def listed_note(name: str, **used: float | None) -> str:
     listed = {key: value for key, value in listed_values(name).items() if used.get(key) == value}
     texts += [f"V = {value:g}" if key == "magnitude" else f"{value:g} pc" for key, value in listed.items()]
     source = f", from {star.known.source.partition(',')[0]}" if star.known is not None and listed else ""
-    return ", ".join(texts) + source if listed or star.spectrum is None else ""
+    return ", ".join(texts) + source if listed or star.light is None else ""
 
 
 def all_names() -> list[str]:

@@ -25,19 +25,18 @@ from mauvecl.host.stars.coverage import (
     extended,
     means,
     remarks,
+    supplemented,
     without_undefined_ends,
 )
 from mauvecl.host.stars.flare import Geometry, with_flare
 from mauvecl.host.stars.flare_spectra import Blackbody, FlareSpectrum, blackbody
 from mauvecl.host.stars.library import (
     ModelStar,
-    embedded,
-    find,
+    OwnStar,
     listed_note,
     listed_values,
-    resolve,
+    named_star,
     spectrum,
-    spectrum_name,
     spectrum_table,
 )
 from mauvecl.schema.calls import validated
@@ -48,6 +47,8 @@ from mauvecl.schema.physical import Amplitude, BinWidth, Magnitude, Reddening, T
 
 if TYPE_CHECKING:
     from astropy.table import QTable
+
+    from mauvecl.host.spectra.conversion import ReadSpectrum
 
 #: Unit of flux densities.
 FLUX_UNIT = u.erg / (u.s * u.cm**2 * u.AA)
@@ -63,7 +64,7 @@ PIVOT_NM = 550.0
 @validated
 @dataclass(frozen=True, eq=False)
 class Source(Drawable, ContentEquality):
-    """A stellar spectrum at the telescope.
+    """A stellar spectrum at the telescope; raises InputError if the arrays do not hold one.
 
     Attributes
     ----------
@@ -88,11 +89,6 @@ class Source(Drawable, ContentEquality):
         Reason why the flux is not that at the telescope, so that a magnitude is needed; empty otherwise.
     temperature_k : float, optional
         Temperature of the photosphere, which flares with ``geometry="replaces"`` need; None if unknown.
-
-    Raises
-    ------
-    InputError
-        If the arrays do not hold such a spectrum.
 
     Examples
     --------
@@ -135,42 +131,35 @@ class Source(Drawable, ContentEquality):
         `library_table` lists the names. Another spectral type, and a well-known star without a spectrum, have that of
         the nearest type, with a message. For an unknown name the error suggests the nearest ones.
         """
-        given, name = name, spectrum_name(name, "name")
-        star = resolve(given)
-        if star is not None and star.spectrum is None:
-            nearest = cls.from_library(name)
-            return replace(nearest, name=star.name, messages=(listed_note(given), *nearest.messages))
-        model = ModelStar.named(name)
-        if model is not None:
-            nm, kelvin = np.geomspace(*GRID), model.temperature_k
-            flux = (nm / PIVOT_NM) ** model.index if kelvin is None else blackbody(nm, kelvin)
+        star = named_star(name, "name")
+        light = star.light
+        if light is None:
+            nearest = cls.from_library(star.nearest)
+            return replace(nearest, name=star.name, messages=(listed_note(name), *nearest.messages))
+        if isinstance(light, ModelStar):
+            nm, kelvin = np.geomspace(*GRID), light.temperature_k
+            flux = (nm / PIVOT_NM) ** light.index if kelvin is None else blackbody(nm, kelvin)
             level = "a formula has no absolute level"
-            return cls(nm, flux, model.name, model.origin, unscaled=level, temperature_k=kelvin)
-        mine = find(name) if embedded(name) is None else None
-        if mine is not None:
-            wavelength, flux = spectrum(mine)
+            return cls(nm, flux, light.name, light.origin, unscaled=level, temperature_k=kelvin)
+        if isinstance(light, OwnStar):
             return cls(
-                wavelength, flux, mine.name, mine.origin, mine.notes,
-                messages=mine.messages, measured_nm=mine.measured_nm, unscaled=mine.unscaled,
+                *spectrum(light), light.name, light.origin, light.notes,
+                messages=light.messages, measured_nm=light.measured_nm, unscaled=light.unscaled,
             )  # fmt: skip
-        entry = embedded(name)
-        assert entry is not None
-        table = spectrum_table(entry["file"])
-        noisy = entry["noisy_below_nm"]
+        table, noisy = spectrum_table(light["file"]), light["noisy_below_nm"]
+        limit = f"noise rules its ultraviolet below {noisy} nm, where its flux is an upper limit"
         return cls(
             table["wavelength"],
             table["flux"],
-            entry["name"],
-            f"{entry['origin']}; {entry['citation']}",
+            light["name"],
+            f"{light['origin']}; {light['citation']}",
             (
-                f"library spectrum {entry['name']} is {entry['star']}; {entry['uv_quality']}",
-                f"photosphere of {entry['temperature_k']} K: {entry['temperature_source']}",
+                f"library spectrum {light['name']} is {light['star']}; {light['uv_quality']}",
+                f"photosphere of {light['temperature_k']} K: {light['temperature_source']}",
             ),
-            messages=(f"noise rules its ultraviolet below {noisy} nm, where its flux is an upper limit",)
-            if noisy
-            else (),
-            unscaled="" if entry["level"] == "as seen" else f"the library keeps it at {entry['level']}",
-            temperature_k=float(entry["temperature_k"]),
+            messages=(limit,) if noisy else (),
+            unscaled="" if light["level"] == "as seen" else f"the library keeps it at {light['level']}",
+            temperature_k=float(light["temperature_k"]),
         )
 
     @classmethod
@@ -186,7 +175,8 @@ class Source(Drawable, ContentEquality):
         """Read a spectrum from a file of text, ECSV, VOTable or FITS.
 
         `messages` lists assumptions and changes. Undefined ends beyond 200-700 nm are dropped. Dark ends within
-        180-750 nm are continued at their level.
+        180-750 nm are continued at their level. Raises InputError if the file is missing, unreadable or holds no usable
+        spectrum, or less than a third of 200-700 nm.
 
         Parameters
         ----------
@@ -198,56 +188,37 @@ class Source(Drawable, ContentEquality):
             Library spectrum that continues the file's beyond its end, scaled to match at the join.
         ignore_checksum : bool
             Whether a FITS file is read that its CHECKSUM or DATASUM contradicts.
-
-        Raises
-        ------
-        InputError
-            If the file is missing, unreadable or holds no usable spectrum, or less than a third of 200-700 nm.
         """
         from mauvecl.host.spectra.formats import read_spectrum
 
         read = read_spectrum(
             Path(path), wavelength_unit=wavelength_unit, flux_unit=flux_unit, ignore_checksum=ignore_checksum
         )
-        star = cls._made(
-            read.wavelength_nm, read.flux_flam, read.name, read.origin, read.notes, read.messages, extend,
-            file_unit=read.axis_unit,
-        )  # fmt: skip
-        unscaled = read.unscaled or star._too_bright()
-        return replace(star, unscaled=unscaled) if unscaled else star
+        star = cls._made(read, extend)
+        return replace(star, unscaled=star.unscaled or star._too_bright())
 
     @classmethod
-    def _made(
-        cls,
-        wavelength: NDArray[np.float64],
-        flux: NDArray[np.float64],
-        name: str,
-        origin: str,
-        notes: tuple[str, ...] = (),
-        messages: tuple[str, ...] = (),
-        extend: str | Source | None = None,
-        file_unit: str = "",
-    ) -> Self:
+    def _made(cls, given: ReadSpectrum, extend: str | Source | None) -> Self:
         """Check a user's spectrum, drop undefined ends, continue others, and make it a source."""
+        name, wavelength, flux = given.name, given.wavelength_nm, given.flux_flam
         check_points(name, wavelength, flux)
-        check_measured(name, wavelength, file_unit or "nm")
+        check_measured(name, wavelength, given.axis_unit or "nm")
         wavelength, flux, cut = without_undefined_ends(name, wavelength, flux)
-        if file_unit or extend is not None:
+        messages = given.messages
+        if given.axis_unit or extend is not None:
             messages += (coverage(wavelength),)
         messages += remarks(wavelength, flux)
         if extend is not None:
             other = cls.from_library(extend) if isinstance(extend, str) else extend
-            wavelength, flux, added = extended(
-                name, wavelength, flux, other.name, other.wavelength_nm, other.flux_flam,
-                ultraviolet=other.messages if isinstance(extend, str) else (),
-            )  # fmt: skip
+            ultraviolet = other.messages if isinstance(extend, str) else ()
+            wavelength, flux, added = extended(name, wavelength, flux, other, ultraviolet=ultraviolet)
             messages += added
         check_flux(name, wavelength, flux)
         measured = (float(wavelength[0]), float(wavelength[-1]))
         wavelength, flux, added = continued(name, wavelength, flux, dark_only=True)
         return cls(
-            wavelength, flux, name, origin, (*notes, *cut), messages=(*messages, *added),
-            measured_nm=measured if added else None,
+            wavelength, flux, name, given.origin, (*given.notes, *cut), messages=(*messages, *added),
+            measured_nm=measured if added else None, unscaled=given.unscaled,
         )  # fmt: skip
 
     def _too_bright(self) -> str:
@@ -288,6 +259,8 @@ class Source(Drawable, ContentEquality):
 
         `extend` is a library spectrum, or its name, that continues the arrays beyond their ends.
         """
+        from mauvecl.host.spectra.conversion import ReadSpectrum
+
         try:
             nm, values = (
                 given if isinstance(given, u.Quantity) else np.asarray(given) * unit
@@ -301,7 +274,7 @@ class Source(Drawable, ContentEquality):
         if isinstance(wavelength, u.Quantity) and wavelength.unit.physical_type != "length" and axis[:1] > axis[-1:]:
             # Rising frequencies or energies are falling wavelengths.
             axis, density = axis[::-1], density[::-1]
-        return cls._made(np.asarray(axis, float), np.asarray(density, float), name, origin, extend=extend)
+        return cls._made(ReadSpectrum(np.asarray(axis, float), np.asarray(density, float), name, origin), extend)
 
     @classmethod
     def from_synphot(cls, spectrum: Any, *, name: str = "synphot spectrum") -> Self:
@@ -313,15 +286,10 @@ class Source(Drawable, ContentEquality):
         own = spectrum.waveset
         if own is None:
             raise InputError(f"{name} defines no wavelengths; use a spectrum with a waveset", key="spectrum")
-        grid = np.arange(160.0, 1150.0, 0.5)
-        nm = np.unique(own.to_value(u.nm))
-        inside = grid[(grid > nm[0]) & (grid < nm[-1])]
-        # A grid point within 1e-3 nm of one of the spectrum's own adds no information.
-        at = np.searchsorted(nm, inside)
-        alone = np.minimum(inside - nm[at - 1], nm[at] - inside) > 1e-3
-        grid = np.union1d(nm, inside[alone])
+        # A point of the grid within 1e-3 nm of one of the spectrum's own adds no information.
+        grid = supplemented(np.unique(own.to_value(u.nm)), np.arange(160.0, 1150.0, 0.5), 1e-3)
         flux = spectrum(grid * u.nm, flux_unit=FLAM).value
-        return cls._made(grid, flux, name, f"synphot {type(spectrum).__name__}")
+        return cls.from_arrays(grid, flux, name=name, origin=f"synphot {type(spectrum).__name__}")
 
     @classmethod
     def from_specutils(cls, spectrum: Any, *, name: str = "specutils spectrum") -> Self:
@@ -375,18 +343,13 @@ class Source(Drawable, ContentEquality):
         return f"<b>{html.escape(self.name)}</b>, {span}{notes}"
 
     def magnitude(self, band: str = "V", system: bands.System = "catalogue") -> float:
-        """Return the synthetic magnitude in a band.
+        """Return the synthetic magnitude in a band; raises InputError if the measured spectrum does not cover it.
 
         Parameters
         ----------
         band : str
         system : {"catalogue", "vega", "ab"}
             The system of catalogues in the band, Vega at zero in every band, or AB.
-
-        Raises
-        ------
-        InputError
-            If the measured spectrum does not cover the band.
         """
         low, high = self.measured_nm or (0.0, np.inf)
         # Continued ends are assumptions, so they do not count.
@@ -437,28 +400,17 @@ class Source(Drawable, ContentEquality):
         """
         light = Blackbody(temperature) if spectrum is None else spectrum
         photosphere = self.temperature_k if photosphere_temperature is None else photosphere_temperature
-        nm, flux = with_flare(
-            self.wavelength_nm,
-            self.flux_flam,
-            amplitude=amplitude,
-            spectrum=light,
-            band=band,
-            geometry=geometry,
-            photosphere_temperature_k=photosphere,
-        )
+        nm, flux = with_flare(self.wavelength_nm, self.flux_flam, amplitude, light, band, geometry, photosphere)
         title = f"flare of {100 * amplitude:g} % in {bands.band(band).name} at {light.describe()}, {geometry}"
         if geometry == "replaces":
             title += f" photosphere of {photosphere:g} K"
-        return replace(
-            self,
-            wavelength_nm=nm,
-            flux_flam=flux,
-            history=(*self.history, title),
-            messages=(*self.messages, *light.messages),
-        )
+        history, messages = (*self.history, title), (*self.messages, *light.messages)
+        return replace(self, wavelength_nm=nm, flux_flam=flux, history=history, messages=messages)
 
     def reddened(self, ebv: Reddening, *, rv: float = 3.1, law: Literal["G23", "F19", "CCM89"] = "G23") -> Self:
         """Return the star reddened by dust (needs the extra ``extinction``).
+
+        Raises InputError if the law does not cover 180-750 nm, or the extra is missing.
 
         Parameters
         ----------
@@ -468,11 +420,6 @@ class Source(Drawable, ContentEquality):
             A_V / E(B-V).
         law : {"G23", "F19", "CCM89"}
             Extinction law of dust_extinction.
-
-        Raises
-        ------
-        InputError
-            If the law does not cover 180-750 nm, or the extra is missing.
         """
         try:
             from dust_extinction import parameter_averages

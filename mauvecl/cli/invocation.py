@@ -37,11 +37,11 @@ def question_values(study: Study, *, detects: bool) -> None:
     """Raise InputError for values that a later step would reject; a verb that `detects` needs flares and thresholds."""
     from mauvecl.detection.names import check_fap, check_statistic
     from mauvecl.host.instrument import instrument_path
-    from mauvecl.host.stars.library import known_band, spectrum_name
+    from mauvecl.host.stars.library import known_band, named_star
 
     for star in study.star:
         if star.library is not None:
-            spectrum_name(star.library)
+            named_star(star.library)
         elif star.file is not None:
             _check_file(star.file)
         known_band(star.band)

@@ -32,7 +32,7 @@ from mauvecl.flares.shapes import Shape, shape_of
 from mauvecl.host.arrays import set_read_only
 from mauvecl.host.stars.bands import band as find_band
 from mauvecl.host.stars.bands import photons
-from mauvecl.host.stars.flare import Geometry, added_light
+from mauvecl.host.stars.flare import Geometry, added_light, check_scales
 from mauvecl.host.stars.flare_spectra import PARSEC_CM, STEFAN_BOLTZMANN, SUN_CM, Blackbody, FlareSpectrum, blackbody
 from mauvecl.host.tables.opening import read_table
 from mauvecl.host.tables.table import Rows
@@ -192,14 +192,8 @@ class EnergyScale:
         photosphere_k: float | None,
     ) -> Self:
         """Return the scale for the light that a flare of amplitude 1 adds to a flux, over a sphere around the star."""
-        light = added_light(
-            wavelength_nm,
-            flux_flam,
-            spectrum=flare,
-            band=band,
-            geometry=geometry,
-            photosphere_temperature_k=photosphere_k,
-        )
+        check_scales(flare)
+        light = added_light(wavelength_nm, flux_flam, flare, band, geometry, photosphere_k)
         if kind == "band":
             flux = light.hot * flux_in_band(band, flare)
             lost = light.lost and light.lost * _through(wavelength_nm, flux_flam, band)

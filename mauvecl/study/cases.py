@@ -386,13 +386,14 @@ class Case:
 
     def at_observed_brightness(self) -> Self:
         """Return the case with the amplitude at which the flare has the flux of its file at the telescope."""
-        from mauvecl.host.stars.flare import added_light
+        from mauvecl.host.stars.flare import added_light, check_scales
 
         flare, star = self.study.flare, self.source
+        check_scales(flare.light())
+        photosphere_k = flare.photosphere_temperature_k
         light = added_light(
-            star.wavelength_nm, star.flux_flam, spectrum=flare.light(), band=flare.band, geometry=flare.geometry,
-            photosphere_temperature_k=flare.photosphere_temperature_k,
-        )  # fmt: skip
+            star.wavelength_nm, star.flux_flam, flare.light(), flare.band, flare.geometry, photosphere_k
+        )
         scaled = flare.spectrum.model_copy(update={"as_observed": False})
         return self.with_sections(flare=flare.model_copy(update={"amplitudes": (1.0 / light.hot,), "spectrum": scaled}))
 

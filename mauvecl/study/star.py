@@ -229,11 +229,11 @@ class Star(Section):
 
     def source(self) -> Source:
         """Load the spectrum and scale it to the magnitude, if one is given."""
-        from mauvecl.host.stars.library import spectrum_name
+        from mauvecl.host.stars.library import named_star
         from mauvecl.host.stars.source import Source, with_listed_note
 
         if self.library is not None:
-            spectrum_name(self.library)
+            named_star(self.library)
             in_v = self.magnitude if (self.band, self.magnitude_system) == ("V", "catalogue") else None
             source = Source.from_library(self.library)
             source = with_listed_note(source, self.library, magnitude=in_v, distance_pc=self.distance_pc)

@@ -15,7 +15,7 @@ from pydantic.fields import FieldInfo
 
 from mauvecl.detection.requests import STATISTICS
 from mauvecl.host.instrument import FORMER_NAMES, FORMERLY_MAUVE
-from mauvecl.host.stars.library import ModelStar, embedded, near_names, spectrum_name
+from mauvecl.host.stars.library import ModelStar, embedded, named_star, near_names
 from mauvecl.host.tables.text_tables import columns, text_table
 from mauvecl.schema.errors import SUBJECT, InputError, shortened
 from mauvecl.schema.fields import (
@@ -144,7 +144,7 @@ def star_name(text: str) -> str:
         return UPLOADED
     if not text.strip():
         raise InputError("no star is chosen: give a name of the library, or upload a spectrum", key="star")
-    spectrum_name(text, own=False)
+    named_star(text, own=False)
     return text.strip()
 
 
@@ -220,10 +220,9 @@ def neighbours(text: str) -> str | None:
 
 def star_words(name: str) -> str:
     """Describe a star of the library by its type and the star of its spectrum."""
-    name = spectrum_name(name, own=False)
-    entry = embedded(name)
-    model = ModelStar.named(name)
-    if model is not None:
+    found = named_star(name, own=False)
+    name, entry = found.nearest, embedded(found.nearest)
+    if isinstance(found.light, ModelStar):
         return f"a {name.replace('body', 'body of').replace('law', 'law of index')}"
     star = name if entry is None else entry["star"]
     if star == name:
@@ -282,7 +281,7 @@ def _reader(field: FieldInfo, widget: Widget, unit: str, *, optional: bool) -> C
     if widget.kind in ("file", "upload"):
         return Choice(("", UPLOADED_FILE), lambda text: text or None)
     if widget.kind == "library":
-        return lambda text: spectrum_name(text, own=False) if text.strip() else None
+        return lambda text: named_star(text, own=False).nearest if text.strip() else None
     if widget.kind == "table":
         return neighbours
     if field.annotation is bool:

@@ -300,7 +300,7 @@ def _star(text: str) -> dict[str, Any]:
     if star is None:
         return {"about": "", "given": {}, "offer": ""}
     if star.known is None:
-        return {"about": listed_note(text) if star.spectrum is None else "", "given": {}, "offer": ""}
+        return {"about": listed_note(text) if star.light is None else "", "given": {}, "offer": ""}
     magnitude = f"{star.known.magnitude:g}"
     given = {"magnitude": magnitude, "band": "V", "target": star.name}
     return {"about": star.known.about, "given": given, "offer": f"Use V = {magnitude}"}

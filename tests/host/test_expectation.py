@@ -1,7 +1,6 @@
 """Expectations of the host, and the closed forms of their noise."""
 
-import pickle
-from dataclasses import FrozenInstanceError, replace
+from dataclasses import replace
 from typing import Any
 
 import astropy.units as u
@@ -41,14 +40,11 @@ def test_rates_equal_the_published_ones(
         assert np.interp(nm, x.wavelength_nm, x.net_source_dn / x.exposure_s) == pytest.approx(rate, rel=0.1)
 
 
-def test_light_of_star_and_sky(sunlike: Source, mauve: Instrument, quiet: Expectation) -> None:
-    """Electrons are linear in light, and the zodiacal light, which is there by default, is a fifth of a count."""
-    bright = expect(sunlike.at_magnitude(4.9), mauve, exposure=50, sky=Sky.none())
-    np.testing.assert_allclose(bright.source_electrons, 10 * quiet.source_electrons, rtol=1e-9)
-    assert not bright.sky_electrons.any()
+def test_zodiacal_light_is_there_by_default(sunlike: Source, mauve: Instrument, quiet: Expectation) -> None:
     rate = quiet.sky_electrons * quiet.gain_dn_per_electron / quiet.frame_s
     assert rate.max() == pytest.approx(0.2, abs=0.05)
     np.testing.assert_array_equal(expect(sunlike, mauve, exposure=50).sky_electrons, quiet.sky_electrons)
+    assert not expect(sunlike, mauve, exposure=50, sky=Sky.none()).sky_electrons.any()
 
 
 @pytest.mark.parametrize("signal", ["net", "paper"])
@@ -131,11 +127,7 @@ def test_provenance_names_the_inputs(quiet: Expectation, sunlike: Source, mauve:
     assert all(isinstance(value, str) for value in quiet.provenance.values())
 
 
-def test_expectation_is_immutable_and_survives_pickling(quiet: Expectation) -> None:
-    with pytest.raises(FrozenInstanceError):
-        quiet.n_frames = 3  # type: ignore[misc]
-    with pytest.raises(ValueError, match="read-only"):
-        quiet.dark_dn[0] = 0.0
-    again = pickle.loads(pickle.dumps(quiet))
-    assert again == quiet
-    assert again.messages == quiet.messages
+def test_arrays_are_read_only(quiet: Expectation, sunlike: Source) -> None:
+    for array in (quiet.dark_dn, sunlike.flux_flam):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 0.0

@@ -12,8 +12,7 @@ from refusals import refused
 from mauvecl import BalmerFlare, Blackbody, FlareWithLines, ObservedFlare, TwoBlackbodies
 
 DATA = Path(__file__).parent.parent / "data"
-QUIET = DATA / "flares" / "adleo_quiescent2.dat"
-FILES = {912: DATA / "spectra" / "ADLeo_912s.dat", 1497: DATA / "flares" / "ADLeo_1497s.dat"}
+FLARE, QUIET = DATA / "spectra" / "ADLeo_912s.dat", DATA / "flares" / "adleo_quiescent2.dat"
 
 
 def blackbody(nm: np.ndarray, kelvin: float) -> np.ndarray:
@@ -22,16 +21,12 @@ def blackbody(nm: np.ndarray, kelvin: float) -> np.ndarray:
     return np.asarray(np.pi * BlackBody(temperature=kelvin * u.K, scale=1.0 * unit)(nm * u.nm).to_value(unit))
 
 
-def ad_leo(seconds: int, continue_at_k: float | None = 9500.0) -> ObservedFlare:
-    return ObservedFlare.read(FILES[seconds], QUIET, wavelength_unit="Angstrom", continue_at_k=continue_at_k)
-
-
 SPECTRA = {
     "blackbody": Blackbody(9000.0),
     "two": TwoBlackbodies(7000.0, 25_000.0, 0.1),
     "Balmer": BalmerFlare(9500.0, 2.5),
     "lines": FlareWithLines(BalmerFlare(9500.0, 1.5), {"Mg II": 0.03, "Ca II": 0.02, "Balmer": 0.1, "250": 0.01}),
-    "observed": ad_leo(912),
+    "observed": ObservedFlare.read(FLARE, QUIET, wavelength_unit="Angstrom", continue_at_k=9500.0),
 }
 
 
@@ -95,28 +90,13 @@ def test_lines_have_the_wavelengths_of_their_atoms() -> None:
     assert centre("Ca II") == pytest.approx(centre("Ca II K", "Ca II H"), abs=1e-6)
 
 
-def test_great_flare_of_ad_leo_is_read() -> None:
-    """Compare colours and ultraviolet of the published spectra at 912 and 1497 s."""
-    for seconds, ratio, ultraviolet in ((912, 1.41, 4.0e-9), (1497, 1.96, 9.2e-10)):
-        flare = ad_leo(seconds)
-        near = [np.mean(flare.flux(np.linspace(a, b, 201))) for a, b in ((359.5, 363.5), (415.0, 419.0))]
-        assert near[0] / near[1] == pytest.approx(ratio, rel=0.05)
-        nm = np.linspace(200.0, 330.0, 13_001)
-        assert 10 * np.trapezoid(flare.flux(nm), nm) == pytest.approx(ultraviolet, rel=0.03)
-        assert flare.measured_nm == pytest.approx((100.36, 444.015))
-        assert any("9500 K continues it" in text for text in flare.messages)
-    nm = np.array([500.0, 600.0, 700.0])
-    shape = flare.flux(nm) / blackbody(nm, 9500.0)
-    np.testing.assert_allclose(shape, shape[0], rtol=2e-4)
-
-
-def test_short_flare_is_not_continued_unless_asked() -> None:
-    with refused("continue_at_k", "100"):
-        ad_leo(912, continue_at_k=None)
-
-
-def test_coarse_spectrum_is_continued_from_its_last_point() -> None:
-    flare = ObservedFlare.from_arrays([150.0, 300.0, 500.0], [1.0, 2.0, 3.0], continue_at_k=8000.0)
+def test_coarse_spectrum_is_continued_from_its_last_point_if_asked() -> None:
+    coarse = [150.0, 300.0, 500.0], [1.0, 2.0, 3.0]
+    with refused("continue_at_k", "150-500"):
+        ObservedFlare.from_arrays(*coarse)
+    flare = ObservedFlare.from_arrays(*coarse, continue_at_k=8000.0)
+    assert flare.measured_nm == (150.0, 500.0)
+    assert "8000 K continues it" in flare.messages[-1]
     far = blackbody(np.array([500.0, flare.wavelength_nm[-1]]), 8000.0)
     assert flare.flux_flam[-1] == pytest.approx(3.0 * far[1] / far[0])
 

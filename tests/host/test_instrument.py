@@ -20,24 +20,6 @@ def test_efficiency_is_the_product_of_the_paper(mauve: Instrument) -> None:
     assert mauve.with_(pointing_loss=0.05).efficiency(300.0) == pytest.approx(0.95 * by_hand, rel=1e-12)
 
 
-def test_detector_has_the_published_values(mauve: Instrument) -> None:
-    assert mauve.dark_dn_per_s == pytest.approx(445.5, abs=0.1)
-    assert mauve.with_(temperature_c=13).dark_dn_per_s == pytest.approx(258, abs=0.5)
-    assert mauve.gain_dn_per_electron == pytest.approx(0.5958, abs=5e-5)
-    assert mauve.saturation_dn == pytest.approx(59.6e3, rel=1e-3)
-    assert mauve.adc_max_dn == 65535
-    assert mauve.field_of_view_arcsec2 == pytest.approx(np.pi * 47.46**2)
-
-
-def test_pixels_cover_the_output_range(mauve: Instrument) -> None:
-    centres = mauve.wavelength_nm
-    assert centres.size == 1643
-    assert centres[0] >= 200
-    assert centres[0] - 0.3043 < 200
-    assert centres[-1] <= 700 < centres[-1] + 0.3043
-    np.testing.assert_allclose(np.diff(centres), 0.3043, rtol=1e-9)
-
-
 @pytest.mark.parametrize("name", ["mauvesim", "mauve"])
 def test_every_value_has_a_source(name: str) -> None:
     instrument = Instrument.load(name)
@@ -111,21 +93,16 @@ def test_curve_units_in_any_spelling(
     np.testing.assert_allclose(curve.at([100.0, 180.0, 340.0, 500.0, 900.0]), [0.05, 0.05, 0.075, 0.1, 0.05])
 
 
-@pytest.mark.parametrize("name", [
-    "grating_efficiency", "fibre_efficiency", "telescope_mirror_reflectivity", "spectrometer_mirror_reflectivity",
-    "collection_lens_efficiency", "quantum_efficiency_a_per_w",
-])  # fmt: skip
-def test_instrument_without_throughput_raises(tmp_path: Path, mauve: Instrument, name: str) -> None:
+def test_instrument_without_throughput_raises(tmp_path: Path, mauve: Instrument) -> None:
     """Refuse two curves of which one is 0 at every wavelength, since all S/N would be 0."""
-    for file, values in (("below", (0.03, 0.03, 0.0, 0.0)), ("above", (0.0, 0.0, 0.03, 0.03))):
-        at = (1000, 4500, 4501 if file == "below" else 4502, 9000)
-        rows = "".join(f"{a} {value}\n" for a, value in zip(at, values, strict=True))
-        unit = "A / W" if name == "quantum_efficiency_a_per_w" and file == "below" else ""
-        text = CURVE.split("1900")[0].replace("unit: ''", f"unit: '{unit}'")
-        (tmp_path / f"{file}.ecsv").write_text(text + rows)
+    for file, middle, values in (("below", 4501, (0.03, 0.03, 0.0, 0.0)), ("above", 4502, (0.0, 0.0, 0.03, 0.03))):
+        knots = zip((1000, 4500, middle, 9000), values, strict=True)
+        rows = "".join(f"{at} {value}\n" for at, value in knots)
+        (tmp_path / f"{file}.ecsv").write_text(CURVE.split("1900")[0] + rows)
+    below, above = tmp_path / "below.ecsv", tmp_path / "above.ecsv"
     with refused("throughput", "0"):
-        mauve.with_(**{name: tmp_path / "below.ecsv", "window_efficiency": tmp_path / "above.ecsv"})
-    assert mauve.with_(**{name: tmp_path / "below.ecsv"}).throughput(300.0) > 0
+        mauve.with_(grating_efficiency=below, window_efficiency=above)
+    assert mauve.with_(grating_efficiency=below).throughput(300.0) > 0
 
 
 def seen(payload: Instrument) -> Expectation:

@@ -18,9 +18,11 @@ NAMES = [str(name) for name in TABLE["name"]]
 
 
 def test_library_is_small_and_complete() -> None:
-    assert 25 <= len(NAMES) <= 40
     assert {"B0V", "B2IV", "G2V", "K2.5V", "M3V", "Sun", "Vega"} <= set(NAMES)
     assert sum(path.stat().st_size for path in LIBRARY.rglob("*") if path.is_file()) < 2e6
+    muscles = [row for row in TABLE if "MUSCLES" in row["origin"]]
+    assert len(muscles) == 11
+    assert all("PHOENIX model" in row["origin"] for row in muscles)
 
 
 @pytest.mark.parametrize("entry", list(TABLE), ids=NAMES)
@@ -42,14 +44,15 @@ def test_each_spectrum_is_usable_and_has_an_origin(entry: Any) -> None:
     assert not source.at_magnitude(7.0).unscaled
 
 
+def mean(name: str, low: float, high: float) -> float:
+    """Return the mean flux of a star in a range of wavelengths, nm."""
+    star = Source.from_library(name)
+    return float(star.flux_flam[(star.wavelength_nm >= low) & (star.wavelength_nm < high)].mean())
+
+
 def near_ultraviolet(name: str) -> float:
     """Return the mean flux at 290-310 nm over that at 540-560 nm."""
-    star = Source.from_library(name)
-
-    def mean(low: float, high: float) -> float:
-        return float(star.flux_flam[(star.wavelength_nm > low) & (star.wavelength_nm < high)].mean())
-
-    return mean(290, 310) / mean(540, 560)
+    return mean(name, 290, 310) / mean(name, 540, 560)
 
 
 def test_library_stars_agree_with_their_neighbours() -> None:
@@ -69,12 +72,8 @@ def test_noise_dominated_ultraviolet_is_reported() -> None:
         )
         assert (near_ultraviolet(name) > 2 * near_ultraviolet("M4V")) <= (limit >= 300 or name in ("M0V", "M1V"))
         # Redder than that they fall, 20 nm by 20 nm.
-        star = Source.from_library(name)
-        bands = [
-            star.flux_flam[(star.wavelength_nm >= a) & (star.wavelength_nm < a + 20)].mean()
-            for a in np.arange(max(limit, 200.0), 400.0, 20.0)
-            if a != 280.0
-        ]
+        starts = [nm for nm in np.arange(max(limit, 200.0), 400.0, 20.0) if nm != 280.0]
+        bands = [mean(name, nm, nm + 20) for nm in starts]
         assert all(blue < 1.2 * red for blue, red in pairwise(bands))
 
 
@@ -83,19 +82,10 @@ def test_colours_are_those_of_the_classes() -> None:
     for name, colour in (("B5V", -0.14), ("A5V", 0.17), ("F0V", 0.31), ("G0V", 0.59), ("G2V", 0.63), ("G5V", 0.68)):
         star = Source.from_library(name)
         assert star.magnitude("B") - star.magnitude("V") == pytest.approx(colour, abs=0.03)
-    gaia = [
-        Source.from_library(name).magnitude("Gaia BP") - Source.from_library(name).magnitude("Gaia RP")
-        for name in ("Vega", "G2V", "K5V", "M0V", "M3V", "M6V")
-    ]
+    stars = map(Source.from_library, ("Vega", "G2V", "K5V", "M0V", "M3V", "M6V"))
+    gaia = [star.magnitude("Gaia BP") - star.magnitude("Gaia RP") for star in stars]
     assert gaia[0] == pytest.approx(0.0, abs=1e-9)
     assert all(a < b for a, b in pairwise(gaia))
-
-
-def test_muscles_entries_admit_their_model_and_cite_their_data() -> None:
-    muscles = [row for row in TABLE if "MUSCLES" in row["origin"]]
-    assert len(muscles) == 11
-    assert all("PHOENIX model" in row["origin"] for row in muscles)
-    assert all(row["citation"].endswith("10.17909/T9DG6F") for row in muscles)
 
 
 @pytest.mark.parametrize("file", sorted(path.name for path in (LIBRARY / "bands").iterdir()))

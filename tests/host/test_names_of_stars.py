@@ -37,15 +37,12 @@ def test_names_of_spectra_are_resolved(text: str, name: str) -> None:
     assert Source.from_library(name).digest == Source.from_library(text).digest
 
 
-@pytest.mark.parametrize(("texts", "name", "magnitude"), [
-    (("eps Eri", "epsilon Eri", "EPS ERI", "HD 22049", "hd22049", "HIP 16537"), "eps Eri", 3.72),
-    (("gj581",), "GJ 581", 10.57), (("HD 40307",), "HD 40307", 7.17), (("GX And",), "GX And", 8.09),
-    (("AU Mic",), "AU Mic", 8.81), (("Proxima",), "Proxima Cen", 11.01), (("HD 1835",), "BE Cet", 6.39),
-    (("GJ 354.1",), "DX Leo", 7.05),  # a decimal point that counts
+@pytest.mark.parametrize(("text", "name"), [
+    ("epsilon Eri", "eps Eri"), ("EPS ERI", "eps Eri"), ("hd22049", "eps Eri"), ("gj581", "GJ 581"),
+    ("Proxima", "Proxima Cen"), ("GJ 354.1", "DX Leo"),  # a decimal point that counts
 ])  # fmt: skip
-def test_names_of_targets_are_resolved(texts: tuple[str, ...], name: str, magnitude: float) -> None:
-    for text in texts:
-        assert (target(text).name, target(text).magnitude) == (name, magnitude)
+def test_names_of_targets_are_resolved(text: str, name: str) -> None:
+    assert target(text).name == name
 
 
 def test_every_listed_star_has_a_spectrum_at_its_magnitude() -> None:
@@ -53,14 +50,11 @@ def test_every_listed_star_has_a_spectrum_at_its_magnitude() -> None:
         x = expect(str(row["name"]), "mauve", exposure=50)
         (star,) = Study.build({"star": [{"library": str(row["name"])}]}, "test").star
         assert star.source().magnitude("V") == pytest.approx(row["V"], abs=0.01), row["name"]
-        np.testing.assert_allclose(x.source_electrons, simulate_one(star.source()), rtol=1e-9)
+        same = expect(star.source(), "mauve", exposure=50)
+        np.testing.assert_allclose(x.source_electrons, same.source_electrons, rtol=1e-9)
         if row["name"] != "Vega":
             assert (star.magnitude, star.distance_pc) == (row["V"], row["distance"])
             assert f"V = {row['V']:g}, {row['distance']:g} pc, from " in " ".join(x.messages)
-
-
-def simulate_one(star: Source) -> Any:
-    return expect(star, "mauve", exposure=50).source_electrons
 
 
 def test_given_values_win_over_those_of_the_list() -> None:
@@ -99,8 +93,9 @@ def test_every_listed_name_is_found() -> None:
     for row in KNOWN:
         place = SkyCoord(row["ra"] * u.deg, row["dec"] * u.deg)
         for name in {row["name"], *str(row["other_names"]).split(", ")} - {"", "--"}:
-            assert target(name).name == row["name"], name
-            assert (target(name).ra_deg, target(name).dec_deg) == (row["ra"], row["dec"])
+            found = target(name)
+            assert (found.name, found.magnitude) == (row["name"], row["V"]), name
+            assert (found.ra_deg, found.dec_deg) == (row["ra"], row["dec"])
         skies = set()
         for one in (str(row["name"]), place):
             try:
@@ -121,14 +116,6 @@ def test_blackbody_equals_that_of_synphot(kelvin: int) -> None:
     middle = np.searchsorted(at, 550.0)
     np.testing.assert_allclose(own / own[middle], other / other[middle], rtol=3e-5)
     assert star.temperature_k == kelvin
-
-
-def test_flat_power_law_has_no_colour() -> None:
-    """A flux per wavelength of index -2 is constant per frequency, and AB magnitudes are those of a constant."""
-    star = Source.from_library("power law -2")
-    magnitudes = [star.magnitude(band, "ab") for band in ("B", "V", "Kepler", "GALEX NUV", "TESS", "Gaia G")]
-    # Trapezoids between the points of the bands' tables differ by 2e-4 mag from the integrals.
-    assert np.ptp(magnitudes) < 3e-4
 
 
 @pytest.mark.parametrize("index", [-4.0, 0.0, 2.5])

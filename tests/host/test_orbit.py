@@ -2,9 +2,7 @@
 
 import sys
 import threading
-import types
 from collections.abc import Callable
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -18,7 +16,7 @@ from refusals import refused
 from scipy.interpolate import RegularGridInterpolator
 
 import mauvecl
-from mauvecl import InputError, Sky, Study, visible
+from mauvecl import Study, visible
 from mauvecl.host.orbit import visibility
 
 VECTORS = Path(sgp4.__file__).parent
@@ -58,41 +56,16 @@ def unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
 
-def verification() -> list[tuple[str, list[list[float]]]]:
-    """Read elements and rows (minutes, x, y, z) of each satellite in the verification of SGP4."""
-    lines = (VECTORS / "SGP4-VER.TLE").read_text().splitlines()
-    tles = [f"{a[:69]}\n{b[:69]}\n" for a, b in pairwise(lines) if a[:2] == "1 " and b[:2] == "2 "]
-    blocks: list[list[list[float]]] = []
-    for line in (VECTORS / "tcppver.out").read_text().splitlines():
-        if line.rstrip().endswith("xx"):
-            blocks.append([])
-        elif line.strip():
-            blocks[-1].append([float(word) for word in line.split()[:4]])
-    return list(zip(tles, blocks, strict=True))
-
-
-def test_positions_equal_those_of_the_sgp4_verification(tmp_path: Path) -> None:
-    """Check gravity model and fields with all satellites whose lines have correct checksums."""
-    count = 0
-    for tle, rows in verification():
-        (tmp_path / "one.tle").write_text(tle)
-        try:
-            elements = section(tle=str(tmp_path / "one.tle")).orbit().elements
-        except InputError:
-            continue
-        for minutes, *place in rows:
-            error, position, _ = elements.satellite.sgp4_tsince(minutes)
-            if not error:
-                assert position == pytest.approx(place, abs=2e-5), (tle, minutes)
-                count += 1
-    assert count > 400
+LINES = (VECTORS / "SGP4-VER.TLE").read_text().splitlines()
+#: Elements of the satellites in the verification of SGP4, by number.
+TLES = {a[2:7]: f"{a[:69]}\n{b[:69]}\n" for a, b in pairwise(LINES) if a[:2] == "1 " and b[:2] == "2 "}
 
 
 def test_newest_elements_of_mauve_are_chosen_among_those_of_others(tmp_path: Path) -> None:
     mauve = section().orbit().elements
     older = f"{mauve.first[:20]}200{mauve.first[23:68]}"
     older += str(sum(int(one) if one.isdigit() else one == "-" for one in older) % 10)
-    others = [tle for tle, _ in verification()[:3]]
+    others = list(TLES.values())[:3]
     path = tmp_path / "group.tle"
     path.write_text("".join([*others, f"MAUVE\n{mauve.first}\n{mauve.second}\n{older}\n{mauve.second}\n"]))
     assert section(tle=str(path)).orbit().elements.first == mauve.first
@@ -105,16 +78,17 @@ def test_newest_elements_of_mauve_are_chosen_among_those_of_others(tmp_path: Pat
 
 def test_track_matches_the_verification_vectors(tmp_path: Path) -> None:
     """Compare a low orbit at the times of a plan; the text of its epoch is accurate to 20 m."""
-    tle, rows = next(one for one in verification() if one[0][2:7] == "06251")
-    (tmp_path / "own.tle").write_text(f"NAME\n{tle}")
-    make = partial(track, tle=str(tmp_path / "own.tle"), kind="tle")
-    minutes = np.array([row[0] for row in rows])
+    (tmp_path / "own.tle").write_text(f"NAME\n{TLES['06251']}")
+    block = (VECTORS / "tcppver.out").read_text().split("6251 xx")[1].split("xx")[0]
+    # Minutes since the epoch and positions; the last line names the next satellite.
+    minutes, *wanted = np.array([line.split()[:4] for line in block.splitlines()[1:-1]], float).T
     step = float(minutes[1] - minutes[0]) * 60
     # Times are the middles of steps.
-    epoch = np.datetime64("2006-01-01", "us") + np.timedelta64(round((float(tle[20:32]) - 1) * 86_400e6), "us")
-    start = str(epoch + np.timedelta64(round((minutes[0] * 60 - step / 2) * 1e6), "us"))
-    found = make(start=start, days=len(rows) * step / 86_400, step_s=step)
-    assert np.abs(found.of_date_km - np.array(rows)[:, 1:]).max() < 0.02
+    days = float(TLES["06251"][20:32]) - 1 + (minutes[0] * 60 - step / 2) / 86_400
+    start = str(np.datetime64("2006-01-01", "us") + np.timedelta64(round(days * 86_400e6), "us"))
+    when = {"start": start, "days": minutes.size * step / 86_400, "step_s": step}
+    found = track(tle=str(tmp_path / "own.tle"), kind="tle", **when)
+    assert np.abs(found.of_date_km - np.transpose(wanted)).max() < 0.02
 
 
 @pytest.mark.long
@@ -161,36 +135,27 @@ def test_orbit_has_the_documented_values() -> None:
     for flux in (1.0, 10.0, 100.0):
         found = seen(start="2026-09-14", days=30.0, targets=["Vega"], limits=NO_LIMITS | {"proton_flux": flux})
         shares.append(100 * (1 - found.kept_by["anomaly"][0]))
-        if flux == 10.0:
-            inside = [values[~found.seen[:, 0]] for values in found.track.subsatellite_deg]
-            ends = [end for values in inside for end in (values.min(), values.max())]
-            assert ends == pytest.approx([-71, 31, -55, -10], abs=2.0)  # cells are 2 deg wide
     assert shares == pytest.approx([6.3, 5.0, 3.2], abs=0.15)
 
 
 def test_mean_orbit_begins_at_the_satellite_and_keeps_its_local_time() -> None:
     """It begins at SGP4's position, follows it for a fortnight but for drag, and is described as a mean orbit."""
-    for start, days, farthest in (("2026-09-14T15:00", 0, 30.0), ("2026-09-28T00:00", 14, None)):
+    orbit = section().orbit()
+    # Short-period terms of J2 and the eccentricity, and drag, which only SGP4 has.
+    for start, most_km in (("2026-09-14T15:00", 30.0), ("2026-09-28T00:00", 3 * orbit.along_track_km(14))):
         mean, exact = (track(start=start, days=0.1, step_s=30.0, kind=kind) for kind in ("mean", "tle"))
-        # Short-period terms of J2 and the eccentricity, and drag, which only SGP4 has.
-        most = farthest or 3 * section().orbit().along_track_km(days)
-        assert np.linalg.norm(mean.of_date_km - exact.of_date_km, axis=1).max() < most
+        assert np.linalg.norm(mean.of_date_km - exact.of_date_km, axis=1).max() < most_km
         assert degrees_between(mean.normal, exact.normal).max() < 0.1
-    later = section(start="2027-06-01", days=30.0)
-    orbit, times = later.orbit(), later.times()
+    times = section(start="2027-06-01", days=30.0).times()
     assert orbit.resolved(times) == "mean"
-    near = track(start="2026-09-14T15:00", days=0.1, step_s=30.0, kind="mean")
-    assert np.abs(orbit.track(times).local_time_h - near.local_time_h.mean()).max() < 0.01
+    assert np.abs(orbit.track(times).local_time_h - mean.local_time_h.mean()).max() < 0.01
     assert "mean Sun-synchronous" in orbit.messages(times)[0]
-    # J2 turns the node of these very elements nearly as fast as the Sun moves.
-    assert orbit.elements.node_drift_deg_per_day == pytest.approx(0.98565, abs=0.002)
 
 
 def test_messages_about_the_epoch() -> None:
     orbit = section().orbit()
     assert orbit.messages(section(start="2026-09-20", days=5.0).times()) == []
-    (reported,) = orbit.messages(section(start="2026-10-10", days=5.0).times())
-    assert "along its track" in reported
+    assert "along its track" in orbit.messages(section(start="2026-10-10", days=5.0).times())[0]
     assert orbit.along_track_km(30) == pytest.approx(1 + 60 + 0.5 * 5.125e-5 * 900 * 2 * np.pi * 6879.04, rel=1e-4)
 
 
@@ -202,34 +167,6 @@ def test_days_begin_at_midnight(start: str) -> None:
     assert 0 <= fraction < 1
     assert times.iso(0.0, 1) == f"{start}T00:00:00.0" if len(start) == 10 else f"{start}.0"[:21]
     assert np.floor(times.julian[1][0]) == 0 or start.endswith("59.5")
-
-
-def test_global_state_is_restored() -> None:
-    from astropy.coordinates import solar_system_ephemeris
-    from astropy.utils import iers
-
-    before = iers.conf.auto_download, solar_system_ephemeris.get()
-    _ = track(start="2027-03-01", days=1.0).beta_deg
-    assert (iers.conf.auto_download, solar_system_ephemeris.get()) == before
-
-
-@pytest.mark.parametrize(
-    ("from_plane_deg", "shares"), [(0.0, (0.622, 0.567, 0.511)), (90 - 39.1, (0.703, 0.607, 0.518))]
-)
-def test_visible_share_of_a_circular_orbit(from_plane_deg: float, shares: tuple[float, ...]) -> None:
-    """Compare with TIME.md, section 5, to 0.5 %: 1 - arccos(cos(rho + x) / cos b) / pi."""
-    when = {"start": "2027-06-01", "days": 10 * section().orbit().elements.period_s / 86_400, "step_s": 10.0}
-    path = track(**when)
-    middle = len(path.normal) // 2
-    angle = np.radians(from_plane_deg)
-    x, y, z = np.cos(angle) * unit(path.position_km)[middle] + np.sin(angle) * path.normal[middle]
-    star = f"{np.degrees(np.arctan2(y, x)) % 360:.9f} {np.degrees(np.arcsin(z)):+.9f}"
-    for margin, share in zip((0.0, 10.0, 20.0), shares, strict=True):
-        found = seen(**when, targets=[star], limits=NO_LIMITS | {"earth_limb_deg": margin}).share[0]
-        assert found == pytest.approx(share, abs=0.005 * share)
-        rho = np.arcsin(EARTH_KM / 6879.0)
-        cosine = np.cos(rho + np.radians(margin)) / np.cos(angle)
-        assert found == pytest.approx(1 - np.arccos(cosine) / np.pi, abs=1e-3)
 
 
 def _agree(found: Any, over_deg: NDArray[np.float64]) -> None:
@@ -340,59 +277,34 @@ def test_temperature_follows_its_equation() -> None:
     assert thermal.temperature_c(np.repeat(light, 3), 10.0)[2::3] == pytest.approx(found, abs=1e-9)
 
 
-def test_zodiacal_light_over_the_year() -> None:
-    """Compare the tables of days with `Sky.at` for each target and month."""
-    when = {"start": "2027-01-01", "days": 360.0, "step_s": 21_600.0, "targets": ["eps Eri", "Vega"]}
-    days = visible(Study.build({"orbit": when}, "test")).by_day
-    for row in days[::30]:
-        try:
-            sky = Sky.at(row["target"], f"{row['day']}T12:00:00")
-        except InputError as error:
-            assert not np.isfinite(row["zodiacal_light"].value)
-            away = float(str(error).split("the Sun is ")[1].split(" deg")[0])
-        else:
-            assert row["zodiacal_light"].value == pytest.approx(sky.surface_brightness, abs=0.01)
-            away = float(sky.description.split(" deg from the Sun")[0].split()[-1])
-        assert row["elongation"].value == pytest.approx(away, abs=0.06)
-
-
 def looked_up(name: str) -> Any:
     """Return a target that SIMBAD is asked for."""
     return visible(Study.build({"orbit": {"targets": [name], "days": 0.1, "simbad": True}}, "test")).targets[0]
 
 
-def _simbad(monkeypatch: pytest.MonkeyPatch, query_tap: Callable[[str], object]) -> None:
-    """Replace SIMBAD's query, in astroquery if it is installed, else in a module of the same form."""
-    try:
-        from astroquery.simbad import SimbadClass
-    except ImportError:
-        package, module = types.ModuleType("astroquery"), types.ModuleType("astroquery.simbad")
-        module.Simbad = types.SimpleNamespace(query_tap=query_tap)  # type: ignore[attr-defined]
-        monkeypatch.setitem(sys.modules, "astroquery", package)
-        monkeypatch.setitem(sys.modules, "astroquery.simbad", module)
-    else:
-        monkeypatch.setattr(SimbadClass, "query_tap", lambda _, query, **__: query_tap(query))
+@pytest.fixture
+def simbad(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Return a function that replaces SIMBAD's query."""
+    service = pytest.importorskip("astroquery.simbad").SimbadClass
+    return lambda answer: monkeypatch.setattr(service, "query_tap", lambda _, query, **__: answer(query))
 
 
-def test_answer_of_simbad_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_answer_of_simbad_is_read(simbad: Callable[..., None]) -> None:
     asked = []
 
     def answer(query: str) -> Table:
         asked.append(query)
-        names, rows = ("ra", "dec", "plx_value", "sp_type", "V"), [(10.5, -3.25, 50.0, " K2V ", 7.5)]
-        if "HD 2" in query:
-            rows = [(1.0, 2.0, 0.0, "", 0.0)]
-        table = Table(rows=[] if "HD 3" in query else rows, names=names, masked=True, dtype=(*"fff", "O", "f"))
-        if "HD 2" in query:
-            for column in ("plx_value", "sp_type", "V"):
-                table[column].mask = True
+        rows = [] if "HD 3" in query else [(10.5, -3.25, 50.0, " K2V ", 7.5)]
+        names = ("ra", "dec", "plx_value", "sp_type", "V")
+        table = Table(rows=rows, names=names, masked=True, dtype=(*"fff", "O", "f"))
+        for column in names[2:] if "HD 2" in query else ():
+            table[column].mask = True
         return table
 
-    _simbad(monkeypatch, answer)
+    simbad(answer)
     star = looked_up("Barnard's other star")
-    assert (star.ra_deg, star.dec_deg, star.distance_pc, star.magnitude, star.spectral_type, star.source) == (
-        10.5, -3.25, 20.0, 7.5, "K2V", "SIMBAD",
-    )  # fmt: skip
+    assert (star.ra_deg, star.dec_deg, star.distance_pc, star.magnitude) == (10.5, -3.25, 20.0, 7.5)
+    assert (star.spectral_type, star.source) == ("K2V", "SIMBAD")
     assert "ident.id = 'Barnard''s other star'" in asked[0]
     bare = looked_up("HD 2")
     assert (bare.name, bare.distance_pc, bare.magnitude, bare.spectral_type) == ("HD 2", None, None, None)
@@ -400,23 +312,21 @@ def test_answer_of_simbad_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
         looked_up("HD 3")
 
 
-def test_network_failure_raises(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_network_failure_raises(simbad: Callable[..., None], monkeypatch: pytest.MonkeyPatch) -> None:
     """Simulate a network that fails, one that never answers, and missing astroquery."""
 
     def fails(_: str) -> None:
         raise ConnectionError("no route to host")
 
-    with monkeypatch.context() as patch:
-        _simbad(patch, fails)
-        with refused("target", "10"):
-            looked_up("HD 1")
-    with monkeypatch.context() as patch:
-        done = threading.Event()
-        _simbad(patch, lambda _: done.wait(60))
-        patch.setattr("mauvecl.host.orbit.orbit.TIMEOUT_S", 0.1)
-        with refused("target", "0.1"):
-            looked_up("HD 1")
-        done.set()
+    simbad(fails)
+    with refused("target", "10"):
+        looked_up("HD 1")
+    done = threading.Event()
+    simbad(lambda _: done.wait(60))
+    monkeypatch.setattr("mauvecl.host.orbit.orbit.TIMEOUT_S", 0.1)
+    with refused("target", "0.1"):
+        looked_up("HD 1")
+    done.set()
     monkeypatch.setitem(sys.modules, "astroquery.simbad", None)
     with refused("target"):
         looked_up("HD 1")

@@ -40,10 +40,10 @@ def text_file(path: Path, scale: float = 1.0) -> Path:
     return path
 
 
-def archive_file(units: tuple[str, str], **header: Any) -> bytes:
+def archive_file(**header: Any) -> bytes:
     columns = [
-        fits.Column("WAVELENGTH", "D", unit=units[0], array=10 * WAVELENGTH_NM),
-        fits.Column("FLUX", "E", unit=units[1], array=FLUX),
+        fits.Column("WAVELENGTH", "D", unit="Angstrom", array=10 * WAVELENGTH_NM),
+        fits.Column("FLUX", "E", unit="erg/s/cm2/A", array=FLUX),
     ]
     primary = fits.PrimaryHDU()
     primary.header.update(header)
@@ -96,9 +96,7 @@ def test_invalid_star_names_raise(tmp_path: Path) -> None:
     assert "'g2v'" in not_done(tmp_path, "add", file, "--name", "g2v")
     assert "64" in not_done(tmp_path, "add", file, "--name", "../escape")
     library(tmp_path, "add", file, "--name", "twin")
-    reported = not_done(tmp_path, "add", file, "--name", "twin")
-    assert "'twin'" in reported
-    assert "--replace" in reported
+    assert "--replace" in not_done(tmp_path, "add", file, "--name", "twin")
     library(tmp_path, "add", text_file(tmp_path / "other.txt", 2.0), "--name", "Twin", "--replace")
     assert len(kept(tmp_path)) == 1
     np.testing.assert_allclose(Source.from_library("twin").flux_flam, 2 * Source.read(file).flux_flam, rtol=1e-15)
@@ -115,10 +113,7 @@ def test_names_in_other_letters_are_kept_side_by_side(tmp_path: Path) -> None:
     assert fluxes[1] == pytest.approx(2 * fluxes[0])
     library(tmp_path, "remove", "γ Pic")
     assert sorted(kept(tmp_path)) == ["_ Pic x", "β Pic"]
-    library(tmp_path, "add", tmp_path / "2.txt", "--name", "γ Pic")
-    library(tmp_path, "remove", "β Pic")
-    assert sorted(kept(tmp_path)) == ["_ Pic x", "γ Pic"]
-    assert "β Pic" in not_done(tmp_path, "remove", "β Pic")
+    assert "γ Pic" in not_done(tmp_path, "remove", "γ Pic")
 
 
 def test_changed_file_raises(tmp_path: Path, own_folder: Path) -> None:
@@ -171,15 +166,9 @@ class Archive(http.server.BaseHTTPRequestHandler):
 def archive() -> Iterator[str]:
     """Serve the archives' files locally and return the address."""
     calspec = WHOLE.read_bytes()
-    ngsl = archive_file(("Angstrom", "erg/s/cm2/A"), TARGNAME="HD037202", DATAQUAL="good", OFFSETPX=0.1)
-    names = (
-        "18sco_stis_004.fits",
-        "18sco_stis_006.fits",
-        "18sco_stis_005.fits",
-        "18sco_mod_009.fits",
-        "cut_stis_001.fits",
-        "vb8_stiswfcnic_004.fits",
-    )
+    ngsl = archive_file(TARGNAME="HD037202", DATAQUAL="good", OFFSETPX=0.1)
+    names = ("18sco_stis_004.fits", "18sco_stis_006.fits", "18sco_stis_005.fits", "18sco_mod_009.fits",
+             "cut_stis_001.fits", "vb8_stiswfcnic_004.fits")  # fmt: skip
     links = "".join(f'<a href="{name}">{name}</a>' for name in names)
     lowlib = "hlsp_lowlib_hst_stis_{}_g230lb-g430l-g750l_v1.0_spect.fits"
     Archive.files = {
@@ -190,7 +179,7 @@ def archive() -> Iterator[str]:
         "ngsl/hd037202/h_stis_ngsl_hd037202_v2.fits": ngsl,
         "ngsl/hd000001/h_stis_ngsl_hd000001_v2.fits": ngsl[: len(ngsl) // 2],
         "ngsl/hd000002/h_stis_ngsl_hd000002_v2.fits": b"<html>Sorry</html>",
-        f"lowlib/{lowlib.format('hd146233')}": archive_file(("Angstrom", "erg/s/cm2/A")),
+        f"lowlib/{lowlib.format('hd146233')}": archive_file(),
     }
     Archive.over = threading.Event()
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Archive)

@@ -14,7 +14,7 @@ from astropy.time import Time
 from astropy.utils import iers
 from refusals import refused
 
-from mauvecl import InputError, Sky
+from mauvecl import InputError, Sky, Study, visible
 
 #: The paper's table, longitude 180 to 0 downwards, latitude 0 to 90 across.
 PAPER = Path(__file__).parents[1] / "data" / "zodiacal-light.txt"
@@ -125,14 +125,5 @@ def test_no_network_access_and_no_global_state(monkeypatch: pytest.MonkeyPatch) 
     before = (iers.conf.auto_download, solar_system_ephemeris.get())
     # Decades past the bundled tables of Earth rotation.
     assert Sky.at("290 -11", "2085-07-01").surface_brightness == pytest.approx(22.4, abs=0.1)
+    visible(Study.build({"orbit": {"targets": ["290 -11"], "days": 1.0, "start": "2085-07-01"}}, "test"))
     assert (iers.conf.auto_download, solar_system_ephemeris.get()) == before
-
-
-def test_total_magnitude_and_spectrum() -> None:
-    area = np.pi * 47.46**2
-    sky = Sky.of_brightness(22.1)
-    assert sky.total_magnitude(area) == pytest.approx(12.48, abs=0.005)
-    spectrum = sky.spectrum(area)
-    assert spectrum.magnitude("V") == pytest.approx(22.1 - 2.5 * np.log10(area), abs=1e-3)
-    assert Sky.none().spectrum(area) is None
-    assert Sky.none().total_magnitude(area) is None

@@ -120,13 +120,12 @@ def test_answers_take_any_spectrum(name: str) -> None:
 def test_search_injects_the_flare_of_the_file() -> None:
     """Templates are those of a blackbody for a file, and of the spectrum otherwise; the file has more ultraviolet."""
     few = ["stare.duration_s=2000", "injections={count=20, sizes=2, widths=2, fitted=0}", "search.nulls=0"]
-    found = {
-        name: mauvecl.inject(study_of(name).with_settings(few)).stars[0].survey
-        for name in ("blackbody", "file", "jump")
-    }
-    np.testing.assert_array_equal(found["file"].templates.directions, found["blackbody"].templates.directions)
-    assert not np.array_equal(found["jump"].templates.directions, found["blackbody"].templates.directions)
-    assert found["file"].unit_snr > found["blackbody"].unit_snr
+    body, file, jump = (
+        mauvecl.inject(study_of(name).with_settings(few)).stars[0].survey for name in ("blackbody", "file", "jump")
+    )
+    np.testing.assert_array_equal(file.templates.directions, body.templates.directions)
+    assert not np.array_equal(jump.templates.directions, body.templates.directions)
+    assert file.unit_snr > body.unit_snr
 
 
 def test_lines_of_a_fixed_flux_do_not_scale() -> None:
