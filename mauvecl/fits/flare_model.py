@@ -495,6 +495,8 @@ class Ratio:
         The end is infinite if the bottom may be zero, and of the other sign, no end, if it cannot be positive.
         """
         left = np.maximum(left, 0.0)
+        if not self.bottom_variance.any():
+            return np.asarray((self.top + sign * np.sqrt(left * self.top_variance)) / self.bottom)
         a = self.bottom**2 - left * self.bottom_variance
         b = self.top * self.bottom - left * self.covariance
         c = self.top**2 - left * self.top_variance

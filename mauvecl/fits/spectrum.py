@@ -32,7 +32,6 @@ from mauvecl.fits.profile import (
     BoundedProfile,
     Profile,
     Slopes,
-    bounded_intervals,
     covariance,
     intervals,
     with_bounds,
@@ -378,7 +377,7 @@ class _Problem:
             nodes = bounded.gain_at_nodes()
             there = bounded.best(nodes)
             for k, rise in enumerate(self.rises):
-                low[k, near], high[k, near] = bounded_intervals(model, bounded, there, nodes, rise)
+                low[k, near], high[k, near] = intervals(model, bounded, there, nodes, rise)
             best = best.replaced(near, there)
         return self.measurement(model, reduction, profile, best, rest, (low, high))
 
@@ -707,7 +706,7 @@ class _Search:
                     continue
                 limit = BestFit(own.log_k[there], own.linear[there], gain[rows[there]])
                 some = BoundedProfile(*profile.rows(there))
-                low, high = bounded_intervals(model, some, limit, at_nodes[there], rise)
+                low, high = intervals(model, some, limit, at_nodes[there], rise)
                 lows[k, rows[there]] = np.minimum(lows[k, rows[there]], low)
                 highs[k, rows[there]] = np.maximum(highs[k, rows[there]], high)
         for k, rise in enumerate(self._allowed):

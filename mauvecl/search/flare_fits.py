@@ -553,9 +553,9 @@ class SingleFlareFit:
         profile = Profile(self.templates.mean_sums, sums)
         given = np.log(self.templates.temperatures_k[self.templates.chosen[0]])
         x = profile.best().log_k if self.templates.coloured else np.full(len(sums), given)
-        amplitude, variance, _ = profile.parts(x)
-        best = np.maximum(amplitude, 1e-12 * length)
-        return x, best / length, (2 * amplitude - best) * best / variance
+        face = profile.face(x)
+        best = np.maximum(face.amplitude, 1e-12 * length)
+        return x, best / length, (2 * face.amplitude - best) * best * face.power
 
     def _averaged(
         self, several: int, sums: NDArray[Any], frames: SearchedFrames
