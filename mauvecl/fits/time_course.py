@@ -75,40 +75,40 @@ class MeasuredBins:
     @property
     def columns(self) -> list[Column]:
         """Columns of the table; those of the quantities depend on the model."""
-        measurement = self.found
+        found = self.found
         return [
             Column("start", "start_s", "s", "start of the bin, from the start of the stare", "from (s)", "g"),
             Column("end", "end_s", "s", "end of the bin", "to (s)", "g"),
             Column("frames", "count", "", "frames of the bin"),
             Column("snr", "found.snr", "", "S/N of the flare in the bin", "S/N", ".1f"),
-            *(column for q in range(len(measurement.names)) for column in self._quantity(q)),
-            Column("chi2", "found.chi2", "", f"chi-squared of the fit, of {measurement.dof} degrees of freedom"),
+            *(column for q in range(len(found.names)) for column in _columns_of(found, q)),
+            Column("chi2", "found.chi2", "", f"chi-squared of the fit, of {found.dof} degrees of freedom"),
             Column("p_value", "found.p_value", "",
                    "probability of a chi-squared at least as large if the model is correct", "p-value", ".2g"),
         ]  # fmt: skip
 
-    def _quantity(self, q: int) -> list[Column]:
-        """Return the columns of a quantity's estimates, errors and intervals."""
-        from astropy import units
 
-        measurement, name = self.found, self.found.names[q]
-        column, unit = name.replace(" ", "_"), str(units.Unit(measurement.units[q]))
-        heading, spec, error = SHOWN.get(column, ("", "", ""))
-        columns = [
-            Column(column, lambda bins: bins.found.estimates[:, q], unit, f"{name} of the flare", heading, spec),
-            Column(f"{column}_error", lambda bins: bins.found.errors[:, q], unit, "its standard error", error, spec),
-        ]
-        for k, level in enumerate(measurement.levels):
-            text = f"end of its {100 * level:.4g} % interval; infinite where there is none"
-            columns += [
-                Column(f"{column}_low_{100 * level:.0f}", self._end("low", k, q), unit, f"lower {text}"),
-                Column(f"{column}_high_{100 * level:.0f}", self._end("high", k, q), unit, f"higher {text}"),
-            ]
-        return columns
+def _columns_of(found: Measurement, q: int) -> list[Column]:
+    """Return the columns of a quantity's estimates, errors and intervals."""
+    from astropy import units
 
-    @staticmethod
-    def _end(side: str, level: int, q: int) -> Callable[[MeasuredBins], Float]:
-        return lambda bins: np.asarray(getattr(bins.found, side)[level][:, q])
+    name = found.names[q]
+    column, unit = name.replace(" ", "_"), str(units.Unit(found.units[q]))
+    heading, spec, error = SHOWN.get(column, ("", "", ""))
+    columns = [
+        Column(column, lambda _: found.estimates[:, q], unit, f"{name} of the flare", heading, spec),
+        Column(f"{column}_error", lambda _: found.errors[:, q], unit, "its standard error", error, spec),
+    ]
+    for level, *ends in zip(found.levels, found.low, found.high, strict=True):
+        text = f"end of its {100 * level:.4g} % interval; infinite where there is none"
+        for side, values in zip(("lower", "higher"), ends, strict=True):
+            named = f"{column}_{side.removesuffix('er')}_{100 * level:.0f}"
+            columns.append(Column(named, partial(_column, values, q), unit, f"{side} {text}"))
+    return columns
+
+
+def _column(values: Float, q: int, _: object) -> Float:
+    return values[:, q]
 
 
 @validated
@@ -601,28 +601,17 @@ def _data(
     covariance = components.covariance(strengths)
     edges = np.column_stack([stare.start_s, stare.start_s + stare.frame_s])
     gain = np.asarray(quiet.gain_dn_per_electron) * np.ones(weights.shape[1])
-    unknown, jitters = _levels_of_stare(components.directions(strengths), reduction, stare)
+    unknown, jitters = _levels(nuisances, model, reduction, stare, components.directions(strengths))
     light = strengths[:, 3]
     if nuisances is not None:
-        unknown = (*_constant_levels(nuisances, model, weights, len(sums)), *unknown)
         sums, light = sums - weights @ nuisances.mean_dn, nuisances.mean_factor * light
     return _Data(sums, edges, light, covariance, unknown, jitters, reduction, model, gain, shape)
 
 
-def _constant_levels(nuisances: Nuisances, model: FlareModel, weights: Float, n_frames: int) -> tuple[_Level, ...]:
-    """Return unknown levels that are constant over a stare."""
-    levels = []
-    for sd, spectrum, of_flare in zip(nuisances.sd, nuisances.spectra, nuisances.of_flare, strict=True):
-        sums = np.tile(weights @ spectrum, (n_frames, 1))
-        spline = scipy.interpolate.CubicSpline(model.log_k, (model.hot * of_flare) @ weights.T)
-        levels.append(_Level(float(sd), sums, np.full(n_frames, float(of_flare.any())), spline))
-    return tuple(levels)
-
-
-def _levels_of_stare(
-    changes: Mapping[str, Float], reduction: Reduction, stare: Stare
+def _levels(
+    nuisances: Nuisances | None, model: FlareModel, reduction: Reduction, stare: Stare, changes: Mapping[str, Float]
 ) -> tuple[tuple[_Level, ...], tuple[_Level, ...]]:
-    """Return the unknown changes of a stare, and its jitters."""
+    """Return the unknown levels of a stare, constant or not, and its jitters."""
 
     def level(of: Changing, sd: float, curve: Float) -> _Level:
         of_flare = curve if of == "light" else np.zeros_like(curve)
@@ -631,10 +620,13 @@ def _levels_of_stare(
     ones, jitters = np.ones(stare.n_frames), dict(stare.jitters)
     if stare.pointing is not None:
         jitters["light"] = float(np.hypot(jitters["light"], stare.pointing.depth))
-    return (
-        tuple(level(unknown.of, unknown.sd, unknown.curve) for unknown in stare.unknowns),
-        tuple(level(of, sd, ones) for of, sd in jitters.items() if sd > 0.0),
-    )
+    unknown = [level(each.of, each.sd, each.curve) for each in stare.unknowns]
+    constant = nuisances and zip(nuisances.sd, nuisances.spectra, nuisances.of_flare, strict=True)
+    for sd, spectrum, of_flare in constant or ():
+        spline = scipy.interpolate.CubicSpline(model.log_k, (model.hot * of_flare) @ reduction.weights.T)
+        sums = np.tile(reduction.weights @ spectrum, (stare.n_frames, 1))
+        unknown.append(_Level(float(sd), sums, ones * float(of_flare.any()), spline))
+    return tuple(unknown), tuple(level(of, sd, ones) for of, sd in jitters.items() if sd > 0.0)
 
 
 def _start(data: _Data, whitening: _Whitening, peak_s: float, half_width_s: float, cooling: bool) -> Float:
