@@ -30,12 +30,7 @@ def exponential_less_one(x: Floats) -> Floats:
 
 
 def strengths(scene: StareScene, numbers: Numbers, frame: int, seed: int, lost: Floats) -> dict[str, Floats]:
-    """Draw the coefficients of the steady components and the factor on light in a frame, minus one.
-
-    Returns
-    -------
-    dict of str to ndarray of float32, shape (n_stare,)
-    """
+    """Draw steady components' coefficients and the factor on light in a frame, minus one, float32 (n_stare,) each."""
     moved = {str(name): np.zeros(len(numbers), np.float32) for name in layout.MOVED}
     if scene.stare_job["jittered"]:
         drawn = random_numbers.four_normals(
@@ -61,12 +56,7 @@ def strengths(scene: StareScene, numbers: Numbers, frame: int, seed: int, lost: 
 
 
 def glow(scene: StareScene, numbers: Numbers, frames: Iterable[int], seed: int) -> Floats:
-    """Draw a normal per statistic, for the photon noise of flares, and the factor on all light minus one.
-
-    Returns
-    -------
-    ndarray of float32, shape (n_stare, n_frame, n_statistic + 1)
-    """
+    """Draw a normal per statistic, and the factor on light minus one, float32 (n_stare, n_frame, n_statistic + 1)."""
     out, lost = [], scene.losses(numbers, seed)
     for frame in frames:
         z: list[Floats] = []
@@ -85,12 +75,7 @@ def _coefficients(scene: StareScene, flares: Flares, frame: int, scenario: int, 
 
 
 def pixels(scene: StareScene, flares: Flares, numbers: Numbers, frames: Iterable[int], seed: int) -> Floats:
-    """Draw statistics by the method "pixels".
-
-    Returns
-    -------
-    ndarray of float32, shape (n_scenario, n_stare, n_frame, n_statistic)
-    """
+    """Draw statistics by the method "pixels", float32 (n_scenario, n_stare, n_frame, n_statistic)."""
     out, lost = [], scene.losses(numbers, seed)
     for frame in frames:
         conditions = strengths(scene, numbers, frame, seed, lost)
@@ -141,12 +126,7 @@ def _quartic(zz: Floats, second: float, first: float, constant: float) -> Floats
 
 
 def sums(scene: StareScene, flares: Flares, numbers: Numbers, frames: Iterable[int], seed: int) -> Floats:
-    """Draw statistics by the method "cumulants".
-
-    Returns
-    -------
-    ndarray of float32, shape (n_scenario, n_stare, n_frame, n_statistic)
-    """
+    """Draw statistics by the method "cumulants", float32 (n_scenario, n_stare, n_frame, n_statistic)."""
     table = SumTable.of(scene.components)
     out, lost = [], scene.losses(numbers, seed)
     for frame in frames:
