@@ -231,16 +231,14 @@ def fit(
     # Exposures with saturated pixels start far from the flare, which decides on the pixels that saturate.
     saturated = [np.flatnonzero(cut)] * (SATURATED_REFITS if near else 0)
     for rows in [*saturated, *[every] * (REFITS - 1)]:
-        for some, reduction in problem.groups(log_k, linear, rows, near):
-            for batch in _batches(some):
-                profile = problem.profile(reduction, batch)
-                best = with_bounds(reduction, profile.sums, profile.best())
-                log_k[batch], linear[batch] = best.log_k, best.linear
+        for batch, reduction in problem.groups(log_k, linear, rows, near):
+            profile = problem.profile(reduction, batch)
+            best = with_bounds(reduction, profile.sums, profile.best())
+            log_k[batch], linear[batch] = best.log_k, best.linear
     parts, order = [], []
-    for some, reduction in problem.groups(log_k, linear, every, near):
-        for batch in _batches(some):
-            parts.append(problem.measured(batch, reduction))
-            order.append(batch)
+    for batch, reduction in problem.groups(log_k, linear, every, near):
+        parts.append(problem.measured(batch, reduction))
+        order.append(batch)
     return Measurement.joined(parts, order)
 
 
@@ -341,7 +339,7 @@ class _Problem:
     def groups(
         self, log_k: Float, linear: Float, rows: NDArray[np.intp], near: bool
     ) -> Iterator[tuple[NDArray[np.intp], Reduction]]:
-        """Yield groups of frames whose fitted flares have nearly the same variance, with their reduction.
+        """Yield batches of frames whose fitted flares have nearly the same variance, with their reduction.
 
         The frames are some `rows` of all, and `near` says whether pixels are near saturation in any of these.
         """
@@ -372,7 +370,8 @@ class _Problem:
             own, clipped = rows[some], None
             if near and (raw[own].max(axis=0) > ceiling).any():
                 clipped = clipped_pixels(raw[own], quiet)
-            yield own, self.reduction(mean, highest, clipped)
+            reduction = self.reduction(mean, highest, clipped)
+            yield from ((batch, reduction) for batch in _batches(own))
 
     def measured(self, rows: NDArray[np.intp], reduction: Reduction) -> Measurement:
         """Measure the flares of some frames of one variance."""

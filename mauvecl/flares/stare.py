@@ -644,11 +644,8 @@ def stare_along(
 def _temperature(orbit: Orbit, track: Track, thermal: Thermal) -> Float:
     """Return the detector temperature at each step, deg C, computed from several time constants before the first."""
     times = track.times
-    past = TimeGrid(
-        times.iso(-SETTLING * thermal.time_constant_s, 3),
-        SETTLING * thermal.time_constant_s / DAY_S,
-        PAST_STEP_S,
-    )
+    settling_s = SETTLING * thermal.time_constant_s
+    past = TimeGrid(times.iso(-settling_s, 3), settling_s / DAY_S, PAST_STEP_S)
     # The same kind of orbit as that of the plan.
     before = Orbit(orbit.elements, orbit.resolved(times)).track(past)
     first = float(thermal.temperature_c(_light(before), PAST_STEP_S)[-1])

@@ -587,8 +587,7 @@ class SingleFlareFit:
             weight[k, inside] = 1.0 / variance[inside]
             time = since / (lead + tail)
             rows = [time**power for power in self.bank.baseline.powers] + list([] if curves is None else curves)
-            for j, row in enumerate(rows):
-                terms[k, :, j] = row
+            terms[k] = np.reshape(rows, terms.shape[:0:-1]).T
         if terms.shape[2]:
             # Orthonormal in each window, so that a projection is a sum of products.
             root = np.sqrt(weight)[:, :, None]

@@ -145,9 +145,13 @@ def test_sums_by_cumulants_are_distributed_as_by_pixels(stares: Stares, name: st
 
 def mixture_cumulants(components: Components, coefficients: Any, mixture: Any, sd: float) -> tuple[float, float]:
     """Return the standardised third and fourth cumulants of a mixture of the sums in one frame."""
-    third = np.einsum("i,j,k,ijk", mixture, mixture, mixture, components.third(coefficients))
-    fourth = np.einsum("i,j,k,l,ijkl", mixture, mixture, mixture, mixture, components.fourth(coefficients))
-    return float(third / sd**3), float(fourth / sd**4)
+    third, fourth = (
+        constant + np.tensordot(coefficients, each, 1)
+        for constant, each in (components.sum_cumulants(3), components.sum_cumulants(4))
+    )
+    for _ in range(3):
+        third, fourth = third @ mixture, fourth @ mixture
+    return float(third / sd**3), float(fourth @ mixture / sd**4)
 
 
 def test_components_equal_the_expectations(stares: Stares) -> None:
