@@ -15,11 +15,11 @@ on the temperature, so each face has constant matrices.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
-from functools import cache, cached_property, lru_cache
+from functools import cache, cached_property
 from itertools import combinations
-from typing import TYPE_CHECKING, ClassVar, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 import scipy
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from mauvecl.fits.flare_model import FlareModel, MeanSums, Reduction
 
 Float = NDArray[np.float64]
-T = TypeVar("T")
 
 #: Steps of the search for the end of an interval.
 STEPS = 12
@@ -51,16 +50,6 @@ ALONG, BEYOND, SMOOTH = 0.8, 2.0, 0.3
 TRIED, REACH = 25, 6.0
 #: Steps of Newton's method for a threshold.
 NEWTON = 3
-
-
-def remembering(function: Callable[[Float], T]) -> Callable[[Float], T]:
-    """Return a function that keeps its last results, since fits ask for several at the same parameters in turn."""
-
-    @lru_cache(maxsize=2)
-    def of_bytes(parameters: bytes) -> T:
-        return function(np.frombuffer(parameters))
-
-    return lambda parameters: of_bytes(parameters.tobytes())
 
 
 @dataclass(frozen=True, eq=False)

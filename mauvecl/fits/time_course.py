@@ -21,12 +21,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.detection.nuisances import Nuisances, fitted_amplitudes, spectrum_of
 from mauvecl.fits.flare_model import EVERY, Ranges, Reduction
-from mauvecl.fits.profile import remembering
 from mauvecl.fits.spectrum import LEVELS, Measurement, clipped_pixels, fit
 from mauvecl.flares.frames import Components, known_strengths
 from mauvecl.flares.settings import Cooling
 from mauvecl.flares.shapes import Shape, shape_of
 from mauvecl.flares.stare import Event, Stare
+from mauvecl.host.arrays import array_cache
 from mauvecl.noise.unknowns import CHANGED_PART, CHANGING, Changing
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, table_of
@@ -326,7 +326,7 @@ class _Data:
     def strengths(self) -> Callable[[Float], Pair]:
         """Function of the parameters that returns the amplitude and log temperature of each frame."""
 
-        @remembering
+        @array_cache(2)
         def strengths(theta: Float) -> Pair:
             rise = np.exp(theta[2]) * self.light * self.shape.mean_over(self.edges, theta[0], np.exp(theta[1]))
             log_k = theta[3] + np.log(self._cooled(theta)[0])
@@ -337,7 +337,7 @@ class _Data:
     @cached_property
     def slopes(self) -> Callable[[Float], Pair]:
         """Function that returns the derivatives of `strengths` by the parameters, each of shape (6, n_frame)."""
-        return remembering(self._slopes)
+        return array_cache(2)(self._slopes)
 
     def _cooled(self, theta: Float) -> tuple[Float, Float, float]:
         """Return temperatures over that at the peak, as in `Cooling`, times since the peak, and the end."""

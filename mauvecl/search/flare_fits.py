@@ -24,8 +24,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.fits.profile import Profile, remembering
+from mauvecl.fits.profile import Profile
 from mauvecl.flares.shapes import between, sides
+from mauvecl.host.arrays import array_cache
 from mauvecl.search.templates import REACH
 
 if TYPE_CHECKING:
@@ -284,7 +285,7 @@ class Block:
                 held.apply(every)
             return every
 
-        @remembering
+        @array_cache(2)
         def triangle(x: Float) -> Float:
             """Return the triangular factor of derivatives and residuals as columns.
 

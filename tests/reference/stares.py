@@ -59,13 +59,16 @@ def glow(scene: StareScene, numbers: Numbers, frames: Iterable[int], seed: int) 
     """Draw a normal per statistic, and the factor on light minus one, float32 (n_stare, n_frame, n_statistic + 1)."""
     out, lost = [], scene.losses(numbers, seed)
     for frame in frames:
-        z: list[Floats] = []
-        for group in range(-(-len(scene.weights) // 4)):
-            z += random_numbers.four_normals(
-                reference.words_at(numbers, int(scene.numbers[frame]), "stare_glow", group, seed)
-            )
+        z = _normals(scene, numbers, frame, "stare_glow", seed)
         out.append([*z[: len(scene.weights)], strengths(scene, numbers, frame, seed, lost)["light"]])
     return np.moveaxis(np.array(out), (0, 1, 2), (1, 2, 0))
+
+
+def _normals(scene: StareScene, numbers: Numbers, frame: int, stream: str, seed: int) -> list[Floats]:
+    """Draw a normal per statistic, rounded up to groups of four, shape (n_stare,) each."""
+    groups = range(-(-len(scene.weights) // 4))
+    words = [reference.words_at(numbers, int(scene.numbers[frame]), stream, group, seed) for group in groups]
+    return [z for each in words for z in random_numbers.four_normals(each)]
 
 
 def _coefficients(scene: StareScene, flares: Flares, frame: int, scenario: int, light: Floats) -> list[Floats]:
@@ -131,11 +134,7 @@ def sums(scene: StareScene, flares: Flares, numbers: Numbers, frames: Iterable[i
     out, lost = [], scene.losses(numbers, seed)
     for frame in frames:
         conditions = strengths(scene, numbers, frame, seed, lost)
-        z: list[Floats] = []
-        for group in range(-(-len(scene.weights) // 4)):
-            z += random_numbers.four_normals(
-                reference.words_at(numbers, int(scene.numbers[frame]), "stare_sums", group, seed)
-            )
+        z = _normals(scene, numbers, frame, "stare_sums", seed)
         rows = []
         for k in range(len(flares.amplitudes)):
             flare = _coefficients(scene, flares, frame, k, conditions["light"])
