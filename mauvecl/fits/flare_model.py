@@ -428,9 +428,8 @@ def undimmed(values: Float, factor: Float) -> Float:
     """Return light (n, k) over the factor by which it was dimmed, (n,); infinite where the factor is not above zero."""
     lost = (factor <= 0.0)[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(
-            np.where(values == 0.0, 0.0, np.where(lost, np.copysign(np.inf, values), values / factor[:, None]))
-        )
+        bright = np.where(lost, np.copysign(np.inf, values), values / factor[:, None])
+    return np.asarray(np.where(values == 0.0, 0.0, bright))
 
 
 @dataclass(frozen=True, eq=False)

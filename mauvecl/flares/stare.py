@@ -111,13 +111,8 @@ class Event:
         shape: Shape | str = "davenport2014",
     ) -> Self:
         """Return the flare with an energy; for one that cools see `total_energy`."""
-        return cls.of_equivalent_duration(
-            scale.equivalent_duration(energy_erg),
-            peak_s=peak_s,
-            half_width_s=half_width_s,
-            temperature=temperature,
-            shape=shape,
-        )
+        amplitude = amplitude_of(scale.equivalent_duration(energy_erg), half_width_s, shape)
+        return cls(peak_s, half_width_s, amplitude, temperature, shape)
 
     @property
     def form(self) -> Shape:
