@@ -115,10 +115,8 @@ class Profile:
 
     def gain(self, log_k: Float) -> Float:
         """Return the decrease of chi-squared by a flare of temperatures (n, ...)."""
-        gain = np.zeros((len(self.sums), *log_k.shape[1:]))
-        for face in self.faces(self.products(log_k)):
-            np.copyto(gain, face.gain, where=(face.gain > gain) & face.positive(face.amplitude, face.others))
-        return gain
+        face = self.face(log_k)
+        return np.asarray(face.gain - np.minimum(face.amplitude, 0.0) ** 2 * face.power)
 
     def gain_at_nodes(self, every: int = 1) -> Float:
         """Return `gain` at each `every`-th temperature of the model, shape (n, n_node)."""
@@ -593,13 +591,13 @@ ROUNDING = 1e-9
 
 
 def _inverse(matrix: Float) -> Float:
-    """Return the inverse of a matrix; most have one element, for which the general way takes ten times as long."""
-    return 1.0 / matrix if len(matrix) == 1 else np.asarray(np.linalg.inv(matrix))
+    """Return the inverse of a matrix; most have one element or none, for which the general way takes far longer."""
+    return 1.0 / matrix if len(matrix) <= 1 else np.asarray(np.linalg.inv(matrix))
 
 
 def _product(matrix: Float, values: Float) -> Float:
     """Return the product of a matrix (k, k) with values (k, ...)."""
-    return matrix[0, 0] * values if len(matrix) == 1 else np.tensordot(matrix, values, 1)
+    return matrix[0] * values if len(matrix) == 1 else np.tensordot(matrix, values, 1) if len(matrix) else values
 
 
 @dataclass(frozen=True, eq=False)
@@ -669,16 +667,15 @@ class Face:
     share: Float  # decrease of the others per unit of the blackbody's, shape (n_some, n or 1, ...)
 
     @cached_property
-    def rounding(self) -> tuple[Float, Float]:
-        """Smallest amplitudes of the blackbody and of the others that count as zero despite rounding."""
+    def rounding(self) -> Float:
+        """Smallest amplitudes of the fixed components that count as zero despite rounding."""
         variance = np.diag(self.inverse).reshape(-1, *(1,) * (self.others.ndim - 1)) + self.share**2 / self.power
-        return -ROUNDING / np.sqrt(self.power), -ROUNDING * np.sqrt(variance)
+        return -ROUNDING * np.sqrt(variance)
 
     def positive(self, amplitude: Float, others: Float) -> NDArray[np.bool_]:
         """Return whether no amplitude is below its bound, shape (n, ...)."""
-        least, other_least = self.rounding
-        positive = np.asarray(amplitude >= least)
-        return positive & (others >= other_least).all(axis=0) if self.bounded else positive
+        positive = np.asarray(amplitude >= -ROUNDING / np.sqrt(self.power))
+        return positive & (others >= self.rounding).all(axis=0) if self.bounded else positive
 
     def value(self, factors: Float) -> Float:
         """Return a sum of the best amplitudes, with factors (n_linear, n, ...)."""
@@ -721,6 +718,13 @@ class BoundedProfile(Profile):
     """Profile likelihood of the temperature for the sums of some frames, with amplitudes of at least zero."""
 
     bounded: ClassVar[bool] = True
+
+    def gain(self, log_k: Float) -> Float:
+        """Return the decrease of chi-squared by a flare of temperatures (n, ...)."""
+        gain = np.zeros((len(self.sums), *log_k.shape[1:]))
+        for face in self.faces(self.products(log_k)):
+            np.copyto(gain, face.gain, where=(face.gain > gain) & face.positive(face.amplitude, face.others))
+        return gain
 
     def best(self, at_nodes: Float | None = None) -> BestFit:
         """Return the best fit of each frame."""
