@@ -178,11 +178,7 @@ class FlareModel:
         bodies_flux = scale * STEFAN_BOLTZMANN * kelvin**4
         light.append(("bolometric", np.concatenate([bodies_flux, whole, np.ones(len(chosen))])))
         derived = _derived(kelvin, scale, names, light, quiet.exposure_s, distance_pc, radius_rsun)
-        log_k = np.log(kelvin)
-        # The exponential of the last node is a temperature that is accepted.
-        while np.exp(log_k[-1]) > TEMPERATURES_K[1]:
-            log_k[-1] = np.nextafter(log_k[-1], 0.0)
-        return cls(log_k, counts[:NODES], counts[NODES:], names, tuple(derived))
+        return cls(_accepted_logs(kelvin), counts[:NODES], counts[NODES:], names, tuple(derived))
 
     def stacked(self, n: int, light: float = 1.0) -> Self:
         """Return the model of exposures that are n times as long, with a known factor on all light.
@@ -299,6 +295,14 @@ def derived_values(model: FlareModel, log_k: Float, linear: Float, factor: Float
             over = np.divide(linear[:, 1], linear[:, 0], out=np.full(log_k.size, np.nan), where=positive)
             values[:, q] = derived.offset + ratio(log_k) * over
     return values
+
+
+def _accepted_logs(kelvin: Float) -> Float:
+    """Return the logarithms of the nodes; the exponential of the last one is a temperature that is accepted."""
+    log_k = np.log(kelvin)
+    while np.exp(log_k[-1]) > TEMPERATURES_K[1]:
+        log_k[-1] = np.nextafter(log_k[-1], 0.0)
+    return log_k
 
 
 def _flux_ratios(star: Source, band: str, kelvin: Float) -> Float:
