@@ -225,22 +225,19 @@ def intervals(
     least, factor = best.gain[:, None] - allowed, profile.factor(best.log_k, best.linear)
 
     def ends_of_sum(spline: CubicSpline) -> tuple[Float, Float]:
-        factors, left = np.moveaxis(spline(x), -1, 0), least
+        factors, own_least = np.moveaxis(spline(x), -1, 0), least
         own = faces if profile.bounded else faces[-1:]
-        ends = _linear_ends(own, factors, left, factor_at)
+        ends = _linear_ends(own, factors, own_least, factor_at)
         if light is not None and light.prior.size:
             value = np.vecdot(spline(best.log_k), best.linear) / factor
-            left = least - light.change(value, factor, ends[1] - ends[0], allowed)[:, None]
-            ends = _linear_ends(own, factors, left, factor_at)
+            own_least = least - light.change(value, factor, ends[1] - ends[0], allowed)[:, None]
+            ends = _linear_ends(own, factors, own_least, factor_at)
         if not profile.bounded:
             ratio, closed = faces[-1].ratio(factors, factor_at), np.isfinite(high - low)
-            _bend(ends, profile, spline, x, ratio, faces[-1].gain - left, allowed, closed)
+            _bend(ends, profile, spline, x, ratio, faces[-1].gain - own_least, allowed, closed)
         return ends
 
-    kelvin = (
-        np.where(np.isnan(low), -np.inf, np.exp(low)),
-        np.where(np.isnan(high), np.inf, np.exp(high)),
-    )
+    kelvin = np.where(np.isnan(low), -np.inf, np.exp(low)), np.where(np.isnan(high), np.inf, np.exp(high))
     columns: list[tuple[Float, Float]] = []
     for derived, spline, (first, times) in zip(model.derived, model.splines, model.multiples, strict=True):
         if first < len(columns):
