@@ -95,7 +95,7 @@ MUTATIONS: dict[str, Mutation] = {
             "const uintv number = LOAD(numbers + frame) & (uintv)0u;\n        /* Normals",
         ),
         ('int(scene.numbers[frame]), "stare_frame"', '0, "stare_frame"'),
-        ('int(scene.numbers[frame]), "stare_sums"', '0, "stare_sums"'),
+        ("int(scene.numbers[frame]), stream", "0, stream"),
     ),
     "jitter and sums of stares from one stream": (
         "test_moments_equal_those_of_the_recipe[cumulants]",
