@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mauvecl.answers.answer import InCell
 from mauvecl.answers.closed_forms import throughput_cases
 from mauvecl.fits.flare_model import FlareModel, Ranges, Ratio, Reduction, usable_variance, variance_of
-from mauvecl.fits.profile import Profile, ratio_at
+from mauvecl.fits.profile import Profile
 from mauvecl.fits.spectrum import (
     Forecast,
     Measurement,
@@ -178,10 +178,8 @@ class ExpectedMeasurement(InCell):
         def at(log_k: Float) -> tuple[Float, Ratio]:
             """Return what is left of the rise at temperatures, and the amplitude there."""
             x = log_k[None]
-            value, variance, hot = profile.parts(x)
-            along = float(profile.along[0] @ profile.along[0])
-            left = rise - (gain - along - value**2 / variance)
-            return left, ratio_at(profile, amplitude, x, profile.linear(x, value, hot), variance, hot)
+            face = profile.face(x)
+            return rise - gain + face.gain, face.ratio(np.moveaxis(amplitude(x), -1, 0), profile.factor_at(x))
 
         nodes = np.linspace(reduction.log_k[0], reduction.log_k[-1], 8 * reduction.log_k.size)
         inside = np.flatnonzero(at(nodes)[0][0] >= 0.0)

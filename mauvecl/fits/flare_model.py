@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 import scipy
@@ -155,7 +155,10 @@ class FlareModel:
             For an unknown name, an impossible value, or a spectrum that does not cover the band.
         """
         chosen = [EmissionLine.named(name) for name in lines]
-        _check_bands(bands_nm)
+        for low, high in bands_nm:
+            if not GRID_NM[0] <= low < high <= GRID_NM[-1]:
+                expected = f"ascending wavelengths within {GRID_NM[0]:g}-{GRID_NM[-1]:g}"
+                raise InputError.of("bands_nm", (low, high), expected)
         kelvin = np.geomspace(*TEMPERATURES_K, NODES)
         nodes = [BalmerFlare().nodes_nm, np.ravel(bands_nm), *(line.nodes_nm for line in chosen)]
         grid = np.unique(np.concatenate([GRID_NM, *nodes]))
@@ -174,9 +177,7 @@ class FlareModel:
         whole = [(balmer.bolometric_flux() - STEFAN_BOLTZMANN * 1e16) / float(balmer.edge_flux)] if jump else []
         bodies_flux = scale * STEFAN_BOLTZMANN * kelvin**4
         light.append(("bolometric", np.concatenate([bodies_flux, whole, np.ones(len(chosen))])))
-        derived = _derived(kelvin, scale, names, light)
-        if distance_pc is not None:
-            derived += _derived_at_distance(scale, names, light, quiet.exposure_s, distance_pc, radius_rsun)
+        derived = _derived(kelvin, scale, names, light, quiet.exposure_s, distance_pc, radius_rsun)
         return cls(_accepted_logs(kelvin), counts[:NODES], counts[NODES:], names, tuple(derived))
 
     def stacked(self, n: int, light: float = 1.0) -> Self:
@@ -188,13 +189,11 @@ class FlareModel:
         light : float
             Mean share of the flare's light that reaches the detector.
         """
-        derived = tuple(
-            replace(derived, factors=n * derived.factors)
-            if derived.name.startswith("energy") and derived.factors is not None
-            else derived
-            for derived in self.derived
-        )
-        return replace(self, hot=n * light * self.hot, fixed=n * light * self.fixed, derived=derived)
+        derived = list(self.derived)
+        for k, each in enumerate(derived):
+            if each.name.startswith("energy") and each.factors is not None:
+                derived[k] = replace(each, factors=n * each.factors)
+        return replace(self, hot=n * light * self.hot, fixed=n * light * self.fixed, derived=tuple(derived))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -262,15 +261,12 @@ class FlareModel:
         self, temperature_k: Temperature, amplitude: float, *, jump: float = 1.0, lines: Sequence[float] = ()
     ) -> Float:
         """Return the model's amplitudes, shape (n_linear,), for a Balmer jump ratio and line fluxes, erg s-1 cm-2."""
-        ratio = next(
-            (spline for spline, derived in zip(self.splines, self.derived, strict=True) if derived.ratio is not None),
-            None,
-        )
-        if ratio is None and jump != 1.0:
+        pairs = zip(self.splines, self.derived, strict=True)
+        ratios = [spline for spline, derived in pairs if spline is not None and derived.ratio is not None]
+        if not ratios and jump != 1.0:
             raise InputError.of("jump", jump, "1 for a model without a Balmer continuum")
-        own = [] if ratio is None else [(jump - 1.0) * amplitude / float(ratio(np.log(temperature_k)))]
-        given = np.array([amplitude, *own, *lines], np.float64)
-        return self._checked(temperature_k, given)
+        own = [(jump - 1.0) * amplitude / float(ratio(np.log(temperature_k))) for ratio in ratios]
+        return self._checked(temperature_k, [amplitude, *own, *lines])
 
     def _checked(self, temperature_k: float, amplitudes: Sequence[float] | Float) -> Float:
         low, high = np.exp(self.log_k[[0, -1]])
@@ -301,14 +297,6 @@ def derived_values(model: FlareModel, log_k: Float, linear: Float, factor: Float
     return values
 
 
-def _check_bands(bands_nm: Ranges) -> None:
-    """Raise InputError unless the ranges of wavelength are ascending and within the model's grid."""
-    for low, high in bands_nm:
-        if not GRID_NM[0] <= low < high <= GRID_NM[-1]:
-            expected = f"ascending wavelengths within {GRID_NM[0]:g}-{GRID_NM[-1]:g}"
-            raise InputError.of("bands_nm", (low, high), expected)
-
-
 def _accepted_logs(kelvin: Float) -> Float:
     """Return the logarithms of the nodes; the exponential of the last one is a temperature that is accepted."""
     log_k = np.log(kelvin)
@@ -331,58 +319,42 @@ def _between(grid: Float, fluxes: Float, low: float, high: float) -> Float:
     return np.asarray(10.0 * np.trapezoid(fluxes[:, inside], grid[inside], axis=1))
 
 
-def _of_one(names: tuple[str, ...], column: int, values: Float | float) -> Float:
-    """Return the factors of a quantity that only one amplitude changes, shape (n_node, n_linear)."""
-    factors = np.zeros((NODES, len(names)))
-    factors[:, column] = values
-    return factors
+def _derived(
+    kelvin: Float, scale: Float, names: tuple[str, ...], light: list[tuple[str, Float]], exposure_s: float,
+    distance_pc: float | None, radius_rsun: float | None,
+) -> Iterator[Derived]:  # fmt: skip
+    """Yield the quantities of a model; `light` holds fluxes per amplitude by range, those of blackbodies first."""
 
+    def of_one(column: int, values: Float | float) -> Float:
+        """Return the factors of a quantity that only one amplitude changes, shape (n_node, n_linear)."""
+        factors = np.zeros((NODES, len(names)))
+        factors[:, column] = values
+        return factors
 
-def _of_all(fluxes: Float) -> Float:
-    """Return the factors of a sum of fluxes per amplitude, those of blackbodies first, shape (n_node, n_linear)."""
-    return np.column_stack([fluxes[:NODES], np.tile(fluxes[NODES:], (NODES, 1))])
-
-
-def _derived(kelvin: Float, scale: Float, names: tuple[str, ...], light: list[tuple[str, Float]]) -> list[Derived]:
-    """Return the quantities of a model that need no distance; `light` holds fluxes per amplitude by range."""
-    derived = [Derived("temperature", "K", "temperature of the flare's blackbody")]
-    rise = "relative rise of the band's photons by the blackbody"
-    derived.append(Derived("amplitude", "", rise, _of_one(names, 0, 1.0)))
+    yield Derived("temperature", "K", "temperature of the flare's blackbody")
+    yield Derived("amplitude", "", "relative rise of the band's photons by the blackbody", of_one(0, 1.0))
     if "balmer" in names:
         edge = np.array([float(blackbody(np.array([BALMER_EDGE_NM]), float(k))[0]) for k in kelvin])
-        derived.append(
-            Derived("jump", "", "flux just below the Balmer edge over that just above", ratio=1.0 / (scale * edge))
-        )
+        yield Derived("jump", "", "flux just below the Balmer edge over that just above", ratio=1.0 / (scale * edge))
     for column, name in enumerate(names):
         if name.startswith("line "):
             what = f"flux of the line {name[5:]} at the telescope"
-            derived.append(Derived(name, "erg / (cm2 s)", what, _of_one(names, column, 1.0)))
-    for where, flux in light:
-        derived.append(Derived(f"flux {where}", "erg / (cm2 s)", f"flux at the telescope, {where}", _of_all(flux)))
-    return derived
-
-
-def _derived_at_distance(
-    scale: Float,
-    names: tuple[str, ...],
-    light: list[tuple[str, Float]],
-    exposure_s: float,
-    distance_pc: float,
-    radius_rsun: float | None,
-) -> list[Derived]:
-    """Return the quantities that follow from the distance of the star, and from its radius if it is known."""
+            yield Derived(name, "erg / (cm2 s)", what, of_one(column, 1.0))
+    fluxes = [(where, np.column_stack([f[:NODES], np.tile(f[NODES:], (NODES, 1))])) for where, f in light]
+    for where, flux in fluxes:
+        yield Derived(f"flux {where}", "erg / (cm2 s)", f"flux at the telescope, {where}", flux)
+    if distance_pc is None:
+        return
     far = distance_pc * PARSEC_CM
-    area = _of_one(names, 0, np.pi * far**2 * scale)
-    derived = [Derived("area", "cm2", "projected area of the blackbody", area)]
+    area = of_one(0, np.pi * far**2 * scale)
+    yield Derived("area", "cm2", "projected area of the blackbody", area)
     if radius_rsun is not None:
         share = area / (np.pi * (radius_rsun * SUN_CM) ** 2)
-        derived.append(Derived("filling factor", "", "share of the star's disc that the blackbody covers", share))
-    for where, flux in light:
-        total = _of_all(flux) * 4 * np.pi * far**2
-        derived.append(Derived(f"luminosity {where}", "erg / s", f"luminosity, {where}", total))
-        energy = total * exposure_s
-        derived.append(Derived(f"energy {where}", "erg", f"energy within the exposure, {where}", energy))
-    return derived
+        yield Derived("filling factor", "", "share of the star's disc that the blackbody covers", share)
+    for where, flux in fluxes:
+        total = flux * 4 * np.pi * far**2
+        yield Derived(f"luminosity {where}", "erg / s", f"luminosity, {where}", total)
+        yield Derived(f"energy {where}", "erg", f"energy within the exposure, {where}", total * exposure_s)
 
 
 #: Shares of a prior in the variance of a ratio at which thresholds are computed, and their largest root.
@@ -460,9 +432,8 @@ def undimmed(values: Float, factor: Float) -> Float:
     """Return light (n, k) over the factor by which it was dimmed, (n,); infinite where the factor is not above zero."""
     lost = (factor <= 0.0)[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(
-            np.where(values == 0.0, 0.0, np.where(lost, np.copysign(np.inf, values), values / factor[:, None]))
-        )
+        bright = np.where(lost, np.copysign(np.inf, values), values / factor[:, None])
+    return np.asarray(np.where(values == 0.0, 0.0, bright))
 
 
 @dataclass(frozen=True, eq=False)
@@ -495,6 +466,8 @@ class Ratio:
         The end is infinite if the bottom may be zero, and of the other sign, no end, if it cannot be positive.
         """
         left = np.maximum(left, 0.0)
+        if not self.bottom_variance.any():
+            return np.asarray((self.top + sign * np.sqrt(left * self.top_variance)) / self.bottom)
         a = self.bottom**2 - left * self.bottom_variance
         b = self.top * self.bottom - left * self.covariance
         c = self.top**2 - left * self.top_variance
@@ -519,8 +492,6 @@ EVERY = 4
 LEAST = 1e-11
 #: Pixels within this many standard deviations of saturation in a frame are not used.
 NEAR_SIGMA = 5.0
-#: Number of frames per block, small enough for a processor's cache.
-FRAMES_AT_ONCE = 64
 #: Smallest share of S/N^2 that must remain after marginalisation over the unknowns.
 LEAST_KEPT = 1e-10
 
@@ -608,12 +579,11 @@ class Reduction(MeanSums):
         light = light_factor(model, unknown, rows)
         return cls(hot, fixed, model.log_k, variance, weights, rows, free, light=light)
 
-    def rest(self, excess_dn: Float, sums: Float) -> Float:
-        """Return chi-squared of the residuals of frames less the quiescent mean, shape (n,)."""
-        used = self.variance > 0.0
-        inverse = np.divide(1.0, self.variance, out=np.zeros_like(self.variance), where=used)
+    def quiescent_chi2(self, excess_dn: Float) -> Float:
+        """Return chi-squared of frames less the quiescent mean, without a flare, shape (n,)."""
+        inverse = np.divide(1.0, self.variance, out=np.zeros_like(self.variance), where=self.variance > 0.0)
         unknown = excess_dn @ self.rows.T
-        return np.asarray(excess_dn**2 @ inverse - np.vecdot(unknown, unknown) - np.vecdot(sums, sums))
+        return np.asarray(excess_dn**2 @ inverse - np.vecdot(unknown, unknown))
 
     @property
     def n_used(self) -> int:
@@ -662,32 +632,6 @@ def light_factor(model: FlareModel, unknown: Nuisances | None, rows: Float) -> L
     )  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class Exposures:
-    """Raw frames, shape (n, n_pixel), and the quiescent mean; sums are taken block by block, without a copy of all."""
-
-    raw: NDArray[Any]
-    mean_dn: Float
-
-    def sums(self, reduction: Reduction, rows: NDArray[np.intp]) -> Float:
-        """Return the sums of some frames, shape (n, n_sum)."""
-        return np.concatenate([excess @ reduction.weights.T for excess in self._excess(rows)])
-
-    def sums_and_rest(self, reduction: Reduction, rows: NDArray[np.intp]) -> tuple[Float, Float, Float | None]:
-        """Return the sums of some frames, chi-squared of the residuals, and sums of the factor on light, (n,) each."""
-        parts, light = [], reduction.light
-        for excess in self._excess(rows):
-            sums = excess @ reduction.weights.T
-            own = np.zeros(0) if light is None else excess @ light.weights
-            parts.append((sums, reduction.rest(excess, sums), own))
-        sums, rest, own = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-        return sums, rest, None if light is None else own
-
-    def _excess(self, rows: NDArray[np.intp]) -> Iterator[Float]:
-        for start in range(0, rows.size, FRAMES_AT_ONCE):
-            yield self.raw[rows[start : start + FRAMES_AT_ONCE]] - self.mean_dn
-
-
 def variance_of(
     quiet: Expectation, added_dn: Float | None = None, highest_dn: Float | None = None
 ) -> tuple[Float, NDArray[np.bool_]]:
@@ -696,16 +640,12 @@ def variance_of(
     Pixels saturate with the light `highest_dn` of a flare, by default the mean `added_dn`.
     """
     added = np.zeros(quiet.wavelength_nm.size) if added_dn is None else added_dn
+    highest = added if highest_dn is None else highest_dn
+    light, most = (np.maximum(quiet.light_dn + each, 0.0) for each in (added, highest))
     constant = quiet.unsaturated_variance_dn2 - quiet.gain_dn_per_electron * quiet.light_dn
-
-    def variance_with(added: Float) -> tuple[Float, Float]:
-        light = np.maximum(quiet.light_dn + added, 0.0)
-        return light, constant + quiet.gain_dn_per_electron * light
-
-    variance = variance_with(added)[1]
-    light, scatter = variance_with(added if highest_dn is None else highest_dn)
+    variance, scatter = (constant + quiet.gain_dn_per_electron * each for each in (light, most))
     # Frames of a pixel near saturation are occasionally clipped, so that the pixel is not reliable.
-    raw = light / quiet.n_frames + quiet.dark_dn + quiet.bias_dn
+    raw = most / quiet.n_frames + quiet.dark_dn + quiet.bias_dn
     used = raw + NEAR_SIGMA * np.sqrt(scatter / quiet.n_frames) < quiet.ceiling_dn
     return np.where(used, variance, 0.0), used
 

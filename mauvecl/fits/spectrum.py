@@ -19,7 +19,6 @@ from mauvecl.detection.nuisances import Nuisances
 from mauvecl.fits.flare_model import (
     NEAR_SIGMA,
     Derived,
-    Exposures,
     FlareModel,
     Ranges,
     Reduction,
@@ -32,7 +31,6 @@ from mauvecl.fits.profile import (
     BoundedProfile,
     Profile,
     Slopes,
-    bounded_intervals,
     covariance,
     intervals,
     with_bounds,
@@ -57,8 +55,8 @@ LEVELS = (0.6827, 0.95)
 REFITS = 2
 #: Frames share a variance if the changes of its logarithm agree to this step in each of some ranges of pixels.
 VARIANCE_STEP, VARIANCE_RANGES = 0.03, 12
-#: Frames that are fitted together, which bounds the memory.
-BATCH = 2048
+#: Frames that are fitted together, which bounds the memory, and number of frames per block of sums over pixels.
+BATCH, FRAMES_AT_ONCE = 2048, 64
 #: Fits more of exposures with pixels near saturation; the logarithmic step of the number of such pixels of those that
 #: share the others in the first fit, and the least share of their pixels that all must be able to use there.
 SATURATED_REFITS, SATURATED_STEP, LEAST_SHARED = 4, 0.05, 0.5
@@ -233,16 +231,14 @@ def fit(
     # Exposures with saturated pixels start far from the flare, which decides on the pixels that saturate.
     saturated = [np.flatnonzero(cut)] * (SATURATED_REFITS if near else 0)
     for rows in [*saturated, *[every] * (REFITS - 1)]:
-        for some, reduction in problem.groups(log_k, linear, rows, near):
-            for batch in _batches(some):
-                profile = Profile(reduction, problem.exposures.sums(reduction, batch))
-                best = with_bounds(reduction, profile.sums, profile.best())
-                log_k[batch], linear[batch] = best.log_k, best.linear
+        for batch, reduction in problem.groups(log_k, linear, rows, near):
+            profile = problem.profile(reduction, batch)
+            best = with_bounds(reduction, profile.sums, profile.best())
+            log_k[batch], linear[batch] = best.log_k, best.linear
     parts, order = [], []
-    for some, reduction in problem.groups(log_k, linear, every, near):
-        for batch in _batches(some):
-            parts.append(problem.measured(batch, reduction))
-            order.append(batch)
+    for batch, reduction in problem.groups(log_k, linear, every, near):
+        parts.append(problem.measured(batch, reduction))
+        order.append(batch)
     return Measurement.joined(parts, order)
 
 
@@ -256,7 +252,8 @@ def _batches(rows: NDArray[np.intp]) -> Iterator[NDArray[np.intp]]:
 class _Problem:
     """Exposures, and the model of the flares that are fitted to them."""
 
-    exposures: Exposures
+    raw: NDArray[Any]  # frames, shape (n, n_pixel)
+    mean_dn: Float  # of frames without a flare
     quiet: Expectation
     model: FlareModel
     nuisances: Nuisances | None
@@ -279,7 +276,7 @@ class _Problem:
         if not levels:
             raise InputError.of("levels", levels, "at least one probability")
         mean = quiet.recorded_dn if nuisances is None else quiet.recorded_dn + nuisances.mean_dn
-        return cls(Exposures(raw, mean), quiet, model, nuisances, tuple(levels), skipped_nm)
+        return cls(raw, mean, quiet, model, nuisances, tuple(levels), skipped_nm)
 
     @property
     def rises(self) -> list[float]:
@@ -293,23 +290,37 @@ class _Problem:
         return Reduction.of(self.model, self.quiet, added_dn, self.nuisances, self.skipped_nm, highest_dn=highest_dn,
                             clipped=clipped)  # fmt: skip
 
+    def _excess(self, rows: NDArray[np.intp]) -> Iterator[Float]:
+        """Yield frames less their mean without a flare, in blocks that fit into a processor's cache."""
+        for start in range(0, rows.size, FRAMES_AT_ONCE):
+            yield self.raw[rows[start : start + FRAMES_AT_ONCE]] - self.mean_dn
+
+    def profile(self, reduction: Reduction, rows: NDArray[np.intp]) -> Profile:
+        """Return the profile of some frames."""
+        light = np.zeros((0, self.mean_dn.size)) if reduction.light is None else reduction.light.weights[None]
+        weights = np.vstack([reduction.weights, light])
+        sums = np.concatenate([excess @ weights.T for excess in self._excess(rows)])
+        n = len(reduction.weights)
+        return Profile(reduction, sums[:, :n], sums[:, n] if len(light) else None)
+
+    def quiescent_chi2(self, reduction: Reduction, rows: NDArray[np.intp]) -> Float:
+        """Return chi-squared of some frames without a flare, shape (n,)."""
+        return np.concatenate([reduction.quiescent_chi2(excess) for excess in self._excess(rows)])
+
     def pilot(self) -> tuple[Float, Float, NDArray[np.bool_]]:
         """Fit all frames with the variance of the quiescent star, and return which have saturated pixels as well.
 
         Pixels that are near saturation in a frame are not used.
         """
-        raw, quiet, n = self.exposures.raw, self.quiet, len(self.exposures.raw)
-        log_k, linear, counts = np.empty(n), np.empty((n, len(self.model.linear))), np.zeros(n, np.intp)
+        raw, quiet, n = self.raw, self.quiet, len(self.raw)
+        log_k, linear = np.empty(n), np.empty((n, len(self.model.linear)))
         usual = self.reduction(None)
-        used, ceiling = usual.variance > 0.0, _highest_usable(quiet)
-        for start in range(0, n, BATCH):
-            part = raw[start : start + BATCH]
-            if (part.max(axis=0) > ceiling)[used].any():
-                counts[start : start + BATCH] = (part > ceiling)[:, used].sum(axis=1)
+        used = usual.variance > 0.0
+        counts = np.count_nonzero(raw > np.where(used, _highest_usable(quiet), np.inf), axis=1)
 
         def best(rows: NDArray[np.intp], reduction: Reduction) -> None:
             for some in _batches(rows):
-                fit_of_some = Profile(reduction, self.exposures.sums(reduction, some)).best()
+                fit_of_some = self.profile(reduction, some).best()
                 log_k[some], linear[some] = fit_of_some.log_k, fit_of_some.linear
 
         best(np.flatnonzero(counts == 0), usual)
@@ -328,11 +339,11 @@ class _Problem:
     def groups(
         self, log_k: Float, linear: Float, rows: NDArray[np.intp], near: bool
     ) -> Iterator[tuple[NDArray[np.intp], Reduction]]:
-        """Yield groups of frames whose fitted flares have nearly the same variance, with their reduction.
+        """Yield batches of frames whose fitted flares have nearly the same variance, with their reduction.
 
         The frames are some `rows` of all, and `near` says whether pixels are near saturation in any of these.
         """
-        quiet, model, raw, nuisances = self.quiet, self.model, self.exposures.raw, self.nuisances
+        quiet, model, raw, nuisances = self.quiet, self.model, self.raw, self.nuisances
         log_k, linear, n_pixel = log_k[rows], linear[rows], quiet.wavelength_nm.size
         edges = np.linspace(0, n_pixel, VARIANCE_RANGES + 1).astype(np.intp)[:-1]
         ceiling = _highest_usable(quiet)
@@ -359,13 +370,13 @@ class _Problem:
             own, clipped = rows[some], None
             if near and (raw[own].max(axis=0) > ceiling).any():
                 clipped = clipped_pixels(raw[own], quiet)
-            yield own, self.reduction(mean, highest, clipped)
+            reduction = self.reduction(mean, highest, clipped)
+            yield from ((batch, reduction) for batch in _batches(own))
 
     def measured(self, rows: NDArray[np.intp], reduction: Reduction) -> Measurement:
         """Measure the flares of some frames of one variance."""
         model = self.model
-        sums, rest, light = self.exposures.sums_and_rest(reduction, rows)
-        profile = Profile(reduction, sums, light)
+        profile = self.profile(reduction, rows)
         at_nodes = profile.gain_at_nodes()
         best = profile.best(at_nodes)
         ends = [intervals(model, profile, best, at_nodes, rise) for rise in self.rises]
@@ -378,9 +389,9 @@ class _Problem:
             nodes = bounded.gain_at_nodes()
             there = bounded.best(nodes)
             for k, rise in enumerate(self.rises):
-                low[k, near], high[k, near] = bounded_intervals(model, bounded, there, nodes, rise)
+                low[k, near], high[k, near] = intervals(model, bounded, there, nodes, rise)
             best = best.replaced(near, there)
-        return self.measurement(model, reduction, profile, best, rest, (low, high))
+        return self.measurement(model, reduction, profile, best, self.quiescent_chi2(reduction, rows), (low, high))
 
     def measurement(
         self,
@@ -388,16 +399,16 @@ class _Problem:
         reduction: Reduction,
         profile: Profile,
         best: BestFit,
-        rest: Float,
+        quiescent: Float,
         ends: tuple[Float, Float],
         second: tuple[float, Slopes] | None = None,
     ) -> Measurement:
         """Return the measurement of best fits with the ends of their intervals.
 
-        `rest` is chi-squared without what the sums explain. A second blackbody is given by its log temperature and the
+        `quiescent` is chi-squared without a flare. A second blackbody is given by its log temperature and the
         derivatives with respect to it.
         """
-        chi2 = rest + np.vecdot(profile.sums, profile.sums) - best.gain
+        chi2 = quiescent - best.gain
         dof = reduction.n_used - reduction.n_free - len(model.linear) - (1 if second is None else 2)
         factor, log_k = profile.factor(best.log_k, best.linear), best.log_k
         spread = covariance(model, profile.reduction, best, factor, None if second is None else second[1])
@@ -628,10 +639,10 @@ def fit_two_temperatures(
     recorded = single.amplitudes * single.factor[:, None]
     for rows, reduction in problem.groups(single.log_k, recorded, np.arange(len(recorded)), True):
         check_enough(expectation, reduction.variance > 0.0, len(model.linear) + 3 + reduction.n_free)
-        sums, rest, light = problem.exposures.sums_and_rest(reduction, rows)
-        for here, log_k, profile, best, ends in _Search(two, reduction, sums, problem.rises, light).fits():
+        whole, quiescent = problem.profile(reduction, rows), problem.quiescent_chi2(reduction, rows)
+        for here, log_k, profile, best, ends in _Search(two, whole, reduction, problem.rises).fits():
             second = log_k, two.slopes(log_k, reduction, best.log_k, best.linear)
-            parts.append(problem.measurement(two.at(log_k), reduction, profile, best, rest[here], ends, second))
+            parts.append(problem.measurement(two.at(log_k), reduction, profile, best, quiescent[here], ends, second))
             order.append(rows[here])
     return Measurement.joined(parts, order)
 
@@ -639,19 +650,16 @@ def fit_two_temperatures(
 class _Search:
     """Fit of exposures with a common variance over second temperatures."""
 
-    def __init__(
-        self, model: TwoTemperatures, reduction: Reduction, sums: Float, allowed: list[float], light: Float | None
-    ) -> None:
-        self._model, self._reduction, self._sums, self._allowed = model, reduction, sums, allowed
-        self._light = light
+    def __init__(self, model: TwoTemperatures, profile: Profile, reduction: Reduction, allowed: list[float]) -> None:
+        self._model, self._whole, self._reduction, self._allowed = model, profile, reduction, allowed
         nodes = reduction.log_k
         #: Second log temperatures that may be tried.
         self._grid = np.linspace(nodes[2 * APART], nodes[-1], PER_NODE * (nodes.size - 1 - 2 * APART) + 1)
-        self._gain = np.full((len(sums), self._grid.size), -np.inf)
+        self._gain = np.full((len(profile.sums), self._grid.size), -np.inf)
 
     def _profile(self, node: int, rows: NDArray[np.intp]) -> BoundedProfile:
         own = self._model.reduction_at(float(self._grid[node]), self._reduction)
-        return BoundedProfile(own, self._sums[rows], None if self._light is None else self._light[rows])
+        return BoundedProfile(own, *self._whole.rows(rows)[1:])
 
     def _evaluate(self, wanted: NDArray[np.bool_]) -> None:
         """Compute the largest gain at second temperatures, (n, n_node)."""
@@ -707,7 +715,7 @@ class _Search:
                     continue
                 limit = BestFit(own.log_k[there], own.linear[there], gain[rows[there]])
                 some = BoundedProfile(*profile.rows(there))
-                low, high = bounded_intervals(model, some, limit, at_nodes[there], rise)
+                low, high = intervals(model, some, limit, at_nodes[there], rise)
                 lows[k, rows[there]] = np.minimum(lows[k, rows[there]], low)
                 highs[k, rows[there]] = np.maximum(highs[k, rows[there]], high)
         for k, rise in enumerate(self._allowed):

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property, partial
+from functools import cached_property, partial
 from itertools import product
 from typing import TYPE_CHECKING, Annotated, NamedTuple, Self
 
@@ -21,12 +21,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.detection.nuisances import Nuisances, fitted_amplitudes, spectrum_of
 from mauvecl.fits.flare_model import EVERY, Ranges, Reduction
-from mauvecl.fits.profile import remembering
 from mauvecl.fits.spectrum import LEVELS, Measurement, clipped_pixels, fit
 from mauvecl.flares.frames import Components, known_strengths
 from mauvecl.flares.settings import Cooling
 from mauvecl.flares.shapes import Shape, shape_of
 from mauvecl.flares.stare import Event, Stare
+from mauvecl.host.arrays import array_cache
 from mauvecl.noise.unknowns import CHANGED_PART, CHANGING, Changing
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, table_of
@@ -75,40 +75,40 @@ class MeasuredBins:
     @property
     def columns(self) -> list[Column]:
         """Columns of the table; those of the quantities depend on the model."""
-        measurement = self.found
+        found = self.found
         return [
             Column("start", "start_s", "s", "start of the bin, from the start of the stare", "from (s)", "g"),
             Column("end", "end_s", "s", "end of the bin", "to (s)", "g"),
             Column("frames", "count", "", "frames of the bin"),
             Column("snr", "found.snr", "", "S/N of the flare in the bin", "S/N", ".1f"),
-            *(column for q in range(len(measurement.names)) for column in self._quantity(q)),
-            Column("chi2", "found.chi2", "", f"chi-squared of the fit, of {measurement.dof} degrees of freedom"),
+            *(column for q in range(len(found.names)) for column in _columns_of(found, q)),
+            Column("chi2", "found.chi2", "", f"chi-squared of the fit, of {found.dof} degrees of freedom"),
             Column("p_value", "found.p_value", "",
                    "probability of a chi-squared at least as large if the model is correct", "p-value", ".2g"),
         ]  # fmt: skip
 
-    def _quantity(self, q: int) -> list[Column]:
-        """Return the columns of a quantity's estimates, errors and intervals."""
-        from astropy import units
 
-        measurement, name = self.found, self.found.names[q]
-        column, unit = name.replace(" ", "_"), str(units.Unit(measurement.units[q]))
-        heading, spec, error = SHOWN.get(column, ("", "", ""))
-        columns = [
-            Column(column, lambda bins: bins.found.estimates[:, q], unit, f"{name} of the flare", heading, spec),
-            Column(f"{column}_error", lambda bins: bins.found.errors[:, q], unit, "its standard error", error, spec),
-        ]
-        for k, level in enumerate(measurement.levels):
-            text = f"end of its {100 * level:.4g} % interval; infinite where there is none"
-            columns += [
-                Column(f"{column}_low_{100 * level:.0f}", self._end("low", k, q), unit, f"lower {text}"),
-                Column(f"{column}_high_{100 * level:.0f}", self._end("high", k, q), unit, f"higher {text}"),
-            ]
-        return columns
+def _columns_of(found: Measurement, q: int) -> list[Column]:
+    """Return the columns of a quantity's estimates, errors and intervals."""
+    from astropy import units
 
-    @staticmethod
-    def _end(side: str, level: int, q: int) -> Callable[[MeasuredBins], Float]:
-        return lambda bins: np.asarray(getattr(bins.found, side)[level][:, q])
+    name = found.names[q]
+    column, unit = name.replace(" ", "_"), str(units.Unit(found.units[q]))
+    heading, spec, error = SHOWN.get(column, ("", "", ""))
+    columns = [
+        Column(column, lambda _: found.estimates[:, q], unit, f"{name} of the flare", heading, spec),
+        Column(f"{column}_error", lambda _: found.errors[:, q], unit, "its standard error", error, spec),
+    ]
+    for level, *ends in zip(found.levels, found.low, found.high, strict=True):
+        text = f"end of its {100 * level:.4g} % interval; infinite where there is none"
+        for side, values in zip(("lower", "higher"), ends, strict=True):
+            named = f"{column}_{side.removesuffix('er')}_{100 * level:.0f}"
+            columns.append(Column(named, partial(_column, values, q), unit, f"{side} {text}"))
+    return columns
+
+
+def _column(values: Float, q: int, _: object) -> Float:
+    return values[:, q]
 
 
 @validated
@@ -273,13 +273,9 @@ Pair = tuple[Float, Float]
 PARAMETERS = ("peak time", "half width", "amplitude", "temperature", "end temperature", "cooling time")
 #: Number of fits after the first, each with the covariances of the previous fit.
 REFITS = 3
-#: Reach of the search for the end of an interval, in standard errors.
-REACH = 12.0
-#: Smallest standard error, relative or in s, of a parameter that the frames constrain.
-NO_STEP = 1e-9
-#: Largest number of Newton's steps to the end of an interval, their largest length and that of the last one, relative
-#: to the rise of chi-squared, and the largest condition number of the scaled information.
-NEWTON_STEPS, LONGEST, CONVERGED, WORST_CONDITION = 20, 1.5, 1e-6, 1e10
+#: Number of steps to the end of an interval, and of those without damping; largest length of a step and of the last,
+#: relative to the root of the rise of chi-squared; relative regularisation of degenerate parameters.
+NEWTON_STEPS, UNDAMPED, LONGEST, CONVERGED, RIDGE = 30, 8, 1.5, 1e-3, 1e-10
 
 
 @dataclass(frozen=True, eq=False)
@@ -329,17 +325,19 @@ class _Data:
     @cached_property
     def strengths(self) -> Callable[[Float], Pair]:
         """Function of the parameters that returns the amplitude and log temperature of each frame."""
-        return remembering(self._strengths)
+
+        @array_cache(2)
+        def strengths(theta: Float) -> Pair:
+            rise = np.exp(theta[2]) * self.light * self.shape.mean_over(self.edges, theta[0], np.exp(theta[1]))
+            log_k = theta[3] + np.log(self._cooled(theta)[0])
+            return rise, np.clip(log_k, self.model.log_k[0], self.model.log_k[-1])
+
+        return strengths
 
     @cached_property
     def slopes(self) -> Callable[[Float], Pair]:
         """Function that returns the derivatives of `strengths` by the parameters, each of shape (6, n_frame)."""
-        return remembering(self._slopes)
-
-    def _strengths(self, theta: Float) -> Pair:
-        rise = np.exp(theta[2]) * self.light * self.shape.mean_over(self.edges, theta[0], np.exp(theta[1]))
-        log_k = theta[3] + np.log(self._cooled(theta)[0])
-        return rise, np.clip(log_k, self.model.log_k[0], self.model.log_k[-1])
+        return array_cache(2)(self._slopes)
 
     def _cooled(self, theta: Float) -> tuple[Float, Float, float]:
         """Return temperatures over that at the peak, as in `Cooling`, times since the peak, and the end."""
@@ -421,7 +419,7 @@ class _Quantity:
 
     name: str
     unit: str
-    place: int  # parameter that is varied to hold the quantity fixed: its own, or the amplitude
+    place: int  # its parameter, or the amplitude
     spline: scipy.interpolate.CubicSpline | None = None  # light per amplitude over log temperature
     factor: float = 1.0
 
@@ -522,8 +520,7 @@ def fit_cooling(
     scale = np.where([quantity.place == 0 for quantity in quantities], 1.0, estimates)
     slopes = scale[:, None] * np.array([quantity.slope(theta, data) for quantity in quantities])[:, free]
     spread = slopes @ covariance @ slopes.T
-    sd = np.sqrt(np.diag(spread)) / np.maximum(np.abs(scale), 1e-300)
-    ends = fit.ends(quantities, estimates, sd, [float(scipy.stats.chi2.ppf(level, 1)) for level in levels])
+    ends = fit.ends(quantities, estimates, [float(scipy.stats.chi2.ppf(level, 1)) for level in levels])
     dof = data.sums.size - free.size - sum(np.isinf(unknown.sd) for unknown in data.unknown)
     empty = np.full(theta.shape, -np.inf)
     without = data.whitening(theta, none=True)
@@ -601,28 +598,17 @@ def _data(
     covariance = components.covariance(strengths)
     edges = np.column_stack([stare.start_s, stare.start_s + stare.frame_s])
     gain = np.asarray(quiet.gain_dn_per_electron) * np.ones(weights.shape[1])
-    unknown, jitters = _levels_of_stare(components.directions(strengths), reduction, stare)
+    unknown, jitters = _levels(nuisances, model, reduction, stare, components.directions(strengths))
     light = strengths[:, 3]
     if nuisances is not None:
-        unknown = (*_constant_levels(nuisances, model, weights, len(sums)), *unknown)
         sums, light = sums - weights @ nuisances.mean_dn, nuisances.mean_factor * light
     return _Data(sums, edges, light, covariance, unknown, jitters, reduction, model, gain, shape)
 
 
-def _constant_levels(nuisances: Nuisances, model: FlareModel, weights: Float, n_frames: int) -> tuple[_Level, ...]:
-    """Return unknown levels that are constant over a stare."""
-    levels = []
-    for sd, spectrum, of_flare in zip(nuisances.sd, nuisances.spectra, nuisances.of_flare, strict=True):
-        sums = np.tile(weights @ spectrum, (n_frames, 1))
-        spline = scipy.interpolate.CubicSpline(model.log_k, (model.hot * of_flare) @ weights.T)
-        levels.append(_Level(float(sd), sums, np.full(n_frames, float(of_flare.any())), spline))
-    return tuple(levels)
-
-
-def _levels_of_stare(
-    changes: Mapping[str, Float], reduction: Reduction, stare: Stare
+def _levels(
+    nuisances: Nuisances | None, model: FlareModel, reduction: Reduction, stare: Stare, changes: Mapping[str, Float]
 ) -> tuple[tuple[_Level, ...], tuple[_Level, ...]]:
-    """Return the unknown changes of a stare, and its jitters."""
+    """Return the unknown levels of a stare, constant or not, and its jitters."""
 
     def level(of: Changing, sd: float, curve: Float) -> _Level:
         of_flare = curve if of == "light" else np.zeros_like(curve)
@@ -631,10 +617,13 @@ def _levels_of_stare(
     ones, jitters = np.ones(stare.n_frames), dict(stare.jitters)
     if stare.pointing is not None:
         jitters["light"] = float(np.hypot(jitters["light"], stare.pointing.depth))
-    return (
-        tuple(level(unknown.of, unknown.sd, unknown.curve) for unknown in stare.unknowns),
-        tuple(level(of, sd, ones) for of, sd in jitters.items() if sd > 0.0),
-    )
+    unknown = [level(each.of, each.sd, each.curve) for each in stare.unknowns]
+    constant = nuisances and zip(nuisances.sd, nuisances.spectra, nuisances.of_flare, strict=True)
+    for sd, spectrum, of_flare in constant or ():
+        spline = scipy.interpolate.CubicSpline(model.log_k, (model.hot * of_flare) @ reduction.weights.T)
+        sums = np.tile(reduction.weights @ spectrum, (stare.n_frames, 1))
+        unknown.append(_Level(float(sd), sums, ones * float(of_flare.any()), spline))
+    return tuple(unknown), tuple(level(of, sd, ones) for of, sd in jitters.items() if sd > 0.0)
 
 
 def _start(data: _Data, whitening: _Whitening, peak_s: float, half_width_s: float, cooling: bool) -> Float:
@@ -659,31 +648,6 @@ def _limits(model: FlareModel, stare: Stare) -> tuple[Float, Float]:
     low = np.array([first - whole, np.log(0.1 * frame), np.log(1e-9), coolest + 1e-9, coolest - hottest, np.log(frame)])
     high = np.array([first + 2 * whole, np.log(whole), np.log(1e9), hottest - 1e-9, 0.0, np.log(100 * whole)])
     return low, high
-
-
-def _least_squares(
-    start: Float, free: NDArray[np.intp], limits: tuple[Float, Float], residuals: Callable[[Float], Float],
-    jacobian: Callable[[Float], Float], *, width_s: float, xtol: float = 1e-8,
-) -> tuple[Float, float]:  # fmt: skip
-    """Return the parameters of the smallest chi-squared, of which some are `free`, and chi-squared.
-
-    The functions take all parameters, and the second returns derivatives by the free ones.
-    """
-
-    def with_free(values: Float) -> Float:
-        there = start.copy()
-        there[free] = values
-        return there
-
-    def of_free(function: Callable[[Float], Float]) -> Callable[[Float], Float]:
-        return lambda values: function(with_free(values))
-
-    low, high = (end[free] for end in limits)
-    first, scale = np.clip(start[free], low + 1e-9, high - 1e-9), np.where(free == 0, width_s, 1.0)
-    solution = scipy.optimize.least_squares(
-        of_free(residuals), first, of_free(jacobian), bounds=(low, high), x_scale=scale, xtol=xtol
-    )
-    return with_free(solution.x), 2 * float(solution.cost)
 
 
 def _quantities(data: _Data, stare: Stare, cooling: bool) -> list[_Quantity]:
@@ -721,20 +685,27 @@ class _BestFit:
         whitening = data.whitening(None)
         theta = np.clip(_start(data, whitening, peak_s, half_width_s, cooling), *limits)
 
-        def jacobian(values: Float) -> Float:
-            return data.jacobian(values, whitening)[:, free]
+        def with_free(values: Float) -> Float:
+            return np.concatenate([values, theta[free.size :]])
 
+        def residuals(values: Float) -> Float:
+            return data.residuals(with_free(values), whitening)
+
+        def jacobian(values: Float) -> Float:
+            return data.jacobian(with_free(values), whitening)[:, free]
+
+        low, high = (end[free] for end in limits)
         for refits in range(REFITS + 1):
             whitening = data.whitening(theta) if refits else whitening
-            residuals = partial(data.residuals, whitening=whitening)
-            theta, chi2 = _least_squares(theta, free, limits, residuals, jacobian, width_s=np.exp(theta[1]))
-        return cls(data, whitening, theta, free, limits, chi2)
+            start, scale = np.clip(theta[free], low + 1e-9, high - 1e-9), np.where(free == 0, np.exp(theta[1]), 1.0)
+            solution = scipy.optimize.least_squares(residuals, start, jacobian, bounds=(low, high), x_scale=scale)
+            theta = with_free(solution.x)
+        return cls(data, whitening, theta, free, limits, 2 * float(solution.cost))
 
-    def ends(self, quantities: Sequence[_Quantity], estimates: Float, sd: Float, rises: Sequence[float]) -> Float:
+    def ends(self, quantities: Sequence[_Quantity], estimates: Float, rises: Sequence[float]) -> Float:
         """Return the ends of the intervals of all quantities, shape (2, n_rise, n_quantity), for rises of chi-squared.
 
-        `sd` is the standard deviation of the peak, or of the logarithm of another quantity. An energy is a multiple of
-        its fluence.
+        An energy is a multiple of its fluence.
         """
         ends = np.full((2, len(rises), len(quantities)), np.nan)
         names = [quantity.name for quantity in quantities]
@@ -744,92 +715,36 @@ class _BestFit:
                 ends[:, :, q] = estimates[q] / estimates[fluence] * ends[:, :, fluence]
                 continue
             for (side, sign), (k, rise) in product(enumerate((-1.0, 1.0)), enumerate(rises)):
-                end = self._newton_end(quantity, sign, self.chi2 + rise)
-                if end is None:
-                    end = self._root_end(quantity, sign * float(sd[q]), self.chi2 + rise)
-                ends[side, k, q] = end
+                ends[side, k, q] = self._end(quantity, sign, self.chi2 + rise)
         return ends
 
-    def _newton_end(self, quantity: _Quantity, sign: float, allowed: float) -> float | None:
-        """Return the end of an interval on one side, or None if Newton's steps do not find it within the limits.
+    def _end(self, quantity: _Quantity, sign: float, allowed: float) -> float:
+        """Return the end of an interval on one side; infinite if chi-squared does not rise that far within the limits.
 
-        Each step goes to where the quantity is extreme on the surface of equal chi-squared, of linearised residuals.
+        Each step goes to where the quantity is extreme on the surface of equal chi-squared, of linearised residuals. A
+        parameter that reaches a limit stays there.
         """
         data, free, (low, high), there = self.data, self.free, self.limits, self.theta.copy()
-        for _ in range(NEWTON_STEPS):
+        for number in range(NEWTON_STEPS):
             residuals = data.residuals(there, self.whitening)
-            jacobian = data.jacobian(there, self.whitening)[:, free]
-            information, slope = jacobian.T @ jacobian, quantity.slope(there, data)[free]
-            scale = np.sqrt(np.diag(information))
+            every = data.jacobian(there, self.whitening)
             # A flare that does not cool leaves the cooling time without any effect.
-            if not ((scale > 0.0) & (scale < np.inf)).all():
-                return None
-            if not np.linalg.cond(information / np.outer(scale, scale)) < WORST_CONDITION:
-                return None
+            power = np.sum(every**2, axis=0)
+            free = free[power[free] > 0.0]
+            jacobian, slope = every[:, free], quantity.slope(there, data)[free]
+            information = jacobian.T @ jacobian + np.diag(RIDGE * power[free])
             back, along = np.linalg.solve(information, np.column_stack([-(residuals @ jacobian), slope])).T
+            if not slope @ along > 0.0:
+                break
             room = allowed - float(residuals @ residuals + residuals @ jacobian @ back)
             step = back + sign * np.sqrt(max(room, 0.0) / (slope @ along)) * along
-            moved = float(np.sum((jacobian @ step) ** 2)) / (allowed - self.chi2)
-            there[free] += step * min(1.0, LONGEST / np.sqrt(moved))
-            if not ((low <= there) & (there <= high))[free].all():
-                return None
-            if moved < CONVERGED:
+            length = float(np.linalg.norm(jacobian @ step)) / np.sqrt(allowed - self.chi2)
+            # Steps across a kink, where the peak changes frames, would not become shorter.
+            share = min(1.0, LONGEST / length) * 0.5 ** max(0, number - UNDAMPED)
+            there[free] += share * step
+            outside = (there < low) | (there > high)
+            if outside[free].any():
+                there, free = np.clip(there, low, high), free[~outside[free]]
+            elif share * length < CONVERGED:
                 return quantity.value(there, data)
-        return None
-
-    def _root_end(self, quantity: _Quantity, step: float, allowed: float) -> float:
-        """Return the end of an interval on the side of a step; infinite if chi-squared does not rise that far."""
-        theta, place, (low, high) = self.theta, quantity.place, self.limits
-        rest = self.free[self.free != place]
-        centre, there = quantity.value(theta, self.data), theta
-
-        @cache  # a root is between values that have different signs, though refits start elsewhere
-        def rise(log_factor: float) -> float:
-            nonlocal there
-            there, chi2 = self._refitted(quantity, log_factor, there, rest)
-            return chi2 - allowed
-
-        inner, outer = 0.0, step
-        if abs(step) < NO_STEP:
-            return float(np.copysign(np.inf, step))
-        while rise(outer) < 0.0:
-            inner, outer = outer, 1.7 * outer
-            if (
-                abs(outer) > REACH * abs(step)
-                or not low[place] <= self._held(quantity, outer, theta)[place] <= high[place]
-            ):
-                return float(np.copysign(np.inf, step))
-        there = theta
-        offset = scipy.optimize.brentq(rise, inner, outer, xtol=1e-3 * abs(step), rtol=1e-6)
-        return float(centre + offset if place == 0 else centre * np.exp(offset))
-
-    def _held(self, quantity: _Quantity, log_factor: float, theta: Float) -> Float:
-        """Return parameters with a changed quantity: by a difference for the peak, otherwise by a factor."""
-        moved, place, centre = theta.copy(), quantity.place, quantity.value(self.theta, self.data)
-        if place == 0:
-            moved[0] = centre + log_factor
-        elif place == 4:
-            moved[4] = np.log(centre) + log_factor - moved[3]
-        else:
-            moved[place] += np.log(centre / quantity.value(moved, self.data)) + log_factor
-        return moved
-
-    def _refitted(
-        self, quantity: _Quantity, log_factor: float, there: Float, rest: NDArray[np.intp]
-    ) -> tuple[Float, float]:
-        """Fit the other parameters from a starting point with a changed quantity; return them and chi-squared."""
-
-        def held(trial: Float) -> Float:
-            trial = self._held(quantity, log_factor, trial)
-            trial[4] = min(trial[4], 0.0)
-            return trial
-
-        def jacobian(trial: Float) -> Float:
-            trial = held(trial)
-            each, slope = self.data.jacobian(trial, self.whitening), quantity.slope(trial, self.data)
-            return np.asarray(each[:, rest] - np.outer(each[:, quantity.place], slope[rest] / slope[quantity.place]))
-
-        return _least_squares(
-            there, rest, self.limits, lambda trial: self.data.residuals(held(trial), self.whitening), jacobian,
-            width_s=np.exp(self.theta[1]), xtol=1e-6,
-        )  # fmt: skip
+        return sign * np.inf

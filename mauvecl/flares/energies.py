@@ -21,7 +21,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, Self
 
@@ -168,7 +167,8 @@ class EnergyScale:
         quarter of the energy of an isotropic source, and the response weights energies although equivalent durations
         count photons.
         """
-        area = np.pi * (radius_rsun * SUN_CM) ** 2 * in_band(band, temperature_k) / in_band(band, flare_k)
+        star, flare = (flux_in_band(band, Blackbody(kelvin)) for kelvin in (temperature_k, flare_k))
+        area = np.pi * (radius_rsun * SUN_CM) ** 2 * star / flare
         return cls(
             find_band(band).name,
             "bolometric",
@@ -241,17 +241,8 @@ def amplitude_of_peak(peak: float, shape: Shape | str) -> float:
     return peak / shape_of(shape).peak
 
 
-@lru_cache(1024)
-def in_band(band: str, temperature_k: float) -> float:
-    """Return a blackbody's surface flux in a band, erg s-1 cm-2; the maximum response is 1."""
-    wavelength, response = _response(band)
-    return _integral(wavelength, response * blackbody(wavelength, temperature_k))
-
-
 def flux_in_band(band: str, flare: FlareSpectrum) -> float:
     """Return the flux of a flare's spectrum in a band, erg s-1 cm-2; the maximum response is 1."""
-    if isinstance(flare, Blackbody):
-        return in_band(band, flare.temperature_k)
     wavelength, response = _response(band)
     grid = flare.grid(wavelength)
     return _integral(grid, np.interp(grid, wavelength, response) * flare.flux(grid))

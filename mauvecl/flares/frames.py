@@ -132,14 +132,14 @@ class Components:
         return sums[0], sums[1:]
 
     @cached_property
-    def _known(self) -> dict[int, tuple[Float, Float]]:
-        return {}
+    def _means(self) -> Float:
+        """Mean sums of each component at a coefficient of one, shape (4 + n_flare, n_statistic)."""
+        return self.sum_cumulants(1)[1]
 
-    def _sums(self, order: int) -> tuple[Float, Float]:
-        """Return `sum_cumulants`, computed once: those of high orders take long, and fits do not need them."""
-        if order not in self._known:
-            self._known[order] = self.sum_cumulants(order)
-        return self._known[order]
+    @cached_property
+    def _covariances(self) -> tuple[Float, Float]:
+        """`sum_cumulants` of the second order."""
+        return self.sum_cumulants(2)
 
     def coefficients(self, stare: Stare, flare: Float | None = None) -> Float:
         """Return the known coefficients of star, sky, dark, neighbours and flares, shape (n_frame, 4 + n_flare).
@@ -161,19 +161,12 @@ class Components:
         """Return the mean statistics, (..., n_statistic), for coefficients of shape (..., 4 + n_flare)."""
         reference = np.zeros(len(STEADY) + self.n_flares)
         reference[: len(STEADY)] = 1.0
-        return np.asarray((coefficients - reference) @ self._sums(1)[1])
+        return np.asarray((coefficients - reference) @ self._means)
 
     def covariance(self, coefficients: Float) -> Float:
         """Return the covariances of the statistics of frames, shape (..., n_statistic, n_statistic)."""
-        return self._of(2, coefficients)
-
-    def third(self, coefficients: Float) -> Float:
-        """Return the joint third cumulants of the statistics, shape (..., n_statistic, n_statistic, n_statistic)."""
-        return self._of(3, coefficients)
-
-    def fourth(self, coefficients: Float) -> Float:
-        """Return the joint fourth cumulants of the statistics, with one axis more than those of `third`."""
-        return self._of(4, coefficients)
+        constant, each = self._covariances
+        return np.asarray(constant + np.tensordot(coefficients, each, 1))
 
     def jittered_covariance(self, coefficients: Float, stare: Stare) -> Float:
         """Return `covariance` with the jitters of a stare."""
@@ -183,16 +176,12 @@ class Components:
             covariance = covariance + moved[..., :, None] * moved[..., None, :]
         return covariance
 
-    def _of(self, order: int, coefficients: Float) -> Float:
-        constant, each = self._sums(order)
-        return np.asarray(constant + np.tensordot(coefficients, each, 1))
-
     def directions(self, coefficients: Float) -> dict[str, Float]:
         """Return the derivatives of the mean statistics, each of shape (..., n_statistic).
 
         They are with respect to relative changes of the star, of all light and of the sky, and to the temperature.
         """
-        mean = self._sums(1)[1]
+        mean = self._means
         light = np.delete(coefficients, 2, axis=-1) @ np.delete(mean, 2, axis=0)
         slope = self.quiet.conditions["dark_slope_per_c"]
         return {

@@ -111,13 +111,8 @@ class Event:
         shape: Shape | str = "davenport2014",
     ) -> Self:
         """Return the flare with an energy; for one that cools see `total_energy`."""
-        return cls.of_equivalent_duration(
-            scale.equivalent_duration(energy_erg),
-            peak_s=peak_s,
-            half_width_s=half_width_s,
-            temperature=temperature,
-            shape=shape,
-        )
+        amplitude = amplitude_of(scale.equivalent_duration(energy_erg), half_width_s, shape)
+        return cls(peak_s, half_width_s, amplitude, temperature, shape)
 
     @property
     def form(self) -> Shape:
@@ -644,11 +639,8 @@ def stare_along(
 def _temperature(orbit: Orbit, track: Track, thermal: Thermal) -> Float:
     """Return the detector temperature at each step, deg C, computed from several time constants before the first."""
     times = track.times
-    past = TimeGrid(
-        times.iso(-SETTLING * thermal.time_constant_s, 3),
-        SETTLING * thermal.time_constant_s / DAY_S,
-        PAST_STEP_S,
-    )
+    settling_s = SETTLING * thermal.time_constant_s
+    past = TimeGrid(times.iso(-settling_s, 3), settling_s / DAY_S, PAST_STEP_S)
     # The same kind of orbit as that of the plan.
     before = Orbit(orbit.elements, orbit.resolved(times)).track(past)
     first = float(thermal.temperature_c(_light(before), PAST_STEP_S)[-1])

@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol, Self
@@ -47,6 +47,10 @@ MOST_UNKNOWNS, MOST_SCENARIOS = 32, 16
 LARGEST = 1e12
 #: Distance of a count from its base up to which the device rounds to whole DN.
 REACH_DN = 2.0**22
+
+
+#: Photons in DN of each pixel, float64, and factors on the dark; hashable, so that what holds for all is computed once.
+Conditions = tuple[tuple[bytes, float], ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,12 +190,16 @@ class StareScene:
         return job.reshape(1)
 
     def conditions(self, flares: Flares) -> Conditions:
-        """Return the range of the frames' conditions."""
+        """Return the conditions of the frames, in steps of at most a factor of 2."""
         low, high = self._ends
         mean = self.components.mean_dn
-        darkest = low[0] * mean[0] + low[1] * mean[1] + low[3] * mean[3]
-        brightest = high[0] * mean[0] + high[1] * mean[1] + high[3] * (mean[3] + flares.most @ mean[len(STEADY) :])
-        return Conditions(darkest.tobytes(), brightest.tobytes(), float(low[2]), float(high[2]))
+        darkest = np.maximum(low[0] * mean[0] + low[1] * mean[1] + low[3] * mean[3], 1e-30)
+        lit = mean[3] + flares.most @ mean[len(STEADY) :]
+        brightest = np.maximum(high[0] * mean[0] + high[1] * mean[1] + high[3] * lit, 1e-30)
+        span = float(np.max(brightest / darkest, initial=1.0, where=brightest > 1e-9))
+        parts = np.linspace(0.0, 1.0, 2 + int(np.ceil(np.log2(min(span, 2.0**20)))))
+        dark = np.geomspace(low[2], high[2], 2 + int(np.log2(high[2] / low[2]))).tolist()
+        return tuple(itertools.product([(darkest ** (1 - part) * brightest**part).tobytes() for part in parts], dark))
 
     @property
     def _ends(self) -> tuple[Float, Float]:
@@ -241,32 +249,12 @@ class StareScene:
             raise _not_joint_error(x.name)
 
 
-@dataclass(frozen=True)
-class Conditions:
-    """Range of the conditions of frames; hashable, so that what holds for all of them is computed once."""
-
-    darkest: bytes  # photons in DN of each pixel, float64
-    brightest: bytes
-    least_dark: float  # factor on the dark
-    most_dark: float
-
-    def __iter__(self) -> Iterator[tuple[Float, float]]:
-        """Yield photons in DN of each pixel and factors on the dark, in steps of at most a factor of 2."""
-        darkest, brightest = np.frombuffer(self.darkest), np.frombuffer(self.brightest)
-        span = float(np.max(brightest / np.maximum(darkest, 1e-30), initial=1.0, where=brightest > 1e-9))
-        steps = 1 + int(np.ceil(np.log2(min(span, 2.0**20))))
-        for part in np.linspace(0.0, 1.0, steps + 1):
-            light = np.maximum(darkest, 1e-30) ** (1 - part) * np.maximum(brightest, 1e-30) ** part
-            number = 2 + int(np.log2(self.most_dark / self.least_dark))
-            for dark in np.geomspace(self.least_dark, self.most_dark, number):
-                yield light, float(dark)
-
-
 # The pixels of a stare are drawn in many parts.
 @lru_cache(maxsize=4)
 def _joint_throughout(x: Expectation, conditions: Conditions) -> bool:
     cumulants, counts = Cumulants.of(x, 1), x.photon_noise == "poisson"
-    for light, dark in conditions:
+    for photons_dn, dark in conditions:
+        light = np.frombuffer(photons_dn)
         photons = light / x.gain_dn_per_electron
         other = x.read_noise_dn**2 + (0.0 if counts else x.gain_dn_per_electron * light)
         if not joint_is_exact(
@@ -507,7 +495,8 @@ def check_sums(scene: StareScene, flares: Flares) -> None:
         raise InputError(f"{ADDITIVE[name].label} must be drawn with method 'pixels', not 'cumulants'", key="method")
     x = scene.components.quiet
     used = (scene.components.weights != 0).any(axis=0)
-    for light, dark in scene.conditions(flares):
+    for photons_dn, dark in scene.conditions(flares):
+        light = np.frombuffer(photons_dn)
         mean = x.bias_dn + light + dark * x.dark_dn
         variance = x.read_noise_dn**2 + x.gain_dn_per_electron * light + dark * x.dark_variance_dn2
         sd = np.sqrt(variance)

@@ -49,7 +49,7 @@ from mauvecl.detection.distributions import CONFIDENCE, Interval, central_counts
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import DAY_S
 from mauvecl.search.search import BATCH
-from mauvecl.search.templates import Bank, Template
+from mauvecl.search.templates import Bank
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -98,40 +98,6 @@ MAX_CORRELATION = 1 - 1e-12
 
 
 @dataclass(frozen=True)
-class UnitFilter:
-    """A detrended template, normalised to unit length."""
-
-    values: Float  # shape (n,)
-    first_frame: int  # frame of values[0] relative to the peak
-
-    @classmethod
-    def of(cls, template: Template, phase: int, powers: tuple[int, ...]) -> UnitFilter:
-        """Remove the fitted baseline polynomial from a template and normalise it."""
-        shape = template.detrended(phase, powers)
-        return cls(shape / np.linalg.norm(shape), template.first)
-
-    def shifted(self, n_frames: int) -> UnitFilter:
-        """Return the filter delayed by `n_frames`."""
-        return UnitFilter(self.values, self.first_frame + n_frames)
-
-    def correlation(self, other: UnitFilter) -> float:
-        """Return the correlation with another filter at their present positions."""
-        first = max(self.first_frame, other.first_frame)
-        end = min(self.first_frame + self.values.size, other.first_frame + other.values.size)
-        return float(
-            self.values[first - self.first_frame : end - self.first_frame]
-            @ other.values[first - other.first_frame : end - other.first_frame]
-        )
-
-    def best_alignment(self, other: UnitFilter) -> tuple[float, UnitFilter]:
-        """Return the largest correlation over all shifts of `other`, and `other` at that shift."""
-        correlations = np.correlate(self.values, other.values, "full")
-        best = int(np.argmax(correlations))
-        shift = self.first_frame - other.first_frame + best - other.values.size + 1
-        return float(correlations[best]), other.shifted(shift)
-
-
-@dataclass(frozen=True)
 class TemplateGrid:
     """Correlations between neighbouring templates of a bank.
 
@@ -148,27 +114,18 @@ class TemplateGrid:
     @classmethod
     def from_bank(cls, bank: Bank) -> TemplateGrid:
         """Compute the correlations between all neighbouring templates of a bank."""
-        rows = [
-            [UnitFilter.of(template, phase, bank.baseline.powers) for phase in range(len(template.phases))]
-            for template in bank.templates
-        ]
+        rows = _unit_filters(bank)
         per_frame, onset, width = [], [], []
         for k, (template, filters) in enumerate(zip(bank.templates, rows, strict=True)):
-            adjacent_rows = rows[max(k - 1, 0) : k] + rows[k + 1 : k + 2]
             # The phases within a frame are followed by those of the next onset.
-            onsets = [onset_filter.shifted(n * template.stride) for n in (-1, 0, 1) for onset_filter in filters]
-            for p, onset_filter in enumerate(filters, len(filters)):
+            onsets = np.concatenate([np.roll(filters, n * template.stride, axis=1) for n in (-1, 0, 1)])
+            for p, own in enumerate(filters, len(filters)):
                 per_frame.append(1 / template.stride)
-                onset.append(_neighbour_correlations(onset_filter, [onsets[p - 1], onsets[p + 1]]))
-                aligned = [
-                    max((onset_filter.best_alignment(other) for other in row), key=lambda pair: pair[0])[1]
-                    for row in adjacent_rows
-                ]
-                width.append(_neighbour_correlations(onset_filter, aligned))
-        directions = [UnitFilter(direction, 0) for direction in bank.directions]
+                onset.append(_neighbour_correlations(own, [onsets[p - 1], onsets[p + 1]]))
+                width.append(_neighbour_correlations(own, [_aligned(own, others) for others in _next_to(rows, k)]))
+        directions = list(bank.directions)
         temperature = [
-            _neighbour_correlations(direction, directions[max(k - 1, 0) : k] + directions[k + 1 : k + 2])
-            for k, direction in enumerate(directions)
+            _neighbour_correlations(direction, _next_to(directions, k)) for k, direction in enumerate(directions)
         ]
         return cls(bank.frame_s, np.array(per_frame), tuple(onset), tuple(width), tuple(temperature))
 
@@ -202,11 +159,39 @@ class TemplateGrid:
         return density, np.array(rows), np.array(temperatures)
 
 
-def _neighbour_correlations(unit_filter: UnitFilter, neighbours: list[UnitFilter]) -> tuple[float, ...]:
+def _unit_filters(bank: Bank) -> list[Float]:
+    """Return the detrended templates of each half-width, of unit length, on common frames, (n_phase, n_frame)."""
+    # Zeros on both sides leave room for shifts.
+    room = max(-template.first for template in bank.templates)
+    size = 2 * room + max(template.first + template.time.size for template in bank.templates)
+    rows = []
+    for template in bank.templates:
+        filters = np.zeros((len(template.phases), size + room))
+        for phase, own in enumerate(filters):
+            shape = template.detrended(phase, bank.baseline.powers)
+            begin = 2 * room + template.first
+            own[begin : begin + shape.size] = shape / np.linalg.norm(shape)
+        rows.append(filters)
+    return rows
+
+
+def _next_to(values: list[Float], k: int) -> list[Float]:
+    """Return the neighbours of an element."""
+    return values[max(k - 1, 0) : k] + values[k + 1 : k + 2]
+
+
+def _aligned(own: Float, others: Float) -> Float:
+    """Return the filter, of some others at any shift, that has the largest correlation with one."""
+    correlations = [scipy.signal.correlate(own, other, method="fft") for other in others]
+    which = int(np.argmax([values.max() for values in correlations]))
+    return np.roll(others[which], int(np.argmax(correlations[which])) - own.size + 1)
+
+
+def _neighbour_correlations(own: Float, neighbours: list[Float]) -> tuple[float, ...]:
     """Return the correlations with the neighbours and, if there are two, between them."""
-    correlations = [unit_filter.correlation(other) for other in neighbours]
+    correlations = [float(own @ other) for other in neighbours]
     if len(neighbours) == 2:
-        correlations.append(neighbours[0].correlation(neighbours[1]))
+        correlations.append(float(neighbours[0] @ neighbours[1]))
     return tuple(correlations)
 
 

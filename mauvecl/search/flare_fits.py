@@ -24,8 +24,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.fits.profile import Profile, remembering
+from mauvecl.fits.profile import Profile
 from mauvecl.flares.shapes import between, sides
+from mauvecl.host.arrays import array_cache
 from mauvecl.search.templates import REACH
 
 if TYPE_CHECKING:
@@ -284,7 +285,7 @@ class Block:
                 held.apply(every)
             return every
 
-        @remembering
+        @array_cache(2)
         def triangle(x: Float) -> Float:
             """Return the triangular factor of derivatives and residuals as columns.
 
@@ -553,9 +554,9 @@ class SingleFlareFit:
         profile = Profile(self.templates.mean_sums, sums)
         given = np.log(self.templates.temperatures_k[self.templates.chosen[0]])
         x = profile.best().log_k if self.templates.coloured else np.full(len(sums), given)
-        amplitude, variance, _ = profile.parts(x)
-        best = np.maximum(amplitude, 1e-12 * length)
-        return x, best / length, (2 * amplitude - best) * best / variance
+        face = profile.face(x)
+        best = np.maximum(face.amplitude, 1e-12 * length)
+        return x, best / length, (2 * face.amplitude - best) * best * face.power
 
     def _averaged(
         self, several: int, sums: NDArray[Any], frames: SearchedFrames
@@ -587,8 +588,7 @@ class SingleFlareFit:
             weight[k, inside] = 1.0 / variance[inside]
             time = since / (lead + tail)
             rows = [time**power for power in self.bank.baseline.powers] + list([] if curves is None else curves)
-            for j, row in enumerate(rows):
-                terms[k, :, j] = row
+            terms[k] = np.reshape(rows, terms.shape[:0:-1]).T
         if terms.shape[2]:
             # Orthonormal in each window, so that a projection is a sum of products.
             root = np.sqrt(weight)[:, :, None]

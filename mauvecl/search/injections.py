@@ -163,19 +163,8 @@ def sites_of(survey: Survey, widths_s: Sequence[float], peak_s: float) -> tuple[
         own = filters[mine]
         used = np.flatnonzero(own.any(axis=0))
         ends = slice(int(used[0]), int(used[-1]) + 1) if used.size else slice(0, 0)
-        own, shape = np.ascontiguousarray(own[:, ends]), mean[ends].astype(np.float32)
-        sites.append(
-            InjectionSite(
-                width,
-                peak_s,
-                first + ends.start,
-                own,
-                shape,
-                filter_widths_s[mine],
-                templates.peaks_s,
-                templates.counts,
-            )
-        )
+        arrays = np.ascontiguousarray(own[:, ends]), mean[ends].astype(np.float32), filter_widths_s[mine]
+        sites.append(InjectionSite(width, peak_s, first + ends.start, *arrays, templates.peaks_s, templates.counts))
     return tuple(sites)
 
 
@@ -315,15 +304,10 @@ class Injections:
         window = slice(first, max(part.stop for part in reached))
         start = (1 + position) * NUMBERS
         frames = survey.frames.part(window)
+        single = replace(frames, known=frames.known.astype(np.float32))
+        sites = tuple(replace(site, first=site.first - first) for site in sites)
         injecting = CriticalAmplitudes(
-            tuple(replace(site, first=site.first - first) for site in sites),
-            self.threshold,
-            survey.bank.directions,
-            survey.response,
-            self.photons,
-            replace(frames, known=frames.known.astype(np.float32)),
-            start,
-            refit,
+            sites, self.threshold, survey.bank.directions, survey.response, self.photons, single, start, refit
         )
         return StaresRequest(
             self.quiescent,

@@ -27,10 +27,7 @@ def model() -> FlareModel:
 
 
 def lit_frames(cooling: Cooling, stare: Stare) -> tuple[list[mauvecl.Expectation], np.ndarray]:
-    """Return frames with a flare that peaks at 52 s, each of one temperature, and these temperatures.
-
-    Each frame is an expectation of its own: neither the model's spectra nor its conditions are those of the fits.
-    """
+    """Return frames with a flare that peaks at 52 s, each an expectation of its own, and their temperatures."""
     x, start = quiet(), stare.start_s
     event = Event(52.0, 40.0, 1.5, cooling)
     rise = event.amplitude * event.form.mean_over(np.column_stack([start, start + 5.0]), 52.0, 40.0)
@@ -59,11 +56,7 @@ def lit_frames(cooling: Cooling, stare: Stare) -> tuple[list[mauvecl.Expectation
 def test_temperature_is_measured_with_correct_errors(
     cooling: Cooling, unknown: dict[str, float] | None, engine: Engine
 ) -> None:
-    """Check that pulls of ln T over all bins of 20 stares have mean 0 and variance 1.
-
-    False failures: 1e-6 on each side of both, and of the coverage (94 to 96 %). The truth of a bin is the fit to its
-    frames without noise, which lies between the temperatures of its frames.
-    """
+    """Check pulls of ln T in all bins of 20 stares against fits without noise; each side fails in 1e-6 of seeds."""
     nuisances = None if unknown is None else Nuisances.of(quiet(), unknown)
     lit, kelvin = lit_frames(cooling, Stare.of(300.0))
     means = np.array([one.recorded_dn for one in lit])
@@ -185,11 +178,7 @@ def test_skipped_wavelengths_change_no_fit_along_a_stare() -> None:
     ids=["known", "unknown"],
 )
 def test_intervals_of_joint_fits_cover(unknown: bool, count: int, engine: Engine) -> None:
-    """Draw pixels with unknown levels of dark and of all light that are equal in all frames of a stare.
-
-    False failures: coverages of 63 to 73 and 92 to 98 %, 1e-6 on each side for each of nine quantities, and as much for
-    squared distances from the truth and for chi-squared of the fits. Unknown levels mislead no start of a fit.
-    """
+    """Count coverages of nine quantities, squared distances and chi-squared; each side fails in 1e-6 of seeds."""
     nuisances = Nuisances.of(quiet(), {"dark": np.inf, "light": 0.02})
     lit, _ = lit_frames(FALLING, Stare.of(300.0))
     raw = np.stack([engine.realise(one, count=count, seed=700 + k) for k, one in enumerate(lit)], axis=1) * 1.0

@@ -1,7 +1,4 @@
-"""Measured flares: forecasts against published numbers and brute force, coverage of intervals, other minimisers.
-
-Draws are normal with the variance of the flaring exposure, by seeds fixed beforehand.
-"""
+"""Measured flares: forecasts, coverage of intervals, other minimisers; draws are normal, by seeds fixed beforehand."""
 
 import tomllib
 from functools import cache
@@ -41,6 +38,14 @@ def drawn(x: Expectation, counts: np.ndarray, n: int, seed: int, unknown: Nuisan
         size = np.where(np.isfinite(unknown.sd), unknown.sd, 0.05)
         raw += (rng.standard_normal((n, size.size)) * size) @ unknown.spectra
     return raw
+
+
+def amplitudes_of(snr: float, x: Expectation, m: FlareModel, kelvin: float, unknown: Any, jump: float = 1.0) -> Any:
+    """Return the amplitudes of a flare with an S/N that is left when the unknowns are marginalised over."""
+    amplitudes = m.amplitudes(kelvin, 0.1, jump=jump)
+    for _ in range(8):
+        amplitudes *= snr / forecast(x, m, kelvin, amplitudes, unknown).snr
+    return amplitudes
 
 
 @pytest.mark.parametrize("row", PUBLISHED["blackbodies"], ids=lambda row: f"{row[0]}-{row[2]:g}-{row[3]}s-{row[4]}K")
@@ -104,8 +109,7 @@ def test_forecasts_agree_with_brute_force(
     m = FlareModel.of(s, MAUVE, x, jump=True, lines=("Ca II",))
     amplitudes = m.amplitudes(kelvin, 0.3, jump=jump, lines=(line,))
     grid = np.union1d(s.wavelength_nm, BalmerFlare().nodes_nm)
-    corners = CA_II_NM
-    grid = np.union1d(grid, np.add.outer(corners, [-0.1, 0.0, 0.1]).ravel())
+    grid = np.union1d(grid, np.add.outer(CA_II_NM, [-0.1, 0.0, 0.1]).ravel())
     base = np.interp(grid, s.wavelength_nm, s.flux_flam)
 
     def counts(amplitude: float, temperature: float, ratio: float, flux: float) -> np.ndarray:
@@ -115,7 +119,7 @@ def test_forecasts_agree_with_brute_force(
         brightness = 10 ** (-0.4 * (s.magnitude("Kepler") - body.magnitude("Kepler")))
         shape = BalmerFlare(temperature, max(ratio, 1.0)).flux(grid)
         hot = amplitude * brightness * shape
-        tents = np.maximum(0.0, 1 - np.abs(np.subtract.outer(grid, corners)) / 0.1).sum(axis=1) / 2.0
+        tents = np.maximum(0.0, 1 - np.abs(np.subtract.outer(grid, CA_II_NM)) / 0.1).sum(axis=1) / 2.0
         lit = Source(grid, base + hot + flux * tents, "flaring", "test")
         return expect(lit, MAUVE, exposure=50.0).net_source_dn - x.net_source_dn
 
@@ -149,10 +153,7 @@ COLUMNS = ("temperature", "amplitude", "flux 200-320 nm", "flux bolometric")
 @pytest.mark.parametrize("unknown", [False, True], ids=["known", "free"])
 @pytest.mark.parametrize("jump", [False, True], ids=["blackbody", "jump"])
 def test_intervals_of_95_percent_cover(jump: bool, unknown: bool) -> None:
-    """Fit 24 cells of 600 draws; 4 or 5 quantities of each fail in 2e-6 of seeds, and all cells together in as many.
-
-    S/N is what is left when the unknowns are marginalised over.
-    """
+    """Fit 24 cells of 600 draws; 4 or 5 quantities of each fail in 2e-6 of seeds, and all cells together in as many."""
     x, m = quiet(), model(jump=jump)
     unknowns = free(x, sky=0.1) if unknown else None
     columns = [m.names.index(name) for name in (*COLUMNS, *(["jump"] if jump else []))]
@@ -160,11 +161,7 @@ def test_intervals_of_95_percent_cover(jump: bool, unknown: bool) -> None:
     covered = np.zeros(len(columns), np.int64)
     for kelvin in (6000.0, 12_000.0, 30_000.0):
         for snr in (10.0, 100.0):
-            amplitude = 0.5
-            for _ in range(6):
-                amplitudes = m.amplitudes(kelvin, amplitude, jump=2.0 if jump else 1.0)
-                amplitude *= snr / forecast(x, m, kelvin, amplitudes, unknowns).snr
-            amplitudes = m.amplitudes(kelvin, amplitude, jump=2.0 if jump else 1.0)
+            amplitudes = amplitudes_of(snr, x, m, kelvin, unknowns, 2.0 if jump else 1.0)
             raw = drawn(x, m.counts(kelvin, amplitudes), n, 28_000 + cells, unknowns)
             found = fit(raw, x, m, unknowns, levels=(0.95,))
             truth = np.array(list(m.values(kelvin, amplitudes).values()))
@@ -271,10 +268,7 @@ def test_great_flare_of_ad_leo(
 
 
 def test_limits_at_a_bound_have_nominal_coverage() -> None:
-    """Fit a jump to a flare without one: half of the fits are at the bound, and limits cover 97.5 %.
-
-    At a bound the statistic is 0 or that of Wilks, each in half of the cases (Chernoff 1954). False failures: 1e-6.
-    """
+    """Half of jumps of flares without one are at the bound (Chernoff 1954), limits cover 97.5 %; 1e-6 of seeds fail."""
     x, m, n = quiet(), model(jump=True), 1500
     found = fit(drawn(x, m.counts(9000.0, m.amplitudes(9000.0, 0.3)), n, 52), x, m, levels=(0.95,))
     column = found.column("jump")
@@ -286,11 +280,7 @@ def test_limits_at_a_bound_have_nominal_coverage() -> None:
 
 @pytest.mark.long
 def test_intervals_agree_with_minos_and_emcee() -> None:
-    """Compare the full likelihood of a flare with a Balmer jump, with unknown dark and star as parameters.
-
-    Our variance is that of the fitted flare; MINOS moves it along. False failures: emcee's own noise, some 3 % of an
-    error against 15 %.
-    """
+    """Compare the full likelihood with unknown dark and star; emcee's noise is some 3 % of an error against 15 %."""
     iminuit, emcee = pytest.importorskip("iminuit"), pytest.importorskip("emcee")
     x, m = quiet(), model(jump=True)
     raw = drawn(x, m.counts(9500.0, m.amplitudes(9500.0, 0.5, jump=2.0)), 1, 77)[0]
@@ -343,17 +333,11 @@ def test_intervals_agree_with_minos_and_emcee() -> None:
     ids=["M3V", "K3V"],
 )
 def test_intervals_of_a_bent_quantity_cover(snr: float, library: str, v: float, kelvin: float, jump: float) -> None:
-    """Count 20 000 fits of flares whose bolometric flux is near its minimum over the temperature.
-
-    Wilks' thresholds as they are cover 96.7 to 97.0 % of bolometric fluxes. False failures: 2e-4 for each quantity, for
-    a coverage of 94 to 96 %.
-    """
+    """Count fits near the least bolometric flux, where Wilks' thresholds cover 96.7 %; 2e-4 of seeds fail for each."""
     n, parts = 20_000, 20
     x = quiet(library, v)
     own, unknown = FlareModel.of(star(library, v), MAUVE, x, jump=True), free(x, sky=0.1)
-    amplitudes = own.amplitudes(kelvin, 0.1, jump=jump)
-    for _ in range(8):
-        amplitudes *= snr / forecast(x, own, kelvin, amplitudes, unknown).snr
+    amplitudes = amplitudes_of(snr, x, own, kelvin, unknown, jump)
     truth = np.array(list(own.values(kelvin, amplitudes).values()))
     inside = np.zeros(truth.size, int)
     for part in range(parts):
@@ -370,9 +354,7 @@ def test_rounding_moves_no_interval(snr: float, library: str, v: float, kelvin: 
     """Change frames of faint flares by one unit in the last place; ends once moved by up to a factor of eight."""
     x = quiet(library, v)
     own, unknown = FlareModel.of(star(library, v), MAUVE, x, jump=True), free(x, sky=0.1)
-    amplitudes = own.amplitudes(kelvin, 0.1, jump=jump)
-    for _ in range(8):
-        amplitudes *= snr / forecast(x, own, kelvin, amplitudes, unknown).snr
+    amplitudes = amplitudes_of(snr, x, own, kelvin, unknown, jump)
     raw = drawn(x, own.counts(kelvin, amplitudes), 300, 9000, unknown)
     one, other = (fit(frames, x, own, unknown) for frames in (raw, np.nextafter(raw, np.inf)))
     for name in ("low", "high"):

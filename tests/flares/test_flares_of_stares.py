@@ -107,10 +107,7 @@ def random_event(rng: np.random.Generator) -> dict[str, Any]:
 
 @pytest.mark.parametrize("seed", long_but(range(12), 0, 1, 2))
 def test_stated_energies_are_those_of_the_light(seed: int) -> None:
-    """Draw stars, distances, bands, shapes, temperatures and cooling at random, and integrate over time and wavelength.
-
-    Light of a flare that cools is mixed from few temperatures, which changes its energy by 3 % at most.
-    """
+    """Integrate random flares over time and wavelength; few temperatures of one that cools change its energy by 3 %."""
     rng = np.random.default_rng(seed)
     events = [random_event(rng) for _ in range(rng.integers(1, 4))]
     band, library = str(rng.choice(BANDS)), str(rng.choice(STARS))

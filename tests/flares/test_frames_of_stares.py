@@ -99,10 +99,7 @@ def test_frames_are_those_of_the_windows(night: Stare) -> None:
 
 
 def test_temperature_follows_the_orbit(night: Stare) -> None:
-    """Check that it stays between both ends, falls in shadow, rises in sunlight, and depends on no start time.
-
-    The shares of the shadow are those of the table of windows, up to the penumbra of 8 s.
-    """
+    """Check ends, shadow as in the table of windows up to the penumbra of 8 s, and independence of the start time."""
     assert ((night.temperature_c > 13) & (night.temperature_c < 21)).all()
     windows = visible(asked()).tables["windows"]
     for (start, stop), minutes in zip(night.gtis, windows["in_shadow"].value, strict=True):

@@ -115,11 +115,7 @@ def test_yields_are_those_of_poisson_and_of_scattered_rates(answer: Any) -> None
 
 
 def test_closed_form_completeness_agrees_with_white_noise() -> None:
-    """Compare with matched filters of the correct width in drawn stretches.
-
-    2000 stretches: three standard deviations are 3.4 % at most; of five energies one misses them once in some 70 tests
-    with other seeds; this one is fixed.
-    """
+    """Compare with matched filters of the correct width in 2000 drawn stretches; a test in 70 fails by chance."""
     answer = planned({"own": {"alpha": 1.8, "rate_per_day": 0.2, "at_erg": 1e33}}, plan={"scatter_dex": 0.0})
     (star,), table, frame = answer.stars, answer.by_energy, 5.0
     window, signal = star["window"].to_value("s"), float(star["signal_per_frame"])
@@ -147,12 +143,7 @@ def test_closed_form_completeness_agrees_with_white_noise() -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("alpha", [1.6, 2.1])
 def test_power_law_is_recovered_from_drawn_flares(alpha: float) -> None:
-    """Draw flares from a power law, apply the completeness, and fit exponent and rate.
-
-    350 campaigns of some 60 recovered flares, with an error of their energies: 68 +- 5 % within one sigma. By chance a
-    right method misses these bounds in one such count of 22 (2 sigma of the binomial), and there are two of them here;
-    the seed is fixed beforehand.
-    """
+    """Fit 350 campaigns of some 60 recovered flares: 68 +- 5 % are within one sigma; a count in 22 fails by chance."""
     rng, error, campaigns = np.random.default_rng(19), 0.1, 350
     table = planned({"own": {"alpha": alpha, "rate_per_day": 0.2, "at_erg": 1e33}}).by_energy
     form = completeness.Completeness(table["energy"].value, np.asarray(table["recovered"]), "bolometric", "a plan")

@@ -8,7 +8,7 @@ import pytest
 from scenes import BANDS
 from scipy.integrate import quad
 
-from mauvecl import SHAPES, Blackbody, EnergyScale, Event, Source, TableShape
+from mauvecl import SHAPES, EnergyScale, Event, TableShape
 
 #: A shape whose height and length follow from its equivalent duration.
 FIDUCIAL: Any = SHAPES["fiducial"]
@@ -156,17 +156,6 @@ def test_energies_agree_with_direct_integration_and_other_band_tables(
         for kind, value in exact.items():
             scale = EnergyScale.of_blackbody(radius, star_k, band=name, flare_k=flare_k, kind=kind)  # type: ignore[arg-type]
             assert scale.erg_per_s == pytest.approx(value, rel=2e-6)
-
-
-def test_blackbody_star_agrees_with_the_blackbody_scale() -> None:
-    nm = np.linspace(160, 1200, 20_801)
-    # Of one solar radius seen from 10 pc.
-    shrunk = (SUN_CM / (10 * 3.0856775814913674e18)) ** 2
-    star = Source.from_arrays(nm, shrunk * Blackbody(5778.0).flux(nm))
-    for how in ({"kind": "band"}, {"flare_k": 9e3}, {"geometry": "replaces", "photosphere_k": 5778.0}):
-        seen, made = EnergyScale.of_star(star, 10.0, **how), EnergyScale.of_blackbody(1.0, 5778.0, **how)  # type: ignore[arg-type]
-        assert seen.kind == made.kind == how.get("kind", "bolometric")
-        assert seen.erg_per_s == pytest.approx(made.erg_per_s, rel=1e-5)
 
 
 @pytest.mark.parametrize("name", list(SHAPES))

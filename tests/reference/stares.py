@@ -30,12 +30,7 @@ def exponential_less_one(x: Floats) -> Floats:
 
 
 def strengths(scene: StareScene, numbers: Numbers, frame: int, seed: int, lost: Floats) -> dict[str, Floats]:
-    """Draw the coefficients of the steady components and the factor on light in a frame, minus one.
-
-    Returns
-    -------
-    dict of str to ndarray of float32, shape (n_stare,)
-    """
+    """Draw steady components' coefficients and the factor on light in a frame, minus one, float32 (n_stare,) each."""
     moved = {str(name): np.zeros(len(numbers), np.float32) for name in layout.MOVED}
     if scene.stare_job["jittered"]:
         drawn = random_numbers.four_normals(
@@ -61,21 +56,19 @@ def strengths(scene: StareScene, numbers: Numbers, frame: int, seed: int, lost: 
 
 
 def glow(scene: StareScene, numbers: Numbers, frames: Iterable[int], seed: int) -> Floats:
-    """Draw a normal per statistic, for the photon noise of flares, and the factor on all light minus one.
-
-    Returns
-    -------
-    ndarray of float32, shape (n_stare, n_frame, n_statistic + 1)
-    """
+    """Draw a normal per statistic, and the factor on light minus one, float32 (n_stare, n_frame, n_statistic + 1)."""
     out, lost = [], scene.losses(numbers, seed)
     for frame in frames:
-        z: list[Floats] = []
-        for group in range(-(-len(scene.weights) // 4)):
-            z += random_numbers.four_normals(
-                reference.words_at(numbers, int(scene.numbers[frame]), "stare_glow", group, seed)
-            )
+        z = _normals(scene, numbers, frame, "stare_glow", seed)
         out.append([*z[: len(scene.weights)], strengths(scene, numbers, frame, seed, lost)["light"]])
     return np.moveaxis(np.array(out), (0, 1, 2), (1, 2, 0))
+
+
+def _normals(scene: StareScene, numbers: Numbers, frame: int, stream: str, seed: int) -> list[Floats]:
+    """Draw a normal per statistic, rounded up to groups of four, shape (n_stare,) each."""
+    groups = range(-(-len(scene.weights) // 4))
+    words = [reference.words_at(numbers, int(scene.numbers[frame]), stream, group, seed) for group in groups]
+    return [z for each in words for z in random_numbers.four_normals(each)]
 
 
 def _coefficients(scene: StareScene, flares: Flares, frame: int, scenario: int, light: Floats) -> list[Floats]:
@@ -85,12 +78,7 @@ def _coefficients(scene: StareScene, flares: Flares, frame: int, scenario: int, 
 
 
 def pixels(scene: StareScene, flares: Flares, numbers: Numbers, frames: Iterable[int], seed: int) -> Floats:
-    """Draw statistics by the method "pixels".
-
-    Returns
-    -------
-    ndarray of float32, shape (n_scenario, n_stare, n_frame, n_statistic)
-    """
+    """Draw statistics by the method "pixels", float32 (n_scenario, n_stare, n_frame, n_statistic)."""
     out, lost = [], scene.losses(numbers, seed)
     for frame in frames:
         conditions = strengths(scene, numbers, frame, seed, lost)
@@ -141,21 +129,12 @@ def _quartic(zz: Floats, second: float, first: float, constant: float) -> Floats
 
 
 def sums(scene: StareScene, flares: Flares, numbers: Numbers, frames: Iterable[int], seed: int) -> Floats:
-    """Draw statistics by the method "cumulants".
-
-    Returns
-    -------
-    ndarray of float32, shape (n_scenario, n_stare, n_frame, n_statistic)
-    """
+    """Draw statistics by the method "cumulants", float32 (n_scenario, n_stare, n_frame, n_statistic)."""
     table = SumTable.of(scene.components)
     out, lost = [], scene.losses(numbers, seed)
     for frame in frames:
         conditions = strengths(scene, numbers, frame, seed, lost)
-        z: list[Floats] = []
-        for group in range(-(-len(scene.weights) // 4)):
-            z += random_numbers.four_normals(
-                reference.words_at(numbers, int(scene.numbers[frame]), "stare_sums", group, seed)
-            )
+        z = _normals(scene, numbers, frame, "stare_sums", seed)
         rows = []
         for k in range(len(flares.amplitudes)):
             flare = _coefficients(scene, flares, frame, k, conditions["light"])

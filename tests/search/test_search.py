@@ -13,6 +13,9 @@ DAVENPORT = SHAPES["davenport2014"]
 ONE = np.ones((1, 1))
 KNOWN = templates.Baseline(offset=False, slope=False, window_s=0.0)
 HALF_WIDTHS_S = Study().search.half_widths_s
+COLOURS = np.array([[1.0, 0.0], [0.95, 0.312], [0.8, 0.6]])
+#: The bank of the theory's table: eight filters from 30 s on, a factor of two apart.
+EIGHT = templates.Bank(tuple(30.0 * 2**k for k in range(8)), ONE, DAVENPORT, 5.0, KNOWN)
 
 
 def filtered(search, sums, curves):
@@ -46,10 +49,7 @@ def filtered(search, sums, curves):
     "level", [KNOWN, templates.Baseline(window_s=600.0), templates.Baseline(cycle=True, window_s=600.0)]
 )
 def test_filters_are_least_squares_over_gaps(level):
-    """Compare correlations by FFT with a fit for each template, with gaps, unequal variances and a varying level.
-
-    The last template is longer than the stare.
-    """
+    """Fit each template over gaps, with unequal variances and a varying level; the last is longer than the stare."""
     stare = Stare.of(6000.0, gaps=[(1000, 1500), (3000, 3050)])
     rng = np.random.default_rng(1)
     curves = np.array([np.sin(stare.start_s / 600), np.cos(stare.start_s / 600)]) if level.cycle else np.zeros((0, 1))
@@ -86,16 +86,9 @@ def test_bank_loses_little_in_time(level):
     assert (1 - kept).max() < 0.013
 
 
-@pytest.fixture(scope="module")
-def day():
-    """Return a day and the bank of the theory's table: eight filters from 30 s on, a factor of two apart."""
-    return Search(templates.Bank(tuple(30.0 * 2**k for k in range(8)), ONE, DAVENPORT, 5.0, KNOWN), Stare.of(86_400.0))
-
-
-def test_largest_value_of_a_day(day):
+def test_largest_value_of_a_day():
     """Compare quantiles with 3.73, 4.20, 4.67 and 0.41-0.48 independent tests a frame; fails once in 10^4 runs."""
-    rng = np.random.default_rng(18)
-    days = 400
+    day, days, rng = Search(EIGHT, Stare.of(86_400.0)), 400, np.random.default_rng(18)
     parts = [day.largest(rng.standard_normal((50, 17280, 1), dtype=np.float32)) for _ in range(days // 50)]
     largest = np.sort(np.concatenate(parts))
     for q, value in ((0.5, 3.73), (0.9, 4.20), (0.99, 4.67)):
@@ -108,25 +101,9 @@ def test_largest_value_of_a_day(day):
     assert 0.38 < tests < 0.55
 
 
-@pytest.fixture(scope="module")
-def short():
-    """Return a search of two sums over a stare with a gap, and its null by importance sampling."""
-    stare = Stare.of(9000.0, gaps=[(4000, 5000)])
-    bank = templates.Bank(
-        (20.0, 60.0, 180.0), np.array([[1.0, 0.0], [0.8, 0.6]]), DAVENPORT, 5.0, templates.Baseline(window_s=900.0)
-    )
-    search = Search(bank, stare)
-    return search, false_alarms.sample_rate(search, seed=2, draws=400)
-
-
 @pytest.mark.long
 def test_repeated_estimates_scatter_by_their_errors():
-    """Compare the scatter of eight seeds of the default bank with their errors, and with drawn noise.
-
-    Chi-squared of 7 degrees at three thresholds, and the mean of the seeds within 4 standard errors at two where
-    alarms can be counted: fails by chance once in 10^3 runs. The stated error of the rate at one false alarm per
-    star-month is below 5 % for every seed.
-    """
+    """Compare the scatter of eight seeds with their errors, and with drawn noise; fails by chance once in 10^3 runs."""
     stare = Stare.of(2500.0)
     search = Search(Study().search.white_bank(5.0), stare)
     repeats = [false_alarms.sample_rate(search, seed=seed) for seed in range(8)]
@@ -156,8 +133,9 @@ def test_rate_of_one_filter_equals_the_closed_form():
     assert tail.probability[kept] == pytest.approx(exact[kept], rel=2e-3)
 
 
-def test_threshold_inverts_the_rate(short):
-    _, tail = short
+def test_threshold_inverts_the_rate():
+    bank = templates.Bank((20.0, 60.0, 180.0), COLOURS[::2], DAVENPORT, 5.0, templates.Baseline(window_s=900.0))
+    tail = false_alarms.sample_rate(Search(bank, Stare.of(9000.0, gaps=[(4000, 5000)])), seed=2, draws=400)
     for rate in (1.0, 1e-2, 1 / 365.25):
         cut = tail.threshold(rate)
         assert tail.log_rate(cut.value)[0] == pytest.approx(np.log(rate), abs=1e-4)
@@ -168,12 +146,8 @@ def test_threshold_inverts_the_rate(short):
 
 @pytest.mark.parametrize("widths", [pytest.param(HALF_WIDTHS_S, marks=pytest.mark.long), (20.0, 40.0, 80.0, 160.0)])
 def test_closed_form_of_the_rate_agrees_with_importance_sampling(widths):
-    """Compare one alarm a day to one in 10^10 days, for one sum and for three temperatures.
-
-    An upper bound, up to a tenth above; four standard errors of the sampled rate, some 8 % each, which thresholds of
-    one bank share: fails by chance once in 10^4 runs.
-    """
-    directions = ONE if widths is HALF_WIDTHS_S else np.array([[1.0, 0.0], [0.95, 0.312], [0.8, 0.6]])
+    """An upper bound, up to a tenth above, for one alarm a day to one in 10^10 days; fails once in 10^4 runs."""
+    directions = ONE if widths is HALF_WIDTHS_S else COLOURS
     bank = templates.Bank(widths, directions, DAVENPORT, 5.0, templates.Baseline(window_s=900.0))
     tail = false_alarms.sample_rate(Search(bank, Stare.of(12_000.0)), seed=2, draws=120)
     for asked in (1.0, 1e-2, 1e-4, 1e-7, 1e-10):
@@ -182,12 +156,8 @@ def test_closed_form_of_the_rate_agrees_with_importance_sampling(widths):
 
 
 def test_closed_form_of_the_rate_has_known_values():
-    """Eight filters a factor of two apart have a median of 3.73 a day (TIME.md), a filter of one frame 1 - (1 - Q)^n.
-
-    Both phases of a template shorter than a frame are the same filter.
-    """
-    eight = templates.Bank(tuple(30.0 * 2**k for k in range(8)), ONE, DAVENPORT, 5.0, KNOWN)
-    assert completeness.search_threshold(np.log(2), eight) == pytest.approx(3.73, abs=0.05)
+    """Eight filters a factor of two apart have a median of 3.73 a day (TIME.md), one of a frame 1 - (1 - Q)^n."""
+    assert completeness.search_threshold(np.log(2), EIGHT) == pytest.approx(3.73, abs=0.05)
     alone = templates.Bank((0.02,), ONE, DAVENPORT, 5.0, KNOWN)
     for sigma in (4.5, 5.0, 6.0):
         assert completeness.search_threshold(17_280 * special.ndtr(-sigma), alone) == pytest.approx(sigma, abs=1e-3)

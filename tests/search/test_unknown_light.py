@@ -1,35 +1,23 @@
 """Fits along stares whose light, star, sky and temperature change by unknown amounts, drawn by NumPy."""
 
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
 import scipy
+from scenes import quiescent, source
 
 import mauvecl
-from mauvecl import Expectation, FlareModel, Source, Stare, expect, fit_cooling
+from mauvecl import Expectation, FlareModel, Stare, fit_cooling
 
 MAUVE = mauvecl.Instrument.load("mauvesim")
 PEAK_S, HALF_WIDTH_S, AMPLITUDE, KELVIN = 100.0, 40.0, 1.5, 10_000.0
 START = {"peak_s": PEAK_S, "half_width_s": HALF_WIDTH_S, "cooling": False}
 
 
-@cache
-def source(magnitude: float) -> Source:
-    return Source.from_library("M3V").at_magnitude(magnitude)
-
-
-@cache
-def quiet(magnitude: float) -> Expectation:
-    return expect(source(magnitude), MAUVE, exposure=5.0)
-
-
 def flare_dn(stare: Stare, m: FlareModel) -> np.ndarray:
     edges = np.column_stack([stare.start_s, stare.start_s + stare.frame_s])
-    rise = AMPLITUDE * mauvecl.Event(PEAK_S, HALF_WIDTH_S, AMPLITUDE, KELVIN).form.mean_over(
-        edges, PEAK_S, HALF_WIDTH_S
-    )
+    rise = AMPLITUDE * mauvecl.SHAPES["davenport2014"].mean_over(edges, PEAK_S, HALF_WIDTH_S)
     return np.asarray(rise[:, None] * m.hot_spline(np.log(KELVIN)))
 
 
@@ -56,14 +44,10 @@ DOCUMENTED = {
     ids=["offset", "documented", "documented, often"],
 )
 def test_joint_fits_marginalise_what_a_stare_does_not_know(changes: dict[str, dict[str, float]], count: int) -> None:
-    """Compare squared pulls with chi-squared: 4 quantities, each fails in 2e-6 of seeds.
-
-    Errors that are understated by a factor of 1.4 fail in 92 of 100 sets of 150. Without the unknowns of the stare the
-    pulls of the amplitude are far larger, which 25 stares notice.
-    """
-    x = quiet(6.0)
+    """Compare squared pulls of 4 quantities, each of which fails in 2e-6 of seeds; fits without the unknowns miss."""
+    x = quiescent("M3V", 6.0, 5.0)
     stare = Stare.of(300.0, **changes)
-    m = FlareModel.of(source(6.0), MAUVE, x)
+    m = FlareModel.of(source("M3V", 6.0), MAUVE, x)
     flare, rng = flare_dn(stare, m), np.random.default_rng(4401)
     truth = fit_cooling(x.recorded_dn + flare, x, m, stare=Stare.of(300.0), levels=(), **START).estimates[0]
     pulls, plain = [], []
@@ -83,14 +67,10 @@ def test_joint_fits_marginalise_what_a_stare_does_not_know(changes: dict[str, di
 
 @pytest.mark.long
 def test_bins_marginalise_what_a_stare_does_not_know() -> None:
-    """Fit bins of 20 stares with an unknown level of all light.
-
-    The mean squared pull of bins that share all their scatter exceeds the limit in 1e-6 of seeds, that of others less
-    often. Fits that know the light miss by far more.
-    """
-    x = quiet(6.0)
+    """Fit bins of 20 stares with an unknown level of light; 1e-6 of seeds fail, and fits that know the light miss."""
+    x = quiescent("M3V", 6.0, 5.0)
     stare = Stare.of(300.0, offsets={"light": 0.03}, jitters={"light": 0.01})
-    m = FlareModel.of(source(6.0), MAUVE, x)
+    m = FlareModel.of(source("M3V", 6.0), MAUVE, x)
     flare, rng = flare_dn(stare, m), np.random.default_rng(4402)
     dark = mauvecl.Nuisances.of(x, {"dark": np.inf})
     pulls, plain = [], []
@@ -112,10 +92,8 @@ def test_bins_marginalise_what_a_stare_does_not_know() -> None:
 
 def test_pixels_that_a_flare_saturates_do_not_count_in_joint_fits() -> None:
     """Compare squared pulls of 20 stares with chi-squared: each of 3 quantities fails in 2e-6 of seeds."""
-    star = Source.from_library("K2.5V").at_magnitude(2.0)
-    x = expect(star, MAUVE, exposure=5.0)
-    stare = Stare.of(300.0)
-    m = FlareModel.of(star, MAUVE, x)
+    x, stare = quiescent("K2.5V", 2.0, 5.0), Stare.of(300.0)
+    m = FlareModel.of(source("K2.5V", 2.0), MAUVE, x)
     flare, rng = flare_dn(stare, m), np.random.default_rng(4403)
     assert (x.mean_raw_dn + flare > x.ceiling_dn).any()
     truth, pulls = np.array([HALF_WIDTH_S, AMPLITUDE, KELVIN]), []
