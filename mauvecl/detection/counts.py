@@ -26,8 +26,8 @@ DROPPED_BITS = 10
 ABOVE = 1 << (32 - DROPPED_BITS)
 #: Sums are integer multiples of 2**-UNIT_BITS, the smallest float32, and of its square.
 UNIT_BITS = 149
-#: Number of squared mantissas whose sum is below 2**64.
-CHUNK = 2**15
+#: Number of squares below 2**48 whose sum has no more than 63 bits.
+CHUNK = 2**14
 #: Range of keys up to which an array counts them; wider ranges are sorted.
 MAX_DENSE_KEYS = 2**16
 
@@ -115,23 +115,14 @@ def is_above(keys: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 def sums_of(values: NDArray[np.float32]) -> tuple[int, int]:
     """Return the exact sums of finite values and of their squares, in units of 2**-149 and 2**-298."""
-    image = values.view(np.int32)
-    exponent = (image >> 23) & 0xFF
-    # Signed mantissas; subnormal numbers have no implicit leading bit.
-    mantissa = image & 0x7FFFFF
-    mantissa |= 0x800000
-    mantissa[exponent == 0] ^= 0x800000
-    mantissa = (mantissa ^ (image >> 31)) - (image >> 31)
+    # Values are whole multiples of 2**(power - 149), below 2**24 of them; subnormal numbers have the smallest power.
+    powers = np.maximum(np.frexp(values)[1] + (UNIT_BITS - 24), 0)
     first = second = 0
-    low, high = int(exponent.min(initial=255)), int(exponent.max(initial=0))
-    for power in range(low, high + 1):
-        mine = mantissa if low == high else mantissa[exponent == power]
-        shift = max(power, 1) - 1
-        first += int(mine.sum(dtype=np.int64)) << shift
-        for begin in range(0, mine.size, CHUNK):
-            part = mine[begin : begin + CHUNK].astype(np.int64).view(np.uint64)
-            # Squares of negative numbers agree modulo 2**64.
-            second += int((part * part).sum()) << 2 * shift
+    for power in np.flatnonzero(np.bincount(powers)).tolist():
+        whole = np.ldexp(values[powers == power].astype(np.float64), UNIT_BITS - power).astype(np.int64)
+        first += int(whole.sum()) << power
+        for part in np.split(whole, range(CHUNK, whole.size, CHUNK)):
+            second += int(part @ part) << 2 * power
     return first, second
 
 

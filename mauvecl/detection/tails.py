@@ -28,7 +28,7 @@ from mauvecl.detection.distributions import (
 )
 from mauvecl.detection.names import check_atom, least_countable
 from mauvecl.detection.statistics import Differences
-from mauvecl.noise import layout
+from mauvecl.noise import layout, reference
 from mauvecl.noise.disturbances import ADDITIVE
 from mauvecl.noise.scene import quantile_at_score
 from mauvecl.noise.unknowns import PROCESSES, SIGNAL_PARTS
@@ -392,12 +392,10 @@ def _block(
     root = np.sqrt(1.0 + added)
     difference = (z - added * sum(others)) / root
     move, logs = tilt.apply(difference)
-    if scene.modulations:
-        factors, more = _factors(scene, tilt.scores, seed, block)
-        excess, logs = _responding(scene, z + move / root, factors), logs + more
-    else:
-        excess = _excess(scene, z + move / root)
-    subtracted = [_excess(scene, other - added * move / root) for other in others]
+    factors, more = _factors(scene, tilt.scores, seed, block)
+    excess, logs = _excess(scene, z + move / root, factors), logs + more
+    # Exposures are subtracted only if no factors are drawn.
+    subtracted = [_excess(scene, other - added * move / root, factors) for other in others]
     mean = added * np.sum(subtracted, axis=0) if subtracted else np.zeros_like(excess)
     variance = np.broadcast_to(kind.variance(hypotheses.setting), excess.shape)
     if scene.comparison.estimated:
@@ -427,8 +425,10 @@ def _normals(n_pixel: int, seed: int, block: int, exposure: int, purpose: int = 
 def _factors(
     scene: Scene, towards: dict[str, tuple[float, float]], seed: int, block: int
 ) -> tuple[dict[str, Float], Float]:
-    """Draw factors on light, sky and dark, each minus one, shape (BLOCK, 1), and the logarithms of their weights."""
-    factors = {name: np.ones((BLOCK, 1)) for name in SIGNAL_PARTS}
+    """Draw factors on light, dark and sky, each minus one, shape (BLOCK,), and the logarithms of their weights."""
+    factors = {str(name): np.ones(BLOCK) for name in SIGNAL_PARTS}
+    if not scene.modulations:
+        return {name: values - 1.0 for name, values in factors.items()}, np.zeros(BLOCK)
     kinds = [factor for _, factor in scene.modulations]
     # The scores of every second realisation are moved, which limits weights to two.
     moved = np.arange(BLOCK)[:, None] % 2 == 1
@@ -441,41 +441,16 @@ def _factors(
             score = np.where(moved, mean + sd * score, score)
             # Ratio of the moved density to the prior's.
             ratio += (score[:, 0] ** 2 - ((score[:, 0] - mean) / sd) ** 2) / 2 - np.log(sd)
-        factors[factor] *= 1.0 + quantile_at_score(table, score).mean(axis=1, keepdims=True)
+        factors[factor] *= 1.0 + quantile_at_score(table, score).mean(axis=1)
     return {name: values - 1.0 for name, values in factors.items()}, np.log(2.0) - np.logaddexp(0.0, ratio)
 
 
-def _responding(scene: Scene, z: Float, factors: dict[str, Float]) -> Float:
-    """Return `_excess` with drawn factors, by the expansion of `analogue` in kernels/detector.cl.mako."""
+def _excess(scene: Scene, z: Float, factors: dict[str, Float]) -> Float:
+    """Return the observed counts minus the reference, DN, of quiescent draws from normals, both (n, n_pixel)."""
     n = scene.n_pixel
-    r = {name: scene.responses[name][0, :n].astype(np.float64) for name in scene.responses.dtype.names or ()}
-    sky = factors["sky"] * r["sky_share"]
-    more, warmer = factors["light"] + sky + factors["light"] * sky, factors["dark"]
-    light, dark = more + 1.0, warmer + 1.0
-    variance = light * r["light_variance"] + dark * r["dark_variance"] + r["other_variance"]
-    third, fourth, fifth = (light * r[f"light_{k}"] + dark * r[f"dark_{k}"] for k in layout.CUMULANTS[1:])
-    sd, skew = np.sqrt(variance), third / variance
-    v = z * sd + skew * (z**2 - 1) / 6 + (fourth * (z**3 - 3 * z) / 24 - third * skew * (2 * z**3 - 5 * z) / 36) / sd**3
-    if scene.quartic:
-        even = fifth * (z**4 - 6 * z**2 + 3) / 120 - skew * fourth * (z**4 - 5 * z**2 + 2) / 24
-        v += (even + skew**2 * third * (12 * z**4 - 53 * z**2 + 17) / 324) / variance**2
-    return _digitised(scene, v + scene.levels["c0"][0, :n] + more * r["light"] + warmer * r["dark"])
-
-
-def _excess(scene: Scene, z: Float) -> Float:
-    """Return the observed counts minus the reference, DN, for the quiescent scenario."""
-    n = scene.n_pixel
-    level = scene.levels[0, :n]
-    drawn = level["c4"].astype(np.float64) if scene.quartic else np.zeros(n)
-    for name in ("c3", "c2", "c1", "c0"):
-        drawn = drawn * z + level[name]
-    return _digitised(scene, drawn)
-
-
-def _digitised(scene: Scene, drawn: Float) -> Float:
-    """Digitise counts above the base and subtract the reference."""
-    n, edge = scene.n_pixel, scene.edges[0, : scene.n_pixel]
-    counts = np.rint(drawn)
+    # The kernels' expansion in double precision.
+    v = reference.analogue(scene, reference.Draws(z.T), 0, **factors, fma=lambda a, b, c: a * b + c)
+    edge, counts = scene.edges[0, :n], np.rint(v.T)
     if scene.clip:
         counts = np.clip(counts, edge["low"] - layout.MAGIC, edge["high"] - layout.MAGIC)
     return np.asarray(counts + edge["whole"] + scene.fraction[0, :n])

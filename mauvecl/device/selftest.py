@@ -350,9 +350,8 @@ def results(engine: Engine, name: str, count: int) -> dict[str, NDArray[Any]]:
 
 def histograms_of(counts: Counts) -> NDArray[np.int64]:
     """Return all counts of histograms as one array."""
-    far = (array for each in counts.far.values() for array in (each.keys, each.counts))
-    arrays = (counts.pixel, counts.element, counts.clipped, *far)
-    return np.concatenate([np.ravel(array).astype(np.int64) for array in arrays])
+    far = [each[~counts.within(k)] for k, bins in counts.bins.items() for each in (bins.keys, bins.counts)]
+    return np.concatenate([np.ravel(each) for each in (*map(counts.dense, counts.bins), counts.clipped, *far)])
 
 
 def tally_of(distribution: Distribution) -> NDArray[np.int64]:
@@ -488,7 +487,7 @@ def chance(engine: Engine) -> Iterator[Check]:
         x = toy(512, 1, dark=dark, read=read, light=0.0)
         signal = engine.snr(x, realisations=100_000, seed=SEED, recipe=recipe)
         # All pixels are equal.
-        counts = signal.counts.pixel.sum(axis=0)
+        counts = signal.counts.dense("pixel").sum(axis=0)
         first = int(signal.scene.base_dn[0, 0]) - layout.OBSERVER_BINS // 2
         p = pearson(counts, exact_counts(x, first))
         passed = bool(p > FALSE_FAILURE_PROBABILITY)

@@ -191,8 +191,7 @@ def test_draws_have_different_counters(monkeypatch: pytest.MonkeyPatch) -> None:
         seen.clear()
         for frame in range(scene.n_draws):
             for exposure in (0, layout.REFERENCE):
-                for group in range(len(scene.pixels) // 4):
-                    reference.draws(scene, index, frame, group, 1, exposure=exposure)
+                reference.draws(scene, index, frame, 1, exposure=exposure)
         for name, _ in scene.modulations:
             if name != "jitter":
                 reference.words_at(index, 0, name, 0, 1)

@@ -194,14 +194,11 @@ def histograms(
     seed: int,
 ) -> snr.Counts:
     """Count pixels, S/N of elements and clipped frames as the kernel `histogram` does, including far values."""
-    counts, half = snr.Counts(scene.n_pixel, len(elements)), layout.OBSERVER_BINS // 2
+    counts = snr.Counts(scene.n_pixel, len(elements))
     n = reference.observed(scene, realisation, seed, scenarios=[0])[0]
 
     def count(kind: str, which: int, numbers: NDArray[np.int64]) -> None:
-        inner = np.abs(numbers + 0.5) < half - 1
-        dense = counts.pixel if kind == "pixel" else counts.element
-        dense[which] = np.bincount(numbers[inner] + half, minlength=2 * half)
-        counts.far[kind].count(which * 2**32 + 2**31 + numbers[~inner])
+        counts.bins[kind].count(which * 2**32 + 2**31 + numbers)
 
     for e, element in enumerate(elements):
         signal, variance = (np.zeros(len(realisation), np.float32) for _ in range(2))
