@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.detection.distributions import Interval, central_counts
+from mauvecl.detection.names import check_probability
 from mauvecl.noise import layout
 from mauvecl.schema.errors import InputError
 
@@ -162,11 +163,6 @@ class FarCounts(SparseCounts):
         upper = np.where(above, edges_of(self.keys + 1), np.minimum(edges_of(self.keys + 1), low))
         # The grid rounds in float32, so a value at its end may lie inside the float64 edges.
         return np.where(above, lower, np.minimum(lower, upper)), np.where(above, np.maximum(lower, upper), upper)
-
-    def equals(self, other: FarCounts) -> bool:
-        """Return whether all counts and sums are equal."""
-        mine, theirs = ((x.first, x.second, x.undefined, x.keys.tolist(), x.counts.tolist()) for x in (self, other))
-        return mine == theirs
 
 
 @dataclass(frozen=True)
@@ -333,21 +329,17 @@ class Distribution:
     def above(self, value: float) -> float:
         """Return the number of realisations at or above a value: exact at edges of bins, interpolated between."""
         lower, upper, counts = self.bins
-        below = _below(counts)
         # The first bin with an upper edge above the value.
         index = int(np.searchsorted(upper, value, side="right"))
         if index == counts.size:
             return 0.0
-        if value <= lower[index]:
-            return float(below[-1] - below[index])
-        share = (upper[index] - value) / (upper[index] - lower[index])
-        return float(below[-1] - below[index + 1] + share * counts[index])
+        share = 1.0 if value <= lower[index] else (upper[index] - value) / (upper[index] - lower[index])
+        return float(counts[index + 1 :].sum() + share * counts[index])
 
     def edge_with_at_most(self, n_above: int) -> float:
         """Return the lowest edge of a bin with at most `n_above` realisations at or above it, or minus infinity."""
         _, upper, counts = self.bins
-        below = _below(counts)
-        more = np.flatnonzero(below[-1] - below[:-1] > n_above)
+        more = np.flatnonzero(np.cumsum(counts[::-1])[::-1] > n_above)
         return float(upper[more[-1]]) if more.size else -math.inf
 
     def around(self, edge: float) -> tuple[int, int]:
@@ -359,15 +351,12 @@ class Distribution:
     def quantile(self, probability: float | NDArray[np.float64]) -> NDArray[np.float64]:
         """Return quantiles, interpolated linearly within bins."""
         lower, upper, counts = self.bins
-        below = _below(counts)
         edges = np.column_stack([lower, upper]).ravel()
-        cumulative = np.column_stack([below[:-1], below[1:]]).ravel() / self.n
-        return np.asarray(np.interp(probability, cumulative, edges))
+        return np.asarray(np.interp(probability, steps_of(counts) / self.n, edges))
 
     def quantile_interval(self, probability: float) -> Interval:
         """Return a quantile with the 95 % interval of order statistics, rounded outwards to edges of bins."""
-        if not 0.0 < probability < 1.0:
-            raise InputError.of("probability", probability, "a probability between 0 and 1")
+        check_probability("probability", probability)
         # The number of values below the quantile is binomial, so it lies between these ranks with 95 %.
         low, high = central_counts(self.n, probability)
         lower, upper, counts = self.bins
@@ -390,9 +379,10 @@ class Distribution:
         return edges, -np.diff(np.rint(above)).astype(np.int64)
 
 
-def _below(counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the number of realisations below each filled bin, and in total; shape (m + 1,)."""
-    return np.concatenate([[0], np.cumsum(counts)])
+def steps_of(counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the number of realisations below the lower and the upper edge of each bin, alternating, shape (2 m,)."""
+    above = np.cumsum(counts)
+    return np.column_stack([above - counts, above]).ravel()
 
 
 #: Number of extreme values of each tail that are kept with their realisations.
@@ -417,16 +407,12 @@ class TailSamples:
             beyond = np.flatnonzero(signed >= np.partition(signed, -TAIL_SAMPLES)[-TAIL_SAMPLES])
         else:
             beyond = np.arange(values.size)
-        if not beyond.size:
-            return
-        merged = np.concatenate([self.values, values[beyond]])
-        realisations = np.concatenate([self.realisations, first + beyond])
-        self._keep(merged, realisations)
+        if beyond.size:
+            self.merge(values[beyond], first + beyond)
 
     def merge(self, values: NDArray[np.float32], realisations: NDArray[np.int64]) -> None:
         """Add the extreme values of other realisations, in any order."""
-        self._keep(np.concatenate([self.values, values]), np.concatenate([self.realisations, realisations]))
-
-    def _keep(self, values: NDArray[np.float32], realisations: NDArray[np.int64]) -> None:
+        values = np.concatenate([self.values, values])
+        realisations = np.concatenate([self.realisations, realisations])
         order = np.lexsort((realisations, -self._sign * values))[:TAIL_SAMPLES]
         self.values, self.realisations = values[order], realisations[order]

@@ -218,18 +218,18 @@ def _adc_moments(x: Expectation) -> tuple[tuple[Float, Float], tuple[Float, Floa
     """
     mean, sd = x.mean_raw_dn, np.sqrt(np.maximum(x.unsaturated_variance_dn2 / x.n_frames - 1 / 12, 0.0))
     recorded = x.recorded_dn / x.n_frames
+    # Integers around each pixel's mean; the outermost ones include the tails.
+    first, last = np.floor(mean - 9 * sd) - 1, np.ceil(mean + 9 * sd) + 1
+    dn = first[:, None] + np.arange(int((last - first).max()) + 1)
+    gap = dn[:, :-1] + 0.5 - mean[:, None]
+    z = np.divide(gap, sd[:, None], out=np.where(gap >= 0, np.inf, -np.inf), where=sd[:, None] > 0)
+    chance = np.diff(special.ndtr(z), prepend=0.0, append=1.0)
     moments = []
-    for low, high in ((-np.inf, float(x.highest_dn)), (0.0, float(x.highest_dn))):
-        shift, variance = np.zeros_like(mean), np.zeros_like(mean)
-        for p, (m, s) in enumerate(zip(mean, sd, strict=True)):
-            # Integers around the mean; the outermost ones include the tails.
-            dn = np.arange(np.floor(m - 9 * s) - 1, np.ceil(m + 9 * s) + 2)
-            below = special.ndtr((dn[:-1] + 0.5 - m) / s) if s > 0 else (dn[:-1] + 0.5 >= m).astype(float)
-            chance = np.diff(below, prepend=0.0, append=1.0)
-            seen = np.clip(dn, low, high)
-            centre = float(chance @ seen)
-            shift[p], variance[p] = centre - recorded[p], chance @ (seen - centre) ** 2
-        moments.append((x.n_frames * shift, x.n_frames * variance))
+    for low in (-np.inf, 0.0):
+        seen = np.clip(dn, low, x.highest_dn)
+        centre = np.sum(chance * seen, axis=1)
+        variance = np.sum(chance * (seen - centre[:, None]) ** 2, axis=1)
+        moments.append((x.n_frames * (centre - recorded), x.n_frames * variance))
     return moments[0], moments[1]
 
 

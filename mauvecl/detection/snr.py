@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.detection.counts import SparseCounts, TailSamples, Tally
+from mauvecl.detection.counts import SparseCounts, TailSamples, Tally, steps_of
 from mauvecl.detection.detection import Detection
 from mauvecl.detection.requests import DetectRequest, SnrRequest
 from mauvecl.host.arrays import ContentEquality
@@ -239,12 +239,6 @@ class SnrResult(Drawable, ContentEquality):
         x, columns = self.expectation, (*COLUMNS, *CLIPPED_COLUMNS) if clipped else COLUMNS
         about = {"exposure_s": x.exposure_s, "name": x.name, "signal": x.signal}
         return table_of(columns, [values | clipped], realisations=self.counts.n, **about)
-
-
-def steps_of(counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the number of realisations below the lower and the upper edge of each bin, alternating, shape (2 m,)."""
-    above = np.cumsum(counts)
-    return np.column_stack([above - counts, above]).ravel()
 
 
 Arrays = dict[str, NDArray[Any]]

@@ -26,7 +26,7 @@ from mauvecl.detection.distributions import (
     central_counts,
     clopper_pearson,
 )
-from mauvecl.detection.names import check_atom, least_countable
+from mauvecl.detection.names import check_atom, check_probability, least_countable
 from mauvecl.detection.statistics import Differences
 from mauvecl.noise import layout, reference
 from mauvecl.noise.disturbances import ADDITIVE
@@ -91,7 +91,7 @@ def per_test(wanted: float, frames: int, stack: int = 1, *, step: int | None = N
     """
     step = stack if step is None else step
     tests = count_tests(frames, stack, step)
-    _check_probability("wanted campaign fap", wanted)
+    check_probability("wanted campaign fap", wanted)
     overlapping = None
     if step < stack and tests > 1:
         stretch = min(tests, STRETCH)
@@ -136,16 +136,11 @@ def campaign(fap: float, frames: int, stack: int = 1, *, step: int | None = None
     """
     step = stack if step is None else step
     tests = count_tests(frames, stack, step)
-    _check_probability("fap", fap)
+    check_probability("fap", fap)
     overlapping = _overlapping(fap, tests, stack, step, seed) if step < stack and tests > 1 else None
     return Campaign(
         tests, fap, tests * fap, min(tests * fap, 1.0), float(-np.expm1(tests * np.log1p(-fap))), overlapping
     )
-
-
-def _check_probability(what: str, value: float) -> None:
-    if not 0.0 < value < 1.0:
-        raise InputError.of(what, value, "a probability between 0 and 1")
 
 
 def count_tests(frames: int, stack: int, step: int) -> int:

@@ -195,8 +195,7 @@ class Engine:
             raise InputError(
                 f"out must be writable contiguous {dtype} of {shape}, not {out.dtype} of {out.shape}", key="out"
             )
-        clipped = np.empty(count, np.uint32)
-        rows = out
+        clipped, rows = np.empty(count, np.uint32), out
         with scene_launches(self.open_device, scene, seed, row_type="ushort" if narrow else "int") as launches:
 
             def work(tile: Tile, done: int) -> None:

@@ -13,25 +13,6 @@ from mauvecl import Comparison, Expectation, Instrument, Sky, Source, expect
 from mauvecl.detection import chi2, distributions
 
 
-@pytest.mark.parametrize("n", [10, 48, 1643])
-@pytest.mark.parametrize("scale", [1.0, 2.5])
-def test_equal_weights_are_a_scaled_non_central_chi_squared(n: int, scale: float) -> None:
-    """Compare with scipy's ncx2 (Boost); weights of 1 + 1e-12 keep ours from using it."""
-    shift = np.linspace(-0.5, 0.7, n)
-    form = distributions.QuadraticForm(np.full(n, scale * (1 + 1e-12)), shift)
-    exact = stats.ncx2(n, np.sum(shift**2), scale=scale)
-    assert form.mean == pytest.approx(exact.mean())
-    assert form.std == pytest.approx(exact.std())
-    for p in (0.999999, 0.99, 0.5, 1e-2, 1e-4, 1e-6, 1e-9):
-        assert form.sf(float(exact.isf(p))) == pytest.approx(p, rel=1e-4, abs=1e-13)
-
-
-def test_unit_weights_use_scipy() -> None:
-    assert distributions.QuadraticForm(np.ones(30), np.zeros(30)).isf(1e-3) == stats.chi2.isf(1e-3, 30)
-    form = distributions.QuadraticForm(np.ones(30), np.full(30, 0.3))
-    assert form.sf(40.0) == pytest.approx(stats.ncx2.sf(40.0, 30, 30 * 0.09), rel=1e-12)
-
-
 def of_two(form: distributions.QuadraticForm, x: float, *, upper: bool) -> float:
     """Return the probability above or below x for two terms, integrated over the normal of the first."""
     (a, b), (first, second) = form.weight, form.shift
@@ -68,7 +49,7 @@ def test_two_terms_of_any_kind_against_quadrature() -> None:
             assert form.sf(x) == pytest.approx(p, rel=1e-9)
 
 
-@pytest.mark.parametrize("n", [1, 2, 5, 29, 400])
+@pytest.mark.parametrize("n", [1, 2, 5, 29, 400, 1643])
 @pytest.mark.parametrize("push", [0.0, 0.5, 1e4])
 def test_few_terms_and_far_tails_agree_with_scipy(n: int, push: float) -> None:
     """Compare equal weights down to 1e-100, with the accuracy that scipy has below 1e-10."""

@@ -58,7 +58,7 @@ def test_extreme_words_and_column_edges(probes: Probes, mean: float) -> None:
 
 def pearson(counts: np.ndarray, low: int, mean: float) -> float:
     """Return the two-sided p-value of Pearson's statistic with scipy's probabilities of low, low + 1, ..."""
-    return exact.pearson(counts, stats.poisson.pmf(low + np.arange(counts.size), mean))
+    return selftest.pearson(counts, stats.poisson.pmf(low + np.arange(counts.size), mean))
 
 
 #: Draws of each mean by expansion, and by table.

@@ -1,13 +1,13 @@
 """Independence of draws, for every method and every mixture of methods in a group."""
 
-from dataclasses import replace
+from typing import Any
 
+import exact
 import numpy as np
 import pytest
 from scenes import instrument, star
 
 from mauvecl import CosmicRays, Engine, Expectation, Normal, PixelMap, Processes
-from mauvecl.device import selftest
 from mauvecl.noise import layout
 from mauvecl.noise.scene import prepare
 
@@ -15,10 +15,8 @@ from mauvecl.noise.scene import prepare
 MIXED = np.array([1500.0 + 7 * g if g >> i & 1 else 300.0 + 11 * g for g in range(16) for i in range(4)])
 
 
-def detector(dark: np.ndarray | float, electrons: np.ndarray | float, read: float = 0.7, **changes) -> Expectation:
-    x = selftest.toy(64, 1, read=read, **changes)
-    ones = np.ones(64)
-    return replace(x, dark_dn=dark * ones, source_electrons=electrons * ones, sky_electrons=0 * ones)
+def detector(dark: Any, photons: Any, read: float = 0.7, **kind: Any) -> Expectation:
+    return exact.flat(64, 1, dark=dark, photons=photons, read=read, **kind)
 
 
 SCENES = {
@@ -76,9 +74,7 @@ def test_pairs_of_pixels_use_one_method() -> None:
         start = int(counts["table"][p])
         np.testing.assert_array_equal(scene.tables[start : start + table.entries.size], table.entries)
     # The last of an odd number has no neighbour.
-    odd = replace(
-        selftest.toy(65, 1, read=0.7, light=0.0), dark_dn=np.append(MIXED, 1500.0), bias_dn=np.full(65, 600.0)
-    )
+    odd = exact.flat(65, 1, dark=np.append(MIXED, 1500.0), read=0.7)
     assert prepare([odd]).dark_counts["bits"][64] == 0
 
 
