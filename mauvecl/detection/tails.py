@@ -73,13 +73,6 @@ class PerTest:
 def per_test(wanted: float, frames: int, stack: int = 1, *, step: int | None = None, seed: int = 1) -> PerTest:
     """Return the false-alarm probability per test for a wanted one of the campaign; the inverse of `campaign`.
 
-    Parameters
-    ----------
-    wanted : float
-        Probability of any false alarm in the whole campaign.
-    frames, stack, step, seed
-        As for `campaign`.
-
     Examples
     --------
     >>> from mauvecl.detection.tails import campaign, per_test
@@ -107,25 +100,11 @@ def per_test(wanted: float, frames: int, stack: int = 1, *, step: int | None = N
 def campaign(fap: float, frames: int, stack: int = 1, *, step: int | None = None, seed: int = 1) -> Campaign:
     """Return the false-alarm probability of a search through consecutive frames.
 
-    Parameters
-    ----------
-    fap : float
-        False-alarm probability of one test.
-    frames : int
-        Number of searched frames; a day of 5 s frames has 17 280.
-    stack : int
-        Frames summed in one test.
-    step : int, optional
-        Frames from one stack to the next. The default is `stack`. Smaller steps make stacks overlap, so that
-        neighbouring tests are correlated by their fraction of common frames.
-    seed : int
-        Seed of the simulation of overlapping stacks.
-
-    Notes
-    -----
-    Sums of frames are nearly normal, so a linear statistic of overlapping stacks is a moving average of independent
-    normals. The probability that its maximum exceeds the threshold is simulated. The correlation of chi-squared
-    statistics is the square of this one, so their probability lies between `overlapping` and `independent`.
+    `fap` is that of one test, `stack` the number of frames summed in a test, and `step` that from one stack to the
+    next, by default `stack`. Smaller steps make stacks overlap, so that neighbouring tests are correlated by their
+    fraction of common frames. Sums of frames are nearly normal, so a linear statistic of overlapping stacks is a moving
+    average of independent normals, whose maximum is simulated. The correlation of chi-squared statistics is the square
+    of this one, so their probability lies between `overlapping` and `independent`.
 
     Examples
     --------
@@ -205,26 +184,12 @@ class Tail:
 
 
 def tail(hypotheses: Hypotheses, fap: float, statistic: str, *, template: int = 0, seed: int) -> Tail:
-    """Find the threshold of a small false-alarm probability by importance sampling.
+    """Find the threshold of a false-alarm probability from 1e-10 to 0.1 by importance sampling.
 
-    Parameters
-    ----------
-    hypotheses : Hypotheses
-        Only the scene and the quiescent star are used.
-    fap : float
-        1e-10 to 0.1.
-    statistic : str
-    template : int
-        Index of the flare that ``matched`` uses as template.
-    seed : int
-
-    Raises
-    ------
-    NoThresholdError
-        If no threshold has the probability.
-    InputError
-        If noise is not drawn jointly and in stacks, additive processes are drawn, priors are drawn that the statistics
-        are not marginalised over, more than 30 quiescent exposures are averaged, or the error remains too large.
+    `template` is the index of the flare that shaped statistics use as template. Raises NoThresholdError if no threshold
+    has the probability. Raises InputError if noise is not drawn jointly and in stacks, additive processes are drawn,
+    priors are drawn that the statistics are not marginalised over, more than 30 quiescent exposures are averaged, or
+    the error remains too large.
     """
     if not SMALLEST_FAP <= fap <= 0.1:
         raise InputError.of("fap", fap, f"between {SMALLEST_FAP:g} and 0.1 for importance sampling")
@@ -236,11 +201,10 @@ def tail(hypotheses: Hypotheses, fap: float, statistic: str, *, template: int = 
         for number in range(len(blocks), goal // BLOCK):
             blocks.append(_block(hypotheses, statistic, template, how, seed, number))
         values, logs = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
-        cut, low, high, error = _threshold(values, logs, fap)
-        beyond, at = _probabilities_at(values, logs, cut)
-        check_atom(f"{statistic} of {hypotheses.quiet.name}", fap, beyond, at)
+        cut, error = _threshold(values, logs, fap)
+        check_atom(f"{statistic} of {hypotheses.quiet.name}", fap, *_probabilities_at(values, logs, cut.value))
         if error <= WANTED_ERROR:
-            return Tail(Interval(cut, low, high), fap, error, values.size)
+            return Tail(cut, fap, error, values.size)
         if goal >= MAX_REALISATIONS:
             raise InputError(
                 f"the threshold of {statistic} at fap = {fap:g} must have a relative error of at most "
@@ -269,8 +233,8 @@ def _check(hypotheses: Hypotheses, fap: float) -> None:
             )
 
 
-def _threshold(values: Float, logs: Float, fap: float) -> tuple[float, float, float, float]:
-    """Return the value with a weighted fraction `fap` at or above, its interval, and the fraction's relative error."""
+def _threshold(values: Float, logs: Float, fap: float) -> tuple[Interval, float]:
+    """Return the value with a weighted fraction `fap` at or above, and the fraction's relative error."""
     order = np.argsort(-values, kind="stable")
     ordered, weight = values[order], np.exp(logs[order])
     above = np.cumsum(weight) / values.size
@@ -278,14 +242,14 @@ def _threshold(values: Float, logs: Float, fap: float) -> tuple[float, float, fl
     variance = np.maximum(np.cumsum(weight**2) / values.size - above**2, 0.0) / values.size
     error = np.sqrt(variance)
     if above[-1] < fap:
-        return float("nan"), float("nan"), float("nan"), float("inf")
+        return Interval(math.nan, math.nan, math.nan), math.inf
     at = int(np.searchsorted(above, fap))
     relative = float(error[at] / above[at])
     # The fraction at the ends differs by its error at the threshold.
     reach = float(special.ndtri(0.5 + CONFIDENCE / 2)) * relative
     ends = np.searchsorted(above, (fap * (1.0 + reach), fap * (1.0 - reach)))
     low, high = (float(ordered[min(int(end), values.size - 1)]) for end in ends)
-    return float(ordered[at]), low, high, relative
+    return Interval(float(ordered[at]), low, high), relative
 
 
 def _probabilities_at(values: Float, logs: Float, cut: float) -> tuple[float, float]:

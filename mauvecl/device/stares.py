@@ -145,15 +145,7 @@ class Stares:
     def reduced(self, request: StaresRequest, shard: Shard | None = None) -> Arrays:
         """Draw the stares of a request, or of a shard of it, and reduce them a few at a time.
 
-        Parameters
-        ----------
-        request : StaresRequest
-        shard : Shard, optional
-
-        Returns
-        -------
-        dict of str to ndarray
-            Joined results of the request's reduction; for a shard with its ``start``, as `StareSums` requires.
+        Return the joined results of the request's reduction; for a shard with its ``start``, as `StareSums` requires.
         """
         there = shard or Shard(0, request.start, request.realisations)
         _check_last(there.start, there.count)

@@ -280,18 +280,10 @@ def components(
 ) -> QTable:
     """Decompose one raw spectrum into the draws of its components, with the NumPy reference.
 
-    Parameters
-    ----------
-    mode, recipe, processes, first_frame
-        See `Drawing`.
-
-    Returns
-    -------
-    QTable
-        One row per pixel, in DN summed over the exposure: ``raw``, as drawn by the engine; the mean signals ``source``,
-        ``sky`` and, if there are any, ``neighbours``; ``photon_noise`` and ``read_noise``; ``dark``; the charge of each
-        enabled additive process by its name; ``bias``; and ``digitisation``, the effect of rounding and clipping.
-        ``raw`` is the sum of the others.
+    The table has one row per pixel, in DN summed over the exposure: ``raw``, as drawn by the engine; the mean signals
+    ``source``, ``sky`` and, if there are any, ``neighbours``; ``photon_noise`` and ``read_noise``; ``dark``; the charge
+    of each enabled additive process by its name; ``bias``; and ``digitisation``, the effect of rounding and clipping.
+    ``raw`` is the sum of the others. Keywords are those of `Drawing`.
 
     Notes
     -----

@@ -234,16 +234,6 @@ def _both_of_a_pair(chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.repeat(pairs.reshape(-1, 2).all(axis=1), 2)[: chosen.size]
 
 
-def fill_estimates(out: NDArray[np.void], reference: Expectation, fraction: Float, mean_sum: Float) -> None:
-    """Fill `out` for variances estimated by an observer who knows the detector; padding has a variance of 1."""
-    n_pixel, variance = reference.wavelength_nm.size, reference.read_noise_dn**2 + reference.dark_variance_dn2 + 1 / 12
-    out["variance"] = 1.0
-    out["fraction"] = fraction
-    out["net_offset"][:n_pixel] = mean_sum - reference.n_frames * (reference.bias_dn + reference.dark_dn)
-    out["gain"][:n_pixel] = reference.gain_dn_per_electron
-    out["variance"][:n_pixel] = np.maximum(reference.n_frames * variance, NO_VARIANCE)
-
-
 def fill_responses(out: NDArray[np.void], x: Expectation, c: Cumulants, factors: Factors) -> None:
     """Fill `out` with a draw's response to factors on light, dark and sky, relative to the priors' medians."""
     share, dark = sky_share(x), factors.medians["dark"]
@@ -475,7 +465,13 @@ def _fill_comparison(
     edge["low"] = layout.MAGIC - base
     edge["high"] = layout.MAGIC + (x.highest_dn - base)
     if comparison.estimated:
-        fill_estimates(arrays["estimates"][k], reference, arrays["fraction"][k], np.rint(mean_sum))
+        # An observer knows the detector; padding has a variance of 1.
+        estimate = arrays["estimates"][k]
+        estimate["variance"], estimate["fraction"] = 1.0, arrays["fraction"][k]
+        known = reference.read_noise_dn**2 + reference.dark_variance_dn2 + 1 / 12
+        offset = np.rint(mean_sum) - reference.n_frames * (reference.bias_dn + reference.dark_dn)
+        estimate["net_offset"][:n_pixel], estimate["gain"][:n_pixel] = offset, reference.gain_dn_per_electron
+        estimate["variance"][:n_pixel] = np.maximum(reference.n_frames * known, NO_VARIANCE)
     ends = element_ends(x)
     element_variance = np.bincount(x.element, variance * used)
     with np.errstate(divide="ignore"):
