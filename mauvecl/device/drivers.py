@@ -507,21 +507,17 @@ def _try(name: str | None, number: int, device: Any, limit_s: float) -> str | No
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(child.pid, signal.SIGKILL)
             child.wait()
-        return _failure(code, _last_line(out) or _last_line(log) or "no message", limit_s)
+        if code == 0:
+            return None
+        message = _last_line(out) or _last_line(log) or "no message"
+    if -code == signal.SIGXCPU:
+        return f"was not finished after {limit_s:g} s of processor time"
+    if code < 0:
+        return f"was ended by a signal ({(signal.strsignal(-code) or str(-code)).lower()}: {message})"
+    return f"failed ({message})"
 
 
 def _last_line(file: IO[bytes]) -> str:
     file.seek(0)
     lines = file.read(2**16).decode(errors="replace").split("\n")
     return next((line.strip()[:200] for line in reversed(lines) if line.strip()), "")
-
-
-def _failure(code: int, message: str, limit_s: float) -> str | None:
-    """Describe the failure of a child by its exit code and its last line; None after a success."""
-    if code == 0:
-        return None
-    if -code == signal.SIGXCPU:
-        return f"was not finished after {limit_s:g} s of processor time"
-    if code < 0:
-        return f"was ended by a signal ({(signal.strsignal(-code) or str(-code)).lower()}: {message})"
-    return f"failed ({message})"

@@ -124,13 +124,10 @@ DEVICE_COLUMNS = (
     Column("compute_units", heading="units"),
     Column("global_memory", unit="byte", heading="GiB", format=lambda size: f"{size / 2**30:.1f}"),
     Column("promise", heading="promise"),
-    Column("rate", unit="1 / s", heading="rate", format=lambda rate, error: error or _rate(rate), others=("error",)),
+    Column("rate", unit="1 / s", heading="rate", others=("error",),
+           format=lambda rate, error: error or ("" if rate is None else f"{rate:.2g} /s")),
     Column("default", heading="chosen", format=lambda chosen: "default" if chosen else ""),
-)
-
-
-def _rate(rate: float | None) -> str:
-    return "" if rate is None else f"{rate:.2g} /s"
+)  # fmt: skip
 
 
 def list_devices(*, measure: bool = True) -> list[dict[str, Any]]:

@@ -183,13 +183,7 @@ class Stares:
         return arrays | {"start": np.array(there.start)} if shard else arrays
 
     def _launches(
-        self,
-        components: Components,
-        stare: Stare,
-        flares: Flares,
-        seed: int,
-        method: Method,
-        processes: Processes,
+        self, components: Components, stare: Stare, flares: Flares, seed: int, method: Method, processes: Processes
     ) -> StareLaunches:
         self.open_device.check_process()
         scene = _scene_of(components, stare, processes)

@@ -271,13 +271,7 @@ Float = NDArray[np.float64]
 FRAMES_AT_ONCE = 256
 
 
-def components(
-    x: Expectation,
-    *,
-    realisation: int,
-    seed: int,
-    **drawing: Unpack[DrawingOptions],
-) -> QTable:
+def components(x: Expectation, *, realisation: int, seed: int, **drawing: Unpack[DrawingOptions]) -> QTable:
     """Decompose one raw spectrum into the draws of its components, with the NumPy reference.
 
     The table has one row per pixel, in DN summed over the exposure: ``raw``, as drawn by the engine; the mean signals

@@ -340,8 +340,7 @@ def prepare(
     Raises InputError if scenarios differ in more than their light, stacked draws are requested near a rail, or a
     process needs joint draws that are not exact.
     """
-    drawing = drawing or Drawing(**words)
-    quiet = scenarios[0]
+    drawing, quiet = drawing or Drawing(**words), scenarios[0]
     factors = Factors.of(drawing.processes, quiet.conditions)
     method = choose_method(scenarios, drawing, factors)
     compared = np.array([0] * len(scenarios) if references is None else references, np.uint32)

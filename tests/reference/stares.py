@@ -166,11 +166,7 @@ def _chain(terms: Iterable[tuple[Floats, Floats]]) -> Floats:
 
 
 def _sums(
-    scene: StareScene,
-    table: SumTable,
-    z: list[Floats],
-    conditions: dict[str, Floats],
-    flare: list[Floats],
+    scene: StareScene, table: SumTable, z: list[Floats], conditions: dict[str, Floats], flare: list[Floats]
 ) -> list[Floats]:
     n = len(scene.weights)
     pairs = stare_scene.unique(n, 2)

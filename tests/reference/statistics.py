@@ -187,11 +187,7 @@ def _summed(values: Floats, weights: Floats) -> Floats:
 
 
 def histograms(
-    scene: Any,
-    observers: NDArray[np.void],
-    elements: NDArray[np.void],
-    realisation: NDArray[np.uint64],
-    seed: int,
+    scene: Any, observers: NDArray[np.void], elements: NDArray[np.void], realisation: NDArray[np.uint64], seed: int
 ) -> snr.Counts:
     """Count pixels, S/N of elements and clipped frames as the kernel `histogram` does, including far values."""
     counts = snr.Counts(scene.n_pixel, len(elements))
