@@ -126,7 +126,7 @@ def quantile(word: NDArray[np.uint32], finer: NDArray[np.uint32], table: Floats)
 
 def combine_factors(a: Floats, b: Floats, fma: Fma = fma) -> Floats:
     """Return the product of two factors, all minus one."""
-    return fma(a, b, a + b)
+    return np.asarray(fma(a, b, a + b))
 
 
 def factors(
@@ -149,7 +149,9 @@ def factors(
     return combine_factors(factor_of["light"], constant), factor_of["dark"], factor_of["sky"]
 
 
-def analogue(scene: Scene, drawn: Draws, k: int, light: Floats, dark: Floats, sky: Floats, fma: Fma = fma) -> Floats:
+def analogue(
+    scene: Scene, drawn: Draws, k: int, light: NDArray[Any], dark: NDArray[Any], sky: NDArray[Any], fma: Fma = fma
+) -> Floats:
     """Return the analogue counts of a scenario above the levels' bases, before the ADC, shape (n_pixel, n_draw).
 
     Factors have the shape (n_draw,). Another `fma` computes in the precision of `drawn`, without the device's bits.
@@ -201,7 +203,7 @@ def _responding(
 
 def even_powers(zz: Floats, second: float, first: float, constant: float, fma: Fma = fma) -> Floats:
     """Return a polynomial of the square of a normal."""
-    return fma(zz, fma(zz, np.float32(second), np.float32(first)), np.float32(constant))
+    return np.asarray(fma(zz, fma(zz, np.float32(second), np.float32(first)), np.float32(constant)))
 
 
 def digitise(v: Floats, edge: np.void | NDArray[np.void], *, clip: bool) -> Floats:
