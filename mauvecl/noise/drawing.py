@@ -372,7 +372,9 @@ def choose_method(scenarios: Sequence[Expectation], drawing: Drawing, factors: F
         raise InputError.of("pixels", quiet.wavelength_nm.size, f"at most {MAX_PIXELS}")
     for other in scenarios[1:]:
         _check_same_detector(quiet, other)
-    corners = _corners(factors)
+    # A grid of factors on light, dark and sky that spans the priors in steps of at most 2.
+    grids = [np.geomspace(low, high, 1 + int(np.ceil(np.log2(high / low)))) for low, high in factors.ends.values()]
+    corners = [*product(*(grid.tolist() for grid in grids))]
     frames = _draw_frames(scenarios, drawing.mode, factors, processes, corners)
     each = 1 if frames else quiet.n_frames
     cumulants = [Cumulants.of(x, each) for x in scenarios]
@@ -411,12 +413,6 @@ def near_rail(x: Expectation, factors: Factors, processes: Processes) -> NDArray
     low: NDArray[np.bool_] = ends[0][0] - ends[0][1] < 0.0
     high: NDArray[np.bool_] = ends[1][0] + ends[1][1] + added > x.highest_dn
     return low | high
-
-
-def _corners(factors: Factors) -> list[tuple[float, float, float]]:
-    """Return a grid of factors on light, dark and sky that spans the priors in steps of at most 2."""
-    grids = [np.geomspace(low, high, 1 + int(np.ceil(np.log2(high / low)))) for low, high in factors.ends.values()]
-    return [*product(*(grid.tolist() for grid in grids))]
 
 
 def _scaled(x: Expectation, c: Cumulants, corner: tuple[float, float, float]) -> Cumulants:
