@@ -111,9 +111,8 @@ def test_device_without_strict_arithmetic_has_weaker_promise(monkeypatch: pytest
 
 def test_selftest_command_reports_and_records_outcome(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Check table, file, exit codes 0 and 1 (failed check), and the outcome in later run records."""
-    # A separate store keeps these invented outcomes out of the user's.
-    store = drivers.KernelCache(tmp_path, tmp_path)
-    monkeypatch.setattr("mauvecl.device.build.kernel_cache", lambda: store)
+    # A separate store keeps these invented outcomes out of the user's; the working folder holds loaded kernels.
+    monkeypatch.setattr(drivers.kernel_cache(), "store", tmp_path / "store")
     checks = [selftest.Check("one thing", True, "as it should be")]
     monkeypatch.setattr(selftest, "run", lambda engine: checks)
     good = run("selftest", "--quiet", "--output", tmp_path, folder=tmp_path).stdout
