@@ -71,7 +71,7 @@ def main() -> int:
         x = replace(toy(PIXELS, 1, dark=mean, read=read, light=0.0), sky_electrons=np.zeros(PIXELS))
         with patch.object(scene, "SMALLEST_EXPANDED", smallest_expanded):
             found = engine.snr(x, realisations=int(options.draws / PIXELS), seed=SEED, recipe=recipe)
-        counts = found.counts.pixel.sum(axis=0)
+        counts = found.counts.dense("pixel").sum(axis=0)
         # A bin holds 2**shift whole DN.
         shift = int(found.observers["bin_shift"][0])
         bins = np.arange(layout.OBSERVER_BINS + 1) - layout.OBSERVER_BINS // 2

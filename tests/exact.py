@@ -1,10 +1,15 @@
 """Exact distributions of whole DN, by Fourier sums of characteristic functions: right to 1e-15 in each probability."""
 
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
+
+from mauvecl import Expectation
+from mauvecl.device import selftest
 
 Float = NDArray[np.float64]
 
@@ -93,13 +98,41 @@ def expansion(
     return sd, shape
 
 
-def pearson(found: NDArray[np.int64], probability: Float) -> float:
-    """Return the two-sided p-value of Pearson's statistic, with rare outcomes in one bin."""
-    expected = found.sum() * probability
-    common = expected > 20
-    observed = np.append(found[common], found[~common].sum())
-    wanted = np.append(expected[common], found.sum() - expected[common].sum())
-    if wanted[-1] < 20:
-        observed, wanted = observed[:-1], wanted[:-1]
-    upper = float(special.chdtrc(observed.size - 1, np.sum((observed - wanted) ** 2 / wanted)))
-    return 2 * min(upper, 1 - upper)
+def flat(pixels: int, frames: int, **uniform: Any) -> Expectation:
+    """Return an exposure without sky; values of `selftest.toy` and the following may be arrays.
+
+    `photons` are those of a frame, `gain` and `bias` those of the detector.
+    """
+    given = {"dark": 0.0, "read": 12.0, "photons": 0.0, "gain": 0.6, "bias": 600.0}
+    values = {name: uniform.pop(name, value) * np.ones(pixels) for name, value in given.items()}
+    names = ("dark_dn", "read_noise_dn", "source_electrons", "gain_dn_per_electron", "bias_dn")
+    arrays = dict(zip(names, values.values(), strict=True))
+    return replace(selftest.toy(pixels, frames, **uniform), sky_electrons=np.zeros(pixels), **arrays)
+
+
+def noise_of(x: Expectation, pixel: int = 0) -> tuple[float, list[tuple[float, float]]]:
+    """Return the variance of the Gaussian noise of an exposure's sum, and its Poisson counts with their DN."""
+    n, step, gain = x.n_frames, float(x.dark_step_dn[pixel]), float(x.gain_dn_per_electron[pixel])
+    light = n * float(x.light_electrons[pixel])
+    gaussian = n * float(x.read_noise_dn[pixel]) ** 2 + (n - 1) / 12
+    poisson = [(n * float(x.dark_dn[pixel]) / step, step)]
+    if x.photon_noise == "poisson":
+        return gaussian, [*poisson, (light, gain)]
+    return gaussian + gain**2 * light, poisson
+
+
+def span(x: Expectation, pixel: int = 0) -> tuple[int, int]:
+    """Return the first whole DN of an exposure's sum that counts, and the number of them."""
+    reach = int(9 * np.sqrt(x.variance_dn2[pixel])) + 6
+    return int(x.n_frames * x.mean_raw_dn[pixel]) - reach, 2 * reach
+
+
+def of_stack(x: Expectation, pixel: int = 0) -> Float:
+    """Return the probabilities of the DN of `span` for an exposure that is rounded once."""
+    return counts(*noise_of(x, pixel), x.n_frames * float(x.mean_raw_dn[pixel]), *span(x, pixel))
+
+
+def of_frames(x: Expectation, pixel: int = 0) -> Float:
+    """Return the same for frames that are each rounded."""
+    frame = noise_of(replace(x, n_frames=1), pixel)
+    return counts(*frame, float(x.mean_raw_dn[pixel]), *span(x, pixel), x.n_frames)

@@ -18,7 +18,7 @@ from mauvecl.answers.answer import Answer, TableOf
 from mauvecl.answers.detect import DetectAnswer, detect
 from mauvecl.answers.signal import SnrAnswer, snr
 from mauvecl.answers.verbs import Progress, by_keywords
-from mauvecl.detection.snr import steps_of
+from mauvecl.detection.counts import steps_of
 from mauvecl.device.engine import Engine
 from mauvecl.noise.drawing import Cumulants
 from mauvecl.schema.columns import Column, number, table_of

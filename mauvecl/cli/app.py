@@ -81,22 +81,22 @@ def selftest(
 
     from mauvecl.answers.answer import make_folder, write_json
     from mauvecl.device import selftest
-    from mauvecl.device.build import read_outcome
+    from mauvecl.device.build import read_outcome, write_outcome
     from mauvecl.device.engine import Engine
 
     started = time.perf_counter()
     folder = None if output is None else make_folder(output)
     with Meter(quiet=quiet or as_json) as meter:
         engine = Engine(device, progress=meter)
-        checks = selftest.run(engine)
+        checks = [asdict(check) for check in selftest.run(engine)]
     seconds = time.perf_counter() - started
-    selftest.record_outcome(engine.device, checks, seconds)
-    failed = sum(not check.passed for check in checks)
+    write_outcome(engine.device, checks, seconds)
+    failed = sum(not check["passed"] for check in checks)
     if as_json:
-        print(json.dumps(read_outcome(engine.device) or [asdict(check) for check in checks], indent=2))
+        print(json.dumps(read_outcome(engine.device) or checks, indent=2))
     else:
         title = f"Self-test of {engine.device_name}, driver {engine.driver}"
-        show_view(View(title, selftest.CHECK_COLUMNS, [asdict(check) for check in checks]))
+        show_view(View(title, selftest.CHECK_COLUMNS, checks))
         outcome = f"{failed} of {len(checks)} checks FAILED" if failed else f"All {len(checks)} checks passed"
         show([f"{outcome} in {seconds:.0f} s. Promise: {engine.device.promise}."])
     if folder is not None:

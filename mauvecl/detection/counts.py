@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.detection.distributions import Interval, central_counts
+from mauvecl.detection.names import check_probability
 from mauvecl.noise import layout
 from mauvecl.schema.errors import InputError
 
@@ -26,8 +27,8 @@ DROPPED_BITS = 10
 ABOVE = 1 << (32 - DROPPED_BITS)
 #: Sums are integer multiples of 2**-UNIT_BITS, the smallest float32, and of its square.
 UNIT_BITS = 149
-#: Number of squared mantissas whose sum is below 2**64.
-CHUNK = 2**15
+#: Number of squares below 2**48 whose sum has no more than 63 bits.
+CHUNK = 2**14
 #: Range of keys up to which an array counts them; wider ranges are sorted.
 MAX_DENSE_KEYS = 2**16
 
@@ -115,23 +116,14 @@ def is_above(keys: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 def sums_of(values: NDArray[np.float32]) -> tuple[int, int]:
     """Return the exact sums of finite values and of their squares, in units of 2**-149 and 2**-298."""
-    image = values.view(np.int32)
-    exponent = (image >> 23) & 0xFF
-    # Signed mantissas; subnormal numbers have no implicit leading bit.
-    mantissa = image & 0x7FFFFF
-    mantissa |= 0x800000
-    mantissa[exponent == 0] ^= 0x800000
-    mantissa = (mantissa ^ (image >> 31)) - (image >> 31)
+    # Values are whole multiples of 2**(power - 149), below 2**24 of them; subnormal numbers have the smallest power.
+    powers = np.maximum(np.frexp(values)[1] + (UNIT_BITS - 24), 0)
     first = second = 0
-    low, high = int(exponent.min(initial=255)), int(exponent.max(initial=0))
-    for power in range(low, high + 1):
-        mine = mantissa if low == high else mantissa[exponent == power]
-        shift = max(power, 1) - 1
-        first += int(mine.sum(dtype=np.int64)) << shift
-        for begin in range(0, mine.size, CHUNK):
-            part = mine[begin : begin + CHUNK].astype(np.int64).view(np.uint64)
-            # Squares of negative numbers agree modulo 2**64.
-            second += int((part * part).sum()) << 2 * shift
+    for power in np.flatnonzero(np.bincount(powers)).tolist():
+        whole = np.ldexp(values[powers == power].astype(np.float64), UNIT_BITS - power).astype(np.int64)
+        first += int(whole.sum()) << power
+        for part in np.split(whole, range(CHUNK, whole.size, CHUNK)):
+            second += int(part @ part) << 2 * power
     return first, second
 
 
@@ -171,11 +163,6 @@ class FarCounts(SparseCounts):
         upper = np.where(above, edges_of(self.keys + 1), np.minimum(edges_of(self.keys + 1), low))
         # The grid rounds in float32, so a value at its end may lie inside the float64 edges.
         return np.where(above, lower, np.minimum(lower, upper)), np.where(above, np.maximum(lower, upper), upper)
-
-    def equals(self, other: FarCounts) -> bool:
-        """Return whether all counts and sums are equal."""
-        mine, theirs = ((x.first, x.second, x.undefined, x.keys.tolist(), x.counts.tolist()) for x in (self, other))
-        return mine == theirs
 
 
 @dataclass(frozen=True)
@@ -342,21 +329,17 @@ class Distribution:
     def above(self, value: float) -> float:
         """Return the number of realisations at or above a value: exact at edges of bins, interpolated between."""
         lower, upper, counts = self.bins
-        below = _below(counts)
         # The first bin with an upper edge above the value.
         index = int(np.searchsorted(upper, value, side="right"))
         if index == counts.size:
             return 0.0
-        if value <= lower[index]:
-            return float(below[-1] - below[index])
-        share = (upper[index] - value) / (upper[index] - lower[index])
-        return float(below[-1] - below[index + 1] + share * counts[index])
+        share = 1.0 if value <= lower[index] else (upper[index] - value) / (upper[index] - lower[index])
+        return float(counts[index + 1 :].sum() + share * counts[index])
 
     def edge_with_at_most(self, n_above: int) -> float:
         """Return the lowest edge of a bin with at most `n_above` realisations at or above it, or minus infinity."""
         _, upper, counts = self.bins
-        below = _below(counts)
-        more = np.flatnonzero(below[-1] - below[:-1] > n_above)
+        more = np.flatnonzero(np.cumsum(counts[::-1])[::-1] > n_above)
         return float(upper[more[-1]]) if more.size else -math.inf
 
     def around(self, edge: float) -> tuple[int, int]:
@@ -368,15 +351,12 @@ class Distribution:
     def quantile(self, probability: float | NDArray[np.float64]) -> NDArray[np.float64]:
         """Return quantiles, interpolated linearly within bins."""
         lower, upper, counts = self.bins
-        below = _below(counts)
         edges = np.column_stack([lower, upper]).ravel()
-        cumulative = np.column_stack([below[:-1], below[1:]]).ravel() / self.n
-        return np.asarray(np.interp(probability, cumulative, edges))
+        return np.asarray(np.interp(probability, steps_of(counts) / self.n, edges))
 
     def quantile_interval(self, probability: float) -> Interval:
         """Return a quantile with the 95 % interval of order statistics, rounded outwards to edges of bins."""
-        if not 0.0 < probability < 1.0:
-            raise InputError.of("probability", probability, "a probability between 0 and 1")
+        check_probability("probability", probability)
         # The number of values below the quantile is binomial, so it lies between these ranks with 95 %.
         low, high = central_counts(self.n, probability)
         lower, upper, counts = self.bins
@@ -399,9 +379,10 @@ class Distribution:
         return edges, -np.diff(np.rint(above)).astype(np.int64)
 
 
-def _below(counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the number of realisations below each filled bin, and in total; shape (m + 1,)."""
-    return np.concatenate([[0], np.cumsum(counts)])
+def steps_of(counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the number of realisations below the lower and the upper edge of each bin, alternating, shape (2 m,)."""
+    above = np.cumsum(counts)
+    return np.column_stack([above - counts, above]).ravel()
 
 
 #: Number of extreme values of each tail that are kept with their realisations.
@@ -426,16 +407,12 @@ class TailSamples:
             beyond = np.flatnonzero(signed >= np.partition(signed, -TAIL_SAMPLES)[-TAIL_SAMPLES])
         else:
             beyond = np.arange(values.size)
-        if not beyond.size:
-            return
-        merged = np.concatenate([self.values, values[beyond]])
-        realisations = np.concatenate([self.realisations, first + beyond])
-        self._keep(merged, realisations)
+        if beyond.size:
+            self.merge(values[beyond], first + beyond)
 
     def merge(self, values: NDArray[np.float32], realisations: NDArray[np.int64]) -> None:
         """Add the extreme values of other realisations, in any order."""
-        self._keep(np.concatenate([self.values, values]), np.concatenate([self.realisations, realisations]))
-
-    def _keep(self, values: NDArray[np.float32], realisations: NDArray[np.int64]) -> None:
+        values = np.concatenate([self.values, values])
+        realisations = np.concatenate([self.realisations, realisations])
         order = np.lexsort((realisations, -self._sign * values))[:TAIL_SAMPLES]
         self.values, self.realisations = values[order], realisations[order]

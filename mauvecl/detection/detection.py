@@ -93,15 +93,9 @@ class Departure:
 
 @validated
 def departures(detection: Detection, fap: float) -> list[Departure]:
-    """Return the departures of all statistics from the closed forms.
+    """Return the departures of all statistics from the closed forms, at a wanted false-alarm probability per test.
 
     Shaped statistics have one departure per flare.
-
-    Parameters
-    ----------
-    detection : Detection
-    fap : float
-        Wanted false-alarm probability per test.
     """
     scene = detection.scene
     others = []
@@ -112,19 +106,17 @@ def departures(detection: Detection, fap: float) -> list[Departure]:
         others.append("priors that the reference does not know")
     elif detection.nuisances is not None and not scene.modulations:
         others.append("unknowns that are marginalised over and not drawn")
-    digital = _adc_moments(detection.quiet) if scene.clip else None
+    digital = _adc_moments(detection.quiet) if scene.clip else []
     rows = []
     for statistic in detection.statistics:
         for template in range(len(detection.flares)) if detection.statistic(statistic).shaped else (0,):
             null = detection.closed_form(statistic, template=template)
             cut = null.isf(fap)
-            rounding = clipping = 0.0
-            if digital is not None:
-                rounding = _shifted_fap(detection, statistic, template, *digital[0], cut) / fap - 1.0
-                clipping = _shifted_fap(detection, statistic, template, *digital[1], cut) / fap - 1.0 - rounding
+            changes = [_shifted_fap(detection, statistic, template, *each, cut) / fap - 1.0 for each in digital]
+            rounding, both = changes or (0.0, 0.0)
             simulated = detection.false_alarm_probability(cut, statistic, template=template)
             skew = _skewed_fap(detection, statistic, template, null, cut) / fap - 1.0
-            effects = skew, rounding, clipping, tuple(others)
+            effects = skew, rounding, both - rounding, tuple(others)
             rows.append(Departure(statistic, template, cut, fap, simulated, *effects, detection.realisations))
     return rows
 
@@ -211,26 +203,26 @@ def _shifted_fap(
     return kind.integrate_drawn(detection.setting, detection.quiet, moved, detection.shape(statistic, template)).sf(cut)
 
 
-def _adc_moments(x: Expectation) -> tuple[tuple[Float, Float], tuple[Float, Float]]:
+def _adc_moments(x: Expectation) -> list[tuple[Float, Float]]:
     """Return mean shift and variance of an exposure behind the ADC, DN, without and with its lower limit.
 
     Saturation at the upper limit is part of the closed forms.
     """
     mean, sd = x.mean_raw_dn, np.sqrt(np.maximum(x.unsaturated_variance_dn2 / x.n_frames - 1 / 12, 0.0))
     recorded = x.recorded_dn / x.n_frames
+    # Integers around each pixel's mean; the outermost ones include the tails.
+    first, last = np.floor(mean - 9 * sd) - 1, np.ceil(mean + 9 * sd) + 1
+    dn = first[:, None] + np.arange(int((last - first).max()) + 1)
+    gap = dn[:, :-1] + 0.5 - mean[:, None]
+    z = np.divide(gap, sd[:, None], out=np.where(gap >= 0, np.inf, -np.inf), where=sd[:, None] > 0)
+    chance = np.diff(special.ndtr(z), prepend=0.0, append=1.0)
     moments = []
-    for low, high in ((-np.inf, float(x.highest_dn)), (0.0, float(x.highest_dn))):
-        shift, variance = np.zeros_like(mean), np.zeros_like(mean)
-        for p, (m, s) in enumerate(zip(mean, sd, strict=True)):
-            # Integers around the mean; the outermost ones include the tails.
-            dn = np.arange(np.floor(m - 9 * s) - 1, np.ceil(m + 9 * s) + 2)
-            below = special.ndtr((dn[:-1] + 0.5 - m) / s) if s > 0 else (dn[:-1] + 0.5 >= m).astype(float)
-            chance = np.diff(below, prepend=0.0, append=1.0)
-            seen = np.clip(dn, low, high)
-            centre = float(chance @ seen)
-            shift[p], variance[p] = centre - recorded[p], chance @ (seen - centre) ** 2
-        moments.append((x.n_frames * shift, x.n_frames * variance))
-    return moments[0], moments[1]
+    for low in (-np.inf, 0.0):
+        seen = np.clip(dn, low, x.highest_dn)
+        centre = np.sum(chance * seen, axis=1)
+        variance = np.sum(chance * (seen - centre[:, None]) ** 2, axis=1)
+        moments.append((x.n_frames * (centre - recorded), x.n_frames * variance))
+    return moments
 
 
 #: Chi-squared and reduced chi-squared by amplitude, for the G2V star, V = 7.4, 50 s (the paper, section "G2V star").
@@ -421,22 +413,12 @@ class Detection(Drawable, ContentEquality, Hypotheses):
         return self.distribution(statistic, flare, template=template).histogram(bins)
 
     def threshold(self, fap: float = 1e-3, statistic: str = "chi2", *, template: int = 0) -> Interval:
-        """Return the threshold at a false-alarm probability.
+        """Return the threshold at a false-alarm probability per test.
 
-        Parameters
-        ----------
-        fap : float
-            False-alarm probability per test.
-        statistic : str
-        template : int
-            Index of the flare that shaped statistics use as template.
-
-        Returns
-        -------
-        Interval
-            The simulated upper quantile, rounded up to a bin's edge (1/512 of a standard deviation, or 2**-13 of the
-            value beyond 32 of them), with an order-statistic interval; or the result of importance sampling, if tails
-            are sampled and too few realisations lie beyond.
+        The threshold is the simulated upper quantile, rounded up to a bin's edge (1/512 of a standard deviation, or
+        2**-13 of the value beyond 32 of them), with an order-statistic interval. If too few realisations lie beyond and
+        tails are sampled, it is the result of importance sampling. `template` is the index of the flare that shaped
+        statistics use as template.
 
         Raises
         ------
@@ -525,12 +507,8 @@ class Detection(Drawable, ContentEquality, Hypotheses):
     def tail_samples(self, statistic: str = "chi2", flare: int | None = None, *, template: int = 0) -> QTable:
         """Return the 1000 largest values of a null, or the smallest of a flare, with their realisations.
 
-        `Engine.realise` with the same seed draws the spectrum of a realisation again.
-
-        Returns
-        -------
-        QTable
-            ``realisation`` and ``value``, the most extreme first.
+        `Engine.realise` with the same seed draws the spectrum of a realisation again. The table has the columns
+        ``realisation`` and ``value``, the most extreme first.
         """
         key = self._key(statistic, flare, template)
         self._at(key)
@@ -572,11 +550,16 @@ class Detection(Drawable, ContentEquality, Hypotheses):
         limit = self.closed_form(statistic, template=flare).isf(fap)
         # A weighted sum has no reduced value.
         reduced = np.nan if isinstance(self.statistic(statistic), LinearStatistic) else d.mean / dof
-        of_flare = (theory.mean, d.mean, d.std, reduced, theory.sf(limit))
+        of_flare = {
+            "expected": theory.mean,
+            "mean": d.mean,
+            "std": d.std,
+            "reduced": reduced,
+            "closed_form_probability": theory.sf(limit),
+        }
         if flare in self.blinding:
-            of_flare = (np.nan,) * 5
-        keys = ("expected", "mean", "std", "reduced", "closed_form_probability")
-        return dict(zip(keys, of_flare, strict=True)) | {
+            of_flare = dict.fromkeys(of_flare, np.nan)
+        return of_flare | {
             "name": self.flares[flare].name,
             "statistic": statistic,
             "dof": dof,

@@ -320,16 +320,8 @@ class QuadraticForm:
         return float(self.weight.sum() ** 2 / np.sum(self.weight**2))
 
     def sf(self, value: float, *, relative: bool = True) -> float:
-        """Return the probability of exceeding `value`.
+        """Return the probability of exceeding `value`; if not `relative`, an error of 1e-15 is enough.
 
-        Parameters
-        ----------
-        value : float
-        relative : bool
-            If False, an error of 1e-15 is enough, however small the probability.
-
-        Notes
-        -----
         For many terms and values near the mean, the characteristic function is inverted by a trapezoidal sum (Davies
         1973, doi 10.1093/biomet/60.2.415), whose terms are computed once for all values. Its aliasing error is the
         probability of a distance above 2 pi / spacing. The spacing makes this distance 40 standard deviations, for an

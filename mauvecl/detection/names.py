@@ -9,9 +9,9 @@ from mauvecl.schema.errors import InputError
 
 #: All statistics in the order of tables and plots.
 STATISTIC_NAMES = ("chi2", "chi2_element", "chi2_pair", "matched", "uv_excess", "paper")
-#: Statistics computed by default.
 #: Recommended statistic, of which answers are given by default; it has the most power where its template is right.
 RECOMMENDED = "matched"
+#: Statistics computed by default.
 DEFAULT_STATISTICS = ("chi2", "chi2_element", "matched")
 
 
@@ -66,10 +66,15 @@ def least_countable(fap: float) -> int:
     return math.ceil(MIN_IN_TAIL / fap)
 
 
+def check_probability(key: str, value: float) -> None:
+    """Raise InputError if a value is no probability between 0 and 1."""
+    if not 0.0 < value < 1.0:
+        raise InputError.of(key, value, "a probability between 0 and 1")
+
+
 def check_fap(fap: float, realisations: int, tails: Tails = "counted") -> None:
     """Raise InputError if `fap` is not a probability, or is too small for counted tails."""
-    if not 0.0 < fap < 1.0:
-        raise InputError.of("fap", fap, "a probability between 0 and 1")
+    check_probability("fap", fap)
     if tails == "counted" and not countable(fap, realisations):
         raise InputError(
             f"fap = {fap:g} leaves {fap * realisations:.3g} of {realisations} realisations beyond the threshold, but "

@@ -86,18 +86,9 @@ class Nuisances(ContentEquality):
     ) -> Nuisances:
         """Compute the nuisance spectra of a quiescent exposure.
 
-        Parameters
-        ----------
-        quiet : Expectation
-        sd : mapping of str to float
-            Prior standard deviations by name, of `NUISANCES` or `own`; infinite to project a parameter out.
-        own : mapping of str to ndarray, shape (n_pixel,), optional
-            User-defined spectra, DN of the exposure for unit amplitude.
-
-        Raises
-        ------
-        InputError
-            If a name has no spectrum, or a spectrum is zero everywhere.
+        `sd` holds prior standard deviations by name, of `NUISANCES` or `own`, infinite to project a parameter out;
+        `own` holds user-defined spectra, DN of the exposure for unit amplitude, shape (n_pixel,). Raises InputError if
+        a name has no spectrum, or a spectrum is zero everywhere.
         """
         own, shape = own or {}, quiet.wavelength_nm.shape
         spectra, of_flare = [], []
@@ -199,12 +190,9 @@ class Nuisances(ContentEquality):
         return np.asarray(self.mean @ self.spectra)
 
     def fitted_dn(self, counts: Float, variance: Float, flare_dn: Float) -> Float:
-        """Return the light of the unknowns, shape (n_pixel,), fitted together with a flare to counts less the star's.
+        """Return the light of the unknowns, fitted together with a flare to counts less the star's.
 
-        Parameters
-        ----------
-        counts, variance, flare_dn : ndarray, shape (n_pixel,)
-            The variance is infinite for pixels that are left out.
+        All arrays have the shape (n_pixel,). The variance is infinite for pixels that are left out.
         """
         for key, values in (("counts", counts), ("variance", variance), ("flare_dn", flare_dn)):
             self._check_pixels(key, values)

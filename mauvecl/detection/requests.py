@@ -293,24 +293,22 @@ def plan_channels(hypotheses: Hypotheses, batch: Sequence[int], *, first: bool) 
     for chi2, scenario in product(sums, range(n_scenario)):
         begin = channels[chi2.name, scenario, 0]
         subtractions.append((channel_of(chi2, scenario, 0), begin, begin + n_subtracted))
-    grids: list[Grid] = []
-    keys: list[Key] = []
-
-    def add(statistic: Statistic, role: Role, flare: int, channel: int, shape: Form) -> None:
-        grids.append(Grid(channel, shape.mean, shape.std))
-        keys.append((statistic.name, role, flare))
-
+    counted: list[tuple[Key, int, Form]] = []
     for statistic in asked:
+        name = statistic.name
         if first and not statistic.shaped:
-            add(statistic, "null", 0, channel_of(statistic, 0, 0), hypotheses.closed_form(statistic.name))
+            counted.append(((name, "null", 0), channel_of(statistic, 0, 0), hypotheses.closed_form(name)))
         for i, flare in enumerate(batch):
-            null = hypotheses.closed_form(statistic.name, template=flare)
+            null = hypotheses.closed_form(name, template=flare)
             if statistic.shaped:
-                add(statistic, "null", flare, channel_of(statistic, 0, flare), null)
+                counted.append(((name, "null", flare), channel_of(statistic, 0, flare), null))
             channel = channel_of(statistic, i + 1, flare)
-            add(statistic, "flare_on_null_grid", flare, channel, null)
-            add(statistic, "flare", flare, channel, hypotheses.closed_form(statistic.name, flare))
-    weights = _padded([*weighted.values()], len(hypotheses.scene.pixels))
+            counted.append(((name, "flare_on_null_grid", flare), channel, null))
+            counted.append(((name, "flare", flare), channel, hypotheses.closed_form(name, flare)))
+    grids = [Grid(channel, form.mean, form.std) for _, channel, form in counted]
+    scene = hypotheses.scene
+    weights = np.zeros((len(weighted), len(scene.pixels)), np.float32)
+    weights[:, : scene.n_pixel] = np.reshape([*weighted.values()], (len(weighted), scene.n_pixel))
     scales = np.array([*smoothed.values()], np.float32) if smoothed else np.zeros((0, 1), np.float32)
     linear_end, scale_end = (
         np.cumsum(_per_scenario(rows, n_scenario), dtype=np.uint32) for rows in (weighted, smoothed)
@@ -318,15 +316,8 @@ def plan_channels(hypotheses: Hypotheses, batch: Sequence[int], *, first: bool) 
     of_elements = [key for key in weighted if hypotheses.statistic(key[0]).by_element]
     pixels_end = linear_end - _per_scenario(of_elements, n_scenario)
     taken = np.array(subtractions, np.uint32).reshape(len(subtractions), 3).T
+    keys = [key for key, _, _ in counted]
     return ChannelPlan(weights, linear_end, pixels_end, scales, scale_end, grids, keys, taken)
-
-
-def _padded(rows: Sequence[NDArray[Any]], size: int) -> NDArray[np.float32]:
-    """Return rows of one value per pixel, continued by zeros to a size, shape (n_row, size)."""
-    padded = np.zeros((len(rows), size), np.float32)
-    for row, values in zip(padded, rows, strict=True):
-        row[: values.size] = values
-    return padded
 
 
 @dataclass(frozen=True)
@@ -440,14 +431,20 @@ class DetectRequest(Countable):
 
 @validated
 @dataclass(frozen=True, eq=False)
-class SnrRequest(Countable):
-    """Arguments of `Engine.snr`."""
+class RealiseRequest(Countable):
+    """Arguments of `Engine.realise`, computed as a single shard, so callers limit the number of realisations."""
 
     expectation: Expectation
     realisations: Realisations
     seed: Seed
     start: FirstRealisation = 0
     drawing: Drawing = AUTOMATIC
+
+
+@validated
+@dataclass(frozen=True, eq=False)
+class SnrRequest(RealiseRequest):
+    """Arguments of `Engine.snr`."""
 
     @cached_property
     def scene(self) -> Scene:
@@ -458,15 +455,3 @@ class SnrRequest(Countable):
     def work(self) -> int:
         """Work per realisation: pixels."""
         return self.scene.n_pixel
-
-
-@validated
-@dataclass(frozen=True, eq=False)
-class RealiseRequest(Countable):
-    """Arguments of `Engine.realise`, computed as a single shard, so callers limit the number of realisations."""
-
-    expectation: Expectation
-    realisations: Realisations
-    seed: Seed
-    start: FirstRealisation = 0
-    drawing: Drawing = AUTOMATIC

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.detection.counts import SparseCounts, TailSamples, Tally
+from mauvecl.detection.counts import SparseCounts, TailSamples, Tally, steps_of
 from mauvecl.detection.detection import Detection
 from mauvecl.detection.requests import DetectRequest, SnrRequest
 from mauvecl.host.arrays import ContentEquality
@@ -86,21 +86,19 @@ def elements(x: Expectation) -> NDArray[np.void]:
     return table
 
 
-#: First and last dense bin; bin 0 contains the expected value.
-FIRST_BIN, LAST_BIN = 1 - layout.OBSERVER_BINS // 2, layout.OBSERVER_BINS // 2 - 2
-#: Limit of the absolute value of bin numbers.
+#: Limit of the absolute value of bin numbers, of which 0 contains the expected value.
 MAX_BIN = 2**31
+#: First and last bin of the device's histograms, whose first and last columns only mark values outside.
+FIRST_BIN, LAST_BIN = 1 - layout.OBSERVER_BINS // 2, layout.OBSERVER_BINS // 2 - 2
 
 
 class Counts:
     """Accumulator of the histograms of all pixels and elements."""
 
     def __init__(self, n_pixel: int, n_element: int) -> None:
-        # Dense bins; the first and the last stay empty.
-        self.pixel = np.zeros((n_pixel, layout.OBSERVER_BINS), np.int64)
-        self.element = np.zeros((n_element, layout.OBSERVER_BINS), np.int64)
-        # Bins of the same width beyond, with keys that combine the pixel or element and the bin.
-        self.far = {"pixel": SparseCounts(), "element": SparseCounts()}
+        self.shapes = {"pixel": (n_pixel, layout.OBSERVER_BINS), "element": (n_element, layout.OBSERVER_BINS)}
+        # Filled bins; keys combine the pixel or element and the bin.
+        self.bins = {"pixel": SparseCounts(), "element": SparseCounts()}
         # Frames clipped at zero and at saturation.
         self.clipped = np.zeros((n_pixel, 2), np.int64)
         self.n = 0
@@ -108,10 +106,11 @@ class Counts:
     def add(
         self, pixel: NDArray[np.integer], element: NDArray[np.integer], clipped: NDArray[np.integer], n: int
     ) -> None:
-        """Add the counts of one or more tiles."""
-        inner = slice(1, layout.OBSERVER_BINS - 1)
-        self.pixel[:, inner] += pixel[:, inner]
-        self.element[:, inner] += element[:, inner]
+        """Add the device's histograms of one or more tiles."""
+        for kind, dense in (("pixel", pixel), ("element", element)):
+            which, column = np.nonzero(dense[:, 1:-1])
+            keys = which * (2 * MAX_BIN) + MAX_BIN + FIRST_BIN + column
+            self.bins[kind].add(keys, dense[which, 1 + column].astype(np.int64))
         self.clipped += clipped
         self.n += n
 
@@ -139,19 +138,26 @@ class Counts:
 
     def _count_far(self, kind: str, which: int, bins: NDArray[np.int64]) -> None:
         outside = bins[(bins < FIRST_BIN) | (bins > LAST_BIN)]
-        if outside.size:
-            self.far[kind].count(which * (2 * MAX_BIN) + MAX_BIN + outside)
+        self.bins[kind].count(which * (2 * MAX_BIN) + MAX_BIN + outside)
 
     def filled(self, kind: str, which: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the filled bins of a pixel or element, ascending, with 0 at the expected value, and their counts."""
-        dense = (self.pixel if kind == "pixel" else self.element)[which]
-        inner = np.flatnonzero(dense)
-        numbers, counts = inner - layout.OBSERVER_BINS // 2, dense[inner]
-        far, offset = self.far[kind], which * (2 * MAX_BIN) + MAX_BIN
-        mine = slice(*np.searchsorted(far.keys, (offset - MAX_BIN, offset + MAX_BIN)))
-        outside = far.keys[mine] - offset
-        below = int(np.count_nonzero(outside < 0))
-        return np.insert(outside, below, numbers), np.insert(far.counts[mine], below, counts)
+        every, offset = self.bins[kind], which * (2 * MAX_BIN) + MAX_BIN
+        mine = slice(*np.searchsorted(every.keys, (offset - MAX_BIN, offset + MAX_BIN)))
+        return every.keys[mine] - offset, every.counts[mine]
+
+    def dense(self, kind: str) -> NDArray[np.int64]:
+        """Return the histograms in the device's columns, without values beyond, shape (n, OBSERVER_BINS)."""
+        dense = np.zeros(self.shapes[kind], np.int64)
+        which, place = np.divmod(self.bins[kind].keys, 2 * MAX_BIN)
+        inner = self.within(kind)
+        dense[which[inner], place[inner] - MAX_BIN - FIRST_BIN + 1] = self.bins[kind].counts[inner]
+        return dense
+
+    def within(self, kind: str) -> NDArray[np.bool_]:
+        """Return which filled bins are among the device's."""
+        bins = self.bins[kind].keys % (2 * MAX_BIN) - MAX_BIN
+        return (bins >= FIRST_BIN) & (bins <= LAST_BIN)
 
 
 def signal_to_noise(dn: NDArray[np.integer], observers: NDArray[np.void], sky: np.float32) -> Floats:
@@ -235,12 +241,6 @@ class SnrResult(Drawable, ContentEquality):
         return table_of(columns, [values | clipped], realisations=self.counts.n, **about)
 
 
-def steps_of(counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the number of realisations below the lower and the upper edge of each bin, alternating, shape (2 m,)."""
-    above = np.cumsum(counts)
-    return np.column_stack([above - counts, above]).ravel()
-
-
 Arrays = dict[str, NDArray[Any]]
 
 
@@ -261,10 +261,10 @@ def pack_detection(tally: Tally, samples: Sequence[TailSamples | None]) -> Array
 
 def pack_snr(counts: Counts) -> Arrays:
     """Pack a shard of an S/N as arrays."""
-    shard = _pack_array("pixel", counts.pixel) | _pack_array("element", counts.element)
-    for name, far in counts.far.items():
-        shard |= _pack_counts(f"far-{name}", far.keys, far.counts)
-    return shard | {"clipped": counts.clipped, "n": np.array(counts.n)}
+    shard = {"clipped": counts.clipped, "n": np.array(counts.n)}
+    for kind, each in counts.bins.items():
+        shard |= _pack_counts(kind, each.keys, each.counts)
+    return shard
 
 
 class DetectionSums:
@@ -305,23 +305,15 @@ class SnrSums:
 
     def add(self, part: int, shard: Arrays) -> None:
         """Add a shard."""
-        counts = self._counts
-        pixel = _unpack_array("pixel", shard, counts.pixel.shape)
-        element = _unpack_array("element", shard, counts.element.shape)
-        counts.add(pixel, element, shard["clipped"], int(shard["n"]))
-        for name, far in counts.far.items():
-            far.add(*_unpack_counts(f"far-{name}", shard))
+        for kind, each in self._counts.bins.items():
+            each.add(*_unpack_counts(kind, shard))
+        self._counts.clipped += shard["clipped"]
+        self._counts.n += int(shard["n"])
 
     def answer(self) -> SnrResult:
         """Return the result, once all shards are added."""
         x, scene = self._request.expectation, self._request.scene
         return SnrResult(x, scene, observers(x, scene), self._elements, self._counts)
-
-
-def _pack_array(name: str, counts: NDArray[np.int64]) -> Arrays:
-    """Pack the filled bins of an array."""
-    where = np.flatnonzero(counts)
-    return _pack_counts(name, where, counts.ravel()[where])
 
 
 def _pack_counts(name: str, keys: NDArray[np.int64], counts: NDArray[np.int64]) -> Arrays:
@@ -339,10 +331,3 @@ def _unpack_counts(name: str, shard: Arrays) -> tuple[NDArray[np.int64], NDArray
 
 def _smallest_type(values: NDArray[np.int64]) -> NDArray[np.unsignedinteger]:
     return values.astype(np.min_scalar_type(int(values.max(initial=0))))
-
-
-def _unpack_array(name: str, shard: Arrays, shape: tuple[int, ...]) -> NDArray[np.int64]:
-    counts = np.zeros(int(np.prod(shape)), np.int64)
-    keys, values = _unpack_counts(name, shard)
-    counts[keys] = values
-    return counts.reshape(shape)

@@ -26,9 +26,9 @@ from mauvecl.detection.distributions import (
     central_counts,
     clopper_pearson,
 )
-from mauvecl.detection.names import check_atom, least_countable
+from mauvecl.detection.names import check_atom, check_probability, least_countable
 from mauvecl.detection.statistics import Differences
-from mauvecl.noise import layout
+from mauvecl.noise import layout, reference
 from mauvecl.noise.disturbances import ADDITIVE
 from mauvecl.noise.scene import quantile_at_score
 from mauvecl.noise.unknowns import PROCESSES, SIGNAL_PARTS
@@ -73,13 +73,6 @@ class PerTest:
 def per_test(wanted: float, frames: int, stack: int = 1, *, step: int | None = None, seed: int = 1) -> PerTest:
     """Return the false-alarm probability per test for a wanted one of the campaign; the inverse of `campaign`.
 
-    Parameters
-    ----------
-    wanted : float
-        Probability of any false alarm in the whole campaign.
-    frames, stack, step, seed
-        As for `campaign`.
-
     Examples
     --------
     >>> from mauvecl.detection.tails import campaign, per_test
@@ -91,7 +84,7 @@ def per_test(wanted: float, frames: int, stack: int = 1, *, step: int | None = N
     """
     step = stack if step is None else step
     tests = count_tests(frames, stack, step)
-    _check_probability("wanted campaign fap", wanted)
+    check_probability("wanted campaign fap", wanted)
     overlapping = None
     if step < stack and tests > 1:
         stretch = min(tests, STRETCH)
@@ -107,25 +100,11 @@ def per_test(wanted: float, frames: int, stack: int = 1, *, step: int | None = N
 def campaign(fap: float, frames: int, stack: int = 1, *, step: int | None = None, seed: int = 1) -> Campaign:
     """Return the false-alarm probability of a search through consecutive frames.
 
-    Parameters
-    ----------
-    fap : float
-        False-alarm probability of one test.
-    frames : int
-        Number of searched frames; a day of 5 s frames has 17 280.
-    stack : int
-        Frames summed in one test.
-    step : int, optional
-        Frames from one stack to the next. The default is `stack`. Smaller steps make stacks overlap, so that
-        neighbouring tests are correlated by their fraction of common frames.
-    seed : int
-        Seed of the simulation of overlapping stacks.
-
-    Notes
-    -----
-    Sums of frames are nearly normal, so a linear statistic of overlapping stacks is a moving average of independent
-    normals. The probability that its maximum exceeds the threshold is simulated. The correlation of chi-squared
-    statistics is the square of this one, so their probability lies between `overlapping` and `independent`.
+    `fap` is that of one test, `stack` the number of frames summed in a test, and `step` that from one stack to the
+    next, by default `stack`. Smaller steps make stacks overlap, so that neighbouring tests are correlated by their
+    fraction of common frames. Sums of frames are nearly normal, so a linear statistic of overlapping stacks is a moving
+    average of independent normals, whose maximum is simulated. The correlation of chi-squared statistics is the square
+    of this one, so their probability lies between `overlapping` and `independent`.
 
     Examples
     --------
@@ -136,16 +115,11 @@ def campaign(fap: float, frames: int, stack: int = 1, *, step: int | None = None
     """
     step = stack if step is None else step
     tests = count_tests(frames, stack, step)
-    _check_probability("fap", fap)
+    check_probability("fap", fap)
     overlapping = _overlapping(fap, tests, stack, step, seed) if step < stack and tests > 1 else None
     return Campaign(
         tests, fap, tests * fap, min(tests * fap, 1.0), float(-np.expm1(tests * np.log1p(-fap))), overlapping
     )
-
-
-def _check_probability(what: str, value: float) -> None:
-    if not 0.0 < value < 1.0:
-        raise InputError.of(what, value, "a probability between 0 and 1")
 
 
 def count_tests(frames: int, stack: int, step: int) -> int:
@@ -210,26 +184,12 @@ class Tail:
 
 
 def tail(hypotheses: Hypotheses, fap: float, statistic: str, *, template: int = 0, seed: int) -> Tail:
-    """Find the threshold of a small false-alarm probability by importance sampling.
+    """Find the threshold of a false-alarm probability from 1e-10 to 0.1 by importance sampling.
 
-    Parameters
-    ----------
-    hypotheses : Hypotheses
-        Only the scene and the quiescent star are used.
-    fap : float
-        1e-10 to 0.1.
-    statistic : str
-    template : int
-        Index of the flare that ``matched`` uses as template.
-    seed : int
-
-    Raises
-    ------
-    NoThresholdError
-        If no threshold has the probability.
-    InputError
-        If noise is not drawn jointly and in stacks, additive processes are drawn, priors are drawn that the statistics
-        are not marginalised over, more than 30 quiescent exposures are averaged, or the error remains too large.
+    `template` is the index of the flare that shaped statistics use as template. Raises NoThresholdError if no threshold
+    has the probability. Raises InputError if noise is not drawn jointly and in stacks, additive processes are drawn,
+    priors are drawn that the statistics are not marginalised over, more than 30 quiescent exposures are averaged, or
+    the error remains too large.
     """
     if not SMALLEST_FAP <= fap <= 0.1:
         raise InputError.of("fap", fap, f"between {SMALLEST_FAP:g} and 0.1 for importance sampling")
@@ -241,11 +201,10 @@ def tail(hypotheses: Hypotheses, fap: float, statistic: str, *, template: int = 
         for number in range(len(blocks), goal // BLOCK):
             blocks.append(_block(hypotheses, statistic, template, how, seed, number))
         values, logs = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
-        cut, low, high, error = _threshold(values, logs, fap)
-        beyond, at = _probabilities_at(values, logs, cut)
-        check_atom(f"{statistic} of {hypotheses.quiet.name}", fap, beyond, at)
+        cut, error = _threshold(values, logs, fap)
+        check_atom(f"{statistic} of {hypotheses.quiet.name}", fap, *_probabilities_at(values, logs, cut.value))
         if error <= WANTED_ERROR:
-            return Tail(Interval(cut, low, high), fap, error, values.size)
+            return Tail(cut, fap, error, values.size)
         if goal >= MAX_REALISATIONS:
             raise InputError(
                 f"the threshold of {statistic} at fap = {fap:g} must have a relative error of at most "
@@ -274,8 +233,8 @@ def _check(hypotheses: Hypotheses, fap: float) -> None:
             )
 
 
-def _threshold(values: Float, logs: Float, fap: float) -> tuple[float, float, float, float]:
-    """Return the value with a weighted fraction `fap` at or above, its interval, and the fraction's relative error."""
+def _threshold(values: Float, logs: Float, fap: float) -> tuple[Interval, float]:
+    """Return the value with a weighted fraction `fap` at or above, and the fraction's relative error."""
     order = np.argsort(-values, kind="stable")
     ordered, weight = values[order], np.exp(logs[order])
     above = np.cumsum(weight) / values.size
@@ -283,14 +242,14 @@ def _threshold(values: Float, logs: Float, fap: float) -> tuple[float, float, fl
     variance = np.maximum(np.cumsum(weight**2) / values.size - above**2, 0.0) / values.size
     error = np.sqrt(variance)
     if above[-1] < fap:
-        return float("nan"), float("nan"), float("nan"), float("inf")
+        return Interval(math.nan, math.nan, math.nan), math.inf
     at = int(np.searchsorted(above, fap))
     relative = float(error[at] / above[at])
     # The fraction at the ends differs by its error at the threshold.
     reach = float(special.ndtri(0.5 + CONFIDENCE / 2)) * relative
     ends = np.searchsorted(above, (fap * (1.0 + reach), fap * (1.0 - reach)))
     low, high = (float(ordered[min(int(end), values.size - 1)]) for end in ends)
-    return float(ordered[at]), low, high, relative
+    return Interval(float(ordered[at]), low, high), relative
 
 
 def _probabilities_at(values: Float, logs: Float, cut: float) -> tuple[float, float]:
@@ -392,12 +351,10 @@ def _block(
     root = np.sqrt(1.0 + added)
     difference = (z - added * sum(others)) / root
     move, logs = tilt.apply(difference)
-    if scene.modulations:
-        factors, more = _factors(scene, tilt.scores, seed, block)
-        excess, logs = _responding(scene, z + move / root, factors), logs + more
-    else:
-        excess = _excess(scene, z + move / root)
-    subtracted = [_excess(scene, other - added * move / root) for other in others]
+    factors, more = _factors(scene, tilt.scores, seed, block)
+    excess, logs = _excess(scene, z + move / root, factors), logs + more
+    # Exposures are subtracted only if no factors are drawn.
+    subtracted = [_excess(scene, other - added * move / root, factors) for other in others]
     mean = added * np.sum(subtracted, axis=0) if subtracted else np.zeros_like(excess)
     variance = np.broadcast_to(kind.variance(hypotheses.setting), excess.shape)
     if scene.comparison.estimated:
@@ -427,8 +384,10 @@ def _normals(n_pixel: int, seed: int, block: int, exposure: int, purpose: int = 
 def _factors(
     scene: Scene, towards: dict[str, tuple[float, float]], seed: int, block: int
 ) -> tuple[dict[str, Float], Float]:
-    """Draw factors on light, sky and dark, each minus one, shape (BLOCK, 1), and the logarithms of their weights."""
-    factors = {name: np.ones((BLOCK, 1)) for name in SIGNAL_PARTS}
+    """Draw factors on light, dark and sky, each minus one, shape (BLOCK,), and the logarithms of their weights."""
+    factors = {str(name): np.ones(BLOCK) for name in SIGNAL_PARTS}
+    if not scene.modulations:
+        return {name: values - 1.0 for name, values in factors.items()}, np.zeros(BLOCK)
     kinds = [factor for _, factor in scene.modulations]
     # The scores of every second realisation are moved, which limits weights to two.
     moved = np.arange(BLOCK)[:, None] % 2 == 1
@@ -441,41 +400,16 @@ def _factors(
             score = np.where(moved, mean + sd * score, score)
             # Ratio of the moved density to the prior's.
             ratio += (score[:, 0] ** 2 - ((score[:, 0] - mean) / sd) ** 2) / 2 - np.log(sd)
-        factors[factor] *= 1.0 + quantile_at_score(table, score).mean(axis=1, keepdims=True)
+        factors[factor] *= 1.0 + quantile_at_score(table, score).mean(axis=1)
     return {name: values - 1.0 for name, values in factors.items()}, np.log(2.0) - np.logaddexp(0.0, ratio)
 
 
-def _responding(scene: Scene, z: Float, factors: dict[str, Float]) -> Float:
-    """Return `_excess` with drawn factors, by the expansion of `analogue` in kernels/detector.cl.mako."""
+def _excess(scene: Scene, z: Float, factors: dict[str, Float]) -> Float:
+    """Return the observed counts minus the reference, DN, of quiescent draws from normals, both (n, n_pixel)."""
     n = scene.n_pixel
-    r = {name: scene.responses[name][0, :n].astype(np.float64) for name in scene.responses.dtype.names or ()}
-    sky = factors["sky"] * r["sky_share"]
-    more, warmer = factors["light"] + sky + factors["light"] * sky, factors["dark"]
-    light, dark = more + 1.0, warmer + 1.0
-    variance = light * r["light_variance"] + dark * r["dark_variance"] + r["other_variance"]
-    third, fourth, fifth = (light * r[f"light_{k}"] + dark * r[f"dark_{k}"] for k in layout.CUMULANTS[1:])
-    sd, skew = np.sqrt(variance), third / variance
-    v = z * sd + skew * (z**2 - 1) / 6 + (fourth * (z**3 - 3 * z) / 24 - third * skew * (2 * z**3 - 5 * z) / 36) / sd**3
-    if scene.quartic:
-        even = fifth * (z**4 - 6 * z**2 + 3) / 120 - skew * fourth * (z**4 - 5 * z**2 + 2) / 24
-        v += (even + skew**2 * third * (12 * z**4 - 53 * z**2 + 17) / 324) / variance**2
-    return _digitised(scene, v + scene.levels["c0"][0, :n] + more * r["light"] + warmer * r["dark"])
-
-
-def _excess(scene: Scene, z: Float) -> Float:
-    """Return the observed counts minus the reference, DN, for the quiescent scenario."""
-    n = scene.n_pixel
-    level = scene.levels[0, :n]
-    drawn = level["c4"].astype(np.float64) if scene.quartic else np.zeros(n)
-    for name in ("c3", "c2", "c1", "c0"):
-        drawn = drawn * z + level[name]
-    return _digitised(scene, drawn)
-
-
-def _digitised(scene: Scene, drawn: Float) -> Float:
-    """Digitise counts above the base and subtract the reference."""
-    n, edge = scene.n_pixel, scene.edges[0, : scene.n_pixel]
-    counts = np.rint(drawn)
+    # The kernels' expansion in double precision.
+    v = reference.analogue(scene, reference.Draws(z.T), 0, **factors, fma=lambda a, b, c: a * b + c)
+    edge, counts = scene.edges[0, :n], np.rint(v.T)
     if scene.clip:
         counts = np.clip(counts, edge["low"] - layout.MAGIC, edge["high"] - layout.MAGIC)
     return np.asarray(counts + edge["whole"] + scene.fraction[0, :n])

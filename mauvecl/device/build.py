@@ -8,6 +8,7 @@ import json
 import os
 import shutil
 import sys
+import time
 import warnings
 from dataclasses import asdict, dataclass
 from functools import cache
@@ -56,8 +57,16 @@ class DeviceRecord:
         return f"{self.platform}: {self.name}"
 
 
-def write_outcome(device: DeviceRecord, record: dict[str, Any]) -> None:
-    """Write the outcome of the self-test on a device to the kernel cache."""
+def write_outcome(device: DeviceRecord, checks: list[dict[str, Any]], seconds: float) -> None:
+    """Write the checks of the self-test to the kernel cache, for run records of the same device, driver and version."""
+    record = {
+        "mauvecl": VERSION,
+        "device": asdict(device),
+        "date_utc": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "seconds": round(seconds, 1),
+        "passed": all(check["passed"] for check in checks),
+        "checks": checks,
+    }
     kernel_cache().write_text(_outcome_key(device), json.dumps(record))
 
 

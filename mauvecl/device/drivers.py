@@ -1,15 +1,13 @@
 """Drivers of OpenCL: their folders, the processor for which they compile, their kernel cache, and first builds.
 
-Folders. The wheel of Intel's runtime contains the driver's library, but its .icd file names a path of the machine on
-which the wheel was built, and no loader searches the file's folder. The loader is therefore given a folder with a
-correct .icd file in addition to those that it would have found. It finds the PoCL of pyopencl's wheels in any case.
+Folders. The .icd file in the wheel of Intel's runtime names a path of the machine that built the wheel. The loader is
+therefore given a folder with a correct .icd file next to those that it would have found.
 
-Processors. The PoCL of wheels and distributions supports many processors. It loads the library of built-in functions
-that suits the instructions of the processor, but before version 5 it compiles kernels for LLVM's name of the processor,
-which need not match the library. LLVM 14 calls AMD's Zen 4 "znver3", which has no AVX-512, while PoCL loads the AVX-512
-library: a build then takes minutes and gigabytes and ends in a segmentation fault. LLVM calls an unknown processor
-"generic", which its compiler rejects for x86-64 (PoCL issue 1049). No setting changes the name. This module therefore
-writes the highest level of the x86-64 psABI that fits processor and library into PoCL's record of the device in memory.
+Processors. PoCL before version 5 loads the library of built-in functions that suits the processor's instructions, but
+compiles kernels for LLVM's name of the processor, which need not match the library. LLVM 14 calls AMD's Zen 4 "znver3",
+which has no AVX-512: a build with the AVX-512 library takes minutes and gigabytes and ends in a segmentation fault. It
+rejects "generic", its name of an unknown processor (PoCL issue 1049). No setting changes the name. This module writes
+the highest level of the x86-64 psABI that fits processor and library into PoCL's record of the device in memory.
 PoCL 5 and later, and Debian's 3.1, name the processor after the library; their record is not changed.
 
 Kernel cache. PoCL aborts the process on a damaged cache entry and finds no device if its cache folder cannot be
@@ -509,21 +507,17 @@ def _try(name: str | None, number: int, device: Any, limit_s: float) -> str | No
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(child.pid, signal.SIGKILL)
             child.wait()
-        return _failure(code, _last_line(out) or _last_line(log) or "no message", limit_s)
+        if code == 0:
+            return None
+        message = _last_line(out) or _last_line(log) or "no message"
+    if -code == signal.SIGXCPU:
+        return f"was not finished after {limit_s:g} s of processor time"
+    if code < 0:
+        return f"was ended by a signal ({(signal.strsignal(-code) or str(-code)).lower()}: {message})"
+    return f"failed ({message})"
 
 
 def _last_line(file: IO[bytes]) -> str:
     file.seek(0)
     lines = file.read(2**16).decode(errors="replace").split("\n")
     return next((line.strip()[:200] for line in reversed(lines) if line.strip()), "")
-
-
-def _failure(code: int, message: str, limit_s: float) -> str | None:
-    """Describe the failure of a child by its exit code and its last line; None after a success."""
-    if code == 0:
-        return None
-    if -code == signal.SIGXCPU:
-        return f"was not finished after {limit_s:g} s of processor time"
-    if code < 0:
-        return f"was ended by a signal ({(signal.strsignal(-code) or str(-code)).lower()}: {message})"
-    return f"failed ({message})"

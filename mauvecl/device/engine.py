@@ -195,8 +195,7 @@ class Engine:
             raise InputError(
                 f"out must be writable contiguous {dtype} of {shape}, not {out.dtype} of {out.shape}", key="out"
             )
-        clipped = np.empty(count, np.uint32)
-        rows = out
+        clipped, rows = np.empty(count, np.uint32), out
         with scene_launches(self.open_device, scene, seed, row_type="ushort" if narrow else "int") as launches:
 
             def work(tile: Tile, done: int) -> None:
@@ -234,21 +233,7 @@ class Engine:
         return sums.answer()
 
     def count(self, request: Countable, shard: Shard, *, out: NDArray[Any] | None = None) -> Arrays:
-        """Compute the sums of one shard of a request, as accumulated by `results.shard_sums`.
-
-        Parameters
-        ----------
-        request : DetectRequest, SnrRequest, RealiseRequest or StaresRequest
-        shard : Shard
-            One of the shards into which `shards.shards` divides the request.
-        out : ndarray, optional
-            As for `realise`.
-
-        Returns
-        -------
-        dict of str to ndarray
-            Raw spectra are ``rows``.
-        """
+        """Compute the sums of one shard of a request; raw spectra are ``rows``, filled into `out` if it is given."""
         match request:
             case DetectRequest():
                 return pack_detection(*self._detection(request, shard))

@@ -83,10 +83,10 @@ class Tiles:
         total: int | None = None,
     ) -> None:
         """Call `work(tile, done)` for each tile, with smaller tiles if the device's memory does not suffice."""
-        size = self.size(bytes_each)
-        done = 0
-        if self._progress is not None and not before:
-            self._progress(0, count if total is None else total)
+        size, done = self.size(bytes_each), 0
+        report: Progress = self._progress or (lambda done, total: None)
+        if not before:
+            report(0, total or count)
         while done < count:
             tile = self.at(start + done, count - done, size)
             try:
@@ -102,8 +102,7 @@ class Tiles:
                 size //= 2
                 continue
             done += tile.wanted
-            if self._progress is not None:
-                self._progress(before + done, count if total is None else total)
+            report(before + done, total or count)
 
     def size(self, bytes_each: int) -> int:
         """Return the number of realisations per tile, a power of two, from the memory of the device."""
@@ -115,11 +114,8 @@ class Tiles:
     def at(self, index: int, left: int, size: int) -> Tile:
         """Return the tile from `index` to a multiple of `size`, so that no tile crosses a multiple of 2**32."""
         first = index - index % size
-        start, stop = index - first, min(index - first + left, size)
         # A short tile computes only the vectors that it needs.
-        skip = start - start % self._step
-        need = -(-stop // self._step) * self._step
-        return Tile(first + skip, need - skip, start - skip, stop - skip)
+        return Tile(first, size, index - first, min(index - first + left, size)).narrow(self._step)
 
 
 #: Realisations times frames counted on the device before its 32-bit bins and 64-bit sums are moved to the host.
@@ -371,21 +367,16 @@ def scene_launches(
     **options: Any,
 ) -> Launches:
     """Return the launches of a scene, with the smallest kernel variant that suits it and has these options."""
+    of_scene = ("frames", "clip", "joint", "quartic", "photons", "additive", "modulations")
     variant = replace(
         device.variant,
         scenarios=BATCH[scene.frames],
         linears=_capacity(linears),
-        frames=scene.frames,
-        clip=scene.clip,
+        smooths=_capacity(smooths),
         noisy=scene.comparison.exposures > 0,
         estimated=scene.comparison.estimated,
-        smooths=_capacity(smooths),
-        joint=scene.joint,
-        quartic=scene.quartic,
-        photons=scene.photons,
-        additive=scene.additive,
-        modulations=scene.modulations,
         chunk=min(chunk or device.variant.chunk, device.variant.chunk),
+        **{name: getattr(scene, name) for name in of_scene},
         **options,
     )
     single = device.width == 1 or scene.frames or variant.compared

@@ -145,15 +145,7 @@ class Stares:
     def reduced(self, request: StaresRequest, shard: Shard | None = None) -> Arrays:
         """Draw the stares of a request, or of a shard of it, and reduce them a few at a time.
 
-        Parameters
-        ----------
-        request : StaresRequest
-        shard : Shard, optional
-
-        Returns
-        -------
-        dict of str to ndarray
-            Joined results of the request's reduction; for a shard with its ``start``, as `StareSums` requires.
+        Return the joined results of the request's reduction; for a shard with its ``start``, as `StareSums` requires.
         """
         there = shard or Shard(0, request.start, request.realisations)
         _check_last(there.start, there.count)
@@ -191,13 +183,7 @@ class Stares:
         return arrays | {"start": np.array(there.start)} if shard else arrays
 
     def _launches(
-        self,
-        components: Components,
-        stare: Stare,
-        flares: Flares,
-        seed: int,
-        method: Method,
-        processes: Processes,
+        self, components: Components, stare: Stare, flares: Flares, seed: int, method: Method, processes: Processes
     ) -> StareLaunches:
         self.open_device.check_process()
         scene = _scene_of(components, stare, processes)
@@ -246,7 +232,6 @@ class StareLaunches(Launches):
         )
         super().__init__(device, scene, variant, seed)
         self._seed = seed
-        self._held: Any = None
         self._stare, self._local = stare, (1, 1) if variant.width > 1 else None
         self._known = [*map(self.upload, (stare.numbers, stare.known, stare.curves, stare.kinds))]
         if table is None:
@@ -254,11 +239,6 @@ class StareLaunches(Launches):
             self._own = [*map(self.upload, more)]
         else:
             self._own = [self.upload(table.packed)]
-
-    def __exit__(self, *_: object) -> None:
-        super().__exit__()
-        if self._held is not None:
-            self._held.release()
 
     def upload_flares(self, flares: Flares, first: int, count: int) -> None:
         """Upload the flares and the pointing losses of the next `count` stares."""
@@ -268,19 +248,10 @@ class StareLaunches(Launches):
         self._flares = [
             self._fill("stare_job", self._stare.stare_struct(flares)),
             *self._known,
-            self._shared(flares.rows) if self._device.record.kind == "cpu" else self._fill("flares", flares.rows),
+            self._fill("flares", flares.rows),
             self._fill("amplitudes", flares.amplitudes),
             self._fill("losses", losses),
         ]
-
-    def _shared(self, array: NDArray[Any]) -> Any:
-        """Return a buffer that shares the host's memory, valid until the next flares are uploaded."""
-        if self._held is not None:
-            self._held.release()
-        flags = self._cl.mem_flags
-        self._given = contiguous(array)
-        self._held = self._cl.Buffer(self._device.context, flags.READ_ONLY | flags.USE_HOST_PTR, hostbuf=self._given)
-        return self._held
 
     def _fill(self, name: str, array: NDArray[Any]) -> Any:
         """Copy an array to a reused buffer."""

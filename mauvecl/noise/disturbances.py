@@ -342,14 +342,7 @@ class Normal:
         return min(self.mean - self.low, self.high - self.mean) >= least_sd * self.sd * (1.0 - 1e-12)
 
     def quantile(self, below: NDArray[np.float64], above: NDArray[np.float64] | None = None) -> Float:
-        """Return the quantiles at probabilities `below`.
-
-        Parameters
-        ----------
-        below : ndarray
-        above : ndarray, same shape, optional
-            1 - below, if the subtraction would lose precision.
-        """
+        """Return the quantiles at probabilities `below`; `above` is 1 - below, if subtraction would lose precision."""
         import numpy as np
         from scipy import special
 

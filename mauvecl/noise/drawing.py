@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
+from itertools import product
 from typing import TYPE_CHECKING, Literal, Self, TypedDict, cast
 
 import numpy as np
@@ -346,6 +347,11 @@ REACH_DN = 2.0**22
 MAX_PIXELS = 65_536
 
 
+#: Fields of an expectation that scenarios on common draws share.
+OF_DETECTOR = ("wavelength_nm", "dark_dn", "bias_dn", "read_noise_dn", "gain_dn_per_electron", "element", "n_frames",
+               "frame_s", "dark_unit", "photon_noise", "adc_max_dn", "saturation_dn")  # fmt: skip
+
+
 @dataclass(frozen=True, eq=False)
 class DrawMethod:
     """Method by which scenarios are drawn; see `Scene` for the switches."""
@@ -366,7 +372,9 @@ def choose_method(scenarios: Sequence[Expectation], drawing: Drawing, factors: F
         raise InputError.of("pixels", quiet.wavelength_nm.size, f"at most {MAX_PIXELS}")
     for other in scenarios[1:]:
         _check_same_detector(quiet, other)
-    corners = _corners(factors)
+    # A grid of factors on light, dark and sky that spans the priors in steps of at most 2.
+    grids = [np.geomspace(low, high, 1 + int(np.ceil(np.log2(high / low)))) for low, high in factors.ends.values()]
+    corners = [*product(*(grid.tolist() for grid in grids))]
     frames = _draw_frames(scenarios, drawing.mode, factors, processes, corners)
     each = 1 if frames else quiet.n_frames
     cumulants = [Cumulants.of(x, each) for x in scenarios]
@@ -407,12 +415,6 @@ def near_rail(x: Expectation, factors: Factors, processes: Processes) -> NDArray
     return low | high
 
 
-def _corners(factors: Factors) -> list[tuple[float, float, float]]:
-    """Return a grid of factors on light, dark and sky that spans the priors in steps of at most 2."""
-    grids = [np.geomspace(low, high, 1 + int(np.ceil(np.log2(high / low)))) for low, high in factors.ends.values()]
-    return [(float(light), float(dark), float(sky)) for light in grids[0] for dark in grids[1] for sky in grids[2]]
-
-
 def _scaled(x: Expectation, c: Cumulants, corner: tuple[float, float, float]) -> Cumulants:
     light, dark, sky = corner
     return c.scaled(light if sky == 1.0 else Factors.on_light(light, sky, sky_share(x)), dark)
@@ -424,15 +426,16 @@ def _joint(scenarios: Sequence[Expectation], varied: Sequence[Sequence[Cumulants
         return False
     for x, c in ((x, c) for x, row in zip(scenarios, varied, strict=True) for c in row):
         exact = joint_is_exact(c)
-        if not exact.all():
-            if recipe == "joint":
-                pixel = int(np.argmin(exact))
-                raise InputError(
-                    f"recipe must be 'apart' or 'auto', not 'joint', since pixel {pixel} of {x.name} has "
-                    f"{np.sqrt(c.gaussian[pixel]):.3g} DN of Gaussian noise next to Poisson counts",
-                    key="recipe",
-                )
+        if exact.all():
+            continue
+        if recipe == "auto":
             return False
+        pixel = int(np.argmin(exact))
+        raise InputError(
+            f"recipe must be 'apart' or 'auto', not 'joint', since pixel {pixel} of {x.name} has "
+            f"{np.sqrt(c.gaussian[pixel]):.3g} DN of Gaussian noise next to Poisson counts",
+            key="recipe",
+        )
     return True
 
 
@@ -484,20 +487,7 @@ def check_reach(x: Expectation, c: Cumulants, factors: Factors) -> None:
 
 
 def _check_same_detector(quiet: Expectation, other: Expectation) -> None:
-    for name in (
-        "wavelength_nm",
-        "dark_dn",
-        "bias_dn",
-        "read_noise_dn",
-        "gain_dn_per_electron",
-        "element",
-        "n_frames",
-        "frame_s",
-        "dark_unit",
-        "photon_noise",
-        "adc_max_dn",
-        "saturation_dn",
-    ):
+    for name in OF_DETECTOR:
         if not np.array_equal(getattr(quiet, name), getattr(other, name)):
             raise InputError(
                 f"scenarios of one study must share instrument and exposure, but {name} of {other.name} differs from "

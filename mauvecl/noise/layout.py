@@ -49,25 +49,12 @@ TABLE_FIELDS = (("table", "u4"), ("bits", "u4"), ("low", "i4"))
 #: Parameters of a launch: seed, sizes, numbers of the first frame and group of four pixels, alias tables of the charge
 #: of additive processes, number of averaged quiescent exposures and its inverse, and half the ratio of the inverse
 #: variance of one exposure to the one used.
-JOB = np.dtype(
-    [
-        *_fields(
-            "u4",
-            "seed_low",
-            "seed_high",
-            "pixel_count",
-            "padded_count",
-            "scenario_count",
-            "draw_count",
-            "frame_count",
-            "first_frame",
-            "first_group",
-        ),
-        *((f"{name}_{field}", kind) for name in ADDITIVE for field, kind in TABLE_FIELDS),
-        *_fields("u4", "reference_count"),
-        *_fields("f4", "reference_weight", "pair_scale"),
-    ]
-)
+JOB = np.dtype([
+    *_fields("u4", "seed_low", "seed_high", "pixel_count", "padded_count", "scenario_count"),
+    *_fields("u4", "draw_count", "frame_count", "first_frame", "first_group"),
+    *((f"{name}_{field}", kind) for name in ADDITIVE for field, kind in TABLE_FIELDS),
+    *_fields("u4", "reference_count"), *_fields("f4", "reference_weight", "pair_scale"),
+])  # fmt: skip
 
 #: Properties of a pixel shared by all scenarios.
 PIXEL = np.dtype([("used", "f4"), ("element_end", "u4"), ("four_uneven", "u4"), ("electron_gain", "f4")])
@@ -95,18 +82,10 @@ CUMULANTS = ("variance", "third", "fourth", "fifth")
 
 #: Response of a joint draw to factors on light and dark: their means, variances and third to fifth cumulants, DN; and
 #: the sky's share of the light.
-RESPONSE = np.dtype(
-    _fields(
-        "f4",
-        "light",
-        "dark",
-        "light_variance",
-        "dark_variance",
-        "other_variance",
-        *(f"{part}_{name}" for name in CUMULANTS[1:] for part in ("light", "dark")),
-        "sky_share",
-    )
-)
+RESPONSE = np.dtype([
+    *_fields("f4", "light", "dark", "light_variance", "dark_variance", "other_variance"),
+    *_fields("f4", *(f"{part}_{name}" for name in CUMULANTS[1:] for part in ("light", "dark")), "sky_share"),
+])  # fmt: skip
 
 #: An observer's subtraction and noise in a pixel: net = value + net_offset, noise^2 = gain max(net, 0) + variance; and
 #: the base-2 logarithm of the histogram's bin width in DN.
@@ -125,29 +104,18 @@ GRID = np.dtype([("channel", "u4"), ("centre", "f4"), ("steps_per_unit", "f4")])
 #: A pixel of a stare's frames: the mean at unit coefficients minus the whole DN that kernels omit; star, sky, dark and
 #: neighbours at unit coefficients, DN; second to fifth cumulants of the photons divided by their mean, of the total at
 #: unit coefficients, and of the dark.
-MIXTURE = np.dtype(
-    _fields(
-        "f4",
-        "rest",
-        "star",
-        "sky",
-        "dark",
-        "neighbours",
-        *(f"photon_{name}" for name in CUMULANTS),
-        *CUMULANTS,
-        *(f"dark_{name}" for name in CUMULANTS),
-    )
-)
+MIXTURE = np.dtype([
+    *_fields("f4", "rest", "star", "sky", "dark", "neighbours", *(f"photon_{name}" for name in CUMULANTS)),
+    *_fields("f4", *CUMULANTS, *(f"dark_{name}" for name in CUMULANTS)),
+])  # fmt: skip
 
 #: Properties common to all frames of a stare: number of frames without and with padding, unknowns, jitters, slope of
 #: the dark with temperature, and numbers of rows of flares and of their amplitudes (one, or one per stare).
-STARE_JOB = np.dtype(
-    [
-        *_fields("u4", "frame_count", "padded_frames", "unknown_count", "jittered"),
-        *_fields("f4", "light_jitter", "sky_jitter", "temperature_jitter", "dark_slope"),
-        *_fields("u4", "scenario_count", "flare_rows", "amplitude_rows"),
-    ]
-)
+STARE_JOB = np.dtype([
+    *_fields("u4", "frame_count", "padded_frames", "unknown_count", "jittered"),
+    *_fields("f4", "light_jitter", "sky_jitter", "temperature_jitter", "dark_slope"),
+    *_fields("u4", "scenario_count", "flare_rows", "amplitude_rows"),
+])  # fmt: skip
 
 #: Parts of the signal that unknowns of a stare change, in the order of their numbers.
 MOVED = CHANGING
@@ -159,20 +127,12 @@ EXPONENTIAL = tuple(float(np.float32(1.0 / np.prod(np.arange(1.0, n + 3)))) for 
 LN2_PARTS = (0.693359375, -2.1219444e-4)
 LOG2_E = 1.442695
 
+#: Structs by their names in C.
 STRUCTS = {
-    "Job": JOB,
-    "Pixel": PIXEL,
-    "Level": LEVEL,
-    "Edge": EDGE,
-    "Poisson": POISSON,
-    "Response": RESPONSE,
-    "Observer": OBSERVER,
-    "Estimate": ESTIMATE,
-    "Element": ELEMENT,
-    "Grid": GRID,
-    "Mixture": MIXTURE,
+    "Job": JOB, "Pixel": PIXEL, "Level": LEVEL, "Edge": EDGE, "Poisson": POISSON, "Response": RESPONSE,
+    "Observer": OBSERVER, "Estimate": ESTIMATE, "Element": ELEMENT, "Grid": GRID, "Mixture": MIXTURE,
     "StareJob": STARE_JOB,
-}
+}  # fmt: skip
 
 #: Statistics with a channel in every scenario, in the kernel's order; linear statistics follow them.
 FIXED_STATISTICS = ("chi2", "chi2_element", "chi2_pair")

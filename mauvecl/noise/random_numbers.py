@@ -16,19 +16,11 @@ Floats = NDArray[np.float32]
 #: Minimax fits in float32 from tools/fit_normal.py: -2 ln(1 + f) / f for f in [sqrt(1/2) - 1, sqrt(2) - 1],
 #: sin(pi s) / s and cos(pi s) in s^2 for s in [-1/2, 1/2].
 POLYNOMIALS = {
-    "log": (
-        "-0x1.fffffap+0",
-        "0x1.0000d4p+0",
-        "-0x1.555ca0p-1",
-        "0x1.ff30e2p-2",
-        "-0x1.97073ap-2",
-        "0x1.62c872p-2",
-        "-0x1.501394p-2",
-        "0x1.9e7c7ep-3",
-    ),
+    "log": ("-0x1.fffffap+0", "0x1.0000d4p+0", "-0x1.555ca0p-1", "0x1.ff30e2p-2", "-0x1.97073ap-2", "0x1.62c872p-2",
+            "-0x1.501394p-2", "0x1.9e7c7ep-3"),
     "sin": ("0x1.921fb6p+1", "-0x1.4abbc4p+2", "0x1.4668f2p+1", "-0x1.32535ap-1", "0x1.3e17cap-4"),
     "cos": ("0x1.fffffep-1", "-0x1.3bd3a6p+2", "0x1.03bd06p+2", "-0x1.54f61ap+0", "0x1.c1f066p-3"),
-}
+}  # fmt: skip
 #: 2 ln 2 in float32.
 TWO_LN2 = "0x1.62e430p+0"
 

@@ -6,15 +6,15 @@ devices with strict arithmetic, because each fused multiply-add is rounded once.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Unpack
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, TypeVar, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
-from mauvecl.noise import layout, random_numbers
+from mauvecl.noise import layout
 from mauvecl.noise.disturbances import ADDITIVE
 from mauvecl.noise.drawing import DrawingOptions
 from mauvecl.noise.random_numbers import Floats, Words, fma, four_normals, words
@@ -28,6 +28,9 @@ if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
 
 MAGIC = np.float32(layout.MAGIC)
+#: A function that computes a * b + c.
+Fma = Callable[[Any, Any, Any], Any]
+T = TypeVar("T", np.uint32, np.float32)
 
 
 def words_at(
@@ -41,16 +44,18 @@ def words_at(
     return words(realisation, frame, exposure + layout.STREAMS[stream], group, seed)
 
 
-def alias_draw(word: NDArray[np.uint32], table: NDArray[np.uint32], bits: int) -> NDArray[np.uint32]:
-    """Return the alias table's column for each word; see `layout.AliasTable`."""
-    shift = np.uint32(layout.WORD_BITS - bits)
+def alias_draw(
+    word: NDArray[np.uint32], table: NDArray[np.uint32], bits: ArrayLike, start: ArrayLike = 0
+) -> NDArray[np.uint32]:
+    """Return the column for each word of the alias table that begins at `start`; see `layout.AliasTable`."""
+    shift = np.uint32(layout.WORD_BITS) - np.asarray(bits, np.uint32)
     column = word >> shift
-    entry = table[column]
+    entry = table[np.asarray(start, np.uint32) + column]
     mask = (np.uint32(1) << shift) - np.uint32(1)
     return np.where((word & mask) < (entry & mask), column, entry >> shift)
 
 
-def expansion_draw(z: Floats, offset: np.float32, slope: np.float32, cubic: np.float32) -> Floats:
+def expansion_draw(z: Floats, offset: ArrayLike, slope: ArrayLike, cubic: ArrayLike) -> Floats:
     """Return Poisson counts of a large mean, relative to the mean rounded to an integer."""
     curve = fma(z, cubic, np.float32(0.16666667))
     return nearest(fma(z, fma(z, curve, slope), offset))
@@ -61,47 +66,50 @@ def nearest(x: Floats) -> Floats:
     return np.asarray((x + MAGIC) - MAGIC)
 
 
+def _per_pixel(four: Sequence[NDArray[T]]) -> NDArray[T]:
+    """Arrange arrays for the first to fourth pixel of each group, (n_group, n_draw), by pixel, (n_pixel, n_draw)."""
+    return np.stack(four, axis=1).reshape(-1, four[0].shape[-1])
+
+
+def poisson_counts(four: Words, source: NDArray[np.void], tables: NDArray[np.uint32]) -> Floats:
+    """Return the counts of all pixels, relative to their rounded means, shape (n_pixel, n_draw)."""
+    source = source[:, None]
+    # Both pixels of a pair use both words if the count comes from a normal.
+    counts = expansion_draw(_per_pixel(four_normals(four)), source["offset"], source["slope"], source["cubic"])
+    by_table = source["bits"][:, 0] > 0
+    words, row = _per_pixel(four)[by_table], source[by_table]
+    counts[by_table] = alias_draw(words, tables, row["bits"], row["table"]).astype(np.int32) + row["low"]
+    return counts
+
+
 @dataclass(frozen=True, eq=False)
 class Draws:
-    """Draws of four neighbouring pixels; each array has the shape (n_realisation,)."""
+    """Draws of all pixels, padding included; arrays have the shape (n_pixel, n_draw)."""
 
-    z: list[Floats]
-    dark: list[Floats]
-    photon: Words | None
-    added: dict[str, list[Floats]]  # electrons of additive processes
-
-
-def poisson_draw(words: Words, i: int, source: np.void, tables: NDArray[np.uint32], pairs: Sequence[Floats]) -> Floats:
-    """Return one pixel's count, relative to its rounded mean; `pairs` are the normals of the four words."""
-    if not source["bits"]:
-        return expansion_draw(pairs[i], source["offset"], source["slope"], source["cubic"])
-    column = alias_draw(words[i], tables[int(source["table"]) :], int(source["bits"]))
-    return np.asarray((column.astype(np.int32) + source["low"]).astype(np.float32))
+    z: NDArray[np.floating]  # without padding if it is all that a draw needs
+    dark: Floats | None = None
+    photon: Words | None = None
+    added: dict[str, Floats] = field(default_factory=dict)  # electrons of additive processes
 
 
-def draws(
-    scene: Scene, realisation: NDArray[np.uint64], frame: ArrayLike, group: int, seed: int, *, exposure: int = 0
-) -> Draws:
-    """Draw everything that four pixels of one draw need; `frame` is one number, or one for each realisation."""
-    job = scene.job
-    address = (realisation, int(job["first_frame"]) + np.asarray(frame))
-    place = (int(job["first_group"]) + group, seed, exposure)
-    z = four_normals(words_at(*address, "noise", *place))
-    dark: list[Floats] = []
-    if not scene.joint:
-        w = words_at(*address, "dark", *place)
-        y = four_normals(w)
-        four = scene.dark_counts[4 * group : 4 * group + 4]
-        dark = [poisson_draw(w, i, four[i], scene.tables, y) for i in range(4)]
-    photon = words_at(*address, "photon", *place) if scene.photons else None
-    added: dict[str, list[Floats]] = {}
+def draws(scene: Scene, realisation: NDArray[np.uint64], frame: ArrayLike, seed: int, *, exposure: int = 0) -> Draws:
+    """Draw everything that a frame needs; `frame` is one number, or one for each realisation."""
+    job, groups = scene.job, np.arange(len(scene.pixels) // 4)[:, None]
+    frame = int(job["first_frame"]) + np.asarray(frame)
+
+    def drawn(stream: str) -> Words:
+        return words_at(realisation, frame, stream, int(job["first_group"]) + groups, seed, exposure)
+
+    added = {}
     for name in scene.additive:
-        table, bits = scene.tables[int(job[f"{name}_table"]) :], int(job[f"{name}_bits"])
-        added[name] = [
-            (alias_draw(word, table, bits).astype(np.int32) + job[f"{name}_low"]).astype(np.float32)
-            for word in words_at(*address, name, *place)
-        ]
-    return Draws(z, dark, photon, added)
+        column = alias_draw(_per_pixel(drawn(name)), scene.tables, job[f"{name}_bits"], job[f"{name}_table"])
+        added[name] = (column.astype(np.int32) + job[f"{name}_low"]).astype(np.float32)
+    return Draws(
+        _per_pixel(four_normals(drawn("noise"))),
+        None if scene.joint else poisson_counts(drawn("dark"), scene.dark_counts, scene.tables),
+        drawn("photon") if scene.photons else None,
+        added,
+    )
 
 
 def quantile(word: NDArray[np.uint32], finer: NDArray[np.uint32], table: Floats) -> Floats:
@@ -116,9 +124,9 @@ def quantile(word: NDArray[np.uint32], finer: NDArray[np.uint32], table: Floats)
     return fma(part, table[cell + 1] - table[cell], table[cell])
 
 
-def combine_factors(a: Floats, b: Floats) -> Floats:
+def combine_factors(a: Floats, b: Floats, fma: Fma = fma) -> Floats:
     """Return the product of two factors, all minus one."""
-    return fma(a, b, a + b)
+    return np.asarray(fma(a, b, a + b))
 
 
 def factors(
@@ -142,60 +150,63 @@ def factors(
 
 
 def analogue(
-    scene: Scene, drawn: Draws, i: int, pixel: int, k: int, light: Floats, dark: Floats, sky: Floats
+    scene: Scene, drawn: Draws, k: int, light: NDArray[Any], dark: NDArray[Any], sky: NDArray[Any], fma: Fma = fma
 ) -> Floats:
-    """Return the analogue count above the level's base, before the ADC, shape (n_realisation,)."""
-    level, z = scene.levels[k, pixel], drawn.z[i]
+    """Return the analogue counts of a scenario above the levels' bases, before the ADC, shape (n_pixel, n_draw).
+
+    Factors have the shape (n_draw,). Another `fma` computes in the precision of `drawn`, without the device's bits.
+    """
+    z, n_pixel = drawn.z, len(drawn.z)
+    level = scene.levels[k, :n_pixel, None]
     if scene.modulations:
+        response = scene.responses[k, :n_pixel, None]
         if any(factor == "sky" for _, factor in scene.modulations):
-            light = combine_factors(light, sky * scene.responses[k, pixel]["sky_share"])
-        v = _responding(scene.responses[k, pixel], level["c0"], z, light, dark, quartic=scene.quartic)
+            light = combine_factors(light, sky * response["sky_share"], fma)
+        v = _responding(response, level["c0"], z, light, dark, fma, quartic=scene.quartic)
     elif scene.joint:
         first, *rest = ("c4", "c3", "c2", "c1", "c0") if scene.quartic else ("c3", "c2", "c1", "c0")
-        v = np.full_like(z, level[first])
+        v = np.broadcast_to(level[first], z.shape)
         for name in rest:
             v = fma(z, v, level[name])
     else:
-        v = fma(drawn.dark[i], scene.dark_counts[pixel]["gain"], fma(z, level["c1"], level["c0"]))
+        assert drawn.dark is not None
+        v = fma(drawn.dark, scene.dark_counts["gain"][:, None], fma(z, level["c1"], level["c0"]))
     if drawn.photon is not None:
-        source = scene.photon_counts[k, pixel]
-        # Both pixels of a pair use both words if the count comes from a normal.
-        count = poisson_draw(drawn.photon, i, source, scene.tables, four_normals(drawn.photon))
-        v = fma(count, source["gain"], v)
+        source = scene.photon_counts[k]
+        v = fma(poisson_counts(drawn.photon, source, scene.tables), source["gain"][:, None], v)
     for electrons in drawn.added.values():
-        v = fma(electrons[i], scene.pixels[pixel]["electron_gain"], v)
+        v = fma(electrons, scene.pixels["electron_gain"][:, None], v)
     return v
 
 
 def _responding(
-    r: np.void, c0: np.float32, z: Floats, light_change: Floats, dark_change: Floats, *, quartic: bool
+    r: NDArray[np.void], c0: Floats, z: Floats, light_change: Floats, dark_change: Floats, fma: Fma, *, quartic: bool
 ) -> Floats:
     one = np.float32(1.0)
     light, dark = light_change + one, dark_change + one
     variance = fma(light, r["light_variance"], fma(dark, r["dark_variance"], r["other_variance"]))
     third = fma(light, r["light_third"], dark * r["dark_third"])
     fourth = fma(light, r["light_fourth"], dark * r["dark_fourth"])
-    with np.errstate(invalid="ignore", divide="ignore"):  # padded pixels have no variance
-        sd, skew, zz = np.sqrt(variance), third / variance, z * z
-        curve = fourth * fma(zz, np.float32(0.041666668), np.float32(-0.125))
-        curve = curve - third * skew * fma(zz, np.float32(0.055555556), np.float32(-0.1388889))
-        cubic = curve / (variance * sd)
-        v = fma(z, sd + cubic, fma(skew, fma(zz, np.float32(0.16666667), np.float32(-0.16666667)), c0))
-        if quartic:
-            fifth = fma(light, r["light_fifth"], dark * r["dark_fifth"])
-            even = fifth * _quartic(zz, 0.008333334, -0.05, 0.025)
-            even = even - skew * fourth * _quartic(zz, 0.041666668, -0.20833333, 0.083333336)
-            even = even + skew * skew * third * _quartic(zz, 0.037037037, -0.16358025, 0.052469134)
-            v = v + even / (variance * variance)
-    out: Floats = v + fma(light_change, r["light"], dark_change * r["dark"])
-    return out
+    sd, skew, zz = np.sqrt(variance), third / variance, z * z
+    curve = fourth * fma(zz, np.float32(0.041666668), np.float32(-0.125))
+    curve = curve - third * skew * fma(zz, np.float32(0.055555556), np.float32(-0.1388889))
+    cubic = curve / (variance * sd)
+    v = fma(z, sd + cubic, fma(skew, fma(zz, np.float32(0.16666667), np.float32(-0.16666667)), c0))
+    if quartic:
+        fifth = fma(light, r["light_fifth"], dark * r["dark_fifth"])
+        even = fifth * even_powers(zz, 0.008333334, -0.05, 0.025, fma)
+        even = even - skew * fourth * even_powers(zz, 0.041666668, -0.20833333, 0.083333336, fma)
+        even = even + skew * skew * third * even_powers(zz, 0.037037037, -0.16358025, 0.052469134, fma)
+        v = v + even / (variance * variance)
+    return np.asarray(v + fma(light_change, r["light"], dark_change * r["dark"]))
 
 
-def _quartic(zz: Floats, second: float, first: float, constant: float) -> Floats:
-    return fma(zz, fma(zz, np.float32(second), np.float32(first)), np.float32(constant))
+def even_powers(zz: Floats, second: float, first: float, constant: float, fma: Fma = fma) -> Floats:
+    """Return a polynomial of the square of a normal."""
+    return np.asarray(fma(zz, fma(zz, np.float32(second), np.float32(first)), np.float32(constant)))
 
 
-def digitise(v: Floats, edge: np.void, *, clip: bool) -> Floats:
+def digitise(v: Floats, edge: np.void | NDArray[np.void], *, clip: bool) -> Floats:
     """Round and clip to DN above the level's base."""
     r = v + MAGIC
     if clip:
@@ -214,19 +225,14 @@ def observed(
     scenarios: Sequence[int] | None = None,
 ) -> NDArray[np.int64]:
     """Sum the DN above the base over the draws of exposure `number`, (n_scenario, n_padded, n_realisation)."""
-    chosen = range(len(scene.levels)) if scenarios is None else scenarios
-    total = np.zeros((len(chosen), len(scene.pixels), len(realisation)), np.int64)
     drawn_frames = range(number * scene.n_draws, (number + 1) * scene.n_draws)
     index, frames, changes = _all_frames(scene, realisation, drawn_frames, seed, exposure)
-    for group in range(len(scene.pixels) // 4):
-        drawn = draws(scene, index, frames, group, seed, exposure=exposure)
-        for i, p in enumerate(range(4 * group, 4 * group + 4)):
-            for row, k in enumerate(chosen):
-                v = analogue(scene, drawn, i, p, k, *changes)
-                with np.errstate(invalid="ignore"):  # padded pixels
-                    dn = digitise(v, scene.edges[k, p], clip=scene.clip).astype(np.int64)
-                total[row, p] = dn.reshape(scene.n_draws, -1).sum(axis=0)
-    return total
+    drawn = draws(scene, index, frames, seed, exposure=exposure)
+    sums = []
+    for k in range(len(scene.levels)) if scenarios is None else scenarios:
+        dn = digitise(analogue(scene, drawn, k, *changes), scene.edges[k, :, None], clip=scene.clip)
+        sums.append(dn.astype(np.int64).reshape(len(dn), scene.n_draws, -1).sum(axis=1))
+    return np.array(sums)
 
 
 def _all_frames(
@@ -245,16 +251,13 @@ def _all_frames(
 
 def clipped(scene: Scene, realisation: NDArray[np.uint64], seed: int) -> NDArray[np.int64]:
     """Count the frames below zero and above saturation of scenario 0, shape (n_realisation, n_pixel, 2)."""
-    count = np.zeros((len(realisation), len(scene.pixels), 2), np.int64)
-    if scene.clip:
-        index, frames, changes = _all_frames(scene, realisation, range(scene.n_draws), seed)
-        for group in range(-(-scene.n_pixel // 4)):
-            drawn = draws(scene, index, frames, group, seed)
-            for i, p in enumerate(range(4 * group, min(4 * group + 4, len(scene.pixels)))):
-                r = (analogue(scene, drawn, i, p, 0, *changes) + MAGIC).reshape(scene.n_draws, -1)
-                count[:, p, 0] = (r < scene.edges[0, p]["low"]).sum(axis=0)
-                count[:, p, 1] = (r > scene.edges[0, p]["high"]).sum(axis=0)
-    return count[:, : scene.n_pixel]
+    if not scene.clip:
+        return np.zeros((len(realisation), scene.n_pixel, 2), np.int64)
+    index, frames, changes = _all_frames(scene, realisation, range(scene.n_draws), seed)
+    r, edge = analogue(scene, draws(scene, index, frames, seed), 0, *changes) + MAGIC, scene.edges[0, :, None]
+    outside = np.stack([r < edge["low"], r > edge["high"]], axis=-1)[: scene.n_pixel]
+    count: NDArray[np.int64] = outside.reshape(scene.n_pixel, scene.n_draws, -1, 2).sum(axis=1)
+    return count.swapaxes(0, 1)
 
 
 def realise(scene: Scene, realisation: NDArray[np.uint64], seed: int) -> NDArray[np.int64]:
@@ -270,27 +273,13 @@ Float = NDArray[np.float64]
 FRAMES_AT_ONCE = 256
 
 
-def components(
-    x: Expectation,
-    *,
-    realisation: int,
-    seed: int,
-    **drawing: Unpack[DrawingOptions],
-) -> QTable:
+def components(x: Expectation, *, realisation: int, seed: int, **drawing: Unpack[DrawingOptions]) -> QTable:
     """Decompose one raw spectrum into the draws of its components, with the NumPy reference.
 
-    Parameters
-    ----------
-    mode, recipe, processes, first_frame
-        See `Drawing`.
-
-    Returns
-    -------
-    QTable
-        One row per pixel, in DN summed over the exposure: ``raw``, as drawn by the engine; the mean signals ``source``,
-        ``sky`` and, if there are any, ``neighbours``; ``photon_noise`` and ``read_noise``; ``dark``; the charge of each
-        enabled additive process by its name; ``bias``; and ``digitisation``, the effect of rounding and clipping.
-        ``raw`` is the sum of the others.
+    The table has one row per pixel, in DN summed over the exposure: ``raw``, as drawn by the engine; the mean signals
+    ``source``, ``sky`` and, if there are any, ``neighbours``; ``photon_noise`` and ``read_noise``; ``dark``; the charge
+    of each enabled additive process by its name; ``bias``; and ``digitisation``, the effect of rounding and clipping.
+    ``raw`` is the sum of the others. Keywords are those of `Drawing`.
 
     Notes
     -----
@@ -299,15 +288,12 @@ def components(
     the dark counts is Poisson times Gaussian. Only in this decomposition, Poisson photons are treated as Gaussian.
     """
     scene = prepare([x], **drawing)
-    names = ["source", "sky", "neighbours", "photon_noise", "dark", "read_noise", *scene.additive]
-    parts = {name: np.zeros(scene.n_pixel) for name in names}
-    raw = np.zeros(scene.n_pixel)
+    parts: dict[str, Float] = {}
     for start in range(0, scene.n_draws, FRAMES_AT_ONCE):
         frames = range(start, min(start + FRAMES_AT_ONCE, scene.n_draws))
-        one = _Parts(x, scene, realisation, frames, seed)
-        for name, part in zip(names, one.all(), strict=True):
-            parts[name] += part.sum(axis=1)
-        raw += len(frames) * scene.base_dn[0] + one.recorded.sum(axis=1)
+        for name, part in _split(x, scene, realisation, frames, seed).items():
+            parts[name] = parts.get(name, 0.0) + part.sum(axis=1)
+    raw = parts.pop("recorded") + scene.n_draws * scene.base_dn[0]
     parts["bias"] = np.asarray(x.n_frames * x.bias_dn)
     values = {"wavelength": x.wavelength_nm, "raw": raw} | parts
     values["digitisation"] = raw - sum(parts.values())
@@ -319,70 +305,44 @@ def components(
     return table_of(columns, [values], **about)
 
 
-class _Parts:
-    """Draws of several frames, or of the sum of all frames, in DN; arrays have the shape (n_pixel, n_draw)."""
-
-    def __init__(self, x: Expectation, scene: Scene, realisation: int, drawn_frames: range, seed: int) -> None:
-        self.x, self.scene = x, scene
-        self.each = x.n_frames // scene.n_draws  # frames in one draw
-        index, frames, changes = _all_frames(scene, np.array([realisation], np.uint64), drawn_frames, seed)
-        self.light, self.warm, self.glow = (
-            (1.0 + change.astype(np.float64)) * middle for change, middle in zip(changes, scene.medians, strict=True)
-        )
-        shape = len(scene.pixels), frames.size
-        undigitised, self.recorded, dark, photon = np.zeros((4, *shape))
-        added = {name: np.zeros(shape) for name in scene.additive}
-        groups = np.arange(len(scene.pixels) // 4)[:, None]
-        words = np.stack(words_at(index, frames, "split_dark", groups, seed), axis=1)
-        scores = random_numbers.four_normals(words_at(index, frames, "split", groups, seed))
-        for group in range(groups.size):
-            drawn = draws(scene, index, frames, group, seed)
-            for i, p in enumerate(range(4 * group, 4 * group + 4)):
-                v = analogue(scene, drawn, i, p, 0, *changes)
-                undigitised[p], self.recorded[p] = v, digitise(v, scene.edges[0, p], clip=scene.clip)
-                for name, charge in drawn.added.items():
-                    added[name][p] = scene.pixels[p]["electron_gain"] * charge[i]
-                if not scene.joint:
-                    dark[p] = scene.dark_counts[p]["gain"] * drawn.dark[i]
-                if drawn.photon is not None:
-                    source = scene.photon_counts[0, p]
-                    normals = random_numbers.four_normals(drawn.photon)
-                    electrons = poisson_draw(drawn.photon, i, source, scene.tables, normals)
-                    photon[p] = source["gain"] * electrons
-        n = scene.n_pixel
-        self.recorded = self.recorded[:n]
-        self.score = np.stack(scores, axis=1).reshape(shape)[:n]
-        self.chance = (words.reshape(shape)[:n].astype(np.float64) + 0.5) / 2**32
-        self.added = {name: charge[:n] for name, charge in added.items()}
-        self.counted_dark, self.counted_photons = dark[:n], photon[:n]
-        self.level = scene.base_dn[0][:, None] + undigitised[:n]
-
-    def all(self) -> list[Float]:
-        """Return source, sky, neighbours, photon noise, dark, read noise and the charges of additive processes."""
-        x, scene, each = self.x, self.scene, self.each
-        gain, step = x.gain_dn_per_electron[:, None], x.dark_step_dn[:, None]
-        source = each * self.light * gain * x.source_electrons[:, None]
-        sky = each * self.light * self.glow * gain * x.sky_electrons[:, None]
-        neighbours = each * self.light * gain * x.neighbour_electrons[:, None]
-        photon_variance = gain * (source + sky + neighbours)
-        read_variance = each * x.read_noise_dn[:, None] ** 2 + (each - 1) / 12
-        mean_dark = each * self.warm * x.dark_dn[:, None]
-        # All random parts: photon noise + read noise + dark counts.
-        total = self.level - sum(self.added.values())
-        total = total - source - sky - neighbours - each * x.bias_dn[:, None]
-        if scene.joint:
-            dark = _dark_given_total(total, mean_dark, x.dark_step_dn, photon_variance + read_variance, self.chance)
-        else:
-            dark = step * np.rint(mean_dark / step) + self.counted_dark
-        rest = total - dark
-        if scene.photons:
-            mean = gain * np.rint(each * x.light_electrons[:, None])
-            photon = mean + self.counted_photons - source - sky - neighbours
-        else:
-            both = photon_variance + read_variance
-            share = np.divide(photon_variance, both, out=np.zeros_like(both), where=both > 0)
-            photon = rest * share + np.sqrt(read_variance * share) * self.score
-        return [source, sky, neighbours, photon, dark, rest - photon, *self.added.values()]
+def _split(
+    x: Expectation, scene: Scene, realisation: int, drawn_frames: range, seed: int
+) -> dict[str, NDArray[np.floating]]:
+    """Return what each draw records above the base, and its components, DN; arrays have the shape (n_pixel, n_draw)."""
+    index, frames, changes = _all_frames(scene, np.array([realisation], np.uint64), drawn_frames, seed)
+    light, warm, glow = (
+        (1.0 + change.astype(np.float64)) * middle for change, middle in zip(changes, scene.medians, strict=True)
+    )
+    drawn, n, each = draws(scene, index, frames, seed), scene.n_pixel, x.n_frames // scene.n_draws
+    v = analogue(scene, drawn, 0, *changes)
+    gain, step = x.gain_dn_per_electron[:, None], x.dark_step_dn[:, None]
+    source = each * light * gain * x.source_electrons[:, None]
+    sky = each * light * glow * gain * x.sky_electrons[:, None]
+    neighbours = each * light * gain * x.neighbour_electrons[:, None]
+    photon_variance = gain * (source + sky + neighbours)
+    read_variance = each * x.read_noise_dn[:, None] ** 2 + (each - 1) / 12
+    mean_dark = each * warm * x.dark_dn[:, None]
+    added = {name: (scene.pixels["electron_gain"][:, None] * charge)[:n] for name, charge in drawn.added.items()}
+    # All random parts: photon noise + read noise + dark counts.
+    total = scene.base_dn[0][:, None] + v[:n].astype(np.float64) - sum(added.values())
+    total = total - source - sky - neighbours - each * x.bias_dn[:, None]
+    groups = np.arange(len(scene.pixels) // 4)[:, None]
+    if drawn.dark is None:
+        chance = _per_pixel(words_at(index, frames, "split_dark", groups, seed))[:n].astype(np.float64) + 0.5
+        dark = _dark_given_total(total, mean_dark, x.dark_step_dn, photon_variance + read_variance, chance / 2**32)
+    else:
+        dark = step * np.rint(mean_dark / step) + (scene.dark_counts["gain"][:, None] * drawn.dark)[:n]
+    if drawn.photon is not None:
+        counted = poisson_counts(drawn.photon, scene.photon_counts[0], scene.tables)[:n]
+        photon = gain * (np.rint(each * x.light_electrons[:, None]) + counted) - source - sky - neighbours
+    else:
+        both = photon_variance + read_variance
+        share = np.divide(photon_variance, both, out=np.zeros_like(both), where=both > 0)
+        score = _per_pixel(four_normals(words_at(index, frames, "split", groups, seed)))[:n]
+        photon = (total - dark) * share + np.sqrt(read_variance * share) * score
+    parts = {"source": source, "sky": sky, "neighbours": neighbours, "photon_noise": photon, "dark": dark}
+    parts |= {"read_noise": total - dark - photon, **added}
+    return parts | {"recorded": digitise(v, scene.edges[0, :, None], clip=scene.clip)[:n]}
 
 
 def _dark_given_total(total: Float, mean: Float, step: Float, variance: Float, chance: Float) -> Float:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import TYPE_CHECKING, Unpack
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -234,16 +234,6 @@ def _both_of_a_pair(chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.repeat(pairs.reshape(-1, 2).all(axis=1), 2)[: chosen.size]
 
 
-def fill_estimates(out: NDArray[np.void], reference: Expectation, fraction: Float, mean_sum: Float) -> None:
-    """Fill `out` for variances estimated by an observer who knows the detector; padding has a variance of 1."""
-    n_pixel, variance = reference.wavelength_nm.size, reference.read_noise_dn**2 + reference.dark_variance_dn2 + 1 / 12
-    out["variance"] = 1.0
-    out["fraction"] = fraction
-    out["net_offset"][:n_pixel] = mean_sum - reference.n_frames * (reference.bias_dn + reference.dark_dn)
-    out["gain"][:n_pixel] = reference.gain_dn_per_electron
-    out["variance"][:n_pixel] = np.maximum(reference.n_frames * variance, NO_VARIANCE)
-
-
 def fill_responses(out: NDArray[np.void], x: Expectation, c: Cumulants, factors: Factors) -> None:
     """Fill `out` with a draw's response to factors on light, dark and sky, relative to the priors' medians."""
     share, dark = sky_share(x), factors.medians["dark"]
@@ -350,17 +340,17 @@ def prepare(
     Raises InputError if scenarios differ in more than their light, stacked draws are requested near a rail, or a
     process needs joint draws that are not exact.
     """
-    drawing = drawing or Drawing(**words)
-    quiet = scenarios[0]
+    drawing, quiet = drawing or Drawing(**words), scenarios[0]
     factors = Factors.of(drawing.processes, quiet.conditions)
     method = choose_method(scenarios, drawing, factors)
-    compared, used = _compared(scenarios, references)
+    compared = np.array([0] * len(scenarios) if references is None else references, np.uint32)
+    used = ~np.any([scenarios[t].saturated for t in np.unique(compared)], axis=0)
     tables = list[AliasTable]()
     darks, dark_dn = _dark_counts(quiet, method, tables)
-    arrays = _PerScenario.empty(scenarios, method, comparison, modulated=bool(drawing.processes.modulations))
+    arrays = _padding(scenarios, method, comparison, modulated=bool(drawing.processes.modulations))
     for k, x in enumerate(scenarios):
-        arrays.fill_draw(k, x, method, factors, dark_dn, tables)
-        arrays.fill_comparison(k, x, scenarios[compared[k]], method, comparison, used)
+        _fill_draw(arrays, k, x, method, factors, dark_dn, tables)
+        _fill_comparison(arrays, k, x, scenarios[compared[k]], method, comparison, used)
     return Scene(
         n_pixel=used.size,
         n_frames=quiet.n_frames,
@@ -379,16 +369,8 @@ def prepare(
         references=compared,
         comparison=comparison,
         used=used,
-        **vars(arrays),
+        **arrays,
     )
-
-
-def _compared(
-    scenarios: Sequence[Expectation], references: Sequence[int] | None
-) -> tuple[NDArray[np.uint32], NDArray[np.bool_]]:
-    """Return the number of each scenario's reference, and the pixels that no reference saturates."""
-    compared = np.zeros(len(scenarios), np.uint32) if references is None else np.array(references, np.uint32)
-    return compared, ~np.any([scenarios[t].saturated for t in np.unique(compared)], axis=0)
 
 
 def _dark_counts(quiet: Expectation, method: DrawMethod, tables: list[AliasTable]) -> tuple[NDArray[np.void], Float]:
@@ -400,100 +382,100 @@ def _dark_counts(quiet: Expectation, method: DrawMethod, tables: list[AliasTable
     return darks, step * fill_poisson_counts(darks[:n_pixel], method.each * quiet.dark_dn / step, step, tables)
 
 
-@dataclass(eq=False)
-class _PerScenario:
-    """Arrays of a `Scene` with a row for each scenario."""
+#: Arrays of a `Scene` with a row for each scenario, by the names of its fields.
+PerScenario = dict[str, NDArray[Any]]
 
-    levels: NDArray[np.void]
-    edges: NDArray[np.void]
-    photon_counts: NDArray[np.void]
-    responses: NDArray[np.void]
-    fraction: Float
-    estimates: NDArray[np.void]
-    base_dn: NDArray[np.int64]
 
-    @classmethod
-    def empty(
-        cls, scenarios: Sequence[Expectation], method: DrawMethod, comparison: Comparison, *, modulated: bool
-    ) -> _PerScenario:
-        """Return arrays filled with the values of padding."""
-        n_pixel = scenarios[0].wavelength_nm.size
-        shape = (len(scenarios), padded(n_pixel))
-        arrays = cls(
-            levels=np.zeros(shape, layout.LEVEL),
-            edges=np.zeros(shape, layout.EDGE),
-            photon_counts=np.zeros(shape if method.photons else 0, layout.POISSON),
-            responses=np.zeros(shape if modulated else 0, layout.RESPONSE),
-            fraction=np.zeros(shape),
-            estimates=np.zeros(shape if comparison.estimated else 0, layout.ESTIMATE),
-            base_dn=np.zeros((len(scenarios), n_pixel), np.int64),
-        )
-        arrays.responses["other_variance"] = NO_VARIANCE
-        for name, array in (("shift", arrays.levels), ("low", arrays.edges), ("high", arrays.edges)):
-            array[name] = layout.MAGIC
-        return arrays
+def _padding(
+    scenarios: Sequence[Expectation], method: DrawMethod, comparison: Comparison, *, modulated: bool
+) -> PerScenario:
+    """Return arrays filled with the values of padding."""
+    n_pixel = scenarios[0].wavelength_nm.size
+    shape = (len(scenarios), padded(n_pixel))
+    arrays: PerScenario = {
+        "levels": np.zeros(shape, layout.LEVEL),
+        "edges": np.zeros(shape, layout.EDGE),
+        "photon_counts": np.zeros(shape if method.photons else 0, layout.POISSON),
+        "responses": np.zeros(shape if modulated else 0, layout.RESPONSE),
+        "fraction": np.zeros(shape),
+        "estimates": np.zeros(shape if comparison.estimated else 0, layout.ESTIMATE),
+        "base_dn": np.zeros((len(scenarios), n_pixel), np.int64),
+    }
+    arrays["responses"]["other_variance"] = NO_VARIANCE
+    for name, array in (("shift", "levels"), ("low", "edges"), ("high", "edges")):
+        arrays[array][name] = layout.MAGIC
+    return arrays
 
-    def fill_draw(
-        self, k: int, x: Expectation, method: DrawMethod, factors: Factors, dark_dn: Float, tables: list[AliasTable]
-    ) -> None:
-        """Fill the arrays for the draw of scenario k, whose dark counts are relative to `dark_dn`."""
-        c, level = method.cumulants[k], self.levels[k, : dark_dn.size]
-        mean = self._mean(k, x, method, factors, dark_dn, tables)
-        base = self.base_dn[k] = np.clip(np.rint(mean), 0, x.highest_dn if method.each == 1 else np.inf)
-        if self.responses.size:
-            fill_responses(self.responses[k, : dark_dn.size], x, c, factors)
-            check_reach(x, c, factors)
-        elif method.joint:
-            for name, coefficient in zip(("c0", "c1", "c2", "c3", "c4"), polynomial(c), strict=True):
-                level[name] = coefficient
-        else:
-            level["c1"] = np.sqrt(c.gaussian)
-        level["c0"] += mean - base
 
-    def _mean(
-        self, k: int, x: Expectation, method: DrawMethod, factors: Factors, dark_dn: Float, tables: list[AliasTable]
-    ) -> Float:
-        """Return the mean, DN, to which a draw is relative; separate Poisson counts are relative to integers."""
-        c, gain = method.cumulants[k], x.gain_dn_per_electron
-        if method.joint:
-            light, dark = factors.median_on_light(sky_share(x)), factors.medians["dark"]
-            return np.asarray(c.mean + (light - 1.0) * c.light_dn + (dark - 1.0) * c.dark_dn)
-        mean = method.each * x.bias_dn + dark_dn
+def _fill_draw(
+    arrays: PerScenario,
+    k: int,
+    x: Expectation,
+    method: DrawMethod,
+    factors: Factors,
+    dark_dn: Float,
+    tables: list[AliasTable],
+) -> None:
+    """Fill the arrays for the draw of scenario k, whose dark counts are relative to `dark_dn`."""
+    c, n_pixel, gain = method.cumulants[k], dark_dn.size, x.gain_dn_per_electron
+    level = arrays["levels"][k, :n_pixel]
+    # The mean to which a draw is relative; separate Poisson counts are relative to integers.
+    if method.joint:
+        light, dark = factors.median_on_light(sky_share(x)), factors.medians["dark"]
+        mean = c.mean + (light - 1.0) * c.light_dn + (dark - 1.0) * c.dark_dn
+    else:
+        photons = c.photons
         if method.photons:
-            out = self.photon_counts[k, : dark_dn.size]
-            return np.asarray(mean + gain * fill_poisson_counts(out, c.photons, gain, tables))
-        return np.asarray(mean + gain * c.photons)
+            photons = fill_poisson_counts(arrays["photon_counts"][k, :n_pixel], c.photons, gain, tables)
+        mean = method.each * x.bias_dn + dark_dn + gain * photons
+    base = arrays["base_dn"][k] = np.clip(np.rint(mean), 0, x.highest_dn if method.each == 1 else np.inf)
+    if arrays["responses"].size:
+        fill_responses(arrays["responses"][k, :n_pixel], x, c, factors)
+        check_reach(x, c, factors)
+    elif method.joint:
+        for name, coefficient in zip(("c0", "c1", "c2", "c3", "c4"), polynomial(c), strict=True):
+            level[name] = coefficient
+    else:
+        level["c1"] = np.sqrt(c.gaussian)
+    level["c0"] += mean - base
 
-    def fill_comparison(
-        self,
-        k: int,
-        x: Expectation,
-        reference: Expectation,
-        method: DrawMethod,
-        comparison: Comparison,
-        used: NDArray[np.bool_],
-    ) -> None:
-        """Fill the arrays for the comparison of scenario k with its reference."""
-        base, n_pixel = self.base_dn[k], used.size
-        level, edge, fraction = self.levels[k, :n_pixel], self.edges[k, :n_pixel], self.fraction[k, :n_pixel]
-        mean_sum = reference.recorded_dn
-        whole = (x.n_frames // method.each) * base - np.rint(mean_sum)
-        if not comparison.exposures:
-            fraction[:] = np.rint(mean_sum) - mean_sum
-        level["shift"] = layout.MAGIC - whole
-        variance = (1.0 + comparison.added_variance) * reference.variance_dn2
-        level["inverse_variance"] = used / variance
-        level["twice"] = 2.0 * fraction * level["inverse_variance"]
-        edge["base"], edge["whole"] = base, whole
-        edge["low"] = layout.MAGIC - base
-        edge["high"] = layout.MAGIC + (x.highest_dn - base)
-        if comparison.estimated:
-            fill_estimates(self.estimates[k], reference, self.fraction[k], np.rint(mean_sum))
-        ends = element_ends(x)
-        element_variance = np.bincount(x.element, variance * used)
-        with np.errstate(divide="ignore"):
-            edge["inverse_element_variance"][ends] = np.where(element_variance > 0, 1.0 / element_variance, 0.0)
-        edge["element_offset"][ends] = np.bincount(x.element, fraction * used)
+
+def _fill_comparison(
+    arrays: PerScenario,
+    k: int,
+    x: Expectation,
+    reference: Expectation,
+    method: DrawMethod,
+    comparison: Comparison,
+    used: NDArray[np.bool_],
+) -> None:
+    """Fill the arrays for the comparison of scenario k with its reference."""
+    base, n_pixel = arrays["base_dn"][k], used.size
+    level, edge, fraction = (arrays[name][k, :n_pixel] for name in ("levels", "edges", "fraction"))
+    mean_sum = reference.recorded_dn
+    whole = (x.n_frames // method.each) * base - np.rint(mean_sum)
+    if not comparison.exposures:
+        fraction[:] = np.rint(mean_sum) - mean_sum
+    level["shift"] = layout.MAGIC - whole
+    variance = (1.0 + comparison.added_variance) * reference.variance_dn2
+    level["inverse_variance"] = used / variance
+    level["twice"] = 2.0 * fraction * level["inverse_variance"]
+    edge["base"], edge["whole"] = base, whole
+    edge["low"] = layout.MAGIC - base
+    edge["high"] = layout.MAGIC + (x.highest_dn - base)
+    if comparison.estimated:
+        # An observer knows the detector; padding has a variance of 1.
+        estimate = arrays["estimates"][k]
+        estimate["variance"], estimate["fraction"] = 1.0, arrays["fraction"][k]
+        known = reference.read_noise_dn**2 + reference.dark_variance_dn2 + 1 / 12
+        offset = np.rint(mean_sum) - reference.n_frames * (reference.bias_dn + reference.dark_dn)
+        estimate["net_offset"][:n_pixel], estimate["gain"][:n_pixel] = offset, reference.gain_dn_per_electron
+        estimate["variance"][:n_pixel] = np.maximum(reference.n_frames * known, NO_VARIANCE)
+    ends = element_ends(x)
+    element_variance = np.bincount(x.element, variance * used)
+    with np.errstate(divide="ignore"):
+        edge["inverse_element_variance"][ends] = np.where(element_variance > 0, 1.0 / element_variance, 0.0)
+    edge["element_offset"][ends] = np.bincount(x.element, fraction * used)
 
 
 def _job(

@@ -486,11 +486,8 @@ class Comparison:
     def of(cls, reference: str = "template", variances: Literal["model", "estimated"] = "model") -> Self:
         """Create a comparison from its names in a study.
 
-        Parameters
-        ----------
-        reference : str
-            ``"template"`` for the expectation, ``"exposure"`` for one exposure, ``"stack:n"`` for n exposures.
-        variances : {"model", "estimated"}
+        `reference` is ``"template"`` for the expectation, ``"exposure"`` for one exposure, or ``"stack:n"`` for n of
+        them.
         """
         word, colon, number = reference.partition(":")
         if not colon and word in ("template", "exposure"):

@@ -28,8 +28,10 @@ def strength(kind: str, fap: float, probability: float) -> tuple[float, float]:
     return cut, optimize.brentq(lambda push: stats.ncx2.sf(cut, DOF, push) - probability, 1e-6, 1e3)
 
 
-def counted(kind: str, fap: float, probability: float, n: int, seeds: int) -> tuple[np.ndarray, np.ndarray]:
-    """Count flares above a simulated threshold and the ends of its interval; return counts and correlation per seed."""
+def intervals(
+    kind: str, fap: float, probability: float, n: int, seeds: int
+) -> tuple[np.ndarray, list[distributions.Interval]]:
+    """Count flares above a simulated threshold and the ends of its interval; return counts and interval per seed."""
     rng = np.random.default_rng([round(1e4 * fap), round(1e4 * probability), n, len(kind)])
     _, push = strength(kind, fap, probability)
     low, high = (int(count) for count in stats.binom.ppf([0.025, 0.975], n, fap))
@@ -48,7 +50,10 @@ def counted(kind: str, fap: float, probability: float, n: int, seeds: int) -> tu
         above[seed] = [(flare >= ordered[n - rank]).sum() for rank in ranks]
         if kind != "other draws":
             shared[seed] = min(null.std() / flare.std(), 1.0)
-    return above, shared
+    return above, [
+        distributions.detection_interval([int(k) for k in row], n, fap, float(r))
+        for row, r in zip(above, shared, strict=True)
+    ]
 
 
 @pytest.mark.long
@@ -63,11 +68,7 @@ def test_interval_has_nominal_coverage(kind: str, fap: float, n: int, seeds: int
     The interval that it takes the place of is wider in all of them, and up to twice as wide.
     """
     for probability in probabilities:
-        above, shared = counted(kind, fap, probability, n, seeds)
-        found = [
-            distributions.detection_interval([int(k) for k in row], n, fap, float(r))
-            for row, r in zip(above, shared, strict=True)
-        ]
+        above, found = intervals(kind, fap, probability, n, seeds)
         covered = np.mean([x.low <= probability <= x.high for x in found])
         error = 5 * np.sqrt(0.05 * 0.95 / seeds)
         assert 0.94 - error < covered < 0.97 + error
@@ -79,11 +80,7 @@ def test_interval_has_nominal_coverage(kind: str, fap: float, n: int, seeds: int
 def test_interval_covers_near_the_ends(probability: float) -> None:
     """Include few missed flares of 1000, and hardly more detections than false alarms; fails in 3e-7 of seeds."""
     for kind in ("matched", "chi2"):
-        above, shared = counted(kind, 0.1, probability, 1000, 1000)
-        found = [
-            distributions.detection_interval([int(k) for k in row], 1000, 0.1, float(r))
-            for row, r in zip(above, shared, strict=True)
-        ]
+        _, found = intervals(kind, 0.1, probability, 1000, 1000)
         covered = np.mean([x.low <= probability <= x.high for x in found])
         assert covered > 0.94 - 5 * np.sqrt(0.05 * 0.95 / 1000)
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from answers import expectations, of_kind
 from scenes import instrument, star
+from scipy import optimize
 
 from mauvecl import Engine, Expectation, InputError, Study, detect
 from mauvecl import map as detection_map
@@ -108,11 +109,7 @@ def at_the_rail() -> float:
         (x, *_) = expectations(one)
         return float((x.mean_raw_dn - x.ceiling_dn).min())
 
-    low, high = -5.0, 10.0
-    for _ in range(40):
-        middle = (low + high) / 2
-        low, high = (middle, high) if faintest(middle) > 0 else (low, middle)
-    return high
+    return float(optimize.brentq(faintest, -5.0, 10.0))
 
 
 def test_answers_report_missing_thresholds(engine: Engine) -> None:

@@ -1,74 +1,16 @@
 """Closed forms against scipy's exact distributions and plain simulation, and the paper's smoothing."""
 
-import itertools
-import time
-
 import numpy as np
 import pytest
 from scenes import instrument, star
-from scipy import integrate, stats
+from scipy import stats
 from scipy.ndimage import gaussian_filter1d
 
 from mauvecl import Comparison, Expectation, Instrument, Sky, Source, expect
 from mauvecl.detection import chi2, distributions
 
 
-@pytest.mark.parametrize("n", [10, 48, 1643])
-@pytest.mark.parametrize("scale", [1.0, 2.5])
-def test_equal_weights_are_a_scaled_non_central_chi_squared(n: int, scale: float) -> None:
-    """Compare with scipy's ncx2 (Boost); weights of 1 + 1e-12 keep ours from using it."""
-    shift = np.linspace(-0.5, 0.7, n)
-    form = distributions.QuadraticForm(np.full(n, scale * (1 + 1e-12)), shift)
-    exact = stats.ncx2(n, np.sum(shift**2), scale=scale)
-    assert form.mean == pytest.approx(exact.mean())
-    assert form.std == pytest.approx(exact.std())
-    for p in (0.999999, 0.99, 0.5, 1e-2, 1e-4, 1e-6, 1e-9):
-        assert form.sf(float(exact.isf(p))) == pytest.approx(p, rel=1e-4, abs=1e-13)
-
-
-def test_unit_weights_use_scipy() -> None:
-    assert distributions.QuadraticForm(np.ones(30), np.zeros(30)).isf(1e-3) == stats.chi2.isf(1e-3, 30)
-    form = distributions.QuadraticForm(np.ones(30), np.full(30, 0.3))
-    assert form.sf(40.0) == pytest.approx(stats.ncx2.sf(40.0, 30, 30 * 0.09), rel=1e-12)
-
-
-def of_two(form: distributions.QuadraticForm, x: float, *, upper: bool) -> float:
-    """Return the probability above or below x for two terms, integrated over the normal of the first."""
-    (a, b), (first, second) = form.weight, form.shift
-    most = np.sqrt(x / a)
-
-    def rest(z: float) -> float:
-        root = np.sqrt(max(x - a * (z + first) ** 2, 0.0) / b)
-        ends = stats.norm.cdf([root - second, -root - second])
-        return float(stats.norm.sf(root - second) + ends[1] if upper else ends[0] - ends[1])
-
-    edges = np.linspace(-most, most, 21) - first
-    inside = sum(
-        integrate.quad(lambda z: stats.norm.pdf(z) * rest(z), *pair, epsabs=0.0, epsrel=1e-10)[0]
-        for pair in itertools.pairwise(edges)
-    )
-    return float(inside + upper * (stats.norm.sf(edges[-1]) + stats.norm.cdf(edges[0])))
-
-
-@pytest.mark.long
-@pytest.mark.filterwarnings("ignore::scipy.integrate.IntegrationWarning")
-def test_two_terms_of_any_kind_against_quadrature() -> None:
-    """Compare weights up to 1e4 apart and shifts up to 8: every tail to 1e-10, quantiles in half a second."""
-    generator = np.random.default_rng(8)
-    for _ in range(3):
-        form = distributions.QuadraticForm(
-            10 ** generator.uniform(-4, 0, 2), generator.normal(0, 1, 2) * generator.choice([0, 1, 4])
-        )
-        for p in (1e-10, 1e-3, 0.3, 0.9, 1 - 1e-4):
-            began = time.process_time()
-            x = form.isf(p)
-            assert time.process_time() - began < 0.5
-            upper = p <= 0.5
-            assert of_two(form, x, upper=upper) == pytest.approx(p if upper else 1 - p, rel=1e-7)
-            assert form.sf(x) == pytest.approx(p, rel=1e-9)
-
-
-@pytest.mark.parametrize("n", [1, 2, 5, 29, 400])
+@pytest.mark.parametrize("n", [1, 2, 5, 29, 400, 1643])
 @pytest.mark.parametrize("push", [0.0, 0.5, 1e4])
 def test_few_terms_and_far_tails_agree_with_scipy(n: int, push: float) -> None:
     """Compare equal weights down to 1e-100, with the accuracy that scipy has below 1e-10."""

@@ -23,7 +23,7 @@ from mauvecl.device.selftest import toy
 def digest(engine):
     x = toy(frames=1)
     raw, seen = engine.realise(x, count=64, seed=1), engine.snr(x, realisations=64, seed=1)
-    return hashlib.sha256(raw.tobytes() + seen.counts.pixel.tobytes()).hexdigest()
+    return hashlib.sha256(raw.tobytes() + seen.counts.dense("pixel").tobytes()).hexdigest()
 {before}
 from mauvecl.device.engine import DeviceError, Engine
 restore, restored = drivers.KernelCache.restore, []

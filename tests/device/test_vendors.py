@@ -65,14 +65,12 @@ def test_users_folder_is_not_replaced(wheel: Path, monkeypatch: pytest.MonkeyPat
     assert os.environ["OCL_ICD_VENDORS"] == "/my/own"
 
 
-def test_driver_that_the_system_lists_is_not_listed_twice(wheel: Path) -> None:
-    (wheel / "usual" / "intel.icd").write_text(f"{wheel}/lib/libintelocl.so\n")
-    with drivers.show_intel_runtime():
-        assert "OCL_ICD_VENDORS" not in os.environ
-
-
-def test_nothing_changes_without_the_wheel(wheel: Path) -> None:
-    (wheel / "lib" / "libintelocl.so").unlink()
+@pytest.mark.parametrize("listed", [True, False], ids=["listed by the system", "no wheel"])
+def test_nothing_changes_without_need(wheel: Path, listed: bool) -> None:
+    if listed:
+        (wheel / "usual" / "intel.icd").write_text(f"{wheel}/lib/libintelocl.so\n")
+    else:
+        (wheel / "lib" / "libintelocl.so").unlink()
     with drivers.show_intel_runtime():
         assert "OCL_ICD_VENDORS" not in os.environ
 

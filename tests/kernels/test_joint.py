@@ -1,6 +1,7 @@
 """The joint draw of Gaussian and Poisson noise against their exact convolution, wherever its condition allows it."""
 
 from dataclasses import replace
+from typing import Any
 
 import exact
 import numpy as np
@@ -20,38 +21,9 @@ SOONEST, BORDER = 4e13, 5.1e13
 TAIL = 5e-3
 
 
-def one_frame(dark: float, photons: float, read: float, *, gain: float = 0.6, pixels: int = 8, **kind) -> Expectation:
-    x = selftest.toy(pixels, 1, dark=dark, read=read, **({"photon_noise": "poisson"} | kind))
-    full = np.ones(pixels)
-    return replace(
-        x,
-        source_electrons=photons * full,
-        sky_electrons=0 * full,
-        gain_dn_per_electron=gain * full,
-        bias_dn=3000.25 * full,
-    )
-
-
-def noise_of(x: Expectation, pixel: int = 0) -> tuple[float, list[tuple[float, float]]]:
-    """Return the variance of the Gaussian noise of an exposure's sum, and its Poisson counts with their DN."""
-    n, step, gain = x.n_frames, float(x.dark_step_dn[pixel]), float(x.gain_dn_per_electron[pixel])
-    light = n * float(x.light_electrons[pixel])
-    gaussian = n * float(x.read_noise_dn[pixel]) ** 2 + (n - 1) / 12
-    poisson = [(n * float(x.dark_dn[pixel]) / step, step)]
-    if x.photon_noise == "poisson":
-        return gaussian, [*poisson, (light, gain)]
-    return gaussian + gain**2 * light, poisson
-
-
-def span(x: Expectation, pixel: int = 0) -> tuple[int, int]:
-    """Return the first whole DN of an exposure's sum that counts, and the number of them."""
-    reach = int(9 * np.sqrt(x.variance_dn2[pixel])) + 6
-    return int(x.n_frames * x.mean_raw_dn[pixel]) - reach, 2 * reach
-
-
-def exactly(x: Expectation, pixel: int = 0) -> np.ndarray:
-    gaussian, poisson = noise_of(x, pixel)
-    return exact.counts(gaussian, poisson, x.n_frames * float(x.mean_raw_dn[pixel]), *span(x, pixel))
+def one_frame(dark: float, photons: float, read: float, *, pixels: int = 8, **kind: Any) -> Expectation:
+    usual = {"photon_noise": "poisson", "bias": 3000.25}
+    return exact.flat(pixels, 1, dark=dark, photons=photons, read=read, **(usual | kind))
 
 
 def by_polynomial(x: Expectation, pixel: int = 0) -> np.ndarray:
@@ -62,7 +34,7 @@ def by_polynomial(x: Expectation, pixel: int = 0) -> np.ndarray:
     shape, sd = np.array([level[f"c{k}"] for k in range(5)], float), float(level["c1"])
     if not scene.quartic:
         shape[4] = 0.0
-    return exact.of_polynomial(shape / sd, sd, float(scene.base_dn[0, pixel]), *span(x, pixel))
+    return exact.of_polynomial(shape / sd, sd, float(scene.base_dn[0, pixel]), *exact.span(x, pixel))
 
 
 #: Dark and photons per frame, read noise: the payload at 21 and at -40 C, the largest skew with its read noise, faint
@@ -81,7 +53,7 @@ PIXELS = {
 def test_joint_draws_cannot_be_distinguished_from_exact_ones(name: str) -> None:
     """Pearson's test would need 1e14 draws to see the polynomial at five sigma; most cases far more."""
     x = one_frame(**PIXELS[name])
-    p, q = exactly(x), by_polynomial(x)
+    p, q = exact.of_stack(x), by_polynomial(x)
     np.testing.assert_allclose([p.sum(), q.sum()], 1.0, atol=1e-12)
     assert exact.draws_to_tell(p, q) > 1e14
 
@@ -94,7 +66,7 @@ def test_nominal_payload_is_drawn_jointly_at_all_settings(name: str) -> None:
         for frames in (1, 2, 10, 100):
             (x,) = star(payload=payload, exposure=5.0 * frames)
             for pixel in (int(x.light_dn.argmin()), int(x.light_dn.argmax())):
-                assert exact.draws_to_tell(exactly(x, pixel), by_polynomial(x, pixel)) > SOONEST
+                assert exact.draws_to_tell(exact.of_stack(x, pixel), by_polynomial(x, pixel)) > SOONEST
 
 
 BOUNDS = [(np.log10(1.5), 1.5), (-1.0, 1.0), (-2.5, 3.3), (0.0, 1.0), (-4.5, 3.3), (0.0, 1.0)]
@@ -129,14 +101,14 @@ def test_worst_draws_that_the_region_allows(what: str, varying: bool) -> None:
         try:
             if varying:
                 quartic = prepare([x], processes=constant).quartic
-                sd, shape = exact.expansion(*noise_of(x), fourth_power=quartic, varying=True)
-                q = exact.of_polynomial(shape, sd, float(x.mean_raw_dn[0]), *span(x))
+                sd, shape = exact.expansion(*exact.noise_of(x), fourth_power=quartic, varying=True)
+                q = exact.of_polynomial(shape, sd, float(x.mean_raw_dn[0]), *exact.span(x))
             else:
                 q = by_polynomial(x)
         except InputError:
             return 30.0
         tried += 1
-        p = exactly(x)
+        p = exact.of_stack(x)
         return float(np.log10(exact.draws_to_tell(p, q)) if what == "Pearson" else -exact.worst_tail(p, q))
 
     found = optimize.differential_evolution(merit, BOUNDS, rng=1, popsize=12, maxiter=25, polish=False)
@@ -159,8 +131,8 @@ def test_noise_that_is_not_smooth_is_drawn_separately() -> None:
 def test_smallest_poisson_means() -> None:
     """Check 1.5 DN of noise with .14 counts, where gamma_3 is small but 2e9 draws show a tail off by a fifth."""
     x = one_frame(0.14, 0.0, 1.5)
-    sd, shape = exact.expansion(*noise_of(x))
-    p, q = exactly(x), exact.of_polynomial(shape, sd, float(x.mean_raw_dn[0]), *span(x))
+    sd, shape = exact.expansion(*exact.noise_of(x))
+    p, q = exact.of_stack(x), exact.of_polynomial(shape, sd, float(x.mean_raw_dn[0]), *exact.span(x))
     assert exact.draws_to_tell(p, q) < 5e9
     assert exact.worst_tail(p, q) > 0.1
     assert not prepare([x]).joint
@@ -183,14 +155,13 @@ def test_factors_follow_the_cumulants(quartic: bool, photon_noise: str) -> None:
     other = replace(
         x, source_electrons=1.4 * x.source_electrons, sky_electrons=1.4 * x.sky_electrons, dark_dn=warm * x.dark_dn
     )
-    drawn = reference.draws(scene, index, 0, 1, 5)
-    for i in range(4):
-        p, z = 4 + i, drawn.z[i].astype(float)
-        sd, shape = exact.expansion(*noise_of(other, p), fourth_power=quartic, varying=True)
-        ours = reference.analogue(scene, drawn, i, p, 0, *factors).astype(float) + scene.base_dn[0, p]
+    drawn = reference.draws(scene, index, 0, 5)
+    counts = reference.analogue(scene, drawn, 0, *factors)[:8].astype(float) + scene.base_dn[0][:, None]
+    for p in range(8):
+        sd, shape = exact.expansion(*exact.noise_of(other, p), fourth_power=quartic, varying=True)
         # float32 of a draw of up to a thousand DN from its base.
-        wanted = other.mean_raw_dn[p] + sd * np.polynomial.Polynomial(shape)(z)
-        np.testing.assert_allclose(ours, wanted, rtol=0, atol=3e-4)
+        wanted = other.mean_raw_dn[p] + sd * np.polynomial.Polynomial(shape)(drawn.z[p].astype(float))
+        np.testing.assert_allclose(counts[p], wanted, rtol=0, atol=3e-4)
 
 
 #: Realisations of 1643 pixels that are all alike: 1e8 draws, which see a skewness that is off by 0.003.
@@ -203,11 +174,11 @@ ROWS = 61_000
 def test_pearson_of_raw_counts(engine: Engine, name: str, recipe: str) -> None:
     """Pearson's test of 1e8 raw counts from the production kernel; fails by chance once in 1e6 new seeds."""
     x = one_frame(**PIXELS[name], pixels=1643)
-    low, size = span(x)
+    low, size = exact.span(x)
     assert prepare([x], recipe=recipe).joint == (recipe == "joint")
     found = engine.snr(x, realisations=ROWS, seed=31, recipe=recipe)
     assert (found.observers["bin_shift"] == 0).all()
     first = int(found.scene.base_dn[0, 0]) - layout.OBSERVER_BINS // 2
-    counts = found.counts.pixel.sum(axis=0)[low - first : low - first + size]
+    counts = found.counts.dense("pixel").sum(axis=0)[low - first : low - first + size]
     assert counts.sum() == ROWS * x.wavelength_nm.size
-    assert exact.pearson(counts, exactly(x)) > 1e-6
+    assert selftest.pearson(counts, exact.of_stack(x)) > 1e-6

@@ -5,22 +5,13 @@ import pytest
 import randomgen
 from probes import Probes
 
+from mauvecl.device import selftest
 from mauvecl.noise import random_numbers
 
 Words = tuple[int, ...]
-#: Counter, key and answer of Random123's file of known answers.
-KNOWN = [
-    ((0, 0, 0, 0), (0, 0), (0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8)),
-    ((0xFFFFFFFF,) * 4, (0xFFFFFFFF,) * 2, (0x408F276D, 0x41C83B0E, 0xA20BC7C6, 0x6D5451FD)),
-    (
-        (0x243F6A88, 0x85A308D3, 0x13198A2E, 0x03707344),
-        (0xA4093822, 0x299F31D0),
-        (0xD16CFE09, 0x94FDCCEB, 0x5001E420, 0x24126EA1),
-    ),
-]
 
 
-@pytest.mark.parametrize(("counter", "key", "answer"), KNOWN)
+@pytest.mark.parametrize(("counter", "key", "answer"), selftest.PHILOX_VECTORS)
 def test_philox_gives_the_known_answers(probes: Probes, counter: Words, key: Words, answer: Words) -> None:
     out = probes.philox(np.array([counter], np.uint32), np.array([key], np.uint32))[0]
     np.testing.assert_array_equal(out, [*answer, *answer])

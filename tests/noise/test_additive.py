@@ -4,46 +4,12 @@ import json
 import os
 import sys
 
-import numpy as np
 import pytest
 from processes import python
 
-from mauvecl import Engine, Processes
-from mauvecl.device import selftest
-from mauvecl.noise import disturbances, layout, reference
-from mauvecl.noise.scene import prepare
+from mauvecl.noise import layout
 
 N = 4000
-
-
-@pytest.mark.parametrize("name", disturbances.ADDITIVE)
-def test_charge_is_a_distribution(name: str) -> None:
-    """The distribution sums to one, and its variance is that of the process; longer times add up independently."""
-    process = disturbances.ADDITIVE[name]()
-    short, long = process.charge(50.0), process.charge(100.0)
-    assert short.sum() == pytest.approx(1.0, abs=1e-9)
-    assert short.size <= process.most_electrons(50.0) + 1
-    doubled = np.convolve(short, short)
-    size = max(long.size, doubled.size)
-    padded = [np.pad(p, (0, size - p.size)) for p in (long, doubled)]
-    assert np.abs(padded[0] - padded[1]).sum() < 1e3 * 2.0**-40, "a thousand times what may be neglected"
-    quiet = selftest.toy(64, 1)
-    electrons = np.arange(process.charge(quiet.frame_s).size)
-    p = process.charge(quiet.frame_s)
-    variance = p @ electrons**2 - (p @ electrons) ** 2
-    assert process.variance_dn2(quiet) == pytest.approx(variance * quiet.gain_dn_per_electron**2)
-
-
-@pytest.mark.parametrize("name", disturbances.ADDITIVE)
-def test_device_draws_what_the_reference_draws(engine: Engine, name: str) -> None:
-    quiet = selftest.toy(64, 3)
-    processes = Processes(**{name: disturbances.ADDITIVE[name]()}).with_particles(500.0)
-    index = np.arange(20, dtype=np.uint64)
-    scene = prepare([quiet], processes=processes)
-    assert name in scene.additive
-    drawn = engine.realise(quiet, count=20, seed=5, processes=processes)
-    assert (drawn == reference.realise(scene, index, 5)).all()
-    assert (drawn != engine.realise(quiet, count=20, seed=5)).any()
 
 
 #: A toy process that is registered before anything else is imported, as a new row of the registry is.

@@ -11,7 +11,6 @@ from scenes import instrument, star
 from scipy import stats
 
 from mauvecl import CosmicRays, Engine, Expectation, Processes
-from mauvecl.noise.scene import prepare
 
 N = 2000
 SEEDS = 24
@@ -78,18 +77,3 @@ def test_sums_of_frames_with_hits_equal_independent_draws(engine: Engine, seed: 
     edges = np.unique(np.quantile(np.concatenate([ours.ravel(), theirs.ravel()]), np.linspace(0, 1, 61)[1:-1]))
     counts = [np.bincount(np.searchsorted(edges, one.ravel()), minlength=edges.size + 1) for one in (ours, theirs)]
     assert stats.chi2_contingency(np.array(counts)).pvalue > 1e-7
-
-
-@pytest.mark.long
-def test_stacks_are_drawn_only_if_no_frame_can_be_clipped() -> None:
-    """Check random cases with the Poisson probability of the fewest hits that clip a frame."""
-    stacked = 0
-    for seed in range(25):
-        case = Case.of(seed)
-        x = case.x
-        room = (x.highest_dn - x.mean_raw_dn) / x.gain_dn_per_electron
-        fitting = np.floor(room.min() / case.rays.electrons[1])
-        if not prepare([x], processes=Processes(cosmic_rays=case.rays)).frames:
-            stacked += 1
-            assert stats.poisson.sf(fitting, case.hits) < 1e-12, seed
-    assert stacked > 1

@@ -111,18 +111,10 @@ def wide(pixels: int) -> Expectation:
 
 
 def test_largest_number_of_pixels_is_drawn(engine: Engine) -> None:
-    """Draw 65 536 pixels: the last equal the reference, all groups differ, and statistics are defined."""
+    """Draw 65 536 pixels: all equal the reference, all groups differ, and statistics are defined."""
     x = wide(65_536)
     raw = engine.realise(x, start=2**40, count=2, seed=3)
-    scene = prepare([x])
-    index = np.array([2**40, 2**40 + 1], np.uint64)
-    for group in (0, 1, 8191, 8192, 16_382, 16_383):
-        drawn = reference.draws(scene, index, 0, group, 3)
-        same = (np.ones(2, np.float32),) * 3
-        for i, p in enumerate(range(4 * group, 4 * group + 4)):
-            v = reference.analogue(scene, drawn, i, p, 0, *same)
-            twin = reference.digitise(v, scene.edges[0, p], clip=scene.clip) + scene.base_dn[0, p]
-            np.testing.assert_array_equal(raw[:, p], twin)
+    np.testing.assert_array_equal(raw, reference.realise(prepare([x]), np.array([2**40, 2**40 + 1], np.uint64), 3))
     z = (raw - x.mean_raw_dn) / np.sqrt(x.variance_dn2)
     assert len(np.unique(z[0].reshape(-1, 4), axis=0)) == 16_384
     found = engine.detect(x, [], realisations=4000, seed=3, statistics=("chi2",)).distribution("chi2")

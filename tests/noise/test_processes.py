@@ -8,6 +8,7 @@ from scenes import instrument, star
 from scipy import stats
 
 from mauvecl import CosmicRays, Engine, Normal, Processes, Study, Uniform, simulate
+from mauvecl.device import selftest
 from mauvecl.noise import layout, random_numbers, reference
 from mauvecl.noise.scene import prepare
 
@@ -103,7 +104,11 @@ def test_charge_has_moments_of_compound_poisson_sum() -> None:
         one = np.arange(500, 1001)
         assert abs(p.sum() - 1) < 1e-11
         np.testing.assert_allclose(p @ e, rate * one.mean(), rtol=1e-9)
-        np.testing.assert_allclose(p @ e**2 - (p @ e) ** 2, rate * np.mean(one**2), rtol=1e-8)
+        variance = rate * np.mean(one**2)
+        np.testing.assert_allclose(p @ e**2 - (p @ e) ** 2, variance, rtol=1e-8)
+        assert p.size == rays.most_electrons(seconds) + 1
+        quiet = replace(selftest.toy(), frame_s=seconds)
+        np.testing.assert_allclose(rays.variance_dn2(quiet), variance * quiet.gain_dn_per_electron**2, rtol=1e-8)
         # The Fourier transform's own rounding.
         np.testing.assert_allclose(p[0], np.exp(-rate), rtol=1e-9, atol=1e-15)
     weighted = CosmicRays(electrons=(2, 4), weights=(1.0, 0.0, 3.0), rate_per_cm2_s=100.0).charge(5.0)
@@ -191,8 +196,7 @@ def test_draws_have_different_counters(monkeypatch: pytest.MonkeyPatch) -> None:
         seen.clear()
         for frame in range(scene.n_draws):
             for exposure in (0, layout.REFERENCE):
-                for group in range(len(scene.pixels) // 4):
-                    reference.draws(scene, index, frame, group, 1, exposure=exposure)
+                reference.draws(scene, index, frame, 1, exposure=exposure)
         for name, _ in scene.modulations:
             if name != "jitter":
                 reference.words_at(index, 0, name, 0, 1)

@@ -1,6 +1,6 @@
 """Stacks against their frames; frames are drawn singly where rounding does not act as noise."""
 
-from dataclasses import replace
+from typing import Any
 
 import exact
 import numpy as np
@@ -10,41 +10,15 @@ from scenes import instrument, star
 from scipy import optimize
 
 from mauvecl import Engine, Expectation, Processes, Uniform
-from mauvecl.device import selftest
 from mauvecl.noise.scene import prepare
 
 #: Smallest number of draws of one pixel that distinguish an allowed stack from its frames, by exact convolution.
 SOONEST = 4e13
 
 
-def quiet(read: float, frames: int, *, dark: float = 0.0, light: float = 0.0, gain: float = 0.6, **kind) -> Expectation:
+def quiet(read: float, frames: int, **kind: Any) -> Expectation:
     """Return eight pixels whose bias has different fractions of a DN."""
-    x = selftest.toy(8, frames, read=read, dark=dark, light=light, **kind)
-    full = np.ones(8)
-    return replace(
-        x,
-        bias_dn=600.0 + np.arange(8) / 8,
-        source_electrons=light * full,
-        sky_electrons=0 * full,
-        gain_dn_per_electron=gain * full,
-    )
-
-
-def both(x: Expectation, pixel: int) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return the exact probabilities of whole DN, frame by frame and as a stack, and the first DN."""
-    n, step, gain = x.n_frames, float(x.dark_step_dn[pixel]), float(x.gain_dn_per_electron[pixel])
-    read, light = float(x.read_noise_dn[pixel]) ** 2, float(x.source_electrons[pixel])
-    poisson = [(float(x.dark_dn[pixel]) / step, step)]
-    if x.photon_noise == "poisson":
-        poisson.append((light, gain))
-    else:
-        read += gain**2 * light
-    half = int(9 * np.sqrt(x.variance_dn2[pixel])) + 6
-    mean = float(x.mean_raw_dn[pixel])
-    low = int(n * mean) - half
-    frames = exact.counts(read, poisson, mean, low, 2 * half, n)
-    together = [(n * count, step) for count, step in poisson]
-    return frames, exact.counts(n * read + (n - 1) / 12, together, n * mean, low, 2 * half), low
+    return exact.flat(8, frames, read=read, **({"bias": 600.0 + np.arange(8) / 8} | kind))
 
 
 @pytest.mark.long
@@ -58,14 +32,13 @@ def test_worst_allowed_stack_is_indistinguishable_from_frames() -> None:
         kind = {
             "unit": "electrons" if point[5] > 0.5 else "DN",
             "photon_noise": "poisson" if point[6] > 0.5 else "gaussian",
+            "bias": 600.0 + point[7],
         }
-        x = quiet(read, round(frames), dark=dark, light=light if point[2] > -2 else 0.0, gain=gain, **kind)
-        x = replace(x, bias_dn=600.0 + point[7] * np.ones(8))
+        x = quiet(read, round(frames), dark=dark, photons=light if point[2] > -2 else 0.0, gain=gain, **kind)
         if prepare([x]).frames:
             return 30.0
         tried += 1
-        p, q, _ = both(x, 0)
-        return float(np.log10(exact.draws_to_tell(p, q)))
+        return float(np.log10(exact.draws_to_tell(exact.of_frames(x), exact.of_stack(x))))
 
     bounds = [(-0.8, 0.8), (-3.0, 1.5), (-2.2, 2.0), (-1.5, 0.5), (np.log10(2), 2.0), (0, 1), (0, 1), (0, 1)]
     found = optimize.differential_evolution(merit, bounds, rng=1, popsize=10, maxiter=25, polish=False)
@@ -83,11 +56,11 @@ def test_auto_mode_stacks_only_where_moments_agree() -> None:
             "unit": generator.choice(["DN", "electrons"]),
             "photon_noise": generator.choice(["gaussian", "poisson"]),
             "dark": float(generator.choice([0.0, 0.1, 3.0, 100.0])),
-            "light": float(generator.choice([0.0, 0.2, 20.0])),
+            "photons": float(generator.choice([0.0, 0.2, 20.0])),
             "gain": float(generator.choice([0.05, 0.6, 1.0])),
         }
         x = quiet(float(10 ** generator.uniform(-1.0, 1.2)), int(generator.integers(2, 60)), **kind)
-        reported = [exact.draws_to_tell(*both(x, p)[:2]) for p in range(8)]
+        reported = [exact.draws_to_tell(exact.of_frames(x, p), exact.of_stack(x, p)) for p in range(8)]
         frames = prepare([x]).frames
         stacked += not frames
         wrong += min(reported) < 1e12
@@ -109,8 +82,8 @@ def test_nearly_noiseless_detector_is_drawn_frame_by_frame(engine: Engine) -> No
     assert prepare([x]).frames
     raw = engine.realise(x, count=rows, seed=5).astype(float)
     for pixel in range(8):
-        p, _, low = both(x, pixel)
-        dn = low + np.arange(p.size)
+        p = exact.of_frames(x, pixel)
+        dn = exact.span(x, pixel)[0] + np.arange(p.size)
         mean = p @ dn
         variance, fourth = (p @ (dn - mean) ** k for k in (2, 4))
         assert abs(raw[:, pixel].mean() - mean) < 5 * np.sqrt(variance / rows) + 1e-9
@@ -120,7 +93,7 @@ def test_nearly_noiseless_detector_is_drawn_frame_by_frame(engine: Engine) -> No
 
 def test_mode_follows_least_light_of_prior() -> None:
     """Choose the mode by the least light that a prior allows, whose photons smooth the rounding least."""
-    x = quiet(0.1, 100, light=60.0)
+    x = quiet(0.1, 100, photons=60.0)
     assert not prepare([x]).frames
     assert prepare([x], processes=Processes(qe_scale=Uniform(0.01, 1.0))).frames
 

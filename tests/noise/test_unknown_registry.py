@@ -6,7 +6,7 @@ import pytest
 from scenes import instrument, star
 
 from mauvecl import Processes, Stare, Study
-from mauvecl.noise import disturbances, layout, unknowns
+from mauvecl.noise import disturbances, unknowns
 from mauvecl.noise.scene import changes_of
 
 ROWS = [
@@ -34,12 +34,6 @@ def test_every_default_prior_has_a_source_or_documentation() -> None:
         assert row.marginalised
         assert row.scatter > 0
         assert unknowns.PROCESSES[row.process].of == row.of
-
-
-def test_streams_of_processes_are_those_of_the_rows() -> None:
-    rows = [*disturbances.ADDITIVE.items(), *unknowns.PROCESSES.items()]
-    rows += [(f"stare_{name}", process) for name, process in unknowns.STARE_PROCESSES.items()]
-    assert all(layout.STREAMS[name] == row.stream for name, row in rows)
 
 
 @pytest.mark.parametrize("row", [row for rows in unknowns.STARE_CHANGES.values() for row in rows.values()], ids=str)

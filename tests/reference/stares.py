@@ -82,30 +82,27 @@ def pixels(scene: StareScene, flares: Flares, numbers: Numbers, frames: Iterable
     out, lost = [], scene.losses(numbers, seed)
     for frame in frames:
         conditions = strengths(scene, numbers, frame, seed, lost)
-        sums = np.zeros((len(flares.amplitudes), 4, len(scene.weights), len(numbers)), np.float32)
-        for group in range(len(scene.mixtures) // 4):
-            drawn = reference.draws(scene.scene, numbers, int(scene.numbers[frame]), group, seed)
-            for i, p in enumerate(range(4 * group, 4 * group + 4)):
-                for k in range(len(flares.amplitudes)):
-                    flare = _coefficients(scene, flares, frame, k, conditions["light"])
-                    v = _count(scene, p, drawn.z[i], conditions, flare)
-                    for electrons in drawn.added.values():
-                        v = fma(electrons[i], scene.scene.pixels[p]["electron_gain"], v)
-                    x = reference.digitise(v, scene.scene.edges[0, p], clip=scene.scene.clip)
-                    for s, weight in enumerate(scene.weights[:, p]):
-                        sums[k, i, s] = fma(x, weight, sums[k, i, s])
-        a, b, c, d = np.moveaxis(sums, 1, 0)
+        drawn = reference.draws(scene.scene, numbers, int(scene.numbers[frame]), seed)
+        sums = np.zeros((4, len(flares.amplitudes), len(scene.weights), len(numbers)), np.float32)
+        for k in range(len(flares.amplitudes)):
+            v = _counts(scene, drawn.z, conditions, _coefficients(scene, flares, frame, k, conditions["light"]))
+            for electrons in drawn.added.values():
+                v = fma(electrons, scene.scene.pixels["electron_gain"][:, None], v)
+            x = reference.digitise(v, scene.scene.edges[0, :, None], clip=scene.scene.clip)
+            for p, weights in enumerate(scene.weights.T):
+                sums[p % 4, k] = fma(x[p], weights[:, None], sums[p % 4, k])
+        a, b, c, d = sums
         out.append(((a + b) + (c + d)) + scene.constants[:, None])
     return np.moveaxis(np.array(out), (0, 1, 2, 3), (2, 0, 3, 1))
 
 
-def _count(scene: StareScene, p: int, z: Floats, conditions: dict[str, Floats], flare: list[Floats]) -> Floats:
-    """Return the count of a pixel above its base, before the ADC."""
-    m, one = scene.mixtures[p], np.float32(1.0)
+def _counts(scene: StareScene, z: Floats, conditions: dict[str, Floats], flare: list[Floats]) -> Floats:
+    """Return the counts of all pixels above their bases, before the ADC, shape (n_pixel, n_stare)."""
+    m, one = scene.mixtures[:, None], np.float32(1.0)
     light, dark = fma(conditions["star"], m["star"], conditions["sky"] * m["sky"]), conditions["dark"]
     light = fma(conditions["neighbours"], m["neighbours"], light)
     for coefficient, spectrum in zip(flare, scene.spectra, strict=True):
-        light = fma(coefficient, spectrum[p], light)
+        light = fma(coefficient, spectrum[:, None], light)
     variance = fma(light, m["photon_variance"], fma(dark, m["dark_variance"], m["variance"]))
     third, fourth, fifth = (fma(dark, m[f"dark_{name}"], m[name]) for name in ("third", "fourth", "fifth"))
     if scene.counts:
@@ -116,16 +113,12 @@ def _count(scene: StareScene, p: int, z: Floats, conditions: dict[str, Floats], 
     skew = third * each
     curve = fourth * fma(zz, np.float32(0.041666668), np.float32(-0.125))
     curve = curve - third * skew * fma(zz, np.float32(0.055555556), np.float32(-0.1388889))
-    even = fifth * _quartic(zz, 0.008333334, -0.05, 0.025)
-    even = even - skew * fourth * _quartic(zz, 0.041666668, -0.20833333, 0.083333336)
-    even = even + skew * skew * third * _quartic(zz, 0.037037037, -0.16358025, 0.052469134)
+    even = fifth * reference.even_powers(zz, 0.008333334, -0.05, 0.025)
+    even = even - skew * fourth * reference.even_powers(zz, 0.041666668, -0.20833333, 0.083333336)
+    even = even + skew * skew * third * reference.even_powers(zz, 0.037037037, -0.16358025, 0.052469134)
     straight = fma(curve * each, sd * each, sd)
     v = fma(z, straight, fma(skew, fma(zz, np.float32(0.16666667), np.float32(-0.16666667)), m["rest"]))
     return np.asarray(fma(even * each, each, v) + fma(dark, m["dark"], light))
-
-
-def _quartic(zz: Floats, second: float, first: float, constant: float) -> Floats:
-    return fma(zz, fma(zz, np.float32(second), np.float32(first)), np.float32(constant))
 
 
 def sums(scene: StareScene, flares: Flares, numbers: Numbers, frames: Iterable[int], seed: int) -> Floats:
@@ -152,11 +145,7 @@ def _chain(terms: Iterable[tuple[Floats, Floats]]) -> Floats:
 
 
 def _sums(
-    scene: StareScene,
-    table: SumTable,
-    z: list[Floats],
-    conditions: dict[str, Floats],
-    flare: list[Floats],
+    scene: StareScene, table: SumTable, z: list[Floats], conditions: dict[str, Floats], flare: list[Floats]
 ) -> list[Floats]:
     n = len(scene.weights)
     pairs = stare_scene.unique(n, 2)

@@ -70,14 +70,11 @@ def statistics(
             if exposures:
                 variance = np.add(variance, added * _variance(total * added, estimate), dtype=np.float32)
             y = np.add(y, estimate["fraction"][:, None], dtype=np.float32)
-        parts = [np.zeros(len(realisation), np.float32) for _ in range(4)]
-        for p, pixel in enumerate(scene.pixels):
-            if estimated:
-                parts[p % 4] = fma(y[p] * y[p], pixel["used"] / variance[p], parts[p % 4])
-            else:
-                slope = fma(y[p], level[p]["inverse_variance"], level[p]["twice"])
-                parts[p % 4] = fma(y[p], slope, parts[p % 4])
-        out[fixed * k] = ((parts[0] + parts[1]) + (parts[2] + parts[3])) + constants[k]
+        if estimated:
+            squares = _summed(y * y, scene.pixels["used"][:, None] / variance)
+        else:
+            squares = _summed(y, fma(y, level["inverse_variance"][:, None], level["twice"][:, None]))
+        out[fixed * k] = squares + constants[k]
         out[fixed * k + 1], of_elements = _element_sums(scene, k, y, variance, weights[pixels_end[k] : linear_end[k]])
         out[fixed * n_scenario + int(pixels_end[k]) : fixed * n_scenario + int(linear_end[k])] = of_elements
         for p, pixel in enumerate(scene.pixels) if pair else ():
@@ -177,8 +174,11 @@ def _above_reference(scene: Any, counts: NDArray[np.int64]) -> NDArray[np.float3
     return np.asarray((above + reference.MAGIC) - scene.levels["shift"][:, :, None])
 
 
-def _summed(values: NDArray[np.float32], weights: NDArray[np.float32]) -> Floats:
-    """Return weighted sums over pixels, shape (n,), from four partial sums by pixel index modulo four."""
+def _summed(values: Floats, weights: Floats) -> Floats:
+    """Return weighted sums over pixels, shape (n,), from four partial sums by pixel index modulo four.
+
+    Weights have the shape (n_pixel,) or (n_pixel, n).
+    """
     parts = [np.zeros(values.shape[1], np.float32) for _ in range(4)]
     for p, weight in enumerate(weights):
         parts[p % 4] = fma(values[p], weight, parts[p % 4])
@@ -187,32 +187,20 @@ def _summed(values: NDArray[np.float32], weights: NDArray[np.float32]) -> Floats
 
 
 def histograms(
-    scene: Any,
-    observers: NDArray[np.void],
-    elements: NDArray[np.void],
-    realisation: NDArray[np.uint64],
-    seed: int,
+    scene: Any, observers: NDArray[np.void], elements: NDArray[np.void], realisation: NDArray[np.uint64], seed: int
 ) -> snr.Counts:
     """Count pixels, S/N of elements and clipped frames as the kernel `histogram` does, including far values."""
-    counts, half = snr.Counts(scene.n_pixel, len(elements)), layout.OBSERVER_BINS // 2
+    counts = snr.Counts(scene.n_pixel, len(elements))
     n = reference.observed(scene, realisation, seed, scenarios=[0])[0]
 
     def count(kind: str, which: int, numbers: NDArray[np.int64]) -> None:
-        inner = np.abs(numbers + 0.5) < half - 1
-        dense = counts.pixel if kind == "pixel" else counts.element
-        dense[which] = np.bincount(numbers[inner] + half, minlength=2 * half)
-        counts.far[kind].count(which * 2**32 + 2**31 + numbers[~inner])
+        counts.bins[kind].count(which * 2**32 + 2**31 + numbers)
 
     for e, element in enumerate(elements):
-        signal, variance = (np.zeros(len(realisation), np.float32) for _ in range(2))
-        for p in range(int(element["first"]), int(element["end"])):
-            observer = observers[p]
-            net = n[p].astype(np.float32) + observer["net_offset"]
-            signal = signal + net
-            variance = variance + fma(np.maximum(net, np.float32(0.0)), observer["gain"], observer["variance"])
-            count("pixel", p, n[p] >> int(observer["bin_shift"]))
-        signal = signal - element["sky"]
-        ratio = np.divide(signal, np.sqrt(variance), out=np.zeros_like(signal), where=variance > 0)
+        first, end = int(element["first"]), int(element["end"])
+        for p in range(first, end):
+            count("pixel", p, n[p] >> int(observers[p]["bin_shift"]))
+        ratio = snr.signal_to_noise(n[first:end], observers[first:end], element["sky"])
         steps = (ratio - element["centre"]) * element["bins_per_unit"]
         count("element", e, np.rint(steps).astype(np.int64))
     counts.clipped += reference.clipped(scene, realisation, seed).sum(axis=0)
