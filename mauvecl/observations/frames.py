@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import IntFlag
-from functools import cached_property
+from functools import cache, cached_property
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import numpy as np
@@ -146,13 +146,7 @@ class Reason(IntFlag):
     @classmethod
     def all_words(cls, values: NDArray[Any]) -> NDArray[np.str_]:
         """Return the reasons of many frames in words."""
-        return np.array(_worded(values, cls.words), np.str_)
-
-
-def _worded(values: NDArray[Any], words: Callable[[int], str]) -> list[str]:
-    """Return the words for many values, made once for each that differs."""
-    texts = {value: words(int(value)) for value in np.unique(values).tolist()}
-    return [texts[value] for value in values.tolist()]
+        return np.array([*map(cache(cls.words), values.tolist())], np.str_)
 
 
 def _check_light(name: str, time: Float, light: Float) -> None:
@@ -383,7 +377,7 @@ class Frames:
         """Bits of the quality flag that exclude each frame, as in "Desat (32)"; empty for others."""
         if self.quality is None:
             return [""] * self.n_frames
-        return _worded(self.quality, QualityBits(self.quality_mask, self.mission).words)
+        return [*map(cache(QualityBits(self.quality_mask, self.mission).words), self.quality.tolist())]
 
     def shifted(self, by_s: Annotated[Float, Unit("s")]) -> Self:
         """Return the frames with other times."""

@@ -336,14 +336,15 @@ class Correlations:
     """
 
     def __init__(self, values: Float, reach: int) -> None:
-        self.values = values
+        self.values, self._reach = values, reach
         self._size = next_fast_len(values.shape[-1] + 2 * reach, real=True)
-        self._spectrum = rfft(values, self._size)
+        self._spectrum = rfft(np.pad(values, [(0, 0)] * (values.ndim - 1) + [(reach, 0)]), self._size)
 
     def of(self, kernel: Float, first: int) -> Float:
         """Return sum_k values[o + first + k] kernel[k] for every frame o of the last axis."""
+        start = self._reach + first
         found = irfft(self._spectrum * rfft(kernel, self._size).conj(), self._size)
-        return np.roll(found, -first, axis=-1)[..., : self.values.shape[-1]]
+        return found[..., start : start + self.values.shape[-1]]
 
 
 def _correlated(values: Float, kernel: Float, first: int) -> Float:
