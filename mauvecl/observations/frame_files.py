@@ -224,17 +224,11 @@ def _frame_file(
 
 
 def _opened(
-    path: Path,
-    what: str,
-    name: str | None,
-    mapping: FrameMapping | None = None,
-    check: bool = True,
-    *,
-    large: bool = False,
+    path: Path, what: str, name: str | None, how: FrameMapping | None = None, check: bool = True, large: bool = False
 ) -> AbstractContextManager[TableFile]:
     """Open a file with frames; only `large` ones may exceed MAUVECL_LARGEST_FILE_MIB."""
     # Groups of names, of each of which the chosen table has one.
-    wanted = (KNOWN["time"], KNOWN["flux"]) if mapping is None else tuple((each,) for each in mapping.times)
+    wanted = (KNOWN["time"], KNOWN["flux"]) if how is None else tuple((each,) for each in how.times)
 
     def of_fits(hdus: Any, what: str) -> TableFile:
         return stored_in_fits(FitsTables(hdus, what), name) or FitsTables(hdus, what, name, wanted)
@@ -510,7 +504,8 @@ def _masked(quality: Values | None, bits: QualityBits) -> Values | None:
 
 def _light(found: Quantities, mapping: FrameMapping) -> tuple[str, Values, Values | None, tuple[str, ...]]:
     """Return the unit of the light, light and errors in it, and remarks."""
-    flux, error, remarks = found.flux, found.error, ()
+    flux, error = found.flux, found.error
+    remarks: tuple[str, ...] = ()
     stated = flux.unit or unit_in_name(flux.name)
     unit = mapping.flux_unit or stated
     if mapping.flux_unit and stated and mapping.flux_unit != stated:

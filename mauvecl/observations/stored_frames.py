@@ -135,16 +135,13 @@ class StoredFile(TableFile):
         self, what: str, path: str, raw: Any, calibration: Mapping[str, Float], of: Mapping[str, Any],
         numbers: NDArray[np.int64] | None,
     ) -> None:  # fmt: skip
-        """Take raw spectra with the calibration of their pixels.
+        """Take raw spectra, in DN, with the calibration of their pixels.
 
-        The array `path`, such as ``star-1/flare-1``, has the shape (n_realisation, n_pixel) or (n_realisation, n_frame,
-        n_pixel), in DN, and is read from the file when it is sliced. The calibration is wavelength, bias, dark, read
-        noise and gain of each pixel and frame. Attributes are ``exposure_s`` and ``frames`` of an exposure, star,
-        instrument, temperature, saturation, and unit of the dark; `numbers` are those of the stored frames of each
-        exposure, shape (n_frame,), or None.
+        The array `path`, such as ``star-1/flare-1``, of the shape (n_realisation, n_pixel) or (n_realisation, n_frame,
+        n_pixel), is read when it is sliced. `of` are attributes of an exposure, and `numbers` those of its stored
+        frames, shape (n_frame,), or None.
         """
-        missing = [key for key in REQUIRED if key not in of]
-        if missing:
+        if missing := [key for key in REQUIRED if key not in of]:
             raise InputError(f"{what} lacks {missing[0]} of {path}; give a file of this version of mauvecl", key="file")
         super().__init__(what, {"OBJECT": of.get("star", ""), "INSTRUME": of["instrument"]})
         self.raw, self.calibration, self.attributes = raw, calibration, of
