@@ -380,7 +380,8 @@ def event_spectrum(
     spectrum, variance = _weighted(survey, series, taken, one)
     flares = series.model.flares(TEMPERATURES_K)
     unknown = series.model.unknowns(series.light)
-    causes: dict[Cause, Float] = {"flare": flares} | {CAUSES[name]: row[None] for name, row in unknown.items()}
+    causes: dict[Cause, Float] = {"flare": flares}
+    causes |= {CAUSES[name]: row[None] for name, row in unknown.items()}
     fits = {cause: chi2_of_one(spectrum, variance, rows) for cause, rows in causes.items()}
     chi2 = {cause: float(each.min()) for cause, each in fits.items()}
     # Light is added, never taken away.

@@ -418,10 +418,12 @@ def fit_throughput(
     assumed = [*(() if m else ("wavelength zero point",)), *(() if m == 4 else ("line width",)),
                *(() if several else ("errors of the star's spectrum",))]  # fmt: skip
     scales, errors = (1.0, 1.0, nominal.gaussian_fwhm_nm, nominal.gaussian_fwhm_nm), np.sqrt(np.diag(joint))[nm.size :]
-    values = [Value(scale * float(shape[k] + (k == 2)), scale * float(errors[k])) if k < m else None
-              for k, scale in enumerate(scales)]  # fmt: skip
-    return ThroughputFit(nm, log_factor, joint, *values, residual, pixels.chi2, pixels.dof, best.smoothing,
-                         apart or error, pixels.structure, tuple(assumed))  # fmt: skip
+    shift, stretch, width, change = (
+        Value(scale * float(shape[k] + (k == 2)), scale * float(errors[k])) if k < m else None
+        for k, scale in enumerate(scales)
+    )
+    return ThroughputFit(nm, log_factor, joint, shift, stretch, width, change, residual, pixels.chi2, pixels.dof,
+                         best.smoothing, apart or error, pixels.structure, tuple(assumed))  # fmt: skip
 
 
 def _joint_covariance(model: ThroughputModel, best: _Linearised, pixels: _Pixels, spectrum_error: float) -> Float:
