@@ -326,7 +326,7 @@ MUTATIONS: dict[str, Mutation] = {
         ("goal = _log_above(0.0, *held, 0.0) + float", "goal = float"),
     ),
     "a flare added to the level of its star": (
-        "test_flare_brighter_than_its_window_has_its_energy",
+        "test_table_of_events_has_the_flare_in_its_units",
         (
             "float(window.values @ likelihood.level) - grid.amplitude * in_level",
             "float(window.values @ likelihood.level) + grid.amplitude * in_level",

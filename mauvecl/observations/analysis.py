@@ -23,7 +23,6 @@ from mauvecl.observations.progress import UNREPORTED, Steps
 from mauvecl.observations.search import (
     CHANCE_DIP,
     NO_COLOUR_K,
-    Detection,
     SeriesSurvey,
     SimulatedRate,
     innovations,
@@ -79,8 +78,7 @@ def inject(
 ) -> Completeness:  # fmt: skip
     """Inject flares of several half-widths and sizes at random times, and count those that the search detects.
 
-    Flares are injected into `free` frames, which belong to no event, and the others are left out of the search. Light
-    curves have no colour, and flares in them no temperature. `steps` reports each half-width.
+    They are injected into `free` frames, which belong to no event; the others are left out. `steps` reports each width.
     """
     every = np.flatnonzero(free)
     rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, INJECTION_KEY]))
@@ -155,8 +153,7 @@ CANDIDATES = 1.0
 MOST_IN_EVENTS, MOST_EVENTS, LONG = 0.5, 2, 100.0
 
 
-#: Range of the dark current in the sum over wavelength of spectra, relative to the level, above which this is not the
-#: star's (assumed).
+#: Range of the dark current in the sum over wavelength, over the level, from which this is not the star's (assumed).
 DARK_SHARE = 0.1
 
 
@@ -175,8 +172,7 @@ class Analysis:
     """Analysis of the frames of one star."""
 
     frames: Frames
-    # flux, error: shape (n_frame,); the light curve that was searched; for spectra, the sum over wavelength.
-    flux: Float
+    flux: Float  # shape (n_frame,); the light curve that was searched; for spectra, the sum over wavelength
     error: Float | None
     level: QuiescentLevel
     survey: SeriesSurvey
@@ -189,8 +185,7 @@ class Analysis:
     events: list[ObservedEvent]  # events above the threshold of candidates, in order of time
     completeness: Completeness  # share of flares that the search detects in these frames
     scatter: list[Scatter]
-    # Shape (n_quiet, n_sum); residuals of quiescent frames given those before them, in standard deviations.
-    residual: Float
+    residual: Float  # shape (n_quiet, n_sum); of quiescent frames given those before them, in standard deviations
     quiet: NDArray[np.bool_]  # shape (n_searched,); frames of the residuals
     likeness: Likeness  # of the residuals and independent noise
     spectra: SpectralAnalysis | None = None  # of spectra that are searched with weights for flares
@@ -212,19 +207,21 @@ class Analysis:
         return series is not None and bool(series.changes) and bool(np.isfinite(series.jitters["light"]))
 
     @cached_property
-    def in_events(self) -> float:
-        """Share of the searched frames in events."""
+    def _inside(self) -> NDArray[np.bool_]:
+        """Searched frames in events."""
         inside = np.zeros(self.survey.stare.n_frames, np.bool_)
         for one in self.events:
             inside[one.first : one.last + 1] = True
-        return float(inside.mean())
+        return inside
+
+    @property
+    def in_events(self) -> float:
+        """Share of the searched frames in events."""
+        return float(self._inside.mean())
 
     @property
     def crowded(self) -> bool:
-        """True if most frames of a long light curve are in events: too few show the star without them.
-
-        One flare may fill a short window.
-        """
+        """True if most frames of a long light curve are in events, so that too few show the star without them."""
         longest = max((one.half_width_s for one in self.events), default=0.0)
         many = len(self.events) > MOST_EVENTS and self.in_events > MOST_IN_EVENTS
         return many and self.survey.stare.duration_s > min(LONG * longest, LONG_S)
@@ -241,9 +238,7 @@ class Analysis:
         used = np.flatnonzero(self.level.used)
         inside, quiet = np.zeros((2, frames.n_frames), np.bool_)
         inside[used[event.first : event.last + 1]] = True
-        quiet[used] = self.level.quiet[used]
-        for other in self.events:
-            quiet[used[other.first : other.last + 1]] = False
+        quiet[used] = self.level.quiet[used] & ~self._inside
         return event_colour(frames.flux, frames.error, inside, quiet)
 
     @property
@@ -366,11 +361,10 @@ def analyse_frames(
     """Find the flares in observed frames.
 
     The `wanted` rate is that of false alarms per star-day. The `model` is that of the pixels of spectra, which are
-    searched as their sum over wavelength without it; `rank` is the largest number of weighted sums of a spectrum.
-    Standard deviations of light, dark current and sky from frame to frame, `jitters`, are infinite for those that the
-    search leaves out; where they do not state it, that of the light is infinite and that of the dark current as
-    measured. The temperature is that of injected flares in spectra. `report` is called with the share of the work that
-    is done, which rises to 1, and may raise to stop the work.
+    searched as their sum over wavelength without it; `rank` is the largest number of weighted sums. `jitters`, standard
+    deviations of light, dark current and sky from frame to frame, are infinite for those that the search leaves out; by
+    default the light, and the dark current as measured. The temperature is that of injected flares in spectra. `report`
+    is called with the share of the work that is done, and may raise to stop the work.
     """
     steps = Steps(report)
     level_steps, rate_steps, search_steps, event_steps, injection_steps = (
@@ -388,7 +382,11 @@ def analyse_frames(
     events = measure_events(survey, taken, detected, [one.cause for one in seen], event_steps)
     spectra = None
     if model is not None:
-        spectra = SpectralAnalysis(cleaned, series, seen, _measured_flares(survey, series, taken, detected, events))
+        measured = [
+            measure_flare(survey, series, taken, one) if event.kind == "flare" else f"its kind is {event.kind}"
+            for event, one in zip(events, detected, strict=True)
+        ]
+        spectra = SpectralAnalysis(cleaned, series, seen, measured)
     quiet = ~taken
     residual = innovations(survey, quiet)
     middle = survey.bank.directions[len(survey.bank.directions) // 2]
@@ -398,20 +396,6 @@ def analyse_frames(
         inject(survey, quiet, threshold, seed, temperature_k, injection_steps),
         binned_scatter(numbers, residual @ middle), residual, quiet, likeness(numbers, residual), spectra,
     )  # fmt: skip
-
-
-def _measured_flares(
-    survey: SeriesSurvey,
-    series: SpectralSeries,
-    taken: NDArray[np.bool_],
-    detected: list[Detection],
-    events: list[ObservedEvent],
-) -> list[Measurement | str]:
-    """Return the measurement of each event's spectra, or why there is none."""
-    return [
-        measure_flare(survey, series, taken, one) if event.kind == "flare" else f"its kind is {event.kind}"
-        for event, one in zip(events, detected, strict=True)
-    ]
 
 
 def _thresholds(

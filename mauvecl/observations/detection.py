@@ -41,8 +41,7 @@ FASTEST_ROTATION_S, SEEN_ONCE, REPEATED = 17_280.0, 20.0, 10.0
 SETTLED = 0.002
 #: Smallest number of quiescent frames to which a process is fitted; with fewer, the longest events are shortened.
 MIN_QUIET = 20
-#: Share of a template's response to the flux of other events that a further event must exceed, since their shapes are
-#: not exactly known.
+#: Share of a template's response to other events, of inexact shapes, that a further event must exceed.
 UNCERTAIN = 0.5
 #: Flux of a template, in standard deviations of a frame, to which its tail belongs to the event: the smallest for which
 #: more than a few events leave most frames to the star (number and share assumed).
@@ -53,18 +52,16 @@ LONG_S = 2 * DAY_S
 LONGEST_TAIL, BEGINNING = 60.0, 1.2
 #: Statistic of an event, relative to that of an event next to it, below which it is that one's beginning or tail.
 BELONGING = 0.1
-#: Half-widths, and shortest time scales of the process, around a larger event in which smaller ones wait for the next
-#: search.
+#: Half-widths, and shortest time scales of the process, in which smaller events wait for the next search.
 NEAR_WIDTHS, NEAR_SCALES = 20.0, 2.0
-#: Mean of consecutive frames at the end of an event, in standard deviations of a frame, and their number, with which
-#: it goes on.
+#: Mean of the last frames of an event, in standard deviations of a frame, and their number, with which it goes on.
 STILL_BRIGHT, END_FRAMES = 1.0, 4
 
 
 def fit_processes(survey: SeriesSurvey, taken: Bool, start: SeriesSurvey | None, steps: Steps) -> SeriesSurvey:
     """Return a survey with the processes that fit its sums and its flux outside the frames of events, `taken`.
 
-    `start` is a survey of nearly the same frames with processes, whose terms are kept. `steps` reports each fit.
+    The terms of `start`, a survey of nearly the same frames, are kept. `steps` reports each fit.
     """
     quiet = ~taken
     time, step = survey.stare.start_s[quiet], survey.stare.frame_s
@@ -88,9 +85,8 @@ def fit_quiet_light(
 ) -> tuple[SeriesSurvey, Bool]:
     """Fit process and events in alternation, from the guess and, if need be, from the events in independent noise.
 
-    A bright, slow flare resembles a process that is seen once. Where that is the result, the one with the events in
-    independent noise is compared, and the smaller Bayesian information criterion decides, with the flares among the
-    parameters. The arguments are those of `alternate`.
+    A bright, slow flare resembles a process that is seen once. There, the fit with the events in independent noise is
+    compared by the Bayesian information criterion, with the flares among the parameters. For arguments see `alternate`.
     """
     fitted, taken = alternate(survey, guessed, before, steps)
     if not _seen_once(fitted):
@@ -186,8 +182,7 @@ def _criterion_of(survey: SeriesSurvey, fits: Sequence[EventLight], kept: Bool, 
 def _criterion_alone(survey: SeriesSurvey, event: Detection, size: float, *alternatives: Sequence[EventLight]) -> float:
     """Return the criterion of the frames of an event in a light curve, whose light has a process of its own.
 
-    The process is added to each of the alternatives, which are flares, or to no flare: the smallest criterion counts. A
-    parameter costs `size`.
+    It is the smallest of those with no flares, and with the flares of each of the alternatives.
     """
     rows = slice(event.first, event.last + 1)
     added = [(1, *_added(survey, [], 0.0))]
@@ -217,9 +212,7 @@ def alternate(
 ) -> tuple[SeriesSurvey, Bool]:
     """Fit process and events in alternation; return the survey with processes, and the frames above `PROVISIONAL`.
 
-    The survey has no processes, and the frames of events are first guessed. `before` is a survey of nearly the same
-    frames with processes, whose terms are kept as long as the events hardly change. `steps` reports each fit and each
-    search.
+    The terms of `before`, a survey of nearly the same frames, are kept as long as the events hardly change.
     """
     taken, rounds = guessed, dict[tuple[bytes, SeriesSurvey | None], tuple[SeriesSurvey, Bool]]()
     for _ in range(ROUNDS):
@@ -293,10 +286,7 @@ def most_events(n_frames: int) -> int:
 
 
 def _merged(found: list[Detection]) -> list[Detection]:
-    """Return the events in order of time, without those that belong to a larger one.
-
-    These overlap with it, or are its beginning or tail: next to it, and much smaller.
-    """
+    """Return the events in order of time, without those that overlap a larger one or are its beginning or tail."""
     kept: list[Detection] = []
     for one in sorted(found, key=lambda each: each.first):
         if kept:
@@ -372,10 +362,7 @@ def _extent(survey: SeriesSurvey, taken: Bool, faint: float, one: Detection) -> 
 def _extended(
     survey: SeriesSurvey, taken: Bool, extents: list[tuple[int, int]], found: list[Detection], *, crowded: bool
 ) -> list[tuple[int, int]]:
-    """Return events that go on as long as the frames at their ends are brighter than the level.
-
-    In crowded light curves they end where these are not.
-    """
+    """Extend events to frames that are brighter than the level; in crowded light curves, cut off those that are not."""
     quiet = ~taken
     if quiet.sum() < MIN_QUIET:
         return extents

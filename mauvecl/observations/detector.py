@@ -39,43 +39,33 @@ class CalibrationFrames:
 
         `temperature_c` is that of the detector where the frames do not state it.
         """
-        nm = frames.wavelength_nm
-        if nm is None or nm.shape != nominal.wavelength_nm.shape:
-            raise InputError.of(
-                "frames", frames.flux.shape, f"spectra of the {nominal.wavelength_nm.size} pixels that "
-                f"{nominal.name} reads", where=frames.name,
-            )  # fmt: skip
-        off = float(np.abs(nm - nominal.wavelength_nm).max())
-        if off > nominal.resolution_element_nm:
-            raise InputError(
-                f"{frames.name}: the wavelengths must be within {nominal.resolution_element_nm:g} nm of those of "
-                f"{nominal.name}, but differ by {off:.3g} nm",
-                key="wavelength",
-            )
-        unit = frames.unit.strip().casefold()
-        if unit not in ("dn", "adu", "ct", "count"):
-            raise InputError.of("unit", frames.unit or "none", "that of raw DN, with bias and dark", where=frames.name)
+        name, nm, own_nm = frames.name, frames.wavelength_nm, nominal.wavelength_nm
+        if nm is None or nm.shape != own_nm.shape:
+            expected = f"spectra of the {own_nm.size} pixels that {nominal.name} reads"
+            raise InputError.of("frames", frames.flux.shape, expected, where=name)
+        off, most = float(np.abs(nm - own_nm).max()), nominal.resolution_element_nm
+        if off > most:
+            fault = f"the wavelengths must be within {most:g} nm of those of {nominal.name}, but differ by {off:.3g} nm"
+            raise InputError(f"{name}: {fault}", key="wavelength")
+        if frames.unit.strip().casefold() not in ("dn", "adu", "ct", "count"):
+            raise InputError.of("unit", frames.unit or "none", "that of raw DN, with bias and dark", where=name)
         if frames.net:
-            raise InputError(
-                f"{frames.name}: dark current and bias are subtracted; use read_frames(..., raw=True)", key="frames"
-            )
+            fault = "dark current and bias are subtracted; use read_frames(..., raw=True)"
+            raise InputError(f"{name}: {fault}", key="frames")
         temperatures = frames.temperature_c
         if temperatures is None:
             if temperature_c is None:
-                raise InputError(
-                    f"{frames.name} needs a column of detector temperatures, or temperature_c", key="temperature_c"
-                )
+                fault = f"{name} needs a column of detector temperatures, or temperature_c"
+                raise InputError(fault, key="temperature_c")
             temperatures = np.full(frames.n_frames, temperature_c)
         good = (frames.faults == 0) & np.isfinite(temperatures)
         lengths = np.unique(frames.exposure_s[good].round(6))
         if good.sum() < 3 or lengths.size != 1:
-            raise InputError(
-                f"{frames.name} needs at least 3 good frames of one exposure time, not {good.sum()} of {lengths.size}",
-                key="frames",
-            )
+            fault = f"needs at least 3 good frames of one exposure time, not {good.sum()} of {lengths.size}"
+            raise InputError(f"{name} {fault}", key="frames")
         if (frames.flux[good] == frames.flux[good][0]).all():
-            raise InputError(f"{frames.name}: frames must differ by their noise, but all are the same", key="frames")
-        return cls(frames.name, frames.flux[good], float(lengths[0]), temperatures[good], star)
+            raise InputError(f"{name}: frames must differ by their noise, but all are the same", key="frames")
+        return cls(name, frames.flux[good], float(lengths[0]), temperatures[good], star)
 
     @property
     def n_frames(self) -> int:
@@ -96,8 +86,7 @@ ITERATIONS = 20
 TELLS = 3.84
 #: Smallest S/N of the gain with which it is reported.
 MIN_SNR = 5.0
-#: Relative error of a gain that is not measured: the root mean square deviation of 20 to 25 uV per electron, the values
-#: that are quoted of the detector, from the nominal 20.
+#: Relative error of a gain that is not measured: the rms deviation of the quoted 20 to 25 uV per electron from 20.
 ASSUMED_GAIN_ERROR = 0.14
 
 
@@ -127,14 +116,12 @@ class PhotonTransfer:
     """Fit of measured variances."""
 
     noise: NoiseModel
-    # Shape (2, 2); of read variance and gain, for known dark counts; from `ASSUMED_ERROR` if the gain is assumed.
-    covariance: Float
+    covariance: Float  # shape (2, 2); of read variance and gain, for known dark counts
     read_noise_error: float  # standard error, DN, with that of the dark counts
     dark_unit: Literal["DN", "electrons"]
     chi2: float
     dof: int
-    # mean_dn, variance, model: shape (n_value,); all means of light, measured and fitted variances.
-    mean_dn: Float
+    mean_dn: Float  # shape (n_value,), like all means of light, measured and fitted variances
     variance: Float
     model: Float
     assumed: tuple[str, ...] = ()  # quantities that these frames do not determine
@@ -163,9 +150,8 @@ class PhotonTransfer:
 def measured_variance(raw_dn: Float, light_dn: Float, dark_dn: Float, usable: NDArray[np.bool_]) -> Float:
     """Measure the variance of frames from differences of consecutive ones, without drifts.
 
-    From each difference the best multiples of light and dark, the means of a frame, are subtracted, since jitter of the
-    pointing and of the temperature change all pixels together. Returned are the variance, light and dark of each usable
-    pixel, and the degrees of freedom of the variance, shape (4, n_pixel).
+    The best multiples of light and dark are subtracted from each, since jitter changes all pixels together. Returned
+    are variance, light and dark of each usable pixel, and the degrees of freedom of the variance, shape (4, n_pixel).
     """
     # A pixel that never changes is dead.
     usable = usable & np.any(raw_dn != raw_dn[0], axis=0)
@@ -195,12 +181,10 @@ def fit_photon_transfer(measured: Sequence[Float], nominal: Instrument, dark_err
         fixed = dark if name == "DN" else np.zeros_like(dark)
         fits[name] = _fit(column, fixed, variance, dof)
     better = fits["DN"][2] - fits["electrons"][2]
-    assumed: list[str] = []
-    unit: Literal["DN", "electrons"] = nominal.dark_unit
-    if abs(better) > TELLS:
-        unit = "electrons" if better > 0 else "DN"
-    else:
-        assumed.append("unit of the dark counts")
+    tells = abs(better) > TELLS
+    measured_unit: Literal["DN", "electrons"] = "electrons" if better > 0 else "DN"
+    unit = measured_unit if tells else nominal.dark_unit
+    assumed = () if tells else ("unit of the dark counts",)
     (read, gain), covariance, chi2, model = fits[unit]
     errors = np.sqrt(np.diag(covariance))
     if not gain > MIN_SNR * errors[1]:
@@ -212,7 +196,7 @@ def fit_photon_transfer(measured: Sequence[Float], nominal: Instrument, dark_err
     noise = NoiseModel(read, float(gain) if unit == "electrons" else 1.0, float(gain))
     read_error = np.hypot(errors[0], noise.dark_factor * dark_error_dn) / (2 * np.sqrt(max(read - ROUNDING, errors[0])))
     return PhotonTransfer(noise, covariance, float(read_error), unit, float(chi2),
-                          variance.size - 2, light, variance, model, tuple(assumed))  # fmt: skip
+                          variance.size - 2, light, variance, model, assumed)  # fmt: skip
 
 
 def _fit(column: Float, fixed: Float, variance: Float, dof: Float) -> tuple[Float, Float, float, Float]:
@@ -246,19 +230,16 @@ class DarkFit:
 
     reference_c: float  # temperature at which the levels hold
     level_dn_per_s: Float  # shape (n_pixel,)
-    # bias_dn, bias_error: shape (n_pixel,); the error is 0 if the bias is assumed.
-    bias_dn: Float
-    bias_error: Float
+    bias_dn: Float  # shape (n_pixel,)
+    bias_error: Float  # 0 if the bias is assumed
     covariance: Float  # shape (n_pixel, 2, 2); of bias and level of each pixel, independent between pixels
     shared: Float  # shape (3, 3); covariance of bias, level and slope of the mean pixel, which all pixels share
     slope_per_c: float  # common to all pixels
-    # pixel_slope_per_c, pixel_slope_error: shape (n_pixel,); of each pixel alone; NaN if it is not determined.
-    pixel_slope_per_c: Float
+    pixel_slope_per_c: Float  # shape (n_pixel,); of each pixel alone; NaN if it is not determined
     pixel_slope_error: Float
     chi2: float
     dof: int
-    # Probability of pixel slopes at least as different if all are equal; NaN if they are not determined.
-    slopes_p_value: float
+    slopes_p_value: float  # of pixel slopes at least as different if all are equal; NaN if not determined
     assumed: tuple[str, ...]  # quantities that these frames do not determine
 
     @property
@@ -315,9 +296,8 @@ def assumed_dark(nominal: Instrument, n_pixel: int) -> DarkFit:
 def fit_dark(dark: Sequence[CalibrationFrames], nominal: Instrument, noise: NoiseModel) -> DarkFit:
     """Fit bias, dark level of each pixel and a common slope to frames without light, by weighted least squares.
 
-    The slope is assumed if the temperatures span less than `SLOPE_RANGE_C`. Each pixel's bias is fitted if exposure
-    times differ by `EXPOSURE_RATIO`, and one for all pixels if the temperatures span `BIAS_RANGE_C`; otherwise it is
-    the instrument's. The variances of `noise` are the weights.
+    The slope is assumed for temperatures within `SLOPE_RANGE_C`. Each pixel's bias is fitted if exposure times differ
+    by `EXPOSURE_RATIO`, and one for all pixels if temperatures span `BIAS_RANGE_C`; otherwise it is the instrument's.
     """
     raw = np.concatenate([one.raw_dn for one in dark])
     n_pixel = raw.shape[1]
@@ -369,10 +349,9 @@ def fit_dark(dark: Sequence[CalibrationFrames], nominal: Instrument, noise: Nois
 def _mean_dark(
     raw: Float, exposure: Float, offset: Float, free: NDArray[np.bool_], nominal: Instrument, noise: NoiseModel
 ) -> tuple[Float, Float, Float]:
-    """Fit bias, dark level and slope of the mean pixel; return them, their covariance, and the variance of a pixel.
+    """Fit bias, level and slope of the mean pixel; return them, their covariance, and the variance of a pixel.
 
-    Offsets are temperatures above the reference. The variance, shape (n_frame,), is that of a typical pixel. Values
-    that are not free are nominal, with no variance.
+    Offsets are temperatures above the reference. Values that are not `free` are nominal, with no variance.
     """
     series, bias = raw.mean(axis=1), nominal.per_pixel("bias_dn", nominal.bias_dn).mean()
     start = np.array([bias, (series - bias).mean() / exposure.mean(), nominal.dark_slope_per_c])
@@ -397,11 +376,10 @@ def _mean_dark(
 def _fit_pixels(
     columns: Float, weight: Float, values: Float, noise: NoiseModel, dark: tuple[Float, Float] | None = None
 ) -> tuple[Float, Float]:
-    """Fit a linear model to each pixel by weighted least squares.
+    """Fit a linear model to each pixel with the weights of a typical one.
 
-    The last column is the signal of the level unless `dark` has exposure times and levels of the dark current. Weights
-    are those of a typical pixel, from whose variance that of the pixels differs. Returned are the values, shape
-    (n_column, n_pixel), and their covariance, shape (n_pixel, n_column, n_column).
+    The last column is the signal of the level unless `dark` has exposure times and levels of the dark current. Returned
+    are the values, shape (n_column, n_pixel), and their covariance, shape (n_pixel, n_column, n_column).
     """
     weighted = columns * weight[:, None]
     hat = np.linalg.solve(weighted.T @ columns, weighted.T)

@@ -32,8 +32,7 @@ LEAST_LOG_WEIGHT = -18.5
 CELL = 0.05
 #: Least standard deviation of a part, as a share of the largest mean.
 LEAST_ERROR = 1e-9
-#: Nodes of the grid along peak and half-width for a shape and for many, and the fall of the log posterior beyond
-#: which nodes are neglected.
+#: Nodes along peak and half-width for a shape and for many; fall of the log posterior beyond which they are neglected.
 NODES, NODES_OF_MANY, NEGLIGIBLE = 25, 17, 14.0
 #: Logarithm of the largest amplitude in units of the range of the frames of the event, for a peak that is not seen.
 MAX_LOG_AMPLITUDE = 5.0
@@ -41,11 +40,9 @@ MAX_LOG_AMPLITUDE = 5.0
 REFINEMENTS = 6
 #: First range of the peak, in half-widths of the template, and factor on the half-width.
 PEAK_RANGE, WIDTH_RANGE = 2.5, 6.0
-#: Departure with which further flares of an event are searched, the fall of chi-squared that they need, and the
-#: largest number.
+#: Departure with which further flares of an event are searched, the fall of chi-squared they need, largest number.
 FURTHER_EPSILON, FURTHER_GAIN, MAX_FLARES = 0.2, 36.0, 6
-#: Rounds in which the photon noise and the departures follow the fit, and the change of the logarithm of the equivalent
-#: duration at which they end.
+#: Rounds in which noise and departures follow the fit, and the change of the log duration at which they end.
 ROUNDS, SETTLED = 3, 0.02
 
 
@@ -227,8 +224,7 @@ class Grid:
 def _ranges(window: Window) -> Float:
     """Return the largest ranges of the peak and of the logarithm of the half-width of a single flare, shape (2, 2).
 
-    A gap before the event may hold the peak, at most as long before as the event lasts. The half-width of a flare whose
-    peak is not seen does not follow from the best template.
+    A gap before the event may hold the peak, at most as long before as the event lasts.
     """
     one, survey = window.one, window.survey
     frame_s = survey.stare.frame_s
@@ -358,10 +354,9 @@ def _refined(likelihood: Likelihood, shape: Profile, flares: Sequence[FittedFlar
 def _single(
     window: Window, family: Family, shape: Profile, flare: FittedFlare, box: Float, last: Grid | None = None
 ) -> list[Fit]:
-    """Fit a single flare with each departure of a family from its shapes.
+    """Fit a single flare with each departure of a family, which follows from a first fit, `shape` and `flare`.
 
-    The departures follow from a first fit, `shape` and `flare`. The grid begins from the range `box`, and `last` is the
-    grid of the first fit, if that was a fit of the same family.
+    The grid begins from the range `box`; `last` is the grid of the first fit, if that was a fit of the same family.
     """
     outer = _ranges(window)
     box = np.column_stack([np.maximum(box[:, 0], outer[:, 0]), np.minimum(box[:, 1], outer[:, 1])])

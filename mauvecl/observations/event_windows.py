@@ -37,8 +37,7 @@ Bool = NDArray[np.bool_]
 
 #: Published shapes that are averaged, besides that of the search.
 AVERAGED = ("davenport2014", "tovarmendoza2022")
-#: Departures of flares from their shape that are averaged with equal weights (assumed). A flare of the general family
-#: is never exactly one of its shapes.
+#: Departures from a shape that are averaged (assumed); a flare of the general family is never exactly of its shapes.
 EPSILON, GENERAL_EPSILON = (0.0, 0.02, 0.06, 0.2), (0.04, 0.1, 0.2)
 #: Widths of the Gaussian rises and decays of the general family from half maximum to maximum, in half-widths (assumed).
 GAUSSIAN_RISES, GAUSSIAN_DECAY = (0.15, 0.5, 1.5), 0.5
@@ -100,15 +99,10 @@ def _exponentials(rates: Float) -> tuple[list[Half], Float]:
     return [_exponential(float(rate)) for rate in np.exp(points)], np.asarray(weights)
 
 
-def _gaussian_rise(width: float) -> Half:
-    """Return the first half of a Gaussian; the width is from half maximum to maximum, in half-widths."""
-    return Half(lambda tau: _gaussian_tail(-tau, width))
-
-
-def _gaussian_tail(tau: Float, width: float) -> Float:
-    """Return the integral of a Gaussian from tau to the end, for a half-width at half maximum of `width`."""
+def _gaussian(tau: Float, width: float) -> Float:
+    """Return the integral of a Gaussian beyond tau; its half-width at half maximum is negative before the peak."""
     root = float(np.sqrt(np.log(2)))
-    return np.asarray(np.sqrt(np.pi) / 2 * width / root * scipy.special.erfc(tau * root / width))
+    return np.asarray(np.sqrt(np.pi) / 2 * abs(width) / root * scipy.special.erfc(tau * root / width))
 
 
 @dataclass(frozen=True)
@@ -152,8 +146,8 @@ class Family:
     @cache
     def general(cls) -> Family:
         """Return the general family, the same object in all calls: rises and decays in all combinations."""
-        rises = [Half(SHAPES["davenport2014"].before), *map(_gaussian_rise, GAUSSIAN_RISES)]
-        gaussian = Half(partial(_gaussian_tail, width=GAUSSIAN_DECAY), decays=True)
+        rises = [Half(SHAPES["davenport2014"].before), *(Half(partial(_gaussian, width=-w)) for w in GAUSSIAN_RISES)]
+        gaussian = Half(partial(_gaussian, width=GAUSSIAN_DECAY), decays=True)
         fast = [_exponential(Davenport2014.DECAY[0][1]), gaussian]
         slow, interpolated = _exponentials(SLOW_RATES)
         choices = [(0.0, 0), *((share, rate) for share in SLOW_SHARES for rate in range(SLOW_RATES.size))]
@@ -190,8 +184,7 @@ Profile = Shape | WeightedSum
 
 #: Correlation of departures in the logarithm of 1 + time from the peak in half-widths (assumed).
 LOG_TIME = 0.7
-#: Light that departs where a shape has none, as a share of the amplitude at the peak (assumed); it falls by e in each
-#: half-width.
+#: Light that departs where a shape has none, over the amplitude, at the peak (assumed); it falls by e per half-width.
 FLOOR = 0.1
 #: Largest number of bins in an event, and on each side of it; growth of the bins with the distance from the peak.
 MAX_INSIDE, MAX_OUTSIDE, GROWTH = 160, 80, 6.0
@@ -214,10 +207,7 @@ class FittedFlare:
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """Bins of frames around an event.
-
-    Frames in a bin are consecutive. Values are those of the sum along the direction of the event's template.
-    """
+    """Bins of consecutive frames around an event, with sums along the direction of its template."""
 
     survey: SeriesSurvey
     one: Detection
@@ -319,10 +309,7 @@ class Window:
 
 
 def _bins(numbers: NDArray[np.int64], size: Float, inside: Bool) -> NDArray[np.int64]:
-    """Return the first frame of each bin: a consecutive frame is added to a bin of fewer frames than its own size.
-
-    Sizes are whole numbers that do not both fall and rise within consecutive frames.
-    """
+    """Return the first frame of each bin of consecutive frames, which are added up to their own size."""
     breaks = np.diff(numbers, prepend=numbers[:1] - 2) != 1
     breaks |= np.diff(inside, prepend=inside[:1])
     sizes = size.astype(np.int64).tolist()
@@ -347,9 +334,8 @@ class Likelihood:
     window: Window
     inverse: Float  # shape (n, n)
     log_factor: float  # of the likelihood, without the constant
-    # Integral of the departures of the flares from their shape, in amplitude x s: its covariance with the values, and
-    # its variance.
-    departure: Float  # shape (n,)
+    # Of the integral of the departures of the flares from their shape, in amplitude x s.
+    departure: Float  # shape (n,); covariance with the values
     variance: float
     # Weights of the values in the level of the star at the peak, and its variance with a known flare, relative to the
     # level; zero where the values are not its light.
@@ -398,8 +384,8 @@ class Likelihood:
     def matched(self, parts: Float, weights: Float, values: Float) -> tuple[Float, Float]:
         """Return the products of models and values, and of models with themselves, shape (n_shape, n_node).
 
-        Models are sums of parts, shape (n_part, n_node, n), with weights, shape (n_shape, n_part). The first product is
-        zero for models that are constant but for rounding errors, as bright in all bins as the level.
+        Models are sums of parts, shape (n_part, n_node, n), with weights, shape (n_shape, n_part). Products of models
+        that are as bright in all bins are zero but for rounding errors, and set to zero.
         """
         pairs = (weights[:, :, None] * weights[:, None]).reshape(len(weights), -1)
         # Long before the peak nothing is bright.
@@ -417,10 +403,10 @@ class Likelihood:
         return slope, np.maximum(information, least)
 
     def level_without(self, light: Float) -> Float:
-        """Return the level of the star at the peak once the light of flares, shape (n,) or (k, n), is subtracted.
+        """Return the level of the star at the peak less the light of flares, of which tails raise it.
 
-        The tail of a bright flare raises the level of the frames without events. That level is returned only where the
-        values are not the star's light, or where the fitted level is not above zero.
+        It is that of frames without events where the values are not the star's light, or the fitted level is not
+        above zero.
         """
         fitted = (self.window.values - light) @ self.level
         return np.where(fitted > 0, fitted, self.window.quiet_level)
@@ -452,8 +438,6 @@ def _unobserved(window: Window, one: FittedFlare, shape: Profile) -> tuple[Float
     edges = np.unique(np.concatenate([one.peak_s + tau * one.half_width_s, window.edges.ravel()]))
     edges = edges[(edges >= one.peak_s - REACH[0] * one.half_width_s)
                   & (edges <= one.peak_s + REACH[1] * one.half_width_s)]  # fmt: skip
-    if edges.size < 2:
-        return np.zeros(0), np.zeros(0)
     middle = (edges[:-1] + edges[1:]) / 2
     place = np.searchsorted(window.edges[:, 0], middle, side="right") - 1
     seen = (place >= 0) & (middle < window.edges[np.maximum(place, 0), 1])

@@ -14,14 +14,7 @@ from numpy.typing import NDArray
 from mauvecl.flares.shapes import between, sides
 from mauvecl.host.arrays import map_in_threads
 from mauvecl.observations.event_fits import Fit, Mixture, fit_event, joined, light_of
-from mauvecl.observations.event_windows import (
-    GENERAL,
-    LOG_TIME,
-    FittedFlare,
-    Likelihood,
-    Window,
-    log_time,
-)
+from mauvecl.observations.event_windows import GENERAL, LOG_TIME, FittedFlare, Likelihood, Window, log_time
 from mauvecl.observations.progress import UNREPORTED, Steps
 from mauvecl.observations.search import MIN_BASELINE, Detection, SeriesSurvey
 
@@ -132,9 +125,8 @@ def _without_departures(window: Window, fit: Fit) -> tuple[Likelihood, Float]:
 def _tempered(window: Window, best: Fit, mixtures: Sequence[Mixture]) -> list[Mixture]:
     """Weaken the preference among fits of an event that no shape fits without departures.
 
-    The likelihoods of departures count every bin, but what a wrong shape leaves varies slowly: the bins of the event
-    count as many times as there are independent values of the departures in it (a power likelihood as of Miller &
-    Dunson 2019, doi 10.1080/01621459.2018.1469995), so that the interval includes the disagreement of the shapes.
+    What a wrong shape leaves varies slowly: bins count as many times as there are independent departures in the event
+    (a power likelihood as of Miller & Dunson 2019, doi 10.1080/01621459.2018.1469995).
     """
     place = log_time(window.middle[window.inside], best.flares[0])
     power = min(1.0, (1.0 + float(np.ptp(place)) / LOG_TIME) / place.size)
@@ -143,10 +135,7 @@ def _tempered(window: Window, best: Fit, mixtures: Sequence[Mixture]) -> list[Mi
 
 
 def _dips(window: Window, fits: Sequence[Fit], summed: float, error: float) -> bool:
-    """Return whether the frames of an event lack the light of the best fit.
-
-    `summed` is the light of the frames above the level, amplitude x s, and `error` its standard error.
-    """
+    """Return whether the frames of an event, with the light `summed` above the level, lack that of the best fit."""
     best = max(fits, key=lambda fit: fit.mixture.log_total)
     plain, model = _without_departures(window, best)
     level = float(plain.level_without(model))
@@ -173,11 +162,9 @@ def _directions(survey: SeriesSurvey, taken: Bool, one: Detection) -> list[tuple
         noise = np.diag(window.process) + window.noise
         model = window.model(survey.bank.shape, np.array([one.peak_s]), np.array([one.half_width_s]))[0]
         weight = model / noise
-        level = window.values[~window.inside]
-        level_mean = (
-            float(level @ (1 / noise)[~window.inside] / (1 / noise)[~window.inside].sum()) if level.size else 0.0
-        )
-        value = float(weight @ (window.values - level_mean)) / np.sqrt(float(weight @ model))
+        outside = ~window.inside
+        level = float(np.average(window.values[outside], weights=1 / noise[outside])) if outside.any() else 0.0
+        value = float(weight @ (window.values - level)) / np.sqrt(float(weight @ model))
         scores.append((value, window.scale))
     mine = scores[one.direction]
     return [(0.5 * np.sign(value) * value**2 - 0.5 * mine[0] ** 2, mine[1] / scale * value / mine[0])
@@ -221,16 +208,13 @@ def _level_variance(process: Process, time: Float, noise: Float, quiet: Bool, we
     """Return the variance of a weighted sum of the level given quiescent frames."""
     one = process.covariance(time[quiet], noise[quiet])
     level = one.solve(np.ones(int(quiet.sum())))
-    constant = 1.0 / float(level.sum())
-    if not process.terms:
-        return float(weights.sum()) ** 2 * constant
     # K w at all times.
     shared = process.times(time, weights)
     towards = shared[quiet]
     solved = one.solve(towards)
     # The constant level is known to 1 / (1^T C^-1 1).
     rest = float(weights.sum() - level @ towards)
-    return float(weights @ shared - towards @ solved) + rest**2 * constant
+    return float(weights @ shared - towards @ solved) + rest**2 / float(level.sum())
 
 
 def _is_step(window: Window, fits: Sequence[Fit]) -> bool:
@@ -269,17 +253,14 @@ class ObservedEvent:
     """A measured event; frames are counted among the searched ones."""
 
     value: float  # largest statistic of the search: the S/N of the best template
-    # first, last: first and last frame of the event, inclusive.
     first: int
-    last: int
+    last: int  # inclusive
     brightest: int  # frame of the largest flux; in spectra, next to the peak of the best template
     half_width_s: float  # half-width of the best template
     amplitude: float  # largest flux above the level, relative to the level
     missing: int  # number of frames missing inside the event
     cut: bool  # true if the event reaches the first or last frame of the light curve or of the part before a longer gap
-    # A flare, or what resembles one: a step of the level, the edge of a dip or, in spectra, a change of the throughput,
-    # the dark current or the sky, or a cosmic ray.
-    kind: Kind
+    kind: Kind  # a flare, or what resembles one; "step" and "dip" are those of the level
     energy: Energy
     gap_at_peak: bool  # true if frames are missing next to the brightest, for as long as the half-width of the fit
 
@@ -318,10 +299,7 @@ def measure_events(
 def measure_event(
     survey: SeriesSurvey, taken: Bool, level: Float, found: Detection, cause: Kind = "flare"
 ) -> ObservedEvent:
-    """Measure a detected event, whose cause follows from its spectrum.
-
-    `taken` are the frames of all events, and `level` is the quiescent level of the flux in units of the survey's scale.
-    """
+    """Measure an event, given its cause, the frames of all events, `taken`, and the level in units of the scale."""
     first, last = found.first, found.last
     rows = slice(first, last + 1)
     energy = measure_energy(survey, taken, level, found)

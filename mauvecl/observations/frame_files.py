@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -29,9 +29,7 @@ from mauvecl.host.tables.table import (
     unit_in_name,
     without_indefinite,
 )
-from mauvecl.host.tables.units import (
-    is_dated,
-)
+from mauvecl.host.tables.units import is_dated
 from mauvecl.observations.frames import ALL_BITS, MAX_FRAMES, Frames, QualityBits, decimal_flags
 from mauvecl.observations.mapping import KNOWN, FrameMapping, recognised, times_of
 from mauvecl.observations.stored_frames import (
@@ -47,13 +45,6 @@ from mauvecl.observations.stored_frames import (
 )
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened
-
-
-def _keys(values: Values) -> NDArray[Any]:
-    """Return numbers, or the texts of dates."""
-    texts = values.texts()
-    return np.asarray(values.numbers() if texts is None or not any(map(is_dated, texts)) else texts)
-
 
 Float = NDArray[np.float64]
 
@@ -98,7 +89,7 @@ def read_frames(
         Whether spectra of `mauvecl realise` keep bias and dark current, which are subtracted otherwise. Others are as
         their file has them.
     """
-    with _parsing(path), _frame_file(path, mapping, check=not ignore_checksum) as (file, how, stem):
+    with _frame_file(path, mapping, check=not ignore_checksum) as (file, how, stem):
         if raw and mapping is None and isinstance(file, StoredFile):
             how = file.raw_mapping
         if quality_bits is not None:
@@ -174,7 +165,7 @@ def reduce_frames(
         Weights of the pixels, in the order of the file; by default the sum over all pixels.
     mapping : FrameMapping or path, optional
     """
-    with _parsing(path), _frame_file(path, mapping) as (file, how, stem):
+    with _frame_file(path, mapping) as (file, how, stem):
         _, flux, error, _ = _light(found := Quantities.of(file, how), how)
         if len(flux.shape) != 2:
             raise InputError.of("flux", flux.shape, "spectra, shape (n_frame, n_pixel)", where=file.what)
@@ -198,11 +189,11 @@ class ColumnNames:
     def read(cls, path: str | Path) -> ColumnNames:
         """Read the names of a table in a file."""
         place, words = without_columns(path)
-        with _parsing(path), _opened(place, f"file {place.name!r}", words[0] if words else None) as file:
+        with _errors_of(path), _opened(place, f"file {place.name!r}", words[0] if words else None) as file:
             return cls(tuple(file.names))
 
 
-def _parsing(path: str | Path) -> AbstractContextManager[None]:
+def _errors_of(path: str | Path) -> AbstractContextManager[None]:
     """Return a context in which exceptions of other libraries become errors of a file."""
     return parsing(f"file {shortened(Path(path).name)}", FORMATS)
 
@@ -211,55 +202,38 @@ def _parsing(path: str | Path) -> AbstractContextManager[None]:
 def _frame_file(
     path: str | Path, mapping: FrameMapping | str | Path | None, check: bool = True
 ) -> Iterator[tuple[TableFile, FrameMapping, str]]:
-    """Open a file, folder or store, and return its quantities and its name without extension."""
-    place, words = without_columns(path)
-    given = FrameMapping.read(mapping) if isinstance(mapping, str | Path) else mapping
-    name = words[0] if words else None if given is None or given.hdu is None else str(given.hdu)
-    with _open_frames(place, given, name, check) as (file, how):
-        yield file, how, place.stem
-
-
-@contextmanager
-def _open_frames(
-    path: Path, mapping: FrameMapping | None, name: str | None, check: bool
-) -> Iterator[tuple[TableFile, FrameMapping]]:
-    """Open a file with frames, and return where its quantities are."""
-    what = f"file {path.name!r}"
-    if path.is_dir():
-        what = f"folder {path.name!r}"
-        if (path / "zarr.json").is_file():
-            with open_store(path, name, what) as store:
-                yield store, mapping or store.mapping
-        elif mapping is None:
-            raise InputError(
-                f"{what} is not a store of spectra; give a mapping that says where its quantities are", key="mapping"
-            )
+    """Open a file, folder or store; yield it with the places of its quantities and its name without extension."""
+    with _errors_of(path):
+        place, words = without_columns(path)
+        how = FrameMapping.read(mapping) if isinstance(mapping, str | Path) else mapping
+        name = words[0] if words else None if how is None or how.hdu is None else str(how.hdu)
+        what = f"{'folder' if place.is_dir() else 'file'} {place.name!r}"
+        opened: AbstractContextManager[TableFile]
+        if not place.is_dir():
+            opened = _opened(place, what, name, how, check, large=True)
+        elif (place / "zarr.json").is_file():
+            opened = open_store(place, name, what)
+        elif how is None:
+            fault = f"{what} is not a store of spectra; give a mapping that says where its quantities are"
+            raise InputError(fault, key="mapping")
         else:
             open_one = partial(_opened, name=name, check=check)
-            yield FolderFile(path, mapping, what, lambda one: open_one(one, f"file {one.name!r}")), mapping
-        return
-    with _opened(path, what, name, mapping, check, large=True) as file:
-        yield file, mapping or (file.mapping if isinstance(file, StoredFile) else recognised(file))
+            opened = nullcontext(FolderFile(place, how, what, lambda one: open_one(one, f"file {one.name!r}")))
+        with opened as file:
+            yield file, how or (file.mapping if isinstance(file, StoredFile) else recognised(file)), place.stem
 
 
 def _opened(
-    path: Path,
-    what: str,
-    name: str | None,
-    mapping: FrameMapping | None = None,
-    check: bool = True,
-    *,
-    large: bool = False,
+    path: Path, what: str, name: str | None, how: FrameMapping | None = None, check: bool = True, large: bool = False
 ) -> AbstractContextManager[TableFile]:
     """Open a file with frames; only `large` ones may exceed MAUVECL_LARGEST_FILE_MIB."""
     # Groups of names, of each of which the chosen table has one.
-    wanted = (KNOWN["time"], KNOWN["flux"]) if mapping is None else tuple((each,) for each in mapping.times)
+    wanted = (KNOWN["time"], KNOWN["flux"]) if how is None else tuple((each,) for each in how.times)
 
     def of_fits(hdus: Any, what: str) -> TableFile:
         return stored_in_fits(FitsTables(hdus, what), name) or FitsTables(hdus, what, name, wanted)
 
-    hdf5 = partial(open_hdf5, name=name)
-    return open_table(path, what, check=check, large=large, of_fits=of_fits, of_hdf5=hdf5)
+    return open_table(path, what, check=check, large=large, of_fits=of_fits, of_hdf5=partial(open_hdf5, name=name))
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,23 +251,17 @@ class Quantities:
     @classmethod
     def of(cls, file: TableFile, mapping: FrameMapping) -> Quantities:
         """Find the quantities of a mapping."""
-
-        def found(name: str | None) -> Values | None:
-            return None if name is None else file.find(name)
-
         times = tuple(file.axis(mapping.flux, 2) if name == "wcs" else file.find(name) for name in mapping.times)
-        flux = file.find(mapping.flux)
-        one = cls(times, flux, found(mapping.error), _flags(found(mapping.quality)), found(mapping.exposure),
-                  found(mapping.temperature), _wavelength(file, mapping))  # fmt: skip
-        nm = one.wavelength
+        names = {name: getattr(mapping, name) for name in ("flux", "error", "quality", "exposure", "temperature")}
+        found: dict[str, Any] = {key: None if name is None else file.find(name) for key, name in names.items()}
+        one = cls(times, **found | {"quality": _flags(found["quality"])}, wavelength=_wavelength(file, mapping))
+        nm, flux = one.wavelength, one.flux
         if nm is None or not nm.shape == flux.shape == times[0].shape or isinstance(file, FolderFile):
             return one
         if 32 * flux.n_rows > (most := limit_bytes("MAUVECL_LARGEST_CONTENT_MIB")):
-            raise InputError(
-                f"{file.what} must have at most {most // 32} rows of pixels, but has {flux.n_rows}; "
-                "MAUVECL_LARGEST_CONTENT_MIB sets the limit",
-                key="MAUVECL_LARGEST_CONTENT_MIB",
-            )
+            fault = f"{file.what} must have at most {most // 32} rows of pixels, but has {flux.n_rows}"
+            limit = "MAUVECL_LARGEST_CONTENT_MIB"
+            raise InputError(f"{fault}; {limit} sets the limit", key=limit)
         return one._of_frames(nm, file.what)
 
     def _of_frames(self, wavelength: Values, what: str) -> Quantities:
@@ -302,9 +270,8 @@ class Quantities:
         Raises InputError if a frame lacks a wavelength that another has, has one twice, or has two exposure times or
         temperatures.
         """
-        key, nm = _keys(self.time[0]), wavelength.numbers()
-        frames, frame = np.unique(key, return_inverse=True)
-        pixels, pixel = np.unique(nm, return_inverse=True)
+        frames, frame = np.unique(_keys(self.time[0]), return_inverse=True)
+        pixels, pixel = np.unique(wavelength.numbers(), return_inverse=True)
         counts = np.zeros((frames.size, pixels.size), np.int64)
         np.add.at(counts, (frame, pixel), 1)
         if (counts != 1).any():
@@ -315,7 +282,7 @@ class Quantities:
                 key="wavelength",
             )
         place = np.empty(counts.shape, np.int64)
-        place[frame, pixel] = np.arange(key.size)
+        place[frame, pixel] = np.arange(frame.size)
 
         def spectra(values: Values) -> Values:
             return Values.of(values.name, values.numbers()[place], values.unit, what)
@@ -326,12 +293,20 @@ class Quantities:
                 raise InputError(f"{what}: {values.name!r} must not change within a frame", key=values.name)
             return Values.of(values.name, rows[:, 0], values.unit, what)
 
-        error, quality = (one and spectra(one) for one in (self.error, self.quality))
-        exposure, temperature = (one and single(one) for one in (self.exposure, self.temperature))
-        axis = Values.of(wavelength.name, pixels, wavelength.unit, what)
-        return Quantities(
-            tuple(map(single, self.time)), spectra(self.flux), error, quality, exposure, temperature, axis
-        )
+        parts: dict[str, Any] = {
+            "time": tuple(map(single, self.time)),
+            "wavelength": Values.of(wavelength.name, pixels, wavelength.unit, what),
+        }
+        for name in ("flux", "error", "quality", "exposure", "temperature"):
+            values, change = getattr(self, name), single if name in ("exposure", "temperature") else spectra
+            parts[name] = None if values is None else change(values)
+        return Quantities(**parts)
+
+
+def _keys(values: Values) -> NDArray[Any]:
+    """Return numbers, or the texts of dates."""
+    texts = values.texts()
+    return np.asarray(values.numbers() if texts is None or not any(map(is_dated, texts)) else texts)
 
 
 def _flags(quality: Values | None) -> Values | None:
@@ -349,10 +324,8 @@ def _wavelength(file: TableFile, mapping: FrameMapping) -> Values | None:
         path = Path(mapping.wavelength_file)
         with _opened(path, f"file {path.name!r}", None) as other:
             if mapping.wavelength is None and len(other.names) != 1:
-                raise InputError(
-                    f"{other.what}: no column of wavelengths is named; give one of {', '.join(other.names)}",
-                    key="wavelength",
-                )
+                fault = f"{other.what}: no column of wavelengths is named"
+                raise InputError(f"{fault}; give one of {', '.join(other.names)}", key="wavelength")
             found = other.find(mapping.wavelength or other.names[0])
             return Values.of(found.name, found.numbers().ravel(), found.unit, found.what)
     if mapping.wavelength is None:
@@ -367,23 +340,19 @@ def _wavelength(file: TableFile, mapping: FrameMapping) -> Values | None:
 def _number_of_rows(file: TableFile, found: Quantities) -> int:
     """Return the number of frames before any is read; raise InputError unless all columns have as many."""
     what, n = file.what, found.time[0].n_rows
-    if n == 0:
-        raise InputError(f"{what} must have a row for each frame, but has no rows", key="frames")
-    if n > MAX_FRAMES:
-        raise InputError(f"{what} must have at most {MAX_FRAMES} frames, but has {n}", key="frames")
+    if not 0 < n <= MAX_FRAMES:
+        expected = f"at most {MAX_FRAMES} frames, but has {n}" if n else "a row for each frame, but has no rows"
+        raise InputError(f"{what} must have {expected}", key="frames")
     if found.wavelength is None:
         _check_one_source(file)
     for values in (*found.time, found.flux, found.error, found.quality, found.exposure, found.temperature):
         if values is not None and values.n_rows != n:
-            raise InputError(
-                f"{what}: {values.name!r} must have {n} rows, as the times do, but has {values.n_rows}", key=values.name
-            )
+            fault = f"{what}: {values.name!r} must have {n} rows, as the times do, but has {values.n_rows}"
+            raise InputError(fault, key=values.name)
     single = found.time if found.wavelength is not None else (*found.time, found.flux)
     if odd := next((one for one in single if len(one.shape) == 2 and one.shape[1] > 1), None):
-        raise InputError(
-            f"{what}: {odd.name!r} holds {odd.shape[1]} values in each row; give one, or name wavelengths in a mapping",
-            key=odd.name,
-        )
+        fault = f"{what}: {odd.name!r} holds {odd.shape[1]} values in each row"
+        raise InputError(f"{fault}; give one, or name wavelengths in a mapping", key=odd.name)
     if len(found.flux.shape) > 2:
         pixels = " x ".join(map(str, found.flux.shape[1:]))
         raise InputError(
@@ -420,12 +389,6 @@ def _brite_exposure_s(file: TableFile) -> float | None:
     return found if 0.0 < found < np.inf else None
 
 
-def _without_marks(light: Float) -> tuple[Float, Sequence[str]]:
-    """Return light without marks of missing values, and what to say about them."""
-    marks, said = marks_in(light, "values")
-    return (np.where(np.isin(light, marks), np.nan, light), said) if marks else (light, ())
-
-
 def _of_level(light: Float, sd: Float | None, unit: str) -> tuple[Float, Float | None, str, list[str]]:
     """Return light and errors, as multiples of the level if they are deviations from it in parts, and remarks."""
     held = np.sort(light[np.isfinite(light)])
@@ -444,43 +407,37 @@ def _of_level(light: Float, sd: Float | None, unit: str) -> tuple[Float, Float |
     return light, sd, unit, said
 
 
-def _left_out(what: str, kept: NDArray[np.bool_]) -> tuple[str, ...]:
-    """Return the remark on rows without a time; raise InputError if no row has one."""
-    if not kept.any():
-        raise InputError(f"{what}: at least one row must have a time, but none has", key="time")
-    n_left = int(np.count_nonzero(~kept))
-    words = "1 row has no time and was" if n_left == 1 else f"{n_left} rows have no time and were"
-    return (f"{what}: {words} left out",) if n_left else ()
-
-
 def _frames_in(
     file: TableFile, mapping: FrameMapping, stem: str, read: Callable[..., Light] = whole_or_reduced
 ) -> Frames:
     """Build frames from a file and the names of its quantities; `read` returns their light."""
-    what = file.what
+    what, header = file.what, file.header
     found = Quantities.of(file, mapping)
     n = _number_of_rows(file, found)
     time, between_edges_s, dates, remarks = times_of(found.time, file, mapping)
-    exposure_s = _exposure_s(file, found, mapping, between_edges_s)
-    bits = QualityBits.of(file.header, mapping.quality_bits, what)
+    each: dict[str, Any] = {"exposure_s": _exposure_s(file, found, mapping, between_edges_s)}
+    bits = QualityBits.of(header, mapping.quality_bits, what)
     wavelength = None if found.wavelength is None else _vacuum_nm(found.wavelength, mapping.wavelength_unit, file)
     light, sd, flags, unit, more = _read_light(file, found, mapping, bits, read)
     kept = np.isfinite(time)
-    remarks += (*more, *_left_out(what, kept))
-    temperature = _temperature_c(file, found, mapping, n)
+    if not kept.any():
+        raise InputError(f"{what}: at least one row must have a time, but none has", key="time")
+    remarks += more
+    if n_left := int(np.count_nonzero(~kept)):
+        words = "1 row has no time and was" if n_left == 1 else f"{n_left} rows have no time and were"
+        remarks += (f"{what}: {words} left out",)
+    each |= {"error": sd, "temperature_c": _temperature_c(file, found, mapping, n)}
+    each["quality"] = None if flags is None else np.where(np.isfinite(flags), flags, bits.mask & -bits.mask)
     made = Frames.of(
         time[kept],
         light[kept],
-        None if sd is None else sd[kept],
-        exposure_s=None if exposure_s is None else exposure_s[kept],
-        quality=None if flags is None else np.where(np.isfinite(flags), flags, bits.mask & -bits.mask)[kept],
+        **{name: None if values is None else values[kept] for name, values in each.items()},
         quality_mask=bits.mask,
         mission=bits.mission,
-        name=mapping.name or str(file.header.get("OBJECT", "") or file.header.get("star", "") or stem),
+        name=mapping.name or str(header.get("OBJECT", "") or header.get("star", "") or stem),
         wavelength_nm=wavelength if light.ndim == 2 else None,
-        temperature_c=None if temperature is None else temperature[kept],
         unit=unit,
-        instrument=str(file.header.get("INSTRUME", "") or file.header.get("TELESCOP", "")).strip(),
+        instrument=str(header.get("INSTRUME", "") or header.get("TELESCOP", "")).strip(),
         reference_mjd=dates.epoch_mjd,
         scale=dates.scale,
         position=dates.position,
@@ -498,26 +455,24 @@ def _read_light(
     file: TableFile, found: Quantities, mapping: FrameMapping, bits: QualityBits, read: Callable[..., Light]
 ) -> tuple[Float, Float | None, Float | None, str, tuple[str, ...]]:
     """Return light, errors, flags, the unit of the light, and remarks; `read` returns the first three."""
-    what = file.what
     unit, flux, error, remarks = _light(found, mapping)
-    remarks += tuple(f"{what}: {text}" for text in file.remarks)
     if len(flux.shape) == 2 and flux.shape[1] == 1 and found.wavelength is None:
         flux, error = _single(flux), None if error is None else _single(error)
     light, sd, flags, more = read(flux, error, _masked(found.quality, bits))
-    remarks += more
-    light, said = _without_marks(without_indefinite(light))
-    sd = None if sd is None else without_indefinite(sd)
-    remarks += tuple(f"{what}: {text}" for text in said)
+    light, sd = without_indefinite(light), None if sd is None else without_indefinite(sd)
+    marks, said = marks_in(light, "values")
+    light = np.where(np.isin(light, marks), np.nan, light) if marks else light
     unused = [name for name in file.columns if FLAGS & {*words_of(name)}]
     if found.quality is None and unused:
-        remarks += (f"{what}: no flags are used; a mapping with quality names one of {', '.join(unused)}",)
+        said = [*said, f"no flags are used; a mapping with quality names one of {', '.join(unused)}"]
     if len(light.shape) == 1:
-        light, sd, unit, said = _of_level(light, sd, unit)
-        remarks += tuple(f"{what}: {text}" for text in said)
+        light, sd, unit, on_level = _of_level(light, sd, unit)
+        said = [*said, *on_level]
+    remarks += (*more, *(f"{file.what}: {text}" for text in (*file.remarks, *said)))
     if sd is not None and not np.isfinite(sd).any():
         # lightkurve writes a column of NaN for errors that it does not know.
         sd = None
-        remarks += (f"{what} has a column of errors without a number: it is left out",)
+        remarks += (f"{file.what} has a column of errors without a number: it is left out",)
     if found.quality is not None and len(found.quality.shape) == 1:
         flags = decimal_flags(found.quality.numbers())
     return light, sd, flags, unit, remarks
@@ -548,46 +503,39 @@ def _masked(quality: Values | None, bits: QualityBits) -> Values | None:
 
 
 def _light(found: Quantities, mapping: FrameMapping) -> tuple[str, Values, Values | None, tuple[str, ...]]:
-    """Return the unit of the light, and light and errors in it."""
+    """Return the unit of the light, light and errors in it, and remarks."""
+    flux, error = found.flux, found.error
     remarks: tuple[str, ...] = ()
-    stated = found.flux.unit or unit_in_name(found.flux.name)
+    stated = flux.unit or unit_in_name(flux.name)
     unit = mapping.flux_unit or stated
     if mapping.flux_unit and stated and mapping.flux_unit != stated:
-        remarks = (f"the unit of {found.flux.name!r} is {mapping.flux_unit} as the mapping says, not {stated}",)
-    words = set(words_of(found.flux.name))
-    if not unit and (is_magnitude(found.flux.name) or words & {"log", "ln", "dex"}):
+        remarks = (f"the unit of {flux.name!r} is {mapping.flux_unit} as the mapping says, not {stated}",)
+    if not unit and (is_magnitude(flux.name) or {*words_of(flux.name)} & {"log", "ln", "dex"}):
         expected = (
             "linear light: convert magnitudes and logarithms first, or name a linear unit as flux_unit in a mapping"
         )
-        raise InputError.of("flux", found.flux.name, expected, where=found.flux.what)
+        raise InputError.of("flux", flux.name, expected, where=flux.what)
     if re.match(r"\s*(?:dex|log|db)\b", unit, re.IGNORECASE) or ("mag" in unit.lower() and "magg" not in unit.lower()):
-        raise InputError.of("flux_unit", unit, "a linear unit: light in magnitudes must be converted first",
-                            where=found.flux.what)  # fmt: skip
-    error = found.error
+        expected = "a linear unit: light in magnitudes must be converted first"
+        raise InputError.of("flux_unit", unit, expected, where=flux.what)
     if error is None:
-        return unit, found.flux, None, remarks
-    if error.shape != found.flux.shape:
-        raise InputError(
-            f"{error.what}: {error.name!r} must have the shape of the flux, {found.flux.shape}, not {error.shape}",
-            key="error",
-        )
+        return unit, flux, None, remarks
+    named = f"{error.what}: {error.name!r}"
+    if error.shape != flux.shape:
+        fault = f"{named} must have the shape of the flux, {flux.shape}, not {error.shape}"
+        raise InputError(fault, key="error")
     own = error.unit or unit_in_name(error.name)
     if own and not unit and own.lower() in PARTS_OF_LEVEL:
-        raise InputError(
-            f"{error.what}: {error.name!r} is in {own}, and {found.flux.name!r} is not; give errors in the unit of "
-            "the light, or flux_unit = '1' in a mapping if its level is 1",
-            key="error",
-        )
+        remedy = "give errors in the unit of the light, or flux_unit = '1' in a mapping if its level is 1"
+        raise InputError(f"{named} is in {own}, and {flux.name!r} is not; {remedy}", key="error")
     if own and unit and own not in (unit, stated):
         try:
             factor = float(unit_in(own).to(unit_in(unit)))
-        except (ValueError, TypeError) as fault:
-            raise InputError(
-                f"{error.what}: {error.name!r} must have a unit like that of {found.flux.name!r}, {unit}, not {own}",
-                key="error",
-            ) from fault
+        except (ValueError, TypeError) as cause:
+            fault = f"{named} must have a unit like that of {flux.name!r}, {unit}, not {own}"
+            raise InputError(fault, key="error") from cause
         error = error.mapped(lambda values: values * factor, unit)
-    return unit, found.flux, error, remarks
+    return unit, flux, error, remarks
 
 
 def _vacuum_nm(wavelength: Values, given: str | None, file: TableFile) -> Float:
@@ -599,9 +547,8 @@ def _vacuum_nm(wavelength: Values, given: str | None, file: TableFile) -> Float:
     if len(nm.shape) == 2:
         for part in nm.pieces:
             if not np.allclose(nm.rows(part.start, part.stop), rows, rtol=1e-9, atol=0.0):
-                raise InputError(
-                    f"{wavelength.what}: the wavelengths must be the same in every frame, but change", key="wavelength"
-                )
+                fault = f"{wavelength.what}: the wavelengths must be the same in every frame, but change"
+                raise InputError(fault, key="wavelength")
     found, _ = vacuum_wavelengths(rows, wavelength.name, "", medium or in_unit, (file.header,))
     return found
 

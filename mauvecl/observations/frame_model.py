@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import scipy
@@ -22,8 +22,7 @@ if TYPE_CHECKING:
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
-#: Units of frames of the instrument: counts of an exposure, with bias and dark current or without, and rates without
-#: these, as `stare` writes them.
+#: Units of frames of the instrument: counts, with bias and dark current or without, and rates without, as of `stare`.
 COUNT_UNITS, RATE_UNITS = ("adu", "DN"), ("adu / s", "DN / s")
 #: Share of bias and dark current below which the median of a pixel cannot include them.
 LEAST_OF_OFFSET = 0.5
@@ -42,8 +41,7 @@ class FrameModel:
     quiet: Expectation  # one frame of the quiescent star in the instrument's pixels
     flare: FlareModel  # flares in one frame in the instrument's pixels
     bins: Float  # shape (n_value, n_pixel); weights of the instrument's pixels in each value of a frame: 0 or 1
-    # Shape (n_value,); values of the frames per DN of an exposure; for flux densities, those of a flat spectrum.
-    per_dn: Float
+    per_dn: Float  # shape (n_value,); values per DN of an exposure; for flux densities, those of a flat spectrum
     raw: bool  # true if the frames include bias and dark current
     star_is_known: bool = False  # true if `quiet` is of the observed star, not of another in its place
 
@@ -54,20 +52,17 @@ class FrameModel:
         `flux_per_dn` is the flux density, erg s-1 cm-2 nm-1, for one DN of the exposure in each of its pixels. Raises
         InputError if wavelengths differ from the instrument's, or the unit is neither counts nor a flux density.
         """
-        unit = _plain(frames.unit)
-        counts = unit in {_plain(each) for each in (*COUNT_UNITS, *RATE_UNITS)}
+        unit, counts = _plain(frames.unit), ("adu", "adu/s")
         assert frames.wavelength_nm is not None
-        flux = None if counts else _per_flam(frames.unit, frames.wavelength_nm)
-        if not counts and flux is None:
+        flux = None if unit in counts else _per_flam(frames.unit, frames.wavelength_nm)
+        if unit not in counts and flux is None:
             accepted = f"one of {', '.join((*COUNT_UNITS, *RATE_UNITS))}, or a flux density"
             raise InputError.of("unit", frames.unit, accepted)
         exposure = float(np.median(frames.exposure_s))
         if np.ptp(frames.exposure_s) > SAME_EXPOSURE * exposure:
-            raise InputError(
-                f"the exposure times of all frames must be the same, but range from {frames.exposure_s.min():g} to "
-                f"{frames.exposure_s.max():g} s",
-                key="exposure_s",
-            )
+            ends = f"{frames.exposure_s.min():g} to {frames.exposure_s.max():g} s"
+            fault = f"the exposure times of all frames must be the same, but range from {ends}"
+            raise InputError(fault, key="exposure_s")
         pixels = _matched(frames.wavelength_nm, quiet.wavelength_nm)
         elements = _matched(frames.wavelength_nm, quiet.element_wavelength_nm)
         if pixels is not None:
@@ -86,7 +81,7 @@ class FrameModel:
             per_flux = np.divide(1.0, flux_per_dn, out=np.zeros_like(flux_per_dn), where=flux_per_dn > 0)
             return cls(quiet, flare, bins, flux / (bins @ per_flux), False)
         ones = np.ones(len(bins))
-        if unit not in {_plain(each) for each in COUNT_UNITS}:
+        if unit != "adu":
             return cls(quiet, flare, bins, ones / exposure, False)
         raw = cls(quiet, flare, bins, ones, True)
         # Light is added to bias and dark current: where a pixel has far less than these, they were subtracted.
@@ -144,19 +139,17 @@ class FrameModel:
         electrons = np.maximum(light / self.per_dn, 0.0) / gain / self.quiet.n_frames
         total = variance / self.per_dn**2 / self.quiet.n_frames
         rest = np.maximum(total - gain**2 * electrons - 1 / 12, 0.0)
-        n = electrons.size
+        nm, none = self.bins @ self.quiet.wavelength_nm / self.bins.sum(axis=1), np.zeros(electrons.size)
+        dark: dict[str, Any] = dict.fromkeys(("sky_electrons", "neighbour_electrons", "dark_dn", "bias_dn"), none)
         return replace(
             self.quiet,
+            **dark,
             source_electrons=electrons,
-            sky_electrons=np.zeros(n),
-            neighbour_electrons=np.zeros(n),
-            dark_dn=np.zeros(n),
-            bias_dn=np.zeros(n),
             read_noise_dn=np.sqrt(rest),
             gain_dn_per_electron=gain,
-            wavelength_nm=self.bins @ self.quiet.wavelength_nm / self.bins.sum(axis=1),
-            element=np.arange(n, dtype=np.int32),
-            element_wavelength_nm=self.bins @ self.quiet.wavelength_nm / self.bins.sum(axis=1),
+            wavelength_nm=nm,
+            element=np.arange(nm.size, dtype=np.int32),
+            element_wavelength_nm=nm,
             n_frames=self.quiet.n_frames * n_frames,
             adc_max_dn=NO_CEILING_DN,
             saturation_dn=float(NO_CEILING_DN),
@@ -215,8 +208,7 @@ class LightChange:
 
     frame: int  # first frame after the change
     width: int  # number of frames before and after it that are compared
-    # change, error: light after the change less that before, relative to the quiescent star, and its standard error.
-    change: float
+    change: float  # light after the change less that before, relative to the quiescent star
     error: float
 
 
@@ -232,10 +224,9 @@ def light_changes(
 ) -> list[LightChange]:  # fmt: skip
     """Find sudden changes of the light that all pixels share, in order of time.
 
-    The light is fitted to each of some frames, ascending, and its means before and after each frame are compared. A
-    change counts if the spectrum of the difference is clearly that of the star rather than one of `others`: flares,
-    dark current and sky. `excess` is the spectra of all frames less that of the quiescent star, `light`; `numbers` are
-    those of all frames on the regular grid, and `sd` is the noise of a frame.
+    The light is fitted to some frames, ascending, and its means before and after each are compared. The spectrum of a
+    change must clearly be that of the star rather than one of `others`: flares, dark current and sky. `excess` are all
+    frames less the star's `light`, with their `numbers` on the regular grid and the noise `sd`.
     """
     weights = light / sd**2 / float(((light / sd) ** 2).sum())
     amplitude, at = excess[frames] @ weights, numbers[frames]
@@ -270,8 +261,7 @@ def light_changes(
 CHANCE_RAYS = 0.01
 #: Flares that explain the light of many pixels at once, K; their residual in one pixel of one frame is a cosmic ray.
 RAY_FLARES_K = (6_000.0, 12_000.0, 30_000.0)
-#: Largest number of rounds of replacing bad values by the fit to the others, which end where the values change by less
-#: than this share of a standard deviation.
+#: Largest number of rounds of replacing bad values, and the change in standard deviations at which they end.
 RAY_ROUNDS, SETTLED = 50, 0.05
 
 
@@ -282,19 +272,16 @@ class CleanedSpectra:
     frames: Frames  # without bias and dark current, in the pixels that are used
     model: FrameModel  # of these pixels
     rays: NDArray[np.int64]  # shape (n_frame,); number of values of each frame that are replaced
-    # Shape (n_pixel,); standard deviation of a quiescent frame, as the file states it or else by the noise model of the
-    # instrument.
-    stated: Float
-    stated_by: str
+    stated: Float  # shape (n_pixel,); standard deviation of a quiescent frame
+    stated_by: str  # "file", or "instrument": by its noise model
     saturated: Bool  # shape (n_frame,)
 
 
 def clean_spectra(frames: Frames, model: FrameModel) -> CleanedSpectra:
-    """Replace single bad values of spectra by a fit to the other pixels of their frame.
+    """Replace single bad values of spectra, as of particles, by a fit to the other pixels of their frame.
 
-    Flares, and changes of the star, the dark current and the sky, change many pixels. A single pixel that deviates in
-    one frame was hit by a particle or read incorrectly. Pixels that are not finite in a frame without a fault are
-    left out of all frames.
+    Flares, and changes of the star, the dark current and the sky, change many pixels. Pixels that are not finite in a
+    frame without a fault are left out of all frames.
     """
     usable = frames.faults == 0
     fine = np.isfinite(frames.flux[usable]).all(axis=0) & (model.bins.sum(axis=1) > 0)

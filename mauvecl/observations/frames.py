@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import IntFlag
-from functools import cached_property
+from functools import cache, cached_property
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import numpy as np
@@ -81,9 +81,8 @@ class QualityBits:
         if not n:
             return ()
         bits = QualityBits(self.noted, self.mission).words(self.noted)
-        frames = "1 frame of" if n == 1 else f"{n} frames of"
-        verb = "is" if n == 1 else "are"
-        return (f"{frames} {name} with the quality flag {bits} {verb} kept, because it can mark flares",)
+        frames, verb = ("1 frame", "is") if n == 1 else (f"{n} frames", "are")
+        return (f"{frames} of {name} with the quality flag {bits} {verb} kept, because it can mark flares",)
 
 
 def decimal_flags(flags: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -99,23 +98,17 @@ def decimal_flags(flags: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _mask(chosen: str | int, names: Mapping[int, str], what: str) -> int:
     """Return the sum of the bits that a text or number chooses."""
-    by_name = {name.lower(): bit for bit, name in names.items()}
+    by_name = {name.lower(): bit for bit, name in names.items()} | {"all": ALL_BITS, "none": 0}
     words = [word for word in re.split(r"[\s,;|+]+", str(chosen).strip()) if word]
-    known = ", ".join(names.values())
-    expected = "all, none, default, or numbers" + (f" and names among {known}" if known else
-                                                   "; names are known for Kepler, K2 and TESS")  # fmt: skip
-    if len(words) == 1 and words[0].lower() in ("all", "none"):
-        return ALL_BITS if words[0].lower() == "all" else 0
     mask = 0
-    for word in words:
+    for word in words or [str(chosen)]:
         if word.isascii() and word.isdigit() and len(word) < 19:
             mask |= int(word)
-        elif word.lower() in by_name:
+        elif word.lower() in by_name and (len(words) == 1 or word.lower() not in ("all", "none")):
             mask |= by_name[word.lower()]
         else:
-            raise InputError.of("quality_bits", word, expected, where=what)
-    if not words:
-        raise InputError.of("quality_bits", chosen, expected, where=what)
+            known = f"names among {', '.join(names.values())}" if names else "for Kepler, K2 and TESS names"
+            raise InputError.of("quality_bits", word, f"all, none, default, or numbers, and {known}", where=what)
     return mask
 
 
@@ -153,13 +146,7 @@ class Reason(IntFlag):
     @classmethod
     def all_words(cls, values: NDArray[Any]) -> NDArray[np.str_]:
         """Return the reasons of many frames in words."""
-        return np.array(_worded(values, cls.words), np.str_)
-
-
-def _worded(values: NDArray[Any], words: Callable[[int], str]) -> list[str]:
-    """Return the words for many values, made once for each that differs."""
-    texts = {value: words(int(value)) for value in np.unique(values).tolist()}
-    return [texts[value] for value in values.tolist()]
+        return np.array([*map(cache(cls.words), values.tolist())], np.str_)
 
 
 def _check_light(name: str, time: Float, light: Float) -> None:
@@ -191,11 +178,9 @@ def _cadence_of(name: str, time: Float) -> float:
     step = np.diff(time)
     cadence = float(np.median(step))
     if not cadence > 0 or (step < MIN_STEP * cadence).any():
-        row = int(np.argmin(step))
         least = f"frames that are at least {MIN_STEP:g} of the median step of {cadence:g} s apart"
-        if not cadence > 0:
-            least = "a different time for each frame"
-        raise _bad(name, "time", f"{step[row]:g} s from one frame to the next", least)
+        least = least if cadence > 0 else "a different time for each frame"
+        raise _bad(name, "time", f"{step.min():g} s from one frame to the next", least)
     span = float(time[-1] - time[0])
     if not span <= MAX_SPAN * cadence:
         most = f"at most {MAX_SPAN} of the median step of {cadence:g} s"
@@ -328,27 +313,21 @@ class Frames:
         if (wavelength is None) != (light.ndim == 1) or (wavelength is not None and wavelength.size != light.shape[1]):
             raise _bad(name, "wavelength", None if wavelength is None else wavelength.shape,
                        "one wavelength for each pixel of spectra, none for a light curve")  # fmt: skip
-        return made if wavelength is None else made._in_order_of_wavelength()._without_dead_pixels()
+        return made if wavelength is None else made._with_sorted_live_pixels(wavelength)
 
-    def _in_order_of_wavelength(self) -> Self:
-        assert self.wavelength_nm is not None
-        if not (np.isfinite(self.wavelength_nm).all() and (self.wavelength_nm > 0).all()):
-            raise _bad(self.name, "wavelength", float(self.wavelength_nm.min()), "wavelengths above 0 nm")
-        order = np.argsort(self.wavelength_nm, kind="stable")
-        return self._with_pixels(order) if (np.diff(order) < 0).any() else self
-
-    def _with_pixels(self, chosen: NDArray[Any]) -> Self:
-        assert self.wavelength_nm is not None
-        error = None if self.error is None else self.error[:, chosen]
-        return replace(self, flux=self.flux[:, chosen], error=error, wavelength_nm=self.wavelength_nm[chosen])
-
-    def _without_dead_pixels(self) -> Self:
-        """Return spectra without the pixels that are not finite in most frames; a remark states their number."""
+    def _with_sorted_live_pixels(self, wavelength: Float) -> Self:
+        """Return spectra in order of wavelength, without the pixels that are not finite in most frames."""
+        if not (np.isfinite(wavelength).all() and (wavelength > 0).all()):
+            raise _bad(self.name, "wavelength", float(wavelength.min()), "wavelengths above 0 nm")
         finite = np.isfinite(self.flux) if self.error is None else np.isfinite(self.flux) & np.isfinite(self.error)
         live = live_pixels(finite.sum(axis=0), self.n_frames, self.name)
-        if live.all():
+        order = np.argsort(wavelength, kind="stable")
+        chosen = order[live[order]]
+        if np.array_equal(chosen, np.arange(wavelength.size)):
             return self
-        return self._with_pixels(live).with_remarks(dead_pixel_remarks(int((~live).sum()), self.name))
+        error = None if self.error is None else self.error[:, chosen]
+        made = replace(self, flux=self.flux[:, chosen], error=error, wavelength_nm=wavelength[chosen])
+        return made.with_remarks(dead_pixel_remarks(int((~live).sum()), self.name))
 
     @property
     def white_light(self) -> tuple[Float, Float | None]:
@@ -398,7 +377,7 @@ class Frames:
         """Bits of the quality flag that exclude each frame, as in "Desat (32)"; empty for others."""
         if self.quality is None:
             return [""] * self.n_frames
-        return _worded(self.quality, QualityBits(self.quality_mask, self.mission).words)
+        return [*map(cache(QualityBits(self.quality_mask, self.mission).words), self.quality.tolist())]
 
     def shifted(self, by_s: Annotated[Float, Unit("s")]) -> Self:
         """Return the frames with other times."""
@@ -424,11 +403,8 @@ class Frames:
             return f"{time_s:.1f} s"
         from astropy.time import Time
 
-        known = {"utc", "tdb", "tai", "tt"}
-        when = Time(
-            self.reference_mjd, time_s / DAY_S, format="mjd", scale=self.scale if self.scale in known else "tdb"
-        )
-        return str(when.isot)
+        scale = self.scale if self.scale in ("utc", "tdb", "tai", "tt") else "tdb"
+        return str(Time(self.reference_mjd, time_s / DAY_S, format="mjd", scale=scale).isot)
 
 
 def live_pixels(finite: NDArray[np.int64], n_frames: int, name: str) -> NDArray[np.bool_]:
@@ -483,10 +459,8 @@ def barycentric(frames: Frames, target: Target, orbit: Orbit | None = None) -> F
     if frames.position not in ("GEOCENTER", "TOPOCENTER"):
         raise InputError.of("position", frames.position, "TOPOCENTER or GEOCENTER, as a mapping states", where=name)
     if frames.position == "TOPOCENTER" and orbit is None:
-        raise InputError(
-            f"{name}: the orbit of {frames.instrument or 'its satellite'} needs two-line elements in `orbit.tle`",
-            key="orbit.tle",
-        )
+        whose = frames.instrument or "its satellite"
+        raise InputError(f"{name}: the orbit of {whose} needs two-line elements in `orbit.tle`", key="orbit.tle")
     with offline():
         when = Time(frames.reference_mjd, frames.time_s / DAY_S, format="mjd", scale=frames.scale)
         parts = [when[k : k + PIECE] for k in range(0, frames.n_frames, PIECE)]
@@ -494,15 +468,11 @@ def barycentric(frames: Frames, target: Target, orbit: Orbit | None = None) -> F
         late = np.concatenate([_light_travel_s(part, target, place) for part in parts])
         first = when[0].tdb + late[0] * u.s
         seconds = (when.tdb - first).to_value(u.s) + late
-        reference = float(first.mjd)
     remark = f"times are at the Solar System's barycentre (TDB) for {target.name} ({target.source})"
     if place is not None:
         remark += f", {_accuracy(place, when)}"
-    made = replace(
-        frames, time_s=seconds, reference_mjd=reference, scale="tdb", position="BARYCENTER",
-        direction_deg=(target.ra_deg, target.dec_deg),
-    )  # fmt: skip
-    return made.with_remarks((remark,))
+    made = replace(frames, time_s=seconds, reference_mjd=float(first.mjd), scale="tdb", position="BARYCENTER")
+    return replace(made, direction_deg=(target.ra_deg, target.dec_deg)).with_remarks((remark,))
 
 
 def _light_travel_s(when: Time, target: Target, orbit: Orbit | None) -> Float:

@@ -24,8 +24,7 @@ FAR = 5.0
 NEAR = 3.0
 #: Number of frames whose median is the level around a single bright frame.
 AROUND = 9
-#: Rise within a few frames, in robust standard deviations of such rises, from which a first guess of the flares begins,
-#: and the numbers of frames.
+#: Rise in robust standard deviations from which a first guess of the flares begins, and the frames that it takes.
 JUMP, JUMP_FRAMES = 8.0, (1, 2, 3)
 #: A guessed flare ends at this share of its rise, or within this number of standard deviations of the level before it.
 DECAYED, WITHIN = 0.02, 3.0
@@ -54,9 +53,7 @@ class QuiescentLevel:
 
     level: Float  # shape (n_frame,); mean of the process given the quiescent frames
     level_error: Float  # shape (n_frame,); its standard error
-    # Shape (n_frame,); standard deviation of a frame at that level: the stated error times `excess`, or the scatter of
-    # quiescent frames if no errors are stated.
-    error: Float
+    error: Float  # shape (n_frame,); standard deviation of a frame at that level, as measured
     excess: float  # measured scatter over the stated errors of quiescent frames; NaN if no errors are stated
     quiet: Bool  # shape (n_frame,); frames that are searched and belong to no event
     reasons: NDArray[np.int64]  # shape (n_frame,); why frames are not searched; see `frames.Reason`
@@ -105,15 +102,12 @@ def noise_of_steps(numbers: NDArray[np.int64], flux: Float) -> float:
 def guess_flares(numbers: NDArray[np.int64], flux: Float, least: float = 0.0) -> Bool:
     """Return a first guess of the frames in flares, which rise faster than the star otherwise does, shape (n_frame,).
 
-    `numbers` are those of the frames on their regular grid; `least` is the least standard deviation of a frame, since
-    most of few counts are equal.
+    `least` is the least standard deviation of a frame, since most of few counts are equal.
     """
     inside = np.zeros(flux.size, np.bool_)
     rises: list[tuple[float, int, int]] = []
     noise = max(noise_of_steps(numbers, flux), least)
     for lag in JUMP_FRAMES:
-        if flux.size <= lag:
-            continue
         rise = np.where(numbers[lag:] - numbers[:-lag] <= 2 * lag, flux[lag:] - flux[:-lag], 0.0)
         limit = JUMP * max(PER_MAD * float(np.median(np.abs(rise))), np.sqrt(2.0) * least)
         rises += [(float(rise[k]), int(k), lag) for k in np.flatnonzero(rise > max(limit, 1e-300))]
@@ -145,8 +139,7 @@ def _first_faint(flux: Float, start: int, limit: float) -> int:
 def quiet_variance(flux: Float, error: Float, level: Float, quiet: Bool) -> tuple[Float, float]:
     """Return the variance of the noise of each frame at its level as stated, and its rise with the flux.
 
-    Stated errors often follow the counts of their own frame; what they owe to the difference from the level is taken
-    away.
+    Stated errors often follow the counts of the frame, of which the difference from the level is taken away.
     """
     squared = error**2
     apart = (flux - level)[quiet]
@@ -159,10 +152,9 @@ def quiet_variance(flux: Float, error: Float, level: Float, quiet: Bool) -> tupl
 
 
 class LevelGiven:
-    """Means of a process at all times given quiescent values: one factorisation for all values at the same times.
+    """Means of a process at all times given quiescent values, by one factorisation for all values at these times.
 
-    The variance is that of the noise of each value, without the excess of the process. The sum of the `weights` of the
-    values is the inverse of the variance of the constant level.
+    The sum of the `weights` of the values is the inverse of the variance of the constant level.
     """
 
     def __init__(self, process: Process, time_s: Float, variance: Float, quiet: Bool) -> None:
@@ -210,15 +202,12 @@ def level_error(process: Process, time_s: Float, variance: Float, quiet: Bool, s
 
 
 def single_frames(numbers: NDArray[np.int64], sigmas: Float, fine: Bool) -> Bool:
-    """Return single frames far above the level whose neighbours on both sides are not.
+    """Return single frames far above the level, by `sigmas`, whose neighbours on both sides are not.
 
-    A flare decays over several frames; one that is shorter than a frame cannot be distinguished from a cosmic ray.
-    `sigmas` is the distance from the level, in standard deviations, and frames without another fault are `fine`.
+    A flare that is shorter than a frame cannot be distinguished from a cosmic ray. Frames without a fault are `fine`.
     """
     at = np.flatnonzero(fine)
     single = np.zeros(sigmas.size, np.bool_)
-    if at.size < 3:
-        return single
     here, before, after = at[1:-1], at[:-2], at[2:]
     adjacent = (numbers[after] - numbers[before]) == 2
     low = (np.abs(sigmas[before]) < NEAR) & (np.abs(sigmas[after]) < NEAR)
@@ -227,18 +216,13 @@ def single_frames(numbers: NDArray[np.int64], sigmas: Float, fine: Bool) -> Bool
 
 
 def spikes(numbers: NDArray[np.int64], flux: Float, error: Float | None, fine: Bool) -> Bool:
-    """Return single frames far above the frames around them, of a star whose level is not known yet.
-
-    Frames without another fault are `fine`.
-    """
-    found = np.zeros(flux.size, np.bool_)
-    at = np.flatnonzero(fine)
+    """Return single frames, of those that are `fine`, far above the frames around them, without a known level."""
+    at, sigmas = np.flatnonzero(fine), np.zeros(flux.size)
     around = scipy.ndimage.median_filter(flux[at], size=AROUND, mode="nearest")
     scatter = noise_of_steps(numbers[at], flux[at])
     sd = np.full(at.size, scatter) if error is None else np.maximum(error[at], scatter)
-    sigmas = np.divide(flux[at] - around, sd, out=np.zeros(at.size), where=sd > 0)
-    found[at] = single_frames(numbers[at], sigmas, np.ones(at.size, np.bool_))
-    return found
+    sigmas[at] = np.divide(flux[at] - around, sd, out=np.zeros(at.size), where=sd > 0)
+    return single_frames(numbers, sigmas, fine)
 
 
 #: Numbers of frames per bin at which the scatter is measured.
@@ -255,8 +239,7 @@ CORRELATED, SIGNIFICANT = 0.12, 5.0
 class Likeness:
     """Comparison of the residuals of the fitted process with independent noise."""
 
-    # Shape (n_lag,); autocorrelation at lags of 1, 2 ... frames, of the sum that is most correlated.
-    correlations: Float
+    correlations: Float  # shape (n_lag,); at lags of 1, 2 ... frames, of the sum that is most correlated
     errors: Float  # shape (n_lag,); their standard errors for independent residuals, of which long lags have fewer
 
     @property
@@ -305,8 +288,7 @@ class Scatter:
     count: int  # number of means
     measured: float  # their standard deviation, in units of the noise of one frame
     white: float  # the same for independent frames: one over the root of `frames`
-    # low, high: range of `measured` in 95 % of light curves of independent, normal frames.
-    low: float
+    low: float  # range of `measured`, with `high`, in 95 % of light curves of independent, normal frames
     high: float
 
     @property
@@ -316,10 +298,7 @@ class Scatter:
 
 
 def binned_scatter(numbers: NDArray[np.int64], residual: Float) -> list[Scatter]:
-    """Measure the scatter of means of consecutive frames without gaps.
-
-    Residuals are in units of the noise of a frame.
-    """
+    """Measure the scatter of means of consecutive frames without gaps, in units of the noise of a frame."""
     found = []
     # Place of each frame among consecutive ones, and their number.
     first = np.flatnonzero(np.diff(numbers, prepend=numbers[:1] - 2) != 1)
@@ -339,8 +318,7 @@ def binned_scatter(numbers: NDArray[np.int64], residual: Float) -> list[Scatter]
 
 Places = NDArray[np.intp]
 
-#: Numbers of frames on each side whose parabolas are compared, and their difference in its usual deviations from which
-#: it may be a step (assumed).
+#: Frames on each side whose parabolas are compared, and their usual deviations from which it may be a step (assumed).
 SIDES, SUDDEN = (12, 40), 8.0
 #: Largest number of steps (assumed).
 MOST_STEPS = 30
@@ -358,9 +336,8 @@ LARGEST = 2.0
 def relative_level(time_s: Float, numbers: NDArray[np.int64], flux: Float, frame_s: float) -> Float:
     """Return the level of each frame relative to the median one, which changes by steps only, shape (n_frame,).
 
-    Sudden changes that last are fitted together with the process of the light. They are steps if each is larger than
-    its error allows, with and without the frames in which a flare may have begun there, and if together they lower the
-    Bayesian information criterion. The frames are those without a fault, `frame_s` apart on the grid of their numbers.
+    Sudden changes are steps if each is larger than its error, with and without the frames in which a flare may have
+    begun there, and if together they lower the Bayesian information criterion. No frame has a fault.
     """
     constant = np.ones(flux.size)
     values = flux / Binned(time_s, flux, constant, frame_s).noise
@@ -378,7 +355,9 @@ def relative_level(time_s: Float, numbers: NDArray[np.int64], flux: Float, frame
         quiet = ~guess_flares(numbers, left)
         process = fit_process(binned(left), process)
         change, error = _fitted_steps(process, time_s, left, quiet, places, frame_s)
-        no_flare = quiet & ~_after_rises(time_s, places, sizes)
+        # A flare may shine after each rise.
+        rises = [(time_s >= start) & (time_s < start + FLARE_S) for start in time_s[places[sizes > 0]]]
+        no_flare = quiet & ~np.any(rises, axis=0)
         apart, error_apart = _fitted_steps(process, time_s, left, no_flare, places, frame_s)
         before, sizes = sizes, sizes + change
         kept = (np.abs(sizes) > SIGNIFICANT * error) & ((before + apart) / np.sign(sizes) > AFTER_FLARE * error_apart)
@@ -421,10 +400,7 @@ def _sudden_changes(time_s: Float, flux: Float) -> tuple[Places, Float]:
 
 
 def _lasts(time_s: Float, flux: Float, place: int, size: float) -> bool:
-    """Return whether a change is not undone within days, as that of a flare or a loss of light is.
-
-    The light of a star that turns in less time has the same median before and after.
-    """
+    """Return whether the median of the light differs days later too, as not after flares, losses and rotation."""
     start = time_s[place]
     for length_s in LENGTHS_S:
         first, later, last = np.searchsorted(time_s, [start - length_s, start + FLARE_S, start + FLARE_S + length_s])
@@ -441,14 +417,6 @@ def _light_of_steps(n_frames: int, places: Places, sizes: Float) -> Float:
     added = np.zeros(n_frames)
     added[places] = sizes
     return np.cumsum(added)
-
-
-def _after_rises(time_s: Float, places: Places, sizes: Float) -> Bool:
-    """Return the frames in which a flare may shine that began at a rise."""
-    inside = np.zeros(time_s.size, np.bool_)
-    for start in time_s[places[sizes > 0]]:
-        inside |= (time_s >= start) & (time_s < start + FLARE_S)
-    return inside
 
 
 def _fitted_steps(

@@ -48,8 +48,7 @@ Bool = NDArray[np.bool_]
 #: Share of the frames in events of a star whose light is constant, and of one that rotates, and noise relative to the
 #: stated one, above which losses are tried (assumed).
 MOST_FLARING, MOST_ACTIVE, MOST_EXCESS = 0.1, 0.3, 1.5
-#: Time scale from which a process is slow, however long the light curve (assumed: 2 d, twelve times the longest loss
-#: that is searched).
+#: Time scale from which a process is slow (assumed: 2 d, twelve times the longest loss that is searched).
 SLOW_S = 172_800.0
 #: Smallest standard deviation of a process that losses of light may have caused, relative to the noise of a mean over
 #: its time scale (assumed: losses with an S/N of 5 in 1 % of the frames give 0.5).
@@ -66,8 +65,7 @@ BRIGHT, BEFORE, DECAY, MOST_BRIGHT = 4.0, 2, 3, 0.3
 SHORTEST_PERIOD_S, ECLIPSES, WIDENED = 17_280.0, np.array([0.03, 0.06, 0.12]), 1.6
 #: Largest number of values in which eclipses are guessed, and the shift of a box in its durations between two periods.
 MOST_BINNED, MOVED = 3000, 0.5
-#: Smallest number of eclipses, and smallest share of them that are at least half as deep as their median (assumed; a
-#: flare may fill some).
+#: Smallest number of eclipses, and smallest share that is at least half as deep as the median (a flare may fill some).
 LEAST_ECLIPSES, ALIKE = 3, 0.8
 #: Share of the period whose median is the light around an eclipse, and parameters of the times of eclipses.
 AROUND, EPHEMERIS = 0.3, 5
@@ -96,9 +94,8 @@ class Loss(Shape):
 def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, taken: Bool, steps: Steps) -> Bool:
     """Return the frames in which light is lost, if losses explain a light curve better than flares do.
 
-    Without losses, a star does not flare in many of its frames, keeps its noise, and varies slowly. Where that does not
-    hold, the light curve is searched upside down for losses, and the smaller Bayesian information criterion decides.
-    `survey` has no processes; `fitted` and `taken` are the process and the events of `fit_quiet_light`.
+    Without losses, a star does not flare in many of its frames, keeps its noise, and varies slowly. Otherwise the light
+    curve, `survey`, is searched upside down, and the criterion of `fitted` and its events, `taken`, is compared.
     """
     none, process = np.zeros_like(taken), fitted.flux_process
     rotates = any(term.rotates for term in process.terms)
@@ -144,10 +141,7 @@ def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, taken: Bool, steps
 
 
 def _eclipses(survey: SeriesSurvey, usual: Callable[[], float]) -> Bool:
-    """Return the frames in periodic losses, if these lower the criterion, shape (n_frame,).
-
-    The survey has no processes; `usual` returns the criterion without losses, which takes long.
-    """
+    """Return the frames in periodic losses if these lower the criterion, which is `usual()` without them."""
     guessed = guess_eclipses(survey)
     none = np.zeros_like(guessed)
     if not 0 < guessed.mean() < MOST_LOST:
@@ -176,8 +170,8 @@ def _eclipses(survey: SeriesSurvey, usual: Callable[[], float]) -> Bool:
 def guess_eclipses(survey: SeriesSurvey) -> Bool:
     """Return a first guess of the frames in periodic losses, by box least squares, shape (n_frame,).
 
-    They are the box that fits best and, as of a binary star, the best one at the same period in the other frames
-    (Kovacs, Zucker & Mazeh 2002, doi 10.1051/0004-6361:20020802).
+    As of a binary star, there may be two boxes of one period (Kovacs, Zucker & Mazeh 2002, doi
+    10.1051/0004-6361:20020802).
     """
     from astropy.timeseries import BoxLeastSquares
 
@@ -244,17 +238,14 @@ ROUNDS = 3
 def survey_light_curve(
     frames: Frames, shape: Shape, seed: int, steps: Steps = UNREPORTED
 ) -> tuple[SeriesSurvey, QuiescentLevel, Frames]:
-    """Fit the quiescent light of a light curve, and prepare its search.
+    """Fit the quiescent light of a light curve, and prepare its search; `seed` is that of the error of the level.
 
-    Frames of few counts are returned with a remark and without errors. The seed is that of the standard error of the
-    level; `steps` reports fits, searches and draws.
+    Frames of few counts are returned with a remark and without errors. `steps` reports fits, searches and draws.
     """
     fits = steps.part(0.0, 0.9)
-    frames, counts = _counted(frames)
-    flux, error = frames.white_light
-    reasons = _faults(frames, counts)
+    frames, counts, reasons, steps_of_level = _prepared(frames)
     used = reasons == 0
-    steps_of_level = _steps_of_level(frames, flux, used, counts)
+    flux, error = frames.white_light
     flux, error = flux / steps_of_level, None if error is None else error / steps_of_level
     # A frame of no count at the least has the Poisson noise of one.
     least = 0.0 if counts is None else float(np.sqrt(max(np.median(flux[used]) * counts, 1.0))) / counts
@@ -293,31 +284,25 @@ def survey_light_curve(
     return survey, light.times(steps_of_level), frames
 
 
-def _counted(frames: Frames) -> tuple[Frames, float | None]:
-    """Return the counts in a unit of the flux of frames of few counts, and these without errors; or frames and None."""
-    if (counts := counts_per_unit(frames)) is None:
-        return frames, None
-    remark = "the frames hold few counts: their noise is Poisson noise of the level, and stated errors are not used"
-    return replace(frames, error=None).with_remarks((remark,)), counts
+def _prepared(frames: Frames) -> tuple[Frames, float | None, NDArray[np.int64], Float]:
+    """Return frames, counts in a unit of their flux, why some are not searched, and the level relative to the typical.
 
-
-def _faults(frames: Frames, counts: float | None) -> NDArray[np.int64]:
-    """Return why frames are not searched, before their level is known; raise InputError if too few are left."""
+    Frames of few counts have no errors; for others, counts are None. Raises InputError if too few frames are usable.
+    """
+    if (counts := counts_per_unit(frames)) is not None:
+        remark = "the frames hold few counts: their noise is Poisson noise of the level, and stated errors are not used"
+        frames = replace(frames, error=None).with_remarks((remark,))
     flux, error = frames.white_light
-    reasons = frames.faults.copy()
+    reasons, level = frames.faults.copy(), np.ones(flux.size)
     check_usable(frames, reasons)
     if counts is None:
         reasons[spikes(frames.numbers, flux, error, reasons == 0)] |= Reason.SPIKE
-    return reasons
-
-
-def _steps_of_level(frames: Frames, flux: Float, used: Bool, counts: float | None) -> Float:
-    """Return the relative level after each sudden change, for all frames; those not used have that of the next used."""
-    if counts is not None or np.ptp(frames.time_s) <= LONG_S:
-        return np.ones(flux.size)
-    relative = relative_level(frames.time_s[used], frames.numbers[used], flux[used], frames.cadence_s)
-    places = np.searchsorted(np.flatnonzero(used), np.arange(flux.size))
-    return relative[np.clip(places, 0, used.sum() - 1)]
+        if np.ptp(frames.time_s) > LONG_S:
+            at = np.flatnonzero(reasons == 0)
+            relative = relative_level(frames.time_s[at], frames.numbers[at], flux[at], frames.cadence_s)
+            # Frames that are not searched have the level of the next one that is.
+            level = relative[np.clip(np.searchsorted(at, np.arange(flux.size)), 0, at.size - 1)]
+    return frames, counts, reasons, level
 
 
 def searched_among(survey: SeriesSurvey, frames: Frames) -> NDArray[np.intp]:

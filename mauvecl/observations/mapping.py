@@ -13,13 +13,7 @@ from pydantic import model_validator
 
 from mauvecl.host.tables.files import read_text, toml
 from mauvecl.host.tables.names import divided_unit, first_of, is_magnitude, key_of
-from mauvecl.host.tables.table import (
-    TableFile,
-    Values,
-    converted,
-    unit_in,
-    unit_in_name,
-)
+from mauvecl.host.tables.table import TableFile, Values, converted, unit_in, unit_in_name
 from mauvecl.host.tables.units import (
     EPOCHS_MJD,
     MISSIONS,
@@ -117,19 +111,13 @@ class FrameMapping(Record):
     name: str | None = None
 
     @model_validator(mode="after")
-    def _known_scale(self) -> Self:
+    def _consistent(self) -> Self:
         if self.scale and scale_of(self.scale) not in SCALES.values():
             raise InputError.of("scale", self.scale, f"one of {', '.join(sorted(set(SCALES.values())))}")
-        return self
-
-    @model_validator(mode="after")
-    def _one_exposure(self) -> Self:
         given = [self.exposure is not None, self.exposure_s is not None, not isinstance(self.time, str)]
         if sum(given) > 1:
-            raise InputError(
-                "the exposure time is given twice; give only one of exposure, exposure_s and two columns of time",
-                key="exposure",
-            )
+            fault = "the exposure time is given twice; give only one of exposure, exposure_s and two columns of time"
+            raise InputError(fault, key="exposure")
         return self
 
     @classmethod
@@ -210,11 +198,9 @@ def recognised(file: TableFile) -> FrameMapping:
             # Dates at the barycentre are those of the light; those at the Sun are seconds from them.
             dated = [name for name in dated if said[name].position == place] or dated
         if len(dated) > 1:
-            raise InputError(
-                f"{file.what}: {len(dated)} columns may be the time; give a mapping that names one of "
-                f"{', '.join(map(shortened, dated))}",
-                key="time",
-            )
+            named = ", ".join(map(shortened, dated))
+            fault = f"{file.what}: {len(dated)} columns may be the time; give a mapping that names one of {named}"
+            raise InputError(fault, key="time")
         timed = [name for name in said if re.match(r"t(?:ime)?[\s_.]", name, re.IGNORECASE)]
         columns["time"] = dated[0] if dated else first_of((*OTHER_TIMES, *timed), names, file.what)
     if columns["time"] is None:

@@ -10,11 +10,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import accumulate, pairwise
 from typing import Any, Literal
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from mauvecl.observations.progress import UNREPORTED, Steps
@@ -29,8 +31,7 @@ MAX_FITTED = 20_000
 MAX_TERMS = 3
 #: Smallest number of values for each parameter of a process.
 VALUES_PER_PARAMETER = 12
-#: Standard deviation of the logarithm of the noise about that of differences of neighbours (assumed), which includes
-#: the changes of the star between two values.
+#: Standard deviation of the log noise about that of differences of neighbours (assumed), which the star changes too.
 NOISE_PRIOR = 0.3
 #: False-alarm probability of the highest peak of the periodogram below which rotation is fitted.
 PERIODIC = 1e-3
@@ -54,8 +55,7 @@ DIFFERENCE = 1e-8
 STARTS, SAME = 4, 0.5
 #: Number of parameters of each kind of term.
 SIZES: dict[Kind, int] = {"correlated": 2, "smooth": 2, "rotation": 5, "sharp rotation": 4}
-#: Number of harmonics of rotation with sharp features, and their first standard deviation relative to that of the
-#: harmonic before.
+#: Number of harmonics of sharp rotation, and their first standard deviation over that of the harmonic before.
 HARMONICS, EACH_HARMONIC = 6, 0.5
 #: What these harmonics cost beyond their parameters, so that only very strong evidence prefers them to two (Kass &
 #: Raftery 1995, doi 10.1080/01621459.1995.10476572).
@@ -132,27 +132,12 @@ def _oscillator(variance: float, frequency: float, quality: float) -> tuple[floa
     return a, a / ratio, c, c * ratio
 
 
-def _terms() -> Any:
-    """Return celerite2's terms.
-
-    Raises InputError if celerite2 is not installed, which has no wheels for some machines.
-    """
-    try:
-        from celerite2 import terms
-    except ImportError as error:
-        raise InputError(
-            "celerite2, which models the light of stars, is not installed; use pip install celerite2", key="celerite2"
-        ) from error
-    return terms
-
-
 @dataclass(frozen=True)
 class Process:
     """Gaussian process of the light without flares."""
 
     terms: tuple[ProcessTerm, ...]
-    # Factor on the stated standard deviations of frames for which the process fits best.
-    excess: float
+    excess: float  # factor on the stated standard deviations of frames for which the process fits best
     bic: tuple[tuple[str, float], ...] = ()  # BIC of each combination of terms that was tried, less the smallest
 
     @property
@@ -161,8 +146,16 @@ class Process:
         return " + ".join((*(term.kind for term in self.terms), "white"))
 
     def kernel(self) -> Any:
-        """Return the sum of the terms as a term of celerite2; one of zero variance if there are none."""
-        return _terms().OriginalCeleriteTerm(self)
+        """Return the sum of the terms as a term of celerite2; one of zero variance if there are none.
+
+        Raises InputError if celerite2 is not installed, which has no wheels for some machines.
+        """
+        try:
+            from celerite2 import terms
+        except ImportError as error:
+            fault = "celerite2, which models the light of stars, is not installed; use pip install celerite2"
+            raise InputError(fault, key="celerite2") from error
+        return terms.OriginalCeleriteTerm(self)
 
     def get_all_coefficients(self) -> tuple[Float, ...]:
         """Return the coefficients of the terms, as celerite2 asks for them."""
@@ -198,8 +191,6 @@ class Process:
 
     def at(self, lags_s: Float) -> Float:
         """Return the covariance at time lags, shape of `lags_s`."""
-        if not self.terms:
-            return np.zeros(np.shape(lags_s))
         return np.asarray(self.kernel().get_value(np.abs(lags_s)))
 
     def times(self, time_s: Float, weights: Float) -> Float:
@@ -268,10 +259,9 @@ class Covariance:
     def squared_norms(self, columns: Float, first: int, after: int) -> Float:
         """Return v^T C^-1 v of each column, shape (n_column,).
 
-        Columns, which are overwritten, have values from time number `first` on, and zeros before and after. Innovations
-        after the last value follow from the state of the recursion there, so that their sum of squares is a quadratic
-        form of as many variables as the process has, the same for all columns; those more than `after` times later are
-        neglected.
+        Columns, which are overwritten, have values from time number `first` on. Innovations after the last value follow
+        from the state of the recursion there: their sum of squares is a quadratic form of as many variables as the
+        process has. Those more than `after` times later are neglected.
         """
         last = first + len(columns)
         rows = slice(first, last)
@@ -346,6 +336,11 @@ class Binned:
         spread = 1.4826 * float(np.median(np.abs(steps))) / np.sqrt(2.0)
         return spread if spread > 0 else float(np.std(self.values))
 
+    @property
+    def log_excess(self) -> float:
+        """Logarithm of this noise over the typical stated one."""
+        return float(np.log(max(self.noise / float(np.sqrt(np.median(self.variance))), 1e-6)))
+
     @cached_property
     def period_s(self) -> float | None:
         """Period of the highest peak of the periodogram, or None if it is noise."""
@@ -375,23 +370,20 @@ def criterion_of_process(process: Process, data: Binned, size: float) -> float:
 
 
 def fit_process(data: Binned, start: Process | None = None, steps: Steps = UNREPORTED) -> Process:
-    """Fit a process to a light curve without flares.
+    """Fit a process to a light curve without flares; the terms of `start`, of nearly the same data, are kept.
 
-    `start` is a process of nearly the same data, of which the terms are kept. `steps` reports each combination of
-    terms.
+    `steps` reports each combination of terms.
     """
-    noise = max(data.noise / float(np.sqrt(np.median(data.variance))), 1e-6)
     if start is not None:
-        process = _fitted(data, start.terms, np.log(start.excess))[0]
-        return Process(process.terms, process.excess, start.bic)
-    best, value = _fitted(data, (), np.log(noise))
+        return replace(_fitted(data, start.terms, float(np.log(start.excess)))[0], bic=start.bic)
+    best, value = _fitted(data, (), data.log_excess)
     tried = {best.name: value}
     while len(best.terms) < MAX_TERMS:
         size = best.n_parameters
         options = []
         for terms in _starts(data, best):
             if (size + sum(SIZES[term.kind] for term in terms)) * VALUES_PER_PARAMETER <= data.values.size:
-                options.append(_fitted(data, (*best.terms, *terms), np.log(noise)))
+                options.append(_fitted(data, (*best.terms, *terms), data.log_excess))
                 steps.step()
         # A combination has several starting points.
         for one, bic in options:
@@ -403,7 +395,7 @@ def fit_process(data: Binned, start: Process | None = None, steps: Steps = UNREP
         if best.terms[-1].kind == "rotation" and (sharp := _sharper(data, best)) is not None:
             tried[sharp[0].name] = sharp[1]
             best, value = min((best, value), sharp, key=lambda pair: pair[1])
-    return Process(best.terms, best.excess, tuple((name, bic - value) for name, bic in tried.items()))
+    return replace(best, bic=tuple((name, bic - value) for name, bic in tried.items()))
 
 
 def _sharper(data: Binned, process: Process) -> tuple[Process, float] | None:
@@ -453,8 +445,7 @@ def _rotation(size: float, period: float) -> ProcessTerm:
 def _period(data: Binned, values: Float, share: float) -> float | None:
     """Return the period of the highest peak of a Lomb-Scargle periodogram in seconds, or None if it is noise.
 
-    The values are those of the data, or what is left of them; `share` is the longest period over the length of the
-    data.
+    The values may be what is left of the data; `share` is the longest period over the length of the data.
     """
     from astropy.timeseries import LombScargle
 
@@ -489,21 +480,17 @@ def _bounds(data: Binned, kind: Kind, start: tuple[float, ...]) -> list[tuple[fl
 
 def _fitted(data: Binned, terms: tuple[ProcessTerm, ...], log_excess: float) -> tuple[Process, float]:
     """Return the process of some terms that fits best, and its BIC."""
-    from scipy.optimize import minimize
-
-    kinds = [term.kind for term in terms]
-    expected = float(np.log(max(data.noise / float(np.sqrt(np.median(data.variance))), 1e-6)))
+    expected = data.log_excess
     start = np.array([log_excess, *(value for term in terms for value in term.parameters)])
     bounds = [(log_excess - 3.0, log_excess + 3.0)]
     for term in terms:
         bounds += _bounds(data, term.kind, term.parameters)
     low, high = np.array(bounds).T
+    places = [*pairwise(accumulate([1, *(len(term.parameters) for term in terms)]))]
 
     def made(x: Float) -> Process:
-        parts, first, values = [], 1, x.tolist()
-        for kind in kinds:
-            parts.append(ProcessTerm(kind, tuple(values[first : first + SIZES[kind]])))
-            first += SIZES[kind]
+        values = x.tolist()
+        parts = [ProcessTerm(term.kind, tuple(values[i:j])) for term, (i, j) in zip(terms, places, strict=True)]
         return Process(tuple(parts), float(np.exp(x[0])))
 
     def cost(x: Float) -> float:
@@ -527,9 +514,8 @@ def _fitted(data: Binned, terms: tuple[ProcessTerm, ...], log_excess: float) -> 
     tolerance = CONVERGED / max(abs(slopes(x)[0]), 1.0)
     # The estimate of the curvature may mislead a fit, which another one from its end on shows.
     for _ in range(STARTS):
-        found = minimize(
-            slopes, x, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": ITERATIONS, "ftol": tolerance}
-        )
+        options: Any = {"maxiter": ITERATIONS, "ftol": tolerance}
+        found = scipy.optimize.minimize(slopes, x, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
         x, before, value = found.x, value, float(found.fun)
         if before - value < SAME:
             break

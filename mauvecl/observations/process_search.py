@@ -14,13 +14,14 @@ threshold solves only those that can exceed it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import irfft, next_fast_len, rfft
 
 from mauvecl.host.arrays import map_in_threads
 from mauvecl.search.search import largest_values
@@ -35,8 +36,7 @@ Bool = NDArray[np.bool_]
 
 #: Flux of a template relative to its peak below which it is neglected.
 NEGLECTED = 1e-4
-#: Frames around a template from which its denominator is computed: a multiple of its length, and the smallest and
-#: largest number.
+#: Frames around a template from which its denominator follows: a multiple of its length, smallest and largest number.
 MARGIN, LEAST_MARGIN, MOST_MARGIN = 4, 1024, 4096
 #: Share of a denominator in frames next to gaps or with other noise from which it is solved exactly.
 IRREGULAR = 1e-4
@@ -46,11 +46,6 @@ CHANGED = 1e-2
 OTHER_NOISE = 0.5
 #: Number of frames, unless a template is longer, and largest number of templates in one solution.
 CHUNK_FRAMES, CHUNK_TEMPLATES = 256, 512
-#: Largest number of frames whose correlations are products with a matrix, which are faster than transforms then.
-MOST_DENSE = 128
-#: Number of frames from which templates share the transforms of light curves, the shortest blocks of these, and the
-#: length of a block in longest kernels of it.
-LEAST_SHARED, LEAST_BLOCK, KERNELS_PER_BLOCK = 2**14, 2**12, 4
 #: Number of values of light curves below which templates are searched one after another.
 FEW_VALUES = 2**15
 
@@ -137,12 +132,10 @@ class FrameGrid:
 
 
 class ProcessSearch:
-    """Search of light curves for flares.
+    """Search of light curves for flares; each frame has independent sums, with a process each.
 
-    Of the stare only the times of the frames are used, and of the bank no baseline: the level is that of the processes.
-    There is one for each sum of a frame, and the sums are independent of each other. The variance is that of the noise
-    of each frame's sums. `before` is a search of the same frames and further ones, with the same bank, processes and
-    variances: denominators are solved anew only where the further frames contribute to them.
+    The variance is that of the noise of each frame's sums. `before` is a search of the same frames and further ones:
+    denominators are solved anew only where the further frames contribute to them.
     """
 
     def __init__(
@@ -201,11 +194,11 @@ class ProcessSearch:
     def values(self, sums: NDArray[Any], above: float | None = None) -> Iterator[tuple[Filter, Float]]:
         """Yield each template with rho, shape (n_stare, n_direction, n_onset); minus infinity if not searched.
 
-        Onsets next to gaps, at which rho of the first light curve cannot exceed a positive threshold `above`, are not
-        searched.
+        Onsets next to gaps are not searched where rho of the first light curve cannot exceed a positive threshold
+        `above`.
         """
         filters = self.rows if above is None else self.filters
-        scores = Correlations(self.scores(sums), [(one.shape.size, one.first) for one in filters])
+        scores = Correlations(self.scores(sums), max(max(one.shape.size, abs(one.first)) for one in filters))
         yield from map_in_threads(partial(self._values, scores, above), filters, _threads(scores.values.size))
 
     def _values(self, scores: Correlations, above: float | None, one: Filter) -> tuple[Filter, Float]:
@@ -318,7 +311,7 @@ class ProcessSearch:
     def _exact(self, k: int, shape: Float, starts: NDArray[np.int64]) -> Float:
         """Return s^T C^-1 s of a shape that starts at some frames of the grid, shape (n_start,).
 
-        The innovations of a template are zero before its first frame, and are neglected `MOST_MARGIN` frames after it.
+        Innovations of a template are neglected `MOST_MARGIN` frames after it.
         """
         begin, end = np.searchsorted(self.at, [starts[0], starts[-1] + shape.size])
         if end <= begin:
@@ -337,59 +330,23 @@ def _threads(n_values: int) -> int | None:
 
 
 class Correlations:
-    """Correlations of light curves with many kernels, of which those of alike lengths share the transforms of the data.
+    """Correlations of light curves with kernels of some largest reach, which share the transform of the light curves.
 
-    Values beyond the ends of the last axis are zero. A kernel is announced by its length and first frame.
+    Values beyond the ends of the last axis are zero.
     """
 
-    def __init__(self, values: Float, kernels: Sequence[tuple[int, int]]) -> None:
-        from scipy.fft import rfft
-
-        self.values, n = values, values.shape[-1]
-        self._before = max(0, -min(first for _, first in kernels))
-        self._spectra: dict[int, NDArray[np.complex128]] = {}
-        for length in {self._length(size) for size, _ in kernels} if n > LEAST_SHARED else ():
-            step = self._step(length)
-            number = -(-(n + self._before + max(size + first for size, first in kernels)) // step)
-            after = (number - 1) * step + length - n - self._before
-            padded = np.pad(values, [(0, 0)] * (values.ndim - 1) + [(self._before, after)])
-            blocks = np.lib.stride_tricks.sliding_window_view(padded, length, axis=-1)[..., ::step, :]
-            self._spectra[length] = rfft(blocks, axis=-1)
-
-    @staticmethod
-    def _length(size: int) -> int:
-        """Return the length of the blocks for a kernel."""
-        return max(LEAST_BLOCK, KERNELS_PER_BLOCK << int(size - 1).bit_length())
-
-    @staticmethod
-    def _step(length: int) -> int:
-        """Return the distance of blocks, which overlap by the longest kernel."""
-        return length - length // KERNELS_PER_BLOCK + 1
+    def __init__(self, values: Float, reach: int) -> None:
+        self.values, self._reach = values, reach
+        self._size = next_fast_len(values.shape[-1] + 2 * reach, real=True)
+        self._spectrum = rfft(np.pad(values, [(0, 0)] * (values.ndim - 1) + [(reach, 0)]), self._size)
 
     def of(self, kernel: Float, first: int) -> Float:
         """Return sum_k values[o + first + k] kernel[k] for every frame o of the last axis."""
-        from scipy.fft import irfft, rfft
-
-        n, length = self.values.shape[-1], self._length(kernel.size)
-        if length not in self._spectra:
-            return _correlated(self.values, kernel, first)
-        product = self._spectra[length] * rfft(kernel, length).conj()
-        found = irfft(product, length, axis=-1)[..., : self._step(length)].reshape(*self.values.shape[:-1], -1)
-        return found[..., self._before + first : self._before + first + n]
+        start = self._reach + first
+        found = irfft(self._spectrum * rfft(kernel, self._size).conj(), self._size)
+        return found[..., start : start + self.values.shape[-1]]
 
 
 def _correlated(values: Float, kernel: Float, first: int) -> Float:
-    """Return sum_k values[o + first + k] kernel[k] for every frame o of the last axis; values outside are zero."""
-    from scipy.signal import oaconvolve
-
-    n = values.shape[-1]
-    if n <= MOST_DENSE:
-        place = np.arange(n)[:, None] - np.arange(n) - first
-        inside = (place >= 0) & (place < kernel.size)
-        return np.asarray(values @ np.where(inside, kernel[np.clip(place, 0, kernel.size - 1)], 0.0))
-    last = first + kernel.size - 1
-    before, after = max(0, -first), max(0, last)
-    padded = np.pad(values, [(0, 0)] * (values.ndim - 1) + [(before, after)])
-    reverse = kernel[::-1].reshape((1,) * (values.ndim - 1) + (-1,))
-    found = oaconvolve(padded, reverse, mode="valid", axes=-1)
-    return np.asarray(found[..., max(0, first) : max(0, first) + n])
+    """Return the correlation of values with a single kernel; see `Correlations`."""
+    return Correlations(values, max(abs(first), kernel.size)).of(kernel, first)

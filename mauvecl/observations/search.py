@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from mauvecl.flares.stare import Stare, select_frames
@@ -57,14 +58,11 @@ class SeriesSurvey:
 
     stare: Stare  # times of the searched frames
     bank: Bank
-    # Sums of a flare of unit amplitude, whose light equals that of the quiescent star.
-    templates: Templates
-    # Shape (n_frame, n_sum); searched sums: for spectra, sums weighted for flares; for a light curve, its flux.
-    sums: Float
+    templates: Templates  # sums of a flare of unit amplitude, whose light equals that of the quiescent star
+    sums: Float  # shape (n_frame, n_sum); sums of spectra weighted for flares, or the flux of a light curve
     variance: Float  # shape (n_frame,); variance of the noise of each sum and of the flux, without their excess
     processes: tuple[Process, ...]  # of the sums, which are independent
-    # Shape (n_frame,); flux over `scale`, from which amplitudes and summed durations follow.
-    flux: Float
+    flux: Float  # shape (n_frame,); flux over `scale`, from which amplitudes and summed durations follow
     flux_process: Process
     scale: float  # typical standard deviation of the flux of a frame, in the unit of the flux
     level: float  # typical quiescent level, in the unit of the flux, to which amplitudes are relative
@@ -195,18 +193,15 @@ class SimulatedRate:
         return float(np.exp(self._log_rate(threshold)))
 
     def _log_rate(self, threshold: float) -> float:
-        from scipy.special import log_ndtr
-        from scipy.stats import beta
-
         n = self.largest.size
         anchor = float(self.largest[-min(n, MIN_ALARMS)])
         above = int(np.count_nonzero(self.largest > min(threshold, anchor)))
         if above == n:
             return float(np.inf)
-        rate = float(np.log(-np.log1p(-float(beta.ppf(UPPER, above + 1, n - above))) / self.days))
+        rate = float(np.log(-np.log1p(-float(scipy.stats.beta.ppf(UPPER, above + 1, n - above))) / self.days))
         if threshold <= anchor:
             return rate
-        fall = float(log_ndtr(-anchor) - log_ndtr(-threshold))
+        fall = float(np.subtract(*scipy.special.log_ndtr([-anchor, -threshold])))
         if self.heavy and above:
             # The exponential that fits the largest values best (Pickands 1975, doi 10.1214/aos/1176343003), or a normal
             # tail if it falls more slowly.
@@ -215,8 +210,6 @@ class SimulatedRate:
 
     def threshold(self, rate: float) -> float:
         """Return the threshold above which the rate of events per star-day is at most `rate`."""
-        from scipy.optimize import brentq
-
         low = float(self.largest[0])
         goal = float(np.log(rate))
         if self._log_rate(low) <= goal:
@@ -224,7 +217,7 @@ class SimulatedRate:
         high = float(self.largest[-1]) + 1.0
         while self._log_rate(high) > goal:
             high += 2.0
-        return float(brentq(lambda u: min(self._log_rate(u), 1e3) - goal, low, high, xtol=1e-4))
+        return float(scipy.optimize.brentq(lambda u: min(self._log_rate(u), 1e3) - goal, low, high, xtol=1e-4))
 
 
 def simulated_rates(
@@ -232,10 +225,9 @@ def simulated_rates(
 ) -> tuple[SimulatedRate, SimulatedRate]:
     """Return the false-alarm rates in light curves of the fitted process, and in those of measured residuals.
 
-    Both have the covariance of the process, and levels are fitted and subtracted as in the search. The noise of the
-    first is normal, or Poisson noise for counts. That of the second are blocks of the standardised residuals of
-    quiescent frames, drawn with replacement (Kuensch 1989, doi 10.1214/aos/1176347265). Enough light curves are drawn
-    for `MIN_ALARMS` at the smallest rate of interest, per star-day, up to a limit; `steps` reports each batch.
+    The noise of the first is normal, or Poisson noise for counts; that of the second are blocks of the residuals of
+    quiescent frames, drawn with replacement (Kuensch 1989, doi 10.1214/aos/1176347265). Enough are drawn for
+    `MIN_ALARMS` at the smallest rate of interest, per star-day, up to a limit; `steps` reports each batch.
     """
     residual = innovations(survey, quiet)
     part = survey.frames(np.arange(survey.stare.n_frames) < MAX_LENGTH)
@@ -266,12 +258,9 @@ def simulated_rates(
 
 
 def largest_dip(survey: SeriesSurvey, quiet: Bool, least: float) -> float:
-    """Return the largest statistic of events that no flare can be: sudden dips, and slow ones that end suddenly.
+    """Return the largest statistic of sudden dips, and of slow ones that end suddenly; below `least` it may be missed.
 
-    Smaller ones than `least` may be missed.
-
-    Quiescent frames are searched upside down, in both directions of time. Noise that is as likely to rise as to fall
-    has dips as large as its false alarms; losses of light have larger ones, and end as suddenly as flares begin.
+    Quiescent frames are searched upside down, in both directions of time. Losses of light have larger dips than noise.
     """
     down = survey.frames(quiet).inverted()
     return max(

@@ -43,14 +43,12 @@ Bool = NDArray[np.bool_]
 
 #: Differences, in standard errors, above which measured noise replaces stated noise.
 DEPARTS = 4.0
-#: Largest number of times that weights and events are found in alternation, and the share of the frames in events that
-#: may change in the last.
+#: Largest number of alternations of weights and events, and share of the frames in events that may change in the last.
 ROUNDS, SETTLED_EVENTS = 3, 0.01
 #: Number of frames in means that show slow changes.
 SLOW_FRAMES = 12
-#: Range of nine tenths of the slow changes of the dark current above which the search leaves it out, because flares
-#: would be measured with a part of it: in standard errors of a frame, and relative to the range of means of frames that
-#: change independently (assumed).
+#: Range of nine tenths of the slow changes of the dark current above which the search leaves it out (assumed): in
+#: standard errors of a frame, and relative to the range of means of frames that change independently.
 DARK_DRIFTS, BEYOND_JITTER = 5.0, 2.0
 #: Range of nine tenths of normal values, in standard deviations.
 NINE_TENTHS = float(scipy.stats.norm.ppf(0.95) - scipy.stats.norm.ppf(0.05))
@@ -62,12 +60,10 @@ BLOCK = 1024
 class PixelNoise:
     """Noise of each pixel in quiescent frames, without the light and dark current that all pixels share."""
 
-    # wavelength_nm, stated, measured: shape (n_pixel,); standard deviations of a frame.
-    wavelength_nm: Float
-    stated: Float
+    wavelength_nm: Float  # shape (n_pixel,)
+    stated: Float  # standard deviations of a frame, like `measured`
     measured: Float
-    # low, high: shape (n_pixel,); range of `measured` for 95 % of normal noise of the stated size.
-    low: Float
+    low: Float  # shape (n_pixel,), like `high`; range of `measured` for 95 % of normal noise of the stated size
     high: Float
     count: int  # number of differences of neighbouring frames
 
@@ -90,13 +86,10 @@ class SpectralSeries:
     light: Float  # shape (n_pixel,); spectrum of the quiescent star
     noise: PixelNoise
     model: FrameModel
-    # Standard deviations of the unknowns that change from frame to frame; infinite for those that are projected out.
-    jitters: Mapping[str, float]
+    jitters: Mapping[str, float]  # standard deviations of unknowns of frames; infinite if they are projected out
     changes: list[LightChange]  # sudden changes of the light that all pixels share
     kept: float  # S/N of flares over that with a steady level of the frames
-    # Range of nine tenths of the slow changes of the dark current, relative to the light in the sum over wavelength; 0
-    # if they are small for the noise.
-    dark_drift: float
+    dark_drift: float  # range of the slow changes of the dark current over the light in the sum; 0 if they are small
 
     @property
     def star_level(self) -> float:
@@ -119,10 +112,9 @@ def relative_error(differences: int) -> float:
 
 
 def measure_noise(excess: Float, pairs: NDArray[np.intp], stated: Float, shared: Float, nm: Float) -> PixelNoise:
-    """Measure the noise of each pixel from differences of neighbouring quiescent frames.
+    """Measure the noise of each pixel from differences of the quiescent frames of `pairs` and their successors.
 
-    The frames of `pairs` and their successors are quiescent and next to each other. The noise of a frame is expected to
-    be as `stated`. Amplitudes of changes that all pixels share, with the spectra `shared`, are fitted to each frame.
+    Changes that all pixels share, with the spectra `shared`, are fitted to each difference.
     """
     basis = np.linalg.svd(shared / stated, full_matrices=False)[2]
     total = np.zeros(stated.size)
@@ -145,12 +137,10 @@ def survey_spectra(
     jitters: Mapping[str, float] | None = None,
     steps: Steps = UNREPORTED,
 ) -> tuple[SeriesSurvey, SpectralSeries, QuiescentLevel]:
-    """Prepare the search of spectra that is weighted for flares.
+    """Prepare the search of spectra that is weighted for flares; `rank` and `jitters` are those of `analyse_frames`.
 
-    Slow changes of the dark current and of what else the weights let through are processes of the weighted sums; the
-    level of the light in each frame is free, so that pointing losses take no part. The level that is returned is that
-    of the sum over wavelength, with flags of single frames that only the weighted sums show; its standard error is
-    drawn with the seed. `rank` and `jitters` are those of `analyse_frames`. `steps` reports fits, searches and draws.
+    Slow changes of what the weights let through are processes of the weighted sums. The level that is returned is that
+    of the sum over wavelength, with flags of single frames that only the weighted sums show.
     """
     fits = steps.part(0.0, 0.9)
     frames = cleaned.frames
@@ -208,8 +198,7 @@ def _weighted_sums(
 ) -> tuple[SpectralSeries, Templates, Float]:
     """Return the spectra less that of the quiescent star, the weights for flares, and the weighted sums of each frame.
 
-    Sums have unit covariance from frame to frame, and are independent of each other over longer times as well. Frames
-    that belong to no event are `quiet`.
+    Sums have unit covariance from frame to frame, and change independently over longer times.
     """
     frames, model = cleaned.frames, cleaned.model
     light = frames.flux[quiet].mean(axis=0)
@@ -251,10 +240,7 @@ def _weighted_sums(
 
 
 def _slow_axes(sums: Float, quiet: Bool) -> Float:
-    """Return the rotation of sums to the axes along which they change slowly, shape (n_sum, n_sum).
-
-    The noise, of unit covariance, stays so.
-    """
+    """Return the rotation of sums, of unit covariance, to the axes along which they change slowly."""
     means = _slow_means(sums[quiet])
     if len(means) < 2 * sums.shape[1]:
         return np.eye(sums.shape[1])
@@ -268,10 +254,7 @@ def _slow_means(values: Float) -> Float:
 
 
 def fit_changes(excess: Float, spectra: Float, sd: Float) -> tuple[Float, Float]:
-    """Fit the amplitudes of spectra together to each frame; return them, shape (n_frame, k), and their covariance.
-
-    The noise of a frame is `sd`.
-    """
+    """Fit amplitudes of spectra, (n_frame, k), together to frames of noise `sd`; return them and their covariance."""
     white = spectra / sd
     covariance: Float = np.asarray(np.linalg.inv(white @ white.T), np.float64)
     return excess @ (covariance @ white / sd).T, covariance
@@ -282,9 +265,8 @@ def _dark_changes(
 ) -> tuple[dict[str, float], float]:
     """Measure changes of the dark current, which is fitted together with the light; both spectra are `shared`.
 
-    The first value is the standard deviation of the dark current from frame to frame beyond that of noise, by name:
-    infinite if it drifts, and none if it does not change significantly. The second is the range of nine tenths of slow
-    changes if it drifts, or else 0.
+    Return its standard deviation from frame to frame beyond noise, by name, if it is significant (infinite if it
+    drifts), and the range of nine tenths of its slow changes if it drifts, or else 0.
     """
     amplitudes, covariance = fit_changes(excess, shared, sd)
     amplitude, error = amplitudes[:, 1], float(np.sqrt(covariance[1, 1]))
@@ -313,13 +295,10 @@ def _whitening(sums: Float, pairs: NDArray[np.intp]) -> Float | None:
 class Colour:
     """Spectrum of an event against the spectrum of the quiescent star."""
 
-    # chi2, dof: chi-squared of the event's spectrum as a multiple of the quiescent one.
-    chi2: float
+    chi2: float  # of the event's spectrum as a multiple of the quiescent one
     dof: int
-    # Probability of a chi-squared at least as large for an event without colour, such as a step of the throughput.
-    p_value: float
-    # Rise relative to the quiescent star in the blue half of the pixels over that in the red half: 1 without colour.
-    blue_over_red: float
+    p_value: float  # of a chi-squared at least as large without colour, as of a step of the throughput
+    blue_over_red: float  # relative rise in the blue half of the pixels over that in the red: 1 without colour
     blue_over_red_error: float
 
 
@@ -371,8 +350,7 @@ class EventSpectrum:
 
     cause: Cause  # explanation of the spectrum: a flare, or a change that resembles one
     snr: float  # S/N of a flare whose amplitude is fitted together with changes of star, dark current and sky
-    # Chi-squared of single causes, each with its best amplitude, and flares with their best temperature.
-    chi2: dict[Cause, float]
+    chi2: dict[Cause, float]  # of single causes, with the best amplitude, and of flares of the best temperature
     dof: int
     p_value: float  # probability of a chi-squared at least as large as the smallest, if its cause is right
 
@@ -402,11 +380,13 @@ def event_spectrum(
     spectrum, variance = _weighted(survey, series, taken, one)
     flares = series.model.flares(TEMPERATURES_K)
     unknown = series.model.unknowns(series.light)
-    whole = float((spectrum**2 / variance).sum())
+    causes: dict[Cause, Float] = {"flare": flares}
+    causes |= {CAUSES[name]: row[None] for name, row in unknown.items()}
+    fits = {cause: chi2_of_one(spectrum, variance, rows) for cause, rows in causes.items()}
+    chi2 = {cause: float(each.min()) for cause, each in fits.items()}
     # Light is added, never taken away.
     rises = flares @ (spectrum / variance) > 0
-    chi2: dict[Cause, float] = {"flare": float(np.where(rises, chi2_of_one(spectrum, variance, flares), whole).min())}
-    chi2 |= {CAUSES[name]: float(chi2_of_one(spectrum, variance, row[None])[0]) for name, row in unknown.items()}
+    chi2["flare"] = float(np.where(rises, fits["flare"], (spectrum**2 / variance).sum()).min())
     together = Nuisances(tuple(unknown), np.array(list(unknown.values())), np.full(len(unknown), np.inf))
     rows = together.rows(variance, together.spectra)
     optimal = flares / variance - (flares @ rows.T) @ rows
@@ -415,20 +395,14 @@ def event_spectrum(
     cause: Cause = min(chi2, key=lambda name: chi2[name])
     dof = spectrum.size - 1
     least = chi2[cause]
-    left = spectrum - _fitted(cause, spectrum, variance, flares, unknown)
+    row = causes[cause][fits[cause].argmin()]
+    left = spectrum - (row @ (spectrum / variance)) / (row @ (row / variance)) * row
     p_value = float(scipy.stats.chi2.sf(least, dof))
     if p_value < NO_FIT and (left**2 / variance).max() > RAY_SHARE * least:
         cause = "cosmic ray"
     elif cause != "flare" and (chi2["flare"] - least < CLEARLY or snr >= FLARE_SNR):
         cause = "flare"
     return EventSpectrum(cause, snr, chi2, dof, p_value)
-
-
-def _fitted(cause: Cause, spectrum: Float, variance: Float, flares: Float, unknown: dict[str, Float]) -> Float:
-    """Return the best fit of a single cause, shape (n_pixel,)."""
-    rows = flares if cause == "flare" else np.array([row for name, row in unknown.items() if CAUSES[name] == cause])
-    row = rows[int(np.argmin(chi2_of_one(spectrum, variance, rows)))]
-    return np.asarray((row @ (spectrum / variance)) / (row @ (row / variance)) * row)
 
 
 def _window(
@@ -464,12 +438,11 @@ def _weighted(
 
 
 def drifts(survey: SeriesSurvey, series: SpectralSeries, taken: NDArray[np.bool_], n_frames: int) -> dict[str, float]:
-    """Return the differences of star, dark current and sky between parts of the frames and their surroundings.
+    """Return the standard deviations by which star, dark current and sky differ in an event from its surroundings.
 
-    They are standard deviations, by name, and follow from means of `n_frames` quiescent frames, compared with the means
-    before and after: the scatter in excess of noise, and the part that noise may hide. If there are fewer than
-    `MIN_PARTS` such means, shorter ones are taken, and changes are assumed to grow in proportion to time. The sky
-    changes by its documented prior.
+    They follow from means of `n_frames` quiescent frames, compared with those before and after: the scatter in excess
+    of noise, and what noise may hide. With fewer than `MIN_PARTS` means, shorter ones are taken, and changes are
+    assumed to grow in proportion to time. The sky has its documented prior.
     """
     unknown = series.model.unknowns(series.light)
     names = ("light", "dark")
@@ -502,8 +475,7 @@ def measure_flare(
 ) -> Measurement | str:
     """Fit a flare to the sum of the spectra of an event, or return the reason why none is.
 
-    The level of each pixel is the mean of the surroundings of the event. Star, dark current and sky may differ from
-    these during the event, by as much as between other parts of the frames that are as long; see `drifts`.
+    Star, dark current and sky may differ from the surroundings as much as other parts of the frames do; see `drifts`.
     """
     at, inside = _window(survey, taken, one)
     n, base = int(inside.sum()), int((~inside).sum())

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
+from importlib import import_module
 from pathlib import Path
 from typing import IO, Any
 
@@ -47,14 +48,10 @@ class FolderFile(TableFile):
                 if not path.is_dir() and not path.name.startswith(".") and path.suffix != ".toml"
             )  # fmt: skip
         if not 1 <= len(self.paths) <= MAX_FILES:
-            raise InputError(
-                f"{what}: {mapping.files or '*'!r} must name 1 to {MAX_FILES} files, not {len(self.paths)}", key="files"
-            )
+            fault = f"{what}: {mapping.files or '*'!r} must name 1 to {MAX_FILES} files, not {len(self.paths)}"
+            raise InputError(fault, key="files")
         with open_file(self.paths[0]) as first:
-            self.header = first.header
-            self.names_of_first = first.names
-        self.headers = lru_cache(maxsize=1)(self._headers)
-        self.values = lru_cache(maxsize=64)(self._values)
+            self.header, self.names_of_first = first.header, first.names
 
     @property
     def names(self) -> list[str]:
@@ -63,11 +60,15 @@ class FolderFile(TableFile):
 
     def named(self, name: str) -> Values | None:
         """Return a column of the table, a keyword of each header, or a column of each file."""
-        if self.table is not None and (found := self.table.named(name)) is not None:
-            return found
+        if self.table is not None and (column := self.table.named(name)) is not None:
+            return column
         keyword = matched(name, self.header)
         if keyword is not None:
-            return Values.of(name, np.array(self._keywords(keyword)), None, self.what)
+            found = [header.get(keyword) for header in self._headers]
+            if None in found:
+                fault = f"{self.what}: {self.paths[found.index(None)].name} needs the keyword {keyword}"
+                raise InputError(fault, key=keyword)
+            return Values.of(name, np.array(found), None, self.what)
         with self.open_file(self.paths[0]) as first:
             one = first.named(name) or (first.find(name) if "*" in name else None)
         return None if one is None else self._of_files(name, one)
@@ -82,9 +83,8 @@ class FolderFile(TableFile):
                 axis = file.axis(name, 1)
             first = first or axis
             if axis.shape != first.shape or not np.allclose(axis.numbers(), first.numbers(), rtol=1e-9, atol=0.0):
-                raise InputError(
-                    f"{self.what}: {path.name} must have the wavelengths of {self.paths[0].name}", key="wavelength"
-                )
+                fault = f"{self.what}: {path.name} must have the wavelengths of {self.paths[0].name}"
+                raise InputError(fault, key="wavelength")
         assert first is not None
         return first
 
@@ -92,36 +92,28 @@ class FolderFile(TableFile):
         """Return a column of every file, with one row per file."""
         n = int(np.prod(one.shape))
 
+        @lru_cache(maxsize=64)
+        def values(number: int) -> Any:
+            path = self.paths[number]
+            with self.open_file(path) as file:
+                found = file.find(name).numbers().ravel()
+            if found.size != n:
+                fault = f"{self.what}: {path.name} needs {n} values of {name!r} as in {self.paths[0].name}"
+                raise InputError(f"{fault}, not {found.size}", key=name)
+            return found
+
         def read(start: int, stop: int) -> Any:
-            return np.stack([self.values(name, k, n) for k in range(start, stop)])
+            return np.stack([values(k) for k in range(start, stop)])
 
         return Values(name, (len(self.paths), n), read, one.unit, self.what)
 
-    def _values(self, name: str, number: int, n: int) -> Any:
-        path = self.paths[number]
-        with self.open_file(path) as file:
-            found = file.find(name).numbers().ravel()
-        if found.size != n:
-            raise InputError(
-                f"{self.what}: {path.name} needs {n} values of {name!r} as in {self.paths[0].name}, not {found.size}",
-                key=name,
-            )
-        return found
-
-    def _headers(self) -> Sequence[dict[str, Any]]:
+    @cached_property
+    def _headers(self) -> list[dict[str, Any]]:
         headers = []
         for path in self.paths:
             with self.open_file(path) as file:
                 headers.append(file.header)
         return headers
-
-    def _keywords(self, keyword: str) -> list[Any]:
-        found = [header.get(keyword) for header in self.headers()]
-        if None in found:
-            raise InputError(
-                f"{self.what}: {self.paths[found.index(None)].name} needs the keyword {keyword}", key=keyword
-            )
-        return found
 
 
 Float = NDArray[np.float64]
@@ -143,16 +135,13 @@ class StoredFile(TableFile):
         self, what: str, path: str, raw: Any, calibration: Mapping[str, Float], of: Mapping[str, Any],
         numbers: NDArray[np.int64] | None,
     ) -> None:  # fmt: skip
-        """Take raw spectra with the calibration of their pixels.
+        """Take raw spectra, in DN, with the calibration of their pixels.
 
-        The array `path`, such as ``star-1/flare-1``, has the shape (n_realisation, n_pixel) or (n_realisation, n_frame,
-        n_pixel), in DN, and is read from the file when it is sliced. The calibration is wavelength, bias, dark, read
-        noise and gain of each pixel and frame. Attributes are ``exposure_s`` and ``frames`` of an exposure, star,
-        instrument, temperature, saturation, and unit of the dark; `numbers` are those of the stored frames of each
-        exposure, shape (n_frame,), or None.
+        The array `path`, such as ``star-1/flare-1``, of the shape (n_realisation, n_pixel) or (n_realisation, n_frame,
+        n_pixel), is read when it is sliced. `of` are attributes of an exposure, and `numbers` those of its stored
+        frames, shape (n_frame,), or None.
         """
-        missing = [key for key in REQUIRED if key not in of]
-        if missing:
+        if missing := [key for key in REQUIRED if key not in of]:
             raise InputError(f"{what} lacks {missing[0]} of {path}; give a file of this version of mauvecl", key="file")
         super().__init__(what, {"OBJECT": of.get("star", ""), "INSTRUME": of["instrument"]})
         self.raw, self.calibration, self.attributes = raw, calibration, of
@@ -164,20 +153,20 @@ class StoredFile(TableFile):
             raise InputError(f"{what} must hold at most {MAX_FRAMES} frames of {path}, not {n}", key="frames")
         within = np.array([exposure / 2]) if numbers is None else (numbers + 0.5) * frame
         at = np.arange(n)
-        each = np.ones(n)
-        self.parts = {
-            "time": Values.of("time", at // self.per_row * exposure + within[at % self.per_row], "s", what),
-            "exposure": Values.of("exposure", each * (exposure if numbers is None else frame), "s", what),
-            "wavelength": Values.of("wavelength", calibration["wavelength_nm"], "nm", what),
-        }
         shape = (n, calibration["wavelength_nm"].size)
-        self.parts["flux"] = Values("flux", shape, self._flux, "adu", what)
+        parts = [
+            Values.of("time", at // self.per_row * exposure + within[at % self.per_row], "s", what),
+            Values.of("exposure", np.full(n, exposure if numbers is None else frame), "s", what),
+            Values.of("wavelength", calibration["wavelength_nm"], "nm", what),
+            Values("flux", shape, self._flux, "adu", what),
+            Values("error", shape, self._error, "adu", what),
+            Values("quality", (n,), self._saturated, "", what, 8 * shape[1]),
+        ]
         if self.stacked == 1:
-            self.parts["raw"] = Values("raw", shape, self._raw, "adu", what)
-        self.parts["error"] = Values("error", shape, self._error, "adu", what)
+            parts.append(Values("raw", shape, self._raw, "adu", what))
         if "temperature_c" in of:
-            self.parts["temperature"] = Values.of("temperature", each * float(of["temperature_c"]), "deg_C", what)
-        self.parts["quality"] = Values("quality", (n,), self._saturated, "", what, 8 * shape[1])
+            parts.append(Values.of("temperature", np.full(n, float(of["temperature_c"])), "deg_C", what))
+        self.parts = {one.name: one for one in parts}
 
     @property
     def names(self) -> list[str]:
@@ -198,10 +187,8 @@ class StoredFile(TableFile):
     def raw_mapping(self) -> FrameMapping:
         """Paths of the quantities, with counts that have bias and dark current; only those of single frames."""
         if self.stacked > 1:
-            raise InputError(
-                f"{self.what} holds sums of {self.stacked} frames; give single frames: `mauvecl realise --frames all`",
-                key="frames",
-            )
+            remedy = "give single frames: `mauvecl realise --frames all`"
+            raise InputError(f"{self.what} holds sums of {self.stacked} frames; {remedy}", key="frames")
         return self.mapping.model_copy(update={"flux": "raw", "error": None})
 
     def _raw(self, start: int, stop: int) -> Float:
@@ -294,9 +281,8 @@ def _chosen(found: list[str], name: str | None, what: str) -> str:
     if not found:
         raise InputError(f"{what} holds no spectra; {WHOLE}", key="file")
     if name is None and len(found) > 1:
-        raise InputError(
-            f"{what} holds {len(found)} arrays ({', '.join(found[:8])}); give one, as in FILE[{found[-1]}]", key="hdu"
-        )
+        fault = f"{what} holds {len(found)} arrays ({', '.join(found[:8])})"
+        raise InputError(f"{fault}; give one, as in FILE[{found[-1]}]", key="hdu")
     wanted = name or found[0]
     if wanted not in found:
         raise InputError.of("hdu", wanted, f"one of {', '.join(found[:8])}", where=what)
@@ -304,8 +290,6 @@ def _chosen(found: list[str], name: str | None, what: str) -> str:
 
 
 def _module(name: str) -> Any:
-    from importlib import import_module
-
     try:
         return import_module(name)
     except ImportError as error:

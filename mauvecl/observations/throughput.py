@@ -68,16 +68,11 @@ class ThroughputFit:
     # Shape (n_pixel + n_shape, n_pixel + n_shape); covariance of `log_factor` and, if they are fitted, of shift and
     # stretch in nm and of the relative width and its change.
     joint: Float
-    # shift_nm, stretch_nm: wavelength of a feature less the nominal one in the middle of the spectrum, and its change
-    # to either end.
-    shift_nm: Value | None
-    stretch_nm: Value | None
-    # fwhm_nm, fwhm_change_nm: width of the line function's Gaussian in the middle of the spectrum, and its change to
-    # the red end.
-    fwhm_nm: Value | None
-    fwhm_change_nm: Value | None
-    # Shape (n_star, n_pixel); observed less fitted counts in standard deviations; NaN for pixels that are not used.
-    residual: Float
+    shift_nm: Value | None  # wavelength of a feature less the nominal one in the middle of the spectrum
+    stretch_nm: Value | None  # change of the shift to either end
+    fwhm_nm: Value | None  # width of the line function's Gaussian in the middle of the spectrum
+    fwhm_change_nm: Value | None  # its change to the red end
+    residual: Float  # shape (n_star, n_pixel); observed less fitted counts in standard deviations; NaN if not used
     chi2: float
     dof: float  # pixels less the effective number of parameters
     smoothing: float  # weight of the squared second derivative
@@ -108,6 +103,18 @@ class ThroughputFit:
 
 
 @dataclass(frozen=True, eq=False)
+class _Pixels:
+    """Factors of single pixels on the throughput that the spline leaves."""
+
+    log_factor: Float  # shape (n_pixel,), like its variance; 0 if the spline follows the throughput
+    variance: Float
+    structure: float  # relative standard deviation of the factors
+    disagree: bool  # true if the stars differ from each other
+    chi2: float  # of the fit with these factors
+    dof: float
+
+
+@dataclass(frozen=True, eq=False)
 class _Linearised:
     """Observed counts as a linear function of the parameters, independent and of variance one."""
 
@@ -115,11 +122,6 @@ class _Linearised:
     design: Float  # shape (n, n_parameter); the spline's coefficients first
     prior: Float  # shape (n_parameter,); standard deviations; infinite for free parameters
     penalty: Float  # shape (n_coefficient, n_coefficient)
-
-    def solved(self, smoothing: float) -> tuple[Float, Float]:
-        """Return the parameters and their covariance."""
-        covariance = np.linalg.inv(self.normal + self._full(smoothing, self.prior))
-        return np.asarray(covariance @ self.projected), np.asarray(covariance)
 
     def likelihood(self, smoothing: float, prior: Float | None = None) -> float:
         """Return minus twice the logarithm of the restricted likelihood, up to a constant."""
@@ -133,23 +135,26 @@ class _Linearised:
             + 2 * np.log(prior[known]).sum() + np.linalg.slogdet(full)[1]
         )  # fmt: skip
 
+    @cached_property
     def smoothing(self) -> float:
-        """Return the smoothing of the largest restricted likelihood."""
+        """Smoothing of the largest restricted likelihood."""
         n = len(self.penalty)
         middle = np.log(np.trace(self.normal[:n, :n]) / np.trace(self.penalty))
-        found = minimize_scalar(
-            lambda log: self.likelihood(np.exp(log)), bounds=middle + np.array(LOG_SMOOTHING), method="bounded"
-        )
-        return float(np.exp(found.x))
+        return _best(self.likelihood, tuple(middle + np.array(LOG_SMOOTHING)))
 
-    def error_of(self, which: NDArray[np.bool_], smoothing: float) -> float:
+    @cached_property
+    def covariance(self) -> Float:
+        """Covariance of the parameters."""
+        return np.asarray(np.linalg.inv(self.normal + self._full(self.smoothing, self.prior)))
+
+    @cached_property
+    def found(self) -> Float:
+        """Parameters."""
+        return np.asarray(self.covariance @ self.projected)
+
+    def error_of(self, which: NDArray[np.bool_]) -> float:
         """Return the prior standard deviation of some parameters that has the largest restricted likelihood."""
-        found = minimize_scalar(
-            lambda log: self.likelihood(smoothing, np.where(which, np.exp(log), self.prior)),
-            bounds=LOG_ERROR,
-            method="bounded",
-        )
-        return float(np.exp(found.x))
+        return _best(lambda sd: self.likelihood(self.smoothing, np.where(which, sd, self.prior)), LOG_ERROR)
 
     @cached_property
     def normal(self) -> Float:
@@ -167,6 +172,55 @@ class _Linearised:
         full[:n, :n] += smoothing * self.penalty
         return full
 
+    def scaled(self, basis: Float) -> Float:
+        """Return the covariance with a smoothing bias as large as that of the fitted curve, on average over pixels."""
+        penalty, covariance = self.penalty, self.covariance
+        n, pull = len(penalty), np.zeros_like(covariance)
+        pull[:, :n] = self.smoothing * covariance[:, :n] @ penalty
+        noise = covariance - pull @ covariance
+        variance = _diagonal(basis, covariance[:n, :n])
+
+        def mean(values: Float) -> float:
+            return float(np.mean(_diagonal(basis, values[:n, :n]) / variance))
+
+        bias = basis @ (pull @ self.found)[:n]
+        of_noise, expected = mean(pull @ noise @ pull.T), mean(pull @ noise)
+        if not expected > of_noise:
+            return covariance
+        scale = (float(np.mean(bias**2 / variance)) - of_noise) / (expected - of_noise)
+        return np.asarray(noise + max(scale, 0.0) * pull @ covariance)
+
+    def pixels(self, model: ThroughputModel) -> _Pixels:
+        """Divide the residuals into those that all stars share, and those by which they differ."""
+        n_star, n_pixel = model.observed_dn.shape
+        design = self.design
+        every = self.values - design @ self.found
+        left = every.reshape(n_star, n_pixel)
+        # The columns of the spline sum to one.
+        whole = design[:, : model.basis.shape[1]].sum(axis=1).reshape(n_star, n_pixel)
+        information = np.sum(whole**2, axis=0)
+        used = information > 0
+        shared = np.divide(np.sum(whole * left, axis=0), information, out=np.zeros(n_pixel), where=used)
+        chi2 = float(every @ every)
+        dof = float(np.any(design != 0, axis=1).sum() - np.sum(self.covariance * self.normal))
+        of_shared = float(np.sum(shared**2 * information))
+        dof_shared = dof - model.usable.sum() + used.sum()
+        disagree = n_star > 1 and scipy.stats.chi2.sf(chi2 - of_shared, dof - dof_shared) < REJECTED
+        if model.order != "paper" or scipy.stats.chi2.sf(of_shared, dof_shared) >= REJECTED:
+            nothing = np.zeros(n_pixel)
+            return _Pixels(nothing, nothing, 0.0, disagree, chi2, dof)
+        variance = (of_shared - dof_shared) / float(np.sum(information))
+        kept = variance * information / (1 + variance * information)
+        chi2 -= float(np.sum(shared**2 * information * kept * (2 - kept)))
+        return _Pixels(np.log1p(kept * shared), variance * (1 - kept), float(np.sqrt(variance)), disagree, chi2,
+                       dof - float(kept.sum()))  # fmt: skip
+
+
+def _best(likelihood: Callable[[float], float], log_range: tuple[float, float]) -> float:
+    """Return the positive number at which -2 log likelihood is smallest."""
+    found = minimize_scalar(lambda log: likelihood(np.exp(log)), bounds=log_range, method="bounded")
+    return float(np.exp(found.x))
+
 
 @dataclass(frozen=True, eq=False)
 class ThroughputModel:
@@ -178,10 +232,8 @@ class ThroughputModel:
     transfer: PhotonTransfer
     sky: Sky
     order: Order
-    # basis, penalty: B-spline at the pixels, shape (n_pixel, n_coefficient), and the matrix of its squared second
-    # derivative.
-    basis: Float
-    penalty: Float
+    basis: Float  # shape (n_pixel, n_coefficient); B-spline at the pixels
+    penalty: Float  # matrix of its squared second derivative
     light_error: float  # relative standard deviation of the light of an observation
 
     @cached_property
@@ -222,11 +274,9 @@ class ThroughputModel:
     @cached_property
     def sky_electrons(self) -> Float:
         """Zodiacal light of a second in each pixel, shape (n_pixel,)."""
-        star, nominal = self.stars[0].star, self.nominal
+        star, frame_s = self.stars[0].star, self.nominal.frame_s
         assert star is not None
-        return expect(star, nominal, exposure=nominal.frame_s, sky=self.sky, order=self.order).sky_electrons / (
-            nominal.frame_s
-        )
+        return expect(star, self.nominal, exposure=frame_s, sky=self.sky, order=self.order).sky_electrons / frame_s
 
     @cached_property
     def responses(self) -> list[tuple[Source, list[csr_array]]]:
@@ -337,10 +387,9 @@ def fit_throughput(
 ) -> ThroughputFit:
     """Fit the throughput to the mean frames of standard stars.
 
-    With two or more stars the zero point of the wavelengths and the width of the line function are fitted as well. The
-    spline has `knots` intervals, and `light_error` is the relative standard deviation of the light of an observation,
-    by pointing; `spectrum_error` is that of the stars' spectra at each of `ERROR_KNOTS` knots. By default it is assumed
-    for one star, and fitted for several if they disagree.
+    With two or more stars, wavelengths and the width of the line function are fitted as well. The spline has `knots`
+    intervals. `light_error` is the relative error of the light of an observation, by pointing, and `spectrum_error`
+    that of the stars' spectra at `ERROR_KNOTS` knots; by default assumed for one star, and fitted if several disagree.
     """
     nm = nominal.wavelength_nm
     model = ThroughputModel(tuple(stars), nominal, dark, transfer, sky, order, *_basis(nm, knots), light_error)
@@ -350,7 +399,7 @@ def fit_throughput(
     m, n = model.n_shape, model.basis.shape[1]
     if several and spectrum_error is None and best.pixels(model).disagree:
         trial = _iterated(model, ONE_STAR_ERROR)
-        error = trial.linear.error_of(trial.linear.prior == ONE_STAR_ERROR, trial.smoothing)
+        error = trial.error_of(trial.prior == ONE_STAR_ERROR)
         best = _iterated(model, error)
     pixels, shape = best.pixels(model), best.found[n : n + m]
     if (np.abs(shape) > LIMITS[:m]).any():
@@ -368,16 +417,17 @@ def fit_throughput(
     residual = np.where(model.usable, (model.observed_dn - light) / sd, np.nan)
     assumed = [*(() if m else ("wavelength zero point",)), *(() if m == 4 else ("line width",)),
                *(() if several else ("errors of the star's spectrum",))]  # fmt: skip
-    values = _shape_values(shape, np.sqrt(np.diag(joint))[nm.size :], nominal.gaussian_fwhm_nm)
-    return ThroughputFit(nm, log_factor, joint, *values, residual, pixels.chi2, pixels.dof, best.smoothing,
-                         apart or error, pixels.structure, tuple(assumed))  # fmt: skip
+    scales, errors = (1.0, 1.0, nominal.gaussian_fwhm_nm, nominal.gaussian_fwhm_nm), np.sqrt(np.diag(joint))[nm.size :]
+    shift, stretch, width, change = (
+        Value(scale * float(shape[k] + (k == 2)), scale * float(errors[k])) if k < m else None
+        for k, scale in enumerate(scales)
+    )
+    return ThroughputFit(nm, log_factor, joint, shift, stretch, width, change, residual, pixels.chi2, pixels.dof,
+                         best.smoothing, apart or error, pixels.structure, tuple(assumed))  # fmt: skip
 
 
-def _joint_covariance(model: ThroughputModel, best: _Solution, pixels: _Pixels, spectrum_error: float) -> Float:
-    """Return the covariance of the log throughput at the pixels and of the shape, with what the fit does not know.
-
-    That is the gain, since counts determine its product with the throughput, and errors of spectra apart from the fit.
-    """
+def _joint_covariance(model: ThroughputModel, best: _Linearised, pixels: _Pixels, spectrum_error: float) -> Float:
+    """Return the covariance of log throughput and shape, with the errors of the gain and, apart, of spectra."""
     n, nm = model.basis.shape[1] + model.n_shape, model.nominal.wavelength_nm
     onto = scipy.linalg.block_diag(model.basis, np.eye(model.n_shape))
     joint = np.asarray(onto @ best.scaled(model.basis)[:n, :n] @ onto.T)
@@ -386,96 +436,18 @@ def _joint_covariance(model: ThroughputModel, best: _Solution, pixels: _Pixels, 
     return joint
 
 
-def _shape_values(
-    shape: Float, errors: Float, fwhm_nm: float
-) -> tuple[Value | None, Value | None, Value | None, Value | None]:
-    """Return shift, stretch, width and change of the width of the wavelengths, None for those that are not fitted."""
-
-    def value(k: int, scale: float) -> Value | None:
-        return Value(scale * float(shape[k] + (k == 2)), scale * float(errors[k])) if k < shape.size else None
-
-    return value(0, 1.0), value(1, 1.0), value(2, fwhm_nm), value(3, fwhm_nm)
-
-
-@dataclass(frozen=True, eq=False)
-class _Pixels:
-    """Factors of single pixels on the throughput that the spline leaves."""
-
-    # log_factor, variance: shape (n_pixel,); 0 if the spline follows the throughput.
-    log_factor: Float
-    variance: Float
-    structure: float  # relative standard deviation of the factors
-    disagree: bool  # true if the stars differ from each other
-    # chi2, dof: of the fit with these factors.
-    chi2: float
-    dof: float
-
-
-@dataclass(frozen=True, eq=False)
-class _Solution:
-    linear: _Linearised
-    smoothing: float
-    found: Float
-    covariance: Float
-
-    def scaled(self, basis: Float) -> Float:
-        """Return the covariance with a smoothing bias as large as that of the fitted curve, on average over pixels."""
-        penalty, covariance = self.linear.penalty, self.covariance
-        n, pull = len(penalty), np.zeros_like(covariance)
-        pull[:, :n] = self.smoothing * covariance[:, :n] @ penalty
-        noise = covariance - pull @ covariance
-        variance = _diagonal(basis, covariance[:n, :n])
-
-        def mean(values: Float) -> float:
-            return float(np.mean(_diagonal(basis, values[:n, :n]) / variance))
-
-        bias = basis @ (pull @ self.found)[:n]
-        of_noise, expected = mean(pull @ noise @ pull.T), mean(pull @ noise)
-        if not expected > of_noise:
-            return covariance
-        scale = (float(np.mean(bias**2 / variance)) - of_noise) / (expected - of_noise)
-        return np.asarray(noise + max(scale, 0.0) * pull @ covariance)
-
-    def pixels(self, model: ThroughputModel) -> _Pixels:
-        """Divide the residuals into those that all stars share, and those by which they differ."""
-        n_star, n_pixel = model.observed_dn.shape
-        design, covariance = self.linear.design, self.covariance
-        every = self.linear.values - design @ self.found
-        left = every.reshape(n_star, n_pixel)
-        # The columns of the spline sum to one.
-        whole = design[:, : model.basis.shape[1]].sum(axis=1).reshape(n_star, n_pixel)
-        information = np.sum(whole**2, axis=0)
-        used = information > 0
-        shared = np.divide(np.sum(whole * left, axis=0), information, out=np.zeros(n_pixel), where=used)
-        chi2 = float(every @ every)
-        dof = float(np.any(design != 0, axis=1).sum() - np.sum(covariance * self.linear.normal))
-        of_shared = float(np.sum(shared**2 * information))
-        dof_shared = dof - model.usable.sum() + used.sum()
-        disagree = n_star > 1 and scipy.stats.chi2.sf(chi2 - of_shared, dof - dof_shared) < REJECTED
-        if model.order != "paper" or scipy.stats.chi2.sf(of_shared, dof_shared) >= REJECTED:
-            nothing = np.zeros(n_pixel)
-            return _Pixels(nothing, nothing, 0.0, disagree, chi2, dof)
-        variance = (of_shared - dof_shared) / float(np.sum(information))
-        kept = variance * information / (1 + variance * information)
-        chi2 -= float(np.sum(shared**2 * information * kept * (2 - kept)))
-        return _Pixels(np.log1p(kept * shared), variance * (1 - kept), float(np.sqrt(variance)), disagree, chi2,
-                       dof - float(kept.sum()))  # fmt: skip
-
-
-def _iterated(model: ThroughputModel, error: float) -> _Solution:
-    """Return the solution of the problem that is linearised around it."""
+def _iterated(model: ThroughputModel, error: float) -> _Linearised:
+    """Return the problem that is linearised around its solution."""
     n, m = model.basis.shape[1], model.n_shape
     coefficients, shape = np.zeros(n), np.zeros(m)
     for _ in range(ITERATIONS):
         linear = model.linearised(coefficients, shape, error)
-        smoothing = linear.smoothing()
-        found, covariance = linear.solved(smoothing)
-        step = found[:n] - coefficients
+        step = linear.found[:n] - coefficients
         moved = np.abs(model.basis @ step).max()
         if moved < SETTLED:
-            return _Solution(linear, smoothing, found, covariance)
+            return linear
         coefficients = coefficients + step * min(1.0, LARGEST_STEP / moved)
-        shape = np.clip(found[n : n + m], -LIMITS[:m], LIMITS[:m])
+        shape = np.clip(linear.found[n : n + m], -LIMITS[:m], LIMITS[:m])
         if not np.abs(model.basis @ coefficients).max() < LARGEST_LOG:
             break
     raise InputError(

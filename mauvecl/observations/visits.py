@@ -49,8 +49,7 @@ class Recovery:
     """Share of sinusoids whose period is recovered."""
 
     time_d: Float  # shape (n_visit,)
-    # Normalised power that noise exceeds with the false-alarm probability, anywhere in the periodogram.
-    threshold: float
+    threshold: float  # power that noise exceeds with the false-alarm probability, anywhere in the periodogram
     periods_d: Float  # shape (n_period,)
     amplitudes: Float  # shape (n_amplitude,); semi-amplitudes in standard errors of a visit
     recovered: list[list[Interval]]  # for each amplitude and period
@@ -142,10 +141,8 @@ def _frequencies(base: float, low: float, high: float) -> Float:
     # Half a resolution beyond the ends, so that periods at the ends can be recovered.
     count = int(np.ceil((high - low) / step)) + OVERSAMPLING + 1
     if count > MAX_FREQUENCIES:
-        raise InputError(
-            f"the periods need {count} frequencies (at most {MAX_FREQUENCIES}); give longer ones or a shorter campaign",
-            key="periods",
-        )
+        fault = f"the periods need {count} frequencies (at most {MAX_FREQUENCIES})"
+        raise InputError(f"{fault}; give longer ones or a shorter campaign", key="periods")
     return np.asarray(max(low - 0.5 / base, step) + step * np.arange(count))
 
 
@@ -360,8 +357,7 @@ def line_index(
 COLOUR_NM = 450.0
 #: Change of the natural logarithm of a flux for a change of one magnitude.
 LOG_PER_MAG = 0.4 * np.log(10.0)
-#: Wavelengths at which spectra with edges are computed, nm: beyond the reach of the line function, in steps far below
-#: the resolution.
+#: Wavelengths of spectra with edges, nm: beyond the reach of the line function, in steps far below the resolution.
 GRID_NM = np.linspace(150.0, 760.0, 6101)
 
 
@@ -443,10 +439,8 @@ class Change:
         elif words == "spectrum":
             if file is None:
                 raise InputError("the change 'spectrum' needs a file; give `change.file`", key="change.file")
-            scale = photons(star.wavelength_nm, star.flux_flam, band) / photons(
-                file.wavelength_nm, file.flux_flam, band
-            )
-            nm, flux = file.wavelength_nm, scale * file.flux_flam
+            of_star, of_file = (photons(one.wavelength_nm, one.flux_flam, band) for one in (star, file))
+            nm, flux = file.wavelength_nm, of_star / of_file * file.flux_flam
             meaning = f"light of {file.name} over that of the star in {band}"
         elif (limits := _band(name)) is not None:
             flux = own * (_below(limits[1]) - _below(limits[0]))
@@ -460,10 +454,9 @@ class Change:
 
 
 def _below(edge_nm: float) -> Float:
-    """Return factors at `GRID_NM` of light that ends at a wavelength.
+    """Return factors at `GRID_NM` of light that ends at a wavelength, with the sum and mean of a sharp edge.
 
-    Flux is linear between the wavelengths, and the factor of each is the share of its triangle below the edge, so that
-    the light and its mean wavelength are those of a sharp edge.
+    The flux is linear between the wavelengths, and the factor of each is the share of its triangle below the edge.
     """
     distance = np.clip((edge_nm - GRID_NM) / (GRID_NM[1] - GRID_NM[0]), -1.0, 1.0)
     return np.asarray(np.where(distance < 0.0, (1.0 + distance) ** 2, 2.0 - (1.0 - distance) ** 2) / 2.0)
@@ -483,10 +476,8 @@ def _line(name: str) -> EmissionLine:
     try:
         return EmissionLine.named(name)
     except InputError:
-        raise InputError.of(
-            "change.of", shortened(name),
-            f"a line such as {', '.join(INDICES)}, a band such as 200-320, balmer jump, colour or spectrum",
-        ) from None  # fmt: skip
+        expected = f"a line such as {', '.join(INDICES)}, a band such as 200-320, balmer jump, colour or spectrum"
+        raise InputError.of("change.of", shortened(name), expected) from None
 
 
 def covered_indices(quiet: Expectation) -> list[Index]:

@@ -167,10 +167,7 @@ def peaks(time: np.ndarray, values: np.ndarray, frequency: np.ndarray) -> tuple[
 
 @pytest.mark.long
 def test_recovered_periods_are_those_of_another_periodogram() -> None:
-    """Six cells; the thresholds have errors of some 20 % of the false-alarm probability, which moves shares by 0.03.
-
-    Beyond that, 4 standard errors of 100 and 1000 trials: a false failure once in 2500 seeds.
-    """
+    """Thresholds differ by some 20 %, which moves shares by 0.03; beyond, 4 standard errors (once in 2500 seeds)."""
     rng = np.random.default_rng(4)
     time = np.sort(rng.uniform(0, 40, 25))
     periods, amplitudes, fap, n = np.array([1.5, 7.0, 15.0]), np.array([1.0, 1.6]), 0.05, 1000

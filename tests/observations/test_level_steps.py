@@ -30,11 +30,7 @@ def stepping(star: Float, rng: np.random.Generator) -> Frames:
 
 @pytest.mark.parametrize("turns", [False, pytest.param(True, marks=pytest.mark.long)])
 def test_flares_beside_steps_of_the_level_are_detected(turns: bool) -> None:
-    """Observe a constant star, and one that turns in 1.2 d and changes within 70 d.
-
-    The level on both sides of each step is right to six standard deviations of a frame. The search promises 1.4 false
-    alarms, of which seven or more occur once in 1600 cases.
-    """
+    """A constant star and one that turns: 1.4 false alarms are promised, seven or more occur once in 1600 cases."""
     time_d = np.arange(N_FRAMES) * FRAME_S / DAY_S
     star = np.ones(N_FRAMES)
     if turns:

@@ -1,13 +1,10 @@
 """Light curves of stars that rotate, of red noise, few counts and short windows: false alarms and energies."""
 
 import re
-from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from marks import long_but
 from numpy.typing import NDArray
 from scenes import PER_CENTURY, PER_MONTH, analysed, detected, flare
 from scipy import stats
@@ -43,13 +40,12 @@ def one_over_f(rng: np.random.Generator, n: int, rms: float) -> Float:
     return rms * series / series.std()
 
 
-@pytest.mark.parametrize("n", [100, 2**12, 2**14 + 1, 3 * 2**14])
+@pytest.mark.parametrize("n", [100, 2**14 + 1])
 def test_correlations_are_sums_over_the_kernel(n: int) -> None:
     rng = np.random.default_rng(411)
     values = rng.standard_normal((2, 1, n))
-    kernels = [(1, 0), (30, -5), (1024, -1023), (1025, 3), (4097, -700)]
-    found = process_search.Correlations(values, kernels)
-    for size, first in kernels:
+    found = process_search.Correlations(values, 4097)
+    for size, first in [(1, 0), (30, -5), (1024, -1023), (1025, 3), (4097, -700)]:
         kernel = rng.standard_normal(size)
         around = np.pad(values[1, 0], 5000)
         expected = np.correlate(around, kernel, "valid")[5000 + first : 5000 + first + n]
@@ -89,11 +85,7 @@ def test_covariance_is_that_of_dense_matrices() -> None:
 def test_statistics_have_unit_variance_over_gaps_and_changing_noise(
     process: processes.Process, n: int, spread: float, tolerance: float, apart: int, taken: bool
 ) -> None:
-    """Denominators against dense matrices at 40 random onsets of each template: exact near gaps, close elsewhere.
-
-    The frames of an event may be taken away from an earlier search, whose denominators are kept elsewhere. A gap may be
-    so long that its frames would take 400 MB for each template.
-    """
+    """Denominators against dense matrices at 40 random onsets of each template; a gap would take 400 MB for each."""
     rng = np.random.default_rng(401)
     kept = rng.random(n) > 0.03
     kept[n // 3 : n // 3 + 30] = False
@@ -151,73 +143,24 @@ def test_values_above_a_threshold_are_those_of_all_solved_denominators(threshold
     assert unsolved
 
 
-@pytest.mark.long
-def test_losses_of_light_are_not_searched_and_flares_between_them_are_found() -> None:
-    """A light curve of 5 h with twelve losses of 0.5 to 5 %, and two flares of S/N 30 between them.
-
-    Losses raise the light when they end, so that the light between them resembles flares. At one false alarm a month
-    0.007 are expected, and none may be found: that fails by chance for 0.7 % of seeds. The threshold of a month is
-    extrapolated from the rates of a day, which take few simulations.
-    """
-    frame_s, noise, rng = 10.0, 1e-3 / np.sqrt(2), np.random.default_rng(421)
-    time = np.arange(1800) * frame_s
-    loss = np.zeros(time.size)
-    for start in rng.uniform(0, 3000, 12) + 1500 * np.arange(12):
-        out, back, length = rng.uniform(20, 200, 3)
-        gone = 1 - np.exp(-np.clip(time - start, 0, length) / out)
-        gone *= np.exp(-np.clip(time - start - length, 0, None) / back)
-        loss = np.maximum(loss, rng.uniform(0.005, 0.05) * gone)
-    whole = time[(loss < 1e-4) & (time > 1000) & (time < 16_000)]
-    peaks = [float(whole[whole.size // 3]), float(whole[2 * whole.size // 3])]
-    flux = 1 - loss + sum(0.02 * flare(time, frame_s, peak, 40.0) for peak in peaks)
-    flux += noise * rng.standard_normal(time.size)
-    answer = analysed(Frames.of(time, flux, np.full(time.size, noise)))
-    analysis = answer.analysis
-    observed = analysis.survey.time_s
-    sure = detected(analysis, PER_MONTH)
-    spans = [(observed[one.first] - 60, observed[one.last] + 60) for one in sure]
-    assert all(any(low < peak < high for low, high in spans) for peak in peaks)
-    assert all(any(low < peak < high for peak in peaks) for low, high in spans)
-    assert analysis.likeness.alike
-    lost = np.array(["loss" in str(one) for one in answer.frames["reason"]])
-    assert lost[loss > 5 * noise].mean() > 0.9
-    assert lost[loss < 0.1 * noise].mean() < 0.05
-
-
-@cache
-def short_window() -> tuple[Any, float, float]:
-    """Return 264 frames of 5 s, of which 93 show the quiescent star, and a flare's durations: whole and in frames."""
-    rng = np.random.default_rng(402)
-    time = (np.arange(264) + 0.5) * 5.0
-    light = 10 * flare(time, 5.0, 528.0, 60.0)
-    frames = Frames.of(time, 1e6 * (1 + light) + 2500 * rng.standard_normal(264), np.full(264, 2500.0))
-    return analysed(frames), 10 * 60 * DAVENPORT.equivalent_duration, float(light.sum()) * 5.0
-
-
-def test_flare_brighter_than_its_window_has_its_energy() -> None:
-    """Check the interval of 95 % and the level, at one seed."""
-    answer, truth, inside = short_window()
-    analysis = answer.analysis
-    (event,) = analysis.events
-    assert event.energy.fitted_s == pytest.approx(truth, rel=2e-3)
-    assert event.energy.low_s[1] - 1.0 < truth < event.energy.high_s[1] + 1.0
-    assert event.energy.summed_s == pytest.approx(inside, rel=2e-3)
-    assert np.median(analysis.level.level) == pytest.approx(1e6, rel=2e-3)
-
-
 def test_table_of_events_has_the_flare_in_its_units() -> None:
-    """Check times within a frame, sizes within two per mille, and the order of the ends of intervals."""
-    answer, truth, inside = short_window()
+    """264 frames of 5 s, of which 93 show the quiescent star: intervals, level, times and sizes, at one seed."""
+    rng, time = np.random.default_rng(402), (np.arange(264) + 0.5) * 5.0
+    light = 10 * flare(time, 5.0, 528.0, 60.0)
+    answer = analysed(Frames.of(time, 1e6 * (1 + light) + 2500 * rng.standard_normal(264), np.full(264, 2500.0)))
+    assert np.median(answer.analysis.level.level) == pytest.approx(1e6, rel=2e-3)
     (row,) = answer.events
     assert row["tpeak"].to_value("s") == pytest.approx(528.0, abs=5.0)
     assert row["tstart"] < row["tpeak"] < row["tstop"]
     assert row["dur"].to_value("s") == pytest.approx((row["tstop"] - row["tstart"]).to_value("s") + 5.0)
     assert row["ampl_rec"] == pytest.approx(10 * flare(np.array([527.5]), 5.0, 528.0, 60.0)[0], rel=5e-3)
     assert row["half_width"].to_value("s") == pytest.approx(60.0, rel=0.01)
-    for name, expected in (("ed", truth), ("ed_fit", truth), ("ed_rec", inside)):
+    truth = 10 * 60 * DAVENPORT.equivalent_duration
+    for name, expected in (("ed", truth), ("ed_fit", truth), ("ed_rec", float(light.sum()) * 5.0)):
         assert row[name].to_value("s") == pytest.approx(expected, rel=2e-3)
     ends = [row[name].to_value("s") for name in ("ed_low_95", "ed_low", "ed", "ed_high", "ed_high_95")]
     assert (np.diff(ends) > 0).all()
+    assert ends[0] - 1.0 < truth < ends[-1] + 1.0
     assert [row["ed_fit_low"], row["ed_fit_high"]] == [row["ed_low"], row["ed_high"]]
 
 
@@ -246,27 +189,6 @@ def test_beginning_of_a_bright_flare_is_no_flare_of_its_own(peak_s: float, half_
     assert energy.low_s[1] < whole < energy.high_s[1]
 
 
-@pytest.mark.parametrize(
-    ("after_s", "half_width_s", "seed"), long_but([(60.0, 40.0, 1), (40.0, 40.0, 2), (50.0, 30.0, 3)], (60.0, 40.0, 1))
-)
-def test_window_that_begins_in_a_tail_has_the_energy_relative_to_the_star(
-    after_s: float, half_width_s: float, seed: int
-) -> None:
-    """Observe 700 s of the tail of a bright flare: the frames without its event hold more light than the star's.
-
-    The energy lies within five standard errors, which a normal error exceeds once in 1.7 million cases.
-    """
-    rng, frame_s, noise = np.random.default_rng([402, seed]), 5.0, 0.007
-    time = (np.arange(140) + 0.5) * frame_s
-    flux = 1 + 60 * flare(time, frame_s, -after_s, half_width_s) + noise * rng.standard_normal(time.size)
-    analysis = analysed(Frames.of(time, flux, np.full(140, noise)), false_alarms=5.0).analysis
-    event = max(detected(analysis), key=lambda one: one.value)
-    right = 60 * half_width_s * DAVENPORT.equivalent_duration
-    low, high = event.energy.low_s[0], event.energy.high_s[0]
-    assert abs(event.energy.fitted_s - right) < 2.5 * (high - low)
-    assert abs(event.energy.fitted_s - right) < 0.1 * right
-
-
 @pytest.mark.long
 def test_faint_star_with_a_great_flare_has_its_energy() -> None:
     """340 frames of mean 30.4 and noise 5.5, amplitude 120: the error is that of the level, to which it is relative."""
@@ -277,19 +199,6 @@ def test_faint_star_with_a_great_flare_has_its_energy() -> None:
     error = (event.energy.high_s[0] - event.energy.low_s[0]) / 2
     assert abs(event.energy.fitted_s - 19_730) < 3 * error
     assert 0.005 < error / event.energy.fitted_s < 0.03
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(("period_d", "cadence_s", "noise"), [(1.0, 120.0, 1e-4), (3.0, 1800.0, 1e-4)])
-def test_rotation_is_no_flare(period_d: float, cadence_s: float, noise: float) -> None:
-    """Sinusoids of 1 % at one false alarm a century: fails by chance once in 2000 times or less."""
-    rng = np.random.default_rng(404)
-    time = np.arange(2000) * cadence_s
-    flux = 1 + 0.01 * np.sin(2 * np.pi * time / (period_d * 86_400)) + noise * rng.standard_normal(time.size)
-    analysis = analysed(Frames.of(time, flux, np.full(time.size, noise))).analysis
-    assert not detected(analysis, PER_CENTURY)
-    assert analysis.level.used.mean() > 0.95
-    assert float(np.median(analysis.level.error)) == pytest.approx(noise, rel=0.1)
 
 
 def test_standard_deviation_of_a_varying_star_is_that_of_its_light() -> None:
@@ -329,10 +238,7 @@ def two_exponentials(time_s: Float, frame_s: float, peak_s: float, half_width_s:
 
 @pytest.mark.long
 def test_edges_of_a_transit_are_no_flares_and_flares_of_its_star_are() -> None:
-    """A growing spot, a transit of 1.2 %, gaps, a spike and three flares; their 95 % intervals, at one seed.
-
-    The smallest flare has a smaller S/N than the fall of light at the transit, and is not called detected.
-    """
+    """A growing spot, a transit of 1.2 %, gaps, a spike and three flares, of which the smallest is a candidate only."""
     rng = np.random.default_rng(20261125)
     frame_s, noise = 120.0, 8 / np.sqrt(2)
     time = np.arange(2160) * frame_s

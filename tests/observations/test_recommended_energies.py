@@ -75,16 +75,10 @@ def test_recommended_energies_are_in_their_intervals(
     missed: float,
     most: tuple[float, float],
 ) -> None:
-    """Intervals of 68 and 95 %, and pulls in their units; each end of a range fails by chance once in 800 times.
+    """Intervals of 68 and 95 %, and pulls in their units: each end of a range fails by chance once in 800 times.
 
-    The sum of squares of 18 pulls notices intervals of half the width in 92 of 100 sets, and of twice the width in 68;
-    counts of 28 intervals at 95 and at 68 % do so in 86 and 63.
-
-    Intervals may hold more than stated where no shape of the average is the true one: pulls of each of the other shapes
-    once notice intervals of a third of the width, as do those of each twice. Some slow flares are taken for
-    variability of the star. Departures of a fifth from published shapes, which have other tails, once explained
-    triangles, with up to 1.9 times their energy: the allowed error of a fifth is 18 times the largest one when the test
-    was written.
+    Squared pulls notice intervals of half the width in 92 of 100 sets of 18. The error of a fifth that other shapes may
+    have is 18 times the largest one when the test was written.
     """
     rng = np.random.default_rng(seed)
     inside, pulls = np.zeros(2), list[float]()
