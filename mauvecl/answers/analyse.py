@@ -561,7 +561,7 @@ def _orbit(study: Study, frames: Frames) -> Orbit | None:
     return study.orbit.orbit() if is_mauve or study.orbit.tle is not None else None
 
 
-@by_keywords
+@by_keywords("frames, as the share of the work that is done")
 def analyse(
     study: Study,
     engine: Engine | Pool | None = None,
@@ -571,16 +571,12 @@ def analyse(
 ) -> AnalyseAnswer:
     """Find the flares in observed frames, with false-alarm rates from the noise as measured.
 
+    The study's `data.file` is read, and its `search.false_alarms` are allowed for a detection; fainter events are
+    candidates, down to one false alarm per star-day. With `data.barycentric` times become those at the Solar System's
+    barycentre, by the satellite's orbit.
+
     Parameters
     ----------
-    study : Study, optional
-        Its sections `data` and `search`: `data.file` is read, `search.false_alarms` are allowed for a detection. With
-        `data.barycentric` times become those at the Solar System's barycentre, by the satellite's orbit.
-        Fainter events are candidates, down to one false alarm per star-day.
-    engine : optional
-        Not used: nothing is drawn on a device.
-    progress : callable, optional
-        Called as ``progress(done, total)`` in frames, as the share of the work that is done; may raise to stop it.
     frames : Frames, optional
         Frames in memory, in place of the file.
     """

@@ -460,7 +460,7 @@ class CalibrateAnswer(Answer):
         return out.getvalue()
 
 
-@by_keywords
+@by_keywords("fits, of which none is reported")
 def calibrate(
     study: Study,
     engine: Engine | Pool | None = None,
@@ -471,12 +471,10 @@ def calibrate(
 ) -> CalibrateAnswer:
     """Fit an instrument to raw frames of standard stars and to frames without light.
 
+    The study's ``calibrate`` lists the observations; its observation names the instrument from which the fit starts.
+
     Parameters
     ----------
-    study : Study, optional
-        Its ``calibrate`` lists the observations, and its observation names the instrument from which the fit starts.
-    engine, progress : optional
-        Not used: nothing is drawn on a device.
     frames : tuple of Frames, optional
         Frames in memory, in place of the files of the observations, in their order.
     stars : tuple of Source or None, optional

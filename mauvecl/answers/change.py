@@ -259,19 +259,13 @@ class ChangeAnswer(Answer):
         return lines
 
 
-@by_keywords
+@by_keywords("stars and cells of the sweep")
 def change(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> ChangeAnswer:
     """Compute the smallest changes of a study's stars between visits that are detected.
 
-    Parameters
-    ----------
-    study : Study, optional
-        Its ``change`` gives the changes and the number of visits, ``run.fap`` and ``limit.power`` the probabilities,
-        and ``nuisances`` the unknowns of each visit.
-    engine : Engine or Pool, optional
-        Not used: errors are closed forms, and periodograms are simulated on the host.
-    progress : callable, optional
-        Called as ``progress(done, total)`` in stars and cells of the sweep.
+    The study's ``change`` gives the changes and the number of visits, ``run.fap`` and ``limit.power`` the
+    probabilities, and ``nuisances`` the unknowns of each visit. Errors are closed forms, and periodograms are simulated
+    on the host.
 
     Examples
     --------

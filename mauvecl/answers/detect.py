@@ -235,20 +235,9 @@ class DetectAnswer(Answer):
         return {"paper": self.paper} | super().as_json()
 
 
-@by_keywords
+@by_keywords("stars")
 def detect(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> DetectAnswer:
     """Simulate the detection of every flare of a study, for every star and sweep value.
-
-    Parameters
-    ----------
-    study : Study, optional
-        The paper's stars and flares by default.
-    engine : Engine or Pool, optional
-        By default that of the default device.
-    progress : callable, optional
-        Called as ``progress(done, total)`` in stars.
-    **keywords
-        Flags of the command, as in ``star="M4V"``, ``magnitude=11``: they change the study, or the default.
 
     Examples
     --------

@@ -231,18 +231,12 @@ def _of_thresholds(tested: QTable, flares: QTable) -> dict[str, float | str]:
     }
 
 
-@by_keywords
+@by_keywords("stars, each of which is drawn for its S/N and then for its flares")
 def gaussian(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> GaussianAnswer:
     """Compare the usual formula with the simulation, over magnitude and exposure or the study's sweep.
 
-    Parameters
-    ----------
-    study : Study, optional
-        Without a sweep: magnitudes from 4 to 12 and exposures of 5, 50 and 600 s, unless it states the magnitudes of
-        its stars, or another exposure than the default. Its usual unknowns are left out: the question is about the
-        noise.
-    progress : callable, optional
-        Called as ``progress(done, total)`` in stars, each of which is drawn for its S/N and then for its flares.
+    Without a sweep: magnitudes from 4 to 12 and exposures of 5, 50 and 600 s, unless the study states the magnitudes of
+    its stars, or another exposure than the default. Usual unknowns are left out: the question is about the noise.
     """
     engine, study = engine or Engine(), study.ideal()
     stated = study.star != PAPER_STARS and all(star.magnitude is not None for star in study.star)

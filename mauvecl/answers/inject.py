@@ -342,18 +342,9 @@ class InjectAnswer(Answer):
         return [star.survey.components.quiet for star in self.stars]
 
 
-@by_keywords
+@by_keywords("injections")
 def inject(study: Study, engine: Stares | Pool | None = None, progress: Progress = None) -> InjectAnswer:
-    """Compute the completeness of a study's search for every star and sweep value.
-
-    Parameters
-    ----------
-    study : Study, optional
-    engine : Stares or Pool, optional
-        Simulator; by default that of the default device.
-    progress : callable, optional
-        Called as ``progress(done, total)`` in injections; may raise to stop the work.
-    """
+    """Compute the completeness of a study's search for every star and sweep value."""
     idle = next((axis.quantity for axis in study.sweep.axes if axis.quantity in ("amplitude", "exposure")), None)
     if idle is not None:
         raise InputError(f"the sweep needs quantities that injections have, but has {idle!r}", key="sweep")

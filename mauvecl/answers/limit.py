@@ -354,18 +354,12 @@ def solve(case: Case, statistic: str, engine: Engine | Pool, report: Report = No
     )
 
 
-@by_keywords
+@by_keywords("steps, 100 for each limit")
 def limit(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> LimitAnswer:
     """Compute the limits of a study's stars and flares, by every statistic.
 
-    Raises InputError as for `solve` if all limits fail; otherwise see `LimitAnswer.failed`.
-
-    Parameters
-    ----------
-    study : Study, optional
-        Its ``limit`` defines the quantity (magnitude, amplitude or exposure) and the power.
-    progress : callable, optional
-        Called as ``progress(done, total)`` in steps, `STEPS` for each limit.
+    The study's ``limit`` defines the quantity (magnitude, amplitude or exposure) and the power. Raises InputError as
+    for `solve` if all limits fail; otherwise see `LimitAnswer.failed`.
     """
     engine = engine or Engine()
     if any(axis.quantity == study.limit.of for axis in study.sweep.axes):

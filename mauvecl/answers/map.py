@@ -150,17 +150,12 @@ class MapAnswer(Answer):
         return assumptions_of(self.study, self.uses, tuple(axis.quantity for axis in self.study.map.axes))
 
 
-@by_keywords
+@by_keywords("cells")
 def map(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> MapAnswer:
     """Compute the detection probability of the study's first star and flare over two quantities.
 
-    Parameters
-    ----------
-    study : Study, optional
-        Its ``map`` defines the axes; other quantities have the study's values. Without a horizontal axis, it has the
-        magnitudes over which the flares of the vertical one are lost.
-    progress : callable, optional
-        Called as ``progress(done, total)`` in cells.
+    The study's ``map`` defines the axes; other quantities have the study's values. Without a horizontal axis, it has
+    the magnitudes over which the flares of the vertical one are lost.
     """
     check_fap(study.run.fap, study.run.realisations, study.run.tails)
     study = study.model_copy(update={"star": study.star[:1]}).at("amplitude", study.flare.amplitudes[0])

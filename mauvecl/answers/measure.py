@@ -274,18 +274,9 @@ class MeasureAnswer(Answer):
         return list({id(flare.quiet): flare.quiet for flare in self.flares}.values())
 
 
-@by_keywords
+@by_keywords("flares")
 def measure(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> MeasureAnswer:
-    """Forecast and simulate the measurement of a study's flares in one exposure.
-
-    Parameters
-    ----------
-    study : Study, optional
-    engine : Engine or Pool, optional
-        Simulator of the exposures; by default that of the default device. The checkpoint of a pool keeps finished fits.
-    progress : callable, optional
-        Called as ``progress(done, total)`` in flares.
-    """
+    """Forecast and simulate the measurement of a study's flares in one exposure."""
     if study.flare.geometry != "added":
         raise InputError.of("flare.geometry", "replaces", "'added', since fits take light for added")
     if study.measure.along_stare:

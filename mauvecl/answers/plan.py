@@ -304,7 +304,7 @@ class PlanAnswer(Answer):
         return [*lines, *([f"Flare rates are extrapolated to E50 of {', '.join(beyond)}."] if beyond else [])]
 
 
-@by_keywords
+@by_keywords("targets")
 def plan(
     study: Study,
     engine: Stares | Pool | None = None,
@@ -312,16 +312,10 @@ def plan(
     *,
     completeness: CompletenessOf | None = None,
 ) -> PlanAnswer:
-    """Plan a campaign on a study's targets.
+    """Plan a campaign on a study's targets: its ``plan`` defines them, its ``orbit`` time and position.
 
     Parameters
     ----------
-    study : Study, optional
-        Its ``plan`` defines the targets, its ``orbit`` time and position.
-    engine : Stares or Pool, optional
-        Simulator of injections; by default that of the default device. The checkpoint of a pool keeps finished targets.
-    progress : callable, optional
-        Called as ``progress(done, total)`` in targets.
     completeness : callable, optional
         Recovered fraction of flares by bolometric energy. By default the study's ``plan.completeness`` decides between
         injections into drawn noise and the closed form.

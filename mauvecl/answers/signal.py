@@ -114,21 +114,13 @@ def place_of(x: Expectation, wavelength_nm: float, per: Per) -> int:
     return int(x.element[pixel]) if per == "element" else pixel
 
 
-@by_keywords
+@by_keywords("stars")
 def exposure(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> ExposureAnswer:
     """Compute the fewest frames whose closed-form S/N at a wavelength reaches a wanted one.
 
-    An S/N that no exposure up to 1e7 s reaches, or a wavelength outside the spectrum, raises InputError if it holds of
-    every star; of some it is reported by a message.
-
-    Parameters
-    ----------
-    study : Study, optional
-        Its ``signal`` gives S/N and wavelength; its exposure is not used.
-    engine : Engine or Pool, optional
-        Not used: nothing is drawn.
-    progress : callable, optional
-        Called as ``progress(done, total)`` in stars.
+    The study's ``signal`` gives S/N and wavelength; its exposure is not used. An S/N that no exposure up to 1e7 s
+    reaches, or a wavelength outside the spectrum, raises InputError if it holds of every star; of some it is reported
+    by a message.
     """
     snr, wavelength_nm, per = study.signal.snr, study.signal.wavelength_nm, study.signal.per
     if snr is None or wavelength_nm is None:
@@ -293,7 +285,7 @@ class SimulateAnswer(Answer):
         return list(self.pictures.values())[number](path, ax=ax)
 
 
-@by_keywords
+@by_keywords("stars")
 def simulate(
     study: Study,
     engine: Engine | Pool | None = None,
@@ -304,14 +296,10 @@ def simulate(
 ) -> SimulateAnswer:
     """Simulate one observation of every star of a study, by component.
 
+    The NumPy reference implementation draws. Usual unknowns are left out: the question is about the noise.
+
     Parameters
     ----------
-    study : Study, optional
-        Its usual unknowns are left out: the question is about the noise.
-    engine : Engine or Pool, optional
-        Not used: the NumPy reference implementation draws.
-    progress : callable, optional
-        Called as ``progress(done, total)`` in stars.
     realisation : int
         Number of the realisation.
     flaring : bool
@@ -399,16 +387,11 @@ class SnrAnswer(Answer):
         ]
 
 
-@by_keywords
+@by_keywords("stars")
 def snr(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> SnrAnswer:
     """Simulate the S/N of every star of a study without flares, for every sweep value.
 
-    Parameters
-    ----------
-    study : Study, optional
-        Its usual unknowns are left out: the question is about the noise.
-    progress : callable, optional
-        Called as ``progress(done, total)`` in stars.
+    Usual unknowns are left out: the question is about the noise.
     """
     # Invalid input raises an error before anything is drawn.
     study = study.ideal()

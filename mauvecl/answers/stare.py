@@ -424,7 +424,7 @@ class StareAnswer(Answer):
         return [f"More than {MOST_ROWS} frames: light curves of {long} are in FITS files alone."] if long else []
 
 
-@by_keywords
+@by_keywords("stares")
 def stare(
     study: Study,
     engine: Stares | None = None,
@@ -432,16 +432,10 @@ def stare(
     *,
     checkpoint: Checkpoint | None = None,
 ) -> StareAnswer:
-    """Simulate one stare for every star and sweep value of a study.
+    """Simulate one stare for every star and sweep value of a study; `run.seed` and `stare.number` select it.
 
     Parameters
     ----------
-    study : Study, optional
-        Its section `stare`, `events`, star, flare, sky, observation; `run.seed` and `stare.number` select the stare.
-    engine : Stares, optional
-        Simulator; by default that of the default device.
-    progress : callable, optional
-        Called as ``progress(done, total)`` in stares.
     checkpoint : Checkpoint, optional
         Keeps the frames that are drawn and the thresholds of searches.
     """

@@ -350,18 +350,9 @@ class VisibleAnswer(Answer):
         return f"the limit of {alone[0].replace('_', ' ')}{value} alone leaves nothing"
 
 
-@by_keywords
+@by_keywords("targets, once at the end")
 def visible(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> VisibleAnswer:
-    """Compute when a study's targets are visible.
-
-    Parameters
-    ----------
-    study : Study, optional
-        Its ``orbit`` defines position, time and limits.
-    engine : Engine or Pool, optional
-        Not used: nothing is drawn.
-    progress : callable, optional
-        Called once, with the number of targets, at the end.
+    """Compute when a study's targets are visible; its ``orbit`` defines position, time and limits.
 
     Examples
     --------
