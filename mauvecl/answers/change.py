@@ -26,7 +26,7 @@ from mauvecl.observations.visits import (
     smallest_change,
     visit_times_d,
 )
-from mauvecl.schema.columns import Column, View, formatted, number, percent
+from mauvecl.schema.columns import Column, View, formatted, interval_columns, number, percent
 from mauvecl.study.cases import Case, cases, collect_messages
 from mauvecl.study.plan import targets_of
 
@@ -149,8 +149,7 @@ INDEX_COLUMNS = (
     Column("equivalent_width", "value.equivalent_width_nm", "nm", "positive in emission", "EW (nm)", number(".3g")),
     Column("captured", "value.captured", "", "share of a line's flux that the index holds at this resolution",
            "captured", percent(".0f"), detail=True),
-    Column("band_low", lambda row: row.value.index.band_nm[0], "nm", "lower end of the band"),
-    Column("band_high", lambda row: row.value.index.band_nm[1], "nm", "upper end"),
+    *interval_columns("band_{}", lambda row: row.value.index.band_nm, "nm", "the band"),
     Column("published", "value.index.published", "", "usual definition at higher resolution, with its source",
            kind=str),
     Column("note", "note", "", "saturated pixels of the index, which has no value then", "note", kind=str),
@@ -166,8 +165,7 @@ PERIOD_COLUMNS = (
            "the same in standard errors of a visit", "in errors", ".3g", detail=True),
     Column("recovered", lambda row: row.shares("value"), "", "share of periods that are recovered", "recovered",
            percent(".0f")),
-    Column("recovered_low", lambda row: row.shares("low"), "", "its 95 % interval, lower end"),
-    Column("recovered_high", lambda row: row.shares("high"), "", "upper end"),
+    *interval_columns("recovered_{}", lambda row: [row.shares(end) for end in ("low", "high")]),
 )  # fmt: skip
 
 

@@ -18,7 +18,7 @@ from mauvecl.device.stares import Stares
 from mauvecl.flares.frames import Components
 from mauvecl.flares.shapes import shape_of
 from mauvecl.runs.pool import Pool, map_in_order
-from mauvecl.schema.columns import INTERVAL, Column, View, interval, number, percent, table_of
+from mauvecl.schema.columns import INTERVAL, Column, View, interval, interval_columns, number, percent, table_of
 from mauvecl.schema.errors import InputError, Message
 from mauvecl.schema.physical import DAY_S
 from mauvecl.search.completeness import SMALL, InjectedCompleteness, frame_signal
@@ -144,9 +144,8 @@ def limit_columns(of: str) -> tuple[Column, ...]:
         limit = itemgetter(name)
         columns += [
             Column(name, "value", unit, f"{of} at which the completeness is {power:g}", name.upper(), size).of(limit),
-            Column(f"{name}_low", "low", unit, "its 95 % interval, lower end", INTERVAL, ends,
-                   (f"{name}_high",), detail=power != 0.5).of(limit),
-            Column(f"{name}_high", "high", unit, "its 95 % interval, upper end").of(limit),
+            *(column.of(limit) for column in interval_columns(f"{name}_{{}}", "{}", unit, heading=INTERVAL, format=ends,
+                                                              detail=power != 0.5)),
         ]  # fmt: skip
     return (
         Column("half_width", "", "s", "half-width of the injected flares; NaN for all of them alike", "half-width (s)",
@@ -174,25 +173,21 @@ def cell_columns(of: str) -> tuple[Column, ...]:
         Column("size", "sizes", SIZE_UNITS[of], f"{of} of the injected flares"),
         Column("amplitude", "amplitudes", "", text),
         Column("completeness", "", "", "share of injected flares that the search finds"),
-        Column("completeness_low", "", "", "its 95 % interval, lower end"),
-        Column("completeness_high", "", "", "its 95 % interval, upper end"),
+        *interval_columns("completeness_{}"),
         Column("injections", "count", "", "number of injected flares"),
     )
 
 
 SEARCH_COLUMNS = (
     Column("threshold", "threshold.value", "", "S/N from which on a template is an alarm", "threshold", ".3f"),
-    Column("threshold_low", "threshold.low", "", "its 95 % interval, lower end", INTERVAL, interval(".3f"),
-           ("threshold_high",)),
-    Column("threshold_high", "threshold.high", "", "its 95 % interval, upper end"),
+    *interval_columns("threshold_{}", "threshold.{}", heading=INTERVAL, format=interval(".3f")),
     Column("checked_at", "checked", "", "S/N at which drawn stares are held against normal noise",
            "alarms a day above", ".2f", detail=True),
     Column("alarms_sampled", "asked", "", "false alarms per star-day there, normal noise", "sampled", ".3g",
            detail=True),
     Column("alarms_simulated", "simulated.value", "", "false alarms per star-day there, drawn stares",
            "drawn", ".3g", detail=True),
-    Column("alarms_low", "simulated.low", "", "lower end: 4 standard errors"),
-    Column("alarms_high", "simulated.high", "", "upper end: 4 standard errors"),
+    *interval_columns("alarms_{}", "simulated.{}", of="their interval of 4 standard errors"),
     Column("alarmed", "", "", "drawn stares with a false alarm at the threshold"),
     Column("alarmed_expected", "expected", "", "how many should have one"),
     Column("in_a_row", "", "", "false alarms per star-day of the common rule, white noise"),

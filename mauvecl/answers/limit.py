@@ -22,7 +22,7 @@ from mauvecl.noise.disturbances import Uniform
 from mauvecl.noise.unknowns import values_of
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import validated
-from mauvecl.schema.columns import INTERVAL, Column, View, interval, number, table_of
+from mauvecl.schema.columns import INTERVAL, Column, View, interval, interval_columns, number, table_of
 from mauvecl.schema.errors import InputError, Message, of_kind
 from mauvecl.study.cases import (
     SATURATED,
@@ -182,7 +182,6 @@ SPOKEN: dict[str, tuple[str, Callable[[float], str]]] = {
 #: Formats of limits by quantity.
 DIGITS = {"magnitude": ".2f", "amplitude": ".4g", "exposure": ".0f"}
 STATISTIC_COLUMN = Column("statistic", description="detection statistic", heading="statistic")
-CHECK = "detection probability there, with a fresh seed"
 
 
 def _limit_columns(answer: LimitAnswer) -> tuple[Column, ...]:
@@ -195,15 +194,13 @@ def _limit_columns(answer: LimitAnswer) -> tuple[Column, ...]:
         *share_columns(answer.study, "quiet.target_share"),
         Column(of, "value.value", unit, "where the flare is detected with the wanted probability",
                "exposure (s)" if of == "exposure" else of, digits),
-        Column("low", "value.low", unit, "its 95 % interval, lower end, with the threshold's own", INTERVAL,
-               interval(digits), ("high",)),
-        Column("high", "value.high", unit, "its 95 % interval, upper end, with the threshold's own"),
+        *interval_columns("{}", "value.{}", unit, "its 95 % interval, with the threshold's own", INTERVAL,
+                          interval(digits)),
         *ideal,
         Column("closed_form", "", unit, "the same for Gaussian noise", "closed form", digits, detail=True),
-        Column("check", "check.probability.value", "", CHECK, "detected there, simulated again", ".4f", detail=True),
-        Column("check_low", "check.probability.low", "", f"{CHECK}; 95 % interval, lower end", INTERVAL,
-               interval(".4f"), ("check_high",), detail=True),
-        Column("check_high", "check.probability.high", "", f"{CHECK}; 95 % interval, higher end"),
+        Column("check", "check.probability.value", "", "detection probability there, with a fresh seed",
+               "detected there, simulated again", ".4f", detail=True),
+        *interval_columns("check_{}", "check.probability.{}", heading=INTERVAL, format=interval(".4f"), detail=True),
         *unknown,
     )  # fmt: skip
 
@@ -211,11 +208,8 @@ def _limit_columns(answer: LimitAnswer) -> tuple[Column, ...]:
 def _unknown_columns(digits: str) -> tuple[Column, ...]:
     """Return the columns of limits over draws of what is unknown of the instrument."""
     return (
-        Column("unknown_low", lambda row: row.unknown.range[0],
-               description="central 95 % of the limits over what is unknown, lower end", heading="95 % of limits",
-               format=lambda low, high: f"{low:{digits}} to {high:{digits}}", others=("unknown_high",)),
-        Column("unknown_high", lambda row: row.unknown.range[1],
-               description="central 95 % of the limits over what is unknown, upper end"),
+        *interval_columns("unknown_{}", lambda row: row.unknown.range, "", "the central 95 % of the limits",
+                          "95 % of limits", lambda low, high: f"{low:{digits}} to {high:{digits}}"),
         Column("matters_most", lambda row: next(iter(row.unknown.shares)),
                description="unknown that explains most of the limits' variance"),
         Column("its_share", lambda row: next(iter(row.unknown.shares.values())),

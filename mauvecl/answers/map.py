@@ -27,7 +27,7 @@ from mauvecl.detection.distributions import Interval
 from mauvecl.detection.names import RECOMMENDED, check_fap
 from mauvecl.device.engine import Engine
 from mauvecl.runs.pool import Pool, map_in_order
-from mauvecl.schema.columns import Column, View, table_of
+from mauvecl.schema.columns import Column, View, interval_columns, table_of
 from mauvecl.schema.errors import InputError, Message, of_kind
 from mauvecl.study.cases import (
     SATURATED,
@@ -59,8 +59,7 @@ STEPS, MOST_MAGNITUDES = (0.1, 0.2, 0.25, 0.5, 1.0), 16
 COLUMNS = (
     Column("statistic", lambda answer: np.array(answer.statistics)[:, None, None], description="detection statistic"),
     Column("probability", description="detection probability"),
-    Column("low", description="its 95 % interval, lower end, with the threshold's own"),
-    Column("high", description="its 95 % interval, upper end, with the threshold's own"),
+    *interval_columns("{}", of="its 95 % interval, with the threshold's own"),
     Column("closed_form", description="the same for Gaussian noise"),
 )
 #: Arrays of the answer: chances, those with everything known, and both ends of the interval.

@@ -30,7 +30,7 @@ from mauvecl.fits.spectrum import LEVELS, Measurement
 from mauvecl.noise.scene import FactorDistributions
 from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool, map_in_order
-from mauvecl.schema.columns import Column, View, number, percent, table_of
+from mauvecl.schema.columns import Column, View, interval_columns, number, percent, table_of
 from mauvecl.schema.errors import InputError, Message
 from mauvecl.study.cases import Case, amplitude_column, cases, collect_messages
 from mauvecl.study.questions import check_sweep
@@ -110,8 +110,7 @@ def _coverage_columns(level: float, suffix: str, whose: str, heading: str = "") 
     text = f"share of {100 * level:.0f} % intervals that hold the truth, {whose}"
     return [
         Column(name, lambda row: row.coverages[name][0], "", text, heading, percent(".1f"), detail=bool(suffix)),
-        Column(f"{name}_low", lambda row: row.coverages[name][1], "", f"{text}: 95 % interval, lower end"),
-        Column(f"{name}_high", lambda row: row.coverages[name][2], "", f"{text}: 95 % interval, upper end"),
+        *interval_columns(f"{name}_{{}}", lambda row: row.coverages[name][1:], "", f"the 95 % interval of the {text}"),
     ]
 
 
@@ -127,9 +126,8 @@ COLUMNS = (
            number(".3g")),
     Column("perfect", lambda row: row.perfect.estimates[0], "", "estimate from an exposure without noise",
            "fit without noise", number(".4g"), detail=True),
-    Column("low_68", lambda row: row.perfect.low[0, 0], "",
-           "lower end of the 68 % interval of that fit; infinite if there is none"),
-    Column("high_68", lambda row: row.perfect.high[0, 0], "", "its upper end"),
+    *interval_columns("{}_68", lambda row: (row.perfect.low[0, 0], row.perfect.high[0, 0]), "",
+                      "the 68 % interval of that fit; infinite if there is none"),
     Column("low_95", lambda row: row.perfect.low[1, 0], "", "lower end of the 95 % interval of that fit", "95 % from",
            number(".4g"), detail=True),
     Column("high_95", lambda row: row.perfect.high[1, 0], "", "its upper end", "to", number(".4g"), detail=True),
@@ -163,12 +161,10 @@ FIT_COLUMNS = (
            "what the model cannot fit of an exposure without noise"),
     Column("rejected", "rejected.value", "", f"share of fits with a p-value below {REJECTED:g}", "p < 0.01",
            percent(".1f")),
-    Column("rejected_low", "rejected.low", "", "95 % interval, lower end"),
-    Column("rejected_high", "rejected.high", "", "95 % interval, upper end"),
+    *interval_columns("rejected_{}", "rejected.{}"),
     Column("detected", "detected.value", "", "share that a matched filter for the true flare detects", "detected",
            percent(".1f")),
-    Column("detected_low", "detected.low", "", "95 % interval, lower end"),
-    Column("detected_high", "detected.high", "", "95 % interval, upper end"),
+    *interval_columns("detected_{}", "detected.{}"),
 )  # fmt: skip
 MODEL_COLUMN = Column("model", description="model that is fitted", heading="model", detail=True)
 
@@ -187,9 +183,8 @@ JOINT_COLUMNS = (
     Column("truth", "joint.truth", "", "true value; undefined where the flare has none", "truth", number(".4g")),
     Column("estimate", lambda row: row.joint.found.estimates[0], "", "of maximum likelihood", "estimate", ".4g"),
     Column("error", lambda row: row.joint.found.errors[0], "", "its standard error", "error", ".2g"),
-    Column("low_68", lambda row: row.joint.found.low[0, 0], "",
-           "lower end of its 68 % interval; infinite if there is none"),
-    Column("high_68", lambda row: row.joint.found.high[0, 0], "", "higher end"),
+    *interval_columns("{}_68", lambda row: (row.joint.found.low[0, 0], row.joint.found.high[0, 0]), "",
+                      "its 68 % interval; infinite if there is none"),
     Column("low_95", lambda row: row.joint.found.low[1, 0], "", "lower end of its 95 % interval", "95 % from", ".4g"),
     Column("high_95", lambda row: row.joint.found.high[1, 0], "", "higher end", "to", ".4g"),
     Column("p_value", "joint.found.p_value", "",

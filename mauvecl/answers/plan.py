@@ -30,7 +30,7 @@ from mauvecl.answers.visible import VisibleAnswer, assumption_columns, visible
 from mauvecl.device.stares import Stares
 from mauvecl.host.orbit.visibility import PARTICLES_SOURCE, THERMAL_SOURCE
 from mauvecl.runs.pool import map_in_order
-from mauvecl.schema.columns import Column, number, percent, records
+from mauvecl.schema.columns import Column, interval_columns, number, percent, records
 from mauvecl.schema.errors import InputError, Message, of_kind, printable, together
 from mauvecl.schema.physical import DAY_S
 from mauvecl.search.completeness import Yield, recovered_per_day
@@ -61,10 +61,6 @@ def months(names: str) -> str:
     return ", ".join(f"{' '.join(each)} {year}" for year, each in years.items())
 
 
-def _interval(low: int | None, high: int | None) -> str:
-    return "" if low is None else f"{low} to {high}"
-
-
 #: Columns of the table of targets, without false alarms, which precede the last.
 COLUMNS = (
     Column("target", "name", "", "name of the target", "target"),
@@ -79,11 +75,9 @@ COLUMNS = (
            lambda expected: two_digits(expected) if expected == expected else "not known"),
     Column("ideal", "", "", "the same by the closed form if everything but the noise were known", "ideal",
            lambda expected: two_digits(expected) if expected == expected else ""),
-    Column("low", lambda row: row.recovered.low if row.recovered else None, "",
-           "lower end of the 95 % interval: scatter of the rates and Poisson noise", "95 %", _interval,
-           ("high",), int),
-    Column("high", lambda row: row.recovered.high if row.recovered else None, "",
-           "upper end of the 95 % interval", kind=int),
+    *interval_columns("{}", lambda row: (row.recovered.low, row.recovered.high) if row.recovered else (None, None), "",
+                      "the 95 % interval: scatter of the rates and Poisson noise", "95 %",
+                      lambda low, high: "" if low is None else f"{low} to {high}", kind=int),
     Column("at_least_one", lambda row: row.recovered.at_least_one if row.recovered else np.nan, "",
            "probability of recovering any", "P(>= 1)", number(".2f"), detail=True),
     Column("best_months", lambda row: " ".join(row.best_months), "", "those with most hours", "best months",
