@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any
 
@@ -136,17 +137,18 @@ DIFFERS = 4.0
 LEAST_CHANCE = 1e-5
 
 
-def limit_columns(of: str) -> tuple[Column, ...]:
-    """Return the columns of the table of limits of a kind of size, for intervals by name."""
+def limit_columns(of: str, *, known: bool) -> tuple[Column, ...]:
+    """Return the columns of limits of a kind of size, for intervals by name; the ideal one unless all is known."""
     unit, columns = SIZE_UNITS[of], list[Column]()
     size, ends = (percent(".4g"), interval(".4g", 100)) if of == "amplitude" else (".4g", interval(".4g"))
     for name, power in POWERS.items():
-        limit = itemgetter(name)
-        columns += [
-            Column(name, "value", unit, f"{of} at which the completeness is {power:g}", name.upper(), size).of(limit),
-            *(column.of(limit) for column in interval_columns(f"{name}_{{}}", "{}", unit, heading=INTERVAL, format=ends,
-                                                              detail=power != 0.5)),
-        ]  # fmt: skip
+        limit = Column(name, "value", unit, f"{of} at which the completeness is {power:g}", name.upper(), size)
+        detail = power != 0.5
+        own = interval_columns(f"{name}_{{}}", "{}", unit, heading=INTERVAL, format=ends, detail=detail)
+        columns += [column.of(itemgetter(name)) for column in (limit, *own)]
+    if not known:
+        text = "E50 if everything but the noise were known: E50 times the ratio of the S/N of a frame"
+        columns.append(Column("e50_ideal", lambda row: row["e50"].value * row["share"], unit, text, "ideal E50", size))
     return (
         Column("half_width", "", "s", "half-width of the injected flares; NaN for all of them alike", "half-width (s)",
                number(".4g", "all")),
@@ -156,22 +158,12 @@ def limit_columns(of: str) -> tuple[Column, ...]:
     )  # fmt: skip
 
 
-def ideal_column(of: str) -> Column:
-    """Return the column of the ideal limit of a kind of size."""
-    return Column(
-        "e50_ideal", lambda row: row["e50"].value * row["share"], SIZE_UNITS[of],
-        "E50 if everything but the noise were known: E50 times the ratio of the S/N of a frame", "ideal E50",
-        percent(".4g") if of == "amplitude" else ".4g",
-    )  # fmt: skip
-
-
 def cell_columns(of: str) -> tuple[Column, ...]:
     """Return the columns of the table of completeness over half-width and a kind of size."""
-    text = "their amplitude: relative rise of the photons in the flare's band"
     return (
         Column("half_width", lambda x: np.array(x.half_widths_s)[:, None], "s", "half-width of the injected flares"),
         Column("size", "sizes", SIZE_UNITS[of], f"{of} of the injected flares"),
-        Column("amplitude", "amplitudes", "", text),
+        Column("amplitude", "amplitudes", "", "relative rise of the photons in the flare's band by them"),
         Column("completeness", "", "", "share of injected flares that the search finds"),
         *interval_columns("completeness_{}"),
         Column("injections", "count", "", "number of injected flares"),
@@ -225,8 +217,7 @@ class StarCompleteness(InCell):
     @property
     def limit_columns(self) -> tuple[Column, ...]:
         """Columns of `limits`."""
-        known = np.isnan(self.ideal_share)
-        return limit_columns(self.sizes.of) if known else (*limit_columns(self.sizes.of), ideal_column(self.sizes.of))
+        return limit_columns(self.sizes.of, known=bool(np.isnan(self.ideal_share)))
 
     @property
     def limits(self) -> QTable:
@@ -251,28 +242,24 @@ class StarCompleteness(InCell):
         """Messages on stares whose false-alarm rate differs from that of normal noise, and on saturated flares."""
         messages: list[str] = []
         if not np.isnan(self.simulated.value) and not self.simulated.low <= self.asked <= self.simulated.high:
-            text = (
+            messages.append(Message(
                 f"FALSE ALARMS of {self.title} are not those of normal noise: {self.simulated.value:.3g} per star-day "
                 f"at {self.checked:.2f} in drawn stares, {self.asked:.3g} by importance sampling: the search does not "
                 "marginalise over what changes in the stare (see [search] frame, cycle, window_s), or set "
-                'search.null = "counted".'
-            )
-            messages.append(Message(text, "false alarms"))
+                'search.null = "counted".', "false alarms",
+            ))  # fmt: skip
         # The probability of at least this many alarms if the expected number is right.
         if scipy.special.gammainc(max(self.alarmed, 1e-300), self.expected) < LEAST_CHANCE:
-            text = (
-                f"FALSE ALARMS of {self.title} exceed the requested rate: {self.alarmed} of the drawn stares have "
-                f"one at the threshold, {self.expected:.2g} should: set search.null = 'counted' with more search.nulls."
-            )
-            messages.append(Message(text, "false alarms"))
+            messages.append(Message(
+                f"FALSE ALARMS of {self.title} exceed the requested rate: {self.alarmed} of the drawn stares have one "
+                f"at the threshold, {self.expected:.2g} should: set search.null = 'counted' with more search.nulls.",
+                "false alarms",
+            ))  # fmt: skip
         if self.shifted:
             messages.append(threshold_line(self.title, self.threshold.value))
         if self.injected.amplitudes.max() > self.saturates:
-            text = (
-                f"SATURATED: flares of {self.title} with an amplitude above {self.saturates:.3g} saturate a pixel, "
-                "which injections leave out."
-            )
-            messages.append(Message(text, "saturated"))
+            text = f"flares of {self.title} with an amplitude above {self.saturates:.3g} saturate a pixel"
+            messages.append(Message(f"SATURATED: {text}, which injections leave out.", "saturated"))
         return messages
 
 
@@ -297,7 +284,7 @@ class InjectAnswer(Answer):
 
     study: Study
     stars: list[StarCompleteness]
-    messages: list[str] = field(default_factory=list)
+    messages: list[str]
 
     #: Sizes E50 and E90: per star and cell of the sweep, one row for all half-widths and one for each.
     table = TableOf("limits", _share, "stars", of=lambda _, star: star.limits, place=True, about=_search)
@@ -350,22 +337,18 @@ def inject(study: Study, engine: Stares | Pool | None = None, progress: Progress
         Sizes.chosen(case)
     q = study.injections
     each = q.count * q.sizes * q.widths
-    answer = InjectAnswer(study, [])
-    for done, case in enumerate(prepared):
 
-        def report(part: float, done: int = done) -> None:
-            if progress is not None:
-                progress(round((done + part) * each), len(prepared) * each)
+    def report(done: int, part: float) -> None:
+        if progress is not None:
+            progress(round((done + part) * each), len(prepared) * each)
 
-        report(0.0)
-        answer.stars.append(_completeness(case, engine, report))
-    report(1.0)
-    answer.messages = [
-        *(text for star in answer.stars for text in star.messages),
-        *collect_messages(answer.inputs),
-        *orbit_lines(study.stare, study.orbit, prepared[0].instrument.frame_s),
-    ]
-    return answer
+    report(0, 0.0)
+    stars = [_completeness(case, engine, partial(report, done)) for done, case in enumerate(prepared)]
+    report(len(stars), 0.0)
+    messages = [text for star in stars for text in star.messages]
+    messages += collect_messages([star.survey.components.quiet for star in stars])
+    messages += orbit_lines(study.stare, study.orbit, prepared[0].instrument.frame_s)
+    return InjectAnswer(study, stars, messages)
 
 
 def _completeness(case: Case, engine: Stares | Pool, report: Callable[[float], None]) -> StarCompleteness:
@@ -391,17 +374,12 @@ def _completeness(case: Case, engine: Stares | Pool, report: Callable[[float], N
     parts = list(reported(peaks, positions, lambda done, total: report(done / total)))
     critical = sizes.of_amplitude(np.stack([part["critical"].T for part in parts], axis=1), widths[:, None, None])
     return StarCompleteness(
-        case.label,
-        case.at,
-        survey,
-        sizes,
-        **found,
-        saturates=injections.saturates,
+        case.label, case.at, survey, sizes, **found, saturates=injections.saturates,
         in_a_row=consecutive_alarm_rate(choice.points, choice.sigma, survey.stare.frame_s),
         injected=InjectedCompleteness(injections.half_widths_s, values, amplitudes, critical),
         fitted=fit_accuracy(parts) if refit.count else None,
         ideal_share=_ideal_share(case, survey),
-    )
+    )  # fmt: skip
 
 
 def _ideal_share(case: Case, survey: Survey) -> float:
