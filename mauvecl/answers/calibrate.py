@@ -69,6 +69,11 @@ class Fitted:
     nominal: float
     unit: str
 
+    @property
+    def determined(self) -> bool:
+        """Whether the observations determine it."""
+        return bool(np.isfinite(self.error))
+
 
 #: Columns of the table of values.
 COLUMNS = (
@@ -80,7 +85,7 @@ COLUMNS = (
     Column("deviation", lambda row: (row.value - row.nominal) / row.error if row.error > 0 else np.nan, "",
            "fitted less nominal value in standard errors", "sigma", number("+.1f")),
     Column("unit", "unit", "", "of the value", "unit", kind=str),
-    Column("determined", lambda row: row.error == row.error, "", "whether these observations determine it", "status",
+    Column("determined", "determined", "", "whether these observations determine it", "status",
            lambda determined: "" if determined else "assumed", kind=bool),
 )  # fmt: skip
 FIT_COLUMNS = (

@@ -59,8 +59,8 @@ from mauvecl.study.study import PAPER_STARS, Study
 if TYPE_CHECKING:
     from astropy.table import QTable
 
+    from mauvecl.detection.distributions import Interval
     from mauvecl.host.exposure.expectation import Expectation
-    from mauvecl.study.questions import CampaignQuestion
 
 #: Largest number of rows of the tables of ROC curves and extremes, divided among flares.
 MOST_ROWS = 100_000
@@ -109,17 +109,12 @@ TEMPLATE_COLUMN = Column("template", description="amplitude of the flare that th
 
 def chance_of_flare(study: Study, star: str, amplitude: float, quiet: Expectation, chance: str) -> str:
     """Return the sentence on the chance that a flare is seen, without what follows it."""
-    saturated = int(quiet.saturated.sum())
-    without = (
-        f", without the {saturated} of {quiet.saturated.size} pixels that saturate in a frame of more than "
-        f"{quiet.longest_safe_frame_s:.3g} s"
-        if saturated
-        else ""
-    )
-    return (
-        f"{name_of_instrument(study)} would see a flare of {100 * amplitude:g} % on {star} in {quiet.exposure_s:g} s "
-        f"with a chance of {chance}{without}"
-    )
+    saturated, without = int(quiet.saturated.sum()), ""
+    if saturated:
+        lost = f"{saturated} of {quiet.saturated.size} pixels that saturate"
+        without = f", without the {lost} in a frame of more than {quiet.longest_safe_frame_s:.3g} s"
+    seen = f"{name_of_instrument(study)} would see a flare of {100 * amplitude:g} % on {star}"
+    return f"{seen} in {quiet.exposure_s:g} s with a chance of {chance}{without}"
 
 
 @dataclass(eq=False)
@@ -315,10 +310,10 @@ def _few_terms(stars: Sequence[StarDetection]) -> list[str]:
     terms = [form.effective_terms for form in forms if isinstance(form, QuadraticForm)]
     if not terms:
         return []
-    few, many = (f"{end:.1f}" for end in (min(terms), max(terms)))
+    squares = " to ".join(dict.fromkeys(f"{end:.1f}" for end in (min(terms), max(terms))))
     return [
-        f"The paper's sum over {stars[0].detection.dof('paper')} pixels scatters like one of "
-        f"{few if few == many else f'{few} to {many}'} independent squares: its faintest pixels make most of it."
+        f"The paper's sum over {stars[0].detection.dof('paper')} pixels scatters like one of {squares} independent "
+        "squares: its faintest pixels make most of it."
     ]
 
 
@@ -345,35 +340,30 @@ def _template_costs(case: Case, star: StarDetection) -> list[str]:
 
 
 def _campaign(case: Case) -> list[str]:
-    """Return sentences on the false alarms of the campaign that a study has, if any."""
+    """Return sentences on the false alarms of a study's campaign, if any, and on the probability per test it wants."""
     asked, run, stack = case.study.campaign, case.study.run, case.quiet.n_frames
     if asked.frames is None:
         return []
     many = campaign(run.fap, asked.frames, stack, step=asked.step, seed=run.seed)
-    text = (
-        f"A campaign of {asked.frames} frames makes {many.tests} tests: at {many.fap:g} per test "
-        f"{many.expected:.3g} false alarms are expected, and the chance of any is {many.independent:.3g} if tests "
-        f"are independent, at most {many.at_most:.3g}"
+
+    def overlap(found: Interval | None, before: str, after: str = "") -> str:
+        if found is None:
+            return ""
+        return f"{before} with the overlap of its stacks {found.value:.3g} [{found.low:.3g}, {found.high:.3g}]{after}"
+
+    lines, tests = list[str](), many.tests
+    lines.append(
+        f"A campaign of {asked.frames} frames makes {tests} tests: at {many.fap:g} per test {many.expected:.3g} false "
+        f"alarms are expected, and the chance of any is {many.independent:.3g} if tests are independent, at most "
+        f"{many.at_most:.3g}{overlap(many.overlapping, ';', ' for a linear statistic')}."
     )
-    if many.overlapping is not None:
-        o = many.overlapping
-        text += f"; with the overlap of its stacks {o.value:.3g} [{o.low:.3g}, {o.high:.3g}] for a linear statistic"
-    return [text + ".", *_wanted(asked, many.tests, stack, run.seed)]
-
-
-def _wanted(asked: CampaignQuestion, tests: int, stack: int, seed: int) -> list[str]:
-    """Return sentences on the false-alarm probability per test for the campaign's wanted values."""
-    lines = []
-    if asked.fap is not None and asked.frames is not None:
-        rate = per_test(asked.fap, asked.frames, stack, step=asked.step, seed=seed)
-        text = (
+    if asked.fap is not None:
+        rate = per_test(asked.fap, asked.frames, stack, step=asked.step, seed=run.seed)
+        lines.append(
             f"For a chance of {asked.fap:g} of any false alarm in the campaign each of its {tests} tests may have "
             f"{rate.independent:.4g} if they are independent, {rate.at_least:.4g} in any case"
+            f"{overlap(rate.overlapping, ', and')}: `fap={rate.at_least:.4g}`."
         )
-        if rate.overlapping is not None:
-            o = rate.overlapping
-            text += f", and with the overlap of its stacks {o.value:.3g} [{o.low:.3g}, {o.high:.3g}]"
-        lines.append(f"{text}: `fap={rate.at_least:.4g}`.")
     if asked.alarms is not None:
         if not asked.alarms < tests:
             raise InputError.of("campaign.alarms", asked.alarms, f"fewer than the {tests} tests")

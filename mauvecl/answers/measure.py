@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from itertools import chain
+from itertools import chain, product
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
@@ -22,8 +22,8 @@ from mauvecl.answers.measurements import (
     matched_filter,
 )
 from mauvecl.answers.verbs import Progress, by_keywords
-from mauvecl.detection.distributions import Interval, clopper_pearson
-from mauvecl.detection.nuisances import join_names
+from mauvecl.detection.distributions import Interval, clopper_pearson, clopper_pearson_ends
+from mauvecl.detection.nuisances import fitted_amplitudes, join_names
 from mauvecl.device.engine import Engine
 from mauvecl.fits.flare_model import usable_variance
 from mauvecl.fits.spectrum import LEVELS, Measurement
@@ -67,11 +67,8 @@ class MeasuredFlare(ExpectedMeasurement):
             return mean, np.zeros_like(mean)
         unknown, expected = self.unknown.around(mean), self.unknown.mean_dn
         variance, used = usable_variance(self.quiet, mean, self.skipped_nm, unknown)
-        spectra = unknown.spectra * used
-        weighted = np.divide(spectra, variance, out=np.zeros_like(spectra), where=used)
-        information = np.diag(unknown.sd**-2.0) + weighted @ spectra.T
-        left = self.frame - mean - expected
-        return mean, expected + np.linalg.solve(information, weighted @ left) @ unknown.spectra
+        variance, left = np.where(used, variance, np.inf), self.frame - mean - expected
+        return mean, expected + fitted_amplitudes(unknown.spectra, unknown.sd, left, variance) @ unknown.spectra
 
     def rows(self) -> QTable:
         """Return one row per quantity."""
@@ -80,12 +77,14 @@ class MeasuredFlare(ExpectedMeasurement):
     @cached_property
     def coverages(self) -> dict[str, Float]:
         """Shares of intervals that hold the truth, with 95 % intervals, by their columns; shape (3, n_derived) each."""
+        found, covers = self.found, dict[str, Float]()
         exposures = {"": np.ones(self.selected.size, np.bool_), "_selected": self.selected}
-        return {
-            f"coverage_{100 * level:.0f}{suffix}": _coverage(self.found, self.truth, k, which)
-            for suffix, which in exposures.items()
-            for k, level in enumerate(self.found.levels)
-        }
+        for (suffix, which), (k, level) in product(exposures.items(), enumerate(found.levels)):
+            inside = ((found.low[k] <= self.truth) & (self.truth <= found.high[k]))[which]
+            cover = covers[f"coverage_{100 * level:.0f}{suffix}"] = np.full((3, self.truth.size), np.nan)
+            known = np.isfinite(self.truth) & bool(len(inside))
+            cover[:, known] = clopper_pearson_ends(inside[:, known].sum(axis=0), max(len(inside), 1))
+        return covers
 
     @property
     def bias_selected(self) -> Float:
@@ -293,7 +292,7 @@ def measure(study: Study, engine: Engine | Pool | None = None, progress: Progres
     messages = collect_messages(expectations)
     messages += [stare.unmeasured for stare in stares if stare.unmeasured]
     messages += dict.fromkeys(line for case in prepared for line in _not_marginalised(case))
-    return MeasureAnswer(study, flares, [*messages, *_faint(flares), *_wrong(flares)], stares)
+    return MeasureAnswer(study, flares, [*messages, *_doubtful(flares)], stares)
 
 
 def _measured(case: Case, amplitude: float, flare: Expectation, engine: Engine | Pool) -> list[MeasuredFlare]:
@@ -332,17 +331,6 @@ def _measured(case: Case, amplitude: float, flare: Expectation, engine: Engine |
     return measured
 
 
-def _coverage(measurement: Measurement, truth: Float, level: int, which: NDArray[np.bool_]) -> Float:
-    """Return coverage and its 95 % interval for each quantity, shape (3, n_derived); NaN without a truth."""
-    inside = (measurement.low[level] <= truth) & (truth <= measurement.high[level])
-    cover = np.full((3, truth.size), np.nan)
-    n = int(which.sum())
-    for q in np.flatnonzero(np.isfinite(truth)) if n else ():
-        interval = clopper_pearson(int(inside[which, q].sum()), n)
-        cover[:, q] = interval.value, interval.low, interval.high
-    return cover
-
-
 def _scatter(estimates: Float) -> Float:
     """Return half of the central 68.27 % of the estimates, shape (n_derived,); undefined for a single one."""
     if len(estimates) < 2:
@@ -353,8 +341,7 @@ def _scatter(estimates: Float) -> Float:
 
 def _not_marginalised(case: Case) -> list[str]:
     """Return a message on drawn factors over which fits do not marginalise."""
-    drawn = FactorDistributions.from_processes(case.processes, case.quiet)
-    unknown = case.unknowns_of_fits()
+    drawn, unknown = FactorDistributions.from_processes(case.processes, case.quiet), case.unknowns_of_fits()
     names = [name for name in (drawn.spreads if drawn else ()) if unknown is None or name not in unknown.names]
     if not names:
         return []
@@ -365,29 +352,22 @@ def _not_marginalised(case: Case) -> list[str]:
     return [Message(text, "not marginalised")]
 
 
-def _faint(flares: Sequence[MeasuredFlare]) -> list[str]:
-    """Return a message for each flare whose intervals are approximate because it is faint."""
-    snr_of = {f"{flare.title}, flare of {100 * flare.amplitude:g} %": flare.snr[1] for flare in flares}
-    return [
-        f"{title}: of an S/N of {snr:.2g} with unknowns marginalised over; below {WILKS_SNR:g} intervals of 95 % cover "
-        "93 to 99 %: the table counts how often they do."
-        for title, snr in snr_of.items()
-        if snr < WILKS_SNR
-    ]
-
-
-def _wrong(flares: Sequence[MeasuredFlare]) -> list[str]:
-    """Return messages on models that do not fit, with the temperature that they give."""
-    lines = []
+def _doubtful(flares: Sequence[MeasuredFlare]) -> list[str]:
+    """Return messages on faint flares, whose intervals are approximate, and on models that do not fit."""
+    faint, wrong = dict[str, None](), []
     for flare in flares:
-        lost, truth = float(flare.perfect.chi2[0]), flare.truth[0]
-        if lost < 1.0:
-            continue
-        kelvin, error = flare.perfect.estimates[0, 0], flare.ahead.errors[0]
-        against = f" where the flare has {truth:.0f} K" if np.isfinite(truth) else ""
-        rejected = 100 * float((flare.found.p_value < REJECTED).mean())
-        lines.append(
-            f"{flare.title}, flare of {100 * flare.amplitude:g} %: the model {flare.model!r} gives {kelvin:.0f} +- "
-            f"{error:.0f} K{against}; its goodness of fit rejects it in {rejected:.0f} % of exposures."
-        )
-    return lines
+        name, truth = f"{flare.title}, flare of {100 * flare.amplitude:g} %", flare.truth[0]
+        if flare.snr[1] < WILKS_SNR:
+            text = (
+                f"{name}: of an S/N of {flare.snr[1]:.2g} with unknowns marginalised over; below {WILKS_SNR:g} "
+                "intervals of 95 % cover 93 to 99 %: the table counts how often they do."
+            )
+            faint[text] = None
+        if flare.perfect.chi2[0] >= 1.0:
+            kelvin, error = flare.perfect.estimates[0, 0], flare.ahead.errors[0]
+            against = f" where the flare has {truth:.0f} K" if np.isfinite(truth) else ""
+            wrong.append(
+                f"{name}: the model {flare.model!r} gives {kelvin:.0f} +- {error:.0f} K{against}; its goodness of fit "
+                f"rejects it in {100 * flare.rejected.value:.0f} % of exposures."
+            )
+    return [*faint, *wrong]
