@@ -107,17 +107,14 @@ class PeriodRow(InCell):
 
 def _lost_pixels(lost: int, every: int) -> str:
     """Return how many pixels saturate, or nothing if none do."""
-    if not lost:
-        return ""
-    return "every pixel saturates" if lost == every else f"{lost} of {every} pixels saturate"
+    text = "every pixel saturates" if lost == every else f"{lost} of {every} pixels saturate"
+    return text if lost else ""
 
 
 def _amount(value: float, unit: str) -> str:
-    if np.isnan(value):
-        return ""
-    if np.isinf(value):
-        return "hidden"
-    return f"{formatted(100 * value, '.3g')} %" if not unit else f"{value:.3g} {unit}"
+    if not np.isfinite(value):
+        return "" if np.isnan(value) else "hidden"
+    return f"{value:.3g} {unit}" if unit else f"{formatted(100 * value, '.3g')} %"
 
 
 #: Columns of the table of changes.
@@ -276,7 +273,11 @@ def change(study: Study, engine: Engine | Pool | None = None, progress: Progress
     asked = study.change
     file = asked.light()
     prepared = cases(study)
-    times = _visits(study) if asked.periods else None
+    times = None
+    if asked.periods:
+        o, target = study.orbit, targets_of(study.orbit, study.plan)[0]
+        seen = Visibility.of(o.orbit().track(o.times()), np.array([target.direction]), o.limits)
+        times = visit_times_d(seen.windows(0), asked.visits, study.observation.exposure_s, study.run.seed)
     rows, indices, along, periods = [], [], list[ChangeRow](), []
     for case in reported(prepared, len(prepared), progress):
         own = _changes(case, file)
@@ -323,10 +324,3 @@ def _indices(case: Case) -> list[IndexRow]:
         flux = flux_per_dn(quiet, case.instrument) * quiet.signal_dn
         rows.append(IndexRow(case.label, case.at, value, error, known_error, quiet.wavelength_nm, flux, lost))
     return rows
-
-
-def _visits(study: Study) -> NDArray[np.float64]:
-    """Draw the times of visits to the first target of a study's orbit."""
-    o, target = study.orbit, targets_of(study.orbit, study.plan)[0]
-    seen = Visibility.of(o.orbit().track(o.times()), np.array([target.direction]), o.limits)
-    return visit_times_d(seen.windows(0), study.change.visits, study.observation.exposure_s, study.run.seed)

@@ -190,19 +190,17 @@ class PlanAnswer(Answer):
             if target.completeness is not None:
                 energies, p = target.completeness.energy_erg, target.completeness.probability
                 first = max(int(np.argmax(p > 0)) - 1, 0)
-                part = slice(first, min(first + 161, energies.size))
+                part = slice(first, first + 161)
                 rate = np.nan if target.rates is None else target.rates.per_day_above(energies[part])
                 yield {"target": target.name, "energy": energies[part], "recovered": p[part], "rate_above": rate}
 
     @property
     def _assumptions(self) -> list[tuple[str, str, str]]:
         study, orbit, law = self.study, self.study.orbit.orbit(), self.study.plan.law()
-        elements = (
-            f"{orbit.elements.source}, epoch {orbit.elements.epoch}; mean is a Sun-synchronous orbit through them"
-        )
-        half_width = (
-            f"t_1/2 = {law.half_width_s:g} s (E / {law.at_erg:g} erg)^{law.exponent:g}, {law.scatter_dex:g} dex"
-        )
+        e = orbit.elements
+        elements = f"{e.source}, epoch {e.epoch}; mean is a Sun-synchronous orbit through them"
+        scale = f"{law.half_width_s:g} s (E / {law.at_erg:g} erg)^{law.exponent:g}"
+        half_width = f"t_1/2 = {scale}, {law.scatter_dex:g} dex"
         light = ("blackbody of " if study.flare.is_blackbody else "") + study.flare.light().describe()
         alarms = f"{study.search.false_alarms:g} per {study.search.per} of exposure"
         return [
@@ -281,20 +279,17 @@ class PlanAnswer(Answer):
 
     @property
     def _messages_on_rates(self) -> list[str]:
-        lines, typical, beyond = list[str](), list[str](), list[str]()
-        for target in self.planned:
-            if target.no_rates:
-                lines.append(f"{target.no_rates[0].upper()}{target.no_rates[1:]}; its expected flares are not given.")
-            if target.rates is not None and "typical" in target.rates.source:
-                typical.append(target.name)
-            if target.completeness is not None and target.extrapolated:
-                beyond.append(f"{target.name} ({target.energy_at(0.5):.2g} erg, {target.published})")
+        planned, lines = self.planned, list[str]()
+        typical = [target.name for target in planned if target.rates is not None and "typical" in target.rates.source]
         if typical:
-            lines.insert(
-                0,
+            lines.append(
                 f"Flare rates of {', '.join(typical)} are those typical of their types at 1000 Myr: mass_msun and "
-                "age_myr, or their own rates, are more accurate.",
+                "age_myr, or their own rates, are more accurate."
             )
+        for why in (target.no_rates for target in planned if target.no_rates):
+            lines.append(f"{why[0].upper()}{why[1:]}; its expected flares are not given.")
+        beyond = [f"{target.name} ({target.energy_at(0.5):.2g} erg, {target.published})" for target in planned
+                  if target.completeness is not None and target.extrapolated]  # fmt: skip
         return [*lines, *([f"Flare rates are extrapolated to E50 of {', '.join(beyond)}."] if beyond else [])]
 
 
@@ -338,7 +333,7 @@ def plan(
             yield k, observe(base, text, star, seen, k, along)
 
     # With a pool, the noise of a target is drawn while the threshold of the next one is sampled.
-    planned_for = partial(_planned, seen, seen.visibility.by_month(), completeness)
+    planned_for = partial(_planned, seen, completeness)
     planned = tuple(reported(map_in_order(engine, planned_for, observations()), len(stars), progress))
     return PlanAnswer(study, seen, planned)
 
@@ -358,8 +353,7 @@ def _refuse(study: Study, *, closed: bool) -> None:
 
 def _stars_of(study: Study) -> list[Star]:
     """Return the library star of each target; the error names all targets without one."""
-    stars: list[Star] = []
-    errors: list[InputError] = []
+    stars, errors = list[Star](), list[InputError]()
     for text in study.plan.targets:
         try:
             stars.append(star_of(text, study.orbit.simbad))
@@ -370,18 +364,12 @@ def _stars_of(study: Study) -> list[Star]:
     return stars
 
 
-def _planned(
-    seen: VisibleAnswer,
-    months: tuple[list[str], Any],
-    completeness: CompletenessOf,
-    item: tuple[int, TargetObservation],
-) -> Planned:
-    """Return the plan of a target, given its number and observation, and the hours of all targets by month."""
-    study, (k, target) = seen.study, item
-    its = None
+def _planned(seen: VisibleAnswer, completeness: CompletenessOf, item: tuple[int, TargetObservation]) -> Planned:
+    """Return the plan of a target, given its number and observation."""
+    study, (k, target), its = seen.study, item, None
     if target.window_s > 0:
         its = completeness(target) if target.signal_per_frame > 0 else NOTHING
-    exposed, (names, hours) = float(seen.visibility.hours[k]), months
+    exposed, (names, hours) = float(seen.visibility.hours[k]), seen.by_month
     observed = exposed if study.plan.hours is None else min(exposed, study.plan.hours)
     days = observed * 3600 / DAY_S
     # The months in which it is seen for the most hours, in order.
