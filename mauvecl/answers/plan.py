@@ -353,7 +353,8 @@ def _refuse(study: Study, *, closed: bool) -> None:
 
 def _stars_of(study: Study) -> list[Star]:
     """Return the library star of each target; the error names all targets without one."""
-    stars, errors = list[Star](), list[InputError]()
+    stars: list[Star] = []
+    errors: list[InputError] = []
     for text in study.plan.targets:
         try:
             stars.append(star_of(text, study.orbit.simbad))

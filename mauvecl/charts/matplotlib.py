@@ -115,18 +115,6 @@ def _own_part(ax: Any) -> Any:
     return ax.figure.add_subfigure(spec)
 
 
-def _headline(figure: Any, text: str) -> None:
-    """Add a title above all panels, wrapped to the figure's width."""
-    title = figure.suptitle(text, fontsize=9.0)
-    words, lines = text.split(" "), [""]
-    for word in words:
-        title.set_text(f"{lines[-1]} {word}".strip())
-        if lines[-1] and title.get_window_extent(_renderer(figure)).width > INSIDE * figure.bbox.width:
-            lines.append("")
-        lines[-1] = f"{lines[-1]} {word}".strip()
-    title.set_text("\n".join(lines))
-
-
 def _legend_below(figure: Any, handles: dict[str, Any]) -> None:
     """Add a legend below all panels, in as few rows as fit, which have about equally many entries."""
     for rows in range(1, len(handles) + 1):
@@ -262,7 +250,7 @@ def draw_picture(picture: Picture, figure: Any = None) -> Any:
         entries = [zip(*axis.get_legend_handles_labels(), strict=True) for axis, _ in drawn]
         _legend_below(figure, {name: handle for each in entries for handle, name in each})
     if title:
-        _headline(figure, title)
+        figure.suptitle(title, fontsize=9.0, wrap=True)
     return figure
 
 
