@@ -322,8 +322,7 @@ FRAMES = (
 )  # fmt: skip
 #: Columns of the measured quantities of an event, one row for each.
 MEASURED = (
-    Column("date", description="brightest frame of the event", heading="event", format=lambda text: text[:22],
-           kind=str),
+    Column("date", "", "", "brightest frame of the event", "event", lambda text: text[:22], kind=str),
     Column("quantity", "measured.names", "", "what is measured", "quantity", kind=str),
     Column("unit", "measured.units", "", "of estimate and intervals", "unit", kind=str),
     Column("estimate", lambda row: row.measured.estimates[0], "", "of maximum likelihood", "estimate", number(".4g")),

@@ -549,8 +549,7 @@ NEIGHBOUR_COLUMNS = (
     Column("separation", "", "arcsec", "from the star", "arcsec", ".4g"),
     Column("magnitude", "", "mag", "in the band", "magnitude", ".2f"),
     Column("band", heading="band", kind=str),
-    Column("spectrum", description="spectrum that represents it; empty if its light does not enter",
-           heading="spectrum", kind=str),
+    Column("spectrum", "", "", "spectrum that represents it; empty if its light does not enter", "spectrum", kind=str),
     Column("enters", description="whether it is within the fibre's radius, so that the assumed share of its light "
            "enters", heading="enters", format=lambda value: "yes" if value else "no", kind=bool),
     Column("share", description="share of the electrons of all stars in the fibre, without a flare",

@@ -140,8 +140,7 @@ INDEX_COLUMNS = (
            "flux", number(".3g")),
     Column("error", "error", "erg / (s cm2)", "standard deviation in one exposure with unknowns of finite spread; inf: "
            "a free unknown changes it", "error", lambda value: "free" if np.isinf(value) else number(".2g")(value)),
-    Column("error_known", "error_known", "erg / (s cm2)", "the same with everything known", "ideal",
-           number(".2g")),
+    Column("error_known", "error_known", "erg / (s cm2)", "the same with everything known", "ideal", number(".2g")),
     Column("snr", "snr", "", "index over its error with everything known", "ideal S/N", number(".3g"), detail=True),
     Column("equivalent_width", "value.equivalent_width_nm", "nm", "positive in emission", "EW (nm)", number(".3g")),
     Column("captured", "value.captured", "", "share of a line's flux that the index holds at this resolution",

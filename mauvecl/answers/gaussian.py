@@ -49,11 +49,9 @@ ELEMENT_COLUMNS = (
 )
 #: Columns of the largest error of each prediction.
 WORST_COLUMNS = (
-    Column("best_snr", description="largest S/N per element by the formula", heading="best S/N", format=".2f",
-           detail=True),
-    Column("snr_off_by",
-           description="largest significant (4 standard errors) difference of the mean S/N from it; 0 if none",
-           heading="S/N off by", format="+.3f"),
+    Column("best_snr", "", "", "largest S/N per element by the formula", "best S/N", ".2f", detail=True),
+    Column("snr_off_by", "", "", "largest significant (4 standard errors) difference of the mean S/N from it; 0 if "
+           "none", "S/N off by", "+.3f"),
     Column("at_nm", description="where", heading="at nm", format=number(".0f"), detail=True),
     Column("coverage_low", description="smallest share of 1-sigma intervals that hold the truth, of all elements",
            heading="1-sigma intervals", format=lambda low, high: f"{100 * low:.2f}-{100 * high:.2f} %",
@@ -68,9 +66,8 @@ WORST_COLUMNS = (
            heading="false alarms", format=".3f"),
     Column("statistic", description="detection statistic", heading="statistic", detail=True),
     Column("why", description="main cause of a difference from the closed form", heading="why", detail=True),
-    Column("probability_off_by",
-           description="largest significant difference of a detection probability from the closed form",
-           heading="detection off by", format="+.4f"),
+    Column("probability_off_by", "", "", "largest significant difference of a detection probability from the closed "
+           "form", "detection off by", "+.4f"),
 )  # fmt: skip
 
 

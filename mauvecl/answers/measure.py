@@ -119,8 +119,7 @@ COLUMNS = (
            lambda name, unit: f"{name} ({unit})" if unit else name, ("unit",)),
     Column("unit", "found.units", "", "of truth, estimates and errors"),
     Column("truth", "", "", "true value; undefined where the flare has none", "truth", number(".4g")),
-    Column("error_known", "known.errors", "", "standard error in advance, everything known", "ideal",
-           number(".3g")),
+    Column("error_known", "known.errors", "", "standard error in advance, everything known", "ideal", number(".3g")),
     Column("error", "ahead.errors", "", "standard error in advance, unknowns marginalised over", "error",
            number(".3g")),
     Column("perfect", lambda row: row.perfect.estimates[0], "", "estimate from an exposure without noise",
@@ -150,8 +149,7 @@ THROUGHPUT_COLUMN = Column("error_throughput", "of_throughput", "",
 
 
 FIT_COLUMNS = (
-    Column("snr", lambda row: row.snr[0], "", "S/N of the flare in one exposure, everything known", "ideal S/N",
-           ".2f"),
+    Column("snr", lambda row: row.snr[0], "", "S/N of the flare in one exposure, everything known", "ideal S/N", ".2f"),
     Column("snr_marginal", lambda row: row.snr[1], "", "the same, unknowns marginalised over", "S/N", ".2f"),
     Column("dof", "found.dof", "", "degrees of freedom of chi-squared"),
     Column("chi2", lambda row: float(np.mean(row.found.chi2)), "", "mean chi-squared of the fits", "chi-squared / dof",
