@@ -19,11 +19,9 @@ import pytest
 from commands import run
 from golden_inputs import DATA, write_inputs
 from scenes import MG_II, NEAR, instrument, paper, source, star
-from stores import CHUNK, flip
-from stores import study as stored_study
 
 import mauvecl
-from mauvecl import BalmerFlare, EnergyScale, Engine, Event, FlareModel, Nuisances, Sky, Source, bulk, expect, fit
+from mauvecl import BalmerFlare, EnergyScale, Engine, Event, FlareModel, Nuisances, Sky, Source, expect, fit
 from mauvecl.flares.frames import Components
 from mauvecl.observations import visits
 
@@ -312,15 +310,6 @@ def frames_of_files(folder: Path) -> Answer:
                "shifted": one.shifted(np.full(one.n_frames, 10.0)).time_s[:3]}
         for name, one in read.items()
     }  # fmt: skip
-
-
-@golden
-def stores(folder: Path) -> Answer:
-    path, asked = folder / "frames.zarr", stored_study(40)
-    bulk.realise(asked, path, Engine())
-    before, rows = [str(one) for one in bulk.verify(path)], bulk.read(path, "star-1/flare-1")
-    flip(path / CHUNK.replace("c/1/0", "c/0/0"))
-    return {"flare": rows.values.astype(np.int64), "before": before, "after": [str(one) for one in bulk.verify(path)]}
 
 
 @golden
