@@ -9,6 +9,7 @@ import io
 import json
 import platform
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import KW_ONLY, asdict, dataclass
 from functools import cached_property
 from html import escape
@@ -321,15 +322,12 @@ def is_answer(folder: Path) -> bool:
     """Return whether a folder holds a run record, or the study and a table of an answer whose record is missing."""
     if (folder / RECORD).is_file():
         return True
-    return (folder / "study.toml").is_file() and any(map(_is_table_of_answer, folder.glob("*.ecsv")))
-
-
-def _is_table_of_answer(path: Path) -> bool:
-    """Return whether a table has a study in its metadata, which a user's own tables do not."""
-    try:
-        return bool(read_embedded_study(path))
-    except InputError:
-        return False
+    for path in folder.glob("*.ecsv") if (folder / "study.toml").is_file() else ():
+        # A user's own tables have no study in their metadata.
+        with suppress(InputError):
+            if read_embedded_study(path):
+                return True
+    return False
 
 
 @validated
@@ -486,8 +484,7 @@ def write_record(
     stale: list[Path] = []
     if files is not None:
         record["files"] = {path.name: digest_of(path) for path in files}
-        if whole:
-            stale = [path for path in _left_by_another(folder) if path.name not in record["files"]]
+        stale = [path for path in _left_by_another(folder) if path.name not in record["files"]] if whole else []
     # Converted to JSON and back, so that the digest of a record that is read again is the same.
     record = json.loads(json_text(record))
     record[OWN_DIGEST] = record_digest(record)
