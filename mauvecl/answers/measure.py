@@ -299,7 +299,7 @@ def _measured(case: Case, amplitude: float, flare: Expectation, engine: Engine |
     expected = expected_measurements(case, amplitude, flare)
     models, unknown = [forecast.fitted for forecast in expected], expected[0].unknown
     skipped = study.measure.skipped_nm
-    weights = matched_filter(quiet, flare, case.unknowns(), skipped_nm=skipped)[0]
+    weights = matched_filter(quiet, flare, case.unknowns(), None, skipped)[0]
 
     def fitted(start: int, count: int) -> Arrays:
         raw = engine.realise(flare, start=start, count=count, seed=study.run.seed, **case.draw_options)
