@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mauvecl.charts.chart import Axis, Dots, Line, Mesh, Panel, Picture, Series, document_of, pictures_of
-from mauvecl.charts.matplotlib import COLOURS, NULL, available, draw_picture, new_figure, picture_of, style
+from mauvecl.charts.matplotlib import COLOURS, NULL, available, draw_picture, in_rows, new_figure, picture_of, style
 from mauvecl.host import VERSION
 from mauvecl.schema.columns import without_empty
 
@@ -54,8 +54,7 @@ def _calendars(answer: VisibleAnswer, hours: Any) -> Picture:
         at = np.arange(0.5, 32), np.arange(-0.5, len(months)), grid
         mesh = Mesh("hours a day", high=max(float(hours.max()), 0.1), edges="white", at=at)
         panels.append(Panel(x, y, [mesh], f"{target.name}: {total:.0f} h in {answer.times.days:g} d"))
-    rows = [panels[k : k + across] for k in range(0, len(panels), across)]
-    height = max(1.3, 0.17 * len(months) + 0.8)
+    rows, height = in_rows(panels, across), max(1.3, 0.17 * len(months) + 0.8)
     return Picture(rows, (3.9 * across + 0.8, height * len(rows) + 0.4), share_x=True)
 
 

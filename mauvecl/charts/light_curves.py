@@ -21,6 +21,7 @@ from mauvecl.charts.matplotlib import (
     MAX_COLUMNS,
     contour_entries,
     draw_contours,
+    in_rows,
     picture_of,
     strokes_of,
     styled_picture,
@@ -54,8 +55,7 @@ def _stars(answer: InjectAnswer, panel: Callable[[Any], Panel], *notes: str, bel
     """Return a picture with a panel per star, the first ones if there are many."""
     stars, study = First(answer.stars, MOST_MAPS, "stars"), answer.study
     columns = min(len(stars), MAX_COLUMNS)
-    panels = [panel(star) for star in stars]
-    rows = [panels[k : k + columns] for k in range(0, len(panels), columns)]
+    rows = in_rows([panel(star) for star in stars], columns)
     title = f"Flares of {study.flare.light().describe()}, {study.search.rate_text}; nominal throughput"
     return Picture(rows, (3.6 * columns + 0.8, 3.2 * len(rows)), title, (stars.note, *notes), below)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache, wraps
 from itertools import cycle
 from pathlib import Path
@@ -150,6 +150,11 @@ def written(value: float) -> str:
         return f"{value:g}".replace("-", MINUS)
     digits = f"{float(digits):g}"
     return rf"$10^{{{int(power)}}}$" if digits == "1" else rf"${digits}\times10^{{{int(power)}}}$"
+
+
+def in_rows(panels: Sequence[Panel], columns: int) -> list[Sequence[Panel]]:
+    """Return panels in rows of so many columns."""
+    return [panels[k : k + columns] for k in range(0, len(panels), columns)]
 
 
 def strokes_of(levels: Iterable[float]) -> dict[float, str]:
