@@ -177,15 +177,6 @@ def test_exposure_inverts_snr(per: str, frames: int, wavelength: float) -> None:
     assert more.frames == frames + 1
 
 
-def test_engine_finds_the_wanted_snr(engine: Engine) -> None:
-    """Compare the mean S/N of realisations at the answer within 5 standard errors and 1 % for the curved root."""
-    (found,) = exposure_for(sunlike(), 20.0, 300.0).exposures
-    quiet = expectations(sunlike(exposure_s=found.exposure_s))[0]
-    table = engine.snr(quiet, realisations=20_000, seed=4).element
-    row = table[int(np.argmin(np.abs(table["wavelength"].value - 300.0)))]
-    assert row["mean"] == pytest.approx(found.snr, abs=5 * row["std"] / np.sqrt(20_000) + 0.01 * found.snr)
-
-
 def test_saturated_pixels_of_an_exposure_are_marked() -> None:
     blinding = exposure_for(sunlike(-2.0), 10.0, 450.0)
     assert blinding.exposures[0].saturated

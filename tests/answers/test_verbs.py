@@ -1,6 +1,5 @@
 """Verbs: one name and signature in Python and on the command line, and one definition of a table's columns."""
 
-import inspect
 import io
 import json
 import re
@@ -24,18 +23,6 @@ SLOW = {
     "inject": ["stare.duration_s=3000", "injections.sizes=3", "injections.widths=2", "injections.count=20",
                "injections.positions=2", "search.nulls=0", "injections.fitted=0"],
 }  # fmt: skip
-
-
-@pytest.mark.parametrize("name", VERBS)
-def test_each_verb_has_one_name_and_one_signature(name: str) -> None:
-    verb = getattr(mauvecl, name)
-    assert verb.__name__ == name
-    assert name in mauvecl.__all__
-    study, engine, progress, *own, keywords = inspect.signature(verb).parameters.values()
-    assert [one.name for one in (study, engine, progress)] == ["study", "engine", "progress"]
-    assert (study.default, engine.default, progress.default) == (None, None, None)
-    assert keywords.kind is keywords.VAR_KEYWORD
-    assert all(one.kind is one.KEYWORD_ONLY and one.default is not one.empty for one in own)
 
 
 def test_command_line_has_every_verb_in_order(tmp_path: Path) -> None:

@@ -53,13 +53,6 @@ def test_calendar_near_the_epoch_has_windows() -> None:
     assert answer.messages == answer.messages[-1:]  # nothing of the orbit: its elements are a week old
 
 
-def test_pictures_are_drawn(found: Any, study: Study) -> None:
-    figure = found.plot()
-    assert len(figure.axes) >= 4
-    many = study.with_settings([f"orbit.targets=[{', '.join(repr(f'{10 * i} 0') for i in range(8))}]", "orbit.days=5"])
-    assert len(visible(many).plot().axes) == 2
-
-
 def test_toml_dates_are_read() -> None:
     starts = {"2027-01-01": "01T00", "2027-01-01T06:00:00": "01T06", "2027-01-01T06:00:00+02:00": "01T04"}
     for text, found in starts.items():

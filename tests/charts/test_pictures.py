@@ -49,7 +49,8 @@ CASES: dict[str, tuple[Any, tuple[str, ...], bool]] = {
     "snr": (snr, FEW, False),
     "snr, swept": (snr, (*FEW, ONE, SWEEP), False),
     "exposure": (mauvecl.exposure, ("signal.snr=10", "signal.wavelength_nm=300"), True),
-    "visible": (mauvecl.visible, ('orbit.targets=["eps Eri"]', "orbit.days=31", "orbit.step_s=600"), False),
+    "visible": (mauvecl.visible, ('orbit.targets=["eps Eri", "AU Mic"]', "orbit.days=31", "orbit.step_s=600"), False),
+    "visible, many": (mauvecl.visible, (f"orbit.targets={[f'{10 * k} 0' for k in range(8)]}", "orbit.days=5"), False),
     "simulate": (mauvecl.simulate, (), False),
 }
 
@@ -73,7 +74,7 @@ def shown_ticks(axis: Any) -> list[Text]:
 
 
 #: What `make test` looks at.
-SHORT = ("detect, one statistic", "limit of exposure", "map", "snr", "exposure")
+SHORT = ("detect, one statistic", "limit of exposure", "map", "snr", "exposure", "visible, many")
 
 
 @pytest.mark.long
