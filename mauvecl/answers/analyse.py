@@ -130,10 +130,6 @@ class EventRow:
         """Return the time of a searched frame, in days."""
         return float(self.analysis.survey.time_s[frame]) / DAY_S
 
-    def cadence(self, frame: int) -> int:
-        """Return the number of a searched frame on the grid of the cadence."""
-        return int(self.analysis.frames.numbers[self.analysis.level.used][frame])
-
     @property
     def date(self) -> str:
         """Date of the brightest frame."""
@@ -203,10 +199,8 @@ class EventRow:
     @cached_property
     def colour(self) -> tuple[float, float, float]:
         """Blue over red rise with its error, and the p-value of an event without colour; NaN in a light curve."""
-        colour = self.analysis.colour(self.event)
-        if colour is None:
-            return (float("nan"),) * 3
-        return colour.blue_over_red, colour.blue_over_red_error, colour.p_value
+        seen = self.analysis.colour(self.event)
+        return (np.nan,) * 3 if seen is None else (seen.blue_over_red, seen.blue_over_red_error, seen.p_value)
 
     @property
     def note(self) -> str:
@@ -214,8 +208,7 @@ class EventRow:
         event = self.event
         reasons = {"step": "a step of the level fits better than a flare",
                    "dip": "its frames lack the light of a flare: the star becomes fainter in them"}  # fmt: skip
-        notes = [reasons[event.kind]] if event.kind in reasons else []
-        notes += [self.spectrum.reason] if self.spectrum is not None and self.spectrum.reason else []
+        notes = [reasons.get(event.kind, ""), self.spectrum.reason if self.spectrum is not None else ""]
         if event.is_limit:
             notes.append("a gap or an end of the frames cuts it: the summed ED is a lower limit")
         elif event.cut:
@@ -231,7 +224,7 @@ class EventRow:
             notes.append(f"no frame shows its peak{looks}")
         elif event.kind == "flare" and event.gap_at_peak:
             notes.append("frames next to its brightest one are missing: they may have held its peak")
-        return "; ".join(notes)
+        return "; ".join(filter(None, notes))
 
 
 #: Columns of the table of events; names as in AltaiPony's flare tables where it has the quantity.
@@ -243,9 +236,10 @@ EVENTS = (
     Column("tstop", lambda row: row.time_d(row.event.last), "d", "middle of the last frame"),
     Column("istart", lambda row: row.event.first, "", "first frame, counted among the searched frames", kind=int),
     Column("istop", lambda row: row.event.last, "", "last frame, inclusive", kind=int),
-    Column("cstart", lambda row: row.cadence(row.event.first), "", "first frame, counted on the grid of the cadence "
-           "with gaps", kind=int),
-    Column("cstop", lambda row: row.cadence(row.event.last), "", "last frame, likewise", kind=int),
+    Column("cstart", lambda row: row.analysis.frames.numbers[row.analysis.level.used][row.event.first], "",
+           "first frame, counted on the grid of the cadence with gaps", kind=int),
+    Column("cstop", lambda row: row.analysis.frames.numbers[row.analysis.level.used][row.event.last], "",
+           "last frame, likewise", kind=int),
     Column("total_n_valid_data_points", lambda row: row.analysis.survey.stare.n_frames, "", "searched frames",
            kind=int),
     Column("dur", lambda row: row.time_d(row.event.last) - row.time_d(row.event.first) + row.analysis.frames.cadence_s

@@ -223,9 +223,8 @@ class Answer(Drawable, ContentEquality):
     @cached_property
     def neighbours(self) -> QTable | None:
         """Neighbours of the stars that the answer observes, or None."""
-        if not self.study.has_neighbours or "instrument" not in self.uses:
-            return None
-        rows = [row for case in self.observed for row in _neighbour_rows(case)]
+        observed = self.observed if self.study.has_neighbours and "instrument" in self.uses else ()
+        rows = [row for case in observed for row in _neighbour_rows(case)]
         shares = sorted({row["assumed_share"] for row in rows})
         about = {"assumed_share": shares[0] if len(shares) == 1 else shares, "study": self.study.text()}
         return table_of(NEIGHBOUR_COLUMNS, rows, **about) if rows else None
@@ -525,18 +524,17 @@ def _neighbour_rows(case: Case) -> Iterator[dict[str, Any]]:
     x, near = case.quiet, case.neighbours
     if near is None:
         return
+    total = float((x.source_electrons + x.neighbour_electrons).sum())
     for star in near.stars:
-        enters, share = star.separation_arcsec <= case.instrument.field_of_view_radius_arcsec, 0.0
-        if enters:
-            rate = rate_of(star, case.instrument, case.study.observation.order)
-            own = near.share * float(rate.sum()) * x.frame_s
-            share = own / float((x.source_electrons + x.neighbour_electrons).sum())
         # Beyond the fibre no spectrum is needed.
-        spectrum, magnitude = star.spectrum[0] if enters else "", star.magnitude
+        enters, share, spectrum = star.separation_arcsec <= case.instrument.field_of_view_radius_arcsec, 0.0, ""
+        if enters:
+            rate, spectrum = rate_of(star, case.instrument, case.study.observation.order), star.spectrum[0]
+            share = near.share * float(rate.sum()) * x.frame_s / total
         yield {
             "star": case.label, "name": star.name, "separation": star.separation_arcsec, "band": star.band,
-            "magnitude": float("nan") if magnitude is None else magnitude, "spectrum": spectrum, "enters": enters,
-            "share": share, "assumed_share": case.star.neighbour_share,
+            "magnitude": float("nan") if star.magnitude is None else star.magnitude, "spectrum": spectrum,
+            "enters": enters, "share": share, "assumed_share": case.star.neighbour_share,
         }  # fmt: skip
 
 

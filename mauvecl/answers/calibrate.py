@@ -335,8 +335,11 @@ class CalibrateAnswer(Answer):
         nm = self.throughput.wavelength_nm
         knots = np.unique(np.concatenate([nm[:1], np.arange(np.ceil(nm[0]), nm[-1], KNOT_NM), nm[-1:]]))
         at = np.searchsorted(nm, knots).clip(0, nm.size - 1)
+        # The light of these pixels in each of some bands.
+        band = at * MODE_BANDS // nm.size
+        light = np.asarray(self.fitted_throughput[at] * (band == np.arange(MODE_BANDS)[:, None]))
         errors = ThroughputErrors.of_covariance(
-            knots, self._covariance(at), f"C: {self.source}", names=tuple(CALIBRATED), sums=self._light(at)
+            knots, self._covariance(at), f"C: {self.source}", names=tuple(CALIBRATED), sums=light
         )
         origin, step_nm = {"tag": "C", "source": self.source}, {"wavelength": knots * u.nm}
         modes = {f"{MODE}{k}": mode for k, mode in enumerate(errors.modes, 1)}
@@ -376,11 +379,6 @@ class CalibrateAnswer(Answer):
         if np.ptp(bias) > 0:
             columns["bias_dn"] = of_all(bias, float(bias.mean())) * u.DN
         return columns
-
-    def _light(self, at: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the light of some pixels in each of `MODE_BANDS` bands, shape (MODE_BANDS, n)."""
-        band = at * MODE_BANDS // self.throughput.wavelength_nm.size
-        return np.asarray(self.fitted_throughput[at] * (band == np.arange(MODE_BANDS)[:, None]))
 
     def _covariance(self, at: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the covariance of log throughput at some pixels and of the logarithms of the values in `CALIBRATED`.

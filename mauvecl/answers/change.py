@@ -86,11 +86,6 @@ class IndexRow(InCell):
         """Why the index has no value; empty if it has one."""
         return _lost_pixels(*self.saturated)
 
-    @property
-    def snr(self) -> float:
-        """Index over its error; negative in absorption."""
-        return self.value.value / self.error_known
-
 
 @dataclass(frozen=True, eq=False)
 class PeriodRow(InCell):
@@ -141,7 +136,8 @@ INDEX_COLUMNS = (
     Column("error", "error", "erg / (s cm2)", "standard deviation in one exposure with unknowns of finite spread; inf: "
            "a free unknown changes it", "error", lambda value: "free" if np.isinf(value) else number(".2g")(value)),
     Column("error_known", "error_known", "erg / (s cm2)", "the same with everything known", "ideal", number(".2g")),
-    Column("snr", "snr", "", "index over its error with everything known", "ideal S/N", number(".3g"), detail=True),
+    Column("snr", lambda row: row.value.value / row.error_known, "", "index over its error with everything known; "
+           "negative in absorption", "ideal S/N", number(".3g"), detail=True),
     Column("equivalent_width", "value.equivalent_width_nm", "nm", "positive in emission", "EW (nm)", number(".3g")),
     Column("captured", "value.captured", "", "share of a line's flux that the index holds at this resolution",
            "captured", percent(".0f"), detail=True),

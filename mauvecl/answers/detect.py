@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
@@ -192,25 +193,22 @@ class DetectAnswer(Answer):
     def _curves(self) -> Iterator[dict[str, Any]]:
         n_points = min(ROC_ROWS, self._row_limit(1))
         for star in self.stars:
-            for statistic in star.detection.statistics:
-                for flare, amplitude in enumerate(star.amplitudes):
-                    roc = star.detection.roc(statistic, flare)
-                    place = {"statistic": statistic, "amplitude": amplitude, "roc": roc}
-                    yield vars(star) | place | roc.points(n_points)
+            for statistic, (flare, amplitude) in product(star.detection.statistics, enumerate(star.amplitudes)):
+                roc = star.detection.roc(statistic, flare)
+                yield vars(star) | {"statistic": statistic, "amplitude": amplitude, "roc": roc} | roc.points(n_points)
 
     @property
     def _extremes(self) -> Iterator[dict[str, Any]]:
         n_values = self._row_limit(2)
         for star in self.stars:
             detection = star.detection
-            for statistic in detection.statistics:
-                for flare, template in enumerate(star.amplitudes):
-                    samples = [(template, detection.tail_samples(statistic, flare))]
-                    if detection.statistic(statistic).shaped or flare == 0:
-                        samples.append((0.0, detection.tail_samples(statistic, template=flare)))
-                    for amplitude, tail in samples:
-                        place = {"statistic": statistic, "amplitude": amplitude, "template": template}
-                        yield vars(star) | place | {"tail": tail[:n_values]}
+            for statistic, (flare, template) in product(detection.statistics, enumerate(star.amplitudes)):
+                samples = [(template, detection.tail_samples(statistic, flare))]
+                if detection.statistic(statistic).shaped or flare == 0:
+                    samples.append((0.0, detection.tail_samples(statistic, template=flare)))
+                for amplitude, tail in samples:
+                    yield vars(star) | {"statistic": statistic, "amplitude": amplitude, "template": template,
+                                        "tail": tail[:n_values]}  # fmt: skip
 
     def _row_limit(self, n_tables: int) -> int:
         """Return the number of rows of each curve or distribution, of which flares and statistics have `n_tables`."""
@@ -456,9 +454,9 @@ class UnknownAnswer(Answer):
     def _rows(self) -> Iterator[dict[str, Any]]:
         for (star, amplitude), costs in self.costs.items():
             for unknown, cost in costs.items():
-                flare = {"star": star, "amplitude": amplitude, "unknown": unknown}
                 detected = float(power(cost.marginal, self.study.run.fap))
-                yield vars(cost) | flare | {"detected": detected, "smallest": self.smallest(star, unknown)}
+                yield vars(cost) | {"star": star, "amplitude": amplitude, "unknown": unknown, "detected": detected,
+                                    "smallest": self.smallest(star, unknown)}  # fmt: skip
 
     @property
     def messages(self) -> list[str]:

@@ -219,27 +219,21 @@ class VisibleAnswer(Answer):
     def _row(self, k: int) -> dict[str, Any]:
         """Return the row of a target, by the names of columns."""
         seen, windows, target = self.visibility, self.windows[k], self.targets[k]
-        hours, away = self.by_month[1][:, k], self.elongation_deg(k)
-        light = self.zodiacal[k][np.isfinite(self.zodiacal[k])]
+        hours, away, sky = self.by_month[1][:, k], self.elongation_deg(k), self.zodiacal[k]
+        # The least and the largest value of no values is none.
+        sky = sky[np.isfinite(sky)] if np.isfinite(sky).any() else sky[:1]
         length, end_s = windows.length_s, self.times.n * self.times.step_s
+        gaps_s = np.append(windows.start_s, end_s) - np.append(0.0, windows.stop_s)
         return {
-            "target": target.name,
-            "ra": target.ra_deg,
-            "dec": target.dec_deg,
-            "hours": seen.hours[k],
-            "share": seen.share[k],
-            **{f"leaves_{name}": shares[k] for name, shares in seen.kept_by.items()},
-            "windows": length.size,
-            "median_window": float(np.median(length / 60)) if length.size else 0.0,
-            "longest_gap": float(np.max(np.append(windows.start_s, end_s) - np.append(0.0, windows.stop_s))) / DAY_S,
-            "per_orbit": float(np.mean(seen.by_orbit(k))),
+            "target": target.name, "ra": target.ra_deg, "dec": target.dec_deg, "hours": seen.hours[k],
+            "share": seen.share[k], **{f"leaves_{name}": shares[k] for name, shares in seen.kept_by.items()},
+            "windows": length.size, "median_window": float(np.median(length / 60)) if length.size else 0.0,
+            "longest_gap": float(np.max(gaps_s)) / DAY_S, "per_orbit": float(np.mean(seen.by_orbit(k))),
             "in_shadow": float(windows.in_shadow_s.sum() / length.sum()) if length.size else 0.0,
             "best_month": self.by_month[0][int(np.argmax(hours))] if hours.any() else "",
-            "least_elongation": float(away.min()),
-            "most_elongation": float(away.max()),
-            "brightest_sky": float(light.min()) if light.size else np.nan,
-            "faintest_sky": float(light.max()) if light.size else np.nan,
-        }
+            "least_elongation": float(away.min()), "most_elongation": float(away.max()),
+            "brightest_sky": float(sky.min()), "faintest_sky": float(sky.max()),
+        }  # fmt: skip
 
     @property
     def views(self) -> list[View]:

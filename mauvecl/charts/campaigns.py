@@ -316,10 +316,9 @@ def _panels(answer: PlanAnswer, k: int, figure: Any) -> Any:
     firsts = [i for i, day in enumerate(seen.days) if day.endswith("-01")]
     step = max(1, len(firsts) // 12)
     top.set_xticks(firsts[::step], [seen.days[i][:7] for i in firsts[::step]], fontsize=7, rotation=30)
-    sun = top.twinx()
+    sun = _right_axis(top)
     sun.plot(days, seen.elongation_deg(k), color=COLOURS[4])
     sun.set(ylabel="angle from the Sun (deg)", ylim=(0, 180))
-    _colour_right(sun)
     top.set_title("when it is seen")
     if target.completeness is None:
         bottom.set_visible(False)
@@ -336,20 +335,21 @@ def _panels(answer: PlanAnswer, k: int, figure: Any) -> Any:
             bottom.axvline(target.energy_at(share), color=NULL, linestyle=dash, linewidth=0.8)
     bottom.set_title("flares recovered (E50 dashed, E90 dotted), and how often they are")
     if target.rates is not None:
-        often = bottom.twinx()
+        often = _right_axis(bottom)
         rate = target.rates.per_day_above(energy[shown]) * target.hours / 24
         used = rate > 0
         often.plot(energy[shown][used], rate[used], color=COLOURS[4])
         often.set(yscale="log", ylabel=f"flares above this energy in {target.hours:.0f} h")
-        _colour_right(often)
         _plain_decades(often.yaxis)
     return figure
 
 
-def _colour_right(axes: Any) -> None:
-    """Show the axis on the right, with its label in the colour of its curve."""
-    axes.spines["right"].set_visible(True)
-    axes.yaxis.label.set_color(COLOURS[4])
+def _right_axis(axes: Any) -> Any:
+    """Return axes with a visible y axis on the right, whose label has the colour of its curve."""
+    twin = axes.twinx()
+    twin.spines["right"].set_visible(True)
+    twin.yaxis.label.set_color(COLOURS[4])
+    return twin
 
 
 def _plain_decades(axis: Any) -> None:
