@@ -371,24 +371,18 @@ def _completeness(case: Case, engine: Stares | Pool, report: Callable[[float], N
 
     peaks = map_in_order(engine, at_one_peak, range(positions))
     parts = list(reported(peaks, positions, lambda done, total: report(done / total)))
+    known = 0.0
+    if any(case.stare.jitters.values()):
+        (flare,) = case.one_frame.expect(case.one_frame.flaring(SMALL))
+        known = frame_signal(survey.components.quiet, flare, SMALL)
     critical = sizes.of_amplitude(np.stack([part["critical"].T for part in parts], axis=1), widths[:, None, None])
     return StarCompleteness(
         case.label, case.at, survey, sizes, **found, saturates=injections.saturates,
         in_a_row=consecutive_alarm_rate(choice.points, choice.sigma, survey.stare.frame_s),
         injected=InjectedCompleteness(injections.half_widths_s, values, amplitudes, critical),
         fitted=fit_accuracy(parts) if refit.count else None,
-        ideal_share=_ideal_share(case, survey),
+        ideal_share=survey.unit_snr / known if known > 0 else float("nan"),
     )  # fmt: skip
-
-
-def _ideal_share(case: Case, survey: Survey) -> float:
-    """Return the S/N of a frame over that with everything but the noise known, or NaN if it is known."""
-    if not any(case.stare.jitters.values()):
-        return float("nan")
-    frame = case.one_frame
-    (flare,) = frame.expect(frame.flaring(SMALL))
-    known = frame_signal(survey.components.quiet, flare, SMALL)
-    return survey.unit_snr / known if known > 0 else float("nan")
 
 
 def _false_alarms(case: Case, survey: Survey, engine: Stares | Pool) -> dict[str, Any]:

@@ -257,10 +257,14 @@ def observe(
     if text.spectral_type is not None:
         target = replace(target, spectral_type=text.spectral_type)
     conditions = None if along is None else along.of(seen.visibility, k, study.orbit.orbit().elements.period_s)
-    lengths = seen.windows[k].length_s
-    window, sky = float(np.median(lengths)) if lengths.size else 0.0, sky_behind(seen, k)
+    lengths, zodiacal, sky = seen.windows[k].length_s, seen.zodiacal[k], None
+    window = float(np.median(lengths)) if lengths.size else 0.0
+    known = np.isfinite(zodiacal)
     changes: dict[str, Any] = {"star": (star,)}
-    if sky is not None:
+    if known.any():
+        # The median over the days on which the target is visible, or over all.
+        used = known & (seen.visibility.by_day(k) > 0)
+        sky = float(np.median(zodiacal[used if used.any() else known]))
         changes["sky"] = SkyLight(surface_brightness=sky)
     if conditions is not None:
         changes["processes"] = study.processes.with_particles(conditions.hits_per_cm2_s)
@@ -268,13 +272,6 @@ def observe(
             at = {"temperature_c": conditions.temperature_c}
             changes["observation"] = study.observation.model_copy(update=at)
     return TargetObservation(target, case.with_sections(**changes).one_frame, window, sky, conditions)
-
-
-def sky_behind(seen: VisibleAnswer, k: int) -> float | None:
-    """Return the median sky brightness, V mag arcsec^-2, over the days on which a target is visible, or over all."""
-    known = np.isfinite(seen.zodiacal[k])
-    used = known & (seen.visibility.by_day(k) > 0)
-    return float(np.median(seen.zodiacal[k][used if used.any() else known])) if known.any() else None
 
 
 #: Orbits of a stare; the baseline window of a search spans several of them.

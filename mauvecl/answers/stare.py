@@ -299,12 +299,6 @@ def band_suffix(name: str, number: int) -> str:
     return "" if number == 0 else "_" + name.removesuffix(" nm").replace("-", "_")
 
 
-def _stare_columns(answer: StareAnswer) -> tuple[Column, ...]:
-    searched = SEARCHED_COLUMNS if answer.study.stare.search else ()
-    drifting = () if answer.study.stare.pointing is None else (POINTING_COLUMN,)
-    return (*COLUMNS, *searched, SATURATED_COLUMN, *drifting)
-
-
 #: Metadata of the tables.
 SEED = ("study", "study.run.seed")
 
@@ -320,8 +314,10 @@ class StareAnswer(Answer):
     messages: list[str] = field(default_factory=list)
 
     #: One row per star and cell: frames, gaps, light and noise of a frame, flares.
-    table = TableOf("stare", _stare_columns, "stares", place=True, title="One stare each", key="stares",
-                    about=SEED)  # fmt: skip
+    table = TableOf("stare", lambda answer: (
+        *COLUMNS, *(SEARCHED_COLUMNS if answer.study.stare.search else ()), SATURATED_COLUMN,
+        *(() if answer.study.stare.pointing is None else (POINTING_COLUMN,)),
+    ), "stares", place=True, title="One stare each", key="stares", about=SEED)  # fmt: skip
     #: One row per flare: peak, half-width, amplitude, temperature, energies, and the S/N of its matched filter.
     events = TableOf(
         "events", EVENT_COLUMNS, lambda answer: chain.from_iterable(stare.flares for stare in answer.stares),

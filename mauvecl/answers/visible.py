@@ -155,11 +155,9 @@ class VisibleAnswer(Answer):
         about=lambda answer: {"start": answer.times.iso(0.0), **metadata_of(answer, "times.days", "study")},
     )  # fmt: skip
     #: One row per month, one column of hours per target.
-    months = TableOf(
-        "months",
-        lambda answer: (Column("month"), *(Column(target.name, unit="h") for target in answer.targets)),
-        "_hours_by_month",
-    )
+    months = TableOf("months", lambda answer: (Column("month", itemgetter(0)), *(
+        Column(target.name, lambda months, k=k: months[1][:, k], "h") for k, target in enumerate(answer.targets)
+    )), lambda answer: [answer.by_month])  # fmt: skip
     #: One row per target and day.
     by_day = TableOf("days", DAY_COLUMNS, "_day_rows")
     #: One row per window.
@@ -244,11 +242,6 @@ class VisibleAnswer(Answer):
         rows = [{"target": target.name} | dict(zip(names, own, strict=True))
                 for target, own in zip(self.targets, hours.T, strict=True)]  # fmt: skip
         return [*super().views, View("Hours of exposure by month", columns, table_of(columns, rows))]
-
-    @property
-    def _hours_by_month(self) -> dict[str, Any]:
-        names, hours = self.by_month
-        return {"month": names} | {target.name: own for target, own in zip(self.targets, hours.T, strict=True)}
 
     @property
     def _day_rows(self) -> Iterator[dict[str, Any]]:

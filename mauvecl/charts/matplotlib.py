@@ -117,10 +117,14 @@ def _own_part(ax: Any) -> Any:
 
 def _legend_below(figure: Any, handles: dict[str, Any]) -> None:
     """Add a legend below all panels, in as few rows as fit, which have about equally many entries."""
+    from matplotlib.backends.backend_agg import RendererAgg
+
+    size = figure.bbox
+    renderer = RendererAgg(size.width, size.height, figure.dpi)  # type: ignore[no-untyped-call]
     for rows in range(1, len(handles) + 1):
         columns = -(-len(handles) // rows)
         legend = figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)
-        if columns == 1 or legend.get_window_extent(_renderer(figure)).width <= INSIDE * figure.bbox.width:
+        if columns == 1 or legend.get_window_extent(renderer).width <= INSIDE * size.width:
             return
         legend.remove()
 
@@ -178,14 +182,6 @@ def in_figure(unit: str) -> str:
     from astropy.units import Unit
 
     return str(Unit(unit).to_string("latex_inline"))
-
-
-def _renderer(figure: Any) -> Any:
-    """Return the renderer that measures text."""
-    from matplotlib.backends.backend_agg import RendererAgg
-
-    size = figure.bbox
-    return RendererAgg(size.width, size.height, figure.dpi)  # type: ignore[no-untyped-call]
 
 
 def styled_picture(draw: Callable[P, Any]) -> Callable[..., Any]:
