@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import product
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
@@ -87,10 +88,10 @@ def _detection_columns(answer: DetectAnswer) -> tuple[Column, ...]:
         lambda star: np.repeat(star.amplitudes, len(star.detection.statistics)),
         f"relative rise of the photons in the band {answer.study.flare.band}",
     )
-    columns = [*share_columns(answer.study, "detection.quiet.target_share"), amplitude]
-    for column in COLUMNS[1:]:
-        columns += [column, IDEAL] if column.name == "high" and not answer.study.nuisances.none else [column]
-    return tuple(columns)
+    place = [column.name for column in COLUMNS].index("high") + 1
+    ideal = () if answer.study.nuisances.none else (IDEAL,)
+    share = share_columns(answer.study, "detection.quiet.target_share")
+    return (*share, amplitude, *COLUMNS[1:place], *ideal, *COLUMNS[place:])
 
 
 def _rows_of(star: StarDetection, fap: float) -> QTable:
@@ -293,11 +294,11 @@ def _messages(answer: DetectAnswer, prepared: Sequence[Case]) -> list[str]:
 def _cost_of_unknowns(prepared: Sequence[Case]) -> list[str]:
     """Return the sentence on the S/N that the faintest flare loses to unknowns."""
     choice, comparison = prepared[0].study.nuisances, prepared[0].study.run.comparison()
-    costs = [
-        unknown_cost(f"{case.label}, flare of {100 * amplitude:g} %", case.quiet, flare, choice, comparison)
-        for case in prepared
-        for amplitude, flare in zip(case.amplitudes, case.flares, strict=True)
-    ]
+    costs = list[Cost]()
+    for case in prepared:
+        for amplitude, flare in zip(case.amplitudes, case.flares, strict=True):
+            name = f"{case.label}, flare of {100 * amplitude:g} %"
+            costs.append(unknown_cost(name, case.quiet, flare, choice, comparison))
     return cost_lines(costs, choice)
 
 
@@ -427,6 +428,7 @@ class UnknownAnswer(Answer):
     study: Study
     costs: dict[tuple[str, float], dict[str, Cost]]  # by (star, amplitude), then by unknown
     inputs: list[Expectation]  # the stars without a flare
+    messages: list[str]
 
     #: One row per star, flare and unknown.
     table = TableOf(
@@ -458,23 +460,17 @@ class UnknownAnswer(Answer):
                 yield vars(cost) | {"star": star, "amplitude": amplitude, "unknown": unknown, "detected": detected,
                                     "smallest": self.smallest(star, unknown)}  # fmt: skip
 
-    @property
-    def messages(self) -> list[str]:
-        return collect_messages(self.inputs)
-
 
 def unknown_table(study: Study) -> UnknownAnswer:
     """Compute the S/N of a study's flares under each of the unknowns of `SHOWN`."""
     prepared, comparison = cases(study, swept=False), study.run.comparison()
-    costs = {
-        (case.label, amplitude): {
-            unknown: unknown_cost(case.label, case.quiet, flare, choice, comparison)
-            for unknown, choice in SHOWN.items()
-        }
-        for case in prepared
-        for amplitude, flare in zip(case.amplitudes, case.flares, strict=True)
-    }
-    return UnknownAnswer(study, costs, [case.quiet for case in prepared])
+    costs = dict[tuple[str, float], dict[str, Cost]]()
+    for case in prepared:
+        for amplitude, flare in zip(case.amplitudes, case.flares, strict=True):
+            of = partial(unknown_cost, case.label, case.quiet, flare, comparison=comparison)
+            costs[case.label, amplitude] = {unknown: of(nuisances=choice) for unknown, choice in SHOWN.items()}
+    quiet = [case.quiet for case in prepared]
+    return UnknownAnswer(study, costs, quiet, collect_messages(quiet))
 
 
 def power(snr: float | NDArray[np.float64], fap: float) -> NDArray[np.float64]:

@@ -321,20 +321,25 @@ def plan(
     _refuse(study, closed=closed)
     if completeness is None:
         completeness = closed_form if closed else partial(inject_target, engine=engine or Stares())
-    stars = _stars_of(study)
+    stars: list[Star] = []
+    errors: list[InputError] = []
+    for text in study.plan.targets:
+        try:
+            stars.append(star_of(text, study.orbit.simbad))
+        except InputError as error:
+            errors.append(error)
+    if errors:
+        # One error names all targets without a star.
+        raise together(errors)
     if progress is not None:
         progress(0, len(stars))
-    seen = visible(study)
+    seen, base = visible(study), Case(study)
     along = OrbitConditions.along(seen.visibility.track) if study.plan.along_orbit else None
-    base = Case(study)
-
-    def observations() -> Iterator[tuple[int, TargetObservation]]:
-        for k, (text, star) in enumerate(zip(study.plan.targets, stars, strict=True)):
-            yield k, observe(base, text, star, seen, k, along)
-
+    named = enumerate(zip(study.plan.targets, stars, strict=True))
+    observed = ((k, observe(base, text, star, seen, k, along)) for k, (text, star) in named)
     # With a pool, the noise of a target is drawn while the threshold of the next one is sampled.
     planned_for = partial(_planned, seen, completeness)
-    planned = tuple(reported(map_in_order(engine, planned_for, observations()), len(stars), progress))
+    planned = tuple(reported(map_in_order(engine, planned_for, observed), len(stars), progress))
     return PlanAnswer(study, seen, planned)
 
 
@@ -349,20 +354,6 @@ def _refuse(study: Study, *, closed: bool) -> None:
             f"processes.{name} needs plan.completeness = 'injections', since 'closed form' takes the stare for known",
             key=f"processes.{name}",
         )
-
-
-def _stars_of(study: Study) -> list[Star]:
-    """Return the library star of each target; the error names all targets without one."""
-    stars: list[Star] = []
-    errors: list[InputError] = []
-    for text in study.plan.targets:
-        try:
-            stars.append(star_of(text, study.orbit.simbad))
-        except InputError as error:
-            errors.append(error)
-    if errors:
-        raise together(errors)
-    return stars
 
 
 def _planned(seen: VisibleAnswer, completeness: CompletenessOf, item: tuple[int, TargetObservation]) -> Planned:
