@@ -427,8 +427,8 @@ class UnknownAnswer(Answer):
 
     study: Study
     costs: dict[tuple[str, float], dict[str, Cost]]  # by (star, amplitude), then by unknown
-    inputs: list[Expectation]  # the stars without a flare
     messages: list[str]
+    inputs: list[Expectation]  # the stars without a flare
 
     #: One row per star, flare and unknown.
     table = TableOf(
@@ -470,7 +470,7 @@ def unknown_table(study: Study) -> UnknownAnswer:
             of = partial(unknown_cost, case.label, case.quiet, flare, comparison=comparison)
             costs[case.label, amplitude] = {unknown: of(nuisances=choice) for unknown, choice in SHOWN.items()}
     quiet = [case.quiet for case in prepared]
-    return UnknownAnswer(study, costs, quiet, collect_messages(quiet))
+    return UnknownAnswer(study, costs, collect_messages(quiet), quiet)
 
 
 def power(snr: float | NDArray[np.float64], fap: float) -> NDArray[np.float64]:

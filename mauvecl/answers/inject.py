@@ -146,15 +146,15 @@ def limit_columns(of: str, *, known: bool) -> tuple[Column, ...]:
         detail = power != 0.5
         own = interval_columns(f"{name}_{{}}", "{}", unit, heading=INTERVAL, format=ends, detail=detail)
         columns += [column.of(itemgetter(name)) for column in (limit, *own)]
-    if not known:
-        text = "E50 if everything but the noise were known: E50 times the ratio of the S/N of a frame"
-        columns.append(Column("e50_ideal", lambda row: row["e50"].value * row["share"], unit, text, "ideal E50", size))
+    text = "E50 if everything but the noise were known: E50 times the ratio of the S/N of a frame"
+    ideal = Column("e50_ideal", lambda row: row["e50"].value * row["share"], unit, text, "ideal E50", size)
     return (
         Column("half_width", "", "s", "half-width of the injected flares; NaN for all of them alike", "half-width (s)",
                number(".4g", "all")),
         *columns,
         Column("never", "", "", "share of flares for which no template fits into what is observed", "no template fits",
                percent(".3g"), detail=True),
+        *(() if known else (ideal,)),
     )  # fmt: skip
 
 

@@ -62,8 +62,8 @@ class Truth:
         if kelvin is not None:
             # Flux of the blackbodies without recombination.
             body, at = continuum if two else Blackbody(kelvin), quiet.wavelength_nm
-            share = photons(at, body.flux(at), band) / photons(at, quiet.flux_flam, band)
-            self._values |= {"temperature": kelvin, "amplitude": self._scale * share}
+            hot = self._scale * photons(at, body.flux(at), band)
+            self._values |= {"temperature": kelvin, "amplitude": hot / photons(at, quiet.flux_flam, band)}
         if kelvin is not None and two is not None:
             # The first is the cooler one.
             (low, area), (high, hot_area) = sorted([(kelvin, 1.0), (two.second_temperature_k, two.second_area)])
