@@ -200,12 +200,13 @@ def _messages(case: Case, cells: Cells, values: Arrays) -> list[str]:
         messages.append(Message(f"NO ANSWER in {number} of {number_of_cells} cells: {why}.", "no answer"))
     how = "" if study.nuisances.none else "marginalised over unknowns, "
     lowered = Counter(statistic for statistic, *_ in cells.lowered)
-    for statistic in filter(lowered.get, run.statistics):
-        text = (
-            f"WRONG SIGN: {how}{statistic} falls with the flare in {lowered[statistic]} of {number_of_cells} cells, "
-            "and only higher values are alarms: its detection probability says nothing of the flare there."
-        )
-        messages.append(Message(text, "wrong sign"))
+    for statistic in run.statistics:
+        if lowered[statistic]:
+            text = (
+                f"WRONG SIGN: {how}{statistic} falls with the flare in {lowered[statistic]} of {number_of_cells} "
+                "cells, and only higher values are alarms: its detection probability says nothing of the flare there."
+            )
+            messages.append(Message(text, "wrong sign"))
     messages += worst_first([*collect_messages(cells.quiet, study.processes), *cells.saturated])
     return [*messages, *marginal_lines(study.nuisances), *_cost(case, cells.x, cells.y)]
 

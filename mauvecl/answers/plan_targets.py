@@ -257,7 +257,8 @@ def observe(
     if text.spectral_type is not None:
         target = replace(target, spectral_type=text.spectral_type)
     conditions = None if along is None else along.of(seen.visibility, k, study.orbit.orbit().elements.period_s)
-    lengths, zodiacal, sky = seen.windows[k].length_s, seen.zodiacal[k], None
+    lengths, zodiacal = seen.windows[k].length_s, seen.zodiacal[k]
+    sky: float | None = None
     window = float(np.median(lengths)) if lengths.size else 0.0
     known = np.isfinite(zodiacal)
     changes: dict[str, Any] = {"star": (star,)}

@@ -490,10 +490,10 @@ def _found_flare(case: Case, alarm: Alarm) -> FoundFlare:
     """Return an alarm with the energy of its flare and the number of the nearest flare of the stare."""
     if not alarm.measured:
         return FoundFlare(case.label, case.at, alarm, float("nan"), 0)
-    fit, flare = alarm.recovered, case.study.flare
-    kelvin = np.nan_to_num(fit.temperature_k[0], nan=flare.temperature_k)
-    values = (float(value) for value in (fit.peak_s[0], fit.half_width_s[0], fit.amplitude[0], kelvin))
-    event = Event(*values, case.study.search.shape)
+    fit = alarm.recovered
+    kelvin = float(np.nan_to_num(fit.temperature_k[0], nan=case.study.flare.temperature_k))
+    values = (float(fit.peak_s[0]), float(fit.half_width_s[0]), float(fit.amplitude[0]))
+    event = Event(*values, kelvin, case.study.search.shape)
     reach = 2 * case.stare_expectation.stare.frame_s
     away = {k: abs(other.peak_s - event.peak_s) for k, other in enumerate(case.events, 1)}
     nearest = min(away, key=lambda k: away[k], default=0)

@@ -55,13 +55,13 @@ def quantity_axis(study: Study, name: str, **how: Any) -> Axis:
 @picture_of("MapAnswer", "map")
 def detection_map(answer: MapAnswer) -> Picture:
     """Plot the detection probability over two quantities, one panel per statistic."""
-    question, study, places, axes = answer.study.map, answer.study, [], []
+    question, study, places, axes = answer.study.map, answer.study, list[Any](), list[Axis]()
     for sweep, values in zip(question.axes, (answer.x, answer.y), strict=True):
         named = isinstance(values[0], str)
         places.append(np.arange(len(values)) if named else np.array(values, float))
         ticks = (places[-1], values) if named else None
         axes.append(quantity_axis(study, sweep.quantity, log=sweep.log and not named, ticks=ticks))
-    x, y = places
+    (x, y), (x_axis, y_axis) = places, axes
     strokes = strokes_of(question.contours) if min(x.size, y.size) > 1 else {}
 
     def finish(axis: Any, probability: Any) -> None:
@@ -73,7 +73,7 @@ def detection_map(answer: MapAnswer) -> Picture:
     for statistic, p in zip(answer.statistics, answer.probability, strict=True):
         series = [Mesh("detection probability", at=(x, y, p)), *lines]
         title = statistic_label(statistic).partition(" (")[0]
-        row.append(Panel(*axes, series, title, partial(finish, probability=p)))
+        row.append(Panel(x_axis, y_axis, series, title, partial(finish, probability=p)))
     names = {axis.quantity for axis in question.axes}
     exposure = "" if "exposure" in names else f", {study.observation.exposure_s:g} s"
     flare = "" if "amplitude" in names else f", flare of {100 * study.flare.amplitudes[0]:g} %"

@@ -73,11 +73,13 @@ def interval_columns(
     In `name` and in the path `get`, {} stands for "low" and "high"; a function `get` returns both ends.
     """
     low, high = name.format("low"), name.format("high")
-    paths = [get.format(end) if isinstance(get, str) else lambda row, k=k: get(row)[k]
-             for k, end in enumerate(("low", "high"))]  # fmt: skip
+
+    def end(k: int) -> str | Callable[[Any], Any]:
+        return get.format(("low", "high")[k]) if isinstance(get, str) else lambda row: get(row)[k]
+
     others = (high,) if heading else ()
-    return (Column(low, paths[0], unit, f"lower end of {of}", heading, format, others, kind, detail),
-            Column(high, paths[1], unit, f"upper end of {of}", kind=kind))  # fmt: skip
+    return (Column(low, end(0), unit, f"lower end of {of}", heading, format, others, kind, detail),
+            Column(high, end(1), unit, f"upper end of {of}", kind=kind))  # fmt: skip
 
 
 @dataclass(frozen=True)
