@@ -215,13 +215,15 @@ def _most_wrong(ratios: Any) -> int:
 def _of_thresholds(tested: QTable, flares: QTable) -> dict[str, float | str]:
     """Return the largest errors of a star's false-alarm and detection probabilities."""
     off = tested[tested["differs"]]
-    wrong = off[_most_wrong(off["ratio"])] if len(off) else {"ratio": 1.0, "statistic": "", "why": ""}
+    wrong: Any = off[_most_wrong(off["ratio"])] if len(off) else {"ratio": 1.0, "statistic": "", "why": ""}
     missed = flares["probability"] - flares["closed_form_probability"]
     # The interval includes the error of the threshold.
     sure = np.abs(missed) > (flares["high"] - flares["low"]) * SURE / ERRORS_IN_INTERVAL
     missed = np.where(sure, missed, 0.0)
-    of_wrong = {"fap_ratio": float(wrong["ratio"]), "statistic": str(wrong["statistic"]), "why": str(wrong["why"])}
-    return of_wrong | {"probability_off_by": float(missed[np.argmax(np.abs(missed))])}
+    return {
+        "fap_ratio": float(wrong["ratio"]), "statistic": str(wrong["statistic"]), "why": str(wrong["why"]),
+        "probability_off_by": float(missed[np.argmax(np.abs(missed))]),
+    }  # fmt: skip
 
 
 @by_keywords("stars, each of which is drawn for its S/N and then for its flares")

@@ -371,9 +371,10 @@ def snr(study: Study, engine: Engine | Pool | None = None, progress: Progress = 
     study = study.ideal()
     prepared, run, asked = cases(study), study.run, study.signal.wavelength_nm
     quiet, engine = [case.quiet for case in prepared], engine or Engine()
-    # Invalid input raises an error before anything is drawn.
-    for x in quiet if asked is not None else ():
-        place_of(x, asked, "element")
+    if asked is not None:
+        # Invalid input raises an error before anything is drawn.
+        for x in quiet:
+            place_of(x, asked, "element")
 
     def answered(case: Case) -> StarSnr:
         result = engine.snr(case.quiet, realisations=run.realisations, seed=run.seed, **case.draw_options)

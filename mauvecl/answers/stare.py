@@ -299,6 +299,12 @@ def band_suffix(name: str, number: int) -> str:
     return "" if number == 0 else "_" + name.removesuffix(" nm").replace("-", "_")
 
 
+def _light_column(kind: str, band: str, number: int) -> Column:
+    attribute, text = LIGHT[kind]
+    name = kind + band_suffix(band, number)
+    return Column(name, lambda star: getattr(star.light, attribute)[:, number], "DN / s", f"{band}: {text}")
+
+
 #: Metadata of the tables.
 SEED = ("study", "study.run.seed")
 
@@ -363,10 +369,7 @@ class StareAnswer(Answer):
         """Return the frames of a star in a cell: time, cadence number, quality, and light in every band."""
         star = self.stares[number]
         columns = [*FRAME_COLUMNS, *(() if star.pointing_loss is None else (LOSS_COLUMN,))]
-        for (k, band), (kind, (attribute, text)) in product(enumerate(star.light.bands), LIGHT.items()):
-            values = getattr(star.light, attribute)[:, k]
-            name = kind + band_suffix(band, k)
-            columns.append(Column(name, lambda _, values=values: values, "DN / s", f"{band}: {text}"))
+        columns += [_light_column(kind, band, k) for k, band in enumerate(star.light.bands) for kind in LIGHT]
         return table_of(columns, [star], star=star.label, **metadata_of(self, *SEED), **star.at)
 
     @property

@@ -155,9 +155,10 @@ class VisibleAnswer(Answer):
         about=lambda answer: {"start": answer.times.iso(0.0), **metadata_of(answer, "times.days", "study")},
     )  # fmt: skip
     #: One row per month, one column of hours per target.
-    months = TableOf("months", lambda answer: (Column("month", itemgetter(0)), *(
-        Column(target.name, lambda months, k=k: months[1][:, k], "h") for k, target in enumerate(answer.targets)
-    )), lambda answer: [answer.by_month])  # fmt: skip
+    months = TableOf("months", lambda answer: (
+        Column("month", itemgetter(0)),
+        *(Column(target.name, itemgetter(k), "h") for k, target in enumerate(answer.targets, 1)),
+    ), lambda answer: [(answer.by_month[0], *answer.by_month[1].T)])  # fmt: skip
     #: One row per target and day.
     by_day = TableOf("days", DAY_COLUMNS, "_day_rows")
     #: One row per window.

@@ -367,9 +367,7 @@ def analysis_parts(answer: AnalyseAnswer) -> list[Part]:
     parts = [Part(title, [f"Analysed by mauvecl {VERSION}. {answer.assumed}", *answer.messages])]
     parts += [Part(view.title, (), *without_empty(*view.texts())) for view in answer.all_views]
     parts.append(Part(lines=answer.remarks, note="Every number is a row of the tables next to this report."))
-    for name, draw in pictures_of(answer).items():
-        parts.append(Part(picture=lambda _, draw=draw: draw(), seen=name))
-    return parts
+    return parts + [Part(picture=draw, seen=name) for name, draw in pictures_of(answer).items()]
 
 
 @document_of("AnalyseAnswer", "analyse.html", when=lambda answer: answer.study.data.report == "html")
