@@ -347,7 +347,7 @@ class CalibrateAnswer(Answer):
         return {
             "throughput-factor": QTable(step_nm | {"factor": self._factor(knots)}, meta=origin),
             "throughput-errors": QTable(step_nm | modes, meta=origin | {"values": values}),
-            "pixel-map": QTable(self._pixel_map, meta=origin),
+            "pixel-map": QTable(self._pixel_map, meta=origin, descriptions={"dark": "factor on the dark current"}),
         }
 
     def _factor(self, knots_nm: NDArray[np.float64]) -> NDArray[np.float64]:
