@@ -155,6 +155,8 @@ def test_study_file_with_curves_shapes_and_events_is_read(tmp_path, stares):
     assert second.event.peak == pytest.approx(0.1)
     assert staring.unknowns[0].name == "light drift"
 
+
+def test_unknowns_of_a_stare_are_drawn_if_requested(stares, found):
     usual = stare(SHORT.with_settings(["nuisances.usual=true", "stare.offsets.sky=0.05"]), stares).stares[0]
     assert not found.stares[0].staring.stare.unknowns
     assert usual.staring.stare.light_jitter == pytest.approx(0.0144, abs=1e-4)
