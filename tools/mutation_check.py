@@ -549,7 +549,7 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "coverage of upper ends alone": (
         "test_intervals_on_either_side_of_the_truth_do_not_cover[low-inf]",
-        ("(measurement.low[level] <= truth) & (truth <= measurement.high[level])", "truth <= measurement.high[level]"),
+        ("(found.low[k] <= self.truth) & (self.truth <= found.high[k])", "self.truth <= found.high[k]"),
     ),
     "whole ranges for their halves": (
         "test_correct_model_covers_and_simple_model_is_rejected",
@@ -557,14 +557,11 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "exposures of a frame": (
         "test_exposure_inverts_snr[450.0-7-pixel]",
-        ("exposure_s=x.exposure_s,\n        frames", "exposure_s=x.exposure_s / x.n_frames,\n        frames"),
+        ("*asked, x.exposure_s, frames", "*asked, x.exposure_s / x.n_frames, frames"),
     ),
     "durations in days and seconds": (
         "test_table_of_events_has_the_flare_in_its_units",
-        (
-            "return last - first + self.analysis.frames.cadence_s / DAY_S",
-            "return last - first + self.analysis.frames.cadence_s",
-        ),
+        ('frames.cadence_s\n           / DAY_S, "d"', 'frames.cadence_s, "d"'),
     ),
     "ends of intervals of two levels": (
         "test_table_of_events_has_the_flare_in_its_units",

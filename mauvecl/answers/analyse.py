@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -15,7 +15,7 @@ from mauvecl.answers.answer import Answer, TableOf, metadata_of
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.fits.flare_model import FlareModel
 from mauvecl.fits.spectrum import Measurement
-from mauvecl.host.orbit.orbit import Orbit, Target
+from mauvecl.host.orbit.orbit import Target
 from mauvecl.host.stars.flare import check_scales
 from mauvecl.host.stars.source import Source
 from mauvecl.observations.analysis import Analysis, SpectralAnalysis, analyse_frames
@@ -25,7 +25,7 @@ from mauvecl.observations.frame_model import FrameModel
 from mauvecl.observations.frames import Frames, Reason, barycentric
 from mauvecl.observations.spectra import EventSpectrum
 from mauvecl.observations.visits import flux_per_dn
-from mauvecl.schema.columns import Column, View, formatted, interval, number, percent
+from mauvecl.schema.columns import Column, View, formatted, interval, interval_columns, number, percent
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import DAY_S
 from mauvecl.study.cases import cases
@@ -39,17 +39,12 @@ if TYPE_CHECKING:
     from mauvecl.study.study import Study
 
 
-@dataclass(frozen=True, eq=False)
-class BlendedStar:
-    """A star in the fibre: the target itself, or a neighbour within the fibre's radius."""
+def blended_stars(cases: Sequence[Case]) -> list[tuple[str, float, float]]:
+    """Return the stars in the fibre of the observed star, itself first: name, separation in arcsec, and rise.
 
-    name: str
-    separation_arcsec: float
-    rise: float  # rise of all stars' light by a flare of unit amplitude on this star, relative to their light
-
-
-def blended_stars(cases: Sequence[Case]) -> list[BlendedStar]:
-    """Return the stars in the fibre of the observed star, itself first; raises InputError for several cases."""
+    The rise is that of all stars' light by a flare of unit amplitude on this star, relative to their light. Raises
+    InputError for several cases.
+    """
     if len(cases) != 1:
         raise InputError(
             "neighbours of observed frames need the one star that was observed, such as `star=G2V` with its magnitude, "
@@ -61,11 +56,10 @@ def blended_stars(cases: Sequence[Case]) -> list[BlendedStar]:
     near, quiet = case.neighbours, case.quiet
     assert near is not None
     total = float((quiet.source_electrons + quiet.neighbour_electrons).sum())
-    stars = [BlendedStar(case.label, 0.0, _electrons(case, case.source) / total)]
-    for neighbour in near.within(case.instrument):
-        rise = near.share * _electrons(case, neighbour.source) / total
-        stars.append(BlendedStar(neighbour.name, neighbour.separation_arcsec, rise))
-    return stars
+    return [(case.label, 0.0, _electrons(case, case.source) / total)] + [
+        (neighbour.name, neighbour.separation_arcsec, near.share * _electrons(case, neighbour.source) / total)
+        for neighbour in near.within(case.instrument)
+    ]
 
 
 def _electrons(case: Case, source: Source) -> float:
@@ -104,11 +98,7 @@ class EventRow:
 
     analysis: Analysis
     number: int
-
-    @property
-    def event(self) -> ObservedEvent:
-        """The event."""
-        return self.analysis.events[self.number]
+    event: ObservedEvent
 
     @property
     def spectrum(self) -> EventSpectrum | None:
@@ -140,20 +130,10 @@ class EventRow:
         """Return the time of a searched frame, in days."""
         return float(self.analysis.survey.time_s[frame]) / DAY_S
 
-    def cadence(self, frame: int) -> int:
-        """Return the number of a searched frame on the grid of the cadence."""
-        return int(self.analysis.frames.numbers[self.analysis.level.used][frame])
-
     @property
     def date(self) -> str:
         """Date of the brightest frame."""
         return self.analysis.frames.date(float(self.analysis.survey.time_s[self.event.brightest]))
-
-    @property
-    def duration_d(self) -> float:
-        """Time from the start of the first frame to the end of the last."""
-        first, last = (self.time_d(k) for k in (self.event.first, self.event.last))
-        return last - first + self.analysis.frames.cadence_s / DAY_S
 
     @property
     def significant(self) -> bool:
@@ -202,11 +182,6 @@ class EventRow:
         return self.analysis.false_alarms(self.event)
 
     @property
-    def probability(self) -> float:
-        """Probability of such an event from noise anywhere in the searched frames."""
-        return float(-np.expm1(-max(self.rates) * self.analysis.days))
-
-    @property
     def fitted_s(self) -> tuple[float, float, float, float, float]:
         """Equivalent duration of the whole flare and the ends of its 68 and 95 % intervals; NaN if it is no flare."""
         energy = self.event.energy
@@ -224,10 +199,8 @@ class EventRow:
     @cached_property
     def colour(self) -> tuple[float, float, float]:
         """Blue over red rise with its error, and the p-value of an event without colour; NaN in a light curve."""
-        colour = self.analysis.colour(self.event)
-        if colour is None:
-            return (float("nan"),) * 3
-        return colour.blue_over_red, colour.blue_over_red_error, colour.p_value
+        seen = self.analysis.colour(self.event)
+        return (np.nan,) * 3 if seen is None else (seen.blue_over_red, seen.blue_over_red_error, seen.p_value)
 
     @property
     def note(self) -> str:
@@ -235,8 +208,7 @@ class EventRow:
         event = self.event
         reasons = {"step": "a step of the level fits better than a flare",
                    "dip": "its frames lack the light of a flare: the star becomes fainter in them"}  # fmt: skip
-        notes = [reasons[event.kind]] if event.kind in reasons else []
-        notes += [self.spectrum.reason] if self.spectrum is not None and self.spectrum.reason else []
+        notes = [reasons.get(event.kind, ""), self.spectrum.reason if self.spectrum is not None else ""]
         if event.is_limit:
             notes.append("a gap or an end of the frames cuts it: the summed ED is a lower limit")
         elif event.cut:
@@ -252,11 +224,7 @@ class EventRow:
             notes.append(f"no frame shows its peak{looks}")
         elif event.kind == "flare" and event.gap_at_peak:
             notes.append("frames next to its brightest one are missing: they may have held its peak")
-        return "; ".join(notes)
-
-
-def _rate(value: float) -> str:
-    return f"{value:.1e}" if value < 0.01 else f"{value:.2g}"
+        return "; ".join(filter(None, notes))
 
 
 #: Columns of the table of events; names as in AltaiPony's flare tables where it has the quantity.
@@ -268,23 +236,23 @@ EVENTS = (
     Column("tstop", lambda row: row.time_d(row.event.last), "d", "middle of the last frame"),
     Column("istart", lambda row: row.event.first, "", "first frame, counted among the searched frames", kind=int),
     Column("istop", lambda row: row.event.last, "", "last frame, inclusive", kind=int),
-    Column("cstart", lambda row: row.cadence(row.event.first), "", "first frame, counted on the grid of the cadence "
-           "with gaps", kind=int),
-    Column("cstop", lambda row: row.cadence(row.event.last), "", "last frame, likewise", kind=int),
+    Column("cstart", lambda row: row.analysis.frames.numbers[row.analysis.level.used][row.event.first], "",
+           "first frame, counted on the grid of the cadence with gaps", kind=int),
+    Column("cstop", lambda row: row.analysis.frames.numbers[row.analysis.level.used][row.event.last], "",
+           "last frame, likewise", kind=int),
     Column("total_n_valid_data_points", lambda row: row.analysis.survey.stare.n_frames, "", "searched frames",
            kind=int),
-    Column("dur", "duration_d", "d", "from the start of the first frame to the end of the last", "duration (min)",
+    Column("dur", lambda row: row.time_d(row.event.last) - row.time_d(row.event.first) + row.analysis.frames.cadence_s
+           / DAY_S, "d", "from the start of the first frame to the end of the last", "duration (min)",
            lambda days: formatted(1440 * days, ".3g"), detail=True),
     Column("ampl_rec", lambda row: row.in_white_light(row.event.amplitude), "", "largest flux above the level, "
            "relative to the level; nan: the dark current changes the level", "peak", percent(".3g")),
     Column("ed", lambda row: row.fitted_s[0], "s", "recommended equivalent duration, of the whole flare: the light "
            "that is observed, and the shape where it is not; proportional to the energy; nan: no flare", "ED (s)",
            number(".4g")),
-    Column("ed_low", lambda row: row.fitted_s[1], "s", "lower end of its 68 % interval, which includes the errors of "
-           "level and shape", "68 %", interval(".4g"), ("ed_high",)),
-    Column("ed_high", lambda row: row.fitted_s[2], "s", "upper end"),
-    Column("ed_low_95", lambda row: row.fitted_s[3], "s", "lower end of its 95 % interval"),
-    Column("ed_high_95", lambda row: row.fitted_s[4], "s", "upper end"),
+    *interval_columns("ed_{}", lambda row: row.fitted_s[1:3], "s", "its 68 % interval, which includes the errors of "
+                      "level and shape", "68 %", interval(".4g")),
+    *interval_columns("ed_{}_95", lambda row: row.fitted_s[3:], "s"),
     Column("ed_rec", lambda row: row.in_white_light(row.event.energy.summed_s), "s", "equivalent duration in the "
            "frames of the event: sum of the flux above the level, relative to the level at the peak; nan: the dark "
            "current changes the level", "ED in frames (s)", number(".4g"), detail=True),
@@ -293,8 +261,7 @@ EVENTS = (
     Column("ed_rec_limit", "event.is_limit", "", "whether it is a lower limit, because a gap or an end cuts the flare",
            kind=bool),
     Column("ed_fit", lambda row: row.fitted_s[0], "s", "the same as ed, by its older name"),
-    Column("ed_fit_low", lambda row: row.fitted_s[1], "s", "the same as ed_low"),
-    Column("ed_fit_high", lambda row: row.fitted_s[2], "s", "the same as ed_high"),
+    *interval_columns("ed_fit_{}", lambda row: row.fitted_s[1:3], "s", "its 68 % interval"),
     Column("shape", "event.energy.shape", "", "shape of the flares that fits best", kind=str),
     Column("half_width", lambda row: row.event.energy.flares[0].half_width_s, "s",
            "t_1/2 of the largest flare fitted to it; nan: none", "half-width (s)", number(".3g"), detail=True),
@@ -304,8 +271,9 @@ EVENTS = (
            "light curves of the fitted process"),
     Column("rate_measured", lambda row: row.rates[1], "1 / d", "the same with residuals resampled from quiescent "
            "frames"),
-    Column("probability", "probability", "", "probability of such an event from noise anywhere in these frames, by "
-           "the larger rate", "from noise", _rate, detail=True),
+    Column("probability", lambda row: float(-np.expm1(-max(row.rates) * row.analysis.days)), "", "probability of such "
+           "an event from noise anywhere in these frames, by the larger rate", "from noise",
+           lambda p: f"{p:.1e}" if p < 0.01 else f"{p:.2g}", detail=True),
     Column("significant", "significant", "", "whether the rate is at most the wanted one", kind=bool),
     Column("verdict", "verdict", "", "detected: a flare with at most the wanted rate; candidate: a flare with a larger "
            "one, one like the changes of throughput in these frames, one of a light curve whose peak is in a gap, "
@@ -319,12 +287,10 @@ EVENTS = (
            "star's if the event has no colour, as a change of throughput"),
     Column("temperature", lambda row: row.quantity("temperature")[0], "K", "temperature of a blackbody fitted to the "
            "summed spectra of the event; nan: not measured", "temperature (K)", number(".4g"), detail=True),
-    Column("temperature_low", lambda row: row.quantity("temperature")[1], "K", "lower end of its 68 % interval"),
-    Column("temperature_high", lambda row: row.quantity("temperature")[2], "K", "upper end"),
+    *interval_columns("temperature_{}", lambda row: row.quantity("temperature")[1:], "K", "its 68 % interval"),
     Column("energy", lambda row: row.quantity(ENERGY)[0], "erg", "bolometric energy in the frames of the event",
            "energy (erg)", number(".3g"), detail=True),
-    Column("energy_low", lambda row: row.quantity(ENERGY)[1], "erg", "lower end of its 68 % interval"),
-    Column("energy_high", lambda row: row.quantity(ENERGY)[2], "erg", "upper end"),
+    *interval_columns("energy_{}", lambda row: row.quantity(ENERGY)[1:], "erg", "its 68 % interval"),
     Column("unmeasured", "unmeasured", "", "why temperature or energy are not measured", kind=str),
     Column("snr_flare", lambda row: float("nan") if row.spectrum is None else row.spectrum.snr, "", "S/N of a flare in "
            "the event's spectrum if star, dark current and sky changed by any amount"),
@@ -350,16 +316,13 @@ FRAMES = (
 )  # fmt: skip
 #: Columns of the measured quantities of an event, one row for each.
 MEASURED = (
-    Column("date", description="brightest frame of the event", heading="event", format=lambda text: text[:22],
-           kind=str),
+    Column("date", "", "", "brightest frame of the event", "event", lambda text: text[:22], kind=str),
     Column("quantity", "measured.names", "", "what is measured", "quantity", kind=str),
     Column("unit", "measured.units", "", "of estimate and intervals", "unit", kind=str),
     Column("estimate", lambda row: row.measured.estimates[0], "", "of maximum likelihood", "estimate", number(".4g")),
-    Column("low", lambda row: row.measured.low[0, 0], "", "lower end of the 68 % interval", "68 %", interval(".4g"),
-           ("high",)),
-    Column("high", lambda row: row.measured.high[0, 0], "", "upper end"),
-    Column("low_95", lambda row: row.measured.low[1, 0], "", "lower end of the 95 % interval"),
-    Column("high_95", lambda row: row.measured.high[1, 0], "", "upper end"),
+    *interval_columns("{}", lambda row: (row.measured.low[0, 0], row.measured.high[0, 0]), "", "the 68 % interval",
+                      "68 %", interval(".4g")),
+    *interval_columns("{}_95", lambda row: (row.measured.low[1, 0], row.measured.high[1, 0])),
     Column("p_value", "measured.p_value", "", "probability of a worse fit of a blackbody"),
 )  # fmt: skip
 #: Columns of the noise per pixel, one row for all pixels.
@@ -368,8 +331,7 @@ PIXELS = (
     Column("stated", "stated", "", "standard deviation of a quiescent frame, as stated or by the instrument's model"),
     Column("measured", "measured", "", "from differences of neighbouring quiescent frames, without changes of light "
            "and dark current that all pixels share"),
-    Column("low", "low", "", "lower end of the range of 95 % of noise of the stated size"),
-    Column("high", "high", "", "upper end"),
+    *interval_columns("{}", of="the range of 95 % of noise of the stated size"),
     Column("departs", "departs", "", "whether the search uses the measured noise"),
 )  # fmt: skip
 #: Columns of the changes of throughput, one row per change.
@@ -412,9 +374,8 @@ NOISE = (
     Column("measured", "measured", "", "standard deviation of the means, in units of the noise of one frame",
            "scatter", number(".3g")),
     Column("white", "white", "", "the same for independent frames", "independent", number(".3g")),
-    Column("low", "low", "", "lower end of the range of 95 % of light curves of independent frames",
-           "95 % of independent", interval(".3g"), ("high",)),
-    Column("high", "high", "", "upper end"),
+    *interval_columns("{}", "", "", "the range of 95 % of light curves of independent frames", "95 % of independent",
+                      interval(".3g")),
 )  # fmt: skip
 
 
@@ -478,24 +439,21 @@ class AnalyseAnswer(Answer):
     @property
     def _flares_of_stars(self) -> Iterator[dict[str, object]]:
         stars = blended_stars(cases(self.study, swept=False))
-        for row, star in product(self.rows, stars):
+        for row, (name, separation_arcsec, rise) in product(self.rows, stars):
             event = row.event
-            amplitude = event.amplitude / star.rise if star.rise else float("inf")
+            amplitude = event.amplitude / rise if rise else float("inf")
             yield {
-                "date": row.date, "ampl_rec": event.amplitude, "star": star.name,
-                "separation": star.separation_arcsec, "amplitude": amplitude,
+                "date": row.date, "ampl_rec": event.amplitude, "star": name, "separation": separation_arcsec,
+                "amplitude": amplitude,
                 "equivalent_duration": event.equivalent_duration_s / event.amplitude * amplitude,
             }  # fmt: skip
 
     @property
     def messages(self) -> list[str]:
-        near = [
-            text
-            for case in (self.observed if self.study.has_neighbours else ())
-            if case.neighbours is not None
-            for text in case.neighbours.messages(case.label, case.instrument)
-        ]
-        return [*near, *([self.white] if self.white else []), *self.analysis.messages]
+        near = list[str]()
+        for case in self.observed if self.study.has_neighbours else ():
+            near += case.neighbours.messages(case.label, case.instrument) if case.neighbours is not None else []
+        return [*near, *filter(None, [self.white]), *self.analysis.messages]
 
     @property
     def uses(self) -> tuple[Use, ...]:
@@ -507,7 +465,7 @@ class AnalyseAnswer(Answer):
     @property
     def rows(self) -> list[EventRow]:
         """Events in order of time."""
-        return [EventRow(self.analysis, number) for number in range(len(self.analysis.events))]
+        return [EventRow(self.analysis, number, event) for number, event in enumerate(self.analysis.events)]
 
     @property
     def json_tables(self) -> dict[str, Table]:
@@ -555,13 +513,7 @@ class AnalyseAnswer(Answer):
         return [f"{row.date[:19]}: {row.note}." for row in self.rows if row.note]
 
 
-def _orbit(study: Study, frames: Frames) -> Orbit | None:
-    """Return the orbit of the satellite that took the frames, or None if it is not known."""
-    is_mauve = "mauve" in frames.instrument.lower()
-    return study.orbit.orbit() if is_mauve or study.orbit.tle is not None else None
-
-
-@by_keywords
+@by_keywords("frames, as the share of the work that is done")
 def analyse(
     study: Study,
     engine: Engine | Pool | None = None,
@@ -571,16 +523,12 @@ def analyse(
 ) -> AnalyseAnswer:
     """Find the flares in observed frames, with false-alarm rates from the noise as measured.
 
+    The study's `data.file` is read, and its `search.false_alarms` are allowed for a detection; fainter events are
+    candidates, down to one false alarm per star-day. With `data.barycentric` times become those at the Solar System's
+    barycentre, by the satellite's orbit.
+
     Parameters
     ----------
-    study : Study, optional
-        Its sections `data` and `search`: `data.file` is read, `search.false_alarms` are allowed for a detection. With
-        `data.barycentric` times become those at the Solar System's barycentre, by the satellite's orbit.
-        Fainter events are candidates, down to one false alarm per star-day.
-    engine : optional
-        Not used: nothing is drawn on a device.
-    progress : callable, optional
-        Called as ``progress(done, total)`` in frames, as the share of the work that is done; may raise to stop it.
     frames : Frames, optional
         Frames in memory, in place of the file.
     """
@@ -590,34 +538,20 @@ def analyse(
         frames = read_frames(study.data.file, study.data.mapping, quality_bits=study.data.quality_bits,
                              ignore_checksum=study.data.ignore_checksum)  # fmt: skip
     if study.data.barycentric is not None:
-        frames = barycentric(frames, Target.of(study.data.barycentric), _orbit(study, frames))
+        known = study.orbit.tle is not None or "mauve" in frames.instrument.lower()
+        frames = barycentric(frames, Target.of(study.data.barycentric), study.orbit.orbit() if known else None)
     search, model = study.search, frame_model(study, frames)
     if study.has_neighbours:
         # Errors of the star or its neighbours are reported before the search.
         blended_stars(cases(study, swept=False))
+    total = frames.n_frames
+    report = None if progress is None else lambda share: progress(round(share * total), total)
     analysis = analyse_frames(
         frames, wanted=search.rate, shape=search.shape, seed=study.run.seed,
         model=model if isinstance(model, FrameModel) else None, rank=search.sums, jitters=search.spreads() or None,
-        temperature_k=study.flare.temperature_k, report=_in_frames(progress, frames.n_frames),
+        temperature_k=study.flare.temperature_k, report=report,
     )  # fmt: skip
     return AnalyseAnswer(study, analysis, model if isinstance(model, str) else "")
-
-
-def _in_frames(progress: Progress, total: int) -> Callable[[float], None] | None:
-    """Return a function of the share that is done, which reports it in whole frames whenever their number rises."""
-    if progress is None:
-        return None
-    last = -1
-
-    def report(share: float) -> None:
-        nonlocal last
-        done = round(share * total)
-        if done > last:
-            last = done
-            progress(done, total)
-
-    report(0.0)
-    return report
 
 
 def frame_model(study: Study, frames: Frames) -> FrameModel | str:

@@ -9,6 +9,7 @@ import io
 import json
 import platform
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import KW_ONLY, asdict, dataclass
 from functools import cached_property
 from html import escape
@@ -222,9 +223,8 @@ class Answer(Drawable, ContentEquality):
     @cached_property
     def neighbours(self) -> QTable | None:
         """Neighbours of the stars that the answer observes, or None."""
-        if not self.study.has_neighbours or "instrument" not in self.uses:
-            return None
-        rows = [row for case in self.observed for row in _neighbour_rows(case)]
+        observed = self.observed if self.study.has_neighbours and "instrument" in self.uses else ()
+        rows = [row for case in observed for row in _neighbour_rows(case)]
         shares = sorted({row["assumed_share"] for row in rows})
         about = {"assumed_share": shares[0] if len(shares) == 1 else shares, "study": self.study.text()}
         return table_of(NEIGHBOUR_COLUMNS, rows, **about) if rows else None
@@ -321,15 +321,12 @@ def is_answer(folder: Path) -> bool:
     """Return whether a folder holds a run record, or the study and a table of an answer whose record is missing."""
     if (folder / RECORD).is_file():
         return True
-    return (folder / "study.toml").is_file() and any(map(_is_table_of_answer, folder.glob("*.ecsv")))
-
-
-def _is_table_of_answer(path: Path) -> bool:
-    """Return whether a table has a study in its metadata, which a user's own tables do not."""
-    try:
-        return bool(read_embedded_study(path))
-    except InputError:
-        return False
+    for path in folder.glob("*.ecsv") if (folder / "study.toml").is_file() else ():
+        # A user's own tables have no study in their metadata.
+        with suppress(InputError):
+            if read_embedded_study(path):
+                return True
+    return False
 
 
 @validated
@@ -486,8 +483,7 @@ def write_record(
     stale: list[Path] = []
     if files is not None:
         record["files"] = {path.name: digest_of(path) for path in files}
-        if whole:
-            stale = [path for path in _left_by_another(folder) if path.name not in record["files"]]
+        stale = [path for path in _left_by_another(folder) if path.name not in record["files"]] if whole else []
     # Converted to JSON and back, so that the digest of a record that is read again is the same.
     record = json.loads(json_text(record))
     record[OWN_DIGEST] = record_digest(record)
@@ -528,18 +524,17 @@ def _neighbour_rows(case: Case) -> Iterator[dict[str, Any]]:
     x, near = case.quiet, case.neighbours
     if near is None:
         return
+    total = float((x.source_electrons + x.neighbour_electrons).sum())
     for star in near.stars:
-        enters, share = star.separation_arcsec <= case.instrument.field_of_view_radius_arcsec, 0.0
-        if enters:
-            rate = rate_of(star, case.instrument, case.study.observation.order)
-            own = near.share * float(rate.sum()) * x.frame_s
-            share = own / float((x.source_electrons + x.neighbour_electrons).sum())
         # Beyond the fibre no spectrum is needed.
-        spectrum, magnitude = star.spectrum[0] if enters else "", star.magnitude
+        enters, share, spectrum = star.separation_arcsec <= case.instrument.field_of_view_radius_arcsec, 0.0, ""
+        if enters:
+            rate, spectrum = rate_of(star, case.instrument, case.study.observation.order), star.spectrum[0]
+            share = near.share * float(rate.sum()) * x.frame_s / total
         yield {
             "star": case.label, "name": star.name, "separation": star.separation_arcsec, "band": star.band,
-            "magnitude": float("nan") if magnitude is None else magnitude, "spectrum": spectrum, "enters": enters,
-            "share": share, "assumed_share": case.star.neighbour_share,
+            "magnitude": float("nan") if star.magnitude is None else star.magnitude, "spectrum": spectrum,
+            "enters": enters, "share": share, "assumed_share": case.star.neighbour_share,
         }  # fmt: skip
 
 
@@ -549,8 +544,7 @@ NEIGHBOUR_COLUMNS = (
     Column("separation", "", "arcsec", "from the star", "arcsec", ".4g"),
     Column("magnitude", "", "mag", "in the band", "magnitude", ".2f"),
     Column("band", heading="band", kind=str),
-    Column("spectrum", description="spectrum that represents it; empty if its light does not enter",
-           heading="spectrum", kind=str),
+    Column("spectrum", "", "", "spectrum that represents it; empty if its light does not enter", "spectrum", kind=str),
     Column("enters", description="whether it is within the fibre's radius, so that the assumed share of its light "
            "enters", heading="enters", format=lambda value: "yes" if value else "no", kind=bool),
     Column("share", description="share of the electrons of all stars in the fibre, without a flare",

@@ -11,7 +11,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import astropy.units as u
 import numpy as np
+from astropy.table import QTable
 from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer, TableOf, ecsv_text
@@ -33,7 +35,7 @@ from mauvecl.observations.detector import (
 from mauvecl.observations.frame_files import read_frames
 from mauvecl.observations.frames import Frames
 from mauvecl.observations.throughput import ERROR_KNOTS, ThroughputFit, fit_throughput
-from mauvecl.schema.columns import Column, View, number, percent, table_of
+from mauvecl.schema.columns import Column, View, number, percent
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
@@ -66,12 +68,11 @@ class Fitted:
     error: float  # NaN if it is assumed
     nominal: float
     unit: str
-    determined: bool
 
     @property
-    def deviation(self) -> float:
-        """Difference from the nominal value in standard errors."""
-        return (self.value - self.nominal) / self.error if self.determined and self.error > 0 else float("nan")
+    def determined(self) -> bool:
+        """Whether the observations determine it."""
+        return bool(np.isfinite(self.error))
 
 
 #: Columns of the table of values.
@@ -81,7 +82,8 @@ COLUMNS = (
            lambda value, error: f"{value:.6g} +- {error:.2g}" if error == error else f"{value:.6g}", ("error",)),
     Column("error", "error", "", "standard error; nan: not determined by these observations"),
     Column("nominal", "nominal", "", "value of the instrument that was given", "nominal", ".6g"),
-    Column("deviation", "deviation", "", "fitted less nominal value in standard errors", "sigma", number("+.1f")),
+    Column("deviation", lambda row: (row.value - row.nominal) / row.error if row.error > 0 else np.nan, "",
+           "fitted less nominal value in standard errors", "sigma", number("+.1f")),
     Column("unit", "unit", "", "of the value", "unit", kind=str),
     Column("determined", "determined", "", "whether these observations determine it", "status",
            lambda determined: "" if determined else "assumed", kind=bool),
@@ -162,21 +164,20 @@ class CalibrateAnswer(Answer):
         d, t, f, n = self.dark, self.transfer, self.throughput, self.nominal
         level = float(np.mean(d.level_dn_per_s))
         at = float(n.dark_scale_dn_per_s * np.exp(n.dark_slope_per_c * d.reference_c))
-        assumed = (*d.assumed, *t.assumed)
         rows = [
-            ("dark current", level, float(np.sqrt(d.shared[1, 1])), at, "DN / s", "dark current" not in assumed),
-            ("dark slope", d.slope_per_c, d.slope_error, n.dark_slope_per_c, "1 / deg_C", "dark slope" not in assumed),
-            ("bias", float(d.bias_dn.mean()), float(d.bias_error.mean()), n.bias_dn, "DN", "bias" not in assumed),
-            ("gain", t.noise.gain, t.gain_error, n.gain_dn_per_electron, "DN / electron", "gain" not in assumed),
-            ("read noise", t.read_noise_dn, t.read_noise_error, n.read_noise_dn, "DN", "read noise" not in assumed),
-            *((name, fit.value if fit else usual, fit.error if fit else np.nan, usual, "nm", fit is not None)
-              for name, fit, usual in (
-                  ("wavelength shift", f.shift_nm, 0.0), ("wavelength stretch", f.stretch_nm, 0.0),
-                  ("line width", f.fwhm_nm, n.gaussian_fwhm_nm),
-                  ("line width, change to the red", f.fwhm_change_nm, 0.0))),
-        ]  # fmt: skip
-        return [Fitted(name, value, error if is_fitted else float("nan"), usual, unit, is_fitted)
-                for name, value, error, usual, unit, is_fitted in rows]  # fmt: skip
+            Fitted("dark current", level, float(np.sqrt(d.shared[1, 1])), at, "DN / s"),
+            Fitted("dark slope", d.slope_per_c, d.slope_error, n.dark_slope_per_c, "1 / deg_C"),
+            Fitted("bias", float(d.bias_dn.mean()), float(d.bias_error.mean()), n.bias_dn, "DN"),
+            Fitted("gain", t.noise.gain, t.gain_error, n.gain_dn_per_electron, "DN / electron"),
+            Fitted("read noise", t.read_noise_dn, t.read_noise_error, n.read_noise_dn, "DN"),
+        ]
+        rows = [replace(row, error=np.nan) if row.name in (*d.assumed, *t.assumed) else row for row in rows]
+        for name, fit, usual in (
+            ("wavelength shift", f.shift_nm, 0.0), ("wavelength stretch", f.stretch_nm, 0.0),
+            ("line width", f.fwhm_nm, n.gaussian_fwhm_nm), ("line width, change to the red", f.fwhm_change_nm, 0.0),
+        ):  # fmt: skip
+            rows.append(Fitted(name, *((fit.value, fit.error) if fit else (usual, np.nan)), usual, "nm"))
+        return rows
 
     @property
     def _fits(self) -> list[dict[str, Any]]:
@@ -334,21 +335,19 @@ class CalibrateAnswer(Answer):
         nm = self.throughput.wavelength_nm
         knots = np.unique(np.concatenate([nm[:1], np.arange(np.ceil(nm[0]), nm[-1], KNOT_NM), nm[-1:]]))
         at = np.searchsorted(nm, knots).clip(0, nm.size - 1)
+        # The light of these pixels in each of some bands.
+        band = at * MODE_BANDS // nm.size
+        light = np.asarray(self.fitted_throughput[at] * (band == np.arange(MODE_BANDS)[:, None]))
         errors = ThroughputErrors.of_covariance(
-            knots, self._covariance(at), f"C: {self.source}", names=tuple(CALIBRATED), sums=self._light(at)
+            knots, self._covariance(at), f"C: {self.source}", names=tuple(CALIBRATED), sums=light
         )
-        factor = {"wavelength": knots, "factor": self._factor(knots)}
-        modes = {"wavelength": knots} | {f"{MODE}{k}": mode for k, mode in enumerate(errors.modes, 1)}
+        origin, step_nm = {"tag": "C", "source": self.source}, {"wavelength": knots * u.nm}
+        modes = {f"{MODE}{k}": mode for k, mode in enumerate(errors.modes, 1)}
         values = {name: list(steps) for name, steps in errors.values.items()}
-        origin = {"tag": "C", "source": self.source}
-
-        def columns(row: dict[str, Any]) -> list[Column]:
-            return [Column(name, unit="nm" if name == "wavelength" else "") for name in row]
-
         return {
-            "throughput-factor": table_of(columns(factor), [factor], **origin),
-            "throughput-errors": table_of(columns(modes), [modes], **origin, values=values),
-            "pixel-map": table_of(self._pixel_columns, [self], **origin),
+            "throughput-factor": QTable(step_nm | {"factor": self._factor(knots)}, meta=origin),
+            "throughput-errors": QTable(step_nm | modes, meta=origin | {"values": values}),
+            "pixel-map": QTable(self._pixel_map, meta=origin, descriptions={"dark": "factor on the dark current"}),
         }
 
     def _factor(self, knots_nm: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -362,8 +361,8 @@ class CalibrateAnswer(Answer):
         return np.interp(knots_nm, centres, self.fitted_throughput / nominal)
 
     @property
-    def _pixel_columns(self) -> list[Column]:
-        """Columns of the pixel map, for the answer."""
+    def _pixel_map(self) -> dict[str, Any]:
+        """Columns of the pixel map: factors on the dark current, values of the given map, and the bias."""
         nominal, dark, bias = self.nominal, self.dark.level_dn_per_s, self.dark.bias_dn
 
         def of_all(values: NDArray[np.float64], others: float) -> NDArray[np.float64]:
@@ -372,22 +371,14 @@ class CalibrateAnswer(Answer):
             every[nominal.read_pixels] = values
             return every
 
-        columns = [
-            Column("pixel", lambda _: np.arange(nominal.pixels)),
-            Column("dark", lambda _: of_all(dark / dark.mean(), 1.0), "", "factor on the dark current"),
-        ]
+        columns: dict[str, Any] = {"pixel": np.arange(nominal.pixels), "dark": of_all(dark / dark.mean(), 1.0)}
         for name in ("response", "gain", "read_noise_dn"):
-            if nominal.pixel_map is not None and getattr(nominal.pixel_map, name) is not None:
-                unit = "DN" if name.endswith("_dn") else ""
-                columns.append(Column(name, f"nominal.pixel_map.{name}", unit))
+            given = getattr(nominal.pixel_map, name, None)
+            if given is not None:
+                columns[name] = given * u.DN if name.endswith("_dn") else given
         if np.ptp(bias) > 0:
-            columns.append(Column("bias_dn", lambda _: of_all(bias, float(bias.mean())), "DN", "bias"))
+            columns["bias_dn"] = of_all(bias, float(bias.mean())) * u.DN
         return columns
-
-    def _light(self, at: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the light of some pixels in each of `MODE_BANDS` bands, shape (MODE_BANDS, n)."""
-        band = at * MODE_BANDS // self.throughput.wavelength_nm.size
-        return np.asarray(self.fitted_throughput[at] * (band == np.arange(MODE_BANDS)[:, None]))
 
     def _covariance(self, at: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the covariance of log throughput at some pixels and of the logarithms of the values in `CALIBRATED`.
@@ -460,7 +451,7 @@ class CalibrateAnswer(Answer):
         return out.getvalue()
 
 
-@by_keywords
+@by_keywords("fits, of which none is reported")
 def calibrate(
     study: Study,
     engine: Engine | Pool | None = None,
@@ -471,12 +462,10 @@ def calibrate(
 ) -> CalibrateAnswer:
     """Fit an instrument to raw frames of standard stars and to frames without light.
 
+    The study's ``calibrate`` lists the observations; its observation names the instrument from which the fit starts.
+
     Parameters
     ----------
-    study : Study, optional
-        Its ``calibrate`` lists the observations, and its observation names the instrument from which the fit starts.
-    engine, progress : optional
-        Not used: nothing is drawn on a device.
     frames : tuple of Frames, optional
         Frames in memory, in place of the files of the observations, in their order.
     stars : tuple of Source or None, optional

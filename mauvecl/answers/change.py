@@ -26,7 +26,7 @@ from mauvecl.observations.visits import (
     smallest_change,
     visit_times_d,
 )
-from mauvecl.schema.columns import Column, View, formatted, number, percent
+from mauvecl.schema.columns import Column, View, formatted, interval_columns, number, percent
 from mauvecl.study.cases import Case, cases, collect_messages
 from mauvecl.study.plan import targets_of
 
@@ -86,11 +86,6 @@ class IndexRow(InCell):
         """Why the index has no value; empty if it has one."""
         return _lost_pixels(*self.saturated)
 
-    @property
-    def snr(self) -> float:
-        """Index over its error; negative in absorption."""
-        return self.value.value / self.error_known
-
 
 @dataclass(frozen=True, eq=False)
 class PeriodRow(InCell):
@@ -107,17 +102,14 @@ class PeriodRow(InCell):
 
 def _lost_pixels(lost: int, every: int) -> str:
     """Return how many pixels saturate, or nothing if none do."""
-    if not lost:
-        return ""
-    return "every pixel saturates" if lost == every else f"{lost} of {every} pixels saturate"
+    text = "every pixel saturates" if lost == every else f"{lost} of {every} pixels saturate"
+    return text if lost else ""
 
 
 def _amount(value: float, unit: str) -> str:
-    if np.isnan(value):
-        return ""
-    if np.isinf(value):
-        return "hidden"
-    return f"{formatted(100 * value, '.3g')} %" if not unit else f"{value:.3g} {unit}"
+    if not np.isfinite(value):
+        return "" if np.isnan(value) else "hidden"
+    return f"{value:.3g} {unit}" if unit else f"{formatted(100 * value, '.3g')} %"
 
 
 #: Columns of the table of changes.
@@ -143,14 +135,13 @@ INDEX_COLUMNS = (
            "flux", number(".3g")),
     Column("error", "error", "erg / (s cm2)", "standard deviation in one exposure with unknowns of finite spread; inf: "
            "a free unknown changes it", "error", lambda value: "free" if np.isinf(value) else number(".2g")(value)),
-    Column("error_known", "error_known", "erg / (s cm2)", "the same with everything known", "ideal",
-           number(".2g")),
-    Column("snr", "snr", "", "index over its error with everything known", "ideal S/N", number(".3g"), detail=True),
+    Column("error_known", "error_known", "erg / (s cm2)", "the same with everything known", "ideal", number(".2g")),
+    Column("snr", lambda row: row.value.value / row.error_known, "", "index over its error with everything known; "
+           "negative in absorption", "ideal S/N", number(".3g"), detail=True),
     Column("equivalent_width", "value.equivalent_width_nm", "nm", "positive in emission", "EW (nm)", number(".3g")),
     Column("captured", "value.captured", "", "share of a line's flux that the index holds at this resolution",
            "captured", percent(".0f"), detail=True),
-    Column("band_low", lambda row: row.value.index.band_nm[0], "nm", "lower end of the band"),
-    Column("band_high", lambda row: row.value.index.band_nm[1], "nm", "upper end"),
+    *interval_columns("band_{}", lambda row: row.value.index.band_nm, "nm", "the band"),
     Column("published", "value.index.published", "", "usual definition at higher resolution, with its source",
            kind=str),
     Column("note", "note", "", "saturated pixels of the index, which has no value then", "note", kind=str),
@@ -166,8 +157,7 @@ PERIOD_COLUMNS = (
            "the same in standard errors of a visit", "in errors", ".3g", detail=True),
     Column("recovered", lambda row: row.shares("value"), "", "share of periods that are recovered", "recovered",
            percent(".0f")),
-    Column("recovered_low", lambda row: row.shares("low"), "", "its 95 % interval, lower end"),
-    Column("recovered_high", lambda row: row.shares("high"), "", "upper end"),
+    *interval_columns("recovered_{}", lambda row: [row.shares(end) for end in ("low", "high")]),
 )  # fmt: skip
 
 
@@ -259,19 +249,13 @@ class ChangeAnswer(Answer):
         return lines
 
 
-@by_keywords
+@by_keywords("stars and cells of the sweep")
 def change(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> ChangeAnswer:
     """Compute the smallest changes of a study's stars between visits that are detected.
 
-    Parameters
-    ----------
-    study : Study, optional
-        Its ``change`` gives the changes and the number of visits, ``run.fap`` and ``limit.power`` the probabilities,
-        and ``nuisances`` the unknowns of each visit.
-    engine : Engine or Pool, optional
-        Not used: errors are closed forms, and periodograms are simulated on the host.
-    progress : callable, optional
-        Called as ``progress(done, total)`` in stars and cells of the sweep.
+    The study's ``change`` gives the changes and the number of visits, ``run.fap`` and ``limit.power`` the
+    probabilities, and ``nuisances`` the unknowns of each visit. Errors are closed forms, and periodograms are simulated
+    on the host.
 
     Examples
     --------
@@ -284,7 +268,11 @@ def change(study: Study, engine: Engine | Pool | None = None, progress: Progress
     asked = study.change
     file = asked.light()
     prepared = cases(study)
-    times = _visits(study) if asked.periods else None
+    times = None
+    if asked.periods:
+        o, target = study.orbit, targets_of(study.orbit, study.plan)[0]
+        seen = Visibility.of(o.orbit().track(o.times()), np.array([target.direction]), o.limits)
+        times = visit_times_d(seen.windows(0), asked.visits, study.observation.exposure_s, study.run.seed)
     rows, indices, along, periods = [], [], list[ChangeRow](), []
     for case in reported(prepared, len(prepared), progress):
         own = _changes(case, file)
@@ -331,10 +319,3 @@ def _indices(case: Case) -> list[IndexRow]:
         flux = flux_per_dn(quiet, case.instrument) * quiet.signal_dn
         rows.append(IndexRow(case.label, case.at, value, error, known_error, quiet.wavelength_nm, flux, lost))
     return rows
-
-
-def _visits(study: Study) -> NDArray[np.float64]:
-    """Draw the times of visits to the first target of a study's orbit."""
-    o, target = study.orbit, targets_of(study.orbit, study.plan)[0]
-    seen = Visibility.of(o.orbit().track(o.times()), np.array([target.direction]), o.limits)
-    return visit_times_d(seen.windows(0), study.change.visits, study.observation.exposure_s, study.run.seed)

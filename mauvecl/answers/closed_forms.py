@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from mauvecl.detection.distributions import Form
     from mauvecl.detection.statistics import Statistic
     from mauvecl.host.exposure.expectation import Expectation
-    from mauvecl.host.instrument.instrument import Instrument
-    from mauvecl.noise.disturbances import Prior
     from mauvecl.study.study import Study
 
 
@@ -74,9 +72,8 @@ def unknown_cost(
 def scatter(unknown: Nuisances, *, usual: bool) -> NDArray[np.float64]:
     """Return the standard deviations of nuisance amplitudes, shape (k,): as drawn by default, or else of the prior."""
     drawn = {row.name: row.scatter for row in DOCUMENTED_NUISANCES if usual}
-    return np.array(
-        [drawn.get(name, sd) if np.isinf(sd) else sd for name, sd in zip(unknown.names, unknown.sd, strict=True)]
-    )
+    spreads = zip(unknown.names, unknown.sd, strict=True)
+    return np.array([drawn.get(name, sd) if np.isinf(sd) else sd for name, sd in spreads])
 
 
 def cost_lines(costs: Sequence[Cost], nuisances: NuisanceChoice) -> list[str]:
@@ -87,12 +84,11 @@ def cost_lines(costs: Sequence[Cost], nuisances: NuisanceChoice) -> list[str]:
     faintest = min(shown, key=lambda cost: cost.known)
     which = spoken(nuisances) if not nuisances.none else f"the usual unknowns ({spoken(NuisanceChoice())})"
     others = f", the faintest of {len(shown)}," if len(shown) > 1 else ""
-    text = (
+    return [Message(
         f"What unknowns cost: {faintest.of}{others} has a matched S/N of {faintest.known:.3g} with everything known; "
         f"with {which} it is {faintest.plain:.2g} by the plain statistic and {faintest.marginal:.3g} marginalised "
-        "(closed forms)."
-    )
-    return [Message(text, "cost of unknowns")]
+        "(closed forms).", "cost of unknowns",
+    )]  # fmt: skip
 
 
 def marginal_lines(nuisances: NuisanceChoice) -> list[str]:
@@ -120,12 +116,8 @@ def _size(sd: float | str, unit: str) -> str:
 
 
 #: Column of the answer with everything but the noise known, the bound of the realistic answer next to it.
-IDEAL = Column(
-    "ideal",
-    description="detection probability if everything but the noise were known, for Gaussian noise",
-    heading="ideal",
-    format=number(".4f"),
-)
+IDEAL = Column("ideal", "", "", "detection probability if everything but the noise were known, for Gaussian noise",
+               "ideal", number(".4f"))  # fmt: skip
 
 
 def ideal_chances(
@@ -216,11 +208,14 @@ def drawn(study: Study) -> DrawnStudies:
     """
     from scipy.stats import qmc
 
-    asked = study.unknowns
-    nominal = study.observation.load_instrument()
-    rows, priors = values_of(nominal), _unknown_priors(study, nominal)
-    sequence = qmc.LatinHypercube(len(priors), rng=np.random.default_rng(study.run.seed))
-    even = sequence.random(asked.draws)
+    asked, o = study.unknowns, study.observation
+    nominal = o.load_instrument()
+    # Values that the study sets are known.
+    known = {*o.changes, *(() if o.temperature_c is None else ("temperature_c",))}
+    rows, priors = values_of(nominal), {k: prior for k, prior in asked.priors(nominal).items() if k not in known}
+    if asked.draws and not priors:
+        raise InputError("no instrument value is unknown; give a prior, or unknowns.draws = 0", key="unknowns.draws")
+    even = qmc.LatinHypercube(len(priors), rng=np.random.default_rng(study.run.seed)).random(asked.draws)
     values = np.column_stack([prior.quantile(even[:, k]) for k, prior in enumerate(priors.values())])
     # An equal share of the realisations, but enough to count the threshold of each draw.
     fewest = int(np.ceil(MIN_IN_TAIL / study.run.fap)) if study.run.tails == "counted" else 1000
@@ -263,16 +258,6 @@ def throughput_cases(case: Case) -> list[Case]:
     return moved
 
 
-def _unknown_priors(study: Study, nominal: Instrument) -> dict[str, Prior]:
-    """Return the priors of unknown values of a study's instrument; values that the study sets are known."""
-    o = study.observation
-    fixed = {*o.changes, *(() if o.temperature_c is None else ("temperature_c",))}
-    priors = {name: prior for name, prior in study.unknowns.priors(nominal).items() if name not in fixed}
-    if study.unknowns.draws and not priors:
-        raise InputError("no instrument value is unknown; give a prior, or unknowns.draws = 0", key="unknowns.draws")
-    return priors
-
-
 def average(intervals: Sequence[Interval]) -> Interval:
     """Return the mean of probabilities over draws, with a 95 % interval for their own errors and the number of draws.
 
@@ -310,19 +295,16 @@ def shares(draws: DrawnStudies, outcome: Float) -> dict[str, float]:
         left = y - straight @ np.linalg.lstsq(straight, y, rcond=None)[0]
         return float(1.0 - left.var() / y.var())
 
-    explained = {(): 0.0} | {
-        some: explained_by(some)
-        for size in range(1, len(names) + 1)
-        for some in itertools.combinations(range(len(names)), size)
-    }
+    every = range(len(names))
+    subsets = itertools.chain.from_iterable(itertools.combinations(every, size) for size in (*every, len(names)))
+    explained = {some: explained_by(some) if some else 0.0 for some in subsets}
     share = np.zeros(len(names))
     for some, value in explained.items():
-        for k in set(range(len(names))) - set(some):
+        for k in {*every}.difference(some):
             # Fraction of orders in which exactly these precede unknown k.
             weight = 1.0 / (len(names) * math.comb(len(names) - 1, len(some)))
             share[k] += weight * (explained[tuple(sorted((*some, k)))] - value)
-    parts = {names[k]: float(share[k]) for k in np.argsort(-share)}
-    return parts | {REST: 1.0 - explained[tuple(range(len(names)))]}
+    return {names[k]: float(share[k]) for k in np.argsort(-share)} | {REST: 1.0 - explained[tuple(every)]}
 
 
 #: Unknowns whose shares of a scatter are named, at most.

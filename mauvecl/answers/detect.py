@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
+from itertools import product
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
@@ -59,8 +61,8 @@ from mauvecl.study.study import PAPER_STARS, Study
 if TYPE_CHECKING:
     from astropy.table import QTable
 
+    from mauvecl.detection.distributions import Interval
     from mauvecl.host.exposure.expectation import Expectation
-    from mauvecl.study.questions import CampaignQuestion
 
 #: Largest number of rows of the tables of ROC curves and extremes, divided among flares.
 MOST_ROWS = 100_000
@@ -86,10 +88,10 @@ def _detection_columns(answer: DetectAnswer) -> tuple[Column, ...]:
         lambda star: np.repeat(star.amplitudes, len(star.detection.statistics)),
         f"relative rise of the photons in the band {answer.study.flare.band}",
     )
-    columns = [*share_columns(answer.study, "detection.quiet.target_share"), amplitude]
-    for column in COLUMNS[1:]:
-        columns += [column, IDEAL] if column.name == "high" and not answer.study.nuisances.none else [column]
-    return tuple(columns)
+    place = [column.name for column in COLUMNS].index("high") + 1
+    ideal = () if answer.study.nuisances.none else (IDEAL,)
+    share = share_columns(answer.study, "detection.quiet.target_share")
+    return (*share, amplitude, *COLUMNS[1:place], *ideal, *COLUMNS[place:])
 
 
 def _rows_of(star: StarDetection, fap: float) -> QTable:
@@ -109,17 +111,12 @@ TEMPLATE_COLUMN = Column("template", description="amplitude of the flare that th
 
 def chance_of_flare(study: Study, star: str, amplitude: float, quiet: Expectation, chance: str) -> str:
     """Return the sentence on the chance that a flare is seen, without what follows it."""
-    saturated = int(quiet.saturated.sum())
-    without = (
-        f", without the {saturated} of {quiet.saturated.size} pixels that saturate in a frame of more than "
-        f"{quiet.longest_safe_frame_s:.3g} s"
-        if saturated
-        else ""
-    )
-    return (
-        f"{name_of_instrument(study)} would see a flare of {100 * amplitude:g} % on {star} in {quiet.exposure_s:g} s "
-        f"with a chance of {chance}{without}"
-    )
+    saturated, without = int(quiet.saturated.sum()), ""
+    if saturated:
+        lost = f"{saturated} of {quiet.saturated.size} pixels that saturate"
+        without = f", without the {lost} in a frame of more than {quiet.longest_safe_frame_s:.3g} s"
+    seen = f"{name_of_instrument(study)} would see a flare of {100 * amplitude:g} % on {star}"
+    return f"{seen} in {quiet.exposure_s:g} s with a chance of {chance}{without}"
 
 
 @dataclass(eq=False)
@@ -197,25 +194,22 @@ class DetectAnswer(Answer):
     def _curves(self) -> Iterator[dict[str, Any]]:
         n_points = min(ROC_ROWS, self._row_limit(1))
         for star in self.stars:
-            for statistic in star.detection.statistics:
-                for flare, amplitude in enumerate(star.amplitudes):
-                    roc = star.detection.roc(statistic, flare)
-                    place = {"statistic": statistic, "amplitude": amplitude, "roc": roc}
-                    yield vars(star) | place | roc.points(n_points)
+            for statistic, (flare, amplitude) in product(star.detection.statistics, enumerate(star.amplitudes)):
+                roc = star.detection.roc(statistic, flare)
+                yield vars(star) | {"statistic": statistic, "amplitude": amplitude, "roc": roc} | roc.points(n_points)
 
     @property
     def _extremes(self) -> Iterator[dict[str, Any]]:
         n_values = self._row_limit(2)
         for star in self.stars:
             detection = star.detection
-            for statistic in detection.statistics:
-                for flare, template in enumerate(star.amplitudes):
-                    samples = [(template, detection.tail_samples(statistic, flare))]
-                    if detection.statistic(statistic).shaped or flare == 0:
-                        samples.append((0.0, detection.tail_samples(statistic, template=flare)))
-                    for amplitude, tail in samples:
-                        place = {"statistic": statistic, "amplitude": amplitude, "template": template}
-                        yield vars(star) | place | {"tail": tail[:n_values]}
+            for statistic, (flare, template) in product(detection.statistics, enumerate(star.amplitudes)):
+                samples = [(template, detection.tail_samples(statistic, flare))]
+                if detection.statistic(statistic).shaped or flare == 0:
+                    samples.append((0.0, detection.tail_samples(statistic, template=flare)))
+                for amplitude, tail in samples:
+                    yield vars(star) | {"statistic": statistic, "amplitude": amplitude, "template": template,
+                                        "tail": tail[:n_values]}  # fmt: skip
 
     def _row_limit(self, n_tables: int) -> int:
         """Return the number of rows of each curve or distribution, of which flares and statistics have `n_tables`."""
@@ -235,20 +229,9 @@ class DetectAnswer(Answer):
         return {"paper": self.paper} | super().as_json()
 
 
-@by_keywords
+@by_keywords("stars")
 def detect(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> DetectAnswer:
     """Simulate the detection of every flare of a study, for every star and sweep value.
-
-    Parameters
-    ----------
-    study : Study, optional
-        The paper's stars and flares by default.
-    engine : Engine or Pool, optional
-        By default that of the default device.
-    progress : callable, optional
-        Called as ``progress(done, total)`` in stars.
-    **keywords
-        Flags of the command, as in ``star="M4V"``, ``magnitude=11``: they change the study, or the default.
 
     Examples
     --------
@@ -311,11 +294,11 @@ def _messages(answer: DetectAnswer, prepared: Sequence[Case]) -> list[str]:
 def _cost_of_unknowns(prepared: Sequence[Case]) -> list[str]:
     """Return the sentence on the S/N that the faintest flare loses to unknowns."""
     choice, comparison = prepared[0].study.nuisances, prepared[0].study.run.comparison()
-    costs = [
-        unknown_cost(f"{case.label}, flare of {100 * amplitude:g} %", case.quiet, flare, choice, comparison)
-        for case in prepared
-        for amplitude, flare in zip(case.amplitudes, case.flares, strict=True)
-    ]
+    costs = list[Cost]()
+    for case in prepared:
+        for amplitude, flare in zip(case.amplitudes, case.flares, strict=True):
+            name = f"{case.label}, flare of {100 * amplitude:g} %"
+            costs.append(unknown_cost(name, case.quiet, flare, choice, comparison))
     return cost_lines(costs, choice)
 
 
@@ -326,10 +309,10 @@ def _few_terms(stars: Sequence[StarDetection]) -> list[str]:
     terms = [form.effective_terms for form in forms if isinstance(form, QuadraticForm)]
     if not terms:
         return []
-    few, many = (f"{end:.1f}" for end in (min(terms), max(terms)))
+    squares = " to ".join(dict.fromkeys(f"{end:.1f}" for end in (min(terms), max(terms))))
     return [
-        f"The paper's sum over {stars[0].detection.dof('paper')} pixels scatters like one of "
-        f"{few if few == many else f'{few} to {many}'} independent squares: its faintest pixels make most of it."
+        f"The paper's sum over {stars[0].detection.dof('paper')} pixels scatters like one of {squares} independent "
+        "squares: its faintest pixels make most of it."
     ]
 
 
@@ -356,35 +339,30 @@ def _template_costs(case: Case, star: StarDetection) -> list[str]:
 
 
 def _campaign(case: Case) -> list[str]:
-    """Return sentences on the false alarms of the campaign that a study has, if any."""
+    """Return sentences on the false alarms of a study's campaign, if any, and on the probability per test it wants."""
     asked, run, stack = case.study.campaign, case.study.run, case.quiet.n_frames
     if asked.frames is None:
         return []
     many = campaign(run.fap, asked.frames, stack, step=asked.step, seed=run.seed)
-    text = (
-        f"A campaign of {asked.frames} frames makes {many.tests} tests: at {many.fap:g} per test "
-        f"{many.expected:.3g} false alarms are expected, and the chance of any is {many.independent:.3g} if tests "
-        f"are independent, at most {many.at_most:.3g}"
+
+    def overlap(found: Interval | None, before: str, after: str = "") -> str:
+        if found is None:
+            return ""
+        return f"{before} with the overlap of its stacks {found.value:.3g} [{found.low:.3g}, {found.high:.3g}]{after}"
+
+    lines, tests = list[str](), many.tests
+    lines.append(
+        f"A campaign of {asked.frames} frames makes {tests} tests: at {many.fap:g} per test {many.expected:.3g} false "
+        f"alarms are expected, and the chance of any is {many.independent:.3g} if tests are independent, at most "
+        f"{many.at_most:.3g}{overlap(many.overlapping, ';', ' for a linear statistic')}."
     )
-    if many.overlapping is not None:
-        o = many.overlapping
-        text += f"; with the overlap of its stacks {o.value:.3g} [{o.low:.3g}, {o.high:.3g}] for a linear statistic"
-    return [text + ".", *_wanted(asked, many.tests, stack, run.seed)]
-
-
-def _wanted(asked: CampaignQuestion, tests: int, stack: int, seed: int) -> list[str]:
-    """Return sentences on the false-alarm probability per test for the campaign's wanted values."""
-    lines = []
-    if asked.fap is not None and asked.frames is not None:
-        rate = per_test(asked.fap, asked.frames, stack, step=asked.step, seed=seed)
-        text = (
+    if asked.fap is not None:
+        rate = per_test(asked.fap, asked.frames, stack, step=asked.step, seed=run.seed)
+        lines.append(
             f"For a chance of {asked.fap:g} of any false alarm in the campaign each of its {tests} tests may have "
             f"{rate.independent:.4g} if they are independent, {rate.at_least:.4g} in any case"
+            f"{overlap(rate.overlapping, ', and')}: `fap={rate.at_least:.4g}`."
         )
-        if rate.overlapping is not None:
-            o = rate.overlapping
-            text += f", and with the overlap of its stacks {o.value:.3g} [{o.low:.3g}, {o.high:.3g}]"
-        lines.append(f"{text}: `fap={rate.at_least:.4g}`.")
     if asked.alarms is not None:
         if not asked.alarms < tests:
             raise InputError.of("campaign.alarms", asked.alarms, f"fewer than the {tests} tests")
@@ -430,12 +408,10 @@ UNKNOWN_COLUMNS = (
     star_column(),
     amplitude_column(),
     Column("unknown", description="what is unknown", heading="unknown"),
-    Column("known", description="S/N of the matched statistic with everything known", heading="S/N, all known",
-           format=".3g"),
+    Column("known", "", "", "S/N of the matched statistic with everything known", "S/N, all known", ".3g"),
     Column("plain", description="the same where it is unknown and the statistic does not know of it",
            heading="S/N, not looked for", format=".3g"),
-    Column("marginalised", "marginal", description="the same, marginalised", heading="S/N, marginalised",
-           format=".3g"),
+    Column("marginalised", "marginal", "", "the same, marginalised", "S/N, marginalised", ".3g"),
     Column("detected", description="detection probability of the marginalised statistic at the header's false alarms",
            heading="then detected", format=percent(".3g")),
     Column("smallest", description="flare amplitude that is detected, marginalised, at the header's power and false "
@@ -451,6 +427,7 @@ class UnknownAnswer(Answer):
 
     study: Study
     costs: dict[tuple[str, float], dict[str, Cost]]  # by (star, amplitude), then by unknown
+    messages: list[str]
     inputs: list[Expectation]  # the stars without a flare
 
     #: One row per star, flare and unknown.
@@ -479,27 +456,21 @@ class UnknownAnswer(Answer):
     def _rows(self) -> Iterator[dict[str, Any]]:
         for (star, amplitude), costs in self.costs.items():
             for unknown, cost in costs.items():
-                flare = {"star": star, "amplitude": amplitude, "unknown": unknown}
                 detected = float(power(cost.marginal, self.study.run.fap))
-                yield vars(cost) | flare | {"detected": detected, "smallest": self.smallest(star, unknown)}
-
-    @property
-    def messages(self) -> list[str]:
-        return collect_messages(self.inputs)
+                yield vars(cost) | {"star": star, "amplitude": amplitude, "unknown": unknown, "detected": detected,
+                                    "smallest": self.smallest(star, unknown)}  # fmt: skip
 
 
 def unknown_table(study: Study) -> UnknownAnswer:
     """Compute the S/N of a study's flares under each of the unknowns of `SHOWN`."""
     prepared, comparison = cases(study, swept=False), study.run.comparison()
-    costs = {
-        (case.label, amplitude): {
-            unknown: unknown_cost(case.label, case.quiet, flare, choice, comparison)
-            for unknown, choice in SHOWN.items()
-        }
-        for case in prepared
-        for amplitude, flare in zip(case.amplitudes, case.flares, strict=True)
-    }
-    return UnknownAnswer(study, costs, [case.quiet for case in prepared])
+    costs = dict[tuple[str, float], dict[str, Cost]]()
+    for case in prepared:
+        for amplitude, flare in zip(case.amplitudes, case.flares, strict=True):
+            of = partial(unknown_cost, case.label, case.quiet, flare, comparison=comparison)
+            costs[case.label, amplitude] = {unknown: of(nuisances=choice) for unknown, choice in SHOWN.items()}
+    quiet = [case.quiet for case in prepared]
+    return UnknownAnswer(study, costs, collect_messages(quiet), quiet)
 
 
 def power(snr: float | NDArray[np.float64], fap: float) -> NDArray[np.float64]:

@@ -49,11 +49,9 @@ ELEMENT_COLUMNS = (
 )
 #: Columns of the largest error of each prediction.
 WORST_COLUMNS = (
-    Column("best_snr", description="largest S/N per element by the formula", heading="best S/N", format=".2f",
-           detail=True),
-    Column("snr_off_by",
-           description="largest significant (4 standard errors) difference of the mean S/N from it; 0 if none",
-           heading="S/N off by", format="+.3f"),
+    Column("best_snr", "", "", "largest S/N per element by the formula", "best S/N", ".2f", detail=True),
+    Column("snr_off_by", "", "", "largest significant (4 standard errors) difference of the mean S/N from it; 0 if "
+           "none", "S/N off by", "+.3f"),
     Column("at_nm", description="where", heading="at nm", format=number(".0f"), detail=True),
     Column("coverage_low", description="smallest share of 1-sigma intervals that hold the truth, of all elements",
            heading="1-sigma intervals", format=lambda low, high: f"{100 * low:.2f}-{100 * high:.2f} %",
@@ -68,9 +66,8 @@ WORST_COLUMNS = (
            heading="false alarms", format=".3f"),
     Column("statistic", description="detection statistic", heading="statistic", detail=True),
     Column("why", description="main cause of a difference from the closed form", heading="why", detail=True),
-    Column("probability_off_by",
-           description="largest significant difference of a detection probability from the closed form",
-           heading="detection off by", format="+.4f"),
+    Column("probability_off_by", "", "", "largest significant difference of a detection probability from the closed "
+           "form", "detection off by", "+.4f"),
 )  # fmt: skip
 
 
@@ -218,31 +215,23 @@ def _most_wrong(ratios: Any) -> int:
 def _of_thresholds(tested: QTable, flares: QTable) -> dict[str, float | str]:
     """Return the largest errors of a star's false-alarm and detection probabilities."""
     off = tested[tested["differs"]]
-    wrong = off[_most_wrong(off["ratio"])] if len(off) else None
+    wrong: Any = off[_most_wrong(off["ratio"])] if len(off) else {"ratio": 1.0, "statistic": "", "why": ""}
     missed = flares["probability"] - flares["closed_form_probability"]
     # The interval includes the error of the threshold.
     sure = np.abs(missed) > (flares["high"] - flares["low"]) * SURE / ERRORS_IN_INTERVAL
     missed = np.where(sure, missed, 0.0)
     return {
-        "fap_ratio": 1.0 if wrong is None else float(wrong["ratio"]),
-        "statistic": "" if wrong is None else str(wrong["statistic"]),
-        "why": "" if wrong is None else str(wrong["why"]),
+        "fap_ratio": float(wrong["ratio"]), "statistic": str(wrong["statistic"]), "why": str(wrong["why"]),
         "probability_off_by": float(missed[np.argmax(np.abs(missed))]),
-    }
+    }  # fmt: skip
 
 
-@by_keywords
+@by_keywords("stars, each of which is drawn for its S/N and then for its flares")
 def gaussian(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> GaussianAnswer:
     """Compare the usual formula with the simulation, over magnitude and exposure or the study's sweep.
 
-    Parameters
-    ----------
-    study : Study, optional
-        Without a sweep: magnitudes from 4 to 12 and exposures of 5, 50 and 600 s, unless it states the magnitudes of
-        its stars, or another exposure than the default. Its usual unknowns are left out: the question is about the
-        noise.
-    progress : callable, optional
-        Called as ``progress(done, total)`` in stars, each of which is drawn for its S/N and then for its flares.
+    Without a sweep: magnitudes from 4 to 12 and exposures of 5, 50 and 600 s, unless the study states the magnitudes of
+    its stars, or another exposure than the default. Usual unknowns are left out: the question is about the noise.
     """
     engine, study = engine or Engine(), study.ideal()
     stated = study.star != PAPER_STARS and all(star.magnitude is not None for star in study.star)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +19,7 @@ from mauvecl.device.stares import Stares
 from mauvecl.flares.frames import Components
 from mauvecl.flares.shapes import shape_of
 from mauvecl.runs.pool import Pool, map_in_order
-from mauvecl.schema.columns import INTERVAL, Column, View, interval, number, percent, table_of
+from mauvecl.schema.columns import INTERVAL, Column, View, interval, interval_columns, number, percent, table_of
 from mauvecl.schema.errors import InputError, Message
 from mauvecl.schema.physical import DAY_S
 from mauvecl.search.completeness import SMALL, InjectedCompleteness, frame_signal
@@ -136,69 +137,54 @@ DIFFERS = 4.0
 LEAST_CHANCE = 1e-5
 
 
-def limit_columns(of: str) -> tuple[Column, ...]:
-    """Return the columns of the table of limits of a kind of size, for intervals by name."""
+def limit_columns(of: str, *, known: bool) -> tuple[Column, ...]:
+    """Return the columns of limits of a kind of size, for intervals by name; the ideal one unless all is known."""
     unit, columns = SIZE_UNITS[of], list[Column]()
     size, ends = (percent(".4g"), interval(".4g", 100)) if of == "amplitude" else (".4g", interval(".4g"))
     for name, power in POWERS.items():
-        limit = itemgetter(name)
-        columns += [
-            Column(name, "value", unit, f"{of} at which the completeness is {power:g}", name.upper(), size).of(limit),
-            Column(f"{name}_low", "low", unit, "its 95 % interval, lower end", INTERVAL, ends,
-                   (f"{name}_high",), detail=power != 0.5).of(limit),
-            Column(f"{name}_high", "high", unit, "its 95 % interval, upper end").of(limit),
-        ]  # fmt: skip
+        limit = Column(name, "value", unit, f"{of} at which the completeness is {power:g}", name.upper(), size)
+        detail = power != 0.5
+        own = interval_columns(f"{name}_{{}}", "{}", unit, heading=INTERVAL, format=ends, detail=detail)
+        columns += [column.of(itemgetter(name)) for column in (limit, *own)]
+    text = "E50 if everything but the noise were known: E50 times the ratio of the S/N of a frame"
+    ideal = Column("e50_ideal", lambda row: row["e50"].value * row["share"], unit, text, "ideal E50", size)
     return (
         Column("half_width", "", "s", "half-width of the injected flares; NaN for all of them alike", "half-width (s)",
                number(".4g", "all")),
         *columns,
         Column("never", "", "", "share of flares for which no template fits into what is observed", "no template fits",
                percent(".3g"), detail=True),
-    )  # fmt: skip
-
-
-def ideal_column(of: str) -> Column:
-    """Return the column of the ideal limit of a kind of size."""
-    return Column(
-        "e50_ideal", lambda row: row["e50"].value * row["share"], SIZE_UNITS[of],
-        "E50 if everything but the noise were known: E50 times the ratio of the S/N of a frame", "ideal E50",
-        percent(".4g") if of == "amplitude" else ".4g",
+        *(() if known else (ideal,)),
     )  # fmt: skip
 
 
 def cell_columns(of: str) -> tuple[Column, ...]:
     """Return the columns of the table of completeness over half-width and a kind of size."""
-    text = "their amplitude: relative rise of the photons in the flare's band"
     return (
         Column("half_width", lambda x: np.array(x.half_widths_s)[:, None], "s", "half-width of the injected flares"),
         Column("size", "sizes", SIZE_UNITS[of], f"{of} of the injected flares"),
-        Column("amplitude", "amplitudes", "", text),
+        Column("amplitude", "amplitudes", "", "relative rise of the photons in the flare's band by them"),
         Column("completeness", "", "", "share of injected flares that the search finds"),
-        Column("completeness_low", "", "", "its 95 % interval, lower end"),
-        Column("completeness_high", "", "", "its 95 % interval, upper end"),
+        *interval_columns("completeness_{}"),
         Column("injections", "count", "", "number of injected flares"),
     )
 
 
 SEARCH_COLUMNS = (
     Column("threshold", "threshold.value", "", "S/N from which on a template is an alarm", "threshold", ".3f"),
-    Column("threshold_low", "threshold.low", "", "its 95 % interval, lower end", INTERVAL, interval(".3f"),
-           ("threshold_high",)),
-    Column("threshold_high", "threshold.high", "", "its 95 % interval, upper end"),
+    *interval_columns("threshold_{}", "threshold.{}", heading=INTERVAL, format=interval(".3f")),
     Column("checked_at", "checked", "", "S/N at which drawn stares are held against normal noise",
            "alarms a day above", ".2f", detail=True),
     Column("alarms_sampled", "asked", "", "false alarms per star-day there, normal noise", "sampled", ".3g",
            detail=True),
     Column("alarms_simulated", "simulated.value", "", "false alarms per star-day there, drawn stares",
            "drawn", ".3g", detail=True),
-    Column("alarms_low", "simulated.low", "", "lower end: 4 standard errors"),
-    Column("alarms_high", "simulated.high", "", "upper end: 4 standard errors"),
+    *interval_columns("alarms_{}", "simulated.{}", of="their interval of 4 standard errors"),
     Column("alarmed", "", "", "drawn stares with a false alarm at the threshold"),
     Column("alarmed_expected", "expected", "", "how many should have one"),
     Column("in_a_row", "", "", "false alarms per star-day of the common rule, white noise"),
     Column("templates", "survey.search.n_filters", "", "templates of the bank", "templates"),
-    Column("sums", "survey.components.n_statistics", "", "weighted sums of a frame",
-           "sums of a frame", detail=True),
+    Column("sums", "survey.components.n_statistics", "", "weighted sums of a frame", "sums of a frame", detail=True),
     Column("spectral_loss", lambda row: float(row.survey.templates.loss.max()), "",
            "largest share of S/N lost because only these sums are searched"),
     Column("star_days", lambda row: row.survey.stare.observed_s / DAY_S, "", "star-days of a stare"),
@@ -230,8 +216,7 @@ class StarCompleteness(InCell):
     @property
     def limit_columns(self) -> tuple[Column, ...]:
         """Columns of `limits`."""
-        known = np.isnan(self.ideal_share)
-        return limit_columns(self.sizes.of) if known else (*limit_columns(self.sizes.of), ideal_column(self.sizes.of))
+        return limit_columns(self.sizes.of, known=bool(np.isnan(self.ideal_share)))
 
     @property
     def limits(self) -> QTable:
@@ -256,28 +241,24 @@ class StarCompleteness(InCell):
         """Messages on stares whose false-alarm rate differs from that of normal noise, and on saturated flares."""
         messages: list[str] = []
         if not np.isnan(self.simulated.value) and not self.simulated.low <= self.asked <= self.simulated.high:
-            text = (
+            messages.append(Message(
                 f"FALSE ALARMS of {self.title} are not those of normal noise: {self.simulated.value:.3g} per star-day "
                 f"at {self.checked:.2f} in drawn stares, {self.asked:.3g} by importance sampling: the search does not "
                 "marginalise over what changes in the stare (see [search] frame, cycle, window_s), or set "
-                'search.null = "counted".'
-            )
-            messages.append(Message(text, "false alarms"))
+                'search.null = "counted".', "false alarms",
+            ))  # fmt: skip
         # The probability of at least this many alarms if the expected number is right.
         if scipy.special.gammainc(max(self.alarmed, 1e-300), self.expected) < LEAST_CHANCE:
-            text = (
-                f"FALSE ALARMS of {self.title} exceed the requested rate: {self.alarmed} of the drawn stares have "
-                f"one at the threshold, {self.expected:.2g} should: set search.null = 'counted' with more search.nulls."
-            )
-            messages.append(Message(text, "false alarms"))
+            messages.append(Message(
+                f"FALSE ALARMS of {self.title} exceed the requested rate: {self.alarmed} of the drawn stares have one "
+                f"at the threshold, {self.expected:.2g} should: set search.null = 'counted' with more search.nulls.",
+                "false alarms",
+            ))  # fmt: skip
         if self.shifted:
             messages.append(threshold_line(self.title, self.threshold.value))
         if self.injected.amplitudes.max() > self.saturates:
-            text = (
-                f"SATURATED: flares of {self.title} with an amplitude above {self.saturates:.3g} saturate a pixel, "
-                "which injections leave out."
-            )
-            messages.append(Message(text, "saturated"))
+            text = f"flares of {self.title} with an amplitude above {self.saturates:.3g} saturate a pixel"
+            messages.append(Message(f"SATURATED: {text}, which injections leave out.", "saturated"))
         return messages
 
 
@@ -302,7 +283,7 @@ class InjectAnswer(Answer):
 
     study: Study
     stars: list[StarCompleteness]
-    messages: list[str] = field(default_factory=list)
+    messages: list[str]
 
     #: Sizes E50 and E90: per star and cell of the sweep, one row for all half-widths and one for each.
     table = TableOf("limits", _share, "stars", of=lambda _, star: star.limits, place=True, about=_search)
@@ -342,18 +323,9 @@ class InjectAnswer(Answer):
         return [star.survey.components.quiet for star in self.stars]
 
 
-@by_keywords
+@by_keywords("injections")
 def inject(study: Study, engine: Stares | Pool | None = None, progress: Progress = None) -> InjectAnswer:
-    """Compute the completeness of a study's search for every star and sweep value.
-
-    Parameters
-    ----------
-    study : Study, optional
-    engine : Stares or Pool, optional
-        Simulator; by default that of the default device.
-    progress : callable, optional
-        Called as ``progress(done, total)`` in injections; may raise to stop the work.
-    """
+    """Compute the completeness of a study's search for every star and sweep value."""
     idle = next((axis.quantity for axis in study.sweep.axes if axis.quantity in ("amplitude", "exposure")), None)
     if idle is not None:
         raise InputError(f"the sweep needs quantities that injections have, but has {idle!r}", key="sweep")
@@ -364,22 +336,18 @@ def inject(study: Study, engine: Stares | Pool | None = None, progress: Progress
         Sizes.chosen(case)
     q = study.injections
     each = q.count * q.sizes * q.widths
-    answer = InjectAnswer(study, [])
-    for done, case in enumerate(prepared):
 
-        def report(part: float, done: int = done) -> None:
-            if progress is not None:
-                progress(round((done + part) * each), len(prepared) * each)
+    def report(done: int, part: float) -> None:
+        if progress is not None:
+            progress(round((done + part) * each), len(prepared) * each)
 
-        report(0.0)
-        answer.stars.append(_completeness(case, engine, report))
-    report(1.0)
-    answer.messages = [
-        *(text for star in answer.stars for text in star.messages),
-        *collect_messages(answer.inputs),
-        *orbit_lines(study.stare, study.orbit, prepared[0].instrument.frame_s),
-    ]
-    return answer
+    report(0, 0.0)
+    stars = [_completeness(case, engine, partial(report, done)) for done, case in enumerate(prepared)]
+    report(len(stars), 0.0)
+    messages = [text for star in stars for text in star.messages]
+    messages += collect_messages([star.survey.components.quiet for star in stars])
+    messages += orbit_lines(study.stare, study.orbit, prepared[0].instrument.frame_s)
+    return InjectAnswer(study, stars, messages)
 
 
 def _completeness(case: Case, engine: Stares | Pool, report: Callable[[float], None]) -> StarCompleteness:
@@ -403,29 +371,18 @@ def _completeness(case: Case, engine: Stares | Pool, report: Callable[[float], N
 
     peaks = map_in_order(engine, at_one_peak, range(positions))
     parts = list(reported(peaks, positions, lambda done, total: report(done / total)))
+    known = 0.0
+    if any(case.stare.jitters.values()):
+        (flare,) = case.one_frame.expect(case.one_frame.flaring(SMALL))
+        known = frame_signal(survey.components.quiet, flare, SMALL)
     critical = sizes.of_amplitude(np.stack([part["critical"].T for part in parts], axis=1), widths[:, None, None])
     return StarCompleteness(
-        case.label,
-        case.at,
-        survey,
-        sizes,
-        **found,
-        saturates=injections.saturates,
+        case.label, case.at, survey, sizes, **found, saturates=injections.saturates,
         in_a_row=consecutive_alarm_rate(choice.points, choice.sigma, survey.stare.frame_s),
         injected=InjectedCompleteness(injections.half_widths_s, values, amplitudes, critical),
         fitted=fit_accuracy(parts) if refit.count else None,
-        ideal_share=_ideal_share(case, survey),
-    )
-
-
-def _ideal_share(case: Case, survey: Survey) -> float:
-    """Return the S/N of a frame over that with everything but the noise known, or NaN if it is known."""
-    if not any(case.stare.jitters.values()):
-        return float("nan")
-    frame = case.one_frame
-    (flare,) = frame.expect(frame.flaring(SMALL))
-    known = frame_signal(survey.components.quiet, flare, SMALL)
-    return survey.unit_snr / known if known > 0 else float("nan")
+        ideal_share=survey.unit_snr / known if known > 0 else float("nan"),
+    )  # fmt: skip
 
 
 def _false_alarms(case: Case, survey: Survey, engine: Stares | Pool) -> dict[str, Any]:

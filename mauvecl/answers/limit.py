@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import product
 from operator import attrgetter
 from threading import Lock
 from typing import TYPE_CHECKING, Any
@@ -22,7 +23,7 @@ from mauvecl.noise.disturbances import Uniform
 from mauvecl.noise.unknowns import values_of
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import validated
-from mauvecl.schema.columns import INTERVAL, Column, View, interval, number, table_of
+from mauvecl.schema.columns import INTERVAL, Column, View, interval, interval_columns, number, table_of
 from mauvecl.schema.errors import InputError, Message, of_kind
 from mauvecl.study.cases import (
     SATURATED,
@@ -44,20 +45,6 @@ if TYPE_CHECKING:
     from astropy.table import QTable
 
     from mauvecl.host.exposure.expectation import Expectation
-    from mauvecl.host.instrument.instrument import Instrument
-
-
-def assumptions(nominal: Instrument) -> Iterator[tuple[str, dict[str, Mapping[str, Any]]]]:
-    """Yield the names of the payload's uncertain values, and changes of the instrument by the ends of their ranges.
-
-    Normal priors extend to one standard deviation (documentation: what is nominal).
-    """
-    values = values_of(nominal)
-    for name, prior in Unknowns().priors(nominal).items():
-        ends = (prior.low, prior.high) if isinstance(prior, Uniform) else (prior.mean - prior.sd, prior.mean + prior.sd)
-        value = values[name]
-        yield value.label, {f"{end:g}": value.changes(nominal, float(f"{end:.12g}")) for end in ends}
-    yield "dark counts are Poisson in", {unit: {"dark_unit": unit} for unit in ("DN", "electrons")}
 
 
 @validated
@@ -69,13 +56,9 @@ def what_matters(study: Study) -> QTable:
     QTable
         One row per star, flare, statistic and assumption; for each limit, the assumption that changes it most first.
     """
-    rows = [
-        row
-        for case in cases(study, swept=False)
-        for single in single_flares(case)
-        for statistic in study.run.statistics
-        for row in sorted(_moves(single, statistic), key=lambda row: -row["span"])
-    ]
+    rows, flares = [], [single for case in cases(study, swept=False) for single in single_flares(case)]
+    for single, statistic in product(flares, study.run.statistics):
+        rows += sorted(_moves(single, statistic), key=lambda row: -row["span"])
     columns = assumption_columns(study.limit.of)
     table = table_of(columns, rows, power=study.limit.power, fap=study.run.fap, study=study.text())
     for column in columns:
@@ -105,14 +88,26 @@ def assumption_columns(of: str) -> tuple[Column, ...]:
 
 
 def _moves(case: Case, statistic: str) -> Iterator[dict[str, Any]]:
-    """Yield the change of a limit with each assumption at both ends of its range, by the names of columns."""
-    nominal = LimitSearch(case, statistic).root()
+    """Yield the change of a limit with each assumption at both ends of its range, by the names of columns.
+
+    Normal priors extend to one standard deviation (documentation: what is nominal).
+    """
+    payload, nominal = case.instrument, LimitSearch(case, statistic).root()
+    values, changes = values_of(payload), dict[str, dict[str, Mapping[str, Any]]]()
+    for name, prior in Unknowns().priors(payload).items():
+        ends = (prior.low, prior.high) if isinstance(prior, Uniform) else (prior.mean - prior.sd, prior.mean + prior.sd)
+        value = values[name]
+        changes[value.label] = {f"{end:g}": value.changes(payload, float(f"{end:.12g}")) for end in ends}
+    changes["dark counts are Poisson in"] = {unit: {"dark_unit": unit} for unit in ("DN", "electrons")}
     limit = {"star": case.star.library or str(case.star.file), "amplitude": case.amplitudes[0], "statistic": statistic}
-    for name, ends in assumptions(case.instrument):
-        changed = (replace(case, study=case.study.with_instrument(change)) for change in ends.values())
+    for label, of_ends in changes.items():
+        changed = (replace(case, study=case.study.with_instrument(change)) for change in of_ends.values())
         low, high = (LimitSearch(each, statistic).root(near=nominal) for each in changed)
-        of_ends = dict(zip(("low_end", "high_end"), ends, strict=True)) | {"at_low_end": low, "at_high_end": high}
-        yield limit | of_ends | {"assumption": name, "nominal": nominal, "span": abs(high - low)}
+        low_end, high_end = of_ends
+        yield limit | {
+            "assumption": label, "low_end": low_end, "high_end": high_end, "nominal": nominal, "at_low_end": low,
+            "at_high_end": high, "span": abs(high - low),
+        }  # fmt: skip
 
 
 #: Steps in which the progress of a limit is reported, since its number of simulations is not known beforehand.
@@ -182,7 +177,6 @@ SPOKEN: dict[str, tuple[str, Callable[[float], str]]] = {
 #: Formats of limits by quantity.
 DIGITS = {"magnitude": ".2f", "amplitude": ".4g", "exposure": ".0f"}
 STATISTIC_COLUMN = Column("statistic", description="detection statistic", heading="statistic")
-CHECK = "detection probability there, with a fresh seed"
 
 
 def _limit_columns(answer: LimitAnswer) -> tuple[Column, ...]:
@@ -195,15 +189,13 @@ def _limit_columns(answer: LimitAnswer) -> tuple[Column, ...]:
         *share_columns(answer.study, "quiet.target_share"),
         Column(of, "value.value", unit, "where the flare is detected with the wanted probability",
                "exposure (s)" if of == "exposure" else of, digits),
-        Column("low", "value.low", unit, "its 95 % interval, lower end, with the threshold's own", INTERVAL,
-               interval(digits), ("high",)),
-        Column("high", "value.high", unit, "its 95 % interval, upper end, with the threshold's own"),
+        *interval_columns("{}", "value.{}", unit, "its 95 % interval, with the threshold's own", INTERVAL,
+                          interval(digits)),
         *ideal,
         Column("closed_form", "", unit, "the same for Gaussian noise", "closed form", digits, detail=True),
-        Column("check", "check.probability.value", "", CHECK, "detected there, simulated again", ".4f", detail=True),
-        Column("check_low", "check.probability.low", "", f"{CHECK}; 95 % interval, lower end", INTERVAL,
-               interval(".4f"), ("check_high",), detail=True),
-        Column("check_high", "check.probability.high", "", f"{CHECK}; 95 % interval, higher end"),
+        Column("check", "check.probability.value", "", "detection probability there, with a fresh seed",
+               "detected there, simulated again", ".4f", detail=True),
+        *interval_columns("check_{}", "check.probability.{}", heading=INTERVAL, format=interval(".4f"), detail=True),
         *unknown,
     )  # fmt: skip
 
@@ -211,11 +203,8 @@ def _limit_columns(answer: LimitAnswer) -> tuple[Column, ...]:
 def _unknown_columns(digits: str) -> tuple[Column, ...]:
     """Return the columns of limits over draws of what is unknown of the instrument."""
     return (
-        Column("unknown_low", lambda row: row.unknown.range[0],
-               description="central 95 % of the limits over what is unknown, lower end", heading="95 % of limits",
-               format=lambda low, high: f"{low:{digits}} to {high:{digits}}", others=("unknown_high",)),
-        Column("unknown_high", lambda row: row.unknown.range[1],
-               description="central 95 % of the limits over what is unknown, upper end"),
+        *interval_columns("unknown_{}", lambda row: row.unknown.range, "", "the central 95 % of the limits",
+                          "95 % of limits", lambda low, high: f"{low:{digits}} to {high:{digits}}"),
         Column("matters_most", lambda row: next(iter(row.unknown.shares)),
                description="unknown that explains most of the limits' variance"),
         Column("its_share", lambda row: next(iter(row.unknown.shares.values())),
@@ -334,38 +323,23 @@ def solve(case: Case, statistic: str, engine: Engine | Pool, report: Report = No
     rise = value.value if question.of == "amplitude" else case.amplitudes[0]
     there = f"exposure {value.value:.0f} s" if question.of == "exposure" else f"{question.of} {value.value:.4g}"
     where = f"{star_label(named, quiet)} at {there}, flare of {100 * rise:.4g} %"
+    amplitude = float("nan") if question.of == "amplitude" else case.amplitudes[0]
     return Limit(
-        star=star_label(named, quiet),
-        amplitude=float("nan") if question.of == "amplitude" else case.amplitudes[0],
-        of=question.of,
-        statistic=statistic,
-        power=question.power,
-        value=value,
-        closed_form=theory,
+        star_label(named, quiet), amplitude, question.of, statistic, question.power, value, closed_form=theory,
         ideal=float("nan") if known else LimitSearch(ideal, statistic).root_or_nan(theory),
-        check=check,
-        points=simulated,
-        question=kind(case, statistic),
-        at=case.at,
+        check=check, points=simulated, question=kind(case, statistic), at=case.at,
         unknown=question.unknown(theory) if isinstance(question, MarginalLimitSearch) else None,
-        messages=tuple(of_kind(collect_messages([quiet, flare]), SATURATED)),
-        quiet=quiet,
+        messages=tuple(of_kind(collect_messages([quiet, flare]), SATURATED)), quiet=quiet,
         cost=unknown_cost(where, quiet, flare, study.nuisances, study.run.comparison()),
-    )
+    )  # fmt: skip
 
 
-@by_keywords
+@by_keywords("steps, 100 for each limit")
 def limit(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> LimitAnswer:
     """Compute the limits of a study's stars and flares, by every statistic.
 
-    Raises InputError as for `solve` if all limits fail; otherwise see `LimitAnswer.failed`.
-
-    Parameters
-    ----------
-    study : Study, optional
-        Its ``limit`` defines the quantity (magnitude, amplitude or exposure) and the power.
-    progress : callable, optional
-        Called as ``progress(done, total)`` in steps, `STEPS` for each limit.
+    The study's ``limit`` defines the quantity (magnitude, amplitude or exposure) and the power. Raises InputError as
+    for `solve` if all limits fail; otherwise see `LimitAnswer.failed`.
     """
     engine = engine or Engine()
     if any(axis.quantity == study.limit.of for axis in study.sweep.axes):
@@ -373,13 +347,8 @@ def limit(study: Study, engine: Engine | Pool | None = None, progress: Progress 
             f"the sweep must run over other quantities than the {study.limit.of}, of which the limit is requested",
             key="sweep",
         )
-    asked = [
-        (single, statistic)
-        for case in cases(study)
-        for single in single_flares(case)
-        for statistic in study.run.statistics
-    ]
-
+    flares = [single for case in cases(study) for single in single_flares(case)]
+    asked = list(product(flares, study.run.statistics))
     steps, lock = [0] * len(asked), Lock()
 
     def report(number: int, done: int) -> None:
@@ -410,14 +379,10 @@ def limit(study: Study, engine: Engine | Pool | None = None, progress: Progress 
 @validated
 def smallest_amplitude(study: Study, engine: Engine | Pool | None = None) -> LimitAnswer:
     """Compute the smallest flare that is detected; see `limit`."""
-    return limit(_asking(study, "amplitude"), engine)
+    return limit(study.with_changes({"limit": {"of": "amplitude"}}, None), engine)
 
 
 @validated
 def shortest_exposure(study: Study, engine: Engine | Pool | None = None) -> LimitAnswer:
     """Compute the shortest exposure in which the flares are detected; see `limit`."""
-    return limit(_asking(study, "exposure"), engine)
-
-
-def _asking(study: Study, of: str) -> Study:
-    return study.model_copy(update={"limit": study.limit.model_copy(update={"of": of})})
+    return limit(study.with_changes({"limit": {"of": "exposure"}}, None), engine)

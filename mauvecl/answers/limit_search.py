@@ -118,14 +118,14 @@ class LimitSearch:
         # Raises InputError where no threshold has the false-alarm probability.
         detection.threshold(self.fap, self.statistic)
         (probability,) = detection.detection_probability(self.fap, self.statistic)
-        self._add(Point(value, probability, seed))
-        return probability
+        return self._added(Point(value, probability, seed))
 
-    def _add(self, point: Point) -> None:
-        """Add a simulated point, and report the number of points."""
+    def _added(self, point: Point) -> Interval:
+        """Add a simulated point, report the number of points, and return its probability."""
         self.points.append(point)
         if self._report is not None:
             self._report(len(self.points))
+        return point.probability
 
     def curve(self, value: float) -> tuple[tuple[float, float], ...]:
         """Return the closed form around a value; exposures are whole frames."""
@@ -230,9 +230,7 @@ class MarginalLimitSearch(LimitSearch):
 
     def simulated(self, value: float, seed: int) -> Interval:
         """Return the mean over draws, each with its own reference and threshold."""
-        probability = average([draw.simulated(value, seed) for draw in self.each])
-        self._add(Point(value, probability, seed))
-        return probability
+        return self._added(Point(value, average([draw.simulated(value, seed) for draw in self.each]), seed))
 
     def unknown(self, near: float) -> Unknown:
         """Return the closed-form limit of each draw, and the share of its variance that each unknown explains."""

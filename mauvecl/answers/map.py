@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict
 from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import TYPE_CHECKING
@@ -27,7 +28,7 @@ from mauvecl.detection.distributions import Interval
 from mauvecl.detection.names import RECOMMENDED, check_fap
 from mauvecl.device.engine import Engine
 from mauvecl.runs.pool import Pool, map_in_order
-from mauvecl.schema.columns import Column, View, table_of
+from mauvecl.schema.columns import Column, View, interval_columns, table_of
 from mauvecl.schema.errors import InputError, Message, of_kind
 from mauvecl.study.cases import (
     SATURATED,
@@ -44,13 +45,10 @@ from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
-    from mauvecl.study.observation import Run
     from mauvecl.study.questions import MapQuestion
 
 #: Quantities of the flare alone: cells that differ in them share their quiescent star, and one launch.
 OF_FLARE = tuple(name for name, quantity in QUANTITIES.items() if quantity.path[0] == "flare")
-
-
 #: Magnitude from which that of saturation is computed.
 MIDDLE = 10.0
 #: Steps of the magnitudes of a map, and their largest number.
@@ -59,8 +57,7 @@ STEPS, MOST_MAGNITUDES = (0.1, 0.2, 0.25, 0.5, 1.0), 16
 COLUMNS = (
     Column("statistic", lambda answer: np.array(answer.statistics)[:, None, None], description="detection statistic"),
     Column("probability", description="detection probability"),
-    Column("low", description="its 95 % interval, lower end, with the threshold's own"),
-    Column("high", description="its 95 % interval, upper end, with the threshold's own"),
+    *interval_columns("{}", of="its 95 % interval, with the threshold's own"),
     Column("closed_form", description="the same for Gaussian noise"),
 )
 #: Arrays of the answer: chances, those with everything known, and both ends of the interval.
@@ -150,17 +147,12 @@ class MapAnswer(Answer):
         return assumptions_of(self.study, self.uses, tuple(axis.quantity for axis in self.study.map.axes))
 
 
-@by_keywords
+@by_keywords("cells")
 def map(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> MapAnswer:
     """Compute the detection probability of the study's first star and flare over two quantities.
 
-    Parameters
-    ----------
-    study : Study, optional
-        Its ``map`` defines the axes; other quantities have the study's values. Without a horizontal axis, it has the
-        magnitudes over which the flares of the vertical one are lost.
-    progress : callable, optional
-        Called as ``progress(done, total)`` in cells.
+    The study's ``map`` defines the axes; other quantities have the study's values. Without a horizontal axis, it has
+    the magnitudes over which the flares of the vertical one are lost.
     """
     check_fap(study.run.fap, study.run.realisations, study.run.tails)
     study = study.model_copy(update={"star": study.star[:1]}).at("amplitude", study.flare.amplitudes[0])
@@ -183,34 +175,40 @@ def map(study: Study, engine: Engine | Pool | None = None, progress: Progress = 
     quiet, star, names = cells.quiet[0], study.star[0], {x.quantity, y.quantity}
     if "magnitude" in names:
         star = star.model_copy(update={"magnitude": None})
-    return MapAnswer(
-        study=study,
-        star="stars of the axis" if "star" in names else star_label(star, quiet),
-        x=cells.x,
-        y=cells.y,
-        statistics=study.run.statistics,
-        messages=_messages(case, cells, values),
-        shares=parts,
-        inputs=(quiet,),
-        **values,
-    )
+    label = "stars of the axis" if "star" in names else star_label(star, quiet)
+    return MapAnswer(study, label, cells.x, cells.y, study.run.statistics, messages=_messages(case, cells, values),
+                     shares=parts, inputs=(quiet,), **values)  # fmt: skip
 
 
 def _messages(case: Case, cells: Cells, values: Arrays) -> list[str]:
     """Return messages on the cells of a map, the most important first."""
-    study, number_of_cells = case.study, len(cells.x) * len(cells.y)
-    return [
-        *_blinded(values),
-        *_without_threshold(study.run, values),
-        *(
-            Message(f"NO ANSWER in {number} of {number_of_cells} cells: {why}.", "no answer")
-            for why, number in cells.failed.items()
-        ),
-        *_wrong_sign(case, cells.lowered, number_of_cells),
-        *worst_first([*collect_messages(cells.quiet, study.processes), *cells.saturated]),
-        *marginal_lines(study.nuisances),
-        *_cost(case, cells.x, cells.y),
-    ]
+    study, run, number_of_cells, messages = case.study, case.study.run, len(cells.x) * len(cells.y), list[str]()
+    lost = np.isnan(values["closed_form"][0])
+    if lost.any():
+        text = f"SATURATED: every pixel that counts saturates in {lost.sum()} of {lost.size} cells: no number there."
+        messages.append(Message(text, SATURATED))
+    missing = np.isnan(values["probability"]) & ~np.isnan(values["closed_form"])
+    for statistic, there in zip(run.statistics, missing, strict=True):
+        if there.any():
+            text = (
+                f"NO THRESHOLD: in {there.sum()} of {there.size} cells no threshold of {statistic} has a false-alarm "
+                f"probability of {run.fap:g}, because one value is more probable, as saturated pixels give it: no "
+                "number there; `mauvecl detect` names the probabilities that thresholds have."
+            )
+            messages.append(Message(text, "no threshold"))
+    for why, number in cells.failed.items():
+        messages.append(Message(f"NO ANSWER in {number} of {number_of_cells} cells: {why}.", "no answer"))
+    how = "" if study.nuisances.none else "marginalised over unknowns, "
+    lowered = Counter(statistic for statistic, *_ in cells.lowered)
+    for statistic in run.statistics:
+        if lowered[statistic]:
+            text = (
+                f"WRONG SIGN: {how}{statistic} falls with the flare in {lowered[statistic]} of {number_of_cells} "
+                "cells, and only higher values are alarms: its detection probability says nothing of the flare there."
+            )
+            messages.append(Message(text, "wrong sign"))
+    messages += worst_first([*collect_messages(cells.quiet, study.processes), *cells.saturated])
+    return [*messages, *marginal_lines(study.nuisances), *_cost(case, cells.x, cells.y)]
 
 
 def magnitudes_of(case: Case) -> Axis:
@@ -251,9 +249,7 @@ def _saturating(quiet: Expectation, magnitude: float) -> float:
     room = quiet.ceiling_dn - (quiet.mean_raw_dn - star)
     # Pixels that their dark current alone saturates have no room, whatever the magnitude.
     free = room > 0
-    if not free.any():
-        return magnitude
-    return magnitude + 2.5 * float(np.log10(np.max(star[free] / room[free])))
+    return magnitude + 2.5 * float(np.log10(np.max(star[free] / room[free]))) if free.any() else magnitude
 
 
 def _cost(case: Case, x: Values, y: Values) -> list[str]:
@@ -274,42 +270,6 @@ Values = tuple[float | str, ...]
 Arrays = dict[str, NDArray[np.float64]]
 #: A statistic, and the indices of a cell in which the flare lowers it.
 Lowered = tuple[str, int, int]
-
-
-def _blinded(values: Arrays) -> list[str]:
-    """Return the sentence on cells where every pixel saturates, if any."""
-    lost = np.isnan(values["closed_form"][0])
-    text = f"SATURATED: every pixel that counts saturates in {lost.sum()} of {lost.size} cells: no number there."
-    return [Message(text, SATURATED)] if lost.any() else []
-
-
-def _without_threshold(run: Run, values: Arrays) -> list[str]:
-    """Return a sentence for each statistic on cells where no threshold has the false-alarm probability, if any."""
-    missing = np.isnan(values["probability"]) & ~np.isnan(values["closed_form"])
-    return [
-        Message(
-            f"NO THRESHOLD: in {int(there.sum())} of {there.size} cells no threshold of {statistic} has a false-alarm "
-            f"probability of {run.fap:g}, because one value is more probable, as saturated pixels give it: no number "
-            "there; `mauvecl detect` names the probabilities that thresholds have.",
-            "no threshold",
-        )
-        for statistic, there in zip(run.statistics, missing, strict=True)
-        if there.any()
-    ]
-
-
-def _wrong_sign(case: Case, lowered: set[Lowered], cells: int) -> list[str]:
-    """Return a sentence for each weighted sum on the cells whose flare lowers it, if any."""
-    how = "marginalised over unknowns, " if not case.study.nuisances.none else ""
-    return [
-        Message(
-            f"WRONG SIGN: {how}{statistic} falls with the flare in {number} of {cells} cells, and only higher values "
-            "are alarms: its detection probability says nothing of the flare there.",
-            "wrong sign",
-        )
-        for statistic in case.study.run.statistics
-        if (number := sum(name == statistic for name, *_ in lowered))
-    ]
 
 
 @dataclass(eq=False)
@@ -367,9 +327,9 @@ def _averaged(maps: list[Arrays]) -> Arrays:
 def _groups(question: MapQuestion, x: Values, y: Values) -> list[list[tuple[int, int]]]:
     """Return the cells (i, j) in groups that share a quiescent star."""
     flare_x, flare_y = (axis.quantity in OF_FLARE for axis in question.axes)
-    groups: dict[tuple[int | None, int | None], list[tuple[int, int]]] = {}
+    groups = defaultdict[tuple[int, int], list[tuple[int, int]]](list)
     for j, i in np.ndindex(len(y), len(x)):
-        groups.setdefault((None if flare_x else i, None if flare_y else j), []).append((i, j))
+        groups[0 if flare_x else i, 0 if flare_y else j].append((i, j))
     return list(groups.values())
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from itertools import chain
+from itertools import chain, product
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
@@ -22,15 +22,15 @@ from mauvecl.answers.measurements import (
     matched_filter,
 )
 from mauvecl.answers.verbs import Progress, by_keywords
-from mauvecl.detection.distributions import Interval, clopper_pearson
-from mauvecl.detection.nuisances import join_names
+from mauvecl.detection.distributions import Interval, clopper_pearson, clopper_pearson_ends
+from mauvecl.detection.nuisances import fitted_amplitudes, join_names
 from mauvecl.device.engine import Engine
 from mauvecl.fits.flare_model import usable_variance
 from mauvecl.fits.spectrum import LEVELS, Measurement
 from mauvecl.noise.scene import FactorDistributions
 from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool, map_in_order
-from mauvecl.schema.columns import Column, View, number, percent, table_of
+from mauvecl.schema.columns import Column, View, interval_columns, number, percent, table_of
 from mauvecl.schema.errors import InputError, Message
 from mauvecl.study.cases import Case, amplitude_column, cases, collect_messages
 from mauvecl.study.questions import check_sweep
@@ -67,11 +67,8 @@ class MeasuredFlare(ExpectedMeasurement):
             return mean, np.zeros_like(mean)
         unknown, expected = self.unknown.around(mean), self.unknown.mean_dn
         variance, used = usable_variance(self.quiet, mean, self.skipped_nm, unknown)
-        spectra = unknown.spectra * used
-        weighted = np.divide(spectra, variance, out=np.zeros_like(spectra), where=used)
-        information = np.diag(unknown.sd**-2.0) + weighted @ spectra.T
-        left = self.frame - mean - expected
-        return mean, expected + np.linalg.solve(information, weighted @ left) @ unknown.spectra
+        variance, left = np.where(used, variance, np.inf), self.frame - mean - expected
+        return mean, expected + fitted_amplitudes(unknown.spectra, unknown.sd, left, variance) @ unknown.spectra
 
     def rows(self) -> QTable:
         """Return one row per quantity."""
@@ -80,12 +77,14 @@ class MeasuredFlare(ExpectedMeasurement):
     @cached_property
     def coverages(self) -> dict[str, Float]:
         """Shares of intervals that hold the truth, with 95 % intervals, by their columns; shape (3, n_derived) each."""
+        found, covers = self.found, dict[str, Float]()
         exposures = {"": np.ones(self.selected.size, np.bool_), "_selected": self.selected}
-        return {
-            f"coverage_{100 * level:.0f}{suffix}": _coverage(self.found, self.truth, k, which)
-            for suffix, which in exposures.items()
-            for k, level in enumerate(self.found.levels)
-        }
+        for (suffix, which), (k, level) in product(exposures.items(), enumerate(found.levels)):
+            inside = ((found.low[k] <= self.truth) & (self.truth <= found.high[k]))[which]
+            cover = covers[f"coverage_{100 * level:.0f}{suffix}"] = np.full((3, self.truth.size), np.nan)
+            known = np.isfinite(self.truth) & bool(len(inside))
+            cover[:, known] = clopper_pearson_ends(inside[:, known].sum(axis=0), max(len(inside), 1))
+        return covers
 
     @property
     def bias_selected(self) -> Float:
@@ -110,8 +109,7 @@ def _coverage_columns(level: float, suffix: str, whose: str, heading: str = "") 
     text = f"share of {100 * level:.0f} % intervals that hold the truth, {whose}"
     return [
         Column(name, lambda row: row.coverages[name][0], "", text, heading, percent(".1f"), detail=bool(suffix)),
-        Column(f"{name}_low", lambda row: row.coverages[name][1], "", f"{text}: 95 % interval, lower end"),
-        Column(f"{name}_high", lambda row: row.coverages[name][2], "", f"{text}: 95 % interval, upper end"),
+        *interval_columns(f"{name}_{{}}", lambda row: row.coverages[name][1:], "", f"the 95 % interval of the {text}"),
     ]
 
 
@@ -121,15 +119,13 @@ COLUMNS = (
            lambda name, unit: f"{name} ({unit})" if unit else name, ("unit",)),
     Column("unit", "found.units", "", "of truth, estimates and errors"),
     Column("truth", "", "", "true value; undefined where the flare has none", "truth", number(".4g")),
-    Column("error_known", "known.errors", "", "standard error in advance, everything known", "ideal",
-           number(".3g")),
+    Column("error_known", "known.errors", "", "standard error in advance, everything known", "ideal", number(".3g")),
     Column("error", "ahead.errors", "", "standard error in advance, unknowns marginalised over", "error",
            number(".3g")),
     Column("perfect", lambda row: row.perfect.estimates[0], "", "estimate from an exposure without noise",
            "fit without noise", number(".4g"), detail=True),
-    Column("low_68", lambda row: row.perfect.low[0, 0], "",
-           "lower end of the 68 % interval of that fit; infinite if there is none"),
-    Column("high_68", lambda row: row.perfect.high[0, 0], "", "its upper end"),
+    *interval_columns("{}_68", lambda row: (row.perfect.low[0, 0], row.perfect.high[0, 0]), "",
+                      "the 68 % interval of that fit; infinite if there is none"),
     Column("low_95", lambda row: row.perfect.low[1, 0], "", "lower end of the 95 % interval of that fit", "95 % from",
            number(".4g"), detail=True),
     Column("high_95", lambda row: row.perfect.high[1, 0], "", "its upper end", "to", number(".4g"), detail=True),
@@ -153,8 +149,7 @@ THROUGHPUT_COLUMN = Column("error_throughput", "of_throughput", "",
 
 
 FIT_COLUMNS = (
-    Column("snr", lambda row: row.snr[0], "", "S/N of the flare in one exposure, everything known", "ideal S/N",
-           ".2f"),
+    Column("snr", lambda row: row.snr[0], "", "S/N of the flare in one exposure, everything known", "ideal S/N", ".2f"),
     Column("snr_marginal", lambda row: row.snr[1], "", "the same, unknowns marginalised over", "S/N", ".2f"),
     Column("dof", "found.dof", "", "degrees of freedom of chi-squared"),
     Column("chi2", lambda row: float(np.mean(row.found.chi2)), "", "mean chi-squared of the fits", "chi-squared / dof",
@@ -163,12 +158,10 @@ FIT_COLUMNS = (
            "what the model cannot fit of an exposure without noise"),
     Column("rejected", "rejected.value", "", f"share of fits with a p-value below {REJECTED:g}", "p < 0.01",
            percent(".1f")),
-    Column("rejected_low", "rejected.low", "", "95 % interval, lower end"),
-    Column("rejected_high", "rejected.high", "", "95 % interval, upper end"),
+    *interval_columns("rejected_{}", "rejected.{}"),
     Column("detected", "detected.value", "", "share that a matched filter for the true flare detects", "detected",
            percent(".1f")),
-    Column("detected_low", "detected.low", "", "95 % interval, lower end"),
-    Column("detected_high", "detected.high", "", "95 % interval, upper end"),
+    *interval_columns("detected_{}", "detected.{}"),
 )  # fmt: skip
 MODEL_COLUMN = Column("model", description="model that is fitted", heading="model", detail=True)
 
@@ -187,9 +180,8 @@ JOINT_COLUMNS = (
     Column("truth", "joint.truth", "", "true value; undefined where the flare has none", "truth", number(".4g")),
     Column("estimate", lambda row: row.joint.found.estimates[0], "", "of maximum likelihood", "estimate", ".4g"),
     Column("error", lambda row: row.joint.found.errors[0], "", "its standard error", "error", ".2g"),
-    Column("low_68", lambda row: row.joint.found.low[0, 0], "",
-           "lower end of its 68 % interval; infinite if there is none"),
-    Column("high_68", lambda row: row.joint.found.high[0, 0], "", "higher end"),
+    *interval_columns("{}_68", lambda row: (row.joint.found.low[0, 0], row.joint.found.high[0, 0]), "",
+                      "its 68 % interval; infinite if there is none"),
     Column("low_95", lambda row: row.joint.found.low[1, 0], "", "lower end of its 95 % interval", "95 % from", ".4g"),
     Column("high_95", lambda row: row.joint.found.high[1, 0], "", "higher end", "to", ".4g"),
     Column("p_value", "joint.found.p_value", "",
@@ -274,18 +266,9 @@ class MeasureAnswer(Answer):
         return list({id(flare.quiet): flare.quiet for flare in self.flares}.values())
 
 
-@by_keywords
+@by_keywords("flares")
 def measure(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> MeasureAnswer:
-    """Forecast and simulate the measurement of a study's flares in one exposure.
-
-    Parameters
-    ----------
-    study : Study, optional
-    engine : Engine or Pool, optional
-        Simulator of the exposures; by default that of the default device. The checkpoint of a pool keeps finished fits.
-    progress : callable, optional
-        Called as ``progress(done, total)`` in flares.
-    """
+    """Forecast and simulate the measurement of a study's flares in one exposure."""
     if study.flare.geometry != "added":
         raise InputError.of("flare.geometry", "replaces", "'added', since fits take light for added")
     if study.measure.along_stare:
@@ -307,7 +290,7 @@ def measure(study: Study, engine: Engine | Pool | None = None, progress: Progres
     messages = collect_messages(expectations)
     messages += [stare.unmeasured for stare in stares if stare.unmeasured]
     messages += dict.fromkeys(line for case in prepared for line in _not_marginalised(case))
-    return MeasureAnswer(study, flares, [*messages, *_faint(flares), *_wrong(flares)], stares)
+    return MeasureAnswer(study, flares, [*messages, *_doubtful(flares)], stares)
 
 
 def _measured(case: Case, amplitude: float, flare: Expectation, engine: Engine | Pool) -> list[MeasuredFlare]:
@@ -316,7 +299,7 @@ def _measured(case: Case, amplitude: float, flare: Expectation, engine: Engine |
     expected = expected_measurements(case, amplitude, flare)
     models, unknown = [forecast.fitted for forecast in expected], expected[0].unknown
     skipped = study.measure.skipped_nm
-    weights = matched_filter(quiet, flare, case.unknowns(), skipped_nm=skipped)[0]
+    weights = matched_filter(quiet, flare, case.unknowns(), None, skipped)[0]
 
     def fitted(start: int, count: int) -> Arrays:
         raw = engine.realise(flare, start=start, count=count, seed=study.run.seed, **case.draw_options)
@@ -346,17 +329,6 @@ def _measured(case: Case, amplitude: float, flare: Expectation, engine: Engine |
     return measured
 
 
-def _coverage(measurement: Measurement, truth: Float, level: int, which: NDArray[np.bool_]) -> Float:
-    """Return coverage and its 95 % interval for each quantity, shape (3, n_derived); NaN without a truth."""
-    inside = (measurement.low[level] <= truth) & (truth <= measurement.high[level])
-    cover = np.full((3, truth.size), np.nan)
-    n = int(which.sum())
-    for q in np.flatnonzero(np.isfinite(truth)) if n else ():
-        interval = clopper_pearson(int(inside[which, q].sum()), n)
-        cover[:, q] = interval.value, interval.low, interval.high
-    return cover
-
-
 def _scatter(estimates: Float) -> Float:
     """Return half of the central 68.27 % of the estimates, shape (n_derived,); undefined for a single one."""
     if len(estimates) < 2:
@@ -367,8 +339,7 @@ def _scatter(estimates: Float) -> Float:
 
 def _not_marginalised(case: Case) -> list[str]:
     """Return a message on drawn factors over which fits do not marginalise."""
-    drawn = FactorDistributions.from_processes(case.processes, case.quiet)
-    unknown = case.unknowns_of_fits()
+    drawn, unknown = FactorDistributions.from_processes(case.processes, case.quiet), case.unknowns_of_fits()
     names = [name for name in (drawn.spreads if drawn else ()) if unknown is None or name not in unknown.names]
     if not names:
         return []
@@ -379,29 +350,22 @@ def _not_marginalised(case: Case) -> list[str]:
     return [Message(text, "not marginalised")]
 
 
-def _faint(flares: Sequence[MeasuredFlare]) -> list[str]:
-    """Return a message for each flare whose intervals are approximate because it is faint."""
-    snr_of = {f"{flare.title}, flare of {100 * flare.amplitude:g} %": flare.snr[1] for flare in flares}
-    return [
-        f"{title}: of an S/N of {snr:.2g} with unknowns marginalised over; below {WILKS_SNR:g} intervals of 95 % cover "
-        "93 to 99 %: the table counts how often they do."
-        for title, snr in snr_of.items()
-        if snr < WILKS_SNR
-    ]
-
-
-def _wrong(flares: Sequence[MeasuredFlare]) -> list[str]:
-    """Return messages on models that do not fit, with the temperature that they give."""
-    lines = []
+def _doubtful(flares: Sequence[MeasuredFlare]) -> list[str]:
+    """Return messages on faint flares, whose intervals are approximate, and on models that do not fit."""
+    faint, wrong = dict[str, None](), []
     for flare in flares:
-        lost, truth = float(flare.perfect.chi2[0]), flare.truth[0]
-        if lost < 1.0:
-            continue
-        kelvin, error = flare.perfect.estimates[0, 0], flare.ahead.errors[0]
-        against = f" where the flare has {truth:.0f} K" if np.isfinite(truth) else ""
-        rejected = 100 * float((flare.found.p_value < REJECTED).mean())
-        lines.append(
-            f"{flare.title}, flare of {100 * flare.amplitude:g} %: the model {flare.model!r} gives {kelvin:.0f} +- "
-            f"{error:.0f} K{against}; its goodness of fit rejects it in {rejected:.0f} % of exposures."
-        )
-    return lines
+        name, truth = f"{flare.title}, flare of {100 * flare.amplitude:g} %", flare.truth[0]
+        if flare.snr[1] < WILKS_SNR:
+            text = (
+                f"{name}: of an S/N of {flare.snr[1]:.2g} with unknowns marginalised over; below {WILKS_SNR:g} "
+                "intervals of 95 % cover 93 to 99 %: the table counts how often they do."
+            )
+            faint[text] = None
+        if flare.perfect.chi2[0] >= 1.0:
+            kelvin, error = flare.perfect.estimates[0, 0], flare.ahead.errors[0]
+            against = f" where the flare has {truth:.0f} K" if np.isfinite(truth) else ""
+            wrong.append(
+                f"{name}: the model {flare.model!r} gives {kelvin:.0f} +- {error:.0f} K{against}; its goodness of fit "
+                f"rejects it in {100 * flare.rejected.value:.0f} % of exposures."
+            )
+    return [*faint, *wrong]

@@ -56,49 +56,37 @@ class Truth:
         added = added - light.flux_at_telescope(nm)
         # Ratio of the flux at the telescope to that of the flare's spectrum.
         self._scale = float(np.trapezoid(added, nm) / np.trapezoid(light.flux(nm), nm))
-        self._continuum = light.continuum if isinstance(light, FlareWithLines) else light
-        self._two = self._continuum if isinstance(self._continuum, TwoBlackbodies) else None
-        self._amplitude = np.nan
-        if self._continuum.temperature_k is not None:
-            at = quiet.wavelength_nm
+        continuum = light.continuum if isinstance(light, FlareWithLines) else light
+        self._values = dict.fromkeys(("temperature", "second temperature", "second area", "amplitude", "jump"), np.nan)
+        two, kelvin = continuum if isinstance(continuum, TwoBlackbodies) else None, continuum.temperature_k
+        if kelvin is not None:
             # Flux of the blackbodies without recombination.
-            light = self._continuum if self._two else Blackbody(self._continuum.temperature_k)
-            body = photons(at, light.flux(at), band)
-            self._amplitude = self._scale * body / photons(at, quiet.flux_flam, band)
+            body, at = continuum if two else Blackbody(kelvin), quiet.wavelength_nm
+            hot = self._scale * photons(at, body.flux(at), band)
+            self._values |= {"temperature": kelvin, "amplitude": hot / photons(at, quiet.flux_flam, band)}
+        if kelvin is not None and two is not None:
+            # The first is the cooler one.
+            (low, area), (high, hot_area) = sorted([(kelvin, 1.0), (two.second_temperature_k, two.second_area)])
+            self._values |= {"temperature": low, "second temperature": high, "second area": hot_area / area}
+        if continuum.surface:
+            self._values["jump"] = continuum.jump if isinstance(continuum, BalmerFlare) else 1.0
+        self._far = np.nan if star.distance_pc is None else star.distance_pc * PARSEC_CM
+        self._area = np.pi * self._far**2 * self._scale if continuum.surface else np.nan
+        self._area *= 1.0 if two is None else 1.0 + two.second_area
 
     def value(self, name: str) -> float:
         """Return the true value of a quantity by its name in fits; NaN if the flare has none."""
-        far = np.nan if self._star.distance_pc is None else self._star.distance_pc * PARSEC_CM
         first, _, rest = name.partition(" ")
+        if name in self._values:
+            return self._values[name]
         if first in ("flux", "luminosity", "energy"):
-            factor = {"flux": 1.0, "luminosity": 4 * np.pi * far**2, "energy": 4 * np.pi * far**2 * self._exposure_s}
+            sphere = 4 * np.pi * self._far**2
+            factor = {"flux": 1.0, "luminosity": sphere, "energy": sphere * self._exposure_s}
             return factor[first] * self._flux(rest)
         if first == "line":
             return self._line(rest)
-        if name in ("temperature", "second temperature", "second area"):
-            return self._temperatures().get(name, np.nan)
-        if name == "amplitude":
-            return self._amplitude
-        if name == "jump":
-            if not self._continuum.surface:
-                return np.nan
-            return self._continuum.jump if isinstance(self._continuum, BalmerFlare) else 1.0
-        area = np.pi * far**2 * self._scale if self._continuum.surface else np.nan
-        area *= 1.0 if self._two is None else 1.0 + self._two.second_area
-        if name == "area":
-            return area
         radius = np.nan if self._star.radius_rsun is None else self._star.radius_rsun * SUN_CM
-        return float(area / (np.pi * radius**2))
-
-    def _temperatures(self) -> dict[str, float]:
-        """Return the temperatures, and the ratio of the hotter blackbody's area to that of the cooler one."""
-        kelvin, two = self._continuum.temperature_k, self._two
-        if kelvin is None:
-            return {}
-        if two is None:
-            return {"temperature": kelvin}
-        (low, area), (high, hot_area) = sorted([(kelvin, 1.0), (two.second_temperature_k, two.second_area)])
-        return {"temperature": low, "second temperature": high, "second area": hot_area / area}
+        return self._area if name == "area" else float(self._area / (np.pi * radius**2))
 
     def _flux(self, where: str) -> float:
         if where == "bolometric":
@@ -199,16 +187,12 @@ class ExpectedMeasurement(InCell):
 
 
 def fit_model(
-    frames: Float,
-    quiet: Expectation,
-    model: FlareModel | TwoTemperatures,
-    unknown: Nuisances | None,
-    skipped_nm: Ranges = (),
+    frames: Float, quiet: Expectation, model: FlareModel | TwoTemperatures, unknown: Nuisances | None, skipped: Ranges
 ) -> Measurement:
     """Fit a model of one or two temperatures to exposures."""
     if isinstance(model, TwoTemperatures):
-        return fit_two_temperatures(frames, quiet, model.single, unknown, skipped_nm=skipped_nm)
-    return fit(frames, quiet, model, unknown, skipped_nm=skipped_nm)
+        return fit_two_temperatures(frames, quiet, model.single, unknown, skipped_nm=skipped)
+    return fit(frames, quiet, model, unknown, skipped_nm=skipped)
 
 
 def model_of(case: Case, *, jump: bool = False, lines: tuple[str, ...] = ()) -> FlareModel:
@@ -241,9 +225,8 @@ def expected_measurements(
     case: Case, amplitude: float, flare: Expectation, models: dict[str, FlareModel | TwoTemperatures] | None = None
 ) -> list[ExpectedMeasurement]:
     """Forecast the measurement of a flare with each model, by default those of `models_of`."""
-    quiet, light, unknown = case.quiet, case.study.flare.light(), case.unknowns_of_fits()
-    band, skipped = case.study.flare.band, case.study.measure.skipped_nm
-    truth = Truth(case.star, case.source, case.flaring(amplitude), light, band, quiet.exposure_s)
+    quiet, own, unknown, skipped = case.quiet, case.study.flare, case.unknowns_of_fits(), case.study.measure.skipped_nm
+    truth = Truth(case.star, case.source, case.flaring(amplitude), own.light(), own.band, quiet.exposure_s)
     lit = flare.recorded_dn - quiet.recorded_dn
     known_snr, snr = (matched_filter(quiet, flare, nuisances, lit, skipped)[1] for nuisances in (None, case.unknowns()))
     # Exposures with each mode of the throughput's own errors at one standard deviation.
@@ -251,8 +234,10 @@ def expected_measurements(
         _mean_exposure(quiet, moved.expect(moved.flaring(amplitude))[0].recorded_dn - moved.quiet.recorded_dn, unknown)
         for moved in throughput_cases(case)
     ]
-    # A fit in few pixels may differ from the flare in those that saturate, which its errors must not use.
-    lost = (*skipped, *_saturated_nm(flare))
+    # A fit in few pixels may differ from the flare in runs of them that saturate, which its errors must not use.
+    nm = flare.wavelength_nm
+    saturated = true_runs(~variance_of(flare)[1])
+    lost = (*skipped, *((float(nm[first]), float(nm[end - 1])) for first, end in saturated))
     expected = []
     for name, model in (models or models_of(case)).items():
         perfect = fit_model(_mean_exposure(quiet, lit, unknown), quiet, model, unknown, skipped)
@@ -266,17 +251,9 @@ def expected_measurements(
             # The observer knows the quiescent exposure from other frames, and fits with the calibrated throughput.
             moved = [fit_model(exposure, quiet, model, unknown, skipped).estimates[0] for exposure in calibrated]
             of_throughput = np.asarray(np.sqrt(np.sum(np.square(moved - perfect.estimates[0]), axis=0)))
-        place = case.label, case.at, amplitude, name, (known_snr, snr)
-        expected.append(
-            ExpectedMeasurement(*place, true, known, ahead, perfect, model, quiet, unknown, of_throughput, skipped)
-        )
+        found = (known_snr, snr), true, known, ahead, perfect, model, quiet, unknown, of_throughput, skipped
+        expected.append(ExpectedMeasurement(case.label, case.at, amplitude, name, *found))
     return expected
-
-
-def _saturated_nm(flare: Expectation) -> list[tuple[float, float]]:
-    """Return the wavelengths of runs of pixels near saturation."""
-    nm = flare.wavelength_nm
-    return [(float(nm[first]), float(nm[end - 1])) for first, end in true_runs(~variance_of(flare)[1])]
 
 
 def _mean_exposure(quiet: Expectation, added_dn: Float, unknown: Nuisances | None) -> Float:
@@ -286,11 +263,7 @@ def _mean_exposure(quiet: Expectation, added_dn: Float, unknown: Nuisances | Non
 
 
 def matched_filter(
-    quiet: Expectation,
-    flare: Expectation,
-    unknown: Nuisances | None,
-    added_dn: Float | None = None,
-    skipped_nm: Ranges = (),
+    quiet: Expectation, flare: Expectation, unknown: Nuisances | None, added_dn: Float | None, skipped_nm: Ranges
 ) -> tuple[Float, float]:
     """Return the weights of a matched filter of variance one, and its mean with the flare.
 

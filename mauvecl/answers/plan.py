@@ -30,7 +30,7 @@ from mauvecl.answers.visible import VisibleAnswer, assumption_columns, visible
 from mauvecl.device.stares import Stares
 from mauvecl.host.orbit.visibility import PARTICLES_SOURCE, THERMAL_SOURCE
 from mauvecl.runs.pool import map_in_order
-from mauvecl.schema.columns import Column, number, percent, records
+from mauvecl.schema.columns import Column, interval_columns, number, percent, records
 from mauvecl.schema.errors import InputError, Message, of_kind, printable, together
 from mauvecl.schema.physical import DAY_S
 from mauvecl.search.completeness import Yield, recovered_per_day
@@ -61,10 +61,6 @@ def months(names: str) -> str:
     return ", ".join(f"{' '.join(each)} {year}" for year, each in years.items())
 
 
-def _interval(low: int | None, high: int | None) -> str:
-    return "" if low is None else f"{low} to {high}"
-
-
 #: Columns of the table of targets, without false alarms, which precede the last.
 COLUMNS = (
     Column("target", "name", "", "name of the target", "target"),
@@ -79,11 +75,9 @@ COLUMNS = (
            lambda expected: two_digits(expected) if expected == expected else "not known"),
     Column("ideal", "", "", "the same by the closed form if everything but the noise were known", "ideal",
            lambda expected: two_digits(expected) if expected == expected else ""),
-    Column("low", lambda row: row.recovered.low if row.recovered else None, "",
-           "lower end of the 95 % interval: scatter of the rates and Poisson noise", "95 %", _interval,
-           ("high",), int),
-    Column("high", lambda row: row.recovered.high if row.recovered else None, "",
-           "upper end of the 95 % interval", kind=int),
+    *interval_columns("{}", lambda row: (row.recovered.low, row.recovered.high) if row.recovered else (None, None), "",
+                      "the 95 % interval: scatter of the rates and Poisson noise", "95 %",
+                      lambda low, high: "" if low is None else f"{low} to {high}", kind=int),
     Column("at_least_one", lambda row: row.recovered.at_least_one if row.recovered else np.nan, "",
            "probability of recovering any", "P(>= 1)", number(".2f"), detail=True),
     Column("best_months", lambda row: " ".join(row.best_months), "", "those with most hours", "best months",
@@ -196,19 +190,17 @@ class PlanAnswer(Answer):
             if target.completeness is not None:
                 energies, p = target.completeness.energy_erg, target.completeness.probability
                 first = max(int(np.argmax(p > 0)) - 1, 0)
-                part = slice(first, min(first + 161, energies.size))
+                part = slice(first, first + 161)
                 rate = np.nan if target.rates is None else target.rates.per_day_above(energies[part])
                 yield {"target": target.name, "energy": energies[part], "recovered": p[part], "rate_above": rate}
 
     @property
     def _assumptions(self) -> list[tuple[str, str, str]]:
         study, orbit, law = self.study, self.study.orbit.orbit(), self.study.plan.law()
-        elements = (
-            f"{orbit.elements.source}, epoch {orbit.elements.epoch}; mean is a Sun-synchronous orbit through them"
-        )
-        half_width = (
-            f"t_1/2 = {law.half_width_s:g} s (E / {law.at_erg:g} erg)^{law.exponent:g}, {law.scatter_dex:g} dex"
-        )
+        e = orbit.elements
+        elements = f"{e.source}, epoch {e.epoch}; mean is a Sun-synchronous orbit through them"
+        scale = f"{law.half_width_s:g} s (E / {law.at_erg:g} erg)^{law.exponent:g}"
+        half_width = f"t_1/2 = {scale}, {law.scatter_dex:g} dex"
         light = ("blackbody of " if study.flare.is_blackbody else "") + study.flare.light().describe()
         alarms = f"{study.search.false_alarms:g} per {study.search.per} of exposure"
         return [
@@ -287,24 +279,21 @@ class PlanAnswer(Answer):
 
     @property
     def _messages_on_rates(self) -> list[str]:
-        lines, typical, beyond = list[str](), list[str](), list[str]()
-        for target in self.planned:
-            if target.no_rates:
-                lines.append(f"{target.no_rates[0].upper()}{target.no_rates[1:]}; its expected flares are not given.")
-            if target.rates is not None and "typical" in target.rates.source:
-                typical.append(target.name)
-            if target.completeness is not None and target.extrapolated:
-                beyond.append(f"{target.name} ({target.energy_at(0.5):.2g} erg, {target.published})")
+        planned, lines = self.planned, list[str]()
+        typical = [target.name for target in planned if target.rates is not None and "typical" in target.rates.source]
         if typical:
-            lines.insert(
-                0,
+            lines.append(
                 f"Flare rates of {', '.join(typical)} are those typical of their types at 1000 Myr: mass_msun and "
-                "age_myr, or their own rates, are more accurate.",
+                "age_myr, or their own rates, are more accurate."
             )
+        for why in (target.no_rates for target in planned if target.no_rates):
+            lines.append(f"{why[0].upper()}{why[1:]}; its expected flares are not given.")
+        beyond = [f"{target.name} ({target.energy_at(0.5):.2g} erg, {target.published})" for target in planned
+                  if target.completeness is not None and target.extrapolated]  # fmt: skip
         return [*lines, *([f"Flare rates are extrapolated to E50 of {', '.join(beyond)}."] if beyond else [])]
 
 
-@by_keywords
+@by_keywords("targets")
 def plan(
     study: Study,
     engine: Stares | Pool | None = None,
@@ -312,16 +301,10 @@ def plan(
     *,
     completeness: CompletenessOf | None = None,
 ) -> PlanAnswer:
-    """Plan a campaign on a study's targets.
+    """Plan a campaign on a study's targets: its ``plan`` defines them, its ``orbit`` time and position.
 
     Parameters
     ----------
-    study : Study, optional
-        Its ``plan`` defines the targets, its ``orbit`` time and position.
-    engine : Stares or Pool, optional
-        Simulator of injections; by default that of the default device. The checkpoint of a pool keeps finished targets.
-    progress : callable, optional
-        Called as ``progress(done, total)`` in targets.
     completeness : callable, optional
         Recovered fraction of flares by bolometric energy. By default the study's ``plan.completeness`` decides between
         injections into drawn noise and the closed form.
@@ -338,20 +321,25 @@ def plan(
     _refuse(study, closed=closed)
     if completeness is None:
         completeness = closed_form if closed else partial(inject_target, engine=engine or Stares())
-    stars = _stars_of(study)
+    stars: list[Star] = []
+    errors: list[InputError] = []
+    for text in study.plan.targets:
+        try:
+            stars.append(star_of(text, study.orbit.simbad))
+        except InputError as error:
+            errors.append(error)
+    if errors:
+        # One error names all targets without a star.
+        raise together(errors)
     if progress is not None:
         progress(0, len(stars))
-    seen = visible(study)
+    seen, base = visible(study), Case(study)
     along = OrbitConditions.along(seen.visibility.track) if study.plan.along_orbit else None
-    base = Case(study)
-
-    def observations() -> Iterator[tuple[int, TargetObservation]]:
-        for k, (text, star) in enumerate(zip(study.plan.targets, stars, strict=True)):
-            yield k, observe(base, text, star, seen, k, along)
-
+    named = enumerate(zip(study.plan.targets, stars, strict=True))
+    observed = ((k, observe(base, text, star, seen, k, along)) for k, (text, star) in named)
     # With a pool, the noise of a target is drawn while the threshold of the next one is sampled.
-    planned_for = partial(_planned, seen, seen.visibility.by_month(), completeness)
-    planned = tuple(reported(map_in_order(engine, planned_for, observations()), len(stars), progress))
+    planned_for = partial(_planned, seen, completeness)
+    planned = tuple(reported(map_in_order(engine, planned_for, observed), len(stars), progress))
     return PlanAnswer(study, seen, planned)
 
 
@@ -368,32 +356,12 @@ def _refuse(study: Study, *, closed: bool) -> None:
         )
 
 
-def _stars_of(study: Study) -> list[Star]:
-    """Return the library star of each target; the error names all targets without one."""
-    stars: list[Star] = []
-    errors: list[InputError] = []
-    for text in study.plan.targets:
-        try:
-            stars.append(star_of(text, study.orbit.simbad))
-        except InputError as error:
-            errors.append(error)
-    if errors:
-        raise together(errors)
-    return stars
-
-
-def _planned(
-    seen: VisibleAnswer,
-    months: tuple[list[str], Any],
-    completeness: CompletenessOf,
-    item: tuple[int, TargetObservation],
-) -> Planned:
-    """Return the plan of a target, given its number and observation, and the hours of all targets by month."""
-    study, (k, target) = seen.study, item
-    its = None
+def _planned(seen: VisibleAnswer, completeness: CompletenessOf, item: tuple[int, TargetObservation]) -> Planned:
+    """Return the plan of a target, given its number and observation."""
+    study, (k, target), its = seen.study, item, None
     if target.window_s > 0:
         its = completeness(target) if target.signal_per_frame > 0 else NOTHING
-    exposed, (names, hours) = float(seen.visibility.hours[k]), months
+    exposed, (names, hours) = float(seen.visibility.hours[k]), seen.by_month
     observed = exposed if study.plan.hours is None else min(exposed, study.plan.hours)
     days = observed * 3600 / DAY_S
     # The months in which it is seen for the most hours, in order.

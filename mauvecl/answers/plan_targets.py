@@ -237,8 +237,8 @@ def star_of(text: PlanTarget, simbad: bool) -> Star:
     }
     missing = [name for name, value in given.items() if value is None]
     if missing:
-        gaia = next((name for name in text.unused if name.casefold() == "phot_g_mean_mag"), None)
-        other = f", and {gaia} is a magnitude in G, not in V" if gaia is not None and "magnitude" in missing else ""
+        gaia = [name for name in text.unused if name.casefold() == "phot_g_mean_mag" and "magnitude" in missing]
+        other = f", and {gaia[0]} is a magnitude in G, not in V" if gaia else ""
         raise InputError(
             f"target {text.name!r} has no {' and no '.join(missing)}; give them in the table of targets, since it is "
             f"not in the embedded list{other}",
@@ -257,10 +257,15 @@ def observe(
     if text.spectral_type is not None:
         target = replace(target, spectral_type=text.spectral_type)
     conditions = None if along is None else along.of(seen.visibility, k, study.orbit.orbit().elements.period_s)
-    lengths = seen.windows[k].length_s
-    window, sky = float(np.median(lengths)) if lengths.size else 0.0, sky_behind(seen, k)
+    lengths, zodiacal = seen.windows[k].length_s, seen.zodiacal[k]
+    sky: float | None = None
+    window = float(np.median(lengths)) if lengths.size else 0.0
+    known = np.isfinite(zodiacal)
     changes: dict[str, Any] = {"star": (star,)}
-    if sky is not None:
+    if known.any():
+        # The median over the days on which the target is visible, or over all.
+        used = known & (seen.visibility.by_day(k) > 0)
+        sky = float(np.median(zodiacal[used if used.any() else known]))
         changes["sky"] = SkyLight(surface_brightness=sky)
     if conditions is not None:
         changes["processes"] = study.processes.with_particles(conditions.hits_per_cm2_s)
@@ -268,13 +273,6 @@ def observe(
             at = {"temperature_c": conditions.temperature_c}
             changes["observation"] = study.observation.model_copy(update=at)
     return TargetObservation(target, case.with_sections(**changes).one_frame, window, sky, conditions)
-
-
-def sky_behind(seen: VisibleAnswer, k: int) -> float | None:
-    """Return the median sky brightness, V mag arcsec^-2, over the days on which a target is visible, or over all."""
-    known = np.isfinite(seen.zodiacal[k])
-    used = known & (seen.visibility.by_day(k) > 0)
-    return float(np.median(seen.zodiacal[k][used if used.any() else known])) if known.any() else None
 
 
 #: Orbits of a stare; the baseline window of a search spans several of them.
@@ -294,10 +292,8 @@ def inject_target(observation: TargetObservation, engine: Stares | Pool | None =
     def computed() -> Arrays:
         star = inject(question, engine).stars[0]
         widths = np.array(star.injected.half_widths_s)
-        critical = star.injected.critical.reshape(widths.size, -1)
-        probability = found_by_energy(critical, widths, energy, study.plan.law())
-        threshold, shifted = np.array(star.threshold.value), np.array(star.shifted)
-        return {"probability": probability, "threshold": threshold, "shifted": shifted}
+        found = found_by_energy(star.injected.critical.reshape(widths.size, -1), widths, energy, study.plan.law())
+        return {"probability": found, "threshold": np.array(star.threshold.value), "shifted": np.array(star.shifted)}
 
     depends_on = ("completeness of a target", question.text(), observation.quiet, observation.scale)
     arrays = kept(engine.checkpoint if isinstance(engine, Pool) else None, depends_on, computed)
@@ -315,8 +311,8 @@ def injection_case(observation: TargetObservation) -> Case:
     study, conditions = observation.case.study, observation.conditions
     orbit_s = study.orbit.orbit().elements.period_s
     gap = max(orbit_s - observation.window_s, 0.0)
-    changes: dict[str, Any] = {"duration_s": ORBITS * orbit_s, "orbit_s": orbit_s, "orbit_gap_s": gap}
-    changes |= {"gaps": (), "along_orbit": False}
+    changes: dict[str, Any] = {"duration_s": ORBITS * orbit_s, "orbit_s": orbit_s, "orbit_gap_s": gap, "gaps": (),
+                               "along_orbit": False}  # fmt: skip
     if conditions is not None and study.stare.thermal is None:
         swing = [(t, value) for t, value in conditions.swing if t < orbit_s]
         changes["thermal"] = Curve(points=tuple((n * orbit_s + t, value) for n in range(ORBITS) for t, value in swing))

@@ -50,11 +50,6 @@ class Exposure:
     saturated: bool
 
 
-def _floored(snr: float) -> str:
-    """Round an S/N down to three digits, so that an insufficient one does not appear sufficient."""
-    return f"{math.floor(1000 * snr) / 1000:.3f}"
-
-
 EXPOSURE_COLUMNS = (
     star_column(),
     Column("wavelength", "wavelength_nm", "nm", "vacuum wavelength, the middle of the pixel or element"),
@@ -64,8 +59,9 @@ EXPOSURE_COLUMNS = (
            "exposure (s)", ".10g"),
     Column("frames", description="frames of the exposure", heading="frames"),
     Column("snr", description="closed-form S/N reached", heading="S/N", format=".3f"),
+    # Rounded down, so that an insufficient S/N does not appear sufficient.
     Column("snr_one_frame_less", description="closed-form S/N of one frame less", heading="a frame less",
-           format=_floored),
+           format=lambda snr: f"{math.floor(1000 * snr) / 1000:.3f}"),
     Column("saturated", description="whether the pixel, or one of the element, saturates in a single frame",
            heading="saturation", format=lambda saturated: "SATURATED" if saturated else ""),
 )  # fmt: skip
@@ -100,11 +96,6 @@ class ExposureAnswer(Answer):
         )
 
 
-def snr_at(x: Expectation, wavelength_nm: float, per: Per = "element") -> float:
-    """Return the closed-form S/N of the pixel or 10.5 nm element at a wavelength; see `place_of`."""
-    return float((x.snr_per_element() if per == "element" else x.snr())[place_of(x, wavelength_nm, per)])
-
-
 def place_of(x: Expectation, wavelength_nm: float, per: Per) -> int:
     """Return the index of the pixel or element at a wavelength; raises InputError outside the spectrum."""
     first, last = float(x.wavelength_nm[0]), float(x.wavelength_nm[-1])
@@ -114,21 +105,13 @@ def place_of(x: Expectation, wavelength_nm: float, per: Per) -> int:
     return int(x.element[pixel]) if per == "element" else pixel
 
 
-@by_keywords
+@by_keywords("stars")
 def exposure(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> ExposureAnswer:
     """Compute the fewest frames whose closed-form S/N at a wavelength reaches a wanted one.
 
-    An S/N that no exposure up to 1e7 s reaches, or a wavelength outside the spectrum, raises InputError if it holds of
-    every star; of some it is reported by a message.
-
-    Parameters
-    ----------
-    study : Study, optional
-        Its ``signal`` gives S/N and wavelength; its exposure is not used.
-    engine : Engine or Pool, optional
-        Not used: nothing is drawn.
-    progress : callable, optional
-        Called as ``progress(done, total)`` in stars.
+    The study's ``signal`` gives S/N and wavelength; its exposure is not used. An S/N that no exposure up to 1e7 s
+    reaches, or a wavelength outside the spectrum, raises InputError if it holds of every star; of some it is reported
+    by a message.
     """
     snr, wavelength_nm, per = study.signal.snr, study.signal.wavelength_nm, study.signal.per
     if snr is None or wavelength_nm is None:
@@ -176,10 +159,12 @@ def exposure_for(
 def _one(case: Case, snr: float, wavelength_nm: float, per: Per) -> tuple[Exposure, Expectation]:
     """Return the fewest frames for an S/N, and the expectation of as many."""
     frame = case.one_frame.quiet
+    place = place_of(frame, wavelength_nm, per)
 
     def after(frames: int) -> float:
-        """Return the S/N of some frames, which may exceed one exposure."""
-        return snr_at(replace(frame, n_frames=frames), wavelength_nm, per)
+        """Return the closed-form S/N of some frames, which may exceed one exposure."""
+        x = replace(frame, n_frames=frames)
+        return float((x.snr_per_element() if per == "element" else x.snr())[place])
 
     single = after(1)
     if not single > 0 or (snr / single) ** 2 * case.instrument.frame_s > LONGEST_S:
@@ -195,20 +180,10 @@ def _one(case: Case, snr: float, wavelength_nm: float, per: Per) -> tuple[Exposu
     while after(frames) < snr:
         frames += 1
     x = replace(frame, n_frames=frames)
-    place = place_of(x, wavelength_nm, per)
     here = x.saturated[x.element == place] if per == "element" else x.saturated[[place]]
-    answer = Exposure(
-        star=case.one_frame.label,
-        wavelength_nm=wavelength_nm,
-        per=per,
-        wanted=snr,
-        exposure_s=x.exposure_s,
-        frames=x.n_frames,
-        snr=after(frames),
-        snr_one_frame_less=after(frames - 1) if frames > 1 else 0.0,
-        saturated=bool(here.any()),
-    )
-    return answer, x
+    reached, less = after(frames), after(frames - 1) if frames > 1 else 0.0
+    asked = case.one_frame.label, wavelength_nm, per, snr
+    return Exposure(*asked, x.exposure_s, frames, reached, less, bool(here.any())), x
 
 
 def _best(title: str, x: Expectation, number: int) -> str:
@@ -217,11 +192,8 @@ def _best(title: str, x: Expectation, number: int) -> str:
     at = float(x.wavelength_nm[x.element == int(np.argmax(each))].mean())
     saturated = int(x.saturated.sum())
     without = f"; {saturated} of {x.saturated.size} pixels saturate" if saturated else ""
-    least = first_of(number, "cases")
-    return (
-        f"{title} has an S/N of up to {each.max():.3g} per element of 10.5 nm in {x.exposure_s:g} s, at {at:.0f} nm"
-        f"{without}{least}."
-    )
+    best = f"{title} has an S/N of up to {each.max():.3g} per element of 10.5 nm in {x.exposure_s:g} s, at {at:.0f} nm"
+    return f"{best}{without}{first_of(number, 'cases')}."
 
 
 class Observation(NamedTuple):
@@ -231,18 +203,13 @@ class Observation(NamedTuple):
     expectation: Expectation
     table: QTable  # of its components
 
-    @property
-    def peak(self) -> int:
-        """Pixel with most signal."""
-        return int(self.expectation.signal_dn.argmax())
-
 
 SUMMARY_COLUMNS = (
     Column("observation", "title", description="star, and flare", heading="observation"),
     Column("frames", "expectation.n_frames", description="frames of the exposure", heading="frames", detail=True),
-    Column("peak_nm", lambda row: row.expectation.wavelength_nm[row.peak], "nm",
+    Column("peak_nm", lambda row: row.expectation.wavelength_nm[row.expectation.signal_dn.argmax()], "nm",
            "wavelength of the largest mean signal", "peak (nm)", ".1f"),
-    Column("peak_dn", lambda row: row.expectation.signal_dn[row.peak], "DN", "largest mean signal of a pixel",
+    Column("peak_dn", lambda row: row.expectation.signal_dn.max(), "DN", "largest mean signal of a pixel",
            "peak (DN)", ".0f"),
     Column("snr_pixel", lambda row: row.expectation.snr().max(), "", "largest closed-form S/N of a pixel",
            "S/N pixel", ".2f"),
@@ -293,7 +260,7 @@ class SimulateAnswer(Answer):
         return list(self.pictures.values())[number](path, ax=ax)
 
 
-@by_keywords
+@by_keywords("stars")
 def simulate(
     study: Study,
     engine: Engine | Pool | None = None,
@@ -304,14 +271,10 @@ def simulate(
 ) -> SimulateAnswer:
     """Simulate one observation of every star of a study, by component.
 
+    The NumPy reference implementation draws. Usual unknowns are left out: the question is about the noise.
+
     Parameters
     ----------
-    study : Study, optional
-        Its usual unknowns are left out: the question is about the noise.
-    engine : Engine or Pool, optional
-        Not used: the NumPy reference implementation draws.
-    progress : callable, optional
-        Called as ``progress(done, total)`` in stars.
     realisation : int
         Number of the realisation.
     flaring : bool
@@ -399,26 +362,19 @@ class SnrAnswer(Answer):
         ]
 
 
-@by_keywords
+@by_keywords("stars")
 def snr(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> SnrAnswer:
     """Simulate the S/N of every star of a study without flares, for every sweep value.
 
-    Parameters
-    ----------
-    study : Study, optional
-        Its usual unknowns are left out: the question is about the noise.
-    progress : callable, optional
-        Called as ``progress(done, total)`` in stars.
+    Usual unknowns are left out: the question is about the noise.
     """
-    # Invalid input raises an error before anything is drawn.
     study = study.ideal()
     prepared, run, asked = cases(study), study.run, study.signal.wavelength_nm
-    quiet = [case.quiet for case in prepared]
+    quiet, engine = [case.quiet for case in prepared], engine or Engine()
     if asked is not None:
+        # Invalid input raises an error before anything is drawn.
         for x in quiet:
             place_of(x, asked, "element")
-
-    engine = engine or Engine()
 
     def answered(case: Case) -> StarSnr:
         result = engine.snr(case.quiet, realisations=run.realisations, seed=run.seed, **case.draw_options)
@@ -427,17 +383,14 @@ def snr(study: Study, engine: Engine | Pool | None = None, progress: Progress = 
     if isinstance(engine, Pool):
         engine.expect(len(prepared) * run.realisations)
     stars = list(reported(map_in_order(engine, answered, prepared), len(prepared), progress))
-    return SnrAnswer(study, stars, [*collect_messages(quiet, study.processes), *filter(None, map(_cut_off, stars))])
-
-
-def _cut_off(star: StarSnr) -> str:
-    """Return a message on pixels that saturated in the simulation, or an empty text."""
-    counts, cut = star.result.counts, star.result.counts.clipped[:, 1]
-    clipped = cut[cut > 0]
-    if not clipped.size:
-        return ""
-    share = 100 * clipped.mean() / (counts.n * star.result.expectation.n_frames)
-    return (
-        f"{star.title}: saturation cut off {clipped.size} of {cut.size} pixels in the simulation, each of them in "
-        f"{share:.3g} % of its frames on average."
-    )
+    messages = collect_messages(quiet, study.processes)
+    for star in stars:
+        cut = star.result.counts.clipped[:, 1]
+        clipped = cut[cut > 0]
+        if clipped.size:
+            share = 100 * clipped.mean() / (star.result.counts.n * star.result.expectation.n_frames)
+            messages.append(
+                f"{star.title}: saturation cut off {clipped.size} of {cut.size} pixels in the simulation, each of them "
+                f"in {share:.3g} % of its frames on average."
+            )
+    return SnrAnswer(study, stars, messages)

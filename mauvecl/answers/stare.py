@@ -11,7 +11,7 @@ import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import chain
+from itertools import chain, product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,7 +29,7 @@ from mauvecl.host import VERSION
 from mauvecl.host.exposure.sky import parse_position, parse_time
 from mauvecl.host.tables.units import offline
 from mauvecl.runs.checkpoint import Checkpoint, kept
-from mauvecl.schema.columns import Column, View, number, percent, table_of, with_error
+from mauvecl.schema.columns import Column, View, interval_columns, number, percent, table_of, with_error
 from mauvecl.schema.errors import InputError, Message
 from mauvecl.schema.physical import DAY_S
 from mauvecl.search.alarms import Alarm, alarms
@@ -73,11 +73,17 @@ def light_curve_file(star: StarStare, sky: SkyLight, *, seed: int, number: int) 
         position = {"RA_OBJ": (place.ra.deg, "[deg]"), "DEC_OBJ": (place.dec.deg, "[deg]")}
         primary.header.update({"RADESYS": "ICRS", **position})
     start, stop = star.staring.stare.gtis.T / DAY_S
-    tables = [_table(star), _hdu("GTI", [("START", "D", "d", start), ("STOP", "D", "d", stop)])]
+    gti = [fits.Column("START", "D", "d", array=start), fits.Column("STOP", "D", "d", array=stop)]
+    tables = [_table(star), fits.BinTableHDU.from_columns(gti, name="GTI")]
     for table in tables:
         table.header.update(times)
+    hdus = [primary, *tables]
+    for name, values in (("SPECTRUM", star.light.spectrum), ("SPECTRUM_ERR", star.light.spectrum_sd)):
+        hdus.append(fits.ImageHDU(np.asarray(values, np.float32), name=name))
+        hdus[-1].header["BUNIT"] = ("adu/s", "of a resolution element; rows are frames")
+    nm = fits.Column("WAVELENGTH", "D", "nm", array=star.light.element_nm)
     content = io.BytesIO()
-    fits.HDUList([primary, *tables, *_spectra(star)]).writeto(content)
+    fits.HDUList([*hdus, fits.BinTableHDU.from_columns([nm], name="WAVELENGTH")]).writeto(content)
     return content.getvalue()
 
 
@@ -101,18 +107,21 @@ def _times(stare: Stare, sky: SkyLight) -> dict[str, tuple[str | float, str]]:
 
 
 def _table(star: StarStare) -> fits.BinTableHDU:
+    """Return the light curve in all bands."""
+    from astropy.io import fits
+
     stare, light = star.staring.stare, star.light
-    columns: list[tuple[str, str, str | None, Any]] = [
-        ("TIME", "D", "d", stare.middle_s / DAY_S),
-        ("CADENCENO", "J", None, stare.numbers),
-        ("QUALITY", "J", None, star.staring.quality),
+    columns = [
+        fits.Column("TIME", "D", "d", array=stare.middle_s / DAY_S),
+        fits.Column("CADENCENO", "J", array=stare.numbers),
+        fits.Column("QUALITY", "J", array=star.staring.quality),
     ]
-    for k, name in enumerate(light.bands):
-        for kind, (attribute, _) in LIGHT.items():
-            columns.append((kind.upper() + band_suffix(name, k), "E", "adu/s", getattr(light, attribute)[:, k]))
+    for (k, band), (kind, (attribute, _)) in product(enumerate(light.bands), LIGHT.items()):
+        name = kind.upper() + band_suffix(band, k)
+        columns.append(fits.Column(name, "E", "adu/s", array=getattr(light, attribute)[:, k]))
     if star.pointing_loss is not None:
-        columns.append(("POINTING_LOSS", "E", None, star.pointing_loss))
-    hdu = _hdu("LIGHTCURVE", columns)
+        columns.append(fits.Column("POINTING_LOSS", "E", array=star.pointing_loss))
+    hdu = fits.BinTableHDU.from_columns(columns, name="LIGHTCURVE")
     hdu.header["BANDS"] = ", ".join(light.bands)
     hdu.header["COMMENT"] = "FLUX: star and sky, bias and known dark taken off. MEAN: the same without noise."
     hdu.header["COMMENT"] = "TIME: middle of the frame, days after MJDREF. QUALITY 1: saturated pixels. 0: none."
@@ -120,26 +129,6 @@ def _table(star: StarStare) -> fits.BinTableHDU:
         hdu.header["LOSTFRMS"] = (star.drifting_frames, "frames that lost light, assumed drifts")
         hdu.header["COMMENT"] = "POINTING_LOSS: share of all light lost in the frame, as drawn."
     return hdu
-
-
-def _spectra(star: StarStare) -> list[Any]:
-    from astropy.io import fits
-
-    light = star.light
-    images = []
-    for name, values in (("SPECTRUM", light.spectrum), ("SPECTRUM_ERR", light.spectrum_sd)):
-        image = fits.ImageHDU(np.asarray(values, np.float32), name=name)
-        image.header["BUNIT"] = ("adu/s", "of a resolution element; rows are frames")
-        images.append(image)
-    return [*images, _hdu("WAVELENGTH", [("WAVELENGTH", "D", "nm", light.element_nm)])]
-
-
-def _hdu(name: str, columns: Sequence[tuple[str, str, str | None, Any]]) -> fits.BinTableHDU:
-    """Return a table of columns: name, format, unit and values."""
-    from astropy.io import fits
-
-    made = [fits.Column(*about, array=values) for *about, values in columns]
-    return fits.BinTableHDU.from_columns(made, name=name)
 
 
 Float = NDArray[np.float64]
@@ -208,11 +197,6 @@ MOST_ROWS = 100_000
 MOST_SHOWN = 2_000_000
 
 
-def _percent_with_error(value: float, error: float) -> str:
-    text = with_error(100 * value, 100 * error)
-    return f"{text} %" if text else ""
-
-
 #: Columns of the table of stares.
 COLUMNS = (
     Column("frames", "staring.stare.n_frames", "", "frames of the stare", "frames"),
@@ -263,28 +247,23 @@ def _fitted(
                detail=detail),
         Column(f"{name}_error", lambda row: float(getattr(row.alarm.recovered, error)[0]), unit,
                f"{text}; standard error by curvature"),
-        *_interval(name, key, unit),
-    ]  # fmt: skip
-
-
-def _interval(name: str, key: str, unit: str) -> list[Column]:
-    return [
-        Column(f"{name}_low", lambda row: row.alarm.intervals[key][0], unit, "lower end of its 68 % interval"),
-        Column(f"{name}_high", lambda row: row.alarm.intervals[key][1], unit, "higher end of its 68 % interval"),
+        *interval_columns(f"{name}_{{}}", lambda row: row.alarm.intervals[key], unit, "its 68 % interval"),
     ]  # fmt: skip
 
 
 #: Columns of the table of flares that a search found, for `FoundFlare`.
 FOUND_COLUMNS = (
     *_fitted("peak_time", "peak_s", "s", "from the start of the stare", "peak at (s)", number(".6g", "not measured")),
-    *_fitted("amplitude", "amplitude", "", "in the flare's band", "amplitude", _percent_with_error, "amplitude_error"),
+    *_fitted("amplitude", "amplitude", "", "in the flare's band", "amplitude",
+             lambda value, error: f"{with_error(100 * value, 100 * error)} %" if value == value else "",
+             "amplitude_error"),
     *_fitted("half_width", "half_width_s", "s", "t_1/2 of the search's shape", "half-width (s)", with_error,
              "half_width_error", detail=True),
     *_fitted("temperature", "temperature_k", "K", "blackbody temperature", "temperature (K)", with_error,
              "temperature_error"),
     *_fitted("equivalent_duration", "equivalent_duration_s", "s", "in the flare's band"),
     Column("energy_bolometric", "bolometric_erg", "erg", "", "bolometric (erg)", number(".3g")),
-    *_interval("energy_bolometric", "energy", "erg"),
+    *interval_columns("energy_bolometric_{}", lambda row: row.alarm.intervals["energy"], "erg", "its 68 % interval"),
     Column("value", "alarm.rho", "", "the search's statistic when it was found: S/N of the template that fits best",
            "value", ".2f", detail=True),
     Column("event", "", "", "row of the star's flares that it is nearest to, from 1 on; 0: none near", "flare",
@@ -326,12 +305,6 @@ def _light_column(kind: str, band: str, number: int) -> Column:
     return Column(name, lambda star: getattr(star.light, attribute)[:, number], "DN / s", f"{band}: {text}")
 
 
-def _stare_columns(answer: StareAnswer) -> tuple[Column, ...]:
-    searched = SEARCHED_COLUMNS if answer.study.stare.search else ()
-    drifting = () if answer.study.stare.pointing is None else (POINTING_COLUMN,)
-    return (*COLUMNS, *searched, SATURATED_COLUMN, *drifting)
-
-
 #: Metadata of the tables.
 SEED = ("study", "study.run.seed")
 
@@ -347,8 +320,10 @@ class StareAnswer(Answer):
     messages: list[str] = field(default_factory=list)
 
     #: One row per star and cell: frames, gaps, light and noise of a frame, flares.
-    table = TableOf("stare", _stare_columns, "stares", place=True, title="One stare each", key="stares",
-                    about=SEED)  # fmt: skip
+    table = TableOf("stare", lambda answer: (
+        *COLUMNS, *(SEARCHED_COLUMNS if answer.study.stare.search else ()), SATURATED_COLUMN,
+        *(() if answer.study.stare.pointing is None else (POINTING_COLUMN,)),
+    ), "stares", place=True, title="One stare each", key="stares", about=SEED)  # fmt: skip
     #: One row per flare: peak, half-width, amplitude, temperature, energies, and the S/N of its matched filter.
     events = TableOf(
         "events", EVENT_COLUMNS, lambda answer: chain.from_iterable(stare.flares for stare in answer.stares),
@@ -424,7 +399,7 @@ class StareAnswer(Answer):
         return [f"More than {MOST_ROWS} frames: light curves of {long} are in FITS files alone."] if long else []
 
 
-@by_keywords
+@by_keywords("stares")
 def stare(
     study: Study,
     engine: Stares | None = None,
@@ -432,16 +407,10 @@ def stare(
     *,
     checkpoint: Checkpoint | None = None,
 ) -> StareAnswer:
-    """Simulate one stare for every star and sweep value of a study.
+    """Simulate one stare for every star and sweep value of a study; `run.seed` and `stare.number` select it.
 
     Parameters
     ----------
-    study : Study, optional
-        Its section `stare`, `events`, star, flare, sky, observation; `run.seed` and `stare.number` select the stare.
-    engine : Stares, optional
-        Simulator; by default that of the default device.
-    progress : callable, optional
-        Called as ``progress(done, total)`` in stares.
     checkpoint : Checkpoint, optional
         Keeps the frames that are drawn and the thresholds of searches.
     """
@@ -465,24 +434,19 @@ def stare(
     messages += [star.search for star in drawn if isinstance(star.search, str)]
     searched = [(star.title, star.search) for star in drawn if isinstance(star.search, SearchResult)]
     messages += [threshold_line(title, search.threshold) for title, search in searched if search.shifted]
-    messages += [line for star in drawn for line in _pointing_lines(star)]
     for star in drawn:
+        lost, drifts = star.pointing_loss, star.staring.stare.pointing
+        if lost is not None and drifts is not None:
+            messages.append(
+                f"POINTING DRIFTS: {star.drifting_frames} of {lost.size} frames at {star.title} lose light, up to "
+                f"{100 * lost.max():.3g} %; assumed: {drifts.rate_per_h:g} per hour, {drifts.duration_s:g} s long on "
+                f"average, with up to {100 * drifts.depth:g} % of the light lost. The search marginalises over the "
+                "level of each frame."
+            )
         if star.saturated_frames:
             text = f"SATURATED: {star.saturated_frames} frames of the stare at {star.title}; their quality is 1."
             messages.insert(0, Message(text, "saturated"))
     return StareAnswer(study, drawn, messages)
-
-
-def _pointing_lines(star: StarStare) -> list[str]:
-    """Return the message about frames that lost light in pointing drifts, if drifts are drawn."""
-    lost, drifts = star.pointing_loss, star.staring.stare.pointing
-    if lost is None or drifts is None:
-        return []
-    return [
-        f"POINTING DRIFTS: {star.drifting_frames} of {lost.size} frames at {star.title} lose light, up to "
-        f"{100 * lost.max():.3g} %; assumed: {drifts.rate_per_h:g} per hour, {drifts.duration_s:g} s long on average, "
-        f"with up to {100 * drifts.depth:g} % of the light lost. The search marginalises over the level of each frame."
-    ]
 
 
 def _draw(case: Case, stares: Stares, checkpoint: Checkpoint | None) -> StarStare:
@@ -517,9 +481,9 @@ def _search(case: Case, draw: Draw, checkpoint: Checkpoint | None) -> SearchResu
             return {"threshold": np.array(tail.threshold(study.search.rate).value), "shifted": np.array(tail.shifted)}
 
         tail = kept(checkpoint, ("threshold", survey, study.text()), computed)
-        threshold = float(tail["threshold"])
     except InputError as error:
         return Message(f"{case.label} is not searched: {error}.", "not searched")
+    threshold = float(tail["threshold"])
     scale = _log_energy(case, survey.templates.temperatures_k)
     raised = alarms(survey, draw(survey.components), threshold, scale)
     return SearchResult(threshold, [_found_flare(case, alarm) for alarm in raised], bool(tail["shifted"]))
@@ -533,11 +497,11 @@ def _found_flare(case: Case, alarm: Alarm) -> FoundFlare:
     kelvin = float(np.nan_to_num(fit.temperature_k[0], nan=case.study.flare.temperature_k))
     values = (float(fit.peak_s[0]), float(fit.half_width_s[0]), float(fit.amplitude[0]))
     event = Event(*values, kelvin, case.study.search.shape)
-    away = [abs(other.peak_s - event.peak_s) for other in case.events]
-    nearest = int(np.argmin(away)) if away else -1
     reach = 2 * case.stare_expectation.stare.frame_s
-    near = nearest >= 0 and away[nearest] <= case.events[nearest].half_width_s + reach
-    return FoundFlare(case.label, case.at, alarm, _found_energy(case, event), nearest + 1 if near else 0)
+    away = {k: abs(other.peak_s - event.peak_s) for k, other in enumerate(case.events, 1)}
+    nearest = min(away, key=lambda k: away[k], default=0)
+    near = nearest > 0 and away[nearest] <= case.events[nearest - 1].half_width_s + reach
+    return FoundFlare(case.label, case.at, alarm, _found_energy(case, event), nearest if near else 0)
 
 
 def _log_energy(case: Case, kelvin: Sequence[float]) -> Factor | None:

@@ -415,28 +415,48 @@ class Question(Protocol[Answered]):
     ) -> Answered: ...
 
 
-def by_keywords(function: Callable[..., Answered]) -> Question[Answered]:
-    """Let the function of a verb take keywords, named as the flags of its command, and validate its arguments.
+#: End of the docstring of every verb.
+COMMON_PARAMETERS = """
 
-    Keywords change the study if there is one, and otherwise the verb's default. ``ideal=True`` asks with everything
-    known but the noise, and ``paper=True`` with the conventions of the MauveSim paper.
+Other Parameters
+----------------
+study : Study, optional
+    By default that of the command line.
+engine : Engine, Stares or Pool, optional
+    What draws, if anything is drawn; by default that of the default device. A pool's checkpoint keeps finished work.
+progress : callable, optional
+    Called as ``progress(done, total)`` in {parts}; may raise to stop the work.
+**keywords
+    Flags of the command, as in ``star="M4V"``, ``magnitude=11``: they change the study, or the default. ``ideal=True``
+    asks with everything known but the noise, and ``paper=True`` with the conventions of the MauveSim paper.
+"""
+
+
+def by_keywords(parts: str) -> Callable[[Callable[..., Answered]], Question[Answered]]:
+    """Return a decorator that lets the function of a verb take keywords, named as the flags of its command.
+
+    It also validates the arguments, and describes those that all verbs have; `parts` is what progress counts.
     """
     from mauvecl.schema.calls import validated
 
-    checked = validated(function)
-    checks = vars(checked)["__validated__"]
+    def decorate(function: Callable[..., Answered]) -> Question[Answered]:
+        checked = validated(function)
+        checks = vars(checked)["__validated__"]
 
-    @wraps(checked)
-    def ask(study: Any = None, *arguments: Any, **keywords: Any) -> Any:
-        own = {key: keywords.pop(key) for key in tuple(keywords) if key in checks}
-        if study is None or keywords:
-            study = _study_of(VERBS[function.__name__], study and checks["study"](study), keywords)
-        return checked(study, *arguments, **own)
+        @wraps(checked)
+        def ask(study: Any = None, *arguments: Any, **keywords: Any) -> Any:
+            own = {key: keywords.pop(key) for key in tuple(keywords) if key in checks}
+            if study is None or keywords:
+                study = _study_of(VERBS[function.__name__], study and checks["study"](study), keywords)
+            return checked(study, *arguments, **own)
 
-    study, *others = inspect.signature(function).parameters.values()
-    keywords = inspect.Parameter("keywords", inspect.Parameter.VAR_KEYWORD, annotation=Any)
-    vars(ask)["__signature__"] = inspect.Signature([study.replace(default=None), *others, keywords])
-    return ask
+        study, *others = inspect.signature(function).parameters.values()
+        keywords = inspect.Parameter("keywords", inspect.Parameter.VAR_KEYWORD, annotation=Any)
+        vars(ask)["__signature__"] = inspect.Signature([study.replace(default=None), *others, keywords])
+        ask.__doc__ = f"{inspect.getdoc(function)}{COMMON_PARAMETERS.format(parts=parts)}"
+        return ask
+
+    return decorate
 
 
 def _study_of(verb: Verb, study: Study | None, given: Mapping[str, Any]) -> Study:

@@ -42,37 +42,21 @@ class Entry(NamedTuple):
 
 def calendar_bytes(entries: Iterable[Entry], name: str) -> bytes:
     """Return a calendar as the bytes of an .ics file."""
-    lines = [
-        "BEGIN:VCALENDAR",
-        "VERSION:2.0",
-        f"PRODID:-//mauvecl//mauvecl {VERSION}//EN",
-        f"X-WR-CALNAME:{_text(name)}",
-    ]
-    for entry in entries:
-        stop = entry.stop
-        if len(stop) == len("2027-01-31"):
-            # An event ends at the beginning of the next day.
-            stop = (datetime.date.fromisoformat(stop) + datetime.timedelta(days=1)).isoformat()
-        unique = hashlib.sha256("\0".join(entry[:3]).encode()).hexdigest()[:24]
-        lines += [
-            "BEGIN:VEVENT",
-            f"UID:{unique}@mauvecl",
-            # A fixed time, so that equal plans give equal files.
-            f"DTSTAMP:{entry.start[:10].replace('-', '')}T000000Z",
-            f"DTSTART{_moment(entry.start)}",
-            f"DTEND{_moment(stop)}",
-            f"SUMMARY:{_text(entry.title)}",
-            f"DESCRIPTION:{_text(entry.text)}",
-            "TRANSP:TRANSPARENT",
-            "END:VEVENT",
-        ]
+    lines = ["BEGIN:VCALENDAR", "VERSION:2.0", f"PRODID:-//mauvecl//mauvecl {VERSION}//EN"]
+    lines.append(f"X-WR-CALNAME:{_text(name)}")
+    for start, stop, title, text in entries:
+        unique = hashlib.sha256("\0".join((start, stop, title)).encode()).hexdigest()[:24]
+        # An event of whole days ends at the beginning of the next day.
+        whole = "T" not in stop
+        end = (datetime.date.fromisoformat(stop) + datetime.timedelta(days=1)).isoformat() if whole else stop
+        times = [moment.replace("-", "").replace(":", "") for moment in (start, end)]
+        begins, ends = (f";VALUE=DATE:{time}" if whole else f":{time}Z" for time in times)
+        # A fixed time of the entry, so that equal plans give equal files.
+        lines += ["BEGIN:VEVENT", f"UID:{unique}@mauvecl", f"DTSTAMP:{times[0][:8]}T000000Z", f"DTSTART{begins}",
+                  f"DTEND{ends}", f"SUMMARY:{_text(title)}", f"DESCRIPTION:{_text(text)}", "TRANSP:TRANSPARENT",
+                  "END:VEVENT"]  # fmt: skip
     lines.append("END:VCALENDAR")
     return "".join(f"{_folded(line)}\r\n" for line in lines).encode()
-
-
-def _moment(text: str) -> str:
-    plain = text.replace("-", "").replace(":", "")
-    return f":{plain}Z" if "T" in plain else f";VALUE=DATE:{plain}"
 
 
 def _text(value: str) -> str:
@@ -171,11 +155,10 @@ class VisibleAnswer(Answer):
         about=lambda answer: {"start": answer.times.iso(0.0), **metadata_of(answer, "times.days", "study")},
     )  # fmt: skip
     #: One row per month, one column of hours per target.
-    months = TableOf(
-        "months",
-        lambda answer: (Column("month"), *(Column(target.name, unit="h") for target in answer.targets)),
-        "_hours_by_month",
-    )
+    months = TableOf("months", lambda answer: (
+        Column("month", itemgetter(0)),
+        *(Column(target.name, itemgetter(k), "h") for k, target in enumerate(answer.targets, 1)),
+    ), lambda answer: [(answer.by_month[0], *answer.by_month[1].T)])  # fmt: skip
     #: One row per target and day.
     by_day = TableOf("days", DAY_COLUMNS, "_day_rows")
     #: One row per window.
@@ -227,73 +210,55 @@ class VisibleAnswer(Answer):
         """Windows of each target."""
         return tuple(self.visibility.windows(k) for k in range(len(self.targets)))
 
+    @cached_property
+    def by_month(self) -> tuple[list[str], Float]:
+        """Calendar months and hours of exposure, shape (n_month, n_target)."""
+        return self.visibility.by_month()
+
     def _row(self, k: int) -> dict[str, Any]:
         """Return the row of a target, by the names of columns."""
         seen, windows, target = self.visibility, self.windows[k], self.targets[k]
-        names, by_month = seen.by_month()
-        hours, away = by_month[:, k], self.elongation_deg(k)
-        light = self.zodiacal[k][np.isfinite(self.zodiacal[k])]
+        hours, away, sky = self.by_month[1][:, k], self.elongation_deg(k), self.zodiacal[k]
+        # The least and the largest value of no values is none.
+        sky = sky[np.isfinite(sky)] if np.isfinite(sky).any() else sky[:1]
         length, end_s = windows.length_s, self.times.n * self.times.step_s
+        gaps_s = np.append(windows.start_s, end_s) - np.append(0.0, windows.stop_s)
         return {
-            "target": target.name,
-            "ra": target.ra_deg,
-            "dec": target.dec_deg,
-            "hours": seen.hours[k],
-            "share": seen.share[k],
-            **{f"leaves_{name}": shares[k] for name, shares in seen.kept_by.items()},
-            "windows": length.size,
-            "median_window": float(np.median(length / 60)) if length.size else 0.0,
-            "longest_gap": float(np.max(np.append(windows.start_s, end_s) - np.append(0.0, windows.stop_s))) / DAY_S,
-            "per_orbit": float(np.mean(seen.by_orbit(k))),
+            "target": target.name, "ra": target.ra_deg, "dec": target.dec_deg, "hours": seen.hours[k],
+            "share": seen.share[k], **{f"leaves_{name}": shares[k] for name, shares in seen.kept_by.items()},
+            "windows": length.size, "median_window": float(np.median(length / 60)) if length.size else 0.0,
+            "longest_gap": float(np.max(gaps_s)) / DAY_S, "per_orbit": float(np.mean(seen.by_orbit(k))),
             "in_shadow": float(windows.in_shadow_s.sum() / length.sum()) if length.size else 0.0,
-            "best_month": names[int(np.argmax(hours))] if hours.any() else "",
-            "least_elongation": float(away.min()),
-            "most_elongation": float(away.max()),
-            "brightest_sky": float(light.min()) if light.size else np.nan,
-            "faintest_sky": float(light.max()) if light.size else np.nan,
-        }
+            "best_month": self.by_month[0][int(np.argmax(hours))] if hours.any() else "",
+            "least_elongation": float(away.min()), "most_elongation": float(away.max()),
+            "brightest_sky": float(sky.min()), "faintest_sky": float(sky.max()),
+        }  # fmt: skip
 
     @property
     def views(self) -> list[View]:
         if len(self.targets) > MOST_MONTHLY:
             return super().views
-        names, hours = self.visibility.by_month()
-        columns = (TARGET_COLUMN, *(Column(name, heading=name, format=".0f") for name in map(str, names)))
-        rows = [
-            {"target": target.name} | dict(zip(map(str, names), hours[:, k], strict=True))
-            for k, target in enumerate(self.targets)
-        ]
+        names, hours = self.by_month
+        columns = (TARGET_COLUMN, *(Column(name, heading=name, format=".0f") for name in names))
+        rows = [{"target": target.name} | dict(zip(names, own, strict=True))
+                for target, own in zip(self.targets, hours.T, strict=True)]  # fmt: skip
         return [*super().views, View("Hours of exposure by month", columns, table_of(columns, rows))]
-
-    @property
-    def _hours_by_month(self) -> dict[str, Any]:
-        names, hours = self.visibility.by_month()
-        return {"month": names} | {target.name: hours[:, k] for k, target in enumerate(self.targets)}
 
     @property
     def _day_rows(self) -> Iterator[dict[str, Any]]:
         for k, target in enumerate(self.targets):
-            yield {
-                "target": target.name,
-                "day": self.days,
-                "hours": self.visibility.by_day(k),
-                "elongation": self.elongation_deg(k),
-                "zodiacal_light": self.zodiacal[k],
-            }
+            yield {"target": target.name, "day": self.days, "hours": self.visibility.by_day(k),
+                   "elongation": self.elongation_deg(k), "zodiacal_light": self.zodiacal[k]}  # fmt: skip
 
     @property
     def _window_rows(self) -> Iterator[dict[str, Any]]:
         times, z = self.times, self.visibility.track.of_date_km[:, 2]
         nodes = times.seconds[1:][(z[:-1] < 0) & (z[1:] >= 0)]
         for target, windows in zip(self.targets, self.windows, strict=True):
-            yield {
-                "target": target.name,
-                "start": np.array([times.iso(float(t)) for t in windows.start_s], str),
-                "stop": np.array([times.iso(float(t)) for t in windows.stop_s], str),
-                "length": windows.length_s / 60,
-                "in_shadow": windows.in_shadow_s / 60,
-                "orbit": np.searchsorted(nodes, windows.start_s),
-            }
+            start, stop = ([times.iso(float(t)) for t in ends] for ends in (windows.start_s, windows.stop_s))
+            yield {"target": target.name, "start": np.array(start, str), "stop": np.array(stop, str),
+                   "length": windows.length_s / 60, "in_shadow": windows.in_shadow_s / 60,
+                   "orbit": np.searchsorted(nodes, windows.start_s)}  # fmt: skip
 
     @property
     def writes_windows(self) -> bool:
@@ -310,15 +275,11 @@ class VisibleAnswer(Answer):
         times, entries = self.times, list[Entry]()
         single = self.study.orbit.orbit().resolved(times) == "tle" and self.writes_windows
         for k, target in enumerate(self.targets):
-            if single:
-                windows = self.windows[k]
-                entries += [
-                    Entry(times.iso(float(a)), times.iso(float(b)), target.name, f"{(b - a) / 60:.0f} min of exposure")
-                    for a, b in zip(windows.start_s, windows.stop_s, strict=True)
-                ]
-                continue
-            hours = self.visibility.by_day(k)
-            for first, last in true_runs(hours >= SEEN_H):
+            windows, hours = self.windows[k], self.visibility.by_day(k)
+            for a, b in zip(windows.start_s, windows.stop_s, strict=True) if single else ():
+                length = f"{(b - a) / 60:.0f} min of exposure"
+                entries.append(Entry(times.iso(float(a)), times.iso(float(b)), target.name, length))
+            for first, last in true_runs(hours >= SEEN_H) if not single else ():
                 mean = f"{hours[first:last].mean():.1f} h of exposure a day"
                 entries.append(Entry(self.days[first], self.days[last - 1], target.name, mean))
         return entries
@@ -350,18 +311,9 @@ class VisibleAnswer(Answer):
         return f"the limit of {alone[0].replace('_', ' ')}{value} alone leaves nothing"
 
 
-@by_keywords
+@by_keywords("targets, once at the end")
 def visible(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> VisibleAnswer:
-    """Compute when a study's targets are visible.
-
-    Parameters
-    ----------
-    study : Study, optional
-        Its ``orbit`` defines position, time and limits.
-    engine : Engine or Pool, optional
-        Not used: nothing is drawn.
-    progress : callable, optional
-        Called once, with the number of targets, at the end.
+    """Compute when a study's targets are visible; its ``orbit`` defines position, time and limits.
 
     Examples
     --------
@@ -371,11 +323,9 @@ def visible(study: Study, engine: Engine | Pool | None = None, progress: Progres
     >>> seen.months["month"].tolist()
     ['2027-01']
     """
-    targets = tuple(targets_of(study.orbit, study.plan))
-    o = study.orbit
-    track = o.orbit().track(o.times())
+    o, targets = study.orbit, tuple(targets_of(study.orbit, study.plan))
     directions = np.array([target.direction for target in targets])
-    answer = VisibleAnswer(study, targets, Visibility.of(track, directions, o.limits))
+    answer = VisibleAnswer(study, targets, Visibility.of(o.orbit().track(o.times()), directions, o.limits))
     if progress is not None:
         progress(len(targets), len(targets))
     return answer

@@ -65,14 +65,10 @@ def residual_series(answer: CalibrateAnswer) -> list[tuple[str, Any, Any]]:
 def calibration_residuals(answer: CalibrateAnswer) -> Picture:
     """Plot the residuals of each star, averaged over some pixels, in their standard deviations."""
     two = Strips(along="y", alpha=0.2, at=([-2], [2]))
-    rows = [
-        [Panel(WAVELENGTH, Axis("residual (sigma)"), [two, Dots("", "star", at=(nm, row))], name)]
-        for name, nm, row in residual_series(answer)
-    ]
-    title = (
-        f"Observed less fitted spectra, means of {BIN} pixels; grey: 2 sigma; p-value {answer.throughput.p_value:.2g}"
-    )
-    return Picture(rows, (5.2, 1.0 + 1.1 * len(rows)), title, share_x=True, share_y=True)
+    rows = [[Panel(WAVELENGTH, Axis("residual (sigma)"), [two, Dots("", "star", at=(nm, row))], name)]
+            for name, nm, row in residual_series(answer)]  # fmt: skip
+    title, notes = f"Observed less fitted spectra, means of {BIN} pixels", f"p-value {answer.throughput.p_value:.2g}"
+    return Picture(rows, (5.2, 1.0 + 1.1 * len(rows)), title, ("grey: 2 sigma", notes), share_x=True, share_y=True)
 
 
 def transfer_series(answer: CalibrateAnswer) -> tuple[dict[str, Any], Any]:
@@ -108,18 +104,12 @@ def dark_current(answer: CalibrateAnswer) -> Picture:
     celsius = np.concatenate([np.atleast_1d(observation.temperature_c) for observation in dark])
     kelvin = np.linspace(celsius.min(), celsius.max(), 101)
     usual = n.dark_scale_dn_per_s * np.exp(n.dark_slope_per_c * kelvin)
-    mean = [
-        *(
-            Dots(
-                "" if number else "means of frames",
-                "star",
-                at=(observation.temperature_c, (observation.raw_dn - d.bias_dn).mean(axis=1) / observation.exposure_s),
-            )
-            for number, observation in enumerate(dark)
-        ),
-        Line("fitted", "flare", at=(kelvin, d.level_dn_per_s.mean() * d.growth(kelvin))),
-        Line("nominal", dash="dashed", at=(kelvin, usual)),
-    ]
+    mean = list[Dots | Line]()
+    for number, frames in enumerate(dark):
+        at = frames.temperature_c, (frames.raw_dn - d.bias_dn).mean(axis=1) / frames.exposure_s
+        mean.append(Dots("" if number else "means of frames", "star", at=at))
+    mean.append(Line("fitted", "flare", at=(kelvin, d.level_dn_per_s.mean() * d.growth(kelvin))))
+    mean.append(Line("nominal", dash="dashed", at=(kelvin, usual)))
     left = Panel(WAVELENGTH, Axis("dark current (DN/s)"), [pixels], f"pixels at {d.reference_c:.1f} °C")
     right = Panel(Axis("detector temperature (°C)"), Axis("mean dark current (DN/s)"), mean)
     title = f"Dark current: slope {with_error(d.slope_per_c, d.slope_error)} per °C"

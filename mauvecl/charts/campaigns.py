@@ -7,7 +7,7 @@ import calendar as months_of_years
 import io
 import textwrap
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from html import escape
 from pathlib import Path
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mauvecl.charts.chart import Axis, Dots, Line, Mesh, Panel, Picture, Series, document_of, pictures_of
-from mauvecl.charts.matplotlib import COLOURS, NULL, available, draw_picture, new_figure, picture_of, style
+from mauvecl.charts.matplotlib import COLOURS, NULL, available, draw_picture, in_rows, new_figure, picture_of, style
 from mauvecl.host import VERSION
 from mauvecl.schema.columns import without_empty
 
@@ -54,8 +54,7 @@ def _calendars(answer: VisibleAnswer, hours: Any) -> Picture:
         at = np.arange(0.5, 32), np.arange(-0.5, len(months)), grid
         mesh = Mesh("hours a day", high=max(float(hours.max()), 0.1), edges="white", at=at)
         panels.append(Panel(x, y, [mesh], f"{target.name}: {total:.0f} h in {answer.times.days:g} d"))
-    rows = [panels[k : k + across] for k in range(0, len(panels), across)]
-    height = max(1.3, 0.17 * len(months) + 0.8)
+    rows, height = in_rows(panels, across), max(1.3, 0.17 * len(months) + 0.8)
     return Picture(rows, (3.9 * across + 0.8, height * len(rows) + 0.4), share_x=True)
 
 
@@ -80,13 +79,15 @@ def _month(day: str) -> str:
 PAGE, MARGIN = (8.27, 11.69), 0.6
 #: Approximate width of a letter divided by its size, for line breaks; line spacing divided by the size.
 LETTER, LINE = 0.53, 1.4
-#: Starts of the columns of the summary and of the assumptions, as fractions of the text width.
+#: Starts of the columns of the summary, of a target and of the assumptions, as fractions of the text width.
 SUMMARY_AT = (0.0, 0.15, 0.215, 0.31, 0.39, 0.47, 0.55, 0.615, 0.69, 0.755, 0.86)
-ASSUMED_AT = (0.0, 0.24, 0.5)
+TARGET_AT, ASSUMED_AT = (0.0, 0.28, 0.72), (0.0, 0.24, 0.5)
+#: Sizes of text on a page: of tables with many columns, and of others; number of columns that are many.
+SMALL, NORMAL, MANY = 5.5, 7.0, 9
 #: Number of colours kept in the pictures of an HTML report.
 COLOURS_KEPT = 64
-#: Margins of a target's panels, as fractions of the figure; computing them takes longer than drawing the figure.
-PANELS = {"left": 0.085, "right": 0.905, "top": 0.955, "bottom": 0.09, "hspace": 0.5}
+#: Height of a target's panels, inches, and their margins as fractions of it: computing them takes longer than drawing.
+PANELS_IN, PANELS = 6.2, {"left": 0.085, "right": 0.905, "top": 0.955, "bottom": 0.09, "hspace": 0.5}
 
 
 def overview(answer: PlanAnswer) -> Picture:
@@ -127,29 +128,48 @@ def visible(answer: PlanAnswer) -> Any:
     return calendar(answer.seen)
 
 
-@document_of("PlanAnswer", "plan.pdf", when=lambda answer: answer.study.plan.report == "pdf")
-def pdf_bytes(answer: PlanAnswer) -> bytes:
-    """Return the report as PDF: summary, a page per target, and all assumptions."""
+@dataclass(frozen=True)
+class Part:
+    """Part of a report, from top to bottom: heading, sentences, a table with a note on it, and a picture."""
 
-    def figures() -> list[Any]:
-        targets = [_target(answer, k) for k in range(len(answer.planned))]
-        return [*_summary(answer), *targets, *_assumptions(answer)]
+    heading: str = ""
+    lines: Sequence[str] = ()
+    names: Sequence[str] = ()  # headings of the table
+    rows: Sequence[Sequence[object]] = ()
+    places: Sequence[float] = ()  # starts of its columns, as fractions of the text width; evenly spaced by default
+    links: int = 0  # number of the part to which the first row is a link, if rows are links to the parts that follow
+    note: str = ""
+    # Draws in a part of a page, or in a figure of its own if it is given none, which it returns.
+    picture: Callable[[Any], Any] | None = None
+    seen: str = ""  # the picture in words
+    height_in: float = 0.0  # of the picture on a page; 0 for a page of its own
+    new_page: bool = False
 
-    return _pdf(f"Mauve: {answer.heading}", figures)
 
-
-def _pdf(title: str, figures: Callable[[], list[Any]]) -> bytes:
-    """Return a PDF with a page per figure; without a date, so that equal answers give equal files."""
+def pdf_bytes(title: str, parts: Sequence[Part]) -> bytes:
+    """Return a report as PDF; without a date, so that equal answers give equal files."""
     from matplotlib.backends.backend_pdf import PdfPages
 
     made, about = io.BytesIO(), {"Title": title, "Creator": f"mauvecl {VERSION}", "CreationDate": None}
     with style(), PdfPages(made, metadata=about) as pages:
-        for figure in figures():
+        sheets = Sheets()
+        for part in parts:
+            sheets.add(part)
+        for figure in sheets.pages:
             pages.savefig(figure)
     return made.getvalue()
 
 
-def html_image(draw: Callable[[], Any], text: str) -> str:
+def html_bytes(title: str, parts: Sequence[Part]) -> bytes:
+    """Return a report as a page, with pictures if matplotlib is installed."""
+    from mako.template import Template
+
+    how = {"default_filters": ["str", "escape"], "imports": ["from html import escape"], "strict_undefined": True}
+    template = Template(filename=str(Path(__file__).with_name("reports.html.mako")), **how)
+    return str(template.render(title=title, parts=parts, html_image=html_image)).encode()
+
+
+def html_image(draw: Callable[[Any], Any], text: str) -> str:
     """Return a figure as an image of few colours; nothing if matplotlib is not installed."""
     if not available():
         return ""
@@ -158,7 +178,7 @@ def html_image(draw: Callable[[], Any], text: str) -> str:
 
     made = io.BytesIO()
     with style():
-        figure = draw()
+        figure = draw(None)
         # savefig draws each picture twice.
         figure.set_dpi(110)
         drawn = FigureCanvasAgg(figure)
@@ -176,6 +196,36 @@ class Sheets:
     def __init__(self) -> None:
         self.pages: list[Any] = []
         self.left_in = 0.0
+
+    def add(self, part: Part) -> None:
+        """Write a part of a report."""
+        if part.new_page:
+            self.left_in = 0.0
+        if part.heading:
+            self.take(0.1)
+            self.line([(0.0, part.heading)], 12 if self.pages[1:] else 14)
+        for text in part.lines:
+            self.line([(0.0, text)], 8)
+            self.take(0.05)
+        if part.names:
+            places = part.places or [k / len(part.names) for k in range(len(part.names))]
+            head = [part.names] if any(part.names) else []
+            size = SMALL if len(part.names) >= MANY and not part.places else NORMAL
+            self.rows([*head, *part.rows], places, size, head=bool(head))
+        if part.note:
+            self.line([(0.0, part.note)], NORMAL, color=NULL)
+        if part.picture is not None and part.height_in:
+            self.picture(part.picture, part.height_in)
+        elif part.picture is not None:
+            self.pages.append(part.picture(None))
+            self.left_in = 0.0
+
+    def picture(self, draw: Callable[[Any], Any], height_in: float) -> None:
+        """Draw a picture of the width of the text."""
+        top, margin = self.take(height_in) / PAGE[1], MARGIN / PAGE[0]
+        heights = [1 - top, height_in / PAGE[1], top - height_in / PAGE[1]]
+        widths = [margin, 1 - 2 * margin, margin]
+        draw(self.pages[-1].subfigures(3, 3, height_ratios=heights, width_ratios=widths)[1, 1])
 
     def line(self, cells: Sequence[tuple[float, str]], size: float, **how: Any) -> None:
         """Write cells at fractions of the text width, each wrapped before the start of the next."""
@@ -211,62 +261,50 @@ class Sheets:
         return top
 
 
-def _summary(answer: PlanAnswer) -> list[Any]:
-    from mauvecl.answers.plan import LEGEND
+def plan_parts(answer: PlanAnswer) -> list[Part]:
+    """Return the report of a plan: summary, messages, a part for each target, and all assumptions."""
+    from mauvecl.answers.plan import LEGEND, target_lines
 
-    sheets = Sheets()
-    sheets.line([(0.0, "Mauve: yields of a campaign")], 15)
-    sheets.line([(0.0, f"{answer.heading}; mauvecl {VERSION}")], 9)
-    sheets.take(0.1)
-    headings, cells = answer.views[0].texts()
-    sheets.rows([headings, *cells], SUMMARY_AT, 7, head=True)
-    sheets.take(0.05)
-    sheets.line([(0.0, LEGEND)], 7, color=NULL)
     height = 0.2 * len(answer.planned) + 1.3
-    if height < PAGE[1] - 2 * MARGIN:
-        top, margin = sheets.take(height) / PAGE[1], MARGIN / PAGE[0]
-        around = {"width_ratios": [margin, 1 - 2 * margin, margin]}
-        heights = [1 - top, height / PAGE[1], top - height / PAGE[1]]
-        part = sheets.pages[-1].subfigures(3, 3, height_ratios=heights, **around)[1, 1]
-        draw_picture(overview(answer), part)
-        part.subplots_adjust(left=0.2, right=0.98, bottom=0.6 / height, top=1 - 0.3 / height)
-    for message in answer.messages:
-        sheets.line([(0.0, message)], 8)
-        sheets.take(0.08)
-    return sheets.pages
+
+    def all_targets(figure: Any) -> Any:
+        drawn = draw_picture(overview(answer), figure)
+        if figure is not None:
+            drawn.subplots_adjust(left=0.2, right=0.98, bottom=0.6 / height, top=1 - 0.3 / height)
+        return drawn
+
+    names, cells = answer.views[0].texts()
+    fits, seen = height < PAGE[1] - 2 * MARGIN, "flares expected and energies of all targets"
+    parts = [
+        Part("Mauve: yields of a campaign", [f"{answer.heading}; mauvecl {VERSION}."], names, cells, SUMMARY_AT, 2,
+             LEGEND, all_targets, seen, height if fits else 0.0),
+        Part(lines=answer.messages),
+    ]  # fmt: skip
+    for k, target in enumerate(answer.planned):
+        draw = partial(_panels, answer, k) if target.seen_h > 0 else None
+        parts.append(Part(
+            target.name, (), ("", "", "table: column"), target_lines(answer, k), TARGET_AT, picture=draw,
+            seen=f"hours and energies of {target.name}", height_in=PANELS_IN, new_page=True,
+        ))  # fmt: skip
+    assumed = answer.assumptions
+    note = "Rows of assumptions.ecsv."
+    parts.append(Part("What is assumed", [note], assumed.colnames, list(assumed), ASSUMED_AT, new_page=True))
+    return parts
 
 
-def _assumptions(answer: PlanAnswer) -> list[Any]:
-    sheets = Sheets()
-    sheets.line([(0.0, "What is assumed")], 14)
-    sheets.line([(0.0, "Rows of assumptions.ecsv.")], 8, color=NULL)
-    sheets.take(0.1)
-    sheets.rows(answer.assumptions, ASSUMED_AT, 7, head=False)
-    return sheets.pages
+@document_of("PlanAnswer", "plan.pdf", when=lambda answer: answer.study.plan.report == "pdf")
+def plan_pdf(answer: PlanAnswer) -> bytes:
+    """Return the report as PDF, with a page per target."""
+    return pdf_bytes(f"Mauve: {answer.heading}", plan_parts(answer))
 
 
-def _target(answer: PlanAnswer, k: int) -> Any:
-    from mauvecl.answers.plan import target_lines
-
-    figure = new_figure(PAGE, layout="none")
-    # The text is above the pictures.
-    margin = MARGIN / PAGE[0]
-    pictures = figure.subfigures(2, 3, height_ratios=[0.43, 0.57], width_ratios=[margin, 1 - 2 * margin, margin])[1, 1]
-    figure.text(margin, 0.96, answer.planned[k].name, fontsize=14, va="top", parse_math=False)
-    figure.text(1 - margin, 0.96, answer.heading, fontsize=8, va="top", ha="right", color=NULL)
-    y = 0.925
-    for name, value, where in target_lines(answer, k):
-        lines = textwrap.wrap(value, 48) or [""]
-        figure.text(margin, y, name, fontsize=8, va="top")
-        figure.text(0.33, y, "\n".join(lines), fontsize=8, va="top", parse_math=False)
-        figure.text(1 - margin, y, where, fontsize=6.5, va="top", ha="right", color=NULL)
-        y -= 0.018 * len(lines)
-    if answer.planned[k].seen_h > 0:
-        _panels(answer, k, pictures)
-    return figure
+@document_of("PlanAnswer", "plan.html", when=lambda answer: answer.study.plan.report == "html")
+def plan_html(answer: PlanAnswer) -> bytes:
+    """Return the report as a page."""
+    return html_bytes(f"Mauve: {answer.heading}", plan_parts(answer))
 
 
-def _panels(answer: PlanAnswer, k: int, figure: Any = None) -> Any:
+def _panels(answer: PlanAnswer, k: int, figure: Any) -> Any:
     """Plot daily hours with elongation, monthly hours, and recovered fraction with the rate by energy."""
     target, seen = answer.planned[k], answer.seen
     figure = new_figure((7.4, 5.4), layout="none") if figure is None else figure
@@ -278,10 +316,9 @@ def _panels(answer: PlanAnswer, k: int, figure: Any = None) -> Any:
     firsts = [i for i, day in enumerate(seen.days) if day.endswith("-01")]
     step = max(1, len(firsts) // 12)
     top.set_xticks(firsts[::step], [seen.days[i][:7] for i in firsts[::step]], fontsize=7, rotation=30)
-    sun = top.twinx()
+    sun = _right_axis(top)
     sun.plot(days, seen.elongation_deg(k), color=COLOURS[4])
     sun.set(ylabel="angle from the Sun (deg)", ylim=(0, 180))
-    _colour_right(sun)
     top.set_title("when it is seen")
     if target.completeness is None:
         bottom.set_visible(False)
@@ -298,20 +335,21 @@ def _panels(answer: PlanAnswer, k: int, figure: Any = None) -> Any:
             bottom.axvline(target.energy_at(share), color=NULL, linestyle=dash, linewidth=0.8)
     bottom.set_title("flares recovered (E50 dashed, E90 dotted), and how often they are")
     if target.rates is not None:
-        often = bottom.twinx()
+        often = _right_axis(bottom)
         rate = target.rates.per_day_above(energy[shown]) * target.hours / 24
         used = rate > 0
         often.plot(energy[shown][used], rate[used], color=COLOURS[4])
         often.set(yscale="log", ylabel=f"flares above this energy in {target.hours:.0f} h")
-        _colour_right(often)
         _plain_decades(often.yaxis)
     return figure
 
 
-def _colour_right(axes: Any) -> None:
-    """Show the axis on the right, with its label in the colour of its curve."""
-    axes.spines["right"].set_visible(True)
-    axes.yaxis.label.set_color(COLOURS[4])
+def _right_axis(axes: Any) -> Any:
+    """Return axes with a visible y axis on the right, whose label has the colour of its curve."""
+    twin = axes.twinx()
+    twin.spines["right"].set_visible(True)
+    twin.yaxis.label.set_color(COLOURS[4])
+    return twin
 
 
 def _plain_decades(axis: Any) -> None:
@@ -322,71 +360,25 @@ def _plain_decades(axis: Any) -> None:
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}" if 1e-3 <= value < 1e4 else f"{value:.0e}"))
 
 
-@document_of("PlanAnswer", "plan.html", when=lambda answer: answer.study.plan.report == "html")
-def plan_html(answer: PlanAnswer) -> bytes:
-    """Return the report: summary, a section per target (with pictures if matplotlib is installed), assumptions."""
-    from mauvecl.answers.plan import LEGEND, target_lines
-
-    pictures = [
-        html_image(lambda: draw_picture(overview(answer)), "flares expected and energies of all targets"),
-        *(
-            html_image(partial(_panels, answer, k), f"hours and energies of {target.name}") if target.seen_h > 0 else ""
-            for k, target in enumerate(answer.planned)
-        ),
-    ]
-    lines = [target_lines(answer, k) for k in range(len(answer.planned))]
-    return _html("plan", answer=answer, legend=LEGEND, lines=lines, pictures=pictures)
-
-
-def _html(report: str, **values: Any) -> bytes:
-    """Return a report by its template."""
-    from mako.template import Template
-
-    how = {"default_filters": ["str", "escape"], "imports": ["from html import escape"], "strict_undefined": True}
-    templates = Template(filename=str(Path(__file__).with_name("reports.html.mako")), **how)
-    return str(templates.get_def(report).render(version=VERSION, **values)).encode()
-
-
-#: Sizes of text on a page of A4: of tables with many columns, and of others.
-SMALL, NORMAL = 5.5, 7.0
-#: Number of columns from which a table has small letters.
-MANY = 9
-
-
-def title(answer: AnalyseAnswer) -> str:
-    """Return the heading of the report."""
+def analysis_parts(answer: AnalyseAnswer) -> list[Part]:
+    """Return the report of an analysis: messages, tables without empty columns, remarks, and pictures."""
     frames = answer.analysis.frames
-    return f"{frames.name}: {frames.n_frames} frames from {frames.date(float(frames.time_s[0]))[:19]}"
-
-
-def _sections(answer: AnalyseAnswer) -> list[tuple[str, list[str], list[list[str]]]]:
-    """Return title, headings and cells of each table, without empty columns."""
-    return [(view.title, *without_empty(*view.texts())) for view in answer.all_views]
+    title = f"{frames.name}: {frames.n_frames} frames from {frames.date(float(frames.time_s[0]))[:19]}"
+    parts = [Part(title, [f"Analysed by mauvecl {VERSION}. {answer.assumed}", *answer.messages])]
+    parts += [Part(view.title, (), *without_empty(*view.texts())) for view in answer.all_views]
+    parts.append(Part(lines=answer.remarks, note="Every number is a row of the tables next to this report."))
+    return parts + [Part(picture=draw, seen=name) for name, draw in pictures_of(answer).items()]
 
 
 @document_of("AnalyseAnswer", "analyse.html", when=lambda answer: answer.study.data.report == "html")
 def analysis_html(answer: AnalyseAnswer) -> bytes:
-    """Return the report: messages, tables, remarks, and pictures if matplotlib is installed."""
-    pictures = [html_image(draw, name) for name, draw in pictures_of(answer).items()]
-    return _html("analysis", answer=answer, title=title(answer), sections=_sections(answer), pictures=pictures)
+    """Return the report as a page."""
+    parts = analysis_parts(answer)
+    return html_bytes(parts[0].heading, parts)
 
 
 @document_of("AnalyseAnswer", "analyse.pdf", when=lambda answer: answer.study.data.report == "pdf")
-def report_pdf(answer: AnalyseAnswer) -> bytes:
-    """Return the report as PDF: messages, tables, remarks, and a page for each picture."""
-
-    def figures() -> list[Any]:
-        sheets = Sheets()
-        sheets.line([(0.0, title(answer))], 14)
-        for text in (f"Analysed by mauvecl {VERSION}. {answer.assumed}", *answer.messages, *answer.remarks):
-            sheets.line([(0.0, text)], 8)
-            sheets.take(0.05)
-        for heading, names, cells in _sections(answer):
-            sheets.take(0.1)
-            sheets.line([(0.0, heading)], 10)
-            places = [k / len(names) for k in range(len(names))]
-            sheets.rows([names, *cells] if names else [], places, SMALL if len(names) >= MANY else NORMAL, head=True)
-        sheets.line([(0.0, "Every number is a row of the tables next to this report.")], SMALL, color=NULL)
-        return [*sheets.pages, *(draw() for draw in pictures_of(answer).values())]
-
-    return _pdf(title(answer), figures)
+def analysis_pdf(answer: AnalyseAnswer) -> bytes:
+    """Return the report as PDF, with a page for each picture."""
+    parts = analysis_parts(answer)
+    return pdf_bytes(parts[0].heading, parts)

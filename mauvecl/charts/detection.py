@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.charts.chart import WAVELENGTH, Axis, Band, Dots, Line, Panel, Picture, Rule, Series
-from mauvecl.charts.matplotlib import COLOURS, COLUMN, MAX_COLUMNS, UNBROKEN, picture_of, written
+from mauvecl.charts.matplotlib import COLOURS, COLUMN, MAX_COLUMNS, UNBROKEN, in_rows, picture_of, written
 from mauvecl.detection.names import NoThresholdError
 from mauvecl.detection.requests import statistic_label
 from mauvecl.detection.statistics import LinearStatistic
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 MOST_FLARES = 16
 #: A star: title, findings, and its flares' names.
 Shown = tuple[str, "Detection", Sequence[str]]
-ELEMENT = "per 10.5 nm element"
 #: Largest number of stars in a picture.
 MOST_STARS = 6
 #: Share of the axis of a statistic that stays empty on either side.
@@ -52,19 +51,16 @@ def _few(answer: DetectAnswer) -> First[Shown]:
 )
 def detection(stars: Sequence[Shown], fap: float = 1e-3) -> Picture:
     """Plot null and flare distributions, with a row per star and a column per statistic."""
-    first = stars[0][1]
+    first, rows = stars[0][1], list[Sequence[Panel]]()
     columns = min(len(first.statistics), MAX_COLUMNS)
-    rows = list[list[Panel]]()
-    for title, outcome, flares in stars:
-        panels = [_distributions(title, outcome, flares, statistic, fap) for statistic in first.statistics]
-        rows += [panels[k : k + columns] for k in range(0, len(panels), columns)]
+    for star in stars:
+        rows += in_rows([_distributions(*star, statistic, fap) for statistic in first.statistics], columns)
     exposures = " and ".join(sorted({f"{outcome.quiet.exposure_s:g}{UNBROKEN}s" for _, outcome, _ in stars}))
     title = (
         f"Detection statistics without and with a flare, {exposures}, {first.realisations:,} realisations each; "
         f"thresholds at a false-alarm probability of {fap:g} per test; nominal throughput"
     )
-    size, notes = (COLUMN * columns, 2.6 * len(rows) + 0.4), (note_of(stars), _flare_note(stars))
-    return Picture(rows, size, title, notes, below=True)
+    return Picture(rows, (COLUMN * columns, 2.6 * len(rows) + 0.4), title, _notes(stars), below=True)
 
 
 def _drawn_flares(names: Sequence[str]) -> list[int]:
@@ -72,10 +68,10 @@ def _drawn_flares(names: Sequence[str]) -> list[int]:
     return [round(k) for k in np.linspace(0, len(names) - 1, min(len(names), MOST_FLARES))]
 
 
-def _flare_note(stars: Sequence[Shown]) -> str:
-    """Return the note on the number of drawn flares; empty if all are drawn."""
+def _notes(stars: Sequence[Shown]) -> tuple[str, str]:
+    """Return the notes on the numbers of drawn stars and flares; empty if all are drawn."""
     most = max(len(names) for *_, names in stars)
-    return part_note(min(MOST_FLARES, most), most, "flares")
+    return note_of(stars), part_note(min(MOST_FLARES, most), most, "flares")
 
 
 def _distributions(title: str, outcome: Detection, flares: Sequence[str], statistic: str, fap: float) -> Panel:
@@ -123,13 +119,8 @@ def _scaled(axis: Any, linear: bool, ends: tuple[float, float]) -> None:
         low, high = np.log10(ends)
         axis.set_xlim(*10 ** np.array([low - MARGIN * (high - low), high + MARGIN * (high - low)]))
         # Over few decades, powers of ten alone are too sparse.
-        digits = next(
-            digits
-            for most, digits in (
-                (0.4, (1, 1.2, 1.4, 1.7, 2, 2.5, 3, 4, 5, 6, 8)), (0.8, (1, 2, 3, 5)), (2.0, (1, 2, 5)), (np.inf, (1,)),
-            )
-            if high - low <= most
-        )  # fmt: skip
+        few = {0.4: (1, 1.2, 1.4, 1.7, 2, 2.5, 3, 4, 5, 6, 8), 0.8: (1, 2, 3, 5), 2.0: (1, 2, 5), np.inf: (1,)}
+        digits = next(digits for most, digits in few.items() if high - low <= most)
         major = [digit * decade for decade in decades for digit in digits]
         minor = [digit * decade for decade in decades for digit in range(1, 10)]
     low, high = axis.get_xlim()
@@ -185,8 +176,8 @@ def spectra(stars: Sequence[Shown]) -> Picture:
         y = Axis("flare less quiet\n(sigma per 10.5 nm)", log=True)
         below.append(Panel(WAVELENGTH, y, [*lines, Rule(along="y", at=1.0)], finish=finish))
     title = "Mean spectra as Mauve would see them; nominal throughput, not a flight calibration"
-    size, notes = (COLUMN * len(stars), 5.0), (note_of(stars), _flare_note(stars))
-    return Picture([above, below], size, title, notes, below=True, share_x=True, heights=(3, 2))
+    size = COLUMN * len(stars), 5.0
+    return Picture([above, below], size, title, _notes(stars), below=True, share_x=True, heights=(3, 2))
 
 
 def _whole(x: Expectation) -> NDArray[np.bool_]:
@@ -236,14 +227,12 @@ def signal_to_noise(stars: Sequence[tuple[str, SnrResult | Expectation]]) -> Pic
         x = drawn.expectation if drawn else cast("Expectation", result)
         title = title if f"{x.exposure_s:g} s" in title else f"{title}, {x.exposure_s:g} s"
         whole = _whole(x)
-        element = drawn.element[whole] if drawn else None
-        rows.append([
-            _snr_panel(title, "per pixel", x.wavelength_nm, x.snr(), drawn.pixel if drawn else None),
-            _snr_panel(title, ELEMENT, x.element_wavelength_nm[whole], x.snr_per_element()[whole], element),
-        ])  # fmt: skip
+        pixel, element = (drawn.pixel, drawn.element[whole]) if drawn else (None, None)
+        nm, snr = x.element_wavelength_nm[whole], x.snr_per_element()[whole]
+        rows.append([_snr_panel(title, "per pixel", x.wavelength_nm, x.snr(), pixel),
+                     _snr_panel(title, "per 10.5 nm element", nm, snr, element)])  # fmt: skip
     title = "S/N of one exposure; nominal throughput, not a flight calibration"
-    size = 7.6, 2.6 * len(rows) + 0.4
-    return Picture(rows, size, title, (note_of(stars),), below=True, share_x=True)
+    return Picture(rows, (7.6, 2.6 * len(rows) + 0.4), title, (note_of(stars),), below=True, share_x=True)
 
 
 def _snr_panel(title: str, what: str, nm: Any, expected: Any, table: QTable | None) -> Panel:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import cycle
+from operator import methodcaller
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from mauvecl.charts.matplotlib import (
     MAX_COLUMNS,
     contour_entries,
     draw_contours,
+    in_rows,
     picture_of,
     strokes_of,
     styled_picture,
@@ -53,8 +55,7 @@ def _stars(answer: InjectAnswer, panel: Callable[[Any], Panel], *notes: str, bel
     """Return a picture with a panel per star, the first ones if there are many."""
     stars, study = First(answer.stars, MOST_MAPS, "stars"), answer.study
     columns = min(len(stars), MAX_COLUMNS)
-    panels = [panel(star) for star in stars]
-    rows = [panels[k : k + columns] for k in range(0, len(panels), columns)]
+    rows = in_rows([panel(star) for star in stars], columns)
     title = f"Flares of {study.flare.light().describe()}, {study.search.rate_text}; nominal throughput"
     return Picture(rows, (3.6 * columns + 0.8, 3.2 * len(rows)), title, (stars.note, *notes), below)
 
@@ -109,13 +110,10 @@ def energies(answer: InjectAnswer) -> Picture:
             at = _edges(x), _edges(y), np.log10(star.fitted["energy_ratio"].T)
             label = "recovered / injected energy (dex)"
             meshes.append(Mesh(label, low=-0.3, high=0.3, palette="RdBu_r", at=at))
-        return Panel(HALF_WIDTH, Axis(SIZES[star.sizes.of], log=True), meshes, star.title, _empty_in_grey)
+        finish = methodcaller("set_facecolor", EMPTY)
+        return Panel(HALF_WIDTH, Axis(SIZES[star.sizes.of], log=True), meshes, star.title, finish)
 
     return _stars(answer, panel, "medians; grey: none found")
-
-
-def _empty_in_grey(axis: Any) -> None:
-    axis.set_facecolor(EMPTY)
 
 
 def _edges(middles: Any) -> Any:
@@ -193,8 +191,7 @@ def compare_light_curves(answers: Sequence[tuple[str, StareAnswer]], band: int =
             above = f"{title}\n" if row is rows[0] else ""
             heading = f"{above}{star.title}, {light.bands[band]}"
             row.append(Panel(Axis(f"time ({unit})"), Axis("flux / quiescent"), series, heading))
-    size = 3.7 * len(answers), 1.5 * len(rows) + 0.8
-    return Picture(rows, size, share_x=True, share_y="row")
+    return Picture(rows, (3.7 * len(answers), 1.5 * len(rows) + 0.8), share_x=True, share_y="row")
 
 
 @picture_of("StareAnswer", "dynamic-spectrum", each=lambda answer: [(star,) for star in answer.stares])
@@ -233,7 +230,7 @@ def spectra_panel(
     mesh = Mesh(label, low=-reach, high=reach, palette="RdBu_r", at=(time, nm, image.T))
 
     def finish(axis: Any) -> None:
-        _empty_in_grey(axis)
+        axis.set_facecolor(EMPTY)
         for ends, colour in marks:
             axis.plot(ends, [1.02, 1.02], transform=axis.get_xaxis_transform(), color=INK[colour], linewidth=3,
                       clip_on=False, solid_capstyle="butt")  # fmt: skip
@@ -253,8 +250,6 @@ def _runs(numbers: NDArray[np.int64]) -> list[NDArray[np.intp]]:
     return np.split(np.arange(numbers.size), np.flatnonzero(np.diff(numbers) > 1) + 1)
 
 
-#: Title of the light curve.
-KINDS = "observed light curve; threshold of events {:.2f}"
 #: Names of events by their colours.
 EVENTS = {"star": "event", "drawn": "candidate", "flare": "look-alike"}
 INKS = {"star": "blue", "drawn": "grey", "flare": "red"}
@@ -262,14 +257,10 @@ INKS = {"star": "blue", "drawn": "grey", "flare": "red"}
 BRIGHT = 30.0
 
 
-def _since(analysis: Analysis, time_s: Any) -> Any:
-    """Return times from the first frame, in the unit of the analysis's pictures."""
-    return (time_s - analysis.frames.time_s[0]) / _unit(analysis)[0]
-
-
-def _unit(analysis: Analysis) -> tuple[float, str]:
-    """Return the unit of time of an analysis's pictures, and its length, s."""
-    return time_unit(float(np.ptp(analysis.frames.time_s)))
+def _since(analysis: Analysis, time_s: Any) -> tuple[Any, str]:
+    """Return times from the first frame in the unit of the analysis's pictures, and this unit."""
+    length_s, name = time_unit(float(np.ptp(analysis.frames.time_s)))
+    return (time_s - analysis.frames.time_s[0]) / length_s, name
 
 
 @picture_of("AnalyseAnswer", "light-curve")
@@ -278,17 +269,15 @@ def observed_light_curve(answer: AnalyseAnswer) -> Picture:
 
     If there are bright events, a second panel shows the flux less the level.
     """
-    analysis, unit = answer.analysis, _unit(answer.analysis)[1]
-    time, used = _since(analysis, analysis.frames.time_s), analysis.level.used
+    analysis, used = answer.analysis, answer.analysis.level.used
+    time, unit = _since(analysis, analysis.frames.time_s)
     level, error, off = analysis.level.level, analysis.level.error, 2 * analysis.level.level_error
     left_out, strips = ~used & np.isfinite(analysis.flux), list[Series]()
     for colour, name in EVENTS.items():
-        ends = [
-            [_since(analysis, analysis.survey.time_s[k]) for k in (event.first, event.last)]
-            for event in analysis.events if _colour(analysis, event) == colour
-        ]  # fmt: skip
-        if ends:
-            strips.append(Strips(name, colour, alpha=0.2, at=np.transpose(ends)))
+        events = [event for event in analysis.events if _colour(analysis, event) == colour]
+        if events:
+            frames = np.transpose([(event.first, event.last) for event in events])
+            strips.append(Strips(name, colour, alpha=0.2, at=_since(analysis, analysis.survey.time_s[frames])[0]))
 
     def series(flux: Any, middle: Any, reach: Any) -> list[Series]:
         parts: list[Series] = [
@@ -312,7 +301,7 @@ def observed_light_curve(answer: AnalyseAnswer) -> Picture:
     if (excess / error)[used].max() > BRIGHT:
         y = Axis("(flux \N{MINUS SIGN} level) / noise", limits=(-6, BRIGHT / 2))
         rows.append([Panel(x, y, series(excess / error, 0 * level, off / error))])
-    title = f"{analysis.frames.name}: {KINDS.format(analysis.threshold)}"
+    title = f"{analysis.frames.name}: observed light curve; threshold of events {analysis.threshold:.2f}"
     return Picture(rows, (7.2, 1.4 + 1.8 * len(rows)), title, below=True, share_x=True)
 
 
@@ -338,8 +327,7 @@ def observed_dynamic_spectrum(answer: AnalyseAnswer) -> Picture:
     panel, _ = spectra_panel(stare, spectra.series.excess, sd, noise.wavelength_nm, marks)
     shown = {_colour(analysis, event) for event in analysis.events}
     marked = ", ".join(f"{EVENTS[colour]}s ({INKS[colour]})" for colour in EVENTS if colour in shown)
-    title = f"{analysis.frames.name}; marked above: {marked}" if marked else analysis.frames.name
-    return Picture([[panel]], (7.2, 3.6), title)
+    return Picture([[panel]], (7.2, 3.6), analysis.frames.name, (f"marked above: {marked}" if marked else "",))
 
 
 @picture_of("AnalyseAnswer", "noise-per-pixel", when=lambda answer: answer.analysis.spectra is not None)
@@ -348,16 +336,13 @@ def observed_pixel_noise(answer: AnalyseAnswer) -> Picture:
     spectra = answer.analysis.spectra
     assert spectra is not None
     noise = spectra.series.noise
-    series: list[Series] = [
-        Band("95 % of normal noise", at=(noise.wavelength_nm, noise.low / noise.stated, noise.high / noise.stated))
-    ]
+    nm, series = noise.wavelength_nm, list[Series]()
+    series.append(Band("95 % of normal noise", at=(nm, noise.low / noise.stated, noise.high / noise.stated)))
     for name, which, colour in (("measured", ~noise.departs, "star"), ("measured, departs", noise.departs, "flare")):
-        at = noise.wavelength_nm[which], (noise.measured / noise.stated)[which]
         if which.any():
-            series.append(Dots(name, colour, size=4, at=at))
+            series.append(Dots(name, colour, size=4, at=(nm[which], (noise.measured / noise.stated)[which])))
     panel = Panel(Axis("wavelength (nm)"), Axis("measured / stated noise"), series)
-    title = f"{answer.analysis.frames.name}: noise of quiescent frames"
-    return Picture([[panel]], (4.6, 3.5), title, below=True)
+    return Picture([[panel]], (4.6, 3.5), f"{answer.analysis.frames.name}: noise of quiescent frames", below=True)
 
 
 @picture_of("AnalyseAnswer", "residuals")
@@ -365,11 +350,8 @@ def observed_residuals(answer: AnalyseAnswer) -> Picture:
     """Plot the residuals of the fitted process against time, their autocorrelation, and their quantiles."""
     analysis = answer.analysis
     residual, likeness = analysis.residual[:, 0], analysis.likeness
-    time, unit = _since(analysis, analysis.survey.time_s)[analysis.quiet], _unit(analysis)[1]
+    time, unit = _since(analysis, analysis.survey.time_s[analysis.quiet])
     size = 1.7 if time.size > 1000 else 4
-
-    def whole(axis: Any) -> None:
-        axis.xaxis.get_major_locator().set_params(integer=True)
 
     lags = np.arange(1, likeness.correlations.size + 1)
     normal = ndtri((np.arange(residual.size) + 0.5) / residual.size)
@@ -384,14 +366,12 @@ def observed_residuals(answer: AnalyseAnswer) -> Picture:
     ]
     row = [
         Panel(Axis(f"time ({unit})"), Axis("residual (standard deviations)"), course),
-        Panel(Axis("lag (frames)"), Axis("autocorrelation"), correlation, finish=whole),
+        Panel(Axis("lag (frames)"), Axis("autocorrelation"), correlation,
+              finish=lambda axis: axis.xaxis.get_major_locator().set_params(integer=True)),
         Panel(Axis("normal quantile"), Axis("quantile of the residuals"), quantiles),
-    ]
-    title = (
-        f"{analysis.frames.name}: residuals of the fitted process, {analysis.level.process.name}; grey: 95 % of "
-        "independent, normal noise"
-    )
-    return Picture([row], (9.6, 2.9), title, widths=(2, 1, 1))
+    ]  # fmt: skip
+    title = f"{analysis.frames.name}: residuals of the fitted process, {analysis.level.process.name}"
+    return Picture([row], (9.6, 2.9), title, ("grey: 95 % of independent, normal noise",), widths=(2, 1, 1))
 
 
 SCATTER = Chart(

@@ -20,6 +20,7 @@ from mauvecl.charts.matplotlib import (
     contour_entries,
     draw_contours,
     in_figure,
+    in_rows,
     picture_of,
     strokes_of,
     styled_picture,
@@ -54,12 +55,13 @@ def quantity_axis(study: Study, name: str, **how: Any) -> Axis:
 @picture_of("MapAnswer", "map")
 def detection_map(answer: MapAnswer) -> Picture:
     """Plot the detection probability over two quantities, one panel per statistic."""
-    question, study = answer.study.map, answer.study
-    named = {which: isinstance(getattr(answer, which)[0], str) for which in "xy"}
-    x, y = (
-        np.arange(len(values)) if named[which] else np.array(values, float)
-        for which, values in (("x", answer.x), ("y", answer.y))
-    )
+    question, study, places, axes = answer.study.map, answer.study, list[Any](), list[Axis]()
+    for sweep, values in zip(question.axes, (answer.x, answer.y), strict=True):
+        named = isinstance(values[0], str)
+        places.append(np.arange(len(values)) if named else np.array(values, float))
+        ticks = (places[-1], values) if named else None
+        axes.append(quantity_axis(study, sweep.quantity, log=sweep.log and not named, ticks=ticks))
+    (x, y), (x_axis, y_axis) = places, axes
     strokes = strokes_of(question.contours) if min(x.size, y.size) > 1 else {}
 
     def finish(axis: Any, probability: Any) -> None:
@@ -67,17 +69,11 @@ def detection_map(answer: MapAnswer) -> Picture:
         if strokes:
             draw_contours(axis, (x, y, probability), strokes)
 
-    x_axis, y_axis = (
-        quantity_axis(study, sweep.quantity, log=sweep.log and not named[which],
-                      ticks=(place, getattr(answer, which)) if named[which] else None)
-        for which, sweep, place in (("x", question.axes[0], x), ("y", question.axes[1], y))
-    )  # fmt: skip
-    lines = contour_entries(strokes, "detected")
-    row = [
-        Panel(x_axis, y_axis, [Mesh("detection probability", at=(x, y, p)), *lines],
-              statistic_label(statistic).partition(" (")[0], partial(finish, probability=p))
-        for statistic, p in zip(answer.statistics, answer.probability, strict=True)
-    ]  # fmt: skip
+    lines, row = contour_entries(strokes, "detected"), []
+    for statistic, p in zip(answer.statistics, answer.probability, strict=True):
+        series = [Mesh("detection probability", at=(x, y, p)), *lines]
+        title = statistic_label(statistic).partition(" (")[0]
+        row.append(Panel(x_axis, y_axis, series, title, partial(finish, probability=p)))
     names = {axis.quantity for axis in question.axes}
     exposure = "" if "exposure" in names else f", {study.observation.exposure_s:g} s"
     flare = "" if "amplitude" in names else f", flare of {100 * study.flare.amplitudes[0]:g} %"
@@ -161,9 +157,7 @@ def noise_budget(observed: Sequence[tuple[str, Expectation]], *, each: int = 1) 
     panels = [replace(BUDGET.panel(budget_series(x), title), finish=finish) for title, x in shown]
     # A column for each cell, unless these are too many.
     across = len(observed) // each if each <= MAX_COLUMNS and len(shown) == len(observed) else 0
-    rows = [panels[k::across] for k in range(across)] or [
-        panels[k : k + MAX_COLUMNS] for k in range(0, len(panels), MAX_COLUMNS)
-    ]
+    rows = [panels[k::across] for k in range(across)] or in_rows(panels, MAX_COLUMNS)
     size = COLUMN * max(len(row) for row in rows), 2.3 * len(rows) + 0.7
     title = "Noise budgets; nominal throughput, not a flight calibration"
     return Picture(rows, size, title, (shown.note,), below=True, share_x=True, share_y="col" if across else True)
@@ -188,12 +182,11 @@ def snr_sweep(answer: SnrAnswer) -> Picture:
             x, expected, low, high = zip(*points, strict=True)
             lengths = np.maximum(np.subtract(expected, low), 0), np.maximum(np.subtract(high, expected), 0)
             series += [Line(name, colour, at=(x, expected)), Dots("", colour, size=7, at=(x, expected, lengths))]
-        x_axis = quantity_axis(answer.study, first, log=first == "exposure")
         y_axis = Axis("S/N per 10.5 nm element", log=True, limits=(0.1, None))
+        x_axis = quantity_axis(answer.study, first, log=first == "exposure")
         row.append(Panel(x_axis, y_axis, series, f"{wavelength:g} nm"))
-    size = (COLUMN if len(row) == 1 else 2.6 * len(row), 3.2)
     title = "S/N in closed form; bars: 95 % of realisations; nominal throughput"
-    return Picture([row], size, title, below=True, share_y=True)
+    return Picture([row], (COLUMN if len(row) == 1 else 2.6 * len(row), 3.2), title, below=True, share_y=True)
 
 
 @picture_of("GaussianAnswer", "gaussian")
@@ -214,18 +207,18 @@ def gaussian(answer: GaussianAnswer) -> Picture:
             axis.grid(axis="y", linewidth=0.3)
 
         y = Axis(limits=(len(rows) - 0.5, -0.5), ticks=(rows, labels))
-        return Panel(Axis(text), y, [series, Rule(dash="-", at=predicted)],
-                     finish=finish)  # fmt: skip
+        return Panel(Axis(text), y, [series, Rule(dash="-", at=predicted)], finish=finish)
 
-    half = (np.asarray(cells["coverage_high"]) - np.asarray(cells["coverage_low"])) / 2
-    coverage = Dots("", "star", marker="", width=5, at=(np.asarray(cells["coverage_low"]) + half, rows, 0 * half, half))
-    dots = {name: Dots("", "star", size=7, at=(np.asarray(cells[name]), rows))
-            for name in ("snr_off_by", "five_sigma_above", "fap_ratio")}  # fmt: skip
+    def dots(name: str) -> Dots:
+        return Dots("", "star", size=7, at=(np.asarray(cells[name]), rows))
+
+    low, high = (np.asarray(cells[f"coverage_{end}"]) for end in ("low", "high"))
+    coverage = Dots("", "star", marker="", width=5, at=((low + high) / 2, rows, 0 * low, (high - low) / 2))
     row = [
-        panel("S/N: simulated\nless predicted", 0.0, 0.1, dots["snr_off_by"]),
+        panel("S/N: simulated\nless predicted", 0.0, 0.1, dots("snr_off_by")),
         panel("coverage of\n1-sigma intervals", 0.6827, 0.03, coverage),
-        panel("5-sigma pixels\nover predicted", 1.0, 0.5, dots["five_sigma_above"]),
-        panel("false alarms\nover predicted", 1.0, 0.2, dots["fap_ratio"]),
+        panel("5-sigma pixels\nover predicted", 1.0, 0.5, dots("five_sigma_above")),
+        panel("false alarms\nover predicted", 1.0, 0.2, dots("fap_ratio")),
     ]
     title = "Simulation and root-of-N formula; vertical lines: as the formula predicts; nominal throughput"
     return Picture([row], (2 * COLUMN, 0.22 * len(cells) + 1.5), title, share_y=True)
@@ -259,8 +252,9 @@ MOST_FLARES = 4
 MANY_FITS = 1000
 
 
-def _few(answer: MeasureAnswer) -> tuple[Any, ...]:
-    return (First(answer.flares, MOST_FLARES, "flares"),)
+def _few(answer: MeasureAnswer, kind: type = object) -> tuple[Any, ...]:
+    """Return the first flares, those whose fitted model is of a kind."""
+    return (First([flare for flare in answer.flares if isinstance(flare.fitted, kind)], MOST_FLARES, "flares"),)
 
 
 @picture_of("MeasureAnswer", "fit", given=_few)
@@ -300,8 +294,7 @@ def _each(flares: Sequence[MeasuredFlare], panel: Callable[[MeasuredFlare], Pane
 def _single(answer: MeasureAnswer) -> tuple[Any, ...]:
     from mauvecl.fits.flare_model import FlareModel
 
-    single = [flare for flare in answer.flares if isinstance(flare.fitted, FlareModel)]
-    return (First(single, MOST_FLARES, "flares"),)
+    return _few(answer, FlareModel)
 
 
 @picture_of("MeasureAnswer", "contours", given=_single, when=lambda answer: bool(_single(answer)[0]))
@@ -373,8 +366,8 @@ def temperatures(star: MeasuredStare) -> Picture:
     assert drawn is not None
     assert perfect is not None
     measurement = drawn.found
-    size = "area" if "area" in measurement.names else "amplitude"
-    light = "luminosity bolometric" if "area" in measurement.names else "flux bolometric"
+    sized = "area" in measurement.names
+    size, light = ("area", "luminosity bolometric") if sized else ("amplitude", "flux bolometric")
     middle, reach = (drawn.start_s + drawn.end_s) / 2, (drawn.end_s - drawn.start_s) / 2
     for name in ("temperature", size, light):
         q = measurement.column(name)
@@ -388,8 +381,8 @@ def temperatures(star: MeasuredStare) -> Picture:
         if limits.any():
             series.append(Dots("lower limit", "star", size=10, marker="^", at=(middle[limits], low[limits])))
         positive = [value for value in (*estimate, *true) if value > 0]
-        of = " ".join(name.split(" ")[::-1])
-        label = f"{of} ({in_figure(measurement.units[q])})" if measurement.units[q] else of
+        unit = f" ({in_figure(measurement.units[q])})" if measurement.units[q] else ""
+        label = " ".join(name.split(" ")[::-1]) + unit
         y = Axis(label, log=True, limits=(0.5 * min(positive), 2 * max(positive)))
         rows.append([Panel(Axis("time from the start of the stare (s)"), y, series)])
     title = f"{star.title}: one simulated stare; nominal throughput"
@@ -403,20 +396,15 @@ def joint(star: MeasuredStare, fit: JointFit) -> Picture:
     since = (stare.middle_s - event.peak_s) / event.half_width_s
     near = (since > -BEFORE) & (since < AFTER)
     x, time = Axis("time from the start of the stare (s)"), stare.middle_s[near]
-    light: list[Series] = [
-        Dots("frames less star, sky, dark and unknowns", size=4, at=(time, drawn[near])),
-        Line("joint fit", "star", at=(time, mean[near])),
-    ]
+    dots = Dots("frames less star, sky, dark and unknowns", size=4, at=(time, drawn[near]))
     off = Dots("", "star", size=4, at=(time, (drawn - mean)[near]))
-    courses = fit.true.kelvin[near], fit.fitted.kelvin[near]
-    kelvin: list[Series] = [
-        Line("joint fit", "star", at=(time, courses[1])),
-        Line("simulated flare", "text", dash="dashed", at=(time, courses[0])),
-    ]
+    true, fitted = fit.true.kelvin[near], fit.fitted.kelvin[near]
+    simulated = Line("simulated flare", "text", dash="dashed", at=(time, true))
+    kelvin = Axis("temperature (K)", limits=(0.8 * min(true.min(), fitted.min()), 1.2 * max(true.max(), fitted.max())))
     rows = [
-        [Panel(x, Axis("light (DN per frame)"), light)],
+        [Panel(x, Axis("light (DN per frame)"), [dots, Line("joint fit", "star", at=(time, mean[near]))])],
         [Panel(x, Axis("residual (DN)"), [off, Rule(along="y", dash="-", at=0.0)])],
-        [Panel(x, Axis("temperature (K)", limits=(0.8 * np.min(courses), 1.2 * np.max(courses))), kelvin)],
+        [Panel(x, kelvin, [Line("joint fit", "star", at=(time, fitted)), simulated])],
     ]
     title = f"{star.title}: one simulated stare; nominal throughput"
     return Picture(rows, (7.2, 6.7), title, below=True, share_x=True, heights=(2, 1, 1.5))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache, wraps
 from itertools import cycle
 from pathlib import Path
@@ -115,24 +115,16 @@ def _own_part(ax: Any) -> Any:
     return ax.figure.add_subfigure(spec)
 
 
-def _headline(figure: Any, text: str) -> None:
-    """Add a title above all panels, wrapped to the figure's width."""
-    title = figure.suptitle(text, fontsize=9.0)
-    words, lines = text.split(" "), [""]
-    for word in words:
-        title.set_text(f"{lines[-1]} {word}".strip())
-        if lines[-1] and title.get_window_extent(_renderer(figure)).width > INSIDE * figure.bbox.width:
-            lines.append("")
-        lines[-1] = f"{lines[-1]} {word}".strip()
-    title.set_text("\n".join(lines))
-
-
 def _legend_below(figure: Any, handles: dict[str, Any]) -> None:
     """Add a legend below all panels, in as few rows as fit, which have about equally many entries."""
+    from matplotlib.backends.backend_agg import RendererAgg
+
+    size = figure.bbox
+    renderer = RendererAgg(size.width, size.height, figure.dpi)  # type: ignore[no-untyped-call]
     for rows in range(1, len(handles) + 1):
         columns = -(-len(handles) // rows)
         legend = figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)
-        if columns == 1 or legend.get_window_extent(_renderer(figure)).width <= INSIDE * figure.bbox.width:
+        if columns == 1 or legend.get_window_extent(renderer).width <= INSIDE * size.width:
             return
         legend.remove()
 
@@ -164,6 +156,11 @@ def written(value: float) -> str:
     return rf"$10^{{{int(power)}}}$" if digits == "1" else rf"${digits}\times10^{{{int(power)}}}$"
 
 
+def in_rows(panels: Sequence[Panel], columns: int) -> list[Sequence[Panel]]:
+    """Return panels in rows of so many columns."""
+    return [panels[k : k + columns] for k in range(0, len(panels), columns)]
+
+
 def strokes_of(levels: Iterable[float]) -> dict[float, str]:
     """Return the line style of each contour; lines are close where a map is steep, so that labels would not fit."""
     return dict(zip(sorted(levels), cycle(("dotted", "dashed", "-", "dashdot")), strict=False))
@@ -185,14 +182,6 @@ def in_figure(unit: str) -> str:
     from astropy.units import Unit
 
     return str(Unit(unit).to_string("latex_inline"))
-
-
-def _renderer(figure: Any) -> Any:
-    """Return the renderer that measures text."""
-    from matplotlib.backends.backend_agg import RendererAgg
-
-    size = figure.bbox
-    return RendererAgg(size.width, size.height, figure.dpi)  # type: ignore[no-untyped-call]
 
 
 def styled_picture(draw: Callable[P, Any]) -> Callable[..., Any]:
@@ -262,7 +251,7 @@ def draw_picture(picture: Picture, figure: Any = None) -> Any:
         entries = [zip(*axis.get_legend_handles_labels(), strict=True) for axis, _ in drawn]
         _legend_below(figure, {name: handle for each in entries for handle, name in each})
     if title:
-        _headline(figure, title)
+        figure.suptitle(title, fontsize=9.0, wrap=True)
     return figure
 
 

@@ -57,6 +57,31 @@ class Column:
         return self.format(*values) if callable(self.format) else formatted(values[0], self.format)
 
 
+def interval_columns(
+    name: str,
+    get: str | Callable[[Any], Any] = "",
+    unit: str = "",
+    of: str = "its 95 % interval",
+    heading: str = "",
+    format: str | Callable[[Any, Any], str] = "",
+    *,
+    kind: type | None = None,
+    detail: bool = False,
+) -> tuple[Column, Column]:
+    """Return the columns of the lower and the upper end of an interval, whose `format` takes both.
+
+    In `name` and in the path `get`, {} stands for "low" and "high"; a function `get` returns both ends.
+    """
+    low, high = name.format("low"), name.format("high")
+
+    def end(k: int) -> str | Callable[[Any], Any]:
+        return get.format(("low", "high")[k]) if isinstance(get, str) else lambda row: get(row)[k]
+
+    others = (high,) if heading else ()
+    return (Column(low, end(0), unit, f"lower end of {of}", heading, format, others, kind, detail),
+            Column(high, end(1), unit, f"upper end of {of}", kind=kind))  # fmt: skip
+
+
 @dataclass(frozen=True)
 class View:
     """A table as people read it: a title and some of its columns. Without a table, the title is a sentence.

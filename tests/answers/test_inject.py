@@ -58,10 +58,8 @@ def test_tables_are_consistent(found):
 @pytest.mark.long
 def test_sweep_over_magnitude_and_temperature_is_answered(stares):
     """Check that fainter stars hide larger flares; all cells share their draws."""
-    axes = [
-        {"quantity": "magnitude", "values": [6.0, 8.0]},
-        {"quantity": "flare_temperature", "values": [8000.0, 20_000.0]},
-    ]
+    magnitudes, temperatures = [6.0, 8.0], [8000.0, 20_000.0]
+    axes = [{"quantity": "magnitude", "values": magnitudes}, {"quantity": "flare_temperature", "values": temperatures}]
     quick = {"count": 30, "positions": 3, "fitted": 0, "widths": 2, "of": "amplitude"}
     answer = inject(study(sweep={"axes": axes}, injections=quick, search={"nulls": 0}), stares)
     assert dict(answer.stars[0].at) == {"magnitude": 6.0, "flare_temperature": 8000.0}
@@ -90,12 +88,9 @@ def test_search_without_the_cycle_reports_its_false_alarms(stares):
 def test_temperature_drift_hides_no_flare(stares):
     """Compare limits and recovered energies with and without an unknown drift of 0.3 deg C per hour."""
     quick = {"count": 80, "positions": 8, "fitted": 40, "widths": 2, "sizes": 3, "low": 1e33, "high": 3e34}
-    plain, drifting = (
-        inject(
-            study(injections=quick, search={"nulls": 20}, stare={"duration_s": 9000.0, "gaps": [], **more}), stares
-        ).stars[0]
-        for more in ({}, {"drifts": {"temperature": 0.3}})
-    )
+    steady = study(injections=quick, search={"nulls": 20}, stare={"duration_s": 9000.0, "gaps": []})
+    asked = steady, steady.with_settings(["stare.drifts.temperature=0.3"])
+    plain, drifting = (inject(one, stares).stars[0] for one in asked)
     for k in (None, 0, 1):
         half = [star.injected.limit(0.5, k).value for star in (plain, drifting)]
         assert half[1] == pytest.approx(half[0], rel=0.03)
@@ -107,10 +102,9 @@ def test_temperature_drift_hides_no_flare(stares):
 @pytest.mark.long
 def test_cosmic_rays_and_saturation_are_reported(stares):
     quick = {"count": 10, "positions": 2, "fitted": 0, "widths": 1, "sizes": 2, "low": 1e33, "high": 1e39}
-    plain, struck = (
-        inject(study(injections=quick, search={"nulls": 5}, stare={"duration_s": 2500.0, "gaps": []}, **more), stares)
-        for more in ({}, {"processes": {"cosmic_rays": {"rate_per_cm2_s": 100.0}}})
-    )
+    still = study(injections=quick, search={"nulls": 5}, stare={"duration_s": 2500.0, "gaps": []})
+    rays = still.with_settings(["processes.cosmic_rays.rate_per_cm2_s=100"])
+    plain, struck = (inject(one, stares) for one in (still, rays))
     assert struck.stars[0].simulated.value >= plain.stars[0].simulated.value
     assert (struck.stars[0].injected.critical != plain.stars[0].injected.critical).all()
     assert of_kind(plain.messages, "saturated")

@@ -12,7 +12,7 @@ from commands import run
 from scenes import paper
 
 import mauvecl
-from mauvecl import Engine, Expectation, FlareModel, InputError, Instrument, Source, Study, expect, fit
+from mauvecl import Engine, FlareModel, InputError, Instrument, Source, Study, expect, fit
 
 # Keywords, and the flags that ask the same.
 ASKED: dict[str, tuple[str, dict[str, Any], str]] = {
@@ -99,29 +99,21 @@ def test_studies_are_built_from_the_same_keywords() -> None:
 
 
 def test_too_few_realisations_are_warned_of() -> None:
+    """Detections sample the tail; maps and limits draw more."""
     with pytest.warns(UserWarning, match="2000 realisations are too few"):
         answer = mauvecl.detect(star="G2V", magnitude=7, amplitude=0.1, realisations=2000, ideal=True)
     assert answer.study.run.tails == "sampled"
-
-
-def test_maps_draw_more_instead() -> None:
     axes = {"x": "magnitude=6,8", "y": {"quantity": "amplitude", "values": [0.1, 1]}}
-    with pytest.warns(UserWarning, match="10 realisations are too few .* so 1000 are drawn"):
-        answer = mauvecl.map(star="G2V", **axes, realisations=10, fap=0.1, ideal=True)
-    assert answer.study.run.realisations == 1000
-    with pytest.warns(UserWarning, match="10 realisations are too few .* so 1000 are drawn"):
-        limit = mauvecl.limit(star="G2V", amplitude=0.1, realisations=10, fap=0.1, ideal=True)
-    assert limit.study.run.realisations == 1000
+    for verb, asked in ((mauvecl.map, axes), (mauvecl.limit, {"amplitude": 0.1})):
+        with pytest.warns(UserWarning, match="10 realisations are too few .* so 1000 are drawn"):
+            answer = verb(star="G2V", **asked, realisations=10, fap=0.1, ideal=True)
+        assert answer.study.run.realisations == 1000
     with pytest.raises(InputError, match="ask for 100000000 realisations"):
         mauvecl.map(star="G2V", **axes, realisations=10, fap=1e-6, ideal=True)
 
 
-@pytest.fixture
-def quiet() -> Expectation:
-    return expect("AU Mic", exposure=50)
-
-
-def test_expectations_and_draws_have_the_defaults_of_the_command_line(quiet: Expectation, engine: Engine) -> None:
+def test_expectations_and_draws_have_the_defaults_of_the_command_line(engine: Engine) -> None:
+    quiet = expect("AU Mic", exposure=50)
     assert quiet == expect("AU Mic", "mauve", exposure=50)
     drawn = engine.realise(quiet, count=2)
     np.testing.assert_array_equal(drawn, engine.realise(quiet, count=2, seed=Study().run.seed))
@@ -146,10 +138,10 @@ def test_printed_answers_hold_the_sentence_and_the_table(engine: Engine) -> None
     assert "probability" in str(answer.stars[0].detection.table(fap=0.1)).splitlines()[0]
 
 
-def test_engine_and_measurement_have_short_reprs(quiet: Expectation, engine: Engine) -> None:
+def test_engine_and_measurement_have_short_reprs(engine: Engine) -> None:
     assert repr(engine) == f"<Engine on {engine.device_name}>"
     assert repr(mauvecl.Stares(engine.open_device)) == f"<Stares on {engine.device_name}>"
-    star = Source.from_library("AU Mic").at_magnitude(8.81)
+    star, quiet = Source.from_library("AU Mic").at_magnitude(8.81), expect("AU Mic", exposure=50)
     model = FlareModel.of(star, Instrument.load("mauve"), quiet)
     measured = fit(engine.realise(expect(star.flaring(1.0), exposure=50), count=3), quiet, model)
     ahead = mauvecl.forecast(quiet, model, 10_000, [1.0])

@@ -6,12 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from astropy.table import QTable
-from commands import run
 from scenes import assert_covered, paper
 from scipy import stats
 
-from mauvecl import Engine, Pool, Study, measure
+from mauvecl import Engine, Pool, Study, gaussian, measure
 
 
 def study_of(*settings: str, **flare: object) -> Study:
@@ -89,14 +87,8 @@ def test_faint_and_bright_flares_have_tables_and_pictures(amplitude: float, engi
 def test_flares_are_measured_along_a_stare(engine: Engine, tmp_path: Path) -> None:
     """Measure a cooling flare in bins and by a joint fit; pulls beyond chi-squared's 1e-9 quantiles fail."""
     events = [{"peak_s": 100.0, "amplitude": 2.0, "half_width_s": 40.0, "cooling": {"end_k": 7000.0, "fold_s": 80.0}}]
-    settings = (
-        "measure.fits=20",
-        "measure.snr_per_bin=20",
-        "measure.joint_fit=true",
-        "stare.duration_s=400",
-        "stare.number=3",
-        "nuisances={usual=false}",
-    )
+    settings = ("measure.fits=20", "measure.snr_per_bin=20", "measure.joint_fit=true", "stare.duration_s=400",
+                "stare.number=3", "nuisances={usual=false}")  # fmt: skip
     study = study_of(*settings, temperature_k=14_000.0)
     study = Study.build(study.model_dump() | {"events": events}, "test")
     answer = measure(study, engine)
@@ -179,14 +171,9 @@ def test_expected_regions_close(jump: Any) -> None:
         assert kelvin[0] < one.perfect.estimates[0, 0] < kelvin[-1]
 
 
-#: Magnitudes of `gaussian` where none is stated.
-MAGNITUDES = [4.0, 6.0, 8.0, 10.0, 12.0]
-
-
 def drawn_study(*settings: str, star: str = "M3V", magnitude: float = 7.0, fits: int = 400) -> Study:
-    return paper(
-        f"star=[{{library='{star}', magnitude={magnitude}}}]", f"measure.fits={fits}", "run.seed=42", *settings
-    )
+    chosen = f"star=[{{library='{star}', magnitude={magnitude}}}]"
+    return paper(chosen, f"measure.fits={fits}", "run.seed=42", *settings)
 
 
 @pytest.mark.parametrize(
@@ -215,24 +202,17 @@ def test_intervals_cover_with_unknowns_drawn(star: str, magnitude: float, settin
 
 def test_fits_take_the_factor_on_light_as_it_is_drawn(engine: Engine) -> None:
     """Compare mean and scatter with those of ten uniform losses, and of what a study states itself."""
-    found = {}
-    for settings in (
-        ["nuisances.usual=true"],
-        ["nuisances.usual=true", "nuisances.light=0.04"],
-        [],
-        ["nuisances.light='free'"],
-    ):
-        unknown = measure(drawn_study("flare.amplitudes=[0.5]", *settings, fits=1), engine).flares[0].unknown
-        found[len(found)] = unknown and {
-            n: (m, s) for n, m, s in zip(unknown.names, unknown.mean, unknown.sd, strict=True)
-        }
-    usual, stated, none, free = found.values()
+    found = []
+    for settings in (["usual=true"], ["usual=true", "light=0.04"], ["light='free'"], []):
+        asked = drawn_study("flare.amplitudes=[0.5]", *(f"nuisances.{one}" for one in settings), fits=1)
+        unknown = measure(asked, engine).flares[0].unknown
+        found.append(unknown and dict(zip(unknown.names, zip(unknown.mean, unknown.sd, strict=True), strict=True)))
+    usual, stated, *others = found
     assert usual["light"] == pytest.approx((-0.025, 0.05 / np.sqrt(120)), rel=1e-3)
     assert np.isinf(usual["star"][1])
     assert "star" not in stated
     assert stated["light"] == pytest.approx((-0.025, 0.04), rel=1e-3)
-    assert none is None
-    assert free == {"light": (0.0, np.inf)}
+    assert others == [{"light": (0.0, np.inf)}, None]
 
 
 def test_hottest_flares_are_measured(engine: Engine) -> None:
@@ -258,24 +238,12 @@ def test_flares_that_saturate_most_pixels_are_measured(usual: str, engine: Engin
     assert np.isnan(own.forecasts(np.array([1000.0]), own.unknown)[0].errors).all()
 
 
-@pytest.mark.parametrize(
-    ("flags", "magnitudes", "exposures"),
-    [
-        (["-m", "9", "-t", "5"], [], [5.0]),
-        (["-m", "9"], [], [5.0, 50.0, 600.0]),
-        (["-t", "5"], MAGNITUDES, [5.0]),
-        (["-m", "9", "-t", "50"], [], [50.0]),
-    ],
-)
-def test_gaussian_answers_for_what_flags_state(
-    flags: list[str], magnitudes: list[float], exposures: list[float], tmp_path: Path
-) -> None:
-    run("gaussian", "-n", "10000", "--fap", "0.01", "--star", "G2V", *flags, "-o", "found", folder=tmp_path)
-    table = QTable.read(tmp_path / "found" / "gaussian.ecsv")
-    stars = {"G2V V = 9"} if "-m" in flags else {f"G2V V = {v:g}" for v in MAGNITUDES}
-    assert set(table["star"]) == stars
-    if magnitudes:
-        assert sorted(set(table["magnitude"].value.tolist())) == magnitudes
-    else:
-        assert "magnitude" not in table.colnames
-    assert sorted(set(table["exposure"].value.tolist())) == exposures
+@pytest.mark.parametrize(("magnitude", "exposure"), [(9, 5), (9, None), (None, 5), (9, 50)])
+def test_gaussian_answers_for_what_is_stated(magnitude: float | None, exposure: float | None, engine: Engine) -> None:
+    table = gaussian(
+        engine=engine, star="G2V", magnitude=magnitude, exposure=exposure, realisations=10_000, fap=0.01
+    ).cells
+    magnitudes = [4, 6, 8, 10, 12] if magnitude is None else [magnitude]
+    assert set(table["star"]) == {f"G2V V = {v:g}" for v in magnitudes}
+    assert ("magnitude" in table.colnames) == (magnitude is None)
+    assert sorted(set(table["exposure"].value.tolist())) == ([5, 50, 600] if exposure is None else [exposure])

@@ -45,11 +45,10 @@ def said(verb: str, study: Study, engine: Engine, folder: Path) -> list[str]:
 
 def hot_star(magnitude: float, low_nm: float, **sections: Any) -> Study:
     data: dict[str, Any] = {
-        "star": [{"library": "A0V", "magnitude": magnitude, "distance_pc": 7.7}],
-        "flare": {"amplitudes": [0.01]},
+        "star": [{"library": "A0V", "magnitude": magnitude, "distance_pc": 7.7}], "flare": {"amplitudes": [0.01]},
         "observation": {"exposure_s": 5.0, "changes": {"output_min_nm": low_nm, "output_max_nm": 340.0}},
         "run": {"realisations": 10_000, "seed": 3, "fap": 0.01, "statistics": ["matched"]},
-    }
+    }  # fmt: skip
     return Study.build(data | sections, "test").paper()
 
 
@@ -111,32 +110,21 @@ def test_messages_are_given_where_they_apply(engine: Engine, tmp_path: Path, nam
         assert len(found) == count, found
 
 
-UNKNOWN: dict[str, dict[str, Any]] = {
-    "known": {},
-    "light": {"nuisances": {"light": "free"}},
-    "both": {"nuisances": {"light": "free", "dark": "free"}},
-}
+UNKNOWN = {"known": {}, "light": {"light": "free"}, "both": {"light": "free", "dark": "free"}}
 
 
 def cool_flare(temperature_k: float, unknown: str, **sections: Any) -> Study:
     """Return a study of a flare whose temperature decides whether it lowers `uv_excess`."""
-    return small(
-        **G2V,
-        flare={"amplitudes": [0.3], "temperature_k": temperature_k},
-        observation={"exposure_s": 50.0},
-        run={"realisations": 10_000, "seed": 3, "fap": 0.01, "statistics": ["uv_excess", "matched"]},
-        **UNKNOWN[unknown],
-        **sections,
-    )
+    flare = {"amplitudes": [0.3], "temperature_k": temperature_k}
+    run = {"realisations": 10_000, "seed": 3, "fap": 0.01, "statistics": ["uv_excess", "matched"]}
+    return small(**G2V, flare=flare, observation={"exposure_s": 50.0}, run=run, nuisances=UNKNOWN[unknown], **sections)
 
 
 @pytest.mark.parametrize("unknown", UNKNOWN)
-@pytest.mark.parametrize("temperature_k", [3000.0, 4000.0, 6000.0, 10_000.0, 20_000.0])
-def test_lowered_statistic_is_reported_if_simulation_lowers_it(
-    engine: Engine, unknown: str, temperature_k: float
-) -> None:
+@pytest.mark.parametrize("kelvin", [3000.0, 4000.0, 6000.0, 10_000.0, 20_000.0])
+def test_lowered_statistic_is_reported_if_simulation_lowers_it(engine: Engine, unknown: str, kelvin: float) -> None:
     """Compare with simulated means that differ by more than five standard errors; fails once in 1e6 seeds."""
-    answer = detect(cool_flare(temperature_k, unknown), engine)
+    answer = detect(cool_flare(kelvin, unknown), engine)
     (one,) = answer.stars
     named = {text.split(" falls by ")[0].split()[-1] for text in of_kind(answer.messages, "wrong sign")}
     for statistic in ("uv_excess", "matched"):
@@ -145,9 +133,9 @@ def test_lowered_statistic_is_reported_if_simulation_lowers_it(
         if abs(gap) > 5 * error:
             assert (statistic in named) == (gap < 0), (statistic, gap)
     assert named <= {"uv_excess"}
-    if unknown == "both" and temperature_k in (4000.0, 10_000.0):
+    if unknown == "both" and kelvin in (4000.0, 10_000.0):
         # Both cases are among those above, and a lowered statistic detects nothing.
-        assert bool(named) == (temperature_k == 4000.0)
+        assert bool(named) == (kelvin == 4000.0)
         assert not named or answer.table["probability"][0] < 0.01 < 0.9 < answer.table["probability"][1]
 
 

@@ -3,7 +3,6 @@
 import re
 import tomllib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -38,17 +37,10 @@ def test_paper_and_ideal_change_the_conventions_alone() -> None:
     assert Study.build({"run": {"statistics": ["matched"]}}, "test").paper().run.statistics == ("matched",)
 
 
-# The ideal answer
-
-
-def answered(verb: str, study: Study, engine: Engine) -> Any:
-    return getattr(mauvecl, verb)(study, engine)
-
-
 @pytest.mark.parametrize("verb", ["detect", "limit", "map"])
 def test_ideal_answer_is_that_of_the_ideal_study(verb: str, engine: Engine) -> None:
     """Compare with the closed form of the study in which everything is known; the realistic answer is the worse."""
-    realistic, ideal = (Table(answered(verb, study, engine).table) for study in (ASKED, ASKED.ideal()))
+    realistic, ideal = (Table(getattr(mauvecl, verb)(study, engine).table) for study in (ASKED, ASKED.ideal()))
     assert "ideal" not in ideal.colnames
     column = {"detect": "closed_form_probability"}.get(verb, "closed_form")
     np.testing.assert_allclose(realistic["ideal"], ideal[column], rtol=1e-4)
@@ -71,16 +63,11 @@ def test_plan_by_the_closed_form_is_worse_than_the_ideal() -> None:
     light = (flare.source_electrons - quiet.source_electrons) * quiet.gain_dn_per_electron / 1e-3
     added = sum(process.variance_dn2(quiet) for process in target.case.study.processes.additive.values())
     variance = quiet.unsaturated_variance_dn2 + added
-    covariance = np.diag(variance)
-    for spectrum, sd in ((quiet.recorded_light_dn, 0.05 / np.sqrt(12)), (quiet.sky_dn, 0.0)):
-        covariance += sd**2 * np.outer(spectrum, spectrum)
+    covariance = np.diag(variance) + 0.05**2 / 12 * np.outer(quiet.recorded_light_dn, quiet.recorded_light_dn)
     used = ~quiet.saturated
     exact = np.sqrt(light[used] @ np.linalg.solve(covariance[np.ix_(used, used)], light[used]))
     assert target.signal_per_frame == pytest.approx(exact, rel=1e-6)
     assert target.signal_with(None) == pytest.approx(np.sqrt(np.sum((light**2 / variance)[used])))
-
-
-# The first line
 
 
 def test_headline_has_the_numbers_of_the_table(engine: Engine) -> None:
@@ -106,8 +93,6 @@ def test_saturated_star_says_so_in_the_headline(engine: Engine) -> None:
     assert "saturate" not in detect(at_end, engine).headline
     assert saturated > 50
 
-
-# Files of version 1
 
 OLD = "[[star]]\nlibrary = 'G2V'\nmagnitude = 7.4\n[run]\nfap = 0.01\n"
 

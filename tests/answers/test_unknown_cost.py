@@ -107,13 +107,9 @@ def test_own_unknowns_are_read_from_files_points_and_flags(tmp_path: Path, engin
     assert Study.build(tomllib.loads(of_points.toml()), "text") == of_points
     quiet, flare = expectations(of_flags)
     stray = np.interp(quiet.wavelength_nm, [200, 450, 700], [1, 3, 1])
+    unknown = Nuisances.of(quiet, {"dark": 0.1, "stray": 2.0}, {"stray": stray})
     by_hand = engine.detect(
-        quiet,
-        [flare],
-        realisations=20_000,
-        seed=of_flags.run.seed,
-        statistics=("matched",),
-        nuisances=Nuisances.of(quiet, {"dark": 0.1, "stray": 2.0}, {"stray": stray}),
+        quiet, [flare], realisations=20_000, seed=of_flags.run.seed, statistics=("matched",), nuisances=unknown
     )
     thresholds = [detect(one, engine).table["threshold"][0] for one in (of_flags, of_points)]
     assert thresholds == [by_hand.threshold(0.01, "matched").value] * 2
@@ -125,15 +121,12 @@ def test_usual_unknowns_follow_the_observation() -> None:
         ["observation.temperature_c=13", "processes.jitter={uniform=[0.0, 0.01]}", "nuisances.dark=0.3"]
     )
     processes = Case(asked).processes
-    assert processes.detector_temperature.mean == 13
-    assert processes.jitter.high == 0.01
+    assert (processes.detector_temperature.mean, processes.jitter.high) == (13, 0.01)
     assert Case(study()).processes.detector_temperature is None
-    quiet = expectations(asked)[0]
-    found = asked.nuisances.marginalised(quiet)
+    found = asked.nuisances.marginalised(expectations(asked)[0])
     assert dict(zip(found.names, found.sd, strict=True)) == {"dark": 0.3, "light": np.inf, "sky": 0.1}
     dark_sky = asked.with_changes({"sky": {"none": True}}, None)
-    found = dark_sky.nuisances.marginalised(expectations(dark_sky)[0])
-    assert found.names == ("dark", "light")
+    assert dark_sky.nuisances.marginalised(expectations(dark_sky)[0]).names == ("dark", "light")
 
 
 def usual_processes(temperature: float) -> Processes:
@@ -143,11 +136,10 @@ def usual_processes(temperature: float) -> Processes:
 @pytest.mark.long
 def test_priors_are_drawn_jointly_on_both_instruments() -> None:
     """Check that no usual setting needs noise to be drawn separately, which priors do not allow."""
-    payloads, temperatures = ("mauvesim", "mauve"), (-20.0, 0.0, 13.0, 21.0, 25.0)
-    for payload, temperature, exposure in itertools.product(payloads, temperatures, (5.0, 50.0, 600.0)):
+    stars = [Source.from_library("G2V").at_magnitude(magnitude) for magnitude in (-1.0, 5.0, 20.0)]
+    for payload, temperature in itertools.product(("mauvesim", "mauve"), (-20.0, 0.0, 13.0, 21.0, 25.0)):
         mauve = instrument(payload, part=True, temperature_c=temperature, output_max_nm=310.0)
-        for magnitude in (-1.0, 5.0, 20.0):
-            star = Source.from_library("G2V").at_magnitude(magnitude)
+        for star, exposure in itertools.product(stars, (5.0, 50.0, 600.0)):
             seen = [expect(star, mauve, exposure=exposure, sky=Sky.of_brightness(22.1))]
             assert prepare(seen, processes=usual_processes(temperature)).joint
 
@@ -159,13 +151,10 @@ SEEDS = itertools.count(2026)
 
 @pytest.mark.long
 def test_false_alarms_with_drawn_unknowns_are_as_requested(engine: Engine) -> None:
-    """Draw the documented unknowns in 24 random scenes, 2e4 times each.
+    """Compare simulated thresholds on fresh draws, and the closed form there; plain statistics fail in ten scenes.
 
-    Marginalised: the simulated threshold on fresh draws, for which its own error counts as much as theirs, for every
-    statistic; and what the closed form, which integrates over what is drawn, says of that threshold. Of 24 comparisons
-    each, one may leave 4 standard errors, which by chance happens in 1 run of 110; two would in 1 of 150 000. And all
-    together within 4 standard errors, a bias of 8 % of the false alarms. Plain, in the first ten scenes: by its usual
-    threshold, which fails.
+    Of 24 comparisons each, one may leave 4 standard errors, which by chance happens in 1 run of 110 (two in 1 of
+    150 000), and all together must stay within 4 standard errors, a bias of 8 % of the false alarms.
     """
     rng = np.random.default_rng(16)
     statistics = ("chi2", "chi2_element", "matched")
@@ -199,12 +188,10 @@ def test_false_alarms_with_drawn_unknowns_are_as_requested(engine: Engine) -> No
 
 
 def test_chance_with_unknowns_is_that_of_their_study() -> None:
-    stars = [{"library": "M3V", "magnitude": 9.0}]
-    run = {"realisations": 10_000, "fap": 0.02, "statistics": ["matched"]}
-    data: dict[str, Any] = {"star": stars, "flare": {"amplitudes": [0.0001, 0.02, 3.0]}, "run": run} | CONVENTIONS
+    settings = ["star=[{library='M3V', magnitude=9}]", "flare.amplitudes=[0.0001, 0.02, 3]"]
     chances, sentences = [], []
     for usual in (False, True):
-        answer = detect(Study.build(data | {"nuisances": {"usual": usual}}, "test"))
+        answer = detect(study(usual=usual).with_settings(settings))
         chances.append(f"{100 * answer.table['closed_form_probability'][1]:.1f} %")
         sentences += of_kind(answer.messages, "chance with unknowns")
     # An answer with unknowns has them in its table.

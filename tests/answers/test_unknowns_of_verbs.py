@@ -140,10 +140,3 @@ def test_neighbours_change_every_verb(verb: str, tmp_path: Path) -> None:
     if verb in ("detect", "limit", "inject", "plan"):
         shares = next(iter(found.tables.values()))["target_share"]
         assert ((shares > 0) & (shares < 0.9)).all()
-
-
-def test_answers_report_unused_unknowns() -> None:
-    base = plain("exposure")
-    assert "not used" not in base.assumed
-    found = answer("exposure", UNKNOWNS["processes.jitter"] | UNKNOWNS["stare.drifts.star"])
-    assert found.assumed.endswith("not used: processes.jitter, stare.drifts.")

@@ -1,10 +1,10 @@
 """Verbs: one name and signature in Python and on the command line, and one definition of a table's columns."""
 
-import inspect
 import io
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,18 +25,6 @@ SLOW = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", VERBS)
-def test_each_verb_has_one_name_and_one_signature(name: str) -> None:
-    verb = getattr(mauvecl, name)
-    assert verb.__name__ == name
-    assert name in mauvecl.__all__
-    study, engine, progress, *own, keywords = inspect.signature(verb).parameters.values()
-    assert [one.name for one in (study, engine, progress)] == ["study", "engine", "progress"]
-    assert (study.default, engine.default, progress.default) == (None, None, None)
-    assert keywords.kind is keywords.VAR_KEYWORD
-    assert all(one.kind is one.KEYWORD_ONLY and one.default is not one.empty for one in own)
-
-
 def test_command_line_has_every_verb_in_order(tmp_path: Path) -> None:
     """List every verb once, in four groups, and in each group in the order of the registry."""
     shown = run("--help", folder=tmp_path).stdout
@@ -47,9 +35,8 @@ def test_command_line_has_every_verb_in_order(tmp_path: Path) -> None:
     for names in listed:
         own = [name for name in names if name in VERBS]
         assert own == sorted(own, key=list(VERBS).index)
-    assert [{"plan", "stare", "analyse", "serve"} & {*names} for names in listed] == [
-        {"plan"}, {"stare"}, {"analyse"}, {"serve"}
-    ]  # fmt: skip
+    some = ["plan", "stare", "analyse", "serve"]
+    assert [name for names in listed for name in some if name in names] == some
 
 
 @pytest.mark.parametrize("name", long_but(QUICK, *(QUICK.keys() - {"change", "simulate"})))
@@ -64,15 +51,14 @@ def test_progress_ends_at_its_total(name: str, engine: Engine) -> None:
     assert len(set(total)) == 1
 
 
-def plain(value: object) -> object:
-    """Return a cell as JSON holds it."""
-    if value is np.ma.masked or (isinstance(value, float | np.floating) and not np.isfinite(value)):
-        return None
-    return value.item() if isinstance(value, np.generic) else value
+def rows_of(table: Table) -> list[list[object]]:
+    """Return the cells of a table as JSON holds them."""
 
+    def plain(value: Any) -> Any:
+        missing = value is np.ma.masked or (isinstance(value, float | np.floating) and not np.isfinite(value))
+        return None if missing else value.item() if isinstance(value, np.generic) else value
 
-def rows_of(table: Table, names: list[str]) -> list[list[object]]:
-    columns = [getattr(table[name], "value", table[name]) for name in names]
+    columns = [getattr(table[name], "value", table[name]) for name in table.colnames]
     return [[plain(value) for value in row] for row in zip(*columns, strict=True)]
 
 
@@ -96,9 +82,8 @@ def test_files_json_and_terminal_agree(name: str, tmp_path: Path) -> None:
     found = json.loads(run(*words, "json", "--json", folder=tmp_path).stdout)
     assert answer.json_tables.keys() <= found.keys()
     for key, table in answer.json_tables.items():
-        names = list(found[key][0])
-        assert names == table.colnames
-        assert [list(row.values()) for row in found[key]] == rows_of(table, names), key
+        assert list(found[key][0]) == table.colnames
+        assert [list(row.values()) for row in found[key]] == rows_of(table), key
     shown = run(*words, "shown", "--wide", folder=tmp_path).stdout
     for view in answer.views:
         assert view.title in shown
