@@ -182,10 +182,7 @@ def _placed(study_file: Path | None, given: dict[str, Any]) -> Path | None:
 
 
 StoreArgument = Annotated[Path, typer.Argument(help="Store that `mauvecl realise` wrote.")]
-RowsFlag = Annotated[
-    str | None,
-    option(metavar="TEXT", text="Realisations, such as 1000:2000, without the last."),
-]
+RowsFlag = Annotated[str | None, option(metavar="TEXT", text="Realisations, such as 1000:2000, without the last.")]
 
 
 @command_of(
@@ -335,8 +332,7 @@ def export(
     store: StoreArgument,
     file: Annotated[Path, typer.Argument(help="Ending in .fits, .h5 or .hdf5.")],
     array: Annotated[
-        list[str] | None,
-        option("--array", metavar="TEXT", text="Such as star-1/flare-2; may be repeated [all]."),
+        list[str] | None, option("--array", metavar="TEXT", text="Such as star-1/flare-2; may be repeated [all].")
     ] = None,
     rows: RowsFlag = None,
     replace: ReplaceFlag = False,
@@ -407,11 +403,7 @@ def plan(session: Session) -> None:
 
 
 @command_of(VERBS["stare"], draws=False, resumes=True)
-def stare(
-    session: Session,
-    given: dict[str, Any],
-    device: DeviceFlag = None,
-) -> None:
+def stare(session: Session, given: dict[str, Any], device: DeviceFlag = None) -> None:
     """Draw stares on one device, which keeps their frames for a resume."""
     from mauvecl.answers.stare import stare as compute
     from mauvecl.device.stares import Stares

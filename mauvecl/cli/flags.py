@@ -48,8 +48,7 @@ DeviceFlag = Annotated[str | None, option(metavar="TEXT", text="OpenCL device: n
 JsonFlag = Annotated[bool, option("--json", text="Print JSON and nothing else.")]
 QuietFlag = Annotated[bool, option("--quiet", "-q", text="Print no progress and no file names.")]
 SetFlag = Annotated[
-    list[str] | None,
-    option("--set", metavar="TEXT", text="Any key of the study, as in run.fap=0.01; may be repeated."),
+    list[str] | None, option("--set", metavar="TEXT", text="Any key of the study, as in run.fap=0.01; may be repeated.")
 ]
 PaperFlag = Annotated[
     bool,

@@ -332,11 +332,7 @@ class Flag:
     """
 
     def __init__(
-        self,
-        *names: str,
-        kind: Any = None,
-        read: Callable[[Any, str], Any] | None = None,
-        help: Help | None = None,
+        self, *names: str, kind: Any = None, read: Callable[[Any, str], Any] | None = None, help: Help | None = None
     ) -> None:
         self.names, self.kind, self.read, self.help = names, kind, read, help
 

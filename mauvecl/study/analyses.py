@@ -87,9 +87,7 @@ class CalibrateQuestion(Section):
         Help("Relative error of the light of an observation, by pointing"),
         Flag("--light-error"),
         Widget(
-            label="Error of the light",
-            hint="By how much the light of an observation differs, by pointing.",
-            unit="%",
+            label="Error of the light", hint="By how much the light of an observation differs, by pointing.", unit="%"
         ),
     ] = 0.0
     spectrum_error: Annotated[

@@ -101,11 +101,7 @@ def _orbit(study: Study) -> str:
     limits = study.orbit.limits
     kept = [
         f"{name} {value:g} deg"
-        for name, value in (
-            ("Earth's limb", limits.earth_limb_deg),
-            ("Sun", limits.sun_deg),
-            ("Moon", limits.moon_deg),
-        )
+        for name, value in (("Earth's limb", limits.earth_limb_deg), ("Sun", limits.sun_deg), ("Moon", limits.moon_deg))
         if value is not None
     ]
     source = "embedded elements" if study.orbit.tle is None else study.orbit.tle.name
@@ -153,10 +149,7 @@ def place_columns(sweep: Sweep, *own: str, star: str = "label") -> tuple[Column,
 
     `own` names quantities for which a table has separate columns, and `star` the attribute with the star's label.
     """
-    return (
-        star_column(star),
-        *(quantity_column(axis.quantity) for axis in sweep.axes if axis.quantity not in own),
-    )
+    return (star_column(star), *(quantity_column(axis.quantity) for axis in sweep.axes if axis.quantity not in own))
 
 
 def star_column(get: str = "star") -> Column:

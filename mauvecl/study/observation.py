@@ -13,13 +13,7 @@ from mauvecl.detection.names import DEFAULT_STATISTICS, RECOMMENDED, STATISTIC_N
 from mauvecl.host.exposure import DEFAULT_SKY
 from mauvecl.host.instrument import DEFAULT_INSTRUMENT, current_name
 from mauvecl.noise.disturbances import Prior, PriorField
-from mauvecl.noise.unknowns import (
-    DOCUMENTED_NUISANCES,
-    INSTRUMENT_VALUES,
-    NUISANCES,
-    Comparison,
-    values_of,
-)
+from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, INSTRUMENT_VALUES, NUISANCES, Comparison, values_of
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.fields import Flag, Help, Quantity, Range, Slider, Widget, says_none
 from mauvecl.schema.physical import (
@@ -79,10 +73,7 @@ class Observation(Section):
         ),
         Quantity("detector_temperature", "temperature of the detector", "detector temperature (deg C)"),
     ] = None
-    order: Annotated[
-        Literal["paper", "physical"],
-        Help("Order of efficiency and line spread function"),
-    ] = "paper"
+    order: Annotated[Literal["paper", "physical"], Help("Order of efficiency and line spread function")] = "paper"
     signal: Annotated[
         Literal["net", "paper"],
         Help("Signal of an S/N", choices="net (the star alone) or paper (with the zodiacal light)"),
@@ -140,8 +131,7 @@ class SkyLight(Section):
         Help("Target whose zodiacal light is the sky, with the time", "a star such as 'AU Mic', or '290.68 +11.12'"),
         Flag("--target"),
         Widget(
-            label="Sky target",
-            hint="A star by name, such as AU Mic, or coordinates in degrees such as 290.68 +11.12.",
+            label="Sky target", hint="A star by name, such as AU Mic, or coordinates in degrees such as 290.68 +11.12."
         ),
     ] = None
     time: Annotated[
@@ -189,10 +179,7 @@ class Run(Section):
 
     realisations: Annotated[Realisations, Help("Noise realisations"), Flag("--realisations", "-n")] = 1_000_000
     seed: Annotated[
-        Seed,
-        Help("Seed"),
-        Flag("--seed"),
-        Widget(hint="The same seed gives the same noise, to the bit.", place=3),
+        Seed, Help("Seed"), Flag("--seed"), Widget(hint="The same seed gives the same noise, to the bit.", place=3)
     ] = DEFAULT_SEED
     statistics: Annotated[
         tuple[str, ...],
@@ -371,10 +358,7 @@ KNOWN = NuisanceChoice(usual=False)
 
 
 Draws = Annotated[
-    int,
-    Range(0, 4096),
-    Help("Draws of unknown instrument values over which the answer is averaged"),
-    Flag("--unknown"),
+    int, Range(0, 4096), Help("Draws of unknown instrument values over which the answer is averaged"), Flag("--unknown")
 ]
 Known = Annotated[
     tuple[str, ...],

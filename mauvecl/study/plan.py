@@ -135,8 +135,7 @@ class PlanTarget(Section):
     neighbours: Annotated[Path | None, Help("Table of other stars near the target, as for a star")] = None
     neighbours_of: Annotated[str | None, Help("The target's own row in that table, or its coordinates")] = None
     neighbour_share: Annotated[
-        Share,
-        Help("Share of the light of neighbours within the fibre's radius that enters it", "an assumption"),
+        Share, Help("Share of the light of neighbours within the fibre's radius that enters it", "an assumption")
     ] = 1.0
 
     unused: Annotated[tuple[str, ...], Help("Columns of its table that are not read")] = ()

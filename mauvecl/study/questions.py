@@ -227,9 +227,7 @@ class MapQuestion(Section):
         Flag("--x", kind=str, read=read_axis),
     ] = None
     y: Annotated[
-        Axis,
-        Help("Vertical axis of the map", "such as amplitude:0.01:1:16:log"),
-        Flag("--y", kind=str, read=read_axis),
+        Axis, Help("Vertical axis of the map", "such as amplitude:0.01:1:16:log"), Flag("--y", kind=str, read=read_axis)
     ] = Axis(quantity="amplitude", start=0.01, stop=1.0, steps=16, log=True)
     contours: Annotated[tuple[Probability, ...], Help("Detection probabilities of contours")] = (0.1, 0.5, 0.9)
 
@@ -263,10 +261,7 @@ class Sweep(Section):
     ] = "product"
     axes: Annotated[
         tuple[Axis, ...],
-        Help(
-            "Values of a quantity",
-            "as in exposure=5,50,600 or magnitude:4:10:7; several give every combination",
-        ),
+        Help("Values of a quantity", "as in exposure=5,50,600 or magnitude:4:10:7; several give every combination"),
         Flag("--sweep", kind=list[str], read=lambda texts, name: [read_axis(text, name) for text in texts]),
     ] = ()
 

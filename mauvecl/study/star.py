@@ -123,9 +123,7 @@ class Star(Section):
         ),
     ] = None
     ignore_checksum: Annotated[
-        bool | None,
-        Help("Read FITS files although their CHECKSUM or DATASUM differs"),
-        Flag("--ignore-checksum"),
+        bool | None, Help("Read FITS files although their CHECKSUM or DATASUM differs"), Flag("--ignore-checksum")
     ] = None
     bin_nm: Annotated[BinWidth | None, Help("Width of bins over which the spectrum is averaged"), Flag("--bin-nm")] = (
         None

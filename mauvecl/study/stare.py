@@ -192,8 +192,7 @@ class SearchChoice(Section):
     offset: Annotated[bool, Help("Whether to marginalise over the offset of the baseline")] = True
     slope: Annotated[bool, Help("Whether to marginalise over the slope of the baseline")] = True
     cycle: Annotated[
-        bool | None,
-        Help("Whether to marginalise over the orbital cycle", default="if the stare has an unknown cycle"),
+        bool | None, Help("Whether to marginalise over the orbital cycle", default="if the stare has an unknown cycle")
     ] = None
     window_s: Annotated[
         Annotated[float, Unit("s"), Range(0)] | None,
