@@ -22,7 +22,7 @@ from typer.main import get_command
 
 from mauvecl.answers.verbs import COMMON, GROUPS, VERBS
 from mauvecl.cli.commands import COMMANDS, export, verify
-from mauvecl.cli.console import EXIT_CODES, Meter, guarded, name_flags_of, show, show_view
+from mauvecl.cli.console import EXIT_CODES, Meter, guarded, show, show_view
 from mauvecl.cli.flags import (
     SHOWS_ALL,
     DeviceFlag,
@@ -32,11 +32,12 @@ from mauvecl.cli.flags import (
     option,
     option_of,
     output_option,
-    whole,
+    whole_number,
 )
 from mauvecl.host import VERSION
 from mauvecl.schema.columns import View, records
 from mauvecl.schema.errors import InputError, missing_package, shortened
+from mauvecl.schema.fields import Range
 
 if TYPE_CHECKING:
     from mauvecl.host.stars.library import OwnStar
@@ -242,7 +243,7 @@ def serve(
     Example: mauvecl serve --show
     """
 
-    number = whole(port, "--port", 1, 65535)
+    number = whole_number(port, "--port", Range(1, 65535))
     if find_spec("bokeh") is None or find_spec("tornado") is None:
         raise missing_package("bokeh", "the page", "web")
     from mauvecl.web.server import serve
@@ -378,8 +379,6 @@ app = typer.Typer(
     "\b\nmauvecl detect --star M3V --magnitude 9\nmauvecl detect --help",
     epilog=EXIT_CODES,
 )
-
-name_flags_of(app)
 
 
 def _version(wanted: bool) -> None:

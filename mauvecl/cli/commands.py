@@ -27,15 +27,17 @@ from mauvecl.cli.flags import (
     ReplaceFlag,
     SetFlag,
     is_star,
+    numbers_of,
     option,
     output_option,
     study_argument,
     study_option,
     warn_of_percent,
-    whole,
+    whole_number,
 )
 from mauvecl.schema.columns import Column, View
-from mauvecl.schema.errors import InputError, together
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.fields import Range
 
 if TYPE_CHECKING:
     from mauvecl.cli.invocation import Session
@@ -61,22 +63,17 @@ class Command:
 
     def build(self) -> Callable[..., None]:
         """Return the function that typer calls."""
-        from mauvecl.study.keywords import keywords_of
         from mauvecl.study.study import keys_of
 
-        verb, entries = self.verb, keys_of(self.verb.keys)
-        keywords = keywords_of(entries)
-        flags = {
-            flag.parameter: study_option(keywords[flag.parameter], field, flag, verb.defaults or {})
-            for _, field, flag in entries
-        }
+        verb = self.verb
+        keywords = {keyword.name: keyword for keyword in keys_of(verb.keys)}
         kinds = get_type_hints(self.run, localns={"Session": Any}, include_extras=True)
         _, *own = inspect.signature(self.run).parameters.values()
         # Annotations and defaults by parameter.
         options: dict[str, tuple[Any, Any]] = {
-            "study_file": (study_argument(flags), None),
-            **{name: (annotation, None) for name, (annotation, _) in flags.items()},
-            "set": (SetFlag, None),
+            "study_file": (study_argument(keywords), None),
+            **{name: (study_option(keyword, verb.defaults or {}), None) for name, keyword in keywords.items()},
+            "setting": (SetFlag, None),
             **({"paper": (PaperFlag, False)} if verb.accepts("observation.instrument") else {}),
             **{p.name: (kinds[p.name], p.default) for p in own if p.name != "given"},
             **self._options(),
@@ -85,10 +82,9 @@ class Command:
 
         def command(study_file: Path | None = None, **values: Any) -> None:
             del values["help_all"]
-            given = {name: values.pop(name, None) for name in (*flags, "set", "paper")}
-            amplitudes = given.get("amplitude") or ()
-            _read_numbers(given, {name: read for name, (_, read) in flags.items() if read is not None})
-            warn_of_percent(amplitudes)
+            given = {name: numbers_of(keyword, values.pop(name)) for name, keyword in keywords.items()}
+            warn_of_percent(given.get("amplitude") or ())
+            given |= {name: values.pop(name, None) for name in ("setting", "paper")}
             self._call(study_file, keywords, given, values, tells_flags="given" in kinds)
 
         parameters = [
@@ -151,19 +147,6 @@ def command_of(
         return run
 
     return decorate
-
-
-def _read_numbers(given: dict[str, Any], readers: dict[str, Callable[[Any], Any]]) -> None:
-    """Convert the texts of numbers, in place; raises InputError that names all wrong ones."""
-    errors = []
-    for name, read in readers.items():
-        if given[name] is not None:
-            try:
-                given[name] = read(given[name])
-            except InputError as error:
-                errors.append(error)
-    if errors:
-        raise together(errors)
 
 
 def _placed(study_file: Path | None, given: dict[str, Any]) -> Path | None:
@@ -386,7 +369,7 @@ def simulate(
     """Draw a realisation, with flares if a flag names their amplitude."""
     from mauvecl.answers.signal import simulate as compute
 
-    number = whole(realisation, "--realisation", 0, 2**63 - 1)
+    number = whole_number(realisation, "--realisation", Range(0, 2**63 - 1))
     session.answer(compute(session.study, realisation=number, flaring=bool(given["amplitude"])))
 
 

@@ -38,12 +38,14 @@ def question_values(study: Study, *, detects: bool) -> None:
     from mauvecl.detection.names import check_fap, check_statistic
     from mauvecl.host.instrument import instrument_path
     from mauvecl.host.stars.library import known_band, spectrum_name
+    from mauvecl.host.tables.files import read_bytes, without_columns
+    from mauvecl.study.keywords import is_there
 
     for star in study.star:
         if star.library is not None:
             spectrum_name(star.library)
-        elif star.file is not None:
-            _check_file(star.file)
+        elif star.file is not None and not is_there(str(star.file)):
+            read_bytes(without_columns(star.file)[0], "spectrum file")
         known_band(star.band)
     instrument_path(study.observation.instrument, Path())
     if not detects:
@@ -53,19 +55,6 @@ def question_values(study: Study, *, detects: bool) -> None:
     for name in run.statistics:
         check_statistic(name)
     check_fap(run.fap, run.realisations, run.tails)
-
-
-def _check_file(file: Path) -> None:
-    from mauvecl.host.tables.files import read_bytes, without_columns
-
-    try:
-        place, _ = without_columns(file)
-        there = place.is_file()
-    except (OSError, ValueError):
-        # The reader reports impossible names.
-        return
-    if not there:
-        read_bytes(place, "spectrum file")
 
 
 def question_time(study: Study, *, insist: bool) -> None:

@@ -312,6 +312,16 @@ def or_error(schema: CoreSchema, words: str, **metadata: str) -> CoreSchema:
 
 
 @dataclass(frozen=True)
+class Accepted:
+    """Words for the accepted values of a field, in the messages of all of its errors."""
+
+    words: str
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return or_error(handler(source), self.words)
+
+
+@dataclass(frozen=True)
 class Help:
     """Description of a field, for ``--help``, tooltips of the page and the reference."""
 

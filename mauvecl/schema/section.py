@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import difflib
-from collections.abc import Callable, Iterator, Sequence
-from decimal import Decimal, InvalidOperation
+from collections.abc import Iterator, Sequence
 from functools import cache
 from typing import TYPE_CHECKING, Any, Self, TypeVar, cast, get_args, get_origin
 
@@ -16,6 +16,7 @@ from pydantic import (
     ValidationInfo,
     ValidatorFunctionWrapHandler,
     field_validator,
+    model_validator,
 )
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError
@@ -221,6 +222,14 @@ def plain(key: str, given: Any, unit: str) -> Any:
 class Section(Record):
     """A section of a study."""
 
+    @model_validator(mode="after")
+    def _checked(self) -> Self:
+        self._check_values()
+        return self
+
+    def _check_values(self) -> None:
+        """Raise InputError if values contradict each other."""
+
     def with_value(self, path: Sequence[str], value: Any) -> Self:
         """Return a copy with another value at a path of sections and a key.
 
@@ -262,6 +271,34 @@ def fields_of(section: type[BaseModel], path: tuple[str, ...] = ()) -> Iterator[
             yield from fields_of(inner, (*path, key))
 
 
+def _given(section: Section, keys: Sequence[str]) -> list[str]:
+    return [key for key in keys if (value := getattr(section, key)) is not None and value is not False]
+
+
+def check_one(section: Section, what: str, *keys: str, needed: bool = False) -> None:
+    """Raise InputError if several of these keys are given or, where one is needed, none."""
+    given = _given(section, keys)
+    if len(given) > 1 or (needed and not given):
+        has, number = " and ".join(given) or "none", "one" if needed else "only one"
+        raise InputError(f"{what} needs {number} of {', '.join(keys)}, but has {has}", key=[*given, *keys][0])
+
+
+def check_all(section: Section, what: str, *keys: str) -> None:
+    """Raise InputError if only a part of these keys is given."""
+    given = _given(section, keys)
+    if 0 < len(given) < len(keys):
+        raise InputError(
+            f"{what} needs all of {', '.join(keys)} or none, but has only {' and '.join(given)}", key=given[0]
+        )
+
+
+def check_needs(section: Section, what: str, keys: Sequence[str], needed: str) -> None:
+    """Raise InputError if one of these keys is given without the key that it needs."""
+    given = _given(section, keys)
+    if given and getattr(section, needed) is None:
+        raise InputError(f"{what} has {' and '.join(given)}, which needs {needed} as well", key=given[0])
+
+
 def check_different(names: Sequence[str], what: str, key: str) -> None:
     """Raise InputError if a name is given twice; its sentence begins with what is named."""
     twice = next((name for name in names if names.count(name) > 1), None)
@@ -289,27 +326,17 @@ def read_number(text: str, name: str, unit: str = "") -> float:
         raise refusal(name, text, f"a number{accepted}") from error
 
 
-def read_count(text: str, name: str) -> int:
-    """Read a whole number, also in the form 1e6."""
-    try:
-        exact = Decimal(text)
-        # Writing out more digits than any count has would take forever.
-        whole = int(exact) if exact.is_finite() and exact.adjusted() < 40 else None
-    except InvalidOperation:
-        exact, whole = Decimal(0), None
-    if whole is None or whole != exact:
-        raise refusal(name, text, "a whole number, such as 1000000 or 1e6")
-    return whole
+def number_or_text(text: str) -> float | str:
+    """Return the number that a text states, or the text itself, which may have a unit."""
+    for kind in (int, float):
+        with contextlib.suppress(ValueError):
+            return kind(text)
+    return text
 
 
-def read_several(texts: Sequence[str], name: str, read: Callable[[str, str], Any]) -> list[Any]:
-    """Read values from several texts, each with one value or values with commas between them."""
-    return [read(word.strip(), name) for text in texts for word in text.split(",")]
-
-
-def read_words(texts: Sequence[str], name: str) -> list[str]:
+def read_words(texts: Sequence[str], _: str) -> list[str]:
     """Read names from several texts, each with one name or names with commas between them."""
-    return read_several(texts, name, lambda word, _: word)
+    return [word.strip() for text in texts for word in text.split(",")]
 
 
 def read_axis(text: str, name: str) -> dict[str, Any]:
@@ -377,11 +404,9 @@ def _pair(text: str, name: str, expected: str, unit: str) -> tuple[float, float]
 
 def read_frames(text: str, name: str) -> str | list[int]:
     """Read which frames are kept: stack, all, or numbers such as 0,4,9."""
-    return text if text in ("stack", "all") else read_several([text], name, _frame)
-
-
-def _frame(text: str, name: str) -> int:
+    if text in ("stack", "all"):
+        return text
     try:
-        return int(text)
+        return [int(word) for word in text.split(",")]
     except ValueError as error:
         raise refusal(name, text, "stack, all, or numbers such as 0,4,9") from error

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from types import NoneType, UnionType
@@ -12,41 +12,60 @@ from mauvecl.host.stars.library import resolve
 from mauvecl.host.tables.files import without_columns
 from mauvecl.noise.unknowns import NUISANCES
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Flag, Unit, first
 from mauvecl.schema.section import read_assignment
 from mauvecl.study.star import FILE_KEYS
 
 if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
 
+    from mauvecl.schema.fields import Flag
     from mauvecl.study.observation import NuisanceChoice
     from mauvecl.study.star import Star
 
 
 class Keyword(NamedTuple):
-    """Keyword of a verb's function, or flag of its command, and the key of the study that it sets."""
+    """Keyword of a verb's function, or flag of its command, with the key of the study that it sets."""
 
-    name: str
-    kind: Any  # type of the value on the command line
-    many: bool  # whether it has several values
-    section: str
-    key: str
-    read: Callable[[Any, str], Any] | None  # converts the texts of a flag, which it receives with the flag's name
-    unit: str  # of the key, in astropy's notation
+    path: str
+    field: FieldInfo
+    flag: Flag
 
-    @classmethod
-    def of(cls, path: str, field: FieldInfo, flag: Flag) -> Keyword:
-        """Return the keyword of a key of the study."""
-        section, _, key = path.rpartition(".")
-        kind, unit = flag.kind or plain_kind(field.annotation), (first(field, Unit) or Unit("")).name
-        return cls(flag.parameter, kind, get_origin(kind) is list, section, key, flag.read, unit)
+    @property
+    def name(self) -> str:
+        """Name in Python, and of the parameter of a command."""
+        return self.flag.parameter
+
+    @property
+    def section(self) -> str:
+        """Section of the key."""
+        return self.path.rpartition(".")[0]
+
+    @property
+    def key(self) -> str:
+        """Key without its section."""
+        return self.path.rpartition(".")[2]
+
+    @property
+    def kind(self) -> Any:
+        """Type of the value on the command line."""
+        return self.flag.kind or plain_kind(self.field.annotation)
+
+    @property
+    def many(self) -> bool:
+        """True if it has several values."""
+        return get_origin(self.kind) is list
+
+    @property
+    def each(self) -> Any:
+        """Type of one of its values on the command line."""
+        return get_args(self.kind)[0] if self.many else self.kind
 
     def value(self, given: Any) -> Any:
         """Convert a value to that of the key, unless it has parts of its own, as in Python."""
         parts = given if self.many else [given]
-        if self.read is None or not all(isinstance(part, str | int | float | Path) for part in parts):
+        if self.flag.read is None or not all(isinstance(part, str | int | float | Path) for part in parts):
             return given
-        return self.read(given, f"{self.name} =")
+        return self.flag.read(given, f"{self.name} =")
 
     def listed(self, given: Any) -> Any:
         """Return a list for a single value of a keyword of several values."""
@@ -55,11 +74,6 @@ class Keyword(NamedTuple):
         # Neither a sequence nor an array.
         single = isinstance(given, str | Path) or getattr(given, "ndim", 1) == 0 or not hasattr(given, "__len__")
         return [given] if single else list(given)
-
-
-def keywords_of(fields: Iterable[tuple[str, FieldInfo, Flag]]) -> dict[str, Keyword]:
-    """Return the keywords of keys, fields and flags by name; of several keys with one name the last has it."""
-    return {flag.parameter: Keyword.of(path, field, flag) for path, field, flag in fields}
 
 
 def values_of(given: Mapping[str, Any], keywords: Mapping[str, Keyword], where: str) -> dict[str, Any]:
@@ -82,26 +96,16 @@ def values_of(given: Mapping[str, Any], keywords: Mapping[str, Keyword], where: 
 
 def plain_kind(annotation: Any) -> Any:
     """Return the type of a keyword's value: a plain type, or a list for a field of several values."""
-    kinds = list(_plain(annotation))
-    if len(kinds) > 1 and str in kinds:
-        # A number or a word.
-        return str
-    return kinds[0]
-
-
-def _plain(annotation: Any) -> Iterator[Any]:
     origin, parts = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
-        yield from _plain(parts[0])
-    elif origin in (Union, UnionType):
-        for part in parts:
-            yield from _plain(part)
-    elif origin is Literal:
-        yield str
-    elif origin is tuple:
-        yield list[plain_kind(parts[0])]  # type: ignore[misc]
-    elif annotation is not NoneType:
-        yield annotation
+        return plain_kind(parts[0])
+    if origin is tuple:
+        return list[plain_kind(parts[0])]  # type: ignore[misc]
+    if origin in (Union, UnionType):
+        kinds = {plain_kind(part) for part in parts if part is not NoneType}
+        # A number or a word is text.
+        return kinds.pop() if len(kinds) == 1 else str
+    return str if origin is Literal else annotation
 
 
 def changes_of(

@@ -74,13 +74,13 @@ def test_several_wrong_values_are_reported_together(tmp_path: Path) -> None:
     code, _, reported = ended("detect", "-s", "M3V", "-m", "x", "-t", "10 m", "-a", "4z", folder=tmp_path)
     assert (code, reported.count("\n")) == (2, 1)
     assert [part.split()[0] for part in reported.removeprefix("mauvecl: ").split("; ")] == [
-        "--magnitude", "--exposure", "--amplitude"
+        "--magnitude", "--amplitude", "--exposure"
     ]  # fmt: skip
     code, _, reported = ended("detect", "-s", "M3V", "-m", "99", "-t", "30 h", "--fap", "2", folder=tmp_path)
     assert (code, reported.count("\n")) == (2, 1)
     parts = reported.removeprefix("mauvecl: ").split("; ")
     flags = [(part.split()[0], part.split()[-1]) for part in parts]
-    assert flags == [("--magnitude", "99.0"), ("--exposure", "108000.0"), ("--fap", "2.0")]
+    assert flags == [("--magnitude", "99"), ("--exposure", "h'"), ("--fap", "2")]
 
 
 def test_errors_of_a_study_name_each_key_once() -> None:
