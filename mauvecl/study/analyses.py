@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from mauvecl.host.stars.library import ALIASES
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help, Range, Slider, Unit, Widget
 from mauvecl.schema.physical import DetectorTemperature, Magnitude, Positive, Wavelength
-from mauvecl.schema.section import Section, read_ranges, read_words
+from mauvecl.schema.section import Section, check_needs, check_one, read_ranges, read_words
 from mauvecl.study.star import Star
 
 if TYPE_CHECKING:
@@ -33,16 +33,10 @@ class CalibrationObservation(Section):
         DetectorTemperature | None, Help("Detector temperature, where the frames do not state it")
     ] = None
 
-    @model_validator(mode="after")
-    def _one_star(self) -> Self:
-        if self.library is not None and self.spectrum is not None:
-            raise InputError(
-                "an observation needs either library or spectrum, or neither for dark frames, but has both",
-                key="spectrum",
-            )
+    def _check_values(self) -> None:
+        check_one(self, "an observation", "spectrum", "library")
         if self.magnitude is not None and self.library is None and self.spectrum is None:
             raise InputError("a magnitude needs the library or spectrum of the star as well", key="magnitude")
-        return self
 
     def source(self) -> Source | None:
         """Load the spectrum of the star at its brightness; None for frames without light."""
@@ -232,19 +226,15 @@ class ChangeQuestion(Section):
             self.file, wavelength_unit=self.wavelength_unit, flux_unit=self.flux_unit, extend=self.extend
         )
 
-    @model_validator(mode="after")
-    def _possible(self) -> Self:
+    def _check_values(self) -> None:
         if not self.shortest_d < self.longest_d:
             raise InputError.of("change.longest_d", self.longest_d, f"more than {self.shortest_d:g} d", unit="d")
         if self.file is None:
             if SPECTRUM in self.of:
                 raise InputError("the change 'spectrum' needs a file: give `change.file`", key="change.file")
-            for key in ("wavelength_unit", "flux_unit", "extend"):
-                if getattr(self, key):
-                    raise InputError(f"change.{key} needs change.file as well", key=f"change.{key}")
+            check_needs(self, "the change", ("wavelength_unit", "flux_unit", "extend"), "file")
         elif SPECTRUM not in self.of:
             raise InputError("change.file needs the change 'spectrum' in change.of as well", key="change.file")
-        return self
 
 
 class DataChoice(Section):
@@ -362,8 +352,7 @@ class MeasureQuestion(Section):
         """True if flares are measured along a stare."""
         return self.snr_per_bin is not None or self.joint_fit
 
-    @model_validator(mode="after")
-    def _possible(self) -> Self:
+    def _check_values(self) -> None:
         if self.lines:
             from mauvecl.host.stars.flare_spectra import EmissionLine
 
@@ -373,7 +362,6 @@ class MeasureQuestion(Section):
             for low, high in getattr(self, key):
                 if not 0 < low < high:
                     raise InputError.of(f"measure.{key}", (low, high), "ascending wavelengths", unit="nm")
-        return self
 
 
 def fitted_models(asked: MeasureQuestion, flare: Flare) -> list[tuple[FittedModel, bool, tuple[str, ...]]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, Literal, Self
@@ -464,15 +464,12 @@ def collect_messages(expectations: list[Expectation], processes: Processes | Non
 
     All answers report the saturation of stars and flares through this function.
     """
-    stars = {star for x in expectations if x.saturated.any() for star, flaring in [_star_of(x)] if not flaring}
-
-    def said(x: Expectation) -> tuple[str, ...]:
-        # A flare saturates the pixels that its star saturates without it, which is one fact.
+    saturated = {star for x in expectations if x.saturated.any() for star, flaring in [_star_of(x)] if not flaring}
+    texts: list[str] = []
+    for x in expectations:
         star, flaring = _star_of(x)
-        repeated = of_kind(x.messages, SATURATED) if flaring and star in stars else []
-        return tuple(message for message in x.messages if message not in repeated)
-
-    texts = [message for x in expectations for message in (*_without_light(x), *said(x), *_coarse(x))]
+        # A flare saturates the pixels that its star saturates without it, which is one fact.
+        texts += _messages_of(x, saturation=not (flaring and star in saturated))
     outside = off_centre(expectations, processes) if processes else []
     return worst_first([*(Message(f"OUTSIDE THE PRIOR: {text}.", "outside the prior") for text in outside), *texts])
 
@@ -500,18 +497,25 @@ def off_centre(expectations: list[Expectation], processes: Processes) -> list[st
     return sentences
 
 
-def _without_light(x: Expectation) -> tuple[str, ...]:
-    """Return the message on an exposure without light of the star, if it has none."""
-    electrons = float(np.sum(x.source_electrons)) * x.n_frames
-    if electrons >= 1.0:
-        return ()
-    return (
-        Message(
-            f"NO LIGHT: {x.name} gives {electrons:.2g} electrons in all {x.wavelength_nm.size} pixels of an exposure "
-            f"of {x.exposure_s:g} s: there is nothing to see of it, and its S/N is 0.",
+def _messages_of(x: Expectation, *, saturation: bool) -> Iterator[str]:
+    """Yield the messages of an expectation, with or without saturation, and on light or noise that is too small."""
+    pixels, electrons = x.wavelength_nm.size, float(np.sum(x.source_electrons)) * x.n_frames
+    if electrons < 1.0:
+        yield Message(
+            f"NO LIGHT: {x.name} gives {electrons:.2g} electrons in all {pixels} pixels of an exposure of "
+            f"{x.exposure_s:g} s: there is nothing to see of it, and its S/N is 0.",
             "no light",
-        ),
-    )
+        )
+    without = [] if saturation else of_kind(x.messages, SATURATED)
+    yield from (message for message in x.messages if message not in without)
+    quiet = float(np.min(x.read_noise_dn)) < NOISY_DN
+    coarse = int(np.count_nonzero(~stack_is_exact(Cumulants.of(x, 1), x))) if quiet else 0
+    if coarse:
+        yield Message(
+            f"In {coarse} of {pixels} pixels of {x.name} a frame has too little noise for its rounding to whole DN to "
+            "be like noise: closed forms treat it as noise and are wrong there; simulations round each frame.",
+            "rounding",
+        )
 
 
 def worst_first(messages: Iterable[str]) -> list[str]:
@@ -524,20 +528,3 @@ def worst_first(messages: Iterable[str]) -> list[str]:
         more = f"SATURATED: pixels of {rest} more stars, flares or exposures of this answer saturate."
         return [*saturated[:MAX_SATURATED], Message(more, SATURATED), *others]
     return [*saturated, *others]
-
-
-def _coarse(x: Expectation) -> tuple[str, ...]:
-    """Return the message on pixels for which rounding dominates, if any."""
-    if float(np.min(x.read_noise_dn)) >= NOISY_DN:
-        return ()
-    pixels = int(np.count_nonzero(~stack_is_exact(Cumulants.of(x, 1), x)))
-    if not pixels:
-        return ()
-    return (
-        Message(
-            f"In {pixels} of {x.wavelength_nm.size} pixels of {x.name} a frame has too little noise for its rounding "
-            "to whole DN to be like noise: closed forms treat it as noise and are wrong there; simulations round each "
-            "frame.",
-            "rounding",
-        ),
-    )

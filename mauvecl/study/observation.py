@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import BeforeValidator, Field, create_model, field_validator, model_validator
+from pydantic import Field, create_model, field_validator, model_validator
 
 from mauvecl.detection.names import DEFAULT_STATISTICS, RECOMMENDED, STATISTIC_NAMES
 from mauvecl.host.exposure import DEFAULT_SKY
@@ -15,18 +15,19 @@ from mauvecl.host.instrument import DEFAULT_INSTRUMENT, current_name
 from mauvecl.noise.disturbances import Prior, PriorField
 from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, INSTRUMENT_VALUES, NUISANCES, Comparison, values_of
 from mauvecl.schema.errors import InputError, shortened
-from mauvecl.schema.fields import Flag, Help, Quantity, Range, Slider, Widget, says_none
+from mauvecl.schema.fields import Accepted, Flag, Help, Quantity, Range, Slider, Widget, says_none
 from mauvecl.schema.physical import (
     DEFAULT_SEED,
     DetectorTemperature,
     Exposure,
+    Positive,
     Probability,
     Realisations,
     Seed,
     SkyBrightness,
     Temperature,
 )
-from mauvecl.schema.section import Section, read_words
+from mauvecl.schema.section import Section, check_all, check_one, read_words
 
 if TYPE_CHECKING:
     import numpy as np
@@ -150,16 +151,9 @@ class SkyLight(Section):
             return given | {"surface_brightness": None, "none": True}
         return given or {"surface_brightness": DEFAULT_SKY}
 
-    @model_validator(mode="after")
-    def _one_sky(self) -> Self:
-        if (self.target is None) != (self.time is None):
-            raise InputError("the sky needs both target and time, or neither, but has only one", key="time")
-        if (self.surface_brightness is not None) + (self.target is not None) + self.none > 1:
-            raise InputError(
-                "the sky is given twice; give only one of surface_brightness, target with time, and none",
-                key="surface_brightness",
-            )
-        return self
+    def _check_values(self) -> None:
+        check_all(self, "the sky", "target", "time")
+        check_one(self, "the sky", "surface_brightness", "target", "none")
 
     def with_value(self, path: Sequence[str], value: Any) -> Self:
         """Return the sky of one value, which replaces all others."""
@@ -236,32 +230,16 @@ class Run(Section):
     def _expand_all(cls, given: tuple[str, ...]) -> tuple[str, ...]:
         return STATISTIC_NAMES if "all" in given else given
 
-    @model_validator(mode="after")
-    def _comparable(self) -> Self:
+    def _check_values(self) -> None:
         self.comparison()
-        return self
 
     def comparison(self) -> Comparison:
         """Return the reference of the comparison for the engine."""
         return Comparison.of(self.reference, self.variances)
 
 
-def _spread(given: Any) -> Any:
-    """Validate a standard deviation or "free"."""
-    if given == "free":
-        return given
-    try:
-        value = float(given) if not isinstance(given, bool) else float("nan")
-    except (TypeError, ValueError):
-        value = float("nan")
-    if not 0 < value < float("inf"):
-        raise InputError(
-            f"the standard deviation of an unknown must be a number above 0, or 'free', not {shortened(str(given))}"
-        )
-    return value
-
-
-Spread = Annotated[float | Literal["free"], BeforeValidator(_spread)]
+#: Standard deviation of an unknown.
+Spread = Annotated[Positive | Literal["free"], Accepted("a number above 0, or 'free'")]
 
 
 def sd_of(spread: Spread) -> float:
@@ -276,11 +254,8 @@ class OwnNuisance(Section):
     points: Annotated[tuple[tuple[float, float], ...] | None, Help("Wavelengths in nm, and DN per exposure")] = None
     sd: Annotated[Spread, Help("Standard deviation of the amplitude, or free")] = "free"
 
-    @model_validator(mode="after")
-    def _one_spectrum(self) -> Self:
-        if (self.file is None) == (self.points is None):
-            raise InputError("a nuisance spectrum needs either file or points, but has neither or both", key="points")
-        return self
+    def _check_values(self) -> None:
+        check_one(self, "a nuisance spectrum", "points", "file", needed=True)
 
     def spectrum(self, name: str, wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the DN per exposure at unit amplitude, shape (n_pixel,)."""
@@ -379,14 +354,12 @@ class Unknowns(create_model("_InstrumentValues", __base__=Section, **_unknown_ke
     The documentation page on nominal values explains the default priors.
     """
 
-    @model_validator(mode="after")
-    def _possible(self) -> Self:
+    def _check_values(self) -> None:
         if self.draws == 1:
             raise InputError.of("unknowns.draws", self.draws, "0 or at least 2")
         other = next((name for name in self.known if name not in INSTRUMENT_VALUES), None)
         if other is not None:
             raise InputError.of("unknowns.known", other, f"some of {', '.join(INSTRUMENT_VALUES)}")
-        return self
 
     def priors(self, instrument: Instrument) -> dict[str, Prior]:
         """Return the priors of an instrument's unknown values by name, as in `noise.unknowns.values_of`."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import model_validator
+from pydantic import field_validator, model_validator
 
 from mauvecl.host.orbit import Limits
 from mauvecl.host.tables.names import (
@@ -33,7 +33,7 @@ from mauvecl.schema.physical import (
     RateExponent,
     Share,
 )
-from mauvecl.schema.section import Section, built, check_different
+from mauvecl.schema.section import Section, built, check_all, check_different, check_one, number_or_text
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -86,6 +86,16 @@ class OrbitQuestion(Section):
     ] = False
     limits: Limits = Limits()
 
+    @field_validator("start")
+    @classmethod
+    def _time(cls, given: str) -> str:
+        from mauvecl.host.exposure.sky import parse_time
+        from mauvecl.host.tables.units import offline
+
+        with offline():
+            parse_time(given, "start")
+        return given
+
     def orbit(self) -> Orbit:
         """Load the orbit."""
         from mauvecl.host.orbit.orbit import Orbit
@@ -101,6 +111,10 @@ class OrbitQuestion(Section):
 
 #: Keys of a target that hold paths, relative to its table or the study file.
 PATH_KEYS = ("rates_file", "neighbours")
+
+
+#: Keys of flare rates, each of another distribution.
+RATES = ("rates", "mass_msun", "alpha", "rates_file")
 
 
 class PlanTarget(Section):
@@ -145,26 +159,15 @@ class PlanTarget(Section):
     def _by_name(cls, data: Any) -> Any:
         return {"name": data} if isinstance(data, str) else data
 
-    @model_validator(mode="after")
-    def _one_distribution(self) -> Self:
-        for names in (("mass_msun", "age_myr"), ("alpha", "rate_per_day", "at_erg")):
-            given = [name for name in names if getattr(self, name) is not None]
-            if given and len(given) < len(names):
-                raise InputError(
-                    f"{self.name} needs all of {', '.join(names)} or none, but has only {' and '.join(given)}",
-                    key=given[0],
-                )
-        if len(ways := self.given_rates) > 1:
-            raise InputError(
-                f"{self.name} needs its flare rates in one way only, but has them by {' and by '.join(ways)}",
-                key="rates",
-            )
-        return self
+    def _check_values(self) -> None:
+        check_all(self, self.name, "mass_msun", "age_myr")
+        check_all(self, self.name, "alpha", "rate_per_day", "at_erg")
+        check_one(self, self.name, *RATES)
 
     @property
     def given_rates(self) -> list[str]:
         """Keys of the given flare rates, of which a target has at most one; the mass has an age."""
-        return [key for key in ("rates", "mass_msun", "alpha", "rates_file") if getattr(self, key) is not None]
+        return [key for key in RATES if getattr(self, key) is not None]
 
     def target(self, simbad: bool) -> Target:
         """Look up the target; given coordinates replace those of its name."""
@@ -250,10 +253,8 @@ class PlanQuestion(Section):
     best_months: Annotated[int, Range(1, 12), Help("Number of best months in the report")] = 3
     report: Annotated[Literal["pdf", "html"], Help("Form of the report"), Flag("--report")] = "pdf"
 
-    @model_validator(mode="after")
-    def _different_targets(self) -> Self:
+    def _check_values(self) -> None:
         check_different([target.name for target in self.targets], "the plan's target", "targets")
-        return self
 
     def law(self) -> DurationLaw:
         """Return the relation between energy and duration of flares."""
@@ -344,7 +345,8 @@ def _target(
             target[key] = text
         else:
             # A text that is no number is refused with the key's own sentence.
-            target[key] = rows.number(column, row, "" if unit is None else unit.name) if _is_number(text) else text
+            is_number = not isinstance(number_or_text(text), str)
+            target[key] = rows.number(column, row, "" if unit is None else unit.name) if is_number else text
     _check_band(rows, columns["magnitude"], row)
     parallax = columns["parallax"]
     if parallax is not None and "distance_pc" not in target:
@@ -404,11 +406,3 @@ def _coordinates(rows: Rows, columns: dict[str, str | None], row: int, target: d
                 remedy = "give its coordinates, or a name of the list"
                 raise rows.error(f"{fault} is not in the embedded list; {remedy}", column)
     return None
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True

@@ -5,14 +5,14 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 from pydantic import Field, model_validator
 
 from mauvecl.schema.errors import InputError, shown
 from mauvecl.schema.fields import Flag, Help, Quantity, Range, Slider, Unit, Widget, first
 from mauvecl.schema.physical import Positive, Probability, Wavelength
-from mauvecl.schema.section import Section, check_different, fields_of, read_axis, read_frames
+from mauvecl.schema.section import Section, check_different, check_needs, fields_of, read_axis, read_frames
 from mauvecl.study.observation import Observation, SkyLight
 from mauvecl.study.star import Flare, Star
 
@@ -70,14 +70,8 @@ class CampaignQuestion(Section):
         Flag("--campaign-alarms"),
     ] = None
 
-    @model_validator(mode="after")
-    def _requires_frames(self) -> Self:
-        given = next((name for name in ("step", "fap", "alarms") if getattr(self, name) is not None), None)
-        if given is not None and self.frames is None:
-            raise InputError(
-                f"campaign.{given} needs campaign.frames, the number of frames that are searched, as well", key=given
-            )
-        return self
+    def _check_values(self) -> None:
+        check_needs(self, "the campaign", ("step", "fap", "alarms"), "frames")
 
 
 class SignalQuestion(Section):
@@ -102,11 +96,9 @@ class BulkQuestion(Section):
         bool, Help("Also store the mean of star, sky and noise of each pixel"), Flag("--components")
     ] = False
 
-    @model_validator(mode="after")
-    def _ascending(self) -> Self:
+    def _check_values(self) -> None:
         if not isinstance(self.frames, str) and list(self.frames) != sorted(set(self.frames)):
             raise InputError.of("bulk.frames", list(self.frames), "ascending numbers")
-        return self
 
     def chosen(self, n_frames: int) -> tuple[int, ...] | None:
         """Return the indices of the frames to store, or None to store their sum."""
@@ -146,6 +138,11 @@ class LimitQuestion(Section):
     ] = 0.9
 
 
+def _wrong_value(quantity: Quantity, text: str) -> InputError:
+    accepted = "a name of the library" if quantity.is_name else quantity.accepted
+    return InputError(f"a value of the axis {quantity.name!r} must be {accepted}, not {text}", key="values")
+
+
 class Axis(Section):
     """Axis of a map or sweep: explicit values, or `steps` values from `start` to `stop`."""
 
@@ -167,12 +164,9 @@ class Axis(Section):
         try:
             return given | {key: Unit(quantity.unit).plain(given[key]) for key in keys}
         except ValueError as error:
-            raise InputError(
-                f"a value of the axis {quantity.name!r} must be {quantity.accepted}, not {error}", key="values"
-            ) from error
+            raise _wrong_value(quantity, str(error)) from error
 
-    @model_validator(mode="after")
-    def _one_way(self) -> Self:
+    def _check_values(self) -> None:
         spaced = (self.start, self.stop, self.steps)
         if (self.values is None) == (None in spaced) or (self.values is not None and spaced != (None, None, None)):
             raise InputError(
@@ -183,35 +177,24 @@ class Axis(Section):
             raise InputError(f"the axis {self.quantity!r} needs at least one value, but has none", key="values")
         quantity = QUANTITIES[self.quantity]
         for value in self.points():
-            if quantity.is_name != isinstance(value, str):
-                accepted = "a name of the library" if quantity.is_name else "a number"
-                raise InputError(
-                    f"a value of the axis {self.quantity!r} must be {accepted}, not {value!r}", key="values"
-                )
-            if quantity.range is not None and value not in quantity.range:
-                raise InputError(
-                    f"a value of the axis {self.quantity!r} must be {quantity.accepted}, not {shown(value)}",
-                    key="values",
-                )
-        return self
+            is_name = isinstance(value, str)
+            if is_name != quantity.is_name or (quantity.range is not None and value not in quantity.range):
+                raise _wrong_value(quantity, shown(value))
 
     def points(self) -> tuple[float | str, ...]:
         """Return the values along the axis."""
         if self.values is not None:
             return self.values
-        assert self.start is not None
-        assert self.stop is not None
-        assert self.steps is not None
-        if self.log and min(self.start, self.stop) <= 0:
+        start, stop, steps = cast("tuple[float, float, int]", (self.start, self.stop, self.steps))
+        share = [i / (steps - 1) for i in range(steps)]
+        if not self.log:
+            return tuple(start + (stop - start) * s for s in share)
+        if min(start, stop) <= 0:
             raise InputError(
-                f"the logarithmic axis {self.quantity!r} needs values above 0, but runs from "
-                f"{self.start:g} to {self.stop:g}",
+                f"the logarithmic axis {self.quantity!r} needs values above 0, but runs from {start:g} to {stop:g}",
                 key="start",
             )
-        share = [i / (self.steps - 1) for i in range(self.steps)]
-        if self.log:
-            return tuple(self.start * (self.stop / self.start) ** s for s in share)
-        return tuple(self.start + (self.stop - self.start) * s for s in share)
+        return tuple(start * (stop / start) ** s for s in share)
 
 
 class MapQuestion(Section):
@@ -231,13 +214,11 @@ class MapQuestion(Section):
     ] = Axis(quantity="amplitude", start=0.01, stop=1.0, steps=16, log=True)
     contours: Annotated[tuple[Probability, ...], Help("Detection probabilities of contours")] = (0.1, 0.5, 0.9)
 
-    @model_validator(mode="after")
-    def _different_axes(self) -> Self:
+    def _check_values(self) -> None:
         if self.y.quantity == ("magnitude" if self.x is None else self.x.quantity):
             raise InputError(
                 f"the axes of the map must be two different quantities, but both are {self.y.quantity!r}", key="y"
             )
-        return self
 
     @property
     def axes(self) -> tuple[Axis, Axis]:
@@ -265,8 +246,7 @@ class Sweep(Section):
         Flag("--sweep", kind=list[str], read=lambda texts, name: [read_axis(text, name) for text in texts]),
     ] = ()
 
-    @model_validator(mode="after")
-    def _possible(self) -> Self:
+    def _check_values(self) -> None:
         check_different([axis.quantity for axis in self.axes], "the sweep's quantity", "axes")
         lengths = {axis.quantity: len(axis.points()) for axis in self.axes}
         if self.how == "list" and len(set(lengths.values())) > 1:
@@ -276,7 +256,6 @@ class Sweep(Section):
             )
         if self.size > MAX_CELLS:
             raise InputError(f"the sweep must have at most {MAX_CELLS} combinations, but has {self.size}", key="axes")
-        return self
 
     @property
     def size(self) -> int:

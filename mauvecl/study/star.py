@@ -26,7 +26,7 @@ from mauvecl.schema.physical import (
     Share,
     Temperature,
 )
-from mauvecl.schema.section import Section, read_line_fluxes
+from mauvecl.schema.section import Section, check_all, check_needs, check_one, read_line_fluxes
 
 if TYPE_CHECKING:
     from mauvecl.host.exposure.neighbours import Neighbours
@@ -189,20 +189,10 @@ class Star(Section):
             listed.pop("magnitude", None)
         return given | {key: value for key, value in listed.items() if given.get(key) is None}
 
-    @model_validator(mode="after")
-    def _one_spectrum(self) -> Self:
-        if (self.library is None) == (self.file is None):
-            raise InputError("a star needs either library or file, but has neither or both", key="library")
-        given = [key for key in FILE_KEYS if getattr(self, key) is not None]
-        if self.file is None and given:
-            raise InputError(
-                f"a star of the library has {' and '.join(given)}, which only a star from a file may have", key=given[0]
-            )
-        if self.neighbours is None and self.neighbours_of is not None:
-            raise InputError(
-                "a star has neighbours_of, which needs the table of its neighbours as well", key="neighbours_of"
-            )
-        return self
+    def _check_values(self) -> None:
+        check_one(self, "a star", "library", "file", needed=True)
+        check_needs(self, "a star of the library", FILE_KEYS, "file")
+        check_needs(self, "a star", ["neighbours_of"], "neighbours")
 
     def with_value(self, path: Sequence[str], value: Any) -> Self:
         """Return a copy with another value; another library star drops values that describe this one."""
@@ -259,8 +249,6 @@ class Star(Section):
 
 #: Keys, other than `file`, that only apply to a flare from a file.
 FLARE_FILE_KEYS = ("quiescent", "wavelength_unit", "flux_unit", "continue_at_k", "as_observed")
-#: Keys that do not apply to a flare from a file.
-BLACKBODY_KEYS = ("second_temperature_k", "second_area", "balmer_jump")
 
 
 class FlareLight(Section):
@@ -393,26 +381,15 @@ class FlareLight(Section):
         ),
     ] = False
 
-    @model_validator(mode="after")
-    def _one_model(self) -> Self:
-        given = [key for key in BLACKBODY_KEYS if getattr(self, key) is not None]
-        if self.file is not None and given:
-            raise InputError(f"the spectrum of a flare needs either file or {given[0]}, but has both", key="file")
-        own = [key for key in FLARE_FILE_KEYS if getattr(self, key)]
-        if self.file is None and own:
-            raise InputError(f"the spectrum of a flare has {own[0]}, which needs a file as well", key=own[0])
-        if (self.second_temperature_k is None) != (self.second_area is None):
-            raise InputError(
-                "the spectrum of a flare needs both second_temperature_k and second_area, or neither, but has only one",
-                key="second_area",
-            )
-        if self.balmer_jump is not None and self.second_area is not None:
-            raise InputError(
-                "the spectrum of a flare needs either balmer_jump or second_area, but has both", key="balmer_jump"
-            )
+    def _check_values(self) -> None:
+        what = "the spectrum of a flare"
+        for key in ("second_temperature_k", "second_area", "balmer_jump"):
+            check_one(self, what, "file", key)
+        check_needs(self, what, FLARE_FILE_KEYS, "file")
+        check_all(self, what, "second_temperature_k", "second_area")
+        check_one(self, what, "balmer_jump", "second_area")
         if self.file is None and self != FlareLight.model_construct():
             self.at_temperature(10_000.0)
-        return self
 
     def at_temperature(self, temperature_k: float) -> FlareSpectrum:
         """Return the spectrum at a temperature, which a spectrum from a file ignores."""
