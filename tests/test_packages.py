@@ -19,21 +19,9 @@ ROOT = Path(__file__).parent.parent
 #: What a checkout has, or an unpacked sdist; a working copy has much more beside it.
 FOLDERS = (".ci", ".github", "bench", "docs", "host", "kernels", "mauvecl", "paper", "recipe", "tests", "tools")
 FILES = (
-    ".dockerignore",
-    ".gitignore",
-    "CHANGELOG.md",
-    "CITATION.cff",
-    "CODE_OF_CONDUCT.md",
-    "CONTRIBUTING.md",
-    "Dockerfile",
-    "LICENSE",
-    "Makefile",
-    "README.md",
-    "SECURITY.md",
-    "SUPPORT.md",
-    "environment.yml",
-    "pyproject.toml",
-)
+    ".dockerignore", ".gitignore", "CHANGELOG.md", "CITATION.cff", "CODE_OF_CONDUCT.md", "CONTRIBUTING.md",
+    "Dockerfile", "LICENSE", "Makefile", "README.md", "SECURITY.md", "SUPPORT.md", "environment.yml", "pyproject.toml",
+)  # fmt: skip
 MADE = ("__pycache__", "_build", "_generated", "commands", "jupyter_execute", ".ipynb_checkpoints", "*_cache",
         ".hypothesis", "node_modules")  # fmt: skip
 VERSION = mauvecl.__version__

@@ -6,7 +6,6 @@ import re
 import shlex
 import subprocess
 import sys
-import tomllib
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,6 @@ import numpy as np
 import pytest
 from commands import ended, run
 from study_keys import fields, metadata
-from test_golden import GOLDEN, QUESTIONS
 from typer.main import get_command
 from typer.testing import CliRunner
 
@@ -134,41 +132,6 @@ KEYS: dict[str, list[tuple[str, ...]]] = {}
 for path, field in fields():
     for flag in metadata(field, "Flag", every=True):
         KEYS.setdefault(flag.parameter, []).append(path)
-
-
-@pytest.mark.parametrize("name", [name for name in QUESTIONS if (GOLDEN / name / "study.toml").exists()])
-def test_defaults_in_help_equal_those_of_the_study(name: str) -> None:
-    """Compare with the studies of the golden questions, in which a flag that is not given has its default."""
-    words = QUESTIONS[name].rpartition(" && ")[2].split()
-    # The paper's conventions set these.
-    of_paper = ("--instrument", "--statistic") if "--paper" in words else ()
-    verb, given = words[0], {*words, *of_paper}
-    study = Study.build(tomllib.loads((GOLDEN / name / "study.toml").read_text(encoding="utf-8")), name)
-    compared = 0
-    for option in options(VERBS[verb]):
-        reported = re.search(r"\[([^][]*)\]\.$", option.help or "")
-        keys = [key for key in KEYS.get(option.name, ()) if key[0] != "star"]
-        if reported is None or not keys or given & {*option.opts} or _is_set(keys, words):
-            continue
-        values = [_at(study, key) for key in keys]
-        number = re.match(r"-?[\d.]+", reported[1])
-        if number and all(isinstance(value, int | float) for value in values):
-            assert float(number[0]) in values, option.name
-            compared += 1
-        elif all(isinstance(value, str) for value in values):
-            assert any(value in reported[1] for value in values), option.name
-            compared += 1
-    assert compared > 0 or verb in ("calibrate", "analyse")
-
-
-def _is_set(keys: list[tuple[str, ...]], words: list[str]) -> bool:
-    return any(word.split("=")[0].startswith(".".join(key)) for key in keys for word in words)
-
-
-def _at(value: Any, path: tuple[str, ...]) -> Any:
-    for key in path:
-        value = getattr(value, key)
-    return value
 
 
 def completed(typed: str, folder: Path) -> set[str]:

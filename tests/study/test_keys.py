@@ -148,10 +148,15 @@ def test_paths_are_relative_to_the_study_file_and_absolute_in_its_text(tmp_path:
     assert str(absolute).count(str(tmp_path / "there" / "f.txt")) == len(keys)
     # Read elsewhere, the text gives the same study.
     assert Study.build(absolute, "elsewhere") == study
-    # An answer's table names the files by their content, and is read next to them.
+    # An answer's table names the files by their content, and is read next to them or in a folder there.
     assert (study.text().count("_sha256"), study.text().count(str(tmp_path))) == (len(keys), 0)
-    Table({"x": [1.0]}, meta={"study": study.text()}).write(tmp_path / "there" / "table.ecsv", format="ascii.ecsv")
-    assert Study.read(tmp_path / "there" / "table.ecsv") == study
+    for table in (tmp_path / "there" / "table.ecsv", tmp_path / "there" / "out" / "table.ecsv"):
+        table.parent.mkdir(exist_ok=True)
+        Table({"x": [1.0]}, meta={"study": study.text()}).write(table, format="ascii.ecsv")
+        assert Study.read(table) == study
+    np.savetxt(tmp_path / "there" / "f.txt", 2 * light)
+    with pytest.raises(InputError, match=r"its file 'f.txt' with sha256 .* has changed"):
+        Study.read(table)
 
 
 # Older files
