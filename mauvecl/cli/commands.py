@@ -164,7 +164,6 @@ def _placed(study_file: Path | None, given: dict[str, Any]) -> Path | None:
     return study_file
 
 
-StoreArgument = Annotated[Path, typer.Argument(help="Store that `mauvecl realise` wrote.")]
 RowsFlag = Annotated[str | None, option(metavar="TEXT", text="Realisations, such as 1000:2000, without the last.")]
 
 
@@ -312,7 +311,7 @@ def _show_faults(title: str, faults: Sequence[Any], columns: Sequence[Column], o
 
 
 def export(
-    store: StoreArgument,
+    store: Annotated[Path, typer.Argument(help="Store that `mauvecl realise` wrote.")],
     file: Annotated[Path, typer.Argument(help="Ending in .fits, .h5 or .hdf5.")],
     array: Annotated[
         list[str] | None, option("--array", metavar="TEXT", text="Such as star-1/flare-2; may be repeated [all].")

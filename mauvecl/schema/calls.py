@@ -62,8 +62,7 @@ def schema_of(hint: Any) -> CoreSchema:
     if origin in SEQUENCES or origin is list:
         return _sequence(origin, args)
     if origin in (dict, Mapping):
-        keys, values = map(schema_of, args)
-        return core_schema.no_info_before_validator_function(_mapping, core_schema.dict_schema(keys, values))
+        return core_schema.dict_schema(*map(schema_of, args))
     if origin in (Any, object):
         return core_schema.any_schema()
     if inspect.isclass(origin):
@@ -114,12 +113,6 @@ def _items(value: Any, size: int | None = None) -> Any:
     if is_single or size not in (None, len(items)):
         raise PydanticCustomError("expected", f"Input should be a sequence{'' if size is None else f' of {size}'}")
     return items
-
-
-def _mapping(value: Any) -> Any:
-    if not isinstance(value, Mapping):
-        raise PydanticCustomError("expected", "Input should be a dictionary")
-    return value
 
 
 #: Schemas of annotations of single values.

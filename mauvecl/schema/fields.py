@@ -79,11 +79,6 @@ SPELLED = {
 }  # fmt: skip
 
 
-def is_measure(text: str) -> bool:
-    """Return whether a text is a number that is followed by a unit, as far as its form tells."""
-    return _MEASURE.fullmatch(text) is not None
-
-
 def with_unit(text: str, unit: str) -> float | None:
     """Read a number with its unit, such as "10 min" or "24%", and convert it; return None for any other text.
 

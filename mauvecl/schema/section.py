@@ -25,7 +25,6 @@ from mauvecl.schema.errors import InputError, shortened, shown, together
 from mauvecl.schema.fields import (
     Unit,
     first,
-    is_measure,
     is_quantity,
     is_truth,
     says_none,
@@ -311,8 +310,8 @@ def check_different(names: Sequence[str], what: str, key: str) -> None:
 
 def refusal(name: str, text: str, expected: str) -> InputError:
     """Return the error of a value's text; its key is the parameter that a flag sets, or else the value's name."""
-    error = InputError.of(name.removesuffix(" ="), text, expected)
-    error.key = name.split()[0].strip("-").replace("-", "_")
+    error = InputError.of(name, text, expected)
+    error.key = name.strip("-").replace("-", "_")
     return error
 
 
@@ -344,24 +343,15 @@ def read_axis(text: str, name: str) -> dict[str, Any]:
     if "=" in text:
         quantity, _, values = text.partition("=")
         parts = [part.strip() for part in values.split(",")]
-        try:
-            return {"quantity": quantity, "values": parts if quantity == "star" else list(map(_measure, parts))}
-        except ValueError as error:
-            raise refusal(name, text, f"numbers, such as {quantity}=5,50,600") from error
-    parts = text.split(":")
+        return {"quantity": quantity, "values": parts if quantity == "star" else list(map(number_or_text, parts))}
     try:
-        quantity, start, stop, steps, *rest = parts
-        spaced = {"quantity": quantity, "start": _measure(start), "stop": _measure(stop), "steps": int(steps)}
+        quantity, start, stop, steps, *rest = text.split(":")
+        spaced = {"start": number_or_text(start), "stop": number_or_text(stop), "steps": int(steps)}
     except ValueError as error:
         raise refusal(name, text, "quantity:start:stop:steps, the same with :log, or quantity=a,b,c") from error
     if rest not in ([], ["log"]):
         raise refusal(name, text, "quantity:start:stop:steps with :log or nothing at its end")
-    return spaced | {"log": bool(rest)}
-
-
-def _measure(text: str) -> float | str:
-    """Read a number; return a text with a unit unchanged, since the axis converts it."""
-    return text if is_measure(text) else float(text)
+    return {"quantity": quantity, "log": bool(rest)} | spaced
 
 
 def read_assignment(text: str, name: str, expected: str) -> tuple[str, str]:
@@ -372,12 +362,12 @@ def read_assignment(text: str, name: str, expected: str) -> tuple[str, str]:
     return key, value
 
 
-def read_line_fluxes(texts: Sequence[str], name: str) -> dict[str, float]:
+def read_line_fluxes(texts: Sequence[str], name: str) -> dict[str, float | str]:
     """Read fluxes of emission lines, such as 'Mg II=0.05'."""
     lines = {}
     for text in texts:
         line, value = read_assignment(text, name, "NAME=FLUX, such as 'Mg II=0.05'")
-        lines[line] = read_number(value, f"{name} {shortened(text)}")
+        lines[line] = number_or_text(value)
     return lines
 
 

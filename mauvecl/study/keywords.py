@@ -65,7 +65,7 @@ class Keyword(NamedTuple):
         parts = given if self.many else [given]
         if self.flag.read is None or not all(isinstance(part, str | int | float | Path) for part in parts):
             return given
-        return self.flag.read(given, f"{self.name} =")
+        return self.flag.read(given, self.name)
 
     def listed(self, given: Any) -> Any:
         """Return a list for a single value of a keyword of several values."""
@@ -135,7 +135,7 @@ def nuisances_of(nuisances: NuisanceChoice, given: Sequence[str] | Mapping[str, 
     own = {name: choice.model_dump(exclude_none=True) for name, choice in nuisances.own.items()}
     expected = f"NAME=SD, with a name of {', '.join(NUISANCES)} or a file's, and a standard deviation or free"
     if not isinstance(given, Mapping):
-        given = dict(read_assignment(text, "nuisance =", expected) for text in given)
+        given = dict(read_assignment(text, "nuisance", expected) for text in given)
     for name, sd in given.items():
         if name in NUISANCES:
             changed[name] = sd

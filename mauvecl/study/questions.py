@@ -143,13 +143,16 @@ def _wrong_value(quantity: Quantity, text: str) -> InputError:
     return InputError(f"a value of the axis {quantity.name!r} must be {accepted}, not {text}", key="values")
 
 
+Number = Annotated[float, Range()]
+
+
 class Axis(Section):
     """Axis of a map or sweep: explicit values, or `steps` values from `start` to `stop`."""
 
     quantity: Annotated[QuantityName, Help("Quantity that varies")]
     values: Annotated[tuple[float | str, ...] | None, Help("Values")] = None
-    start: Annotated[float | None, Help("First of evenly spaced values")] = None
-    stop: Annotated[float | None, Help("Last of evenly spaced values")] = None
+    start: Annotated[Number | None, Help("First of evenly spaced values")] = None
+    stop: Annotated[Number | None, Help("Last of evenly spaced values")] = None
     steps: Annotated[Annotated[int, Range(2, 1000)] | None, Help("Number of evenly spaced values")] = None
     log: Annotated[bool, Help("Whether values are evenly spaced in the logarithm")] = False
 

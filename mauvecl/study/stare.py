@@ -306,6 +306,4 @@ class InjectionQuestion(Section):
         """Half-widths of injected flares, evenly spaced in the logarithm."""
         import numpy as np
 
-        if self.widths == 1:
-            return (self.half_width_low_s,)
         return tuple(float(w) for w in np.geomspace(self.half_width_low_s, self.half_width_high_s, self.widths))
