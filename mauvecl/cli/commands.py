@@ -82,10 +82,7 @@ class Command:
 
         def command(study_file: Path | None = None, **values: Any) -> None:
             del values["help_all"]
-            given = {name: numbers_of(keyword, values.pop(name)) for name, keyword in keywords.items()}
-            warn_of_percent(given.get("amplitude") or ())
-            given |= {name: values.pop(name, None) for name in ("setting", "paper")}
-            self._call(study_file, keywords, given, values, tells_flags="given" in kinds)
+            self._call(study_file, keywords, values)
 
         parameters = [
             inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=usual, annotation=kind)
@@ -96,30 +93,24 @@ class Command:
         command.__annotations__ = {name: kind for name, (kind, _) in options.items()}
         return command
 
-    def _call(
-        self,
-        study_file: Path | None,
-        keywords: dict[str, Keyword],
-        given: dict[str, Any],
-        values: dict[str, Any],
-        *,
-        tells_flags: bool,
-    ) -> None:
+    def _call(self, study_file: Path | None, keywords: dict[str, Keyword], values: dict[str, Any]) -> None:
         """Run the command with the values of its flags and of its other options."""
         from mauvecl.cli.invocation import Session, question_time, question_values
         from mauvecl.study.study import Study
 
-        verb = self.verb
+        given = {name: numbers_of(keyword, values.pop(name)) for name, keyword in keywords.items()}
+        warn_of_percent(given.get("amplitude") or ())
+        given |= {name: values.pop(name, None) for name in ("setting", "paper")}
         study_file = _placed(study_file, given)
         how = {name: values.pop(name, usual) for name, (_, usual) in self._options().items()}
-        if tells_flags:
+        if "given" in inspect.signature(self.run).parameters:
             values["given"] = given
         own = None if study_file is None else Study.read(study_file)
-        study, messages = verb.study_of(given, keywords, own, "command line")
+        study, messages = self.verb.study_of(given, keywords, own, "command line")
         question_values(study, detects={"fap", "realisations"} <= keywords.keys())
         if self.draws:
             question_time(study, insist=how["insist"])
-        with Session(verb.name, study, draws=self.draws, notes=messages, **how) as session:
+        with Session(self.verb.name, study, draws=self.draws, notes=messages, **how) as session:
             self.run(session, **values)
 
     def _options(self) -> dict[str, tuple[Any, Any]]:

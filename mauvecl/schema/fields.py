@@ -15,7 +15,7 @@ import math
 import operator
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin
 
@@ -392,8 +392,8 @@ class Slider:
 class Widget:
     """Field of the page that sets a key."""
 
-    hint: str  # explanation for visitors, in sentences
-    label: str = ""  # text of the key's help by default
+    label: str = field(default="", kw_only=False)  # text of the key's help by default
+    hint: str = field(default="", kw_only=False)  # explanation for visitors, in sentences
     group: str = ""  # heading of the field's group; by default that of its section, if fields do not show at once
     place: int = 0  # order within the group; fields of the same place follow the order of the study
     name: str = ""  # name in links; that of the key by default

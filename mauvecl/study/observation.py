@@ -46,7 +46,7 @@ class Observation(Section):
         Exposure,
         Help("Exposure time", "rounded up to whole frames of 5 s"),
         Flag("--exposure", "-t"),
-        Widget(label="Exposure", hint="Time on the star; whole frames of 5 s are added up.", slider=Slider(5, 3600, 5)),
+        Widget("Exposure", "Time on the star; whole frames of 5 s are added up.", slider=Slider(5, 3600, 5)),
         Quantity("exposure", "length of the exposure", "exposure (s)"),
     ] = 50.0
     instrument: Annotated[
@@ -56,8 +56,8 @@ class Observation(Section):
         ),
         Flag("--instrument"),
         Widget(
-            label="Payload",
-            hint="mauve: dark counts are Poisson in electrons, as in physics. mauvesim: Poisson in DN, as in the "
+            "Payload",
+            "mauve: dark counts are Poisson in electrons, as in physics. mauvesim: Poisson in DN, as in the "
             "MauveSim paper, which makes the dark noise 1.3 times as large.",
             choices=("mauve", "mauvesim"),
         ),
@@ -80,8 +80,8 @@ class Observation(Section):
         Help("Signal of an S/N", choices="net (the star alone) or paper (with the zodiacal light)"),
         Flag("--signal"),
         Widget(
-            label="Counted as signal",
-            hint="In the S/N: the light of the star alone (net), or that of the sky too, as in the MauveSim paper. It "
+            "Counted as signal",
+            "In the S/N: the light of the star alone (net), or that of the sky too, as in the MauveSim paper. It "
             "moves no detection.",
             group="Sky",
             place=2,
@@ -115,8 +115,8 @@ class SkyLight(Section):
         Help("Surface brightness of the sky in V", "or none", default=f"{DEFAULT_SKY:g}"),
         Flag("--sky", kind=str),
         Widget(
-            label="Sky brightness",
-            hint="Zodiacal light, V magnitudes per square arc second.",
+            "Sky brightness",
+            "Zodiacal light, V magnitudes per square arc second.",
             name="sky_brightness",
             first=f"{DEFAULT_SKY:g}",
             unit="mag/arcsec²",
@@ -128,15 +128,13 @@ class SkyLight(Section):
         str | None,
         Help("Target whose zodiacal light is the sky, with the time", "a star such as 'AU Mic', or '290.68 +11.12'"),
         Flag("--target"),
-        Widget(
-            label="Sky target", hint="A star by name, such as AU Mic, or coordinates in degrees such as 290.68 +11.12."
-        ),
+        Widget("Sky target", "A star by name, such as AU Mic, or coordinates in degrees such as 290.68 +11.12."),
     ] = None
     time: Annotated[
         str | None,
         Help("Time of the observation, UTC, with the target"),
         Flag("--time"),
-        Widget(label="Time, UTC", hint="Such as 2026-09-01T12:00."),
+        Widget("Time, UTC", "Such as 2026-09-01T12:00."),
     ] = None
     none: Annotated[bool, Help("Whether there is no sky")] = False
 
@@ -189,8 +187,8 @@ class Run(Section):
         Help("False-alarm probability per test"),
         Flag("--fap"),
         Widget(
-            label="False-alarm probability",
-            hint="How often noise alone passes for a flare, per test: it sets the threshold.",
+            "False-alarm probability",
+            "How often noise alone passes for a flare, per test: it sets the threshold.",
             unit="per test",
             slider=Slider(1e-6, 0.1, 10**0.1, log=True),
         ),

@@ -55,7 +55,7 @@ class OrbitQuestion(Section):
         str,
         Help("First day or time, UTC"),
         Flag("--start"),
-        Widget(label="First day", hint="The first day of the time that is looked at, UTC.", kind="day"),
+        Widget("First day", "The first day of the time that is looked at, UTC.", kind="day"),
     ] = "2027-01-01"
     days: Annotated[
         float,
@@ -64,8 +64,8 @@ class OrbitQuestion(Section):
         Help("Length of time"),
         Flag("--days"),
         Widget(
-            label="Days",
-            hint="How many days from the first one on are looked at: 365 show every season.",
+            "Days",
+            "How many days from the first one on are looked at: 365 show every season.",
             unit="d",
             most=1000,
             slider=Slider(5, 730, 5),
@@ -231,8 +231,8 @@ class PlanQuestion(Section):
         Help("Exposure of each target at most", default="all"),
         Flag("--hours"),
         Widget(
-            label="Hours on each target",
-            hint="How long each target is observed, at most: never longer than it is seen.",
+            "Hours on each target",
+            "How long each target is observed, at most: never longer than it is seen.",
             first="100",
             slider=Slider(10, 1000, 10),
         ),

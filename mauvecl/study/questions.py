@@ -119,8 +119,8 @@ class LimitQuestion(Section):
         Help("Quantity whose limit is computed"),
         Flag("--of"),
         Widget(
-            label="Solve for",
-            hint="The smallest flare, the faintest star or the shortest exposure that is detected with the wanted "
+            "Solve for",
+            "The smallest flare, the faintest star or the shortest exposure that is detected with the wanted "
             "probability; all else is as entered. The tab Limit and map simulates it.",
             first="amplitude",
         ),
@@ -130,8 +130,8 @@ class LimitQuestion(Section):
         Help("Wanted detection probability"),
         Flag("--power"),
         Widget(
-            label="Wanted probability",
-            hint="With which a flare is to be detected at the limit.",
+            "Wanted probability",
+            "With which a flare is to be detected at the limit.",
             group="Detection",
             slider=Slider(0.5, 0.99, 0.01),
         ),

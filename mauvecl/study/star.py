@@ -67,11 +67,7 @@ class Star(Section):
         str,
         Help("Band of the magnitude", choices=", ".join(ALIASES)),
         Flag("--band"),
-        Widget(
-            label="Band",
-            hint="The band of the magnitude. In V, Vega has 0.03, as in catalogues.",
-            choices=tuple(ALIASES),
-        ),
+        Widget("Band", "The band of the magnitude. In V, Vega has 0.03, as in catalogues.", choices=tuple(ALIASES)),
     ] = "V"
     magnitude_system: Annotated[
         Literal["catalogue", "vega", "ab"],
@@ -83,8 +79,8 @@ class Star(Section):
         Help("Dust in front of the star, E(B-V)", "needs mauvecl[extinction]"),
         Flag("--ebv"),
         Widget(
-            label="Reddening",
-            hint="Dust in front of the star, E(B-V) in magnitudes. The magnitude above is that of the reddened star. "
+            "Reddening",
+            "Dust in front of the star, E(B-V) in magnitudes. The magnitude above is that of the reddened star. "
             "Nothing: no dust.",
             group="Star",
         ),
@@ -94,8 +90,8 @@ class Star(Section):
         Help("Unit of a spectrum file's wavelengths", "as in Angstrom, or 'nm air'"),
         Flag("--wavelength-unit"),
         Widget(
-            label="Unit of wavelengths",
-            hint="That of the file's wavelengths, such as Angstrom or Angstrom air. Nothing: what the file says.",
+            "Unit of wavelengths",
+            "That of the file's wavelengths, such as Angstrom or Angstrom air. Nothing: what the file says.",
             group="Own spectrum",
             suggestions=("nm", "Angstrom", "um", "nm air", "Angstrom air", "Hz", "eV"),
         ),
@@ -105,8 +101,8 @@ class Star(Section):
         Help("Unit of a spectrum file's fluxes", "as in 'W m-2 nm-1'"),
         Flag("--flux-unit"),
         Widget(
-            label="Unit of fluxes",
-            hint="That of the file's fluxes, such as W m-2 nm-1 or Jy. Nothing: what the file says.",
+            "Unit of fluxes",
+            "That of the file's fluxes, such as W m-2 nm-1 or Jy. Nothing: what the file says.",
             group="Own spectrum",
             suggestions=("erg s-1 cm-2 Angstrom-1", "W m-2 nm-1", "W m-2 um-1", "Jy", "photon s-1 cm-2 Angstrom-1"),
         ),
@@ -116,8 +112,8 @@ class Star(Section):
         Help("Library spectrum that continues a spectrum file beyond its ends, scaled to it"),
         Flag("--extend"),
         Widget(
-            label="Continue with",
-            hint="Library spectrum that continues the file beyond its ends, scaled to it, such as G2V. Nothing: none.",
+            "Continue with",
+            "Library spectrum that continues the file beyond its ends, scaled to it, such as G2V. Nothing: none.",
             group="Own spectrum",
             kind="library",
         ),
@@ -133,8 +129,8 @@ class Star(Section):
         Help("Distance of the star", "for energies"),
         Flag("--distance"),
         Widget(
-            label="Distance",
-            hint="With it, measured flares have luminosities and energies. Nothing: fluxes at the telescope alone.",
+            "Distance",
+            "With it, measured flares have luminosities and energies. Nothing: fluxes at the telescope alone.",
             group="Measurement",
         ),
     ] = None
@@ -147,8 +143,8 @@ class Star(Section):
         Help("Table of other stars near the star", "with separation, magnitude and spectral type, or of a Gaia query"),
         Flag("--neighbours"),
         Widget(
-            label="Neighbours",
-            hint="Other stars near the star, as CSV: name, separation (arcsec), magnitude and spectral_type, or the "
+            "Neighbours",
+            "Other stars near the star, as CSV: name, separation (arcsec), magnitude and spectral_type, or the "
             "columns of a Gaia query. The light of those within 47 arcsec enters.",
             group="Neighbours",
             kind="table",
@@ -160,8 +156,8 @@ class Star(Section):
         Help("The star's own row in that table, by name, or its coordinates"),
         Flag("--neighbours-of"),
         Widget(
-            label="The star itself",
-            hint="Its own row in that table, by name, or its coordinates, such as 290.68 +11.12; needed if the table "
+            "The star itself",
+            "Its own row in that table, by name, or its coordinates, such as 290.68 +11.12; needed if the table "
             "has positions but no separations.",
             group="Neighbours",
         ),
@@ -171,8 +167,8 @@ class Star(Section):
         Help("Share of the light of neighbours within the fibre's radius that enters it", "an assumption"),
         Flag("--neighbour-share"),
         Widget(
-            label="Share that enters",
-            hint="Share of the light of neighbours within 47 arcsec that enters the fibre; an assumption, since it is "
+            "Share that enters",
+            "Share of the light of neighbours within 47 arcsec that enters the fibre; an assumption, since it is "
             "not published.",
             group="Neighbours",
         ),
@@ -259,8 +255,8 @@ class FlareLight(Section):
         Help("Ratio of the flare's flux just below the Balmer edge to that just above", default="1"),
         Flag("--balmer-jump"),
         Widget(
-            label="Balmer jump",
-            hint="Flux just below 364.6 nm over that just above, by hydrogen recombination: 1 to 4 in most flares. "
+            "Balmer jump",
+            "Flux just below 364.6 nm over that just above, by hydrogen recombination: 1 to 4 in most flares. "
             "Nothing: a plain blackbody.",
         ),
         Quantity(
@@ -273,8 +269,7 @@ class FlareLight(Section):
         Help("Temperature of a second blackbody of the flare", "needs its area"),
         Flag("--second-temperature"),
         Widget(
-            label="Second temperature",
-            hint="A second blackbody in the flare, instead of a Balmer jump. Nothing: there is none.",
+            "Second temperature", "A second blackbody in the flare, instead of a Balmer jump. Nothing: there is none."
         ),
         Quantity("second_temperature", "temperature of the flare's second blackbody", "second temperature (K)"),
     ] = None
@@ -282,11 +277,7 @@ class FlareLight(Section):
         AreaRatio | None,
         Help("Area of the second blackbody over that of the first"),
         Flag("--second-area"),
-        Widget(
-            label="Second area",
-            hint="Area at the second temperature over that at the first, if there is one.",
-            first="0.05",
-        ),
+        Widget("Second area", "Area at the second temperature over that at the first, if there is one.", first="0.05"),
         Quantity("second_area", "area of the flare's second blackbody over that of the first", "second area"),
     ] = None
     lines: Annotated[
@@ -312,8 +303,8 @@ class FlareLight(Section):
         Help("Spectrum file of an observed or computed flare"),
         Flag("--flare-file"),
         Widget(
-            label="Own flare spectrum",
-            hint="Spectrum of an observed or computed flare without its star, in place of a blackbody. The amplitude "
+            "Own flare spectrum",
+            "Spectrum of an observed or computed flare without its star, in place of a blackbody. The amplitude "
             "scales it.",
             name="flare_file",
             place=2,
@@ -325,8 +316,8 @@ class FlareLight(Section):
         Help("Spectrum file of its star without the flare, which is subtracted"),
         Flag("--flare-quiescent"),
         Widget(
-            label="Star without the flare",
-            hint="Spectrum of the same star without the flare, on the same scale and in the same units. It is "
+            "Star without the flare",
+            "Spectrum of the same star without the flare, on the same scale and in the same units. It is "
             "subtracted. Nothing: the file holds the flare alone.",
             group="Own flare",
             name="flare_quiescent",
@@ -339,8 +330,8 @@ class FlareLight(Section):
         Help("Unit of the wavelengths of the flare's files"),
         Flag("--flare-wavelength-unit"),
         Widget(
-            label="Flare: unit of wavelengths",
-            hint="Such as Angstrom or Angstrom air. Nothing: what the file says.",
+            "Flare: unit of wavelengths",
+            "Such as Angstrom or Angstrom air. Nothing: what the file says.",
             group="Own flare",
             name="flare_wavelength_unit",
             suggestions=("nm", "Angstrom", "um", "nm air", "Angstrom air"),
@@ -351,8 +342,8 @@ class FlareLight(Section):
         Help("Unit of the fluxes of the flare's files"),
         Flag("--flare-flux-unit"),
         Widget(
-            label="Flare: unit of fluxes",
-            hint="Such as W m-2 nm-1 or Jy. Nothing: what the file says.",
+            "Flare: unit of fluxes",
+            "Such as W m-2 nm-1 or Jy. Nothing: what the file says.",
             group="Own flare",
             name="flare_flux_unit",
             suggestions=("erg s-1 cm-2 Angstrom-1", "W m-2 nm-1", "Jy"),
@@ -363,8 +354,8 @@ class FlareLight(Section):
         Help("Temperature of a blackbody that continues the flare's file beyond its ends"),
         Flag("--continue-at"),
         Widget(
-            label="Continue at",
-            hint="Temperature of a blackbody that continues the flare's spectrum beyond its ends. Nothing: it must "
+            "Continue at",
+            "Temperature of a blackbody that continues the flare's spectrum beyond its ends. Nothing: it must "
             "cover what the instrument sees.",
             group="Own flare",
         ),
@@ -374,8 +365,8 @@ class FlareLight(Section):
         Help("Take the flare for as bright at the telescope as its file states, in place of amplitudes"),
         Flag("--as-observed"),
         Widget(
-            label="As bright as observed",
-            hint="Whether the flare has the flux of its file at the telescope, in place of the amplitude above.",
+            "As bright as observed",
+            "Whether the flare has the flux of its file at the telescope, in place of the amplitude above.",
             group="Own flare",
             place=2,
         ),
@@ -457,8 +448,8 @@ class Flare(Section):
         ),
         Flag("--amplitude", "-a"),
         Widget(
-            label="Flare amplitude",
-            hint="By how much the flare at its peak brightens the star in the band of the Kepler satellite. In the "
+            "Flare amplitude",
+            "By how much the flare at its peak brightens the star in the band of the Kepler satellite. In the "
             "ultraviolet the rise is many times as large.",
             name="amplitude_percent",
             first="2",

@@ -204,15 +204,14 @@ class SearchChoice(Section):
         Help("False alarms of the search per star-day, star-month or star-year"),
         Flag("--false-alarms"),
         Widget(
-            label="False alarms",
-            hint="Expected number of detections that are only noise, in the time that the next field states.",
+            "False alarms", "Expected number of detections that are only noise, in the time that the next field states."
         ),
     ] = 1.0
     per: Annotated[
         Per,
         Help("Star-time of frames for the false alarms"),
         Flag("--alarms-per"),
-        Widget(label="False alarms per", hint="Observing time of one star to which the number of false alarms refers."),
+        Widget("False alarms per", "Observing time of one star to which the number of false alarms refers."),
     ] = "month"
     null: Annotated[
         Literal["sampled", "counted"],
