@@ -7,7 +7,7 @@ import datetime
 import difflib
 from collections.abc import Iterator, Sequence
 from functools import cache
-from typing import TYPE_CHECKING, Any, Self, TypeVar, cast, get_args, get_origin
+from typing import TYPE_CHECKING, Any, Self, TypeVar, cast, get_args
 
 from pydantic import (
     BaseModel,
@@ -105,41 +105,20 @@ MOST_FAULTS = 5
 
 def input_error(where: str, model: type[BaseModel], error: ValidationError) -> InputError:
     """Return the faults as one InputError whose message begins with the place where they are."""
-    faults: dict[tuple[str, ...], Any] = {}
+    faults: dict[tuple[int | str, ...], Any] = {}
     for fault in error.errors():
-        # A key of several types has an error for each of them.
-        key = _key_of(model, fault["loc"])
         # A list of which an entry is wrong counts as too short.
-        if not any(other[: len(key)] == key for other in faults):
-            faults[key] = fault
+        if not any(other[: len(fault["loc"])] == fault["loc"] for other in faults):
+            faults[fault["loc"]] = fault
     first, *others = (_input_error_of(model, fault) for fault in [*faults.values()][:MOST_FAULTS])
     left = len(faults) - MOST_FAULTS
     more = [InputError(f"and {left} more values are wrong", key=first.key)] if left > 0 else []
     return together([first.within(where), *others, *more])
 
 
-def _key_of(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str, ...]:
-    """Return the part of an error's location that names a key, with the numbers of entries in lists."""
-    path: list[str] = []
-    inner: type[BaseModel] | None = model
-    in_table = False
-    for part in location:
-        if in_table:
-            # Names in a table are the user's.
-            in_table = False
-        elif isinstance(part, str):
-            if inner is None:
-                break
-            annotation = field.annotation if (field := inner.model_fields.get(part)) else None
-            inner = model_in(annotation)
-            in_table = any(get_origin(kind) is dict for kind in (annotation, *get_args(annotation)))
-        path.append(str(part))
-    return tuple(path)
-
-
 def _input_error_of(model: type[BaseModel], first: Any) -> InputError:
-    path = [str(part) for part in first["loc"]]
-    key = ".".join(_key_of(model, first["loc"])) or model.__name__.lower()
+    path = [str(part) for part in first["loc"] if part != "[key]"]
+    key = ".".join(path) or model.__name__.lower()
     value, message = first.get("input"), first["msg"]
     match first["type"]:
         case "extra_forbidden":

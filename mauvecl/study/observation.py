@@ -89,9 +89,10 @@ class Observation(Section):
     ] = "net"
     mode: Annotated[Literal["auto", "frames", "stacked"], Help("How the frames of an exposure are drawn")] = "auto"
     recipe: Annotated[Literal["auto", "joint", "apart"], Help("How the noise of a frame is drawn")] = "auto"
-    changes: Annotated[dict[str, float | int | str], Help("Changed values of the instrument, by name")] = Field(
-        default_factory=dict
-    )
+    changes: Annotated[
+        dict[str, Annotated[float | int | str, Accepted("a number or text")]],
+        Help("Changed values of the instrument, by name"),
+    ] = Field(default_factory=dict)
 
     @field_validator("instrument")
     @classmethod

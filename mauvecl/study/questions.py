@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 from pydantic import Field, model_validator
 
 from mauvecl.schema.errors import InputError, shown
-from mauvecl.schema.fields import Flag, Help, Quantity, Range, Slider, Unit, Widget, first
+from mauvecl.schema.fields import Accepted, Flag, Help, Quantity, Range, Slider, Unit, Widget, first
 from mauvecl.schema.physical import Positive, Probability, Wavelength
 from mauvecl.schema.section import Section, check_different, check_needs, fields_of, read_axis, read_frames
 from mauvecl.study.observation import Observation, SkyLight
@@ -89,6 +89,7 @@ class BulkQuestion(Section):
 
     frames: Annotated[
         Literal["stack", "all"] | Annotated[tuple[Annotated[int, Range(0)], ...], Field(min_length=1)],
+        Accepted("stack, all, or numbers of frames"),
         Help("Stored frames", choices="stack (the sum of an exposure), all, or numbers of frames such as 0,4,9"),
         Flag("--frames", kind=str, read=read_frames),
     ] = "stack"
@@ -144,13 +145,14 @@ def _wrong_value(quantity: Quantity, text: str) -> InputError:
 
 
 Number = Annotated[float, Range()]
+NumberOrName = Annotated[float | str, Accepted("a number or a name")]
 
 
 class Axis(Section):
     """Axis of a map or sweep: explicit values, or `steps` values from `start` to `stop`."""
 
     quantity: Annotated[QuantityName, Help("Quantity that varies")]
-    values: Annotated[tuple[float | str, ...] | None, Help("Values")] = None
+    values: Annotated[tuple[NumberOrName, ...] | None, Help("Values")] = None
     start: Annotated[Number | None, Help("First of evenly spaced values")] = None
     stop: Annotated[Number | None, Help("Last of evenly spaced values")] = None
     steps: Annotated[Annotated[int, Range(2, 1000)] | None, Help("Number of evenly spaced values")] = None
