@@ -113,17 +113,14 @@ def changes_of(
 ) -> dict[str, dict[str, Any]]:
     """Return the values that keywords set, by sections of the study; stars have their own function."""
     changes: dict[str, dict[str, Any]] = {}
-    setting: dict[tuple[str, str], str] = {}
+    named: dict[str, str] = {}
     for name, keyword in keywords.items():
-        if keyword.section != "star" and name != "nuisance":
-            value = given[name]
-            if value is not None:
-                other = setting.setdefault((keyword.section, keyword.key), name)
-                if other != name:
-                    raise InputError(
-                        f"give either `{other}` or `{name}`: both set {keyword.section}.{keyword.key}", key=other
-                    )
-                changes.setdefault(keyword.section, {})[keyword.key] = keyword.value(value)
+        if given[name] is None or keyword.section == "star" or name == "nuisance":
+            continue
+        other = named.setdefault(keyword.path, name)
+        if other != name:
+            raise InputError(f"give either `{other}` or `{name}`: both set {keyword.path}", key=other)
+        changes.setdefault(keyword.section, {})[keyword.key] = keyword.value(given[name])
     if given.get("nuisance"):
         changes.setdefault("nuisances", {}).update(nuisances_of(nuisances, given["nuisance"]))
     return changes
@@ -154,17 +151,16 @@ def stars_of(
     if "star" not in given:
         return None
     names, magnitudes = given["star"], given["magnitude"]
-    of_stars = {keyword.key: given[name] for name, keyword in keywords.items() if keyword.section == "star"}
-    changed = {
-        key: value for key, value in of_stars.items() if value is not None and key not in ("library", "magnitude")
-    }
+    described = [name for name, each in keywords.items() if each.section == "star" and given[name] is not None]
+    changed = {keywords[name].key: given[name] for name in described if name not in ("star", "magnitude")}
     of_files = [key for key in changed if key in FILE_KEYS]
     if not (names or magnitudes or changed):
         return None
     if not (names or own):
         # Those of the default study are not meant.
-        described = next(name for name, each in keywords.items() if each.section == "star" and given[name] is not None)
-        raise InputError(f"`{described}` needs a star, such as `star='M3V'`; `mauvecl library` lists them", key="star")
+        raise InputError(
+            f"`{described[0]}` needs a star, such as `star='M3V'`; `mauvecl library` lists them", key="star"
+        )
     if names:
         # A name of an existing file is a file; other names are searched for in the library.
         each = [star for name in names for star in ([name] if is_there(name) else map(str.strip, name.split(",")))]

@@ -69,14 +69,10 @@ def test_each_flag_has_one_help_text() -> None:
 
 
 @pytest.mark.parametrize("name", VERBS)
-def test_help_has_examples_and_fits_80_columns(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import typer.rich_utils
-
+def test_help_has_examples_and_fits_80_columns(name: str, tmp_path: Path) -> None:
     if hasattr(VERBS[name], "commands"):
         return
-    monkeypatch.setattr(typer.rich_utils, "MAX_WIDTH", 80, raising=False)
-    monkeypatch.setenv("TERMINAL_WIDTH", "80")
-    shown = run(*name.split(), "--help", folder=tmp_path).stdout
+    shown = run(*name.split(), "--help", folder=tmp_path, columns=80).stdout
     examples = re.findall(rf"^ +(mauvecl {name}.*)$", shown.replace("\\\n", " "), re.MULTILINE)
     assert examples
     assert all(shlex.split(example)[0] == "mauvecl" for example in examples)
