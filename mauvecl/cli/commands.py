@@ -215,15 +215,9 @@ def _tell(store: Store, place: Path, session: Session) -> None:
     assumed = f"Assumed: {'; '.join(clauses)}."
     session.say([*messages, assumed])
     rows = [
-        {
-            "array": scene.path,
-            "star": scene.star,
-            "amplitude": scene.amplitude,
-            "shape": [store.rows, *scene.row],
-            "type": scene.dtype.name,
-        }
-        for scene in store.scenes
-    ]
+        {"array": scene.path, "star": scene.star, "amplitude": scene.amplitude, "shape": [store.rows, *scene.row],
+         "type": scene.dtype.name} for scene in store.scenes
+    ]  # fmt: skip
     if session.as_json:
         session.print_json(
             {"assumed": assumed, "messages": messages, "store": str(place), "bytes": store.n_bytes, "arrays": rows}

@@ -79,7 +79,9 @@ def question_room(store: Store, *, insist: bool) -> None:
     if insist:
         return
     there = next(folder for folder in (store.path, *store.path.absolute().parents) if folder.is_dir())
-    free = shutil.disk_usage(there).free + _held(store.path)
+    # An unfinished store already has some of its bytes.
+    held = sum(path.stat().st_size for path in store.path.glob("star-*/*/c/*/*"))
+    free = shutil.disk_usage(there).free + held
     if store.n_bytes > free:
         rows = free // (store.n_bytes // store.rows)
         raise InputError(
@@ -87,11 +89,6 @@ def question_room(store: Store, *, insist: bool) -> None:
             f"{_size(free)}; give at most {rows} or another place, or --insist to start anyway",
             key="realisations",
         )
-
-
-def _held(folder: Path) -> int:
-    """Return the bytes that an unfinished store already has."""
-    return sum(path.stat().st_size for path in folder.glob("star-*/*/c/*/*")) if folder.is_dir() else 0
 
 
 def _size(size: float) -> str:

@@ -22,16 +22,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError
 
 from mauvecl.schema.errors import InputError, shortened, shown, together
-from mauvecl.schema.fields import (
-    Unit,
-    first,
-    is_quantity,
-    is_truth,
-    says_none,
-    with_unit,
-    without_unit,
-    word_of,
-)
+from mauvecl.schema.fields import Unit, first, is_quantity, is_truth, says_none, with_unit, without_unit, word_of
 
 if TYPE_CHECKING:
     from pydantic._internal._model_construction import ModelMetaclass
@@ -129,7 +120,7 @@ def _input_error_of(model: type[BaseModel], first: Any) -> InputError:
         case "missing":
             return InputError(f"{key!r} is missing, but needs a value", key=key)
         case "value_error":
-            return _own_error(model, path, key, first)
+            return _own_error(model, path, first)
         case "too_long" | "too_short":
             expected = message.partition("should have ")[2].partition(" after")[0]
         case "truth":
@@ -143,18 +134,19 @@ def _input_error_of(model: type[BaseModel], first: Any) -> InputError:
     return InputError.of(key, value, expected)
 
 
-def _own_error(model: type[BaseModel], path: list[str], key: str, first: Any) -> InputError:
+def _own_error(model: type[BaseModel], path: list[str], first: Any) -> InputError:
     """Return the error that a validator raised, with the key where its sentence does not name it."""
-    inner = first["ctx"]["error"]
-    message, field = str(inner), _fields(model, path[:-1]).get(path[-1]) if path else None
+    key, field = ".".join(path), _fields(model, path[:-1]).get(path[-1]) if path else None
     is_value = field is not None and model_in(field.annotation) is None
-    if not isinstance(inner, InputError):
-        inner = InputError(message, key=key if path else None)
-    name = inner.key
+    found = first["ctx"]["error"]
+    if not isinstance(found, InputError):
+        found = InputError(str(found))
+    name = found.key
     # A record's own error names the key; that of a single value's validator may not.
-    found = inner.within(key) if is_value and path[-1] not in message else inner
+    if is_value and path[-1] not in str(found):
+        found = found.within(key)
     if name is None or path[-1:] == [name]:
-        found.key = ".".join(path) or None
+        found.key = key or None
     elif name in _fields(model, path) or (is_value and isinstance(first.get("input"), dict)):
         # Validators of records, and of tables that are no records, name a key of them.
         found.key = ".".join([*path, name])

@@ -111,16 +111,10 @@ def _along_orbit(study: Study, frame_s: float, changes: dict[str, Any]) -> Stare
 def unused_lines(exposure_s: float, stare: Stare, events: Sequence[Event]) -> list[str]:
     """Return messages about settings without effect on the stare: the exposure, and flares that peak outside it."""
     lines = check_contributions(events, stare.start_s, stare.frame_s)
-    if exposure_s != stare.frame_s:
-        lines.insert(
-            0,
-            Message(
-                f"A stare consists of frames of {stare.frame_s:g} s: observation.exposure_s = {exposure_s:g} s is not "
-                "used.",
-                "not used",
-            ),
-        )
-    return lines
+    if exposure_s == stare.frame_s:
+        return lines
+    frames = f"A stare consists of frames of {stare.frame_s:g} s"
+    return [Message(f"{frames}: observation.exposure_s = {exposure_s:g} s is not used.", "not used"), *lines]
 
 
 def orbit_lines(stare: StareQuestion, orbit: OrbitQuestion, frame_s: float) -> list[str]:
