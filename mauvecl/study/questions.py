@@ -29,14 +29,6 @@ QUANTITIES = {
     for path, field in fields_of(section, (name,))
     if (one := first(field, Quantity)) is not None
 }
-#: Units of the quantities that have one.
-UNITS = {name: quantity.unit for name, quantity in QUANTITIES.items() if quantity.unit}
-
-
-#: Magnitudes and exposures of the default sweep of `gaussian`.
-MAGNITUDES, EXPOSURES_S = (4.0, 6.0, 8.0, 10.0, 12.0), (5.0, 50.0, 600.0)
-
-
 if TYPE_CHECKING:
     QuantityName = str
 else:
@@ -277,8 +269,8 @@ class Sweep(Section):
 
 def formula_grid(*, magnitude: bool = True, exposure_s: float | None = None) -> Sweep:
     """Return the default sweep of `gaussian`, over magnitudes and over exposures, or at a given exposure."""
-    axes = [Axis(quantity="magnitude", values=MAGNITUDES)] if magnitude else []
-    exposures = EXPOSURES_S if exposure_s is None else (exposure_s,)
+    axes = [Axis(quantity="magnitude", values=(4.0, 6.0, 8.0, 10.0, 12.0))] if magnitude else []
+    exposures = (5.0, 50.0, 600.0) if exposure_s is None else (exposure_s,)
     return Sweep(axes=(*axes, Axis(quantity="exposure", values=exposures)))
 
 

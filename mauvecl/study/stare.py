@@ -109,10 +109,8 @@ class StareQuestion(Section):
 
     def _check_values(self) -> None:
         if self.orbit_gap_s >= self.orbit_s:
-            raise InputError(
-                f"stare.orbit_gap_s = {self.orbit_gap_s:g} must be shorter than the orbit of {self.orbit_s:g} s",
-                key="orbit_gap_s",
-            )
+            expected = f"shorter than the orbit of {self.orbit_s:g} s"
+            raise InputError.of("stare.orbit_gap_s", self.orbit_gap_s, expected, unit="s")
         for low, high in self.bands_nm:
             if not 0 < low < high:
                 raise InputError.of("stare.bands_nm", (low, high), "ascending wavelengths", unit="nm")
@@ -290,15 +288,10 @@ class InjectionQuestion(Section):
 
     def _check_values(self) -> None:
         if self.low is not None and self.high is not None and not self.low < self.high:
-            raise InputError(
-                f"injections.low must be below high, but is {self.low:g} for high = {self.high:g}", key="low"
-            )
+            raise InputError.of("injections.low", self.low, f"below high = {self.high:g}")
         if self.half_width_low_s > self.half_width_high_s:
-            raise InputError(
-                f"injections.half_width_low_s = {self.half_width_low_s:g} must be below "
-                f"half_width_high_s = {self.half_width_high_s:g}",
-                key="half_width_low_s",
-            )
+            expected = f"below half_width_high_s = {self.half_width_high_s:g}"
+            raise InputError.of("injections.half_width_low_s", self.half_width_low_s, expected)
 
     @property
     def half_widths_s(self) -> tuple[float, ...]:
