@@ -25,6 +25,7 @@ from mauvecl.schema.errors import SUBJECT, InputError, printable
 
 if TYPE_CHECKING:
     import typer
+    from rich.console import Console
     from rich.table import Table
 
     from mauvecl.runs.pool import PoolProgress
@@ -277,11 +278,16 @@ def _time_left(seconds: float) -> str:
     return f"{seconds:.0f} s left"
 
 
-def show(lines: Sequence[str]) -> None:
-    """Print plain lines on standard output, broken between words on a terminal."""
+def _console(**how: Any) -> Console:
     from rich.console import Console
 
-    console = Console(highlight=False, soft_wrap=True, markup=False, emoji=False)
+    # Names may contain brackets and colons, which are not markup here.
+    return Console(highlight=False, markup=False, emoji=False, **how)
+
+
+def show(lines: Sequence[str]) -> None:
+    """Print plain lines on standard output, broken between words on a terminal."""
+    console = _console(soft_wrap=True)
     for line in lines:
         console.print(_broken(line, console.width) if console.is_terminal else line)
 
@@ -304,14 +310,10 @@ def show_view(view: View, *, wide: bool = True) -> bool:
     Unless `wide`, a table that is too wide is printed without the columns of details, and first columns whose values
     all rows share stand in the title. A `wide` table in a pipe is as wide as it needs to be.
     """
-    from rich.console import Console
-
     if view.table is None:
         show([view.title])
         return False
-    # Names may contain brackets and colons, which are not markup here.
-    how: dict[str, Any] = {"highlight": False, "markup": False, "emoji": False}
-    console = Console(**how)
+    console = _console()
     room = WIDEST if wide and not console.is_terminal else console.width
     title, columns = view.title, _printed(view)
     left_out = not wide and bool(view.details) and _width(columns) > room
@@ -328,7 +330,7 @@ def show_view(view: View, *, wide: bool = True) -> bool:
     show([title])
     for part in _parts(columns, room):
         # A column that exceeds the terminal is printed completely.
-        Console(**how, width=max(room, _width(part))).print(_table(part))
+        _console(width=max(room, _width(part))).print(_table(part))
     return left_out
 
 

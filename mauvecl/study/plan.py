@@ -341,12 +341,9 @@ def _target(
         if column is None or not text or (key == "coordinates" and is_missing_position(text)):
             continue
         unit = first(field, Unit)
-        if unit is None and first(field, Range) is None:
-            target[key] = text
-        else:
-            # A text that is no number is refused with the key's own sentence.
-            is_number = not isinstance(number_or_text(text), str)
-            target[key] = rows.number(column, row, "" if unit is None else unit.name) if is_number else text
+        # A text that is no number is refused with the key's own sentence.
+        is_number = (unit or first(field, Range)) and not isinstance(number_or_text(text), str)
+        target[key] = rows.number(column, row, unit.name if unit else "") if is_number else text
     _check_band(rows, columns["magnitude"], row)
     parallax = columns["parallax"]
     if parallax is not None and "distance_pc" not in target:
