@@ -142,15 +142,10 @@ def test_extreme_numbers_raise(value: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "text",
-    [
-        "a = " + "[" * 20_000 + "]" * 20_000,
-        "a = " + "{b = " * 2000 + "1" + "}" * 2000,
-        ".".join("a" * 50_000) + " = 1",
-        "[" + ".".join("a" * 5000) + "]",
-        "a = " + "[" * 40 + "]" * 40,
-    ],
+    ["a = " + "[" * 20_000 + "]" * 20_000, "a = " + "{b = " * 2000 + "1" + "}" * 2000,
+     ".".join("a" * 50_000) + " = 1", "[" + ".".join("a" * 5000) + "]", "a = " + "[" * 40 + "]" * 40],
     ids=["arrays", "tables", "a dotted key", "a dotted table", "a few more than any study"],
-)
+)  # fmt: skip
 def test_deep_nesting_is_refused(text: str, tmp_path: Path) -> None:
     """Refuse keys of 50 000 parts, which raised RecursionError or took 3.8 GB."""
     for name in ("deep.toml", "deep"):
@@ -206,14 +201,10 @@ def test_output_that_is_a_folder_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "words",
-    [
-        (*DETECT, "--cluster", "tcp://\udcff:1"),
-        (*DETECT, "--cluster", "local:" + "9" * 5000),
-        ("library", "fetch", "ngsl:HD 1", "--from", "http://\udcff/"),
-        ("verify", "deep"),
-    ],
+    [(*DETECT, "--cluster", "tcp://\udcff:1"), (*DETECT, "--cluster", "local:" + "9" * 5000),
+     ("library", "fetch", "ngsl:HD 1", "--from", "http://\udcff/"), ("verify", "deep")],
     ids=["cluster", "long cluster", "collection", "deep store"],
-)
+)  # fmt: skip
 def test_what_tables_of_refusals_cannot_hold_is_refused(words: tuple[str, ...], tmp_path: Path) -> None:
     (tmp_path / "deep").mkdir()
     (tmp_path / "deep" / "zarr.json").write_text("[" * 100_000)
