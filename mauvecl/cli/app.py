@@ -9,6 +9,7 @@ import json
 import os
 import re
 import sys
+import textwrap
 import time
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache
@@ -295,13 +296,9 @@ def text_of(text: str | None) -> str:
 
 def _broken(command: str) -> str:
     """Divide a command longer than 72 characters into lines that end in a backslash before a flag."""
-    lines = [""]
-    for part in re.split(r" (?=-)", command):
-        if lines[-1] and len(lines[-1]) + len(part) > 72:
-            lines[-1] += " \\"
-            lines.append("   ")
-        lines[-1] += f" {part}" if lines[-1] else part
-    return "\n".join(lines)
+    glued = re.sub(r" (?!-)", "\0", command)
+    lines = textwrap.wrap(glued, 73, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False)
+    return " \\\n".join(lines).replace("\0", " ")
 
 
 #: Functions of the commands without a study.

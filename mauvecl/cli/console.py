@@ -189,16 +189,10 @@ def _write_traceback(error: Exception) -> Path | str:
     from mauvecl.host import VERSION
 
     now = datetime.datetime.now(datetime.UTC).strftime("%Y%m%dT%H%M%S")
-    text = "\n".join(
-        [
-            f"mauvecl {VERSION}, Python {platform.python_version()}, {platform.platform()}",
-            f"command: {sys.argv!r}"[:20_000],
-            "".join(traceback.format_exception(error, limit=-60)),
-        ]
-    )
-    for folder in (_folder, Path(tempfile.gettempdir())):
-        if folder is None:
-            continue
+    versions = f"mauvecl {VERSION}, Python {platform.python_version()}, {platform.platform()}"
+    steps = "".join(traceback.format_exception(error, limit=-60))
+    text = "\n".join([versions, f"command: {sys.argv!r}"[:20_000], steps])
+    for folder in filter(None, (_folder, Path(tempfile.gettempdir()))):
         with contextlib.suppress(OSError):
             # A random name, which nobody can have created before.
             handle, name = tempfile.mkstemp(prefix=f"mauvecl-fault-{now}-", suffix=".txt", dir=folder)

@@ -334,9 +334,7 @@ class Case:
             return unknown
         if given is None and "star" not in unknown.names:
             unknown = unknown.with_spectrum("star", quiet.net_source_dn, math.inf)
-        if stare is not None:
-            return unknown.without(["light"]) if given is None else unknown
-        drawn = FactorDistributions.from_processes(self.processes, quiet)
+        drawn = FactorDistributions.from_processes(self.processes, quiet) if stare is None else None
         light = None if drawn is None else drawn.spreads.get("light")
         if light is None:
             return unknown.without(["light"]) if given is None else unknown

@@ -83,9 +83,9 @@ def stare_of(study: Study, instrument: Instrument) -> Stare:
             **changes,
         )
     for _, changed, _, mean in priors:
-        value = stare.temperature_c + mean if changed == "temperature" else getattr(stare, changed) * mean
-        known: dict[str, Any] = {"temperature_c" if changed == "temperature" else changed: value}
-        stare = replace(stare, **known)
+        name = "temperature_c" if changed == "temperature" else changed
+        value: Any = getattr(stare, name)
+        stare = replace(stare, **{name: value + mean if changed == "temperature" else value * mean})
     return stare
 
 
@@ -124,10 +124,8 @@ def orbit_lines(stare: StareQuestion, orbit: OrbitQuestion, frame_s: float) -> l
     if not stare.along_orbit:
         return []
     times = TimeGrid(orbit.start, stare.duration_s / DAY_S, frame_s)
-    assumed = (
-        "Limits, temperatures and windows of a stare along the orbit are assumptions; stray light is not modelled."
-    )
-    return [*orbit.orbit().messages(times), assumed]
+    assumed = "Limits, temperatures and windows of a stare along the orbit are assumptions"
+    return [*orbit.orbit().messages(times), f"{assumed}; stray light is not modelled."]
 
 
 def threshold_line(title: str, threshold: float) -> str:
