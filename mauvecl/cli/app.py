@@ -212,11 +212,8 @@ def remove(names: Annotated[list[str], typer.Argument(help="Names of kept stars.
 def _tell(star: OwnStar, quiet: bool) -> None:
     if quiet:
         return
-    lines = [
-        f"Kept {star.name}: --star {json.dumps(star.name) if ' ' in star.name else star.name}",
-        *star.notes,
-        *star.messages,
-    ]
+    name = json.dumps(star.name) if " " in star.name else star.name
+    lines = [f"Kept {star.name}: --star {name}", *star.notes, *star.messages]
     if star.unscaled:
         lines.append(f"It needs --magnitude: {star.unscaled}.")
     if star.dereddened:

@@ -225,9 +225,8 @@ class Session(Options):
             self._leave_all(answer)
         if self.as_json:
             content = answer.as_json()
-            said = [with_flags(line) for line in (*self._notes_on(answer), *content["messages"])]
-            remarks = {"headline": answer.headline, "assumed": answer.assumed, "messages": said}
-            self.print_json(remarks | {key: value for key, value in content.items() if key != "messages"})
+            said = [with_flags(line) for line in (*self._notes_on(answer), *content.pop("messages"))]
+            self.print_json({"headline": answer.headline, "assumed": answer.assumed, "messages": said} | content)
             return
         self.say([answer.headline])
         left_out = [show_view(view, wide=self.wide) for view in answer.all_views]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -171,8 +172,6 @@ class PlanTarget(Section):
 
     def target(self, simbad: bool) -> Target:
         """Look up the target; given coordinates replace those of its name."""
-        from dataclasses import replace
-
         from mauvecl.host.orbit.orbit import Target
 
         if self.coordinates is None:

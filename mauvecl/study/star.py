@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
@@ -230,8 +231,6 @@ class Star(Section):
 
     def applied(self, source: Source) -> Source:
         """Return a spectrum with the star's temperature, bins, dust and magnitude."""
-        from dataclasses import replace
-
         if self.effective_temperature_k is not None:
             source = replace(source, temperature_k=self.effective_temperature_k)
         if self.bin_nm is not None:
@@ -384,33 +383,22 @@ class FlareLight(Section):
 
     def at_temperature(self, temperature_k: float) -> FlareSpectrum:
         """Return the spectrum at a temperature, which a spectrum from a file ignores."""
-        from mauvecl.host.stars.flare_spectra import (
-            BalmerFlare,
-            Blackbody,
-            FlareWithLines,
-            ObservedFlare,
-            TwoBlackbodies,
-        )
+        from mauvecl.host.stars import flare_spectra as spectra
 
-        light: FlareSpectrum = Blackbody(temperature_k)
+        light: FlareSpectrum = spectra.Blackbody(temperature_k)
         if self.file is not None:
-            light = ObservedFlare.read(
-                self.file,
-                self.quiescent,
-                wavelength_unit=self.wavelength_unit,
-                flux_unit=self.flux_unit,
-                continue_at_k=self.continue_at_k,
-            )
+            units = {"wavelength_unit": self.wavelength_unit, "flux_unit": self.flux_unit}
+            light = spectra.ObservedFlare.read(self.file, self.quiescent, continue_at_k=self.continue_at_k, **units)
         elif self.second_temperature_k is not None and self.second_area is not None:
-            light = TwoBlackbodies(temperature_k, self.second_temperature_k, self.second_area)
+            light = spectra.TwoBlackbodies(temperature_k, self.second_temperature_k, self.second_area)
         elif self.balmer_jump is not None:
-            light = BalmerFlare(temperature_k, self.balmer_jump, self.electron_temperature_k)
+            light = spectra.BalmerFlare(temperature_k, self.balmer_jump, self.electron_temperature_k)
         if not (self.lines or self.line_fluxes):
             return light
         scaled = (
             {name: self.line_scale * value for name, value in each.items()} for each in (self.lines, self.line_fluxes)
         )
-        return FlareWithLines(light, *scaled)
+        return spectra.FlareWithLines(light, *scaled)
 
     def with_value(self, path: Sequence[str], value: Any) -> Self:
         """Return a copy with another value of one key; raises InputError if the key has no effect."""

@@ -165,18 +165,14 @@ def set_key(data: Any, path: list[str], value: Any, text: str) -> None:
     for part in parents:
         if isinstance(data, list | tuple):
             if part not in (numbers := [str(i) for i in range(len(data))]):
-                raise InputError(
-                    f"setting = {shortened(text)}: the entry must be 0 to {len(numbers) - 1}, not {shortened(part)}",
-                    key="setting",
-                )
+                fault = f"the entry must be 0 to {len(numbers) - 1}, not {shortened(part)}"
+                raise InputError(f"setting = {shortened(text)}: {fault}", key="setting")
             data = data[int(part)]
         elif isinstance(data, dict):
             data = data.setdefault(part, {})
     if not isinstance(data, dict):
-        raise InputError(
-            f"setting = {shortened(text)}: {shortened('.'.join(parents))} must be a section with keys, but is a value",
-            key="setting",
-        )
+        fault = f"{shortened('.'.join(parents))} must be a section with keys, but is a value"
+        raise InputError(f"setting = {shortened(text)}: {fault}", key="setting")
     data[last] = value
 
 
