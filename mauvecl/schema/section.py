@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import datetime
 import difflib
+import math
 from collections.abc import Iterator, Sequence
 from functools import cache
 from typing import TYPE_CHECKING, Any, Self, TypeVar, cast, get_args
@@ -297,10 +298,12 @@ def read_number(text: str, name: str, unit: str = "") -> float:
 
 
 def number_or_text(text: str) -> float | str:
-    """Return the number that a text states, or the text itself, which may have a unit."""
-    for kind in (int, float):
-        with contextlib.suppress(ValueError):
-            return kind(text)
+    """Return the finite number that a text states, or the text itself, which may have a unit."""
+    with contextlib.suppress(ValueError):
+        return int(text)
+    with contextlib.suppress(ValueError):
+        if math.isfinite(value := float(text)):
+            return value
     return text
 
 

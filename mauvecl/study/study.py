@@ -434,8 +434,7 @@ class Study(Section):
     @property
     def has_neighbours(self) -> bool:
         """True if a star or a target of a plan has a table of neighbours."""
-        targets = any(target.neighbours is not None for target in self.plan.targets)
-        return targets or any(star.neighbours is not None for star in self.star)
+        return any(one.neighbours is not None for one in (*self.star, *self.plan.targets))
 
 
 def _without_empty(data: Any) -> Any:
