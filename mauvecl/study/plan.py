@@ -90,11 +90,13 @@ class OrbitQuestion(Section):
     @field_validator("start")
     @classmethod
     def _time(cls, given: str) -> str:
-        from mauvecl.host.exposure.sky import parse_time
-        from mauvecl.host.tables.units import offline
+        # The default is a time, for which astropy need not be loaded.
+        if given != cls.model_fields["start"].default:
+            from mauvecl.host.exposure.sky import parse_time
+            from mauvecl.host.tables.units import offline
 
-        with offline():
-            parse_time(given, "start")
+            with offline():
+                parse_time(given, "start")
         return given
 
     def orbit(self) -> Orbit:
