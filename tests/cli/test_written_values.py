@@ -10,16 +10,12 @@ from refusals import refused
 from mauvecl import Study
 
 
-def build(section: str, **values: object) -> Study:
-    return Study.build({section: values}, "test")
-
-
 def test_lists_of_a_study_have_units() -> None:
-    assert build("flare", amplitudes=["24 %", "3%", 0.5]).flare.amplitudes == pytest.approx((0.24, 0.03, 0.5))
+    assert Study.of(amplitude=["24 %", "3%", 0.5]).flare.amplitudes == pytest.approx((0.24, 0.03, 0.5))
     energies = ["1e33 erg", "1e26J", "1e33", "+1.0E+33erg"]
-    assert build("stare", energies_erg=energies).stare.energies_erg == pytest.approx((1e33,) * 4)
+    assert Study.of(energy=energies).stare.energies_erg == pytest.approx((1e33,) * 4)
     axis = {"quantity": "exposure", "values": ["1 min", 5, "2h"]}
-    assert build("sweep", axes=[axis]).sweep.axes[0].points() == (60.0, 5.0, 7200.0)
+    assert Study.of(sweep=[axis]).sweep.axes[0].points() == (60.0, 5.0, 7200.0)
 
 
 def test_flags_take_units(tmp_path: Path) -> None:
