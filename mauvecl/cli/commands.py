@@ -309,11 +309,10 @@ def export(
 
     Example: mauvecl export frames.zarr some.fits --array star-1/quiescent --rows 0:1000
     """
-    from mauvecl.runs.export import Selection
-    from mauvecl.runs.export import export as write
+    from mauvecl.runs.export import Selection, export
     from mauvecl.runs.store import Store
 
-    write(Selection.of(Store.open(store), array, _rows_of(rows)), file, replace=replace)
+    export(Selection.of(Store.open(store), array, _rows_of(rows)), file, replace=replace)
     if not quiet:
         show([f"Wrote {file}, {file.stat().st_size / 2**20:.1f} MiB."])
 

@@ -22,9 +22,8 @@ if TYPE_CHECKING:
 def study_argument(flags: Collection[str]) -> Any:
     """Return the annotation of the argument that is a study, or in its place what a flag takes."""
     other = next((f", or {what}" for flag, (what, *_) in PLACES.items() if flag in flags and what), "")
-    described = f"Study (TOML), the ECSV table of an answer{other}; flags override it."
     argument = typer.Argument(
-        help=described,
+        help=f"Study (TOML), the ECSV table of an answer{other}; flags override it.",
         show_default=False,
         autocompletion=lambda incomplete: complete_star(incomplete) if incomplete else _files(incomplete),
     )

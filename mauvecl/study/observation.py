@@ -327,7 +327,6 @@ class NuisanceChoice(create_model("_Amplitudes", __base__=Section, **_keys)):  #
 #: Choice of unknowns with which everything but the noise is known.
 KNOWN = NuisanceChoice(usual=False)
 
-
 Draws = Annotated[
     int, Range(0, 4096), Help("Draws of unknown instrument values over which the answer is averaged"), Flag("--unknown")
 ]

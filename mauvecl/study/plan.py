@@ -115,7 +115,6 @@ class OrbitQuestion(Section):
 #: Keys of a target that hold paths, relative to its table or the study file.
 PATH_KEYS = ("rates_file", "neighbours")
 
-
 #: Keys of flare rates, each of another distribution.
 RATES = ("rates", "mass_msun", "alpha", "rates_file")
 

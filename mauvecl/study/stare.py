@@ -37,7 +37,6 @@ if TYPE_CHECKING:
 #: Orbital period rounded down to a multiple of the frame time, s.
 ORBIT_FRAMES_S = 5680.0
 
-
 #: Known changes during a stare.
 KNOWN_CHANGES = ("thermal", "variability", "throughput", "sky")
 Spreads = dict[Changing, Positive]

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-
 #: Smallest distance of a prior's cuts from its mean, in standard deviations, for a normal distribution to replace it:
 #: 6e-7 of the values lie beyond.
 NEGLIGIBLE_CUT_SD = 5.0

@@ -330,21 +330,14 @@ class Study(Section):
     def with_enough_tails(self, *, sampled: bool = True, raised: bool = False) -> tuple[Self, list[str]]:
         """Return a copy whose thresholds can be found, with a message if it differs.
 
-        Parameters
-        ----------
-        sampled : bool
-            Whether importance sampling may find thresholds that cannot be counted.
-        raised : bool
-            Whether more realisations are drawn instead, up to `MOST_RAISED`.
+        Importance sampling may find thresholds that cannot be counted if `sampled`; if `raised`, more realisations are
+        drawn instead, up to `MOST_RAISED`.
         """
         run = self.run
         if not 0 < run.fap < 1 or countable(run.fap, run.realisations):
             return self, []
-        least = least_countable(run.fap)
-        few = (
-            f"{run.realisations} realisations are too few to count thresholds with a false-alarm probability of "
-            f"{run.fap:g}, so "
-        )
+        least, wanted = least_countable(run.fap), f"thresholds with a false-alarm probability of {run.fap:g}"
+        few = f"{run.realisations} realisations are too few to count {wanted}, so "
         if raised and least <= MOST_RAISED:
             return self.with_settings([f"run.realisations={least}"]), [f"{few}{least} are drawn."]
         if not sampled:
