@@ -287,16 +287,6 @@ def refusal(name: str, text: str, expected: str) -> InputError:
     return error
 
 
-def read_number(text: str, name: str, unit: str = "") -> float:
-    """Read a number in a unit, which may be followed by another one, as in "10 min" or "24%"."""
-    try:
-        value = with_unit(text, unit)
-        return float(text) if value is None else value
-    except ValueError as error:
-        accepted = f" in {Unit(unit).written}, or in a unit of the same kind" if unit else ""
-        raise refusal(name, text, f"a number{accepted}") from error
-
-
 def number_or_text(text: str) -> float | str:
     """Return the finite number that a text states, or the text itself, which may have a unit."""
     with contextlib.suppress(ValueError):
@@ -360,7 +350,8 @@ def read_declinations(text: str, name: str) -> tuple[float, float] | str:
 def _pair(text: str, name: str, expected: str, unit: str) -> tuple[float, float]:
     """Read two numbers, each of which may have a unit of its own."""
     try:
-        low, high = (read_number(part, name, unit) for part in text.split(":"))
+        measures = ((part, with_unit(part, unit)) for part in text.split(":"))
+        low, high = (float(part) if value is None else value for part, value in measures)
     except ValueError as error:
         raise refusal(name, text, expected) from error
     return low, high
