@@ -36,7 +36,7 @@ from mauvecl.schema.section import Section, built, fields_of
 from mauvecl.study.analyses import CalibrateQuestion, ChangeQuestion, DataChoice, MeasureQuestion
 from mauvecl.study.keywords import Keyword, changes_of, stars_of, values_of
 from mauvecl.study.observation import NuisanceChoice, Observation, Run, SkyLight, Unknowns
-from mauvecl.study.plan import OrbitQuestion, PlanQuestion
+from mauvecl.study.plan import OrbitQuestion, PlanQuestion, PlanTarget
 from mauvecl.study.questions import (
     QUANTITIES,
     Axis,
@@ -427,7 +427,8 @@ class Study(Section):
     @property
     def has_neighbours(self) -> bool:
         """True if a star or a target of a plan has a table of neighbours."""
-        return any(one.neighbours is not None for one in (*self.star, *self.plan.targets))
+        stars: tuple[Star | PlanTarget, ...] = (*self.star, *self.plan.targets)
+        return any(star.neighbours is not None for star in stars)
 
 
 def _without_empty(data: Any) -> Any:
