@@ -5,7 +5,6 @@ import io
 import os
 import subprocess
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 from unittest import mock
 
@@ -20,17 +19,14 @@ SMALL_SHARDS = [
 ]
 
 
-@dataclass(frozen=True)
-class Done:
-    stdout: str
-    stderr: str
+Done = subprocess.CompletedProcess[str]
 
 
 def run(*words: str | Path, folder: Path, code: int = 0, columns: int = 200) -> Done:
     """Run a command in this process, which is faster than `started`, in a terminal of some width."""
     found, out, reported = ended(*words, folder=folder, columns=columns)
     assert found == code, out + reported
-    return Done(out, reported)
+    return Done(words, code, out, reported)
 
 
 def ended(*words: str | Path, folder: Path, columns: int = 200) -> tuple[int, str, str]:
@@ -62,4 +58,4 @@ def started(*words: str | Path, folder: Path, code: int = 0, **environment: str)
     )
     assert done.returncode == code, done.stdout + done.stderr
     assert "Traceback" not in done.stderr
-    return Done(done.stdout, done.stderr)
+    return done

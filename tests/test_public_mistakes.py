@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scenes import study_of_g2v
 from test_validation import FUNCTIONS, PARAMETERS, accepted, annotation, anything, arguments, example, holds_arrays
 
 import mauvecl
@@ -38,10 +39,7 @@ def instances() -> dict[type, Any]:
     star = mauvecl.Source.from_library("G2V").at_magnitude(7.4)
     part = mauvecl.Instrument.load("mauvesim").with_(output_min_nm=300.0, output_max_nm=306.0)
     quiet, flare = (mauvecl.expect(one, part, exposure=5) for one in (star, star.flaring(0.5)))
-    stare = {"output_min_nm": 300.0, "output_max_nm": 306.0}
-    study = mauvecl.Study.build(
-        {"star": [{"library": "G2V", "magnitude": 7.4}], "observation": {"changes": stare}}, "t"
-    )
+    study = study_of_g2v(observation={"changes": {"output_min_nm": 300.0, "output_max_nm": 306.0}})
     time = 5.0 * np.arange(30)
     model = mauvecl.FlareModel.of(star, part, quiet)
     made = (

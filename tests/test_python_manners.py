@@ -10,24 +10,19 @@ import numpy as np
 import pytest
 from marks import long_but
 from refusals import refused
+from scenes import study_of_g2v
 
 import mauvecl
 from mauvecl import Engine, Expectation, Instrument, Pool, Sky, Source, Study, detect, expect, snr
 
 
 def study(**settings: object) -> Study:
-    asked = Study.build(
-        {
-            "star": [{"library": "G2V", "magnitude": 7.4}],
-            "flare": {"amplitudes": [0.1, 0.3]},
-            "run": {"realisations": 5000, "fap": 0.05, "statistics": ["matched", "chi2"]},
-            "observation": {"changes": {"output_min_nm": 300.0, "output_max_nm": 322.0}},
-            "map": {
-                "x": {"quantity": "magnitude", "values": [7.0, 8.0]},
-                "y": {"quantity": "amplitude", "values": [0.1, 0.3]},
-            },
-        },
-        "test",
+    x, y = {"quantity": "magnitude", "values": [7.0, 8.0]}, {"quantity": "amplitude", "values": [0.1, 0.3]}
+    asked = study_of_g2v(
+        flare={"amplitudes": [0.1, 0.3]},
+        run={"realisations": 5000, "fap": 0.05, "statistics": ["matched", "chi2"]},
+        observation={"changes": {"output_min_nm": 300.0, "output_max_nm": 322.0}},
+        map={"x": x, "y": y},
     )
     return asked.with_settings([f"{key}={value}" for key, value in settings.items()])
 

@@ -38,7 +38,7 @@ from mauvecl.study.cases import (
     worst_first,
 )
 from mauvecl.study.observation import KNOWN, Unknowns
-from mauvecl.study.questions import QUANTITIES, UNITS
+from mauvecl.study.questions import QUANTITIES
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
@@ -180,7 +180,7 @@ STATISTIC_COLUMN = Column("statistic", description="detection statistic", headin
 
 
 def _limit_columns(answer: LimitAnswer) -> tuple[Column, ...]:
-    of, digits, unit = answer.study.limit.of, DIGITS[answer.study.limit.of], UNITS.get(answer.study.limit.of, "")
+    of, digits, unit = answer.study.limit.of, DIGITS[answer.study.limit.of], QUANTITIES[answer.study.limit.of].unit
     unknown = _unknown_columns(digits) if answer.study.unknowns.draws else ()
     known = "the same for Gaussian noise if everything but the noise were known"
     ideal = () if answer.study.nuisances.none else (Column("ideal", "", unit, known, "ideal", number(digits)),)

@@ -107,8 +107,8 @@ class Verb:
     ) -> tuple[Study, list[str]]:
         """Return the study that keywords of the verb ask for, with messages on what they do not state.
 
-        `given` has the value of each keyword, or None, and also ``paper``, and ``set``, texts of any keys. They change
-        the study or, without one, the verb's default; `where` names their origin in messages.
+        `given` has the value of each keyword, or None, and also ``paper``, and ``setting``, texts of any keys. They
+        change the study or, without one, the verb's default; `where` names their origin in messages.
         """
         from mauvecl.study.keywords import changes_of, stars_of
         from mauvecl.study.study import Study
@@ -117,14 +117,14 @@ class Verb:
         if study is None:
             for name, keyword in keywords.items():
                 if given[name] is None:
-                    given[name] = (self.defaults or {}).get(f"{keyword.section}.{keyword.key}")
+                    given[name] = (self.defaults or {}).get(keyword.path)
             study = self.default(given) if self.default else Study()
         if given.get("paper"):
             study = study.paper()
         stars = stars_of(study.star, given, keywords, own=own)
         study = study.with_changes(changes_of(given, keywords, study.nuisances), stars, where)
-        if given.get("set"):
-            study = study.with_settings(given["set"], where)
+        if given.get("setting"):
+            study = study.with_settings(given["setting"], where)
         if own or given.get("tails", study) is not None:
             return study, []
         # Maps and limits would sample a tail in each cell or step, which takes longer than more realisations.
@@ -461,10 +461,10 @@ def by_keywords(parts: str) -> Callable[[Callable[..., Answered]], Question[Answ
 
 def _study_of(verb: Verb, study: Study | None, given: Mapping[str, Any]) -> Study:
     """Return the study that keywords of Python ask for."""
-    from mauvecl.study.keywords import keywords_of, values_of
+    from mauvecl.study.keywords import values_of
     from mauvecl.study.study import keys_of
 
-    keywords, where = keywords_of(keys_of(verb.keys)), f"{verb.name}()"
+    keywords, where = {entry.name: entry for entry in keys_of(verb.keys)}, f"{verb.name}()"
     asked, messages = verb.study_of(values_of(given, keywords, where), keywords, study, where)
     for message in messages:
         warnings.warn(message, stacklevel=3)

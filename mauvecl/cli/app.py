@@ -9,6 +9,7 @@ import json
 import os
 import re
 import sys
+import textwrap
 import time
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache
@@ -22,7 +23,7 @@ from typer.main import get_command
 
 from mauvecl.answers.verbs import COMMON, GROUPS, VERBS
 from mauvecl.cli.commands import COMMANDS, export, verify
-from mauvecl.cli.console import EXIT_CODES, Meter, guarded, name_flags_of, show, show_view
+from mauvecl.cli.console import EXIT_CODES, Meter, guarded, show, show_view
 from mauvecl.cli.flags import (
     SHOWS_ALL,
     DeviceFlag,
@@ -32,11 +33,12 @@ from mauvecl.cli.flags import (
     option,
     option_of,
     output_option,
-    whole,
+    whole_number,
 )
 from mauvecl.host import VERSION
 from mauvecl.schema.columns import View, records
 from mauvecl.schema.errors import InputError, missing_package, shortened
+from mauvecl.schema.fields import Range
 
 if TYPE_CHECKING:
     from mauvecl.host.stars.library import OwnStar
@@ -210,11 +212,8 @@ def remove(names: Annotated[list[str], typer.Argument(help="Names of kept stars.
 def _tell(star: OwnStar, quiet: bool) -> None:
     if quiet:
         return
-    lines = [
-        f"Kept {star.name}: --star {json.dumps(star.name) if ' ' in star.name else star.name}",
-        *star.notes,
-        *star.messages,
-    ]
+    name = json.dumps(star.name) if " " in star.name else star.name
+    lines = [f"Kept {star.name}: --star {name}", *star.notes, *star.messages]
     if star.unscaled:
         lines.append(f"It needs --magnitude: {star.unscaled}.")
     if star.dereddened:
@@ -242,7 +241,7 @@ def serve(
     Example: mauvecl serve --show
     """
 
-    number = whole(port, "--port", 1, 65535)
+    number = whole_number(port, "--port", Range(1, 65535))
     if find_spec("bokeh") is None or find_spec("tornado") is None:
         raise missing_package("bokeh", "the page", "web")
     from mauvecl.web.server import serve
@@ -294,13 +293,9 @@ def text_of(text: str | None) -> str:
 
 def _broken(command: str) -> str:
     """Divide a command longer than 72 characters into lines that end in a backslash before a flag."""
-    lines = [""]
-    for part in re.split(r" (?=-)", command):
-        if lines[-1] and len(lines[-1]) + len(part) > 72:
-            lines[-1] += " \\"
-            lines.append("   ")
-        lines[-1] += f" {part}" if lines[-1] else part
-    return "\n".join(lines)
+    glued = re.sub(r" (?!-)", "\0", command)
+    lines = textwrap.wrap(glued, 73, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False)
+    return " \\\n".join(lines).replace("\0", " ")
 
 
 #: Functions of the commands without a study.
@@ -378,8 +373,6 @@ app = typer.Typer(
     "\b\nmauvecl detect --star M3V --magnitude 9\nmauvecl detect --help",
     epilog=EXIT_CODES,
 )
-
-name_flags_of(app)
 
 
 def _version(wanted: bool) -> None:

@@ -27,15 +27,17 @@ from mauvecl.cli.flags import (
     ReplaceFlag,
     SetFlag,
     is_star,
+    numbers_of,
     option,
     output_option,
     study_argument,
     study_option,
     warn_of_percent,
-    whole,
+    whole_number,
 )
 from mauvecl.schema.columns import Column, View
-from mauvecl.schema.errors import InputError, together
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.fields import Range
 
 if TYPE_CHECKING:
     from mauvecl.cli.invocation import Session
@@ -61,22 +63,17 @@ class Command:
 
     def build(self) -> Callable[..., None]:
         """Return the function that typer calls."""
-        from mauvecl.study.keywords import keywords_of
         from mauvecl.study.study import keys_of
 
-        verb, entries = self.verb, keys_of(self.verb.keys)
-        keywords = keywords_of(entries)
-        flags = {
-            flag.parameter: study_option(keywords[flag.parameter], field, flag, verb.defaults or {})
-            for _, field, flag in entries
-        }
+        verb = self.verb
+        keywords = {keyword.name: keyword for keyword in keys_of(verb.keys)}
         kinds = get_type_hints(self.run, localns={"Session": Any}, include_extras=True)
         _, *own = inspect.signature(self.run).parameters.values()
         # Annotations and defaults by parameter.
         options: dict[str, tuple[Any, Any]] = {
-            "study_file": (study_argument(flags), None),
-            **{name: (annotation, None) for name, (annotation, _) in flags.items()},
-            "set": (SetFlag, None),
+            "study_file": (study_argument(keywords), None),
+            **{name: (study_option(keyword, verb.defaults or {}), None) for name, keyword in keywords.items()},
+            "setting": (SetFlag, None),
             **({"paper": (PaperFlag, False)} if verb.accepts("observation.instrument") else {}),
             **{p.name: (kinds[p.name], p.default) for p in own if p.name != "given"},
             **self._options(),
@@ -85,11 +82,7 @@ class Command:
 
         def command(study_file: Path | None = None, **values: Any) -> None:
             del values["help_all"]
-            given = {name: values.pop(name, None) for name in (*flags, "set", "paper")}
-            amplitudes = given.get("amplitude") or ()
-            _read_numbers(given, {name: read for name, (_, read) in flags.items() if read is not None})
-            warn_of_percent(amplitudes)
-            self._call(study_file, keywords, given, values, tells_flags="given" in kinds)
+            self._call(study_file, keywords, values)
 
         parameters = [
             inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=usual, annotation=kind)
@@ -100,30 +93,24 @@ class Command:
         command.__annotations__ = {name: kind for name, (kind, _) in options.items()}
         return command
 
-    def _call(
-        self,
-        study_file: Path | None,
-        keywords: dict[str, Keyword],
-        given: dict[str, Any],
-        values: dict[str, Any],
-        *,
-        tells_flags: bool,
-    ) -> None:
+    def _call(self, study_file: Path | None, keywords: dict[str, Keyword], values: dict[str, Any]) -> None:
         """Run the command with the values of its flags and of its other options."""
         from mauvecl.cli.invocation import Session, question_time, question_values
         from mauvecl.study.study import Study
 
-        verb = self.verb
+        given = {name: numbers_of(keyword, values.pop(name)) for name, keyword in keywords.items()}
+        warn_of_percent(given.get("amplitude") or ())
+        given |= {name: values.pop(name, None) for name in ("setting", "paper")}
         study_file = _placed(study_file, given)
         how = {name: values.pop(name, usual) for name, (_, usual) in self._options().items()}
-        if tells_flags:
+        if "given" in inspect.signature(self.run).parameters:
             values["given"] = given
         own = None if study_file is None else Study.read(study_file)
-        study, messages = verb.study_of(given, keywords, own, "command line")
+        study, messages = self.verb.study_of(given, keywords, own, "command line")
         question_values(study, detects={"fap", "realisations"} <= keywords.keys())
         if self.draws:
             question_time(study, insist=how["insist"])
-        with Session(verb.name, study, draws=self.draws, notes=messages, **how) as session:
+        with Session(self.verb.name, study, draws=self.draws, notes=messages, **how) as session:
             self.run(session, **values)
 
     def _options(self) -> dict[str, tuple[Any, Any]]:
@@ -153,19 +140,6 @@ def command_of(
     return decorate
 
 
-def _read_numbers(given: dict[str, Any], readers: dict[str, Callable[[Any], Any]]) -> None:
-    """Convert the texts of numbers, in place; raises InputError that names all wrong ones."""
-    errors = []
-    for name, read in readers.items():
-        if given[name] is not None:
-            try:
-                given[name] = read(given[name])
-            except InputError as error:
-                errors.append(error)
-    if errors:
-        raise together(errors)
-
-
 def _placed(study_file: Path | None, given: dict[str, Any]) -> Path | None:
     """Give a file that is no study to the flag that takes such files, and return None in its place."""
     if study_file is None:
@@ -181,11 +155,7 @@ def _placed(study_file: Path | None, given: dict[str, Any]) -> Path | None:
     return study_file
 
 
-StoreArgument = Annotated[Path, typer.Argument(help="Store that `mauvecl realise` wrote.")]
-RowsFlag = Annotated[
-    str | None,
-    option(metavar="TEXT", text="Realisations, such as 1000:2000, without the last."),
-]
+RowsFlag = Annotated[str | None, option(metavar="TEXT", text="Realisations, such as 1000:2000, without the last.")]
 
 
 @command_of(
@@ -245,15 +215,9 @@ def _tell(store: Store, place: Path, session: Session) -> None:
     assumed = f"Assumed: {'; '.join(clauses)}."
     session.say([*messages, assumed])
     rows = [
-        {
-            "array": scene.path,
-            "star": scene.star,
-            "amplitude": scene.amplitude,
-            "shape": [store.rows, *scene.row],
-            "type": scene.dtype.name,
-        }
-        for scene in store.scenes
-    ]
+        {"array": scene.path, "star": scene.star, "amplitude": scene.amplitude, "shape": [store.rows, *scene.row],
+         "type": scene.dtype.name} for scene in store.scenes
+    ]  # fmt: skip
     if session.as_json:
         session.print_json(
             {"assumed": assumed, "messages": messages, "store": str(place), "bytes": store.n_bytes, "arrays": rows}
@@ -332,11 +296,10 @@ def _show_faults(title: str, faults: Sequence[Any], columns: Sequence[Column], o
 
 
 def export(
-    store: StoreArgument,
+    store: Annotated[Path, typer.Argument(help="Store that `mauvecl realise` wrote.")],
     file: Annotated[Path, typer.Argument(help="Ending in .fits, .h5 or .hdf5.")],
     array: Annotated[
-        list[str] | None,
-        option("--array", metavar="TEXT", text="Such as star-1/flare-2; may be repeated [all]."),
+        list[str] | None, option("--array", metavar="TEXT", text="Such as star-1/flare-2; may be repeated [all].")
     ] = None,
     rows: RowsFlag = None,
     replace: ReplaceFlag = False,
@@ -346,11 +309,10 @@ def export(
 
     Example: mauvecl export frames.zarr some.fits --array star-1/quiescent --rows 0:1000
     """
-    from mauvecl.runs.export import Selection
-    from mauvecl.runs.export import export as write
+    from mauvecl.runs.export import Selection, export
     from mauvecl.runs.store import Store
 
-    write(Selection.of(Store.open(store), array, _rows_of(rows)), file, replace=replace)
+    export(Selection.of(Store.open(store), array, _rows_of(rows)), file, replace=replace)
     if not quiet:
         show([f"Wrote {file}, {file.stat().st_size / 2**20:.1f} MiB."])
 
@@ -390,7 +352,7 @@ def simulate(
     """Draw a realisation, with flares if a flag names their amplitude."""
     from mauvecl.answers.signal import simulate as compute
 
-    number = whole(realisation, "--realisation", 0, 2**63 - 1)
+    number = whole_number(realisation, "--realisation", Range(0, 2**63 - 1))
     session.answer(compute(session.study, realisation=number, flaring=bool(given["amplitude"])))
 
 
@@ -407,11 +369,7 @@ def plan(session: Session) -> None:
 
 
 @command_of(VERBS["stare"], draws=False, resumes=True)
-def stare(
-    session: Session,
-    given: dict[str, Any],
-    device: DeviceFlag = None,
-) -> None:
+def stare(session: Session, given: dict[str, Any], device: DeviceFlag = None) -> None:
     """Draw stares on one device, which keeps their frames for a resume."""
     from mauvecl.answers.stare import stare as compute
     from mauvecl.device.stares import Stares

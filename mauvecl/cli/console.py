@@ -16,7 +16,7 @@ import textwrap
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 
@@ -25,6 +25,7 @@ from mauvecl.schema.errors import SUBJECT, InputError, printable
 
 if TYPE_CHECKING:
     import typer
+    from rich.console import Console
     from rich.table import Table
 
     from mauvecl.runs.pool import PoolProgress
@@ -55,6 +56,8 @@ GONE = {
 }
 #: Libraries that write to standard output for mauvecl.
 PRINTERS = ("click", "typer", "rich", "mauvecl.cli")
+#: The running command line, whose flags messages name.
+_app: typer.Typer | None = None
 #: Output folder of the verb, once known, to which tracebacks are written.
 _folder: Path | None = None
 
@@ -67,8 +70,8 @@ def writes_to(folder: Path) -> None:
 
 def guarded(app: typer.Typer) -> int:
     """Run the command line, and return its exit code."""
-    global _folder
-    _folder = None
+    global _app, _folder
+    _app, _folder = app, None
     out = sys.stdout
     for stream in (sys.stdout, sys.stderr):
         # Names may contain any character; those that the terminal's encoding lacks are written as escapes.
@@ -77,33 +80,29 @@ def guarded(app: typer.Typer) -> int:
     with warnings.catch_warnings():
         warnings.showwarning = _warn
         try:
-            code = _run(app)
+            code = app(standalone_mode=False)
+            if code == INTERRUPTED:
+                _say("interrupted", INTERRUPTED)
         except SystemExit as end:
             code = end.code if isinstance(end.code, int) else BAD_INPUT if end.code else 0
             if isinstance(end.__context__, BrokenPipeError):
                 # Click and rich end in different ways if the reader of standard output is gone.
                 sys.stdout, code = out, READER_GONE
-    return _flushed(code)
-
-
-def _run(app: typer.Typer) -> int:
-    try:
-        code = app(standalone_mode=False)
-    except InputError as error:
-        return _say(name_flag(error), BAD_INPUT)
-    except MemoryError:
-        return _say("the memory does not suffice for this question; try a smaller one or use more memory", BAD_INPUT)
-    except OSError as error:
-        return _failed_call(error)
-    except Exception as error:
-        return _failed(error)
-    if code == INTERRUPTED:
-        return _say("interrupted", INTERRUPTED)
-    return code if isinstance(code, int) else 0
+        except Exception as error:
+            code = _failed(error)
+    return _flushed(code if isinstance(code, int) else 0)
 
 
 def _failed(error: Exception) -> int:
-    """Report a wrong use of flags, a device that fails, or an unforeseen failure."""
+    """Report bad input, a wrong use of flags, a device or file that fails, or an unforeseen failure."""
+    # Imported here, because verbs that draw nothing do not need it.
+    device = sys.modules.get("mauvecl.device.build")
+    if isinstance(error, InputError):
+        return _say(name_flag(error), BAD_INPUT)
+    if isinstance(error, MemoryError):
+        return _say("the memory does not suffice for this question; try a smaller one or use more memory", BAD_INPUT)
+    if isinstance(error, OSError) and (code := _failed_call(error)):
+        return code
     # Click's own classes are private to newer versions of typer.
     if hasattr(error, "format_message") and isinstance(getattr(error, "exit_code", None), int):
         # A usage error of Click, or the help text of an empty command line, which Click prints itself.
@@ -115,10 +114,8 @@ def _failed(error: Exception) -> int:
     # Python wraps an interrupt while a class is made, and pydantic one of its builders.
     if type(error).__name__ == "Abort" or "KeyboardInterrupt" in f"{error!r} {error.__cause__!r}":
         return _say("interrupted", INTERRUPTED)
-    # Imported here, because verbs that draw nothing do not need it.
-    program = sys.modules.get("mauvecl.device.build")
-    if program is not None and isinstance(error, program.DeviceError):
-        return _say(str(error), BAD_INPUT, whole=isinstance(error, program.BuildError))
+    if device is not None and isinstance(error, device.DeviceError):
+        return _say(str(error), BAD_INPUT, whole=isinstance(error, device.BuildError))
     where = _write_traceback(error)
     what = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
     return _say(
@@ -129,20 +126,17 @@ def _failed(error: Exception) -> int:
 
 
 def _failed_call(error: OSError) -> int:
-    """Report an error of the operating system: standard output, or a file that the user named."""
-    code = _flushed(0)
-    if code:
+    """Report a failure of standard output or of a file that the user named; return 0 for any other."""
+    if code := _flushed(0):
         return code
     *_, (frame, _) = traceback.walk_tb(error.__traceback__)
     if error.filename is None and str(frame.f_globals.get("__name__", "")).startswith(PRINTERS):
         # Click writes through its own stream.
-        _discard()
         return _not_written(error)
     if error.filename is None and error.errno not in DISK:
-        return _failed(error)
-    name = "a file"
-    if error.filename is not None:
-        name = repr(error.filename if isinstance(error.filename, int) else os.fsdecode(error.filename))
+        return 0
+    named = isinstance(error.filename, str | bytes)
+    name = "a file" if error.filename is None else repr(os.fsdecode(error.filename) if named else error.filename)
     return _say(
         f"{printable(name, 200)} cannot be used ({error.strerror or error}); "
         "give another place (what was written before is kept)",
@@ -170,9 +164,6 @@ def _flushed(code: int) -> int:
         if sys.stdout is not None:
             sys.stdout.flush()
     except OSError as error:
-        _discard()
-        if isinstance(error, BrokenPipeError):
-            return READER_GONE
         return _not_written(error)
     except ValueError:
         # Already closed.
@@ -181,17 +172,16 @@ def _flushed(code: int) -> int:
 
 
 def _not_written(error: OSError) -> int:
-    return _say(
-        f"standard output cannot be written ({error.strerror}); use one with room (files are kept)", OUTPUT_FULL
-    )
-
-
-def _discard() -> None:
-    """Discard the buffer of standard output, on which Python would fail again at exit."""
+    """Report that standard output fails, and discard its buffer, on which Python would fail again at exit."""
     with contextlib.suppress(OSError, ValueError, AttributeError):
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, sys.stdout.fileno())
         os.close(nowhere)
+    if isinstance(error, BrokenPipeError):
+        return READER_GONE
+    return _say(
+        f"standard output cannot be written ({error.strerror}); use one with room (files are kept)", OUTPUT_FULL
+    )
 
 
 def _write_traceback(error: Exception) -> Path | str:
@@ -199,16 +189,10 @@ def _write_traceback(error: Exception) -> Path | str:
     from mauvecl.host import VERSION
 
     now = datetime.datetime.now(datetime.UTC).strftime("%Y%m%dT%H%M%S")
-    text = "\n".join(
-        [
-            f"mauvecl {VERSION}, Python {platform.python_version()}, {platform.platform()}",
-            f"command: {sys.argv!r}"[:20_000],
-            "".join(traceback.format_exception(error, limit=-60)),
-        ]
-    )
-    for folder in (_folder, Path(tempfile.gettempdir())):
-        if folder is None:
-            continue
+    versions = f"mauvecl {VERSION}, Python {platform.python_version()}, {platform.platform()}"
+    steps = "".join(traceback.format_exception(error, limit=-60))
+    text = "\n".join([versions, f"command: {sys.argv!r}"[:20_000], steps])
+    for folder in filter(None, (_folder, Path(tempfile.gettempdir()))):
         with contextlib.suppress(OSError):
             # A random name, which nobody can have created before.
             handle, name = tempfile.mkstemp(prefix=f"mauvecl-fault-{now}-", suffix=".txt", dir=folder)
@@ -288,11 +272,16 @@ def _time_left(seconds: float) -> str:
     return f"{seconds:.0f} s left"
 
 
-def show(lines: Sequence[str]) -> None:
-    """Print plain lines on standard output, broken between words on a terminal."""
+def _console(**how: Any) -> Console:
     from rich.console import Console
 
-    console = Console(highlight=False, soft_wrap=True, markup=False, emoji=False)
+    # Names may contain brackets and colons, which are not markup here.
+    return Console(highlight=False, markup=False, emoji=False, **how)
+
+
+def show(lines: Sequence[str]) -> None:
+    """Print plain lines on standard output, broken between words on a terminal."""
+    console = _console(soft_wrap=True)
     for line in lines:
         console.print(_broken(line, console.width) if console.is_terminal else line)
 
@@ -315,14 +304,10 @@ def show_view(view: View, *, wide: bool = True) -> bool:
     Unless `wide`, a table that is too wide is printed without the columns of details, and first columns whose values
     all rows share stand in the title. A `wide` table in a pipe is as wide as it needs to be.
     """
-    from rich.console import Console
-
     if view.table is None:
         show([view.title])
         return False
-    # Names may contain brackets and colons, which are not markup here.
-    how: dict[str, Any] = {"highlight": False, "markup": False, "emoji": False}
-    console = Console(**how)
+    console = _console()
     room = WIDEST if wide and not console.is_terminal else console.width
     title, columns = view.title, _printed(view)
     left_out = not wide and bool(view.details) and _width(columns) > room
@@ -339,7 +324,7 @@ def show_view(view: View, *, wide: bool = True) -> bool:
     show([title])
     for part in _parts(columns, room):
         # A column that exceeds the terminal is printed completely.
-        Console(**how, width=max(room, _width(part))).print(_table(part))
+        _console(width=max(room, _width(part))).print(_table(part))
     return left_out
 
 
@@ -392,45 +377,30 @@ def _parts(columns: list[Printed], room: int) -> list[list[Printed]]:
 
 #: A remedy in a message: `extend`, `resume=True`, `wavelength_unit='Angstrom'`, `fap=0.001`.
 _REMEDY = re.compile(r"`(?P<name>[a-z][a-z0-9_.]*)(?:=(?P<value>[^`]+))?`")
-#: Parameters with flags of other names that are not keys of the study.
-_OTHERWISE = {"setting": "--set"}
-
-#: The command line whose flags messages name, alone in a list.
-_app: list[typer.Typer] = []
 
 
-def name_flags_of(app: typer.Typer) -> None:
-    """Set the command line whose flags messages name."""
-    _app[:] = [app]
+def _flags(name: str, *, off: bool = False) -> list[str]:
+    """Return the flags that set a parameter or a key of the study, or turn it off, the long one first.
 
-
-def _commands() -> Iterator[Any]:
-    """Yield the called command, then all others."""
+    They are those of the called command, or else of all keys of the study.
+    """
     from typer.main import get_command
 
-    called: Any = get_command(_app[0])
-    others = [called]
-    for word in sys.argv[1:]:
-        called = getattr(called, "commands", {}).get(word, called)
-    yield called
-    while others:
-        command = others.pop()
-        yield command
-        others += getattr(command, "commands", {}).values()
-
-
-def _flags(name: str, command: Any, *, off: bool = False) -> list[str]:
-    """Return the flags that set a parameter or a key of the study, or turn it off, the long one first."""
     from mauvecl.study.study import keys_of
 
+    command: Any = None if _app is None else get_command(_app)
+    for word in sys.argv[1:]:
+        command = getattr(command, "commands", {}).get(word, command)
     # If a key has several flags, the last takes its value unchanged.
-    parameters = {key: flag.parameter for key, _, flag in keys_of()}
-    wanted = {name} | {parameter for key, parameter in parameters.items() if f".{key}".endswith(f".{name}")}
-    for parameter in command.params:
+    keywords = {keyword.path: keyword for keyword in keys_of() if f".{keyword.path}".endswith(f".{name}")}
+    wanted = {name, *(keyword.name for keyword in keywords.values())}
+    for parameter in getattr(command, "params", ()):
         if parameter.name in wanted:
             flags = parameter.secondary_opts if off else parameter.opts
             return sorted((flag for flag in flags if flag.startswith("-")), key=len, reverse=True)
-    return []
+    known = next((keyword for keyword in keys_of() if keyword.name in wanted), None)
+    on, *others = known.flag.names[0].split("/") if known else [""]
+    return others if off else [on] if known else []
 
 
 def with_flags(text: str) -> str:
@@ -439,18 +409,14 @@ def with_flags(text: str) -> str:
 
 
 def _as_flag(match: re.Match[str]) -> str:
-    name, off = match["name"], match["value"] in ("false", "False")
-    found = (flags[0] for command in _commands() if (flags := _flags(name, command, off=off)))
-    flag = _OTHERWISE.get(name) or next(found, None)
-    if flag is None:
+    value: Any = match["value"]
+    off = value in ("false", "False")
+    flags = _flags(match["name"], off=off)
+    if not flags:
         return match[0]
-    if match["value"] is None or off:
-        return flag
-    try:
-        value = ast.literal_eval(match["value"])
-    except (ValueError, SyntaxError):
-        value = match["value"]
-    return flag if value is True else f"{flag} {shlex.quote(str(value))}"
+    with contextlib.suppress(ValueError, SyntaxError):
+        value = None if value is None else ast.literal_eval(value)
+    return flags[0] if value is None or value is True or off else f"{flags[0]} {shlex.quote(str(value))}"
 
 
 def name_flag(error: InputError) -> str:
@@ -458,20 +424,17 @@ def name_flag(error: InputError) -> str:
     if error.parts:
         # A flag that sets the same value of several stars is named once.
         return "; ".join(dict.fromkeys(map(name_flag, error.parts)))
-    text, key = with_flags(str(error)), error.key
-    if key is None:
+    text, key = with_flags(str(error)), error.key or ""
+    begin = SUBJECT.match(text)
+    if begin is None or begin["key"].replace(" ", "_") not in (key, key.rpartition(".")[2]):
         return text
+    # "flare amplitude" is the amplitude of a flare, and the key of a value in a table may have the flag of the table.
     name = re.sub(r"\.\d+(?=\.|$)", "", key)
-    flags = [_OTHERWISE[name]] if name in _OTHERWISE else _flags(name, command := next(_commands()))
-    if not flags:
-        # "flare amplitude" is the amplitude of a flare.
-        flags = _flags(name.removeprefix("flare_"), command)
+    names = (name, name.removeprefix("flare_"), name.rpartition(".")[0])
+    flags = next(filter(None, map(_flags, filter(None, names))), [])
     given = (
         word.partition("=")[0] == flag if flag.startswith("--") else word.startswith(flag)
         for word in sys.argv[1:]
         for flag in flags
     )
-    begin = SUBJECT.match(text)
-    if begin is None or begin["key"].replace(" ", "_") not in (key, key.rpartition(".")[2]) or not any(given):
-        return text
-    return f"{flags[0]} {begin['verb'].removeprefix('= ')}{text[begin.end() :]}"
+    return f"{flags[0]} {begin['verb'].removeprefix('= ')}{text[begin.end() :]}" if any(given) else text

@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from glob import escape, glob
 from pathlib import Path
 from types import NoneType
@@ -14,20 +13,17 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin
 import typer
 
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Flag, Help, Unit, as_typed, first, is_measure
+from mauvecl.schema.fields import Help, Range, Unit, as_typed, first, whole
 
 if TYPE_CHECKING:
-    from pydantic.fields import FieldInfo
-
     from mauvecl.study.keywords import Keyword
 
 
 def study_argument(flags: Collection[str]) -> Any:
     """Return the annotation of the argument that is a study, or in its place what a flag takes."""
     other = next((f", or {what}" for flag, (what, *_) in PLACES.items() if flag in flags and what), "")
-    described = f"Study (TOML), the ECSV table of an answer{other}; flags override it."
     argument = typer.Argument(
-        help=described,
+        help=f"Study (TOML), the ECSV table of an answer{other}; flags override it.",
         show_default=False,
         autocompletion=lambda incomplete: complete_star(incomplete) if incomplete else _files(incomplete),
     )
@@ -48,8 +44,7 @@ DeviceFlag = Annotated[str | None, option(metavar="TEXT", text="OpenCL device: n
 JsonFlag = Annotated[bool, option("--json", text="Print JSON and nothing else.")]
 QuietFlag = Annotated[bool, option("--quiet", "-q", text="Print no progress and no file names.")]
 SetFlag = Annotated[
-    list[str] | None,
-    option("--set", metavar="TEXT", text="Any key of the study, as in run.fap=0.01; may be repeated."),
+    list[str] | None, option("--set", metavar="TEXT", text="Any key of the study, as in run.fap=0.01; may be repeated.")
 ]
 PaperFlag = Annotated[
     bool,
@@ -107,55 +102,46 @@ RESUMING = ("resume", "restart")
 WORKERS = ("device", "cluster", *RESUMING, "insist")
 
 
-def study_option(
-    keyword: Keyword, field: FieldInfo, flag: Flag, defaults: Mapping[str, Any]
-) -> tuple[Any, Callable[[Any], Any] | None]:
-    """Return the annotation of a flag of the study's key for typer, and what converts its texts of numbers, if any.
+def study_option(keyword: Keyword, defaults: Mapping[str, Any]) -> Any:
+    """Return the annotation of a flag of the study's key for typer.
 
-    Typer leaves numbers as text, so that messages have one style. `defaults` holds defaults of a verb that differ from
-    the study's, by key.
+    Typer leaves numbers as text, which the study converts, so that messages have one style. `defaults` holds defaults
+    of a verb that differ from the study's, by key.
     """
-    # `mauvecl --help` shows no flags, and starts twice as fast without importing the study.
-    from mauvecl.schema.section import read_count, read_number, read_several
-
-    path = f"{keyword.section}.{keyword.key}"
-    each = get_args(keyword.kind)[0] if keyword.many else keyword.kind
-    kind, metavar = keyword.kind, {str: "TEXT", Path: "FILE"}.get(each)
-    read: Callable[[Any], Any] | None = None
-    if each in (float, int):
-        kind, metavar = list[str] if keyword.many else str, "NUMBER" if each is float else "INTEGER"
-        one: Callable[..., Any] = partial(read_number, unit=keyword.unit) if each is float else read_count
-        name = flag.names[0]
-        read = partial(read_several, name=name, read=one) if keyword.many else partial(one, name=name)
+    metavar = {str: "TEXT", Path: "FILE", float: "NUMBER", int: "INTEGER"}.get(keyword.each)
+    kind = keyword.kind
+    if keyword.each in (float, int):
+        kind, metavar = (list[str], f"{metavar},...") if keyword.many else (str, metavar)
     made = option(
-        *flag.names,
-        text=_help(path, field, flag, keyword.kind, defaults),
-        rich_help_panel=path.partition(".")[0].capitalize(),
-        autocompletion=COMPLETIONS.get(path),
-        metavar=f"{metavar},..." if read and keyword.many else metavar,
+        *keyword.flag.names,
+        text=_help(keyword, defaults),
+        rich_help_panel=keyword.path.partition(".")[0].capitalize(),
+        autocompletion=COMPLETIONS.get(keyword.path),
+        metavar=metavar,
     )
-    return Annotated[kind | None, made], read
+    return Annotated[kind | None, made]
 
 
 def option_of(key: str) -> Any:
     """Return the option of a key's flag, for a verb without a study."""
-    from mauvecl.study.keywords import Keyword
+    # `mauvecl --help` shows no flags, and starts twice as fast without importing the study.
     from mauvecl.study.study import keys_of
 
-    ((path, field, flag),) = keys_of((key,))
-    return get_args(study_option(Keyword.of(path, field, flag), field, flag, {})[0])[1]
+    (keyword,) = keys_of((key,))
+    return get_args(study_option(keyword, {}))[1]
 
 
-def _help(path: str, field: FieldInfo, flag: Flag, kind: Any, defaults: Mapping[str, Any]) -> str:
+def _help(keyword: Keyword, defaults: Mapping[str, Any]) -> str:
     """Return the help text: description, accepted words, unit, explanation and default."""
+    path, field, flag = keyword
     help = flag.help or first(field, Help) or Help("")
     unit = None if flag.help else first(field, Unit)
     choices = help.choices or _words(field.annotation if flag.kind is None else None)
     text = help.text + (f": {choices}" if choices else "") + (f", {unit.written}" if unit else "")
-    text += (f", {help.more}" if help.more else "") + ("; may be repeated" if get_origin(kind) is list else "")
+    text += (f", {help.more}" if help.more else "") + ("; may be repeated" if keyword.many else "")
     if path in defaults:
         default = f"{as_typed(defaults[path])}, or the study's"
-    elif help.default or flag.help or kind is bool:
+    elif help.default or flag.help or keyword.kind is bool:
         default = help.default
     else:
         default = as_typed(field.get_default(call_default_factory=True))
@@ -220,25 +206,37 @@ PLACES: dict[str, tuple[str, str, Callable[[Path], bool]]] = {
 }
 
 
-def warn_of_percent(texts: Sequence[str]) -> None:
-    """Warn of amplitudes that look like a percentage without its sign."""
-    from mauvecl.schema.section import read_number
+def numbers_of(keyword: Keyword, given: Any) -> Any:
+    """Convert the texts of a flag of numbers, which may hold several with commas between them."""
+    from mauvecl.schema.section import number_or_text
 
-    for text in (word.strip() for texts_of_flag in texts for word in texts_of_flag.split(",")):
-        if not is_measure(text) and read_number(text, "--amplitude") >= 1:
+    if given is None or keyword.each not in (float, int):
+        return given
+    if not keyword.many:
+        return number_or_text(given)
+    return [number_or_text(word.strip()) for text in given for word in text.split(",")]
+
+
+def warn_of_percent(amplitudes: Iterable[float | str]) -> None:
+    """Warn of amplitudes that look like a percentage without its sign."""
+    for value in amplitudes:
+        if not isinstance(value, str) and value >= 1:
             warnings.warn(
-                f"--amplitude {text} is a rise of {100 * float(text):g} %; --amplitude {text}% is one of {text} %",
+                f"--amplitude {value} is a rise of {100 * value:g} %; --amplitude {value}% is one of {value} %",
                 stacklevel=2,
             )
 
 
-def whole(text: str, flag: str, low: int, high: int) -> int:
-    """Read a whole number between two ends."""
-    from mauvecl.schema.section import read_count, refusal
+def whole_number(text: str, flag: str, reach: Range) -> int:
+    """Read a whole number of a range."""
+    from mauvecl.schema.section import number_or_text, refusal
 
-    value = read_count(text, flag)
-    if not low <= value <= high:
-        raise refusal(flag, text, f"between {low} and {high}")
+    try:
+        value = whole(number_or_text(text))
+    except ValueError:
+        value = None
+    if value is None or value not in reach:
+        raise refusal(flag, text, reach.words(whole=True))
     return value
 
 

@@ -38,12 +38,14 @@ def question_values(study: Study, *, detects: bool) -> None:
     from mauvecl.detection.names import check_fap, check_statistic
     from mauvecl.host.instrument import instrument_path
     from mauvecl.host.stars.library import known_band, named_star
+    from mauvecl.host.tables.files import read_bytes, without_columns
+    from mauvecl.study.keywords import is_there
 
     for star in study.star:
         if star.library is not None:
             named_star(star.library)
-        elif star.file is not None:
-            _check_file(star.file)
+        elif star.file is not None and not is_there(str(star.file)):
+            read_bytes(without_columns(star.file)[0], "spectrum file")
         known_band(star.band)
     instrument_path(study.observation.instrument, Path())
     if not detects:
@@ -53,19 +55,6 @@ def question_values(study: Study, *, detects: bool) -> None:
     for name in run.statistics:
         check_statistic(name)
     check_fap(run.fap, run.realisations, run.tails)
-
-
-def _check_file(file: Path) -> None:
-    from mauvecl.host.tables.files import read_bytes, without_columns
-
-    try:
-        place, _ = without_columns(file)
-        there = place.is_file()
-    except (OSError, ValueError):
-        # The reader reports impossible names.
-        return
-    if not there:
-        read_bytes(place, "spectrum file")
 
 
 def question_time(study: Study, *, insist: bool) -> None:
@@ -90,7 +79,9 @@ def question_room(store: Store, *, insist: bool) -> None:
     if insist:
         return
     there = next(folder for folder in (store.path, *store.path.absolute().parents) if folder.is_dir())
-    free = shutil.disk_usage(there).free + _held(store.path)
+    # An unfinished store already has some of its bytes.
+    held = sum(path.stat().st_size for path in store.path.glob("star-*/*/c/*/*"))
+    free = shutil.disk_usage(there).free + held
     if store.n_bytes > free:
         rows = free // (store.n_bytes // store.rows)
         raise InputError(
@@ -98,11 +89,6 @@ def question_room(store: Store, *, insist: bool) -> None:
             f"{_size(free)}; give at most {rows} or another place, or --insist to start anyway",
             key="realisations",
         )
-
-
-def _held(folder: Path) -> int:
-    """Return the bytes that an unfinished store already has."""
-    return sum(path.stat().st_size for path in folder.glob("star-*/*/c/*/*")) if folder.is_dir() else 0
 
 
 def _size(size: float) -> str:
@@ -239,9 +225,8 @@ class Session(Options):
             self._leave_all(answer)
         if self.as_json:
             content = answer.as_json()
-            said = [with_flags(line) for line in (*self._notes_on(answer), *content["messages"])]
-            remarks = {"headline": answer.headline, "assumed": answer.assumed, "messages": said}
-            self.print_json(remarks | {key: value for key, value in content.items() if key != "messages"})
+            said = [with_flags(line) for line in (*self._notes_on(answer), *content.pop("messages"))]
+            self.print_json({"headline": answer.headline, "assumed": answer.assumed, "messages": said} | content)
             return
         self.say([answer.headline])
         left_out = [show_view(view, wide=self.wide) for view in answer.all_views]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ from mauvecl.host.tables.units import (
     time_unit,
 )
 from mauvecl.schema.errors import InputError, shortened
+from mauvecl.schema.fields import Accepted
 from mauvecl.schema.physical import DAY_S, Exposure
 from mauvecl.schema.section import Record
 
@@ -86,8 +87,8 @@ class FrameMapping(Record):
         Name of the star.
     """
 
-    hdu: str | int | None = None
-    time: str | tuple[str, str]
+    hdu: Annotated[str | int | None, Accepted("a name or number")] = None
+    time: Annotated[str | tuple[str, str], Accepted("the name of a column, or of two")]
     time_unit: str | None = None
     time_at: Literal["middle", "start", "end"] | None = None
     epoch: str | None = None
@@ -97,7 +98,7 @@ class FrameMapping(Record):
     flux_unit: str | None = None
     error: str | None = None
     quality: str | None = None
-    quality_bits: str | int | None = None
+    quality_bits: Annotated[str | int | None, Accepted("text or a whole number")] = None
     exposure: str | None = None
     exposure_s: Exposure | None = None
     exposure_unit: str | None = None

@@ -12,7 +12,7 @@ import os
 import sys
 from collections import ChainMap
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from functools import cache, partial, wraps
+from functools import cache, cached_property, partial, wraps
 from itertools import chain, repeat
 from pathlib import Path
 from pkgutil import resolve_name
@@ -62,8 +62,7 @@ def schema_of(hint: Any) -> CoreSchema:
     if origin in SEQUENCES or origin is list:
         return _sequence(origin, args)
     if origin in (dict, Mapping):
-        keys, values = map(schema_of, args)
-        return core_schema.no_info_before_validator_function(_mapping, core_schema.dict_schema(keys, values))
+        return core_schema.dict_schema(*map(schema_of, args))
     if origin in (Any, object):
         return core_schema.any_schema()
     if inspect.isclass(origin):
@@ -114,12 +113,6 @@ def _items(value: Any, size: int | None = None) -> Any:
     if is_single or size not in (None, len(items)):
         raise PydanticCustomError("expected", f"Input should be a sequence{'' if size is None else f' of {size}'}")
     return items
-
-
-def _mapping(value: Any) -> Any:
-    if not isinstance(value, Mapping):
-        raise PydanticCustomError("expected", "Input should be a dictionary")
-    return value
 
 
 #: Schemas of annotations of single values.
@@ -216,26 +209,24 @@ class _Parameter:
     """A parameter, whose annotation is resolved when it is first given an argument."""
 
     def __init__(self, function: Callable[..., Any], parameter: inspect.Parameter, owner: type | None) -> None:
-        self.name, self.default = parameter.name, parameter.default
-        self.text = parameter.annotation
+        self.name, self.default, self.text = parameter.name, parameter.default, parameter.annotation
         self.modules = [function.__globals__]
         if owner is not None and function.__name__ == "__init__":
             # A dataclass inherits fields, whose annotations belong to the module of the base class.
             self.modules += [vars(sys.modules[base.__module__]) for base in owner.__mro__[1:-1]]
-        self.validate: Callable[[Any], Any] | None = None
+
+    @cached_property
+    def validate(self) -> Callable[[Any], Any]:
+        """Validate a value."""
+        return validator(self.annotation()).validate_python
 
     def __call__(self, value: Any) -> Any:
         if value is self.default or self.text is inspect.Parameter.empty:
             return value
-        if self.validate is None:
-            self.validate = validator(self.annotation()).validate_python
         try:
             return self.validate(value)
         except ValidationError as error:
-            faults = [
-                (tuple(part for part in fault["loc"] if part != ALTERNATIVE), fault)
-                for fault in error.errors(include_url=False)
-            ]
+            faults = [(tuple(part for part in fault["loc"] if part != ALTERNATIVE), fault) for fault in error.errors()]
         # The innermost wrong value, with the alternatives that it may be.
         place, first = max(faults, key=lambda item: len(item[0]))
         expected = dict.fromkeys(fault["msg"].removeprefix("Input should be ") for at, fault in faults if at == place)

@@ -74,12 +74,10 @@ class InputError(ValueError):
     sentence : str
         What is wrong, with the value and what is accepted.
     key : str, optional
-        The parameter, or the key of a study such as ``run.fap``.
+        The parameter, or the key of a study such as ``run.fap``; None for a fault that is not in one value.
 
     Attributes
     ----------
-    key : str or None
-        The parameter, or the key of a study such as ``run.fap``; None for a fault that is not in one value.
     parts : tuple of InputError
         The errors of which this one consists, if several values are wrong; its key is that of the first.
     """

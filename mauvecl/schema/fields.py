@@ -15,7 +15,7 @@ import math
 import operator
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin
 
@@ -77,11 +77,6 @@ SPELLED = {
     "sec": "s", "hrs": "h", "C": "deg_C", "degC": "deg_C", "°C": "deg_C", "Rsun": "solRad", "Msun": "solMass",
     "per cent": "%", "kelvin": "K", "ly": "lyr", "light years": "lyr",
 }  # fmt: skip
-
-
-def is_measure(text: str) -> bool:
-    """Return whether a text is a number that is followed by a unit, as far as its form tells."""
-    return _MEASURE.fullmatch(text) is not None
 
 
 def with_unit(text: str, unit: str) -> float | None:
@@ -312,6 +307,16 @@ def or_error(schema: CoreSchema, words: str, **metadata: str) -> CoreSchema:
 
 
 @dataclass(frozen=True)
+class Accepted:
+    """Words for the accepted values of a field, in the messages of all of its errors."""
+
+    words: str
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return or_error(handler(source), self.words)
+
+
+@dataclass(frozen=True)
 class Help:
     """Description of a field, for ``--help``, tooltips of the page and the reference."""
 
@@ -332,11 +337,7 @@ class Flag:
     """
 
     def __init__(
-        self,
-        *names: str,
-        kind: Any = None,
-        read: Callable[[Any, str], Any] | None = None,
-        help: Help | None = None,
+        self, *names: str, kind: Any = None, read: Callable[[Any, str], Any] | None = None, help: Help | None = None
     ) -> None:
         self.names, self.kind, self.read, self.help = names, kind, read, help
 
@@ -391,8 +392,8 @@ class Slider:
 class Widget:
     """Field of the page that sets a key."""
 
-    hint: str  # explanation for visitors, in sentences
-    label: str = ""  # text of the key's help by default
+    label: str = field(default="", kw_only=False)  # text of the key's help by default
+    hint: str = field(default="", kw_only=False)  # explanation for visitors, in sentences
     group: str = ""  # heading of the field's group; by default that of its section, if fields do not show at once
     place: int = 0  # order within the group; fields of the same place follow the order of the study
     name: str = ""  # name in links; that of the key by default

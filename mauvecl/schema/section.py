@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import difflib
-from collections.abc import Callable, Iterator, Sequence
-from decimal import Decimal, InvalidOperation
+import math
+from collections.abc import Iterator, Sequence
 from functools import cache
-from typing import TYPE_CHECKING, Any, Self, TypeVar, cast, get_args, get_origin
+from typing import TYPE_CHECKING, Any, Self, TypeVar, cast, get_args
 
 from pydantic import (
     BaseModel,
@@ -16,22 +17,13 @@ from pydantic import (
     ValidationInfo,
     ValidatorFunctionWrapHandler,
     field_validator,
+    model_validator,
 )
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError
 
 from mauvecl.schema.errors import InputError, shortened, shown, together
-from mauvecl.schema.fields import (
-    Unit,
-    first,
-    is_measure,
-    is_quantity,
-    is_truth,
-    says_none,
-    with_unit,
-    without_unit,
-    word_of,
-)
+from mauvecl.schema.fields import Unit, first, is_quantity, is_truth, says_none, with_unit, without_unit, word_of
 
 if TYPE_CHECKING:
     from pydantic._internal._model_construction import ModelMetaclass
@@ -105,41 +97,20 @@ MOST_FAULTS = 5
 
 def input_error(where: str, model: type[BaseModel], error: ValidationError) -> InputError:
     """Return the faults as one InputError whose message begins with the place where they are."""
-    faults: dict[tuple[str, ...], Any] = {}
+    faults: dict[tuple[int | str, ...], Any] = {}
     for fault in error.errors():
-        # A key of several types has an error for each of them.
-        key = _key_of(model, fault["loc"])
         # A list of which an entry is wrong counts as too short.
-        if not any(other[: len(key)] == key for other in faults):
-            faults[key] = fault
+        if not any(other[: len(fault["loc"])] == fault["loc"] for other in faults):
+            faults[fault["loc"]] = fault
     first, *others = (_input_error_of(model, fault) for fault in [*faults.values()][:MOST_FAULTS])
     left = len(faults) - MOST_FAULTS
     more = [InputError(f"and {left} more values are wrong", key=first.key)] if left > 0 else []
     return together([first.within(where), *others, *more])
 
 
-def _key_of(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str, ...]:
-    """Return the part of an error's location that names a key, with the numbers of entries in lists."""
-    path: list[str] = []
-    inner: type[BaseModel] | None = model
-    in_table = False
-    for part in location:
-        if in_table:
-            # Names in a table are the user's.
-            in_table = False
-        elif isinstance(part, str):
-            if inner is None:
-                break
-            annotation = field.annotation if (field := inner.model_fields.get(part)) else None
-            inner = model_in(annotation)
-            in_table = any(get_origin(kind) is dict for kind in (annotation, *get_args(annotation)))
-        path.append(str(part))
-    return tuple(path)
-
-
 def _input_error_of(model: type[BaseModel], first: Any) -> InputError:
-    path = [str(part) for part in first["loc"]]
-    key = ".".join(_key_of(model, first["loc"])) or model.__name__.lower()
+    path = [str(part) for part in first["loc"] if part != "[key]"]
+    key = ".".join(path) or model.__name__.lower()
     value, message = first.get("input"), first["msg"]
     match first["type"]:
         case "extra_forbidden":
@@ -150,7 +121,7 @@ def _input_error_of(model: type[BaseModel], first: Any) -> InputError:
         case "missing":
             return InputError(f"{key!r} is missing, but needs a value", key=key)
         case "value_error":
-            return _own_error(model, path, key, first)
+            return _own_error(model, path, first)
         case "too_long" | "too_short":
             expected = message.partition("should have ")[2].partition(" after")[0]
         case "truth":
@@ -164,18 +135,19 @@ def _input_error_of(model: type[BaseModel], first: Any) -> InputError:
     return InputError.of(key, value, expected)
 
 
-def _own_error(model: type[BaseModel], path: list[str], key: str, first: Any) -> InputError:
+def _own_error(model: type[BaseModel], path: list[str], first: Any) -> InputError:
     """Return the error that a validator raised, with the key where its sentence does not name it."""
-    inner = first["ctx"]["error"]
-    message, field = str(inner), _fields(model, path[:-1]).get(path[-1]) if path else None
+    key, field = ".".join(path), _fields(model, path[:-1]).get(path[-1]) if path else None
     is_value = field is not None and model_in(field.annotation) is None
-    if not isinstance(inner, InputError):
-        inner = InputError(message, key=key if path else None)
-    name = inner.key
+    found = first["ctx"]["error"]
+    if not isinstance(found, InputError):
+        found = InputError(str(found))
+    name = found.key
     # A record's own error names the key; that of a single value's validator may not.
-    found = inner.within(key) if is_value and path[-1] not in message else inner
+    if is_value and path[-1] not in str(found):
+        found = found.within(key)
     if name is None or path[-1:] == [name]:
-        found.key = ".".join(path) or None
+        found.key = key or None
     elif name in _fields(model, path) or (is_value and isinstance(first.get("input"), dict)):
         # Validators of records, and of tables that are no records, name a key of them.
         found.key = ".".join([*path, name])
@@ -221,6 +193,14 @@ def plain(key: str, given: Any, unit: str) -> Any:
 class Section(Record):
     """A section of a study."""
 
+    @model_validator(mode="after")
+    def _checked(self) -> Self:
+        self._check_values()
+        return self
+
+    def _check_values(self) -> None:
+        """Raise InputError if values contradict each other."""
+
     def with_value(self, path: Sequence[str], value: Any) -> Self:
         """Return a copy with another value at a path of sections and a key.
 
@@ -262,6 +242,34 @@ def fields_of(section: type[BaseModel], path: tuple[str, ...] = ()) -> Iterator[
             yield from fields_of(inner, (*path, key))
 
 
+def _given(section: Section, keys: Sequence[str]) -> list[str]:
+    return [key for key in keys if (value := getattr(section, key)) is not None and value is not False]
+
+
+def check_one(section: Section, what: str, *keys: str, needed: bool = False) -> None:
+    """Raise InputError if several of these keys are given or, where one is needed, none."""
+    given = _given(section, keys)
+    if len(given) > 1 or (needed and not given):
+        has, number = " and ".join(given) or "none", "one" if needed else "only one"
+        raise InputError(f"{what} needs {number} of {', '.join(keys)}, but has {has}", key=[*given, *keys][0])
+
+
+def check_all(section: Section, what: str, *keys: str) -> None:
+    """Raise InputError if only a part of these keys is given."""
+    given = _given(section, keys)
+    if 0 < len(given) < len(keys):
+        raise InputError(
+            f"{what} needs all of {', '.join(keys)} or none, but has only {' and '.join(given)}", key=given[0]
+        )
+
+
+def check_needs(section: Section, what: str, keys: Sequence[str], needed: str) -> None:
+    """Raise InputError if one of these keys is given without the key that it needs."""
+    given = _given(section, keys)
+    if given and getattr(section, needed) is None:
+        raise InputError(f"{what} has {' and '.join(given)}, which needs {needed} as well", key=given[0])
+
+
 def check_different(names: Sequence[str], what: str, key: str) -> None:
     """Raise InputError if a name is given twice; its sentence begins with what is named."""
     twice = next((name for name in names if names.count(name) > 1), None)
@@ -274,42 +282,24 @@ def check_different(names: Sequence[str], what: str, key: str) -> None:
 
 def refusal(name: str, text: str, expected: str) -> InputError:
     """Return the error of a value's text; its key is the parameter that a flag sets, or else the value's name."""
-    error = InputError.of(name.removesuffix(" ="), text, expected)
-    error.key = name.split()[0].strip("-").replace("-", "_")
+    error = InputError.of(name, text, expected)
+    error.key = name.strip("-").replace("-", "_")
     return error
 
 
-def read_number(text: str, name: str, unit: str = "") -> float:
-    """Read a number in a unit, which may be followed by another one, as in "10 min" or "24%"."""
-    try:
-        value = with_unit(text, unit)
-        return float(text) if value is None else value
-    except ValueError as error:
-        accepted = f" in {Unit(unit).written}, or in a unit of the same kind" if unit else ""
-        raise refusal(name, text, f"a number{accepted}") from error
+def number_or_text(text: str) -> float | str:
+    """Return the finite number that a text states, or the text itself, which may have a unit."""
+    with contextlib.suppress(ValueError):
+        return int(text)
+    with contextlib.suppress(ValueError):
+        if math.isfinite(value := float(text)):
+            return value
+    return text
 
 
-def read_count(text: str, name: str) -> int:
-    """Read a whole number, also in the form 1e6."""
-    try:
-        exact = Decimal(text)
-        # Writing out more digits than any count has would take forever.
-        whole = int(exact) if exact.is_finite() and exact.adjusted() < 40 else None
-    except InvalidOperation:
-        exact, whole = Decimal(0), None
-    if whole is None or whole != exact:
-        raise refusal(name, text, "a whole number, such as 1000000 or 1e6")
-    return whole
-
-
-def read_several(texts: Sequence[str], name: str, read: Callable[[str, str], Any]) -> list[Any]:
-    """Read values from several texts, each with one value or values with commas between them."""
-    return [read(word.strip(), name) for text in texts for word in text.split(",")]
-
-
-def read_words(texts: Sequence[str], name: str) -> list[str]:
+def read_words(texts: Sequence[str], _: str) -> list[str]:
     """Read names from several texts, each with one name or names with commas between them."""
-    return read_several(texts, name, lambda word, _: word)
+    return [word.strip() for text in texts for word in text.split(",")]
 
 
 def read_axis(text: str, name: str) -> dict[str, Any]:
@@ -317,24 +307,15 @@ def read_axis(text: str, name: str) -> dict[str, Any]:
     if "=" in text:
         quantity, _, values = text.partition("=")
         parts = [part.strip() for part in values.split(",")]
-        try:
-            return {"quantity": quantity, "values": parts if quantity == "star" else list(map(_measure, parts))}
-        except ValueError as error:
-            raise refusal(name, text, f"numbers, such as {quantity}=5,50,600") from error
-    parts = text.split(":")
+        return {"quantity": quantity, "values": parts if quantity == "star" else list(map(number_or_text, parts))}
     try:
-        quantity, start, stop, steps, *rest = parts
-        spaced = {"quantity": quantity, "start": _measure(start), "stop": _measure(stop), "steps": int(steps)}
+        quantity, start, stop, steps, *rest = text.split(":")
+        spaced = {"start": number_or_text(start), "stop": number_or_text(stop), "steps": int(steps)}
     except ValueError as error:
         raise refusal(name, text, "quantity:start:stop:steps, the same with :log, or quantity=a,b,c") from error
     if rest not in ([], ["log"]):
         raise refusal(name, text, "quantity:start:stop:steps with :log or nothing at its end")
-    return spaced | {"log": bool(rest)}
-
-
-def _measure(text: str) -> float | str:
-    """Read a number; return a text with a unit unchanged, since the axis converts it."""
-    return text if is_measure(text) else float(text)
+    return {"quantity": quantity, "log": bool(rest)} | spaced
 
 
 def read_assignment(text: str, name: str, expected: str) -> tuple[str, str]:
@@ -345,12 +326,12 @@ def read_assignment(text: str, name: str, expected: str) -> tuple[str, str]:
     return key, value
 
 
-def read_line_fluxes(texts: Sequence[str], name: str) -> dict[str, float]:
+def read_line_fluxes(texts: Sequence[str], name: str) -> dict[str, float | str]:
     """Read fluxes of emission lines, such as 'Mg II=0.05'."""
     lines = {}
     for text in texts:
         line, value = read_assignment(text, name, "NAME=FLUX, such as 'Mg II=0.05'")
-        lines[line] = read_number(value, f"{name} {shortened(text)}")
+        lines[line] = number_or_text(value)
     return lines
 
 
@@ -369,7 +350,8 @@ def read_declinations(text: str, name: str) -> tuple[float, float] | str:
 def _pair(text: str, name: str, expected: str, unit: str) -> tuple[float, float]:
     """Read two numbers, each of which may have a unit of its own."""
     try:
-        low, high = (read_number(part, name, unit) for part in text.split(":"))
+        measures = ((part, with_unit(part, unit)) for part in text.split(":"))
+        low, high = (float(part) if value is None else value for part, value in measures)
     except ValueError as error:
         raise refusal(name, text, expected) from error
     return low, high
@@ -377,11 +359,9 @@ def _pair(text: str, name: str, expected: str, unit: str) -> tuple[float, float]
 
 def read_frames(text: str, name: str) -> str | list[int]:
     """Read which frames are kept: stack, all, or numbers such as 0,4,9."""
-    return text if text in ("stack", "all") else read_several([text], name, _frame)
-
-
-def _frame(text: str, name: str) -> int:
+    if text in ("stack", "all"):
+        return text
     try:
-        return int(text)
+        return [int(word) for word in text.split(",")]
     except ValueError as error:
         raise refusal(name, text, "stack, all, or numbers such as 0,4,9") from error

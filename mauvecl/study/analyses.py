@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from mauvecl.host.stars.library import ALIASES
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help, Range, Slider, Unit, Widget
 from mauvecl.schema.physical import DetectorTemperature, Magnitude, Positive, Wavelength
-from mauvecl.schema.section import Section, read_ranges, read_words
+from mauvecl.schema.section import Section, check_needs, check_one, read_ranges, read_words
 from mauvecl.study.star import Star
 
 if TYPE_CHECKING:
@@ -33,16 +33,10 @@ class CalibrationObservation(Section):
         DetectorTemperature | None, Help("Detector temperature, where the frames do not state it")
     ] = None
 
-    @model_validator(mode="after")
-    def _one_star(self) -> Self:
-        if self.library is not None and self.spectrum is not None:
-            raise InputError(
-                "an observation needs either library or spectrum, or neither for dark frames, but has both",
-                key="spectrum",
-            )
+    def _check_values(self) -> None:
+        check_one(self, "an observation", "spectrum", "library")
         if self.magnitude is not None and self.library is None and self.spectrum is None:
             raise InputError("a magnitude needs the library or spectrum of the star as well", key="magnitude")
-        return self
 
     def source(self) -> Source | None:
         """Load the spectrum of the star at its brightness; None for frames without light."""
@@ -64,8 +58,8 @@ class CalibrateQuestion(Section):
         tuple[CalibrationObservation, ...],
         Help("Observations of standard stars and of no light"),
         Widget(
-            label="Observations",
-            hint="A zip archive: a TOML file with [[calibrate.observations]], as for the command line, and the frames, "
+            "Observations",
+            "A zip archive: a TOML file with [[calibrate.observations]], as for the command line, and the frames, "
             "mappings and spectra that it names.",
             kind="upload",
         ),
@@ -76,8 +70,8 @@ class CalibrateQuestion(Section):
         Help("Intervals of the spline of the throughput"),
         Flag("--knots"),
         Widget(
-            label="Intervals of the throughput",
-            hint="Intervals of the spline that describes the throughput: more of them follow narrower features, with "
+            "Intervals of the throughput",
+            "Intervals of the spline that describes the throughput: more of them follow narrower features, with "
             "larger errors.",
         ),
     ] = 100
@@ -86,23 +80,16 @@ class CalibrateQuestion(Section):
         Range(0, 1),
         Help("Relative error of the light of an observation, by pointing"),
         Flag("--light-error"),
-        Widget(
-            label="Error of the light",
-            hint="By how much the light of an observation differs, by pointing.",
-            unit="%",
-        ),
+        Widget("Error of the light", "By how much the light of an observation differs, by pointing.", unit="%"),
     ] = 0.0
     spectrum_error: Annotated[
         Annotated[float, Range(0, 1)] | None,
         Help("Relative error of the spectra of the stars, at each of 12 wavelengths",
              default="0.1 for one star, fitted for several if they disagree"),
         Flag("--spectrum-error"),
-        Widget(
-            label="Error of the spectra",
-            hint="Error of the stars' spectra, at each of 12 wavelengths. Empty: 10 % for one star, fitted if several "
-            "disagree.",
-            unit="%",
-        ),
+        Widget("Error of the spectra",
+               "Error of the stars' spectra, at each of 12 wavelengths. Empty: 10 % for one star, fitted if several "
+               "disagree.", unit="%"),
     ] = None  # fmt: skip
 
 
@@ -122,8 +109,8 @@ class ChangeQuestion(Section):
         Help("Change", choices="a line such as Mg II, balmer jump, colour, a band in nm such as 200-320, or spectrum"),
         Flag("--change", kind=list[str], read=read_words),
         Widget(
-            label="Changes",
-            hint="What changes, with commas: lines such as Mg II or 656.5 (nm), balmer jump, colour, and bands such as "
+            "Changes",
+            "What changes, with commas: lines such as Mg II or 656.5 (nm), balmer jump, colour, and bands such as "
             "200-320 (nm).",
             name="changes",
             first=", ".join(DEFAULT_CHANGES),
@@ -134,9 +121,8 @@ class ChangeQuestion(Section):
         Help("Spectrum that the change adds", "as an accretion excess or a companion"),
         Flag("--change-file"),
         Widget(
-            label="Added spectrum",
-            hint="Light that a change adds to the star, such as an accretion excess or a companion: the change "
-            "“spectrum”.",
+            "Added spectrum",
+            "Light that a change adds to the star, such as an accretion excess or a companion: the change “spectrum”.",
             name="change_file",
             place=1,
             kind="file",
@@ -147,8 +133,8 @@ class ChangeQuestion(Section):
         Help("Band in which the light of that spectrum is measured", choices=", ".join(ALIASES)),
         Flag("--change-band"),
         Widget(
-            label="Band of the added light",
-            hint="The smallest change is the light of the added spectrum in this band over that of the star.",
+            "Band of the added light",
+            "The smallest change is the light of the added spectrum in this band over that of the star.",
             group="Added spectrum",
             name="change_band",
             choices=tuple(ALIASES),
@@ -159,8 +145,8 @@ class ChangeQuestion(Section):
         Help("Unit of the wavelengths of that spectrum"),
         Flag("--change-wavelength-unit"),
         Widget(
-            label="Added: unit of wavelengths",
-            hint="Such as Angstrom or Angstrom air. Nothing: what the file says.",
+            "Added: unit of wavelengths",
+            "Such as Angstrom or Angstrom air. Nothing: what the file says.",
             group="Added spectrum",
             name="change_wavelength_unit",
             suggestions=("nm", "Angstrom", "um", "nm air", "Angstrom air"),
@@ -171,8 +157,8 @@ class ChangeQuestion(Section):
         Help("Unit of the fluxes of that spectrum"),
         Flag("--change-flux-unit"),
         Widget(
-            label="Added: unit of fluxes",
-            hint="Such as W m-2 nm-1 or Jy. Nothing: what the file says.",
+            "Added: unit of fluxes",
+            "Such as W m-2 nm-1 or Jy. Nothing: what the file says.",
             group="Added spectrum",
             name="change_flux_unit",
             suggestions=("erg s-1 cm-2 Angstrom-1", "W m-2 nm-1", "Jy"),
@@ -183,8 +169,8 @@ class ChangeQuestion(Section):
         Help("Library spectrum that continues that spectrum beyond its end"),
         Flag("--change-extend"),
         Widget(
-            label="Added: continue with",
-            hint="Library spectrum that continues the added one beyond its end, such as M3V, scaled to match at the "
+            "Added: continue with",
+            "Library spectrum that continues the added one beyond its end, such as M3V, scaled to match at the "
             "join. Nothing: it must cover what the instrument sees.",
             group="Added spectrum",
             name="change_extend",
@@ -197,8 +183,8 @@ class ChangeQuestion(Section):
         Help("Visits that are compared"),
         Flag("--visits"),
         Widget(
-            label="Visits",
-            hint="How many exposures of the star are compared with each other.",
+            "Visits",
+            "How many exposures of the star are compared with each other.",
             first="20",
             slider=Slider(2, 100, 1),
         ),
@@ -234,19 +220,15 @@ class ChangeQuestion(Section):
             self.file, wavelength_unit=self.wavelength_unit, flux_unit=self.flux_unit, extend=self.extend
         )
 
-    @model_validator(mode="after")
-    def _possible(self) -> Self:
+    def _check_values(self) -> None:
         if not self.shortest_d < self.longest_d:
             raise InputError.of("change.longest_d", self.longest_d, f"more than {self.shortest_d:g} d", unit="d")
         if self.file is None:
             if SPECTRUM in self.of:
                 raise InputError("the change 'spectrum' needs a file: give `change.file`", key="change.file")
-            for key in ("wavelength_unit", "flux_unit", "extend"):
-                if getattr(self, key):
-                    raise InputError(f"change.{key} needs change.file as well", key=f"change.{key}")
+            check_needs(self, "the change", ("wavelength_unit", "flux_unit", "extend"), "file")
         elif SPECTRUM not in self.of:
             raise InputError("change.file needs the change 'spectrum' in change.of as well", key="change.file")
-        return self
 
 
 class DataChoice(Section):
@@ -257,8 +239,8 @@ class DataChoice(Section):
         Help("Observed frames: FITS, ECSV or CSV; the verb's argument stands for it"),
         Flag("--data"),
         Widget(
-            label="Frames",
-            hint="A light curve or a sequence of spectra: FITS, ECSV or CSV of at most 16 MiB; the command line reads "
+            "Frames",
+            "A light curve or a sequence of spectra: FITS, ECSV or CSV of at most 16 MiB; the command line reads "
             "larger ones. Files of mauvecl, TESS, Kepler and lightkurve need no mapping.",
             name="frames",
             kind="upload",
@@ -269,8 +251,8 @@ class DataChoice(Section):
         Help("Where time, flux and error are in that file (TOML)"),
         Flag("--mapping"),
         Widget(
-            label="Mapping",
-            hint="Other files need a short TOML file that names the columns of time, flux and error, such as "
+            "Mapping",
+            "Other files need a short TOML file that names the columns of time, flux and error, such as "
             "time = 'TIME', flux = 'RATE'; the documentation has one for each layout.",
             kind="upload",
         ),
@@ -284,8 +266,8 @@ class DataChoice(Section):
         ),
         Flag("--quality-bits"),
         Widget(
-            label="Quality bits",
-            hint="Bits of the quality flag that exclude a frame: numbers and names as in Desat,128, or all, or none. "
+            "Quality bits",
+            "Bits of the quality flag that exclude a frame: numbers and names as in Desat,128, or all, or none. "
             "Without them lightkurve's default applies to Kepler and K2, its default without ImpulsiveOutlier to TESS, "
             "and all bits to other files.",
         ),
@@ -331,8 +313,8 @@ class MeasureQuestion(Section):
             read=partial(read_ranges, expected="two wavelengths in nm, such as 322:368", unit="nm"),
         ),
         Widget(
-            label="Leave out wavelengths",
-            hint="Ranges in nm that fits do not use, such as 322:368, or 200:250, 322:368.",
+            "Leave out wavelengths",
+            "Ranges in nm that fits do not use, such as 322:368, or 200:250, 322:368.",
             unit="nm",
         ),
     ] = ()
@@ -341,8 +323,8 @@ class MeasureQuestion(Section):
         Help("S/N of bins of frames in which the flares of the study's stare are measured against time"),
         Flag("--snr-per-bin"),
         Widget(
-            label="S/N of bins",
-            hint="Simulated fits then also measure the flare of a stare of one orbit against time, in bins of frames "
+            "S/N of bins",
+            "Simulated fits then also measure the flare of a stare of one orbit against time, in bins of frames "
             "in which it reaches this S/N. Nothing: they do not.",
         ),
     ] = None
@@ -353,8 +335,8 @@ class MeasureQuestion(Section):
         ),
         Flag("--joint-fit"),
         Widget(
-            label="Joint fit",
-            hint="Simulated fits then also fit shape and spectrum of the flare to all frames of a stare of one orbit "
+            "Joint fit",
+            "Simulated fits then also fit shape and spectrum of the flare to all frames of a stare of one orbit "
             "together: its peak, half-width, amplitude and temperature.",
         ),
     ] = False
@@ -364,8 +346,7 @@ class MeasureQuestion(Section):
         """True if flares are measured along a stare."""
         return self.snr_per_bin is not None or self.joint_fit
 
-    @model_validator(mode="after")
-    def _possible(self) -> Self:
+    def _check_values(self) -> None:
         if self.lines:
             from mauvecl.host.stars.flare_spectra import EmissionLine
 
@@ -375,7 +356,6 @@ class MeasureQuestion(Section):
             for low, high in getattr(self, key):
                 if not 0 < low < high:
                     raise InputError.of(f"measure.{key}", (low, high), "ascending wavelengths", unit="nm")
-        return self
 
 
 def fitted_models(asked: MeasureQuestion, flare: Flare) -> list[tuple[FittedModel, bool, tuple[str, ...]]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, Literal, Self
@@ -14,6 +14,7 @@ from mauvecl.noise.drawing import Cumulants, stack_is_exact
 from mauvecl.noise.unknowns import COURSES, PROCESSES, STARE_PROCESSES, Processes, default_processes
 from mauvecl.schema.columns import Column, percent, short
 from mauvecl.schema.errors import Message, of_kind
+from mauvecl.study.observation import Observation
 from mauvecl.study.questions import QUANTITIES, Sweep
 from mauvecl.study.star import Star
 from mauvecl.study.stare import KNOWN_CHANGES
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     from mauvecl.host.exposure.sky import Sky
     from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.host.stars.source import Source
-    from mauvecl.study.observation import Observation, SkyLight
+    from mauvecl.study.observation import SkyLight
     from mauvecl.study.study import Study
 
 #: Parts of a study that answers use.
@@ -101,11 +102,7 @@ def _orbit(study: Study) -> str:
     limits = study.orbit.limits
     kept = [
         f"{name} {value:g} deg"
-        for name, value in (
-            ("Earth's limb", limits.earth_limb_deg),
-            ("Sun", limits.sun_deg),
-            ("Moon", limits.moon_deg),
-        )
+        for name, value in (("Earth's limb", limits.earth_limb_deg), ("Sun", limits.sun_deg), ("Moon", limits.moon_deg))
         if value is not None
     ]
     source = "embedded elements" if study.orbit.tle is None else study.orbit.tle.name
@@ -153,10 +150,7 @@ def place_columns(sweep: Sweep, *own: str, star: str = "label") -> tuple[Column,
 
     `own` names quantities for which a table has separate columns, and `star` the attribute with the star's label.
     """
-    return (
-        star_column(star),
-        *(quantity_column(axis.quantity) for axis in sweep.axes if axis.quantity not in own),
-    )
+    return (star_column(star), *(quantity_column(axis.quantity) for axis in sweep.axes if axis.quantity not in own))
 
 
 def star_column(get: str = "star") -> Column:
@@ -202,7 +196,9 @@ class Loader:
         self.source: Callable[[Star], Source] = lru_cache(MAX_SOURCES)(source or (lambda star: star.source()))
         self.sky: Callable[[SkyLight], Sky] = lru_cache(MAX_SOURCES)(lambda light: light.sky())
         self._near: Callable[[Star], Neighbours | None] = lru_cache(MAX_SOURCES)(lambda star: star.near())
-        self._instruments: dict[str, Instrument] = {}
+        self._instrument: Callable[[str], Instrument] = lru_cache(None)(
+            lambda text: Observation.model_validate_json(text).load_instrument()
+        )
 
     def neighbours(self, star: Star) -> Neighbours | None:
         """Return the neighbours of a star, which do not depend on its magnitude."""
@@ -210,14 +206,7 @@ class Loader:
 
     def instrument(self, observation: Observation) -> Instrument:
         """Return the instrument of an observation."""
-        from mauvecl.host.instrument.instrument import Instrument
-
-        file, kept = observation.instrument, self._instruments
-        key = repr((file, observation.temperature_c, sorted(observation.changes.items())))
-        if key not in kept:
-            kept[file] = kept.get(file) or Instrument.load(file)
-            kept[key] = observation.changed(kept[file])
-        return kept[key]
+        return self._instrument(observation.model_dump_json(include={"instrument", "temperature_c", "changes"}))
 
 
 @dataclass(frozen=True, eq=False)
@@ -345,9 +334,7 @@ class Case:
             return unknown
         if given is None and "star" not in unknown.names:
             unknown = unknown.with_spectrum("star", quiet.net_source_dn, math.inf)
-        if stare is not None:
-            return unknown.without(["light"]) if given is None else unknown
-        drawn = FactorDistributions.from_processes(self.processes, quiet)
+        drawn = FactorDistributions.from_processes(self.processes, quiet) if stare is None else None
         light = None if drawn is None else drawn.spreads.get("light")
         if light is None:
             return unknown.without(["light"]) if given is None else unknown
@@ -472,15 +459,12 @@ def collect_messages(expectations: list[Expectation], processes: Processes | Non
 
     All answers report the saturation of stars and flares through this function.
     """
-    stars = {star for x in expectations if x.saturated.any() for star, flaring in [_star_of(x)] if not flaring}
-
-    def said(x: Expectation) -> tuple[str, ...]:
-        # A flare saturates the pixels that its star saturates without it, which is one fact.
+    saturated = {star for x in expectations if x.saturated.any() for star, flaring in [_star_of(x)] if not flaring}
+    texts: list[str] = []
+    for x in expectations:
         star, flaring = _star_of(x)
-        repeated = of_kind(x.messages, SATURATED) if flaring and star in stars else []
-        return tuple(message for message in x.messages if message not in repeated)
-
-    texts = [message for x in expectations for message in (*_without_light(x), *said(x), *_coarse(x))]
+        # A flare saturates the pixels that its star saturates without it, which is one fact.
+        texts += _messages_of(x, saturation=not (flaring and star in saturated))
     outside = off_centre(expectations, processes) if processes else []
     return worst_first([*(Message(f"OUTSIDE THE PRIOR: {text}.", "outside the prior") for text in outside), *texts])
 
@@ -508,18 +492,25 @@ def off_centre(expectations: list[Expectation], processes: Processes) -> list[st
     return sentences
 
 
-def _without_light(x: Expectation) -> tuple[str, ...]:
-    """Return the message on an exposure without light of the star, if it has none."""
-    electrons = float(np.sum(x.source_electrons)) * x.n_frames
-    if electrons >= 1.0:
-        return ()
-    return (
-        Message(
-            f"NO LIGHT: {x.name} gives {electrons:.2g} electrons in all {x.wavelength_nm.size} pixels of an exposure "
-            f"of {x.exposure_s:g} s: there is nothing to see of it, and its S/N is 0.",
+def _messages_of(x: Expectation, *, saturation: bool) -> Iterator[str]:
+    """Yield the messages of an expectation, with or without saturation, and on light or noise that is too small."""
+    pixels, electrons = x.wavelength_nm.size, float(np.sum(x.source_electrons)) * x.n_frames
+    if electrons < 1.0:
+        yield Message(
+            f"NO LIGHT: {x.name} gives {electrons:.2g} electrons in all {pixels} pixels of an exposure of "
+            f"{x.exposure_s:g} s: there is nothing to see of it, and its S/N is 0.",
             "no light",
-        ),
-    )
+        )
+    without = [] if saturation else of_kind(x.messages, SATURATED)
+    yield from (message for message in x.messages if message not in without)
+    quiet = float(np.min(x.read_noise_dn)) < NOISY_DN
+    coarse = int(np.count_nonzero(~stack_is_exact(Cumulants.of(x, 1), x))) if quiet else 0
+    if coarse:
+        yield Message(
+            f"In {coarse} of {pixels} pixels of {x.name} a frame has too little noise for its rounding to whole DN to "
+            "be like noise: closed forms treat it as noise and are wrong there; simulations round each frame.",
+            "rounding",
+        )
 
 
 def worst_first(messages: Iterable[str]) -> list[str]:
@@ -532,20 +523,3 @@ def worst_first(messages: Iterable[str]) -> list[str]:
         more = f"SATURATED: pixels of {rest} more stars, flares or exposures of this answer saturate."
         return [*saturated[:MAX_SATURATED], Message(more, SATURATED), *others]
     return [*saturated, *others]
-
-
-def _coarse(x: Expectation) -> tuple[str, ...]:
-    """Return the message on pixels for which rounding dominates, if any."""
-    if float(np.min(x.read_noise_dn)) >= NOISY_DN:
-        return ()
-    pixels = int(np.count_nonzero(~stack_is_exact(Cumulants.of(x, 1), x)))
-    if not pixels:
-        return ()
-    return (
-        Message(
-            f"In {pixels} of {x.wavelength_nm.size} pixels of {x.name} a frame has too little noise for its rounding "
-            "to whole DN to be like noise: closed forms treat it as noise and are wrong there; simulations round each "
-            "frame.",
-            "rounding",
-        ),
-    )

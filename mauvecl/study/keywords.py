@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from types import NoneType, UnionType
@@ -12,41 +12,60 @@ from mauvecl.host.stars.library import resolve
 from mauvecl.host.tables.files import without_columns
 from mauvecl.noise.unknowns import NUISANCES
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Flag, Unit, first
 from mauvecl.schema.section import read_assignment
 from mauvecl.study.star import FILE_KEYS
 
 if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
 
+    from mauvecl.schema.fields import Flag
     from mauvecl.study.observation import NuisanceChoice
     from mauvecl.study.star import Star
 
 
 class Keyword(NamedTuple):
-    """Keyword of a verb's function, or flag of its command, and the key of the study that it sets."""
+    """Keyword of a verb's function, or flag of its command, with the key of the study that it sets."""
 
-    name: str
-    kind: Any  # type of the value on the command line
-    many: bool  # whether it has several values
-    section: str
-    key: str
-    read: Callable[[Any, str], Any] | None  # converts the texts of a flag, which it receives with the flag's name
-    unit: str  # of the key, in astropy's notation
+    path: str
+    field: FieldInfo
+    flag: Flag
 
-    @classmethod
-    def of(cls, path: str, field: FieldInfo, flag: Flag) -> Keyword:
-        """Return the keyword of a key of the study."""
-        section, _, key = path.rpartition(".")
-        kind, unit = flag.kind or plain_kind(field.annotation), (first(field, Unit) or Unit("")).name
-        return cls(flag.parameter, kind, get_origin(kind) is list, section, key, flag.read, unit)
+    @property
+    def name(self) -> str:
+        """Name in Python, and of the parameter of a command."""
+        return self.flag.parameter
+
+    @property
+    def section(self) -> str:
+        """Section of the key."""
+        return self.path.rpartition(".")[0]
+
+    @property
+    def key(self) -> str:
+        """Key without its section."""
+        return self.path.rpartition(".")[2]
+
+    @property
+    def kind(self) -> Any:
+        """Type of the value on the command line."""
+        return self.flag.kind or plain_kind(self.field.annotation)
+
+    @property
+    def many(self) -> bool:
+        """True if it has several values."""
+        return get_origin(self.kind) is list
+
+    @property
+    def each(self) -> Any:
+        """Type of one of its values on the command line."""
+        return get_args(self.kind)[0] if self.many else self.kind
 
     def value(self, given: Any) -> Any:
         """Convert a value to that of the key, unless it has parts of its own, as in Python."""
         parts = given if self.many else [given]
-        if self.read is None or not all(isinstance(part, str | int | float | Path) for part in parts):
+        if self.flag.read is None or not all(isinstance(part, str | int | float | Path) for part in parts):
             return given
-        return self.read(given, f"{self.name} =")
+        return self.flag.read(given, self.name)
 
     def listed(self, given: Any) -> Any:
         """Return a list for a single value of a keyword of several values."""
@@ -55,11 +74,6 @@ class Keyword(NamedTuple):
         # Neither a sequence nor an array.
         single = isinstance(given, str | Path) or getattr(given, "ndim", 1) == 0 or not hasattr(given, "__len__")
         return [given] if single else list(given)
-
-
-def keywords_of(fields: Iterable[tuple[str, FieldInfo, Flag]]) -> dict[str, Keyword]:
-    """Return the keywords of keys, fields and flags by name; of several keys with one name the last has it."""
-    return {flag.parameter: Keyword.of(path, field, flag) for path, field, flag in fields}
 
 
 def values_of(given: Mapping[str, Any], keywords: Mapping[str, Keyword], where: str) -> dict[str, Any]:
@@ -82,26 +96,16 @@ def values_of(given: Mapping[str, Any], keywords: Mapping[str, Keyword], where: 
 
 def plain_kind(annotation: Any) -> Any:
     """Return the type of a keyword's value: a plain type, or a list for a field of several values."""
-    kinds = list(_plain(annotation))
-    if len(kinds) > 1 and str in kinds:
-        # A number or a word.
-        return str
-    return kinds[0]
-
-
-def _plain(annotation: Any) -> Iterator[Any]:
     origin, parts = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
-        yield from _plain(parts[0])
-    elif origin in (Union, UnionType):
-        for part in parts:
-            yield from _plain(part)
-    elif origin is Literal:
-        yield str
-    elif origin is tuple:
-        yield list[plain_kind(parts[0])]  # type: ignore[misc]
-    elif annotation is not NoneType:
-        yield annotation
+        return plain_kind(parts[0])
+    if origin is tuple:
+        return list[plain_kind(parts[0])]  # type: ignore[misc]
+    if origin in (Union, UnionType):
+        kinds = {plain_kind(part) for part in parts if part is not NoneType}
+        # A number or a word is text.
+        return kinds.pop() if len(kinds) == 1 else str
+    return str if origin is Literal else annotation
 
 
 def changes_of(
@@ -109,17 +113,14 @@ def changes_of(
 ) -> dict[str, dict[str, Any]]:
     """Return the values that keywords set, by sections of the study; stars have their own function."""
     changes: dict[str, dict[str, Any]] = {}
-    setting: dict[tuple[str, str], str] = {}
+    named: dict[str, str] = {}
     for name, keyword in keywords.items():
-        if keyword.section != "star" and name != "nuisance":
-            value = given[name]
-            if value is not None:
-                other = setting.setdefault((keyword.section, keyword.key), name)
-                if other != name:
-                    raise InputError(
-                        f"give either `{other}` or `{name}`: both set {keyword.section}.{keyword.key}", key=other
-                    )
-                changes.setdefault(keyword.section, {})[keyword.key] = keyword.value(value)
+        if given[name] is None or keyword.section == "star" or name == "nuisance":
+            continue
+        other = named.setdefault(keyword.path, name)
+        if other != name:
+            raise InputError(f"give either `{other}` or `{name}`: both set {keyword.path}", key=other)
+        changes.setdefault(keyword.section, {})[keyword.key] = keyword.value(given[name])
     if given.get("nuisance"):
         changes.setdefault("nuisances", {}).update(nuisances_of(nuisances, given["nuisance"]))
     return changes
@@ -131,7 +132,7 @@ def nuisances_of(nuisances: NuisanceChoice, given: Sequence[str] | Mapping[str, 
     own = {name: choice.model_dump(exclude_none=True) for name, choice in nuisances.own.items()}
     expected = f"NAME=SD, with a name of {', '.join(NUISANCES)} or a file's, and a standard deviation or free"
     if not isinstance(given, Mapping):
-        given = dict(read_assignment(text, "nuisance =", expected) for text in given)
+        given = dict(read_assignment(text, "nuisance", expected) for text in given)
     for name, sd in given.items():
         if name in NUISANCES:
             changed[name] = sd
@@ -150,17 +151,16 @@ def stars_of(
     if "star" not in given:
         return None
     names, magnitudes = given["star"], given["magnitude"]
-    of_stars = {keyword.key: given[name] for name, keyword in keywords.items() if keyword.section == "star"}
-    changed = {
-        key: value for key, value in of_stars.items() if value is not None and key not in ("library", "magnitude")
-    }
+    described = [name for name, each in keywords.items() if each.section == "star" and given[name] is not None]
+    changed = {keywords[name].key: given[name] for name in described if name not in ("star", "magnitude")}
     of_files = [key for key in changed if key in FILE_KEYS]
     if not (names or magnitudes or changed):
         return None
     if not (names or own):
         # Those of the default study are not meant.
-        described = next(name for name, each in keywords.items() if each.section == "star" and given[name] is not None)
-        raise InputError(f"`{described}` needs a star, such as `star='M3V'`; `mauvecl library` lists them", key="star")
+        raise InputError(
+            f"`{described[0]}` needs a star, such as `star='M3V'`; `mauvecl library` lists them", key="star"
+        )
     if names:
         # A name of an existing file is a file; other names are searched for in the library.
         each = [star for name in names for star in ([name] if is_there(name) else map(str.strip, name.split(",")))]

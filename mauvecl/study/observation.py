@@ -7,32 +7,27 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import BeforeValidator, Field, create_model, field_validator, model_validator
+from pydantic import Field, create_model, field_validator, model_validator
 
 from mauvecl.detection.names import DEFAULT_STATISTICS, RECOMMENDED, STATISTIC_NAMES
 from mauvecl.host.exposure import DEFAULT_SKY
 from mauvecl.host.instrument import DEFAULT_INSTRUMENT, current_name
 from mauvecl.noise.disturbances import Prior, PriorField
-from mauvecl.noise.unknowns import (
-    DOCUMENTED_NUISANCES,
-    INSTRUMENT_VALUES,
-    NUISANCES,
-    Comparison,
-    values_of,
-)
+from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, INSTRUMENT_VALUES, NUISANCES, Comparison, values_of
 from mauvecl.schema.errors import InputError, shortened
-from mauvecl.schema.fields import Flag, Help, Quantity, Range, Slider, Widget, says_none
+from mauvecl.schema.fields import Accepted, Flag, Help, Quantity, Range, Slider, Widget, says_none
 from mauvecl.schema.physical import (
     DEFAULT_SEED,
     DetectorTemperature,
     Exposure,
+    Positive,
     Probability,
     Realisations,
     Seed,
     SkyBrightness,
     Temperature,
 )
-from mauvecl.schema.section import Section, read_words
+from mauvecl.schema.section import Section, check_all, check_one, read_words
 
 if TYPE_CHECKING:
     import numpy as np
@@ -51,7 +46,7 @@ class Observation(Section):
         Exposure,
         Help("Exposure time", "rounded up to whole frames of 5 s"),
         Flag("--exposure", "-t"),
-        Widget(label="Exposure", hint="Time on the star; whole frames of 5 s are added up.", slider=Slider(5, 3600, 5)),
+        Widget("Exposure", "Time on the star; whole frames of 5 s are added up.", slider=Slider(5, 3600, 5)),
         Quantity("exposure", "length of the exposure", "exposure (s)"),
     ] = 50.0
     instrument: Annotated[
@@ -61,8 +56,8 @@ class Observation(Section):
         ),
         Flag("--instrument"),
         Widget(
-            label="Payload",
-            hint="mauve: dark counts are Poisson in electrons, as in physics. mauvesim: Poisson in DN, as in the "
+            "Payload",
+            "mauve: dark counts are Poisson in electrons, as in physics. mauvesim: Poisson in DN, as in the "
             "MauveSim paper, which makes the dark noise 1.3 times as large.",
             choices=("mauve", "mauvesim"),
         ),
@@ -79,17 +74,14 @@ class Observation(Section):
         ),
         Quantity("detector_temperature", "temperature of the detector", "detector temperature (deg C)"),
     ] = None
-    order: Annotated[
-        Literal["paper", "physical"],
-        Help("Order of efficiency and line spread function"),
-    ] = "paper"
+    order: Annotated[Literal["paper", "physical"], Help("Order of efficiency and line spread function")] = "paper"
     signal: Annotated[
         Literal["net", "paper"],
         Help("Signal of an S/N", choices="net (the star alone) or paper (with the zodiacal light)"),
         Flag("--signal"),
         Widget(
-            label="Counted as signal",
-            hint="In the S/N: the light of the star alone (net), or that of the sky too, as in the MauveSim paper. It "
+            "Counted as signal",
+            "In the S/N: the light of the star alone (net), or that of the sky too, as in the MauveSim paper. It "
             "moves no detection.",
             group="Sky",
             place=2,
@@ -97,9 +89,10 @@ class Observation(Section):
     ] = "net"
     mode: Annotated[Literal["auto", "frames", "stacked"], Help("How the frames of an exposure are drawn")] = "auto"
     recipe: Annotated[Literal["auto", "joint", "apart"], Help("How the noise of a frame is drawn")] = "auto"
-    changes: Annotated[dict[str, float | int | str], Help("Changed values of the instrument, by name")] = Field(
-        default_factory=dict
-    )
+    changes: Annotated[
+        dict[str, Annotated[float | int | str, Accepted("a number or text")]],
+        Help("Changed values of the instrument, by name"),
+    ] = Field(default_factory=dict)
 
     @field_validator("instrument")
     @classmethod
@@ -110,11 +103,8 @@ class Observation(Section):
         """Load the instrument and apply `changes` and the detector temperature."""
         from mauvecl.host.instrument.instrument import Instrument
 
-        return self.changed(Instrument.load(self.instrument))
-
-    def changed(self, instrument: Instrument) -> Instrument:
-        """Return an instrument with `changes` and the detector temperature."""
         changes = self.changes | ({} if self.temperature_c is None else {"temperature_c": self.temperature_c})
+        instrument = Instrument.load(self.instrument)
         return instrument.with_(**changes) if changes else instrument
 
 
@@ -126,8 +116,8 @@ class SkyLight(Section):
         Help("Surface brightness of the sky in V", "or none", default=f"{DEFAULT_SKY:g}"),
         Flag("--sky", kind=str),
         Widget(
-            label="Sky brightness",
-            hint="Zodiacal light, V magnitudes per square arc second.",
+            "Sky brightness",
+            "Zodiacal light, V magnitudes per square arc second.",
             name="sky_brightness",
             first=f"{DEFAULT_SKY:g}",
             unit="mag/arcsec²",
@@ -139,16 +129,13 @@ class SkyLight(Section):
         str | None,
         Help("Target whose zodiacal light is the sky, with the time", "a star such as 'AU Mic', or '290.68 +11.12'"),
         Flag("--target"),
-        Widget(
-            label="Sky target",
-            hint="A star by name, such as AU Mic, or coordinates in degrees such as 290.68 +11.12.",
-        ),
+        Widget("Sky target", "A star by name, such as AU Mic, or coordinates in degrees such as 290.68 +11.12."),
     ] = None
     time: Annotated[
         str | None,
         Help("Time of the observation, UTC, with the target"),
         Flag("--time"),
-        Widget(label="Time, UTC", hint="Such as 2026-09-01T12:00."),
+        Widget("Time, UTC", "Such as 2026-09-01T12:00."),
     ] = None
     none: Annotated[bool, Help("Whether there is no sky")] = False
 
@@ -160,16 +147,9 @@ class SkyLight(Section):
             return given | {"surface_brightness": None, "none": True}
         return given or {"surface_brightness": DEFAULT_SKY}
 
-    @model_validator(mode="after")
-    def _one_sky(self) -> Self:
-        if (self.target is None) != (self.time is None):
-            raise InputError("the sky needs both target and time, or neither, but has only one", key="time")
-        if (self.surface_brightness is not None) + (self.target is not None) + self.none > 1:
-            raise InputError(
-                "the sky is given twice; give only one of surface_brightness, target with time, and none",
-                key="surface_brightness",
-            )
-        return self
+    def _check_values(self) -> None:
+        check_all(self, "the sky", "target", "time")
+        check_one(self, "the sky", "surface_brightness", "target", "none")
 
     def with_value(self, path: Sequence[str], value: Any) -> Self:
         """Return the sky of one value, which replaces all others."""
@@ -189,10 +169,7 @@ class Run(Section):
 
     realisations: Annotated[Realisations, Help("Noise realisations"), Flag("--realisations", "-n")] = 1_000_000
     seed: Annotated[
-        Seed,
-        Help("Seed"),
-        Flag("--seed"),
-        Widget(hint="The same seed gives the same noise, to the bit.", place=3),
+        Seed, Help("Seed"), Flag("--seed"), Widget(hint="The same seed gives the same noise, to the bit.", place=3)
     ] = DEFAULT_SEED
     statistics: Annotated[
         tuple[str, ...],
@@ -211,8 +188,8 @@ class Run(Section):
         Help("False-alarm probability per test"),
         Flag("--fap"),
         Widget(
-            label="False-alarm probability",
-            hint="How often noise alone passes for a flare, per test: it sets the threshold.",
+            "False-alarm probability",
+            "How often noise alone passes for a flare, per test: it sets the threshold.",
             unit="per test",
             slider=Slider(1e-6, 0.1, 10**0.1, log=True),
         ),
@@ -249,32 +226,16 @@ class Run(Section):
     def _expand_all(cls, given: tuple[str, ...]) -> tuple[str, ...]:
         return STATISTIC_NAMES if "all" in given else given
 
-    @model_validator(mode="after")
-    def _comparable(self) -> Self:
+    def _check_values(self) -> None:
         self.comparison()
-        return self
 
     def comparison(self) -> Comparison:
         """Return the reference of the comparison for the engine."""
         return Comparison.of(self.reference, self.variances)
 
 
-def _spread(given: Any) -> Any:
-    """Validate a standard deviation or "free"."""
-    if given == "free":
-        return given
-    try:
-        value = float(given) if not isinstance(given, bool) else float("nan")
-    except (TypeError, ValueError):
-        value = float("nan")
-    if not 0 < value < float("inf"):
-        raise InputError(
-            f"the standard deviation of an unknown must be a number above 0, or 'free', not {shortened(str(given))}"
-        )
-    return value
-
-
-Spread = Annotated[float | Literal["free"], BeforeValidator(_spread)]
+#: Standard deviation of an unknown.
+Spread = Annotated[Positive | Literal["free"], Accepted("a number above 0, or 'free'")]
 
 
 def sd_of(spread: Spread) -> float:
@@ -289,11 +250,8 @@ class OwnNuisance(Section):
     points: Annotated[tuple[tuple[float, float], ...] | None, Help("Wavelengths in nm, and DN per exposure")] = None
     sd: Annotated[Spread, Help("Standard deviation of the amplitude, or free")] = "free"
 
-    @model_validator(mode="after")
-    def _one_spectrum(self) -> Self:
-        if (self.file is None) == (self.points is None):
-            raise InputError("a nuisance spectrum needs either file or points, but has neither or both", key="points")
-        return self
+    def _check_values(self) -> None:
+        check_one(self, "a nuisance spectrum", "points", "file", needed=True)
 
     def spectrum(self, name: str, wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the DN per exposure at unit amplitude, shape (n_pixel,)."""
@@ -369,12 +327,8 @@ class NuisanceChoice(create_model("_Amplitudes", __base__=Section, **_keys)):  #
 #: Choice of unknowns with which everything but the noise is known.
 KNOWN = NuisanceChoice(usual=False)
 
-
 Draws = Annotated[
-    int,
-    Range(0, 4096),
-    Help("Draws of unknown instrument values over which the answer is averaged"),
-    Flag("--unknown"),
+    int, Range(0, 4096), Help("Draws of unknown instrument values over which the answer is averaged"), Flag("--unknown")
 ]
 Known = Annotated[
     tuple[str, ...],
@@ -395,14 +349,12 @@ class Unknowns(create_model("_InstrumentValues", __base__=Section, **_unknown_ke
     The documentation page on nominal values explains the default priors.
     """
 
-    @model_validator(mode="after")
-    def _possible(self) -> Self:
+    def _check_values(self) -> None:
         if self.draws == 1:
             raise InputError.of("unknowns.draws", self.draws, "0 or at least 2")
         other = next((name for name in self.known if name not in INSTRUMENT_VALUES), None)
         if other is not None:
             raise InputError.of("unknowns.known", other, f"some of {', '.join(INSTRUMENT_VALUES)}")
-        return self
 
     def priors(self, instrument: Instrument) -> dict[str, Prior]:
         """Return the priors of an instrument's unknown values by name, as in `noise.unknowns.values_of`."""

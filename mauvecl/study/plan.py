@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import model_validator
+from pydantic import field_validator, model_validator
 
 from mauvecl.host.orbit import Limits
 from mauvecl.host.tables.names import (
@@ -33,7 +34,7 @@ from mauvecl.schema.physical import (
     RateExponent,
     Share,
 )
-from mauvecl.schema.section import Section, built, check_different
+from mauvecl.schema.section import Section, built, check_all, check_different, check_one, number_or_text
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -55,7 +56,7 @@ class OrbitQuestion(Section):
         str,
         Help("First day or time, UTC"),
         Flag("--start"),
-        Widget(label="First day", hint="The first day of the time that is looked at, UTC.", kind="day"),
+        Widget("First day", "The first day of the time that is looked at, UTC.", kind="day"),
     ] = "2027-01-01"
     days: Annotated[
         float,
@@ -64,8 +65,8 @@ class OrbitQuestion(Section):
         Help("Length of time"),
         Flag("--days"),
         Widget(
-            label="Days",
-            hint="How many days from the first one on are looked at: 365 show every season.",
+            "Days",
+            "How many days from the first one on are looked at: 365 show every season.",
             unit="d",
             most=1000,
             slider=Slider(5, 730, 5),
@@ -86,6 +87,18 @@ class OrbitQuestion(Section):
     ] = False
     limits: Limits = Limits()
 
+    @field_validator("start")
+    @classmethod
+    def _time(cls, given: str) -> str:
+        # The default is a time, for which astropy need not be loaded.
+        if given != cls.model_fields["start"].default:
+            from mauvecl.host.exposure.sky import parse_time
+            from mauvecl.host.tables.units import offline
+
+            with offline():
+                parse_time(given, "start")
+        return given
+
     def orbit(self) -> Orbit:
         """Load the orbit."""
         from mauvecl.host.orbit.orbit import Orbit
@@ -101,6 +114,9 @@ class OrbitQuestion(Section):
 
 #: Keys of a target that hold paths, relative to its table or the study file.
 PATH_KEYS = ("rates_file", "neighbours")
+
+#: Keys of flare rates, each of another distribution.
+RATES = ("rates", "mass_msun", "alpha", "rates_file")
 
 
 class PlanTarget(Section):
@@ -135,8 +151,7 @@ class PlanTarget(Section):
     neighbours: Annotated[Path | None, Help("Table of other stars near the target, as for a star")] = None
     neighbours_of: Annotated[str | None, Help("The target's own row in that table, or its coordinates")] = None
     neighbour_share: Annotated[
-        Share,
-        Help("Share of the light of neighbours within the fibre's radius that enters it", "an assumption"),
+        Share, Help("Share of the light of neighbours within the fibre's radius that enters it", "an assumption")
     ] = 1.0
 
     unused: Annotated[tuple[str, ...], Help("Columns of its table that are not read")] = ()
@@ -146,31 +161,18 @@ class PlanTarget(Section):
     def _by_name(cls, data: Any) -> Any:
         return {"name": data} if isinstance(data, str) else data
 
-    @model_validator(mode="after")
-    def _one_distribution(self) -> Self:
-        for names in (("mass_msun", "age_myr"), ("alpha", "rate_per_day", "at_erg")):
-            given = [name for name in names if getattr(self, name) is not None]
-            if given and len(given) < len(names):
-                raise InputError(
-                    f"{self.name} needs all of {', '.join(names)} or none, but has only {' and '.join(given)}",
-                    key=given[0],
-                )
-        if len(ways := self.given_rates) > 1:
-            raise InputError(
-                f"{self.name} needs its flare rates in one way only, but has them by {' and by '.join(ways)}",
-                key="rates",
-            )
-        return self
+    def _check_values(self) -> None:
+        check_all(self, self.name, "mass_msun", "age_myr")
+        check_all(self, self.name, "alpha", "rate_per_day", "at_erg")
+        check_one(self, self.name, *RATES)
 
     @property
     def given_rates(self) -> list[str]:
         """Keys of the given flare rates, of which a target has at most one; the mass has an age."""
-        return [key for key in ("rates", "mass_msun", "alpha", "rates_file") if getattr(self, key) is not None]
+        return [key for key in RATES if getattr(self, key) is not None]
 
     def target(self, simbad: bool) -> Target:
         """Look up the target; given coordinates replace those of its name."""
-        from dataclasses import replace
-
         from mauvecl.host.orbit.orbit import Target
 
         if self.coordinates is None:
@@ -229,8 +231,8 @@ class PlanQuestion(Section):
         Help("Exposure of each target at most", default="all"),
         Flag("--hours"),
         Widget(
-            label="Hours on each target",
-            hint="How long each target is observed, at most: never longer than it is seen.",
+            "Hours on each target",
+            "How long each target is observed, at most: never longer than it is seen.",
             first="100",
             slider=Slider(10, 1000, 10),
         ),
@@ -251,10 +253,8 @@ class PlanQuestion(Section):
     best_months: Annotated[int, Range(1, 12), Help("Number of best months in the report")] = 3
     report: Annotated[Literal["pdf", "html"], Help("Form of the report"), Flag("--report")] = "pdf"
 
-    @model_validator(mode="after")
-    def _different_targets(self) -> Self:
+    def _check_values(self) -> None:
         check_different([target.name for target in self.targets], "the plan's target", "targets")
-        return self
 
     def law(self) -> DurationLaw:
         """Return the relation between energy and duration of flares."""
@@ -341,11 +341,9 @@ def _target(
         if column is None or not text or (key == "coordinates" and is_missing_position(text)):
             continue
         unit = first(field, Unit)
-        if unit is None and first(field, Range) is None:
-            target[key] = text
-        else:
-            # A text that is no number is refused with the key's own sentence.
-            target[key] = rows.number(column, row, "" if unit is None else unit.name) if _is_number(text) else text
+        # A text that is no number is refused with the key's own sentence.
+        is_number = (unit or first(field, Range)) and not isinstance(number_or_text(text), str)
+        target[key] = rows.number(column, row, unit.name if unit else "") if is_number else text
     _check_band(rows, columns["magnitude"], row)
     parallax = columns["parallax"]
     if parallax is not None and "distance_pc" not in target:
@@ -405,11 +403,3 @@ def _coordinates(rows: Rows, columns: dict[str, str | None], row: int, target: d
                 remedy = "give its coordinates, or a name of the list"
                 raise rows.error(f"{fault} is not in the embedded list; {remedy}", column)
     return None
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True

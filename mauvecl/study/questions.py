@@ -5,14 +5,14 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 from pydantic import Field, model_validator
 
 from mauvecl.schema.errors import InputError, shown
-from mauvecl.schema.fields import Flag, Help, Quantity, Range, Slider, Unit, Widget, first
+from mauvecl.schema.fields import Accepted, Flag, Help, Quantity, Range, Slider, Unit, Widget, first
 from mauvecl.schema.physical import Positive, Probability, Wavelength
-from mauvecl.schema.section import Section, check_different, fields_of, read_axis, read_frames
+from mauvecl.schema.section import Section, check_different, check_needs, fields_of, read_axis, read_frames
 from mauvecl.study.observation import Observation, SkyLight
 from mauvecl.study.star import Flare, Star
 
@@ -29,14 +29,6 @@ QUANTITIES = {
     for path, field in fields_of(section, (name,))
     if (one := first(field, Quantity)) is not None
 }
-#: Units of the quantities that have one.
-UNITS = {name: quantity.unit for name, quantity in QUANTITIES.items() if quantity.unit}
-
-
-#: Magnitudes and exposures of the default sweep of `gaussian`.
-MAGNITUDES, EXPOSURES_S = (4.0, 6.0, 8.0, 10.0, 12.0), (5.0, 50.0, 600.0)
-
-
 if TYPE_CHECKING:
     QuantityName = str
 else:
@@ -70,14 +62,8 @@ class CampaignQuestion(Section):
         Flag("--campaign-alarms"),
     ] = None
 
-    @model_validator(mode="after")
-    def _requires_frames(self) -> Self:
-        given = next((name for name in ("step", "fap", "alarms") if getattr(self, name) is not None), None)
-        if given is not None and self.frames is None:
-            raise InputError(
-                f"campaign.{given} needs campaign.frames, the number of frames that are searched, as well", key=given
-            )
-        return self
+    def _check_values(self) -> None:
+        check_needs(self, "the campaign", ("step", "fap", "alarms"), "frames")
 
 
 class SignalQuestion(Section):
@@ -95,6 +81,7 @@ class BulkQuestion(Section):
 
     frames: Annotated[
         Literal["stack", "all"] | Annotated[tuple[Annotated[int, Range(0)], ...], Field(min_length=1)],
+        Accepted("stack, all, or numbers of frames"),
         Help("Stored frames", choices="stack (the sum of an exposure), all, or numbers of frames such as 0,4,9"),
         Flag("--frames", kind=str, read=read_frames),
     ] = "stack"
@@ -102,11 +89,9 @@ class BulkQuestion(Section):
         bool, Help("Also store the mean of star, sky and noise of each pixel"), Flag("--components")
     ] = False
 
-    @model_validator(mode="after")
-    def _ascending(self) -> Self:
+    def _check_values(self) -> None:
         if not isinstance(self.frames, str) and list(self.frames) != sorted(set(self.frames)):
             raise InputError.of("bulk.frames", list(self.frames), "ascending numbers")
-        return self
 
     def chosen(self, n_frames: int) -> tuple[int, ...] | None:
         """Return the indices of the frames to store, or None to store their sum."""
@@ -127,8 +112,8 @@ class LimitQuestion(Section):
         Help("Quantity whose limit is computed"),
         Flag("--of"),
         Widget(
-            label="Solve for",
-            hint="The smallest flare, the faintest star or the shortest exposure that is detected with the wanted "
+            "Solve for",
+            "The smallest flare, the faintest star or the shortest exposure that is detected with the wanted "
             "probability; all else is as entered. The tab Limit and map simulates it.",
             first="amplitude",
         ),
@@ -138,21 +123,30 @@ class LimitQuestion(Section):
         Help("Wanted detection probability"),
         Flag("--power"),
         Widget(
-            label="Wanted probability",
-            hint="With which a flare is to be detected at the limit.",
+            "Wanted probability",
+            "With which a flare is to be detected at the limit.",
             group="Detection",
             slider=Slider(0.5, 0.99, 0.01),
         ),
     ] = 0.9
 
 
+def _wrong_value(quantity: Quantity, text: str) -> InputError:
+    accepted = "a name of the library" if quantity.is_name else quantity.accepted
+    return InputError(f"a value of the axis {quantity.name!r} must be {accepted}, not {text}", key="values")
+
+
+Number = Annotated[float, Range()]
+NumberOrName = Annotated[float | str, Accepted("a number or a name")]
+
+
 class Axis(Section):
     """Axis of a map or sweep: explicit values, or `steps` values from `start` to `stop`."""
 
     quantity: Annotated[QuantityName, Help("Quantity that varies")]
-    values: Annotated[tuple[float | str, ...] | None, Help("Values")] = None
-    start: Annotated[float | None, Help("First of evenly spaced values")] = None
-    stop: Annotated[float | None, Help("Last of evenly spaced values")] = None
+    values: Annotated[tuple[NumberOrName, ...] | None, Help("Values")] = None
+    start: Annotated[Number | None, Help("First of evenly spaced values")] = None
+    stop: Annotated[Number | None, Help("Last of evenly spaced values")] = None
     steps: Annotated[Annotated[int, Range(2, 1000)] | None, Help("Number of evenly spaced values")] = None
     log: Annotated[bool, Help("Whether values are evenly spaced in the logarithm")] = False
 
@@ -167,12 +161,9 @@ class Axis(Section):
         try:
             return given | {key: Unit(quantity.unit).plain(given[key]) for key in keys}
         except ValueError as error:
-            raise InputError(
-                f"a value of the axis {quantity.name!r} must be {quantity.accepted}, not {error}", key="values"
-            ) from error
+            raise _wrong_value(quantity, str(error)) from error
 
-    @model_validator(mode="after")
-    def _one_way(self) -> Self:
+    def _check_values(self) -> None:
         spaced = (self.start, self.stop, self.steps)
         if (self.values is None) == (None in spaced) or (self.values is not None and spaced != (None, None, None)):
             raise InputError(
@@ -183,35 +174,24 @@ class Axis(Section):
             raise InputError(f"the axis {self.quantity!r} needs at least one value, but has none", key="values")
         quantity = QUANTITIES[self.quantity]
         for value in self.points():
-            if quantity.is_name != isinstance(value, str):
-                accepted = "a name of the library" if quantity.is_name else "a number"
-                raise InputError(
-                    f"a value of the axis {self.quantity!r} must be {accepted}, not {value!r}", key="values"
-                )
-            if quantity.range is not None and value not in quantity.range:
-                raise InputError(
-                    f"a value of the axis {self.quantity!r} must be {quantity.accepted}, not {shown(value)}",
-                    key="values",
-                )
-        return self
+            is_name = isinstance(value, str)
+            if is_name != quantity.is_name or (quantity.range is not None and value not in quantity.range):
+                raise _wrong_value(quantity, shown(value))
 
     def points(self) -> tuple[float | str, ...]:
         """Return the values along the axis."""
         if self.values is not None:
             return self.values
-        assert self.start is not None
-        assert self.stop is not None
-        assert self.steps is not None
-        if self.log and min(self.start, self.stop) <= 0:
+        start, stop, steps = cast("tuple[float, float, int]", (self.start, self.stop, self.steps))
+        share = [i / (steps - 1) for i in range(steps)]
+        if not self.log:
+            return tuple(start + (stop - start) * s for s in share)
+        if min(start, stop) <= 0:
             raise InputError(
-                f"the logarithmic axis {self.quantity!r} needs values above 0, but runs from "
-                f"{self.start:g} to {self.stop:g}",
+                f"the logarithmic axis {self.quantity!r} needs values above 0, but runs from {start:g} to {stop:g}",
                 key="start",
             )
-        share = [i / (self.steps - 1) for i in range(self.steps)]
-        if self.log:
-            return tuple(self.start * (self.stop / self.start) ** s for s in share)
-        return tuple(self.start + (self.stop - self.start) * s for s in share)
+        return tuple(start * (stop / start) ** s for s in share)
 
 
 class MapQuestion(Section):
@@ -227,19 +207,15 @@ class MapQuestion(Section):
         Flag("--x", kind=str, read=read_axis),
     ] = None
     y: Annotated[
-        Axis,
-        Help("Vertical axis of the map", "such as amplitude:0.01:1:16:log"),
-        Flag("--y", kind=str, read=read_axis),
+        Axis, Help("Vertical axis of the map", "such as amplitude:0.01:1:16:log"), Flag("--y", kind=str, read=read_axis)
     ] = Axis(quantity="amplitude", start=0.01, stop=1.0, steps=16, log=True)
     contours: Annotated[tuple[Probability, ...], Help("Detection probabilities of contours")] = (0.1, 0.5, 0.9)
 
-    @model_validator(mode="after")
-    def _different_axes(self) -> Self:
+    def _check_values(self) -> None:
         if self.y.quantity == ("magnitude" if self.x is None else self.x.quantity):
             raise InputError(
                 f"the axes of the map must be two different quantities, but both are {self.y.quantity!r}", key="y"
             )
-        return self
 
     @property
     def axes(self) -> tuple[Axis, Axis]:
@@ -263,15 +239,11 @@ class Sweep(Section):
     ] = "product"
     axes: Annotated[
         tuple[Axis, ...],
-        Help(
-            "Values of a quantity",
-            "as in exposure=5,50,600 or magnitude:4:10:7; several give every combination",
-        ),
+        Help("Values of a quantity", "as in exposure=5,50,600 or magnitude:4:10:7; several give every combination"),
         Flag("--sweep", kind=list[str], read=lambda texts, name: [read_axis(text, name) for text in texts]),
     ] = ()
 
-    @model_validator(mode="after")
-    def _possible(self) -> Self:
+    def _check_values(self) -> None:
         check_different([axis.quantity for axis in self.axes], "the sweep's quantity", "axes")
         lengths = {axis.quantity: len(axis.points()) for axis in self.axes}
         if self.how == "list" and len(set(lengths.values())) > 1:
@@ -281,7 +253,6 @@ class Sweep(Section):
             )
         if self.size > MAX_CELLS:
             raise InputError(f"the sweep must have at most {MAX_CELLS} combinations, but has {self.size}", key="axes")
-        return self
 
     @property
     def size(self) -> int:
@@ -298,8 +269,8 @@ class Sweep(Section):
 
 def formula_grid(*, magnitude: bool = True, exposure_s: float | None = None) -> Sweep:
     """Return the default sweep of `gaussian`, over magnitudes and over exposures, or at a given exposure."""
-    axes = [Axis(quantity="magnitude", values=MAGNITUDES)] if magnitude else []
-    exposures = EXPOSURES_S if exposure_s is None else (exposure_s,)
+    axes = [Axis(quantity="magnitude", values=(4.0, 6.0, 8.0, 10.0, 12.0))] if magnitude else []
+    exposures = (5.0, 50.0, 600.0) if exposure_s is None else (exposure_s,)
     return Sweep(axes=(*axes, Axis(quantity="exposure", values=exposures)))
 
 

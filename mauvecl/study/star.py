@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
@@ -26,7 +27,7 @@ from mauvecl.schema.physical import (
     Share,
     Temperature,
 )
-from mauvecl.schema.section import Section, read_line_fluxes
+from mauvecl.schema.section import Section, check_all, check_needs, check_one, read_line_fluxes
 
 if TYPE_CHECKING:
     from mauvecl.host.exposure.neighbours import Neighbours
@@ -67,11 +68,7 @@ class Star(Section):
         str,
         Help("Band of the magnitude", choices=", ".join(ALIASES)),
         Flag("--band"),
-        Widget(
-            label="Band",
-            hint="The band of the magnitude. In V, Vega has 0.03, as in catalogues.",
-            choices=tuple(ALIASES),
-        ),
+        Widget("Band", "The band of the magnitude. In V, Vega has 0.03, as in catalogues.", choices=tuple(ALIASES)),
     ] = "V"
     magnitude_system: Annotated[
         Literal["catalogue", "vega", "ab"],
@@ -83,8 +80,8 @@ class Star(Section):
         Help("Dust in front of the star, E(B-V)", "needs mauvecl[extinction]"),
         Flag("--ebv"),
         Widget(
-            label="Reddening",
-            hint="Dust in front of the star, E(B-V) in magnitudes. The magnitude above is that of the reddened star. "
+            "Reddening",
+            "Dust in front of the star, E(B-V) in magnitudes. The magnitude above is that of the reddened star. "
             "Nothing: no dust.",
             group="Star",
         ),
@@ -94,8 +91,8 @@ class Star(Section):
         Help("Unit of a spectrum file's wavelengths", "as in Angstrom, or 'nm air'"),
         Flag("--wavelength-unit"),
         Widget(
-            label="Unit of wavelengths",
-            hint="That of the file's wavelengths, such as Angstrom or Angstrom air. Nothing: what the file says.",
+            "Unit of wavelengths",
+            "That of the file's wavelengths, such as Angstrom or Angstrom air. Nothing: what the file says.",
             group="Own spectrum",
             suggestions=("nm", "Angstrom", "um", "nm air", "Angstrom air", "Hz", "eV"),
         ),
@@ -105,8 +102,8 @@ class Star(Section):
         Help("Unit of a spectrum file's fluxes", "as in 'W m-2 nm-1'"),
         Flag("--flux-unit"),
         Widget(
-            label="Unit of fluxes",
-            hint="That of the file's fluxes, such as W m-2 nm-1 or Jy. Nothing: what the file says.",
+            "Unit of fluxes",
+            "That of the file's fluxes, such as W m-2 nm-1 or Jy. Nothing: what the file says.",
             group="Own spectrum",
             suggestions=("erg s-1 cm-2 Angstrom-1", "W m-2 nm-1", "W m-2 um-1", "Jy", "photon s-1 cm-2 Angstrom-1"),
         ),
@@ -116,16 +113,14 @@ class Star(Section):
         Help("Library spectrum that continues a spectrum file beyond its ends, scaled to it"),
         Flag("--extend"),
         Widget(
-            label="Continue with",
-            hint="Library spectrum that continues the file beyond its ends, scaled to it, such as G2V. Nothing: none.",
+            "Continue with",
+            "Library spectrum that continues the file beyond its ends, scaled to it, such as G2V. Nothing: none.",
             group="Own spectrum",
             kind="library",
         ),
     ] = None
     ignore_checksum: Annotated[
-        bool | None,
-        Help("Read FITS files although their CHECKSUM or DATASUM differs"),
-        Flag("--ignore-checksum"),
+        bool | None, Help("Read FITS files although their CHECKSUM or DATASUM differs"), Flag("--ignore-checksum")
     ] = None
     bin_nm: Annotated[BinWidth | None, Help("Width of bins over which the spectrum is averaged"), Flag("--bin-nm")] = (
         None
@@ -135,8 +130,8 @@ class Star(Section):
         Help("Distance of the star", "for energies"),
         Flag("--distance"),
         Widget(
-            label="Distance",
-            hint="With it, measured flares have luminosities and energies. Nothing: fluxes at the telescope alone.",
+            "Distance",
+            "With it, measured flares have luminosities and energies. Nothing: fluxes at the telescope alone.",
             group="Measurement",
         ),
     ] = None
@@ -149,8 +144,8 @@ class Star(Section):
         Help("Table of other stars near the star", "with separation, magnitude and spectral type, or of a Gaia query"),
         Flag("--neighbours"),
         Widget(
-            label="Neighbours",
-            hint="Other stars near the star, as CSV: name, separation (arcsec), magnitude and spectral_type, or the "
+            "Neighbours",
+            "Other stars near the star, as CSV: name, separation (arcsec), magnitude and spectral_type, or the "
             "columns of a Gaia query. The light of those within 47 arcsec enters.",
             group="Neighbours",
             kind="table",
@@ -162,8 +157,8 @@ class Star(Section):
         Help("The star's own row in that table, by name, or its coordinates"),
         Flag("--neighbours-of"),
         Widget(
-            label="The star itself",
-            hint="Its own row in that table, by name, or its coordinates, such as 290.68 +11.12; needed if the table "
+            "The star itself",
+            "Its own row in that table, by name, or its coordinates, such as 290.68 +11.12; needed if the table "
             "has positions but no separations.",
             group="Neighbours",
         ),
@@ -173,8 +168,8 @@ class Star(Section):
         Help("Share of the light of neighbours within the fibre's radius that enters it", "an assumption"),
         Flag("--neighbour-share"),
         Widget(
-            label="Share that enters",
-            hint="Share of the light of neighbours within 47 arcsec that enters the fibre; an assumption, since it is "
+            "Share that enters",
+            "Share of the light of neighbours within 47 arcsec that enters the fibre; an assumption, since it is "
             "not published.",
             group="Neighbours",
         ),
@@ -191,20 +186,10 @@ class Star(Section):
             listed.pop("magnitude", None)
         return given | {key: value for key, value in listed.items() if given.get(key) is None}
 
-    @model_validator(mode="after")
-    def _one_spectrum(self) -> Self:
-        if (self.library is None) == (self.file is None):
-            raise InputError("a star needs either library or file, but has neither or both", key="library")
-        given = [key for key in FILE_KEYS if getattr(self, key) is not None]
-        if self.file is None and given:
-            raise InputError(
-                f"a star of the library has {' and '.join(given)}, which only a star from a file may have", key=given[0]
-            )
-        if self.neighbours is None and self.neighbours_of is not None:
-            raise InputError(
-                "a star has neighbours_of, which needs the table of its neighbours as well", key="neighbours_of"
-            )
-        return self
+    def _check_values(self) -> None:
+        check_one(self, "a star", "library", "file", needed=True)
+        check_needs(self, "a star of the library", FILE_KEYS, "file")
+        check_needs(self, "a star", ["neighbours_of"], "neighbours")
 
     def with_value(self, path: Sequence[str], value: Any) -> Self:
         """Return a copy with another value; another library star drops values that describe this one."""
@@ -246,8 +231,6 @@ class Star(Section):
 
     def applied(self, source: Source) -> Source:
         """Return a spectrum with the star's temperature, bins, dust and magnitude."""
-        from dataclasses import replace
-
         if self.effective_temperature_k is not None:
             source = replace(source, temperature_k=self.effective_temperature_k)
         if self.bin_nm is not None:
@@ -261,8 +244,6 @@ class Star(Section):
 
 #: Keys, other than `file`, that only apply to a flare from a file.
 FLARE_FILE_KEYS = ("quiescent", "wavelength_unit", "flux_unit", "continue_at_k", "as_observed")
-#: Keys that do not apply to a flare from a file.
-BLACKBODY_KEYS = ("second_temperature_k", "second_area", "balmer_jump")
 
 
 class FlareLight(Section):
@@ -273,8 +254,8 @@ class FlareLight(Section):
         Help("Ratio of the flare's flux just below the Balmer edge to that just above", default="1"),
         Flag("--balmer-jump"),
         Widget(
-            label="Balmer jump",
-            hint="Flux just below 364.6 nm over that just above, by hydrogen recombination: 1 to 4 in most flares. "
+            "Balmer jump",
+            "Flux just below 364.6 nm over that just above, by hydrogen recombination: 1 to 4 in most flares. "
             "Nothing: a plain blackbody.",
         ),
         Quantity(
@@ -287,8 +268,7 @@ class FlareLight(Section):
         Help("Temperature of a second blackbody of the flare", "needs its area"),
         Flag("--second-temperature"),
         Widget(
-            label="Second temperature",
-            hint="A second blackbody in the flare, instead of a Balmer jump. Nothing: there is none.",
+            "Second temperature", "A second blackbody in the flare, instead of a Balmer jump. Nothing: there is none."
         ),
         Quantity("second_temperature", "temperature of the flare's second blackbody", "second temperature (K)"),
     ] = None
@@ -296,11 +276,7 @@ class FlareLight(Section):
         AreaRatio | None,
         Help("Area of the second blackbody over that of the first"),
         Flag("--second-area"),
-        Widget(
-            label="Second area",
-            hint="Area at the second temperature over that at the first, if there is one.",
-            first="0.05",
-        ),
+        Widget("Second area", "Area at the second temperature over that at the first, if there is one.", first="0.05"),
         Quantity("second_area", "area of the flare's second blackbody over that of the first", "second area"),
     ] = None
     lines: Annotated[
@@ -326,8 +302,8 @@ class FlareLight(Section):
         Help("Spectrum file of an observed or computed flare"),
         Flag("--flare-file"),
         Widget(
-            label="Own flare spectrum",
-            hint="Spectrum of an observed or computed flare without its star, in place of a blackbody. The amplitude "
+            "Own flare spectrum",
+            "Spectrum of an observed or computed flare without its star, in place of a blackbody. The amplitude "
             "scales it.",
             name="flare_file",
             place=2,
@@ -339,8 +315,8 @@ class FlareLight(Section):
         Help("Spectrum file of its star without the flare, which is subtracted"),
         Flag("--flare-quiescent"),
         Widget(
-            label="Star without the flare",
-            hint="Spectrum of the same star without the flare, on the same scale and in the same units. It is "
+            "Star without the flare",
+            "Spectrum of the same star without the flare, on the same scale and in the same units. It is "
             "subtracted. Nothing: the file holds the flare alone.",
             group="Own flare",
             name="flare_quiescent",
@@ -353,8 +329,8 @@ class FlareLight(Section):
         Help("Unit of the wavelengths of the flare's files"),
         Flag("--flare-wavelength-unit"),
         Widget(
-            label="Flare: unit of wavelengths",
-            hint="Such as Angstrom or Angstrom air. Nothing: what the file says.",
+            "Flare: unit of wavelengths",
+            "Such as Angstrom or Angstrom air. Nothing: what the file says.",
             group="Own flare",
             name="flare_wavelength_unit",
             suggestions=("nm", "Angstrom", "um", "nm air", "Angstrom air"),
@@ -365,8 +341,8 @@ class FlareLight(Section):
         Help("Unit of the fluxes of the flare's files"),
         Flag("--flare-flux-unit"),
         Widget(
-            label="Flare: unit of fluxes",
-            hint="Such as W m-2 nm-1 or Jy. Nothing: what the file says.",
+            "Flare: unit of fluxes",
+            "Such as W m-2 nm-1 or Jy. Nothing: what the file says.",
             group="Own flare",
             name="flare_flux_unit",
             suggestions=("erg s-1 cm-2 Angstrom-1", "W m-2 nm-1", "Jy"),
@@ -377,8 +353,8 @@ class FlareLight(Section):
         Help("Temperature of a blackbody that continues the flare's file beyond its ends"),
         Flag("--continue-at"),
         Widget(
-            label="Continue at",
-            hint="Temperature of a blackbody that continues the flare's spectrum beyond its ends. Nothing: it must "
+            "Continue at",
+            "Temperature of a blackbody that continues the flare's spectrum beyond its ends. Nothing: it must "
             "cover what the instrument sees.",
             group="Own flare",
         ),
@@ -388,63 +364,41 @@ class FlareLight(Section):
         Help("Take the flare for as bright at the telescope as its file states, in place of amplitudes"),
         Flag("--as-observed"),
         Widget(
-            label="As bright as observed",
-            hint="Whether the flare has the flux of its file at the telescope, in place of the amplitude above.",
+            "As bright as observed",
+            "Whether the flare has the flux of its file at the telescope, in place of the amplitude above.",
             group="Own flare",
             place=2,
         ),
     ] = False
 
-    @model_validator(mode="after")
-    def _one_model(self) -> Self:
-        given = [key for key in BLACKBODY_KEYS if getattr(self, key) is not None]
-        if self.file is not None and given:
-            raise InputError(f"the spectrum of a flare needs either file or {given[0]}, but has both", key="file")
-        own = [key for key in FLARE_FILE_KEYS if getattr(self, key)]
-        if self.file is None and own:
-            raise InputError(f"the spectrum of a flare has {own[0]}, which needs a file as well", key=own[0])
-        if (self.second_temperature_k is None) != (self.second_area is None):
-            raise InputError(
-                "the spectrum of a flare needs both second_temperature_k and second_area, or neither, but has only one",
-                key="second_area",
-            )
-        if self.balmer_jump is not None and self.second_area is not None:
-            raise InputError(
-                "the spectrum of a flare needs either balmer_jump or second_area, but has both", key="balmer_jump"
-            )
+    def _check_values(self) -> None:
+        what = "the spectrum of a flare"
+        for key in ("second_temperature_k", "second_area", "balmer_jump"):
+            check_one(self, what, "file", key)
+        check_needs(self, what, FLARE_FILE_KEYS, "file")
+        check_all(self, what, "second_temperature_k", "second_area")
+        check_one(self, what, "balmer_jump", "second_area")
         if self.file is None and self != FlareLight.model_construct():
             self.at_temperature(10_000.0)
-        return self
 
     def at_temperature(self, temperature_k: float) -> FlareSpectrum:
         """Return the spectrum at a temperature, which a spectrum from a file ignores."""
-        from mauvecl.host.stars.flare_spectra import (
-            BalmerFlare,
-            Blackbody,
-            FlareWithLines,
-            ObservedFlare,
-            TwoBlackbodies,
-        )
+        from mauvecl.host.stars import flare_spectra as spectra
 
-        light: FlareSpectrum = Blackbody(temperature_k)
+        light: FlareSpectrum = spectra.Blackbody(temperature_k)
         if self.file is not None:
-            light = ObservedFlare.read(
-                self.file,
-                self.quiescent,
-                wavelength_unit=self.wavelength_unit,
-                flux_unit=self.flux_unit,
-                continue_at_k=self.continue_at_k,
-            )
+            units = {"wavelength_unit": self.wavelength_unit, "flux_unit": self.flux_unit}
+            light = spectra.ObservedFlare.read(self.file, self.quiescent, continue_at_k=self.continue_at_k, **units)
         elif self.second_temperature_k is not None and self.second_area is not None:
-            light = TwoBlackbodies(temperature_k, self.second_temperature_k, self.second_area)
+            light = spectra.TwoBlackbodies(temperature_k, self.second_temperature_k, self.second_area)
         elif self.balmer_jump is not None:
-            light = BalmerFlare(temperature_k, self.balmer_jump, self.electron_temperature_k)
+            light = spectra.BalmerFlare(temperature_k, self.balmer_jump, self.electron_temperature_k)
         if not (self.lines or self.line_fluxes):
             return light
         scaled = (
             {name: self.line_scale * value for name, value in each.items()} for each in (self.lines, self.line_fluxes)
         )
-        return FlareWithLines(light, *scaled)
+        return spectra.FlareWithLines(light, *scaled)
 
     def with_value(self, path: Sequence[str], value: Any) -> Self:
         """Return a copy with another value of one key; raises InputError if the key has no effect."""
@@ -482,8 +436,8 @@ class Flare(Section):
         ),
         Flag("--amplitude", "-a"),
         Widget(
-            label="Flare amplitude",
-            hint="By how much the flare at its peak brightens the star in the band of the Kepler satellite. In the "
+            "Flare amplitude",
+            "By how much the flare at its peak brightens the star in the band of the Kepler satellite. In the "
             "ultraviolet the rise is many times as large.",
             name="amplitude_percent",
             first="2",

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from mauvecl.flares.settings import (
     DAYS,
@@ -26,7 +26,7 @@ from mauvecl.noise.unknowns import COURSES, STARE_PROCESSES, Changing, NuisanceN
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.fields import Flag, Help, Range, Unit, Widget
 from mauvecl.schema.physical import Amplitude, Duration, Energy, Positive, Temperature, Wavelength
-from mauvecl.schema.section import Section, read_ranges
+from mauvecl.schema.section import Section, check_one, read_ranges
 from mauvecl.study.observation import Spread, sd_of
 
 if TYPE_CHECKING:
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 
 #: Orbital period rounded down to a multiple of the frame time, s.
 ORBIT_FRAMES_S = 5680.0
-
 
 #: Known changes during a stare.
 KNOWN_CHANGES = ("thermal", "variability", "throughput", "sky")
@@ -107,17 +106,13 @@ class StareQuestion(Section):
         (550.0, 700.0),
     )
 
-    @model_validator(mode="after")
-    def _possible(self) -> Self:
+    def _check_values(self) -> None:
         if self.orbit_gap_s >= self.orbit_s:
-            raise InputError(
-                f"stare.orbit_gap_s = {self.orbit_gap_s:g} must be shorter than the orbit of {self.orbit_s:g} s",
-                key="orbit_gap_s",
-            )
+            expected = f"shorter than the orbit of {self.orbit_s:g} s"
+            raise InputError.of("stare.orbit_gap_s", self.orbit_gap_s, expected, unit="s")
         for low, high in self.bands_nm:
             if not 0 < low < high:
                 raise InputError.of("stare.bands_nm", (low, high), "ascending wavelengths", unit="nm")
-        return self
 
     @property
     def has_unknowns(self) -> bool:
@@ -131,6 +126,10 @@ class StareQuestion(Section):
             orbits = math.ceil(self.duration_s / self.orbit_s)
             every += [((n + 1) * self.orbit_s - self.orbit_gap_s, (n + 1) * self.orbit_s) for n in range(orbits)]
         return every
+
+
+#: Keys of the size of an event.
+SIZES = ("amplitude", "peak", "equivalent_duration_s", "energy_erg")
 
 
 class EventChoice(Section):
@@ -152,19 +151,14 @@ class EventChoice(Section):
     shape: Annotated[ShapeName | None, Help("Shape", default="the stare's", choices=", ".join(SHAPE_NAMES))] = None
     shape_file: Annotated[Path | None, Help("File of a shape with two columns, time in half-widths and value")] = None
 
-    @model_validator(mode="after")
-    def _one_size(self) -> Self:
-        if len(given := self.sizes) > 1:
-            raise InputError(f"an event needs only one of {' and '.join(given)}", key=given[0])
-        if self.shape is not None and self.shape_file is not None:
-            raise InputError("an event needs either shape or shape_file, but has both", key="shape")
-        return self
+    def _check_values(self) -> None:
+        check_one(self, "an event", *SIZES)
+        check_one(self, "an event", "shape", "shape_file")
 
     @property
     def sizes(self) -> list[str]:
         """Keys of the given sizes, at most one."""
-        keys = ("amplitude", "peak", "equivalent_duration_s", "energy_erg")
-        return [key for key in keys if getattr(self, key) is not None]
+        return [key for key in SIZES if getattr(self, key) is not None]
 
     def load_shape(self, default: str) -> Shape:
         """Return the shape, or the published shape named `default` if none is given."""
@@ -192,8 +186,7 @@ class SearchChoice(Section):
     offset: Annotated[bool, Help("Whether to marginalise over the offset of the baseline")] = True
     slope: Annotated[bool, Help("Whether to marginalise over the slope of the baseline")] = True
     cycle: Annotated[
-        bool | None,
-        Help("Whether to marginalise over the orbital cycle", default="if the stare has an unknown cycle"),
+        bool | None, Help("Whether to marginalise over the orbital cycle", default="if the stare has an unknown cycle")
     ] = None
     window_s: Annotated[
         Annotated[float, Unit("s"), Range(0)] | None,
@@ -208,15 +201,14 @@ class SearchChoice(Section):
         Help("False alarms of the search per star-day, star-month or star-year"),
         Flag("--false-alarms"),
         Widget(
-            label="False alarms",
-            hint="Expected number of detections that are only noise, in the time that the next field states.",
+            "False alarms", "Expected number of detections that are only noise, in the time that the next field states."
         ),
     ] = 1.0
     per: Annotated[
         Per,
         Help("Star-time of frames for the false alarms"),
         Flag("--alarms-per"),
-        Widget(label="False alarms per", hint="Observing time of one star to which the number of false alarms refers."),
+        Widget("False alarms per", "Observing time of one star to which the number of false alarms refers."),
     ] = "month"
     null: Annotated[
         Literal["sampled", "counted"],
@@ -226,13 +218,11 @@ class SearchChoice(Section):
     points: Annotated[int, Range(1, 100), Help("Consecutive frames of the conventional rule, for comparison")] = 3
     sigma: Annotated[Positive, Help("Threshold of the conventional rule, in standard deviations")] = 3.0
 
-    @model_validator(mode="after")
-    def _possible(self) -> Self:
+    def _check_values(self) -> None:
         if list(self.half_widths_s) != sorted(set(self.half_widths_s)):
             raise InputError.of("search.half_widths_s", list(self.half_widths_s), "ascending times")
         if self.slope and not self.offset:
             raise InputError("search.slope needs search.offset = true as well", key="slope")
-        return self
 
     @property
     def rate(self) -> float:
@@ -295,25 +285,16 @@ class InjectionQuestion(Section):
         int, Range(0, 100_000), Help("Injections of each size and half-width that are fitted if they are detected")
     ] = 40
 
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
+    def _check_values(self) -> None:
         if self.low is not None and self.high is not None and not self.low < self.high:
-            raise InputError(
-                f"injections.low must be below high, but is {self.low:g} for high = {self.high:g}", key="low"
-            )
+            raise InputError.of("injections.low", self.low, f"below high = {self.high:g}")
         if self.half_width_low_s > self.half_width_high_s:
-            raise InputError(
-                f"injections.half_width_low_s = {self.half_width_low_s:g} must be below "
-                f"half_width_high_s = {self.half_width_high_s:g}",
-                key="half_width_low_s",
-            )
-        return self
+            expected = f"below half_width_high_s = {self.half_width_high_s:g}"
+            raise InputError.of("injections.half_width_low_s", self.half_width_low_s, expected)
 
     @property
     def half_widths_s(self) -> tuple[float, ...]:
         """Half-widths of injected flares, evenly spaced in the logarithm."""
         import numpy as np
 
-        if self.widths == 1:
-            return (self.half_width_low_s,)
         return tuple(float(w) for w in np.geomspace(self.half_width_low_s, self.half_width_high_s, self.widths))

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-
 #: Smallest distance of a prior's cuts from its mean, in standard deviations, for a normal distribution to replace it:
 #: 6e-7 of the values lie beyond.
 NEGLIGIBLE_CUT_SD = 5.0
@@ -83,9 +82,9 @@ def stare_of(study: Study, instrument: Instrument) -> Stare:
             **changes,
         )
     for _, changed, _, mean in priors:
-        value = stare.temperature_c + mean if changed == "temperature" else getattr(stare, changed) * mean
-        known: dict[str, Any] = {"temperature_c" if changed == "temperature" else changed: value}
-        stare = replace(stare, **known)
+        name = "temperature_c" if changed == "temperature" else changed
+        value: Any = getattr(stare, name)
+        stare = replace(stare, **{name: value + mean if changed == "temperature" else value * mean})
     return stare
 
 
@@ -111,16 +110,10 @@ def _along_orbit(study: Study, frame_s: float, changes: dict[str, Any]) -> Stare
 def unused_lines(exposure_s: float, stare: Stare, events: Sequence[Event]) -> list[str]:
     """Return messages about settings without effect on the stare: the exposure, and flares that peak outside it."""
     lines = check_contributions(events, stare.start_s, stare.frame_s)
-    if exposure_s != stare.frame_s:
-        lines.insert(
-            0,
-            Message(
-                f"A stare consists of frames of {stare.frame_s:g} s: observation.exposure_s = {exposure_s:g} s is not "
-                "used.",
-                "not used",
-            ),
-        )
-    return lines
+    if exposure_s == stare.frame_s:
+        return lines
+    frames = f"A stare consists of frames of {stare.frame_s:g} s"
+    return [Message(f"{frames}: observation.exposure_s = {exposure_s:g} s is not used.", "not used"), *lines]
 
 
 def orbit_lines(stare: StareQuestion, orbit: OrbitQuestion, frame_s: float) -> list[str]:
@@ -130,10 +123,8 @@ def orbit_lines(stare: StareQuestion, orbit: OrbitQuestion, frame_s: float) -> l
     if not stare.along_orbit:
         return []
     times = TimeGrid(orbit.start, stare.duration_s / DAY_S, frame_s)
-    assumed = (
-        "Limits, temperatures and windows of a stare along the orbit are assumptions; stray light is not modelled."
-    )
-    return [*orbit.orbit().messages(times), assumed]
+    assumed = "Limits, temperatures and windows of a stare along the orbit are assumptions"
+    return [*orbit.orbit().messages(times), f"{assumed}; stray light is not modelled."]
 
 
 def threshold_line(title: str, threshold: float) -> str:

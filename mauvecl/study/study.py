@@ -11,10 +11,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from itertools import chain
 from pathlib import Path
-from types import UnionType
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, Union, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, Field, model_validator
+from pydantic import BaseModel, Field
 
 from mauvecl.detection.names import DEFAULT_STATISTICS, countable, least_countable
 from mauvecl.host.instrument import FORMER_NAMES, FORMERLY_MAUVE
@@ -35,9 +34,9 @@ from mauvecl.schema.errors import InputError, Message, shortened
 from mauvecl.schema.fields import AnyUnit, Flag, Help, found
 from mauvecl.schema.section import Section, built, fields_of
 from mauvecl.study.analyses import CalibrateQuestion, ChangeQuestion, DataChoice, MeasureQuestion
-from mauvecl.study.keywords import changes_of, keywords_of, stars_of, values_of
+from mauvecl.study.keywords import Keyword, changes_of, stars_of, values_of
 from mauvecl.study.observation import NuisanceChoice, Observation, Run, SkyLight, Unknowns
-from mauvecl.study.plan import OrbitQuestion, PlanQuestion
+from mauvecl.study.plan import OrbitQuestion, PlanQuestion, PlanTarget
 from mauvecl.study.questions import (
     QUANTITIES,
     Axis,
@@ -89,31 +88,28 @@ def read_version(data: dict[str, Any], where: str) -> dict[str, Any]:
     return data | {"version": VERSION} | dict(zip(of_defaults, (observation, nuisances, run, plan), strict=True))
 
 
-def paths_in(data: Any, kind: Any) -> Iterator[tuple[dict[str, Any], str]]:
-    """Yield each table and key that hold a path as text, in data of an annotated type such as a section."""
-    parts = get_args(kind)
-    if get_origin(kind) in (Union, UnionType):
-        for part in parts:
-            yield from paths_in(data, part)
-    elif get_origin(kind) is tuple and isinstance(data, list):
+def with_paths(value: Any, change: Callable[[Path], Any]) -> Any:
+    """Return a value with other paths, such as those in the sections of a study."""
+    if isinstance(value, Path):
+        return change(value)
+    if isinstance(value, tuple):
+        return tuple(with_paths(item, change) for item in value)
+    if isinstance(value, dict):
+        return {key: with_paths(item, change) for key, item in value.items()}
+    if isinstance(value, BaseModel):
+        changed = {key: with_paths(item, change) for key, item in value}
+        return value.model_copy(update={key: item for key, item in changed.items() if item != getattr(value, key)})
+    return value
+
+
+def tables_in(data: Any) -> Iterator[dict[str, Any]]:
+    """Yield the tables in nested data."""
+    if isinstance(data, dict):
+        yield data
+        data = list(data.values())
+    if isinstance(data, list | tuple):
         for value in data:
-            yield from paths_in(value, parts[0])
-    elif isinstance(data, dict):
-        kinds = dict.fromkeys(data, parts[1]) if get_origin(kind) is dict else {}
-        if isinstance(kind, type) and issubclass(kind, BaseModel):
-            kinds = {key: field.annotation for key, field in kind.model_fields.items()}
-        for key, value in [*data.items()]:
-            if isinstance(value, str) and kinds.get(key) in (Path, Path | None):
-                yield data, key
-            else:
-                yield from paths_in(value, kinds.get(key))
-
-
-def with_paths(data: Any, kind: Any, change: Callable[[Path], Path]) -> Any:
-    """Change the paths in data of an annotated type, such as a section, in place, and return the data."""
-    for table, key in paths_in(data, kind):
-        table[key] = str(change(Path(table[key])))
-    return data
+            yield from tables_in(value)
 
 
 def locate_files(data: dict[str, Any], table: Path) -> None:
@@ -122,21 +118,19 @@ def locate_files(data: dict[str, Any], table: Path) -> None:
     Searches the table's folder, its parent, the current folder, and the paths in a ``study.toml`` next to the table.
     Raises InputError if no file with the name and digest is found.
     """
-    for section, key in paths_in(data, Study):
-        if f"{key}_sha256" not in section:
-            continue
-        name, digest = Path(section[key]).name, section.pop(f"{key}_sha256")
-        places = [table.parent / name, table.parent.parent / name, Path(name), *_beside(table, name)]
-        for place in places:
-            if without_columns(place)[0].is_file() and _digest(without_columns(place)[0]) == digest:
-                section[key] = str(place.resolve())
-                break
-        else:
-            raise InputError(
-                f"{shortened(table.name)}: its file {shortened(name)} with sha256 {shortened(str(digest))} is missing "
-                "or has changed; it must lie next to the table",
-                key=key,
-            )
+    for section in tables_in(data):
+        for key in [key for key, name in section.items() if f"{key}_sha256" in section and isinstance(name, str)]:
+            name, digest = Path(section[key]).name, section.pop(f"{key}_sha256")
+            places = [table.parent / name, table.parent.parent / name, Path(name), *_beside(table, name)]
+            files = ((place, without_columns(place)[0]) for place in places)
+            found = next((place for place, file in files if file.is_file() and _digest(file) == digest), None)
+            if found is None:
+                raise InputError(
+                    f"{shortened(table.name)}: its file {shortened(name)} with sha256 {shortened(str(digest))} is "
+                    "missing or has changed; it must lie next to the table",
+                    key=key,
+                )
+            section[key] = str(found.resolve())
 
 
 def _beside(table: Path, name: str) -> list[Path]:
@@ -145,8 +139,8 @@ def _beside(table: Path, name: str) -> list[Path]:
     if not study.is_file():
         return []
     data = toml(read_text(study, "study file"), "study file 'study.toml'")
-    files = [section[key] for section, key in paths_in(data, Study)]
-    return [table.parent / file for file in files if Path(file).name == name]
+    texts = [value for section in tables_in(data) for value in section.values() if isinstance(value, str)]
+    return [table.parent / file for file in texts if Path(file).name == name]
 
 
 def _digest(file: Path) -> str:
@@ -171,18 +165,14 @@ def set_key(data: Any, path: list[str], value: Any, text: str) -> None:
     for part in parents:
         if isinstance(data, list | tuple):
             if part not in (numbers := [str(i) for i in range(len(data))]):
-                raise InputError(
-                    f"setting = {shortened(text)}: the entry must be 0 to {len(numbers) - 1}, not {shortened(part)}",
-                    key="setting",
-                )
+                fault = f"the entry must be 0 to {len(numbers) - 1}, not {shortened(part)}"
+                raise InputError(f"setting = {shortened(text)}: {fault}", key="setting")
             data = data[int(part)]
         elif isinstance(data, dict):
             data = data.setdefault(part, {})
     if not isinstance(data, dict):
-        raise InputError(
-            f"setting = {shortened(text)}: {shortened('.'.join(parents))} must be a section with keys, but is a value",
-            key="setting",
-        )
+        fault = f"{shortened('.'.join(parents))} must be a section with keys, but is a value"
+        raise InputError(f"setting = {shortened(text)}: {fault}", key="setting")
     data[last] = value
 
 
@@ -242,15 +232,13 @@ class Study(Section):
     calibrate: CalibrateQuestion = CalibrateQuestion()
     change: ChangeQuestion = ChangeQuestion()
 
-    @model_validator(mode="after")
-    def _one_photosphere(self) -> Self:
+    def _check_values(self) -> None:
         own = [number for number, star in enumerate(self.star) if star.effective_temperature_k is not None]
         if own and self.flare.geometry == "replaces" and self.flare.photosphere_temperature_k is not None:
             raise InputError(
                 f"only one of flare.photosphere_temperature_k and star.{own[0]}.effective_temperature_k may be given",
                 key="flare.photosphere_temperature_k",
             )
-        return self
 
     @classmethod
     def read(cls, path: str | Path) -> Self:
@@ -266,10 +254,10 @@ class Study(Section):
             )
         if path.suffix == ".ecsv":
             locate_files(data, path)
-        data = read_version(data, path.name)
+        study = cls.build(read_version(data, path.name), path.name)
         # Paths are relative to the study file.
-        data = with_paths(data, cls, lambda file: path.parent / file)
-        return cls.build(data, path.name)
+        moved: Self = with_paths(study, lambda file: path.parent / file)
+        return moved
 
     @classmethod
     def build(cls, data: dict[str, Any], where: str) -> Self:
@@ -288,9 +276,9 @@ class Study(Section):
         >>> Study.of(star="M4V", magnitude=11, amplitude=0.05, exposure=2 * u.min)
         <Study of M4V V = 11; flares of 5 %; 120 s on mauve>
         """
-        count, where = Counter(flag.parameter for *_, flag in keys_of()), "Study.of()"
+        count, where = Counter(entry.name for entry in keys_of()), "Study.of()"
         # A name of several keys belongs to none of them.
-        named = keywords_of(entry for entry in keys_of() if count[entry[2].parameter] == 1)
+        named = {entry.name: entry for entry in keys_of() if count[entry.name] == 1}
         given = values_of(keywords, named, where)
         study = cls().paper() if given["paper"] else cls()
         changes = changes_of(given, named, study.nuisances)
@@ -342,21 +330,14 @@ class Study(Section):
     def with_enough_tails(self, *, sampled: bool = True, raised: bool = False) -> tuple[Self, list[str]]:
         """Return a copy whose thresholds can be found, with a message if it differs.
 
-        Parameters
-        ----------
-        sampled : bool
-            Whether importance sampling may find thresholds that cannot be counted.
-        raised : bool
-            Whether more realisations are drawn instead, up to `MOST_RAISED`.
+        Importance sampling may find thresholds that cannot be counted if `sampled`; if `raised`, more realisations are
+        drawn instead, up to `MOST_RAISED`.
         """
         run = self.run
         if not 0 < run.fap < 1 or countable(run.fap, run.realisations):
             return self, []
-        least = least_countable(run.fap)
-        few = (
-            f"{run.realisations} realisations are too few to count thresholds with a false-alarm probability of "
-            f"{run.fap:g}, so "
-        )
+        least, wanted = least_countable(run.fap), f"thresholds with a false-alarm probability of {run.fap:g}"
+        few = f"{run.realisations} realisations are too few to count {wanted}, so "
         if raised and least <= MOST_RAISED:
             return self.with_settings([f"run.realisations={least}"]), [f"{few}{least} are drawn."]
         if not sampled:
@@ -366,7 +347,7 @@ class Study(Section):
 
     def _stated(self) -> dict[str, Any]:
         """Return the data of the study's text, without sections that have their default values."""
-        data: dict[str, Any] = with_paths(self.model_dump(mode="json", exclude_none=True), type(self), Path.resolve)
+        data: dict[str, Any] = self.model_dump(exclude_none=True)
         unused = {"sweep": not self.sweep.axes, "unknowns": not self.unknowns.draws, "signal": self.signal.snr is None}
         fields = type(self).model_fields
         for name in [*data]:
@@ -391,7 +372,7 @@ class Study(Section):
         """Return the study as TOML, without sections that have their default values."""
         import tomli_w
 
-        return tomli_w.dumps(self._stated())
+        return tomli_w.dumps(with_paths(self._stated(), lambda file: str(file.resolve())))
 
     def __repr__(self) -> str:
         o, swept = self.observation, [axis.quantity for axis in self.sweep.axes]
@@ -411,12 +392,13 @@ class Study(Section):
         import tomli_w
 
         data = self._stated()
-        for section, key in paths_in(data, type(self)):
-            place, _ = without_columns(Path(section[key]))
-            section[key] = Path(section[key]).name
-            # Keep the answer even if the file no longer exists.
-            with contextlib.suppress(InputError):
-                section[f"{key}_sha256"] = _digest(place)
+        for section in tables_in(data):
+            for key, value in [*section.items()]:
+                if isinstance(value, Path):
+                    section[key] = value.name
+                    # Keep the answer even if the file no longer exists.
+                    with contextlib.suppress(InputError):
+                        section[f"{key}_sha256"] = _digest(without_columns(value)[0])
         return tomli_w.dumps(data)
 
     def with_instrument(self, changes: Mapping[str, Any]) -> Self:
@@ -445,8 +427,8 @@ class Study(Section):
     @property
     def has_neighbours(self) -> bool:
         """True if a star or a target of a plan has a table of neighbours."""
-        targets = any(target.neighbours is not None for target in self.plan.targets)
-        return targets or any(star.neighbours is not None for star in self.star)
+        stars: tuple[Star | PlanTarget, ...] = (*self.star, *self.plan.targets)
+        return any(star.neighbours is not None for star in stars)
 
 
 def _without_empty(data: Any) -> Any:
@@ -476,9 +458,9 @@ def study_keys() -> Mapping[str, FieldInfo]:
 
 
 @cache
-def keys_of(wanted: tuple[str, ...] = ("",)) -> tuple[tuple[str, FieldInfo, Flag], ...]:
-    """Return key, field and metadata of the flags of keys and whole sections in their order, by default of all."""
-    flags = [(key, field, flag) for key, field in study_keys().items() for flag in found(field, Flag)]
-    each = [[entry for entry in flags if f"{entry[0]}.".startswith(f"{name}." if name else "")] for name in wanted]
+def keys_of(wanted: tuple[str, ...] = ("",)) -> tuple[Keyword, ...]:
+    """Return the keywords of keys and whole sections in their order, by default of all."""
+    every = [Keyword(key, field, flag) for key, field in study_keys().items() for flag in found(field, Flag)]
+    each = [[entry for entry in every if f"{entry.path}.".startswith(f"{name}." if name else "")] for name in wanted]
     assert all(each), wanted
     return tuple(chain.from_iterable(each))

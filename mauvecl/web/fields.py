@@ -27,7 +27,6 @@ from mauvecl.schema.fields import (
     as_typed,
     first,
     found,
-    is_measure,
     range_of,
     with_unit,
 )
@@ -74,11 +73,11 @@ class Number:
         form = r"[+-]?\d+" if self.whole else r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,3})?"
         if not text.strip():
             raise InputError(f"nothing is entered; {accepted} is needed", key="number")
-        if not self.whole and is_measure(text):
-            try:
-                text = repr(self.scale * float(with_unit(text, self.unit) or 0.0))
-            except ValueError:
-                raise InputError(f"{shortened(text)} has another unit: enter {accepted}", key="number") from None
+        try:
+            measure = None if self.whole else with_unit(text, self.unit)
+        except ValueError:
+            raise InputError(f"{shortened(text)} has another unit: enter {accepted}", key="number") from None
+        text = text if measure is None else repr(self.scale * measure)
         if re.fullmatch(form, text.strip(), flags=re.ASCII) is None:
             point = ", with a point for decimals" if "," in text else ""
             raise InputError(f"{shortened(text)} is not {kind}: enter {accepted}{point}", key="number")

@@ -333,7 +333,7 @@ def study_file(study: Study, name: str) -> tuple[str, bytes]:
     """Return name and content of the study file, in a zip archive with the visitor's files if there are any."""
     # The visitor's files that the study names, each once.
     files, text = dict[Path, Path](), study.toml()
-    with_paths(study.model_dump(mode="json"), Study, lambda file: files.setdefault(file, file))
+    with_paths(study, lambda file: files.setdefault(file, file))
     if not files:
         return f"{name}.toml", text.encode()
     out = io.BytesIO()
@@ -377,8 +377,7 @@ def commands_and_programs(tab: Tab, question: Question, folder: Path) -> list[di
     for name in tab.questions:
         (verb, *_), study = QUESTIONS[name].verbs, QUESTIONS[name].study(question.case(folder).study)
         # Paths relative to the study, instead of those on the server.
-        data = with_paths(study.model_dump(mode="json"), Study, lambda file: Path(file.name))
-        study, keys = Study.build(data, "page"), dict[str, Any]()
+        study, keys = with_paths(study, lambda file: Path(file.name)), dict[str, Any]()
         for key, value in keys_used(VERBS[verb], study, Study()):
             set_key(keys, key.split("."), value, key)
         text = pformat(keys, width=100, sort_dicts=False).replace("\n", "\n    ")

@@ -141,14 +141,6 @@ def test_every_value_of_the_record_is_verified(out: Path) -> None:
     assert json.loads(place.read_text(encoding="utf-8"))["record_digest"] != record["record_digest"]
 
 
-def test_study_of_the_user_is_not_an_answer(tmp_path: Path) -> None:
-    """Report nothing for a user's study and table, which no run wrote."""
-    (tmp_path / "study.toml").write_text("[run]\nfap = 0.01\n", encoding="utf-8")
-    header = "# %ECSV 1.0\n# ---\n# datatype:\n# - {name: amplitude, datatype: float64}\n"
-    (tmp_path / "flares.ecsv").write_text(f"{header}amplitude\n0.1\n", encoding="utf-8")
-    assert "'.' is not a store of spectra" in run("verify", ".", folder=tmp_path, code=2).stderr
-
-
 def full_from(step: int, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Simulate a disk that is full after `step` files; return the names of the files that were tried."""
     tried: list[str] = []

@@ -17,26 +17,30 @@ from mauvecl import BalmerFlare, InputError, Instrument, Sky, Source, Study, Two
 FIELDS = dict(fields())
 
 
-@pytest.mark.parametrize(
-    ("key", "value", "plain"),
-    [
-        ("observation.exposure_s", 1 * u.min, 60.0),
-        ("observation.exposure_s", 86_400, 86_400.0),
-        ("observation.temperature_c", 300 * u.K, 26.85),
-        ("observation.temperature_c", None, None),
-        ("signal.wavelength_nm", 1 * u.PHz, 299.792458),
-        ("run.realisations", 5000.0, 5000),
-        ("run.fap", 10 * u.percent, 0.1),
-        ("measure.bands_nm", [[0.3, 0.4] * u.um], ((300.0, 400.0),)),
-        ("measure.bands_nm", [[0.3 * u.um, 400 * u.nm]], ((300.0, 400.0),)),
-        ("orbit.simbad", True, True),
-    ],
-)
+@pytest.mark.parametrize(("key", "value", "plain"), [
+    ("observation.exposure_s", 1 * u.min, 60.0), ("observation.exposure_s", 86_400, 86_400.0),
+    ("observation.exposure_s", "10 min", 600.0), ("observation.exposure_s", "10min", 600.0),
+    ("observation.exposure_s", "2h", 7200.0), ("observation.exposure_s", "3 hours", 10_800.0),
+    ("observation.exposure_s", "0.5 d", 43_200.0), ("observation.exposure_s", "90 sec", 90.0),
+    ("observation.temperature_c", 300 * u.K, 26.85), ("observation.temperature_c", None, None),
+    ("observation.temperature_c", "290 K", 16.85), ("observation.temperature_c", "-10 °C", -10.0),
+    ("observation.temperature_c", "20 deg C", 20.0), ("flare.temperature_k", "9000 K", 9000.0),
+    ("flare.temperature_k", "1e4 kelvin", 1e4), ("star.0.magnitude", "7mag", 7.0), ("star.0.distance_pc", "5 pc", 5.0),
+    ("star.0.distance_pc", "10 light years", 3.066013937), ("star.0.radius_rsun", "0.5 Rsun", 0.5),
+    ("star.0.radius_rsun", "695700 km", 1.0), ("sky.surface_brightness", "22 mag/arcsec^2", 22.0),
+    ("signal.wavelength_nm", 1 * u.PHz, 299.792458), ("signal.wavelength_nm", "2800 Angstrom", 280.0),
+    ("run.realisations", 5000.0, 5000), ("run.fap", 10 * u.percent, 0.1), ("run.fap", "0.1 %", 1e-3),
+    ("measure.bands_nm", [[0.3, 0.4] * u.um], ((300.0, 400.0),)),
+    ("measure.bands_nm", [[0.3 * u.um, 400 * u.nm]], ((300.0, 400.0),)), ("orbit.simbad", True, True),
+])  # fmt: skip
 def test_values_in_range_are_plain_numbers(key: str, value: Any, plain: Any) -> None:
-    section, name = key.split(".")
-    found = getattr(getattr(Study.build({section: {name: value}}, "test"), section), name)
-    np.testing.assert_allclose(found, plain, rtol=1e-12) if plain is not None else None
+    section, *_, name = key.split(".")
+    data = [{"library": "G2V", name: value}] if section == "star" else {name: value}
+    study = Study.build({section: data}, "test")
+    found = getattr(study.star[0] if section == "star" else getattr(study, section), name)
     assert type(found) is type(plain)
+    if plain is not None:
+        np.testing.assert_allclose(found, plain, rtol=1e-9)
 
 
 # Ranges of quantities
@@ -148,10 +152,15 @@ def test_paths_are_relative_to_the_study_file_and_absolute_in_its_text(tmp_path:
     assert str(absolute).count(str(tmp_path / "there" / "f.txt")) == len(keys)
     # Read elsewhere, the text gives the same study.
     assert Study.build(absolute, "elsewhere") == study
-    # An answer's table names the files by their content, and is read next to them.
+    # An answer's table names the files by their content, and is read next to them or in a folder there.
     assert (study.text().count("_sha256"), study.text().count(str(tmp_path))) == (len(keys), 0)
-    Table({"x": [1.0]}, meta={"study": study.text()}).write(tmp_path / "there" / "table.ecsv", format="ascii.ecsv")
-    assert Study.read(tmp_path / "there" / "table.ecsv") == study
+    for table in (tmp_path / "there" / "table.ecsv", tmp_path / "there" / "out" / "table.ecsv"):
+        table.parent.mkdir(exist_ok=True)
+        Table({"x": [1.0]}, meta={"study": study.text()}).write(table, format="ascii.ecsv")
+        assert Study.read(table) == study
+    np.savetxt(tmp_path / "there" / "f.txt", 2 * light)
+    with pytest.raises(InputError, match=r"its file 'f.txt' with sha256 .* has changed"):
+        Study.read(table)
 
 
 # Older files

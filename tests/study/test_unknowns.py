@@ -1,5 +1,6 @@
 """Averages over unknown instrument values, and their importance."""
 
+from functools import cache
 from itertools import permutations
 from typing import Any
 
@@ -77,14 +78,12 @@ def test_shares_equal_those_of_a_linear_model(averaged: Any) -> None:
     """Add the unknowns to a linear fit in each of 720 orders, and average what each adds to the explained variance."""
     unknown = averaged.limits[0].unknown
     x, y = stats.zscore(unknown.draws.values), unknown.limits
-    known: dict[frozenset[int], float] = {}
 
+    @cache
     def explained(some: frozenset[int]) -> float:
-        if some not in known:
-            fitted = np.column_stack([x[:, sorted(some)], np.ones(len(y))])
-            left = y - fitted @ np.linalg.lstsq(fitted, y, rcond=None)[0]
-            known[some] = 1.0 - left.var() / y.var()
-        return known[some]
+        fitted = np.column_stack([x[:, sorted(some)], np.ones(len(y))])
+        left = y - fitted @ np.linalg.lstsq(fitted, y, rcond=None)[0]
+        return 1.0 - left.var() / y.var()
 
     orders = list(permutations(range(len(ALL))))
     wanted = np.zeros(len(ALL))
