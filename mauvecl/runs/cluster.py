@@ -6,6 +6,7 @@ import contextlib
 import logging
 import os
 import pickle
+import re
 import signal
 import threading
 import time
@@ -15,7 +16,6 @@ from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from urllib.parse import urlsplit
 
 from mauvecl.detection.requests import Countable, Shard
 from mauvecl.detection.snr import Arrays
@@ -336,17 +336,8 @@ def _local_cluster(n_workers: int, distributed: Any) -> Any:
 
 def _is_address(where: str) -> bool:
     """Return whether an address has a scheme of Dask, a host and a port."""
-    try:
-        parts = urlsplit(where)
-        host, port = parts.hostname, parts.port
-    except ValueError:
-        return False
-    plain = where.isascii() and where.isprintable() and " " not in where
-    return plain and parts.scheme in SCHEMES and bool(host) and bool(port) and parts.path in ("", "/")
-
-
-#: Schemes of Dask's network protocols.
-SCHEMES = ("tcp", "tls", "ucx", "ucxx", "ws", "wss")
+    found = re.fullmatch(r"(tcp|tls|ucxx?|wss?)://([\w.-]+|\[[\w:.%]+\]):(\d{1,5})/?", where, flags=re.ASCII)
+    return found is not None and 0 < int(found[3]) < 2**16
 
 
 LOGS = ("distributed", *(f"distributed.{part}" for part in ("client", "nanny", "worker", "scheduler", "core")))
