@@ -509,7 +509,7 @@ class Visitor(WebSocketHandler):
 
     async def _ask_columns(self, asked: dict[str, Any]) -> None:
         """Send the names of the columns of the visitor's frames; none if they are no table."""
-        file, names = UPLOADED.get(self, "upload", "frames"), ()
+        file, names = UPLOADED.get(self, "upload", "frames"), tuple[str, ...]()
         if file is not None:
             work = READER.submit(read_limited, ColumnNames, ColumnNames.read, {file.name: file.content})
             names = (await asyncio.wrap_future(work)).names
