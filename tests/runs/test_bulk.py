@@ -55,9 +55,7 @@ def test_rows_equal_those_of_the_engine(tmp_path: Path, engine: Engine) -> None:
     quiet, flare = expectations(asked)
     for name, x in (("star-1/quiescent", quiet), ("star-1/flare-1", flare)):
         found = bulk.read(tmp_path / "frames.zarr", name)
-        assert found.dims == ("realisation", "pixel")
-        assert found.dtype == np.uint16
-        assert found.attrs["units"] == "DN"
+        assert (found.dims, found.dtype, found.attrs["units"]) == (("realisation", "pixel"), np.uint16, "DN")
         np.testing.assert_array_equal(found.values, engine.realise(x, count=300, seed=11))
         np.testing.assert_array_equal(found[17:20].values, engine.realise(x, start=17, count=3, seed=11))
         np.testing.assert_array_equal(found.wavelength, x.wavelength_nm)

@@ -70,15 +70,11 @@ def test_order_of_shards_does_not_affect_the_answer(engine: Engine, scene: list[
 
 
 @pytest.mark.long
-def test_shards_of_every_kind_of_request_join(engine: Engine) -> None:
-    """Include requests with several launches and all arguments."""
+def test_shards_of_several_launches_with_all_arguments_join(engine: Engine) -> None:
     scene = star(amplitudes=tuple(np.linspace(0.01, 0.3, 17)), payload=instrument(part=True))
-    how: dict[str, Any] = {
-        "n": 9000,
-        "statistics": ("chi2_pair", "matched"),
-        "comparison": Comparison.of("stack:3", "estimated"),
-        "processes": mauvecl.Processes(jitter=mauvecl.Uniform(0.0, 0.05)),
-    }
+    how: dict[str, Any] = {"n": 9000, "statistics": ("chi2_pair", "matched")}
+    how |= {"comparison": Comparison.of("stack:3", "estimated")}
+    how |= {"processes": mauvecl.Processes(jitter=mauvecl.Uniform(0.0, 0.05))}
     pool = Pool(Shuffled(engine, 4))
     same(detected(pool, scene, **how), detected(engine, scene, **how))
     assert pool.standing.of == 2 * 3
