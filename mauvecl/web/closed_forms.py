@@ -134,7 +134,8 @@ class Question:
         if value is None:
             return None
         if page_field.kind == "upload":
-            return str(value.written(folder))
+            written = value.written(folder)
+            return str(written) if isinstance(written, Path) else written
         if page_field.kind == "file":
             return str(write_spectrum(value, folder, SPECTRA[name]))
         if page_field.kind == "table":
