@@ -31,10 +31,10 @@ def study(realisations: int = 300, **sections: Any) -> Study:
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[None]:
+def locked(folder: Path, *, wait: bool = True) -> Iterator[None]:
     handle = os.open(folder, os.O_RDONLY)
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX)
+        fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         yield
     finally:
         os.close(handle)
@@ -66,22 +66,6 @@ class Painter(Engine):
 PAINTER: Any = Painter()
 
 
-def forked(work: Callable[[], object]) -> int:
-    """Do work in a child process, and return its number."""
-    child = os.fork()
-    if child == 0:
-        try:
-            work()
-        finally:
-            os._exit(0)
-    return child
-
-
-def killed(child: int) -> bool:
-    _, status = os.waitpid(child, 0)
-    return os.WIFSIGNALED(status)
-
-
 def killed_at(step: int, work: Callable[[], object], *calls: tuple[Any, str]) -> bool:
     """Do work in a child that is killed at one of its calls of some functions; return whether there were so many."""
     counted = iter(range(step))
@@ -94,12 +78,15 @@ def killed_at(step: int, work: Callable[[], object], *calls: tuple[Any, str]) ->
 
         return wrapped
 
-    def run() -> None:
-        for owner, name in calls:
-            setattr(owner, name, mortal(getattr(owner, name)))
-        work()
-
-    return killed(forked(run))
+    child = os.fork()
+    if child == 0:
+        try:
+            for owner, name in calls:
+                setattr(owner, name, mortal(getattr(owner, name)))
+            work()
+        finally:
+            os._exit(0)
+    return os.WIFSIGNALED(os.waitpid(child, 0)[1])
 
 
 def full_after(n_bytes: int, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -66,7 +66,7 @@ def draw(
     start, count : int
         Range of realisations, `start` to `start + count - 1`.
     out : ndarray, shape (count, *scene.row), optional
-        Array to fill.
+        Array to fill, and to return.
 
     Returns
     -------
@@ -101,7 +101,6 @@ def realise(
         Its ``run.realisations`` is the number of rows of each array, and its ``bulk`` selects the stored data.
     path : str or Path
         A new folder, or an unfinished store of the same study.
-    engine : Engine or Pool
     resume : bool
         Whether to complete an unfinished store; otherwise it raises InputError.
     restart : bool
@@ -216,21 +215,14 @@ def _fill(store: Store, todo: list[Chunk], engine: Engine | Pool, progress: Prog
 class Fault:
     """A faulty file of a store.
 
-    Attributes
-    ----------
-    key : str
-        Path in the store.
-    state : str
-        ``missing``; ``damaged``: wrong CRC or unreadable text; ``foreign``: intact, but not what was written;
-        ``unlisted``: intact, but not in the list of digests; ``differs``: not what the engine draws; or ``not of this
-        store``.
-    mended : bool
-        Whether the file was repaired.
+    Its state is ``missing``; ``damaged``: wrong CRC or unreadable text; ``foreign``: intact, but not what was written;
+    ``unlisted``: intact, but not in the list of digests; ``differs``: not what the engine draws; or ``not of this
+    store``.
     """
 
-    key: str
+    key: str  # path in the store
     state: str
-    mended: bool
+    mended: bool  # whether the file was repaired
 
 
 #: Columns of the table of faults.
@@ -244,7 +236,7 @@ FAULT_COLUMNS = (
 @validated
 def state(store: Store, chunk: Chunk) -> str:
     """Return ``good``, or the fault of a chunk's file; see `Fault`."""
-    place, size = store.path / chunk.key, store.chunk_bytes(chunk)
+    place, size = store.path / chunk.key, chunk.n_bytes
     if not place.exists():
         return "missing"
     try:
@@ -274,7 +266,6 @@ def verify(
 
     Parameters
     ----------
-    path : str or Path
     engine : Engine or Pool, optional
         Required to repair or redraw.
     repair : bool
@@ -285,11 +276,6 @@ def verify(
         Half-open range of realisations to which the check of chunks is restricted.
     progress : callable, optional
         Called as ``progress(done, total)`` in chunks.
-
-    Returns
-    -------
-    list of Fault
-        Empty for an intact store.
 
     Raises
     ------
@@ -313,12 +299,11 @@ def verify(
                 key="rows",
             )
         faults = list(_faults_of_description(store, repair))
-        for number, chunk in enumerate(store.chunks(first, last)):
+        for number, chunk in enumerate(store.chunks(first, last), 1):
             fault = _fault(store, chunk, engine, repair, redraw)
-            if fault is not None:
-                faults.append(fault)
+            faults += [] if fault is None else [fault]
             if progress is not None:
-                progress(number + 1, total)
+                progress(number, total)
         if repair:
             store.sort_digests()
         faults += [Fault(key, "not of this store", False) for key, own in store.files() if not own]
@@ -373,11 +358,7 @@ def _faults_of_description(store: Store, repair: bool) -> Iterator[Fault]:
 def read(path: str | Path, scene: str = "star-1/quiescent") -> Any:
     """Open an array of spectra, which is read from disk on access.
 
-    Parameters
-    ----------
-    path : str or Path
-    scene : str
-        Path of the array, such as ``"star-1/flare-2"``.
+    The array has a path such as ``"star-1/flare-2"``.
 
     Returns
     -------

@@ -185,24 +185,14 @@ class Checkpoint:
     ----------
     folder : Path
         Existing output folder of the run.
-    verb : str
     study : Study
         Any object with a method `toml`; checkpoints do not know the sections of a study.
-    resume : bool
-        Whether to continue an unfinished run.
-    restart : bool
-        Whether to discard an unfinished run.
+    resume, restart : bool
+        Whether to continue an unfinished run, or to discard it.
     patience_s : float
         See `PATIENCE_S`.
     held : bool
         Whether the caller has locked the folder.
-
-    Attributes
-    ----------
-    damaged : int
-        Number of unusable files.
-    messages : list of str
-        Remarks for the user.
     """
 
     def __init__(
@@ -218,8 +208,8 @@ class Checkpoint:
     ) -> None:
         self.parent, self.folder, self.verb, self.study = folder, folder / FOLDER, verb, study
         self._resume, self._restart, self._patience_s, self._is_held = resume, restart, patience_s, held
-        self.damaged = 0
-        self.messages: list[str] = []
+        self.damaged = 0  # number of unusable files
+        self.messages: list[str] = []  # remarks for the user
         self._held: list[tuple[str, Arrays]] = []
         self._lock = threading.Lock()
 

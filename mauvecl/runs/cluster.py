@@ -6,6 +6,7 @@ import contextlib
 import logging
 import os
 import pickle
+import re
 import signal
 import threading
 import time
@@ -15,7 +16,6 @@ from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from urllib.parse import urlsplit
 
 from mauvecl.detection.requests import Countable, Shard
 from mauvecl.detection.snr import Arrays
@@ -46,13 +46,7 @@ class _Attempt:
 
     awaited: Future[Arrays]
     task: Task
-    #: Workers that may count it, and those that may hold its request; None for all.
-    workers: list[str] | None = None
-    holders: list[str] | None = None
-
-    def is_left_by(self, present: set[str]) -> bool:
-        """Return whether all workers that may count it, or hold its request, have left."""
-        return any(some and present.isdisjoint(some) for some in (self.workers, self.holders))
+    workers: list[str] | None  # those that may count it; None for all
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +54,7 @@ class Counted:
     """Answer of a worker."""
 
     sums: Arrays
-    #: See `code_identity`.
-    code: tuple[str, str]
+    code: tuple[str, str]  # see `code_identity`
 
 
 @validated
@@ -93,15 +86,13 @@ class DaskWorkers:
         self._where, self._device, self._sends = where, device, 0
         self._lock = threading.Lock()
         self._closing = False
-        self._given: dict[str, tuple[DaskFuture[Any], list[str] | None]] = {}
-        # Futures of submitted tasks.
+        # Futures of requests by their keys, and of submitted tasks.
+        self._given: dict[str, DaskFuture[Any]] = {}
         self._sent: dict[DaskFuture[Any], _Attempt] = {}
         # Addresses of workers with other code, which may have joined after the start.
         self._strangers: set[str] = set()
-        self._watching = False
-        self._open = contextlib.ExitStack()
-        try:
-            self._client: Client = self._open.enter_context(_client(where, distributed))
+        with contextlib.ExitStack() as stack:
+            self._client: Client = stack.enter_context(_client(where, distributed))
             try:
                 self._client.wait_for_workers(1, timeout=WORKER_PATIENCE_S)
             except TimeoutError as error:
@@ -120,11 +111,9 @@ class DaskWorkers:
                         f"worker {worker} has mauvecl {version} (code {code}), but needs {VERSION} "
                         f"(code {code_identity()[1]}) as here"
                     )
-            self._devices = [record for _, record in introduced.values()]
-            self._counted = len(introduced), time.monotonic()
-        except BaseException:
-            self._open.close()
-            raise
+            self._open = stack.pop_all()
+        self._devices = [record for _, record in introduced.values()]
+        self._counted = len(introduced), time.monotonic()
 
     @property
     def count(self) -> int:
@@ -146,26 +135,23 @@ class DaskWorkers:
     def submit(self, task: Task) -> Future[Arrays]:
         """Submit a shard to any free worker; raw spectra are returned, and the task's `out` is not used."""
         awaited: Future[Arrays] = Future()
-        attempt = _Attempt(awaited, task)
         with self._lock:
             if self._closing:
                 awaited.set_exception(Stopped())
                 return awaited
+            self._sends += 1
             try:
-                attempt.workers = self._ours()
                 if task.key not in self._given:
-                    # A task instead of scattered data, since the scheduler can repeat it if its worker is lost. Bytes,
+                    # A task instead of scattered data, since the scheduler repeats it if its worker is lost. Bytes,
                     # because a worker with other code might read and write a request differently.
                     content, key = pickle.dumps(task.request), f"mauvecl-request-{task.key}-{self._sends}"
-                    request_task = self._client.submit(bytes, content, key=key, workers=attempt.workers)
-                    self._given[task.key] = request_task, attempt.workers
+                    self._given[task.key] = self._client.submit(bytes, content, key=key)
                     if len(self._given) > MAX_REQUESTS:
                         del self._given[next(iter(self._given))]
-                request, attempt.holders = self._given[task.key]
-                self._sends += 1
+                attempt = _Attempt(awaited, task, self._ours())
                 sent = self._client.submit(
                     _count,
-                    request,
+                    self._given[task.key],
                     task.shard,
                     self._device,
                     key=f"mauvecl-{task.name}-{self._sends}",
@@ -189,16 +175,13 @@ class DaskWorkers:
         """Ask all workers for their code, and return whether more of them have other code than before."""
         answers = self._client.run(code_identity, on_error="return")
         # A worker that leaves raises OSError.
-        strangers = {worker for worker, code in answers.items() if not isinstance(code, OSError | tuple)}
-        strangers |= {worker for worker, code in answers.items() if isinstance(code, tuple) and code != code_identity()}
+        strangers = {
+            worker for worker, code in answers.items() if not isinstance(code, OSError) and code != code_identity()
+        }
         with self._lock:
-            new = not strangers <= self._strangers
+            new, is_first = not strangers <= self._strangers, not self._strangers
             self._strangers |= strangers
-            if new:
-                # Requests may be on workers with other code.
-                self._given.clear()
-            start, self._watching = new and not self._watching, self._watching or new
-        if start:
+        if new and is_first:
             threading.Thread(target=self._watch, name="mauvecl-strangers", daemon=True).start()
         return new
 
@@ -212,17 +195,10 @@ class DaskWorkers:
                 # The client is closed or has lost the scheduler.
                 return
             with self._lock:
-                left = {sent: attempt for sent, attempt in self._sent.items() if attempt.is_left_by(present)}
-                for sent in left:
-                    del self._sent[sent]
-            for attempt in left.values():
-                self._forget_request(attempt)
+                sent = [key for key, it in self._sent.items() if it.workers and present.isdisjoint(it.workers)]
+                left = [self._sent.pop(key) for key in sent]
+            for attempt in left:
                 attempt.awaited.set_exception(ShardLost("its workers have left", failed=False))
-
-    def _forget_request(self, attempt: _Attempt) -> None:
-        """Let the next attempt send the request again, which may be lost with its workers."""
-        with self._lock:
-            self._given.pop(attempt.task.key, None)
 
     def _came(self, attempt: _Attempt, sent: DaskFuture[Any]) -> None:
         with self._lock:
@@ -240,11 +216,7 @@ class DaskWorkers:
     def _sums(self, attempt: _Attempt, sent: DaskFuture[Any]) -> Arrays:
         """Return the counts of a task that has ended, or raise why there are none."""
         if sent.status == "finished":
-            try:
-                answer = _result(sent)
-            except ShardLost:
-                self._forget_request(attempt)
-                raise
+            answer = _result(sent)
             if isinstance(answer, Counted) and answer.code == code_identity():
                 return answer.sums
         error = sent.exception() if sent.status == "error" else None
@@ -255,8 +227,9 @@ class DaskWorkers:
             raise DeviceError(f"cluster {self._where} failed at {attempt.task.shard}: {error}", "failed")
         if sent.status in ("cancelled", "lost") and self._client.status != "running":
             raise self._gone()
-        if error is None:
-            self._forget_request(attempt)
+        with self._lock:
+            # The next attempt sends the request again, which may be lost, too.
+            self._given.pop(attempt.task.key, None)
         other = "workers with other code" if sent.status == "finished" else "workers that have left"
         raise ShardLost(f"cluster {self._where}: {error or other}")
 
@@ -363,20 +336,12 @@ def _local_cluster(n_workers: int, distributed: Any) -> Any:
 
 def _is_address(where: str) -> bool:
     """Return whether an address has a scheme of Dask, a host and a port."""
-    try:
-        parts = urlsplit(where)
-        host, port = parts.hostname, parts.port
-    except ValueError:
-        return False
-    plain = where.isascii() and where.isprintable() and " " not in where
-    return plain and parts.scheme in SCHEMES and bool(host) and bool(port) and parts.path in ("", "/")
-
-
-#: Schemes of Dask's network protocols.
-SCHEMES = ("tcp", "tls", "ucx", "ucxx", "ws", "wss")
+    found = re.fullmatch(r"(tcp|tls|ucxx?|wss?)://([\w.-]+|\[[\w:.%]+\]):(\d{1,5})/?", where, flags=re.ASCII)
+    return found is not None and 0 < int(found[3]) < 2**16
 
 
 LOGS = ("distributed", *(f"distributed.{part}" for part in ("client", "nanny", "worker", "scheduler", "core")))
+
 
 # Functions below run on a worker.
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import shutil
 import threading
 from collections.abc import Iterator, Mapping, Sequence
@@ -86,8 +87,8 @@ def _describe(root: Any, scene: StoredScene, study: Study) -> None:
             _values(group, f"{scene.name}-{name}", values, "DN", ["pixel"])
     array = group.create_array(
         scene.name,
-        shape=(study.run.realisations, *scene.row),
-        chunks=(scene.chunk_rows(study.run.realisations), *scene.row),
+        shape=(scene.rows, *scene.row),
+        chunks=(scene.chunk_rows, *scene.row),
         dtype=scene.dtype,
         compressors=[Crc32cCodec()],
         fill_value=0,
@@ -143,6 +144,7 @@ class StoredScene:
     expectation: Expectation
     frames: tuple[int, ...] | None
     at: Mapping[str, float | str]
+    rows: int  # number of realisations
 
     @property
     def path(self) -> str:
@@ -172,9 +174,19 @@ class StoredScene:
         """Size of a realisation, bytes."""
         return int(np.prod(self.row)) * self.dtype.itemsize
 
-    def chunk_rows(self, realisations: int) -> int:
-        """Return the number of realisations per chunk."""
-        return max(min(CHUNK_BYTES // self.row_bytes, realisations), 1)
+    @cached_property
+    def chunk_rows(self) -> int:
+        """Number of realisations per chunk."""
+        return max(min(CHUNK_BYTES // self.row_bytes, self.rows), 1)
+
+    def chunk_numbers(self, first: int = 0, stop: int | None = None) -> range:
+        """Return the numbers of the chunks that contain rows `first` to `stop - 1`, by default of all."""
+        return range(first // self.chunk_rows, -(-(self.rows if stop is None else stop) // self.chunk_rows))
+
+    def chunk(self, number: int) -> Chunk:
+        """Return a chunk by number."""
+        start = number * self.chunk_rows
+        return Chunk(self, number, start, min(start + self.chunk_rows, self.rows))
 
 
 #: Columns of the table of arrays.
@@ -209,6 +221,11 @@ class Chunk:
     def key(self) -> str:
         """Path of the file in the store."""
         return f"{self.scene.path}/{self.name}"
+
+    @property
+    def n_bytes(self) -> int:
+        """Size of the file, bytes: rows and CRC."""
+        return self.scene.chunk_rows * self.scene.row_bytes + CRC_BYTES
 
 
 @dataclass(eq=False)
@@ -268,9 +285,9 @@ class Store:
             # The amplitude is an attribute of the flare's array.
             swept = {name: value for name, value in case.at.items() if name != "amplitude"}
             name = full_label(case.label, swept)
-            stored.append(StoredScene(f"star-{number}", "quiescent", name, 0.0, case.quiet, chosen, swept))
-            for k, (amplitude, x) in enumerate(zip(case.amplitudes, case.flares, strict=True), 1):
-                stored.append(StoredScene(f"star-{number}", f"flare-{k}", name, amplitude, x, chosen, swept))
+            for k, (amplitude, x) in enumerate(zip((0.0, *case.amplitudes), (case.quiet, *case.flares), strict=True)):
+                array = f"flare-{k}" if k else "quiescent"
+                stored.append(StoredScene(f"star-{number}", array, name, amplitude, x, chosen, swept, self.rows))
         return stored
 
     def scene(self, path: str) -> StoredScene:
@@ -300,17 +317,11 @@ class Store:
     def chunks(self, first: int = 0, stop: int | None = None) -> Iterator[Chunk]:
         """Yield the chunks of all scenes that contain rows `first` to `stop - 1`; all chunks by default."""
         for scene in self.scenes:
-            rows = scene.chunk_rows(self.rows)
-            for number in self._numbers(scene, first, stop):
-                yield Chunk(scene, number, number * rows, min((number + 1) * rows, self.rows))
+            yield from map(scene.chunk, scene.chunk_numbers(first, stop))
 
     def count(self, first: int = 0, stop: int | None = None) -> int:
         """Return the number of chunks that `chunks` yields, without iterating."""
-        return sum(len(self._numbers(scene, first, stop)) for scene in self.scenes)
-
-    def _numbers(self, scene: StoredScene, first: int = 0, stop: int | None = None) -> range:
-        rows = scene.chunk_rows(self.rows)
-        return range(first // rows, -(-(self.rows if stop is None else stop) // rows))
+        return sum(len(scene.chunk_numbers(first, stop)) for scene in self.scenes)
 
     def make(self) -> None:
         """Write the description of the arrays, or check that an existing one is the same.
@@ -386,38 +397,26 @@ class Store:
     def note(self, chunk: Chunk, digest_text: str) -> None:
         """Add a chunk's digest to its array's list; threads wait for each other."""
         self.digests[chunk.key] = digest_text
-        line = _line(chunk.name, digest_text)
+        place = self.path / chunk.scene.path / DIGESTS
         what = f"{chunk.scene.path}/{DIGESTS} of {self.path.name}"
-        # A single short write at the end. A line that a full disk cut short is terminated first.
-        with (
-            self._listing,
-            writing(what, NO_ROOM, key="store"),
-            (self.path / chunk.scene.path / DIGESTS).open("a+b", buffering=0) as file,
-        ):
-            file.seek(0, 2)
-            if file.tell():
-                file.seek(-1, 2)
-                line = line if file.read(1) == b"\n" else "\n" + line
-            file.write(line.encode())
+        with self._listing, writing(what, NO_ROOM, key="store"), place.open("ab", buffering=0) as file:
+            # A single short write, which first ends a line that a full disk has cut short.
+            file.write(f"\n{_line(chunk.name, digest_text)}".encode())
 
     def sort_digests(self) -> None:
         """Write the lists of digests in the order of their chunks, which may have been written in another."""
         for scene in self.scenes:
-            place = self.path / scene.path / DIGESTS
-            keys = sorted(
-                (key for key in self.digests if key.startswith(f"{scene.path}/c/")),
-                key=lambda key: int(key.removeprefix(f"{scene.path}/c/").partition("/")[0]),
-            )
-            names = [(key.removeprefix(f"{scene.path}/"), self.digests[key]) for key in keys]
-            text = "".join(_line(name, digest_text) for name, digest_text in names).encode()
+            place, start = self.path / scene.path / DIGESTS, f"{scene.path}/"
+            names = [key.removeprefix(start) for key in self.digests if key.startswith(f"{start}c/")]
+            names.sort(key=lambda name: int(name.split("/")[1]))
+            text = "".join(_line(name, self.digests[start + name]) for name in names).encode()
             if names and place.read_bytes() != text:
                 write_whole(place, text)
 
     def encode(self, chunk: Chunk, rows: NDArray[Any]) -> tuple[memoryview, bytes]:
         """Encode a chunk by Zarr's codecs `bytes` and `crc32c`, padding the last chunk with zeros."""
-        full = chunk.scene.chunk_rows(self.rows)
-        if len(rows) < full:
-            rows = np.concatenate([rows, np.zeros((full - len(rows), *chunk.scene.row), rows.dtype)])
+        missing = chunk.scene.chunk_rows - len(rows)
+        rows = np.pad(rows, [(0, missing), *[(0, 0)] * len(chunk.scene.row)]) if missing else rows
         whole = np.ascontiguousarray(rows, chunk.scene.dtype)
         return memoryview(whole.data).cast("B"), crc(whole)
 
@@ -433,16 +432,17 @@ class Store:
             size = (self.path / chunk.key).stat().st_size
         except OSError:
             return False
-        return chunk.key in self.digests and size == self.chunk_bytes(chunk)
+        return chunk.key in self.digests and size == chunk.n_bytes
 
     def owns(self, key: str) -> bool:
         """Return whether a path in the store is that of a chunk."""
-        scene = next((scene for scene in self.scenes if key.startswith(f"{scene.path}/c/")), None)
-        number = key.removeprefix(f"{scene.path}/c/").partition("/")[0] if scene else ""
+        path, _, name = key.partition("/c/")
+        scene = next((scene for scene in self.scenes if scene.path == path), None)
         # Twenty digits suffice for any chunk; int() of a very long name would be slow.
-        if scene is None or not (number.isascii() and number.isdigit() and len(number) <= 20):
+        number = re.match("[0-9]{1,20}(?=/)", name)
+        if scene is None or number is None:
             return False
-        return int(number) in self._numbers(scene) and key == Chunk(scene, int(number), 0, 0).key
+        return int(number[0]) in scene.chunk_numbers() and key == scene.chunk(int(number[0])).key
 
     def files(self) -> Iterator[tuple[str, bool]]:
         """Yield every file and link in the folder, and whether it belongs to this store."""
@@ -473,10 +473,6 @@ class Store:
             if folder != str(self.path):
                 Path(folder).rmdir()
         self.digests = {}
-
-    def chunk_bytes(self, chunk: Chunk) -> int:
-        """Return the size of a chunk's file, bytes: rows and CRC."""
-        return chunk.scene.chunk_rows(self.rows) * chunk.scene.row_bytes + CRC_BYTES
 
 
 def crc(data: bytes | NDArray[Any]) -> bytes:

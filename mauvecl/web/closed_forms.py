@@ -86,8 +86,8 @@ class Question:
         values = self.values
         data: dict[str, Any] = {}
         for name, page_field in FIELDS.items():
-            if page_field.path and self._applies(name):
-                self._set(data, name, folder)
+            if page_field.path and self._applies(name) and (value := self._value(name, folder)) is not None:
+                set_key(data, [*page_field.path], value, name)
         star = {"library": values["star"]}
         if self.uploaded is not None:
             star = {"file": str(write_spectrum(self.uploaded, folder, SPECTRA["star"]))}
@@ -99,14 +99,13 @@ class Question:
         if "change_file" in self.uploads and SPECTRUM not in values["changes"]:
             data["change"]["of"] = (*values["changes"], SPECTRUM)
         points = self.uploads.get("own_unknown", values["own_unknown"])
-        spectra = {"own": {"points": points}} if points else {}
-        data["nuisances"] = {"usual": values["unknown"] == REALISTIC, "own": spectra}
-        number, tails = values["realisations"]
-        data["run"] |= {
-            "realisations": number,
-            "tails": tails,
-            "statistics": list(dict.fromkeys(["chi2", "chi2_element", values["statistic"]])),
+        data["nuisances"] = {
+            "usual": values["unknown"] == REALISTIC,
+            "own": {"own": {"points": points}} if points else {},
         }
+        number, tails = values["realisations"]
+        statistics = list(dict.fromkeys(["chi2", "chi2_element", values["statistic"]]))
+        data["run"] |= {"realisations": number, "tails": tails, "statistics": statistics}
         if values["targets"]:
             data.setdefault("plan", {})["targets"] = list(values["targets"])
         return data
@@ -127,25 +126,23 @@ class Question:
         }
         return conditions.get(name, True)
 
-    def _set(self, data: dict[str, Any], name: str, folder: Path) -> None:
-        """Set the key of a field in the data of a study, in place, unless it is empty; its file goes to a folder."""
+    def _value(self, name: str, folder: Path) -> Any:
+        """Return the value of a field's key, or None if it is empty; its file is written to a folder."""
         page_field, value = FIELDS[name], self.values[name]
         if page_field.kind in ("file", "upload"):
-            upload = self.uploads.get(name)
-            if upload is None:
-                return
-            value = (
-                upload.written(folder) if page_field.kind == "upload" else write_spectrum(upload, folder, SPECTRA[name])
-            )
+            value = self.uploads.get(name)
         if value is None:
-            return
+            return None
+        if page_field.kind == "upload":
+            written = value.written(folder)
+            return str(written) if isinstance(written, Path) else written
+        if page_field.kind == "file":
+            return str(write_spectrum(value, folder, SPECTRA[name]))
         if page_field.kind == "table":
-            value = write_table(value, folder)
-        value = (
-            str(value) if isinstance(value, Path) else value if page_field.scale == 1.0 else value / page_field.scale
-        )
+            return str(write_table(value, folder))
+        value = value if page_field.scale == 1.0 else value / page_field.scale
         # A single flare.
-        set_key(data, [*page_field.path], [value] if page_field.path[-1] == "amplitudes" else value, name)
+        return [value] if page_field.path[-1] == "amplitudes" else value
 
 
 #: Answers that are simulated, by name: of one question.
@@ -267,10 +264,8 @@ class ClosedForms:
         setting = self.case.setting(quiet)
         if not setting.used.any():
             return []
-        electrons = (light * (base.source_electrons + more * rise) for more in rises)
-        return [
-            statistic.detection_forms(setting, replace(quiet, source_electrons=light), q.fap) for light in electrons
-        ]
+        flares = (replace(quiet, source_electrons=light * (base.source_electrons + more * rise)) for more in rises)
+        return [statistic.detection_forms(setting, flare, q.fap) for flare in flares]
 
     @property
     def slow(self) -> bool:

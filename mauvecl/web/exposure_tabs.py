@@ -323,11 +323,12 @@ Row = tuple[str, float, float]
 def costs(closed: ClosedForms) -> tuple[float, list[Row]]:
     """Return the flare's matched S/N with everything known, and with unknowns alone and together."""
     # Without a sky its brightness is no unknown. Those without a default prior are projected out.
-    there = {name: row for name, row in NUISANCES.items() if np.any(row.spectrum(closed.quiet))}
-    sd = {name: np.inf if row.prior is None else row.prior.sd for name, row in there.items()}
-    spreads = {name: "free" if np.isinf(value) else value for name, value in sd.items()}
-    alone = [NuisanceChoice.model_validate({"usual": False, name: spread}) for name, spread in spreads.items()]
-    chosen = {spoken(choice).removeprefix("the "): choice for choice in alone}
+    chosen = {}
+    for name, row in NUISANCES.items():
+        if np.any(row.spectrum(closed.quiet)):
+            spread = "free" if row.prior is None or np.isinf(row.prior.sd) else row.prior.sd
+            alone = NuisanceChoice.model_validate({"usual": False, name: spread})
+            chosen[spoken(alone).removeprefix("the ")] = alone
     chosen["all the usual together"] = NuisanceChoice()
     if closed.study.nuisances.own:
         chosen["your own spectrum"] = NuisanceChoice(usual=False, own=closed.study.nuisances.own)

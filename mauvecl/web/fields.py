@@ -366,20 +366,9 @@ def _group(name: str) -> tuple[str, ...]:
 ASKED = ("star", *(name for name in _group("") if name != "star"))
 ADVANCED = {
     name: _group(name)
-    for name in (
-        "Star",
-        "Detection",
-        "Flare's spectrum",
-        "Measurement",
-        "Detector",
-        "Sky",
-        "Unknown",
-        "Change",
-        "Search",
-        "Neighbours",
-        "Pointing",
-    )
-}
+    for name in ("Star", "Detection", "Flare's spectrum", "Measurement", "Detector", "Sky", "Unknown", "Change",
+                 "Search", "Neighbours", "Pointing")
+}  # fmt: skip
 #: Fields of the card.
 SOLVED = _group("Limit")
 #: Fields that apply only with the file of another field, below which they stand.

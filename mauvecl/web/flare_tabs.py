@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from bokeh.models import FixedTicker, HoverTool, LinearColorMapper
@@ -21,6 +22,7 @@ from mauvecl.schema.columns import View, chance_text, records
 from mauvecl.study.observation import KNOWN, NuisanceChoice
 from mauvecl.web.closed_forms import LIMITS, Answers, short
 from mauvecl.web.tab import Tab
+from mauvecl.web.uploads import Shelf
 
 if TYPE_CHECKING:
     from bokeh.models.sources import ColumnDataSource
@@ -34,6 +36,7 @@ if TYPE_CHECKING:
 
 
 Float = NDArray[np.float64]
+T = TypeVar("T")
 
 #: Ranges of the pictures: magnitudes, and amplitudes in per cent, fixed for all questions.
 MAGNITUDES, PERCENTS = (2.0, 14.0), (0.1, 100.0)
@@ -45,6 +48,8 @@ LABELLED = {0.1: 0.25, 0.5: 0.5, 0.9: 0.75}
 FIRST, HALVINGS, CHANGE = 9, 5, 0.1
 
 
+#: Maps and curves of all visitors, without the closed forms, which take tens of MB.
+KEPT = Shelf(2**26)
 #: Fields on which a map does not depend; an upload is identified by its content.
 FREE = {"magnitude", "amplitude_percent", "realisations", "seed", "targets", "start", "days", "hours", "uploaded"}
 
@@ -54,26 +59,20 @@ def odds(closed: ClosedForms, magnitude: float, rises: Float) -> list[DetectionF
     return closed.at(10 ** (-0.4 * (magnitude - closed.question.magnitude)), rises)
 
 
-@dataclass(frozen=True)
-class _Kept:
-    """Question identified by the values on which its map or curve depends."""
-
-    key: tuple[Any, ...]
-    # Taken by what computes the map: caches keep this object, and closed forms take tens of MB.
-    closed: list[ClosedForms] = field(compare=False)
-
-    @classmethod
-    def of(cls, closed: ClosedForms, *more: float) -> _Kept:
-        """Identify a question; `more` are further values on which the result depends."""
-        question = closed.question
-        values = (value for name, value in question.values.items() if name not in FREE)
-        return cls((*values, question.uploaded and question.uploaded.digest, *more), [closed])
+def _kept(make: Callable[[ClosedForms], T], closed: ClosedForms, *more: float) -> T:
+    """Return a map or curve, which is kept for the values of the question, and `more`, on which it depends."""
+    question = closed.question
+    values = (value for name, value in question.values.items() if name not in FREE)
+    key = (*values, question.uploaded and question.uploaded.digest, *more)
+    found: T | None = KEPT.get(None, make.__name__, key)
+    if found is None:
+        found = make(closed)
+        KEPT.keep(None, make.__name__, key, found, 32)
+    return found
 
 
-@lru_cache(maxsize=32)
-def _curve(kept: _Kept) -> tuple[Float, Float]:
+def _curve(closed: ClosedForms) -> tuple[Float, Float]:
     """Return magnitudes and probabilities, with more points where these change."""
-    closed = kept.closed.pop()
 
     def exact(magnitudes: Float) -> list[float]:
         each = (odds(closed, magnitude, np.ones(1)) for magnitude in magnitudes)
@@ -91,15 +90,13 @@ def _curve(kept: _Kept) -> tuple[Float, Float]:
     return fine, np.asarray(special.ndtr(PchipInterpolator(x, probits)(fine)))
 
 
-@lru_cache(maxsize=32)
-def _map(kept: _Kept) -> tuple[Float, Float, Float]:
+def _map(closed: ClosedForms) -> tuple[Float, Float, Float]:
     """Return magnitudes, logarithms of amplitudes in per cent, and probabilities.
 
     The interpolated quantities are, in standard deviations without a flare: logarithms of the flare's part of the
     statistic and of its spread, the threshold and the skewness. A gamma distribution of these moments (Pearson's type
     III) is within 0.05 of the closed forms where they are steepest.
     """
-    closed = kept.closed.pop()
     (columns, rows), (low, high) = STEPS, np.log10(PERCENTS)
     x, y = np.linspace(*MAGNITUDES, columns), np.linspace(low, high, rows)
     # A saturated star has no detectable flare.
@@ -137,7 +134,7 @@ def curve(closed: ClosedForms, answers: Answers) -> ChartData:
     series: dict[str, Any] = {"own": ([q.magnitude], [closed.chance]), "power": power}
     text = f"The closed form of {q.statistic} takes too long for a curve: simulate it."
     if not closed.slow:
-        x, y = series["closed form"] = _curve(_Kept.of(closed, q.amplitude_percent))
+        x, y = series["closed form"] = _kept(_curve, closed, q.amplitude_percent)
         text = f"{100 * power:g} % of such flares are detected {_reach(x, y, power, q.band)}"
     if "limit" in answers:
         limits = [limit for limit in answers["limit"].limits if limit.statistic == q.statistic]
@@ -210,7 +207,7 @@ def detection_map(closed: ClosedForms, answers: Answers) -> ChartData:
     series: dict[str, Any] = {"own": ([q.magnitude], [np.log10(q.amplitude_percent)])}
     text = f"The closed form of {q.statistic} takes too long for a map: simulate it."
     if not closed.slow:
-        x, y, p = _map(_Kept.of(closed))
+        x, y, p = _kept(_map, closed)
         series |= {
             "map": _image(x, y, p),
             "contours": _contours(x, y, p, 0.1, 0.9),
@@ -427,23 +424,18 @@ def course(closed: ClosedForms, answers: Answers) -> ChartData:
 def measured(closed: ClosedForms, answers: Answers) -> View:
     """Return the errors of each quantity, and the counts of simulated fits."""
     each, fits = expected(closed), simulated(answers)
-    first = next(iter(each.values()))
+    first, *_ = each.values()
+    errors = zip(*(measurement.ahead.errors for measurement in each.values()), strict=True)
     table = [
-        {"quantity": name, "unit": unit, "truth": value, **dict(zip(each, errors, strict=True))}
-        for name, unit, value, *errors in zip(
-            first.ahead.names,
-            first.ahead.units,
-            first.truth,
-            *(measurement.ahead.errors for measurement in each.values()),
-            strict=True,
-        )
+        {"quantity": name, "unit": unit, "truth": truth, **dict(zip(each, own, strict=True))}
+        for name, unit, truth, own in zip(first.ahead.names, first.ahead.units, first.truth, errors, strict=True)
     ]
-    counted = () if fits is None else ("scatter", "coverage_95")
     if fits is not None:
         table = [row | counts for row, counts in zip(table, records(fits.rows()), strict=True)]
     verb = {column.name: column for column in COLUMNS}
-    errors = [replace(verb["error"], name=name, heading=f"error, {name}") for name in each]
-    columns = [verb["quantity"], verb["unit"], verb["truth"], *errors, *(verb[name] for name in counted)]
+    of_error = [replace(verb["error"], name=name, heading=f"error, {name}") for name in each]
+    columns = [verb["quantity"], verb["unit"], verb["truth"], *of_error]
+    columns += [] if fits is None else [verb["scatter"], verb["coverage_95"]]
     return View("", columns, table)
 
 

@@ -112,11 +112,9 @@ def light_curve(closed: ClosedForms, answers: Answers) -> ChartData:
         text = _summary(answer.rows, analysis)
         half = frames.cadence_s / 2
         for verdict in VERDICTS:
-            rows = [row.event for row in answer.rows if row.verdict == verdict]
-            ends = np.array(
-                [(analysis.survey.time_s[event.first], analysis.survey.time_s[event.last]) for event in rows]
-            )
-            series[f"{verdict} events"] = minutes(frames, ends.reshape(-1, 2) + [-half, half]).T
+            ends = [(row.event.first, row.event.last) for row in answer.rows if row.verdict == verdict]
+            times = analysis.survey.time_s[np.reshape(np.array(ends, int), (-1, 2))]
+            series[f"{verdict} events"] = minutes(frames, times + [-half, half]).T
     for name, which in (("searched", used), ("left out", ~used & np.isfinite(flux))):
         chosen = np.flatnonzero(which)
         chosen = chosen[thinned(flux[chosen], MOST_POINTS)]
@@ -506,6 +504,6 @@ VISIBILITY = Tab(
     simulations={"visible": "Find when"},
     needs="targets",
     view=1,
-    files={"visible": "visible", "months": "visible", "days": "visible"},
+    files=dict.fromkeys(("visible", "months", "days"), "visible"),
     words=target_words,
 )

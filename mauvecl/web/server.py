@@ -42,7 +42,7 @@ from mauvecl.web.closed_forms import TITLES, ClosedForms
 from mauvecl.web.figures import INKS, PINS, Canvas
 from mauvecl.web.page import SEEN, SIMULATIONS, TABS, State, reads_of
 from mauvecl.web.uploads import EXAMPLES, MAPPED, TIME_UNITS, UPLOADS
-from mauvecl.web.visitor import UNUSED, Job, Visitor, limit_arenas, reading, release_memory, shown
+from mauvecl.web.visitor import READER, UNUSED, Job, Visitor, limit_arenas, release_memory, shown
 
 if TYPE_CHECKING:
     from tornado.httputil import HTTPServerRequest
@@ -150,38 +150,30 @@ class BoundedServer(HTTPServer):
         super().handle_stream(stream, address)
 
 
-#: Characters of a line.
-MOST = 400
+#: Largest number of characters of a line.
+MOST = 1200
 
 
-class Plain(logging.Formatter):
-    """Formatter of one line: time, logger, message and, for exceptions, the location."""
+class OneLine(logging.Formatter):
+    """Formatter of one bounded line: time, level, logger, message and, for exceptions, their lines in mauvecl."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the line."""
-        parts = [self.formatTime(record), record.levelname, record.name, _line(record.getMessage())]
-        if record.exc_info and record.exc_info[1] is not None:
-            error = record.exc_info[1]
-            parts.append(f"({type(error).__name__}: {_line(str(error))}; {_where(error)})")
-        return " ".join(parts)
+        return printable(" ".join(super().format(record).split()), MOST)
 
-
-def _line(text: str) -> str:
-    """Shorten text to one bounded line."""
-    return printable(" ".join(text.split()), MOST)
-
-
-def _where(error: BaseException) -> str:
-    """Return modules and lines of a traceback: those of mauvecl, or the last one."""
-    frames = [(frame.f_globals.get("__name__", "?"), line) for frame, line in traceback.walk_tb(error.__traceback__)]
-    ours = [frame for frame in frames if frame[0].startswith("mauvecl.")] or frames[-1:]
-    return ", ".join(f"{name} line {line}" for name, line in ours)
+    def formatException(self, ei: Any) -> str:  # noqa: N802
+        """Return kind and message of an exception, and modules and lines of its traceback: ours, or the last one."""
+        if ei[0] is None:
+            return ""
+        frames = [(frame.f_globals.get("__name__", "?"), line) for frame, line in traceback.walk_tb(ei[2])]
+        ours = [frame for frame in frames if frame[0].startswith("mauvecl.")] or frames[-1:]
+        return f"({ei[0].__name__}: {ei[1]}; {', '.join(f'{name} line {line}' for name, line in ours)})"
 
 
 def install() -> None:
     """Apply the format to warnings and errors of all libraries."""
     handler = logging.StreamHandler()
-    handler.setFormatter(Plain())
+    handler.setFormatter(OneLine("%(asctime)s %(levelname)s %(name)s %(message)s"))
     logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
     # They write their own otherwise.
     for name in ("bokeh", "tornado"):
@@ -245,8 +237,7 @@ def close_unused() -> None:
     """Close the connections of unused pages, and release the memory of visitors who have left."""
     if Visitor.has_left:
         Visitor.has_left = False
-        reading(release_memory)
-
+        READER.submit(release_memory)
     now = time.monotonic()
     for visitor in list(Visitor.here):
         if now - visitor.used > IDLE_S and visitor.job is None:
@@ -257,7 +248,7 @@ def warm() -> None:
     """Prepare imports, response matrix, kernels and page before the first visitor."""
     with tempfile.TemporaryDirectory() as folder:
         closed = ClosedForms.of(State().question(), Path(folder))
-    for tab in TABS:
+    for tab in TABS.values():
         shown(tab, closed, {})
     Job(lambda pool: pool.realise(closed.quiet, count=1, seed=0)).future.result()
     prepare()

@@ -68,8 +68,6 @@ class Simulation:
     #: Verbs that answer it. The page keeps the answer of the first under the question's name, others under their own.
     verbs: tuple[str, ...]
     study: Callable[[Study], Study] = lambda study: study  # makes the study that is asked from that of the page
-    # Further answers of the first verb by name, with what makes their study; a refused one is left out.
-    others: Mapping[str, Callable[[Study], Study]] = field(default_factory=dict)
 
 
 def _fits(study: Study) -> Study:
@@ -80,10 +78,7 @@ def _fits(study: Study) -> Study:
 
 #: Simulations by the name of their question: that of the verb, unless it changes the study or has another name.
 QUESTIONS = {name: Simulation((name,)) for name in VERBS} | {
-    "detection": Simulation(
-        ("detect", "snr"),
-        others={OTHER: lambda study: _changed(study, nuisances={"usual": not study.nuisances.usual})},
-    ),
+    "detection": Simulation(("detect", "snr")),
     "map": Simulation(("map",), _map_around),
     "measure": Simulation(("measure",), _fits),
     "completeness": Simulation(("inject",), partial(_changed, injections=INJECTED, search={"nulls": 0})),
@@ -101,11 +96,15 @@ def simulate(
     *,
     given: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Return the answers to a question by name; its first verb reports its progress and takes the contents of files."""
+    """Return the answers to a question by name; its first verb reports its progress and takes the contents of files.
+
+    A detection has that with the other choice of unknowns next to it, which is left out if it is refused.
+    """
     question = QUESTIONS[name]
     asked, (main, *more) = question.study(study), question.verbs
     wanted = [(name, main, asked), *((verb, verb, asked) for verb in more)]
-    wanted += [(other, main, change(asked)) for other, change in question.others.items()]
+    if name == "detection":
+        wanted.append((OTHER, main, _changed(asked, nuisances={"usual": not asked.nuisances.usual})))
     counted = sum(VERBS[verb].counts == "realisations" for _, verb, _ in wanted)
     if counted > 1:
         pool.expect(counted * asked.run.realisations)
@@ -114,7 +113,7 @@ def simulate(
         try:
             answers[called] = VERBS[verb].ask(of, pool, progress, **(given or {} if verb == main else {}))
         except InputError:
-            if called not in question.others:
+            if called != OTHER:
                 raise
     return answers
 
@@ -195,9 +194,9 @@ class Tab:
 
     def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
         """Return the table of one of `files`."""
-        table: Table = (
-            answers[str(self.files[name])].tables[name] if self.own_table is None else self.own_table(closed, answers)
-        )
+        if self.own_table is not None:
+            return self.own_table(closed, answers)
+        table: Table = answers[str(self.files[name])].tables[name]
         return table
 
     def rows(self, closed: ClosedForms, answers: Answers) -> list[list[str]]:
@@ -205,10 +204,8 @@ class Tab:
         if self.own_view is None and self.answer not in answers:
             return self.rows_before(closed.question)
         shown = answers[self.answer].views[self.view] if self.own_view is None else self.own_view(closed, answers)
-        if not shown.columns:
-            return []
         headings, cells = without_empty(*shown.texts(FIXED))
-        return [headings, *cells]
+        return [headings, *cells] if headings else []
 
 
 #: Keys that are stated even at their default, so that readers see what was assumed.
@@ -253,10 +250,9 @@ def differing(new: BaseModel, old: BaseModel, path: str = "") -> Iterator[tuple[
 
 def as_command(verb: str, study: Study) -> str:
     """Return a question to a verb as a command, which names a study file if flags cannot say all of it."""
-    from_file = ["mauvecl", verb, STUDY_FILE]
+    question, from_file = VERBS[verb], shlex.join(["mauvecl", verb, STUDY_FILE])
     if any(file is not None for file in (study.flare.spectrum.file, *(star.file for star in study.star))):
-        return shlex.join(from_file)
-    question = VERBS[verb]
+        return from_file
     base = Study().with_settings([f"{key}={value}" for key, value in (question.defaults or {}).items()])
     words = ["mauvecl", verb]
     for name, value in keys_used(question, study, base):
@@ -271,8 +267,7 @@ def as_command(verb: str, study: Study) -> str:
             words += ["--sky", "none"] if value.get("none") else _flag_words("sky", value, question)
         else:
             words += _flag_words(name, value, question) or ["--set", f"{name}={_toml(value)}"]
-    long = any(len(word) > MOST_CHARACTERS for word in words)
-    return shlex.join(from_file if long else words)
+    return from_file if max(map(len, words)) > MOST_CHARACTERS else shlex.join(words)
 
 
 def keys_used(verb: Verb, study: Study, base: Study) -> Iterator[tuple[str, Any]]:

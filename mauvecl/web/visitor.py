@@ -18,7 +18,7 @@ from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from mauvecl.web.closed_forms import Answers
     from mauvecl.web.tab import Tab
 
+T = TypeVar("T")
 #: Simulations that a server computes at the same time; others wait.
 TOGETHER = 2
 #: Simulations that take longer, s, leave memory to release; that of a short one would stop all visitors for longer.
@@ -49,12 +50,7 @@ LONG_S = 1.0
 _threads = ThreadPoolExecutor(TOGETHER, thread_name_prefix="mauvecl-page")
 _per_thread = threading.local()
 #: Uploads are read one after the other, outside the event loop.
-_reader = ThreadPoolExecutor(1, thread_name_prefix="mauvecl-upload")
-
-
-def reading(read: Callable[[], Any]) -> Future[Any]:
-    """Read an upload in the background."""
-    return _reader.submit(read)
+READER = ThreadPoolExecutor(1, thread_name_prefix="mauvecl-upload")
 
 
 class Cancelled(Exception):  # noqa: N818
@@ -185,8 +181,8 @@ def _sent(message: asyncio.Future[None]) -> None:
 LOOK_S = 0.25
 #: Number of threads, besides the event loop, that make closed forms, pictures and files for all visitors.
 _closed_forms = ThreadPoolExecutor(2, thread_name_prefix="mauvecl-closed")
-#: Files that a visitor's connection remembers, and answers of simulations.
-MOST_KEPT, MOST_ANSWERS = 4, 12
+#: Answers of simulations that a visitor's connection remembers.
+MOST_ANSWERS = 12
 #: Things that are done for a visitor at a time.
 MOST_TASKS = 8
 #: Message if the page itself fails.
@@ -310,11 +306,11 @@ class Visitor(WebSocketHandler):
             return
 
         async def answer() -> None:
-            closed = await self._in_thread(partial(self.closed, state, tab))
+            closed = await _in_thread(self.closed, state, tab)
             answers = self.answers(state)
-            self.send(**message, answer=await self._in_thread(partial(card, tab, closed, answers)))
+            self.send(**message, answer=await _in_thread(card, tab, closed, answers))
             if self._next is None:
-                self.send(n=n, **await self._in_thread(partial(shown, tab.name, closed, answers)))
+                self.send(n=n, **await _in_thread(shown, tab, closed, answers))
 
         await self._or_why(answer(), **message)
 
@@ -325,8 +321,7 @@ class Visitor(WebSocketHandler):
             question, folder = state.question(tab.reads), Path(self._folder.name)
             return ClosedForms.of(question, folder, chance=tab.chance, given=self.given(state, tab))
 
-        closed: ClosedForms = self._cached("closed", (self._key(state, tab.reads), tab.chance), make)
-        return closed
+        return self._last("closed", (self._key(state, tab.reads), tab.chance), make)
 
     def given(self, state: State, tab: Tab) -> dict[str, Any]:
         """Return the content of the files that a tab reads; the last ones are cached."""
@@ -338,16 +333,14 @@ class Visitor(WebSocketHandler):
             except InputError as error:
                 raise reworded(error, str(error), tab.needs) from error
 
-        key = tab.name, self._key(state, tab.reads & (UPLOADS.keys() | DATA))
-        given: dict[str, Any] = self._cached("given", key, read)
-        return given
+        return self._last("given", (tab.name, self._key(state, tab.reads & (UPLOADS.keys() | DATA))), read)
 
-    def _cached(self, kind: str, key: Hashable, make: Callable[[], Any], most: int = 1) -> Any:
-        """Return the value of a key; the last `most` of a kind are kept."""
-        value = RESULTS.get(self, kind, key)
+    def _last(self, kind: str, key: Hashable, make: Callable[[], T]) -> T:
+        """Return the value of a key; the last one of a kind is cached."""
+        value: T | None = RESULTS.get(self, kind, key)
         value = make() if value is None else value
         # Closed forms compute and keep more when they are used, and are counted again.
-        RESULTS.keep(self, kind, key, value, most)
+        RESULTS.keep(self, kind, key, value)
         return value
 
     def answers(self, state: State) -> dict[str, Any]:
@@ -394,29 +387,24 @@ class Visitor(WebSocketHandler):
             log.exception("no answer")
             self.send(**message, refused=OWN_FAULT)
 
-    @staticmethod
-    async def _in_thread(work: Callable[[], Any]) -> Any:
-        """Run a function in a thread."""
-        return await asyncio.get_running_loop().run_in_executor(_closed_forms, work)
-
     async def _ask_solve(self, asked: dict[str, Any]) -> None:
         """Send the limit of the quantity for which the question solves, and the chances with other payloads."""
         n = self._solving = asked["n"]
-        closed = await self._in_thread(partial(self.closed, self.state(asked["link"]), tab_of("")))
+        closed = await _in_thread(self.closed, self.state(asked["link"]), tab_of(""))
         if n != self._solving:
             # It takes long for a bright star, and a later question waits.
             self.send(n=n, solved="")
             return
-        self.send(n=n, payloads=await self._in_thread(partial(other_payloads, closed)))
-        self.send(n=n, solved=await self._in_thread(partial(solved, closed)))
+        self.send(n=n, payloads=await _in_thread(other_payloads, closed))
+        self.send(n=n, solved=await _in_thread(solved, closed))
 
     async def _ask_pinned(self, asked: dict[str, Any]) -> None:
         """Send the data of a pinned scenario for a tab's pictures."""
         tab = tab_of(str(asked.get("tab")))
         pictures = [picture for picture in tab.pictures if picture.pins]
         question = self.state(asked["link"]).question(tab.reads)
-        closed = await self._in_thread(partial(ClosedForms.of, question, Path(self._folder.name)))
-        drawn = await self._in_thread(lambda: {p.name: p.drawn(closed, {})["sources"][p.pins] for p in pictures})
+        closed = await _in_thread(ClosedForms.of, question, Path(self._folder.name))
+        drawn = await _in_thread(lambda: {p.name: p.drawn(closed, {})["sources"][p.pins] for p in pictures})
         pins = {name: {c: packed(v) for c, v in columns.items()} for name, columns in drawn.items()}
         self.send(n=asked["n"], pins=pins)
 
@@ -441,7 +429,7 @@ class Visitor(WebSocketHandler):
                 # Another draw took its place, or a simulation reports what is wrong.
                 return
             if RESULTS.get(self, "closed", key) is closed:
-                self.send(n=asked["n"], **shown(tab.name, closed, self.answers(state) | {"draw": drawn}))
+                self.send(n=asked["n"], **shown(tab, closed, self.answers(state) | {"draw": drawn}))
 
         self._begin(draw(self._drawing))
 
@@ -456,9 +444,9 @@ class Visitor(WebSocketHandler):
     async def _simulate(self, n: int, kind: str, state: State) -> None:
         key = kind, self._key(state, reads_of(kind))
         question, tab = state.question(reads_of(kind)), SIMULATIONS[kind]
-        given = await self._in_thread(partial(self.given, state, tab))
+        given = await _in_thread(self.given, state, tab)
         made = partial(ClosedForms.of, question, Path(self._folder.name), chance=tab.chance, given=given)
-        closed = await self._in_thread(made)
+        closed = await _in_thread(made)
         if self.job is not None:
             raise InputError("a simulation is running already: wait until it ends", key="simulate")
         main, *more = QUESTIONS[kind].verbs
@@ -507,7 +495,7 @@ class Visitor(WebSocketHandler):
         names = tuple(upload.options.values())
         reply: dict[str, Any] = {"n": asked["n"], "field": field}
         try:
-            work = reading(lambda: upload.read(name, content, state.question(names).values))
+            work = READER.submit(lambda: upload.read(name, content, state.question(names).values))
             UPLOADED.keep(self, "upload", field, await asyncio.wrap_future(work), len(UPLOADS))
             reply["entered"] = upload.entered
         except InputError as error:
@@ -521,44 +509,41 @@ class Visitor(WebSocketHandler):
 
     async def _ask_columns(self, asked: dict[str, Any]) -> None:
         """Send the names of the columns of the visitor's frames; none if they are no table."""
-        file, names = UPLOADED.get(self, "upload", "frames"), ()
+        file, names = UPLOADED.get(self, "upload", "frames"), tuple[str, ...]()
         if file is not None:
-            work = reading(partial(read_limited, ColumnNames, ColumnNames.read, {file.name: file.content}))
+            work = READER.submit(read_limited, ColumnNames, ColumnNames.read, {file.name: file.content})
             names = (await asyncio.wrap_future(work)).names
         self.send(n=asked["n"], columns=names)
 
     async def _ask_file(self, asked: dict[str, Any]) -> None:
         """Send a table, document or study."""
         which = (str(asked.get(word)) for word in ("tab", "name", "ending"))
-        file, content = await self._in_thread(partial(self.file, self.state(asked["link"]), *which))
+        file, content = await _in_thread(self.file, self.state(asked["link"]), *which)
         self.send(content, n=asked["n"], file=file)
 
     def file(self, state: State, tab: str, name: str, ending: str) -> tuple[str, bytes]:
-        """Send a table or study of the question; the last ones are cached."""
+        """Return the name and content of a table, document or study of the question."""
+        if tab in TABS:
+            return as_file(TABS[tab], name, ending, self.closed(state, TABS[tab]), self.answers(state))
         # The page asks for the study of a question by its name alone.
-        front = TABS.get(tab) or next((other for other in TABS.values() if name in other.questions), None)
+        front = next((tab for tab in TABS.values() if name in tab.questions), None)
         if front is None:
             raise InputError(f"no tab asks {name[:40]!r}; give a question of a tab", key="name")
         # A simulation asks what its own answers depend on, which their tables state.
-        reads = reads_of(name) if tab not in TABS and name in SIMULATIONS else front.reads
-        answers = self.answers(state)
-
-        def make() -> tuple[str, bytes]:
-            if tab in TABS:
-                return as_file(TABS[tab], name, ending, self.closed(state, front), answers)
-            study = state.question(reads).case(Path(self._folder.name)).study
-            return study_file(QUESTIONS[name].study(study), "study")
-
-        which = self._key(state, reads), tab, name, ending, tuple(answers)
-        made: tuple[str, bytes] = self._cached("file", which, make, MOST_KEPT)
-        return made
+        question = state.question(reads_of(name) if name in SIMULATIONS else front.reads)
+        return study_file(QUESTIONS[name].study(question.case(Path(self._folder.name)).study), "study")
 
     async def _ask_export(self, asked: dict[str, Any]) -> None:
         """Send a tab's questions as commands and as Python programs."""
         tab = tab_of(str(asked.get("tab")))
         question = self.state(asked["link"]).question(tab.reads)
-        taken = await self._in_thread(partial(commands_and_programs, tab, question, Path(self._folder.name)))
+        taken = await _in_thread(commands_and_programs, tab, question, Path(self._folder.name))
         self.send(n=asked["n"], taken=taken)
+
+
+async def _in_thread(work: Callable[..., T], *given: Any) -> T:
+    """Run a function in a thread."""
+    return await asyncio.get_running_loop().run_in_executor(_closed_forms, partial(work, *given))
 
 
 def tab_of(name: str) -> Tab:
@@ -566,9 +551,8 @@ def tab_of(name: str) -> Tab:
     return TABS.get(name, next(iter(TABS.values())))
 
 
-def shown(name: str, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
+def shown(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
     """Return the data of a tab in the form of messages."""
-    tab = tab_of(name)
     pictures = {}
     for picture in tab.pictures:
         drawn = picture.drawn(closed, answers)

@@ -1,12 +1,9 @@
 """Stores of raw spectra: content, verification, and recovery."""
 
-import fcntl
 import itertools
 import json
 import os
-import random
 import shutil
-import signal
 import subprocess
 import time
 import tomllib
@@ -25,7 +22,7 @@ from astropy.wcs import WCS
 from commands import run
 from marks import long_but
 from refusals import refused
-from stores import CHUNK, LAST, PAINTER, flip, forked, full_after, killed, killed_at, study, tree
+from stores import CHUNK, LAST, PAINTER, flip, full_after, killed_at, locked, study, tree
 
 from mauvecl import Engine, Study, bulk
 from mauvecl.runs.store import Store
@@ -58,9 +55,7 @@ def test_rows_equal_those_of_the_engine(tmp_path: Path, engine: Engine) -> None:
     quiet, flare = expectations(asked)
     for name, x in (("star-1/quiescent", quiet), ("star-1/flare-1", flare)):
         found = bulk.read(tmp_path / "frames.zarr", name)
-        assert found.dims == ("realisation", "pixel")
-        assert found.dtype == np.uint16
-        assert found.attrs["units"] == "DN"
+        assert (found.dims, found.dtype, found.attrs["units"]) == (("realisation", "pixel"), np.uint16, "DN")
         np.testing.assert_array_equal(found.values, engine.realise(x, count=300, seed=11))
         np.testing.assert_array_equal(found[17:20].values, engine.realise(x, start=17, count=3, seed=11))
         np.testing.assert_array_equal(found.wavelength, x.wavelength_nm)
@@ -149,10 +144,8 @@ def test_damage_is_found_and_repaired_to_the_bit(path: Path, engine: Engine, fau
     assert all(state in (found[key], "?") for key, state in expected.items())
     assert all(one.mended for one in bulk.verify(path, engine, repair=True))
     # A list of digests keeps the line that could not be read.
-    after = tree(path)
-    assert {k: v for k, v in after.items() if "digests" not in k} == {
-        k: v for k, v in before.items() if "digests" not in k
-    }
+    after, before = ({k: v for k, v in one.items() if "digests" not in k} for one in (tree(path), before))
+    assert after == before
     assert bulk.verify(path, engine, redraw=True) == []
 
 
@@ -186,47 +179,14 @@ def test_another_study_raises_with_the_difference(path: Path, engine: Engine) ->
     assert bulk.verify(path) == []
 
 
-@pytest.fixture
-def described_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Study], None]:
-    """Return a function that describes a store once for all its runs, which then begin to write at once."""
-
-    def describe(asked: Study) -> None:
-        store = Store(tmp_path, asked)
-        described, scenes = store.description(), store.scenes
-        monkeypatch.setattr(Store, "description", lambda self: described)
-        monkeypatch.setattr(Store, "scenes", property(lambda self: scenes))
-
-    return describe
-
-
 @pytest.mark.long
-def test_random_kills_lose_nothing(
-    tmp_path: Path, painted: dict[str, bytes], described_once: Callable[[Study], None]
-) -> None:
-    """Kill a run at random moments, within about the time that it takes, and resume it; files have the same bits."""
-    described_once(study(1000))
-    path, kills, moments = tmp_path / "frames.zarr", 0, random.Random(5)
-    paint = partial(bulk.realise, study(1000), path, PAINTER)
-    began = time.monotonic()
-    killed(forked(paint))
-    takes = time.monotonic() - began
-    while kills < 30:
-        if path.exists() and tree(path) == painted:
-            # A store that is finished after many kills: the next one begins.
-            shutil.rmtree(path)
-        child = forked(paint)
-        time.sleep(moments.uniform(0.0, takes))
-        os.kill(child, signal.SIGKILL)
-        kills += killed(child)
-    paint()
-    assert tree(path) == painted
-    assert bulk.verify(path) == []
-
-
-@pytest.mark.long
-def test_kill_at_every_step_of_writing_loses_nothing(tmp_path: Path, described_once: Callable[[Study], None]) -> None:
-    """Kill before each fsync, rename and line of digests."""
-    described_once(study(200))
+def test_kill_at_every_step_of_writing_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Kill before each fsync, rename and line of digests; a run that goes on leaves the same bits."""
+    store = Store(tmp_path, study(200))
+    # Described once for all runs, which then begin to write at once.
+    described, scenes = store.description(), store.scenes
+    monkeypatch.setattr(Store, "description", lambda self: described)
+    monkeypatch.setattr(Store, "scenes", property(lambda self: scenes))
     first: dict[str, bytes] = {}
     for step in itertools.count():
         path = tmp_path / f"{step}.zarr"
@@ -280,13 +240,11 @@ def test_no_chunk_is_being_written_when_a_stopped_run_has_ended(
     def slow(store: Store, chunk: Any, rows: Any) -> None:
         time.sleep(0.2)
         write(store, chunk, rows)
-        folder = os.open(store.path, os.O_RDONLY)
         try:
-            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            is_locked.append(False)
+            with locked(store.path, wait=False):
+                is_locked.append(False)
         except BlockingIOError:
             is_locked.append(True)
-        os.close(folder)
 
     def stop(done: int, total: int) -> None:
         if done:

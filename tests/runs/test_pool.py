@@ -70,15 +70,11 @@ def test_order_of_shards_does_not_affect_the_answer(engine: Engine, scene: list[
 
 
 @pytest.mark.long
-def test_shards_of_every_kind_of_request_join(engine: Engine) -> None:
-    """Include requests with several launches and all arguments."""
+def test_shards_of_several_launches_with_all_arguments_join(engine: Engine) -> None:
     scene = star(amplitudes=tuple(np.linspace(0.01, 0.3, 17)), payload=instrument(part=True))
-    how: dict[str, Any] = {
-        "n": 9000,
-        "statistics": ("chi2_pair", "matched"),
-        "comparison": Comparison.of("stack:3", "estimated"),
-        "processes": mauvecl.Processes(jitter=mauvecl.Uniform(0.0, 0.05)),
-    }
+    how: dict[str, Any] = {"n": 9000, "statistics": ("chi2_pair", "matched")}
+    how |= {"comparison": Comparison.of("stack:3", "estimated")}
+    how |= {"processes": mauvecl.Processes(jitter=mauvecl.Uniform(0.0, 0.05))}
     pool = Pool(Shuffled(engine, 4))
     same(detected(pool, scene, **how), detected(engine, scene, **how))
     assert pool.standing.of == 2 * 3
@@ -153,18 +149,22 @@ class Failing:
         return self._engine.count(request, shard, **more)
 
 
-def test_failed_launch_is_repeated(engine: Engine, scene: list[Expectation]) -> None:
-    calls: list[int] = []
-    made: list[int] = []
+def working(make: Callable[[], Any]) -> Pool:
+    """Return a pool of one engine, which is made anew after each failure."""
+    return Pool(LocalWorkers([None], make=lambda device, progress: make()))
 
-    def make(device: str | None, progress: Any) -> Any:
-        made.append(1)
+
+def test_failed_launch_is_repeated(engine: Engine, scene: list[Expectation]) -> None:
+    calls, made = list[int](), itertools.count()
+
+    def make() -> Failing:
+        next(made)
         return Failing(engine, {2, 5, 6}, calls)
 
-    pool = Pool(LocalWorkers([None], make=make))
+    pool = working(make)
     same(detected(pool, scene), detected(engine, scene))
     assert pool.standing.retries == 3
-    assert len(made) == 4, "each time with a new context"
+    assert next(made) == 4, "each time with a new context"
 
 
 def test_closed_workers_end_every_wait(engine: Engine, scene: list[Expectation]) -> None:
@@ -177,31 +177,29 @@ def test_closed_workers_end_every_wait(engine: Engine, scene: list[Expectation])
             assert free.wait(60)
             return engine.count(request, shard, **more)
 
-    workers = LocalWorkers([None], make=lambda device, progress: Held(engine, set(), []))  # type: ignore[return-value, arg-type]
-    ends: list[BaseException] = []
+    pool, ends = working(lambda: Held(engine, set(), [])), list[BaseException]()
 
     def ask() -> None:
         try:
-            detected(Pool(workers), scene, 8192)
+            detected(pool, scene, 8192)
         except (pools.Stopped, RuntimeError) as end:
             ends.append(end)
 
     # Daemon threads: one that waits for ever fails the test instead of holding it.
-    asking, closing = (threading.Thread(target=one, daemon=True) for one in (ask, workers.close))
+    asking, closing = (threading.Thread(target=one, daemon=True) for one in (ask, pool.workers.close))
     asking.start()
     assert begun.wait(60)
     closing.start()
     time.sleep(0.2)
     free.set()
-    asking.join(60)
-    closing.join(60)
-    assert not asking.is_alive()
-    assert not closing.is_alive()
+    for thread in (asking, closing):
+        thread.join(60)
+        assert not thread.is_alive()
     assert len(ends) == 1
 
 
 def test_device_that_always_fails_raises(engine: Engine, scene: list[Expectation]) -> None:
-    pool = Pool(LocalWorkers([None], make=lambda device, progress: Failing(engine, set(range(99)), [])))  # type: ignore[return-value, arg-type]
+    pool = working(lambda: Failing(engine, set(range(99)), []))
     with failed("failed", "realisations 0 to 4095 failed 8 times", "OUT_OF_RESOURCES"):
         detected(pool, scene)
 
@@ -277,23 +275,22 @@ def test_fingerprints_distinguish_requests(scene: list[Expectation]) -> None:
         assert shards.fingerprint(base) != names[0], "shards of an older form are not read"
 
 
-def test_shards_do_not_depend_on_the_number_of_realisations(scene: list[Expectation]) -> None:
-    """Check all shards but the last, so that a longer run finds those of a shorter one."""
-    quiet, *flares = scene
-    short, long = (shards.shards(requests.DetectRequest(quiet, tuple(flares), n, 5, ("chi2",))) for n in (N, 10 * N))
-    assert short[:-1] == long[: len(short) - 1]
-    for request_shards, n in ((short, N), (long, 10 * N)):
-        assert sum(shard.count for shard in request_shards) == n
+def test_shards_depend_on_the_number_of_realisations_in_the_last_and_largest_only(
+    scene: list[Expectation], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A longer run finds the shards of a shorter one; huge ones have as many as one process can add up."""
 
-
-def test_large_requests_have_larger_shards(scene: list[Expectation], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Limit the number of shards to what one process can add up."""
-    monkeypatch.setattr(shards, "SHARD_WORK", 2**34)
-    for n in (10**6, 10**9, 10**12, 10**15):
+    def cut(n: int) -> list[shards.Shard]:
         found = shards.shards(requests.DetectRequest(scene[0], tuple(scene[1:]), n, 5, ("chi2",)))
-        assert len(found) <= 2 * shards.MAX_SHARDS + 1
         assert sum(shard.count for shard in found) == n
         assert all(shard.count & (shard.count - 1) == 0 for shard in found[:-1])
+        return found
+
+    short, long = cut(N), cut(10 * N)
+    assert short[:-1] == long[: len(short) - 1]
+    monkeypatch.setattr(shards, "SHARD_WORK", 2**34)
+    for n in (10**6, 10**9, 10**12, 10**15):
+        assert len(cut(n)) <= 2 * shards.MAX_SHARDS + 1
 
 
 def interrupting(after: int) -> Callable[[int, int], None]:
@@ -306,7 +303,7 @@ def interrupting(after: int) -> Callable[[int, int], None]:
 
 def at_work(folder: Path, engine: Engine, progress: Any = None, study: mauvecl.Study | None = None, **how: Any) -> Any:
     """Ask for a detection whose shards are kept; return it, the pool and the checkpoint."""
-    with shards.Checkpoint(folder, "detect", study or small(), patience_s=0.0, **how) as checkpoint:
+    with shards.Checkpoint(folder, "detect", study or small(), **{"patience_s": 0.0} | how) as checkpoint:
         pool = Pool(LocalWorkers([None], make=lambda d, progress: engine), checkpoint=checkpoint, progress=progress)
         return detected(pool, SCENE), pool, checkpoint
 
@@ -397,9 +394,7 @@ def test_counts_of_another_form_raise(begun: Path, engine: Engine) -> None:
 
 
 def test_short_runs_leave_no_files(tmp_path: Path, engine: Engine) -> None:
-    with shards.Checkpoint(tmp_path, "detect", small()) as checkpoint:
-        pool = Pool(LocalWorkers([None], make=lambda d, progress: engine), checkpoint=checkpoint)
-        detected(pool, SCENE)
+    at_work(tmp_path, engine, patience_s=shards.PATIENCE_S)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -484,13 +479,10 @@ def test_progress_that_raises_stops_the_work_ahead_of_it(engine: Engine) -> None
     def progress(done: int, total: int) -> None:
         raise ArithmeticError
 
-    try:
+    with pytest.raises(ArithmeticError):
         mauvecl.map(small(map=AXES), pool, progress)
-    except ArithmeticError:
-        with pytest.raises(pools.Stopped):
-            detected(pool, SCENE)
-    else:
-        pytest.fail("the progress was not asked")
+    with pytest.raises(pools.Stopped):
+        detected(pool, SCENE)
 
 
 @pytest.mark.parametrize("package", ["distributed", "cryptography"])

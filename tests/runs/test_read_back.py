@@ -59,28 +59,14 @@ def _written(folder: Path, asked: Study, engine: Engine, ending: str) -> Path:
     return folder / f"frames.{ending}"
 
 
-#: Rows of the store.
-ROWS = 20
+def test_bad_exports_are_refused(tmp_path: Path) -> None:
+    bulk.realise(study(20), tmp_path / "s.zarr", PAINTER)
 
+    def exported(*words: str) -> str:
+        return run("export", "s.zarr", *words, folder=tmp_path, code=2).stderr
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    bulk.realise(study(ROWS), tmp_path / "s.zarr", PAINTER)
-    (tmp_path / "notes").mkdir()
-    (tmp_path / "notes" / "mine.txt").write_text("keep me")
-    return tmp_path
-
-
-def exported(folder: Path, *words: str) -> str:
-    return run("export", "s.zarr", *words, folder=folder, code=2).stderr
-
-
-def test_bad_exports_are_refused(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert f"0:{ROWS}" in exported(folder, "s.fits", "--rows", "10:60")
-    assert "hdf5" in exported(folder, "s.txt")
-    with monkeypatch.context() as patch:
-        patch.setattr("mauvecl.runs.export.MAX_BYTES", 1000)
-        assert "rows" in exported(folder, "s.fits")
-    (folder / "s.zarr" / "star-1/quiescent/c/0/0").unlink()
-    assert "star-1/quiescent/c/0/0" in exported(folder, "s.fits")
-    assert not (folder / "s.fits").exists()
+    assert "0:20" in exported("s.fits", "--rows", "10:60")
+    assert "hdf5" in exported("s.txt")
+    (tmp_path / "s.zarr" / "star-1/quiescent/c/0/0").unlink()
+    assert "star-1/quiescent/c/0/0" in exported("s.fits")
+    assert not (tmp_path / "s.fits").exists()

@@ -35,6 +35,13 @@ def relabelled(place: Path, change: Callable[[str], str]) -> None:
     place.write_text(json.dumps(content, indent=2))
 
 
+#: Functions of a store that need it alone.
+WRITES: tuple[Callable[[Path], object], ...] = (
+    lambda path: bulk.realise(study(), path, PAINTER),
+    lambda path: bulk.realise(study(), path, PAINTER, restart=True),
+    bulk.verify,
+    bulk.forget,
+)
 COPIES = ["zarr.json", "star-1/quiescent/zarr.json", "star-1/flare-1/zarr.json"]
 
 
@@ -59,16 +66,9 @@ def test_contradicting_studies_raise(made: Path, other: Path, copy: str) -> None
     """Give two studies with valid digests; nothing is read or written, since either could be the drawn one."""
     shutil.copy(other / copy, made / copy)
     before = tree(made)
-    for ask in (
-        lambda: bulk.verify(made),
-        lambda: bulk.verify(made, PAINTER, repair=True, redraw=True),
-        lambda: bulk.read(made),
-        lambda: bulk.realise(study(), made, PAINTER),
-        lambda: bulk.realise(study(), made, PAINTER, restart=True),
-        lambda: bulk.forget(made),
-    ):
+    for ask in (*WRITES, bulk.read, partial(bulk.verify, engine=PAINTER, repair=True, redraw=True)):
         with refused("store", "'zarr.json'"):
-            ask()
+            ask(made)
     assert tree(made) == before
 
 
@@ -100,14 +100,9 @@ def test_locked_store_is_neither_read_nor_removed(made: Path) -> None:
     with locked(made):
         done = run("realise", "study.toml", "--restart", "--output", made, folder=made.parent, code=2)
         assert f"{str(made)!r} is being written by another process" in done.stderr
-        for ask in (
-            lambda: bulk.realise(study(), made, PAINTER),
-            lambda: bulk.realise(study(), made, PAINTER, restart=True),
-            lambda: bulk.verify(made),
-            lambda: bulk.forget(made),
-        ):
+        for ask in WRITES:
             with refused("lock", str(made)):
-                ask()
+                ask(made)
     assert tree(made) == before
 
 
@@ -171,6 +166,7 @@ def test_store_larger_than_any_disk_raises(tmp_path: Path, monkeypatch: pytest.M
         bulk.verify(path, rows=(0, 10**12))
     assert [f.key for f in bulk.verify(path, rows=(0, first.stop))] == ["star-1/flare-1/c/0/0"]
     run("export", path, "few.h5", "--array", "star-1/quiescent", "--rows", "3:5", folder=tmp_path)
+    assert "one file may hold 4 GiB" in run("export", path, "all.h5", folder=tmp_path, code=2).stderr
     with refused("run.realisations"):
         bulk.realise(asked, path, PAINTER)
     bulk.forget(path)

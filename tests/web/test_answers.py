@@ -147,6 +147,9 @@ async def test_stars_and_targets_are_described(talk: Talk) -> None:
     refused = await talk.ask("simulate", "ended", kind="plan", link=link(targets="12 34", hours="50"))
     assert refused["ended"] == ""
     assert "spectral" in refused["refused"], "a plan needs what is known of a target"
+    # It lies outside the declinations that are observed, and its plan has no energies to draw.
+    await talk.simulate("plan", hidden := link(targets="Proxima Cen"))
+    assert "Proxima Cen is never seen" in (await talk.answer(hidden, "plan"))["pictures"]["expected"]["text"]
 
 
 # Both chances

@@ -52,14 +52,6 @@ def valued(data: Any, key: str) -> Any:
     return data
 
 
-def study_in(file: str, content: bytes) -> str:
-    """Return the text of a study, which stands in an archive with the visitor's files if there are any."""
-    if file.endswith(".toml"):
-        return content.decode()
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        return archive.read("study.toml").decode()
-
-
 def test_fields_are_shown_where_they_matter(words: dict[str, Any]) -> None:
     assert {tab: {*seen["reads"]} for tab, seen in words["tabs"].items()} == SHOWN
 
@@ -75,10 +67,12 @@ async def test_every_field_is_a_key_of_the_study(talk: Talk, words: dict[str, An
         for entered in (before, before | {name: row["text"]}):
             asked = link(**entered)
             question, printed = next(iter((await talk.exported(asked, tab)).items()))
-            study = study_in(*await talk.file(link=asked, tab="", name=question, ending="study"))
+            file, study = await talk.file(link=asked, tab="", name=question, ending="study")
+            if file.endswith(".zip"):
+                study = zipfile.ZipFile(io.BytesIO(study)).read("study.toml")
             given: dict[str, Any] = {}
             exec(printed["python"].partition("answer =")[0], given)
-            found = (tomllib.loads(study), given["study"].model_dump(mode="json"))
+            found = (tomllib.loads(study.decode()), given["study"].model_dump(mode="json"))
             seen.append([valued(one, row["key"]) == row["value"] for one in found])
             seen[-1].append(f"{row['command']} " in f"{printed['command']} ")
         assert seen == [[False] * 3, [True] * 3], (name, printed)
@@ -290,8 +284,8 @@ async def test_own_star_and_unknown_are_in_the_study_that_the_command_names(talk
     assert "your own star" in reported["words"]
     assert any("ASSUMED" in text for text, _ in reported["notes"])
     assert {kind for _, kind in reported["notes"]} == {"info"}, "red is what changes the answer"
-    for tab, shown in SHOWN.items():
-        for one in (await talk.exported(asked, tab)).values() if "star" in shown else ():
+    for tab in (tab for tab, shown in SHOWN.items() if "star" in shown):
+        for one in (await talk.exported(asked, tab)).values():
             assert re.fullmatch(r"mauvecl \w+ study\.toml", one["command"])
             assert "'file': 'star.ecsv'" in one["python"]
     await taken(talk, asked, "detection", tmp_path)
@@ -363,8 +357,7 @@ async def test_neighbours_of_the_page_are_those_of_the_command_line(talk: Talk, 
     near = {"neighbours": table, "neighbours_of": "Gaia DR3 1"}
     asked = [link(**entered | more) for more in ({}, near, near | {"neighbour_share": "0"})]
     # The ideal chance falls with the noise of the neighbour's light.
-    found = [(await talk.chances(one))[1] for one in asked]
-    alone, blended, none_of_it = found
+    alone, blended, none_of_it = [(await talk.chances(one))[1] for one in asked]
     command = await taken(talk, link(**entered, **near, **FEW), "detection", tmp_path)
     assert alone == none_of_it
     assert blended < alone - 0.004
@@ -485,22 +478,17 @@ async def test_uploaded_frames_are_analysed_as_on_the_command_line(talk: Talk, s
     offered = [one.split()[1] for one in drawn["answer"]["files"] if one.startswith("analyse ")]
     tables = {}
     for name in offered:
-        ending = "" if name.endswith(".html") else "ecsv"
-        _, content = await talk.file(link=link(**OWN), tab="analyse", name=name, ending=ending)
+        _, content = await talk.file(link=link(**OWN), tab="analyse", name=name, ending="ecsv")
         assert b"mauvecl-page" not in content, "nothing names a folder of the server"
-        if ending:
-            tables[name] = Table.read(content.decode(), format="ascii.ecsv")
-        else:
+        if name.endswith(".html"):
             assert b"<!doctype html>" in content
+        else:
+            tables[name] = Table.read(content.decode(), format="ascii.ecsv")
     assert "measured" not in tables
-    told = await talk.ask("file", "refused", link=link(**OWN), tab="analyse", name="measured", ending="ecsv")
-    assert told["refused"]
-    detected = [row for row in drawn["rows"] if "detected" in row]
-    assert len(detected) == 1
+    assert await talk.ask("file", "refused", link=link(**OWN), tab="analyse", name="measured", ending="ecsv")
+    assert sum("detected" in row for row in drawn["rows"]) == 1
     command = await taken(talk, link(**OWN), "analyse", tmp_path)
-    assert command.startswith("mauvecl analyse my_curve.csv ")
-    assert "--mapping curve.toml" in command
-    assert "--alarms-per day" in command
+    assert re.fullmatch(r"mauvecl analyse my_curve\.csv (?=.*--mapping curve\.toml).*--alarms-per day.*", command)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["curve.toml", "my_curve.csv", "study.toml"]
     assert (tmp_path / "my_curve.csv").read_bytes() == light_curve()
     assert Study.read(tmp_path / "study.toml").data.file == tmp_path / "my_curve.csv"

@@ -6,6 +6,7 @@ import io
 import re
 import time
 import zipfile
+from contextlib import contextmanager
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -16,10 +17,12 @@ import pytest
 from astropy.table import QTable
 
 from mauvecl import __version__
-from tests.web.test_files import light_curve, standards, zipped
+from tests.web.test_files import light_curve, standards, star_file, zipped
 from tests.web.visits import PATIENCE, Server, enter, fresh, settled, until
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from playwright.sync_api import Browser, Locator, Page
 
 pytestmark = pytest.mark.long
@@ -50,17 +53,36 @@ def simulate(page: Page, name: str = "Simulate") -> str:
     return shown(page)
 
 
-def download(page: Page, label: str) -> bytes:
+def download(page: Page, label: str, within: str = "body") -> bytes:
     with page.expect_download() as coming:
-        page.get_by_role("button", name=label, exact=True).click()
+        page.locator(within).get_by_role("button", name=label, exact=True).click()
     return Path(coming.value.path()).read_bytes()
 
 
-def taken(page: Page) -> bytes:
+@contextmanager
+def exporting(page: Page) -> Iterator[Locator]:
+    """Open the dialog of exports, and close it."""
     page.get_by_role("button", name="Share, export, cite", exact=True).click()
-    study = download(page, "Study for the command line")
+    page.locator("#export[open]").wait_for()
+    yield page.locator("#export")
     page.keyboard.press("Escape")
-    return study
+
+
+def taken(page: Page) -> bytes:
+    with exporting(page):
+        return download(page, "Study for the command line")
+
+
+def give(page: Page, field: str, content: bytes | str, name: str = "mine.txt") -> None:
+    """Choose a file for a field."""
+    content = content.encode() if isinstance(content, str) else content
+    file: Any = {"name": name, "mimeType": "text/plain", "buffer": content}
+    page.locator(f"[data-upload={field}]").set_input_files(file)
+
+
+def says(page: Page, words: str) -> None:
+    """Wait until the answer holds these words."""
+    until(page, lambda: words in shown(page))
 
 
 def ranges(page: Page, picture: str) -> list[float]:
@@ -100,10 +122,6 @@ def centre(page: Page, picture: str, x: float, y: float) -> tuple[float, float]:
 def afresh(page: Page) -> None:
     page.get_by_role("button", name="Start afresh").click()
     settled(page)
-
-
-def chosen(contents: dict[str, bytes]) -> dict[str, Any]:
-    return {"name": "standards.zip", "mimeType": "application/zip", "buffer": zipped(contents)}
 
 
 def test_visitor_changes_values_and_reads_the_answer(browser: Browser, server: Server) -> None:
@@ -156,18 +174,11 @@ def test_visitor_changes_values_and_reads_the_answer(browser: Browser, server: S
         assert shown(page) == before
         assert page.get_by_text(reported).count() == 0
     before = places(page)
-    for label, text in (
-        ("Magnitude", "abc"),
-        ("Magnitude", "8.5"),
-        ("Star", "AU Mic"),
-        ("Star", "GJ 581"),
-        ("Star", "x"),
-    ):
+    for label, text in (("Magnitude", "abc"), ("Magnitude", "8.5"), ("Star", "AU Mic"), ("Star", "x")):
         field = page.get_by_label(label, exact=True)
         field.fill(text)
         settled(page)
-        wrong = field.get_attribute("aria-invalid") == "true"
-        assert wrong == (text in ("abc", "x"))
+        assert (field.get_attribute("aria-invalid") == "true") == (text in ("abc", "x"))
         assert places(page) == pytest.approx(before, abs=1), text
     enter(page, "Star", "G2V")
     # Values that cannot be together mark their field, and choices follow from others.
@@ -196,14 +207,14 @@ def test_visitor_changes_values_and_reads_the_answer(browser: Browser, server: S
     field.press("End")
     field.press("Backspace")
     field.press_sequentially("2")
-    until(page, lambda: "V = 8.2" in shown(page))
+    says(page, "V = 8.2")
     assert shown(page) != before
     assert "magnitude=8.2" in page.url
     field.press("ArrowUp")
-    until(page, lambda: "V = 8.3" in shown(page))
+    says(page, "V = 8.3")
     page.get_by_label("Exposure, slider").focus()
     page.keyboard.press("ArrowRight")
-    until(page, lambda: "in 55 s" in shown(page))
+    says(page, "in 55 s")
     page.get_by_label("Flare amplitude, slider").focus()
     page.keyboard.press("ArrowRight")
     until(page, lambda: "a flare of 2 %" not in shown(page))
@@ -233,7 +244,7 @@ def test_visitor_looks_for_a_star_and_goes_back(page: Page) -> None:
     page.get_by_role("option", name="HD 85512", exact=True).wait_for()
     field.press("ArrowDown")
     field.press("Enter")
-    until(page, lambda: "on HD 40307 V" in shown(page))
+    says(page, "on HD 40307 V")
     second = shown(page)
     enter(page, "Star", "K3V")
     until(page, lambda: "star=K3V" in page.url)
@@ -254,15 +265,15 @@ def test_visitor_looks_for_a_star_and_goes_back(page: Page) -> None:
     assert page.locator("#panel-noise").is_visible()
     afresh(page)
     enter(page, "Star", "gj 581")
-    until(page, lambda: "V = 10.57" in shown(page))
+    says(page, "V = 10.57")
     assert page.locator("#k-star").inner_text() == "M3V, 6.215 pc, V = 10.57; Hipparcos"
     page.go_back()
-    until(page, lambda: "on G2V V = 8.5" in shown(page))
+    says(page, "on G2V V = 8.5")
     enter(page, "Star", "AU Mic")
-    until(page, lambda: "AU Mic V = 8.81" in shown(page))
+    says(page, "AU Mic V = 8.81")
     # A magnitude that the user entered stays.
     enter(page, "Magnitude", "9")
-    until(page, lambda: "V = 9 in" in shown(page))
+    says(page, "V = 9 in")
     # The name is confirmed after the answer to the typed text has come, or while the server still computes it.
     for answered in (True, False):
         page.goto(page.url.partition("?")[0])
@@ -277,11 +288,11 @@ def test_visitor_looks_for_a_star_and_goes_back(page: Page) -> None:
             until(page, lambda: "gj 581" in page.locator("#words-of").inner_text())
             settled(page)
         field.press("Enter")
-        until(page, lambda: "V = 10.57" in shown(page))
+        says(page, "V = 10.57")
         assert page.get_by_label("Magnitude", exact=True).input_value() == "10.57"
         # Name and magnitude are one step of the history.
         page.go_back()
-        until(page, lambda: "on G2V V = 8.5" in shown(page))
+        says(page, "on G2V V = 8.5")
 
 
 def test_visitor_studies_and_keeps_pictures(page: Page) -> None:
@@ -297,14 +308,9 @@ def test_visitor_studies_and_keeps_pictures(page: Page) -> None:
     assert page.get_by_role("img", name="Flare minus quiet, in sigma of the noise").count() == 1
     page.locator("#figure-excess .legend li:visible", has_text="drawn exposure").wait_for()
     before = settled_ranges(page, "excess")
-    plot = page.locator("#plot-excess")
-    reset = page.locator("#figure-excess").get_by_role("button", name="Reset zoom")
 
     def point() -> tuple[float, float]:
-        # The button and the wheel scroll the page, and the picture with it.
-        plot.scroll_into_view_if_needed()
-        box = plot.bounding_box()
-        x, y = box["x"] + 0.4 * box["width"], box["y"] + 0.3 * box["height"]
+        x, y = centre(page, "excess", 0.4, 0.3)
         page.mouse.move(x, y)
         return x, y
 
@@ -323,7 +329,7 @@ def test_visitor_studies_and_keeps_pictures(page: Page) -> None:
     page.mouse.move(x + 60, y + 60, steps=4)
     page.mouse.up()
     inside()
-    reset.click()
+    page.locator("#figure-excess").get_by_role("button", name="Reset zoom").click()
     back()
     page.evaluate("document.activeElement.blur()")
     point()
@@ -337,7 +343,7 @@ def test_visitor_studies_and_keeps_pictures(page: Page) -> None:
     page.mouse.wheel(0, -200)
     page.keyboard.up("Control")
     inside()
-    plot.focus()
+    box.focus()
     page.keyboard.press("0")
     back()
     point()
@@ -382,9 +388,7 @@ def test_visitor_studies_and_keeps_pictures(page: Page) -> None:
     enter(page, "Magnitude", "9")
     assert page.evaluate(f"{ends % 'recorded'}.end") == 300, "the axis stays where the visitor has put it"
     for ending, first in (("SVG", b"<svg"), ("PNG", b"\x89PNG")):
-        with page.expect_download() as coming:
-            page.locator("#figure-telescope").get_by_role("button", name=ending, exact=True).click()
-        assert Path(coming.value.path()).read_bytes().startswith(first)
+        assert download(page, ending, "#figure-telescope").startswith(first)
     settled_ranges(page, "recorded")
     names = page.evaluate("page.pictures.all.recorded.figure.plot.renderers.map(one => one.name)")
     assert names.index("drawn exposure") < names.index("star") < names.index("star with flare")
@@ -392,19 +396,12 @@ def test_visitor_studies_and_keeps_pictures(page: Page) -> None:
     page.locator("#text-map", has_text="At least half").wait_for()
     before = shown(page)
     settled_ranges(page, "map")
-    box = page.locator("#plot-map").bounding_box()
-    page.mouse.click(box["x"] + 0.5 * box["width"], box["y"] + 0.4 * box["height"])
+    page.mouse.click(*centre(page, "map", 0.5, 0.4))
     until(page, lambda: "magnitude=8.5" not in page.url and "magnitude" in page.url)
     assert shown(page) != before
     entered = float(page.get_by_label("Magnitude", exact=True).input_value())
-    own = page.evaluate("[...page.pictures.all.map.figure.models.get('own').data.x]")
-    until(
-        page,
-        lambda: (
-            own != []
-            and abs(page.evaluate("page.pictures.all.map.figure.models.get('own').data.x[0]") - entered) < 1e-3
-        ),
-    )
+    own = "page.pictures.all.map.figure.models.get('own').data.x[0]"
+    until(page, lambda: abs(page.evaluate(own) - entered) < 1e-3)
 
 
 def test_visitor_in_the_dark_keeps_pictures_on_white(browser: Browser, server: Server) -> None:
@@ -426,31 +423,21 @@ def test_visitor_in_the_dark_keeps_pictures_on_white(browser: Browser, server: S
             assert tip.evaluate(colours) == page.locator("#asked").evaluate(colours), f"those of the {theme} page"
         page.mouse.move(1, 1)
         if theme == "dark":
-            frame, saved = page.locator("#figure-distributions"), {}
-            for ending in ("svg", "png", "pdf"):
-                with page.expect_download() as coming:
-                    frame.get_by_role("button", name=ending.upper(), exact=True).click()
-                assert coming.value.suggested_filename == f"mauvecl-distributions.{ending}"
-                saved[ending] = Path(coming.value.path()).read_bytes()
-            svg = saved["svg"].decode()
+            svg, png, pdf = (download(page, ending, "#figure-distributions") for ending in ("SVG", "PNG", "PDF"))
             asked = ("V = 8", "Detection statistic: chi2", f"mauvecl {__version__}")
             for part in ("The statistic without and with the flare", "no flare", "threshold", *asked):
-                assert part in svg, part
-            with Image.open(io.BytesIO(saved["png"])) as image:
+                assert part in svg.decode(), part
+            with Image.open(io.BytesIO(png)) as image:
                 assert image.width >= 1600
                 assert image.convert("RGB").getpixel((2, 2)) == (255, 255, 255)
                 dark = np.mean(np.asarray(image.convert("L"))[image.height // 3 : -image.height // 3] < 100)
             assert dark < 0.1, "dark on light"
-            with page.expect_download() as coming:
-                page.locator("#figure-roc").get_by_role("button", name="SVG", exact=True).click()
-            assert "A click" not in Path(coming.value.path()).read_text(), "what the page offers is not on paper"
-            assert saved["pdf"].startswith(b"%PDF-")
-            at = int(saved["pdf"].split(b"startxref\n")[1].split()[0])
-            table = saved["pdf"][at:].split(b"\n")
+            assert b"A click" not in download(page, "SVG", "#figure-roc"), "what the page offers is not on paper"
+            assert pdf.startswith(b"%PDF-")
+            table = pdf[int(pdf.split(b"startxref\n")[1].split()[0]) :].split(b"\n")
             assert table[0] == b"xref"
             for n in range(1, 6):
-                place = int(table[n + 2].split()[0])
-                assert saved["pdf"][place:].startswith(b"%d 0 obj" % n)
+                assert pdf[int(table[n + 2].split()[0]) :].startswith(b"%d 0 obj" % n)
             page.emulate_media(color_scheme="light")
             page.reload()
             settled(page)
@@ -486,10 +473,9 @@ def test_visitor_simulates_shares_and_compares(browser: Browser, page: Page, ser
     page.get_by_text("64 cells are simulated").wait_for()
     assert b"\n[map.x]\n" in download(page, "map (study)")
     tab(page, "Detection")
-    page.get_by_role("button", name="Share, export, cite", exact=True).click()
-    page.get_by_text("mauvecl detect --star G2V --magnitude 8.5").wait_for()
-    assert "Study.build(" in page.locator("#as-python").inner_text()
-    page.keyboard.press("Escape")
+    with exporting(page):
+        page.get_by_text("mauvecl detect --star G2V --magnitude 8.5").wait_for()
+        assert "Study.build(" in page.locator("#as-python").inner_text()
     afresh(page)
     first = page.locator("#chance").inner_text()
     page.get_by_role("button", name="Pin", exact=True).click()
@@ -498,8 +484,7 @@ def test_visitor_simulates_shares_and_compares(browser: Browser, page: Page, ser
     second = page.locator("#chance").inner_text()
     tab(page, "Compare")
     row = page.locator("#pinned tr", has_text="Detected").inner_text().split()
-    assert first.split()[0] in row
-    assert second.split()[0] in row
+    assert {first.split()[0], second.split()[0]} <= {*row}
     page.reload()
     settled(page)
     page.get_by_role("button", name="Open scenario 1").click()
@@ -562,34 +547,29 @@ def test_visitor_simulates_shares_and_compares(browser: Browser, page: Page, ser
 def test_visitor_uploads_spectra(browser: Browser, page: Page, tmp_path: Path) -> None:
     """Good and bad ones, by choice and by dropping; units are advised where they are needed; a reload keeps files."""
     before = shown(page)
-    wavelength = np.linspace(170.0, 1000.0, 400)
-    good, bad = tmp_path / "my star.txt", tmp_path / "bad.txt"
-    np.savetxt(good, np.transpose([wavelength, 1e-12 * np.exp(-(((wavelength - 500) / 150) ** 2))]))
-    bad.write_text("200 1e-12\n300 <script>alert(1)</script>\n")
-    choose, star = page.locator("[data-upload=star]"), page.get_by_label("Star", exact=True)
-    choose.set_input_files(bad)
+    star = page.get_by_label("Star", exact=True)
+    give(page, "star", "200 1e-12\n300 <script>alert(1)</script>\n")
     page.locator("#w-star", has_text=re.compile(r"line 2: .* is not numeric")).wait_for()
     answerless(page)
     assert star.input_value() == "", "no star's name next to another star's file"
-    choose.set_input_files(good)
+    give(page, "star", star_file())
     until(page, lambda: star.input_value() == "uploaded star")
-    until(page, lambda: "on uploaded star V" in shown(page))
+    says(page, "on uploaded star V")
     assert shown(page) != before
     large = tmp_path / "large.txt"
     for size in (4.2, 200):
         with large.open("wb") as file:
             file.truncate(int(size * 2**20))
-        choose.set_input_files(large)
+        page.locator("[data-upload=star]").set_input_files(large)
         page.locator("#w-star", has_text=f"the upload has {size:.1f} MiB, but may have at most 4 MiB").wait_for()
         answerless(page)
     enter(page, "Star", "K5V")
     assert "K5V" in shown(page)
-    choose.set_input_files(good)
+    give(page, "star", star_file())
     until(page, lambda: "star=uploaded" in page.url and "on uploaded star V" in shown(page))
-    (tmp_path / "stray.txt").write_text("200 1\n450 3\n700 1\n")
-    page.locator("[data-upload=own_unknown]").set_input_files(tmp_path / "stray.txt")
+    give(page, "own_unknown", "200 1\n450 3\n700 1\n")
     until(page, lambda: page.locator("#f-own_unknown").input_value() == "uploaded spectrum")
-    until(page, lambda: "on uploaded star V" in shown(page))
+    says(page, "on uploaded star V")
     with zipfile.ZipFile(io.BytesIO(taken(page))) as archive:
         archive.extractall(tmp_path / "study")
     assert 'file = "star.ecsv"' in (tmp_path / "study" / "study.toml").read_text()
@@ -604,21 +584,17 @@ def test_visitor_uploads_spectra(browser: Browser, page: Page, tmp_path: Path) -
         text,
     )
     page.locator("[data-uploaded=star]", has_text="dropped star.txt").wait_for()
-    until(page, lambda: "on uploaded star V" in shown(page))
-    page.get_by_role("button", name="Share, export, cite", exact=True).click()
-    page.get_by_text("The link does not hold your file").wait_for()
-    page.keyboard.press("Escape")
+    says(page, "on uploaded star V")
+    with exporting(page):
+        page.get_by_text("The link does not hold your file").wait_for()
     enter(page, "Star", "Vega")
-    page.get_by_role("button", name="Share, export, cite", exact=True).click()
-    page.locator("#export[open]").wait_for()
-    assert not page.get_by_text("The link does not hold your file").is_visible()
-    page.keyboard.press("Escape")
+    with exporting(page):
+        assert not page.get_by_text("The link does not hold your file").is_visible()
     afresh(page)
     tab(page, "Change")
     enter(page, "Changes", "Mg II")
     text = "\n".join(f"{angstrom} 1e-12" for angstrom in range(1700, 10001, 10))
-    file = {"name": "companion.txt", "mimeType": "text/plain", "buffer": text.encode()}
-    page.locator("[data-upload=change_file]").set_input_files(file)
+    give(page, "change_file", text, "companion.txt")
     page.locator("#w-change_file", has_text="Added: unit of wavelengths Angstrom").wait_for()
     page.get_by_role("button", name="Added: unit of wavelengths: Angstrom", exact=True).click()
     until(page, lambda: "change_file=uploaded" in page.url)
@@ -627,16 +603,11 @@ def test_visitor_uploads_spectra(browser: Browser, page: Page, tmp_path: Path) -
     enter(page, "Band of the added light", "B")
     simulate(page, "Change")
     page.locator("#panel-change .rows", has_text="spectrum").wait_for()
-    page.get_by_role("button", name="Share, export, cite", exact=True).click()
-    page.get_by_text("--change-file added.ecsv --change-band B").wait_for()
-    page.keyboard.press("Escape")
+    with exporting(page):
+        page.get_by_text("--change-file added.ecsv --change-band B").wait_for()
     page.locator("[data-remove=change_file]").click()
-    until(
-        page,
-        lambda: (
-            "change_file" not in page.url and not page.get_by_label("Band of the added light", exact=True).is_visible()
-        ),
-    )
+    page.get_by_label("Band of the added light", exact=True).wait_for(state="hidden")
+    until(page, lambda: "change_file" not in page.url)
     assert "change_band=B" not in page.url
     settled(page)
     tab(page, "Detection")
@@ -644,9 +615,7 @@ def test_visitor_uploads_spectra(browser: Browser, page: Page, tmp_path: Path) -
     unit = page.get_by_label("Unit of wavelengths", exact=True)
     assert not unit.is_visible()
     short = "\n".join(f"{angstrom} 1e-12" for angstrom in range(3300, 7501, 10))
-    page.locator("[data-upload=star]").set_input_files(
-        {"name": "angstrom.txt", "mimeType": "text/plain", "buffer": short.encode()}
-    )
+    give(page, "star", short, "angstrom.txt")
     page.get_by_text("look like Angstrom").first.wait_for()
     answerless(page)
     # What the message advises is one click away, and the field that it names stands below the file.
@@ -655,11 +624,11 @@ def test_visitor_uploads_spectra(browser: Browser, page: Page, tmp_path: Path) -
     page.get_by_text("“Continue with” continues it by a library spectrum").first.wait_for()
     assert unit.input_value() == "Angstrom"
     enter(page, "Continue with", "M3V")
-    until(page, lambda: "on uploaded star V" in shown(page))
+    says(page, "on uploaded star V")
     continued, address = shown(page), page.url
     assert page.get_by_text("below 330 nm it is continued by M3V").count() == 1
     page.reload()
-    until(page, lambda: "on uploaded star V" in shown(page))
+    says(page, "on uploaded star V")
     assert shown(page) == continued
     assert page.locator("[data-uploaded=star]").inner_text() == "angstrom.txt"
     # Another visitor has not got the file, nor has another tab of this browser.
@@ -670,9 +639,9 @@ def test_visitor_uploads_spectra(browser: Browser, page: Page, tmp_path: Path) -
         other.close()
     # An archive after a refused one.
     tab(page, "Calibrate")
-    page.locator('[data-upload="observations"]').set_input_files(chosen({"../a.csv": b"1"}))
+    give(page, "observations", zipped({"../a.csv": b"1"}))
     page.locator("#panel-calibrate").get_by_text("the archive holds a file named '../a.csv'").wait_for()
-    page.locator('[data-upload="observations"]').set_input_files(chosen(standards()))
+    give(page, "observations", zipped(standards()), "standards.zip")
     page.locator('[data-simulate="calibrate"]').click()
     # Seen, although the refusal hid the notes.
     page.get_by_text("notes on this answer").wait_for()
@@ -696,9 +665,7 @@ def test_visitor_finds_reasons_and_targets_at_any_width(browser: Browser, server
     angstrom = "\n".join(f"{wavelength} 1e-12" for wavelength in range(3000, 7001, 10)).encode()
 
     def refuse(name: str, content: bytes, reason: str) -> None:
-        page.locator(f"[data-upload={name}]").set_input_files(
-            {"name": "mine.txt", "mimeType": "text/plain", "buffer": content}
-        )
+        give(page, name, content)
         page.locator(f"#w-{name}:visible", has_text=reason).wait_for()
         # Messages at typed fields are seen while the field has the focus.
         page.locator(f"[data-choose={name}]").focus()
@@ -736,12 +703,10 @@ def test_visitor_with_a_phone(browser: Browser, server: Server) -> None:
     """Two fingers zoom, and flares of a plan are seen at once."""
     page = fresh(browser, server.address, viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True)
     before = settled_ranges(page, "excess")
-    page.locator("#plot-excess").scroll_into_view_if_needed()
-    box = page.locator("#plot-excess").bounding_box()
-    at = {"x": box["x"] + box["width"] / 2, "y": box["y"] + box["height"] / 2}
+    x, y = centre(page, "excess", 0.5, 0.5)
     touch = page.context.new_cdp_session(page)
     for kind, apart in (("touchStart", 20), *(("touchMove", 20 + 8 * k) for k in range(1, 9)), ("touchEnd", 0)):
-        points = [{"x": at["x"] + side * apart, "y": at["y"], "id": (side + 1) // 2} for side in (-1, 1) if apart]
+        points = [{"x": x + side * apart, "y": y, "id": (side + 1) // 2} for side in (-1, 1) if apart]
         touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
     until(page, lambda: ranges(page, "excess")[1] - ranges(page, "excess")[0] < before[1] - before[0])
     assert page.evaluate("visualViewport.scale") == 1, "the picture, not the page"
@@ -809,7 +774,7 @@ def test_visitor_with_a_keyboard(page: Page) -> None:
     page.keyboard.press("Escape")
 
 
-def test_visitor_pastes_and_opens_targets(page: Page, tmp_path: Path) -> None:
+def test_visitor_pastes_and_opens_targets(page: Page) -> None:
     tab(page, "Visibility")
     page.context.grant_permissions(["clipboard-read", "clipboard-write"])
     page.get_by_label("Target of target 1").click()
@@ -820,21 +785,22 @@ def test_visitor_pastes_and_opens_targets(page: Page, tmp_path: Path) -> None:
     assert page.get_by_label("Target of target 2").get_attribute("aria-invalid") == "true"
     page.get_by_label("Coordinates (deg) of target 2").fill("53.2 -9.4")
     until(page, lambda: page.get_by_role("button", name="Find when").is_enabled())
-    file = tmp_path / "targets.csv"
-    file.write_text('name,ra,dec,mass_msun,age_myr\n"one, two",10,20,1.0,600\nAU Mic,,,,\n')
-    page.locator("#targets-file").set_input_files(file)
+
+    def give_targets(text: str) -> None:
+        file: Any = {"name": "targets.csv", "mimeType": "text/csv", "buffer": text.encode()}
+        page.locator("#targets-file").set_input_files(file)
+
+    give_targets('name,ra,dec,mass_msun,age_myr\n"one, two",10,20,1.0,600\nAU Mic,,,,\n')
     until(page, lambda: page.get_by_label("age_myr of target 1").input_value() == "600")
     assert page.get_by_label("Target of target 1").input_value() == "one, two"
     until(page, lambda: page.get_by_role("button", name="Find when").is_enabled())
     # Names of columns as on the command line.
-    file.write_text("source_id,main_id,RAJ2000,DEJ2000,Vmag,SpType,Plx\n12,HD 1,10.5,-3,8,K5V,100\n")
-    page.locator("#targets-file").set_input_files(file)
+    give_targets("source_id,main_id,RAJ2000,DEJ2000,Vmag,SpType,Plx\n12,HD 1,10.5,-3,8,K5V,100\n")
     until(page, lambda: page.get_by_label("Target of target 1").input_value() == "12")
     cells = [page.get_by_label(f"{name} of target 1").input_value() for name in ("V", "Type")]
     assert cells == ["8", "K5V"]
     until(page, lambda: page.get_by_role("button", name="Find when").is_enabled())
-    file.write_text("name\none\nAU Mic\n")
-    page.locator("#targets-file").set_input_files(file)
+    give_targets("name\none\nAU Mic\n")
     until(page, lambda: page.get_by_label("Target of target 2").input_value() == "AU Mic")
     page.get_by_role("button", name="Remove target 1", exact=True).click()
     assert page.get_by_label("Target of target 1").input_value() == "AU Mic"
@@ -842,22 +808,18 @@ def test_visitor_pastes_and_opens_targets(page: Page, tmp_path: Path) -> None:
     assert page.get_by_role("button", name="Find when").is_disabled()
 
 
-def test_visitor_tries_an_example(page: Page) -> None:
-    """One click reads a light curve of Kepler and answers it, whatever was entered on another file."""
+def test_visitor_analyses_an_example_and_own_columns(page: Page) -> None:
+    """One click answers a light curve of Kepler; columns of a file that is not understood are chosen from menus."""
     tab(page, "Analyse")
     page.get_by_label("Quality bits", exact=True).fill("all")
     page.get_by_role("button", name="Try an example file").click()
     page.get_by_text("Done: ").wait_for()
-    until(page, lambda: "flares are detected in 9.97 star-days of KIC 10002792" in shown(page))
-    assert page.get_by_label("Quality bits", exact=True).input_value() == ""
+    says(page, "flares are detected in 9.97 star-days of KIC 10002792")
+    assert page.get_by_label("Quality bits", exact=True).input_value() == "", "that was entered on another file"
     assert "detected" in page.locator("#panel-analyse .rows").inner_text()
-
-
-def test_visitor_chooses_columns_from_menus(page: Page) -> None:
-    """Those of a file that is not understood; what is chosen is a mapping, which the command line reads as well."""
+    afresh(page)
     tab(page, "Analyse")
-    file = {"name": "mine.csv", "mimeType": "text/csv", "buffer": light_curve(flags=True)}
-    page.locator("[data-upload=frames]").set_input_files(file)
+    give(page, "frames", light_curve(flags=True), "mine.csv")
     menus = page.get_by_role("group", name="Which column is what?")
     menus.get_by_label("Time", exact=True).select_option("minute")
     flux = menus.get_by_label("Flux", exact=True)
@@ -868,7 +830,8 @@ def test_visitor_chooses_columns_from_menus(page: Page) -> None:
     menus.get_by_label("Error", exact=True).select_option("sd")
     assert menus.is_visible(), "what was chosen can be chosen otherwise"
     simulate(page, "Analyse")
-    until(page, lambda: "1 flare is detected" in shown(page))
+    says(page, "1 flare is detected")
+    # What is chosen is a mapping, which the command line reads as well.
     with zipfile.ZipFile(io.BytesIO(taken(page))) as archive:
         mapping = archive.read("columns.toml").decode()
     assert mapping == 'time = "minute"\ntime_unit = "min"\nflux = "rate"\nerror = "sd"\n'
@@ -963,12 +926,10 @@ def test_visitor_with_a_hostile_link_or_without_scripts(browser: Browser, server
     context.close()
 
 
-def test_visitor_loses_the_server_and_finds_it_again(browser: Browser, server: Server, tmp_path: Path) -> None:
+def test_visitor_loses_the_server_and_finds_it_again(browser: Browser, server: Server) -> None:
     page = fresh(browser, f"{server.address}?magnitude=9&fap=0.05&realisations=10000")
-    wavelength = np.linspace(170.0, 1000.0, 400)
-    np.savetxt(tmp_path / "star.txt", np.transpose([wavelength, np.full(400, 1e-12)]))
-    page.locator("[data-upload=star]").set_input_files(tmp_path / "star.txt")
-    until(page, lambda: "on uploaded star V" in shown(page))
+    give(page, "star", star_file())
+    says(page, "on uploaded star V")
     before = simulate(page)
     server.kill()
     page.get_by_text("The connection to the server is lost").wait_for()
@@ -1054,8 +1015,7 @@ def limiting_magnitude(visitor: Keys) -> None:
 def own_spectrum_in_angstrom(visitor: Keys) -> None:
     """Upload the same spectrum in nm and in Angstrom, which give the same answer."""
     page = visitor.page
-    nm = np.linspace(170.0, 1000.0, 400)
-    flux = 1e-12 * np.exp(-(((nm - 500) / 150) ** 2))
+    nm, flux = np.loadtxt(star_file().decode().splitlines()).T
     shown = []
     for unit, scale in (("nm", 1.0), ("Angstrom", 10.0)):
         rows = "\n".join(f"{w:.6f},{f:.6e}" for w, f in zip(scale * nm, flux, strict=True))

@@ -89,30 +89,26 @@ class Server:
 
     async def talk(self, **headers: str) -> Talk:
         """Return the connection of a new visitor, who has been greeted."""
-        headers = {"Origin": f"http://{self.host}"} | headers
-        found = Talk(
-            await websocket_connect(HTTPRequest(f"ws://{self.host}/live", headers=headers, request_timeout=60))
-        )
+        found = Talk(await self._connected({"Origin": f"http://{self.host}"} | headers))
         assert "hello" in await found.next()
         return found
+
+    def _connected(self, headers: dict[str, str]) -> Any:
+        return websocket_connect(HTTPRequest(f"ws://{self.host}/live", headers=headers, request_timeout=60))
 
     async def refuses_talk(self, **headers: str) -> int:
         """Return the status with which a connection is refused."""
         try:
-            await websocket_connect(HTTPRequest(f"ws://{self.host}/live", headers=headers, request_timeout=60))
+            await self._connected(headers)
         except HTTPClientError as error:
             return error.code
         raise AssertionError("let in")
 
     async def got(self, path: str = "", **headers: str) -> tuple[int, str]:
         """Return status and text of a page."""
-        try:
-            answer = await AsyncHTTPClient().fetch(
-                HTTPRequest(self.address + path, headers=headers, request_timeout=60)
-            )
-        except HTTPClientError as error:
-            return error.code, (error.response.body or b"").decode() if error.response else ""
-        return answer.code, answer.body.decode(errors="replace")
+        request = HTTPRequest(self.address + path, headers=headers, request_timeout=60)
+        answer = await AsyncHTTPClient().fetch(request, raise_error=False)
+        return answer.code, (answer.body or b"").decode(errors="replace")
 
     def fetched(self, path: str = "", **headers: str) -> tuple[int, str]:
         """Return status and text of a page, outside of a talk."""
