@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,6 @@ from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from mauvecl.host.instrument.instrument import LineSpread
-    from mauvecl.host.stars.source import Source
 
 Float = NDArray[np.float64]
 
@@ -72,7 +71,20 @@ def check_measured(name: str, wavelength: Float, unit: str = "nm") -> None:
     raise InputError(f"{fault}, but needs at least a third, which `extend` can continue{meant}", key="extend")
 
 
-def check_covers(source: Source, needed_nm: tuple[float, float] = NEEDED_NM, of: str = "") -> None:
+class Spectrum(Protocol):
+    """Spectrum of a star that has a name, as a `Source` is."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def wavelength_nm(self) -> Float: ...
+    @property
+    def flux_flam(self) -> Float: ...
+    @property
+    def measured_nm(self) -> tuple[float, float] | None: ...
+
+
+def check_covers(source: Spectrum, needed_nm: tuple[float, float] = NEEDED_NM, of: str = "") -> None:
     """Raise InputError if the measured range of a source does not cover that of the pixels."""
     low, high = source.measured_nm or source.wavelength_nm[[0, -1]]
     if low > needed_nm[0] or high < needed_nm[1]:
@@ -227,7 +239,7 @@ def means(wavelength: Float, flux: Float, edges: Float) -> Float:
 
 
 def extended(
-    name: str, wavelength: Float, flux: Float, other: Source, *, ultraviolet: tuple[str, ...] = ()
+    name: str, wavelength: Float, flux: Float, other: Spectrum, *, ultraviolet: tuple[str, ...] = ()
 ) -> tuple[Float, Float, tuple[str, ...]]:
     """Continue a spectrum by a longer one, scaled at the join, and return messages.
 
@@ -258,7 +270,7 @@ def extended(
     return wavelength, flux, tuple(messages) or (f"its extension {other.name} reaches no farther and is not used",)
 
 
-def _join(name: str, wavelength: Float, flux: Float, other: Source, blue: bool) -> tuple[Float, float]:
+def _join(name: str, wavelength: Float, flux: Float, other: Spectrum, blue: bool) -> tuple[Float, float]:
     """Return the range in which two spectra are compared, widened by the noise of the first, and their ratio there."""
     both = f"spectrum {name} and its extension {other.name}"
     low, high = max(wavelength[0], other.wavelength_nm[0]), min(wavelength[-1], other.wavelength_nm[-1])
