@@ -17,37 +17,22 @@ import argparse
 import sys
 import tempfile
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import numpy as np
-from astropy.table import QTable, Table
-from numpy.typing import NDArray
+from astropy.table import Table
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 
-from scenes import paper
 from tables import processor, versions, write
 
-from mauvecl import (
-    Expectation,
-    FlareModel,
-    Instrument,
-    Sky,
-    Source,
-    Study,
-    calibrate,
-    expect,
-    fit,
-    measure,
-    plan,
-)
+from mauvecl import Study, calibrate
 from mauvecl.host.instrument.curves import Curve
+from mauvecl.host.stars.source import Source
 from mauvecl.observations.throughput import ERROR_KNOTS, ONE_STAR_ERROR
+from tests.observations.test_calibrated_coverage import deviations
 from tests.observations.test_calibration import NOMINAL, STARS, frames_of, relative, truth
-
-Float = NDArray[np.float64]
 
 NM = np.linspace(195.0, 705.0, 2041)
 #: Factors on the nominal throughput by name; that of the tests is smooth.
@@ -58,63 +43,6 @@ FACTORS = {
     "wave": np.exp(0.15 * np.sin((NM - 200) / 12)),
     "nominal": np.ones(NM.size),
 }
-
-
-#: Values in which the true instrument differs from the nominal one.
-CHANGED = (
-    "throughput_factor",
-    "dark_scale_dn_per_s",
-    "dark_slope_per_c",
-    "conversion_uv_per_electron",
-    "read_noise_dn",
-    "bias_dn",
-)
-
-
-def with_(settings: list[str], instrument: Path | Instrument) -> Study:
-    """Return a study with a fitted instrument's file, or with the values of a true one."""
-    study = paper(*settings)
-    if isinstance(instrument, Path):
-        return study.with_settings([f"observation.instrument={instrument}"])
-    return study.with_instrument({name: getattr(instrument, name) for name in CHANGED})
-
-
-FLARE = ["star=[{library='M3V', magnitude=9}]", "flare.amplitudes=[0.5]"]
-PLAN = ["plan.targets=[{name='eps Eri'}, {name='YZ CMi'}]", "orbit.days=2", "plan.completeness='closed form'"]
-#: Measured quantities that are compared.
-MEASURED = ("temperature", "flux 200-320 nm", "flux 200-700 nm")
-
-
-def light(instrument: Instrument, amplitude: float) -> Expectation:
-    star = Source.from_library("M3V").at_magnitude(9.0)
-    return expect(
-        star.flaring(amplitude) if amplitude else star, instrument, exposure=50.0, sky=Sky.of_brightness(22.1)
-    )
-
-
-@cache
-def true_answers(true: Instrument) -> tuple[Float, QTable]:
-    """Return the counts of a flare and a plan through an instrument."""
-    added = light(true, 0.5).recorded_dn - light(true, 0.0).recorded_dn
-    return added, plan(with_(PLAN, true)).table
-
-
-def deviations(true: Instrument, file: Path) -> dict[str, float]:
-    """Return answers through a true instrument, less those of a fitted one, in standard errors of the throughput."""
-    added, right = true_answers(true)
-    fitted = Instrument.load(file)
-    quiet, star = light(fitted, 0.0), Source.from_library("M3V").at_magnitude(9.0)
-    measured = fit(quiet.recorded_dn + added, quiet, FlareModel.of(star, fitted, quiet))
-    table, found = measure(with_([*FLARE, "run.realisations=10"], file)).table, {}
-    for name in MEASURED:
-        (row,) = table[table["quantity"] == name]
-        off = measured.estimates[0, measured.column(name)] - float(row["perfect"])
-        found[name] = off / float(row["error_throughput"])
-    for row, truth_row in zip(plan(with_(PLAN, file)).table, right, strict=True):
-        for name in ("E50", "expected"):
-            off = np.log(truth_row[name] / row[name]) / row[f"{name}_error"]
-            found[f"{name}, {row['target']}"] = float(off)
-    return found
 
 
 def row_of(text: str) -> str:

@@ -300,16 +300,6 @@ def test_steps_of_the_throughput_are_followed() -> None:
     assert any("structure finer than" in text for text in found.messages)
 
 
-@pytest.mark.long
-def test_throughputs_lie_in_their_bands() -> None:
-    """Ten fits: 95 % of the pixels within their bands, by 4 standard errors of ten fits and 2 %."""
-    true, shares = truth(), []
-    for seed in range(10):
-        off, error = relative(answer_of(STARS, true, 70 + seed), true)
-        shares.append(np.mean(np.abs(off) < 1.96 * error))
-    assert abs(np.mean(shares) - 0.95) < 0.02 + 4 * np.std(shares, ddof=1) / np.sqrt(10), shares
-
-
 def test_fitted_values_and_throughput_vary_together(tmp_path: Path) -> None:
     """Modes, which lose 1e-4 of the variances: counts per photon have their own error, without that of the gain."""
     found = answer_of(STARS[:2], truth(), 9)
