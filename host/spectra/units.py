@@ -175,15 +175,18 @@ def check_assumed_unit(values: Float, unit: str) -> None:
     low, high = float(finite.min()), float(finite.max())
     own, other = _part(low * factor, high * factor), likely_unit(low, high, unit)
     elsewhere = 0.0 if other is None else _part(low * _USUAL_UNITS[other], high * _USUAL_UNITS[other])
-    is_plausible = own >= MIN_MEASURED and low * factor >= PLAUSIBLE_NM[0] and high * factor <= PLAUSIBLE_NM[1]
-    if is_plausible and (other is None or elsewhere < max(own, 1.0 - 1e-9)):
-        return
     fault = f"wavelengths from {low:g} to {high:g} without a stated unit"
     needed, remedy = f"of {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm", "give their unit: `wavelength_unit"
-    if other is None:
-        raise InputError(f"{fault} cover {own:.0%} {needed} in {unit}; {remedy}` names it", key="wavelength_unit")
-    fault += f" look like {other}, in which they cover {elsewhere:.0%} {needed}, and {own:.0%} in {unit}"
-    raise InputError(f"{fault}; {remedy}={other!r}` or `wavelength_unit={unit!r}`", key="wavelength_unit")
+    if other is not None and (own < MIN_MEASURED or elsewhere >= max(own, 1.0 - 1e-9)):
+        fault += f" look like {other}, in which they cover {elsewhere:.0%} {needed}, and {own:.0%} in {unit}"
+        raise InputError(f"{fault}; {remedy}={other!r}` or `wavelength_unit={unit!r}`", key="wavelength_unit")
+    if own < MIN_MEASURED:
+        fault += f" cover {own:.0%} {needed}, not at least a third, in {unit}"
+    elif low * factor < PLAUSIBLE_NM[0] or high * factor > PLAUSIBLE_NM[1]:
+        fault += f" extend beyond {PLAUSIBLE_NM[0]:g}-{PLAUSIBLE_NM[1]:g} nm in {unit}"
+    else:
+        return
+    raise InputError(f"{fault}; {remedy}` names it", key="wavelength_unit")
 
 
 Medium = Literal["air", "vacuum"]
