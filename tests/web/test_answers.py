@@ -418,6 +418,7 @@ async def test_plans_are_the_same_everywhere(talk: Talk, tmp_path: Path) -> None
     page = QTable.read(io.BytesIO(table), format="ascii.ecsv")
     (tmp_path / "targets.csv").write_text("\n".join(["name", *TARGETS]) + "\n")
     words = ("plan", "targets.csv", "--hours", HOURS, "--start", "2027-01-01", "--days", "30")
+    drawn = await talk.answer(asked, "plan")
     answer = on_the_command_line(tmp_path, *words)
     python = plan(Study().with_settings([
         f"plan.targets=[{', '.join(f'{{name={name!r}}}' for name in TARGETS)}]", f"plan.hours={HOURS}",
@@ -429,3 +430,6 @@ async def test_plans_are_the_same_everywhere(talk: Talk, tmp_path: Path) -> None
         for name in ("expected", "ideal", "E50"):
             numbers = [float(getattr(table[name], "value", table[name])[k]) for table in (page, python.table)]
             assert [row[name]] * 2 == pytest.approx(numbers, rel=1e-9), (row["target"], name)
+        # The picture's flares above the smallest energy are all that are expected, by a sum over fewer energies.
+        found = column(drawn, "expected", f"found {k}", "y")[0]
+        assert found == pytest.approx(row["expected"], rel=5e-3), row["target"]
