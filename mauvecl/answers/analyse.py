@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -544,14 +544,29 @@ def analyse(
     if study.has_neighbours:
         # Errors of the star or its neighbours are reported before the search.
         blended_stars(cases(study, swept=False))
-    total = frames.n_frames
-    report = None if progress is None else lambda share: progress(round(share * total), total)
     analysis = analyse_frames(
         frames, wanted=search.rate, shape=search.shape, seed=study.run.seed,
         model=model if isinstance(model, FrameModel) else None, rank=search.sums, jitters=search.spreads() or None,
-        temperature_k=study.flare.temperature_k, report=report,
+        temperature_k=study.flare.temperature_k, report=_in_frames(progress, frames.n_frames),
     )  # fmt: skip
     return AnalyseAnswer(study, analysis, model if isinstance(model, str) else "")
+
+
+def _in_frames(progress: Progress, total: int) -> Callable[[float], None] | None:
+    """Return a function of the share that is done, which reports it in whole frames whenever their number rises."""
+    if progress is None:
+        return None
+    last = -1
+
+    def report(share: float) -> None:
+        nonlocal last
+        done = round(share * total)
+        if done > last:
+            last = done
+            progress(done, total)
+
+    report(0.0)
+    return report
 
 
 def frame_model(study: Study, frames: Frames) -> FrameModel | str:

@@ -403,7 +403,7 @@ def fit_throughput(
         best = _iterated(model, error)
     pixels, shape = best.pixels(model), best.found[n : n + m]
     if (np.abs(shape) > LIMITS[:m]).any():
-        fault = "the spectra of the stars must match a wavelength scale and line width near the nominal ones, but do not"
+        fault = "the stars' spectra must match a wavelength scale and line width near the nominal ones, but do not"
         most = f"use standards with shifts up to {LIMITS[0]:g} nm and widths within {100 * LIMITS[2]:g} %"
         raise InputError(f"{fault}; {most}", key="observations")
     # One star cannot tell errors of its spectrum from the throughput.

@@ -14,7 +14,6 @@ from mauvecl.noise.drawing import Cumulants, stack_is_exact
 from mauvecl.noise.unknowns import COURSES, PROCESSES, STARE_PROCESSES, Processes, default_processes
 from mauvecl.schema.columns import Column, percent, short
 from mauvecl.schema.errors import Message, of_kind
-from mauvecl.study.observation import Observation
 from mauvecl.study.questions import QUANTITIES, Sweep
 from mauvecl.study.star import Star
 from mauvecl.study.stare import KNOWN_CHANGES
@@ -31,7 +30,7 @@ if TYPE_CHECKING:
     from mauvecl.host.exposure.sky import Sky
     from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.host.stars.source import Source
-    from mauvecl.study.observation import SkyLight
+    from mauvecl.study.observation import Observation, SkyLight
     from mauvecl.study.study import Study
 
 #: Parts of a study that answers use.
@@ -196,9 +195,7 @@ class Loader:
         self.source: Callable[[Star], Source] = lru_cache(MAX_SOURCES)(source or (lambda star: star.source()))
         self.sky: Callable[[SkyLight], Sky] = lru_cache(MAX_SOURCES)(lambda light: light.sky())
         self._near: Callable[[Star], Neighbours | None] = lru_cache(MAX_SOURCES)(lambda star: star.near())
-        self._instrument: Callable[[str], Instrument] = lru_cache(None)(
-            lambda text: Observation.model_validate_json(text).load_instrument()
-        )
+        self._instruments: dict[str, Instrument] = {}
 
     def neighbours(self, star: Star) -> Neighbours | None:
         """Return the neighbours of a star, which do not depend on its magnitude."""
@@ -206,7 +203,10 @@ class Loader:
 
     def instrument(self, observation: Observation) -> Instrument:
         """Return the instrument of an observation."""
-        return self._instrument(observation.model_dump_json(include={"instrument", "temperature_c", "changes"}))
+        key = repr((observation.instrument, observation.temperature_c, sorted(observation.changes.items())))
+        if key not in self._instruments:
+            self._instruments[key] = observation.load_instrument()
+        return self._instruments[key]
 
 
 @dataclass(frozen=True, eq=False)
