@@ -179,7 +179,8 @@ def check_assumed_unit(values: Float, unit: str) -> None:
     needed, remedy = f"of {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm", "give their unit: `wavelength_unit"
     if other is not None and (own < MIN_MEASURED or elsewhere >= max(own, 1.0 - 1e-9)):
         fault += f" look like {other}, in which they cover {elsewhere:.0%} {needed}, and {own:.0%} in {unit}"
-        raise InputError(f"{fault}; {remedy}={other!r}` or `wavelength_unit={unit!r}`", key="wavelength_unit")
+        also = f" or `wavelength_unit={unit!r}`" if own >= MIN_MEASURED else ""
+        raise InputError(f"{fault}; {remedy}={other!r}`{also}", key="wavelength_unit")
     if own < MIN_MEASURED:
         fault += f" cover {own:.0%} {needed}, not at least a third, in {unit}"
     elif low * factor < PLAUSIBLE_NM[0] or high * factor > PLAUSIBLE_NM[1]:
