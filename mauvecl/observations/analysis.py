@@ -366,10 +366,8 @@ def analyse_frames(
     default the light, and the dark current as measured. The temperature is that of injected flares in spectra. `report`
     is called with the share of the work that is done, and may raise to stop the work.
     """
-    steps = Steps(report)
-    level_steps, rate_steps, search_steps, event_steps, injection_steps = (
-        steps.part(first, last) for first, last in pairwise(STAGES)
-    )
+    parts = (Steps(report).part(first, last) for first, last in pairwise(STAGES))
+    level_steps, rate_steps, search_steps, event_steps, injection_steps = parts
     if model is None:
         survey, level, frames = survey_light_curve(frames, shape_of(shape), seed, level_steps)
     else:

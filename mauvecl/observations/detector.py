@@ -300,10 +300,9 @@ def fit_dark(dark: Sequence[CalibrationFrames], nominal: Instrument, noise: Nois
     by `EXPOSURE_RATIO`, and one for all pixels if temperatures span `BIAS_RANGE_C`; otherwise it is the instrument's.
     """
     raw = np.concatenate([one.raw_dn for one in dark])
-    n_pixel = raw.shape[1]
     temperature = np.concatenate([one.temperature_c for one in dark])
     exposure = np.concatenate([np.full(one.n_frames, one.exposure_s) for one in dark])
-    reference, spread = float(temperature.mean()), float(np.ptp(temperature))
+    n_pixel, reference, spread = raw.shape[1], float(temperature.mean()), float(np.ptp(temperature))
     offset = temperature - reference
     fits_slope, by_pixel = spread >= SLOPE_RANGE_C, float(exposure.max() / exposure.min()) >= EXPOSURE_RATIO
     shares_bias = not by_pixel and spread >= BIAS_RANGE_C
@@ -320,8 +319,7 @@ def fit_dark(dark: Sequence[CalibrationFrames], nominal: Instrument, noise: Nois
     columns = np.column_stack([np.ones_like(seconds), seconds, seconds * offset])
     values, used = (raw, [0, 1]) if by_pixel else (raw - bias, [1])
     found, errors = _fit_pixels(columns[:, used], 1.0 / typical, values, noise)
-    level = found[-1]
-    bias = found[0] if by_pixel else bias
+    level, bias = found[-1], found[0] if by_pixel else bias
     covariance = np.zeros((n_pixel, 2, 2))
     covariance[:, -len(used) :, -len(used) :] = errors
     change, error = np.full((2, n_pixel), np.nan)

@@ -277,10 +277,8 @@ def survey_light_curve(
     finite = np.isfinite(flux)
     below = finite & (reasons != 0) & (np.where(finite, flux, 0.0) - level < -FAR * sd)
     reasons = np.where(below, reasons | Reason.BELOW, reasons)
-    used = reasons == 0
-    survey = survey.frames(used[searched_among(survey, frames)])
-    last = steps.part(0.9, 1.0)
-    light = quiescent_light(frames, survey, reasons, ~guessed, seed, last)
+    survey = survey.frames((reasons == 0)[searched_among(survey, frames)])
+    light = quiescent_light(frames, survey, reasons, ~guessed, seed, steps.part(0.9, 1.0))
     return survey, light.times(steps_of_level), frames
 
 
