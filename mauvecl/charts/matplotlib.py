@@ -115,16 +115,24 @@ def _own_part(ax: Any) -> Any:
     return ax.figure.add_subfigure(spec)
 
 
+def _headline(figure: Any, text: str) -> None:
+    """Add a title above all panels, wrapped to a part of the width; matplotlib would fill it to the edges."""
+    title = figure.suptitle(text, fontsize=9.0)
+    lines = [""]
+    for word in text.split(" "):
+        title.set_text(f"{lines[-1]} {word}".strip())
+        if lines[-1] and title.get_window_extent(_renderer(figure)).width > INSIDE * figure.bbox.width:
+            lines.append("")
+        lines[-1] = f"{lines[-1]} {word}".strip()
+    title.set_text("\n".join(lines))
+
+
 def _legend_below(figure: Any, handles: dict[str, Any]) -> None:
     """Add a legend below all panels, in as few rows as fit, which have about equally many entries."""
-    from matplotlib.backends.backend_agg import RendererAgg
-
-    size = figure.bbox
-    renderer = RendererAgg(size.width, size.height, figure.dpi)  # type: ignore[no-untyped-call]
     for rows in range(1, len(handles) + 1):
         columns = -(-len(handles) // rows)
         legend = figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)
-        if columns == 1 or legend.get_window_extent(renderer).width <= INSIDE * size.width:
+        if columns == 1 or legend.get_window_extent(_renderer(figure)).width <= INSIDE * figure.bbox.width:
             return
         legend.remove()
 
@@ -182,6 +190,14 @@ def in_figure(unit: str) -> str:
     from astropy.units import Unit
 
     return str(Unit(unit).to_string("latex_inline"))
+
+
+def _renderer(figure: Any) -> Any:
+    """Return the renderer that measures text."""
+    from matplotlib.backends.backend_agg import RendererAgg
+
+    size = figure.bbox
+    return RendererAgg(size.width, size.height, figure.dpi)  # type: ignore[no-untyped-call]
 
 
 def styled_picture(draw: Callable[P, Any]) -> Callable[..., Any]:
@@ -251,7 +267,7 @@ def draw_picture(picture: Picture, figure: Any = None) -> Any:
         entries = [zip(*axis.get_legend_handles_labels(), strict=True) for axis, _ in drawn]
         _legend_below(figure, {name: handle for each in entries for handle, name in each})
     if title:
-        figure.suptitle(title, fontsize=9.0, wrap=True)
+        _headline(figure, title)
     return figure
 
 
