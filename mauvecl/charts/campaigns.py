@@ -77,8 +77,9 @@ def _month(day: str) -> str:
 
 #: A4, and its margin, inches.
 PAGE, MARGIN = (8.27, 11.69), 0.6
-#: Approximate width of a letter divided by its size, for line breaks; line spacing divided by the size.
-LETTER, LINE = 0.53, 1.4
+#: Approximate width of a letter divided by its size, for line breaks; that of bold letters over it; line spacing over
+#: the size.
+LETTER, BOLD, LINE = 0.53, 1.1, 1.4
 #: Starts of the columns of the summary, of a target and of the assumptions, as fractions of the text width.
 SUMMARY_AT = (0.0, 0.15, 0.215, 0.31, 0.39, 0.47, 0.55, 0.615, 0.69, 0.755, 0.86)
 TARGET_AT, ASSUMED_AT = (0.0, 0.28, 0.72), (0.0, 0.24, 0.5)
@@ -230,10 +231,10 @@ class Sheets:
     def line(self, cells: Sequence[tuple[float, str]], size: float, **how: Any) -> None:
         """Write cells at fractions of the text width, each wrapped before the start of the next."""
         edges = [*(place for place, _ in cells[1:]), 1.0]
-        width = PAGE[0] - 2 * MARGIN
+        width, letter = PAGE[0] - 2 * MARGIN, LETTER * (BOLD if how.get("weight") == "bold" else 1.0)
         wrapped = []
         for (place, text), end in zip(cells, edges, strict=True):
-            letters = max(8, int((end - place) * width * 72 / (LETTER * size)) - 1)
+            letters = max(5, int((end - place) * width * 72 / (letter * size)) - 1)
             wrapped.append((MARGIN + place * width, textwrap.wrap(text, letters) or [""]))
         height = max(len(lines) for _, lines in wrapped) * size * LINE / 72
         y = self.take(height)
