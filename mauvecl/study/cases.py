@@ -203,10 +203,15 @@ class Loader:
 
     def instrument(self, observation: Observation) -> Instrument:
         """Return the instrument of an observation."""
-        key = repr((observation.instrument, observation.temperature_c, sorted(observation.changes.items())))
-        if key not in self._instruments:
-            self._instruments[key] = observation.load_instrument()
-        return self._instruments[key]
+        from mauvecl.host.instrument.instrument import Instrument
+
+        file, kept = observation.instrument, self._instruments
+        key = repr((file, observation.temperature_c, sorted(observation.changes.items())))
+        if key not in kept:
+            # A file is read once, since each draw of unknowns and each temperature of a sweep changes it.
+            kept[file] = kept.get(file) or Instrument.load(file)
+            kept[key] = observation.changed(kept[file])
+        return kept[key]
 
 
 @dataclass(frozen=True, eq=False)

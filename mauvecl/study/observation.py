@@ -103,8 +103,11 @@ class Observation(Section):
         """Load the instrument and apply `changes` and the detector temperature."""
         from mauvecl.host.instrument.instrument import Instrument
 
+        return self.changed(Instrument.load(self.instrument))
+
+    def changed(self, instrument: Instrument) -> Instrument:
+        """Return an instrument with `changes` and the detector temperature."""
         changes = self.changes | ({} if self.temperature_c is None else {"temperature_c": self.temperature_c})
-        instrument = Instrument.load(self.instrument)
         return instrument.with_(**changes) if changes else instrument
 
 

@@ -75,6 +75,19 @@ def test_sweep_gives_the_expectations_of_each_value(quantity: str, engine: Engin
             assert x.n_frames == y.n_frames
 
 
+def test_file_of_an_instrument_is_read_once(tmp_path: Any, monkeypatch: pytest.MonkeyPatch, engine: Engine) -> None:
+    """Temperatures of a sweep change an instrument that is kept, as draws of unknown values do."""
+    path, loaded = tmp_path / "own.toml", list[str]()
+    path.write_text('version = 2\nextends = "mauve"\n')
+    load = mauvecl.Instrument.load
+    monkeypatch.setattr(mauvecl.Instrument, "load", lambda name: loaded.append(str(name)) or load(name))
+    asked = study_of_g2v(observation={"instrument": str(path)}, sweep={"axes": [
+        {"quantity": "detector_temperature", "values": [0.0, 10.0, 20.0]},
+    ]})  # fmt: skip
+    assert len(mauvecl.snr(asked, engine).stars) == 3
+    assert loaded == [str(path)]
+
+
 def test_sweep_is_read_back(tmp_path: Any) -> None:
     asked = study([MAGNITUDES, EXPOSURES], "list", unknowns={"draws": 4, "known": ["qe_scale"]})
     path = tmp_path / "study.toml"
