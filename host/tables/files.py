@@ -318,10 +318,11 @@ def json_data(text: str, what: str) -> Any:
 
 
 def possible(data: Any, what: str, key: str = "", depth: int = 0) -> None:
-    """Check nested data, which have a key at a depth, for values that are impossible in any study or instrument.
+    """Check nested data for values that are impossible in any study or instrument.
 
-    Raises InputError for a number beyond `SMALLEST` to `LARGEST` (energies in erg: `LARGEST_ERG`),
-    an integer beyond 64 bits, text that is too long or contains impossible characters, or nesting that is too deep.
+    `key` and `depth` are those of the data in the whole. Raises InputError for a number beyond `SMALLEST` to `LARGEST`
+    (energies in erg: `LARGEST_ERG`), an integer beyond 64 bits, text that is too long or contains impossible
+    characters, or nesting that is too deep.
     """
     is_energy = key in ENERGIES or any(part.endswith(ERG) for part in key.split("."))
     fault = _fault(data, LARGEST_ERG if is_energy else LARGEST)

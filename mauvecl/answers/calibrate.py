@@ -71,7 +71,7 @@ class Fitted:
 
     @property
     def determined(self) -> bool:
-        """Whether the observations determine it."""
+        """True if the observations determine the value."""
         return bool(np.isfinite(self.error))
 
 

@@ -165,7 +165,7 @@ def written(value: float) -> str:
 
 
 def in_rows(panels: Sequence[Panel], columns: int) -> list[Sequence[Panel]]:
-    """Return panels in rows of so many columns."""
+    """Divide panels into rows with a number of columns."""
     return [panels[k : k + columns] for k in range(0, len(panels), columns)]
 
 

@@ -242,13 +242,14 @@ def fields_of(section: type[BaseModel], path: tuple[str, ...] = ()) -> Iterator[
             yield from fields_of(inner, (*path, key))
 
 
-def _given(section: Section, keys: Sequence[str]) -> list[str]:
+def given_keys(section: Section, keys: Sequence[str]) -> list[str]:
+    """Return those of some keys that a section gives."""
     return [key for key in keys if (value := getattr(section, key)) is not None and value is not False]
 
 
 def check_one(section: Section, what: str, *keys: str, needed: bool = False) -> None:
     """Raise InputError if several of these keys are given or, where one is needed, none."""
-    given = _given(section, keys)
+    given = given_keys(section, keys)
     if len(given) > 1 or (needed and not given):
         has, number = " and ".join(given) or "none", "one" if needed else "only one"
         raise InputError(f"{what} needs {number} of {', '.join(keys)}, but has {has}", key=[*given, *keys][0])
@@ -256,7 +257,7 @@ def check_one(section: Section, what: str, *keys: str, needed: bool = False) -> 
 
 def check_all(section: Section, what: str, *keys: str) -> None:
     """Raise InputError if only a part of these keys is given."""
-    given = _given(section, keys)
+    given = given_keys(section, keys)
     if 0 < len(given) < len(keys):
         raise InputError(
             f"{what} needs all of {', '.join(keys)} or none, but has only {' and '.join(given)}", key=given[0]
@@ -265,7 +266,7 @@ def check_all(section: Section, what: str, *keys: str) -> None:
 
 def check_needs(section: Section, what: str, keys: Sequence[str], needed: str) -> None:
     """Raise InputError if one of these keys is given without the key that it needs."""
-    given = _given(section, keys)
+    given = given_keys(section, keys)
     if given and getattr(section, needed) is None:
         raise InputError(f"{what} has {' and '.join(given)}, which needs {needed} as well", key=given[0])
 

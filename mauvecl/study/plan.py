@@ -34,7 +34,7 @@ from mauvecl.schema.physical import (
     RateExponent,
     Share,
 )
-from mauvecl.schema.section import Section, built, check_all, check_different, check_one, number_or_text
+from mauvecl.schema.section import Section, built, check_all, check_different, check_one, given_keys, number_or_text
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -169,7 +169,7 @@ class PlanTarget(Section):
     @property
     def given_rates(self) -> list[str]:
         """Keys of the given flare rates, of which a target has at most one; the mass has an age."""
-        return [key for key in RATES if getattr(self, key) is not None]
+        return given_keys(self, RATES)
 
     def target(self, simbad: bool) -> Target:
         """Look up the target; given coordinates replace those of its name."""

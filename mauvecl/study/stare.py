@@ -26,7 +26,7 @@ from mauvecl.noise.unknowns import COURSES, STARE_PROCESSES, Changing, NuisanceN
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.fields import Flag, Help, Range, Unit, Widget
 from mauvecl.schema.physical import Amplitude, Duration, Energy, Positive, Temperature, Wavelength
-from mauvecl.schema.section import Section, check_one, read_ranges
+from mauvecl.schema.section import Section, check_one, given_keys, read_ranges
 from mauvecl.study.observation import Spread, sd_of
 
 if TYPE_CHECKING:
@@ -158,7 +158,7 @@ class EventChoice(Section):
     @property
     def sizes(self) -> list[str]:
         """Keys of the given sizes, at most one."""
-        return [key for key in SIZES if getattr(self, key) is not None]
+        return given_keys(self, SIZES)
 
     def load_shape(self, default: str) -> Shape:
         """Return the shape, or the published shape named `default` if none is given."""

@@ -89,7 +89,7 @@ def read_version(data: dict[str, Any], where: str) -> dict[str, Any]:
 
 
 def with_paths(value: Any, change: Callable[[Path], Any]) -> Any:
-    """Return a value with other paths, such as those in the sections of a study."""
+    """Return a value, such as a study, in which `change` has replaced every path."""
     if isinstance(value, Path):
         return change(value)
     if isinstance(value, tuple):
