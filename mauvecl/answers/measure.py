@@ -17,9 +17,11 @@ from numpy.typing import NDArray
 from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf, reported
 from mauvecl.answers.measurements import (
     ExpectedMeasurement,
+    MeasuredStare,
     expected_measurements,
     fit_model,
     matched_filter,
+    measured_stare,
 )
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection.distributions import Interval, clopper_pearson, clopper_pearson_ends
@@ -37,7 +39,6 @@ from mauvecl.study.questions import check_sweep
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
-    from mauvecl.answers.measured_stares import MeasuredStare
     from mauvecl.detection.snr import Arrays
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.study.cases import Use
@@ -92,6 +93,12 @@ class MeasuredFlare(ExpectedMeasurement):
         estimates = self.found.estimates[self.selected]
         return (np.median(estimates, axis=0) if len(estimates) else np.nan) - self.truth
 
+    @property
+    def scatter(self) -> Float:
+        """Half of the central 68.27 % of the estimates, shape (n_derived,); undefined for a single one."""
+        low, high = np.quantile(self.found.estimates, [0.15865, 0.84135], axis=0)
+        return np.asarray((high - low) / 2 if len(self.found.estimates) > 1 else np.full_like(low, np.nan))
+
     @cached_property
     def rejected(self) -> Interval:
         """Share of fits that are rejected, with its 95 % interval."""
@@ -132,7 +139,7 @@ COLUMNS = (
     Column("median", lambda row: np.median(row.found.estimates, axis=0), "", "median of the estimates"),
     Column("bias", lambda row: np.median(row.found.estimates, axis=0) - row.truth, "",
            "median of the estimates less the truth", "bias", number(".4g"), detail=True),
-    Column("scatter", lambda row: _scatter(row.found.estimates), "", "half of the central 68.27 % of the estimates",
+    Column("scatter", "", "", "half of the central 68.27 % of the estimates",
            "scatter", number(".4g"), detail=True),
     *_coverage_columns(LEVELS[0], "", "of all"),
     *_coverage_columns(LEVELS[1], "", "of all", "in 95 %"),
@@ -281,12 +288,7 @@ def measure(study: Study, engine: Engine | Pool | None = None, progress: Progres
     asked = [(case, *flare, engine) for case in prepared for flare in zip(case.amplitudes, case.flares, strict=True)]
     measured = reported(map_in_order(engine, lambda row: _measured(*row), asked), len(asked), progress)
     flares = list(chain.from_iterable(measured))
-    stares = []
-    if study.measure.along_stare:
-        # Single exposures do not need the modules of stares.
-        from mauvecl.answers.measured_stares import measured_stare
-
-        stares = [measured_stare(case, engine) for case in prepared]
+    stares = [measured_stare(case, engine) for case in prepared] if study.measure.along_stare else []
     messages = collect_messages(expectations)
     messages += [stare.unmeasured for stare in stares if stare.unmeasured]
     messages += dict.fromkeys(line for case in prepared for line in _not_marginalised(case))
@@ -327,14 +329,6 @@ def _measured(case: Case, amplitude: float, flare: Expectation, engine: Engine |
         found = Measurement.joined(batches)
         measured.append(MeasuredFlare(**vars(forecast), found=found, selected=selected, frame=parts[0]["first"]))
     return measured
-
-
-def _scatter(estimates: Float) -> Float:
-    """Return half of the central 68.27 % of the estimates, shape (n_derived,); undefined for a single one."""
-    if len(estimates) < 2:
-        return np.full(estimates.shape[1], np.nan)
-    low, high = np.quantile(estimates, [0.15865, 0.84135], axis=0)
-    return np.asarray((high - low) / 2)
 
 
 def _not_marginalised(case: Case) -> list[str]:

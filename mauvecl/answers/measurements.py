@@ -1,4 +1,4 @@
-"""Measurements of flares that are expected or simulated, in single exposures."""
+"""Measurements of flares that are expected or simulated, in single exposures and along a stare."""
 
 from __future__ import annotations
 
@@ -32,11 +32,17 @@ from mauvecl.host.stars.flare_spectra import (
     FlareWithLines,
     TwoBlackbodies,
 )
+from mauvecl.runs.checkpoint import kept
+from mauvecl.runs.pool import Pool
 from mauvecl.schema.errors import InputError
 from mauvecl.study.analyses import fitted_models
 
 if TYPE_CHECKING:
     from mauvecl.detection.nuisances import Nuisances
+    from mauvecl.device.engine import Engine
+    from mauvecl.fits.time_course import CoolingCourse, MeasuredBins
+    from mauvecl.flares.frames import Components, StareExpectation
+    from mauvecl.flares.stare import Event
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.host.stars.flare_spectra import FlareSpectrum
     from mauvecl.host.stars.source import Source
@@ -212,15 +218,6 @@ def models_of(case: Case) -> dict[str, FlareModel | TwoTemperatures]:
     return {name: TwoTemperatures(model) if name == "two-temperatures" else model for name, model in models.items()}
 
 
-def last_of_one_temperature(models: dict[str, FlareModel | TwoTemperatures]) -> tuple[str, FlareModel]:
-    """Return the name and the model of the last one with a single temperature, or that of a blackbody."""
-    single = [(name, model) for name, model in models.items() if isinstance(model, FlareModel)]
-    if single:
-        return single[-1]
-    (two,) = (model for model in models.values() if isinstance(model, TwoTemperatures))
-    return "blackbody", two.single
-
-
 def expected_measurements(
     case: Case, amplitude: float, flare: Expectation, models: dict[str, FlareModel | TwoTemperatures] | None = None
 ) -> list[ExpectedMeasurement]:
@@ -277,3 +274,92 @@ def matched_filter(
         weights = weights - (rows @ delta) @ rows
     power = float(weights @ delta)
     return (weights / np.sqrt(power), float(np.sqrt(power))) if power > 0 else (weights, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class JointFit:
+    """Fit of shape and spectrum to all frames, with the drawn flare."""
+
+    found: Measurement
+    truth: Float  # shape (n_derived,)
+    true: CoolingCourse
+    fitted: CoolingCourse
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredStare(InCell):
+    """Flares of a simulated stare, measured in bins of frames with one model, and by a joint fit."""
+
+    model: str
+    staring: StareExpectation
+    events: tuple[Event, ...]
+    drawn: MeasuredBins | None
+    perfect: MeasuredBins | None  # the same bins without noise
+    joint: JointFit | None
+    unmeasured: str = ""  # why no bin reaches the S/N
+
+
+def measured_stare(case: Case, engine: Engine | Pool) -> MeasuredStare:
+    """Draw the stare of a case, and measure its flares with the last model of a single temperature."""
+    # Single exposures do not need the modules of stares.
+    from mauvecl.device.stares import Stares
+    from mauvecl.fits.time_course import fit_bins, measure_along
+    from mauvecl.flares.stare_scene import StaresRequest
+
+    study, asked = case.study, case.study.measure
+    staring, events = case.stare_expectation, case.events
+    if asked.joint_fit and len(events) != 1:
+        raise InputError(
+            f"a joint fit needs a stare with a single flare, but it has {len(events)}", key="measure.joint_fit"
+        )
+    quiet, stare, seed = staring.quiet, staring.stare, study.run.seed
+    single = [(name, one) for name, one in models_of(case.one_frame).items() if isinstance(one, FlareModel)]
+    name, model = single[-1] if single else ("blackbody", model_of(case.one_frame))
+    unknown = case.unknowns_of_fits(quiet, stare)
+    processes = study.processes.additive_only
+
+    def draw(components: Components) -> Float:
+        request = StaresRequest(components, stare, 1, seed, staring.flare, start=study.stare.number, method="pixels",
+                                processes=processes)  # fmt: skip
+        reduced = engine.stares if isinstance(engine, Pool) else Stares(engine.open_device).reduced
+        return np.asarray(reduced(request)["values"][0], np.float64)
+
+    checkpoint = engine.checkpoint if isinstance(engine, Pool) else None
+    depends_on = ("pixels", quiet, staring.flare_electrons, stare, staring.flare, study.stare.number, seed, processes)
+    raw = kept(checkpoint, depends_on, lambda: {"frames": staring.raw(draw)})["frames"]
+    where = case.label, case.at, name, staring, tuple(events)
+    joint = _joint_fit(case, raw, unknown) if asked.joint_fit else None
+    if asked.snr_per_bin is None:
+        return MeasuredStare(*where, None, None, joint)
+    try:
+        bins = measure_along(raw, quiet, model, unknown, snr_per_bin=asked.snr_per_bin, stare=stare,
+                             skipped_nm=asked.skipped_nm)  # fmt: skip
+    except InputError as error:
+        sentence = f"No flare of {case.label} is measured along the stare: {error}."
+        return MeasuredStare(*where, None, None, joint, sentence)
+    perfect = fit_bins(
+        staring.mean_raw, quiet, model, unknown, stare, bins.first, bins.count, skipped_nm=asked.skipped_nm
+    )
+    return MeasuredStare(*where, bins, perfect, joint)
+
+
+def _joint_fit(case: Case, raw: Float, unknown: Nuisances | None) -> JointFit:
+    """Fit a blackbody to the one flare of a stare; the search for the best fit starts from the true flare."""
+    from mauvecl.fits.time_course import cooling_course, cooling_event, fit_cooling
+    from mauvecl.flares.settings import Cooling
+
+    staring, (event,), model = case.stare_expectation, case.events, model_of(case.one_frame)
+    quiet, stare, skipped = staring.quiet, staring.stare, case.study.measure.skipped_nm
+    measurement = fit_cooling(
+        raw, quiet, model, unknown, peak_s=event.peak_s, half_width_s=event.half_width_s, shape=event.form,
+        cooling=isinstance(event.temperature, Cooling), stare=stare, skipped_nm=skipped,
+    )  # fmt: skip
+    true, fitted = (
+        cooling_course(flare_event, measurement, raw, quiet, model, stare, skipped)
+        for flare_event in (event, cooling_event(measurement, event.form))
+    )
+    truth = true.values
+    if not case.study.flare.is_blackbody:
+        # Only the shape is that of the model.
+        truth = np.where(np.arange(truth.size) < 2, truth, np.nan)
+    return JointFit(measurement, truth, true, fitted)
