@@ -318,14 +318,6 @@ def describe_shares(shares: Mapping[str, float]) -> str:
     return ", ".join(f"{name} {100 * share:.0f} %" for name, share in first) + note
 
 
-def draw_columns(draws: DrawnStudies) -> tuple[Column, ...]:
-    """Return the columns of the drawn values of unknowns, for rows with `draws`."""
-    return tuple(
-        Column(name, description=f"drawn {label}").of(lambda row: row.draws.by_name)
-        for name, label in zip(draws.names, draws.labels, strict=True)
-    )
-
-
 class InterpolatedForm:
     """Closed form that is exact at some points and interpolated in the probit between them."""
 

@@ -15,10 +15,10 @@ from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf, reported, share_co
 from mauvecl.answers.plan_targets import (
     NOTHING,
     CompletenessOf,
-    OrbitConditions,
     Planned,
     TargetObservation,
     closed_form,
+    conditions_along,
     errors_of_throughput,
     inject_target,
     observe,
@@ -98,10 +98,10 @@ STAR_COLUMNS = (
     Column("dec", "observation.target.dec_deg", "deg", "declination"),
     Column("position", "observation.target.source", "", "who says so"),
     Column("spectral_type", lambda row: row.observation.target.spectral_type or ""),
-    Column("spectrum", lambda row: row.observation.star.library or "", "",
+    Column("spectrum", lambda row: row.observation.case.star.library or "", "",
            "embedded spectrum that stands for the star"),
-    Column("V", lambda row: row.observation.star.magnitude or 0.0, "mag"),
-    Column("distance", lambda row: row.observation.star.distance_pc or 0.0, "pc"),
+    Column("V", lambda row: row.observation.case.star.magnitude or 0.0, "mag"),
+    Column("distance", lambda row: row.observation.case.star.distance_pc or 0.0, "pc"),
     Column("sky", lambda row: np.nan if row.observation.sky is None else row.observation.sky, "mag / arcsec2",
            "zodiacal light behind it, median over the days on which it is seen"),
     Column("signal_per_frame", "observation.signal_per_frame", "", "S/N of one frame with a flare of amplitude 1"),
@@ -109,7 +109,7 @@ STAR_COLUMNS = (
            "bolometric energy of a second of equivalent duration"),
     Column("temperature", lambda row: row.observation.quiet.conditions["temperature_c"], "deg_C",
            "of the detector, mean while it is seen"),
-    Column("hits", "observation.hits_per_cm2_s", "1 / (s cm2)",
+    Column("hits", "observation.case.study.processes.particles_per_cm2_s", "1 / (s cm2)",
            "of cosmic rays and trapped protons, mean while it is seen"),
     Column("window", lambda row: row.observation.window_s / 60, "min", "median stretch in which it is seen"),
     Column("saturated", lambda row: int(row.observation.quiet.saturated.sum()), "",
@@ -288,8 +288,11 @@ class PlanAnswer(Answer):
             )
         for why in (target.no_rates for target in planned if target.no_rates):
             lines.append(f"{why[0].upper()}{why[1:]}; its expected flares are not given.")
-        beyond = [f"{target.name} ({target.energy_at(0.5):.2g} erg, {target.published})" for target in planned
-                  if target.completeness is not None and target.extrapolated]  # fmt: skip
+        beyond = []
+        for target in planned:
+            if target.completeness is not None and target.rates is not None:
+                e50, (low, high) = target.energy_at(0.5), target.rates.measured_erg
+                beyond += [] if low <= e50 <= high else [f"{target.name} ({e50:.2g} erg, {target.published})"]
         return [*lines, *([f"Flare rates are extrapolated to E50 of {', '.join(beyond)}."] if beyond else [])]
 
 
@@ -334,7 +337,7 @@ def plan(
     if progress is not None:
         progress(0, len(stars))
     seen, base = visible(study), Case(study)
-    along = OrbitConditions.along(seen.visibility.track) if study.plan.along_orbit else None
+    along = conditions_along(seen.visibility.track) if study.plan.along_orbit else None
     named = enumerate(zip(study.plan.targets, stars, strict=True))
     observed = ((k, observe(base, text, star, seen, k, along)) for k, (text, star) in named)
     # With a pool, the noise of a target is drawn while the threshold of the next one is sampled.
@@ -394,13 +397,13 @@ def target_lines(answer: PlanAnswer, k: int) -> list[tuple[str, str, str]]:
     record = records(answer.table)[k]
     columns = PlanAnswer.table.columns_of(answer)
     said = {column.name: column.text(record) for column in columns if column.heading}
-    place, seen = observation.target, answer.seen
+    place, star, seen = observation.target, observation.case.star, answer.seen
     lines = [
         ("right ascension, declination", f"{place.ra_deg:.4f}, {place.dec_deg:.4f} deg ({place.source})",
          "stars: ra, dec, position"),
-        ("type; spectrum that stands for it", f"{place.spectral_type}; {observation.star.library}",
+        ("type; spectrum that stands for it", f"{place.spectral_type}; {star.library}",
          "stars: spectral_type, spectrum"),
-        ("V; distance", f"{observation.star.magnitude:g}; {observation.star.distance_pc:g} pc", "stars: V, distance"),
+        ("V; distance", f"{star.magnitude:g}; {star.distance_pc:g} pc", "stars: V, distance"),
         ("seen; observed", f"{said['seen']} h; {said['hours']} h", "plan: seen, hours"),
     ]  # fmt: skip
     if target.seen_h == 0:
@@ -411,7 +414,7 @@ def target_lines(answer: PlanAnswer, k: int) -> list[tuple[str, str, str]]:
         ("best months", said["best_months"], "plan: best_months; months"),
         ("angle from the Sun", f"{away.min():.0f} to {away.max():.0f} deg", "days: elongation"),
         ("detector; hits by particles", f"{observation.quiet.conditions['temperature_c']:.1f} deg C; "
-         f"{observation.hits_per_cm2_s:.2f} per cm^2 and s", "stars: temperature, hits"),
+         f"{observation.case.study.processes.particles_per_cm2_s:.2f} per cm^2 and s", "stars: temperature, hits"),
         ("S/N of a frame at amplitude 1", f"{observation.signal_per_frame:.4g}", "stars: signal_per_frame"),
         ("half of flares recovered from", energy(target.energy_at(0.5), " erg"), "plan: E50; energies: recovered"),
         ("90 % of flares recovered from", energy(target.energy_at(0.9), " erg"), "plan: E90; energies: recovered"),
