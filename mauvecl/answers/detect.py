@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from itertools import product
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
@@ -98,8 +97,7 @@ def _rows_of(star: StarDetection, fap: float) -> QTable:
     """Return the table of a star's detection with the ideal probabilities, if it has any."""
     table = star.detection.table(fap)[[column.name for column in COLUMNS[1:]]]
     if star.ideal is not None:
-        after = table.colnames.index("high") + 1
-        table.add_column(star.ideal.ravel(), name=IDEAL.name, index=after)
+        table.add_column(star.ideal.ravel(), name=IDEAL.name, index=table.colnames.index("high") + 1)
         table[IDEAL.name].info.description = IDEAL.description
     return table
 
@@ -266,21 +264,17 @@ def detect(study: Study, engine: Engine | Pool | None = None, progress: Progress
             paper = _paper(prepared)
         stars.append(star)
     answer = DetectAnswer(study, stars, paper=paper)
-    costs = [text for case, star in zip(prepared, stars, strict=True) for text in _template_costs(case, star)]
-    last = [*_few_terms(stars), *marginal_lines(study.nuisances)]
-    # One sentence on unknowns: their effect on the chance, or on the S/N where they are taken into account.
-    last += chance_with_unknowns(prepared) or _cost_of_unknowns(prepared)
-    answer.messages = list(dict.fromkeys([*_messages(answer, prepared), *campaigns, *costs, *last]))
+    answer.messages = list(dict.fromkeys(_messages(answer, prepared, campaigns)))
     return answer
 
 
-def _messages(answer: DetectAnswer, prepared: Sequence[Case]) -> list[str]:
-    """Return messages on lost pixels, on thresholds, and of the expectations."""
-    run, detections = answer.study.run, [(star.title, star.detection) for star in answer.stars]
+def _messages(answer: DetectAnswer, prepared: Sequence[Case], campaigns: Sequence[str]) -> list[str]:
+    """Return messages on lost pixels, on thresholds, of the expectations, on campaigns, templates and unknowns."""
+    study, run, detections = answer.study, answer.study.run, [(star.title, star.detection) for star in answer.stars]
     messages: list[str] = [message.about(title) for title, one in detections for message in one.messages]
     messages += [message.about(title) for title, one in detections for message in one.without_threshold(run.fap)]
     messages += [message.about(title) for title, one in detections for message in one.lowered]
-    messages += collect_messages([x for case in prepared for x in case.expectations], answer.study.processes)
+    messages += collect_messages([x for case in prepared for x in case.expectations], study.processes)
     errors = answer.table["fap_error"][np.isfinite(answer.table["fap_error"])]
     if not countable(run.fap, run.realisations) and errors.size:
         text = (
@@ -288,18 +282,17 @@ def _messages(answer: DetectAnswer, prepared: Sequence[Case]) -> list[str]:
             f"{100 * errors.max():.1f} % of it: {run.realisations} realisations leave fewer than 100 beyond them."
         )
         messages.append(Message(text, "sampled"))
-    return messages
-
-
-def _cost_of_unknowns(prepared: Sequence[Case]) -> list[str]:
-    """Return the sentence on the S/N that the faintest flare loses to unknowns."""
-    choice, comparison = prepared[0].study.nuisances, prepared[0].study.run.comparison()
-    costs = list[Cost]()
-    for case in prepared:
+    messages += campaigns
+    for case, star in zip(prepared, answer.stars, strict=True):
+        messages += _template_costs(case, star)
+    messages += [*_few_terms(answer.stars), *marginal_lines(study.nuisances)]
+    # One sentence on unknowns: their effect on the chance, or on the S/N where they are taken into account.
+    chance, costs = chance_with_unknowns(prepared), list[Cost]()
+    for case in prepared if not chance else ():
         for amplitude, flare in zip(case.amplitudes, case.flares, strict=True):
             name = f"{case.label}, flare of {100 * amplitude:g} %"
-            costs.append(unknown_cost(name, case.quiet, flare, choice, comparison))
-    return cost_lines(costs, choice)
+            costs.append(unknown_cost(name, case.quiet, flare, study.nuisances, run.comparison()))
+    return [*messages, *chance, *cost_lines(costs, study.nuisances)]
 
 
 def _few_terms(stars: Sequence[StarDetection]) -> list[str]:
@@ -447,8 +440,7 @@ class UnknownAnswer(Answer):
         `unknown` is None for everything known. S/N grows with the amplitude; the flare's own photon noise is left out.
         """
         amplitude, costs = self.of_star(star)
-        cost = next(iter(costs.values())) if unknown is None else costs[unknown]
-        snr = cost.known if unknown is None else cost.marginal
+        snr = next(iter(costs.values())).known if unknown is None else costs[unknown].marginal
         needed = special.ndtri(self.study.limit.power) - special.ndtri(self.study.run.fap)
         return float(amplitude * needed / snr) if snr > 0 else float("inf")
 
@@ -467,8 +459,10 @@ def unknown_table(study: Study) -> UnknownAnswer:
     costs = dict[tuple[str, float], dict[str, Cost]]()
     for case in prepared:
         for amplitude, flare in zip(case.amplitudes, case.flares, strict=True):
-            of = partial(unknown_cost, case.label, case.quiet, flare, comparison=comparison)
-            costs[case.label, amplitude] = {unknown: of(nuisances=choice) for unknown, choice in SHOWN.items()}
+            of = case.label, case.quiet, flare
+            costs[case.label, amplitude] = {
+                name: unknown_cost(*of, choice, comparison) for name, choice in SHOWN.items()
+            }
     quiet = [case.quiet for case in prepared]
     return UnknownAnswer(study, costs, collect_messages(quiet), quiet)
 
