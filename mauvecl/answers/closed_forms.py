@@ -189,11 +189,6 @@ class DrawnStudies:
     values: Float  # shape (n_draw, n_name)
     studies: tuple[Study, ...]  # the study with each draw's instrument, without unknowns, and its share of realisations
 
-    @property
-    def by_name(self) -> dict[str, Float]:
-        """Drawn values of each unknown."""
-        return dict(zip(self.names, self.values.T, strict=True))
-
 
 def drawn(study: Study) -> DrawnStudies:
     """Draw instrument values from a study's priors, as a Latin hypercube with the study's seed.

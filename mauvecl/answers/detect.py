@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from mauvecl.answers import closed_forms as forms
 from mauvecl.answers.answer import (
     IF_KNOWN,
     Answer,
@@ -21,16 +22,6 @@ from mauvecl.answers.answer import (
     name_of_instrument,
     reported,
     share_columns,
-)
-from mauvecl.answers.closed_forms import (
-    IDEAL,
-    Cost,
-    chance_with_unknowns,
-    cost_lines,
-    ideal_chances,
-    marginal_lines,
-    spoken,
-    unknown_cost,
 )
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection.detection import (
@@ -88,7 +79,7 @@ def _detection_columns(answer: DetectAnswer) -> tuple[Column, ...]:
         f"relative rise of the photons in the band {answer.study.flare.band}",
     )
     place = [column.name for column in COLUMNS].index("high") + 1
-    ideal = () if answer.study.nuisances.none else (IDEAL,)
+    ideal = () if answer.study.nuisances.none else (forms.IDEAL,)
     share = share_columns(answer.study, "detection.quiet.target_share")
     return (*share, amplitude, *COLUMNS[1:place], *ideal, *COLUMNS[place:])
 
@@ -97,8 +88,8 @@ def _rows_of(star: StarDetection, fap: float) -> QTable:
     """Return the table of a star's detection with the ideal probabilities, if it has any."""
     table = star.detection.table(fap)[[column.name for column in COLUMNS[1:]]]
     if star.ideal is not None:
-        table.add_column(star.ideal.ravel(), name=IDEAL.name, index=table.colnames.index("high") + 1)
-        table[IDEAL.name].info.description = IDEAL.description
+        table.add_column(star.ideal.ravel(), name=forms.IDEAL.name, index=table.colnames.index("high") + 1)
+        table[forms.IDEAL.name].info.description = forms.IDEAL.description
     return table
 
 
@@ -251,7 +242,7 @@ def detect(study: Study, engine: Engine | Pool | None = None, progress: Progress
         detection = engine.detect(case.quiet, case.flares, seed=run.seed, **how)
         statistics = [detection.statistic(name) for name in detection.statistics]
         return StarDetection(
-            case.label, case.at, case.amplitudes, detection, ideal_chances(case, case.flares, statistics)
+            case.label, case.at, case.amplitudes, detection, forms.ideal_chances(case, case.flares, statistics)
         )
 
     if isinstance(engine, Pool):
@@ -285,14 +276,14 @@ def _messages(answer: DetectAnswer, prepared: Sequence[Case], campaigns: Sequenc
     messages += campaigns
     for case, star in zip(prepared, answer.stars, strict=True):
         messages += _template_costs(case, star)
-    messages += [*_few_terms(answer.stars), *marginal_lines(study.nuisances)]
+    messages += [*_few_terms(answer.stars), *forms.marginal_lines(study.nuisances)]
     # One sentence on unknowns: their effect on the chance, or on the S/N where they are taken into account.
-    chance, costs = chance_with_unknowns(prepared), list[Cost]()
+    chance, costs = forms.chance_with_unknowns(prepared), list[forms.Cost]()
     for case in prepared if not chance else ():
         for amplitude, flare in zip(case.amplitudes, case.flares, strict=True):
             name = f"{case.label}, flare of {100 * amplitude:g} %"
-            costs.append(unknown_cost(name, case.quiet, flare, study.nuisances, run.comparison()))
-    return [*messages, *chance, *cost_lines(costs, study.nuisances)]
+            costs.append(forms.unknown_cost(name, case.quiet, flare, study.nuisances, run.comparison()))
+    return [*messages, *chance, *forms.cost_lines(costs, study.nuisances)]
 
 
 def _few_terms(stars: Sequence[StarDetection]) -> list[str]:
@@ -387,7 +378,7 @@ def _paper(prepared: Sequence[Case]) -> list[str]:
 
 #: Default unknowns, which include those of the table in METHODS.
 SHOWN: dict[str, NuisanceChoice] = {
-    spoken(choice): choice
+    forms.spoken(choice): choice
     for choice in (
         NuisanceChoice(usual=False, dark=0.1),
         NuisanceChoice(usual=False, light=0.01),
@@ -419,7 +410,7 @@ class UnknownAnswer(Answer):
     USES = ("instrument", "sky", "flare", "nuisances", "seed")
 
     study: Study
-    costs: dict[tuple[str, float], dict[str, Cost]]  # by (star, amplitude), then by unknown
+    costs: dict[tuple[str, float], dict[str, forms.Cost]]  # by (star, amplitude), then by unknown
     messages: list[str]
     inputs: list[Expectation]  # the stars without a flare
 
@@ -430,7 +421,7 @@ class UnknownAnswer(Answer):
         about=lambda answer: metadata_of(answer, "study.run.fap", "study.limit.power") | {"study": answer.study.toml()},
     )  # fmt: skip
 
-    def of_star(self, star: str) -> tuple[float, dict[str, Cost]]:
+    def of_star(self, star: str) -> tuple[float, dict[str, forms.Cost]]:
         """Return the amplitude of the first flare of a star, and its costs by unknown."""
         return next((amplitude, costs) for (name, amplitude), costs in self.costs.items() if name == star)
 
@@ -456,12 +447,12 @@ class UnknownAnswer(Answer):
 def unknown_table(study: Study) -> UnknownAnswer:
     """Compute the S/N of a study's flares under each of the unknowns of `SHOWN`."""
     prepared, comparison = cases(study, swept=False), study.run.comparison()
-    costs = dict[tuple[str, float], dict[str, Cost]]()
+    costs = dict[tuple[str, float], dict[str, forms.Cost]]()
     for case in prepared:
         for amplitude, flare in zip(case.amplitudes, case.flares, strict=True):
             of = case.label, case.quiet, flare
             costs[case.label, amplitude] = {
-                name: unknown_cost(*of, choice, comparison) for name, choice in SHOWN.items()
+                name: forms.unknown_cost(*of, choice, comparison) for name, choice in SHOWN.items()
             }
     quiet = [case.quiet for case in prepared]
     return UnknownAnswer(study, costs, collect_messages(quiet), quiet)

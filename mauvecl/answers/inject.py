@@ -158,18 +158,6 @@ def limit_columns(of: str, *, known: bool) -> tuple[Column, ...]:
     )  # fmt: skip
 
 
-def cell_columns(of: str) -> tuple[Column, ...]:
-    """Return the columns of the table of completeness over half-width and a kind of size."""
-    return (
-        Column("half_width", lambda x: np.array(x.half_widths_s)[:, None], "s", "half-width of the injected flares"),
-        Column("size", "sizes", SIZE_UNITS[of], f"{of} of the injected flares"),
-        Column("amplitude", "amplitudes", "", "relative rise of the photons in the flare's band by them"),
-        Column("completeness", "", "", "share of injected flares that the search finds"),
-        *interval_columns("completeness_{}"),
-        Column("injections", "count", "", "number of injected flares"),
-    )
-
-
 SEARCH_COLUMNS = (
     Column("threshold", "threshold.value", "", "S/N from which on a template is an alarm", "threshold", ".3f"),
     *interval_columns("threshold_{}", "threshold.{}", heading=INTERVAL, format=interval(".3f")),
@@ -231,7 +219,15 @@ class StarCompleteness(InCell):
     @property
     def cells(self) -> QTable:
         """Completeness at each half-width and size, and how well the flares are recovered."""
-        columns = [column.of(attrgetter("injected")) for column in cell_columns(self.sizes.of)]
+        own = (
+            Column("half_width", lambda x: np.array(x.half_widths_s)[:, None], "s", "half-width of injected flares"),
+            Column("size", "sizes", SIZE_UNITS[self.sizes.of], f"{self.sizes.of} of the injected flares"),
+            Column("amplitude", "amplitudes", "", "relative rise of the photons in the flare's band by them"),
+            Column("completeness", "", "", "share of injected flares that the search finds"),
+            *interval_columns("completeness_{}"),
+            Column("injections", "count", "", "number of injected flares"),
+        )
+        columns = [column.of(attrgetter("injected")) for column in own]
         if self.fitted is not None:
             columns += [column.of(attrgetter("fitted")) for column in ACCURACY_COLUMNS]
         return table_of(columns, [self])

@@ -12,17 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.answers import closed_forms as forms
 from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf, first_of, share_columns
-from mauvecl.answers.closed_forms import (
-    Cost,
-    DrawnStudies,
-    cost_lines,
-    describe_shares,
-    drawn,
-    marginal_lines,
-    shares,
-    unknown_cost,
-)
 from mauvecl.answers.limit_search import LimitSearch, Point, Report, settle
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection.distributions import Interval
@@ -134,7 +125,7 @@ STEPS = 100
 class Unknown:
     """Effect of unknown instrument values on a limit."""
 
-    draws: DrawnStudies
+    draws: forms.DrawnStudies
     limits: NDArray[np.float64]  # closed-form limit of each draw, NaN if it has none, shape (n_draw,)
     shares: dict[str, float]  # share of the limits' variance that each unknown explains, largest first
 
@@ -163,7 +154,7 @@ class Limit:
     at: Mapping[str, float | str] = field(default_factory=dict)  # sweep values
     unknown: Unknown | None = None  # for limits averaged over unknown instrument values
     messages: tuple[str, ...] = ()  # saturation at the limit, without and with the flare
-    cost: Cost | None = None  # loss of S/N to unknowns at the limit
+    cost: forms.Cost | None = None  # loss of S/N to unknowns at the limit
     # The star at the limit, without the flare.
     quiet: Expectation | None = field(default=None, compare=False, repr=False)
 
@@ -231,8 +222,8 @@ def _unknown_columns(digits: str) -> tuple[Column, ...]:
 def _draw_columns(answer: LimitAnswer) -> tuple[Column, ...]:
     draws = next(limit.unknown.draws for limit in answer.limits if limit.unknown is not None)
     values = (
-        Column(name, description=f"drawn {label}").of(lambda row: row.unknown.draws.by_name)
-        for name, label in zip(draws.names, draws.labels, strict=True)
+        Column(name, lambda row, k=k: row.unknown.draws.values[:, k], description=f"drawn {label}")
+        for k, (name, label) in enumerate(zip(draws.names, draws.labels, strict=True))
     )
     return (*answer.flare_columns, *values, Column(answer.study.limit.of, "unknown.limits", "", "closed-form limit"))
 
@@ -297,8 +288,8 @@ class LimitAnswer(Answer):
         views = [View(title, shown, table_of(shown, self.limits))]
         if draws:
             heading = "matters most, share of the variance"
-            shares = Column("shares", lambda row: describe_shares(row.unknown.shares), heading=heading)
-            shown = (*self.placed(self.flare_columns), *_unknown_columns(DIGITS[of])[:2], shares)
+            column = Column("shares", lambda row: forms.describe_shares(row.unknown.shares), heading=heading)
+            shown = (*self.placed(self.flare_columns), *_unknown_columns(DIGITS[of])[:2], column)
             what = "what is unknown of the instrument: the limits of each, and what explains their scatter"
             views.append(View(f"Averaged over {draws} draws of {what}", shown, table_of(shown, self.limits)))
         return [*views, *super().views]
@@ -315,7 +306,8 @@ class LimitAnswer(Answer):
         stars = worst_first([*at_limits, *collect_messages(self.inputs, self.study.processes)])
         costs = [limit.cost for limit in self.limits if limit.cost is not None]
         failed = [Message(f"NO LIMIT: {text}.", "no limit") for text in self.failed]
-        return [*failed, *stars, *marginal_lines(self.study.nuisances), *cost_lines(costs, self.study.nuisances)]
+        unknown = [*forms.marginal_lines(self.study.nuisances), *forms.cost_lines(costs, self.study.nuisances)]
+        return [*failed, *stars, *unknown]
 
 
 def solve(case: Case, statistic: str, engine: Engine | Pool, report: Report = None) -> Limit:
@@ -327,7 +319,7 @@ def solve(case: Case, statistic: str, engine: Engine | Pool, report: Report = No
     """
     study = case.study
     check_fap(study.run.fap, study.run.realisations, study.run.tails)
-    draws = drawn(study) if study.unknowns.draws else None
+    draws = forms.drawn(study) if study.unknowns.draws else None
     each = [LimitSearch(replace(case, study=one), statistic, engine) for one in draws.studies] if draws else []
     question = LimitSearch(case, statistic, engine, report, each)
     # The root of the nominal instrument is near and found quickly.
@@ -349,9 +341,9 @@ def solve(case: Case, statistic: str, engine: Engine | Pool, report: Report = No
         star_label(named, quiet), amplitude, question.of, statistic, question.power, value, closed_form=theory,
         ideal=float("nan") if known else LimitSearch(ideal, statistic).root_or_nan(theory),
         check=check, points=simulated, curve=question.curve(value.value), at=case.at,
-        unknown=Unknown(draws, roots, shares(draws, roots)) if draws else None,
+        unknown=Unknown(draws, roots, forms.shares(draws, roots)) if draws else None,
         messages=tuple(of_kind(collect_messages([quiet, flare]), SATURATED)), quiet=quiet,
-        cost=unknown_cost(where, quiet, flare, study.nuisances, study.run.comparison()),
+        cost=forms.unknown_cost(where, quiet, flare, study.nuisances, study.run.comparison()),
     )  # fmt: skip
 
 

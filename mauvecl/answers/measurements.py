@@ -13,25 +13,10 @@ from mauvecl.answers.answer import InCell
 from mauvecl.answers.closed_forms import throughput_cases
 from mauvecl.fits.flare_model import FlareModel, Ranges, Ratio, Reduction, usable_variance, variance_of
 from mauvecl.fits.profile import Profile
-from mauvecl.fits.spectrum import (
-    Forecast,
-    Measurement,
-    TwoTemperatures,
-    fit,
-    fit_two_temperatures,
-    forecast_model,
-)
+from mauvecl.fits.spectrum import Forecast, Measurement, TwoTemperatures, fit, fit_two_temperatures, forecast_model
 from mauvecl.host.arrays import true_runs
+from mauvecl.host.stars import flare_spectra as spectra
 from mauvecl.host.stars.bands import photons
-from mauvecl.host.stars.flare_spectra import (
-    PARSEC_CM,
-    SUN_CM,
-    BalmerFlare,
-    Blackbody,
-    EmissionLine,
-    FlareWithLines,
-    TwoBlackbodies,
-)
 from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool
 from mauvecl.schema.errors import InputError
@@ -62,12 +47,12 @@ class Truth:
         added = added - light.flux_at_telescope(nm)
         # Ratio of the flux at the telescope to that of the flare's spectrum.
         self._scale = float(np.trapezoid(added, nm) / np.trapezoid(light.flux(nm), nm))
-        continuum = light.continuum if isinstance(light, FlareWithLines) else light
+        continuum = light.continuum if isinstance(light, spectra.FlareWithLines) else light
         self._values = dict.fromkeys(("temperature", "second temperature", "second area", "amplitude", "jump"), np.nan)
-        two, kelvin = continuum if isinstance(continuum, TwoBlackbodies) else None, continuum.temperature_k
+        two, kelvin = continuum if isinstance(continuum, spectra.TwoBlackbodies) else None, continuum.temperature_k
         if kelvin is not None:
             # Flux of the blackbodies without recombination.
-            body, at = continuum if two else Blackbody(kelvin), quiet.wavelength_nm
+            body, at = continuum if two else spectra.Blackbody(kelvin), quiet.wavelength_nm
             hot = self._scale * photons(at, body.flux(at), band)
             self._values |= {"temperature": kelvin, "amplitude": hot / photons(at, quiet.flux_flam, band)}
         if kelvin is not None and two is not None:
@@ -75,8 +60,8 @@ class Truth:
             (low, area), (high, hot_area) = sorted([(kelvin, 1.0), (two.second_temperature_k, two.second_area)])
             self._values |= {"temperature": low, "second temperature": high, "second area": hot_area / area}
         if continuum.surface:
-            self._values["jump"] = continuum.jump if isinstance(continuum, BalmerFlare) else 1.0
-        self._far = np.nan if star.distance_pc is None else star.distance_pc * PARSEC_CM
+            self._values["jump"] = continuum.jump if isinstance(continuum, spectra.BalmerFlare) else 1.0
+        self._far = np.nan if star.distance_pc is None else star.distance_pc * spectra.PARSEC_CM
         self._area = np.pi * self._far**2 * self._scale if continuum.surface else np.nan
         self._area *= 1.0 if two is None else 1.0 + two.second_area
 
@@ -91,25 +76,25 @@ class Truth:
             return factor[first] * self._flux(rest)
         if first == "line":
             return self._line(rest)
-        radius = np.nan if self._star.radius_rsun is None else self._star.radius_rsun * SUN_CM
+        radius = np.nan if self._star.radius_rsun is None else self._star.radius_rsun * spectra.SUN_CM
         return self._area if name == "area" else float(self._area / (np.pi * radius**2))
 
     def _flux(self, where: str) -> float:
         if where == "bolometric":
-            lines = self._light.fluxes_cgs.values() if isinstance(self._light, FlareWithLines) else ()
+            lines = self._light.fluxes_cgs.values() if isinstance(self._light, spectra.FlareWithLines) else ()
             return self._scale * self._light.bolometric_flux() + sum(lines)
         low, high = (float(end) for end in where.removesuffix(" nm").split("-"))
         nm = self._light.grid(np.linspace(low, high, 4001))
         return 10.0 * float(np.trapezoid(self._scale * self._light.flux(nm) + self._light.flux_at_telescope(nm), nm))
 
     def _line(self, name: str) -> float:
-        if not isinstance(self._light, FlareWithLines):
+        if not isinstance(self._light, spectra.FlareWithLines):
             return 0.0 if self._light.surface else np.nan
         relative = self._scale * self._light.continuum_flux
         lines = [(line, relative * share) for line, share in self._light.fractions.items()]
         lines += self._light.fluxes_cgs.items()
-        wanted = EmissionLine.named(name).name
-        return next((flux for line, flux in lines if EmissionLine.named(line).name == wanted), 0.0)
+        wanted = spectra.EmissionLine.named(name).name
+        return next((flux for line, flux in lines if spectra.EmissionLine.named(line).name == wanted), 0.0)
 
 
 @dataclass(frozen=True, eq=False)

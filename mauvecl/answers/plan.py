@@ -11,20 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mauvecl.answers import plan_targets as targets
 from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf, reported, share_columns
-from mauvecl.answers.plan_targets import (
-    NOTHING,
-    CompletenessOf,
-    Planned,
-    TargetObservation,
-    closed_form,
-    conditions_along,
-    errors_of_throughput,
-    inject_target,
-    observe,
-    rates_of,
-    star_of,
-)
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.answers.visible import VisibleAnswer, assumption_columns, visible
 from mauvecl.device.stares import Stares
@@ -146,7 +134,7 @@ class PlanAnswer(Answer):
 
     study: Study
     seen: VisibleAnswer
-    planned: tuple[Planned, ...]
+    planned: tuple[targets.Planned, ...]
 
     #: One row per target.
     table = TableOf("plan", _target_columns, "planned", title=lambda answer: answer.heading, about=lambda answer: {
@@ -302,7 +290,7 @@ def plan(
     engine: Stares | Pool | None = None,
     progress: Progress = None,
     *,
-    completeness: CompletenessOf | None = None,
+    completeness: targets.CompletenessOf | None = None,
 ) -> PlanAnswer:
     """Plan a campaign on a study's targets: its ``plan`` defines them, its ``orbit`` time and position.
 
@@ -323,12 +311,12 @@ def plan(
     closed = completeness is None and study.plan.completeness == "closed form"
     _refuse(study, closed=closed)
     if completeness is None:
-        completeness = closed_form if closed else partial(inject_target, engine=engine or Stares())
+        completeness = targets.closed_form if closed else partial(targets.inject_target, engine=engine or Stares())
     stars: list[Star] = []
     errors: list[InputError] = []
     for text in study.plan.targets:
         try:
-            stars.append(star_of(text, study.orbit.simbad))
+            stars.append(targets.star_of(text, study.orbit.simbad))
         except InputError as error:
             errors.append(error)
     if errors:
@@ -337,9 +325,9 @@ def plan(
     if progress is not None:
         progress(0, len(stars))
     seen, base = visible(study), Case(study)
-    along = conditions_along(seen.visibility.track) if study.plan.along_orbit else None
+    along = targets.conditions_along(seen.visibility.track) if study.plan.along_orbit else None
     named = enumerate(zip(study.plan.targets, stars, strict=True))
-    observed = ((k, observe(base, text, star, seen, k, along)) for k, (text, star) in named)
+    observed = ((k, targets.observe(base, text, star, seen, k, along)) for k, (text, star) in named)
     # With a pool, the noise of a target is drawn while the threshold of the next one is sampled.
     planned_for = partial(_planned, seen, completeness)
     planned = tuple(reported(map_in_order(engine, planned_for, observed), len(stars), progress))
@@ -359,25 +347,27 @@ def _refuse(study: Study, *, closed: bool) -> None:
         )
 
 
-def _planned(seen: VisibleAnswer, completeness: CompletenessOf, item: tuple[int, TargetObservation]) -> Planned:
+def _planned(
+    seen: VisibleAnswer, completeness: targets.CompletenessOf, item: tuple[int, targets.TargetObservation]
+) -> targets.Planned:
     """Return the plan of a target, given its number and observation."""
     study, (k, target), its = seen.study, item, None
     if target.window_s > 0:
-        its = completeness(target) if target.signal_per_frame > 0 else NOTHING
+        its = completeness(target) if target.signal_per_frame > 0 else targets.NOTHING
     exposed, (names, hours) = float(seen.visibility.hours[k]), seen.by_month
     observed = exposed if study.plan.hours is None else min(exposed, study.plan.hours)
     days = observed * 3600 / DAY_S
     # The months in which it is seen for the most hours, in order.
     most = sorted(np.argsort(-hours[:, k], kind="stable")[: study.plan.best_months])
     best = tuple(names[i] for i in most if hours[i, k] > 0)
-    rates, why = rates_of(study.plan.targets[k], target)
+    rates, why = targets.rates_of(study.plan.targets[k], target)
     recovered, ideal = None, float("nan")
     if rates is not None:
         recovered = Yield.of_expected(0.0, 0.0) if its is None else Yield.of(rates, its, days)
-        if study.nuisances.usual and its not in (None, NOTHING):
-            ideal = recovered_per_day(rates, closed_form(target, known=True)) * days
-    return Planned(target, exposed, observed, its, rates, recovered, best, why, errors_of_throughput(target, rates),
-                   ideal)  # fmt: skip
+        if study.nuisances.usual and its not in (None, targets.NOTHING):
+            ideal = recovered_per_day(rates, targets.closed_form(target, known=True)) * days
+    errors = targets.errors_of_throughput(target, rates)
+    return targets.Planned(target, exposed, observed, its, rates, recovered, best, why, errors, ideal)
 
 
 SUMMARY_TABLE = "plan.ecsv"

@@ -281,12 +281,6 @@ def band_suffix(name: str, number: int) -> str:
     return "" if number == 0 else "_" + name.removesuffix(" nm").replace("-", "_")
 
 
-def _light_column(kind: str, band: str, number: int) -> Column:
-    attribute, text = LIGHT[kind]
-    name = kind + band_suffix(band, number)
-    return Column(name, lambda star: getattr(star.light, attribute)[:, number], "DN / s", f"{band}: {text}")
-
-
 #: Metadata of the tables.
 SEED = ("study", "study.run.seed")
 
@@ -351,7 +345,9 @@ class StareAnswer(Answer):
         """Return the frames of a star in a cell: time, cadence number, quality, and light in every band."""
         star = self.stares[number]
         columns = [*FRAME_COLUMNS, *(() if star.pointing_loss is None else (LOSS_COLUMN,))]
-        columns += [_light_column(kind, band, k) for k, band in enumerate(star.light.bands) for kind in LIGHT]
+        for (k, band), (kind, (attribute, text)) in product(enumerate(star.light.bands), LIGHT.items()):
+            values, name = getattr(star.light, attribute)[:, k], kind + band_suffix(band, k)
+            columns.append(Column(name, lambda _, values=values: values, "DN / s", f"{band}: {text}"))
         return table_of(columns, [star], star=star.label, **metadata_of(self, *SEED), **star.at)
 
     @property
@@ -383,11 +379,7 @@ class StareAnswer(Answer):
 
 @by_keywords("stares")
 def stare(
-    study: Study,
-    engine: Stares | None = None,
-    progress: Progress = None,
-    *,
-    checkpoint: Checkpoint | None = None,
+    study: Study, engine: Stares | None = None, progress: Progress = None, *, checkpoint: Checkpoint | None = None
 ) -> StareAnswer:
     """Simulate one stare for every star and sweep value of a study; `run.seed` and `stare.number` select it.
 

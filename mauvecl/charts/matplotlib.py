@@ -219,14 +219,8 @@ def styled_picture(draw: Callable[P, Any]) -> Callable[..., Any]:
 def picture_of(kind: str, name: str, **how: Any) -> Callable[[Callable[P, Any]], Callable[..., Any]]:
     """Register a function as a picture of a class, and decorate it as `styled_picture` does; `plot` draws the first.
 
-    Parameters
-    ----------
-    kind : str
-        Name of the class, as in ``"LimitAnswer"``.
-    name : str
-        Name of the picture's file without its ending.
-    **how
-        `given`, `each` and `when`; see `chart.Entry`.
+    `kind` is the name of the class, as in "LimitAnswer", `name` that of the file without its ending; `how` is as for
+    `chart.Entry`.
     """
     return lambda draw: register(kind, name, styled_picture(draw), **how)
 

@@ -177,16 +177,12 @@ def test_exposure_inverts_snr(per: str, frames: int, wavelength: float) -> None:
     assert more.frames == frames + 1
 
 
-def test_saturated_pixels_of_an_exposure_are_marked() -> None:
-    blinding = exposure_for(sunlike(-2.0), 10.0, 450.0)
+def test_exposures_that_saturate_or_exceed_a_day_say_so() -> None:
+    """Longer times are sums of several exposures, although `expect` allows only one day."""
+    blinding, found = exposure_for(sunlike(-2.0), 10.0, 450.0), exposure_for(sunlike(14.5), 10.0, 550.0)
     assert blinding.exposures[0].saturated
     assert of_kind(blinding.messages, "saturated")
     assert not exposure_for(sunlike(), 10.0, 400.0).exposures[0].saturated
-
-
-def test_exposure_above_one_day_is_answered() -> None:
-    """Check that longer times are sums of several exposures, although `expect` allows only one day."""
-    found = exposure_for(sunlike(14.5), 10.0, 550.0)
     (answer,) = found.exposures
     assert answer.exposure_s > 86_400.0
     assert answer.snr_one_frame_less < 10.0 <= answer.snr
