@@ -272,15 +272,12 @@ def test_wrong_fields_of_records_raise(record: type[BaseModel]) -> None:
                 assert says_what_is_accepted(str(error)) or "did you mean" in str(error), error
 
 
-def test_attributes_cannot_be_set() -> None:
+def test_attributes_and_arguments_that_do_not_exist_are_refused() -> None:
     study = mauvecl.Study().paper()
     for thing, name in ((study, "star"), (study.run, "fap"), (mauvecl.Instrument.load("mauvesim"), "light_loss")):
         with pytest.raises(InputError) as error:
             setattr(thing, name, 1)
         assert error.value.key == name
-
-
-def test_python_reports_missing_and_superfluous_arguments() -> None:
     star = mauvecl.Source.from_library("G2V")
     for call in (lambda: star.flaring(), lambda: star.binned(1.0, 2.0), lambda: mauvecl.Study().run.__class__(5)):
         with pytest.raises(TypeError, match="argument"):

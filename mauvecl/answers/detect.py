@@ -13,16 +13,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from mauvecl.answers import closed_forms as forms
-from mauvecl.answers.answer import (
-    IF_KNOWN,
-    Answer,
-    InCell,
-    TableOf,
-    metadata_of,
-    name_of_instrument,
-    reported,
-    share_columns,
-)
+from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, name_of_instrument, reported, share_columns
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection.detection import (
     AREA_COLUMNS,
@@ -418,7 +409,7 @@ class UnknownAnswer(Answer):
     table = TableOf(
         "unknowns", UNKNOWN_COLUMNS, "_rows",
         title="What unknowns cost: S/N of the matched statistic, by closed forms",
-        about=lambda answer: metadata_of(answer, "study.run.fap", "study.limit.power") | {"study": answer.study.toml()},
+        about=("study.run.fap", "study.limit.power", "study"),
     )  # fmt: skip
 
     def of_star(self, star: str) -> tuple[float, dict[str, forms.Cost]]:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
+from operator import itemgetter
 from threading import Lock
 from typing import TYPE_CHECKING, Any
 
@@ -222,7 +223,7 @@ def _unknown_columns(digits: str) -> tuple[Column, ...]:
 def _draw_columns(answer: LimitAnswer) -> tuple[Column, ...]:
     draws = next(limit.unknown.draws for limit in answer.limits if limit.unknown is not None)
     values = (
-        Column(name, lambda row, k=k: row.unknown.draws.values[:, k], description=f"drawn {label}")
+        Column(name, itemgetter(k), description=f"drawn {label}").of(lambda row: row.unknown.draws.values.T)
         for k, (name, label) in enumerate(zip(draws.names, draws.labels, strict=True))
     )
     return (*answer.flare_columns, *values, Column(answer.study.limit.of, "unknown.limits", "", "closed-form limit"))

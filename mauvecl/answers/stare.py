@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain, product
+from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -346,8 +347,8 @@ class StareAnswer(Answer):
         star = self.stares[number]
         columns = [*FRAME_COLUMNS, *(() if star.pointing_loss is None else (LOSS_COLUMN,))]
         for (k, band), (kind, (attribute, text)) in product(enumerate(star.light.bands), LIGHT.items()):
-            values, name = getattr(star.light, attribute)[:, k], kind + band_suffix(band, k)
-            columns.append(Column(name, lambda _, values=values: values, "DN / s", f"{band}: {text}"))
+            column = Column(kind + band_suffix(band, k), itemgetter(k), "DN / s", f"{band}: {text}")
+            columns.append(column.of(attrgetter(f"light.{attribute}.T")))
         return table_of(columns, [star], star=star.label, **metadata_of(self, *SEED), **star.at)
 
     @property

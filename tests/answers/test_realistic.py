@@ -19,15 +19,13 @@ SETTINGS = [
 ASKED = Study().with_settings(SETTINGS)
 
 
-def test_defaults_are_realistic() -> None:
+def test_defaults_are_realistic_unlike_those_of_the_paper() -> None:
     study = Study()
     assert (study.observation.instrument, study.nuisances.usual, study.run.statistics) == ("mauve", True, ("matched",))
     mauve, mauvesim = Instrument.load("mauve"), Instrument.load("mauvesim")
     assert (mauve.dark_unit, mauvesim.dark_unit) == ("electrons", "DN")
     assert mauve == mauvesim.with_(dark_unit="electrons", photon_noise="poisson")
-
-
-def test_paper_and_ideal_change_the_conventions_alone() -> None:
+    # Nothing but these conventions changes.
     for changed, instrument in ((ASKED.paper(), "mauvesim"), (ASKED.ideal(), "mauve")):
         assert changed.observation.instrument == instrument
         assert not changed.nuisances.usual

@@ -23,16 +23,14 @@ def found(study: Study) -> Any:
     return visible(study)
 
 
-def test_messages_name_unseen_targets_and_the_orbit(found: Any) -> None:
+def test_unseen_targets_are_named_and_the_others_have_days_in_the_calendar(found: Any) -> None:
     reported = " ".join(found.messages)
     assert "EK Dra is never seen: the limit of declination (-46.4 to 31.8 deg) alone leaves nothing" in reported
     assert "mean Sun-synchronous" in reported
     assert "Stray light is not modelled" in reported
     assert {"earth_limb_deg", "sun_deg", "moon_deg", "proton_flux"} <= set(found.assumptions["limit"])
     assert all("assumption" in source for source in found.assumptions["source"])
-
-
-def test_calendar_beyond_the_elements_has_days(found: Any) -> None:
+    # Windows beyond the elements are not known.
     events = icalendar.Calendar.from_ical(found.documents["visible.ics"]()).walk("VEVENT")
     assert {str(event["SUMMARY"]) for event in events} == {"eps Eri", "AU Mic"}
     for name in NAMES:
