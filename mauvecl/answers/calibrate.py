@@ -96,7 +96,8 @@ THROUGHPUT_COLUMNS = (
            "over nominal", ".4f"),
     Column("relative_error", "throughput.error", "", "relative standard error, with that of the gain", "error",
            percent(".2f")),
-    Column("relative_error_counts", "relative_error_counts", "",
+    Column("relative_error_counts",
+           lambda fit: np.sqrt(np.maximum(fit.throughput.error**2 - fit.transfer.relative_gain_error**2, 0.0)), "",
            "relative standard error of DN per photon, which the gain does not change"),
 )  # fmt: skip
 DARK_COLUMNS = (
@@ -184,11 +185,6 @@ class CalibrateAnswer(Answer):
         """Throughput at each pixel."""
         fit = self.throughput
         return np.asarray(np.exp(fit.log_factor) * self.nominal.throughput(fit.wavelength_nm))
-
-    @property
-    def relative_error_counts(self) -> NDArray[np.float64]:
-        """Relative standard error of DN per photon at each pixel."""
-        return np.sqrt(np.maximum(self.throughput.error**2 - self.transfer.relative_gain_error**2, 0.0))
 
     @property
     def tables(self) -> dict[str, Table]:

@@ -187,11 +187,6 @@ class ChangeAnswer(Answer):
         return (*self.USES, "orbit", "seed") if self.periods else self.USES
 
     @property
-    def many(self) -> int:
-        """Number of stars at other magnitudes: all with a magnitude, in every cell of the sweep."""
-        return len(self.along) // (MAGNITUDES.size * len(self.study.change.of))
-
-    @property
     def visits(self) -> str:
         """Number and exposure of the visits, as sentences say them."""
         visits = self.study.change.visits

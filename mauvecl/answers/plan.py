@@ -370,14 +370,12 @@ def _planned(
     return targets.Planned(target, exposed, observed, its, rates, recovered, best, why, errors, ideal)
 
 
-SUMMARY_TABLE = "plan.ecsv"
 #: Explanation of the columns.
 LEGEND = (
     "E50 and E90: bolometric energies from which on half and 90 % of the flares are recovered. Flares: recovered "
     "in the hours observed, expected by the rates as they are; 95 % of campaigns recover the numbers next to them, by "
     "Poisson's scatter and that of a star's rate; ideal: by the closed form if everything but the noise were known; "
-    "P(>= 1): probability of recovering any. False alarms: expected of "
-    f"noise. Numbers are those of {SUMMARY_TABLE}."
+    "P(>= 1): probability of recovering any. False alarms: expected of noise. Numbers are those of plan.ecsv."
 )
 
 

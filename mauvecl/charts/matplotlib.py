@@ -29,8 +29,6 @@ INK = {
 }  # fmt: skip
 #: Wavelengths that are shown, nm.
 RANGE_NM = (200.0, 700.0)
-#: Markers by their names in charts.
-MARKERS = {"circle": "o"}
 #: Cells of a mesh above which vector files hold it as pixels.
 MANY = 5000
 #: Panels side by side.
@@ -317,7 +315,7 @@ def _draw_series(axis: Any, item: Series) -> Any:
         case Band():
             axis.fill_between(*at, step="mid" if item.step else None, **look, linewidth=0)
         case Dots():
-            form = MARKERS.get(item.marker, item.marker) or "none"
+            form = "o" if item.marker == "circle" else item.marker or "none"
             axis.errorbar(*at, fmt=form, markersize=0.6 * item.size, elinewidth=0.6 * item.width, **look)
         case Line():
             step = "steps-mid" if item.step else "default"

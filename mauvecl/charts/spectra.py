@@ -235,10 +235,12 @@ AROUND_NM = 15.0
 
 def along_magnitude(answer: ChangeAnswer, names: Sequence[str], scale: float) -> list[tuple[str, Any, Any]]:
     """Return name, magnitudes and smallest changes of the first star, times a factor, where they are known."""
+    from mauvecl.answers.change import MAGNITUDES
+
     lines = list[tuple[str, Any, Any]]()
     for name in names:
         own = [row for row in answer.along if row.change.name == name]
-        x, y = np.array([(row.magnitude, row.smallest.one) for row in own[: len(own) // answer.many]]).T
+        x, y = np.array([(row.magnitude, row.smallest.one) for row in own[: MAGNITUDES.size]]).T
         lines.append((shown_name(name), x[np.isfinite(y)], scale * y[np.isfinite(y)]))
     return lines
 
