@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,9 +26,7 @@ if TYPE_CHECKING:
 
 #: Function that is called with the number of simulations after each of them.
 Report = Callable[[int], None] | None
-#: Steps of the search for the root of the closed form, from where a flare is hardest to see.
-STEPS = {"magnitude": -0.5, "amplitude": 2.0, "exposure": 2.0}
-#: Ends of that search, hardest and easiest.
+#: Ends of the search for the root of the closed form, hardest and easiest; the shortest exposure is a frame.
 SEARCH = {"magnitude": (20.0, -2.0), "amplitude": (1e-5, 1e3), "exposure": (None, 1e6)}
 #: Largest number of simulations; two or three usually suffice, since each moves by the closed form's slope.
 MOST_EVALUATIONS = 8
@@ -145,13 +144,16 @@ class LimitSearch:
             if self.theory(ends[0]) < self.power <= self.theory(ends[1]):
                 return crossing(*ends, rtol=1e-5)
         hardest, easiest = SEARCH[self.of]
-        value = self.frame_s if hardest is None else hardest
-        if self.theory(value) >= self.power:
+        first = hardest or self.frame_s
+        if self.of == "magnitude":
+            values = np.arange(first, easiest - 0.1, -0.5).tolist()
+        else:
+            values = (first * 2.0 ** np.arange(np.ceil(np.log2(easiest / first)) + 1)).tolist()
+        if self.theory(first) >= self.power:
             if self.of == "exposure":
-                return value
-            raise self._beyond(value, "already exceeds")
-        while (easiest - value) * (_nearer(self.of, value) - value) > 0:
-            before, value = value, _nearer(self.of, value)
+                return first
+            raise self._beyond(first, "already exceeds")
+        for before, value in pairwise(values):
             if self.theory(value) < self.power:
                 continue
             if self.of == "exposure":
@@ -209,11 +211,6 @@ class LimitSearch:
         values = (_value(self.of, at - width), _value(self.of, at + width))
         below, above = (special.ndtri(np.clip(self.theory(v), 1e-9, 1 - 1e-9)) for v in values)
         return float((above - below) / (2 * width))
-
-
-def _nearer(of: str, value: float) -> float:
-    """Return the next value towards easier detection."""
-    return value + STEPS[of] if of == "magnitude" else value * STEPS[of]
 
 
 def _coordinate(of: str, value: float) -> float:

@@ -1,6 +1,5 @@
 """Visibility answers: tables agree with each other and with the host, and the calendar is valid."""
 
-import tomllib
 from typing import Any
 
 import icalendar
@@ -55,12 +54,3 @@ def test_toml_dates_are_read() -> None:
     starts = {"2027-01-01": "01T00", "2027-01-01T06:00:00": "01T06", "2027-01-01T06:00:00+02:00": "01T04"}
     for text, found in starts.items():
         assert paper(f"orbit.start={text}").orbit.times().iso(0.0) == f"2027-01-{found}:00:00"
-
-
-def test_study_contains_all_flags(study: Study) -> None:
-    limits = ["orbit.limits.moon_deg=none", "orbit.limits.anomaly=[[-90, -50], [40, -50], [0, 0]]"]
-    changed = study.with_settings([*limits, "orbit.limits.eclipse=only"])
-    assert Study.build(tomllib.loads(changed.toml()), "text") == changed
-    assert changed.orbit.limits.moon_deg is None
-    assert 'moon_deg = "none"' in changed.toml()
-    assert "orbit" not in tomllib.loads(Study().paper().toml())
