@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.answers import closed_forms as forms
-from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf, first_of, share_columns
+from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, first_of, share_columns
 from mauvecl.answers.limit_search import LimitSearch, Point, Report, settle
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection.distributions import Interval
@@ -32,8 +32,6 @@ from mauvecl.study.cases import (
     amplitude_column,
     cases,
     collect_messages,
-    full_label,
-    place_columns,
     star_column,
     star_label,
     worst_first,
@@ -138,10 +136,9 @@ class Unknown:
 
 
 @dataclass(frozen=True)
-class Limit:
+class Limit(InCell):
     """Limit of a quantity."""
 
-    star: str
     amplitude: float  # amplitude of the flare; NaN if the amplitude is the limit
     of: str
     statistic: str
@@ -152,12 +149,10 @@ class Limit:
     check: Point  # detection probability at the value, simulated again with another seed
     points: tuple[Point, ...]  # simulations of the search
     curve: tuple[tuple[float, float], ...] = field(compare=False, repr=False)  # the closed form around the limit
-    at: Mapping[str, float | str] = field(default_factory=dict)  # sweep values
-    unknown: Unknown | None = None  # for limits averaged over unknown instrument values
-    messages: tuple[str, ...] = ()  # saturation at the limit, without and with the flare
-    cost: forms.Cost | None = None  # loss of S/N to unknowns at the limit
-    # The star at the limit, without the flare.
-    quiet: Expectation | None = field(default=None, compare=False, repr=False)
+    unknown: Unknown | None  # for limits averaged over unknown instrument values
+    messages: tuple[str, ...]  # saturation at the limit, without and with the flare
+    cost: forms.Cost  # loss of S/N to unknowns at the limit
+    quiet: Expectation = field(compare=False, repr=False)  # the star at the limit, without the flare
 
     @property
     def verdict(self) -> str:
@@ -252,10 +247,6 @@ class LimitAnswer(Answer):
         when=lambda answer: answer.assumptions is not None,
     )  # fmt: skip
 
-    def placed(self, columns: Sequence[Column]) -> tuple[Column, ...]:
-        """Return columns after those of the star and of swept quantities other than the amplitude."""
-        return (*place_columns(self.study.sweep, "amplitude", star="star"), *columns)
-
     @property
     def flare_columns(self) -> tuple[Column, ...]:
         """Columns of flare and statistic."""
@@ -272,7 +263,7 @@ class LimitAnswer(Answer):
         ideal = "" if np.isnan(limit.ideal) else f"; {number(limit.ideal)} {IF_KNOWN}"
         least = first_of(len(self.limits), "limits")
         return (
-            f"{self.instrument_name} would see {flare} on {full_label(limit.star, limit.at)}{within} with a "
+            f"{self.instrument_name} would see {flare} on {limit.title}{within} with a "
             f"chance of {100 * asked.power:g} % {before} {number(limit.value.value)} "
             f"({number(limit.value.low)} to {number(limit.value.high)}{ideal}){least}."
         )
@@ -298,14 +289,14 @@ class LimitAnswer(Answer):
     @cached_property
     def inputs(self) -> list[Expectation]:
         """Each star at its limits."""
-        return [limit.quiet for limit in self.limits if limit.quiet is not None]
+        return [limit.quiet for limit in self.limits]
 
     @property
     def messages(self) -> list[str]:
         """Messages about failed limits, the stars, and unknowns."""
         at_limits = [text for limit in self.limits for text in limit.messages]
         stars = worst_first([*at_limits, *collect_messages(self.inputs, self.study.processes)])
-        costs = [limit.cost for limit in self.limits if limit.cost is not None]
+        costs = [limit.cost for limit in self.limits]
         failed = [Message(f"NO LIMIT: {text}.", "no limit") for text in self.failed]
         unknown = [*forms.marginal_lines(self.study.nuisances), *forms.cost_lines(costs, self.study.nuisances)]
         return [*failed, *stars, *unknown]
@@ -339,9 +330,9 @@ def solve(case: Case, statistic: str, engine: Engine | Pool, report: Report = No
     where = f"{star_label(named, quiet)} at {there}, flare of {100 * rise:.4g} %"
     amplitude = float("nan") if question.of == "amplitude" else case.amplitudes[0]
     return Limit(
-        star_label(named, quiet), amplitude, question.of, statistic, question.power, value, closed_form=theory,
+        star_label(named, quiet), case.at, amplitude, question.of, statistic, question.power, value, closed_form=theory,
         ideal=float("nan") if known else LimitSearch(ideal, statistic).root_or_nan(theory),
-        check=check, points=simulated, curve=question.curve(value.value), at=case.at,
+        check=check, points=simulated, curve=question.curve(value.value),
         unknown=Unknown(draws, roots, forms.shares(draws, roots)) if draws else None,
         messages=tuple(of_kind(collect_messages([quiet, flare]), SATURATED)), quiet=quiet,
         cost=forms.unknown_cost(where, quiet, flare, study.nuisances, study.run.comparison()),

@@ -81,7 +81,7 @@ def limits(answer: LimitAnswer) -> Picture:
         flare = "" if np.isnan(limit.amplitude) else f", flare {100 * limit.amplitude:g} %"
         statistic = f", {limit.statistic}" if several else ""
         value = f"{limit.value.value:.2f}" if of == "magnitude" else figures.written(float(f"{limit.value.value:.3g}"))
-        text = f"{limit.star}{flare}{statistic}: {value}{QUANTITIES[of].suffix}"
+        text = f"{limit.label}{flare}{statistic}: {value}{QUANTITIES[of].suffix}"
         at = [point.value for point in points], p, (p - low, high - p)
         series += [
             Dots(text, colour, marker=marker, size=6, at=at),
